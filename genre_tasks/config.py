@@ -1,0 +1,113 @@
+"""Configuration of the stages: bounded pydantic models. A stage gets its own subtree and nothing else.
+
+Defaults are the paper's numbers where the paper gives one (Sec. III and IV); presets in ``configs/`` say what they
+change and why.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class Section(BaseModel):
+    """Base of all sections: unknown keys are errors, values are frozen."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class IngestConfig(Section):
+    """Chunks, source views and the working resolution (paper Sec. III-C, IV-A)."""
+
+    chunk_frames: int = Field(20, ge=2, le=200, description="Frames of a chunk; the last one may be shorter.")
+    source_every: int = Field(4, ge=1, le=20, description="Every n-th frame is a source view, the others held out.")
+    width_px: int = Field(1280, ge=16, le=4096, description="Working width of all images.")
+    height_px: int = Field(720, ge=16, le=4096, description="Working height of all images.")
+    cameras: tuple[str, ...] | None = Field(None, description="Cameras to use, by name; null: all.")
+    points: str | None = Field(None, description="A PLY file with coloured points, for a log without LiDAR.")
+    strict: bool = Field(False, description="Fail on a missing or unreadable image or sweep instead of marking it.")
+    min_actor_travel_m: float = Field(0.5, ge=0, description="A track that moves less is part of the background.")
+    min_actor_points: int = Field(10, ge=1, description="An actor with fewer LiDAR points is left out and counted.")
+    min_actor_frames: int = Field(3, ge=1, description="An actor seen in fewer frames is left out and counted.")
+
+
+class InitialConfig(Section):
+    """Gaussians on LiDAR points and a fixed number far away (paper Sec. III-A)."""
+
+    max_points: int = Field(400_000, ge=100, description="Near Gaussians at most; voxel size follows from it.")
+    distant_count: int = Field(10_000, ge=0, description="Gaussians of the distant region.")
+    distant_radius_m: float = Field(200.0, gt=10, description="Radius of the distant region's shell.")
+    neighbours: int = Field(16, ge=4, le=64, description="LiDAR neighbourhood for normal and thickness.")
+    opacity: float = Field(0.6, gt=0, lt=1, description="Opacity of near Gaussians at the start.")
+    max_range_m: float = Field(100.0, gt=1, description="LiDAR points farther from the path are left to the distant region.")
+
+
+class LossConfig(Section):
+    """Weights of the rendering loss (paper Eq. 9–11, Sec. III-C)."""
+
+    rgb: float = Field(0.8, ge=0)
+    perceptual: float = Field(0.2, ge=0, description="λ_lpips; the distance is the project's own perceptual one.")
+    ssim: float = Field(0.2, ge=0)
+    depth: float = Field(0.01, ge=0, description="Source views only.")
+    novel: float = Field(0.5, ge=0, description="Weight of the novel-view terms.")
+    perceptual_every: int = Field(4, ge=1, description="The perceptual term is taken in every n-th iteration.")
+
+
+class OptimiserConfig(Section):
+    """GNet and ENet: the unrolled learned optimiser (paper Sec. III-C, III-D)."""
+
+    iterations: int = Field(24, ge=1, le=1000, description="T.")
+    views_per_iteration: int = Field(6, ge=1, description="Source views rendered in each iteration.")
+    novel_views_per_iteration: int = Field(0, ge=0, description="Fixed novel views rendered in each iteration.")
+    loss: LossConfig = LossConfig()
+    method: Literal["learned", "adam"] = Field("learned", description="adam: the tuned per-attribute baseline.")
+    weights: str = Field("builtin", description="builtin, or a path to a .safetensors file.")
+    snapshots: int = Field(6, ge=0, description="Intermediate scenes kept for the curve of accuracy against seconds.")
+    seed: int = Field(0, ge=0)
+
+
+class NovelViewsConfig(Section):
+    """Views beside the path that are fixed: the source frames' poses, shifted (design: +3 and −3 m only)."""
+
+    shifts_m: tuple[float, ...] = Field((3.0, -3.0), description="Left is positive.")
+    lidar_max_points: int = Field(200_000, ge=100, description="Points drawn in the LiDAR map.")
+
+
+class FnetConfig(Section):
+    """FNet: the one-step diffusion fixer (paper Sec. III-B)."""
+
+    model: Literal["small", "sd-turbo"] = "small"
+    weights: str = Field("builtin", description="builtin, or a folder with the model's weights.")
+    timestep: int = Field(200, ge=1, le=999, description="τ.")
+    batch_views: int = Field(4, ge=1)
+    seed: int = Field(0, ge=0)
+
+
+class EvaluateConfig(Section):
+    """What is measured after a stage."""
+
+    shifts_m: tuple[float, ...] = Field((1.0, 2.0, 3.0, 4.0, 5.0), description="Each is rendered on both sides.")
+    distributions: bool = Field(True, description="Fréchet and kernel distances against the chunk's real images.")
+    every: int = Field(1, ge=1, description="At shifts, every n-th frame of the chunk is rendered.")
+    bootstrap: int = Field(200, ge=0, description="Resamples over frames for the 95 % interval of the kernel distance.")
+    pictures: int = Field(3, ge=0, description="Pictures kept for the report.")
+
+
+class StorageConfig(Section):
+    """What is kept of what could be rendered again."""
+
+    keep: Literal["all", "needed"] = Field("all", description="needed: no snapshots.")
+
+
+class PipelineConfig(Section):
+    """The whole configuration: one section per stage."""
+
+    ingest: IngestConfig = IngestConfig()
+    initial: InitialConfig = InitialConfig()
+    gnet: OptimiserConfig = OptimiserConfig()
+    novel_views: NovelViewsConfig = NovelViewsConfig()
+    fnet: FnetConfig = FnetConfig()
+    enet: OptimiserConfig = OptimiserConfig(iterations=12, novel_views_per_iteration=6)
+    evaluate: EvaluateConfig = EvaluateConfig()
+    storage: StorageConfig = StorageConfig()

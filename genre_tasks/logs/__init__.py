@@ -1,0 +1,1 @@
+"""The typed driving log and its readers."""

@@ -1,0 +1,157 @@
+"""Values of a driving log: cameras, images, sweeps, cuboid tracks.
+
+Conventions: ``world_SE3_camera`` takes camera coordinates to world coordinates; camera axes x right, y down,
+z forward; metres, seconds, float64; quaternions w, x, y, z. Continuous image coordinates: the top-left corner of the
+image is (0, 0) and the centre of the first pixel is (0.5, 0.5).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float64 = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A pinhole lens with optional Brown–Conrady distortion.
+
+    ``fx_px … cy_px`` are in pixels of an image of ``width_px × height_px``; ``distortion`` is (k1, k2, p1, p2, k3) or
+    empty for an undistorted image.
+    """
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    width_px: int
+    height_px: int
+    distortion: tuple[float, ...] = ()
+
+    def resized(self, width_px: int, height_px: int) -> Lens:
+        """The same lens for an image resampled to ``width_px × height_px`` (whole field of view kept)."""
+        sx, sy = width_px / self.width_px, height_px / self.height_px
+        return replace(
+            self,
+            fx_px=self.fx_px * sx,
+            fy_px=self.fy_px * sy,
+            cx_px=self.cx_px * sx,
+            cy_px=self.cy_px * sy,
+            width_px=width_px,
+            height_px=height_px,
+        )
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera of the rig: its name, its lens at native resolution, and the rolling shutter's readout (0 = global)."""
+
+    name: str
+    lens: Lens
+    readout_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One LiDAR sweep in world coordinates.
+
+    ``points_world`` [N, 3] float64 metres; ``intensity`` [N] float32 in [0, 1]; ``timestamps_s`` [N] float64, per point.
+    """
+
+    points_world: Float64
+    intensity: Float32
+    timestamps_s: Float64
+
+
+@dataclass(frozen=True)
+class CuboidTrack:
+    """One annotated object through time.
+
+    ``frames`` [F] int (increasing log frames in which it is annotated); ``world_SE3_box`` [F, 4, 4] float64, box axes
+    x forward (length), y left (width), z up (height); ``size_m`` (length, width, height), the median over frames.
+    ``moving``: the annotation says that it moves in at least one frame.
+    """
+
+    track_id: str
+    label: str
+    frames: NDArray[np.int64]
+    world_SE3_box: Float64
+    size_m: tuple[float, float, float]
+    moving: bool
+
+
+@runtime_checkable
+class Truth(Protocol):
+    """The true image at any viewpoint (only a ray-cast log has it)."""
+
+    def image(
+        self,
+        frame: int,
+        world_SE3_camera: Float64,  # [4, 4]
+        lens: Lens,
+    ) -> NDArray[np.uint8]:  # [H, W, 3] sRGB, H × W of the lens
+        """What a camera at that pose would have seen at that frame's time."""
+        ...
+
+
+class DrivingLog(Protocol):
+    """A driving log, read lazily: opening is cheap, images and sweeps are read when asked for.
+
+    Frames count from 0 to ``frame_count - 1``. A *missing* image or sweep is ``None``; an *unreadable* sweep raises
+    ``InputError`` naming file and frame (image bytes are not decoded here).
+    """
+
+    @property
+    def uri(self) -> str:
+        """What the user wrote: ``pandaset:PATH/002``, ``synthetic:street?seed=1000``."""
+        ...
+
+    @property
+    def dataset(self) -> str:
+        """``pandaset``, ``synthetic``: the first folder of the store's layout."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """A name for the log that can be a folder: ``002``, ``street-seed=1000``."""
+        ...
+
+    @property
+    def frame_count(self) -> int: ...
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]: ...
+
+    def frame_timestamp_s(self, frame: int) -> float:
+        """The LiDAR sweep's time, seconds (float64)."""
+        ...
+
+    def world_SE3_lidar(self, frame: int) -> Float64:
+        """[4, 4]; the LiDAR (ego) pose: x forward, y left, z up. Raises ``InputError`` if it is not finite."""
+        ...
+
+    def world_SE3_camera(self, camera: str, frame: int) -> Float64:
+        """[4, 4]. Raises ``InputError`` if it is not finite."""
+        ...
+
+    def camera_timestamp_s(self, camera: str, frame: int) -> float: ...
+
+    def image_bytes(self, camera: str, frame: int) -> bytes | None:
+        """The encoded image (JPEG or PNG) as it came, or ``None`` where the log has none."""
+        ...
+
+    def sweep(self, frame: int) -> Sweep | None: ...
+
+    def tracks(self) -> tuple[CuboidTrack, ...]: ...
+
+    def digest(self) -> str:
+        """sha256 (hex) over everything that a reconstruction may read from this log."""
+        ...
+
+    @property
+    def truth(self) -> Truth | None: ...

@@ -1,0 +1,1 @@
+"""Chunks, Gaussians and the scene graph."""

@@ -1,0 +1,56 @@
+"""The paper's 14-attribute Gaussians (Sec. III-A), in raw space, and the one conversion to what is rendered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+OPACITY_CLAMP = 1e-6
+"""Opacities are kept in [1e-6, 1 − 1e-6] when they are taken to logits, so that the logit is finite."""
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N Gaussians as a structure of arrays, float32, in the space in which they are optimised."""
+
+    means: Tensor  # [N, 3] metres
+    log_scales: Tensor  # [N, 3] natural logarithm of metres
+    quats: Tensor  # [N, 4] w, x, y, z; need not be unit
+    logit_opacities: Tensor  # [N]
+    colors: Tensor  # [N, 3] sRGB, nominally in [0, 1]
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    def activated(self) -> Splats:
+        """What a renderer takes: scales = exp, opacities = sigmoid; the only place where this is done."""
+        return Splats(self.means, self.log_scales.exp(), self.quats, torch.sigmoid(self.logit_opacities), self.colors)
+
+    def packed(self) -> Tensor:
+        """[N, 14] in the order means 0:3, log_scales 3:6, quats 6:10, logit_opacities 10, colors 11:14."""
+        return torch.cat([self.means, self.log_scales, self.quats, self.logit_opacities[:, None], self.colors], 1)
+
+    @staticmethod
+    def unpacked(packed: Tensor) -> Gaussians:
+        """The inverse of :meth:`packed`; views into ``packed`` [N, 14]."""
+        return Gaussians(packed[:, 0:3], packed[:, 3:6], packed[:, 6:10], packed[:, 10], packed[:, 11:14])
+
+
+@dataclass(frozen=True)
+class Splats:
+    """N Gaussians as a renderer takes them."""
+
+    means: Tensor  # [N, 3] metres
+    scales: Tensor  # [N, 3] metres, > 0
+    quats: Tensor  # [N, 4] w, x, y, z; normalised by the renderer
+    opacities: Tensor  # [N] in [0, 1]
+    colors: Tensor  # [N, 3]
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    def to(self, *args: object, **kwargs: object) -> Splats:
+        """Each tensor moved as ``Tensor.to`` moves it."""
+        return Splats(*(getattr(self, f.name).to(*args, **kwargs) for f in fields(self)))
