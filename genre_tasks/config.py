@@ -94,12 +94,6 @@ class EvaluateConfig(Section):
     pictures: int = Field(3, ge=0, description="Pictures kept for the report.")
 
 
-class StorageConfig(Section):
-    """What is kept of what could be rendered again."""
-
-    keep: Literal["all", "needed"] = Field("all", description="needed: no snapshots.")
-
-
 class PipelineConfig(Section):
     """The whole configuration: one section per stage."""
 
@@ -110,4 +104,3 @@ class PipelineConfig(Section):
     fnet: FnetConfig = FnetConfig()
     enet: OptimiserConfig = OptimiserConfig(iterations=12, novel_views_per_iteration=6)
     evaluate: EvaluateConfig = EvaluateConfig()
-    storage: StorageConfig = StorageConfig()

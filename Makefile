@@ -1,0 +1,29 @@
+# make demo: the main job on a synthetic log.  make test: the tests.  Both set up .venv first.
+PYTHON ?= python3
+VENV   ?= .venv
+GENRE   = $(VENV)/bin/genre
+READY   = $(VENV)/.ready
+
+.PHONY: setup demo test test-all lint clean
+setup: $(READY)
+
+$(READY): pyproject.toml constraints.txt setup.py $(wildcard genre_tasks/render/*.cpp)
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "GenRe needs Python 3.11 or newer; run e.g. make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(VENV)/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@touch $(READY)
+
+demo: $(READY)
+	$(GENRE) run 'synthetic:street?seed=1000' --preset demo
+
+test: $(READY)
+	$(VENV)/bin/python -m pytest
+
+test-all: $(READY)
+	$(VENV)/bin/python -m pytest -m "" --timeout 3600
+
+lint: $(READY)
+	$(VENV)/bin/ruff check . && $(VENV)/bin/ruff format --check . && $(VENV)/bin/mypy && $(VENV)/bin/lint-imports
+
+clean:
+	rm -rf $(VENV) build *.egg-info genre_tasks/render/*.so
