@@ -15,8 +15,10 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from genre_tasks.errors import InputError
+from genre_tasks.metrics.threads import map_single_threaded
 
 TAPS = (0, 2, 4, 10, 14)
 """Blocks whose outputs are compared: strides 2, 4, 8, 16 and 32, the last block of each resolution but the head's."""
@@ -68,36 +70,44 @@ class PerceptualDistance(nn.Module):
         """Distance of each pair; differentiable in ``a`` and in ``b``."""
         if a.shape != b.shape or a.ndim != 4 or a.shape[-1] != 3:
             raise ValueError(f"expected two tensors of shape [B, H, W, 3], got {tuple(a.shape)} and {tuple(b.shape)}")
-        return self.between(self.features(a), self.features(b))
+        if a.is_cuda or not len(a):
+            return self._distance(a, b)
+        return _PerImage.apply(self, a, b)
 
-    def features(self, images: Tensor) -> tuple[Tensor, ...]:
-        """Unit-normalised features at each tap, [B, C_l, H_l, W_l]: to be kept where one image is compared often."""
+    def pooled_features(self, images: Tensor) -> Tensor:
+        """[B, H, W, 3] sRGB in [0, 1] → [B, 1280], the input of ImageNet's classifier; no gradient.
+
+        Images are taken one by one: memory does not grow with B.
+        """
+        if images.is_cuda:
+            return self._pooled(images)
+        if not len(images):
+            return images.new_zeros((0, POOLED_DIMENSIONS))
+        return torch.cat(map_single_threaded(self._pooled, images.split(1)))
+
+    def _distance(self, a: Tensor, b: Tensor) -> Tensor:
+        """[B] from [B, H, W, 3] twice."""
+        distances = []
+        for left, right in zip(self._features(a), self._features(b), strict=True):
+            distances.append((left - right).square().sum(1).mean((1, 2)))
+        return torch.stack(distances).mean(0)
+
+    def _features(self, images: Tensor) -> list[Tensor]:
+        """Unit-normalised features at each tap, [B, C_l, H_l, W_l]."""
         x = self._stem(images)
         out = []
         for index, block in enumerate(self.network._blocks[: self.taps[-1] + 1]):
             x = block(x)
             if index in self.taps:
                 out.append(F.normalize(x, dim=1, eps=_NORM_FLOOR))
-        return tuple(out)
-
-    @staticmethod
-    def between(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
-        """[B] distance between two results of :meth:`features` (the second may have a batch of 1)."""
-        distances = []
-        for left, right in zip(a, b, strict=True):
-            # Rows first, then the column of row sums: a reduction to few numbers is split by the number of threads,
-            # and the same input is to give the same bytes at any thread count.
-            rows = (left - right).square().sum((1, 3)).sum(1)
-            distances.append(rows / (left.shape[2] * left.shape[3]))
-        return torch.stack(distances).mean(0)
+        return out
 
     @torch.no_grad()
-    def pooled_features(self, images: Tensor) -> Tensor:
-        """[B, H, W, 3] sRGB in [0, 1] → [B, 1280], the input of ImageNet's classifier; no gradient."""
+    def _pooled(self, images: Tensor) -> Tensor:
         x = self._stem(images)
         for block in self.network._blocks:
             x = block(x)
-        return self.network._swish(self.network._conv_head(x)).mean(3).mean(2)
+        return self.network._swish(self.network._conv_head(x)).mean((2, 3))
 
     def _stem(self, images: Tensor) -> Tensor:
         """Preprocessing as the weights were trained with, padding of small images, and the first convolution."""
@@ -106,6 +116,35 @@ class PerceptualDistance(nn.Module):
         if height < STRIDE or width < STRIDE:
             x = F.pad(x, (0, max(0, STRIDE - width), 0, max(0, STRIDE - height)), mode="replicate")
         return self.network._swish(self.network._conv_stem(x.contiguous(memory_format=torch.channels_last)))
+
+
+class _PerImage(torch.autograd.Function):
+    """The distance of each pair on one thread, forwards and backwards: see :mod:`genre_tasks.metrics.threads`."""
+
+    @staticmethod
+    def forward(ctx: Any, module: PerceptualDistance, a: Tensor, b: Tensor) -> Tensor:
+        wanted = ctx.needs_input_grad[1:]
+
+        def one(index: int) -> tuple[list[Tensor], Tensor]:
+            pair = [x[index : index + 1].detach().requires_grad_(w) for x, w in zip((a, b), wanted, strict=True)]
+            with torch.set_grad_enabled(any(wanted)):
+                return pair, module._distance(*pair)
+
+        ctx.graphs = map_single_threaded(one, range(len(a)))
+        return torch.cat([value.detach() for _, value in ctx.graphs])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        wanted = ctx.needs_input_grad[1:]
+
+        def one(index: int) -> tuple[Tensor, ...]:
+            pair, value = ctx.graphs[index]
+            inputs = [x for x, w in zip(pair, wanted, strict=True) if w]
+            return torch.autograd.grad(value, inputs, grad[index : index + 1])
+
+        parts = iter(zip(*map_single_threaded(one, range(len(grad))), strict=True))
+        return None, *(torch.cat(next(parts)) if w else None for w in wanted)
 
 
 @lru_cache(maxsize=4)

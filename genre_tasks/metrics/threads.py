@@ -1,0 +1,33 @@
+"""The same bytes at any thread count: convolutions on one thread each, images side by side.
+
+PyTorch's CPU convolutions and matrix products split their sums by the number of threads, so that their last bits depend
+on it. Here each item is computed on exactly one thread, and the threads are used for several items at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+import torch
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def map_single_threaded(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    """``[function(item) for item in items]`` in order, each call on one thread, ``torch.get_num_threads()`` at a time.
+
+    The gradient mode is a property of a thread: ``function`` sets its own. Exceptions come through.
+    """
+    threads = torch.get_num_threads()
+    try:
+        if threads == 1 or len(items) < 2:
+            torch.set_num_threads(1)
+            return [function(item) for item in items]
+        workers = min(threads, len(items))
+        with ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            return list(pool.map(function, items))
+    finally:
+        torch.set_num_threads(threads)
