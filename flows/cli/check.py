@@ -1,0 +1,26 @@
+"""``genre check``: what a log has and lacks, before hours are spent."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Annotated
+
+import typer
+
+
+def check(
+    log: Annotated[str, typer.Argument(help="pandaset:PATH/002 or synthetic:street?seed=1000")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object to stdout.")] = False,
+) -> None:
+    """Say what a log has and lacks: cameras, images, sweeps, tracks, times, travel, chunks."""
+    from genre_tasks.logs.check import check_log
+    from genre_tasks.logs.registry import open_log
+
+    found = check_log(open_log(log))
+    if as_json:
+        typer.echo(json.dumps(dataclasses.asdict(found), default=str))
+        return
+    from flows.cli.tables import print_fields
+
+    print_fields(log, dataclasses.asdict(found))

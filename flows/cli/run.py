@@ -1,0 +1,81 @@
+"""``genre run``: one log through the whole pipeline, with progress, a table at the end and a report."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from genre_tasks.config import PipelineConfig
+
+DEFAULT_STORE = "genre-store"
+
+
+def run(
+    log: Annotated[str, typer.Argument(help="pandaset:PATH/002 or synthetic:street?seed=1000")],
+    preset: Annotated[str, typer.Option(help="demo, small or paper.")] = "small",
+    config: Annotated[Path | None, typer.Option(help="A YAML file over the preset.")] = None,
+    store: Annotated[str, typer.Option(help="A folder (or URI) that keeps every artifact.")] = DEFAULT_STORE,
+    chunks: Annotated[str | None, typer.Option(help="Which chunks, e.g. 0,1; all without it.")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", help="section.key=value, e.g. gnet.iterations=8.")] = None,
+    strict: Annotated[bool, typer.Option("--strict", help="A missing or unreadable image or sweep is an error.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be computed, and what it would take.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object to stdout.")] = False,
+) -> None:
+    """Reconstruct a log: GNet, novel views, FNet, ENet, evaluation and a report. Finished stages come from the store.
+
+    Add --debug to any command for tracebacks.
+    """
+    from flows.configuration import load_configuration
+    from flows.produce import opened_log
+
+    settings = [*(set_ or []), *(["ingest.strict=true"] if strict else [])]
+    effective = load_configuration(preset, config, settings)
+    wanted = _numbers(chunks)
+    opened_log(log)  # a log that cannot be opened is said before a server is started
+    if dry_run:
+        _dry_run(log, preset, store, wanted, effective, as_json)
+        return
+    from flows.cli.terminal import TerminalReporter, print_run
+    from flows.reconstruct import reconstruct_log
+    from flows.reporting import report_to
+
+    reporter = TerminalReporter()
+    report_to(reporter)
+    with reporter:
+        summary = reconstruct_log(
+            log, preset=preset, store=store, chunks=wanted, config=effective.model_dump(mode="json")
+        )
+    if as_json:
+        typer.echo(json.dumps({key: summary[key] for key in ("log", "preset", "store", "run", "chunks")}))
+    else:
+        print_run(summary)
+
+
+def _numbers(text: str | None) -> list[int] | None:
+    if text is None:
+        return None
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        from genre_tasks.errors import ConfigError
+
+        raise ConfigError(f"cannot read --chunks {text!r}", remedy="Write numbers with commas: 0,1.") from None
+
+
+def _dry_run(
+    log: str, preset: str, store: str, chunks: list[int] | None, config: PipelineConfig, as_json: bool
+) -> None:
+    from flows.cli.terminal import print_plan
+    from flows.configuration import differences
+    from flows.predict import plan_run
+
+    plan: dict[str, Any] = plan_run(log, store, chunks, config)
+    plan |= {"preset": preset, "differs": {k: list(v) for k, v in differences(config, preset).items()}}
+    if as_json:
+        typer.echo(json.dumps(plan))
+    else:
+        print_plan(plan)

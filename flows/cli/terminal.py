@@ -1,0 +1,102 @@
+"""What the terminal shows: one live line per stage, tables at the end."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from flows.produce import ArtifactRef
+
+_HEADLINES = ("interpolation/psnr", "interpolation/ssim", "interpolation/perceptual", "shift_3m/psnr", "shift_3m/perceptual", "shift_3m/kernel")
+
+
+class TerminalReporter:
+    """Progress on stderr: a line that rewrites itself on a terminal, a line every ten seconds elsewhere."""
+
+    def __init__(self) -> None:
+        self._live = sys.stderr.isatty()
+        self._started = 0.0
+        self._said = 0.0
+        self._what = ""
+
+    def __enter__(self) -> TerminalReporter:
+        self._write("starting Prefect", end=not self._live)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if self._live:
+            self._write("")
+
+    def stage_started(self, stage: str, chunk: int) -> None:
+        self._started = self._said = time.monotonic()
+        self._what = f"chunk {chunk}  {stage}"
+        if self._live:
+            self._write(self._what)
+
+    def progress(self, done: int, total: int, note: str = "") -> None:
+        now = time.monotonic()
+        if now - self._said < (0.2 if self._live else 10.0):
+            return
+        self._said = now
+        left = (now - self._started) / done * (total - done) if done else None
+        ahead = "" if left is None else f"  {left:.0f} s left"
+        self._write(f"{self._what}  {done}/{total}  {note}{ahead}", end=not self._live)
+
+    def stage_ended(self, stage: str, chunk: int, ref: ArtifactRef) -> None:
+        seconds = time.monotonic() - self._started
+        word = "from the cache" if ref.cached else f"computed in {seconds:.1f} s"
+        self._write(f"chunk {chunk}  {stage:<18} {word}", end=True)
+        if ref.note:
+            self._write(f"  warning: {ref.note}", end=True)
+
+    def _write(self, text: str, end: bool = False) -> None:
+        if self._live:
+            sys.stderr.write("\r\x1b[2K" + text[:118] + ("\n" if end else ""))
+        else:
+            sys.stderr.write(text + "\n")
+        sys.stderr.flush()
+
+
+def print_run(summary: dict[str, Any]) -> None:
+    """The table of metrics per stage, what came from the cache, and where the report is."""
+    console = Console()
+    for chunk in summary["chunks"]:
+        table = Table(title=f"{summary['log']}, chunk {chunk['chunk']}", title_justify="left")
+        shown = [h for h in _HEADLINES if any(h in s["metrics"] for s in chunk["stages"])]
+        for column in ("stage", "served", "seconds", "peak MiB", *shown):
+            table.add_column(column, justify="left" if column in ("stage", "served") else "right")
+        for stage in chunk["stages"]:
+            cells = [f"{stage['metrics'][h]:.3f}" if h in stage["metrics"] else "" for h in shown]
+            served = "cache" if stage["cached"] else "computed"
+            table.add_row(stage["stage"], served, f"{stage['seconds']:.1f}", f"{stage['peak_mib']:.0f}", *cells)
+        console.print(table)
+        for warning in chunk["warnings"]:
+            console.print(f"  note: {warning}", markup=False)
+    stages = [s for c in summary["chunks"] for s in c["stages"]]
+    hits = sum(s["cached"] for s in stages)
+    console.print(f"{hits} of {len(stages)} stages came from the cache" + (" (all of them)" if hits == len(stages) else ""))
+    console.print(f"run    {summary['run']}")
+    console.print(f"report {summary['report']}", soft_wrap=True)
+
+
+def print_plan(plan: dict[str, Any]) -> None:
+    """The dry run's table."""
+    console = Console()
+    table = Table(title=f"{plan['log']} (dry run)", title_justify="left")
+    for column in ("chunk", "stage", "key", "cache", "seconds", "GB"):
+        table.add_column(column, justify="right" if column in ("seconds", "GB") else "left")
+    for row in plan["stages"]:
+        table.add_row(
+            str(row["chunk"]), row["stage"], (row["key"] or "")[:12], row["cache"], f"{row['seconds']:.0f}", f"{row['gigabytes']:.1f}"
+        )
+    console.print(table)
+    console.print(f"about {plan['seconds']:.0f} s to compute, {plan['gigabytes']:.1f} GB at the peak; predicted from {plan['basis']}")
+    for key, (before, after) in plan["differs"].items():
+        console.print(f"  {key}: {before} → {after}", markup=False)

@@ -1,0 +1,29 @@
+"""``genre verify``: does every artifact of a store still match its manifest?"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+
+def verify(
+    store: Annotated[str, typer.Option(help="The store to read through.")] = "genre-store",
+) -> None:
+    """Read every artifact of a store and compare it with its manifest; exit code 1 if any is damaged."""
+    from genre_tasks.errors import ArtifactCorruptError
+    from storage.local import open_store
+
+    opened = open_store(store)
+    whole, damaged = 0, 0
+    for artifact in opened.artifacts():
+        try:
+            opened.verify(artifact)
+            whole += 1
+        except ArtifactCorruptError as error:
+            damaged += 1
+            typer.echo(f"damaged: {error}")
+    typer.echo(f"{whole} artifacts are whole, {damaged} damaged")
+    if damaged:
+        typer.echo("Run the log again: damaged artifacts are computed anew, nothing else is.")
+        raise typer.Exit(1)

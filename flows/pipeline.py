@@ -1,0 +1,149 @@
+"""The stages of the pipeline as data: name, artifact kind, configuration section, inputs, weights, function.
+
+Reading this file tells what flows into what. Stage functions are named, not imported: a run that is served from the
+cache never pays for torch.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from genre_tasks.config import PipelineConfig
+from storage.code_digest import code_digest
+
+RECONSTRUCTING = ("ingest", "initial", "gnet", "novel_views", "fnet", "enet")
+
+
+@dataclass(frozen=True)
+class StageSpec:
+    """One stage.
+
+    ``function`` is ``module:name``; it is called as ``function(config section, *arguments, progress=…)``, where each
+    argument is the name of an earlier stage (its value) or one of ``log``, ``chunk_index``, ``stage_name``, ``truth``.
+    ``weights`` names the weights it loads; ``also`` are modules it reaches by name only (registries), which belong to
+    its code; ``splits`` names a setting that bounds memory and does not change a payload's bytes: it is halved when
+    memory runs out, and is not part of the key.
+    """
+
+    name: str
+    kind: str
+    section: str
+    function: str
+    arguments: tuple[str, ...]
+    weights: str | None = None
+    also: tuple[str, ...] = ()
+    splits: str | None = None
+
+    @property
+    def module(self) -> str:
+        return self.function.partition(":")[0]
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """The earlier stages it reads."""
+        return tuple(a for a in self.arguments if a not in SPECIAL_ARGUMENTS)
+
+    @property
+    def needs_log(self) -> bool:
+        """Whether it reads the driving log itself (its frames, or the truth a synthetic log has)."""
+        return "log" in self.arguments or "truth" in self.arguments
+
+
+SPECIAL_ARGUMENTS = ("log", "chunk_index", "stage_name", "truth")
+_STAGES = "genre_tasks.stages"
+_READERS = ("genre_tasks.logs.pandaset", "genre_tasks.logs.synthetic")
+
+PIPELINE: tuple[StageSpec, ...] = (
+    StageSpec("ingest", "chunk", "ingest", f"{_STAGES}.ingest:ingest", ("log", "chunk_index"), also=_READERS),
+    StageSpec("initial", "reconstruction", "initial", f"{_STAGES}.initial:initial", ("ingest",)),
+    StageSpec("gnet", "reconstruction", "gnet", f"{_STAGES}.gnet:gnet", ("ingest", "initial"), weights="gnet"),
+    StageSpec("novel_views", "novel_views", "novel_views", f"{_STAGES}.novel_views:novel_views", ("ingest", "gnet")),
+    StageSpec(
+        "fnet",
+        "fixed_views",
+        "fnet",
+        f"{_STAGES}.fnet:fnet",
+        ("ingest", "novel_views"),
+        weights="fnet",
+        splits="batch_views",
+    ),
+    StageSpec("enet", "reconstruction", "enet", f"{_STAGES}.enet:enet", ("ingest", "gnet", "fnet"), weights="enet"),
+    *(
+        StageSpec(
+            f"evaluate/{name}",
+            "evaluation",
+            "evaluate",
+            f"{_STAGES}.evaluate:evaluate_scene",
+            ("ingest", "stage_name", name, "truth"),
+            also=_READERS,
+        )
+        for name in ("initial", "gnet", "enet")
+    ),
+    StageSpec(
+        "evaluate/fnet",
+        "evaluation",
+        "evaluate",
+        f"{_STAGES}.evaluate:evaluate_fixed",
+        ("ingest", "fnet", "novel_views", "truth"),
+        also=_READERS,
+    ),
+)
+BY_NAME: Mapping[str, StageSpec] = {spec.name: spec for spec in PIPELINE}
+
+
+def section_of(spec: StageSpec, config: PipelineConfig) -> Any:
+    """The configuration subtree that the stage gets."""
+    return getattr(config, spec.section)
+
+
+def weights_file(spec: StageSpec, config: PipelineConfig) -> Path | None:
+    """The weights that the stage will load, or ``None`` if it loads none."""
+    section = section_of(spec, config)
+    if spec.weights is None or getattr(section, "method", "learned") != "learned":
+        return None
+    from genre_tasks.weights import resolve_weights
+
+    return resolve_weights(spec.weights, section.weights)
+
+
+def weights_digest(path: Path | None) -> str | None:
+    """sha256 over the weights (a file with its JSON beside it, or all files of a folder)."""
+    if path is None:
+        return None
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path, path.with_suffix(".json")]
+    digest = hashlib.sha256()
+    for file in files:
+        if file.exists():
+            digest.update(file.name.encode() + b"\0")
+            with file.open("rb") as stream:
+                digest.update(hashlib.file_digest(stream, "sha256").digest())
+    return digest.hexdigest()
+
+
+def stage_key(
+    spec: StageSpec,
+    config: PipelineConfig,
+    inputs: Mapping[str, str],
+    weights: str | None,
+) -> str:
+    """The artifact's key: sha256 of stage, code digest, configuration subtree, inputs' payload digests, weights.
+
+    ``inputs`` maps each input's name to the digest of its payload (for ``log``: the log's digest and the chunk).
+    """
+    configuration = section_of(spec, config).model_dump(mode="json", exclude={spec.splits} if spec.splits else set())
+    points = configuration.get("points") if spec.name == "ingest" else None
+    if points and Path(points).is_file():  # the file is an input: its bytes count, not its name alone
+        configuration["points"] = hashlib.sha256(Path(points).read_bytes()).hexdigest()
+    recipe = {
+        "stage": spec.name,
+        "code": code_digest(spec.module, also=spec.also),
+        "configuration": configuration,
+        "inputs": dict(sorted(inputs.items())),
+        "weights": weights,
+    }
+    return hashlib.sha256(json.dumps(recipe, sort_keys=True).encode()).hexdigest()

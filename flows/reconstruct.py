@@ -1,0 +1,146 @@
+"""The flows: one log through GNet → novel views → FNet → ENet, and a dataset of logs."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+from prefect import flow
+from prefect.artifacts import create_image_artifact, create_table_artifact
+
+from flows.configuration import differences, load_configuration, validated
+from flows.pipeline import PIPELINE
+from flows.produce import ArtifactRef, Job, opened_log
+from flows.runs import Run, finish_run, summary_of
+from flows.stage_task import stage_task
+from genre_tasks.config import PipelineConfig
+from genre_tasks.errors import GenreError, InputError
+
+_log = logging.getLogger("genre")
+
+
+@flow(name="reconstruct-log", flow_run_name="{log}", persist_result=False, validate_parameters=False)
+def reconstruct_log(
+    log: str,
+    preset: str = "small",
+    store: str = "genre-store",
+    chunks: list[int] | None = None,
+    config: dict[str, Any] | None = None,
+    settings: list[str] | None = None,
+) -> dict[str, Any]:
+    """Reconstructs and enhances one driving log, chunk by chunk; returns the run's summary as plain values.
+
+    Args:
+        log: ``pandaset:PATH/002`` or ``synthetic:street?seed=1000``.
+        preset: demo, small or paper. store: a folder or URI.
+        chunks: which chunks; all if None. config: a whole effective configuration (it overrides the preset's).
+        settings: ``section.key=value`` strings, applied last.
+
+    A chunk that its input makes impossible is left out and the others go on; the error is raised at the end.
+    """
+    if config is None:
+        effective = load_configuration(preset, settings=settings or ())
+    else:
+        effective = validated(config, "parameters of the flow")
+    values = effective.model_dump(mode="json")
+    failed: list[GenreError] = []
+    done: dict[int, dict[str, ArtifactRef]] = {}
+    for chunk in chosen_chunks(log, effective, chunks):
+        try:
+            done[chunk] = _reconstruct_chunk(Job(log, chunk, store, values))
+        except InputError as error:
+            _log.error("chunk %d is left out: %s", chunk, error)
+            failed.append(error)
+    if not done and failed:
+        raise failed[0]
+    run = Run(log, preset, store, values, differences(effective, preset), done)
+    summary = finish_run(run)
+    _publish(run)
+    if failed:
+        raise failed[0]
+    return summary
+
+
+def chosen_chunks(log: str, config: PipelineConfig, chunks: list[int] | None) -> list[int]:
+    """The chunks to run. Raises ``InputError`` for one that the log does not have."""
+    from genre_tasks.stages.ingest import chunk_count
+
+    count = chunk_count(config.ingest, opened_log(log))
+    wanted = list(range(count)) if chunks is None else chunks
+    for chunk in wanted:
+        if not 0 <= chunk < count:
+            raise InputError(f"there is no chunk {chunk}", remedy=f"Chunks are 0 to {count - 1}.", log=log)
+    return wanted
+
+
+def _reconstruct_chunk(job: Job) -> dict[str, ArtifactRef]:
+    refs: dict[str, ArtifactRef] = {}
+    for spec in PIPELINE:
+        inputs = {name: refs[name] for name in spec.inputs}
+        state = stage_task(spec.name, job.chunk, job, inputs, return_state=True)
+        refs[spec.name] = state.result()
+    return refs
+
+
+def _publish(run: Run) -> None:
+    """Tables and pictures in Prefect's UI; the store has the same and more."""
+    for chunk in summary_of(run).chunks:
+        rows = [
+            {"stage": s.stage, "served": "cache" if s.cached else "computed", "seconds": round(s.seconds, 2)}
+            | {k: round(v, 4) for k, v in s.metrics.items()}
+            for s in chunk.stages
+        ]
+        create_table_artifact(table=rows, key=f"chunk-{chunk.chunk}", description=f"{run.log}, chunk {chunk.chunk}")
+        for stage in chunk.stages:
+            for name, png in sorted(stage.pictures.items())[:1]:
+                create_image_artifact(image_url=_data_url(png), key=f"chunk-{chunk.chunk}-{_slug(stage.stage)}", description=name)
+
+
+def _data_url(png: bytes) -> str:
+    import base64
+
+    return "data:image/png;base64," + base64.b64encode(png).decode()
+
+
+def _slug(text: str) -> str:
+    return "".join(c if c.isalnum() else "-" for c in text.lower())
+
+
+@flow(name="reconstruct-dataset", persist_result=False, validate_parameters=False)
+def reconstruct_dataset(
+    logs: list[str],
+    preset: str = "small",
+    store: str = "genre-store",
+    settings: list[str] | None = None,
+) -> list[dict[str, Any]]:
+    """Reconstructs many logs, a child flow run each; a log that fails does not stop the others.
+
+    ``logs`` are URIs; ``pandaset:PATH/*`` stands for every sequence in a folder. Raises the first error at the end.
+    """
+    summaries: list[dict[str, Any]] = []
+    failed: list[Exception] = []
+    for log in expanded(logs):
+        try:
+            summaries.append(reconstruct_log(log, preset=preset, store=store, settings=settings))
+        except GenreError as error:
+            _log.error("%s failed: %s", log, error)
+            failed.append(error)
+    if failed:
+        raise failed[0]
+    return summaries
+
+
+def expanded(logs: list[str]) -> list[str]:
+    """``reader:PATH/*`` becomes one URI per folder, sorted. Raises ``InputError`` where nothing matches."""
+    out: list[str] = []
+    for uri in logs:
+        reader, _, path = uri.partition(":")
+        if not path.endswith("/*"):
+            out.append(uri)
+            continue
+        folders = sorted(p for p in Path(path[:-2]).glob("*") if p.is_dir())
+        if not folders:
+            raise InputError(f"no log matches {uri}", remedy="Name a folder that holds sequences.", file=path[:-2])
+        out += [f"{reader}:{p}" for p in folders]
+    return out

@@ -1,0 +1,184 @@
+"""Finished runs: their summary, their record beside the artifacts, and how to get a stage's value back."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from flows.pipeline import PIPELINE, RECONSTRUCTING
+from flows.produce import ArtifactRef, run_id
+from flows.summary import ChunkSummary, RunSummary, StageSummary
+from genre_tasks.errors import InputError
+from storage.address import Address
+from storage.local import open_store
+
+if TYPE_CHECKING:
+    from storage.local import Artifact
+
+_FOLDER = "runs"
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run: what was asked for, and the references of every stage of every chunk."""
+
+    log: str
+    preset: str
+    store: str
+    config: dict[str, Any]
+    differs: dict[str, tuple[Any, Any]]
+    chunks: dict[int, dict[str, ArtifactRef]]
+
+    @property
+    def name(self) -> str:
+        """The same for runs that made (or found) the same artifacts."""
+        keys = {f"{c}/{s}": ref.key for c, refs in self.chunks.items() for s, ref in refs.items()}
+        return run_id(self.log, self.preset, keys)
+
+    @property
+    def folder(self) -> Path:
+        return open_store(self.store).root / _FOLDER / self.name
+
+
+def finish_run(run: Run) -> dict[str, Any]:
+    """Writes the run's record and report into the store and returns the record (``--json`` prints a part of it)."""
+    from flows.report import write_report
+
+    summary = summary_of(run)
+    run.folder.mkdir(parents=True, exist_ok=True)
+    report = write_report(run.folder / "report.html", summary)
+    record = {
+        "log": run.log,
+        "preset": run.preset,
+        "store": run.store,
+        "run": run.name,
+        "report": str(report),
+        "config": run.config,
+        "differs": {key: list(values) for key, values in run.differs.items()},
+        "chunks": [
+            {
+                "chunk": chunk.chunk,
+                "warnings": list(chunk.warnings),
+                "stages": [
+                    {
+                        "stage": s.stage,
+                        "key": s.key,
+                        "cached": s.cached,
+                        "seconds": s.seconds,
+                        "peak_mib": s.peak_mib,
+                        "metrics": s.metrics,
+                    }
+                    for s in chunk.stages
+                ],
+            }
+            for chunk in summary.chunks
+        ],
+    }
+    path = run.folder / "run.json"
+    partial = path.with_suffix(".tmp")
+    partial.write_text(json.dumps(record, indent=1))
+    partial.replace(path)
+    return record
+
+
+def summary_of(run: Run) -> RunSummary:
+    """What the report and the tables show, read from the store's manifests and evaluation artifacts."""
+    chunks = tuple(_chunk_summary(run, chunk, refs) for chunk, refs in sorted(run.chunks.items()))
+    return RunSummary(run=run.name, log=run.log, preset=run.preset, store=run.store, chunks=chunks, differs=run.differs)
+
+
+def _chunk_summary(run: Run, chunk: int, refs: dict[str, ArtifactRef]) -> ChunkSummary:
+    store = open_store(run.store)
+    found = {name: _found(run.store, ref) for name, ref in refs.items()}
+    stages = []
+    for spec in PIPELINE:
+        manifest = found[spec.name].manifest
+        metrics: dict[str, float] = {}
+        pictures: dict[str, bytes] = {}
+        curve: tuple[tuple[float, float], ...] = ()
+        if f"evaluate/{spec.name}" in found:
+            evaluation = store.read(found[f"evaluate/{spec.name}"])
+            metrics = _with_counts(evaluation.metrics)
+            pictures = {name: _png(image) for name, image in evaluation.pictures.items()}
+            curve = _against_seconds(evaluation.curve, manifest.measurements.get("seconds_per_iteration", ()))
+        stages.append(
+            StageSummary(
+                stage=spec.name,
+                key=manifest.key,
+                cached=refs[spec.name].cached,
+                seconds=manifest.seconds,
+                peak_mib=manifest.peak_mib,
+                metrics=metrics,
+                pictures=pictures,
+                curve=curve,
+                warnings=manifest.warnings,
+            )
+        )
+    return ChunkSummary(chunk=chunk, stages=tuple(stages), warnings=_marks(found["ingest"]))
+
+
+def _with_counts(metrics: Any) -> dict[str, float]:
+    """Metric values by name, and for each group of them the number of images as ``…/n``."""
+    out = {m.name: m.value for m in metrics}
+    return out | {m.name.rpartition("/")[0] + "/n": float(m.n) for m in metrics}
+
+
+def _marks(ingested: Artifact) -> tuple[str, ...]:
+    marks = ingested.manifest.measurements.get("marks", ())
+    return tuple(str(m) for m in marks)
+
+
+def _against_seconds(curve: Any, seconds: Any) -> tuple[tuple[float, float], ...]:
+    spent = [0.0, *itertools.accumulate(seconds)]
+    return tuple((spent[iteration], psnr) for iteration, psnr in curve if iteration < len(spent))
+
+
+def _png(image: Any) -> bytes:
+    import io
+
+    from PIL import Image
+
+    out = io.BytesIO()
+    Image.fromarray(image).save(out, format="PNG")
+    return out.getvalue()
+
+
+def _found(store: str, ref: ArtifactRef) -> Artifact:
+    opened = open_store(store)
+    parts = Path(ref.path).relative_to(opened.root).parts
+    address = Address(parts[0], parts[1], int(parts[2]), "/".join(parts[3:-1]), parts[-1])
+    artifact = opened.find(address)
+    if artifact is None:
+        raise InputError("an artifact of this run is gone", remedy="Run the log again.", file=ref.path, stage=ref.stage)
+    return artifact
+
+
+def recorded_runs(store: str) -> list[dict[str, Any]]:
+    """The records of all finished runs of a store, oldest first."""
+    paths = sorted((open_store(store).root / _FOLDER).glob("*/run.json"), key=lambda p: p.stat().st_mtime)
+    return [json.loads(path.read_text()) for path in paths]
+
+
+def stage_value(store: str, run: str, chunk: int | None, stage: str) -> tuple[int, Any]:
+    """The chunk's number and the value of one of its stages, for a run named by (the start of) its name."""
+    found = [r for r in recorded_runs(store) if r["run"].startswith(run)]
+    if len(found) != 1:
+        raise InputError(
+            f"{len(found)} runs of this store begin with '{run}'", remedy="`genre show runs` lists them.", file=store
+        )
+    (record,) = found
+    chunks = {c["chunk"]: c["stages"] for c in record["chunks"]}
+    number = min(chunks) if chunk is None else chunk
+    if number not in chunks:
+        raise InputError(f"the run has no chunk {number}", remedy=f"It has {sorted(chunks)}.", log=record["log"])
+    keys = {s["stage"]: s["key"] for s in chunks[number]}
+    if stage not in keys:
+        raise InputError(f"the run has no stage '{stage}'", remedy=f"It has {', '.join(RECONSTRUCTING)}.", stage=stage)
+    opened = open_store(store)
+    for artifact in opened.artifacts():
+        if artifact.manifest.key == keys[stage] and artifact.manifest.chunk == number:
+            return number, opened.read(artifact)
+    raise InputError("the artifact is gone", remedy="Run the log again.", log=record["log"], stage=stage)
