@@ -155,3 +155,18 @@ class DrivingLog(Protocol):
 
     @property
     def truth(self) -> Truth | None: ...
+
+
+@dataclass(frozen=True)
+class LogProblem:
+    """Something that a reader left out or repaired without failing: a word to count by, and one sentence."""
+
+    kind: str
+    message: str
+
+
+@runtime_checkable
+class ReportsProblems(Protocol):
+    """A log whose reader leaves things out (a box without a position, a camera without images) says so here."""
+
+    def problems(self) -> tuple[LogProblem, ...]: ...
