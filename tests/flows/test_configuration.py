@@ -1,0 +1,73 @@
+"""Presets, files and settings merge in order; what is unknown is named with the nearest known key."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from flows.configuration import PRESETS, differences, load_configuration
+from genre_tasks.errors import ConfigError
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_presets_are_valid(preset: str) -> None:
+    config = load_configuration(preset)
+    assert config.gnet.iterations == 24 and config.enet.iterations == 12
+    assert differences(config, preset) == {}
+
+
+def test_paper_preset_has_the_papers_numbers() -> None:
+    config = load_configuration("paper")
+    assert (config.ingest.height_px, config.ingest.width_px) == (720, 1280)
+    loss = config.enet.loss
+    assert (loss.rgb, loss.perceptual, loss.ssim, loss.depth, loss.novel) == (0.8, 0.2, 0.2, 0.01, 0.5)
+    assert config.fnet.timestep == 200 and config.novel_views.shifts_m == (3.0, -3.0)
+    training = yaml.safe_load((ROOT / "configs/paper.yaml").read_text())["training"]
+    assert training["logs"] == {"train": 93, "test": 10} and training["fnet_steps"] == 20000
+
+
+def test_settings_win_over_file_over_preset(tmp_path: Path) -> None:
+    file = tmp_path / "c.yaml"
+    file.write_text("gnet: {iterations: 7, seed: 5}\n")
+    config = load_configuration("demo", file, ["gnet.iterations=8", "evaluate.shifts_m=[1, 2]"])
+    assert (config.gnet.iterations, config.gnet.seed, config.evaluate.shifts_m) == (8, 5, (1.0, 2.0))
+    assert differences(config, "demo")["gnet.iterations"] == (24, 8)
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("gnet.iteration=8", ["gnet.iteration", "Did you mean 'gnet.iterations'"]),
+        ("gnte.iterations=8", ["gnte", "Did you mean 'gnet'"]),
+        ("gnet.loss.lpisp=1", ["gnet.loss.lpisp"]),
+        ("gnet.iterations=0", ["gnet.iterations", "greater than or equal to 1"]),
+        ("gnet=8", ["'gnet' is a section"]),
+        ("gnet.iterations", ["--set"]),
+    ],
+)
+def test_a_wrong_setting_is_named(setting: str, words: list[str]) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_configuration("demo", settings=[setting])
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_unknown_preset_and_file(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="Did you mean 'small'"):
+        load_configuration("smal")
+    with pytest.raises(ConfigError, match=r"nothing\.yaml"):
+        load_configuration("demo", tmp_path / "nothing.yaml")
+    broken = tmp_path / "broken.yaml"
+    broken.write_text("gnet: [")
+    with pytest.raises(ConfigError, match="not YAML"):
+        load_configuration("demo", broken)
+
+
+def test_seeds_do_not_overlap() -> None:
+    seeds = yaml.safe_load((ROOT / "configs/seeds.yaml").read_text())
+    ranges = [seeds["training"], seeds["validation"], [seeds["demo"]] * 2, seeds["claims"]]
+    assert all(a[1] < b[0] for a, b in zip(ranges, ranges[1:], strict=False))

@@ -1,0 +1,77 @@
+"""The house keeps its rules: imports go one way, the code is linted and typed, the files users rely on are sound."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def _run(*command: str) -> None:
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
+
+
+def test_imports_go_one_way() -> None:
+    _run(str(Path(sys.executable).parent / "lint-imports"))
+
+
+def test_ruff_finds_nothing() -> None:
+    _run(sys.executable, "-m", "ruff", "check", ".")
+
+
+def test_code_is_formatted() -> None:
+    _run(sys.executable, "-m", "ruff", "format", "--check", ".")
+
+
+def test_types_hold() -> None:
+    _run(sys.executable, "-m", "mypy")
+
+
+def test_compose_file_follows_the_specification() -> None:
+    jsonschema = pytest.importorskip("jsonschema")
+    schema = json.loads((ROOT / "tests/data/compose_spec.json").read_text())
+    compose = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
+    jsonschema.Draft201909Validator(schema).validate(compose)
+    assert set(compose["services"]) == {"database", "server", "worker"}
+    for service in compose["services"].values():
+        for name in service.get("depends_on", {}):
+            assert "healthcheck" in compose["services"][name]
+    named = {v.split(":")[0] for s in compose["services"].values() for v in s.get("volumes", []) if "/" not in v[:1] + v[:2]}
+    assert {n for n in named if re.fullmatch(r"\w+", n)} == set(compose["volumes"])
+
+
+def test_deployments_name_flows_that_exist() -> None:
+    for deployment in yaml.safe_load((ROOT / "prefect.yaml").read_text())["deployments"]:
+        path, _, function = deployment["entrypoint"].partition(":")
+        assert f"def {function}(" in (ROOT / path).read_text()
+
+
+def test_every_required_package_is_pinned() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    pinned = {
+        re.sub(r"[-_.]+", "-", line.split("==")[0]).lower()
+        for line in (ROOT / "constraints.txt").read_text().splitlines()
+        if "==" in line
+    }
+    wanted = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
+    names = {re.sub(r"[-_.]+", "-", re.split(r"[<>=\[ ]", w)[0]).lower() for w in wanted}
+    assert names <= pinned, sorted(names - pinned)
+
+
+def test_help_does_not_load_the_heavy_packages() -> None:
+    code = (
+        "import sys\n"
+        "import flows.cli.main\n"
+        "heavy = {'torch', 'prefect', 'kornia', 'diffusers', 'pyarrow', 'numpy'} & set(sys.modules)\n"
+        "sys.exit(', '.join(sorted(heavy)) or 0)"
+    )
+    _run(sys.executable, "-c", code)
