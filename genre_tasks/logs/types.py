@@ -60,7 +60,7 @@ class Camera:
 class Sweep:
     """One LiDAR sweep in world coordinates.
 
-    ``points_world`` [N, 3] float64 metres; ``intensity`` [N] float32 in [0, 1]; ``timestamps_s`` [N] float64, per point.
+    ``points_world`` [N, 3] float64 metres; ``intensity`` [N] float32 in [0, 1]; ``timestamps_s`` [N] float64 per point.
     """
 
     points_world: Float64
