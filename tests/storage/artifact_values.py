@@ -1,0 +1,157 @@
+"""Small values of every kind of artifact, made from a NumPy generator, and their comparison."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import torch
+
+from genre_tasks.logs.types import Lens
+from genre_tasks.scene.chunk import Actor, Chunk, Mark, Points, View
+from genre_tasks.scene.gaussians import Gaussians
+from genre_tasks.scene.graph import ActorNode, SceneGraph
+from genre_tasks.scene.results import Evaluation, Metric, Reconstruction, ViewScore
+from genre_tasks.scene.views import FixedViews, NovelView, NovelViews
+
+
+def pose(rng: np.random.Generator) -> np.ndarray:
+    out = np.eye(4)
+    out[:3] = rng.normal(size=(3, 4))
+    return out
+
+
+def lens(rng: np.random.Generator, width: int = 7, height: int = 5) -> Lens:
+    distortion = tuple(rng.normal(size=5).tolist()) if rng.random() < 0.5 else ()
+    return Lens(*rng.uniform(1, 1000, 4).tolist(), width, height, distortion)
+
+
+def points(rng: np.random.Generator, count: int) -> Points:
+    return Points(
+        (rng.normal(size=(count, 3)) * 100).astype(np.float32),
+        rng.integers(0, 256, (count, 3), dtype=np.uint8),
+        rng.random(count) < 0.5,
+        rng.integers(-5, 300, count).astype(np.int16),
+    )
+
+
+def chunk(rng: np.random.Generator, frames: int = 3, actors: int = 2, count: int = 11) -> Chunk:
+    names = ("front_camera", "zurück")
+    views = tuple(
+        View(
+            c, f, ("source", "heldout")[f % 2], 1.6e9 + float(rng.random()), pose(rng), lens(rng),
+            rng.bytes(int(rng.integers(0, 3000))),
+        )  # fmt: skip
+        for f in range(frames)
+        for c in names
+    )
+    made = []
+    for k in range(actors):
+        n = int(rng.integers(0, frames + 1))
+        poses = np.array([pose(rng) for _ in range(n)]).reshape(-1, 4, 4)
+        size = tuple(rng.uniform(0.1, 9, 3).tolist())
+        made.append(Actor(f"t{k}", "Car", size, np.arange(n), poses, points(rng, k * count)))
+    return Chunk(
+        dataset="synthetic", log="street-seed=1", index=2, frames=tuple(range(frames)), camera_names=names,
+        width_px=7, height_px=5, world_SE3_chunk=pose(rng),
+        chunk_SE3_ego=np.array([pose(rng) for _ in range(frames)]).reshape(-1, 4, 4), views=views,
+        static=points(rng, count), actors=tuple(made),
+        marks=(Mark("missing_sweep", "no sweep", frame=1), Mark("missing_image", "gone", 2, "zurück"), Mark("standstill", "0 m")),
+    )  # fmt: skip
+
+
+def scene(rng: np.random.Generator, count: int = 13, actors: tuple[ActorNode, ...] = ()) -> SceneGraph:
+    packed = torch.from_numpy((rng.normal(size=(count, 14)) * 10 ** rng.uniform(-6, 3, (count, 14))).astype(np.float32))
+    nodes = torch.from_numpy(rng.integers(0, 2 + len(actors), count))
+    return SceneGraph(Gaussians.unpacked(packed), nodes, actors)
+
+
+def reconstruction(rng: np.random.Generator, count: int = 13, actors: int = 2, snapshots: int = 2) -> Reconstruction:
+    nodes = tuple(
+        ActorNode(f"t{k}", "Car", (4.0, 2.0, 1.5), np.arange(k + 1), np.array([pose(rng) for _ in range(k + 1)]))
+        for k in range(actors)
+    )
+    return Reconstruction(
+        scene(rng, count, nodes),
+        tuple(rng.random(4).tolist()),
+        {8 * (k + 1): scene(rng, count + k, nodes) for k in range(snapshots)},
+        tuple(rng.random(4).tolist()),
+        {"behind": 3, "non_finite": 0},
+    )
+
+
+def novel_view(rng: np.random.Generator, k: int, width: int = 7, height: int = 5) -> NovelView:
+    shift = (3.0, -3.0)[k % 2]
+    return NovelView("front_camera", k, shift, pose(rng), lens(rng, width, height), ("back/camera", k + 1))
+
+
+def novel_views(rng: np.random.Generator, count: int = 2, width: int = 7, height: int = 5) -> NovelViews:
+    def layer() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        alpha = rng.random((count, height, width)).astype(np.float32)
+        alpha[rng.random(alpha.shape) < 0.2] = 0.0
+        alpha[rng.random(alpha.shape) < 0.2] = 1.0
+        color = rng.random((count, height, width, 3)).astype(np.float32) * alpha[..., None]
+        depth = (10 ** rng.uniform(-3, 6, alpha.shape)).astype(np.float32) * (alpha > 0)
+        return torch.from_numpy(color), torch.from_numpy(alpha), torch.from_numpy(depth)
+
+    return NovelViews(tuple(novel_view(rng, k, width, height) for k in range(count)), *layer(), *layer())
+
+
+def fixed_views(rng: np.random.Generator, count: int = 2, width: int = 7, height: int = 5) -> FixedViews:
+    color = torch.from_numpy(rng.random((count, height, width, 3)).astype(np.float32))
+    return FixedViews(tuple(novel_view(rng, k, width, height) for k in range(count)), color)
+
+
+def evaluation(rng: np.random.Generator, count: int = 3) -> Evaluation:
+    return Evaluation(
+        "gnet",
+        (Metric("interpolation/psnr", float("inf"), 5), *(Metric(f"shift_{k}m/kernel", rng.random(), k, 0.1, 0.3) for k in range(count))),
+        tuple(ViewScore("front_camera", k, 3.0, *rng.random(3).tolist()) for k in range(count)),
+        tuple((8 * k, float(rng.random())) for k in range(count)),
+        {f"{k}m_left_front_camera_04{s}": rng.integers(0, 256, (4 + k, 6, 3), dtype=np.uint8) for k in range(count) for s in ("", ".truth")},
+    )  # fmt: skip
+
+
+MAKERS = {
+    "chunk": chunk,
+    "reconstruction": reconstruction,
+    "novel_views": novel_views,
+    "fixed_views": fixed_views,
+    "evaluation": evaluation,
+}
+
+
+def make(kind: str, seed: int = 0) -> Any:
+    """The value of a kind that a seed gives."""
+    return MAKERS[kind](np.random.default_rng(seed))
+
+
+def assert_same(a: Any, b: Any, at: str = "value", approximate: tuple[str, ...] = ()) -> None:
+    """Equal in type, dtype, shape and every bit; fields named in ``approximate`` to the colour border's bound."""
+    assert type(a) is type(b), at
+    if dataclasses.is_dataclass(a):
+        for f in dataclasses.fields(a):
+            x, y = getattr(a, f.name), getattr(b, f.name)
+            if f.name in approximate:
+                assert x.dtype == y.dtype and x.shape == y.shape, f"{at}.{f.name}"
+                assert x.numel() == 0 or (x - y).abs().max() <= 1e-3, f"{at}.{f.name}"
+            else:
+                assert_same(x, y, f"{at}.{f.name}", approximate)
+    elif isinstance(a, torch.Tensor):
+        assert a.dtype == b.dtype and torch.equal(a, b), at
+    elif isinstance(a, np.ndarray):
+        assert a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes(), at
+    elif isinstance(a, dict):
+        assert sorted(a) == sorted(b), at
+        for k in a:
+            assert_same(a[k], b[k], f"{at}[{k}]", approximate)
+    elif isinstance(a, tuple):
+        assert len(a) == len(b), at
+        for k, (x, y) in enumerate(zip(a, b, strict=True)):
+            assert_same(x, y, f"{at}[{k}]", approximate)
+    else:
+        assert a == b, at
+
+
+COLORS = ("color", "lidar_color")
