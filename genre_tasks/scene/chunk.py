@@ -17,8 +17,8 @@ Role = Literal["source", "heldout"]
 class View:
     """One camera at one frame of a chunk.
 
-    ``frame`` counts in the log; ``chunk_SE3_camera`` [4, 4] float64; ``lens`` at the *working* resolution; ``image`` the
-    encoded bytes as they came (native resolution), never ``None``: a view without an image is not in the chunk.
+    ``frame`` counts in the log; ``chunk_SE3_camera`` [4, 4] float64; ``lens`` at the *working* resolution; ``image``
+    the encoded bytes as they came (native resolution), never ``None``: a view without an image is not in the chunk.
     """
 
     camera: str

@@ -66,3 +66,24 @@ def shift_laterally(chunk_SE3_camera: Float64, chunk_SE3_ego: Float64, shift_m: 
     out = chunk_SE3_camera.copy()
     out[:3, 3] += shift_m * np.array([-forward[1], forward[0], 0.0])
     return out
+
+
+def interpolate_pose(start: Float64, end: Float64, t: float) -> Float64:
+    """The rigid transform [4, 4] at ``t`` in [0, 1]: straight in position, the shortest turn in rotation.
+
+    The relative turn is taken as a rotation vector, so it is exact for equal rotations, does not see the sign of
+    quaternions, and picks one axis, always the same, for a half turn.
+    """
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_matrix(start[:3, :3].T @ end[:3, :3]).as_rotvec()
+    rotation = start[:3, :3] @ Rotation.from_rotvec(t * turn).as_matrix()
+    return se3(rotation, (1 - t) * start[:3, 3] + t * end[:3, 3])
+
+
+def rigid(pose: Float64, tolerance: float = 1e-3) -> bool:
+    """Whether a [4, 4] matrix is finite and its rotation part is one."""
+    if not np.isfinite(pose).all():
+        return False
+    turn = pose[:3, :3]
+    return bool(np.abs(turn.T @ turn - np.eye(3)).max() < tolerance and np.linalg.det(turn) > 0)

@@ -58,7 +58,8 @@ class Evaluation:
 
     ``curve`` lists (iteration, held-out PSNR) along the unrolled iterations, where the stage kept snapshots.
     ``pictures`` maps a name like ``3m_left_front_camera_04`` (``0m_…``, ``3m_left_…``, ``3m_right_…``; the same names
-    for every stage of a chunk, and ``…`` with the suffix ``.truth`` where truth exists) to an sRGB image [H, W, 3] uint8.
+    for every stage of a chunk, and ``…`` with the suffix ``.truth`` where truth exists) to an sRGB image [H, W, 3]
+    uint8.
     """
 
     stage: str

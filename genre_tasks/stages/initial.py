@@ -1,0 +1,23 @@
+"""The initial scene of a chunk (paper Sec. III-A)."""
+
+from __future__ import annotations
+
+from genre_tasks.config import InitialConfig
+from genre_tasks.errors import NonFiniteError
+from genre_tasks.progress import Progress, silent
+from genre_tasks.scene.chunk import Chunk
+from genre_tasks.scene.initialise import initial_scene
+from genre_tasks.scene.results import Reconstruction
+
+
+def initial(config: InitialConfig, chunk: Chunk, progress: Progress = silent) -> Reconstruction:
+    """Gaussians on the chunk's LiDAR points and far away. Raises ``InputError`` if no point is near the path."""
+    progress(0, 1, "initial scene")
+    scene = initial_scene(config, chunk)
+    packed = scene.gaussians.packed()
+    bad = (~packed.isfinite()).nonzero()
+    if len(bad):
+        index = tuple(int(i) for i in bad[0])
+        raise NonFiniteError("initial", "gaussians", len(bad), index, log=chunk.log, chunk=chunk.index)
+    progress(1, 1, "initial scene")
+    return Reconstruction(scene)
