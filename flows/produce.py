@@ -1,4 +1,4 @@
-"""One stage of one chunk: key, look-up, verification, computation, commit. No Prefect here: a test calls it as it is."""
+"""One stage of one chunk: key, look-up, verification, computation, commit. Without Prefect."""
 
 from __future__ import annotations
 
@@ -140,6 +140,7 @@ def produce(
         seconds=usage.seconds,
         peak_mib=usage.peak_mib,
         environment=environment(),
+        measurements={"marks": [f"{m.kind}: {m.detail}" for m in getattr(value, "marks", ())]},
         warnings=(note,) if note else (),
     )
     return _ref(artifact, cached=False, note=note)

@@ -178,7 +178,6 @@ def stage_value(store: str, run: str, chunk: int | None, stage: str) -> tuple[in
     if stage not in keys:
         raise InputError(f"the run has no stage '{stage}'", remedy=f"It has {', '.join(RECONSTRUCTING)}.", stage=stage)
     opened = open_store(store)
-    for artifact in opened.artifacts():
-        if artifact.manifest.key == keys[stage] and artifact.manifest.chunk == number:
-            return number, opened.read(artifact)
+    for artifact in opened.artifacts(key=keys[stage]):
+        return number, opened.read(artifact)
     raise InputError("the artifact is gone", remedy="Run the log again.", log=record["log"], stage=stage)

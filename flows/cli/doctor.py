@@ -17,7 +17,18 @@ _OPTIONAL = {
     "transformers": ("loading SD-Turbo", "pip install 'genre[sd-turbo]'"),
     "pandas": ("writing logs in the PandaSet layout", "pip install pandas"),
 }
-_REQUIRED = ("torch", "kornia", "prefect", "pyarrow", "numpy", "OpenEXR", "scikit-image", "diffusers", "trimesh", "embreex")
+_REQUIRED = (
+    "torch",
+    "kornia",
+    "prefect",
+    "pyarrow",
+    "numpy",
+    "OpenEXR",
+    "scikit-image",
+    "diffusers",
+    "trimesh",
+    "embreex",
+)
 
 
 def doctor(
@@ -38,10 +49,11 @@ def _machine() -> dict[str, Any]:
 
     from flows.memory import memory_limit_gib
 
+    total = psutil.virtual_memory().total / 2**30
     out: dict[str, Any] = {
         "python": platform.python_version(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "memory": f"{psutil.virtual_memory().total / 2**30:.1f} GiB, of which this process may use {memory_limit_gib():.1f}",
+        "memory": f"{total:.1f} GiB, of which this process may use {memory_limit_gib():.1f}",
     }
     import torch
 

@@ -22,7 +22,9 @@ def render(
     shift: Annotated[float, typer.Option(help="Metres to the left of the path; negative is to the right.")] = 0.0,
     camera: Annotated[str | None, typer.Option(help="A camera of the rig; the first one without it.")] = None,
     chunk: Annotated[int | None, typer.Option(help="A chunk of the run; the first one without it.")] = None,
-    frame: Annotated[int | None, typer.Option(help="With .png and .exr: a frame of the log; the middle one without it.")] = None,
+    frame: Annotated[
+        int | None, typer.Option(help="With .png and .exr: a frame of the log; the middle one without it.")
+    ] = None,
     store: Annotated[str, typer.Option(help="The run's store.")] = "genre-store",
 ) -> None:
     """Render a scene of a finished run at the recorded poses or shifted to the side."""
@@ -41,7 +43,8 @@ def render(
         )
     images = _rendered(ingested, reconstruction.scene, name, frames, shift)
     _write(out, images)
-    typer.echo(f"wrote {out}: {len(frames)} frame{'s' * (len(frames) > 1)} of {name}, {shift:+g} m, chunk {number}, after {stage}")
+    count = f"{len(frames)} frame{'s' * (len(frames) > 1)}"
+    typer.echo(f"wrote {out}: {count} of {name}, {shift:+g} m, chunk {number}, after {stage}")
 
 
 def _frames(chunk: Chunk, frame: int | None, every: bool) -> list[int]:

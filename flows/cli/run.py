@@ -21,8 +21,12 @@ def run(
     store: Annotated[str, typer.Option(help="A folder (or URI) that keeps every artifact.")] = DEFAULT_STORE,
     chunks: Annotated[str | None, typer.Option(help="Which chunks, e.g. 0,1; all without it.")] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", help="section.key=value, e.g. gnet.iterations=8.")] = None,
-    strict: Annotated[bool, typer.Option("--strict", help="A missing or unreadable image or sweep is an error.")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be computed, and what it would take.")] = False,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="A missing or unreadable image or sweep is an error.")
+    ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say what would be computed, and what it would take.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object to stdout.")] = False,
 ) -> None:
     """Reconstruct a log: GNet, novel views, FNet, ENet, evaluation and a report. Finished stages come from the store.

@@ -12,12 +12,14 @@ if TYPE_CHECKING:
 
 
 def show(
-    what: Annotated[str, typer.Argument(help="runs, stages, config, a run, or (the start of) an artifact's key.")] = "runs",
+    what: Annotated[
+        str, typer.Argument(help="runs, stages, config, a run, or (the start of) an artifact's key.")
+    ] = "runs",
     store: Annotated[str, typer.Option(help="The store to look into.")] = "genre-store",
     preset: Annotated[str, typer.Option(help="With `config`: whose values to show.")] = "small",
     picture: Annotated[Path | None, typer.Option(help="Write the artifact's picture to this PNG.")] = None,
 ) -> None:
-    """Show what a store holds: `genre show`, `genre show stages`, `genre show RUN`, `genre show KEY --picture x.png`."""
+    """Show what a store holds: `genre show`, `genre show stages`, `genre show RUN`, `genre show KEY`."""
     from flows.cli.tables import print_fields, print_rows
 
     if what == "config":
@@ -74,7 +76,10 @@ def _show_one(what: str, store: str, picture: Path | None) -> None:
         if run["run"].startswith(what):
             print_fields(f"run {run['run']}", {k: run[k] for k in ("log", "preset", "report", "differs")})
             for chunk in run["chunks"]:
-                rows = [{"stage": s["stage"], "key": s["key"][:12], "seconds": s["seconds"], **s["metrics"]} for s in chunk["stages"]]
+                rows = [
+                    {"stage": s["stage"], "key": s["key"][:12], "seconds": s["seconds"], **s["metrics"]}
+                    for s in chunk["stages"]
+                ]
                 for row in rows:
                     print_fields(f"chunk {chunk['chunk']}  {row.pop('stage')}", row)
             return
@@ -98,7 +103,9 @@ def _show_one(what: str, store: str, picture: Path | None) -> None:
     if picture is not None:
         image = picture_of(opened, artifact)
         if image is None:
-            raise InputError("this artifact has no picture", remedy="Leave out --picture.", stage=artifact.manifest.stage)
+            raise InputError(
+                "this artifact has no picture", remedy="Leave out --picture.", stage=artifact.manifest.stage
+            )
         from PIL import Image
 
         Image.fromarray(image).save(picture)

@@ -14,7 +14,14 @@ if TYPE_CHECKING:
 
     from flows.produce import ArtifactRef
 
-_HEADLINES = ("interpolation/psnr", "interpolation/ssim", "interpolation/perceptual", "shift_3m/psnr", "shift_3m/perceptual", "shift_3m/kernel")
+_HEADLINES = (
+    "interpolation/psnr",
+    "interpolation/ssim",
+    "interpolation/perceptual",
+    "shift_3m/psnr",
+    "shift_3m/perceptual",
+    "shift_3m/kernel",
+)
 
 
 class TerminalReporter:
@@ -81,7 +88,9 @@ def print_run(summary: dict[str, Any]) -> None:
             console.print(f"  note: {warning}", markup=False)
     stages = [s for c in summary["chunks"] for s in c["stages"]]
     hits = sum(s["cached"] for s in stages)
-    console.print(f"{hits} of {len(stages)} stages came from the cache" + (" (all of them)" if hits == len(stages) else ""))
+    console.print(
+        f"{hits} of {len(stages)} stages came from the cache" + (" (all of them)" if hits == len(stages) else "")
+    )
     console.print(f"run    {summary['run']}")
     console.print(f"report {summary['report']}", soft_wrap=True)
 
@@ -94,9 +103,15 @@ def print_plan(plan: dict[str, Any]) -> None:
         table.add_column(column, justify="right" if column in ("seconds", "GB") else "left")
     for row in plan["stages"]:
         table.add_row(
-            str(row["chunk"]), row["stage"], (row["key"] or "")[:12], row["cache"], f"{row['seconds']:.0f}", f"{row['gigabytes']:.1f}"
+            str(row["chunk"]),
+            row["stage"],
+            (row["key"] or "")[:12],
+            row["cache"],
+            f"{row['seconds']:.0f}",
+            f"{row['gigabytes']:.1f}",
         )
     console.print(table)
-    console.print(f"about {plan['seconds']:.0f} s to compute, {plan['gigabytes']:.1f} GB at the peak; predicted from {plan['basis']}")
+    cost = f"about {plan['seconds']:.0f} s to compute, {plan['gigabytes']:.1f} GB at the peak"
+    console.print(f"{cost}; predicted from {plan['basis']}")
     for key, (before, after) in plan["differs"].items():
         console.print(f"  {key}: {before} → {after}", markup=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import pytest
@@ -70,4 +71,4 @@ def test_unknown_preset_and_file(tmp_path: Path) -> None:
 def test_seeds_do_not_overlap() -> None:
     seeds = yaml.safe_load((ROOT / "configs/seeds.yaml").read_text())
     ranges = [seeds["training"], seeds["validation"], [seeds["demo"]] * 2, seeds["claims"]]
-    assert all(a[1] < b[0] for a, b in zip(ranges, ranges[1:], strict=False))
+    assert all(a[1] < b[0] for a, b in itertools.pairwise(ranges))
