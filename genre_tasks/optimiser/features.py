@@ -1,0 +1,73 @@
+"""What the learned optimiser is told about each Gaussian in each iteration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from genre_tasks.optimiser.state import GROUPS, Frame, State
+from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR
+
+FEATURES = 65
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """Features that do not change over the iterations: [N, 4] unit, distance, and whether distant or an actor."""
+
+    columns: Tensor
+
+    @staticmethod
+    def of(frame: Frame, centre: Tensor) -> Fixed:
+        """``centre`` [3]: the mean camera position; actors' distances are taken as 10 m, since they move."""
+        scene = frame.scene
+        actor, distant = scene.nodes >= FIRST_ACTOR, scene.nodes == DISTANT
+        distance = (scene.gaussians.means - centre).norm(dim=1)
+        distance = torch.where(actor, torch.full_like(distance, 10.0), distance)
+        columns = [
+            frame.unit.log() / 2,
+            (distance[:, None] + 1).log() / 2 - 1.5,
+            distant[:, None].float(),
+            actor[:, None].float(),
+        ]
+        return Fixed(torch.cat(columns, 1))
+
+
+def features(
+    frame: Frame,
+    fixed: Fixed,
+    state: State,
+    gradient: Tensor,  # [N, 14]
+    total: int,
+) -> Tensor:  # [N, FEATURES]
+    """Direction, latest gradient and its usual size, the Gaussian itself, what saw it, and t / T; all of order 1.
+
+    Gradients enter detached and normalised (no second derivative of the renderer, paper Sec. III-C): a loss scaled by
+    any factor gives the same features.
+    """
+    deviation = state.deviation()
+    seen = (state.seen > 0).to(deviation.dtype)
+    share = seen.sum().clamp_min(1)
+    usual = [((deviation[:, a:b].square() * seen).sum() / (share * (b - a))).sqrt() for a, b in GROUPS.values()]
+    usual_row = torch.cat([u.expand(b - a) for u, (a, b) in zip(usual, GROUPS.values(), strict=True)])
+    size = torch.log10((deviation / (usual_row + 1e-30)).clamp(1e-4, 1e4)) / 2
+    start, offsets = frame.scene.gaussians, state.offsets
+    part = min(state.iteration / total, 1.0)
+    time = offsets.new_tensor([part, (1 - part) ** 2, min(state.iteration, 4) / 4])
+    columns = [
+        state.direction().clamp(-4, 4),
+        (gradient / deviation).clamp(-4, 4) / 2,
+        size * seen,
+        (offsets[:, 0:3] / 3).clamp(-3, 3),
+        ((start.log_scales + offsets[:, 3:6] - frame.unit.log()) / 2).clamp(-3, 3),
+        torch.nn.functional.normalize(start.quats + offsets[:, 6:10], dim=1),
+        (start.logit_opacities[:, None] + offsets[:, 10:11]) / 4,
+        start.colors + offsets[:, 11:14] - 0.5,
+        fixed.columns,
+        state.seen_now,
+        torch.log1p(state.seen) / 3,
+        time.expand(len(offsets), 3),
+    ]
+    return torch.cat(columns, 1).detach()

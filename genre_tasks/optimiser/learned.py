@@ -1,0 +1,94 @@
+"""The learned optimiser that GNet and ENet are (paper Sec. III-C, III-D): a head per Gaussian over a sparse UNet.
+
+The step is ``Δ = −rate · schedule(t/T) · [exp(3 tanh(a/3)) · u + tanh(b)]`` with ``u`` Adam's normalised direction and
+``a, b`` [N, 14] from the network, whose last layer starts at zero: untrained, it is tuned Adam to the bit.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor, nn
+
+from genre_tasks.metrics.threads import map_single_threaded
+from genre_tasks.optimiser.adam import GNET_RATES
+from genre_tasks.optimiser.features import FEATURES, Fixed, features
+from genre_tasks.optimiser.rules import Step, rate_vector, schedule
+from genre_tasks.optimiser.sparse_unet import SparseUNet, VoxelPyramid
+from genre_tasks.optimiser.state import Frame, State
+from genre_tasks.optimiser.voxels import voxel_pyramid
+
+
+class NetworkConfig(BaseModel):
+    """The network's shape and the rates that it scales; stored as JSON beside the weights."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    hidden: int = Field(64, ge=4, le=512, description="Width of the head per Gaussian.")
+    channels: tuple[int, ...] = Field((16, 32, 48), min_length=1, description="Channels of the UNet's levels.")
+    voxel_m: float = Field(1.0, gt=0, description="Width of a static voxel near the cameras.")
+    rates: tuple[float, ...] = Field(GNET_RATES, description="One per attribute group, as TunedAdam's.")
+
+
+class LearnedOptimiser(nn.Module):
+    """Weights shared over iterations and Gaussians; used for GNet and ENet alike."""
+
+    def __init__(self, config: NetworkConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or NetworkConfig()
+        hidden, channels = self.config.hidden, self.config.channels
+        self.entry = nn.Linear(FEATURES, hidden)
+        self.unet = SparseUNet(hidden, channels)
+        self.mix = nn.Linear(hidden + channels[0], hidden)
+        self.head = nn.Linear(hidden, 28)
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(self.head.bias)
+
+    @staticmethod
+    def load(weights: Path) -> LearnedOptimiser:
+        """From ``weights`` (safetensors) and the JSON configuration beside it.
+
+        Raises ``InputError`` for missing files and tensors that do not fit (named), ``ConfigError`` for the JSON.
+        """
+        from genre_tasks.optimiser.weights import load
+
+        return load(weights)
+
+    def forward(
+        self,
+        inputs: Tensor,  # [N, FEATURES]
+        pyramid: VoxelPyramid,
+    ) -> tuple[Tensor, Tensor]:
+        """Log-gains a and offsets b, each [N, 14]."""
+        own = F.silu(self.entry(inputs))
+        around = self.unet(pyramid.pool(own), pyramid)
+        both = torch.cat([own, around.index_select(0, pyramid.voxel_of)], 1)
+        gain, offset = self.head(F.silu(self.mix(both))).split(14, 1)
+        return gain, offset
+
+    def pyramid(self, frame: Frame, centre: Tensor) -> VoxelPyramid:
+        """The voxels of a scene at its start; they serve all iterations."""
+        return voxel_pyramid(frame.scene, centre, self.config.voxel_m, len(self.config.channels))
+
+    def delta(self, state: State, inputs: Tensor, pyramid: VoxelPyramid, total: int) -> Tensor:
+        """The step [N, 14], differentiable in the network's weights."""
+        gain, offset = self(inputs, pyramid)
+        rates = rate_vector(self.config.rates).to(inputs.device)
+        learned = torch.exp(3 * torch.tanh(gain / 3)) * state.direction() + torch.tanh(offset)
+        return -rates * schedule(state.iteration, total) * learned
+
+    def start(self, frame: Frame, centre: Tensor) -> Step:
+        """See :class:`genre_tasks.optimiser.rules.StepRule`. Runs on one thread: the same bytes at any count."""
+        pyramid, fixed = self.pyramid(frame, centre), Fixed.of(frame, centre)
+
+        def step(state: State, gradient: Tensor, total: int) -> Tensor:
+            def one(_: int) -> Tensor:
+                with torch.no_grad():
+                    return self.delta(state, features(frame, fixed, state, gradient, total), pyramid, total)
+
+            return map_single_threaded(one, (0,))[0]
+
+        return step

@@ -1,0 +1,65 @@
+"""One evaluation of the rendering loss and its gradient with respect to the Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from genre_tasks.config import LossConfig
+from genre_tasks.errors import NonFiniteError
+from genre_tasks.optimiser.loss import Distance, image_gradients, plan_loss
+from genre_tasks.optimiser.state import Frame
+from genre_tasks.optimiser.targets import Target
+from genre_tasks.render.api import render_views
+from genre_tasks.render.types import RenderSettings
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What an iteration sees: the loss, its gradient [N, 14] with respect to the offsets, and culled Gaussians."""
+
+    loss: float
+    gradient: Tensor
+    culled: dict[str, int]
+
+
+@dataclass(frozen=True)
+class Objective:
+    """The loss of paper Eq. 9–11 as a function of the offsets and a batch of views.
+
+    ``distance`` is the perceptual distance, or ``None`` to leave that term out.
+    """
+
+    config: LossConfig
+    distance: Distance | None = None
+    settings: RenderSettings = field(default_factory=RenderSettings)
+
+    def __call__(
+        self,
+        frame: Frame,
+        offsets: Tensor,  # [N, 14]
+        targets: Sequence[Target],
+        iteration: int,
+        generator: torch.Generator,
+    ) -> Sight:
+        """``iteration`` and ``generator`` decide where the perceptual term is taken."""
+        leaf = offsets.detach().requires_grad_()
+        plan = plan_loss(self.config, targets, iteration, generator, self.distance is not None)
+        with torch.enable_grad():
+            image = render_views(frame.scene.with_gaussians(frame.gaussians(leaf)), targets, self.settings)
+            depth = image.expected_depth()
+        loss, by_color, by_depth = image_gradients(self.config, image.color, depth, targets, plan, self.distance)
+        torch.autograd.backward([image.color, depth], [by_color, by_depth])
+        assert leaf.grad is not None
+        return Sight(loss, leaf.grad, image.culled)
+
+
+def check_finite(values: Tensor, name: str, stage: str, **where: object) -> None:
+    """Raises ``NonFiniteError`` naming the tensor and its first non-finite entry."""
+    bad = ~torch.isfinite(values)
+    if bool(bad.any()):
+        first = tuple(torch.nonzero(bad)[0].tolist())
+        raise NonFiniteError(stage, name, int(bad.sum()), first, **where)

@@ -1,0 +1,111 @@
+"""What is optimised, and what is carried from iteration to iteration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from genre_tasks.scene.gaussians import Gaussians
+from genre_tasks.scene.graph import DISTANT, SceneGraph
+
+GROUPS = {"means": (0, 3), "log_scales": (3, 6), "quats": (6, 10), "logit_opacities": (10, 11), "colors": (11, 14)}
+"""Columns of the 14 attributes, in the order of ``Gaussians.packed``."""
+
+FIRST_DECAY, SECOND_DECAY = 0.9, 0.99
+FLOOR = 1e-15
+"""Added to the root of the second moment, so that an attribute without gradient has none, instead of 0/0."""
+
+MIN_UNIT_M, MAX_UNIT_M = 0.005, 50.0
+LOG_SCALE_BOUNDS, DISTANT_LOG_SCALE_BOUNDS = (-8.0, 1.0986), (-8.0, 4.6)
+"""ln metres: 0.3 mm to 3 m near, to 100 m in the distant region. What starts outside stays where it started."""
+LOGIT_BOUND = 9.0
+COLOR_BOUNDS = (-0.5, 1.5)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The fixed frame of an unrolled optimisation: the scene at its start, and the unit of each Gaussian's mean.
+
+    ``unit`` [N, 1] metres: the median of the three initial scales (for a disc its radius), bounded. In these units
+    the distant shell and a lane marking share one rate.
+    """
+
+    scene: SceneGraph
+    unit: Tensor
+    low: Tensor  # [N, 14] bounds of the packed attributes
+    high: Tensor  # [N, 14]
+
+    @staticmethod
+    def of(scene: SceneGraph) -> Frame:
+        """From the scene at the start."""
+        start = scene.gaussians.packed()
+        unit = scene.gaussians.log_scales.median(1).values.exp().clamp(MIN_UNIT_M, MAX_UNIT_M)[:, None]
+        low, high = torch.full_like(start, -torch.inf), torch.full_like(start, torch.inf)
+        distant = (scene.nodes == DISTANT)[:, None]
+        for bound, near, far in zip((low, high), LOG_SCALE_BOUNDS, DISTANT_LOG_SCALE_BOUNDS, strict=True):
+            bound[:, 3:6] = torch.where(distant, far, near)
+        low[:, 10], high[:, 10] = -LOGIT_BOUND, LOGIT_BOUND
+        low[:, 11:14], high[:, 11:14] = COLOR_BOUNDS
+        return Frame(scene, unit, torch.minimum(low, start), torch.maximum(high, start))
+
+    def gaussians(self, offsets: Tensor) -> Gaussians:
+        """The Gaussians at ``offsets`` [N, 14] from the start: means in units, all else in raw space."""
+        start = self.scene.gaussians
+        move = Gaussians.unpacked(offsets)
+        return Gaussians(
+            start.means + move.means * self.unit,
+            start.log_scales + move.log_scales,
+            start.quats + move.quats,
+            start.logit_opacities + move.logit_opacities,
+            start.colors + move.colors,
+        )
+
+    def bounded(self, offsets: Tensor) -> Tensor:
+        """Offsets held inside the bounds; those inside stay the same bytes."""
+        start = self.scene.gaussians.packed()
+        clamped = torch.minimum(torch.maximum(start + offsets, self.low), self.high)
+        outside = (start + offsets != clamped) & (self.low > -torch.inf)
+        return torch.where(outside, clamped - start, offsets)
+
+
+@dataclass(frozen=True)
+class State:
+    """``offsets`` [N, 14]; moments of the gradient over the iterations that saw a Gaussian; how many those are.
+
+    ``seen_now`` [N, 1] is 1 where the latest gradient is not zero, ``seen`` [N, 1] counts those iterations.
+    """
+
+    offsets: Tensor
+    first: Tensor  # [N, 14]
+    second: Tensor  # [N, 14]
+    seen: Tensor  # [N, 1]
+    seen_now: Tensor  # [N, 1]
+    iteration: int = 0
+
+    @staticmethod
+    def start(count: int, like: Tensor) -> State:
+        """Nothing moved, nothing seen."""
+        zeros, column = like.new_zeros((count, 14)), like.new_zeros((count, 1))
+        return State(zeros, zeros, zeros, column, column)
+
+    def saw(self, gradient: Tensor) -> State:
+        """With this iteration's gradient [N, 14] with respect to ``offsets`` taken into the moments."""
+        now = (gradient != 0).any(1, keepdim=True).to(gradient.dtype)
+        first = self.first + now * (1 - FIRST_DECAY) * (gradient - self.first)
+        second = self.second + now * (1 - SECOND_DECAY) * (gradient * gradient - self.second)
+        return replace(self, first=first, second=second, seen=self.seen + now, seen_now=now)
+
+    def moved(self, frame: Frame, delta: Tensor) -> State:
+        """With ``delta`` [N, 14] applied to what any view has seen so far; the rest stays the same bytes."""
+        offsets = torch.where(self.seen > 0, frame.bounded(self.offsets + delta), self.offsets)
+        return replace(self, offsets=offsets, iteration=self.iteration + 1)
+
+    def deviation(self) -> Tensor:
+        """Root of the unbiased second moment, [N, 14], > 0."""
+        return (self.second / (1 - SECOND_DECAY ** self.seen.clamp_min(1))).sqrt() + FLOOR
+
+    def direction(self) -> Tensor:
+        """Adam's normalised step, [N, 14], of order 1; exactly 0 where nothing has been seen."""
+        return (self.first / (1 - FIRST_DECAY ** self.seen.clamp_min(1)) / self.deviation()).clamp(-6.0, 6.0)

@@ -1,0 +1,24 @@
+"""ENet: the fixer's images distilled back into the scene in T learned steps (paper Sec. III-C)."""
+
+from __future__ import annotations
+
+from genre_tasks.config import OptimiserConfig
+from genre_tasks.optimiser.run import optimise
+from genre_tasks.progress import Progress, silent
+from genre_tasks.scene.chunk import Chunk
+from genre_tasks.scene.results import Reconstruction
+from genre_tasks.scene.views import FixedViews
+
+
+def enet(
+    config: OptimiserConfig,
+    chunk: Chunk,
+    reconstruction: Reconstruction,
+    fixed: FixedViews,
+    progress: Progress = silent,
+) -> Reconstruction:
+    """The enhanced scene, optimised against source views and fixed novel views.
+
+    Raises ``InputError`` (no source view, an unreadable image, weights that do not fit), ``NonFiniteError``.
+    """
+    return optimise("enet", config, chunk, reconstruction.scene, fixed, progress)

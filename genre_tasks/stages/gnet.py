@@ -1,0 +1,17 @@
+"""GNet: a scene from its initial Gaussians in T learned steps against the source views (paper Sec. III-D)."""
+
+from __future__ import annotations
+
+from genre_tasks.config import OptimiserConfig
+from genre_tasks.optimiser.run import optimise
+from genre_tasks.progress import Progress, silent
+from genre_tasks.scene.chunk import Chunk
+from genre_tasks.scene.results import Reconstruction
+
+
+def gnet(config: OptimiserConfig, chunk: Chunk, initial: Reconstruction, progress: Progress = silent) -> Reconstruction:
+    """The reconstructed scene. Source views only: fixed novel views enter GNet's training alone.
+
+    Raises ``InputError`` (no source view, an unreadable image, weights that do not fit), ``NonFiniteError``.
+    """
+    return optimise("gnet", config, chunk, initial.scene, None, progress)
