@@ -70,12 +70,12 @@ class SceneGraph:
             present[FIRST_ACTOR + k] = pose is not None
             if pose is not None:
                 rotation[FIRST_ACTOR + k], translation[FIRST_ACTOR + k] = pose[:3, :3], pose[:3, 3]
-        like = {"dtype": g.means.dtype, "device": g.means.device}
+        turns = torch.as_tensor(rotation).to(g.means)
         moving = torch.nonzero(self.nodes >= FIRST_ACTOR)[:, 0]
         node = self.nodes[moving]
-        turn = torch.as_tensor(rotation, **like)[node]
-        quats = matrix_to_quat(torch.as_tensor(rotation, **like))[node]
-        means = (turn @ g.means[moving, :, None])[..., 0] + torch.as_tensor(translation, **like)[node]
+        turn = turns[node]
+        quats = matrix_to_quat(turns)[node]
+        means = (turn @ g.means[moving, :, None])[..., 0] + torch.as_tensor(translation).to(g.means)[node]
         absent = ~torch.as_tensor(present, device=node.device)[node]
         opacity = torch.where(absent, torch.full_like(g.logit_opacities[moving], -30.0), g.logit_opacities[moving])
         return Gaussians(
