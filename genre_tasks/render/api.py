@@ -1,0 +1,146 @@
+"""The one function that renders, whatever the backend."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from genre_tasks.errors import NonFiniteError
+from genre_tasks.logs.types import Float64, Lens
+from genre_tasks.render.types import Cameras, Render, RenderSettings
+from genre_tasks.scene.gaussians import Splats
+from genre_tasks.scene.geometry import matrix_to_quat, quat_multiply
+from genre_tasks.scene.graph import SceneGraph
+
+
+DEFAULT = RenderSettings()
+
+
+class PosedView(Protocol):
+    """What is asked of a view: a log frame, a pose [4, 4] and a lens."""
+
+    @property
+    def frame(self) -> int: ...
+    @property
+    def chunk_SE3_camera(self) -> Float64: ...
+    @property
+    def lens(self) -> Lens: ...
+
+
+def render(splats: Splats, cameras: Cameras, settings: RenderSettings = DEFAULT) -> Render:
+    """Renders N Gaussians at V cameras; N and V may be 0.
+
+    Differentiable in means, scales, quaternions, opacities and colours, and in ``cameras.camera_SE3_chunk`` (as a
+    rigid motion: three translations, three rotations) where it requires grad. Colour is premultiplied, depth is
+    Σ w z. A Gaussian with a non-finite value or a quaternion without direction is left out, gets zero gradient, and is
+    counted in ``Render.culled``. The ``cpu`` backend gives the same bits at any number of threads and of views a call.
+
+    Raises:
+        ValueError: a tensor has another shape than expected.
+        NonFiniteError: a camera is not finite.
+        ResourceError: the backend is not installed, or memory does not suffice.
+    """
+    _check_shapes(splats, cameras)
+    backend = settings.backend
+    if backend == "auto":
+        backend = "cpu" if splats.means.device.type == "cpu" else "cuda"
+    if backend == "reference":
+        from genre_tasks.render.reference import render_reference
+
+        return _result(*render_reference(splats, cameras))
+    if cameras.focal_px.requires_grad or cameras.center_px.requires_grad:
+        raise ValueError(f"backend {backend} has no gradient in focal length or principal point; use reference")
+    if backend == "cuda":
+        from genre_tasks.render.cuda import render_cuda
+
+        return _result(*render_cuda(splats, cameras))
+    from genre_tasks.render.cpu import render_cpu
+
+    if not (cameras.camera_SE3_chunk.requires_grad and torch.is_grad_enabled()):
+        return _result(*render_cpu(splats, cameras, settings.threads))
+    parts = [render_cpu(*_in_camera_frame(splats, cameras, v), settings.threads) for v in range(len(cameras))]
+    color, alpha, depth = (torch.cat(images) for images in zip(*(images for images, _ in parts), strict=True))
+    return Render(color, alpha, depth, _summed([counts for _, counts in parts]))
+
+
+def render_views(scene: SceneGraph, views: Sequence[PosedView], settings: RenderSettings = DEFAULT) -> Render:
+    """Renders a scene graph at views of one image size, in their order; actors stand where their frame puts them.
+
+    A call of :func:`render` for each frame, or a single one where the scene has no actors. Raises as :func:`render`.
+    """
+    groups: dict[int, list[int]] = {}
+    for i, view in enumerate(views):
+        groups.setdefault(view.frame if scene.actors else 0, []).append(i)
+    if len({(v.lens.width_px, v.lens.height_px) for v in views}) != 1:
+        raise ValueError("expected one or more views of one image size")
+    parts = []
+    for frame, members in groups.items():
+        cameras = Cameras.of([views[i].chunk_SE3_camera for i in members], [views[i].lens for i in members])
+        parts.append(render(scene.at(frame).activated(), _on(cameras, scene.gaussians.means), settings))
+    if len(parts) == 1:
+        return parts[0]
+    order = torch.argsort(torch.tensor([i for members in groups.values() for i in members]))
+    color, alpha, depth = (torch.cat([getattr(p, n) for p in parts])[order] for n in ("color", "alpha", "depth"))
+    return Render(color, alpha, depth, _summed([p.culled for p in parts]))
+
+
+def _summed(counts: Sequence[dict[str, int]]) -> dict[str, int]:
+    return {k: sum(c.get(k, 0) for c in counts) for k in dict.fromkeys(k for c in counts for k in c)}
+
+
+def _result(images: tuple[Tensor, Tensor, Tensor], culled: dict[str, int]) -> Render:
+    return Render(*images, culled)
+
+
+def _on(cameras: Cameras, like: Tensor) -> Cameras:
+    names = ("camera_SE3_chunk", "focal_px", "center_px")
+    return replace(cameras, **{n: getattr(cameras, n).to(like.device) for n in names})
+
+
+def _check_shapes(splats: Splats, cameras: Cameras) -> None:
+    n, v = len(splats), len(cameras)
+    expected = {
+        "means": (splats.means, (n, 3)), "scales": (splats.scales, (n, 3)), "quats": (splats.quats, (n, 4)),
+        "opacities": (splats.opacities, (n,)), "colors": (splats.colors, (n, 3)),
+        "camera_SE3_chunk": (cameras.camera_SE3_chunk, (v, 4, 4)), "focal_px": (cameras.focal_px, (v, 2)),
+        "center_px": (cameras.center_px, (v, 2)),
+    }  # fmt: skip
+    for name, (tensor, shape) in expected.items():
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"expected {name} of shape {shape}, got {tuple(tensor.shape)}")
+    if cameras.width_px < 1 or cameras.height_px < 1:
+        raise ValueError(f"expected an image of at least 1 × 1, got {cameras.width_px} × {cameras.height_px}")
+    for name in ("camera_SE3_chunk", "focal_px", "center_px"):
+        bad = ~torch.isfinite(getattr(cameras, name))
+        if bool(bad.any()):
+            first = tuple(torch.nonzero(bad)[0].tolist())
+            raise NonFiniteError("render", name, int(bad.sum()), first)
+
+
+def _in_camera_frame(splats: Splats, cameras: Cameras, v: int) -> tuple[Splats, Cameras]:
+    """The splats in coordinates of camera v, and that camera at the origin, so that autograd reaches the pose.
+
+    The rotation's gradient goes through a small turn beside the constant rotation, whose quaternion is (1, ω/2) to
+    first order: exact for rigid motions, and without the square roots of a matrix-to-quaternion conversion.
+    """
+    pose = cameras.camera_SE3_chunk[v]
+    rotation = pose[:3, :3]
+    turn = rotation @ rotation.detach().T  # the identity, with a gradient
+    omega = torch.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+    delta = torch.cat([omega.new_ones(1), omega / 2])
+    fixed = matrix_to_quat(rotation.detach())
+    quats = quat_multiply(quat_multiply(delta, fixed).to(splats.quats.dtype).expand(len(splats), 4), splats.quats)
+    like = splats.means.dtype
+    moved = replace(splats, means=splats.means @ rotation.T.to(like) + pose[:3, 3].to(like), quats=quats)
+    camera = Cameras(
+        torch.eye(4)[None],
+        cameras.focal_px[v : v + 1],
+        cameras.center_px[v : v + 1],
+        cameras.width_px,
+        cameras.height_px,
+    )
+    return moved, camera

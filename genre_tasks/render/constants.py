@@ -1,0 +1,37 @@
+"""The renderer's numeric constants, each once, with its reason; the kernel is compiled with these very values.
+
+They are the values the field agrees on (3DGS, gsplat) unless the comment says otherwise. No imports: the kernel's build
+reads this file without torch.
+"""
+
+from __future__ import annotations
+
+NEAR_M = 0.01
+"""Gaussians nearer than this (camera z, metres) are culled; 0.2, as in the first 3DGS code, hides close geometry."""
+
+BLUR_PX2 = 0.3
+"""Added to both diagonal entries of the projected covariance: a Gaussian covers at least about one pixel."""
+
+ALPHA_MIN = 1.0 / 255.0
+"""Contributions below one 8-bit level are skipped; a Gaussian whose opacity is below is culled."""
+
+ALPHA_MAX = 0.99
+"""Keeps 1 − α invertible in the backward pass; the gradient in opacity and footprint is zero where it clamps."""
+
+TRANSMITTANCE_STOP = 1e-4
+"""A ray ends before a layer that would leave less than (1 − ALPHA_MAX)²: two opaque splats end a ray."""
+
+JACOBIAN_MARGIN = 0.3
+"""The linearisation point is limited to the image edge plus this × tan(fov / 2), per side: EWA explodes off-axis."""
+
+QUAT_MIN_NORM2 = 1e-6
+"""Quaternions with a smaller squared norm are culled: they do not say a rotation, and their gradient explodes."""
+
+MAX_VARIANCE_PX2 = 1e18
+"""Projected variances above are culled (footprints of 1e9 px): their determinant leaves the range of float32."""
+
+MAX_CENTER_PX = 1e7
+"""Projected centres farther off are culled: from 2^24 ≈ 1.7e7 on a float32 pixel coordinate misses whole pixels."""
+
+CULL_REASONS = ("non_finite", "quaternion", "behind", "degenerate")
+"""Reasons counted in ``Render.culled``. Being outside of the image or below ``ALPHA_MIN`` is ordinary, not counted."""

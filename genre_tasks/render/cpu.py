@@ -1,0 +1,103 @@
+"""The ``cpu`` backend: the compiled kernel as a ``torch.autograd.Function``."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from genre_tasks.errors import ResourceError
+from genre_tasks.render.constants import CULL_REASONS
+from genre_tasks.render.kernel_library import load_kernel
+from genre_tasks.render.types import Cameras
+from genre_tasks.scene.gaussians import Splats
+
+Arrays = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+Images = tuple[Tensor, Tensor, Tensor]
+
+
+def _check(status: int) -> None:
+    if status == 1:
+        raise ResourceError("not enough memory to render", remedy="Render fewer views a call, or smaller images")
+    if status:
+        raise ResourceError(
+            "the renderer's CPU kernel failed", remedy="Render with backend reference and report the scene"
+        )
+
+
+class _Batch:
+    """The kernel's state after a forward pass, freed with this object."""
+
+    def __init__(self, handle: ctypes.c_void_p) -> None:
+        self.handle = handle
+        self._free = load_kernel().genre_free
+
+    def __del__(self) -> None:
+        self._free(self.handle)
+
+
+def _forward(
+    arrays: Arrays, cameras: Cameras, threads: int, keep: bool
+) -> tuple[Images, dict[str, int], _Batch | None]:
+    kernel = load_kernel()
+    views, height, width = len(cameras), cameras.height_px, cameras.width_px
+    poses = cameras.camera_SE3_chunk.detach().to("cpu", torch.float32).contiguous()
+    lenses = torch.cat([cameras.focal_px, cameras.center_px], 1).detach().to("cpu", torch.float32).contiguous()
+    color, alpha = torch.empty(views, height, width, 3), torch.empty(views, height, width)
+    depth = torch.empty_like(alpha)
+    culled = (ctypes.c_longlong * len(CULL_REASONS))()
+    handle = ctypes.c_void_p()
+    status = kernel.genre_forward(
+        len(arrays[0]), *(a.data_ptr() for a in arrays), views, poses.data_ptr(), lenses.data_ptr(), width, height,
+        threads, color.data_ptr(), alpha.data_ptr(), depth.data_ptr(), culled, ctypes.byref(handle) if keep else None,
+    )  # fmt: skip
+    _check(status)
+    counts = {reason: n for reason, n in zip(CULL_REASONS, culled, strict=True) if n}
+    return (color, alpha, depth), counts, _Batch(handle) if keep else None
+
+
+class _Rasterise(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, cameras: Cameras, threads: int, culled: dict[str, int], means: Tensor, scales: Tensor, quats: Tensor,
+        opacities: Tensor, colors: Tensor,
+    ) -> Images:  # fmt: skip
+        arrays = (means, scales, quats, opacities, colors)
+        images, counts, ctx.batch = _forward(arrays, cameras, threads, keep=any(ctx.needs_input_grad))
+        culled.update(counts)
+        ctx.cameras, ctx.threads = cameras, threads
+        ctx.save_for_backward(*arrays, *images)
+        return images
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_color: Tensor, v_alpha: Tensor, v_depth: Tensor) -> tuple[Tensor | None, ...]:
+        saved = ctx.saved_tensors
+        arrays, images = saved[:5], saved[5:]
+        batch, ctx.batch = ctx.batch, None
+        if batch is None:  # a second backward through a retained graph: the state was given back after the first
+            batch = _forward(arrays, ctx.cameras, ctx.threads, keep=True)[2]
+        grads = [torch.zeros_like(a) for a in arrays]
+        v = [x.contiguous() for x in (v_color, v_alpha, v_depth)]
+        status = load_kernel().genre_backward(
+            batch.handle, len(arrays[0]), *(a.data_ptr() for a in arrays), *(a.data_ptr() for a in images),
+            *(x.data_ptr() for x in v), ctx.threads, *(g.data_ptr() for g in grads),
+        )  # fmt: skip
+        _check(status)
+        return (None, None, None, *grads)
+
+
+def render_cpu(splats: Splats, cameras: Cameras, threads: int | None) -> tuple[Images, dict[str, int]]:
+    """Colour [V, H, W, 3], alpha and depth [V, H, W], float32, and the culled counts; differentiable in the splats.
+
+    ``threads`` ``None`` takes torch's number. The bits of images and gradients do not depend on it.
+    """
+    arrays = (splats.means, splats.scales, splats.quats, splats.opacities, splats.colors)
+    culled: dict[str, int] = {}
+    images = _Rasterise.apply(
+        cameras, threads or torch.get_num_threads(), culled, *(a.to(torch.float32).contiguous() for a in arrays)
+    )
+    return images, culled

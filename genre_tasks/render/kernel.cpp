@@ -1,0 +1,396 @@
+// The CPU rasteriser behind a plain C interface. Every result has the same bits at any number of threads.
+#include <algorithm>
+#include <atomic>
+#include <cstdint>
+#include <cstdlib>
+#include <exception>
+#include <memory>
+#include <mutex>
+#include <new>
+#include <stdexcept>
+#include <thread>
+#include <vector>
+
+#include "kernel_blend.h"
+
+// Threads live for one call: no pool to survive a fork, no OpenMP runtime beside the one that torch brings.
+template <class F>
+static void parallel(int threads, F f) {
+  std::mutex guard;
+  std::exception_ptr error;
+  auto run = [&](int worker) {
+    try {
+      f(worker);
+    } catch (...) {
+      std::lock_guard<std::mutex> lock(guard);
+      error = std::current_exception();
+    }
+  };
+  std::vector<std::thread> crew;
+  crew.reserve(threads);
+  for (int w = 1; w < threads; w++) {
+    try {
+      crew.emplace_back(run, w);
+    } catch (const std::system_error&) {
+      run(w);  // no more threads to be had: do it here
+    }
+  }
+  run(0);
+  for (auto& t : crew) t.join();
+  if (error) std::rethrow_exception(error);
+}
+
+static size_t share(size_t n, int worker, int threads) { return n * worker / threads; }
+
+// Grows, never shrinks, is never initialised.
+template <class T>
+struct Buffer {
+  T* p = nullptr;
+  size_t n = 0, capacity = 0;
+  Buffer() = default;
+  Buffer(const Buffer&) = delete;
+  ~Buffer() { std::free(p); }
+  void reserve(size_t m, size_t keep_first = 0) {
+    if (m <= capacity) return;
+    size_t bytes = ((m + m / 4 + 64) * sizeof(T) + 63) / 64 * 64;
+    T* fresh = static_cast<T*>(std::aligned_alloc(64, bytes));
+    if (!fresh) throw std::bad_alloc();
+    if (keep_first) std::memcpy(static_cast<void*>(fresh), p, keep_first * sizeof(T));
+    std::free(p);
+    p = fresh, capacity = bytes / sizeof(T);
+  }
+  void resize(size_t m) { reserve(m), n = m; }
+  T& operator[](size_t i) { return p[i]; }
+  size_t bytes() const { return capacity * sizeof(T); }
+};
+
+// What the backward pass needs of one view.
+struct View {
+  Camera camera;
+  int tiles_x, tiles_y;
+  Buffer<Footprint> input, sorted;       // drawn footprints in input order, and in depth order
+  Buffer<uint32_t> id, slot_end, tile_begin;  // by input place: Gaussian, end of its pair slots; by tile: first pair
+  Buffer<Pair> pairs;                    // tile after tile, each front to back
+  long long culled[CULL_REASONS];
+  size_t bytes() const {
+    return input.bytes() + sorted.bytes() + id.bytes() + slot_end.bytes() + tile_begin.bytes() + pairs.bytes();
+  }
+};
+
+// What a pass needs only while it runs.
+struct Scratch {
+  Buffer<uint64_t> keys, other;
+  std::vector<std::unique_ptr<Buffer<uint32_t>>> tiles;  // per thread: tile numbers of its footprints
+  std::vector<std::vector<uint32_t>> histogram;          // per thread, per tile
+  Buffer<uint32_t> order;
+  Buffer<Lanes> slots;
+  Buffer<float> gradient;  // [drawn, 14]
+  size_t bytes() const { return keys.bytes() + other.bytes() + order.bytes() + slots.bytes() + gradient.bytes(); }
+};
+
+// Used memory is handed on: fresh pages cost more than the work on a small view.
+template <class T>
+struct Shelf {
+  static constexpr size_t LIMIT = 256u << 20;
+  std::mutex guard;
+  std::vector<std::unique_ptr<T>> free;
+  size_t held = 0;
+  std::unique_ptr<T> take() {
+    std::lock_guard<std::mutex> lock(guard);
+    if (free.empty()) return std::make_unique<T>();
+    auto x = std::move(free.back());
+    free.pop_back(), held -= x->bytes();
+    return x;
+  }
+  void give(std::unique_ptr<T> x) {
+    std::lock_guard<std::mutex> lock(guard);
+    if (held + x->bytes() <= LIMIT) held += x->bytes(), free.push_back(std::move(x));
+  }
+};
+// Never destroyed: a handle may be freed while the process ends.
+static Shelf<View>& views_shelf() { static auto* s = new Shelf<View>; return *s; }
+static Shelf<Scratch>& scratch_shelf() { static auto* s = new Shelf<Scratch>; return *s; }
+
+struct Gaussians {
+  int count;
+  const float *means, *scales, *quats, *opacities, *colors;
+};
+
+static int clamp_tile(float pixel, int low, int high) {
+  return (int)std::min((float)high, std::max((float)low, std::floor((pixel - 0.5f) * (1.f / TILE))));
+}
+
+// Tiles under a footprint: for each row of tiles the exact extent of the ellipse within that band.
+template <class F>
+static inline void for_tiles(const Footprint& g, int tiles_x, int tiles_y, F f) {
+  int last_row = clamp_tile(g.y + g.half_y, -1, tiles_y - 1);
+  float reach = 4 * g.a * cut_level(g);
+  for (int j = clamp_tile(g.y - g.half_y, 0, tiles_y); j <= last_row; j++) {
+    float from = std::max(j * TILE + 0.5f - g.y, -g.half_y), to = std::min(j * TILE + TILE - 0.5f - g.y, g.half_y);
+    float right = std::min(std::max(g.dy_at_right, from), to), left = std::min(std::max(-g.dy_at_right, from), to);
+    float sr = std::sqrt(std::max(0.f, reach - g.discriminant * right * right));
+    float sl = std::sqrt(std::max(0.f, reach - g.discriminant * left * left));
+    int first = clamp_tile(g.x + (-g.b * left - sl) * g.inv_2a, 0, tiles_x);
+    int last = clamp_tile(g.x + (-g.b * right + sr) * g.inv_2a, -1, tiles_x - 1);
+    for (int i = first; i <= last; i++) f(j * tiles_x + i);
+  }
+}
+
+static void project_all(View& v, const Gaussians& in, int threads) {
+  v.input.resize(in.count), v.id.resize(in.count);
+  std::vector<size_t> begin(threads), count(threads);
+  std::vector<long long> culled((size_t)threads * (CULL_REASONS + 2), 0);
+  parallel(threads, [&](int w) {
+    size_t at = begin[w] = share(in.count, w, threads), end = share(in.count, w + 1, threads);
+    long long tally[CULL_REASONS + 2] = {};
+    Projection p;
+    for (size_t i = at; i < end; i++) {
+      int verdict = footprint(v.camera, in.means + 3 * i, in.scales + 3 * i, in.quats + 4 * i, in.opacities[i],
+                              in.colors + 3 * i, p, v.input[at]);
+      tally[verdict]++;
+      if (verdict == DRAWN) v.id[at++] = (uint32_t)i;
+    }
+    count[w] = at - begin[w];
+    std::copy(tally, tally + CULL_REASONS + 2, &culled[(size_t)w * (CULL_REASONS + 2)]);
+  });
+  size_t n = count[0];
+  for (int w = 1; w < threads; w++) {
+    std::memmove(static_cast<void*>(v.input.p + n), v.input.p + begin[w], count[w] * sizeof(Footprint));
+    std::memmove(v.id.p + n, v.id.p + begin[w], count[w] * 4);
+    n += count[w];
+  }
+  v.input.n = v.id.n = n;
+  for (int r = 0; r < CULL_REASONS; r++) {
+    v.culled[r] = 0;
+    for (int w = 0; w < threads; w++) v.culled[r] += culled[(size_t)w * (CULL_REASONS + 2) + r];
+  }
+}
+
+// Stable, so Gaussians of one depth keep their input order. Depths are positive: their bits sort as integers.
+static void sort_by_depth(View& v, Scratch& s) {
+  size_t n = v.input.n;
+  s.keys.resize(n), s.other.resize(n);
+  for (size_t i = 0; i < n; i++) {
+    uint32_t u;
+    std::memcpy(&u, &v.input[i].z, 4);
+    s.keys[i] = (uint64_t)u << 32 | (uint32_t)i;
+  }
+  uint64_t *from = s.keys.p, *to = s.other.p;
+  for (int shift = 32; shift < 64; shift += 11) {
+    uint32_t start[2049] = {0};
+    for (size_t i = 0; i < n; i++) start[((from[i] >> shift) & 2047) + 1]++;
+    for (int i = 0; i < 2048; i++) start[i + 1] += start[i];
+    for (size_t i = 0; i < n; i++) to[start[(from[i] >> shift) & 2047]++] = from[i];
+    std::swap(from, to);
+  }
+  s.order.resize(n);
+  for (size_t i = 0; i < n; i++) s.order[i] = (uint32_t)from[i];
+}
+
+// One counting sort of (tile, footprint) pairs in depth order: tiles need no sort of their own.
+static void bin(View& v, Scratch& s, int threads) {
+  size_t n = v.input.n, tiles = (size_t)v.tiles_x * v.tiles_y;
+  v.sorted.resize(n), v.slot_end.resize(n), v.tile_begin.resize(tiles + 1);
+  while ((int)s.tiles.size() < threads) s.tiles.push_back(std::make_unique<Buffer<uint32_t>>());
+  s.histogram.resize(std::max((size_t)threads, s.histogram.size()));
+  std::vector<size_t> totals(threads);
+  parallel(threads, [&](int w) {
+    auto& histogram = s.histogram[w];
+    auto& list = *s.tiles[w];
+    histogram.assign(tiles, 0);
+    size_t at = 0, end = share(n, w + 1, threads);
+    for (size_t i = share(n, w, threads); i < end; i++) {
+      if (i + 8 < end) __builtin_prefetch(&v.input[s.order[i + 8]]);
+      v.sorted[i] = v.input[s.order[i]];
+      size_t before = at;
+      if (at + tiles > list.capacity) list.reserve(2 * list.capacity + tiles + 1024, at);
+      for_tiles(v.sorted[i], v.tiles_x, v.tiles_y, [&](int t) { histogram[t]++, list[at++] = t; });
+      v.slot_end[s.order[i]] = (uint32_t)(at - before);
+    }
+    totals[w] = at;
+  });
+  size_t total = 0;
+  for (size_t t : totals) total += t;
+  if (total >= UINT32_MAX) throw std::bad_alloc();
+  uint32_t sum = 0;
+  for (size_t i = 0; i < n; i++) v.slot_end[i] = sum += v.slot_end[i];
+  sum = 0;
+  for (size_t t = 0; t < tiles; t++) {
+    v.tile_begin[t] = sum;
+    for (int w = 0; w < threads; w++) {
+      uint32_t c = s.histogram[w][t];
+      s.histogram[w][t] = sum, sum += c;
+    }
+  }
+  v.tile_begin[tiles] = sum;
+  v.pairs.resize(sum);
+  parallel(threads, [&](int w) {
+    auto& next = s.histogram[w];
+    const uint32_t* tile = s.tiles[w]->p;
+    for (size_t i = share(n, w, threads), end = share(n, w + 1, threads); i < end; i++) {
+      uint32_t place = s.order[i], slot = place ? v.slot_end[place - 1] : 0;
+      for (; slot < v.slot_end[place]; slot++) v.pairs[next[*tile++]++] = Pair{(uint32_t)i, slot};
+    }
+  });
+}
+
+template <class F>
+static void for_each_tile(const View& v, int threads, F f) {
+  std::atomic<int> next{0};
+  int tiles = v.tiles_x * v.tiles_y;
+  parallel(threads, [&](int) {
+    for (int t; (t = next.fetch_add(8)) < tiles;)
+      for (int k = t; k < std::min(t + 8, tiles); k++) f(k, k % v.tiles_x * TILE, k / v.tiles_x * TILE);
+  });
+}
+
+static void forward(View& v, Scratch& s, const Gaussians& in, int threads, float* color, float* alpha, float* depth) {
+  project_all(v, in, threads);
+  sort_by_depth(v, s);
+  bin(v, s, threads);
+  for_each_tile(v, threads, [&](int t, int X, int Y) {
+    blend_forward(v.sorted.p, v.pairs.p + v.tile_begin[t], v.pairs.p + v.tile_begin[t + 1], X, Y, v.camera.width,
+                  v.camera.height, color, alpha, depth);
+  });
+}
+
+// Which lane of `sums` holds which sum: found by trying, the folds permute.
+static std::vector<int> lane_of_sums() {
+  std::vector<int> lane(SUMS);
+  for (int k = 0; k < SUMS; k++) {
+    Lanes x[SUMS] = {};
+    x[k] = broadcast(1.f / LANES);
+    Lanes r = sums(x);
+    for (int i = 0; i < LANES; i++)
+      if (r[i] > 0.5f) lane[k] = i;
+  }
+  return lane;
+}
+
+// Leaves the gradient of each drawn Gaussian in s.gradient.
+static void backward(View& v, Scratch& s, const Gaussians& in, int threads, Images out, Images grad) {
+  static const std::vector<int> lane = lane_of_sums();
+  s.slots.resize(v.pairs.n), s.gradient.resize(v.input.n * ATTRIBUTES);
+  for_each_tile(v, threads, [&](int t, int X, int Y) {
+    blend_backward(v.sorted.p, v.pairs.p + v.tile_begin[t], v.pairs.p + v.tile_begin[t + 1], X, Y, v.camera.width,
+                   v.camera.height, out, grad, s.slots.p);
+  });
+  parallel(threads, [&](int w) {
+    for (size_t i = share(v.input.n, w, threads), end = share(v.input.n, w + 1, threads); i < end; i++) {
+      Lanes total{};
+      for (uint32_t k = i ? v.slot_end[i - 1] : 0; k < v.slot_end[i]; k++) total += s.slots[k];
+      float sum[SUMS];
+      for (int k = 0; k < SUMS; k++) sum[k] = total[lane[k]];
+      size_t id = v.id[i];
+      project_backward(v.camera, v.input[i], in.means + 3 * id, in.scales + 3 * id, in.quats + 4 * id, sum,
+                       s.gradient.p + i * ATTRIBUTES);
+    }
+  });
+}
+
+struct Gradients {
+  float *means, *scales, *quats, *opacities, *colors;
+};
+
+// Adds the view's gradients; called in the order of the views, so that sums do not depend on threads.
+static void accumulate(View& v, const Scratch& s, Gradients g) {
+  for (size_t i = 0; i < v.input.n; i++) {
+    const float* x = s.gradient.p + i * ATTRIBUTES;
+    size_t id = v.id[i];
+    for (int k = 0; k < 3; k++) {
+      g.means[3 * id + k] += x[MEAN + k], g.scales[3 * id + k] += x[SCALE + k], g.colors[3 * id + k] += x[COLOR + k];
+    }
+    for (int k = 0; k < 4; k++) g.quats[4 * id + k] += x[QUAT + k];
+    g.opacities[id] += x[OPACITY];
+  }
+}
+
+struct Batch {
+  std::vector<std::unique_ptr<View>> views;
+};
+
+// Whole views side by side where there are enough of them; the rest one by one, with all threads inside.
+template <class F, class G>
+static void for_each_view(int views, int threads, F work, G finish) {
+  for (int v = 0; v < views;) {
+    int together = views - v >= threads ? threads : 1;
+    parallel(together, [&](int w) { work(v + w, w, together > 1 ? 1 : threads); });
+    for (int w = 0; w < together; w++) finish(v + w, w);
+    v += together;
+  }
+}
+
+struct ScratchSet {
+  std::vector<std::unique_ptr<Scratch>> of;
+  explicit ScratchSet(int n) { while (n--) of.push_back(scratch_shelf().take()); }
+  ~ScratchSet() { for (auto& s : of) scratch_shelf().give(std::move(s)); }
+};
+
+enum Status { OK = 0, OUT_OF_MEMORY = 1, FAILED = 2 };
+
+template <class F>
+static int guarded(F f) {
+  try {
+    f();
+    return OK;
+  } catch (const std::bad_alloc&) {
+    return OUT_OF_MEMORY;
+  } catch (...) {
+    return FAILED;
+  }
+}
+
+extern "C" {
+
+// poses [V, 4, 4] chunk to camera, lenses [V, 4] fx fy cx cy; color [V, H, W, 3], alpha and depth [V, H, W];
+// culled [4] is added to. With `batch`, the state for genre_backward is kept there until genre_free.
+int genre_forward(int count, const float* means, const float* scales, const float* quats, const float* opacities,
+                  const float* colors, int views, const float* poses, const float* lenses, int width, int height, int threads,
+                  float* color, float* alpha, float* depth, long long* culled, void** batch) {
+  return guarded([&] {
+    Gaussians in{count, means, scales, quats, opacities, colors};
+    ScratchSet scratch(std::max(1, threads));
+    auto kept = std::make_unique<Batch>();
+    kept->views.resize(views);
+    size_t pixels = (size_t)width * height;
+    for_each_view(views, std::max(1, threads), [&](int v, int w, int inner) {
+      auto view = views_shelf().take();
+      view->camera = make_camera(poses + 16 * v, lenses + 4 * v, width, height);
+      view->tiles_x = (width + TILE - 1) / TILE, view->tiles_y = (height + TILE - 1) / TILE;
+      forward(*view, *scratch.of[w], in, inner, color + 3 * pixels * v, alpha + pixels * v, depth + pixels * v);
+      kept->views[v] = std::move(view);
+    }, [&](int v, int) {
+      for (int r = 0; r < CULL_REASONS; r++) culled[r] += kept->views[v]->culled[r];
+      if (!batch) views_shelf().give(std::move(kept->views[v]));
+    });
+    if (batch) *batch = kept.release();
+  });
+}
+
+// Gradients are added to grad_* (zero them first). `color`, `alpha`, `depth` are what genre_forward wrote.
+int genre_backward(void* batch, int count, const float* means, const float* scales, const float* quats,
+                   const float* opacities, const float* colors, const float* color, const float* alpha, const float* depth,
+                   const float* v_color, const float* v_alpha, const float* v_depth, int threads, float* grad_means,
+                   float* grad_scales, float* grad_quats, float* grad_opacities, float* grad_colors) {
+  return guarded([&] {
+    auto& views = static_cast<Batch*>(batch)->views;
+    Gaussians in{count, means, scales, quats, opacities, colors};
+    Gradients g{grad_means, grad_scales, grad_quats, grad_opacities, grad_colors};
+    ScratchSet scratch(std::max(1, threads));
+    for_each_view((int)views.size(), std::max(1, threads), [&](int v, int w, int inner) {
+      size_t at = (size_t)views[v]->camera.width * views[v]->camera.height * v;
+      backward(*views[v], *scratch.of[w], in, inner, Images{color + 3 * at, alpha + at, depth + at},
+               Images{v_color + 3 * at, v_alpha + at, v_depth + at});
+    }, [&](int v, int w) { accumulate(*views[v], *scratch.of[w], g); });
+  });
+}
+
+void genre_free(void* batch) {
+  auto* b = static_cast<Batch*>(batch);
+  for (auto& v : b->views) views_shelf().give(std::move(v));
+  delete b;
+}
+
+// Of what this library was built, so that a stale one is noticed.
+const char* genre_digest() { return SOURCE_DIGEST; }
+}

@@ -1,0 +1,82 @@
+"""Finds and loads the compiled kernel for this machine."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+from functools import cache
+from pathlib import Path
+
+from genre_tasks.errors import ConfigError, ResourceError
+from genre_tasks.render import build_kernel
+
+REMEDY = "Run `pip install -e .` in the repository (it needs g++ or clang++, or the ziglang package)"
+_NEEDED_FLAGS = {
+    "avx512": {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl", "avx2", "fma", "bmi2"},
+    "avx2": {"avx", "avx2", "fma", "bmi1", "bmi2", "f16c", "movbe"},
+    "sse42": {"sse4_2", "popcnt", "ssse3"},
+}
+"""What /proc/cpuinfo must list for the x86-64 level that the library was compiled for."""
+
+
+def _cpu_flags() -> set[str]:
+    try:
+        text = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        return set()
+    return next((set(line.split(":", 1)[1].split()) for line in text.splitlines() if line.startswith("flags")), set())
+
+
+def supported_isas() -> list[str]:
+    """The instruction sets of the kernel that this machine can run, best first (never one that it lacks)."""
+    if "generic" in build_kernel.isas():
+        return ["generic"]
+    flags = _cpu_flags()
+    if not flags and platform.system() != "Linux":
+        # No list to read: torch knows the machine's level by other means.
+        import torch
+
+        known = {"AVX512": ["avx512", "avx2", "sse42"], "AVX2": ["avx2", "sse42"]}
+        return known.get(torch.backends.cpu.get_cpu_capability(), ["sse42"])
+    return [isa for isa, needed in _NEEDED_FLAGS.items() if needed <= flags]
+
+
+def chosen_isa() -> str:
+    """The best supported instruction set, or ``GENRE_RENDER_ISA``; :class:`ConfigError` if it cannot run."""
+    supported = supported_isas()
+    asked = os.environ.get("GENRE_RENDER_ISA")
+    if asked and asked not in supported:
+        raise ConfigError(
+            f"GENRE_RENDER_ISA={asked} cannot run on this machine", remedy=f"Unset it, or choose from {supported}"
+        )
+    if not supported:
+        raise ResourceError(
+            "the CPU is older than the kernel's oldest instruction set (SSE4.2)", remedy="Use backend reference"
+        )
+    return asked or supported[0]
+
+
+@cache
+def load_kernel(folder: Path = build_kernel.HERE, isa: str | None = None) -> ctypes.CDLL:
+    """The kernel with its argument types declared; loaded once.
+
+    Raises:
+        ResourceError: it was never compiled, is older than its sources, or does not load.
+    """
+    path = folder / build_kernel.library_name(isa or chosen_isa())
+    if not path.exists():
+        raise ResourceError("the renderer's CPU kernel is not compiled", remedy=REMEDY, file=path)
+    try:
+        library = ctypes.CDLL(str(path))
+        library.genre_digest.restype = ctypes.c_char_p
+        digest = library.genre_digest().decode()
+    except (OSError, AttributeError) as error:
+        raise ResourceError(f"the renderer's CPU kernel does not load: {error}", remedy=REMEDY, file=path) from error
+    if digest != build_kernel.source_digest():
+        raise ResourceError("the renderer's CPU kernel is older than its sources", remedy=REMEDY, file=path)
+    p, i = ctypes.c_void_p, ctypes.c_int
+    library.genre_forward.argtypes = [i, p, p, p, p, p, i, p, p, i, i, i, p, p, p, p, p]
+    library.genre_backward.argtypes = [p, i, *[p] * 5, *[p] * 6, i, *[p] * 5]
+    library.genre_free.argtypes, library.genre_free.restype = [p], None
+    return library
