@@ -1,0 +1,28 @@
+"""Weights that ship with the package, and the one place where a configured name becomes a path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from genre_tasks.errors import InputError
+
+
+def resolve_weights(name: str, configured: str) -> Path:
+    """The file (or folder) that ``configured`` names.
+
+    Args:
+        name: the network, as ``fnet``, ``gnet`` or ``enet``: the stem of its built-in file.
+        configured: ``builtin``, or a path.
+
+    Raises:
+        InputError: it does not exist.
+    """
+    if configured == "builtin":
+        path = Path(__file__).parent / f"{name}.safetensors"
+        remedy = f"Reinstall the package, train weights with `genre train {name}`, or give a path by `{name}.weights`."
+    else:
+        path = Path(configured).expanduser()
+        remedy = f"Check `{name}.weights`, or leave it at `builtin`."
+    if not path.exists():
+        raise InputError(f"the weights of {name} do not exist", remedy=remedy, file=path, stage=name)
+    return path
