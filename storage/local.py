@@ -6,7 +6,7 @@ import os
 import shutil
 import time
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,8 +17,9 @@ from genre_tasks.errors import ArtifactCorruptError, ConfigError
 from storage.address import Address
 from storage.codecs import codec_of
 from storage.failures import as_genre_error
-from storage.files import digest_file, make_folders, payload_files, sync, write_file
+from storage.files import make_folders, payload_files, sync
 from storage.manifest import MANIFEST, FileEntry, Manifest, NewerSchemaError, parse_manifest, payload_digest
+from storage.sealing import difference, seal
 from storage.store import Artifact
 
 __all__ = ["Artifact", "LocalStore", "open_store"]
@@ -88,7 +89,7 @@ class LocalStore:
                 make_folders(target.parent)
                 temporary.mkdir()
                 codec.write(temporary, value)
-                _seal(temporary, manifest)
+                seal(temporary, manifest)
                 self._publish(temporary, target, address)
             finally:
                 shutil.rmtree(temporary, ignore_errors=True)
@@ -124,7 +125,7 @@ class LocalStore:
             present = dict(payload_files(artifact.path))
             present.pop(MANIFEST, None)
             for name, entry in listed.items():
-                problem = _difference(present.get(name), entry)
+                problem = difference(present.get(name), entry)
                 if problem:
                     raise _corrupt(artifact, name, problem)
             for name in present:
@@ -139,10 +140,14 @@ class LocalStore:
             return codec.read(artifact.path, artifact.manifest.measurements)
 
     def discard(self, where: Artifact | Address) -> None:
-        """Remove an artifact (sound or corrupt): renamed away first, so that nobody sees half of it."""
+        """Remove an artifact (sound or corrupt): renamed away first, so that nobody sees half of it.
+
+        Raises ``NewerSchemaError`` where a newer version of the project wrote it: that is not ours to remove.
+        """
         address = where.address if isinstance(where, Artifact) else where
         target = self.root / address.relative
         with _translated(target, address):
+            _manifest_in(target)
             trash = _move_aside(target)
             if trash is not None:
                 sync(target.parent)
@@ -173,6 +178,19 @@ class LocalStore:
                     w is None or w == h for w, h in zip(wanted, have, strict=True)
                 ):
                     yield Artifact(at, folder, manifest)
+
+    def check(self) -> Iterator[tuple[Path, ArtifactCorruptError | None]]:
+        """Each folder with a manifest, in order, and what is wrong with it; also where the manifest is unreadable."""
+        for folder in _folders_with_manifest(self.root):
+            try:
+                manifest = parse_manifest((folder / MANIFEST).read_bytes(), folder / MANIFEST)
+                artifact = Artifact(manifest.address, folder, manifest)
+                if folder != self.root / artifact.address.relative:
+                    raise _corrupt(artifact, MANIFEST, f"The manifest belongs to {artifact.address}")
+                self.verify(artifact)
+                yield folder, None
+            except ArtifactCorruptError as error:
+                yield folder, error
 
     def clean_temporaries(self, older_than_s: float = 3600.0) -> int:
         """Remove what killed processes left, if nothing in it was touched for ``older_than_s``; returns how many."""
@@ -209,13 +227,13 @@ class LocalStore:
             shutil.rmtree(trash, ignore_errors=True)
 
     def _sound(self, path: Path, address: Address) -> bool:
+        manifest = _manifest_in(path)
+        if manifest is None or manifest.address != address:
+            return False
         try:
-            manifest = parse_manifest((path / MANIFEST).read_bytes(), path / MANIFEST)
             self.verify(Artifact(address, path, manifest))
-            return manifest.address == address
-        except NewerSchemaError:
-            raise
-        except (ArtifactCorruptError, FileNotFoundError, NotADirectoryError):
+            return True
+        except ArtifactCorruptError:
             return False
 
 
@@ -229,17 +247,14 @@ def open_store(uri: str) -> LocalStore:
     raise ConfigError(f"The store {uri!r} is of no known kind", remedy="Give a folder: a path, or file:///path.")
 
 
-def _seal(folder: Path, manifest: Callable[[tuple[FileEntry, ...]], Manifest]) -> None:
-    """Sync all files, digest them, write the manifest last, sync the folders."""
-    entries = []
-    for name, path in payload_files(folder):
-        sync(path)
-        entries.append(FileEntry(path=name, sha256=digest_file(path), size=path.stat().st_size))
-    write_file(folder / MANIFEST, manifest(tuple(entries)).to_json())
-    sync(folder / MANIFEST)
-    for below in sorted((p for p in folder.rglob("*") if p.is_dir()), reverse=True):
-        sync(below)
-    sync(folder)
+def _manifest_in(folder: Path) -> Manifest | None:
+    """The manifest, or ``None`` where there is none that can be trusted; a newer one raises."""
+    try:
+        return parse_manifest((folder / MANIFEST).read_bytes(), folder / MANIFEST)
+    except NewerSchemaError:
+        raise
+    except (ArtifactCorruptError, FileNotFoundError, NotADirectoryError):
+        return None
 
 
 def _move_aside(target: Path) -> Path | None:
@@ -249,20 +264,6 @@ def _move_aside(target: Path) -> Path | None:
     except FileNotFoundError:
         return None
     return trash
-
-
-def _difference(path: Path | None, entry: FileEntry) -> str | None:
-    if path is None:
-        return "A file is missing"
-    try:
-        size = path.lstat().st_size
-        if path.is_symlink():
-            return "A file is a link"
-        if size != entry.size:
-            return f"A file has {size} bytes, expected {entry.size}"
-        return None if digest_file(path) == entry.sha256 else "A file does not have the sha256 of the manifest"
-    except FileNotFoundError:
-        return "A file is missing"
 
 
 def _corrupt(artifact: Artifact, name: str, problem: str) -> ArtifactCorruptError:

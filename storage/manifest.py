@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from genre_tasks.errors import ArtifactCorruptError
 from storage.address import Address
-from storage.keys import canonical_json, digest_bytes, digest_value
+from storage.keys import digest_bytes, digest_value
 
 MANIFEST = "manifest.json"
 SCHEMA_VERSION = 1
@@ -106,23 +106,22 @@ def parse_manifest(data: bytes, file: Path) -> Manifest:
     """
     try:
         body = json.loads(data)
-        version = int(body["schema_version"])
-    except (ValueError, TypeError, KeyError) as error:
+        version, seal = int(body["schema_version"]), body.pop(_SEAL, None)
+        own = digest_value(body)
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise ArtifactCorruptError("The manifest is not readable", remedy=_RECOMPUTE, file=file) from error
+    if seal != own and not (seal is None and version > SCHEMA_VERSION):
+        raise ArtifactCorruptError("The manifest does not match its own digest", remedy=_RECOMPUTE, file=file)
     if version > SCHEMA_VERSION:
         raise NewerSchemaError(
             f"The manifest has schema version {version}, this version knows up to {SCHEMA_VERSION}",
             remedy="Update the project, or choose another place with --store.",
             file=file,
         )
-    seal = body.pop(_SEAL, None)
     try:
-        sealed = seal == digest_bytes(canonical_json(body).encode())
         manifest = Manifest.model_validate(body)
-    except (ValueError, ValidationError) as error:
+    except ValidationError as error:
         raise ArtifactCorruptError("The manifest does not fit its schema", remedy=_RECOMPUTE, file=file) from error
-    if not sealed:
-        raise ArtifactCorruptError("The manifest does not match its own digest", remedy=_RECOMPUTE, file=file)
     if manifest.payload_digest != payload_digest(manifest.files):
         raise ArtifactCorruptError("The payload digest is not of the files listed", remedy=_RECOMPUTE, file=file)
     for entry in manifest.files:

@@ -14,7 +14,7 @@ import pyarrow as pa
 
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
 from genre_tasks.scene.results import Evaluation, Metric, ViewScore
-from storage.codecs.images import read_png, write_png
+from storage.codecs.png import read_png, write_png
 from storage.codecs.tables import REMEDY, column, read_table, schema, write_table
 
 METRICS = schema(

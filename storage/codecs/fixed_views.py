@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from genre_tasks.scene.views import FixedViews
-from storage.codecs.images import read_exr, write_exr
+from storage.codecs.exr import read_channels, write_exr
 from storage.codecs.novel_views import read_views, write_views
 from storage.codecs.tables import checked
-from storage.color import from_linear_half, to_linear_half
+from storage.color import from_linear_half
 
 CHANNELS: dict[str, Any] = dict.fromkeys("RGB", np.float16)
 
@@ -24,8 +25,7 @@ def write(folder: Path, value: FixedViews) -> None:
         value.color.detach().cpu().numpy(), "fixed colour", np.float32, (len(value.views), height, width, 3)
     )
     for i, path in enumerate(write_views(folder, value.views, height, width)):
-        light = to_linear_half(color[i], None, f"colour of {path.name}")
-        write_exr(path, {c: light[..., k] for k, c in enumerate("RGB")})
+        write_exr(path, color[i])
 
 
 def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> FixedViews:
@@ -35,9 +35,14 @@ def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> FixedVi
     views, files, (height, width) = read_views(folder)
     color = np.empty((len(views), height, width, 3), np.float32)
     for i, path in enumerate(files):
-        channels = read_exr(path, CHANNELS, (height, width))
-        color[i] = from_linear_half(np.stack([channels[c] for c in "RGB"], -1), None)
+        color[i] = read_image(path, (height, width))
     return FixedViews(views, torch.from_numpy(color))
+
+
+def read_image(path: Path, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """One image, [H, W, 3] sRGB."""
+    channels = read_channels(path, CHANNELS, shape)
+    return from_linear_half(np.stack([channels[c] for c in "RGB"], -1), None)
 
 
 def measurements(value: FixedViews) -> dict[str, Any]:

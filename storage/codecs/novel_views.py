@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from genre_tasks.errors import ArtifactCorruptError
 from genre_tasks.scene.views import NovelView, NovelViews
-from storage.codecs.images import read_exr, write_exr
+from storage.codecs.exr import read_channels, write_channels
 from storage.codecs.lenses import LENS_AND_POSE, lens_columns, pose_and_lens
 from storage.codecs.tables import REMEDY, checked, column, read_table, schema, write_table
 from storage.color import from_linear_half, to_linear_half
@@ -100,7 +101,7 @@ def write(folder: Path, value: NovelViews) -> None:
             light = to_linear_half(colors[i], alphas[i], f"colour of {path.name}")
             channels |= {f"{layer}{c}": light[..., k] for k, c in enumerate("RGB")}
             channels |= {f"{layer}A": alphas[i], f"{layer}Z": depths[i]}
-        write_exr(path, channels)
+        write_channels(path, channels)
 
 
 def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> NovelViews:
@@ -114,13 +115,20 @@ def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> NovelVi
         for layer in LAYERS
     }
     for i, path in enumerate(files):
-        channels = read_exr(path, CHANNELS, (height, width))
-        for layer, (color, alpha, depth) in out.items():
-            light = np.stack([channels[f"{layer}{c}"] for c in "RGB"], -1)
-            alpha[i], depth[i] = channels[f"{layer}A"], channels[f"{layer}Z"]
-            color[i] = from_linear_half(light, alpha[i])
+        for layer, (color, alpha, depth) in read_image(path, (height, width)).items():
+            out[layer][0][i], out[layer][1][i], out[layer][2][i] = color, alpha, depth
     render, lidar = (tuple(torch.from_numpy(a) for a in out[layer]) for layer in LAYERS)
     return NovelViews(views, *render, *lidar)
+
+
+def read_image(path: Path, shape: tuple[int, int]) -> dict[str, tuple[NDArray[np.float32], ...]]:
+    """One view: layer → colour [H, W, 3] (sRGB, premultiplied), alpha [H, W], depth [H, W]."""
+    channels = read_channels(path, CHANNELS, shape)
+    out: dict[str, tuple[NDArray[np.float32], ...]] = {}
+    for layer in LAYERS:
+        light, alpha = np.stack([channels[f"{layer}{c}"] for c in "RGB"], -1), channels[f"{layer}A"]
+        out[layer] = (from_linear_half(light, alpha), alpha, channels[f"{layer}Z"])
+    return out
 
 
 def measurements(value: NovelViews) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""EXR (ZIP, half colour, float32 the rest) and PNG: written whole, checked strictly on read."""
+"""EXR: ZIP, scene-linear half colour, float32 the rest; written whole, checked strictly on read."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
 from storage.codecs.tables import REMEDY
+from storage.color import to_linear_half
 from storage.files import write_file
 
 EXR_THREADS = 2
 
 
-def write_exr(path: Path, channels: Mapping[str, NDArray[Any]]) -> None:
+def write_channels(path: Path, channels: Mapping[str, NDArray[Any]]) -> None:
     """Write channels [H, W], float16 or float32, as one scan-line part. No timestamps: equal input, equal bytes."""
     import OpenEXR
 
@@ -35,7 +36,7 @@ def write_exr(path: Path, channels: Mapping[str, NDArray[Any]]) -> None:
     write_file(path, sink.getbuffer())
 
 
-def read_exr(path: Path, dtypes: Mapping[str, Any], shape: tuple[int, int]) -> dict[str, NDArray[Any]]:
+def read_channels(path: Path, dtypes: Mapping[str, Any], shape: tuple[int, int]) -> dict[str, NDArray[Any]]:
     """The channels, exactly those of ``dtypes``, each of its dtype and of ``shape`` (H, W).
 
     A truncated or altered file does not raise in OpenEXR: it has no parts, or channels without pixels. Here each of
@@ -67,30 +68,15 @@ def read_exr(path: Path, dtypes: Mapping[str, Any], shape: tuple[int, int]) -> d
     return found
 
 
-def write_png(path: Path, image: NDArray[np.uint8]) -> None:
-    """Write an sRGB image [H, W, 3] uint8, lossless, without timestamps."""
-    from PIL import Image
-
-    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
-        raise ConfigError(
-            f"Picture {path.stem} is {image.dtype} {list(image.shape)}, expected uint8 [H, W, 3]",
-            remedy="Fix the stage that made this picture.",
-        )
-    sink = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(image)).save(sink, "PNG")
-    write_file(path, sink.getbuffer())
-
-
-def read_png(path: Path) -> NDArray[np.uint8]:
-    """[H, W, 3] uint8. Raises ``ArtifactCorruptError`` for anything that is no RGB PNG."""
-    from PIL import Image
-
-    try:
-        with Image.open(path, formats=["PNG"]) as image:
-            if image.mode != "RGB":
-                raise ArtifactCorruptError(f"The picture has mode {image.mode}, expected RGB", remedy=REMEDY, file=path)
-            return np.array(image)
-    except (OSError, SyntaxError, ValueError) as error:
-        if isinstance(error, OSError) and error.errno is not None:
-            raise
-        raise ArtifactCorruptError(f"The picture does not decode ({error})", remedy=REMEDY, file=path) from error
+def write_exr(
+    path: Path,
+    color: NDArray[np.float32],  # [H, W, 3] sRGB, premultiplied
+    alpha: NDArray[np.float32] | None = None,  # [H, W]; None: opaque
+    depth: NDArray[np.float32] | None = None,  # [H, W] metres
+) -> None:
+    """One display-referred image as a scene-linear EXR with R, G, B and what is given of A and Z."""
+    light = to_linear_half(color, alpha, path.name)
+    channels: dict[str, NDArray[Any]] = {c: light[..., k] for k, c in enumerate("RGB")}
+    channels |= {} if alpha is None else {"A": alpha}
+    channels |= {} if depth is None else {"Z": depth}
+    write_channels(path, channels)
