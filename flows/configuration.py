@@ -17,9 +17,7 @@ PRESETS = ("demo", "small", "paper")
 _FOLDER = Path(__file__).resolve().parent.parent / "configs"
 
 
-def load_configuration(
-    preset: str, file: Path | None = None, settings: Sequence[str] = ()
-) -> PipelineConfig:
+def load_configuration(preset: str, file: Path | None = None, settings: Sequence[str] = ()) -> PipelineConfig:
     """The effective configuration: the preset, then ``file``, then each ``section.key=value`` of ``settings``.
 
     Raises ``ConfigError`` for an unknown preset, file, key (with the nearest known one) or a value out of range.
@@ -79,7 +77,9 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     try:
         values = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
     except FileNotFoundError as error:
-        raise ConfigError("no such configuration file", remedy="Check the path given to --config.", file=path) from error
+        raise ConfigError(
+            "no such configuration file", remedy="Check the path given to --config.", file=path
+        ) from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"the file is not YAML: {error}", remedy="Mend the line it names.", file=path) from error
     if not isinstance(values, dict):

@@ -25,8 +25,7 @@ class StageSpec:
 
     ``function`` is ``module:name``; it is called as ``function(config section, *arguments, progress=…)``, where each
     argument is the name of an earlier stage (its value) or one of ``log``, ``chunk_index``, ``stage_name``, ``truth``.
-    ``weights`` names the weights it loads; ``also`` are modules it reaches by name only (registries), which belong to
-    its code; ``splits`` names a setting that bounds memory and does not change a payload's bytes: it is halved when
+    ``weights`` names the weights it loads; ``splits`` names a setting that bounds memory and does not change a payload's bytes: it is halved when
     memory runs out, and is not part of the key.
     """
 
@@ -36,7 +35,6 @@ class StageSpec:
     function: str
     arguments: tuple[str, ...]
     weights: str | None = None
-    also: tuple[str, ...] = ()
     splits: str | None = None
 
     @property
@@ -56,10 +54,9 @@ class StageSpec:
 
 SPECIAL_ARGUMENTS = ("log", "chunk_index", "stage_name", "truth")
 _STAGES = "genre_tasks.stages"
-_READERS = ("genre_tasks.logs.pandaset", "genre_tasks.logs.synthetic")
 
 PIPELINE: tuple[StageSpec, ...] = (
-    StageSpec("ingest", "chunk", "ingest", f"{_STAGES}.ingest:ingest", ("log", "chunk_index"), also=_READERS),
+    StageSpec("ingest", "chunk", "ingest", f"{_STAGES}.ingest:ingest", ("log", "chunk_index")),
     StageSpec("initial", "reconstruction", "initial", f"{_STAGES}.initial:initial", ("ingest",)),
     StageSpec("gnet", "reconstruction", "gnet", f"{_STAGES}.gnet:gnet", ("ingest", "initial"), weights="gnet"),
     StageSpec("novel_views", "novel_views", "novel_views", f"{_STAGES}.novel_views:novel_views", ("ingest", "gnet")),
@@ -80,7 +77,6 @@ PIPELINE: tuple[StageSpec, ...] = (
             "evaluate",
             f"{_STAGES}.evaluate:evaluate_scene",
             ("ingest", "stage_name", name, "truth"),
-            also=_READERS,
         )
         for name in ("initial", "gnet", "enet")
     ),
@@ -90,7 +86,6 @@ PIPELINE: tuple[StageSpec, ...] = (
         "evaluate",
         f"{_STAGES}.evaluate:evaluate_fixed",
         ("ingest", "fnet", "novel_views", "truth"),
-        also=_READERS,
     ),
 )
 BY_NAME: Mapping[str, StageSpec] = {spec.name: spec for spec in PIPELINE}
@@ -130,10 +125,12 @@ def stage_key(
     config: PipelineConfig,
     inputs: Mapping[str, str],
     weights: str | None,
+    reader: tuple[str, ...] = (),
 ) -> str:
     """The artifact's key: sha256 of stage, code digest, configuration subtree, inputs' payload digests, weights.
 
-    ``inputs`` maps each input's name to the digest of its payload (for ``log``: the log's digest and the chunk).
+    ``inputs`` maps each input's name to the digest of its payload (for ``log``: the log's digest and the chunk);
+    ``reader`` is the module that reads the log, which no import of the stage names but which is part of its code.
     """
     configuration = section_of(spec, config).model_dump(mode="json", exclude={spec.splits} if spec.splits else set())
     points = configuration.get("points") if spec.name == "ingest" else None
@@ -141,7 +138,7 @@ def stage_key(
         configuration["points"] = hashlib.sha256(Path(points).read_bytes()).hexdigest()
     recipe = {
         "stage": spec.name,
-        "code": code_digest(spec.module, also=spec.also),
+        "code": code_digest(spec.module, also=reader),
         "configuration": configuration,
         "inputs": dict(sorted(inputs.items())),
         "weights": weights,

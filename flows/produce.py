@@ -68,7 +68,12 @@ def key_of(spec: StageSpec, job: Job, inputs: Mapping[str, ArtifactRef]) -> tupl
         digests["log"] = opened_log(job.log).digest()
         digests["chunk"] = str(job.chunk)
     weights = weights_digest(weights_file(spec, config))
-    return stage_key(spec, config, digests, weights), weights
+    return stage_key(spec, config, digests, weights, reader_of(spec, job)), weights
+
+
+def reader_of(spec: StageSpec, job: Job) -> tuple[str, ...]:
+    """The module that reads the log, for a stage that does."""
+    return (type(opened_log(job.log)).__module__,) if spec.needs_log else ()
 
 
 def address_of(stage: str, job: Job, key: str) -> Address:
@@ -135,7 +140,7 @@ def produce(
         value,
         inputs={name: inputs[name].key for name in spec.inputs},
         configuration=section_of(spec, config).model_dump(mode="json"),
-        code_digest=code_digest(spec.module, also=spec.also),
+        code_digest=code_digest(spec.module, also=reader_of(spec, job)),
         weights_digest=weights_digest(weights_file(spec, config)),
         seconds=usage.seconds,
         peak_mib=usage.peak_mib,

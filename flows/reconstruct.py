@@ -94,7 +94,9 @@ def _publish(run: Run) -> None:
         create_table_artifact(table=rows, key=f"chunk-{chunk.chunk}", description=f"{run.log}, chunk {chunk.chunk}")
         for stage in chunk.stages:
             for name, png in sorted(stage.pictures.items())[:1]:
-                create_image_artifact(image_url=_data_url(png), key=f"chunk-{chunk.chunk}-{_slug(stage.stage)}", description=name)
+                create_image_artifact(
+                    image_url=_data_url(png), key=f"chunk-{chunk.chunk}-{_slug(stage.stage)}", description=name
+                )
 
 
 def _data_url(png: bytes) -> str:

@@ -38,7 +38,9 @@ class LogReporter:
             _log.info("%d/%d %s", done, total, note)
 
     def stage_ended(self, stage: str, chunk: int, ref: ArtifactRef) -> None:
-        _log.info("chunk %d %s: %s%s", chunk, stage, "cached" if ref.cached else "done", f" ({ref.note})" * bool(ref.note))
+        _log.info(
+            "chunk %d %s: %s%s", chunk, stage, "cached" if ref.cached else "done", f" ({ref.note})" * bool(ref.note)
+        )
 
 
 _current: Reporter = LogReporter()

@@ -98,10 +98,12 @@ def _chunk_summary(run: Run, chunk: int, refs: dict[str, ArtifactRef]) -> ChunkS
         manifest = found[spec.name].manifest
         metrics: dict[str, float] = {}
         pictures: dict[str, bytes] = {}
+        intervals: dict[str, tuple[float, float]] = {}
         curve: tuple[tuple[float, float], ...] = ()
         if f"evaluate/{spec.name}" in found:
             evaluation = store.read(found[f"evaluate/{spec.name}"])
             metrics = _with_counts(evaluation.metrics)
+            intervals = {m.name: (m.low, m.high) for m in evaluation.metrics if m.low is not None and m.high is not None}
             pictures = {name: _png(image) for name, image in evaluation.pictures.items()}
             curve = _against_seconds(evaluation.curve, manifest.measurements.get("seconds_per_iteration", ()))
         stages.append(
@@ -115,6 +117,7 @@ def _chunk_summary(run: Run, chunk: int, refs: dict[str, ArtifactRef]) -> ChunkS
                 pictures=pictures,
                 curve=curve,
                 warnings=manifest.warnings,
+                intervals=intervals,
             )
         )
     return ChunkSummary(chunk=chunk, stages=tuple(stages), warnings=_marks(found["ingest"]))

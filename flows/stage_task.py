@@ -10,6 +10,7 @@ import dataclasses
 from typing import Any
 
 from prefect import task
+from prefect.cache_policies import NO_CACHE
 from prefect.client.schemas.objects import State, TaskRun
 from prefect.context import TaskRunContext
 from prefect.states import Completed
@@ -40,7 +41,7 @@ async def _may_pass(task: Task[..., Any], run: TaskRun, state: State[Any]) -> bo
     retry_delay_seconds=exponential_backoff(backoff_factor=1),
     retry_condition_fn=_may_pass,
     persist_result=False,
-    cache_policy=None,
+    cache_policy=NO_CACHE,
 )
 def stage_task(stage: str, chunk: int, job: Job, inputs: dict[str, ArtifactRef]) -> Any:
     """Produces a stage's artifact and returns its reference, in a ``Cached`` state if it was there already.
