@@ -16,7 +16,6 @@ from genre_tasks.scene.gaussians import Splats
 from genre_tasks.scene.geometry import matrix_to_quat, quat_multiply
 from genre_tasks.scene.graph import SceneGraph
 
-
 DEFAULT = RenderSettings()
 
 

@@ -1,0 +1,140 @@
+"""The ``reference`` backend: plain torch in the dtype of its input, with autograd. The oracle of every other backend.
+
+The same rules and constants as the kernel, written for reading: project, sort by depth, composite. Images are cut into
+blocks of pixels, each with exactly those Gaussians that can reach it, and a block's intermediates are recomputed in the
+backward pass, so that memory does not grow with the image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from genre_tasks.render import constants as const
+from genre_tasks.render.types import Cameras
+from genre_tasks.scene.gaussians import Splats
+
+BLOCK_PX = 16
+
+
+@dataclass(frozen=True)
+class _Footprints:
+    """K projected Gaussians, front to back."""
+
+    center: Tensor  # [K, 2] px
+    conic: Tensor  # [K, 3] inverse covariance: xx, xy, yy
+    opacity: Tensor  # [K]
+    features: Tensor  # [K, 4] colour, camera z
+    half: Tensor  # [K, 2] half extents in px of the region where alpha ≥ ALPHA_MIN
+
+
+def render_reference(splats: Splats, cameras: Cameras) -> tuple[tuple[Tensor, Tensor, Tensor], dict[str, int]]:
+    """Colour [V, H, W, 3], alpha and depth [V, H, W] in the splats' dtype, and the culled counts.
+
+    Differentiable in the splats, in the poses and in focal lengths and principal points.
+    """
+    culled = dict.fromkeys(const.CULL_REASONS, 0)
+    views = [_view(splats, cameras, v, culled) for v in range(len(cameras))]
+    height, width = cameras.height_px, cameras.width_px
+    image = torch.stack(views) if views else splats.means.new_zeros(0, height, width, 5)
+    return (image[..., :3], image[..., 4], image[..., 3]), {k: n for k, n in culled.items() if n}
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """[N, 4], need not be unit → [N, 3, 3]; autograd through the normalisation gives (v − (v·q̂)q̂) / ‖q‖."""
+    # Dividing by the largest entry first keeps the squares of long quaternions finite and changes no direction.
+    quats = quats / quats.detach().abs().amax(1, keepdim=True)
+    w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
+    rows = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+    ]
+    return torch.stack(rows, 1)
+
+
+def _view(splats: Splats, cameras: Cameras, v: int, culled: dict[str, int]) -> Tensor:
+    """[H, W, 5]: colour, Σ w z, alpha."""
+    front = _project(splats, cameras, v, culled)
+    width, height = cameras.width_px, cameras.height_px
+    low, high = (front.center - front.half).detach(), (front.center + front.half).detach()
+    bands = []
+    for y in range(0, height, BLOCK_PX):
+        blocks = []
+        y_end = min(y + BLOCK_PX, height)
+        in_band = torch.nonzero((high[:, 1] >= y + 0.5) & (low[:, 1] <= y_end - 0.5))[:, 0]
+        for x in range(0, width, BLOCK_PX):
+            x_end = min(x + BLOCK_PX, width)
+            inside = in_band[(high[in_band, 0] >= x + 0.5) & (low[in_band, 0] <= x_end - 0.5)]
+            blocks.append(_block(front, inside, (x, x_end, y, y_end)))
+        bands.append(torch.cat(blocks, 1))
+    return torch.cat(bands, 0)
+
+
+def _block(front: _Footprints, inside: Tensor, box: tuple[int, int, int, int]) -> Tensor:
+    args = (front.center[inside], front.conic[inside], front.opacity[inside], front.features[inside])
+    if torch.is_grad_enabled():
+        return checkpoint(_composite, *args, box, use_reentrant=False)
+    return _composite(*args, box)
+
+
+def _project(splats: Splats, cameras: Cameras, v: int, culled: dict[str, int]) -> _Footprints:
+    """Culls, counts and projects; means, scales, … of culled Gaussians are never touched, so no NaN can leak."""
+    like = splats.means
+    pose = cameras.camera_SE3_chunk[v].to(like)
+    (fx, fy), (cx, cy) = cameras.focal_px[v].to(like), cameras.center_px[v].to(like)
+    width, height = cameras.width_px, cameras.height_px
+    with torch.no_grad():
+        values = (splats.means, splats.scales, splats.quats, splats.opacities[:, None], splats.colors)
+        finite = torch.isfinite(torch.cat(values, 1)).all(1)
+        turned = finite & (splats.quats.square().sum(1) >= const.QUAT_MIN_NORM2)
+        ahead = turned & (splats.means @ pose[2, :3] + pose[2, 3] >= const.NEAR_M)
+        culled["non_finite"] += int((~finite).sum())
+        culled["quaternion"] += int((finite & ~turned).sum())
+        culled["behind"] += int((turned & ~ahead).sum())
+        at = torch.nonzero(ahead & (splats.opacities >= const.ALPHA_MIN))[:, 0]
+    points = splats.means[at] @ pose[:3, :3].T + pose[:3, 3]
+    x, y, z = points.unbind(1)
+    mx, my = (const.JACOBIAN_MARGIN * size / (2 * f) for size, f in ((width, fx), (height, fy)))
+    u = (x / z).clamp(-cx / fx - mx, (width - cx) / fx + mx)
+    v_ = (y / z).clamp(-cy / fy - my, (height - cy) / fy + my)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack([fx / z, zero, -fx * u / z, zero, fy / z, -fy * v_ / z], 1).view(-1, 2, 3)
+    m = jacobian @ pose[:3, :3] @ rotation_matrices(splats.quats[at]) * splats.scales[at][:, None, :]
+    xx, yy = m.square().sum(2).unbind(1)
+    xx, yy, xy = xx + const.BLUR_PX2, yy + const.BLUR_PX2, (m[:, 0] * m[:, 1]).sum(1)
+    # Lagrange's identity: xx·yy − xy² cancels for long thin footprints.
+    det = torch.linalg.cross(m[:, 0], m[:, 1]).square().sum(1) + const.BLUR_PX2 * (xx + yy - const.BLUR_PX2)
+    center = torch.stack([fx * x / z + cx, fy * y / z + cy], 1)
+    with torch.no_grad():
+        sound = (det > 0) & (torch.maximum(xx, yy) <= const.MAX_VARIANCE_PX2)
+        sound &= (center.abs() <= const.MAX_CENTER_PX).all(1)
+        culled["degenerate"] += int((~sound).sum())
+        keep = torch.nonzero(sound)[:, 0]
+        keep = keep[torch.argsort(z[keep], stable=True)]
+        level = 2 * torch.log(splats.opacities[at][keep] / const.ALPHA_MIN) * (1 + 1e-6)
+        half = torch.sqrt(level[:, None] * torch.stack([xx, yy], 1)[keep])
+    conic = torch.stack([yy, -xy, xx], 1)[keep] / det[keep][:, None]
+    features = torch.cat([splats.colors[at], z[:, None]], 1)[keep]
+    return _Footprints(center[keep], conic, splats.opacities[at][keep], features, half)
+
+
+def _composite(
+    center: Tensor, conic: Tensor, opacity: Tensor, features: Tensor, box: tuple[int, int, int, int]
+) -> Tensor:
+    """Front to back over the pixels of a block, [h, w, 5]; every pixel × every Gaussian."""
+    x0, x1, y0, y1 = box
+    xs = torch.arange(x0, x1, dtype=center.dtype, device=center.device) + 0.5
+    ys = torch.arange(y0, y1, dtype=center.dtype, device=center.device) + 0.5
+    dx, dy = xs[:, None] - center[:, 0], ys[:, None] - center[:, 1]
+    a, b, c = conic.unbind(1)
+    power = (a * dx * dx)[None] / 2 + b * dx[None] * dy[:, None] + (c * dy * dy)[:, None] / 2
+    raw = opacity * torch.exp(-power.clamp(min=0))
+    alpha = torch.where(raw >= const.ALPHA_MIN, raw.clamp(max=const.ALPHA_MAX), torch.zeros_like(raw))
+    after = torch.cumprod(1 - alpha, -1)
+    before = torch.cat([torch.ones_like(after[..., :1]), after[..., :-1]], -1)
+    weight = torch.where(after >= const.TRANSMITTANCE_STOP, alpha * before, torch.zeros_like(alpha))
+    return torch.cat([weight @ features, weight.sum(-1, keepdim=True)], -1)
