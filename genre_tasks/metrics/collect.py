@@ -1,0 +1,133 @@
+"""Metrics of a set of images: each against its truth where there is one, and all of them against the real images."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from genre_tasks.errors import NonFiniteError
+from genre_tasks.metrics.distribution import frechet_distance, kernel_distance
+from genre_tasks.metrics.image import psnr, ssim
+from genre_tasks.metrics.perceptual import perceptual_distance
+from genre_tasks.metrics.threads import map_single_threaded
+from genre_tasks.scene.chunk import Chunk, View
+from genre_tasks.scene.images import decode_image
+from genre_tasks.scene.results import Metric, ViewScore
+from genre_tasks.scene.views import NovelView
+
+BOOTSTRAP_SEED = 0
+"""The resamples over frames are the same for every stage and method, so that their intervals are comparable."""
+
+_REAL_BATCH = 16
+_KEPT_CHUNKS = 4
+
+
+@dataclass(frozen=True)
+class FeatureSet:
+    """Pooled features of N images with the frame of each."""
+
+    features: Tensor  # [N, 1280]
+    frames: tuple[int, ...]
+
+
+_real: OrderedDict[str, FeatureSet] = OrderedDict()
+
+
+def real_images(chunk: Chunk) -> FeatureSet:
+    """Features of all real images of a chunk at the working resolution: the reference of the distribution distances.
+
+    Computed once per process and chunk (by content). Raises ``InputError`` for an image that cannot be decoded.
+    """
+    digest = hashlib.sha256(f"{chunk.width_px}×{chunk.height_px}".encode())
+    for view in chunk.views:
+        digest.update(f"{view.camera}/{view.frame}".encode() + hashlib.sha256(view.image).digest())
+    key = digest.hexdigest()
+    if key not in _real:
+        parts = [torch.zeros((0, 1280))]
+        for start in range(0, len(chunk.views), _REAL_BATCH):
+            images = map_single_threaded(view_image, chunk.views[start : start + _REAL_BATCH])
+            parts.append(perceptual_distance().pooled_features(torch.stack(images)))
+        _real[key] = FeatureSet(torch.cat(parts), tuple(v.frame for v in chunk.views))
+        if len(_real) > _KEPT_CHUNKS:
+            _real.popitem(last=False)
+    _real.move_to_end(key)
+    return _real[key]
+
+
+def view_image(view: View) -> Tensor:
+    """[H, W, 3] sRGB in [0, 1] at the working resolution."""
+    return decode_image(view.image, view.lens.width_px, view.lens.height_px)
+
+
+@dataclass
+class Collector:
+    """Takes images batch by batch and keeps their scores and features, not the images.
+
+    ``prefix`` goes before a metric's last word: ``render_`` makes ``shift_3m/render_psnr``.
+    """
+
+    stage: str
+    distributions: bool
+    prefix: str = ""
+    scores: list[ViewScore] = field(default_factory=list)
+    _features: list[Tensor] = field(default_factory=list)
+    _frames: list[int] = field(default_factory=list)
+
+    def add(
+        self,
+        views: Sequence[View | NovelView],  # V
+        images: Tensor,  # [V, H, W, 3] sRGB in [0, 1]
+        truths: Tensor | None,  # [V, H, W, 3]
+    ) -> None:
+        """Raises ``NonFiniteError`` naming camera and frame of an image that is not finite."""
+        for view, image in zip(views, images, strict=True):
+            bad = torch.nonzero(~torch.isfinite(image))
+            if len(bad):
+                index = tuple(int(i) for i in bad[0])
+                where = {"camera": view.camera, "frame": view.frame}
+                raise NonFiniteError(f"evaluate/{self.stage}", "image", len(bad), index, **where)
+        if self.distributions:
+            self._features.append(perceptual_distance().pooled_features(images))
+            self._frames += [v.frame for v in views]
+        if truths is not None:
+            self.scores += scored(views, images, truths)
+
+    def quality(self, group: str) -> list[Metric]:
+        """``group/psnr``, ``ssim``, ``perceptual``: means over the images with truth; nothing if there are none."""
+        n = len(self.scores)
+        names = ("psnr", "ssim", "perceptual") if n else ()
+        return [Metric(f"{group}/{self.prefix}{k}", sum(getattr(s, k) for s in self.scores) / n, n) for k in names]
+
+    def distances(self, group: str, real: FeatureSet, bootstrap: int) -> list[Metric]:
+        """``group/frechet`` and ``kernel`` with its interval; nothing where undefined (fewer than 2 images)."""
+        if not self._features:
+            return []
+        features = torch.cat(self._features)
+        found = {
+            "frechet": frechet_distance(features, real.features),
+            "kernel": kernel_distance(
+                features, real.features, self._frames, real.frames, bootstrap, seed=BOOTSTRAP_SEED
+            ),
+        }
+        return [
+            Metric(f"{group}/{self.prefix}{name}", d.value, d.n, d.low, d.high)
+            for name, d in found.items()
+            if d is not None
+        ]
+
+
+def scored(views: Sequence[View | NovelView], images: Tensor, truths: Tensor) -> list[ViewScore]:
+    """PSNR, SSIM and perceptual distance of each image [V, H, W, 3] against its truth."""
+    with torch.no_grad():
+        perceptual = perceptual_distance()(images, truths).tolist()
+    pairs = [(a.numpy(), b.numpy()) for a, b in zip(images, truths, strict=True)]
+    both = map_single_threaded(lambda pair: (psnr(*pair), ssim(*pair)), pairs)
+    return [
+        ViewScore(v.camera, v.frame, v.shift_m if isinstance(v, NovelView) else 0.0, p, s, d)
+        for v, (p, s), d in zip(views, both, perceptual, strict=True)
+    ]

@@ -1,0 +1,222 @@
+"""Evaluation: an oracle that renders the truth scores perfectly, and what is measured where."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+
+from genre_tasks.config import EvaluateConfig, IngestConfig
+from genre_tasks.errors import NonFiniteError
+from genre_tasks.logs.types import Float64, Lens
+from genre_tasks.metrics import collect
+from genre_tasks.metrics.collect import real_images
+from genre_tasks.render.types import Render
+from genre_tasks.scene.chunk import Chunk
+from genre_tasks.scene.gaussians import Gaussians
+from genre_tasks.scene.graph import STATIC, SceneGraph
+from genre_tasks.scene.novel import novel_view_poses
+from genre_tasks.scene.results import Evaluation, Reconstruction
+from genre_tasks.scene.views import FixedViews, NovelViews
+from genre_tasks.stages import evaluate
+from genre_tasks.stages.evaluate import evaluate_fixed, evaluate_scene
+from genre_tasks.stages.ingest import ingest
+from tests.fakes import FakeLog
+
+CONFIG = EvaluateConfig(shifts_m=(1.0, 3.0), bootstrap=20)
+LOG = FakeLog(frame_count=8, width_px=48, height_px=32, world_offset_m=(64.0, -32.0, 2.0))
+
+
+@dataclass(frozen=True)
+class FakeTruth:
+    """Ray-casts the fake world; the world's offset is taken off again."""
+
+    log: FakeLog
+
+    def image(self, frame: int, world_SE3_camera: Float64, lens: Lens) -> np.ndarray:
+        pose = world_SE3_camera.copy()
+        pose[:3, 3] -= np.asarray(self.log.world_offset_m)
+        return self.log.render(pose, lens, frame)
+
+
+@pytest.fixture(scope="module")
+def chunk() -> Chunk:
+    return ingest(IngestConfig(width_px=48, height_px=32), LOG, 0)
+
+
+@pytest.fixture
+def scene() -> SceneGraph:
+    count = 50
+    generator = torch.Generator().manual_seed(0)
+    means = torch.rand(count, 3, generator=generator) * 10 - 5 + torch.tensor([8.0, 0.0, 0.0])
+    quats = torch.tensor([1.0, 0, 0, 0]).repeat(count, 1)
+    gaussians = Gaussians(means, torch.full((count, 3), -0.5), quats, torch.full((count,), 2.0), torch.rand(count, 3))
+    return SceneGraph(gaussians, torch.full((count,), STATIC), ())
+
+
+def oracle(chunk: Chunk, noise: float = 0.0):
+    """A renderer that ray-casts the truth at the asked poses, with noise if asked."""
+    truth, generator = FakeTruth(LOG), torch.Generator().manual_seed(1)
+
+    def render_views(scene, views, settings) -> Render:
+        images = [truth.image(v.frame, chunk.world_SE3_chunk @ v.chunk_SE3_camera, v.lens) for v in views]
+        color = torch.from_numpy(np.stack(images).astype(np.float32) / 255)
+        color = color + noise * torch.randn(color.shape, generator=generator)
+        return Render(color, torch.ones(color.shape[:3]), torch.ones(color.shape[:3]))
+
+    return render_views
+
+
+def by_name(evaluation: Evaluation) -> dict[str, float]:
+    names = [m.name for m in evaluation.metrics]
+    assert len(set(names)) == len(names)
+    return {m.name: m.value for m in evaluation.metrics}
+
+
+def test_a_perfect_renderer_scores_perfectly(chunk: Chunk, scene: SceneGraph, monkeypatch) -> None:
+    """Poses, frames, sides and the pairing with images and truth are right."""
+    monkeypatch.setattr(evaluate, "render_views", oracle(chunk))
+    result = evaluate_scene(CONFIG, chunk, "gnet", Reconstruction(scene, (0.5,) * 3), FakeTruth(LOG))
+    values = by_name(result)
+    for group in ("interpolation", "shift_1m", "shift_3m"):
+        assert (
+            values[f"{group}/psnr"] > 60 and values[f"{group}/ssim"] > 0.9999 and values[f"{group}/perceptual"] < 1e-4
+        )
+    assert set(values) == {
+        f"{g}/{k}"
+        for g, ks in {
+            "interpolation": ("psnr", "ssim", "perceptual"),
+            "shift_0m": ("frechet", "kernel"),
+            "shift_1m": ("psnr", "ssim", "perceptual", "frechet", "kernel"),
+            "shift_3m": ("psnr", "ssim", "perceptual", "frechet", "kernel"),
+        }.items()
+        for k in ks
+    }
+    counts = {m.name: m.n for m in result.metrics}
+    assert counts["interpolation/psnr"] == counts["shift_0m/kernel"] == 12  # 6 held-out frames × 2 cameras
+    assert counts["shift_3m/psnr"] == counts["shift_3m/kernel"] == 32  # 8 frames × 2 cameras × 2 sides
+    assert {(v.shift_m > 0, abs(v.shift_m)) for v in result.views} == {
+        (False, 0.0), *itertools.product((True, False), (1.0, 3.0))
+    }  # fmt: skip
+    ((iteration, accuracy),) = result.curve
+    assert iteration == 3 and accuracy > 60
+
+
+def test_worse_renders_score_worse(chunk: Chunk, scene: SceneGraph, monkeypatch) -> None:
+    results = []
+    for noise in (0.02, 0.15):
+        monkeypatch.setattr(evaluate, "render_views", oracle(chunk, noise))
+        results.append(by_name(evaluate_scene(CONFIG, chunk, "gnet", Reconstruction(scene), FakeTruth(LOG))))
+    better, worse = results
+    assert better["interpolation/psnr"] == pytest.approx(-20 * np.log10(0.02), abs=1.0)
+    for name, value in better.items():
+        if name.endswith(("psnr", "ssim")):
+            assert value > worse[name]
+        else:
+            assert value < worse[name], name
+
+
+def test_without_truth_and_by_the_real_renderer(chunk: Chunk, scene: SceneGraph) -> None:
+    calls = []
+    config = EvaluateConfig(shifts_m=(3.0,), every=4, bootstrap=10)
+    result = evaluate_scene(
+        config, chunk, "initial", Reconstruction(scene), None, progress=lambda *a: calls.append(a[:2])
+    )
+    values = by_name(result)
+    assert {n for n in values if n.startswith("shift_3m")} == {"shift_3m/frechet", "shift_3m/kernel"}
+    assert 0 < values["interpolation/psnr"] < 40
+    assert all(v.shift_m == 0 for v in result.views)
+    assert sum(v.psnr for v in result.views) / len(result.views) == pytest.approx(values["interpolation/psnr"])
+    kernel = next(m for m in result.metrics if m.name == "shift_3m/kernel")
+    assert kernel.n == 8 and kernel.low < kernel.high  # 2 frames × 2 cameras × 2 sides
+    assert calls[0][0] == 0 and calls[-1][0] == calls[-1][1]
+    assert all(a[0] <= b[0] and a[1] == b[1] for a, b in itertools.pairwise(calls))
+    assert result.curve[0][0] == 0
+
+
+def test_pictures_have_the_same_names_in_every_stage(chunk: Chunk, scene: SceneGraph, monkeypatch) -> None:
+    monkeypatch.setattr(evaluate, "render_views", oracle(chunk))
+    truth = FakeTruth(LOG)
+    pictures = evaluate_scene(CONFIG, chunk, "gnet", Reconstruction(scene), truth).pictures
+    names = ["0m_front_03", "3m_left_front_04", "3m_right_front_04"]
+    assert sorted(pictures) == sorted([*names, *(f"{n}.truth" for n in names)])
+    for name in names:
+        np.testing.assert_allclose(pictures[name].astype(int), pictures[f"{name}.truth"].astype(int), atol=1)
+    assert (pictures[names[1]] != pictures[names[2]]).any()
+    fixed, novel = views_of(chunk)
+    assert sorted(evaluate_fixed(CONFIG, chunk, fixed, novel, truth).pictures) == sorted(
+        [*names[1:], *(f"{n}.truth" for n in names[1:])]
+    )
+    assert sorted(evaluate_fixed(CONFIG, chunk, fixed, novel, None).pictures) == names[1:]
+    none = EvaluateConfig(shifts_m=(), pictures=0)
+    assert evaluate_scene(none, chunk, "gnet", Reconstruction(scene), None).pictures == {}
+
+
+def test_curve_follows_the_snapshots(chunk: Chunk, scene: SceneGraph) -> None:
+    grey = scene.with_gaussians(replace(scene.gaussians, logit_opacities=torch.full((len(scene),), -30.0)))
+    reconstruction = Reconstruction(scene, (1.0,) * 4, {0: grey, 2: scene})
+    config = EvaluateConfig(shifts_m=(), distributions=False, pictures=0)
+    result = evaluate_scene(config, chunk, "gnet", reconstruction, None)
+    assert [i for i, _ in result.curve] == [0, 2, 4]
+    assert result.curve[1][1] == result.curve[2][1] != result.curve[0][1]
+    assert {m.name for m in result.metrics} == {f"interpolation/{k}" for k in ("psnr", "ssim", "perceptual")}
+
+
+def views_of(chunk: Chunk, better: float = 0.02, worse: float = 0.1) -> tuple[FixedViews, NovelViews]:
+    """Noisy truth as the fixer's images, noisier truth as the renders it was given."""
+    views = novel_view_poses(chunk, (3.0, -3.0))
+    fine, coarse = (oracle(chunk, noise)(None, views, None) for noise in (better, worse))
+    blank = torch.zeros_like(fine.alpha)
+    novel = NovelViews(views, coarse.color, coarse.alpha, coarse.depth, fine.color, blank, blank)
+    return FixedViews(views, fine.color), novel
+
+
+def test_fixed_views_are_compared_with_their_renders(chunk: Chunk) -> None:
+    fixed, novel = views_of(chunk)
+    result = evaluate_fixed(CONFIG, chunk, fixed, novel, FakeTruth(LOG))
+    values = by_name(result)
+    assert result.stage == "fnet"
+    assert values["shift_3m/psnr"] == pytest.approx(-20 * np.log10(0.02), abs=1.0)
+    assert values["shift_3m/psnr"] > values["shift_3m/render_psnr"] + 8
+    for name in ("perceptual", "frechet", "kernel"):
+        assert values[f"shift_3m/{name}"] < values[f"shift_3m/render_{name}"]
+    assert {m.n for m in result.metrics} == {8} and len(result.views) == 8
+    assert {m.name for m in evaluate_fixed(CONFIG, chunk, fixed, novel, None).metrics} == {
+        f"shift_3m/{p}{k}" for p in ("", "render_") for k in ("frechet", "kernel")
+    }
+    with pytest.raises(ValueError, match="those of other views"):
+        evaluate_fixed(CONFIG, chunk, FixedViews(fixed.views[::-1], fixed.color), novel, None)
+
+
+def test_a_render_that_is_not_finite_is_named(chunk: Chunk) -> None:
+    fixed, novel = views_of(chunk)
+    fixed.color[3, 5, 6, 1] = torch.nan
+    with pytest.raises(NonFiniteError) as caught:
+        evaluate_fixed(CONFIG, chunk, fixed, novel, None)
+    assert (caught.value.camera, caught.value.frame) == (fixed.views[3].camera, fixed.views[3].frame)
+    assert caught.value.first_index == (5, 6, 1)
+
+
+def test_real_features_are_taken_once(chunk: Chunk, monkeypatch) -> None:
+    first = real_images(chunk)
+    assert first.features.shape == (16, 1280) and first.frames == tuple(v.frame for v in chunk.views)
+    monkeypatch.setattr(collect, "decode_image", None)
+    assert real_images(chunk) is first
+    with pytest.raises(TypeError):
+        real_images(replace(chunk, views=chunk.views[1:]))
+
+
+def test_same_bytes_at_any_thread_count(chunk: Chunk, scene: SceneGraph) -> None:
+    before, results = torch.get_num_threads(), []
+    config = EvaluateConfig(shifts_m=(3.0,), every=4, bootstrap=10, pictures=0)
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            collect._real.clear()
+            results.append(evaluate_scene(config, chunk, "gnet", Reconstruction(scene), FakeTruth(LOG)))
+    finally:
+        torch.set_num_threads(before)
+    assert results[0] == results[1]
