@@ -1,0 +1,160 @@
+"""Pictures of the scene: rays through a lens, sun and sky, and the average over sub-pixel samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from genre_tasks.logs.synthetic.mesh import linear
+from genre_tasks.logs.synthetic.noise import fractal
+from genre_tasks.logs.synthetic.raycast import Hits, Scene
+from genre_tasks.logs.synthetic.road import generator
+from genre_tasks.logs.synthetic.textures import MIRROR, Material, albedo
+from genre_tasks.logs.types import Float32, Float64, Lens
+
+_BAND_RAYS = 1 << 16
+_HAZE_M = 420.0
+
+
+@dataclass(frozen=True)
+class Light:
+    """Sun and sky of a seed. ``sun`` [3] unit towards it; colours are linear; ``clouds`` the share of them."""
+
+    sun: Float64
+    sun_colour: Float32
+    zenith: Float32
+    horizon: Float32
+    clouds: float
+    drift: float
+    exposure: float
+
+
+def draw_light(seed: int) -> Light:
+    """Late morning to afternoon, clear to broken clouds."""
+    rng = generator(seed, "light")
+    height, azimuth = np.deg2rad(rng.uniform(28, 62)), rng.uniform(0, 2 * np.pi)
+    sun = np.array([np.cos(height) * np.cos(azimuth), np.cos(height) * np.sin(azimuth), np.sin(height)])
+    warm = 1 - (height - 0.49) / 0.6
+    return Light(
+        sun=sun,
+        sun_colour=np.array([2.3, 2.15 - 0.2 * warm, 1.9 - 0.5 * warm], np.float32),
+        zenith=linear((0.26, 0.45, 0.78)) * np.float32(rng.uniform(0.9, 1.2)),
+        horizon=linear((0.74, 0.82, 0.90)),
+        clouds=float(rng.uniform(0.30, 0.62)),
+        drift=float(rng.uniform(0, 200)),
+        exposure=float(rng.uniform(0.85, 1.0)),
+    )
+
+
+def sky(light: Light, direction: Float32) -> Float32:
+    """[n, 3] linear radiance of the sky: a gradient, clouds and a glow around the sun."""
+    up = np.clip(direction[:, 2], 0, 1)
+    share = (1 - (1 - up) ** 3)[:, None]
+    value = light.horizon * (1 - share) + light.zenith * share
+    plane = direction[:, :2] / (up[:, None] + np.float32(0.18))
+    drift = np.float32(light.drift)
+    cover = fractal(plane[:, 0] * 1.4 + drift, plane[:, 1] * 1.4, 5, 40)
+    cloud = np.clip((cover - np.float32(1 - light.clouds)) * 5, 0, 1) * np.clip(up * 6, 0, 1)
+    white = np.float32(0.72) + np.float32(0.28) * (1 - cloud)
+    value = value + (white[:, None] - value) * (cloud * np.float32(0.9))[:, None]
+    glow = np.clip(direction @ light.sun.astype(np.float32), 0, 1) ** 40
+    return value + glow[:, None] * np.float32(0.35)
+
+
+def camera_rays(lens: Lens, samples: int) -> Float64:
+    """[H · W · samples, 3] unit directions in camera axes; samples of a pixel are neighbours, on a fixed grid."""
+    side = int(round(samples**0.5))
+    step = (np.arange(side) + 0.5) / side
+    dx, dy = np.meshgrid(step, step)
+    x = (np.arange(lens.width_px)[None, :, None] + dx.ravel() - lens.cx_px) / lens.fx_px
+    y = (np.arange(lens.height_px)[:, None, None] + dy.ravel() - lens.cy_px) / lens.fy_px
+    x, y = np.broadcast_arrays(x, y)
+    if any(lens.distortion):
+        x, y = _undistorted(x, y, lens.distortion)
+    rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def _undistorted(x: Float64, y: Float64, distortion: tuple[float, ...]) -> tuple[Float64, Float64]:
+    """Inverse of Brown–Conrady by fixed-point iteration (converges for the mild distortion of such lenses)."""
+    k1, k2, p1, p2, k3 = (*distortion, *([0.0] * 5))[:5]
+    u, v = x, y
+    for _ in range(20):
+        r = u * u + v * v
+        radial = 1 + r * (k1 + r * (k2 + r * k3))
+        du = 2 * p1 * u * v + p2 * (r + 2 * u * u)
+        dv = p1 * (r + 2 * v * v) + 2 * p2 * u * v
+        u, v = (x - du) / radial, (y - dv) / radial
+    return u, v
+
+
+def shade(
+    scene: Scene, light: Light, hits: Hits, origin: Float64, direction: Float64, time: float, spread: float
+) -> Float32:
+    """[n, 3] linear radiance seen along rays; ``spread`` is the angle between neighbouring rays."""
+    d = direction.astype(np.float32)
+    out = sky(light, d) if (hits.face < 0).any() else np.zeros_like(d)
+    pick = np.flatnonzero(hits.face >= 0)
+    if len(pick) == 0:
+        return out
+    h = Hits(hits.distance_m[pick], hits.face[pick], hits.u[pick], hits.v[pick], hits.normal[pick])
+    d, n, faces = d[pick], h.normal, scene.faces
+    material = faces.material[h.face]
+    slant = np.clip(-(n * d).sum(1), 0.05, 1)
+    blur = h.distance_m * np.float32(spread) / np.sqrt(slant)
+    base = albedo(material, scene.texture_points(h), faces.colour[h.face], faces.parameters[h.face], blur)
+
+    points = origin.astype(np.float32) + d * h.distance_m[:, None]
+    facing = n @ light.sun.astype(np.float32)
+    # Leaves let light through from behind.
+    facing = np.where(material == Material.LEAF, 0.35 + 0.65 * np.abs(facing), facing)
+    lit = np.flatnonzero(facing > 0)
+    sunlight = np.zeros(len(pick), np.float32)
+    dark = scene.shadowed(points[lit], n[lit], light.sun, time)
+    sunlight[lit] = np.where(dark, 0, facing[lit])
+    up = (0.5 + 0.5 * n[:, 2])[:, None]
+    ambient = (0.55 * (light.zenith + light.horizon) * up + np.array([0.20, 0.19, 0.17], np.float32) * (1 - up)) * 0.62
+    value = base * (sunlight[:, None] * light.sun_colour + ambient)
+    value = np.where((material == Material.LAMP)[:, None], base, value)
+    value = _mirrored(light, value, d, n, MIRROR[material], slant)
+    haze = (1 - np.exp(-h.distance_m / np.float32(_HAZE_M)))[:, None]
+    out[pick] = value + (light.horizon * np.float32(0.9) - value) * haze
+    return out
+
+
+def _mirrored(light: Light, value: Float32, d: Float32, n: Float32, share: Float32, slant: Float32) -> Float32:
+    """Adds the sky's reflection to glass and paint (Schlick's approximation)."""
+    pick = np.flatnonzero(share > 0)
+    if len(pick) == 0:
+        return value
+    f = share[pick] + (1 - share[pick]) * (1 - slant[pick]) ** 5
+    r = d[pick] - 2 * (d[pick] * n[pick]).sum(1)[:, None] * n[pick]
+    seen = sky(light, r) * np.clip(r[:, 2] * 4 + 0.5, 0.12, 1)[:, None]
+    value[pick] = value[pick] * (1 - f[:, None]) + seen * f[:, None]
+    return value
+
+
+def picture(
+    scene: Scene, light: Light, time: float, world_SE3_camera: Float64, lens: Lens, samples: int
+) -> NDArray[np.uint8]:
+    """[H, W, 3] sRGB; the mean of ``samples`` rays a pixel, taken in linear light."""
+    rays = camera_rays(lens, samples) @ world_SE3_camera[:3, :3].T
+    origin = world_SE3_camera[:3, 3]
+    spread = 1.0 / (max(lens.fx_px, 1e-6) * samples**0.5)
+    band = max(1, _BAND_RAYS // samples) * samples
+    rows = []
+    for first in range(0, len(rays), band):
+        d = rays[first : first + band]
+        value = shade(scene, light, scene.cast(origin, d, time), origin, d, time, spread)
+        # Bright samples are clipped first, so that an edge against the sky stays as smooth as a camera's.
+        rows.append(np.minimum(value * np.float32(light.exposure), 1.0).reshape(-1, samples, 3).mean(1))
+    return to_srgb(np.concatenate(rows)).reshape(lens.height_px, lens.width_px, 3)
+
+
+def to_srgb(value: Float32) -> NDArray[np.uint8]:
+    """Linear light to 8-bit sRGB (IEC 61966-2-1)."""
+    v = np.clip(value.astype(np.float64), 0, 1)
+    coded = np.where(v <= 0.0031308, 12.92 * v, 1.055 * v ** (1 / 2.4) - 0.055)
+    return np.round(coded * 255).astype(np.uint8)
