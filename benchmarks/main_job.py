@@ -1,6 +1,6 @@
 """The main job's claims, measured: claim seeds of the synthetic street and chunk 1 of the real sequence.
 
-python benchmarks/main_job.py --json docs/benchmarks/main_job.json [--store DIR] [--pandaset PATH/002] [--seeds 1001,1002]
+python benchmarks/main_job.py --json docs/benchmarks/main_job.json [--store DIR] [--seeds 1001,1002]
 
 Each log goes through the pipeline (preset ``small``) without Prefect, from and into a store, so a broken-off run goes
 on where it stopped. The tuned-Adam baseline has the same initial scene, renderer, loss and number of view renders.
