@@ -97,11 +97,16 @@ def closure(module: str, also: Sequence[str], root: Path) -> tuple[dict[str, Pat
     return files, packages
 
 
+_CPP_STRING = r"(\"(?:\\.|[^\"\\])*\"|'(?:\\.|[^'\\])*')"
+_CPP_COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/|" + _CPP_STRING, re.DOTALL)
+_CPP_SPACES = re.compile(r"[ \t]+|" + _CPP_STRING)
+
+
 def strip_cpp_comments(source: str) -> str:
-    """C++ without comments, trailing spaces and empty lines; strings are left alone."""
-    pattern = r'//[^\n]*|/\*.*?\*/|("(?:\\.|[^"\\])*"|\'(?:\\.|[^\'\\])*\')'
-    bare = re.sub(pattern, lambda m: m[1] or " ", source, flags=re.DOTALL)
-    return "\n".join(line.rstrip() for line in bare.splitlines() if line.strip())
+    """C++ without comments, empty lines and repeated spaces; strings are left alone."""
+    bare = _CPP_COMMENT.sub(lambda m: m[1] or " ", source)
+    lines = _CPP_SPACES.sub(lambda m: m[1] or " ", bare).splitlines()
+    return "\n".join(line.strip() for line in lines if line.strip())
 
 
 def _file(name: str, root: Path) -> Path | None:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from genre_tasks.logs.types import Lens
-from genre_tasks.scene.chunk import Actor, Chunk, Mark, Points, View
+from genre_tasks.scene.chunk import Actor, Chunk, Mark, Points, Role, View
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import ActorNode, SceneGraph
 from genre_tasks.scene.results import Evaluation, Metric, Reconstruction, ViewScore
@@ -36,16 +36,18 @@ def points(rng: np.random.Generator, count: int) -> Points:
     )
 
 
+def role(frame: int) -> Role:
+    return "heldout" if frame % 2 else "source"
+
+
 def chunk(rng: np.random.Generator, frames: int = 3, actors: int = 2, count: int = 11) -> Chunk:
     names = ("front_camera", "zurück")
     views = tuple(
-        View(
-            c, f, ("source", "heldout")[f % 2], 1.6e9 + float(rng.random()), pose(rng), lens(rng),
-            rng.bytes(int(rng.integers(0, 3000))),
-        )  # fmt: skip
+        View(c, f, role(f), 1.6e9 + float(rng.random()), pose(rng), lens(rng), rng.bytes(int(rng.integers(0, 3000))))
         for f in range(frames)
         for c in names
     )
+    marks = (Mark("missing_sweep", "none", frame=1), Mark("missing_image", "gone", 2, "zurück"), Mark("standstill", ""))
     made = []
     for k in range(actors):
         n = int(rng.integers(0, frames + 1))
@@ -57,7 +59,7 @@ def chunk(rng: np.random.Generator, frames: int = 3, actors: int = 2, count: int
         width_px=7, height_px=5, world_SE3_chunk=pose(rng),
         chunk_SE3_ego=np.array([pose(rng) for _ in range(frames)]).reshape(-1, 4, 4), views=views,
         static=points(rng, count), actors=tuple(made),
-        marks=(Mark("missing_sweep", "no sweep", frame=1), Mark("missing_image", "gone", 2, "zurück"), Mark("standstill", "0 m")),
+        marks=marks,
     )  # fmt: skip
 
 
@@ -104,13 +106,15 @@ def fixed_views(rng: np.random.Generator, count: int = 2, width: int = 7, height
 
 
 def evaluation(rng: np.random.Generator, count: int = 3) -> Evaluation:
+    kernel = [Metric(f"shift_{k}m/kernel", float(rng.random()), k, 0.1, 0.3) for k in range(count)]
+    names = [f"{k}m_left_front_camera_04{suffix}" for k in range(count) for suffix in ("", ".truth")]
     return Evaluation(
         "gnet",
-        (Metric("interpolation/psnr", float("inf"), 5), *(Metric(f"shift_{k}m/kernel", rng.random(), k, 0.1, 0.3) for k in range(count))),
+        (Metric("interpolation/psnr", float("inf"), 5), *kernel),
         tuple(ViewScore("front_camera", k, 3.0, *rng.random(3).tolist()) for k in range(count)),
         tuple((8 * k, float(rng.random())) for k in range(count)),
-        {f"{k}m_left_front_camera_04{s}": rng.integers(0, 256, (4 + k, 6, 3), dtype=np.uint8) for k in range(count) for s in ("", ".truth")},
-    )  # fmt: skip
+        {name: rng.integers(0, 256, (4 + k, 6, 3), dtype=np.uint8) for k, name in enumerate(names)},
+    )
 
 
 MAKERS = {

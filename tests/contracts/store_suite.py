@@ -1,0 +1,174 @@
+"""What every store must do. Inherit :class:`StoreSuite` and give the fixture ``store``."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from genre_tasks.errors import ArtifactCorruptError, ConfigError, NonFiniteError
+from storage.address import Address
+from storage.manifest import MANIFEST
+from storage.store import Store
+from tests.storage.artifact_values import COLORS, MAKERS, assert_same, make
+
+KEY, OTHER = "a" * 64, "b" * 64
+
+
+def address(stage: str = "gnet", key: str = KEY, chunk: int = 0) -> Address:
+    return Address("synthetic", "street-seed=1", chunk, stage, key)
+
+
+class StoreSuite:
+    """Contract tests; every value of every kind is small."""
+
+    @pytest.fixture
+    def store(self, tmp_path: Path) -> Store:
+        raise NotImplementedError
+
+    @pytest.fixture
+    def second(self, store: Store) -> Store:
+        """The same store, opened once more (as another process would)."""
+        raise NotImplementedError
+
+    def commit(self, store: Store, kind: str, at: Address | None = None, seed: int = 0, **fields: Any) -> Any:
+        return store.commit(at or address(), kind, make(kind, seed), **fields)
+
+    @pytest.mark.parametrize("kind", MAKERS)
+    def test_what_is_committed_is_read_back(self, store: Store, second: Store, kind: str) -> None:
+        self.commit(store, kind)
+        found = second.find(address())
+        assert found is not None and found.manifest.kind == kind
+        assert_same(make(kind), second.read(found), kind, COLORS)
+
+    @pytest.mark.parametrize("kind", MAKERS)
+    def test_the_same_value_has_the_same_payload(self, store: Store, kind: str) -> None:
+        one = self.commit(store, kind, address(key=KEY), seconds=1.0, created_at="2001-01-01")
+        two = self.commit(store, kind, address(key=OTHER), seconds=2.0, environment={"host": "x"})
+        other = self.commit(store, kind, address(key="c" * 64), seed=1)
+        assert one.manifest.files == two.manifest.files
+        assert one.manifest.payload_digest == two.manifest.payload_digest != other.manifest.payload_digest
+
+    @pytest.mark.parametrize("kind", ["novel_views", "fixed_views"])
+    def test_what_was_read_is_committed_as_the_same_bytes(self, store: Store, kind: str) -> None:
+        one = self.commit(store, kind)
+        again = store.read(store.commit(address(key=OTHER), kind, store.read(one)))
+        assert_same(store.read(one), again, kind, COLORS)
+
+    def test_absent_is_none(self, store: Store) -> None:
+        assert store.find(address()) is None
+        assert list(store.artifacts()) == []
+
+    def test_manifest_says_what_was_given(self, store: Store) -> None:
+        fields = {
+            "inputs": {"initial": OTHER},
+            "configuration": {"iterations": 3, "loss": {"rgb": 0.8}},
+            "code_digest": "c" * 64,
+            "weights_digest": "d" * 64,
+            "seconds": 1.5,
+            "peak_mib": 12.25,
+            "environment": {"python": "3"},
+            "measurements": {"marks": ["one"], "bad": float("nan")},
+            "warnings": ("careful",),
+        }
+        made = self.commit(store, "reconstruction", **fields)
+        found = store.find(address())
+        assert found is not None
+        for name, value in fields.items():
+            if name != "measurements":
+                assert getattr(found.manifest, name) == value
+        assert found.manifest.measurements["marks"] == ["one"] and found.manifest.measurements["bad"] is None
+        assert found.manifest.measurements["culled"] == {"behind": 3, "non_finite": 0}
+        assert found.manifest == made.manifest and found.manifest.created_at.startswith("20")
+
+    def test_first_writer_wins(self, store: Store, second: Store) -> None:
+        one = self.commit(store, "evaluation", seed=0, seconds=1.0)
+        two = self.commit(second, "evaluation", seed=1, seconds=2.0)
+        assert two.manifest == one.manifest
+        assert_same(make("evaluation", 0), store.read(two), "evaluation")
+
+    def test_two_threads_on_one_key(self, store: Store, second: Store) -> None:
+        results: list[Any] = []
+        start = threading.Barrier(6)
+
+        def work(k: int) -> None:
+            start.wait()
+            results.append(self.commit((store, second)[k % 2], "reconstruction", seed=k, warnings=(str(k),)))
+
+        threads = [threading.Thread(target=work, args=(k,)) for k in range(6)]
+        for t in threads:
+            t.start()
+        for t in threads:
+            t.join()
+        assert len(results) == 6 and len({r.manifest.warnings for r in results}) == 1
+        winner = int(results[0].manifest.warnings[0])
+        assert_same(make("reconstruction", winner), store.read(results[0]), "reconstruction")
+        assert len(list(store.artifacts())) == 1
+
+    def test_discard_removes_that_one_only(self, store: Store) -> None:
+        one, two = self.commit(store, "evaluation"), self.commit(store, "evaluation", address(key=OTHER))
+        store.discard(one)
+        assert store.find(address()) is None
+        assert [a.address for a in store.artifacts()] == [two.address]
+        store.discard(one)
+        store.discard(two.address)
+        assert list(store.artifacts()) == []
+        assert self.commit(store, "evaluation").address == one.address
+
+    def test_artifacts_filters(self, store: Store) -> None:
+        places = [
+            ("evaluate/gnet", KEY, 0),
+            ("gnet", KEY, 0),
+            ("gnet", OTHER, 0),
+            ("gnet", KEY, 1),
+            ("initial", KEY, 0),
+        ]
+        wanted = [address(*place) for place in places]
+        for at in wanted:
+            self.commit(store, "evaluation", at)
+        assert sorted(a.address for a in store.artifacts()) == sorted(wanted)
+        assert {a.address for a in store.artifacts(stage="gnet")} == {a for a in wanted if a.stage == "gnet"}
+        assert [a.address for a in store.artifacts(chunk=1)] == [wanted[3]]
+        assert [a.address for a in store.artifacts("synthetic", "street-seed=1", 0, "evaluate/gnet")] == [wanted[0]]
+        assert [a.address for a in store.artifacts(key=OTHER)] == [wanted[2]]
+        assert list(store.artifacts(dataset="pandaset")) == [] == list(store.artifacts(kind="chunk"))
+
+    def test_unknown_kind_says_what_is_known(self, store: Store) -> None:
+        with pytest.raises(ConfigError, match=r"Did you mean 'chunk'.*evaluation"):
+            store.commit(address(), "chunks", None)
+
+    def test_a_value_that_does_not_encode_leaves_nothing(self, store: Store) -> None:
+        bad = make("novel_views")
+        bad.depth[1, 2, 3] = float("nan")
+        with pytest.raises(NonFiniteError, match=r"render depth holds 1 .*\(1, 2, 3\)"):
+            store.commit(address(), "novel_views", bad)
+        assert store.find(address()) is None
+
+    def test_corrupt_is_found_and_recommitted(self, store: Store) -> None:
+        one = self.commit(store, "evaluation")
+        self.damage(one, "metrics.parquet")
+        with pytest.raises(ArtifactCorruptError, match=r"metrics\.parquet"):
+            store.verify(one)
+        two = self.commit(store, "evaluation", warnings=("anew",))
+        store.verify(two)
+        assert two.manifest.warnings == ("anew",)
+
+    def damage(self, artifact: Any, name: str) -> None:
+        """Flip one bit of a file; a store that is no folder overrides this."""
+        path = artifact.path / name
+        data = bytearray(path.read_bytes())
+        data[len(data) // 2] ^= 4
+        path.write_bytes(data)
+
+    def test_names_of_no_folder_are_refused(self) -> None:
+        for dataset, log, stage, key in (
+            ("..", "l", "s", "k"), ("d", "a/b", "s", "k"), ("d", "l", "s//t", "k"), ("d", "l", "../s", "k"),
+            ("d", "l", "s", ""), ("d", "l", "s", ".hidden"), ("d", "l\n", "s", "k"),
+        ):  # fmt: skip
+            with pytest.raises(ConfigError, match="cannot be a folder's name"):
+                Address(dataset, log, 0, stage, key)
+        with pytest.raises(ConfigError, match="negative"):
+            Address("d", "l", -1, "s", "k")
+        assert MANIFEST not in str(address())
