@@ -57,6 +57,9 @@ ALLOWED: Mapping[tuple[str, str], str] = {
     ("numpy._core.numeric", "_frombuffer"): "frombuffer",
     ("builtins", "slice"): "slice",
     ("builtins", "bytearray"): "bytearray",
+    ("__builtin__", "slice"): "slice",
+    ("__builtin__", "bytearray"): "bytearray",
+    ("__builtin__", "bytes"): "bytearray",
     ("_codecs", "encode"): "encode",
 }
 
