@@ -11,6 +11,10 @@ from numpy.typing import NDArray
 from genre_tasks.logs.types import Float32, Float64, Lens
 
 Role = Literal["source", "heldout"]
+MarkKind = Literal[
+    "missing_image", "unreadable_image", "missing_sweep", "unreadable_sweep", "cuboid_outside", "cuboid_invalid",
+    "actor_few_points", "timestamps", "standstill",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -35,7 +39,8 @@ class Points:
     """Coloured LiDAR points of one node (the static background in chunk coordinates, or an actor in its box frame).
 
     ``positions`` [P, 3] float32 metres; ``colors`` [P, 3] uint8 sRGB; ``colored`` [P] bool: some image saw the point
-    unoccluded (elsewhere the colour is grey 128); ``frames`` [P] int16, the log frame of the sweep each point is from.
+    unoccluded (elsewhere the colour is grey 128); ``frames`` [P] int16, the log frame of the sweep each point is
+    from, −1 of none (a point file, or road filled in where LiDAR is blind).
     """
 
     positions: Float32
@@ -67,10 +72,7 @@ class Actor:
 class Mark:
     """Something the log lacks or that was set aside, kept so that a report can say it."""
 
-    kind: Literal[
-        "missing_image", "unreadable_image", "missing_sweep", "unreadable_sweep", "cuboid_outside", "cuboid_invalid",
-        "actor_few_points", "timestamps", "standstill",
-    ]
+    kind: MarkKind
     detail: str
     frame: int | None = None
     camera: str | None = None

@@ -17,7 +17,7 @@ LOWEST_SINE = -0.08
 """The shell reaches this far below the horizon (5°): roads and hills that LiDAR does not reach."""
 
 OPACITY = 0.8
-OVERLAP = 0.5
+OVERLAP = 0.7
 """Standard deviation per spacing of neighbours on the shell."""
 
 SKY_FOOTPRINT_M = 0.15

@@ -14,12 +14,16 @@ from genre_tasks.scene.distant import distant_region
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.geometry import matrix_to_quat
 from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR, STATIC, ActorNode, SceneGraph
+from genre_tasks.scene.ground import CELL_M
 from genre_tasks.scene.voxels import Voxels, group, levels, voxel_size_for
 
-SPACING = 0.55
+SPACING = 0.7
 """In-plane standard deviation per root-mean-square distance to the three nearest neighbours: discs just overlap."""
 
 MIN_SCALE_M, MAX_SCALE_M = 0.005, 3.0
+
+MAX_SCALE_VOXELS = 0.7
+"""An isolated point is far from its neighbours and yet small: in-plane, at most so many of its voxel's sizes."""
 
 NEIGHBOURHOOD = 0.4
 """Normals come from LiDAR points thinned to this fraction of a Gaussian's voxel: some sixteen in its surroundings."""
@@ -87,7 +91,8 @@ def node_gaussians(points: Points, distance: NDArray, max_count: int, config: In
     spacing = neighbour_spacing(means, size)
     fine = group(points.positions, level, NEIGHBOURHOOD * size).mean(points.positions)
     rotation, spread = surface_frames(means, fine, config.neighbours)
-    plane = SPACING * spacing
+    own = size * np.exp2(voxels.mean(level[:, None])[:, 0])
+    plane = np.minimum(SPACING * spacing, MAX_SCALE_VOXELS * np.maximum(own, CELL_M))
     scales = np.stack([plane, plane, np.minimum(spread[:, 2], plane)], 1).clip(MIN_SCALE_M, MAX_SCALE_M)
     count = len(means)
     colors = voxel_colors(points, voxels, means, spacing)

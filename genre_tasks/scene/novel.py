@@ -12,7 +12,8 @@ from genre_tasks.scene.chunk import Chunk, Points, View
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.geometry import shift_laterally
 from genre_tasks.scene.graph import FIRST_ACTOR, STATIC, ActorNode, SceneGraph
-from genre_tasks.scene.initialise import SPACING, neighbour_spacing, path_distance
+from genre_tasks.scene.ground import CELL_M
+from genre_tasks.scene.initialise import MAX_SCALE_VOXELS, SPACING, neighbour_spacing, path_distance
 from genre_tasks.scene.views import NovelView
 from genre_tasks.scene.voxels import group, levels, voxel_size_for
 
@@ -83,8 +84,10 @@ def _blobs(points: Points, distance: np.ndarray, max_count: int) -> Gaussians:
     size = voxel_size_for(positions, level, max_count)
     voxels = group(positions, level, size)
     means = voxels.mean(positions)
-    scale = (SPACING * neighbour_spacing(means, size)).clip(*_LIDAR_SCALE_M) if len(means) else np.empty(0)
     count = len(means)
+    own = size * np.exp2(voxels.mean(level[:, None])[:, 0])
+    spacing = neighbour_spacing(means, size) if count else np.empty(0)
+    scale = np.minimum(SPACING * spacing, MAX_SCALE_VOXELS * np.maximum(own, CELL_M)).clip(*_LIDAR_SCALE_M)
     quats = torch.zeros(count, 4)
     quats[:, 0] = 1.0
     return Gaussians(

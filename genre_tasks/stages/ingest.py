@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,27 +13,50 @@ from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.logs.types import Camera, DrivingLog, Float32, Float64
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.actors import Movers, Path, inside_box, movers
-from genre_tasks.scene.chunk import Actor, Chunk, Mark, Points, View
+from genre_tasks.scene.chunk import Actor, Chunk, Mark, MarkKind, Points, View
 from genre_tasks.scene.coloring import Cloud, color_clouds
 from genre_tasks.scene.geometry import se3_inverse
+from genre_tasks.scene.ground import road_fill
 from genre_tasks.scene.images import decode_pixels, encoded_size
 from genre_tasks.scene.ply import read_ply
 
 STANDSTILL_M = 0.1
 """An ego vehicle that travels less than this in a chunk stands still: there is no parallax."""
 
-EGO_BOX_M = (2.6, 1.3)
-"""Half length and half width, about the LiDAR and below it, of what is the ego vehicle itself."""
+EGO_BOX_M = (2.6, 1.3, 2.6)
+"""Half length, width and height, about the LiDAR pose, of what is the ego vehicle itself and its sensors. Some logs
+put that pose on the road, others at the sensor: the height covers both."""
 
 NO_SWEEP = -1
-"""The frame of points that come from a file and not from a sweep."""
+"""The frame of points that are of no sweep: those of a file, and of the road where LiDAR is blind."""
 
-_IMAGE_REMEDY = "Fetch the file again, or run without strict to go on without it."
+_REMEDY = "Fetch the file again, or run without strict to go on without it."
 
 
 def chunk_count(config: IngestConfig, log: DrivingLog) -> int:
     """How many chunks a log has; the last one may be short."""
     return -(-log.frame_count // config.chunk_frames)
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """What the steps of reading one chunk share; ``marks`` grows."""
+
+    config: IngestConfig
+    log: DrivingLog
+    chunk: int
+    frames: tuple[int, ...]
+    world_SE3_chunk: Float64
+    chunk_SE3_ego: Float64
+    marks: list[Mark]
+    progress: Progress
+
+    def report(self, done: int, note: str) -> None:
+        """Steps: images of each frame, sweeps of each frame, then colours as many."""
+        self.progress(done, 3 * len(self.frames), note)
+
+    def error(self, problem: str, remedy: str, camera: str | None = None, frame: int | None = None) -> InputError:
+        return InputError(problem, remedy=remedy, log=self.log.name, chunk=self.chunk, camera=camera, frame=frame)
 
 
 def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Progress = silent) -> Chunk:
@@ -45,40 +69,35 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
     """
     frames = _frames(config, log, chunk_index)
     cameras = _cameras(config, log)
-    where = {"log": log.name, "chunk": chunk_index}
     poses = np.stack([log.world_SE3_lidar(f) for f in frames])
     world_SE3_chunk = np.eye(4)
     world_SE3_chunk[:3, 3] = poses[len(frames) // 2, :3, 3]
     chunk_SE3_ego = se3_inverse(world_SE3_chunk) @ poses
-    marks = _path_marks(log, frames, chunk_SE3_ego)
-    steps = 3 * len(frames)
-    views, pixels = _views(config, log, frames, cameras, world_SE3_chunk, chunk_index, marks, progress, steps)
-    sources = sorted({v.frame for v in views if v.role == "source"})
+    reading = _Reading(config, log, chunk_index, frames, world_SE3_chunk, chunk_SE3_ego, [], progress)
+    reading.marks.extend(_path_marks(log, frames, chunk_SE3_ego))
+    views, pixels = _views(reading, cameras)
+    sources = {v.frame for v in views if v.role == "source"}
     if len(sources) < 2:
-        raise InputError(
-            f"the chunk has {len(sources)} source frames with images, at least two are needed",
-            remedy="Choose other chunks with --chunks, or a smaller ingest.source_every.",
-            **where,  # type: ignore[arg-type]
-        )
-    moving = movers(log.tracks(), frames, world_SE3_chunk, config.min_actor_travel_m, config.min_actor_frames)
-    marks.extend(moving.marks)
-    static, actors = _clouds(config, log, frames, world_SE3_chunk, chunk_SE3_ego, moving, where, marks, progress)
-    given = static[1]
-    clouds = [static[0], *actors]
-    images = _reported([(v, p) for v, p in zip(views, pixels, strict=True) if p is not None], progress, steps)
-    colored = color_clouds(clouds, images)
+        problem = f"the chunk has {len(sources)} source frames with images, at least two are needed"
+        raise reading.error(problem, "Choose other chunks with --chunks, or a smaller ingest.source_every.")
+    if config.points is not None:
+        static, actors, given = _from_file(reading, config.points)
+    else:
+        (static, actors), given = _from_sweeps(reading), None
+    clouds = [static, *actors]
+    colored = color_clouds(clouds, _reported(reading, views, pixels))
     if given is not None:
         colored[0] = (given, np.ones(len(given), dtype=bool))
     points = [Points(c.positions, *colors, c.frames) for c, colors in zip(clouds, colored, strict=True)]
-    progress(steps, steps, "ingest")
+    reading.report(3 * len(frames), "ingest")
     return Chunk(
-        log.dataset, log.name, chunk_index, tuple(frames), tuple(c.name for c in cameras), config.width_px,
-        config.height_px, world_SE3_chunk, chunk_SE3_ego, tuple(views), points[0],
-        tuple(_actor(c.path, p) for c, p in zip(actors, points[1:], strict=True) if c.path is not None), tuple(marks),
+        log.dataset, log.name, chunk_index, frames, tuple(c.name for c in cameras), config.width_px, config.height_px,
+        world_SE3_chunk, chunk_SE3_ego, tuple(views), points[0],
+        tuple(_actor(c.path, p) for c, p in zip(actors, points[1:], strict=True) if c.path), tuple(reading.marks),
     )  # fmt: skip
 
 
-def _frames(config: IngestConfig, log: DrivingLog, chunk_index: int) -> list[int]:
+def _frames(config: IngestConfig, log: DrivingLog, chunk_index: int) -> tuple[int, ...]:
     count = chunk_count(config, log)
     if not 0 <= chunk_index < count:
         known = "it has none" if count == 0 else f"it has 0 to {count - 1}"
@@ -88,7 +107,7 @@ def _frames(config: IngestConfig, log: DrivingLog, chunk_index: int) -> list[int
             log=log.name,
         )
     start = chunk_index * config.chunk_frames
-    return list(range(start, min(start + config.chunk_frames, log.frame_count)))
+    return tuple(range(start, min(start + config.chunk_frames, log.frame_count)))
 
 
 def _cameras(config: IngestConfig, log: DrivingLog) -> tuple[Camera, ...]:
@@ -118,43 +137,28 @@ def _path_marks(log: DrivingLog, frames: Sequence[int], chunk_SE3_ego: Float64) 
     return marks
 
 
-def _views(
-    config: IngestConfig,
-    log: DrivingLog,
-    frames: Sequence[int],
-    cameras: Sequence[Camera],
-    world_SE3_chunk: Float64,
-    chunk: int,
-    marks: list[Mark],
-    progress: Progress,
-    steps: int,
-) -> tuple[list[View], list[NDArray[np.uint8] | None]]:
+def _views(reading: _Reading, cameras: Sequence[Camera]) -> tuple[list[View], list[NDArray[np.uint8] | None]]:
     """Views in order, and the decoded pixels of source views (``None`` for held-out ones)."""
+    config, log = reading.config, reading.log
     views: list[View] = []
     pixels: list[NDArray[np.uint8] | None] = []
-    chunk_SE3_world = se3_inverse(world_SE3_chunk)
-    for n, frame in enumerate(frames):
-        progress(n, steps, "images")
+    chunk_SE3_world = se3_inverse(reading.world_SE3_chunk)
+    for n, frame in enumerate(reading.frames):
+        reading.report(n, "images")
+        source = n % config.source_every == 0
         for camera in cameras:
             data = log.image_bytes(camera.name, frame)
             problem, decoded = ("there is no image", None) if data is None else _decode(config, camera, data)
-            if problem:
+            if data is None or problem:
                 if config.strict:
-                    raise InputError(
-                        problem, remedy=_IMAGE_REMEDY, log=log.name, chunk=chunk, camera=camera.name, frame=frame
-                    )
-                kind = "missing_image" if data is None else "unreadable_image"
-                marks.append(Mark(kind, problem, frame=frame, camera=camera.name))  # type: ignore[arg-type]
+                    raise reading.error(problem, _REMEDY, camera.name, frame)
+                kind: MarkKind = "missing_image" if data is None else "unreadable_image"
+                reading.marks.append(Mark(kind, problem, frame=frame, camera=camera.name))
                 continue
-            assert data is not None
-            source = n % config.source_every == 0
             pose = chunk_SE3_world @ log.world_SE3_camera(camera.name, frame)
-            views.append(
-                View(
-                    camera.name, frame, "source" if source else "heldout", log.camera_timestamp_s(camera.name, frame),
-                    pose, camera.lens.resized(config.width_px, config.height_px), data,
-                )
-            )  # fmt: skip
+            lens = camera.lens.resized(config.width_px, config.height_px)
+            time_s = log.camera_timestamp_s(camera.name, frame)
+            views.append(View(camera.name, frame, "source" if source else "heldout", time_s, pose, lens, data))
             pixels.append(decoded if source else None)
     return views, pixels
 
@@ -172,103 +176,100 @@ def _decode(config: IngestConfig, camera: Camera, data: bytes) -> tuple[str, NDA
     return "", pixels
 
 
-def _clouds(
-    config: IngestConfig,
-    log: DrivingLog,
-    frames: Sequence[int],
-    world_SE3_chunk: Float64,
-    chunk_SE3_ego: Float64,
-    moving: Movers,
-    where: dict[str, object],
-    marks: list[Mark],
-    progress: Progress,
-) -> tuple[tuple[Cloud, NDArray[np.uint8] | None], list[Cloud]]:
-    """((the background, its colours where the user gave them), the actors' clouds)."""
-    origin = world_SE3_chunk[:3, 3]
-    if config.points is not None:
-        positions, colors = read_ply(config.points)
-        local = (positions - origin).astype(np.float32)
-        marks.extend(Mark("actor_few_points", f"track {p.track_id}: points come from a file") for p in moving.kept)
-        return (Cloud(local, np.full(len(local), NO_SWEEP, np.int16)), colors), []
-    static: list[Float32] = []
-    static_frames: list[int] = []
-    own: dict[int, list[tuple[int, Float32]]] = {k: [] for k in range(len(moving.kept))}
-    for n, frame in enumerate(frames):
-        progress(len(frames) + n, 3 * len(frames), "sweeps")
-        points = _sweep(config, log, frame, origin, where, marks)
+def _from_file(reading: _Reading, file: str) -> tuple[Cloud, list[Cloud], NDArray[np.uint8] | None]:
+    """(background, no actors, the file's colours if it has any)."""
+    positions, colors = read_ply(file)
+    local = (positions - reading.world_SE3_chunk[:3, 3]).astype(np.float32)
+    for path in _movers(reading).kept:
+        reading.marks.append(Mark("actor_few_points", f"track {path.track_id}: points come from a file"))
+    return Cloud(local, np.full(len(local), NO_SWEEP, np.int16)), [], colors
+
+
+def _from_sweeps(reading: _Reading) -> tuple[Cloud, list[Cloud]]:
+    """(background, actors) of the chunk's LiDAR sweeps."""
+    moving = _movers(reading)
+    static: list[tuple[int, Float32]] = []
+    own: list[list[tuple[int, Float32]]] = [[] for _ in moving.kept]
+    for n, frame in enumerate(reading.frames):
+        reading.report(len(reading.frames) + n, "sweeps")
+        points = _sweep(reading, frame)
         if points is None:
             continue
-        points = _without_ego(points, chunk_SE3_ego[n])
+        points = _without_ego(points, reading.chunk_SE3_ego[n])
         left = np.ones(len(points), dtype=bool)
         for k, path in enumerate((*moving.kept, *moving.brief)):
             index, box = inside_box(points, path, frame)
             fresh = left[index]
             left[index] = False
-            if k in own and fresh.any():
+            if k < len(own) and fresh.any():
                 own[k].append((frame, box[fresh]))
-        static.append(points[left])
-        static_frames.append(frame)
+        static.append((frame, points[left]))
     if not static:
-        raise InputError(
-            "the chunk has no LiDAR sweep", remedy="Give points by ingest.points=FILE.ply, or choose other chunks.",
-            **where,  # type: ignore[arg-type]
-        )  # fmt: skip
+        remedy = "Give points by ingest.points=FILE.ply, or choose other chunks with --chunks."
+        raise reading.error("the chunk has no LiDAR sweep", remedy)
+    static.append((NO_SWEEP, road_fill(np.concatenate([p for _, p in static]), reading.chunk_SE3_ego)))
     actors = []
-    for k, path in enumerate(moving.kept):
-        cloud = _cloud(own[k], path)
-        if len(cloud.positions) < config.min_actor_points or len(own[k]) < config.min_actor_frames:
-            detail = f"track {path.track_id}: {len(cloud.positions)} LiDAR points in {len(own[k])} frames"
-            marks.append(Mark("actor_few_points", detail))
+    for parts, path in zip(own, moving.kept, strict=True):
+        count = sum(len(p) for _, p in parts)
+        if count < reading.config.min_actor_points or len(parts) < reading.config.min_actor_frames:
+            detail = f"track {path.track_id}: {count} LiDAR points in {len(parts)} frames"
+            reading.marks.append(Mark("actor_few_points", detail))
         else:
-            actors.append(cloud)
-    return (_cloud(list(zip(static_frames, static, strict=True)), None), None), actors
+            actors.append(_cloud(parts, path))
+    return _cloud(static, None), actors
+
+
+def _movers(reading: _Reading) -> Movers:
+    config = reading.config
+    found = movers(
+        reading.log.tracks(),
+        reading.frames,
+        reading.world_SE3_chunk,
+        config.min_actor_travel_m,
+        config.min_actor_frames,
+    )
+    reading.marks.extend(found.marks)
+    return found
 
 
 def _cloud(parts: list[tuple[int, Float32]], path: Path | None) -> Cloud:
-    positions = np.concatenate([p for _, p in parts]) if parts else np.empty((0, 3), np.float32)
     frames = np.repeat(np.array([f for f, _ in parts], np.int16), [len(p) for _, p in parts])
-    return Cloud(np.ascontiguousarray(positions), frames, path)
+    return Cloud(np.concatenate([p for _, p in parts]), frames, path)
 
 
-def _sweep(
-    config: IngestConfig,
-    log: DrivingLog,
-    frame: int,
-    origin: Float64,
-    where: dict[str, object],
-    marks: list[Mark],
-) -> Float32 | None:
+def _sweep(reading: _Reading, frame: int) -> Float32 | None:
     """Points [P, 3] of a sweep in chunk coordinates; subtraction in float64, non-finite returns dropped."""
     try:
-        sweep = log.sweep(frame)
+        sweep = reading.log.sweep(frame)
     except InputError as error:
-        if config.strict:
+        if reading.config.strict:
             raise
-        marks.append(Mark("unreadable_sweep", error.problem, frame=frame))
+        reading.marks.append(Mark("unreadable_sweep", error.problem, frame=frame))
         return None
     if sweep is None:
-        if config.strict:
-            remedy = "Fetch the file again, or run without strict to go on without it."
-            raise InputError("there is no LiDAR sweep", remedy=remedy, frame=frame, **where)  # type: ignore[arg-type]
-        marks.append(Mark("missing_sweep", "there is no LiDAR sweep", frame=frame))
+        if reading.config.strict:
+            raise reading.error("there is no LiDAR sweep", _REMEDY, frame=frame)
+        reading.marks.append(Mark("missing_sweep", "there is no LiDAR sweep", frame=frame))
         return None
-    points = (sweep.points_world - origin).astype(np.float32)
+    points = (sweep.points_world - reading.world_SE3_chunk[:3, 3]).astype(np.float32)
     return points[np.isfinite(points).all(1)]
 
 
 def _without_ego(points: Float32, chunk_SE3_ego: Float64) -> Float32:
     """Points that are not on the ego vehicle itself."""
     local = (points - chunk_SE3_ego[:3, 3].astype(np.float32)) @ chunk_SE3_ego[:3, :3].astype(np.float32)
-    on_ego = (np.abs(local[:, 0]) < EGO_BOX_M[0]) & (np.abs(local[:, 1]) < EGO_BOX_M[1]) & (local[:, 2] < 0)
-    return points[~on_ego]
+    return points[~(np.abs(local) < np.array(EGO_BOX_M, np.float32)).all(1)]
 
 
 def _reported(
-    images: list[tuple[View, NDArray[np.uint8]]], progress: Progress, steps: int
-) -> list[tuple[View, NDArray[np.uint8]]]:
-    """The same images; colouring is reported as one step."""
-    progress(2 * steps // 3, steps, "colours")
-    return images
+    reading: _Reading, views: list[View], pixels: list[NDArray[np.uint8] | None]
+) -> Iterator[tuple[View, NDArray[np.uint8]]]:
+    """Source views with their pixels, each reported as it is taken."""
+    count = len(reading.frames)
+    for n, (view, image) in enumerate(zip(views, pixels, strict=True)):
+        if image is not None:
+            reading.report(2 * count + n * count // len(views), "colours")
+            yield view, image
 
 
 def _actor(path: Path, points: Points) -> Actor:
