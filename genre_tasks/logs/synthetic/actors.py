@@ -7,14 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from genre_tasks.logs.synthetic.materials import Material
 from genre_tasks.logs.synthetic.mesh import Mesh, boxes, ellipsoid, joined, quads, soup, tube
-from genre_tasks.logs.synthetic.textures import Material
 from genre_tasks.logs.types import Float64
 
-PoseAt = Callable[[Float64], Float64]
+PoseAt = Callable[[Any], Float64]
 
 CAR_COLOURS = (
     (0.75, 0.76, 0.78),
@@ -148,9 +149,7 @@ def _cabin(shape: CarShape, colour: Float64, free: tuple[float, ...]) -> Mesh:
         middle = (xs[1] + xs[2]) / 2
         ends.append(([middle, s * base, z], [middle, s * roof, h - 0.03]))
         ends.append((head[s][0], head[s][1]))
-        posts += [
-            tube(np.array(e, float) + [0, s * 0.01, 0], [0.045, 0.04], 5, Material.PAINT, colour, free) for e in ends
-        ]
+        posts += [tube(np.add(e, [0, s * 0.01, 0]), [0.045, 0.04], 5, Material.PAINT, colour, free) for e in ends]
     return joined([glass, lid, *posts])
 
 

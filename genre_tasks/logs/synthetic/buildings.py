@@ -9,9 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from genre_tasks.logs.synthetic.materials import Material
 from genre_tasks.logs.synthetic.mesh import Mesh, joined, masonry, quads
-from genre_tasks.logs.synthetic.textures import Material
 from genre_tasks.logs.types import Float64
 
 Colour = tuple[float, float, float]
@@ -79,7 +80,7 @@ def building(rng: np.random.Generator, width: float, height: float, depth: float
         [rng.uniform(1, width - 2, count), rng.uniform(1, max(1.5, depth - 3), count), np.full(count, top)], 1
     )
     if count:
-        parts.append(masonry(at, at + [1.1, 1.1, 1.9], Material.BRICK, (0.5, 0.35, 0.3)))
+        parts.append(masonry(at, np.add(at, [1.1, 1.1, 1.9]), Material.BRICK, (0.5, 0.35, 0.3)))
     return joined(parts)
 
 
@@ -99,7 +100,7 @@ def _shell(width: float, depth: float, top: float, wall: int, tone: Float64, fre
 def _openings(bays: int, bay: float, floors: int, base: float, storey: float, sizes: Float64) -> _Front:
     """A regular grid of openings; ``sizes``: width share, sill height share, lintel height share."""
     i, j = (a.ravel() for a in np.meshgrid(np.arange(bays), np.arange(floors)))
-    left, bottom = i * bay, base + j * storey
+    left, bottom = np.asarray(i * bay, np.float64), np.asarray(base + j * storey, np.float64)
     half = bay * sizes[0] / 2
     return _Front(
         left + bay / 2 - half,
@@ -186,7 +187,7 @@ def _upper_floors(
     return joined(parts)
 
 
-def _balconies(f: _Front, pick: np.ndarray) -> Mesh:
+def _balconies(f: _Front, pick: NDArray[np.bool_]) -> Mesh:
     """A slab and a railing of bars."""
     left, right, floor = f.left[pick] - 0.25, f.right[pick] + 0.25, f.cell_bottom[pick] + 0.05
     n = len(left)

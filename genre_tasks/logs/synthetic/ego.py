@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from genre_tasks.logs.synthetic.parameters import CAMERA_NAMES, StreetParameters
 from genre_tasks.logs.synthetic.road import Road, generator
@@ -59,12 +60,12 @@ class Ego:
     speed: float
     phases: tuple[float, float]
 
-    def travel(self, times: Float64) -> Float64:
+    def travel(self, times: ArrayLike) -> Float64:
         """s in metres, 0 at time 0; grows as long as the speed is positive."""
         t = np.asarray(times, float)
         return self.speed * (t + 0.3 * (np.sin(0.4 * t + self.phases[0]) - np.sin(self.phases[0])))
 
-    def pose(self, times: Float64) -> Float64:
+    def pose(self, times: ArrayLike) -> Float64:
         """[n, 4, 4] in the street's coordinates."""
         t = np.asarray(times, float)
         s = self.travel(t)

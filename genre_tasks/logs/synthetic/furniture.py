@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from genre_tasks.logs.synthetic.materials import Material
 from genre_tasks.logs.synthetic.mesh import Mesh, boxes, ellipsoid, joined, soup, tube
-from genre_tasks.logs.synthetic.textures import Material
 from genre_tasks.logs.types import Float64
 
 
@@ -18,7 +18,7 @@ def tree(rng: np.random.Generator, height: float, leaves: int) -> Mesh:
     fork = height * rng.uniform(0.3, 0.42)
     lean = rng.uniform(-0.25, 0.25, 2)
     top = np.array([*lean, fork])
-    parts = [tube([[0, 0, -0.3], top], [0.05 + height * 0.022, height * 0.016], 8, Material.BARK, brown)]
+    parts = [tube(np.stack([[0, 0, -0.3], top]), [0.05 + height * 0.022, height * 0.016], 8, Material.BARK, brown)]
     clumps = int(rng.integers(6, 10))
     spread = height * rng.uniform(0.2, 0.28)
     angle = np.arange(clumps) * 2.4 + rng.uniform(0, 6)
@@ -80,16 +80,17 @@ def sign(rng: np.random.Generator) -> Mesh:
         a = np.linspace(0, 2 * np.pi, 17)
         rim = np.stack([0 * a, np.cos(a), np.sin(a)], 1) * half
         flat = np.stack([np.zeros((16, 3)), rim[:-1], rim[1:]], 1)
-    plate = soup(flat + [-0.06, 0, height], flat, Material.SIGN, colour, free)
-    back = soup(flat + [-0.045, 0, height], None, Material.METAL, (0.5, 0.5, 0.5))
-    pole = tube([[0, 0, -0.2], [0, 0, height + half]], [0.035, 0.035], 8, Material.METAL, (0.55, 0.55, 0.55))
+    plate = soup(np.add(flat, [-0.06, 0, height]), flat, Material.SIGN, colour, free)
+    back = soup(np.add(flat, [-0.045, 0, height]), None, Material.METAL, (0.5, 0.5, 0.5))
+    axis = np.array([[0, 0, -0.2], [0, 0, height + half]])
+    pole = tube(axis, [0.035, 0.035], 8, Material.METAL, (0.55, 0.55, 0.55))
     return joined([plate, back, pole])
 
 
 def bin_(rng: np.random.Generator) -> Mesh:
     colour = rng.uniform(0.1, 0.5, 3)
-    body = tube([[0, 0, 0], [0, 0, 0.85]], [0.24, 0.28], 10, Material.METAL, colour)
-    return joined([body, tube([[0, 0, 0.85], [0, 0, 1.0]], [0.3, 0.18], 10, Material.METAL, colour * 0.6)])
+    body = tube([[0.0, 0.0, 0.0], [0.0, 0.0, 0.85]], [0.24, 0.28], 10, Material.METAL, colour)
+    return joined([body, tube([[0.0, 0.0, 0.85], [0.0, 0.0, 1.0]], [0.3, 0.18], 10, Material.METAL, colour * 0.6)])
 
 
 def bench(rng: np.random.Generator) -> Mesh:

@@ -6,15 +6,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from genre_tasks.logs.synthetic import furniture
-from genre_tasks.logs.synthetic.actors import Actor, Part, car, draw_shape, pedestrian
+from genre_tasks.logs.synthetic.actors import Actor, Part, PoseAt, car, draw_shape, pedestrian
 from genre_tasks.logs.synthetic.buildings import building
 from genre_tasks.logs.synthetic.ego import FRAME_S, Ego
+from genre_tasks.logs.synthetic.materials import Material
 from genre_tasks.logs.synthetic.mesh import Mesh, joined, masonry
 from genre_tasks.logs.synthetic.parameters import StreetParameters
 from genre_tasks.logs.synthetic.road import KERB_HEIGHT_M, Road, generator, road_surfaces
-from genre_tasks.logs.synthetic.textures import Material
 from genre_tasks.logs.types import Float64
 
 _BEHIND_M = 70.0
@@ -139,7 +140,8 @@ def _pavements(seed: int, road: Road, start: float, end: float) -> Iterator[Mesh
 
 
 def _parked_cars(seed: int, road: Road, start: float, end: float) -> tuple[list[Parked], list[Mesh]]:
-    parked, meshes = [], []
+    parked: list[Parked] = []
+    meshes: list[Mesh] = []
     for side in (1, -1):
         rng = generator(seed, f"parked {side}")
         density = rng.uniform(0.35, 0.9)
@@ -181,10 +183,10 @@ def _moving_cars(parameters: StreetParameters, road: Road, ego: Ego) -> Iterator
         yield Actor(f"car-{k}", "Car", (Part(mesh),), (shape.length, shape.width + 0.1, shape.height), motion)
 
 
-def _drive(road: Road, first: float, speed: float, lane: float):  # noqa: ANN202
+def _drive(road: Road, first: float, speed: float, lane: float) -> PoseAt:
     yaw = 0.0 if speed > 0 else np.pi
 
-    def pose(times: Float64) -> Float64:
+    def pose(times: ArrayLike) -> Float64:
         return road.pose(first + speed * np.asarray(times), lane, 0.0, yaw)
 
     return pose
@@ -205,10 +207,10 @@ def _pedestrians(parameters: StreetParameters, road: Road, ego: Ego) -> Iterator
         yield Actor(f"pedestrian-{k}", "Pedestrian", parts, size, _walk(road, first, way, pace, t))
 
 
-def _walk(road: Road, first: float, way: int, pace: float, t: float):  # noqa: ANN202
+def _walk(road: Road, first: float, way: int, pace: float, t: float) -> PoseAt:
     yaw = 0.0 if way > 0 else np.pi
 
-    def pose(times: Float64) -> Float64:
+    def pose(times: ArrayLike) -> Float64:
         return road.upright(first + way * pace * np.asarray(times), t, KERB_HEIGHT_M, yaw)
 
     return pose

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from genre_tasks.logs.synthetic.ego import FRAME_S, LIDAR_HEIGHT_M, Ego
+from genre_tasks.logs.synthetic.materials import REFLECTIVITY
 from genre_tasks.logs.synthetic.parameters import StreetParameters
 from genre_tasks.logs.synthetic.raycast import Scene
 from genre_tasks.logs.synthetic.road import generator
-from genre_tasks.logs.synthetic.textures import REFLECTIVITY
 from genre_tasks.logs.types import Float64, Sweep
 
 RANGE_M = 100.0
@@ -23,8 +23,8 @@ def elevations(beams: int) -> Float64:
 def sweep(scene: Scene, ego: Ego, parameters: StreetParameters, frame: int, offset_m: Float64, start_s: float) -> Sweep:
     """One turn, seen from the moving roof; the forward direction is scanned at the frame's own time.
 
-    Points that come back from 1 to 100 m, in world coordinates (``offset_m`` [3] added in float64); each with the time at
-    which its beam was sent (``start_s`` is the time of frame 0).
+    Points that come back from 1 to 100 m, in world coordinates (``offset_m`` [3] added in float64); each with the time
+    at which its beam was sent (``start_s`` is the time of frame 0).
     """
     count = parameters.lidar_azimuths
     # From behind through the right, the front and the left, as seen from above: clockwise turns have falling azimuth.

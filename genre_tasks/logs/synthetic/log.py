@@ -88,8 +88,8 @@ class StreetTruth:
 class SyntheticStreet:
     """A procedural street, drawn from a seed; implements ``DrivingLog``.
 
-    ``uri_query``: the parameters of ``StreetParameters`` as text. Raises ``ConfigError`` on unknown or bad ones. Opening
-    is cheap: geometry is built when the first image, sweep or track is asked for.
+    ``uri_query``: the parameters of ``StreetParameters`` as text. Raises ``ConfigError`` on unknown or bad ones.
+    Opening is cheap: geometry is built when the first image, sweep or track is asked for.
     """
 
     def __init__(self, uri_query: Mapping[str, str]) -> None:
@@ -99,7 +99,7 @@ class SyntheticStreet:
         self._road = Road(self.parameters.seed)
         self._ego = draw_ego(self.parameters, self._road)
         rng = generator(self.parameters.seed, "origin")
-        self.offset_m = rng.uniform([-40, -40, -10], [40, 40, 10]) + [self.parameters.origin_m, 0.0, 0.0]
+        self.offset_m = np.add(rng.uniform([-40, -40, -10], [40, 40, 10]), [self.parameters.origin_m, 0.0, 0.0])
         self._start_s = _EPOCH_S + 60.0 * (self.parameters.seed % 100_000)
         self._png: _Memo[bytes] = _Memo(_PNG_CACHE_BYTES, len)
         self._truth = StreetTruth(self)

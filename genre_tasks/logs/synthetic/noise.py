@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from genre_tasks.logs.types import Float32
+# Real numbers of either precision; float32 in practice.
+Reals = NDArray[np.floating[Any]]
 
 _SIZE = 256
 _TABLE = np.random.default_rng(20250301).random(_SIZE * _SIZE, np.float32)
 
 
-def cell(i: NDArray, j: NDArray | int, stream: int = 0) -> Float32:
+def cell(i: NDArray, j: NDArray | int, stream: int = 0) -> Reals:
     """A random number in [0, 1) for each integer cell (i, j); ``stream`` gives independent ones."""
     a = (np.asarray(i).astype(np.int32) + np.int32(stream * 37 & 255)) & 255
     b = (np.asarray(j).astype(np.int32) + np.int32(stream * 91 & 255)) & 255
     return _TABLE[a * _SIZE + b]
 
 
-def noise(x: Float32, y: Float32, stream: int = 0) -> Float32:
+def dot3(a: Reals, b: Reals) -> Reals:
+    """[n] products of [n, 3] rows, summed in fixed order (numpy's reduction over three is ten times as slow)."""
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+
+
+def noise(x: Reals, y: Reals, stream: int = 0) -> Reals:
     """Smooth value noise in [0, 1], one feature a unit."""
     i, j = np.floor(x), np.floor(y)
     u, v = x - i, y - j
@@ -32,7 +40,7 @@ def noise(x: Float32, y: Float32, stream: int = 0) -> Float32:
     return low * (1 - v) + high * v
 
 
-def fractal(x: Float32, y: Float32, octaves: int, stream: int = 0) -> Float32:
+def fractal(x: Reals, y: Reals, octaves: int, stream: int = 0) -> Reals:
     """Octaves of noise, each half as strong and about twice as fine; in [0, 1]."""
     total, weight, amount = np.zeros_like(x), 0.0, 1.0
     for k in range(octaves):
@@ -43,12 +51,12 @@ def fractal(x: Float32, y: Float32, octaves: int, stream: int = 0) -> Float32:
     return total / np.float32(weight)
 
 
-def stripe(x: Float32, centre: float, width: float, blur: Float32) -> Float32:
+def stripe(x: Reals, centre: float, width: float, blur: Reals) -> Reals:
     """1 on a line of that width, 0 beside it, box-filtered over ``blur``."""
     return np.clip((width / 2 - np.abs(x - np.float32(centre))) / np.maximum(blur, 1e-4) + 0.5, 0, 1)
 
 
-def seam(x: Float32, period: float, width: float, blur: Float32) -> Float32:
+def seam(x: Reals, period: float, width: float, blur: Reals) -> Reals:
     """A periodic ``stripe`` (joints between bricks or slabs), fading to its mean where the blur exceeds the period."""
     away = np.abs(x - np.float32(period) * np.round(x / np.float32(period)))
     sharp = np.clip((width / 2 - away) / np.maximum(blur, 1e-4) + 0.5, 0, 1)

@@ -52,7 +52,7 @@ class StreetParameters:
         for field in fields(self):
             value = getattr(self, field.name)
             if all_keys or field.name == "seed" or value != field.default:
-                parts.append(f"{field.name}={value:g}" if isinstance(value, float) else f"{field.name}={value}")
+                parts.append(f"{field.name}={value!r}")
         return separator.join(parts)
 
 

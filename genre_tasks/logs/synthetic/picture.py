@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from genre_tasks.logs.synthetic.materials import MIRROR, Material
 from genre_tasks.logs.synthetic.mesh import linear
-from genre_tasks.logs.synthetic.noise import fractal
+from genre_tasks.logs.synthetic.noise import Reals, dot3, fractal
 from genre_tasks.logs.synthetic.raycast import Hits, Scene
 from genre_tasks.logs.synthetic.road import generator
-from genre_tasks.logs.synthetic.textures import MIRROR, Material, albedo
+from genre_tasks.logs.synthetic.textures import albedo
 from genre_tasks.logs.types import Float32, Float64, Lens
 
 _BAND_RAYS = 1 << 16
@@ -48,7 +49,7 @@ def draw_light(seed: int) -> Light:
     )
 
 
-def sky(light: Light, direction: Float32) -> Float32:
+def sky(light: Light, direction: Reals) -> Reals:
     """[n, 3] linear radiance of the sky: a gradient, clouds and a glow around the sun."""
     up = np.clip(direction[:, 2], 0, 1)
     share = (1 - (1 - up) ** 3)[:, None]
@@ -65,7 +66,7 @@ def sky(light: Light, direction: Float32) -> Float32:
 
 def camera_rays(lens: Lens, samples: int) -> Float64:
     """[H · W · samples, 3] unit directions in camera axes; samples of a pixel are neighbours, on a fixed grid."""
-    side = int(round(samples**0.5))
+    side = round(samples**0.5)
     step = (np.arange(side) + 0.5) / side
     dx, dy = np.meshgrid(step, step)
     x = (np.arange(lens.width_px)[None, :, None] + dx.ravel() - lens.cx_px) / lens.fx_px
@@ -92,7 +93,7 @@ def _undistorted(x: Float64, y: Float64, distortion: tuple[float, ...]) -> tuple
 
 def shade(
     scene: Scene, light: Light, hits: Hits, origin: Float64, direction: Float64, time: float, spread: float
-) -> Float32:
+) -> Reals:
     """[n, 3] linear radiance seen along rays; ``spread`` is the angle between neighbouring rays."""
     d = direction.astype(np.float32)
     out = sky(light, d) if (hits.face < 0).any() else np.zeros_like(d)
@@ -102,7 +103,7 @@ def shade(
     h = Hits(hits.distance_m[pick], hits.face[pick], hits.u[pick], hits.v[pick], hits.normal[pick])
     d, n, faces = d[pick], h.normal, scene.faces
     material = faces.material[h.face]
-    slant = np.clip(-(n * d).sum(1), 0.05, 1)
+    slant = np.clip(-dot3(n, d), 0.05, 1)
     blur = h.distance_m * np.float32(spread) / np.sqrt(slant)
     base = albedo(material, scene.texture_points(h), faces.colour[h.face], faces.parameters[h.face], blur)
 
@@ -115,8 +116,8 @@ def shade(
     dark = scene.shadowed(points[lit], n[lit], light.sun, time)
     sunlight[lit] = np.where(dark, 0, facing[lit])
     up = (0.5 + 0.5 * n[:, 2])[:, None]
-    ambient = (0.55 * (light.zenith + light.horizon) * up + np.array([0.20, 0.19, 0.17], np.float32) * (1 - up)) * 0.62
-    value = base * (sunlight[:, None] * light.sun_colour + ambient)
+    ambient = (0.55 * (light.zenith + light.horizon) * up + np.array([0.20, 0.19, 0.17], np.float32) * (1 - up)) * 0.8
+    value: Reals = base * (sunlight[:, None] * light.sun_colour + ambient)
     value = np.where((material == Material.LAMP)[:, None], base, value)
     value = _mirrored(light, value, d, n, MIRROR[material], slant)
     haze = (1 - np.exp(-h.distance_m / np.float32(_HAZE_M)))[:, None]
@@ -124,13 +125,13 @@ def shade(
     return out
 
 
-def _mirrored(light: Light, value: Float32, d: Float32, n: Float32, share: Float32, slant: Float32) -> Float32:
+def _mirrored(light: Light, value: Reals, d: Reals, n: Reals, share: Reals, slant: Reals) -> Reals:
     """Adds the sky's reflection to glass and paint (Schlick's approximation)."""
     pick = np.flatnonzero(share > 0)
     if len(pick) == 0:
         return value
     f = share[pick] + (1 - share[pick]) * (1 - slant[pick]) ** 5
-    r = d[pick] - 2 * (d[pick] * n[pick]).sum(1)[:, None] * n[pick]
+    r = d[pick] - 2 * dot3(d[pick], n[pick])[:, None] * n[pick]
     seen = sky(light, r) * np.clip(r[:, 2] * 4 + 0.5, 0.12, 1)[:, None]
     value[pick] = value[pick] * (1 - f[:, None]) + seen * f[:, None]
     return value
@@ -153,7 +154,7 @@ def picture(
     return to_srgb(np.concatenate(rows)).reshape(lens.height_px, lens.width_px, 3)
 
 
-def to_srgb(value: Float32) -> NDArray[np.uint8]:
+def to_srgb(value: Reals) -> NDArray[np.uint8]:
     """Linear light to 8-bit sRGB (IEC 61966-2-1)."""
     v = np.clip(value.astype(np.float64), 0, 1)
     coded = np.where(v <= 0.0031308, 12.92 * v, 1.055 * v ** (1 / 2.4) - 0.055)

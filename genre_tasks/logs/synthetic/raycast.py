@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from genre_tasks.logs.synthetic.actors import Actor, Part
 from genre_tasks.logs.synthetic.layout import Layout
 from genre_tasks.logs.synthetic.mesh import Mesh, joined
+from genre_tasks.logs.synthetic.noise import dot3
 from genre_tasks.logs.types import Float32, Float64
 
 _SHADOW_OFFSET_M = 0.01
@@ -98,7 +99,7 @@ class Scene:
         for m in self._moving:
             times = np.atleast_1d(np.asarray(time, float))
             middle = m.world_SE3_part(times[[len(times) // 2]])[0]
-            pick = _near_cone(o, d, middle[:3, :3] @ m.centre + middle[:3, 3], m.radius + slack_m)
+            pick = _near_sphere(origin, d, middle[:3, :3] @ m.centre + middle[:3, 3], m.radius + slack_m)
             if len(pick) == 0:
                 continue
             pose = m.world_SE3_part(times if len(times) == 1 else times[pick])
@@ -111,8 +112,7 @@ class Scene:
             face[to] = part["primID"][near] + m.first_face
             rotation = np.broadcast_to(pose[:, :3, :3], (len(pick), 3, 3))[near]
             normal[to] = np.einsum("nij,nj->ni", rotation, self._normals[face[to]])
-        away = (normal * d).sum(1) > 0
-        normal[away] *= -1
+        np.multiply(normal, np.where(dot3(normal, d) > 0, np.float32(-1), np.float32(1))[:, None], out=normal)
         return Hits(distance, face, u, v, normal)
 
     def shadowed(self, points: Float32, normals: Float32, sun: Float64, time: float) -> NDArray[np.bool_]:
@@ -126,7 +126,7 @@ class Scene:
             pose = m.world_SE3_part(np.array([time]))[0]
             centre = pose[:3, :3] @ m.centre + pose[:3, 3]
             off = flat - (across @ centre).astype(np.float32)
-            pick = np.flatnonzero(((off * off).sum(1) < m.radius**2) & ~dark)
+            pick = np.flatnonzero((off[:, 0] ** 2 + off[:, 1] ** 2 < m.radius**2) & ~dark)
             if len(pick) == 0:
                 continue
             local_o = (o[pick] - pose[:3, 3]) @ pose[:3, :3]
@@ -142,8 +142,8 @@ class Scene:
         return t[:, 0] * (1 - u - v) + t[:, 1] * u + t[:, 2] * v
 
 
-def _near_cone(o: Float32, d: Float32, centre: Float64, radius: float) -> NDArray[np.int64]:
-    """Rays that pass a sphere."""
-    to = centre.astype(np.float32) - o
-    along = np.maximum((to * d).sum(1), 0)
-    return np.flatnonzero((to * to).sum(1) - along * along < radius**2)
+def _near_sphere(origin: Float64, d: Float32, centre: Float64, radius: float) -> NDArray[np.int64]:
+    """Rays that pass a sphere; a single origin ([3]) is much the faster."""
+    to = (centre - origin).astype(np.float32)
+    along = np.maximum(d @ to if to.ndim == 1 else dot3(to, d), 0)
+    return np.flatnonzero(dot3(to, to) - along * along < radius**2)

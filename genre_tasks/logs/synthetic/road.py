@@ -12,8 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
+from genre_tasks.logs.synthetic.materials import Material
 from genre_tasks.logs.synthetic.mesh import Mesh, joined, sheet
-from genre_tasks.logs.synthetic.textures import Material
 from genre_tasks.logs.types import Float64
 
 LANE_M = 3.5
@@ -87,11 +87,11 @@ class Road:
     def heading(self, s: Float64 | float) -> Float64:
         """Yaw of the curve, radians."""
         grid, _, heading = self._table
-        return np.interp(s, grid, heading)
+        return np.asarray(np.interp(s, grid, heading))
 
     def slope(self, s: Float64 | float) -> Float64:
         """dz/ds."""
-        return self.section.bends[4] * np.sin(np.asarray(s) / 40) / 40
+        return np.asarray(self.section.bends[4] * np.sin(np.asarray(s) / 40) / 40)
 
     def point(self, s: Float64 | float, t: Float64 | float, height: Float64 | float = 0.0) -> Float64:
         """[..., 3] position of street coordinates, ``height`` above the road."""
@@ -104,7 +104,7 @@ class Road:
     def pose(
         self, s: Float64 | float, t: Float64 | float, height: Float64 | float = 0.0, yaw: Float64 | float = 0.0
     ) -> Float64:
-        """[..., 4, 4] pose on the road: x along the street (turned by ``yaw``), y left, z up, pitched with the slope."""
+        """[..., 4, 4] pose on the road, pitched with it: x along the street (turned by ``yaw``), y left, z up."""
         s = np.asarray(s, float)
         heading = self.heading(s) + yaw
         pitch = np.arctan(self.slope(s)) * np.cos(yaw)
