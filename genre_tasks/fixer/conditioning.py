@@ -5,6 +5,7 @@ Images are sRGB in [0, 1], [B, 3, H, W]; masks and alphas are [B, 1, H, W].
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -12,8 +13,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from genre_tasks.errors import InputError
 from genre_tasks.fixer.network import Conditions
 from genre_tasks.logs.types import Float64, Lens
+from genre_tasks.scene.chunk import Chunk, View
+from genre_tasks.scene.images import decode_image
+from genre_tasks.scene.views import NovelView, NovelViews
 
 MAX_COLOUR_SHIFT = 0.03
 """Largest change of an image's mean per channel, where the render is more than half opaque. A fixer repairs structure;
@@ -32,8 +37,10 @@ class Degraded:
     lidar_color: Tensor  # [B, 3, H, W]
     lidar_alpha: Tensor  # [B, 1, H, W]
     reference: Tensor  # [B, 3, H, W] the nearest source image, from its own viewpoint
-    warped: Tensor  # [B, 3, H, W] the reference warped to the view, black where that is undefined
+    warped: Tensor  # [B, 3, H, W] the reference warped to the view by rendered depth, black where that is undefined
     warp_mask: Tensor  # [B, 1, H, W]
+    lidar_warped: Tensor  # [B, 3, H, W] the same by the LiDAR map's depth: sparser, free of floaters
+    lidar_warp_mask: Tensor  # [B, 1, H, W]
 
     def at(self, index: slice) -> Degraded:
         """The views of a slice."""
@@ -111,10 +118,69 @@ def warp_reference(
     return warped * mask, mask
 
 
+def source_views(chunk: Chunk, novel: Sequence[NovelView]) -> dict[tuple[str, int], View]:
+    """The references of novel views, each once, in order of appearance. Raises ``InputError`` for a stranger."""
+    views = {(v.camera, v.frame): v for v in chunk.views}
+    for view in novel:
+        if view.reference not in views:
+            raise InputError(
+                "the reference of a novel view is no view of the chunk",
+                remedy="Render the novel views of this chunk again.",
+                log=chunk.log,
+                chunk=chunk.index,
+                camera=view.reference[0],
+                frame=view.reference[1],
+                stage="fnet",
+            )
+    return {v.reference: views[v.reference] for v in novel}
+
+
+def source_images(sources: Mapping[tuple[str, int], View]) -> dict[tuple[str, int], Tensor]:
+    """Their images [3, H, W] at the working resolution. Raises ``InputError`` for an unreadable one."""
+    return {
+        key: decode_image(view.image, view.lens.width_px, view.lens.height_px).permute(2, 0, 1)
+        for key, view in sources.items()
+    }
+
+
+def degraded(
+    novel: NovelViews,
+    indices: range,
+    sources: Mapping[tuple[str, int], View],
+    images: Mapping[tuple[str, int], Tensor],
+) -> Degraded:
+    """The views ``indices`` with what they are fixed from; ``images`` are the references [3, H, W]."""
+    at = slice(indices.start, indices.stop)
+    views = novel.views[at]
+    reference = torch.stack([images[v.reference] for v in views]).to(novel.color)
+    poses = [(v.chunk_SE3_camera, sources[v.reference].chunk_SE3_camera) for v in views]
+    lenses = [(v.lens, sources[v.reference].lens) for v in views]
+    alpha, lidar_alpha = novel.alpha[at, None], novel.lidar_alpha[at, None]
+    return Degraded(
+        novel.color[at].permute(0, 3, 1, 2),
+        alpha,
+        novel.lidar_color[at].permute(0, 3, 1, 2),
+        lidar_alpha,
+        reference,
+        *warp_reference(reference, novel.depth[at, None], alpha, poses, lenses),
+        *warp_reference(reference, novel.lidar_depth[at, None], lidar_alpha, poses, lenses),
+    )
+
+
 def conditions(views: Degraded) -> Conditions:
     """The network's input, of the same size."""
     render = fill_holes(views.color, views.alpha, views.lidar_color, views.lidar_alpha)
-    hints = torch.cat([views.alpha, views.lidar_alpha, views.warped, views.warp_mask], 1)
+    hints = torch.cat(
+        [
+            views.alpha,
+            views.lidar_alpha,
+            views.warped,
+            views.warp_mask,
+            views.lidar_warped,
+            views.lidar_warp_mask,
+        ],
+        1,
+    )
     return Conditions(render, views.reference, views.lidar_color, hints)
 
 

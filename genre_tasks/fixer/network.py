@@ -15,8 +15,9 @@ from torch import Tensor, nn
 
 from genre_tasks.fixer.attention import mix_views, remove_text_attention
 
-HINTS = 6
-"""Channels of ``Conditions.hints``: render alpha, LiDAR alpha, warped reference (3), where the warp is valid."""
+HINTS = 10
+"""Channels of ``Conditions.hints``: render alpha, LiDAR alpha; the reference warped by rendered depth (3) and where
+that is valid; the same by the LiDAR map's depth."""
 
 
 @dataclass(frozen=True)

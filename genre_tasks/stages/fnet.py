@@ -11,14 +11,13 @@ from torch import Tensor
 
 from genre_tasks.config import FnetConfig
 from genre_tasks.errors import InputError
-from genre_tasks.fixer.conditioning import Degraded, warp_reference
+from genre_tasks.fixer.conditioning import degraded, source_images, source_views
 from genre_tasks.fixer.inference import fix, noise_of
 from genre_tasks.fixer.network import Encoded, Fnet
 from genre_tasks.fixer.weights import load_fnet
 from genre_tasks.metrics.threads import map_single_threaded
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.chunk import Chunk, View
-from genre_tasks.scene.images import decode_image
 from genre_tasks.scene.views import FixedViews, NovelViews
 from genre_tasks.weights import resolve_weights
 
@@ -61,10 +60,8 @@ def fix_views(
     total = len(novel.views)
     if not total:
         return FixedViews(novel.views, novel.color.clone())
-    sources = _sources(chunk, novel)
-    images = {
-        key: _channels_first(decode_image(v.image, v.lens.width_px, v.lens.height_px)) for key, v in sources.items()
-    }
+    sources = source_views(chunk, novel.views)
+    images = source_images(sources)
     encoded = _encode_references(network, images, list(images))
     done, lock = 0, Lock()
 
@@ -80,27 +77,6 @@ def fix_views(
     batches = [range(start, min(start + size, total)) for start in range(0, total, size)]
     color = torch.cat(map_single_threaded(run, batches))
     return FixedViews(novel.views, color.permute(0, 2, 3, 1).contiguous())
-
-
-def degraded(
-    novel: NovelViews,
-    indices: range,
-    sources: dict[tuple[str, int], View],
-    images: dict[tuple[str, int], Tensor],
-) -> Degraded:
-    """The views ``indices`` with what they are fixed from; ``images`` are the references [3, H, W]."""
-    at = slice(indices.start, indices.stop)
-    views = novel.views[at]
-    reference = torch.stack([images[v.reference] for v in views])
-    warped, mask = warp_reference(
-        reference,
-        novel.depth[at, None],
-        novel.alpha[at, None],
-        [(v.chunk_SE3_camera, sources[v.reference].chunk_SE3_camera) for v in views],
-        [(v.lens, sources[v.reference].lens) for v in views],
-    )
-    color, lidar = (x[at].permute(0, 3, 1, 2) for x in (novel.color, novel.lidar_color))
-    return Degraded(color, novel.alpha[at, None], lidar, novel.lidar_alpha[at, None], reference, warped, mask)
 
 
 def _fix_batch(
@@ -120,23 +96,6 @@ def _fix_batch(
     return fix(network, views, noise, Encoded(latent, ()))
 
 
-def _sources(chunk: Chunk, novel: NovelViews) -> dict[tuple[str, int], View]:
-    """The references of the novel views, each once, in order of appearance."""
-    views = {(v.camera, v.frame): v for v in chunk.views}
-    for view in novel.views:
-        if view.reference not in views:
-            raise InputError(
-                "the reference of a novel view is no view of the chunk",
-                remedy="Render the novel views of this chunk again.",
-                log=chunk.log,
-                chunk=chunk.index,
-                camera=view.reference[0],
-                frame=view.reference[1],
-                stage="fnet",
-            )
-    return {v.reference: views[v.reference] for v in novel.views}
-
-
 @torch.no_grad()
 def _encode_references(
     network: Fnet, images: dict[tuple[str, int], Tensor], keys: Sequence[tuple[str, int]]
@@ -151,7 +110,3 @@ def _encode_references(
             return Encoded(network.encode(F.pad(image, pad, mode="replicate")).latent, ())
 
     return dict(zip(keys, map_single_threaded(encode, keys), strict=True))
-
-
-def _channels_first(image: Tensor) -> Tensor:
-    return image.permute(2, 0, 1)

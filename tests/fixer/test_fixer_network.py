@@ -84,7 +84,7 @@ def test_the_batch_must_hold_whole_samples():
         toy().unet(torch.randn(4, 4, 4, 6), 200, None, cross_attention_kwargs={"views": 3})
 
 
-@pytest.mark.parametrize("name", ["color", "lidar_color", "reference", "warped", "alpha"])
+@pytest.mark.parametrize("name", ["color", "lidar_color", "reference", "warped", "lidar_warped", "alpha"])
 def test_every_input_has_an_effect(name):
     fnet, views = toy(), random_views(1, 32, 48)
     noise = noise_of(fnet, 0, range(1), 32, 48)
@@ -144,7 +144,9 @@ def test_any_size_comes_back_at_its_size(height, width):
 def test_black_and_saturated_images_stay_finite(level, dtype):
     fnet = toy().to(dtype)
     full, one = torch.full((1, 3, 32, 48), level, dtype=dtype), torch.full((1, 1, 32, 48), level, dtype=dtype)
-    out = fix(fnet, Degraded(full, one, full, one, full, full, one), noise_of(fnet, 0, range(1), 32, 48).to(dtype))
+    out = fix(
+        fnet, Degraded(full, one, full, one, full, full, one, full, one), noise_of(fnet, 0, range(1), 32, 48).to(dtype)
+    )
     assert out.dtype == dtype and torch.isfinite(out).all() and out.min() >= 0 and out.max() <= 1
 
 

@@ -1,0 +1,270 @@
+"""Training of the small fixer: its autoencoder first, then UNet, decoder and skips on pairs (paper Sec. III-B).
+
+The encoder is frozen after the first part. Checkpoints hold everything that a step depends on: a resumed training
+takes the same steps as one that was never stopped.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from genre_tasks.errors import InputError, NonFiniteError
+from genre_tasks.fixer.conditioning import conditions
+from genre_tasks.fixer.network import Fnet, FnetArchitecture, build, restart_residual, small_architecture
+from genre_tasks.fixer.pairs import Pairs, sample
+from genre_tasks.progress import Progress, silent
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """How long and with what. The paper trains 20 000 steps of batch 8 at 720 × 1280 from SD-Turbo."""
+
+    autoencoder_steps: int = 500
+    autoencoder_batch: int = 4
+    steps: int = 4000
+    batch: int = 2
+    crop: tuple[int, int] = (128, 192)
+    learning_rate: float = 6e-4
+    autoencoder_learning_rate: float = 1e-3
+    warmup: int = 100
+    perceptual: float = 0.1
+    clean_share: float = 0.08
+    average: float = 0.998
+    kl: float = 1e-5
+    seed: int = 0
+    checkpoint_every: int = 250
+
+
+AUTOENCODER_SETTINGS = ("autoencoder_steps", "autoencoder_batch", "autoencoder_learning_rate", "crop", "kl", "seed")
+"""Settings on which the first part depends: with others of these its result is not used again."""
+
+
+@dataclass
+class TrainingState:
+    """Everything that the next step depends on."""
+
+    fnet: Fnet
+    average: dict[str, Tensor]
+    optimiser: torch.optim.Optimizer
+    generator: torch.Generator
+    step: int
+    losses: list[float]
+
+
+Distance = Callable[[Tensor, Tensor], Tensor]
+
+
+def train(
+    pairs: Pairs,
+    settings: TrainingSettings,
+    folder: Path,
+    distance: Distance,
+    progress: Progress = silent,
+    on_checkpoint: Callable[[Fnet, int], None] | None = None,
+    architecture: FnetArchitecture | None = None,
+) -> Fnet:
+    """A trained fixer (averaged weights); continues from ``folder`` where a checkpoint of the same settings lies there.
+
+    Args:
+        distance: perceptual distance of [B, H, W, 3] images, [B].
+        on_checkpoint: called with the averaged network and the step at each checkpoint (a sample picture, say).
+
+    Raises:
+        InputError: the checkpoint is of other settings. NonFiniteError: a loss is not finite.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    start = architecture or small_architecture()
+    total = settings.autoencoder_steps + settings.steps
+    fnet = _pretrained(pairs, settings, start, folder, progress, total)
+    state = _fixer_state(fnet, settings)
+    _restore(state, folder / "fixer.pt", settings)
+    report = _Reporter(progress, settings.autoencoder_steps, total, state.step)
+    while state.step < settings.steps:
+        views, truth = sample(pairs, state.generator, settings.batch, settings.crop, settings.clean_share)
+        inputs = conditions(views)
+        noise = torch.randn(settings.batch, *fnet.noise_shape(*settings.crop), generator=state.generator)
+        out = fnet(inputs, noise)
+        perceived = distance(_last(out.clamp(0, 1)), _last(truth)).mean()
+        _step(state, (out - truth).abs().mean() + settings.perceptual * perceived, settings, settings.learning_rate)
+        with torch.no_grad():
+            decay = min(settings.average, (1 + state.step) / (10 + state.step))
+            for name, parameter in fnet.named_parameters():
+                state.average[name].lerp_(parameter, 1 - decay)
+        report(state)
+        if state.step % settings.checkpoint_every == 0 or state.step == settings.steps:
+            _save(state, folder / "fixer.pt", settings)
+            if on_checkpoint is not None:
+                on_checkpoint(averaged(state), state.step)
+    return averaged(state)
+
+
+def train_autoencoder(
+    pairs: Pairs, settings: TrainingSettings, architecture: FnetArchitecture, progress: Progress, total: int
+) -> Fnet:
+    """Encoder and decoder as a plain autoencoder on true images; latents are then scaled to unit variance.
+
+    With a small KL term: latents must survive noise of the size of σ_τ, not be a normal distribution.
+    """
+    fnet = build(architecture, settings.seed)
+    vae = fnet.vae
+    # the fixer's decoder starts at zero; an autoencoder's must not
+    nn.init.normal_(vae.decoder.conv_out.weight, std=0.02, generator=torch.Generator().manual_seed(settings.seed))
+    optimiser = torch.optim.AdamW(vae.parameters(), lr=settings.autoencoder_learning_rate, weight_decay=0.0)
+    generator = torch.Generator().manual_seed(settings.seed)
+    state = TrainingState(fnet, {}, optimiser, generator, 0, [])
+    report = _Reporter(progress, 0, total, 0)
+    spread = torch.zeros(())
+    while state.step < settings.autoencoder_steps:
+        _, image = sample(pairs, generator, settings.autoencoder_batch, settings.crop, 0.0)
+        posterior = vae.encode(image * 2 - 1).latent_dist
+        out = vae.decode(posterior.sample(generator)).sample / 2 + 0.5
+        loss = (out - image).abs().mean() + settings.kl * posterior.kl().mean() / posterior.mean[0].numel()
+        _step(state, loss, settings, settings.autoencoder_learning_rate, settings.autoencoder_steps)
+        spread = torch.lerp(spread, posterior.mean.detach().std(), 0.05) if state.step > 1 else posterior.mean.std()
+        report(state)
+    vae.register_to_config(scaling_factor=1.0 / float(spread))
+    return fnet
+
+
+def averaged(state: TrainingState) -> Fnet:
+    """A copy of the network with the averaged weights, for inference."""
+    fnet = build(state.fnet.architecture)
+    fnet.load_state_dict(state.average)
+    return fnet.eval().requires_grad_(False)
+
+
+def _pretrained(
+    pairs: Pairs,
+    settings: TrainingSettings,
+    architecture: FnetArchitecture,
+    folder: Path,
+    progress: Progress,
+    total: int,
+) -> Fnet:
+    """The network after the first part, from ``folder`` or trained; the decoder's and UNet's ends are zeroed."""
+    path = folder / "autoencoder.pt"
+    if path.exists():
+        stored = torch.load(path, weights_only=True)
+        _require_same(stored["settings"], settings, path, AUTOENCODER_SETTINGS)
+        scale, weights = stored["scale"], stored["weights"]
+    else:
+        trained = train_autoencoder(pairs, settings, architecture, progress, total)
+        scale, weights = trained.vae.config.scaling_factor, trained.state_dict()
+        _write({"settings": _plain(settings), "scale": scale, "weights": weights}, path)
+    fnet = build(scaled(architecture, scale), settings.seed)
+    fnet.load_state_dict(weights)
+    restart_residual(fnet)
+    return fnet
+
+
+def scaled(architecture: FnetArchitecture, scaling_factor: float) -> FnetArchitecture:
+    """The architecture with a latent scale."""
+    return FnetArchitecture(
+        {**architecture.vae, "scaling_factor": scaling_factor},
+        architecture.unet,
+        architecture.residual,
+        architecture.timestep,
+    )
+
+
+def _fixer_state(fnet: Fnet, settings: TrainingSettings) -> TrainingState:
+    fnet.vae.encoder.requires_grad_(False)
+    if fnet.vae.quant_conv is not None:
+        fnet.vae.quant_conv.requires_grad_(False)
+    trained = [p for p in fnet.parameters() if p.requires_grad]
+    optimiser = torch.optim.AdamW(trained, lr=settings.learning_rate, weight_decay=1e-4)
+    average = {name: value.detach().clone() for name, value in fnet.state_dict().items()}
+    return TrainingState(fnet, average, optimiser, torch.Generator().manual_seed(settings.seed + 1), 0, [])
+
+
+def _step(
+    state: TrainingState, loss: Tensor, settings: TrainingSettings, rate: float, steps: int | None = None
+) -> None:
+    """One step of the optimiser: warm-up, then a cosine to a hundredth of the rate; gradients clipped at norm 1."""
+    if not bool(torch.isfinite(loss)):
+        raise NonFiniteError("train fnet", f"loss of step {state.step}", 1, ())
+    done = state.step / max(1, settings.steps if steps is None else steps)
+    factor = min(1.0, (state.step + 1) / settings.warmup) * (
+        0.505 + 0.495 * float(torch.cos(torch.tensor(done * torch.pi)))
+    )
+    for group in state.optimiser.param_groups:
+        group["lr"] = rate * factor
+    state.optimiser.zero_grad()
+    loss.backward()
+    nn.utils.clip_grad_norm_([p for g in state.optimiser.param_groups for p in g["params"]], 1.0)
+    state.optimiser.step()
+    state.step += 1
+    state.losses.append(float(loss.detach()))
+
+
+class _Reporter:
+    """Progress with the recent loss and the time left."""
+
+    def __init__(self, progress: Progress, offset: int, total: int, first: int) -> None:
+        self.progress, self.offset, self.total, self.first = progress, offset, total, first
+        self.began = time.monotonic()
+
+    def __call__(self, state: TrainingState) -> None:
+        done = self.offset + state.step
+        each = (time.monotonic() - self.began) / max(1, state.step - self.first)
+        recent = state.losses[-100:]
+        left = each * (self.total - done)
+        self.progress(done, self.total, f"loss {sum(recent) / len(recent):.4f}, {left / 60:.1f} min left")
+
+
+def _save(state: TrainingState, path: Path, settings: TrainingSettings) -> None:
+    document = {
+        "settings": _plain(settings),
+        "weights": state.fnet.state_dict(),
+        "average": state.average,
+        "optimiser": state.optimiser.state_dict(),
+        "generator": state.generator.get_state(),
+        "step": state.step,
+        "losses": state.losses,
+    }
+    _write(document, path)
+
+
+def _restore(state: TrainingState, path: Path, settings: TrainingSettings) -> None:
+    if not path.exists():
+        return
+    stored = torch.load(path, weights_only=True)
+    _require_same(stored["settings"], settings, path, tuple(_plain(settings)))
+    state.fnet.load_state_dict(stored["weights"])
+    state.average = stored["average"]
+    state.optimiser.load_state_dict(stored["optimiser"])
+    state.generator.set_state(stored["generator"])
+    state.step, state.losses = stored["step"], stored["losses"]
+
+
+def _write(document: dict[str, Any], path: Path) -> None:
+    """Renamed into place: a kill leaves the last whole checkpoint."""
+    part = path.with_suffix(".tmp")
+    torch.save(document, part)
+    part.replace(path)
+
+
+def _plain(settings: TrainingSettings) -> dict[str, Any]:
+    return {**asdict(settings), "crop": list(settings.crop)}
+
+
+def _require_same(stored: dict[str, Any], settings: TrainingSettings, path: Path, names: Sequence[str]) -> None:
+    now = _plain(settings)
+    other = [name for name in names if stored.get(name) != now[name]]
+    if other:
+        raise InputError(
+            f"the checkpoint was trained with other settings: {', '.join(other)}",
+            remedy="Train with the same settings, or into another folder.",
+            file=path,
+        )
+
+
+def _last(image: Tensor) -> Tensor:
+    return image.permute(0, 2, 3, 1)
