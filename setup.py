@@ -26,7 +26,10 @@ class BuildKernel(build_ext):
     def get_outputs(self) -> list[str]:
         """Files that a wheel takes."""
         recipe = runpy.run_path(str(ROOM / "build_kernel.py"))
-        return [str(Path(self.build_lib) / ROOM / recipe["library_name"](isa)) for isa in recipe["isas"]()]
+        return [
+            str(Path(self.build_lib) / ROOM / recipe["library_name"](isa))
+            for isa in recipe["isas_for"](recipe["find_compiler"]())
+        ]
 
     def get_output_mapping(self) -> dict[str, str]:
         """Nothing for setuptools to copy: an editable install has the libraries in place already."""

@@ -69,15 +69,24 @@ def find_compiler() -> tuple[str, ...]:
     raise RuntimeError(NO_COMPILER)
 
 
-def _isa_flags(compiler: tuple[str, ...], flags: tuple[str, ...]) -> tuple[str, ...]:
-    """zig spells architectures with underscores."""
-    if "ziglang" not in compiler and "zig" not in Path(compiler[0]).name:
-        return flags
-    return tuple(f.replace("x86-64-v", "x86_64_v") for f in flags)
+def _is_zig(compiler: tuple[str, ...]) -> bool:
+    return "ziglang" in compiler or "zig" in Path(compiler[0]).name
+
+
+def isas_for(compiler: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
+    """:func:`isas` as a compiler takes them.
+
+    zig spells architectures with underscores, and compiles its C++ library anew for each (half a minute, once): it
+    leaves AVX-512 out.
+    """
+    if not _is_zig(compiler):
+        return isas()
+    flags = {isa: tuple(f.replace("x86-64-v", "x86_64_v") for f in flags) for isa, flags in isas().items()}
+    return {isa: f for isa, f in flags.items() if isa != "avx512"}
 
 
 def build_kernel(target_dir: Path) -> list[Path]:
-    """Compiles every library of :func:`isas` into ``target_dir`` (some seconds) and returns their paths.
+    """Compiles every library of :func:`isas_for` the compiler found into ``target_dir`` (some seconds) and returns their paths.
 
     Each appears whole or not at all, so a running process keeps the one it has loaded. Raises ``RuntimeError`` without
     a compiler or when it fails, with its last lines.
@@ -90,7 +99,7 @@ def build_kernel(target_dir: Path) -> list[Path]:
     def compile_one(isa: str, flags: tuple[str, ...]) -> Path:
         out = target_dir / library_name(isa)
         part = out.with_name(f"{out.name}.{os.getpid()}.tmp")
-        command = [*compiler, *FLAGS, *_isa_flags(compiler, flags), *defines, str(HERE / "kernel.cpp"), "-o", str(part)]
+        command = [*compiler, *FLAGS, *flags, *defines, str(HERE / "kernel.cpp"), "-o", str(part)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             part.unlink(missing_ok=True)
@@ -99,4 +108,4 @@ def build_kernel(target_dir: Path) -> list[Path]:
         return out
 
     with ThreadPoolExecutor(2) as pool:
-        return list(pool.map(lambda item: compile_one(*item), isas().items()))
+        return list(pool.map(lambda item: compile_one(*item), isas_for(compiler).items()))

@@ -96,6 +96,8 @@ def render_cpu(splats: Splats, cameras: Cameras, threads: int | None) -> tuple[I
     ``threads`` ``None`` takes torch's number. The bits of images and gradients do not depend on it.
     """
     arrays = (splats.means, splats.scales, splats.quats, splats.opacities, splats.colors)
+    if any(a.device.type != "cpu" for a in arrays):
+        raise ValueError(f"expected tensors on the cpu for backend cpu, got {splats.means.device}")
     culled: dict[str, int] = {}
     images = _Rasterise.apply(
         cameras, threads or torch.get_num_threads(), culled, *(a.to(torch.float32).contiguous() for a in arrays)

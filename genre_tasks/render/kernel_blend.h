@@ -138,4 +138,5 @@ static void blend_backward(const Footprint* sorted, const Pair* pair, const Pair
     }
   }
   for (; pair < end; pair++) stream(&slots[pair->slot], Lanes{});
+  stream_end();
 }

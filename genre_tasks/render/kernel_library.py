@@ -42,8 +42,13 @@ def supported_isas() -> list[str]:
     return [isa for isa, needed in _NEEDED_FLAGS.items() if needed <= flags]
 
 
-def chosen_isa() -> str:
-    """The best supported instruction set, or ``GENRE_RENDER_ISA``; :class:`ConfigError` if it cannot run."""
+def candidate_isas() -> list[str]:
+    """What to look for, best first: ``GENRE_RENDER_ISA`` alone if it is set, else all that run here.
+
+    Raises:
+        ConfigError: ``GENRE_RENDER_ISA`` names what this machine cannot run.
+        ResourceError: the machine runs none.
+    """
     supported = supported_isas()
     asked = os.environ.get("GENRE_RENDER_ISA")
     if asked and asked not in supported:
@@ -54,19 +59,20 @@ def chosen_isa() -> str:
         raise ResourceError(
             "the CPU is older than the kernel's oldest instruction set (SSE4.2)", remedy="Use backend reference"
         )
-    return asked or supported[0]
+    return [asked] if asked else supported
 
 
 @cache
-def load_kernel(folder: Path = build_kernel.HERE, isa: str | None = None) -> ctypes.CDLL:
-    """The kernel with its argument types declared; loaded once.
+def load_kernel(folder: Path = build_kernel.HERE) -> ctypes.CDLL:
+    """The best kernel in ``folder`` that this machine can run, with its argument types declared; loaded once.
 
     Raises:
         ResourceError: it was never compiled, is older than its sources, or does not load.
     """
-    path = folder / build_kernel.library_name(isa or chosen_isa())
-    if not path.exists():
-        raise ResourceError("the renderer's CPU kernel is not compiled", remedy=REMEDY, file=path)
+    paths = [folder / build_kernel.library_name(isa) for isa in candidate_isas()]
+    path = next((p for p in paths if p.exists()), None)
+    if path is None:
+        raise ResourceError("the renderer's CPU kernel is not compiled", remedy=REMEDY, file=paths[0])
     try:
         library = ctypes.CDLL(str(path))
         library.genre_digest.restype = ctypes.c_char_p

@@ -103,6 +103,13 @@ INLINE void stream(Lanes* at, const Lanes& x) {
 #endif
 }
 
+// Non-temporal stores are not ordered with what follows, not even for the thread that joins this one.
+INLINE void stream_end() {
+#if defined(__SSE2__)
+  _mm_sfence();
+#endif
+}
+
 template <int H, size_t... I>
 INLINE NativeF fold_native(NativeF a, NativeF b, std::index_sequence<I...>) {
   constexpr auto low = [](int i) { int o = i % (2 * H), s = i - o; return o < H ? s + o : WIDTH + s + o - H; };
