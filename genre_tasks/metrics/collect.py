@@ -7,10 +7,13 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from genre_tasks.errors import NonFiniteError
+from genre_tasks.logs.types import Truth
 from genre_tasks.metrics.distribution import frechet_distance, kernel_distance
 from genre_tasks.metrics.image import psnr, ssim
 from genre_tasks.metrics.perceptual import perceptual_distance
@@ -25,6 +28,7 @@ BOOTSTRAP_SEED = 0
 
 _REAL_BATCH = 16
 _KEPT_CHUNKS = 4
+_KEPT_TRUTH_BYTES = 2**28
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,24 @@ def real_images(chunk: Chunk) -> FeatureSet:
 def view_image(view: View) -> Tensor:
     """[H, W, 3] sRGB in [0, 1] at the working resolution."""
     return decode_image(view.image, view.lens.width_px, view.lens.height_px)
+
+
+_true: OrderedDict[tuple[object, ...], tuple[Truth, NDArray[np.uint8]]] = OrderedDict()
+
+
+def true_pixels(chunk: Chunk, truth: Truth, view: NovelView) -> NDArray[np.uint8]:
+    """[H, W, 3] sRGB: what the camera would have seen. Every stage asks for the same views: the last are kept.
+
+    Only an image's own truth object answers for it: the entry keeps the object, so that its id stays its own.
+    """
+    pose = chunk.world_SE3_chunk @ view.chunk_SE3_camera
+    key = (id(truth), view.frame, pose.tobytes(), view.lens)
+    if key not in _true:
+        _true[key] = truth, truth.image(view.frame, pose, view.lens)
+        while len(_true) > 1 and sum(image.nbytes for _, image in _true.values()) > _KEPT_TRUTH_BYTES:
+            _true.popitem(last=False)
+    _true.move_to_end(key)
+    return _true[key][1]
 
 
 @dataclass

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from genre_tasks.config import EvaluateConfig
 from genre_tasks.logs.types import Truth
-from genre_tasks.metrics.collect import Collector, real_images, view_image
+from genre_tasks.metrics.collect import Collector, real_images, true_pixels, view_image
 from genre_tasks.metrics.image import psnr
 from genre_tasks.progress import Progress, silent
 from genre_tasks.render import render_views
@@ -188,11 +188,7 @@ def _true_images(chunk: Chunk, truth: Truth | None, views: Sequence[NovelView]) 
     """[V, H, W, 3] in [0, 1], or ``None`` where the log cannot tell."""
     if truth is None:
         return None
-    return torch.stack([torch.from_numpy(_true_pixels(chunk, truth, v).astype(np.float32) / 255) for v in views])
-
-
-def _true_pixels(chunk: Chunk, truth: Truth, view: NovelView) -> NDArray[np.uint8]:
-    return truth.image(view.frame, chunk.world_SE3_chunk @ view.chunk_SE3_camera, view.lens)
+    return torch.stack([torch.from_numpy(true_pixels(chunk, truth, v).astype(np.float32) / 255) for v in views])
 
 
 def _mean_psnr(scene: SceneGraph, views: Sequence[View], settings: RenderSettings, steps: _Steps) -> float:
@@ -216,7 +212,7 @@ def _scene_pictures(
         if isinstance(view, View):
             pictures[f"{name}.truth"] = _to_uint8(view_image(view))
         elif truth is not None:
-            pictures[f"{name}.truth"] = _true_pixels(chunk, truth, view)
+            pictures[f"{name}.truth"] = true_pixels(chunk, truth, view)
     return pictures
 
 
@@ -231,7 +227,7 @@ def _fixed_pictures(
             name = _picture_name(view)
             pictures[name] = _to_uint8(fixed.color[at[view.camera, view.frame, view.shift_m]])
             if truth is not None:
-                pictures[f"{name}.truth"] = _true_pixels(chunk, truth, view)
+                pictures[f"{name}.truth"] = true_pixels(chunk, truth, view)
     return pictures
 
 

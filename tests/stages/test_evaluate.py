@@ -209,6 +209,27 @@ def test_real_features_are_taken_once(chunk: Chunk, monkeypatch) -> None:
         real_images(replace(chunk, views=chunk.views[1:]))
 
 
+def test_truth_is_cast_once_for_all_stages(chunk: Chunk, monkeypatch) -> None:
+    fixed, novel = views_of(chunk)
+    asked = []
+
+    class Counting(FakeTruth):
+        def image(self, frame: int, world_SE3_camera: Float64, lens: Lens) -> np.ndarray:
+            asked.append(frame)
+            return super().image(frame, world_SE3_camera, lens)
+
+    truth = Counting(LOG)
+    first = evaluate_fixed(CONFIG, chunk, fixed, novel, truth)
+    assert len(asked) == len(fixed.views)  # the pictures' viewpoints are among them
+    assert evaluate_fixed(CONFIG, chunk, fixed, novel, truth).metrics == first.metrics
+    assert len(asked) == len(fixed.views)
+    evaluate_fixed(CONFIG, chunk, fixed, novel, Counting(LOG))  # another truth is asked anew
+    assert len(asked) == 2 * len(fixed.views)
+    monkeypatch.setattr(collect, "_KEPT_TRUTH_BYTES", 1)
+    evaluate_fixed(CONFIG, chunk, fixed, novel, Counting(LOG))
+    assert len(collect._true) == 1
+
+
 def test_same_bytes_at_any_thread_count(chunk: Chunk, scene: SceneGraph) -> None:
     before, results = torch.get_num_threads(), []
     config = EvaluateConfig(shifts_m=(3.0,), every=4, bootstrap=10, pictures=0)
