@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import os
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +20,26 @@ from storage.files import write_file
 EXR_THREADS = 2
 
 
-def write_channels(path: Path, channels: Mapping[str, NDArray[Any]]) -> None:
-    """Write channels [H, W], float16 or float32, as one scan-line part. No timestamps: equal input, equal bytes."""
+@lru_cache(maxsize=1)
+def _stop_threads_before_forks() -> None:
+    """A fork copies no threads: a child that inherits OpenEXR's pool would wait for it for ever."""
     import OpenEXR
 
+    os.register_at_fork(before=lambda: OpenEXR.set_global_thread_count(0))
+
+
+def _openexr() -> Any:
+    """The module, with its pool of threads started."""
+    import OpenEXR
+
+    _stop_threads_before_forks()
     OpenEXR.set_global_thread_count(EXR_THREADS)
+    return OpenEXR
+
+
+def write_channels(path: Path, channels: Mapping[str, NDArray[Any]]) -> None:
+    """Write channels [H, W], float16 or float32, as one scan-line part. No timestamps: equal input, equal bytes."""
+    OpenEXR = _openexr()
     for name, pixels in channels.items():
         if pixels.dtype not in (np.float16, np.float32) or pixels.ndim != 2 or 0 in pixels.shape:
             raise ConfigError(
@@ -42,9 +59,7 @@ def read_channels(path: Path, dtypes: Mapping[str, Any], shape: tuple[int, int])
     A truncated or altered file does not raise in OpenEXR: it has no parts, or channels without pixels. Here each of
     these raises ``ArtifactCorruptError`` naming file and channel.
     """
-    import OpenEXR
-
-    OpenEXR.set_global_thread_count(EXR_THREADS)
+    OpenEXR = _openexr()
 
     def corrupt(problem: str) -> ArtifactCorruptError:
         return ArtifactCorruptError(problem, remedy=REMEDY, file=path)

@@ -33,6 +33,8 @@ store = LocalStore(Path(sys.argv[1]))
 values = {kind: make(kind) for kind in sys.argv[2:]}
 for kind in values:
     codec_of(kind)
+store.commit(Address("d", "l", 0, "reconstruction", "warm"), "reconstruction", values["reconstruction"])
+print("ready", flush=True)
 for line in sys.stdin:
     child = os.fork()
     if child == 0:
@@ -55,6 +57,7 @@ def test_kills_inside_commits(tmp_path: Path) -> None:
         text=True, env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
     )  # fmt: skip
     assert server.stdin is not None and server.stdout is not None
+    assert server.stdout.readline() == "ready\n"
     store, half_written = LocalStore(tmp_path), 0
     expected = {kind: store.commit(Address("d", "l", 0, kind, "reference"), kind, make(kind)) for kind in KINDS}
     try:
@@ -62,7 +65,7 @@ def test_kills_inside_commits(tmp_path: Path) -> None:
             server.stdin.write(f"{k}\n")
             server.stdin.flush()
             child = int(server.stdout.readline())
-            time.sleep(moments.uniform(0.01, 0.6))
+            time.sleep(moments.uniform(0.01, 0.5))
             os.kill(child, signal.SIGKILL)
             assert server.stdout.readline() == "done\n"
             half_written += len(list(tmp_path.rglob(".tmp-*")))

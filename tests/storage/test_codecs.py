@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from pathlib import Path
 
 import numpy as np
@@ -207,6 +208,21 @@ def test_exr_bytes_do_not_depend_on_time_or_order(tmp_path: Path) -> None:
     write_channels(tmp_path / "a.exr", channels)
     write_channels(tmp_path / "b.exr", dict(reversed(channels.items())))
     assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
+
+
+def test_a_forked_child_can_write_too(tmp_path: Path) -> None:
+    """OpenEXR's threads do not survive a fork; without care the child waits for them for ever."""
+    channels = {"Z": np.random.default_rng(0).random((400, 300)).astype(np.float32)}
+    write_channels(tmp_path / "parent.exr", channels)
+    child = multiprocessing.get_context("fork").Process(target=write_channels, args=(tmp_path / "child.exr", channels))
+    child.start()
+    child.join(60)
+    alive = child.is_alive()
+    child.kill()
+    assert not alive and child.exitcode == 0
+    write_channels(tmp_path / "again.exr", channels)
+    one, two, three = ((tmp_path / f"{name}.exr").read_bytes() for name in ("parent", "child", "again"))
+    assert one == two == three
 
 
 def test_one_image_for_others(tmp_path: Path) -> None:
