@@ -27,10 +27,10 @@ class NetworkConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    hidden: int = Field(64, ge=4, le=512, description="Width of the head per Gaussian.")
-    channels: tuple[int, ...] = Field((16, 32, 48), min_length=1, description="Channels of the UNet's levels.")
-    voxel_m: float = Field(1.0, gt=0, description="Width of a static voxel near the cameras.")
-    rates: tuple[float, ...] = Field(GNET_RATES, description="One per attribute group, as TunedAdam's.")
+    hidden: int = Field(default=64, ge=4, le=512, description="Width of the head per Gaussian.")
+    channels: tuple[int, ...] = Field(default=(16, 32, 48), min_length=1, description="Channels of the UNet's levels.")
+    voxel_m: float = Field(default=1.0, gt=0, description="Width of a static voxel near the cameras.")
+    rates: tuple[float, ...] = Field(default=GNET_RATES, description="One per attribute group, as TunedAdam's.")
 
 
 class LearnedOptimiser(nn.Module):

@@ -42,8 +42,7 @@ def plan_loss(
 ) -> LossPlan:
     """Weights and crops of a batch: the mean over source views plus λ_novel times the mean over novel views.
 
-    The crop's term counts for its one view as if it were the whole image's, hence with λ_lpips times that view's
-    weight times the number of views of its kind.
+    The crop's term counts for its one view as if it were the whole image's: with λ_lpips times that view's weight.
     """
     novel = sum(t.novel for t in targets)
     source = len(targets) - novel
@@ -65,7 +64,6 @@ def view_loss(
     target: Target,
     crop: Crop | None = None,
     distance: Distance | None = None,
-    crop_weight: float = 1.0,
 ) -> Tensor:
     """The weighted sum of one view's terms, a scalar; finite for any finite input, also without LiDAR returns."""
     image = target.image.image
@@ -78,7 +76,7 @@ def view_loss(
         row, column, height, width = crop
         window = slice(row, row + height), slice(column, column + width)
         value = distance(color[window][None].clamp(0, 1), image[window][None])[0]
-        loss = loss + config.perceptual * crop_weight * value
+        loss = loss + config.perceptual * value
     return loss
 
 
@@ -103,14 +101,11 @@ def image_gradients(
     distance: Distance | None = None,
 ) -> tuple[float, Tensor, Tensor]:
     """The batch's loss and its gradients with respect to ``color`` and ``depth``."""
-    counts = {kind: sum(t.novel == kind for t in targets) for kind in (False, True)}
 
     def one(i: int) -> tuple[Tensor, Tensor, Tensor]:
         c, d = color[i].detach().requires_grad_(), depth[i].detach().requires_grad_()
         with torch.enable_grad():
-            loss = plan.weights[i] * view_loss(
-                config, c, d, targets[i], plan.crops[i], distance, float(counts[targets[i].novel])
-            )
+            loss = plan.weights[i] * view_loss(config, c, d, targets[i], plan.crops[i], distance)
         by_color, by_depth = torch.autograd.grad(loss, (c, d), allow_unused=True)
         return loss.detach(), by_color, torch.zeros_like(d) if by_depth is None else by_depth
 

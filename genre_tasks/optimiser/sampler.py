@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 
@@ -39,6 +40,15 @@ class ViewSampler:
                 self._waiting[camera] = self._shuffled(self._by_camera[camera])
             drawn.append(self._waiting[camera].pop())
         return [self.targets[i] for i in drawn]
+
+    def queues(self) -> dict[str, Any]:
+        """What is still to come of the present rounds, as plain values for a checkpoint."""
+        return {"cameras": list(self._cameras), "waiting": {k: list(v) for k, v in self._waiting.items()}}
+
+    def set_queues(self, queues: dict[str, Any]) -> None:
+        """The inverse of :meth:`queues`."""
+        self._cameras = list(queues["cameras"])
+        self._waiting = {k: list(v) for k, v in queues["waiting"].items()}
 
     def _shuffled(self, items: list) -> list:
         return [items[i] for i in torch.randperm(len(items), generator=self._generator).tolist()]

@@ -1,0 +1,128 @@
+"""Training scenes of the optimiser: chunks, initial scenes and true novel views, kept in a store of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from genre_tasks.config import IngestConfig, InitialConfig
+from genre_tasks.logs.registry import open_log
+from genre_tasks.logs.types import DrivingLog
+from genre_tasks.optimiser.episodes import TrainingScene
+from genre_tasks.optimiser.targets import of_fixed, of_source, of_views
+from genre_tasks.scene.chunk import Chunk
+from genre_tasks.scene.novel import novel_view_poses
+from genre_tasks.scene.results import Reconstruction
+from genre_tasks.scene.views import FixedViews
+from genre_tasks.stages.ingest import ingest
+from genre_tasks.stages.initial import initial
+from storage.address import Address
+from storage.keys import digest_value
+from storage.local import LocalStore
+
+
+@dataclass(frozen=True)
+class SceneRecipe:
+    """How a training scene is made.
+
+    ``every``: only every n-th frame's images are kept (a ray-cast image costs half a second); a divisor of four keeps
+    the source views. ``novel_every``: every n-th of the views at ±3 m is ray-cast as truth.
+    """
+
+    uri: str
+    chunk: int = 0
+    max_points: int = 18_000
+    distant_count: int = 2_000
+    width_px: int = 320
+    height_px: int = 180
+    every: int = 2
+    novel_every: int = 2
+    shifts_m: tuple[float, ...] = (3.0, -3.0)
+
+
+@dataclass(frozen=True)
+class PreparedScene:
+    """The parts of a training scene as the stages leave them; ``truth`` is ``None`` for a real log."""
+
+    recipe: SceneRecipe
+    chunk: Chunk
+    start: Reconstruction
+    truth: FixedViews | None
+
+
+class ThinnedLog:
+    """A log of which only every n-th frame has images; all else is the log's own."""
+
+    def __init__(self, log: DrivingLog, every: int) -> None:
+        self._log, self._every = log, every
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._log, name)
+
+    def image_bytes(self, camera: str, frame: int) -> bytes | None:
+        """As the log's, or ``None`` for the frames that are left out."""
+        return self._log.image_bytes(camera, frame) if frame % self._every == 0 else None
+
+
+def prepare(store: LocalStore, recipe: SceneRecipe) -> PreparedScene:
+    """Reads the scene from the store, or makes and stores it."""
+    log = open_log(recipe.uri)
+    key = digest_value(asdict(recipe))
+
+    def kept(stage: str, kind: str, make: Any) -> Any:
+        address = Address(log.dataset, log.name, recipe.chunk, stage, key)
+        artifact = store.find(address) or store.commit(address, kind, make())
+        return store.read(artifact)
+
+    sizes = {"width_px": recipe.width_px, "height_px": recipe.height_px}
+    thinned: Any = ThinnedLog(log, recipe.every)
+    chunk = kept("ingest", "chunk", lambda: ingest(IngestConfig(**sizes), thinned, recipe.chunk))
+    points = InitialConfig(max_points=recipe.max_points, distant_count=recipe.distant_count)
+    start = kept("initial", "reconstruction", lambda: initial(points, chunk))
+    truth = None
+    if log.truth is not None:
+        truth = kept("truth", "fixed_views", lambda: true_views(log, chunk, recipe))
+    return PreparedScene(recipe, chunk, start, truth)
+
+
+def true_views(log: DrivingLog, chunk: Chunk, recipe: SceneRecipe) -> FixedViews:
+    """The ray-cast images at every ``novel_every``-th view beside the path."""
+    assert log.truth is not None
+    views = novel_view_poses(chunk, recipe.shifts_m)[:: recipe.novel_every]
+    images = [log.truth.image(v.frame, chunk.world_SE3_chunk @ v.chunk_SE3_camera, v.lens) for v in views]
+    return FixedViews(views, torch.from_numpy(np.stack(images).astype(np.float32) / np.float32(255)))
+
+
+def training_scene(
+    prepared: PreparedScene,
+    start: Reconstruction | None = None,
+    fixed: FixedViews | None = None,
+    depth: bool = True,
+    heldout: int = 12,
+) -> TrainingScene:
+    """Targets decoded; ``start`` replaces the initial scene, ``fixed`` is what the optimiser sees beside the path.
+
+    True images judge at the novel views where they exist, else the fixed ones.
+    """
+    chunk = prepared.chunk
+    judge = prepared.truth or fixed
+    views = spread(chunk.of_role("heldout"), heldout)
+    return TrainingScene(
+        f"{chunk.log}/{chunk.index}",
+        (start or prepared.start).scene,
+        of_source(chunk, depth),
+        of_views(chunk, views),
+        () if fixed is None else of_fixed(fixed),
+        () if judge is None else of_fixed(judge),
+    )
+
+
+def spread(items: Sequence[Any], count: int) -> tuple[Any, ...]:
+    """At most ``count`` of the items, evenly spread."""
+    if len(items) <= count:
+        return tuple(items)
+    return tuple(items[round(i * (len(items) - 1) / (count - 1))] for i in range(count))

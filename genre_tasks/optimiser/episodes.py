@@ -1,0 +1,109 @@
+"""Episodes of meta-training: one scene somewhere along its unrolled optimisation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+
+from genre_tasks.optimiser.features import Fixed, features
+from genre_tasks.optimiser.learned import LearnedOptimiser
+from genre_tasks.optimiser.objective import Objective, Sight
+from genre_tasks.optimiser.sampler import ViewSampler
+from genre_tasks.optimiser.sparse_unet import VoxelPyramid
+from genre_tasks.optimiser.state import Frame, State
+from genre_tasks.optimiser.targets import Target
+from genre_tasks.optimiser.unroll import camera_centre
+from genre_tasks.scene.gaussians import Gaussians
+from genre_tasks.scene.graph import SceneGraph
+
+
+@dataclass(frozen=True)
+class TrainingScene:
+    """A start and what it is optimised towards.
+
+    ``source`` and ``fixed`` are what the optimiser sees; ``heldout`` and ``truth`` (true or fixed images at the novel
+    views) judge it in training alone. ``fixed`` and ``truth`` may be empty.
+    """
+
+    name: str
+    scene: SceneGraph
+    source: tuple[Target, ...]
+    heldout: tuple[Target, ...]
+    fixed: tuple[Target, ...] = ()
+    truth: tuple[Target, ...] = ()
+
+
+@dataclass(frozen=True)
+class Course:
+    """How an episode goes: which scene, T, views in each iteration, and the start's change of size and opacity."""
+
+    scene: int
+    iterations: int
+    views: int
+    novel_views: int
+    log_scale_shift: float
+    logit_shift: float
+
+
+@dataclass
+class Episode:
+    """A scene at iteration ``state.iteration`` of its course, with the gradient there already taken."""
+
+    course: Course
+    frame: Frame
+    pyramid: VoxelPyramid
+    columns: Fixed
+    samplers: tuple[ViewSampler, ...]
+    state: State
+    sight: Sight | None = None
+
+    @staticmethod
+    def start(course: Course, scene: TrainingScene, network: LearnedOptimiser, generator: torch.Generator) -> Episode:
+        """At iteration 0."""
+        frame = Frame.of(shifted(scene.scene, course))
+        centre = camera_centre(scene.source)
+        samplers = (
+            ViewSampler(scene.source, course.views, generator),
+            ViewSampler(scene.fixed, course.novel_views, generator),
+            ViewSampler(scene.heldout, JUDGES, generator),
+            ViewSampler(scene.truth, JUDGES, generator),
+        )
+        state = State.start(len(scene.scene), scene.scene.gaussians.means)
+        return Episode(course, frame, network.pyramid(frame, centre), Fixed.of(frame, centre), samplers, state)
+
+    def look(self, objective: Objective, generator: torch.Generator) -> Sight:
+        """Loss and gradient at the present offsets, on the next views that the optimiser may see."""
+        batch = [*self.samplers[0].draw(), *self.samplers[1].draw()]
+        return objective(self.frame, self.state.offsets, batch, self.state.iteration, generator)
+
+    def judge(self, objective: Objective, generator: torch.Generator) -> Sight:
+        """Loss and gradient at the present offsets, on views that the optimiser does not see."""
+        batch = [*self.samplers[2].draw(), *self.samplers[3].draw()]
+        return objective(self.frame, self.state.offsets, batch, 0, generator)
+
+    def step(self, network: LearnedOptimiser) -> torch.Tensor:
+        """Moves the state by the network's step and returns the step [N, 14], differentiable in the weights."""
+        assert self.sight is not None
+        self.state = self.state.saw(self.sight.gradient)
+        total = self.course.iterations
+        inputs = features(self.frame, self.columns, self.state, self.sight.gradient, total)
+        delta = network.delta(self.state, inputs, self.pyramid, total)
+        self.state = self.state.moved(self.frame, delta.detach())
+        return delta
+
+
+JUDGES = 3
+"""Held-out views, and true novel views, in each judgement."""
+
+
+def shifted(scene: SceneGraph, course: Course) -> SceneGraph:
+    """The scene with all sizes and opacities changed alike, so that training meets starts of many kinds."""
+    g: Gaussians = scene.gaussians
+    return scene.with_gaussians(
+        replace(
+            g,
+            log_scales=g.log_scales + course.log_scale_shift,
+            logit_opacities=g.logit_opacities + course.logit_shift,
+        )
+    )
