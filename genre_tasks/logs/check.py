@@ -98,7 +98,9 @@ class _Inspection:
         return self.attempt(lambda: self.log.camera_timestamp_s(camera.name, 0), "fatal") is not None
 
     def add(self, severity: Literal["fatal", "warning", "note"], message: str, remedy: str = "") -> None:
-        self.findings.append(Finding(severity, message, remedy))
+        finding = Finding(severity, message, remedy)
+        if finding not in self.findings:  # one broken file may be met twice
+            self.findings.append(finding)
 
     def attempt(self, read: Callable[[], Value], severity: Literal["fatal", "warning"]) -> Value | None:
         """What ``read`` returns; an ``InputError`` becomes a finding, and ``None``."""

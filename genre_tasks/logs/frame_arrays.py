@@ -38,8 +38,8 @@ def values(node: Any) -> NDArray[Any]:
     if node.function == "ArrowStringArray":
         return _arrow_strings(node.state["_pa_array"])
     if node.function == "backed" and node.args[:1] == (Global("StringArray"),):
-        parts: Any = node.state
-        return next(_ndarray(part) for part in parts if isinstance(part, Call) and part.function == "reconstruct")
+        cells = [part for part in node.state if isinstance(part, Call) and part.function == "reconstruct"]
+        return _ndarray(cells[0])
     raise PickleRefusedError(f"a column stored as {node.function}")
 
 

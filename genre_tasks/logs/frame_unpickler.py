@@ -118,7 +118,7 @@ def parse_frame(data: bytes) -> Frame:
     tree = read_pickle_tree(data, ALLOWED)
     try:
         return _frame(tree)
-    except (ValueError, TypeError, IndexError, KeyError, OverflowError, AttributeError) as error:
+    except (ValueError, TypeError, LookupError, OverflowError, AttributeError, RecursionError) as error:
         raise PickleBrokenError(f"{type(error).__name__}: {error}") from error
 
 

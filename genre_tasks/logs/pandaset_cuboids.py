@@ -14,7 +14,7 @@ import numpy as np
 
 from genre_tasks.errors import InputError
 from genre_tasks.logs.frame_unpickler import Frame
-from genre_tasks.logs.pandaset_layout import PANDA_R_OURS, SPINNING_SENSOR
+from genre_tasks.logs.pandaset_layout import BOX_HEADING, PANDA_R_OURS, SPINNING_SENSOR, rotations
 from genre_tasks.logs.types import CuboidTrack, Float64, LogProblem
 
 _BOX = ("position.x", "position.y", "position.z", "dimensions.x", "dimensions.y", "dimensions.z", "yaw")
@@ -23,7 +23,7 @@ _MIN_ID_PREFIX = 24  # a sibling id cut off by a few characters still names one 
 
 @dataclass
 class _Annotated:
-    """What the files say under one uuid: frame → the seven numbers of ``_BOX``."""
+    """What the files say under one uuid: frame → the seven numbers of ``_BOX``, and a quaternion."""
 
     uuid: str
     label: str
@@ -62,7 +62,7 @@ def _collect(objects: dict[str, _Annotated], frame: int, table: Frame) -> list[L
     if missing:
         remedy = "Copy the cuboids of the sequence again, or remove them: a log without tracks is survived."
         raise InputError(f"the cuboids lack the columns {', '.join(missing)}", remedy=remedy, frame=frame)
-    boxes = np.stack([np.asarray(table.columns[name], dtype=np.float64) for name in _BOX], axis=1)
+    boxes = _boxes(table)
     column = {name: values.tolist() for name, values in table.columns.items() if name not in _BOX}
     problems = []
     for row, uuid in enumerate(map(str, column["uuid"])):
@@ -70,12 +70,23 @@ def _collect(objects: dict[str, _Annotated], frame: int, table: Frame) -> list[L
         sibling = str(column["cuboids.sibling_id"][row]) if "cuboids.sibling_id" in column else "-"
         seen = objects.setdefault(uuid, _Annotated(uuid, str(column["label"][row]), sensor, sibling))
         box = boxes[row]
-        if not np.isfinite(box).all() or (box[3:6] <= 0).any():
+        if not np.isfinite(box).all() or (box[3:6] <= 0).any() or not box[7:].any():
             problems.append(LogProblem("invalid_box", f"the box of {seen.label} {uuid} in frame {frame} is not finite"))
             continue
         seen.boxes.setdefault(frame, box)
         seen.moving |= _moves({name: values[row] for name, values in column.items()})
     return problems
+
+
+def _boxes(table: Frame) -> Float64:
+    """[N, 11]: ``_BOX`` and the orientation as a quaternion, which is about z by the yaw unless the file says more."""
+    box = [np.asarray(table.columns[name], dtype=np.float64) for name in _BOX]
+    if all(name in table.columns for name in BOX_HEADING):
+        heading = [np.asarray(table.columns[name], dtype=np.float64) for name in BOX_HEADING]
+    else:
+        half = np.where(np.isfinite(box[-1]), box[-1], 0.0) / 2  # such a box is left out for its yaw
+        heading = [np.cos(half), np.zeros_like(half), np.zeros_like(half), np.sin(half)]
+    return np.stack([*box, *heading], axis=1)
 
 
 def _moves(row: dict[str, object]) -> bool:
@@ -132,10 +143,8 @@ def _track(group: list[_Annotated]) -> CuboidTrack | None:
 
 
 def _box_poses(rows: Float64) -> Float64:
-    """[F, 4, 4] from [F, 7] rows of ``_BOX``: yaw turns PandaSet's axes about the world's z."""
-    cos, sin = np.cos(rows[:, 6]), np.sin(rows[:, 6])
+    """[F, 4, 4] from rows [F, 11] of ``_boxes``."""
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = cos, -sin, sin, cos
-    poses[:, :3, :3] = poses[:, :3, :3] @ PANDA_R_OURS
+    poses[:, :3, :3] = rotations(rows[:, 7:]) @ PANDA_R_OURS
     poses[:, :3, 3] = rows[:, :3]
     return poses

@@ -2,7 +2,7 @@
 
 Checked by overlay on a real sequence: images are undistorted; ``poses.json`` is sensor → world; LiDAR and box axes are
 x right, y forward, z up (ours: x forward, y left, z up); principal points count from the centre of the first pixel
-(ours: from its corner).
+(ours: from its corner). The LiDAR pose's origin lies near the ground, about 1.8 m below the front camera.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ SPINNING_SENSOR = 0  # column d, and cuboids.sensor_id: the 64-beam Pandar64; 1 
 READOUT_S = 0.03  # rolling shutter of PandaSet's cameras, top to bottom row
 PIXEL_CENTRE = 0.5
 INTENSITY_SCALE = 255.0
+BOX_HEADING = ("heading.w", "heading.x", "heading.y", "heading.z")
+"""Extra cuboid columns of this project's writer, for boxes on a slope; PandaSet's own files have the yaw alone."""
 
 # Takes coordinates in our axes (x forward, y left, z up) to PandaSet's (x right, y forward, z up).
 PANDA_R_OURS = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -76,15 +78,22 @@ def pose_matrix(pose: Any, *, file: Path, log: str, frame: int, camera: str | No
     if not (np.isfinite(position).all() and np.isfinite(norm)) or norm < 1e-6:
         problem = "the pose is not finite, or its quaternion is zero"
         raise InputError(problem, remedy=_POSE_REMEDY, file=file, log=log, frame=frame, camera=camera)
-    w, x, y, z = quaternion / norm
     matrix = np.eye(4)
-    matrix[:3, :3] = [
+    matrix[:3, :3] = rotations(quaternion[None])[0]
+    matrix[:3, 3] = position
+    return matrix
+
+
+def rotations(quaternions: Float64) -> Float64:
+    """[N, 3, 3] from quaternions [N, 4] (w, x, y, z) of any non-zero length."""
+    w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
+    rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    matrix[:3, 3] = position
-    return matrix
+    matrices: Float64 = np.moveaxis(np.array(rows), 2, 0)
+    return matrices
 
 
 _POSE_REMEDY = "Correct the pose in that file, or leave its chunk out with --chunks."
@@ -92,11 +101,20 @@ _POSE_REMEDY = "Correct the pose in that file, or leave its chunk out with --chu
 
 def pose_entry(world_SE3_sensor: Float64) -> dict[str, dict[str, float]]:
     """The entry of a ``poses.json`` for a [4, 4] pose."""
+    heading = quaternions(world_SE3_sensor[None, :3, :3])[0]
+    position = world_SE3_sensor[:3, 3]
+    return {
+        "position": {axis: float(value) for axis, value in zip("xyz", position, strict=True)},
+        "heading": {axis: float(value) for axis, value in zip("wxyz", heading, strict=True)},
+    }
+
+
+def quaternions(rotation: Float64) -> Float64:
+    """[N, 4] unit quaternions (w, x, y, z) of rotations [N, 3, 3]."""
     from scipy.spatial.transform import Rotation
 
-    x, y, z, w = (float(v) for v in Rotation.from_matrix(world_SE3_sensor[:3, :3]).as_quat())
-    px, py, pz = (float(v) for v in world_SE3_sensor[:3, 3])
-    return {"position": {"x": px, "y": py, "z": pz}, "heading": {"w": w, "x": x, "y": y, "z": z}}
+    turned: Float64 = Rotation.from_matrix(rotation).as_quat()[:, [3, 0, 1, 2]]
+    return turned
 
 
 def to_our_axes(world_SE3_panda: Float64) -> Float64:

@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 from genre_tasks.errors import InputError, ResourceError
 from genre_tasks.logs.frame_pickler import pickle_frame
 from genre_tasks.logs.pandaset_layout import (
+    BOX_HEADING,
     INTENSITY_SCALE,
     PANDA_R_OURS,
     PIXEL_CENTRE,
     SPINNING_SENSOR,
     frame_stem,
     pose_entry,
+    quaternions,
     to_panda_axes,
 )
 from genre_tasks.logs.types import Camera, CuboidTrack, DrivingLog, Float64, Sweep
@@ -28,18 +30,17 @@ from genre_tasks.progress import Progress, silent
 
 _SIGNATURES = {b"\xff\xd8\xff": ".jpg", b"\x89PNG\r\n\x1a\n": ".png"}
 _GZIP_LEVEL = 4  # coordinates are noise in their low bits: higher levels take three times as long for 2 %
-_MAX_TILT = 1e-6
 
 
 def write_pandaset(log: DrivingLog, folder: Path, progress: Progress = silent) -> Path:
     """Writes ``log`` as the sequence folder ``folder`` (``…/002``) and returns it.
 
     Images keep their bytes (``.jpg``, or ``.png`` for a lossless log); what is missing stays missing. The folder
-    appears whole or not at all. Distortion and readout, which PandaSet does not state, are kept in ``intrinsics.json``.
+    appears whole or not at all. What PandaSet does not state (distortion, readout, a box's tilt) has
+    fields of its own.
 
     Raises:
-        InputError: the folder holds something already; the log itself raises; an image is neither JPEG nor PNG; a box
-            is tilted (the layout knows only a yaw).
+        InputError: the folder holds something already; the log itself raises; an image is neither JPEG nor PNG.
         ResourceError: the disk is full or not writable.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -130,24 +131,15 @@ def _sweep_columns(sweep: Sweep) -> dict[str, NDArray[Any]]:
 
 def _write_cuboids(log: DrivingLog, root: Path) -> None:
     tracks = log.tracks()
-    yaws = {track.track_id: _yaw(track, log) for track in tracks}
+    turns = {track.track_id: track.world_SE3_box[:, :3, :3] @ PANDA_R_OURS.T for track in tracks}
     for frame in range(log.frame_count):
         rows = [(t, int(np.flatnonzero(t.frames == frame)[0])) for t in tracks if frame in t.frames]
+        rotation = np.array([turns[t.track_id][k] for t, k in rows], dtype=np.float64).reshape(-1, 3, 3)
         path = root / "annotations/cuboids" / f"{frame_stem(frame)}.pkl.gz"
-        _write_frame(path, _cuboid_columns(rows, yaws))
+        _write_frame(path, _cuboid_columns(rows, rotation))
 
 
-def _yaw(track: CuboidTrack, log: DrivingLog) -> Float64:
-    """[F] about the world's z, the box's length along PandaSet's local +y."""
-    rotation = track.world_SE3_box[:, :3, :3] @ PANDA_R_OURS.T
-    if np.abs(rotation[:, 2, :2]).max(initial=0.0) > _MAX_TILT:
-        remedy = "Leave this track out: the PandaSet layout knows only a yaw about the vertical."
-        raise InputError(f"the box of track {track.track_id} is tilted", remedy=remedy, log=log.uri)
-    yaw: Float64 = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
-    return yaw
-
-
-def _cuboid_columns(rows: list[tuple[CuboidTrack, int]], yaws: dict[str, Float64]) -> dict[str, NDArray[Any]]:
+def _cuboid_columns(rows: list[tuple[CuboidTrack, int]], rotation: Float64) -> dict[str, NDArray[Any]]:
     """The columns of PandaSet's own files; ``sensor_id`` −1: seen by one sensor only, no sibling."""
     tracks = [track for track, _ in rows]
     centres = np.array([t.world_SE3_box[k, :3, 3] for t, k in rows], dtype=np.float64).reshape(-1, 3)
@@ -156,7 +148,7 @@ def _cuboid_columns(rows: list[tuple[CuboidTrack, int]], yaws: dict[str, Float64
     columns: dict[str, NDArray[Any]] = {
         "uuid": np.array([t.track_id for t in tracks], dtype=object),
         "label": np.array([t.label for t in tracks], dtype=object),
-        "yaw": np.array([yaws[t.track_id][k] for t, k in rows], dtype=np.float64),
+        "yaw": np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]),
         "stationary": ~moving,
         "camera_used": np.full(len(rows), -1, dtype=np.int64),
     }
@@ -165,4 +157,6 @@ def _cuboid_columns(rows: list[tuple[CuboidTrack, int]], yaws: dict[str, Float64
     columns["attributes.object_motion"] = np.array(["Moving" if m else "Parked" for m in moving], dtype=object)
     columns["cuboids.sibling_id"] = np.array(["-"] * len(rows), dtype=object)
     columns["cuboids.sensor_id"] = np.full(len(rows), -1, dtype=np.int64)
+    if np.abs(rotation[:, 2, :2]).max(initial=0.0) > 0:
+        columns |= dict(zip(BOX_HEADING, quaternions(rotation).T, strict=True))
     return columns

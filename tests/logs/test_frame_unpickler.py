@@ -259,11 +259,19 @@ class TestBounds:
         assert self._peak(b"\x80\x04" + opcode + b"abc.") < 2**20
 
     def test_deep_nesting_is_no_crash(self) -> None:
-        deep = b"\x80\x03)" + b"\x85" * 300_000 + b"."
+        deep = b"\x80\x03)" + b"\x85" * 100_000 + b"."
         with pytest.raises(PickleBrokenError):
             parse_frame(deep)
         with pytest.raises(PickleRefusedError):
-            parse_frame(b"\x80\x03})" + b"\x85" * 300_000 + b"Ns.")
+            parse_frame(b"\x80\x03})" + b"\x85" * 100_000 + b"Ns.")
+
+    def test_deep_calls_are_no_crash(self) -> None:
+        data = pickle_frame({"x": np.zeros(3)})
+        numbers = b"B" + struct.pack("<I", 24) + bytes(24)
+        wrapped = b"cbuiltins\nbytearray\n" * 5000 + numbers + b"\x85R" * 5000
+        assert data.count(numbers) == 1
+        with pytest.raises(PickleBrokenError, match="RecursionError"):
+            parse_frame(data.replace(numbers, wrapped))
 
     def test_bomb(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr("genre_tasks.logs.frame_unpickler.MAX_UNPACKED_BYTES", 2**20)
