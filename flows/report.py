@@ -28,11 +28,10 @@ _TRUTH = ".truth"
 
 @dataclass(frozen=True)
 class Kind:
-    """How a metric is shown: its label, which direction is better, its scale and decimals."""
+    """How a metric is shown: its label, which direction is better, its decimals."""
 
     label: str
     higher: bool
-    scale: float = 1.0
     decimals: int = 3
 
 
@@ -40,7 +39,7 @@ KINDS = {
     "psnr": Kind("PSNR, dB", True, decimals=2),
     "ssim": Kind("SSIM", True, decimals=4),
     "perceptual": Kind("Perceptual", False, decimals=4),
-    "kernel": Kind("Kernel × 10³", False, scale=1e3, decimals=2),
+    "kernel": Kind("Kernel", False, decimals=4),
     "frechet": Kind("Fréchet", False, decimals=3),
 }
 
@@ -139,7 +138,7 @@ def headline(chunk: ChunkSummary) -> list[tuple[str, str, str]]:
         ("Held-out PSNR after ENet", enet, gnet, "interpolation/psnr", "GNet"),
         ("Fixed images at 3 m, PSNR", fnet, given, "shift_3m/psnr", "renders"),
         ("Perceptual at 3 m after ENet", enet, gnet, "shift_3m/perceptual", "GNet"),
-        ("Kernel × 10³ at 3 m after ENet", enet, gnet, "shift_3m/kernel", "GNet"),
+        ("Kernel at 3 m after ENet", enet, gnet, "shift_3m/kernel", "GNet"),
     ]  # fmt: skip
     out = []
     for label, now, before, name, against in wanted:
@@ -225,7 +224,7 @@ def _metrics(chunk: ChunkSummary, name: str) -> Mapping[str, float]:
 def _text(value: float, kind: Kind, sign: bool = False) -> str:
     if not math.isfinite(value):
         return "not finite"
-    return f"{value * kind.scale:{'+' if sign else ''}.{kind.decimals}f}".replace("-", "−")
+    return f"{value:{'+' if sign else ''}.{kind.decimals}f}".replace("-", "−")
 
 
 def _group_order(group: str) -> tuple[bool, float, str]:
