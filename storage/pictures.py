@@ -54,19 +54,23 @@ def from_above(
     positions: NDArray[np.float32],  # [N, 3] metres, z up
     colors: NDArray[np.float32],  # [N, 3] sRGB
 ) -> Image8 | None:
-    """Points seen from above (x to the right, y up), the highest in front; the farthest 1 % are cut off."""
+    """Points seen from above (x to the right, y up), the highest in front; the farthest 1 % are cut off.
+
+    A pixel is at least so large that it holds 1.5 points on average, so that few points still make surfaces.
+    """
     if not len(positions):
         return None
     low, high = np.percentile(positions[:, :2], [1, 99], axis=0)
     extent = np.maximum(high - low, 1.0)
-    scale = _MAP_PX / extent.max()
-    width, height = (int(v) for v in np.ceil(extent * scale) + 1)
+    scale = min(_MAP_PX / extent.max(), float(np.sqrt(len(positions) / 1.5 / extent.prod())))
+    width, height = (int(v) for v in np.floor(extent * scale) + 1)
     order = np.argsort(positions[:, 2], kind="stable")
     pixel = np.floor((positions[order, :2] - low) * scale).astype(int)
     inside = ((pixel >= 0) & (pixel < [width, height])).all(1)
     image = np.full((height, width, 3), 24, np.uint8)
     image[height - 1 - pixel[inside, 1], pixel[inside, 0]] = as_uint8(colors[order][inside])
-    return image
+    enlarge = max(1, _MAP_PX // max(height, width))
+    return image.repeat(enlarge, 0).repeat(enlarge, 1)
 
 
 def _chunk(folder: Path) -> Image8 | None:

@@ -89,13 +89,14 @@ class StoreSuite:
         assert two.manifest == one.manifest
         assert_same(make("evaluation", 0), store.read(two), "evaluation")
 
-    def test_two_threads_on_one_key(self, store: Store, second: Store) -> None:
+    @pytest.mark.parametrize("kind", ["reconstruction", "novel_views"])
+    def test_many_threads_on_one_key(self, store: Store, second: Store, kind: str) -> None:
         results: list[Any] = []
         start = threading.Barrier(6)
 
         def work(k: int) -> None:
             start.wait()
-            results.append(self.commit((store, second)[k % 2], "reconstruction", seed=k, warnings=(str(k),)))
+            results.append(self.commit((store, second)[k % 2], kind, seed=k, warnings=(str(k),)))
 
         threads = [threading.Thread(target=work, args=(k,)) for k in range(6)]
         for t in threads:
@@ -104,7 +105,7 @@ class StoreSuite:
             t.join()
         assert len(results) == 6 and len({r.manifest.warnings for r in results}) == 1
         winner = int(results[0].manifest.warnings[0])
-        assert_same(make("reconstruction", winner), store.read(results[0]), "reconstruction")
+        assert_same(make(kind, winner), store.read(results[0]), kind, COLORS)
         assert len(list(store.artifacts())) == 1
 
     def test_discard_removes_that_one_only(self, store: Store) -> None:
