@@ -86,7 +86,7 @@ def isas_for(compiler: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
 
 
 def build_kernel(target_dir: Path) -> list[Path]:
-    """Compiles every library of :func:`isas_for` the compiler found into ``target_dir`` (some seconds) and returns their paths.
+    """Compiles into ``target_dir`` every library that the compiler found can make (some seconds); returns their paths.
 
     Each appears whole or not at all, so a running process keeps the one it has loaded. Raises ``RuntimeError`` without
     a compiler or when it fails, with its last lines.

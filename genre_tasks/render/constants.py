@@ -18,8 +18,11 @@ ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.99
 """Keeps 1 − α invertible in the backward pass; the gradient in opacity and footprint is zero where it clamps."""
 
-TRANSMITTANCE_STOP = 1e-4
-"""A ray ends before a layer that would leave less than (1 − ALPHA_MAX)²: two opaque splats end a ray."""
+TRANSMITTANCE_STOP = 9.99e-5
+"""A ray ends before a layer that would leave less: two opaque splats, (1 − ALPHA_MAX)² = 1e-4, end a ray.
+
+A thousandth below 1e-4, so that rounding does not decide (in float32 the square is just below 1e-4, in float64 above).
+"""
 
 JACOBIAN_MARGIN = 0.3
 """The linearisation point is limited to the image edge plus this × tan(fov / 2), per side: EWA explodes off-axis."""

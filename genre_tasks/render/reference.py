@@ -82,12 +82,9 @@ def _block(front: _Footprints, inside: Tensor, box: tuple[int, int, int, int]) -
 
 
 def _project(splats: Splats, cameras: Cameras, v: int, culled: dict[str, int]) -> _Footprints:
-    """Culls, counts and projects; means, scales, … of culled Gaussians are never touched, so no NaN can leak."""
-    like = splats.means
-    pose = cameras.camera_SE3_chunk[v].to(like)
-    (fx, fy), (cx, cy) = cameras.focal_px[v].to(like), cameras.center_px[v].to(like)
-    width, height = cameras.width_px, cameras.height_px
+    """Culls, counts and projects. No derivative ever passes through a culled Gaussian, so no NaN can leak from it."""
     with torch.no_grad():
+        pose = cameras.camera_SE3_chunk[v].to(splats.means)
         values = (splats.means, splats.scales, splats.quats, splats.opacities[:, None], splats.colors)
         finite = torch.isfinite(torch.cat(values, 1)).all(1)
         turned = finite & (splats.quats.square().sum(1) >= const.QUAT_MIN_NORM2)
@@ -96,30 +93,41 @@ def _project(splats: Splats, cameras: Cameras, v: int, culled: dict[str, int]) -
         culled["quaternion"] += int((finite & ~turned).sum())
         culled["behind"] += int((turned & ~ahead).sum())
         at = torch.nonzero(ahead & (splats.opacities >= const.ALPHA_MIN))[:, 0]
-    points = splats.means[at] @ pose[:3, :3].T + pose[:3, 3]
-    x, y, z = points.unbind(1)
+        center, (xx, _, yy), det, z = _geometry(splats, cameras, v, at)
+        sound = (det > 0) & (torch.maximum(xx, yy) <= const.MAX_VARIANCE_PX2)
+        sound &= (center.abs() <= const.MAX_CENTER_PX).all(1)
+        culled["degenerate"] += int((~sound).sum())
+        level = 2 * torch.log(splats.opacities[at] / const.ALPHA_MIN) * (1 + 1e-6)
+        half = torch.sqrt(level[:, None] * torch.stack([xx, yy], 1))
+        size = center.new_tensor([cameras.width_px, cameras.height_px])
+        seen = sound & ((center + half >= 0.5) & (center - half <= size - 0.5)).all(1)
+        order = torch.argsort(z[seen], stable=True)
+        at, half = at[seen][order], half[seen][order]
+    center, (xx, xy, yy), det, z = _geometry(splats, cameras, v, at)
+    conic = torch.stack([yy, -xy, xx], 1) / det[:, None]
+    return _Footprints(center, conic, splats.opacities[at], torch.cat([splats.colors[at], z[:, None]], 1), half)
+
+
+def _geometry(
+    splats: Splats, cameras: Cameras, v: int, at: Tensor
+) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], Tensor, Tensor]:
+    """Of the Gaussians ``at``: centres [K, 2] px, blurred covariance xx, xy, yy in px², its determinant, camera z."""
+    like = splats.means
+    pose = cameras.camera_SE3_chunk[v].to(like)
+    (fx, fy), (cx, cy) = cameras.focal_px[v].to(like), cameras.center_px[v].to(like)
+    width, height = cameras.width_px, cameras.height_px
+    x, y, z = (splats.means[at] @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
     mx, my = (const.JACOBIAN_MARGIN * size / (2 * f) for size, f in ((width, fx), (height, fy)))
-    u = (x / z).clamp(-cx / fx - mx, (width - cx) / fx + mx)
-    v_ = (y / z).clamp(-cy / fy - my, (height - cy) / fy + my)
+    x_limited = (x / z).clamp(-cx / fx - mx, (width - cx) / fx + mx)
+    y_limited = (y / z).clamp(-cy / fy - my, (height - cy) / fy + my)
     zero = torch.zeros_like(z)
-    jacobian = torch.stack([fx / z, zero, -fx * u / z, zero, fy / z, -fy * v_ / z], 1).view(-1, 2, 3)
+    jacobian = torch.stack([fx / z, zero, -fx * x_limited / z, zero, fy / z, -fy * y_limited / z], 1).view(-1, 2, 3)
     m = jacobian @ pose[:3, :3] @ rotation_matrices(splats.quats[at]) * splats.scales[at][:, None, :]
     xx, yy = m.square().sum(2).unbind(1)
     xx, yy, xy = xx + const.BLUR_PX2, yy + const.BLUR_PX2, (m[:, 0] * m[:, 1]).sum(1)
     # Lagrange's identity: xx·yy − xy² cancels for long thin footprints.
     det = torch.linalg.cross(m[:, 0], m[:, 1]).square().sum(1) + const.BLUR_PX2 * (xx + yy - const.BLUR_PX2)
-    center = torch.stack([fx * x / z + cx, fy * y / z + cy], 1)
-    with torch.no_grad():
-        sound = (det > 0) & (torch.maximum(xx, yy) <= const.MAX_VARIANCE_PX2)
-        sound &= (center.abs() <= const.MAX_CENTER_PX).all(1)
-        culled["degenerate"] += int((~sound).sum())
-        keep = torch.nonzero(sound)[:, 0]
-        keep = keep[torch.argsort(z[keep], stable=True)]
-        level = 2 * torch.log(splats.opacities[at][keep] / const.ALPHA_MIN) * (1 + 1e-6)
-        half = torch.sqrt(level[:, None] * torch.stack([xx, yy], 1)[keep])
-    conic = torch.stack([yy, -xy, xx], 1)[keep] / det[keep][:, None]
-    features = torch.cat([splats.colors[at], z[:, None]], 1)[keep]
-    return _Footprints(center[keep], conic, splats.opacities[at][keep], features, half)
+    return torch.stack([fx * x / z + cx, fy * y / z + cy], 1), (xx, xy, yy), det, z
 
 
 def _composite(

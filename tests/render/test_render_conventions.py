@@ -1,0 +1,162 @@
+"""What the numbers of an image mean, and that faults in the input stay where they are."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from genre_tasks.errors import NonFiniteError
+from genre_tasks.render import Cameras, RenderSettings, render
+from genre_tasks.scene.gaussians import Splats
+
+BOTH = pytest.mark.parametrize(
+    "settings", [RenderSettings("cpu", 1), RenderSettings("reference")], ids=lambda s: s.backend
+)
+
+
+def _camera(size: int = 17, focal: float = 50.0) -> Cameras:
+    return Cameras(torch.eye(4)[None], torch.full((1, 2), focal), torch.full((1, 2), size / 2), size, size)
+
+
+def _on_axis(depths: list[float], opacities: list[float]) -> Splats:
+    n = len(depths)
+    means = torch.zeros(n, 3)
+    means[:, 2] = torch.tensor(depths)
+    colors = torch.tensor([[0.2, 0.5, 0.8]]).repeat(n, 1)
+    return Splats(
+        means, torch.full((n, 3), 0.2), torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1), torch.tensor(opacities), colors
+    )
+
+
+@BOTH
+def test_one_gaussian_is_the_analytic_one(settings):
+    out = render(_on_axis([5.0], [0.8]), _camera(), settings)
+    offset = torch.arange(17.0) - 8  # pixel centres from the principal point
+    variance = (50 * 0.2 / 5) ** 2 + 0.3
+    alpha = 0.8 * torch.exp(-(offset[:, None] ** 2 + offset[None] ** 2) / (2 * variance))
+    alpha = torch.where(alpha >= 1 / 255, alpha, torch.zeros(()))
+    assert 0 < (alpha > 0).float().mean() < 1
+    assert torch.allclose(out.alpha[0], alpha, atol=1e-6)
+    assert torch.allclose(out.depth[0], 5 * alpha, atol=5e-6)
+    assert torch.allclose(out.color[0], alpha[..., None] * torch.tensor([0.2, 0.5, 0.8]), atol=1e-6)
+    assert torch.allclose(out.expected_depth()[0], torch.where(alpha > 0, 5.0, 0.0), atol=1e-4)
+
+
+@BOTH
+def test_alpha_clamps_without_gradient_and_two_opaque_layers_end_a_ray(settings):
+    splats = _on_axis([5.0, 6.0, 7.0], [1.0, 1.0, 1.0])
+    opacities = splats.opacities.clone().requires_grad_()
+    out = render(replace(splats, opacities=opacities), _camera(), settings)
+    middle = (0, 8, 8)
+    assert out.alpha[middle].item() == pytest.approx(1 - 0.01**2, abs=1e-6)  # the third layer is not reached
+    assert out.depth[middle].item() == pytest.approx(0.99 * 5 + 0.01 * 0.99 * 6, abs=1e-5)
+    out.alpha[middle].backward()
+    assert opacities.grad is not None and torch.equal(opacities.grad, torch.zeros(3))
+
+
+@BOTH
+def test_opacity_gradient_below_the_clamp(settings):
+    opacities = torch.tensor([0.6], requires_grad=True)
+    out = render(replace(_on_axis([5.0], [0.6]), opacities=opacities), _camera(), settings)
+    out.alpha[0, 8, 8].backward()
+    assert opacities.grad is not None and opacities.grad.item() == pytest.approx(1.0, abs=1e-6)
+
+
+@BOTH
+def test_nothing_to_draw(scene, settings):
+    splats, cameras = scene(0, 33, 17, views=2)
+    out = render(splats, cameras, settings)
+    assert out.color.shape == (2, 17, 33, 3) and out.alpha.shape == out.depth.shape == (2, 17, 33)
+    assert not out.color.any() and not out.alpha.any() and not out.depth.any() and out.culled == {}
+    splats, cameras = scene(50)
+    none = replace(cameras, **{n: getattr(cameras, n)[:0] for n in ("camera_SE3_chunk", "focal_px", "center_px")})
+    assert render(splats, none, settings).color.shape == (0, 48, 64, 3)
+
+
+ENTRIES = [("means", k) for k in range(3)] + [("scales", k) for k in range(3)] + [("quats", k) for k in range(4)]
+ENTRIES += [("opacities", None), *(("colors", k) for k in range(3))]
+
+
+@BOTH
+@pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize(("name", "entry"), ENTRIES)
+def test_poison_touches_nothing_else(scene, gradients, settings, name, entry, poison):
+    splats, cameras = scene(40, 33, 17)
+    n = 7
+    values = getattr(splats, name).clone()
+    values[(n,) if entry is None else (n, entry)] = poison
+    out, grads = gradients(replace(splats, **{name: values}), cameras, settings)
+    rest = torch.arange(40) != n
+    clean, expected = gradients(Splats(*(getattr(splats, a)[rest] for a in grads)), cameras, settings)
+    assert out.culled == {"non_finite": 1} and clean.culled == {}
+    for image in ("color", "alpha", "depth"):
+        assert torch.equal(getattr(out, image), getattr(clean, image))
+    for attribute, grad in grads.items():
+        assert torch.equal(grad[rest], expected[attribute]) and not grad[n].any()
+
+
+@BOTH
+def test_bad_quaternions_and_what_is_behind_are_counted(scene, gradients, settings):
+    splats, cameras = scene(40, views=2)
+    quats, means = splats.quats.clone(), splats.means.clone()
+    quats[3], quats[4] = 0.0, 1e-4
+    means[5] = torch.tensor([0.0, 0.0, -3.0])
+    out, grads = gradients(replace(splats, quats=quats, means=means), cameras, settings)
+    assert out.culled == {"quaternion": 4, "behind": 2}
+    assert all(torch.isfinite(g).all() and not g[3:6].any() for g in grads.values())
+
+
+@BOTH
+def test_length_and_sign_of_quaternions_do_not_matter(scene, settings):
+    splats, cameras = scene(100)
+    image = render(splats, cameras, settings).color
+    for factor in (-1.0, 8.0, 1e-2, 1e18, 1e30):
+        assert torch.allclose(
+            render(replace(splats, quats=splats.quats * factor), cameras, settings).color, image, atol=2e-5
+        )
+
+
+@BOTH
+@pytest.mark.parametrize("size", [math.exp(-30), 0.0, 1e4, 1e9, math.exp(40)])
+@pytest.mark.parametrize("axes", [[0], [0, 1], [0, 1, 2]])
+def test_extreme_sizes_stay_finite(scene, gradients, settings, size, axes):
+    splats, cameras = scene(60, 33, 17)
+    scales = splats.scales.clone()
+    scales[::7, axes] = size
+    out, grads = gradients(replace(splats, scales=scales), cameras, settings)
+    assert all(torch.isfinite(x).all() for x in (out.color, out.alpha, out.depth, *grads.values()))
+    assert out.alpha.min() >= 0 and out.alpha.max() <= 1
+
+
+@BOTH
+@pytest.mark.parametrize(
+    "place", [(0, 0, 0), (0, 0, 0.01), (1e5, 0, 1e5), (1e38, -1e38, 1e38), (300, 0, 0.011), (4e6, 4e6, 50)]
+)
+def test_extreme_places_stay_finite(scene, gradients, settings, place):
+    splats, cameras = scene(60, 33, 17)
+    means = splats.means.clone()
+    means[::7] = torch.tensor(place, dtype=torch.float32)
+    out, grads = gradients(replace(splats, means=means), cameras, settings)
+    assert all(torch.isfinite(x).all() for x in (out.color, out.alpha, out.depth, *grads.values()))
+
+
+def test_half_precision_in_float32_out(scene):
+    splats, cameras = scene(100)
+    rounded = splats.to(torch.bfloat16)
+    out = render(rounded, cameras)
+    assert out.color.dtype == torch.float32
+    assert torch.equal(out.color, render(rounded.to(torch.float32), cameras).color)
+
+
+def test_faulty_arguments_are_named(scene):
+    splats, cameras = scene(5)
+    with pytest.raises(ValueError, match=r"expected quats of shape \(5, 4\), got \(5, 3\)"):
+        render(replace(splats, quats=splats.quats[:, :3]), cameras)
+    bad = cameras.camera_SE3_chunk.clone()
+    bad[0, 1, 3] = math.nan
+    with pytest.raises(NonFiniteError) as caught:
+        render(splats, replace(cameras, camera_SE3_chunk=bad))
+    assert caught.value.tensor == "camera_SE3_chunk" and caught.value.first_index == (0, 1, 3)

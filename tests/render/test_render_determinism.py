@@ -1,0 +1,119 @@
+"""The same bits: from run to run, at any number of threads, with other views or alone, with or without the culled."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from genre_tasks.logs.types import Lens
+from genre_tasks.render import Cameras, RenderSettings, render, render_views
+from genre_tasks.scene.gaussians import Gaussians, Splats
+from genre_tasks.scene.graph import FIRST_ACTOR, STATIC, ActorNode, SceneGraph
+from genre_tasks.scene.views import NovelView
+
+IMAGES = ("color", "alpha", "depth")
+ONE = RenderSettings("cpu", 1)
+
+
+def _same(a, b) -> bool:
+    (image, grads), (other, expected) = a, b
+    images = all(torch.equal(getattr(image, n), getattr(other, n)) for n in IMAGES)
+    return images and image.culled == other.culled and all(torch.equal(grads[n], expected[n]) for n in expected)
+
+
+@pytest.mark.parametrize("views", [1, 3])
+@pytest.mark.parametrize(("n", "width", "height"), [(1, 1, 1), (301, 33, 17), (5003, 320, 180)])
+def test_same_bits_at_any_thread_count_and_again(scene, gradients, n, width, height, views):
+    splats, cameras = scene(n, width, height, views=views)
+    first = gradients(splats, cameras, ONE)
+    assert n == 1 or first[0].alpha.mean() > 0.1
+    assert _same(gradients(splats, cameras, ONE), first)
+    for threads in (2, 3, 5):
+        assert _same(gradients(splats, cameras, RenderSettings("cpu", threads)), first), threads
+
+
+def test_many_views_are_the_single_views(scene, gradients):
+    splats, cameras = scene(2000, views=5)
+    together, grads = gradients(splats, cameras, RenderSettings("cpu", 2))
+    parts = {n: getattr(cameras, n) for n in ("camera_SE3_chunk", "focal_px", "center_px")}
+    for v in range(5):
+        alone = render(splats, replace(cameras, **{n: t[v : v + 1] for n, t in parts.items()}), ONE)
+        assert all(torch.equal(getattr(together, n)[v], getattr(alone, n)[0]) for n in IMAGES)
+    assert all(torch.isfinite(g).all() for g in grads.values())
+
+
+def test_identical_depths_keep_the_input_order(scene, gradients):
+    splats, cameras = scene(200)
+    level = replace(splats, means=splats.means * torch.tensor([1.0, 1.0, 0.0]) + torch.tensor([0.0, 0.0, 9.0]))
+    straight = replace(cameras, camera_SE3_chunk=torch.eye(4)[None])
+    first = gradients(level, straight, ONE)
+    assert _same(gradients(level, straight, RenderSettings("cpu", 2)), first)
+    truth = render(level.to(torch.float64), straight, RenderSettings("reference"))
+    assert torch.allclose(first[0].color.double(), truth.color, atol=1e-5)
+    flipped = Splats(*(getattr(level, n).flip(0) for n in first[1]))
+    assert not torch.allclose(render(flipped, straight, ONE).color, first[0].color, atol=1e-3)
+
+
+def test_adding_what_is_culled_changes_no_bit(scene):
+    splats, cameras = scene(500)
+    extra, _ = scene(100, seed=9)
+    hidden = [replace(extra, means=extra.means * -1.0), replace(extra, opacities=extra.opacities * 0)]
+    hidden.append(replace(extra, quats=extra.quats * 0))
+    all_of = Splats(
+        *(torch.cat([getattr(s, n) for s in (hidden[0], splats, *hidden[1:])]) for n in Splats.__annotations__)
+    )
+    image, more = render(splats, cameras, ONE), render(all_of, cameras, RenderSettings("cpu", 2))
+    assert all(torch.equal(getattr(image, n), getattr(more, n)) for n in IMAGES)
+
+
+def test_a_retained_graph_gives_the_same_gradient_twice(scene):
+    splats, cameras = scene(300)
+    means = splats.means.clone().requires_grad_()
+    loss = render(replace(splats, means=means), cameras, ONE).color.square().sum()
+    (first,) = torch.autograd.grad(loss, means, retain_graph=True)
+    (second,) = torch.autograd.grad(loss, means)
+    assert torch.equal(first, second)
+
+
+def test_python_threads_may_render_at_the_same_time(scene, gradients):
+    jobs = [scene(1000 + 50 * k, views=2, seed=k) for k in range(6)]
+    expected = [gradients(*job, ONE) for job in jobs]
+    with ThreadPoolExecutor(3) as pool:
+        found = list(pool.map(lambda job: gradients(*job, RenderSettings("cpu", 2)), jobs))
+    assert all(_same(a, b) for a, b in zip(found, expected, strict=True))
+
+
+def _graph(splats: Splats) -> SceneGraph:
+    gaussians = Gaussians(splats.means, splats.scales.log(), splats.quats, torch.logit(splats.opacities), splats.colors)
+    path = np.broadcast_to(np.eye(4), (2, 4, 4)).copy()
+    path[1, 0, 3] = 3.0
+    actor = ActorNode("a", "car", (4.0, 2.0, 1.5), np.array([0, 1]), path)
+    nodes = torch.where(torch.arange(len(splats)) % 2 == 0, STATIC, FIRST_ACTOR)
+    return SceneGraph(gaussians, nodes, (actor,))
+
+
+def test_views_of_moving_actors_keep_their_order(scene):
+    splats, cameras = scene(300, views=2)
+    graph = _graph(splats)
+    lens = Lens(45.0, 45.0, 32.0, 24.0, 64, 48)
+    poses = [np.linalg.inv(p.double().numpy()) for p in cameras.camera_SE3_chunk]
+    views = [NovelView("c", f, 0.0, poses[v], lens, ("c", 0)) for f, v in ((1, 0), (0, 1), (1, 1), (2, 0), (0, 0))]
+    out = render_views(graph, views, ONE)
+    for i, view in enumerate(views):
+        alone = render(graph.at(view.frame).activated(), Cameras.of([view.chunk_SE3_camera], [lens]), ONE)
+        assert all(torch.equal(getattr(out, n)[i], getattr(alone, n)[0]) for n in IMAGES)
+    assert not torch.equal(out.color[0], out.color[4])
+    still = render_views(replace(graph, actors=()), views, ONE)
+    assert torch.equal(still.color[0], still.color[4])
+
+
+def test_views_of_mixed_sizes_are_refused(scene):
+    graph = _graph(scene(10)[0])
+    lenses = [Lens(45.0, 45.0, 32.0, 24.0, 64, 48), Lens(45.0, 45.0, 32.0, 24.0, 32, 24)]
+    views = [NovelView("c", 0, 0.0, np.eye(4), lens, ("c", 0)) for lens in lenses]
+    with pytest.raises(ValueError, match="one image size"):
+        render_views(graph, views)

@@ -1,0 +1,120 @@
+"""Building and loading the kernel: every failure has one clear line, and constants exist once."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from genre_tasks.errors import ConfigError, ResourceError
+from genre_tasks.render import RenderSettings, build_kernel, constants, cpu, kernel_library, render
+
+
+@pytest.fixture
+def fresh_loader():
+    kernel_library.load_kernel.cache_clear()
+    yield kernel_library.load_kernel
+    kernel_library.load_kernel.cache_clear()
+
+
+def test_missing_library_says_what_to_run(tmp_path, fresh_loader):
+    with pytest.raises(ResourceError, match=r"not compiled.*pip install -e \.") as caught:
+        fresh_loader(tmp_path)
+    assert str(tmp_path) in str(caught.value.file)
+
+
+def test_stale_library_is_refused(tmp_path, fresh_loader, monkeypatch):
+    for isa in kernel_library.supported_isas():
+        shutil.copy(build_kernel.HERE / build_kernel.library_name(isa), tmp_path)
+    assert fresh_loader(tmp_path)
+    fresh_loader.cache_clear()
+    monkeypatch.setattr(build_kernel, "source_digest", lambda: "0" * 16)
+    with pytest.raises(ResourceError, match="older than its sources"):
+        fresh_loader(tmp_path)
+
+
+def test_broken_library_is_refused(tmp_path, fresh_loader):
+    (tmp_path / build_kernel.library_name(kernel_library.supported_isas()[0])).write_bytes(b"not a library")
+    with pytest.raises(ResourceError, match="does not load"):
+        fresh_loader(tmp_path)
+
+
+def test_an_instruction_set_that_is_lacking_is_never_loaded(fresh_loader, monkeypatch):
+    monkeypatch.setenv("GENRE_RENDER_ISA", "avx10")
+    with pytest.raises(ConfigError, match="GENRE_RENDER_ISA=avx10"):
+        fresh_loader()
+    monkeypatch.delenv("GENRE_RENDER_ISA")
+    monkeypatch.setattr(kernel_library, "_cpu_flags", lambda: {"sse4_2", "popcnt", "ssse3"})
+    if "generic" not in build_kernel.isas():
+        assert kernel_library.candidate_isas() == ["sse42"]
+
+
+@pytest.mark.parametrize("isa", kernel_library.supported_isas())
+def test_every_instruction_set_draws_the_same_picture(isa, scene, gradients, fresh_loader, monkeypatch):
+    splats, cameras = scene(300)
+    truth, exact = gradients(splats, cameras, RenderSettings("reference"), torch.float64)
+    monkeypatch.setenv("GENRE_RENDER_ISA", isa)
+    monkeypatch.setattr(cpu, "load_kernel", fresh_loader)
+    image, grads = gradients(splats, cameras, RenderSettings("cpu", 1))
+    assert (image.color.double() - truth.color).abs().max() < 1e-5
+    for name, grad in grads.items():
+        relative = torch.linalg.vector_norm(grad.double() - exact[name]) / torch.linalg.vector_norm(exact[name])
+        assert relative < 1e-5, (name, float(relative))
+
+
+def test_no_compiler_is_one_clear_line(tmp_path, monkeypatch):
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(RuntimeError, match=r"install g\+\+ or clang\+\+.*ziglang") as caught:
+        build_kernel.build_kernel(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_failing_compiler_leaves_nothing(tmp_path, monkeypatch):
+    monkeypatch.setenv("CXX", "false")
+    with pytest.raises(RuntimeError, match="false failed on the kernel"):
+        build_kernel.build_kernel(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_fresh_build_loads(tmp_path, fresh_loader):
+    paths = build_kernel.build_kernel(tmp_path)
+    assert [p.name for p in paths] == [
+        build_kernel.library_name(i) for i in build_kernel.isas_for(build_kernel.find_compiler())
+    ]
+    assert fresh_loader(tmp_path).genre_digest().decode() == build_kernel.source_digest()
+
+
+def test_constants_live_in_one_place():
+    text = "".join(
+        (build_kernel.HERE / s).read_text() for s in build_kernel.SOURCES if Path(s).suffix in (".cpp", ".h")
+    )
+    numeric = {n for n in vars(constants) if n.isupper() and isinstance(getattr(constants, n), float)}
+    assert numeric == set(build_kernel.CONSTANTS)
+    assert all(re.search(rf"\b{name}\b", text) for name in numeric)
+    for literal in (r"0?\.99f", r"0?\.999f", r"1\.?f? */ *255", r"0\.01f", r"(?<![\d.])0?\.3f", r"1e-4f \?"):
+        assert not re.search(literal, text), literal
+
+
+def test_cuda_without_gsplat_says_how_to_get_it(scene):
+    if importlib.util.find_spec("gsplat"):
+        pytest.skip("gsplat is installed")
+    with pytest.raises(ResourceError, match=r"needs gsplat.*\[cuda\]"):
+        render(*scene(5), RenderSettings("cuda"))
+
+
+def test_cuda_against_the_reference(scene):
+    pytest.importorskip("gsplat", reason="gsplat is not installed")
+    if not torch.cuda.is_available():
+        pytest.skip("no GPU")
+    splats, cameras = scene(300)
+    out = render(splats.to("cuda"), cameras, RenderSettings("cuda"))
+    truth = render(splats.to(torch.float64), cameras, RenderSettings("reference"))
+    assert (out.color.cpu().double() - truth.color).abs().max() < 0.02  # 0.999 against 0.99, and the alpha cut
+    assert (out.depth.cpu().double() - truth.depth).abs().mean() < 0.01

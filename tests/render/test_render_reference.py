@@ -1,0 +1,107 @@
+"""The CPU kernel against the float64 reference: values, gradients of attributes and of poses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from genre_tasks.render import Cameras, RenderSettings, render
+from genre_tasks.scene.gaussians import Splats
+
+CPU, REFERENCE = RenderSettings("cpu", 1), RenderSettings("reference")
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("width", "height"), [(64, 48), (33, 17), (1, 1)])
+def test_values_and_gradients_of_300(scene, gradients, seed, width, height):
+    splats, cameras = scene(300, width, height, views=2, seed=seed)
+    image, grads = gradients(splats, cameras, CPU)
+    truth, exact = gradients(splats, cameras, REFERENCE, torch.float64)
+    for name, bound in (("color", 1e-5), ("alpha", 1e-5), ("depth", 3e-4)):
+        error = getattr(image, name).double() - getattr(truth, name)
+        assert error.abs().max() < bound, name
+    for name, grad in grads.items():
+        assert torch.linalg.vector_norm(exact[name]) > 0
+        relative = torch.linalg.vector_norm(grad.double() - exact[name]) / torch.linalg.vector_norm(exact[name])
+        assert relative <= 1e-5, (name, float(relative))
+
+
+def test_values_of_20000(scene, gradients):
+    splats, cameras = scene(20_000, 320, 180)
+    image = render(splats, cameras, CPU)
+    with torch.no_grad():
+        truth = render(splats.to(torch.float64), cameras, REFERENCE)
+    assert truth.alpha.mean() > 0.5
+    for name, bound in (("color", 1e-5), ("alpha", 1e-5), ("depth", 1e-3)):
+        error = (getattr(image, name).double() - getattr(truth, name)).abs()
+        # float32 and float64 may fall on different sides of the alpha cut or of the stop: in few pixels, by little.
+        assert (error > bound).double().mean() < 1e-3, name
+        assert error.max() < (0.02 if name != "depth" else 1.0), name
+    assert image.culled == truth.culled
+
+
+def _smooth() -> tuple[Splats, Cameras]:
+    """Gaussians that fill the image without reaching the cut or the clamp, so that finite differences are valid."""
+    g = torch.Generator().manual_seed(5)
+    means = torch.randn(5, 3, generator=g, dtype=torch.float64) * 0.3 + torch.tensor([0.1, -0.1, 4.0])
+    scales = 1.5 + torch.rand(5, 3, generator=g, dtype=torch.float64)
+    quats, colors = torch.randn(5, 4, generator=g).double(), torch.rand(5, 3, generator=g).double()
+    splats = Splats(means, scales, quats, torch.full((5,), 0.5, dtype=torch.float64), colors)
+    pose = torch.linalg.matrix_exp(_twist(torch.tensor([0.2, -0.1, 0.15, 0.1, 0.2, -0.3], dtype=torch.float64)))
+    return splats, Cameras(pose[None], torch.tensor([[20.0, 22.0]]), torch.tensor([[12.5, 7.5]]), 24, 16)
+
+
+def _twist(v: torch.Tensor) -> torch.Tensor:
+    zero = v.new_zeros(())
+    rows = [[zero, -v[2], v[1], v[3]], [v[2], zero, -v[0], v[4]], [-v[1], v[0], zero, v[5]], [zero] * 4]
+    return torch.stack([torch.stack(r) for r in rows])
+
+
+def _moved_loss(splats: Splats, cameras: Cameras, xi: torch.Tensor, settings: RenderSettings) -> torch.Tensor:
+    pose = torch.linalg.matrix_exp(_twist(xi)) @ cameras.camera_SE3_chunk[0].to(xi.dtype)
+    out = render(splats.to(xi.dtype), replace(cameras, camera_SE3_chunk=pose[None]), settings)
+    return (out.color.square().sum() + (out.alpha - 0.3).square().sum() + 0.1 * out.depth.sum()).double()
+
+
+@pytest.mark.parametrize(("settings", "dtype", "bound"), [(CPU, torch.float32, 1e-5), (REFERENCE, torch.float64, 1e-7)])
+def test_pose_gradient_against_finite_differences(settings, dtype, bound):
+    splats, cameras = _smooth()
+    xi = torch.zeros(6, dtype=dtype, requires_grad=True)
+    _moved_loss(splats, cameras, xi, settings).backward()
+    step = 1e-5
+    expected = torch.zeros(6, dtype=torch.float64)
+    with torch.no_grad():
+        for k in range(6):
+            e = torch.zeros(6, dtype=torch.float64)
+            e[k] = step
+            ahead, back = (_moved_loss(splats, cameras, s * e, REFERENCE) for s in (1, -1))
+            expected[k] = (ahead - back) / (2 * step)
+    assert xi.grad is not None
+    relative = torch.linalg.vector_norm(xi.grad.double() - expected) / torch.linalg.vector_norm(expected)
+    assert relative < bound, (float(relative), xi.grad, expected)
+
+
+def test_pose_gradient_leaves_the_image_and_other_gradients(scene, gradients):
+    splats, cameras = scene(300, views=2)
+    still, grads = gradients(splats, cameras, CPU)
+    pose = cameras.camera_SE3_chunk.clone().requires_grad_()
+    moving, other = gradients(splats, replace(cameras, camera_SE3_chunk=pose), CPU)
+    assert pose.grad is not None and pose.grad[:, :3].abs().amax((1, 2)).min() > 0
+    assert torch.allclose(still.color, moving.color, atol=2e-5)
+    for name in grads:
+        relative = torch.linalg.vector_norm(grads[name] - other[name]) / torch.linalg.vector_norm(grads[name])
+        assert relative < 1e-4, (name, float(relative))
+    assert moving.culled == still.culled
+
+
+def test_reference_gradients_against_finite_differences():
+    splats, cameras = _smooth()
+    inputs = [x.requires_grad_() for x in (splats.means, splats.scales, splats.quats, splats.opacities, splats.colors)]
+
+    def images(*x: torch.Tensor) -> torch.Tensor:
+        out = render(Splats(*x), cameras, REFERENCE)
+        return torch.cat([out.color.flatten(), out.alpha.flatten(), out.depth.flatten()])[::37]
+
+    assert torch.autograd.gradcheck(images, inputs, eps=1e-6, atol=1e-6)
