@@ -5,8 +5,9 @@ from __future__ import annotations
 import statistics
 from typing import Any
 
+from flows.logs import chosen_chunks, opened_log
 from flows.pipeline import PIPELINE, StageSpec
-from flows.produce import ArtifactRef, Job, look_up, opened_log
+from flows.produce import ArtifactRef, Job, look_up
 from genre_tasks.config import PipelineConfig
 from storage.local import open_store
 
@@ -29,8 +30,6 @@ def plan_run(log: str, store: str, chunks: list[int] | None, config: PipelineCon
 
     A key depends on the payloads of the inputs: below a miss it is not known yet (``follows``).
     """
-    from flows.reconstruct import chosen_chunks
-
     known = _measured(store, opened_log(log).dataset)
     rows: list[dict[str, Any]] = []
     for chunk in chosen_chunks(log, config, chunks):

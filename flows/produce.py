@@ -15,6 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from flows.logs import opened_log
 from flows.pipeline import BY_NAME, StageSpec, section_of, stage_key, weights_digest, weights_file
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ArtifactCorruptError, ResourceError
@@ -26,7 +27,6 @@ from storage.local import Artifact, open_store
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from genre_tasks.logs.types import DrivingLog
     from storage.store import Store
 
 
@@ -50,14 +50,6 @@ class ArtifactRef:
     path: str
     cached: bool
     note: str = ""
-
-
-@functools.lru_cache(maxsize=4)
-def opened_log(uri: str) -> DrivingLog:
-    """The log behind a URI, opened once per process."""
-    from genre_tasks.logs.registry import open_log
-
-    return open_log(uri)
 
 
 def key_of(spec: StageSpec, job: Job, inputs: Mapping[str, ArtifactRef]) -> tuple[str, str | None]:

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 from typing import Any
 
 from prefect import flow
 from prefect.artifacts import create_image_artifact, create_table_artifact
 
 from flows.configuration import differences, load_configuration, validated
+from flows.logs import chosen_chunks, expanded
 from flows.pipeline import PIPELINE
-from flows.produce import ArtifactRef, Job, opened_log
+from flows.produce import ArtifactRef, Job
 from flows.runs import Run, finish_run, summary_of
 from flows.stage_task import stage_task
-from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import GenreError, InputError
 
 _log = logging.getLogger("genre")
@@ -60,18 +59,6 @@ def reconstruct_log(
     if failed:
         raise failed[0]
     return summary
-
-
-def chosen_chunks(log: str, config: PipelineConfig, chunks: list[int] | None) -> list[int]:
-    """The chunks to run. Raises ``InputError`` for one that the log does not have."""
-    from genre_tasks.stages.ingest import chunk_count
-
-    count = chunk_count(config.ingest, opened_log(log))
-    wanted = list(range(count)) if chunks is None else chunks
-    for chunk in wanted:
-        if not 0 <= chunk < count:
-            raise InputError(f"there is no chunk {chunk}", remedy=f"Chunks are 0 to {count - 1}.", log=log)
-    return wanted
 
 
 def _reconstruct_chunk(job: Job) -> dict[str, ArtifactRef]:
@@ -131,18 +118,3 @@ def reconstruct_dataset(
     if failed:
         raise failed[0]
     return summaries
-
-
-def expanded(logs: list[str]) -> list[str]:
-    """``reader:PATH/*`` becomes one URI per folder, sorted. Raises ``InputError`` where nothing matches."""
-    out: list[str] = []
-    for uri in logs:
-        reader, _, path = uri.partition(":")
-        if not path.endswith("/*"):
-            out.append(uri)
-            continue
-        folders = sorted(p for p in Path(path[:-2]).glob("*") if p.is_dir())
-        if not folders:
-            raise InputError(f"no log matches {uri}", remedy="Name a folder that holds sequences.", file=path[:-2])
-        out += [f"{reader}:{p}" for p in folders]
-    return out

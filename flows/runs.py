@@ -103,7 +103,9 @@ def _chunk_summary(run: Run, chunk: int, refs: dict[str, ArtifactRef]) -> ChunkS
         if f"evaluate/{spec.name}" in found:
             evaluation = store.read(found[f"evaluate/{spec.name}"])
             metrics = _with_counts(evaluation.metrics)
-            intervals = {m.name: (m.low, m.high) for m in evaluation.metrics if m.low is not None and m.high is not None}
+            intervals = {
+                m.name: (m.low, m.high) for m in evaluation.metrics if m.low is not None and m.high is not None
+            }
             pictures = {name: _png(image) for name, image in evaluation.pictures.items()}
             curve = _against_seconds(evaluation.curve, manifest.measurements.get("seconds_per_iteration", ()))
         stages.append(

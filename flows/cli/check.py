@@ -23,4 +23,13 @@ def check(
         return
     from flows.cli.tables import print_fields
 
-    print_fields(log, dataclasses.asdict(found))
+    fields = {name: value for name, value in dataclasses.asdict(found).items() if name not in ("uri", "cameras")}
+    cameras = {
+        c.name: f"{c.width_px}×{c.height_px}"
+        + "".join(f", {len(getattr(c, k))} {k}" for k in ("missing", "unreadable", "odd_size") if getattr(c, k))
+        for c in found.cameras
+    }
+    findings = [f"{f.severity}: {f.message}{'. ' * bool(f.remedy)}{f.remedy}" for f in found.findings]
+    print_fields(log, {"verdict": found.verdict, "cameras": cameras} | fields | {"findings": "\n".join(findings)})
+    if found.verdict == "unusable":
+        raise typer.Exit(1)

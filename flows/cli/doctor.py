@@ -68,9 +68,10 @@ def _renderer() -> str:
     from genre_tasks.errors import GenreError
 
     try:
-        from genre_tasks.render.cpu import instruction_set
+        from genre_tasks.render.kernel_library import candidate_isas, load_kernel
 
-        return f"cpu kernel, {instruction_set()}"
+        load_kernel()
+        return f"cpu kernel, {candidate_isas()[0]}"
     except GenreError as error:
         return f"cpu kernel cannot be loaded: {error}"
 

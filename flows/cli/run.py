@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -34,7 +35,7 @@ def run(
     Add --debug to any command for tracebacks.
     """
     from flows.configuration import load_configuration
-    from flows.produce import opened_log
+    from flows.logs import opened_log
 
     settings = [*(set_ or []), *(["ingest.strict=true"] if strict else [])]
     effective = load_configuration(preset, config, settings)
@@ -43,6 +44,7 @@ def run(
     if dry_run:
         _dry_run(log, preset, store, wanted, effective, as_json)
         return
+    Path(os.environ["PREFECT_HOME"]).mkdir(parents=True, exist_ok=True)
     from flows.cli.terminal import TerminalReporter, print_run
     from flows.reconstruct import reconstruct_log
     from flows.reporting import report_to

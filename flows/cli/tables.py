@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 
 def print_fields(title: str, fields: Mapping[str, Any]) -> None:
@@ -16,7 +17,7 @@ def print_fields(title: str, fields: Mapping[str, Any]) -> None:
     table.add_column()
     table.add_column(overflow="fold")
     for name, value in fields.items():
-        table.add_row(name.replace("_", " "), _text(value))
+        table.add_row(name.replace("_", " "), Text(_text(value)))
     console.print(table)
 
 
@@ -27,7 +28,7 @@ def print_rows(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     for name in rows[0] if rows else ["nothing yet"]:
         table.add_column(name.replace("_", " "), overflow="fold")
     for row in rows:
-        table.add_row(*(_text(v) for v in row.values()))
+        table.add_row(*(Text(_text(v)) for v in row.values()))
     console.print(table)
 
 

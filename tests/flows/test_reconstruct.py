@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 
 from flows import reconstruct, runs, stage_task
+from flows.logs import expanded, opened_log
 from flows.pipeline import PIPELINE
-from flows.produce import Job, opened_log
+from flows.produce import Job
 from genre_tasks.errors import ConfigError, InputError, ResourceError, TransientIOError
 from tests.faults.tiny import LOG, SETTINGS
 
@@ -110,13 +111,13 @@ def test_an_unknown_chunk_is_named(tmp_path: Path) -> None:
 def test_a_folder_of_sequences_is_expanded(tmp_path: Path) -> None:
     for name in ("002", "001"):
         (tmp_path / name).mkdir()
-    assert reconstruct.expanded([f"pandaset:{tmp_path}/*", LOG]) == [
+    assert expanded([f"pandaset:{tmp_path}/*", LOG]) == [
         f"pandaset:{tmp_path}/001",
         f"pandaset:{tmp_path}/002",
         LOG,
     ]
     with pytest.raises(InputError, match="no log matches"):
-        reconstruct.expanded([f"pandaset:{tmp_path}/none/*"])
+        expanded([f"pandaset:{tmp_path}/none/*"])
 
 
 def test_a_stages_value_can_be_had_back(tmp_path: Path) -> None:
