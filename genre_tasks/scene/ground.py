@@ -21,7 +21,7 @@ _PLANE_TOLERANCE_M = 0.35
 
 _MIN_COARSE_CELLS = 20
 _PLANE_WEIGHT = 1e-3
-"""Weight of the plane in a cell's height, in points: it decides only where no road point is near."""
+"""Weight of the plane in a cell's height, where a cell with road points has 1: it decides far from all of them."""
 
 
 def road_fill(positions: Float32, chunk_SE3_ego: Float64) -> Float32:
@@ -43,9 +43,13 @@ def road_fill(positions: Float32, chunk_SE3_ego: Float64) -> Float32:
         return np.empty((0, 3), np.float32)
     height = near[:, 2] - _at(plane, near[:, :2])
     road = np.abs(height) < _PLANE_TOLERANCE_M
+    # The lowest point of each cell stands for it: a wall's foot or a tyre would lift the mean.
     flat = np.ravel_multi_index((cell[road, 0], cell[road, 1]), shape)
-    count = np.bincount(flat, minlength=shape.prod()).reshape(shape).astype(np.float64)
-    total = np.bincount(flat, height[road], shape.prod()).reshape(shape)
+    lowest = np.full(shape.prod(), np.inf)
+    np.minimum.at(lowest, flat, height[road])
+    known = np.isfinite(lowest)
+    count = known.astype(np.float64).reshape(shape)
+    total = np.where(known, lowest, 0.0).reshape(shape)
     sigma = _SMOOTH_M / CELL_M
     # Over the plane, so that the plane's own height is 0 and enters only the denominator.
     smooth = gaussian_filter(total, sigma) / (gaussian_filter(count, sigma) + _PLANE_WEIGHT)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from genre_tasks.logs.types import Float32, Float64
 
 OCTAVE_M = 8.0
-"""Up to this distance voxels have their base size; beyond, the size doubles with the distance."""
+"""Up to twice this distance voxels have their base size; it doubles there and at each doubling after."""
 
 MIN_VOXEL_M = 0.02
 _HALF, _BITS = 1 << 18, 19
@@ -35,7 +35,7 @@ class Voxels:
 
 
 def levels(distance_m: NDArray) -> NDArray[np.int64]:
-    """Octave of each distance: 0 up to 8 m, 1 up to 16 m, …"""
+    """Octave of each distance: 0 up to 16 m, 1 up to 32 m, …"""
     return np.floor(np.log2(np.maximum(distance_m, OCTAVE_M) / OCTAVE_M)).astype(np.int64)
 
 

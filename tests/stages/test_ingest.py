@@ -1,0 +1,225 @@
+"""Ingest on the fake log: contracts, values, and logs as the world delivers them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from genre_tasks.config import IngestConfig
+from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.logs.types import CuboidTrack
+from genre_tasks.scene.chunk import Chunk, Mark
+from genre_tasks.stages.ingest import NO_SWEEP, chunk_count, ingest
+from tests.fakes import SENSOR_HEIGHT_M, FakeCar, FakeLog, yaw_pose
+
+CONFIG = IngestConfig(width_px=96, height_px=64)
+
+
+@pytest.fixture(scope="module")
+def log() -> FakeLog:
+    return FakeLog()
+
+
+@pytest.fixture(scope="module")
+def chunk(log: FakeLog) -> Chunk:
+    return ingest(CONFIG, log, 0)
+
+
+def _kinds(marks: tuple[Mark, ...]) -> list[str]:
+    return [m.kind for m in marks]
+
+
+def test_roles_views_and_origin(log: FakeLog, chunk: Chunk) -> None:
+    assert chunk_count(CONFIG, log) == 1 and chunk.frames == tuple(range(20)) and chunk.marks == ()
+    assert {v.frame for v in chunk.of_role("source")} == {0, 4, 8, 12, 16}
+    assert len(chunk.of_role("heldout")) == 30
+    assert [(v.frame, v.camera) for v in chunk.views[:3]] == [(0, "front"), (0, "left"), (1, "front")]
+    assert np.array_equal(chunk.world_SE3_chunk[:3, :3], np.eye(3))
+    assert np.allclose(chunk.chunk_SE3_ego[10, :3, 3], 0) and np.allclose(chunk.world_SE3_chunk[:3, 3], [3, 0, 1.8])
+    assert chunk.views[0].image == log.image_bytes("front", 0)
+
+
+def test_points_lie_on_the_world_and_have_its_colours(chunk: Chunk) -> None:
+    world = chunk.static.positions + chunk.world_SE3_chunk[:3, 3]
+    known = np.stack([np.abs(world[:, 2]), np.abs(np.abs(world[:, 1]) - 8), np.abs(np.abs(world[:, 0]) - 45)]).min(0)
+    parked = (np.abs(world - [14.0, -4.0, 0.75]) < [2.01, 0.91, 0.76]).all(1)
+    returns = ~parked & (chunk.static.frames != NO_SWEEP)
+    assert (known[returns] < 0.02).mean() > 0.999
+    filled = np.abs(world[chunk.static.frames == NO_SWEEP, 2])
+    assert len(filled) > 1000 and np.percentile(filled, 99) < 0.05
+    far_wall = (np.abs(world[:, 1] - 8) < 0.01) & (world[:, 2] > 0.5) & chunk.static.colored
+    mean = chunk.static.colors[far_wall].mean(0) / 255
+    assert np.allclose(mean, [0.7, 0.45, 0.3], atol=0.04)
+    assert (chunk.static.colors[~chunk.static.colored] == 128).all()
+
+
+def test_the_moving_car_is_an_actor_and_the_parked_one_is_not(chunk: Chunk) -> None:
+    (actor,) = chunk.actors
+    assert actor.track_id == "mover" and len(actor.frames) == 20
+    # In the box frame its points lie on the box: not smeared along its way.
+    inside = np.abs(actor.points.positions) < np.array(actor.size_m) / 2 + 0.02
+    assert inside.all(1).mean() > 0.99
+    assert actor.points.colored.mean() > 0.8
+    assert (actor.points.colors[actor.points.colored].mean(0) / 255)[0] > 0.7, "it is red"
+    for frame in (0, 19):
+        pose = actor.chunk_SE3_box[frame]
+        near = np.abs(chunk.static.positions[chunk.static.frames == frame] - pose[:3, 3])
+        assert not (near < [1.9, 0.8, 0.6]).all(1).any(), "none of its points stay in the background"
+
+
+def test_colours_come_from_source_views_only(log: FakeLog, chunk: Chunk) -> None:
+    heldout = {(v.camera, v.frame): b"" for v in chunk.of_role("heldout")}
+    other = log.with_(missing_images=frozenset(heldout))
+    again = ingest(CONFIG, other, 0)
+    assert np.array_equal(again.static.colors, chunk.static.colors)
+
+
+def test_same_bytes_again(log: FakeLog, chunk: Chunk) -> None:
+    again = ingest(CONFIG, log, 0)
+    for name in ("positions", "colors", "colored", "frames"):
+        assert np.array_equal(getattr(again.static, name), getattr(chunk.static, name))
+        assert np.array_equal(getattr(again.actors[0].points, name), getattr(chunk.actors[0].points, name))
+
+
+@pytest.mark.parametrize("offset", [(1e6, -1e6, 0.0), (4.4e5, 4.6e6, 100.0)])
+def test_a_far_world_origin_changes_nothing(log: FakeLog, chunk: Chunk, offset: tuple[float, float, float]) -> None:
+    far = ingest(CONFIG, log.with_(world_offset_m=offset), 0)
+    lidar, far_lidar = (c.static.positions[c.static.frames != NO_SWEEP] for c in (chunk, far))
+    assert lidar.shape == far_lidar.shape and np.abs(lidar - far_lidar).max() < 1e-3
+    assert np.abs(far.chunk_SE3_ego - chunk.chunk_SE3_ego).max() < 1e-6
+    assert np.abs(far.actors[0].chunk_SE3_box - chunk.actors[0].chunk_SE3_box).max() < 1e-6
+    assert np.abs(far.views[7].chunk_SE3_camera - chunk.views[7].chunk_SE3_camera).max() < 1e-6
+
+
+def test_missing_and_unreadable_parts_are_marked(log: FakeLog) -> None:
+    broken = log.with_(
+        missing_images=frozenset({("front", 4)}),
+        corrupt_images=frozenset({("left", 5)}),
+        missing_sweeps=frozenset({3}),
+        unreadable_sweeps=frozenset({6}),
+    )
+    out = ingest(CONFIG, broken, 0)
+    marks = {(m.kind, m.camera, m.frame) for m in out.marks}
+    assert marks == {
+        ("missing_image", "front", 4), ("unreadable_image", "left", 5), ("missing_sweep", None, 3),
+        ("unreadable_sweep", None, 6),
+    }  # fmt: skip
+    assert len(out.views) == 38 and not {3, 6} & set(out.static.frames.tolist())
+
+
+@pytest.mark.parametrize(
+    ("fault", "where"),
+    [
+        ({"missing_images": frozenset({("front", 4)})}, {"camera": "front", "frame": 4}),
+        ({"corrupt_images": frozenset({("left", 5)})}, {"camera": "left", "frame": 5}),
+        ({"missing_sweeps": frozenset({3})}, {"frame": 3}),
+        ({"unreadable_sweeps": frozenset({6})}, {"frame": 6, "file": "6.bin"}),
+    ],
+)
+def test_strict_fails_and_says_where(log: FakeLog, fault: dict, where: dict) -> None:
+    with pytest.raises(InputError) as caught:
+        ingest(CONFIG.model_copy(update={"strict": True}), log.with_(**fault), 0)
+    assert all(getattr(caught.value, name) == value for name, value in where.items())
+    assert caught.value.remedy
+
+
+def test_an_image_of_another_shape_is_unreadable(log: FakeLog) -> None:
+    lens = replace(log.lens, height_px=96)
+
+    class Taller(FakeLog):
+        @property
+        def cameras(self) -> tuple:
+            return tuple(replace(c, lens=lens) for c in super().cameras)
+
+    with pytest.raises(InputError, match="0 source frames"):
+        ingest(CONFIG, Taller(frame_count=8), 0)
+
+
+def test_short_last_chunk(log: FakeLog) -> None:
+    longer = log.with_(frame_count=26)
+    out = ingest(CONFIG, longer, 1)
+    assert chunk_count(CONFIG, longer) == 2 and out.frames == tuple(range(20, 26))
+    assert {v.frame for v in out.of_role("source")} == {20, 24}
+
+
+def test_fewer_than_two_source_frames(log: FakeLog) -> None:
+    with pytest.raises(InputError, match="1 source frames") as caught:
+        ingest(CONFIG, log.with_(frame_count=23), 1)
+    assert caught.value.chunk == 1 and "--chunks" in caught.value.remedy and "source_every" in caught.value.remedy
+
+
+def test_unknown_chunk_and_camera(log: FakeLog) -> None:
+    with pytest.raises(ConfigError, match="no chunk 1"):
+        ingest(CONFIG, log, 1)
+    with pytest.raises(ConfigError, match=r"unknown cameras rear.*front, left"):
+        ingest(CONFIG.model_copy(update={"cameras": ("front", "rear")}), log, 0)
+
+
+def test_one_camera_and_no_cuboids(log: FakeLog) -> None:
+    out = ingest(CONFIG.model_copy(update={"cameras": ("left",)}), log.with_(without_tracks=True), 0)
+    assert out.camera_names == ("left",) and out.actors == () and len(out.views) == 20 and out.static.colored.any()
+
+
+def test_no_lidar_needs_points(log: FakeLog, tmp_path: Path) -> None:
+    blind = log.with_(no_lidar=True, world_offset_m=(4e5, 4e6, 0.0))
+    with pytest.raises(InputError, match="no LiDAR") as caught:
+        ingest(CONFIG, blind, 0)
+    assert "ingest.points=" in caught.value.remedy
+    file = tmp_path / "points.ply"
+    header = "ply\nformat ascii 1.0\nelement vertex 2\nproperty double x\nproperty double y\nproperty double z\n"
+    body = "400020.5 4000008 1\n400020.5 4000007 1\n"
+    file.write_text(header + "end_header\n" + body)
+    out = ingest(CONFIG.model_copy(update={"points": str(file)}), blind, 0)
+    assert np.allclose(out.static.positions, [[17.5, 8, 1 - SENSOR_HEIGHT_M], [17.5, 7, 1 - SENSOR_HEIGHT_M]])
+    assert out.static.colored.all() and _kinds(out.marks) == ["actor_few_points"]
+
+
+def test_standstill_and_odd_timestamps(log: FakeLog) -> None:
+    times = tuple(1.7e9 + 0.1 * f for f in range(20))
+    odd = (*times[:5], times[4], times[9], times[6], *times[8:])
+    out = ingest(CONFIG, log.with_(speed_mps=0.0, timestamps_s=odd), 0)
+    assert _kinds(out.marks) == ["timestamps", "standstill"]
+    assert len(out.actors) == 1 and np.isfinite(out.static.positions).all()
+    assert _kinds(ingest(CONFIG, log.with_(timestamps_s=times), 0).marks) == []
+
+
+def _track(name: str, frames: list[int], poses: list[np.ndarray], **changes: object) -> CuboidTrack:
+    track = CuboidTrack(name, "car", np.array(frames), np.stack(poses), (4.0, 1.8, 1.5), True)
+    return replace(track, **changes)  # type: ignore[arg-type]
+
+
+def test_cuboids_that_are_unfit(log: FakeLog) -> None:
+    here = yaw_pose(0.0, (20.0, 0.0, 0.75))
+    there = yaw_pose(0.0, (26.0, 0.0, 0.75))
+    nan = here.copy()
+    nan[0, 3] = np.nan
+    tracks = (
+        _track("after", [30, 31], [here, there]),
+        _track("before", [-3, -2], [here, there]),
+        _track("nan", [0, 1, 2], [nan, nan, nan]),
+        _track("flat", [0, 19], [here, there], size_m=(4.0, float("nan"), 1.5)),
+        _track("brief", [7], [here]),
+        _track("empty", [0, 19], [yaw_pose(0.0, (0.0, 60.0, 30.0)), yaw_pose(0.0, (9.0, 60.0, 30.0))]),
+    )
+    out = ingest(CONFIG, log.with_(extra_tracks=tracks), 0)
+    assert [a.track_id for a in out.actors] == ["mover"]
+    assert sorted(_kinds(out.marks)) == ["actor_few_points"] * 2 + ["cuboid_invalid"] * 2 + ["cuboid_outside"]
+    (outside,) = [m for m in out.marks if m.kind == "cuboid_outside"]
+    assert outside.detail.startswith("2 tracks")
+
+
+def test_poses_between_annotations_and_past_the_end() -> None:
+    sparse = FakeLog(cars=(FakeCar("mover", 6.0, 3.5, speed_mps=6.0),), track_every=6)
+    (actor,) = ingest(CONFIG, sparse, 0).actors
+    assert actor.frames.tolist() == list(range(19)), "annotated at 0, 6, 12, 18: nothing is extrapolated to 19"
+    expected = 6.0 + 0.6 * np.arange(19) - 3.0
+    assert np.allclose(actor.chunk_SE3_box[:, 0, 3], expected)
+
+
+def test_progress_rises_to_the_end(log: FakeLog) -> None:
+    calls: list[tuple[int, int]] = []
+    ingest(CONFIG, log, 0, lambda done, total, note="": calls.append((done, total)))
+    assert calls == sorted(calls) and calls[-1] == (60, 60) and len(calls) > 20
