@@ -25,8 +25,8 @@ class StageSpec:
 
     ``function`` is ``module:name``; it is called as ``function(config section, *arguments, progress=…)``, where each
     argument is the name of an earlier stage (its value) or one of ``log``, ``chunk_index``, ``stage_name``, ``truth``.
-    ``weights`` names the weights it loads; ``splits`` names a setting that bounds memory and does not change a payload's bytes: it is halved when
-    memory runs out, and is not part of the key.
+    ``weights`` names the weights it loads. ``splits`` names a setting that bounds memory and does not change a
+    payload's bytes: it is halved when memory runs out, and is not part of the key.
     """
 
     name: str

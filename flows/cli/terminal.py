@@ -27,14 +27,13 @@ _HEADLINES = (
 class TerminalReporter:
     """Progress on stderr: a line that rewrites itself on a terminal, a line every ten seconds elsewhere."""
 
-    def __init__(self) -> None:
+    def __init__(self, what: str = "starting Prefect") -> None:
         self._live = sys.stderr.isatty()
-        self._started = 0.0
-        self._said = 0.0
-        self._what = ""
+        self._started = self._said = time.monotonic()
+        self._what = what
 
     def __enter__(self) -> TerminalReporter:
-        self._write("starting Prefect", end=not self._live)
+        self._write(self._what, end=not self._live)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
