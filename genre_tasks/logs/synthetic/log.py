@@ -19,8 +19,9 @@ from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.logs.synthetic.ego import FRAME_S, draw_ego, ego_SE3_camera, rig
 from genre_tasks.logs.synthetic.layout import Layout, lay_out
 from genre_tasks.logs.synthetic.lidar import sweep
+from genre_tasks.logs.synthetic.noise import rotated
 from genre_tasks.logs.synthetic.parameters import parse_parameters
-from genre_tasks.logs.synthetic.picture import draw_light, picture
+from genre_tasks.logs.synthetic.picture import camera_rays, draw_light, picture
 from genre_tasks.logs.synthetic.raycast import Scene
 from genre_tasks.logs.synthetic.road import Road, generator
 from genre_tasks.logs.synthetic.tracks import annotate
@@ -177,13 +178,10 @@ class SyntheticStreet:
 
     def depth(self, frame: int, world_SE3_camera: Float64, lens: Lens) -> Float64:
         """[H, W] true depth along the camera's z axis at pixel centres, metres; inf is sky."""
-        from genre_tasks.logs.synthetic.picture import camera_rays
-
         self.check_frame(frame)
         rays = camera_rays(lens, 1)
-        hits = self._scene.cast(
-            world_SE3_camera[:3, 3] - self.offset_m, rays @ world_SE3_camera[:3, :3].T, frame * FRAME_S
-        )
+        origin = world_SE3_camera[:3, 3] - self.offset_m
+        hits = self._scene.cast(origin, rotated(world_SE3_camera[:3, :3], rays), frame * FRAME_S)
         return (hits.distance_m.astype(np.float64) * rays[:, 2]).reshape(lens.height_px, lens.width_px)
 
     def render(self, frame: int, street_SE3_camera: Float64, lens: Lens) -> NDArray[np.uint8]:

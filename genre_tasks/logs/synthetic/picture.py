@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from genre_tasks.logs.synthetic.materials import MIRROR, Material
 from genre_tasks.logs.synthetic.mesh import linear
-from genre_tasks.logs.synthetic.noise import Reals, dot3, fractal
+from genre_tasks.logs.synthetic.noise import Reals, dot3, fractal, rotated
 from genre_tasks.logs.synthetic.raycast import Hits, Scene
 from genre_tasks.logs.synthetic.road import generator
 from genre_tasks.logs.synthetic.textures import albedo
@@ -40,7 +40,7 @@ def draw_light(seed: int) -> Light:
     warm = 1 - (height - 0.49) / 0.6
     return Light(
         sun=sun,
-        sun_colour=np.array([2.3, 2.15 - 0.2 * warm, 1.9 - 0.5 * warm], np.float32),
+        sun_colour=np.array([2.1, 1.97 - 0.2 * warm, 1.75 - 0.5 * warm], np.float32),
         zenith=linear((0.26, 0.45, 0.78)) * np.float32(rng.uniform(0.9, 1.2)),
         horizon=linear((0.74, 0.82, 0.90)),
         clouds=float(rng.uniform(0.30, 0.62)),
@@ -60,22 +60,22 @@ def sky(light: Light, direction: Reals) -> Reals:
     cloud = np.clip((cover - np.float32(1 - light.clouds)) * 5, 0, 1) * np.clip(up * 6, 0, 1)
     white = np.float32(0.72) + np.float32(0.28) * (1 - cloud)
     value = value + (white[:, None] - value) * (cloud * np.float32(0.9))[:, None]
-    glow = np.clip(direction @ light.sun.astype(np.float32), 0, 1) ** 40
+    glow = np.clip(dot3(direction, light.sun.astype(np.float32)), 0, 1) ** 40
     return value + glow[:, None] * np.float32(0.35)
 
 
-def camera_rays(lens: Lens, samples: int) -> Float64:
-    """[H · W · samples, 3] unit directions in camera axes; samples of a pixel are neighbours, on a fixed grid."""
+def camera_rays(lens: Lens, samples: int, rows: slice = slice(None)) -> Float64:
+    """[rows · W · samples, 3] unit directions in camera axes; samples of a pixel are neighbours, on a fixed grid."""
     side = round(samples**0.5)
     step = (np.arange(side) + 0.5) / side
     dx, dy = np.meshgrid(step, step)
     x = (np.arange(lens.width_px)[None, :, None] + dx.ravel() - lens.cx_px) / lens.fx_px
-    y = (np.arange(lens.height_px)[:, None, None] + dy.ravel() - lens.cy_px) / lens.fy_px
+    y = (np.arange(lens.height_px)[rows, None, None] + dy.ravel() - lens.cy_px) / lens.fy_px
     x, y = np.broadcast_arrays(x, y)
     if any(lens.distortion):
         x, y = _undistorted(x, y, lens.distortion)
     rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return rays / np.sqrt(dot3(rays, rays))[:, None]
 
 
 def _undistorted(x: Float64, y: Float64, distortion: tuple[float, ...]) -> tuple[Float64, Float64]:
@@ -92,7 +92,7 @@ def _undistorted(x: Float64, y: Float64, distortion: tuple[float, ...]) -> tuple
 
 
 def shade(
-    scene: Scene, light: Light, hits: Hits, origin: Float64, direction: Float64, time: float, spread: float
+    scene: Scene, light: Light, hits: Hits, origin: Float64, direction: Reals, time: float, spread: float
 ) -> Reals:
     """[n, 3] linear radiance seen along rays; ``spread`` is the angle between neighbouring rays."""
     d = direction.astype(np.float32)
@@ -108,7 +108,7 @@ def shade(
     base = albedo(material, scene.texture_points(h), faces.colour[h.face], faces.parameters[h.face], blur)
 
     points = origin.astype(np.float32) + d * h.distance_m[:, None]
-    facing = n @ light.sun.astype(np.float32)
+    facing = dot3(n, light.sun.astype(np.float32))
     # Leaves let light through from behind.
     facing = np.where(material == Material.LEAF, 0.35 + 0.65 * np.abs(facing), facing)
     lit = np.flatnonzero(facing > 0)
@@ -116,7 +116,9 @@ def shade(
     dark = scene.shadowed(points[lit], n[lit], light.sun, time)
     sunlight[lit] = np.where(dark, 0, facing[lit])
     up = (0.5 + 0.5 * n[:, 2])[:, None]
-    ambient = (0.55 * (light.zenith + light.horizon) * up + np.array([0.20, 0.19, 0.17], np.float32) * (1 - up)) * 0.8
+    # Sky from above, and light thrown back by the street from below; the factors make shade about a third of sunlight.
+    ambient: Reals = 0.62 * (0.6 * light.zenith + light.horizon) * up
+    ambient = ambient + np.array([0.36, 0.33, 0.28], np.float32) * (1 - up)
     value: Reals = base * (sunlight[:, None] * light.sun_colour + ambient)
     value = np.where((material == Material.LAMP)[:, None], base, value)
     value = _mirrored(light, value, d, n, MIRROR[material], slant)
@@ -141,13 +143,13 @@ def picture(
     scene: Scene, light: Light, time: float, world_SE3_camera: Float64, lens: Lens, samples: int
 ) -> NDArray[np.uint8]:
     """[H, W, 3] sRGB; the mean of ``samples`` rays a pixel, taken in linear light."""
-    rays = camera_rays(lens, samples) @ world_SE3_camera[:3, :3].T
     origin = world_SE3_camera[:3, 3]
     spread = 1.0 / (max(lens.fx_px, 1e-6) * samples**0.5)
-    band = max(1, _BAND_RAYS // samples) * samples
+    band = max(1, _BAND_RAYS // (lens.width_px * samples))
     rows = []
-    for first in range(0, len(rays), band):
-        d = rays[first : first + band]
+    for first in range(0, lens.height_px, band):
+        rays = camera_rays(lens, samples, slice(first, first + band))
+        d = rotated(world_SE3_camera[:3, :3], rays)
         value = shade(scene, light, scene.cast(origin, d, time), origin, d, time, spread)
         # Bright samples are clipped first, so that an edge against the sky stays as smooth as a camera's.
         rows.append(np.minimum(value * np.float32(light.exposure), 1.0).reshape(-1, samples, 3).mean(1))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from genre_tasks.logs.synthetic.actors import Actor, Part
 from genre_tasks.logs.synthetic.layout import Layout
 from genre_tasks.logs.synthetic.mesh import Mesh, joined
-from genre_tasks.logs.synthetic.noise import dot3
+from genre_tasks.logs.synthetic.noise import Reals, dot3, rotated
 from genre_tasks.logs.types import Float32, Float64
 
 _SHADOW_OFFSET_M = 0.01
@@ -83,7 +83,7 @@ class Scene:
     def cast(
         self,
         origin: Float64,  # [3] or [n, 3]
-        direction: Float64,  # [n, 3] unit
+        direction: Reals,  # [n, 3] unit
         time: float | Float64,  # seconds; one, or one a ray
         slack_m: float = 0.0,
     ) -> Hits:
@@ -129,7 +129,7 @@ class Scene:
             pick = np.flatnonzero((off[:, 0] ** 2 + off[:, 1] ** 2 < m.radius**2) & ~dark)
             if len(pick) == 0:
                 continue
-            local_o = (o[pick] - pose[:3, 3]) @ pose[:3, :3]
+            local_o = rotated(pose[:3, :3].T, o[pick] - pose[:3, 3])
             local_d = np.broadcast_to(sun @ pose[:3, :3], local_o.shape)
             hit = m.scene.run(local_o.astype(np.float32), local_d.astype(np.float32), query="OCCLUDED")  # type: ignore[attr-defined]
             dark[pick[hit >= 0]] = True
