@@ -108,6 +108,8 @@ def _ends(seed: int, road: Road, start: float, end: float) -> Iterator[Mesh]:
 
 def _pavements(seed: int, road: Road, start: float, end: float) -> Iterator[Mesh]:
     """Trees, lamps and small things along both kerbs."""
+    # A long street (a log of over 60 frames or so) has thinner trees, which keeps it under 300 000 triangles.
+    sparse = min(1.0, 260.0 / (end - start))
     for side in (1, -1):
         rng = generator(seed, f"pavement {side}")
         kerb = road.section.kerb(side)
@@ -118,7 +120,7 @@ def _pavements(seed: int, road: Road, start: float, end: float) -> Iterator[Mesh
         while s < end:
             s += pitch * rng.uniform(0.7, 1.3)
             if leafy and rng.random() < 0.85:
-                mesh = furniture.tree(rng, size * rng.uniform(0.8, 1.2), int(rng.integers(900, 1500)))
+                mesh = furniture.tree(rng, size * rng.uniform(0.8, 1.2), int(rng.integers(900, 1500) * sparse))
                 yield mesh.placed(road.upright(s, kerb + side * 0.95, KERB_HEIGHT_M, rng.uniform(0, 6.28)))
         for s in np.arange(start + rng.uniform(0, 20), end, rng.uniform(22, 34)):
             yield furniture.lamp(rng, rng.uniform(5.5, 7)).placed(
