@@ -6,15 +6,15 @@ cache never pays for torch.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from genre_tasks.config import PipelineConfig
+from storage import keys
 from storage.code_digest import code_digest
+from storage.keys import digest_file, digest_value
 
 RECONSTRUCTING = ("ingest", "initial", "gnet", "novel_views", "fnet", "enet")
 
@@ -111,13 +111,7 @@ def weights_digest(path: Path | None) -> str | None:
     if path is None:
         return None
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path, path.with_suffix(".json")]
-    digest = hashlib.sha256()
-    for file in files:
-        if file.exists():
-            digest.update(file.name.encode() + b"\0")
-            with file.open("rb") as stream:
-                digest.update(hashlib.file_digest(stream, "sha256").digest())
-    return digest.hexdigest()
+    return digest_value([[file.name, digest_file(file)] for file in files if file.exists()])
 
 
 def stage_key(
@@ -135,12 +129,6 @@ def stage_key(
     configuration = section_of(spec, config).model_dump(mode="json", exclude={spec.splits} if spec.splits else set())
     points = configuration.get("points") if spec.name == "ingest" else None
     if points and Path(points).is_file():  # the file is an input: its bytes count, not its name alone
-        configuration["points"] = hashlib.sha256(Path(points).read_bytes()).hexdigest()
-    recipe = {
-        "stage": spec.name,
-        "code": code_digest(spec.module, also=reader),
-        "configuration": configuration,
-        "inputs": dict(sorted(inputs.items())),
-        "weights": weights,
-    }
-    return hashlib.sha256(json.dumps(recipe, sort_keys=True).encode()).hexdigest()
+        configuration["points"] = digest_file(Path(points))
+    code = code_digest(spec.module, also=reader)
+    return keys.stage_key(spec.name, code, configuration, inputs, weights)

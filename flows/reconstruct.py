@@ -15,6 +15,7 @@ from flows.produce import ArtifactRef, Job
 from flows.runs import Run, finish_run, summary_of
 from flows.stage_task import stage_task
 from genre_tasks.errors import GenreError, InputError
+from storage.local import open_store
 
 _log = logging.getLogger("genre")
 
@@ -45,11 +46,14 @@ def reconstruct_log(
     values = effective.model_dump(mode="json")
     failed: list[GenreError] = []
     done: dict[int, dict[str, ArtifactRef]] = {}
-    for chunk in chosen_chunks(log, effective, chunks):
+    open_store(store).clean_temporaries()  # what killed runs left half-written
+    chosen = chosen_chunks(log, effective, chunks)
+    for chunk in chosen:
         try:
             done[chunk] = _reconstruct_chunk(Job(log, chunk, store, values))
         except InputError as error:
-            _log.error("chunk %d is left out: %s", chunk, error)
+            if len(chosen) > 1:  # a single one raises below
+                _log.error("chunk %d is left out: %s", chunk, error)
             failed.append(error)
     if not done and failed:
         raise failed[0]

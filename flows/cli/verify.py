@@ -11,16 +11,13 @@ def verify(
     store: Annotated[str, typer.Option(help="The store to read through.")] = "genre-store",
 ) -> None:
     """Read every artifact of a store and compare it with its manifest; exit code 1 if any is damaged."""
-    from genre_tasks.errors import ArtifactCorruptError
     from storage.local import open_store
 
-    opened = open_store(store)
     whole, damaged = 0, 0
-    for artifact in opened.artifacts():
-        try:
-            opened.verify(artifact)
+    for _, error in open_store(store).check():
+        if error is None:
             whole += 1
-        except ArtifactCorruptError as error:
+        else:
             damaged += 1
             typer.echo(f"damaged: {error}")
     typer.echo(f"{whole} artifacts are whole, {damaged} damaged")

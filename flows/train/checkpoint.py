@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -98,7 +98,7 @@ def _described(episode: Episode) -> dict[str, Any]:
 def _episode(training: MetaTraining, entry: dict[str, Any], tensors: dict[str, Tensor]) -> Episode:
     course = Course(**entry["course"])
     episode = Episode.start(course, training.scenes[course.scene], training.network, training.generator)
-    episode.state = type(episode.state)(*(tensors[name] for name in STATE), iteration=entry["iteration"])
+    episode.state = replace(episode.state, **{name: tensors[name] for name in STATE}, iteration=entry["iteration"])
     if entry["loss"] is not None:
         episode.sight = Sight(entry["loss"], tensors["gradient"], {})
     for sampler, queues in zip(episode.samplers, entry["samplers"], strict=True):

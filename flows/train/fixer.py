@@ -40,8 +40,8 @@ class PairSettings:
 
     width_px: int = 320
     height_px: int = 180
-    optimised: int = 12
-    underfitted: int = 6
+    optimised: int = 14
+    underfitted: int = 8
     perturbed: int = 6
     real_every: tuple[int, ...] = (4, 10)
 

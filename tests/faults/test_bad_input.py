@@ -77,7 +77,7 @@ def test_no_lidar(tmp_path: Path) -> None:
 def test_a_corrupt_image_under_strict(log: Path, tmp_path: Path) -> None:
     file = log / "camera/front_camera/04.png"
     file.write_bytes(file.read_bytes()[:300])
-    words = ("frame 4", "front_camera", "--strict")
+    words = ("frame 4", "front_camera", "strict")
     refused(tmp_path, *run_of(log, tmp_path / "store", "--strict"), words=words)
 
 
