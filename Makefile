@@ -7,7 +7,7 @@ READY   = $(VENV)/.ready
 .PHONY: setup demo test test-all lint clean
 setup: $(READY)
 
-$(READY): pyproject.toml constraints.txt setup.py $(wildcard genre_tasks/render/*.cpp)
+$(READY): pyproject.toml constraints.txt setup.py $(wildcard genre_tasks/render/*.cpp genre_tasks/render/*.h) genre_tasks/render/constants.py genre_tasks/render/build_kernel.py
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "GenRe needs Python 3.11 or newer; run e.g. make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
