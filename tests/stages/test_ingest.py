@@ -10,10 +10,9 @@ import pytest
 
 from genre_tasks.config import IngestConfig
 from genre_tasks.errors import ConfigError, InputError
-from genre_tasks.logs.types import CuboidTrack
 from genre_tasks.scene.chunk import Chunk, Mark
 from genre_tasks.stages.ingest import NO_SWEEP, chunk_count, ingest
-from tests.fakes import SENSOR_HEIGHT_M, FakeCar, FakeLog, yaw_pose
+from tests.fakes import SENSOR_HEIGHT_M, FakeLog
 
 CONFIG = IngestConfig(width_px=96, height_px=64)
 
@@ -82,16 +81,6 @@ def test_same_bytes_again(log: FakeLog, chunk: Chunk) -> None:
     for name in ("positions", "colors", "colored", "frames"):
         assert np.array_equal(getattr(again.static, name), getattr(chunk.static, name))
         assert np.array_equal(getattr(again.actors[0].points, name), getattr(chunk.actors[0].points, name))
-
-
-@pytest.mark.parametrize("offset", [(1e6, -1e6, 0.0), (4.4e5, 4.6e6, 100.0)])
-def test_a_far_world_origin_changes_nothing(log: FakeLog, chunk: Chunk, offset: tuple[float, float, float]) -> None:
-    far = ingest(CONFIG, log.with_(world_offset_m=offset), 0)
-    lidar, far_lidar = (c.static.positions[c.static.frames != NO_SWEEP] for c in (chunk, far))
-    assert lidar.shape == far_lidar.shape and np.abs(lidar - far_lidar).max() < 1e-3
-    assert np.abs(far.chunk_SE3_ego - chunk.chunk_SE3_ego).max() < 1e-6
-    assert np.abs(far.actors[0].chunk_SE3_box - chunk.actors[0].chunk_SE3_box).max() < 1e-6
-    assert np.abs(far.views[7].chunk_SE3_camera - chunk.views[7].chunk_SE3_camera).max() < 1e-6
 
 
 def test_missing_and_unreadable_parts_are_marked(log: FakeLog) -> None:
@@ -175,48 +164,6 @@ def test_no_lidar_needs_points(log: FakeLog, tmp_path: Path) -> None:
     out = ingest(CONFIG.model_copy(update={"points": str(file)}), blind, 0)
     assert np.allclose(out.static.positions, [[17.5, 8, 1 - SENSOR_HEIGHT_M], [17.5, 7, 1 - SENSOR_HEIGHT_M]])
     assert out.static.colored.all() and _kinds(out.marks) == ["actor_few_points"]
-
-
-def test_standstill_and_odd_timestamps(log: FakeLog) -> None:
-    times = tuple(1.7e9 + 0.1 * f for f in range(20))
-    odd = (*times[:5], times[4], times[9], times[6], *times[8:])
-    out = ingest(CONFIG, log.with_(speed_mps=0.0, timestamps_s=odd), 0)
-    assert _kinds(out.marks) == ["timestamps", "standstill"]
-    assert len(out.actors) == 1 and np.isfinite(out.static.positions).all()
-    assert _kinds(ingest(CONFIG, log.with_(timestamps_s=times), 0).marks) == []
-
-
-def _track(name: str, frames: list[int], poses: list[np.ndarray], **changes: object) -> CuboidTrack:
-    track = CuboidTrack(name, "car", np.array(frames), np.stack(poses), (4.0, 1.8, 1.5), True)
-    return replace(track, **changes)  # type: ignore[arg-type]
-
-
-def test_cuboids_that_are_unfit(log: FakeLog) -> None:
-    here = yaw_pose(0.0, (20.0, 0.0, 0.75))
-    there = yaw_pose(0.0, (26.0, 0.0, 0.75))
-    nan = here.copy()
-    nan[0, 3] = np.nan
-    tracks = (
-        _track("after", [30, 31], [here, there]),
-        _track("before", [-3, -2], [here, there]),
-        _track("nan", [0, 1, 2], [nan, nan, nan]),
-        _track("flat", [0, 19], [here, there], size_m=(4.0, float("nan"), 1.5)),
-        _track("brief", [7], [here]),
-        _track("empty", [0, 19], [yaw_pose(0.0, (0.0, 60.0, 30.0)), yaw_pose(0.0, (9.0, 60.0, 30.0))]),
-    )
-    out = ingest(CONFIG, log.with_(extra_tracks=tracks), 0)
-    assert [a.track_id for a in out.actors] == ["mover"]
-    assert sorted(_kinds(out.marks)) == ["actor_few_points"] * 2 + ["cuboid_invalid"] * 2 + ["cuboid_outside"]
-    (outside,) = [m for m in out.marks if m.kind == "cuboid_outside"]
-    assert outside.detail.startswith("2 tracks")
-
-
-def test_poses_between_annotations_and_past_the_end() -> None:
-    sparse = FakeLog(cars=(FakeCar("mover", 6.0, 3.5, speed_mps=6.0),), track_every=6)
-    (actor,) = ingest(CONFIG, sparse, 0).actors
-    assert actor.frames.tolist() == list(range(19)), "annotated at 0, 6, 12, 18: nothing is extrapolated to 19"
-    expected = 6.0 + 0.6 * np.arange(19) - 3.0
-    assert np.allclose(actor.chunk_SE3_box[:, 0, 3], expected)
 
 
 def test_progress_rises_to_the_end(log: FakeLog) -> None:
