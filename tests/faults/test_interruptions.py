@@ -1,0 +1,51 @@
+"""Two workers on one job, and Ctrl-C: nothing lost, nothing half-written, no traceback."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+from flows.pipeline import PIPELINE
+from tests.faults import tiny
+
+pytestmark = pytest.mark.fault
+
+
+def test_two_workers_on_one_job_agree(tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    with tiny.prefect_server(tmp_path) as url:
+        env = tiny.environment(tmp_path, PREFECT_API_URL=url)
+        workers = [
+            subprocess.Popen([tiny.GENRE, *tiny.arguments(store)], env=env, cwd=tmp_path, stderr=subprocess.PIPE)
+            for _ in range(2)
+        ]
+        errors = [worker.communicate(timeout=600)[1] for worker in workers]
+        assert [worker.returncode for worker in workers] == [0, 0], errors
+        quiet = tmp_path / "quiet"
+        tiny.run_to_the_end(tmp_path, quiet, PREFECT_API_URL=url)
+    assert tiny.payloads(store) == tiny.payloads(quiet)
+    assert len(list(store.rglob("manifest.json"))) == len(PIPELINE)
+    assert not list(store.rglob(".tmp-*"))
+
+
+def test_ctrl_c_ends_cleanly_and_the_run_goes_on(tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    with tiny.prefect_server(tmp_path) as url:
+        env = tiny.environment(tmp_path, PREFECT_API_URL=url)
+        command = [tiny.GENRE, *tiny.arguments(store)]
+        process = subprocess.Popen(command, env=env, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+        while not list(store.rglob("initial/*/manifest.json")):
+            assert process.poll() is None
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=120)
+        assert process.returncode == 130
+        assert "Traceback" not in error and "run the same command again" in error
+        assert not list(store.rglob(".tmp-*"))
+        again = tiny.run_to_the_end(tmp_path, store, PREFECT_API_URL=url)
+    served = {s["stage"]: s["cached"] for s in again["chunks"][0]["stages"]}
+    assert served["ingest"] and served["initial"] and not all(served.values())
