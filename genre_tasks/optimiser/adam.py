@@ -10,8 +10,8 @@ from torch import Tensor
 from genre_tasks.optimiser.rules import Step, rate_vector, schedule
 from genre_tasks.optimiser.state import Frame, State
 
-GNET_RATES = (0.2, 0.1, 0.05, 0.3, 0.04)
-ENET_RATES = (0.1, 0.05, 0.025, 0.15, 0.02)
+GNET_RATES = (0.2, 0.2, 0.05, 0.3, 0.02)
+ENET_RATES = (0.1, 0.1, 0.025, 0.15, 0.01)
 
 
 @dataclass(frozen=True)

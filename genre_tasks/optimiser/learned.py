@@ -18,7 +18,7 @@ from genre_tasks.optimiser.adam import GNET_RATES
 from genre_tasks.optimiser.features import FEATURES, Fixed, features
 from genre_tasks.optimiser.rules import Step, rate_vector, schedule
 from genre_tasks.optimiser.sparse_unet import SparseUNet, VoxelPyramid
-from genre_tasks.optimiser.state import Frame, State
+from genre_tasks.optimiser.state import GROUPS, Frame, State
 from genre_tasks.optimiser.voxels import voxel_pyramid
 
 
@@ -30,7 +30,9 @@ class NetworkConfig(BaseModel):
     hidden: int = Field(default=64, ge=4, le=512, description="Width of the head per Gaussian.")
     channels: tuple[int, ...] = Field(default=(16, 32, 48), min_length=1, description="Channels of the UNet's levels.")
     voxel_m: float = Field(default=1.0, gt=0, description="Width of a static voxel near the cameras.")
-    rates: tuple[float, ...] = Field(default=GNET_RATES, description="One per attribute group, as TunedAdam's.")
+    rates: tuple[float, ...] = Field(
+        default=GNET_RATES, min_length=len(GROUPS), max_length=len(GROUPS), description="As TunedAdam's."
+    )
 
 
 class LearnedOptimiser(nn.Module):

@@ -14,7 +14,7 @@ GROUPS = {"means": (0, 3), "log_scales": (3, 6), "quats": (6, 10), "logit_opacit
 """Columns of the 14 attributes, in the order of ``Gaussians.packed``."""
 
 FIRST_DECAY, SECOND_DECAY = 0.9, 0.99
-FLOOR = 1e-15
+FLOOR = 1e-20
 """Added to the root of the second moment, so that an attribute without gradient has none, instead of 0/0."""
 
 MIN_UNIT_M, MAX_UNIT_M = 0.005, 50.0

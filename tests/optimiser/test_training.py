@@ -1,0 +1,93 @@
+"""Meta-training learns, and resumes to the same bytes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from flows.train import checkpoint
+from flows.train.optimiser import network_from, train_optimiser
+from genre_tasks.config import LossConfig
+from genre_tasks.errors import InputError
+from genre_tasks.optimiser.adam import TunedAdam
+from genre_tasks.optimiser.episodes import TrainingScene
+from genre_tasks.optimiser.learned import NetworkConfig
+from genre_tasks.optimiser.objective import Objective
+from genre_tasks.optimiser.training import MetaConfig, MetaTraining
+from genre_tasks.optimiser.unroll import Plan, unroll
+from tests.optimiser import street
+
+RATES = tuple(0.3 * r for r in TunedAdam().rates)
+NETWORK = NetworkConfig(hidden=16, channels=(8, 12), rates=RATES)
+LOSS = LossConfig(perceptual=0)
+CONFIG = MetaConfig(
+    steps=40, segment=3, pool=2, iterations=(6, 9), views=(2, 3), novel_views=1, rate=1e-2, warm_up=4,
+    loss=LOSS, judge_loss=LOSS,
+)  # fmt: skip
+
+
+def _scene(seed: int) -> TrainingScene:
+    truth = street.scene(120, seed)
+    views = street.targets(truth)
+    novel = street.targets(truth, novel=True)
+    return TrainingScene(f"s{seed}", street.blurred(truth), views[:3], views[3:], novel[:2], novel[2:])
+
+
+def test_training_beats_the_rates_it_starts_from() -> None:
+    scenes = [_scene(seed) for seed in range(3)]
+    training = MetaTraining(network_from(NETWORK, 0), scenes, CONFIG)
+    records = [training.step() for _ in range(CONFIG.steps)]
+    assert all(torch.isfinite(torch.tensor([r.judged_loss, r.gradient_norm])).all() for r in records)
+    unseen, results = _scene(9), []
+    for rule in (TunedAdam(RATES), training.network.eval()):
+        run = unroll(rule, unseen.scene, unseen.source, (), Objective(LOSS), Plan(8, 3))
+        results.append(run.losses[-1])
+    assert results[1] < 0.97 * results[0]
+
+
+def _weights(training: MetaTraining) -> list[torch.Tensor]:
+    return [p.detach().clone() for p in training.network.parameters()]
+
+
+def test_resuming_gives_the_same_bytes(tmp_path: Path) -> None:
+    scenes = [_scene(seed) for seed in range(2)]
+    whole = MetaTraining(network_from(NETWORK, 0), scenes, CONFIG)
+    for _ in range(5):
+        whole.step()
+    checkpoint.save(whole, tmp_path / "c.safetensors")
+    again = MetaTraining(network_from(NETWORK, 1), scenes, CONFIG)
+    checkpoint.resume(again, tmp_path / "c.safetensors")
+    assert [whole.step() for _ in range(4)] == [again.step() for _ in range(4)]
+    for a, b in zip(_weights(whole), _weights(again), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_a_checkpoint_of_other_settings_is_refused(tmp_path: Path) -> None:
+    scenes = [_scene(0)]
+    checkpoint.save(MetaTraining(network_from(NETWORK, 0), scenes, CONFIG), tmp_path / "c.safetensors")
+    other = MetaTraining(network_from(NETWORK, 0), scenes, CONFIG.model_copy(update={"rate": 1.0}))
+    with pytest.raises(InputError, match="other config"):
+        checkpoint.resume(other, tmp_path / "c.safetensors")
+
+
+def test_an_interrupted_training_goes_on_and_writes_its_curve(tmp_path: Path) -> None:
+    scenes = [_scene(0)]
+    config = CONFIG.model_copy(update={"steps": 4})
+
+    def run(folder: Path, stop: int | None) -> list[torch.Tensor]:
+        def watch(done: int, network: object) -> None:
+            if done == stop:
+                raise KeyboardInterrupt
+
+        trained = train_optimiser(network_from(NETWORK, 0), scenes, config, folder, save_every=2, watch=watch)
+        return [p.clone() for p in trained.parameters()]
+
+    whole = run(tmp_path / "whole", None)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "parts", 2)
+    resumed = run(tmp_path / "parts", None)
+    assert all(torch.equal(a, b) for a, b in zip(whole, resumed, strict=True))
+    curves = [(tmp_path / name / "curve.csv").read_text() for name in ("whole", "parts")]
+    assert curves[0] == curves[1] and curves[0].count("\n") == 5

@@ -1,0 +1,206 @@
+"""The unrolled loop with both rules, and the hard cases of a learned optimiser."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from genre_tasks.config import LossConfig
+from genre_tasks.errors import NonFiniteError
+from genre_tasks.optimiser.adam import TunedAdam
+from genre_tasks.optimiser.features import FEATURES, Fixed, features
+from genre_tasks.optimiser.learned import LearnedOptimiser, NetworkConfig
+from genre_tasks.optimiser.objective import Objective
+from genre_tasks.optimiser.rules import StepRule
+from genre_tasks.optimiser.state import Frame, State
+from genre_tasks.optimiser.unroll import Plan, unroll
+from genre_tasks.scene.gaussians import Gaussians
+from genre_tasks.scene.graph import SceneGraph
+from genre_tasks.scene.results import Reconstruction
+from tests.optimiser import street
+
+OBJECTIVE = Objective(LossConfig(perceptual=0))
+SMALL = NetworkConfig(hidden=16, channels=(8, 12), rates=TunedAdam().rates)
+
+
+def _network(seed: int = 0, trained: bool = True) -> LearnedOptimiser:
+    """With a head that is not zero, as training would leave it."""
+    torch.manual_seed(seed)
+    network = LearnedOptimiser(SMALL)
+    if trained:
+        torch.nn.init.normal_(network.head.weight, std=0.02)
+    return network.eval().requires_grad_(False)
+
+
+def _run(rule: StepRule, scene: SceneGraph, truth: SceneGraph, plan: Plan) -> Reconstruction:
+    return unroll(rule, scene, street.targets(truth), street.targets(truth, novel=True), OBJECTIVE, plan)
+
+
+@pytest.fixture(scope="module")
+def truth() -> SceneGraph:
+    return street.scene()
+
+
+def test_an_untrained_network_is_tuned_adam_to_the_bit(truth: SceneGraph) -> None:
+    start, plan = street.blurred(truth), Plan(5, 2, 1)
+    a = _run(TunedAdam(SMALL.rates), start, truth, plan)
+    b = _run(_network(trained=False), start, truth, plan)
+    assert a.losses == b.losses
+    assert torch.equal(a.scene.gaussians.packed(), b.scene.gaussians.packed())
+
+
+@pytest.mark.parametrize("rule", [TunedAdam(), _network()], ids=["adam", "learned"])
+def test_the_loss_falls_and_the_result_says_how(rule: StepRule, truth: SceneGraph) -> None:
+    seen = []
+    start = street.blurred(truth)
+    result = unroll(
+        rule,
+        start,
+        street.targets(truth),
+        (),
+        OBJECTIVE,
+        Plan(20, 4, snapshots=3),
+        lambda done, total, note="": seen.append((done, total, note)),
+    )
+    assert result.losses[-1] < 0.6 * result.losses[0]
+    assert len(result.losses) == len(result.seconds_per_iteration) == 20
+    assert sorted(result.snapshots) == [5, 10, 15]
+    assert seen[-1][:2] == (20, 20) and seen[-1][2].startswith("loss ")
+    assert not torch.equal(result.snapshots[5].gaussians.means, result.scene.gaussians.means)
+    assert not result.scene.gaussians.means.requires_grad
+
+
+def test_same_seed_same_bytes_at_any_thread_count(truth: SceneGraph) -> None:
+    start, before, results = street.blurred(truth), torch.get_num_threads(), []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            results.append(_run(_network(), start, truth, Plan(4, 2, 2, seed=7)))
+    finally:
+        torch.set_num_threads(before)
+    assert results[0].losses == results[1].losses
+    assert torch.equal(results[0].scene.gaussians.packed(), results[1].scene.gaussians.packed())
+    other = _run(_network(), start, truth, Plan(4, 2, 2, seed=8))
+    assert other.losses != results[0].losses
+
+
+def _hidden(scene: SceneGraph) -> SceneGraph:
+    """The first five Gaussians behind every camera."""
+    means = scene.gaussians.means.clone()
+    means[:5] = torch.tensor([0.0, 0.0, -50.0])
+    return scene.with_gaussians(replace(scene.gaussians, means=means))
+
+
+@pytest.mark.parametrize("rule", [TunedAdam(), _network()], ids=["adam", "learned"])
+def test_a_gaussian_that_no_view_has_seen_gets_exactly_no_update(rule: StepRule, truth: SceneGraph) -> None:
+    start = _hidden(street.blurred(truth))
+    result = _run(rule, start, truth, Plan(6, 4, 4))
+    before, after = start.gaussians.packed(), result.scene.gaussians.packed()
+    assert torch.equal(before[:5], after[:5])
+    assert bool((before[5:] != after[5:]).any())
+
+
+def _step(network: LearnedOptimiser, scene: SceneGraph, gradient: torch.Tensor, shift: float = 0.0) -> torch.Tensor:
+    frame = Frame.of(scene)
+    centre = torch.tensor([shift, 0.0, 0.0])
+    state = State.start(len(scene), gradient).saw(gradient)
+    return network.start(frame, centre)(state, gradient, 24)
+
+
+def test_permuting_the_gaussians_permutes_the_step(truth: SceneGraph) -> None:
+    gradient = torch.randn(len(truth), 14, generator=torch.Generator().manual_seed(0))
+    order = torch.randperm(len(truth), generator=torch.Generator().manual_seed(1))
+    mixed = replace(
+        truth, gaussians=Gaussians.unpacked(truth.gaussians.packed()[order].clone()), nodes=truth.nodes[order]
+    )
+    network = _network()
+    torch.testing.assert_close(
+        _step(network, mixed, gradient[order]), _step(network, truth, gradient)[order], atol=1e-5, rtol=0
+    )
+
+
+def test_shifting_everything_by_whole_voxels_changes_nothing() -> None:
+    scene = street.scene(actor=False)
+    gradient = torch.randn(len(scene), 14, generator=torch.Generator().manual_seed(0))
+    coarsest = SMALL.voxel_m * 2**5 * 2 * 2 ** (len(SMALL.channels) - 1)
+    g = scene.gaussians
+    moved = scene.with_gaussians(replace(g, means=g.means + torch.tensor([coarsest, 0.0, 0.0])))
+    network = _network()
+    torch.testing.assert_close(
+        _step(network, moved, gradient, shift=coarsest), _step(network, scene, gradient), atol=1e-5, rtol=0
+    )
+
+
+@pytest.mark.parametrize("size", [1e-12, 1e-6, 1.0, 1e8])
+def test_the_step_does_not_depend_on_the_size_of_the_loss(size: float, truth: SceneGraph) -> None:
+    gradient = torch.randn(len(truth), 14, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(
+        _step(_network(), truth, size * gradient), _step(_network(), truth, gradient), atol=1e-4, rtol=0
+    )
+
+
+def test_gradients_of_many_sizes_at_once_give_finite_bounded_features(truth: SceneGraph) -> None:
+    generator = torch.Generator().manual_seed(0)
+    sizes = 10 ** (torch.rand(len(truth), 14, generator=generator) * 20 - 12)
+    gradient = torch.randn(len(truth), 14, generator=generator) * sizes
+    frame = Frame.of(truth)
+    fixed = Fixed.of(frame, torch.zeros(3))
+    inputs = features(frame, fixed, State.start(len(truth), gradient).saw(gradient), gradient, 24)
+    assert inputs.shape == (len(truth), FEATURES)
+    assert bool(torch.isfinite(inputs).all()) and float(inputs.abs().max()) < 20
+    assert bool(torch.isfinite(_step(_network(), truth, gradient)).all())
+
+
+def test_far_beyond_its_horizon_it_stays_bounded(truth: SceneGraph) -> None:
+    result = unroll(TunedAdam(), street.blurred(truth), street.targets(truth), (), OBJECTIVE, Plan(12, 4))
+    long = unroll(TunedAdam(), street.blurred(truth), street.targets(truth), (), OBJECTIVE, Plan(120, 4))
+    assert long.losses[-1] <= result.losses[-1] * 1.05
+    packed = long.scene.gaussians.packed()
+    assert bool(torch.isfinite(packed).all())
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_empty_and_single_scenes(count: int) -> None:
+    full = street.scene(actor=False)
+    scene = SceneGraph(
+        Gaussians.unpacked(full.gaussians.packed()[50 : 50 + count].clone()), full.nodes[50 : 50 + count], ()
+    )
+    result = unroll(_network(), scene, street.targets(full), (), OBJECTIVE, Plan(2, 2))
+    assert len(result.scene) == count
+    assert bool(torch.isfinite(result.scene.gaussians.packed()).all())
+
+
+def test_all_gaussians_in_one_voxel() -> None:
+    full = street.scene(actor=False)
+    g = full.gaussians
+    scene = full.with_gaussians(replace(g, means=torch.tensor([0.0, 0.0, 6.0]).expand(len(full), 3).clone()))
+    result = unroll(_network(), scene, street.targets(full), (), OBJECTIVE, Plan(2, 2))
+    assert bool(torch.isfinite(result.scene.gaussians.packed()).all())
+
+
+def test_a_step_that_is_not_finite_is_named(truth: SceneGraph) -> None:
+    class Broken:
+        def start(self, frame: Frame, centre: torch.Tensor):
+            def step(state: State, gradient: torch.Tensor, total: int) -> torch.Tensor:
+                delta = torch.zeros_like(gradient)
+                delta[-1, 4] = torch.nan
+                return delta
+
+            return step
+
+    with pytest.raises(NonFiniteError) as raised:
+        unroll(Broken(), street.blurred(truth), street.targets(truth), (), OBJECTIVE, Plan(2, 2, stage="gnet"))
+    assert raised.value.stage == "gnet" and raised.value.first_index == (len(truth) - 1, 4)
+
+
+def test_bounds_hold_and_what_starts_outside_may_stay() -> None:
+    scene = street.scene(actor=False)
+    frame = Frame.of(scene)
+    state = State.start(len(scene), scene.gaussians.means).saw(torch.ones(len(scene), 14))
+    far = state.moved(frame, torch.full((len(scene), 14), 100.0))
+    g = frame.gaussians(far.offsets)
+    assert float(g.logit_opacities.max()) <= 9.0 + 1e-5
+    assert float(g.log_scales[30:].max()) <= 1.0987 and float(g.log_scales[:30].max()) <= 4.6001
+    assert float(g.colors.max()) <= 1.5 + 1e-5
