@@ -25,8 +25,9 @@ from storage.code_digest import code_digest
 from storage.local import Artifact, open_store
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
+    from genre_tasks.scene.chunk import Mark
     from storage.store import Store
 
 
@@ -137,7 +138,7 @@ def produce(
         seconds=usage.seconds,
         peak_mib=usage.peak_mib,
         environment=environment(),
-        measurements={"marks": [f"{m.kind}: {m.detail}" for m in getattr(value, "marks", ())]},
+        measurements={"marks": _grouped_marks(getattr(value, "marks", ()))},
         warnings=(note,) if note else (),
     )
     return _ref(artifact, cached=False, note=note)
@@ -210,6 +211,17 @@ def _specials(spec: StageSpec, job: Job) -> dict[str, Any]:
         log = opened_log(job.log)
         values |= {"log": log, "truth": log.truth}
     return values
+
+
+def _grouped_marks(marks: Iterable[Mark]) -> list[str]:
+    """What the chunk's log lacks, a line a kind: the first detail, and how many more there are."""
+    kinds: dict[str, list[str]] = {}
+    for mark in marks:
+        kinds.setdefault(mark.kind.replace("_", " "), []).append(mark.detail)
+    return [
+        f"{kind}: {details[0]}" + f" (and {len(details) - 1} more)" * (len(details) > 1)
+        for kind, details in kinds.items()
+    ]
 
 
 def _smaller(spec: StageSpec, section: Any, attempt: int) -> Any:
