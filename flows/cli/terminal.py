@@ -6,6 +6,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any
 
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -14,14 +15,15 @@ if TYPE_CHECKING:
 
     from flows.produce import ArtifactRef
 
-_HEADLINES = (
-    "interpolation/psnr",
-    "interpolation/ssim",
-    "interpolation/perceptual",
-    "shift_3m/psnr",
-    "shift_3m/perceptual",
-    "shift_3m/kernel",
-)
+_HEADLINES = {
+    "interpolation/psnr": "PSNR",
+    "interpolation/ssim": "SSIM",
+    "interpolation/perceptual": "perc.",
+    "shift_3m/psnr": "PSNR@3m",
+    "shift_3m/perceptual": "perc.@3m",
+    "shift_3m/kernel": "kernel@3m",
+}
+"""What the table at the end shows; the report has everything."""
 
 
 class TerminalReporter:
@@ -72,17 +74,25 @@ class TerminalReporter:
 
 def print_run(summary: dict[str, Any]) -> None:
     """The table of metrics per stage, what came from the cache, and where the report is."""
-    console = Console()
+    console = _console()
     for chunk in summary["chunks"]:
-        table = Table(title=f"{summary['log']}, chunk {chunk['chunk']}", title_justify="left")
+        table = Table(
+            title=f"{summary['log']}, chunk {chunk['chunk']}",
+            title_justify="left",
+            box=box.SIMPLE,
+            padding=(0, 1, 0, 0),
+        )
         shown = [h for h in _HEADLINES if any(h in s["metrics"] for s in chunk["stages"])]
-        for column in ("stage", "served", "seconds", "peak MiB", *shown):
-            table.add_column(column, justify="left" if column in ("stage", "served") else "right")
+        for column in ("stage", "", "s", "MiB", *(_HEADLINES[h] for h in shown)):
+            table.add_column(column, justify="left" if column in ("stage", "") else "right", no_wrap=True)
         for stage in chunk["stages"]:
-            cells = [f"{stage['metrics'][h]:.3f}" if h in stage["metrics"] else "" for h in shown]
-            served = "cache" if stage["cached"] else "computed"
-            table.add_row(stage["stage"], served, f"{stage['seconds']:.1f}", f"{stage['peak_mib']:.0f}", *cells)
+            if not stage["stage"].startswith("evaluate/"):
+                cells = [f"{stage['metrics'][h]:.3f}" if h in stage["metrics"] else "" for h in shown]
+                served = "cached" if stage["cached"] else "new"
+                table.add_row(stage["stage"], served, f"{stage['seconds']:.1f}", f"{stage['peak_mib']:.0f}", *cells)
         console.print(table)
+        evaluation = sum(s["seconds"] for s in chunk["stages"] if s["stage"].startswith("evaluate/"))
+        console.print(f"  evaluation took {evaluation:.1f} s, which no stage's seconds include")
         for warning in chunk["warnings"]:
             console.print(f"  note: {warning}", markup=False)
     stages = [s for c in summary["chunks"] for s in c["stages"]]
@@ -94,9 +104,14 @@ def print_run(summary: dict[str, Any]) -> None:
     console.print(f"report {summary['report']}", soft_wrap=True)
 
 
+def _console() -> Console:
+    """As wide as the terminal; wide enough for the tables where there is none."""
+    return Console() if sys.stdout.isatty() else Console(width=110)
+
+
 def print_plan(plan: dict[str, Any]) -> None:
     """The dry run's table."""
-    console = Console()
+    console = _console()
     table = Table(title=f"{plan['log']} (dry run)", title_justify="left")
     for column in ("chunk", "stage", "key", "cache", "seconds", "GB"):
         table.add_column(column, justify="right" if column in ("seconds", "GB") else "left")
