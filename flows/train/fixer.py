@@ -152,15 +152,16 @@ def train_fnet(
     settings: TrainingSettings | None = None,
     validation: Pairs | None = None,
     progress: Progress = silent,
+    start: Path | None = None,
 ) -> Path:
     """Trains the small fixer on files of pairs; writes ``fnet.safetensors`` and ``fnet.json`` into ``folder``.
 
     Resumes from the checkpoints in ``folder``; with ``validation`` a sample picture (render | fixed | truth) is written
-    at each of them.
+    at each of them. ``start``: weights to train further instead of beginning with the autoencoder.
     """
     from genre_tasks.fixer.pairs import load_pairs
     from genre_tasks.fixer.training import TrainingSettings, train
-    from genre_tasks.fixer.weights import save_fnet
+    from genre_tasks.fixer.weights import load_fnet, save_fnet
     from genre_tasks.metrics.perceptual import perceptual_distance
 
     def checkpoint(fnet: Fnet, step: int) -> None:
@@ -169,7 +170,8 @@ def train_fnet(
             save_picture(fnet, validation, folder / f"sample-{step:06d}.png")
 
     settings = settings or TrainingSettings()
-    train(load_pairs(pairs), settings, folder, perceptual_distance(), progress, checkpoint)
+    fixer = None if start is None else load_fnet(start)
+    train(load_pairs(pairs), settings, folder, perceptual_distance(), progress, checkpoint, start=fixer)
     return folder / "fnet.safetensors"
 
 

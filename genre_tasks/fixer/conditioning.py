@@ -24,8 +24,27 @@ MAX_COLOUR_SHIFT = 0.03
 """Largest change of an image's mean per channel, where the render is more than half opaque. A fixer repairs structure;
 a larger drift of the whole image is an error of the network (about 8 of 255 levels, just visible side by side)."""
 
+HIDDEN_PX = 5.0
+"""Parallax at which a point counts as hidden. A road seen from 1.6 m above changes by about 2 px of parallax (at 3 m
+of shift) from one row of pixels to the next, and must not hide itself."""
+
 MIN_WARP_ALPHA = 0.5
 """Rendered depth is trusted for the warp where at least half of the ray's light is accounted for."""
+
+
+def _hidden(x: Tensor, y: Tensor, z: Tensor, inside: Tensor, baseline_px: float) -> Tensor:
+    """Where a point [H, W], at ``x, y`` in [−1, 1] of the reference's image and depth ``z`` there, lies behind another.
+
+    Behind: a point within one pixel is nearer by ``HIDDEN_PX`` of parallax between view and reference.
+    """
+    height, width = z.shape
+    row = ((y + 1) / 2 * height).long().clamp(0, height - 1)
+    column = ((x + 1) / 2 * width).long().clamp(0, width - 1)
+    cell = (row * width + column).reshape(-1)
+    nearness = torch.where(inside, 1 / z, torch.zeros_like(z))
+    nearest = torch.zeros(height * width).to(z).scatter_reduce(0, cell, nearness.reshape(-1), "amax")
+    spread = F.max_pool2d(nearest.reshape(1, 1, height, width), 3, 1, 1).reshape(-1)
+    return baseline_px * (spread[cell].reshape(height, width) - nearness) > HIDDEN_PX
 
 
 @dataclass(frozen=True)
@@ -90,7 +109,8 @@ def warp_reference(
 ) -> tuple[Tensor, Tensor]:  # [B, 3, H, W], [B, 1, H, W]
     """The reference as the view would see it, by the rendered depth, and where that is defined (elsewhere black).
 
-    Occlusion is not tested: whether a pixel agrees with the render is for the network to judge.
+    Defined is a pixel whose point lies in the reference's image and is not hidden there by a nearer point of the view
+    (the view's depth, splatted into the reference; what the view does not see cannot be found to hide anything).
     """
     batch, _, height, width = depth.shape
     grids, valid = [], []
@@ -110,6 +130,8 @@ def warp_reference(
         x = (points[..., 0] / safe * source.fx_px + source.cx_px) / source.width_px * 2 - 1
         y = (points[..., 1] / safe * source.fy_px + source.cy_px) / source.height_px * 2 - 1
         inside = known & ahead & (x.abs() < 1) & (y.abs() < 1)
+        baseline_px = float(np.linalg.norm(view_pose[:3, 3] - source_pose[:3, 3])) * source.fx_px
+        inside &= ~_hidden(x, y, safe, inside, baseline_px)
         grids.append(torch.stack([x, y], -1).clamp(-2, 2))
         valid.append(inside)
     mask = torch.stack(valid)[:, None].to(reference.dtype)

@@ -19,13 +19,16 @@ HINTS = 10
 """Channels of ``Conditions.hints``: render alpha, LiDAR alpha; the reference warped by rendered depth (3) and where
 that is valid; the same by the LiDAR map's depth."""
 
+GATES = 3
+"""Sources that a corrected render may copy from: LiDAR map, reference by rendered depth, reference by LiDAR depth."""
+
 
 @dataclass(frozen=True)
 class FnetArchitecture:
     """What makes a network: the configurations of the two diffusers models, and how the output is formed.
 
-    ``residual``: the decoder predicts a correction of the render, so that an untrained fixer is the identity; without
-    it the decoder's image is the output, as in SD-Turbo.
+    ``residual``: the decoder predicts a correction of the render (see :func:`corrected`), so that an untrained fixer is
+    the identity; without it the decoder's image is the output, as in SD-Turbo.
     """
 
     vae: dict[str, Any]
@@ -116,7 +119,7 @@ class Fnet(nn.Module):
         ).sample
         return noisy - self.sigma * predicted.unflatten(0, views.shape[:2])[:, 0]
 
-    def decode(self, latent: Tensor, render: Encoded, lidar: Encoded, hints: Tensor, image: Tensor) -> Tensor:
+    def decode(self, latent: Tensor, render: Encoded, lidar: Encoded, inputs: Conditions) -> Tensor:
         """The image [B, 3, H, W], not clamped, of a latent and what the skip connections bring."""
         decoder = self.vae.decoder
         z = latent / self.vae.config.scaling_factor
@@ -125,10 +128,10 @@ class Fnet(nn.Module):
         x = decoder.mid_block(decoder.conv_in(z))
         levels = list(zip(self.skips, render.features, lidar.features, strict=True))
         for block, (skip, ours, points) in zip(decoder.up_blocks, reversed(levels), strict=True):
-            pooled = F.adaptive_avg_pool2d(hints, (ours.shape[-2], ours.shape[-1]))
+            pooled = F.adaptive_avg_pool2d(inputs.hints, (ours.shape[-2], ours.shape[-1]))
             x = block(x + skip(torch.cat([ours, points, pooled], 1)))
         x = decoder.conv_out(decoder.conv_act(decoder.conv_norm_out(x))) / 2
-        return image + x if self.architecture.residual else x + 0.5
+        return corrected(x, inputs) if self.architecture.residual else x + 0.5
 
     def forward(self, conditions: Conditions, noise: Tensor, reference: Encoded | None = None) -> Tensor:
         """The fixed images [B, 3, H, W], not clamped (a loss needs the gradient beyond 0 and 1).
@@ -142,11 +145,26 @@ class Fnet(nn.Module):
         render, lidar = self.encode(conditions.render), self.encode(conditions.lidar)
         reference = self.encode(conditions.reference) if reference is None else reference
         latent = self.denoise(render.latent, reference.latent, lidar.latent, noise)
-        return self.decode(latent, render, lidar, conditions.hints, conditions.render)
+        return self.decode(latent, render, lidar, conditions)
 
     def noise_shape(self, height: int, width: int) -> tuple[int, int, int]:
         """Shape of one view's noise, [C, h, w]."""
         return int(self.vae.config.latent_channels), height // self.latent_stride, width // self.latent_stride
+
+
+def corrected(output: Tensor, inputs: Conditions) -> Tensor:
+    """The render plus a residual, plus gates times what the aligned sources have that the render has not.
+
+    ``output`` [B, 3 + GATES, H, W]. A gate of 1 copies its source's pixel (LiDAR map, the two warps of the reference):
+    sharp detail that exists is carried over and not drawn anew.
+    """
+    out = inputs.render + output[:, :3]
+    lidar_alpha, warped, mask = inputs.hints[:, 1:2], inputs.hints[:, 2:5], inputs.hints[:, 5:6]
+    lidar_warped, lidar_mask = inputs.hints[:, 6:9], inputs.hints[:, 9:10]
+    sources = ((inputs.lidar, lidar_alpha), (warped, mask), (lidar_warped, lidar_mask))
+    for k, (image, cover) in enumerate(sources):  # images are premultiplied: no division where they are empty
+        out = out + output[:, 3 + k : 4 + k] * (image - cover * inputs.render)
+    return out
 
 
 def noise_level(timestep: int) -> tuple[float, float]:
@@ -160,7 +178,7 @@ def noise_level(timestep: int) -> tuple[float, float]:
 
 
 def small_architecture(
-    widths: tuple[int, ...] = (16, 32, 32, 64), latent_channels: int = 8, unet_widths: tuple[int, ...] = (48, 96)
+    widths: tuple[int, ...] = (24, 32, 48, 64), latent_channels: int = 8, unet_widths: tuple[int, ...] = (32, 64)
 ) -> FnetArchitecture:
     """The default network: the same classes, sized for CPUs."""
     blocks = len(widths)
@@ -172,6 +190,7 @@ def small_architecture(
             "block_out_channels": widths,
             "layers_per_block": 1,
             "latent_channels": latent_channels,
+            "out_channels": 3 + GATES,
             "norm_num_groups": 8,
             "mid_block_add_attention": False,
             "scaling_factor": 1.0,
@@ -183,7 +202,7 @@ def small_architecture(
             "down_block_types": ("CrossAttnDownBlock2D",) * depth,
             "up_block_types": ("CrossAttnUpBlock2D",) * depth,
             "layers_per_block": 1,
-            "attention_head_dim": 4,
+            "attention_head_dim": 1,  # heads (diffusers' name is historical): on CPUs attention costs by the head
             "cross_attention_dim": 8,
             "norm_num_groups": 8,
         },

@@ -6,6 +6,7 @@ takes the same steps as one that was never stopped.
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -26,20 +27,20 @@ from genre_tasks.progress import Progress, silent
 class TrainingSettings:
     """How long and with what. The paper trains 20 000 steps of batch 8 at 720 × 1280 from SD-Turbo."""
 
-    autoencoder_steps: int = 500
+    autoencoder_steps: int = 200
     autoencoder_batch: int = 4
-    steps: int = 4000
+    steps: int = 2600
     batch: int = 2
     crop: tuple[int, int] = (128, 192)
-    learning_rate: float = 6e-4
-    autoencoder_learning_rate: float = 1e-3
-    warmup: int = 100
+    learning_rate: float = 1e-3
+    autoencoder_learning_rate: float = 2e-3
+    warmup: int = 50
     perceptual: float = 0.1
     clean_share: float = 0.08
-    average: float = 0.998
+    average: float = 0.995
     kl: float = 1e-5
     seed: int = 0
-    checkpoint_every: int = 250
+    checkpoint_every: int = 200
 
 
 AUTOENCODER_SETTINGS = ("autoencoder_steps", "autoencoder_batch", "autoencoder_learning_rate", "crop", "kl", "seed")
@@ -69,10 +70,12 @@ def train(
     progress: Progress = silent,
     on_checkpoint: Callable[[Fnet, int], None] | None = None,
     architecture: FnetArchitecture | None = None,
+    start: Fnet | None = None,
 ) -> Fnet:
     """A trained fixer (averaged weights); continues from ``folder`` where a checkpoint of the same settings lies there.
 
     Args:
+        start: a fixer to train further; without it training begins with the autoencoder.
         distance: perceptual distance of [B, H, W, 3] images, [B].
         on_checkpoint: called with the averaged network and the step at each checkpoint (a sample picture, say).
 
@@ -80,12 +83,15 @@ def train(
         InputError: the checkpoint is of other settings. NonFiniteError: a loss is not finite.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    start = architecture or small_architecture()
-    total = settings.autoencoder_steps + settings.steps
-    fnet = _pretrained(pairs, settings, start, folder, progress, total)
+    first = settings.autoencoder_steps if start is None else 0
+    total = first + settings.steps
+    if start is None:
+        fnet = _pretrained(pairs, settings, architecture or small_architecture(), folder, progress, total)
+    else:
+        fnet = copy.deepcopy(start).requires_grad_(True).train()
     state = _fixer_state(fnet, settings)
     _restore(state, folder / "fixer.pt", settings)
-    report = _Reporter(progress, settings.autoencoder_steps, total, state.step)
+    report = _Reporter(progress, first, total, state.step)
     while state.step < settings.steps:
         views, truth = sample(pairs, state.generator, settings.batch, settings.crop, settings.clean_share)
         inputs = conditions(views)
@@ -124,10 +130,11 @@ def train_autoencoder(
     while state.step < settings.autoencoder_steps:
         _, image = sample(pairs, generator, settings.autoencoder_batch, settings.crop, 0.0)
         posterior = vae.encode(image * 2 - 1).latent_dist
-        out = vae.decode(posterior.sample(generator)).sample / 2 + 0.5
+        out = vae.decode(posterior.sample(generator)).sample[:, :3] / 2 + 0.5
         loss = (out - image).abs().mean() + settings.kl * posterior.kl().mean() / posterior.mean[0].numel()
         _step(state, loss, settings, settings.autoencoder_learning_rate, settings.autoencoder_steps)
-        spread = torch.lerp(spread, posterior.mean.detach().std(), 0.05) if state.step > 1 else posterior.mean.std()
+        latent = posterior.mean.detach()
+        spread = torch.lerp(spread, latent.std(), 0.05) if state.step > 1 else latent.std()
         report(state)
     vae.register_to_config(scaling_factor=1.0 / float(spread))
     return fnet

@@ -96,3 +96,17 @@ def test_small_changes_are_left_as_they_are():
 def test_without_opaque_pixels_nothing_is_corrected():
     fixed = torch.rand(1, 3, 4, 4)
     assert torch.equal(bound_colour_shift(fixed, torch.zeros(1, 3, 4, 4), torch.zeros(1, 1, 4, 4)), fixed)
+
+
+def test_what_a_nearer_thing_hides_is_not_warped():
+    # a post at 4 m before a wall at 20 m; the reference stands 2 m to the left of the view, and sees the post where the
+    # view's wall pixels (30 · 2 / 4 − 30 · 2 / 20 = 12 px beside the view's post) lie behind it
+    image, one = torch.rand(1, 3, 24, 40), torch.ones(1, 1, 24, 40)
+    depth = one * 20
+    depth[..., 10:14] = 4
+    pose = np.eye(4)
+    pose[0, 3] = 2.0
+    _, mask = warp_reference(image, depth, one, [(pose, np.eye(4))], [(lens(), lens())])
+    assert mask[..., 10:14].all()
+    assert not mask[..., 22:26].any()
+    assert mask[..., 28:36].all() and mask[..., :10].all()

@@ -148,7 +148,7 @@ def base(tmp_path) -> Path:
 
     toy_size: FnetArchitecture = small_architecture((8, 8, 16, 16), 4, (16, 16))
     torch.manual_seed(0)
-    AutoencoderKL(**toy_size.vae).save_pretrained(tmp_path / "base" / "vae")
+    AutoencoderKL(**{**toy_size.vae, "out_channels": 3}).save_pretrained(tmp_path / "base" / "vae")
     UNet2DConditionModel(**toy_size.unet).save_pretrained(tmp_path / "base" / "unet")
     return tmp_path / "base"
 
