@@ -114,6 +114,34 @@ def psnr(scene: SceneGraph, targets: Sequence[Target]) -> float:
     return float((-10 * torch.log10(error)).mean())
 
 
+def plot_curve(curve: Path, picture: Path, window: int = 50) -> None:
+    """The learning curve as a PNG: the unseen views' loss at each segment's end, over its mean, and its running mean.
+
+    Each scene's losses are divided by that scene's mean, so that easy and hard streets can share an axis.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    import numpy as np
+
+    rows = _read_curve(curve)
+    scenes = [row["scene"] for row in rows]
+    loss = np.array([float(row["judged_loss"]) for row in rows])
+    for name in set(scenes):
+        own = np.array([s == name for s in scenes])
+        loss[own] /= loss[own].mean()
+    figure, axes = plt.subplots(figsize=(7, 3.5), layout="constrained")
+    axes.plot(loss, ".", markersize=2, alpha=0.4, label="a segment")
+    if len(loss) >= window:
+        mean = np.convolve(loss, np.ones(window) / window, "valid")
+        axes.plot(np.arange(window - 1, len(loss)), mean, label=f"mean of {window}")
+    axes.set(xlabel="weight updates", ylabel="loss on unseen views / scene's mean")
+    axes.legend()
+    figure.savefig(picture, dpi=120)
+    plt.close(figure)
+
+
 def _read_curve(path: Path) -> list[dict[str, str]]:
     if not path.is_file():
         return []
