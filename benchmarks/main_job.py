@@ -22,10 +22,10 @@ from flows.pipeline import PIPELINE
 from flows.produce import ArtifactRef, Job, produce
 from storage.local import open_store
 
-SYNTHETIC_STAGES = tuple(spec.name for spec in PIPELINE)
+ALL_STAGES = tuple(spec.name for spec in PIPELINE)
 
 
-def reconstruct(job: Job, stages: tuple[str, ...] = SYNTHETIC_STAGES) -> dict[str, ArtifactRef]:
+def reconstruct(job: Job, stages: tuple[str, ...] = ALL_STAGES) -> dict[str, ArtifactRef]:
     """The named stages of one chunk, in order."""
     refs: dict[str, ArtifactRef] = {}
     for spec in PIPELINE:
@@ -112,6 +112,32 @@ def claim(name: str, measured: float, op: str, target: float, unit: str, data: s
     }
 
 
+_STAGES = (("initial", "initial"), ("adam", "tuned Adam"), ("gnet", "GNet"), ("fnet", "FNet"), ("enet", "ENet"))
+_COLUMNS = {
+    "held-out PSNR": "interpolation/psnr",
+    "SSIM": "interpolation/ssim",
+    "perceptual": "interpolation/perceptual",
+    "PSNR @3m": "shift_3m/psnr",
+    "perceptual @3m": "shift_3m/perceptual",
+    "kernel @3m": "shift_3m/kernel",
+}
+
+
+def markdown(rows: list[dict[str, Any]]) -> Iterator[str]:
+    """The rows as the table that the README shows."""
+    yield "| log | stage | seconds | " + " | ".join(_COLUMNS) + " |"
+    yield "|---|---|---|" + "---|" * len(_COLUMNS)
+    for row in rows:
+        for stage, name in _STAGES:
+            found = row["metrics"][stage]
+            cells = [f"{found[m]:.3f}" if m in found else "" for m in _COLUMNS.values()]
+            log = f"{row['log'].split('/')[-1].removeprefix('synthetic:')} chunk {row['chunk']}"
+            yield f"| {log} | {name} | {row['seconds'][stage]:.1f} | " + " | ".join(cells) + " |"
+        fixed = row["metrics"]["fnet"]
+        given = [f"{fixed[key]:.3f}" if (key := m.replace("/", "/render_")) in fixed else "" for m in _COLUMNS.values()]
+        yield "| | the renders FNet was given | | " + " | ".join(given) + " |"
+
+
 def say(text: str) -> None:
     sys.stderr.write(text + "\n")
 
@@ -132,6 +158,8 @@ def main() -> None:
     result = {"machine": platform.processor() or platform.machine(), "commit": commit, "rows": rows, "claims": claims}
     options.json.parent.mkdir(parents=True, exist_ok=True)
     options.json.write_text(json.dumps(result, indent=1) + "\n")
+    for line in markdown(rows):
+        sys.stdout.write(line + "\n")
     for c in claims:
         say(
             f"{'holds' if c['holds'] else 'FAILS'}  {c['id']:<28} {c['measured']:9.4f} {c['op']} {c['target']}  {c['data']}"
