@@ -51,9 +51,6 @@ def main() -> None:
             raise
         typer.echo(f"error: {error}", err=True)
         raise SystemExit(2 if isinstance(error, ConfigError | InputError) else 1) from None
-    except KeyboardInterrupt:
-        typer.echo("stopped; finished stages are kept: run the same command again to go on", err=True)
-        raise SystemExit(130) from None
 
 
 if __name__ == "__main__":

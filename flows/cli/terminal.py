@@ -6,6 +6,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any
 
+import typer
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -41,6 +42,9 @@ class TerminalReporter:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         if self._live:
             self._write("")
+        if kind is KeyboardInterrupt:
+            self._write("stopped; what is finished is kept: run the same command again to go on", end=True)
+            raise typer.Exit(130)
 
     def stage_started(self, stage: str, chunk: int) -> None:
         self._started = self._said = time.monotonic()
