@@ -40,7 +40,9 @@ class InitialConfig(Section):
     distant_radius_m: float = Field(200.0, gt=10, description="Radius of the distant region's shell.")
     neighbours: int = Field(16, ge=4, le=64, description="LiDAR neighbourhood for normal and thickness.")
     opacity: float = Field(0.6, gt=0, lt=1, description="Opacity of near Gaussians at the start.")
-    max_range_m: float = Field(100.0, gt=1, description="LiDAR points farther from the path are left to the distant region.")
+    max_range_m: float = Field(
+        100.0, gt=1, description="LiDAR points farther from the path are left to the distant region."
+    )
 
 
 class LossConfig(Section):

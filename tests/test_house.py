@@ -45,7 +45,9 @@ def test_compose_file_follows_the_specification() -> None:
     for service in compose["services"].values():
         for name in service.get("depends_on", {}):
             assert "healthcheck" in compose["services"][name]
-    named = {v.split(":")[0] for s in compose["services"].values() for v in s.get("volumes", []) if "/" not in v[:1] + v[:2]}
+    named = {
+        v.split(":")[0] for s in compose["services"].values() for v in s.get("volumes", []) if "/" not in v[:1] + v[:2]
+    }
     assert {n for n in named if re.fullmatch(r"\w+", n)} == set(compose["volumes"])
 
 
