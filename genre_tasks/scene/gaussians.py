@@ -11,6 +11,15 @@ OPACITY_CLAMP = 1e-6
 """Opacities are kept in [1e-6, 1 − 1e-6] when they are taken to logits, so that the logit is finite."""
 
 
+def sigmoid(logits: Tensor) -> Tensor:
+    """1 / (1 + e^−x), elementwise, the same bits at any thread count.
+
+    ``torch.sigmoid`` rounds differently at the ends of the pieces that its threads take. Below −80, where the value is
+    under 1e-34, it is constant, so that neither value nor gradient overflows.
+    """
+    return 1.0 / (1.0 + torch.exp(-logits.clamp_min(-80.0)))
+
+
 @dataclass(frozen=True)
 class Gaussians:
     """N Gaussians as a structure of arrays, float32, in the space in which they are optimised."""
@@ -26,7 +35,7 @@ class Gaussians:
 
     def activated(self) -> Splats:
         """What a renderer takes: scales = exp, opacities = sigmoid; the only place where this is done."""
-        return Splats(self.means, self.log_scales.exp(), self.quats, torch.sigmoid(self.logit_opacities), self.colors)
+        return Splats(self.means, self.log_scales.exp(), self.quats, sigmoid(self.logit_opacities), self.colors)
 
     def packed(self) -> Tensor:
         """[N, 14] in the order means 0:3, log_scales 3:6, quats 6:10, logit_opacities 10, colors 11:14."""
