@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from flows.cli.main import prepare_environment
 from flows.configuration import load_configuration
 from flows.pipeline import PIPELINE
 from flows.produce import ArtifactRef, Job, produce
@@ -151,6 +152,7 @@ def main() -> None:
     parser.add_argument("--seeds", default="1001,1002,1003")
     parser.add_argument("--pandaset", default="../shared/data/pandaset/002")
     options = parser.parse_args()
+    prepare_environment(debug=False)  # before torch is imported
     rows = [measure(f"synthetic:street?seed={seed}", 0, options.store) for seed in options.seeds.split(",") if seed]
     claims = [c for row in rows for c in claims_of(row, real=False)]
     if Path(options.pandaset).is_dir():
