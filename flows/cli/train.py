@@ -1,4 +1,4 @@
-"""``genre train``: the commands behind the shipped weights, in their order: pairs, fnet, enet, gnet.
+"""``genre train``: the commands behind the shipped weights, in their order: pairs, fnet, gnet, enet.
 
 Everything goes into one folder and is resumable: a command that was stopped goes on where it was.
 """
@@ -51,3 +51,39 @@ def fnet(folder: Folder = Path("training")) -> None:
     with TerminalReporter("training fnet") as reporter:
         weights = train_fnet(files, folder / "fnet", progress=reporter.progress)
     typer.echo(f"weights in {weights}; use them with --set fnet.weights={weights}")
+
+
+@app.command()
+def gnet(folder: Folder = Path("training"), real: Real = None) -> None:
+    """Train GNet on streets made on the spot; FNet is not needed."""
+    from flows.cli.terminal import TerminalReporter
+    from flows.train.recipes import train_gnet
+    from genre_tasks.optimiser.weights import save
+    from storage.local import LocalStore
+
+    with TerminalReporter("training gnet") as reporter:
+        network = train_gnet(LocalStore(folder / "store"), folder / "gnet", real, reporter.progress)
+    save(network, folder / "gnet.safetensors")
+    typer.echo(
+        f"weights in {folder / 'gnet.safetensors'}; use them with --set gnet.weights={folder / 'gnet.safetensors'}"
+    )
+
+
+@app.command()
+def enet(folder: Folder = Path("training"), real: Real = None) -> None:
+    """Train ENet from GNet's weights, on scenes that GNet made and with FNet's images of them."""
+    from flows.cli.terminal import TerminalReporter
+    from flows.train.recipes import train_enet
+    from genre_tasks.errors import InputError
+    from genre_tasks.optimiser.weights import save
+    from storage.local import LocalStore
+
+    start = folder / "gnet" / "fine" / "weights.safetensors"
+    if not start.is_file():
+        raise InputError("GNet is not trained yet", remedy="Run `genre train gnet` first.", file=start)
+    with TerminalReporter("training enet") as reporter:
+        network = train_enet(LocalStore(folder / "store"), folder / "enet", folder / "gnet", real, reporter.progress)
+    save(network, folder / "enet.safetensors")
+    typer.echo(
+        f"weights in {folder / 'enet.safetensors'}; use them with --set enet.weights={folder / 'enet.safetensors'}"
+    )

@@ -36,6 +36,14 @@ GNET_JUDGE = LossConfig(perceptual=0.0, depth=0.0, novel=0.1)
 STAND_IN_TRUTH = 0.6
 ENET_LOSS = LossConfig(perceptual=0.02, perceptual_every=2)
 ENET_JUDGE = LossConfig(perceptual=0.05, perceptual_every=1, depth=0.0)
+Stage = tuple[str, bool, int, float, int]
+"""Folder, whether at 320×180, weight updates, rate, seed."""
+GNET_STAGES: tuple[Stage, ...] = (
+    ("coarse", False, 1200, 2.5e-3, 0),
+    ("fine", True, 240, 5e-4, 1),
+    ("finer", True, 240, 5e-4, 2),
+)
+ENET_STAGES: tuple[Stage, ...] = (("coarse", False, 300, 1e-3, 0), ("fine", True, 160, 5e-4, 1))
 ENET_COARSE = 24
 ENET_CONFIG = MetaConfig(
     steps=0,
@@ -74,47 +82,37 @@ def fine_scenes(count: int = 15, real: str | None = None) -> list[SceneRecipe]:
 
 
 def train_gnet(
-    store: LocalStore,
-    folder: Path,
-    real: str | None = None,
-    steps: tuple[int, int] = (1200, 200),
-    progress: Progress = silent,
+    store: LocalStore, folder: Path, real: str | None = None, progress: Progress = silent
 ) -> LearnedOptimiser:
-    """GNet from nothing: first at 160×90, then at 320×180; both resume. ``real`` is the URI of a real log (chunk 0)."""
-    coarse = [training_scene(prepare(store, r)) for r in coarse_scenes(real=real)]
-    config = MetaConfig(steps=steps[0], pool=6, rate=2.5e-3, loss=GNET_LOSS, judge_loss=GNET_JUDGE)
+    """GNet from nothing, in the stages of ``GNET_STAGES``; each resumes. ``real``: the URI of a log with a chunk 0."""
     network = network_from(NetworkConfig(rates=GNET_RATES), seed=0)
-    train_optimiser(network, coarse, config, folder / "coarse", progress=progress)
-    fine = [training_scene(prepare(store, r)) for r in fine_scenes(real=real)]
-    config = config.model_copy(update={"steps": steps[1], "rate": 5e-4, "seed": 1})
-    network = network_from(NetworkConfig(rates=GNET_RATES), 0, folder / "coarse" / "weights.safetensors")
-    return train_optimiser(network, fine, config, folder / "fine", progress=progress)
+    for name, fine, steps, rate, seed in GNET_STAGES:
+        recipes = fine_scenes(real=real) if fine else coarse_scenes(real=real)
+        scenes = [training_scene(prepare(store, r)) for r in recipes]
+        config = MetaConfig(steps=steps, pool=6, rate=rate, seed=seed, loss=GNET_LOSS, judge_loss=GNET_JUDGE)
+        train_optimiser(network, scenes, config, folder / name, progress=progress)
+    return network
 
 
 def train_enet(
-    store: LocalStore,
-    folder: Path,
-    gnet_weights: Path,
-    real: str | None = None,
-    steps: tuple[int, int] = (300, 100),
-    progress: Progress = silent,
+    store: LocalStore, folder: Path, gnet_folder: Path, real: str | None = None, progress: Progress = silent
 ) -> LearnedOptimiser:
-    """ENet from GNet's weights, at ENet's rates, on scenes that GNet or tuned Adam made.
+    """ENet from GNet's weights after their coarse stage, at ENet's rates, on scenes that GNet or tuned Adam made.
 
     First at 160×90 on streets with stand-ins for FNet's images (see :func:`stand_in_views`), then at 320×180 with
-    FNet's images, on the real log too.
+    FNet's images, on the real log too. ``gnet_folder`` is where :func:`train_gnet` trained.
     """
     from genre_tasks.metrics.perceptual import perceptual_distance
 
-    distance = perceptual_distance()
-    coarse = enet_scenes([prepare(store, r) for r in coarse_scenes(ENET_COARSE)], gnet_weights, stand_in_views)
-    network = network_from(NetworkConfig(rates=ENET_RATES), 0, gnet_weights)
-    config = ENET_CONFIG.model_copy(update={"steps": steps[0]})
-    train_optimiser(network, coarse, config, folder / "coarse", distance, progress=progress)
-    fine = enet_scenes([prepare(store, r) for r in fine_scenes(real=real)], gnet_weights, fixed_views)
-    network = network_from(NetworkConfig(rates=ENET_RATES), 0, folder / "coarse" / "weights.safetensors")
-    config = config.model_copy(update={"steps": steps[1], "rate": 3e-4, "seed": 1})
-    return train_optimiser(network, fine, config, folder / "fine", distance, progress=progress)
+    network = network_from(NetworkConfig(rates=ENET_RATES), 0, gnet_folder / "coarse" / "weights.safetensors")
+    for name, fine, steps, rate, seed in ENET_STAGES:
+        recipes = fine_scenes(real=real) if fine else coarse_scenes(ENET_COARSE)
+        made_by = gnet_folder / name / "weights.safetensors"
+        prepared = [prepare(store, r) for r in recipes]
+        scenes = enet_scenes(prepared, made_by, fixed_views if fine else stand_in_views)
+        config = ENET_CONFIG.model_copy(update={"steps": steps, "rate": rate, "seed": seed})
+        train_optimiser(network, scenes, config, folder / name, perceptual_distance(), progress=progress)
+    return network
 
 
 def enet_scenes(
