@@ -162,7 +162,7 @@ def train_fnet(
     from genre_tasks.fixer.pairs import load_pairs
     from genre_tasks.fixer.training import TrainingSettings, train
     from genre_tasks.fixer.weights import load_fnet, save_fnet
-    from genre_tasks.metrics.perceptual import perceptual_distance
+    from genre_tasks.metrics.perceptual import CHEAP_TAPS, perceptual_distance
 
     def checkpoint(fnet: Fnet, step: int) -> None:
         save_fnet(fnet, folder / "fnet.safetensors")
@@ -171,7 +171,7 @@ def train_fnet(
 
     settings = settings or TrainingSettings()
     fixer = None if start is None else load_fnet(start)
-    train(load_pairs(pairs), settings, folder, perceptual_distance(), progress, checkpoint, start=fixer)
+    train(load_pairs(pairs), settings, folder, perceptual_distance(CHEAP_TAPS), progress, checkpoint, start=fixer)
     return folder / "fnet.safetensors"
 
 

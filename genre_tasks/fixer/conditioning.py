@@ -192,18 +192,29 @@ def degraded(
 def conditions(views: Degraded) -> Conditions:
     """The network's input, of the same size."""
     render = fill_holes(views.color, views.alpha, views.lidar_color, views.lidar_alpha)
-    hints = torch.cat(
-        [
-            views.alpha,
-            views.lidar_alpha,
-            views.warped,
-            views.warp_mask,
-            views.lidar_warped,
-            views.lidar_warp_mask,
-        ],
-        1,
-    )
+    aligned = [views.alpha, views.lidar_alpha, views.warped, views.warp_mask, views.lidar_warped, views.lidar_warp_mask]
+    hints = torch.cat([*aligned, *_evidence(render, views)], 1)
     return Conditions(render, views.reference, views.lidar_color, hints)
+
+
+def _evidence(render: Tensor, views: Degraded) -> list[Tensor]:
+    """Six maps [B, 1, H, W] of about unit size that say where to trust which source.
+
+    How far LiDAR map and warps disagree with the render in the mean of a neighbourhood, and how sharp render and warps
+    are (mean distance to the neighbourhood's mean): a blurred render beside a sharp, agreeing warp asks for a copy, a
+    sharp one for none.
+    """
+    warps = [(views.warped, views.warp_mask), (views.lidar_warped, views.lidar_warp_mask)]
+    sources = [(views.lidar_color, views.lidar_alpha), *warps]
+    disagreement = [4 * _smooth(image - cover * render).abs().mean(1, keepdim=True) for image, cover in sources]
+    filled = [image + (1 - cover) * render for image, cover in warps]
+    sharpness = [16 * _smooth((x - _smooth(x)).abs().mean(1, keepdim=True)) for x in (render, *filled)]
+    return disagreement + sharpness
+
+
+def _smooth(image: Tensor) -> Tensor:
+    """The mean of 5 × 5 pixels, edges repeated."""
+    return F.avg_pool2d(F.pad(image, (2, 2, 2, 2), mode="replicate"), 5, 1)
 
 
 def padded(inputs: Conditions, stride: int) -> Conditions:

@@ -15,9 +15,9 @@ from torch import Tensor, nn
 
 from genre_tasks.fixer.attention import mix_views, remove_text_attention
 
-HINTS = 10
+HINTS = 16
 """Channels of ``Conditions.hints``: render alpha, LiDAR alpha; the reference warped by rendered depth (3) and where
-that is valid; the same by the LiDAR map's depth."""
+that is valid; the same by the LiDAR map's depth; six maps of agreement and sharpness (``conditioning``)."""
 
 GATES = 3
 """Sources that a corrected render may copy from: LiDAR map, reference by rendered depth, reference by LiDAR depth."""
@@ -129,7 +129,8 @@ class Fnet(nn.Module):
         levels = list(zip(self.skips, render.features, lidar.features, strict=True))
         for block, (skip, ours, points) in zip(decoder.up_blocks, reversed(levels), strict=True):
             pooled = F.adaptive_avg_pool2d(inputs.hints, (ours.shape[-2], ours.shape[-1]))
-            x = block(x + skip(torch.cat([ours, points, pooled], 1)))
+            added = skip(torch.cat([ours, points, pooled], 1))
+            x = block(_unit(x) + _unit(added) if self.architecture.residual else x + added)
         x = decoder.conv_out(decoder.conv_act(decoder.conv_norm_out(x))) / 2
         return corrected(x, inputs) if self.architecture.residual else x + 0.5
 
@@ -150,6 +151,12 @@ class Fnet(nn.Module):
     def noise_shape(self, height: int, width: int) -> tuple[int, int, int]:
         """Shape of one view's noise, [C, h, w]."""
         return int(self.vae.config.latent_channels), height // self.latent_stride, width // self.latent_stride
+
+
+def _unit(x: Tensor) -> Tensor:
+    """Each sample at root mean square 1, so that latent and skip are of one weight: a decoder trained for hundreds of
+    steps grows its activations from level to level into the thousands (its normalisations hide that)."""
+    return x / x.square().mean((1, 2, 3), keepdim=True).clamp_min(1e-12).sqrt()
 
 
 def corrected(output: Tensor, inputs: Conditions) -> Tensor:
@@ -224,11 +231,18 @@ def build(architecture: FnetArchitecture, seed: int = 0) -> Fnet:
     return fnet
 
 
-def restart_residual(fnet: Fnet) -> None:
-    """Zeroes the last convolutions of decoder and UNet, in place: the fixer is the identity until it is trained."""
+def restart_residual(fnet: Fnet, seed: int = 0) -> None:
+    """Zeroes the last convolutions of decoder and UNet, in place: the fixer is the identity until it is trained.
+
+    Its skips may then start at random: at full strength, from the first step, they bring what the latent has lost.
+    """
     for last in (fnet.vae.decoder.conv_out, fnet.unet.conv_out):
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
+    generator = torch.Generator().manual_seed(seed)
+    for skip in fnet.skips:
+        assert isinstance(skip, nn.Conv2d)
+        nn.init.normal_(skip.weight, std=2 * skip.in_channels**-0.5, generator=generator)
 
 
 def sd_turbo(source: str, timestep: int = 200, rank: int = 16) -> Fnet:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from genre_tasks.fixer.conditioning import bound_colour_shift, fill_holes, warp_reference
+from genre_tasks.fixer.conditioning import Degraded, bound_colour_shift, conditions, fill_holes, warp_reference
+from genre_tasks.fixer.network import HINTS
 from genre_tasks.logs.types import Lens
 
 
@@ -110,3 +111,15 @@ def test_what_a_nearer_thing_hides_is_not_warped():
     assert mask[..., 10:14].all()
     assert not mask[..., 22:26].any()
     assert mask[..., 28:36].all() and mask[..., :10].all()
+
+
+def test_agreement_and_sharpness_are_told():
+    sharp = torch.rand(1, 3, 16, 24)
+    one, zero = torch.ones(1, 1, 16, 24), torch.zeros(1, 1, 16, 24)
+    views = Degraded(sharp * 0 + 0.5, one, sharp * 0, zero, sharp, sharp, one, sharp * 0, zero)
+    hints = conditions(views).hints
+    assert hints.shape == (1, HINTS, 16, 24)
+    lidar, warp, lidar_warp, render_sharp, warp_sharp, lidar_warp_sharp = hints[0, 10:]
+    assert not lidar.any() and not lidar_warp.any()  # nothing there, nothing that disagrees
+    assert warp.mean() > 0.1 and warp_sharp.mean() > 2
+    assert not render_sharp.any() and not lidar_warp_sharp.any()
