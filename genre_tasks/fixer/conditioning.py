@@ -28,6 +28,9 @@ HIDDEN_PX = 5.0
 """Parallax at which a point counts as hidden. A road seen from 1.6 m above changes by about 2 px of parallax (at 3 m
 of shift) from one row of pixels to the next, and must not hide itself."""
 
+HOLE_ALPHA = 0.5
+"""What is thinner than this is a hole, the more so the thinner."""
+
 MIN_WARP_ALPHA = 0.5
 """Rendered depth is trusted for the warp where at least half of the ray's light is accounted for."""
 
@@ -78,12 +81,15 @@ def fill_holes(
 ) -> Tensor:  # [B, 3, H, W]
     """The render over the LiDAR map over the surrounding colours: an image without holes.
 
+    A hole is where alpha is under ``HOLE_ALPHA``. Above it a render is not touched: scenes are optimised on black, and
+    their colours make up for what is missing to full alpha.
+
     What neither covers takes the alpha-weighted mean of ever larger neighbourhoods (pull–push), and
     black where nothing was drawn at all.
     """
-    left = 1 - alpha
-    over = color + left * lidar_color
-    cover = alpha + left * lidar_alpha
+    solid = (alpha / HOLE_ALPHA).clamp(0, 1)
+    over = color + (1 - solid) * lidar_color
+    cover = solid + (1 - solid) * lidar_alpha
     return (over + (1 - cover) * _pull_push(over, cover)).clamp(0, 1)
 
 
