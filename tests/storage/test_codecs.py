@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-import multiprocessing
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -212,15 +214,30 @@ def test_exr_bytes_do_not_depend_on_time_or_order(tmp_path: Path) -> None:
 
 def test_a_forked_child_can_write_too(tmp_path: Path) -> None:
     """OpenEXR's threads do not survive a fork; without care the child waits for them for ever."""
-    channels = {"Z": np.random.default_rng(0).random((400, 300)).astype(np.float32)}
-    write_channels(tmp_path / "parent.exr", channels)
-    child = multiprocessing.get_context("fork").Process(target=write_channels, args=(tmp_path / "child.exr", channels))
-    child.start()
-    child.join(60)
-    alive = child.is_alive()
-    child.kill()
-    assert not alive and child.exitcode == 0
-    write_channels(tmp_path / "again.exr", channels)
+    # in a process of its own: what other tests started here would come along in the fork
+    script = """
+import multiprocessing, sys
+from pathlib import Path
+import numpy as np
+from storage.codecs.exr import write_channels
+
+folder = Path(sys.argv[1])
+channels = {"Z": np.random.default_rng(0).random((400, 300)).astype(np.float32)}
+write_channels(folder / "parent.exr", channels)
+child = multiprocessing.get_context("fork").Process(target=write_channels, args=(folder / "child.exr", channels))
+child.start()
+child.join(60)
+alive = child.is_alive()
+child.kill()
+write_channels(folder / "again.exr", channels)
+sys.exit(alive or child.exitcode)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(tmp_path)],
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])},
+        check=False,
+    )
+    assert done.returncode == 0
     one, two, three = ((tmp_path / f"{name}.exr").read_bytes() for name in ("parent", "child", "again"))
     assert one == two == three
 

@@ -167,7 +167,7 @@ def _commit(root: str, seed: int, start: object, results: object) -> None:
 
 
 def test_two_processes_on_one_key(tmp_path: Path) -> None:
-    context = multiprocessing.get_context("fork")
+    context = multiprocessing.get_context("spawn")  # a fork would take along what other tests started here
     start, results = context.Barrier(2), context.Queue()
     workers = [context.Process(target=_commit, args=(str(tmp_path), seed, start, results)) for seed in (1, 2)]
     for worker in workers:
