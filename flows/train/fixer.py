@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from flows.train.thinned import ThinnedLog
 from genre_tasks.config import IngestConfig, InitialConfig, OptimiserConfig
 from genre_tasks.errors import ConfigError
 from genre_tasks.progress import Progress, silent
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from genre_tasks.fixer.network import Fnet
     from genre_tasks.fixer.pairs import Pairs
     from genre_tasks.fixer.training import TrainingSettings
-    from genre_tasks.logs.types import DrivingLog
     from genre_tasks.scene.chunk import Chunk
     from genre_tasks.scene.graph import SceneGraph
     from genre_tasks.scene.views import NovelView
@@ -97,7 +97,7 @@ def street_pairs(seed: int, settings: PairSettings) -> Pairs:
     from genre_tasks.logs.registry import open_log
 
     rng = np.random.default_rng(seed)
-    log = SourceFramesOnly(open_log(f"synthetic:street?seed={seed}"), 4)
+    log = ThinnedLog(open_log(f"synthetic:street?seed={seed}"), 4)
     points = (20_000, 40_000)[seed % 2]
     chunk, scenes = _optimised(log, settings, 4, points, seed)
     ages = sorted(k for k in scenes if k < ITERATIONS)
@@ -117,7 +117,7 @@ def validation_pairs(seeds: Sequence[int], settings: PairSettings, views: int = 
 
     parts = []
     for seed in seeds:
-        log = SourceFramesOnly(open_log(f"synthetic:street?seed={seed}"), 4)
+        log = ThinnedLog(open_log(f"synthetic:street?seed={seed}"), 4)
         chunk, scenes = _optimised(log, settings, 4, 20_000, seed)
         rng = np.random.default_rng(seed)
         parts.append(_beside(log, chunk, scenes[ITERATIONS], views, 40_000, rng, shifts=(3.0,)))
@@ -220,20 +220,6 @@ def joined(parts: Sequence[Pairs]) -> Pairs:
 
     views = Degraded(*(torch.cat([getattr(p.views, n) for p in parts]) for n in NAMES))
     return Pairs(views, torch.cat([p.truth for p in parts]), np.concatenate([p.shift_m for p in parts]))
-
-
-class SourceFramesOnly:
-    """A log that has images at source frames only: pairs beside the path need no others, and ray-casting costs time."""
-
-    def __init__(self, log: DrivingLog, every: int) -> None:
-        self._log, self._every = log, every
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._log, name)
-
-    def image_bytes(self, camera: str, frame: int) -> bytes | None:
-        """As the log's, or ``None`` between source frames."""
-        return self._log.image_bytes(camera, frame) if frame % self._every == 0 else None
 
 
 def _optimised(

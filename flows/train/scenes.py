@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from flows.train.thinned import ThinnedLog
 from genre_tasks.config import IngestConfig, InitialConfig
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.types import DrivingLog
@@ -52,20 +53,6 @@ class PreparedScene:
     chunk: Chunk
     start: Reconstruction
     truth: FixedViews | None
-
-
-class ThinnedLog:
-    """A log of which only every n-th frame has images; all else is the log's own."""
-
-    def __init__(self, log: DrivingLog, every: int) -> None:
-        self._log, self._every = log, every
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._log, name)
-
-    def image_bytes(self, camera: str, frame: int) -> bytes | None:
-        """As the log's, or ``None`` for the frames that are left out."""
-        return self._log.image_bytes(camera, frame) if frame % self._every == 0 else None
 
 
 def prepare(store: LocalStore, recipe: SceneRecipe) -> PreparedScene:
