@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,23 +36,41 @@ GNET_JUDGE = LossConfig(perceptual=0.0, depth=0.0, novel=0.1)
 STAND_IN_TRUTH = 0.6
 ENET_LOSS = LossConfig(perceptual=0.02, perceptual_every=2)
 ENET_JUDGE = LossConfig(perceptual=0.05, perceptual_every=1, depth=0.0)
-Stage = tuple[str, bool, int, float, int]
-"""Folder, whether at 320×180, weight updates, rate, seed."""
-GNET_STAGES: tuple[Stage, ...] = (
-    ("coarse", False, 1200, 2.5e-3, 0),
-    ("fine", True, 240, 5e-4, 1),
-    ("finer", True, 240, 5e-4, 2),
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stage of a training: its folder, whether at 320×180, weight updates, their rate, the seed.
+
+    ``judged`` weighs the unseen views, ``views`` are drawn in an iteration, ``more_real`` doubles the real log's part.
+    """
+
+    name: str
+    fine: bool
+    steps: int
+    rate: float
+    seed: int
+    judged: float = 1.0
+    views: tuple[int, ...] = (4, 6, 6, 8)
+    more_real: bool = False
+
+
+GNET_STAGES = (
+    Stage("coarse", False, 1200, 2.5e-3, 0),
+    Stage("fine", True, 240, 5e-4, 1),
+    Stage("finer", True, 240, 5e-4, 2),
+    Stage("unseen", True, 200, 7e-4, 3, judged=4.0),
+    Stage("many", True, 110, 6e-4, 4, judged=4.0, views=(6, 15, 30), more_real=True),
 )
-ENET_STAGES: tuple[Stage, ...] = (("coarse", False, 300, 1e-3, 0), ("fine", True, 160, 5e-4, 1))
+ENET_STAGES = (
+    Stage("coarse", False, 300, 1e-3, 0, judged=2.0, views=(4, 6, 6)),
+    Stage("fine", True, 160, 5e-4, 1, judged=2.0, views=(4, 6, 6)),
+)
 ENET_COARSE = 24
 ENET_CONFIG = MetaConfig(
-    steps=0,
     pool=5,
     iterations=(8, 12, 12, 16),
-    views=(4, 6, 6),
     novel_views=6,
-    rate=1e-3,
-    judged=2.0,
     log_scale_spread=0.0,
     logit_spread=0.0,
     loss=ENET_LOSS,
@@ -86,11 +104,12 @@ def train_gnet(
 ) -> LearnedOptimiser:
     """GNet from nothing, in the stages of ``GNET_STAGES``; each resumes. ``real``: the URI of a log with a chunk 0."""
     network = network_from(NetworkConfig(rates=GNET_RATES), seed=0)
-    for name, fine, steps, rate, seed in GNET_STAGES:
-        recipes = fine_scenes(real=real) if fine else coarse_scenes(real=real)
+    for stage in GNET_STAGES:
+        recipes = fine_scenes(real=real) if stage.fine else coarse_scenes(real=real)
+        recipes = [r for r in recipes if stage.more_real and r.uri == real] + recipes
         scenes = [training_scene(prepare(store, r)) for r in recipes]
-        config = MetaConfig(steps=steps, pool=6, rate=rate, seed=seed, loss=GNET_LOSS, judge_loss=GNET_JUDGE)
-        train_optimiser(network, scenes, config, folder / name, progress=progress)
+        config = MetaConfig(pool=6, loss=GNET_LOSS, judge_loss=GNET_JUDGE)
+        train_optimiser(network, scenes, _at(config, stage), folder / stage.name, progress=progress)
     return network
 
 
@@ -105,13 +124,13 @@ def train_enet(
     from genre_tasks.metrics.perceptual import perceptual_distance
 
     network = network_from(NetworkConfig(rates=ENET_RATES), 0, gnet_folder / "coarse" / "weights.safetensors")
-    for name, fine, steps, rate, seed in ENET_STAGES:
-        recipes = fine_scenes(real=real) if fine else coarse_scenes(ENET_COARSE)
-        made_by = gnet_folder / name / "weights.safetensors"
+    for stage in ENET_STAGES:
+        recipes = fine_scenes(real=real) if stage.fine else coarse_scenes(ENET_COARSE)
+        made_by = gnet_folder / stage.name / "weights.safetensors"
         prepared = [prepare(store, r) for r in recipes]
-        scenes = enet_scenes(prepared, made_by, fixed_views if fine else stand_in_views)
-        config = ENET_CONFIG.model_copy(update={"steps": steps, "rate": rate, "seed": seed})
-        train_optimiser(network, scenes, config, folder / name, perceptual_distance(), progress=progress)
+        scenes = enet_scenes(prepared, made_by, fixed_views if stage.fine else stand_in_views)
+        config = _at(ENET_CONFIG, stage)
+        train_optimiser(network, scenes, config, folder / stage.name, perceptual_distance(), progress=progress)
     return network
 
 
@@ -152,6 +171,12 @@ def stand_in_views(scene: PreparedScene, start: Reconstruction) -> FixedViews:
         render = render_views(start.scene, views).color.clamp(0, 1)
     truth = torch.stack([blur(image) for image in scene.truth.color[::2]])
     return FixedViews(views, STAND_IN_TRUTH * truth + (1 - STAND_IN_TRUTH) * render)
+
+
+def _at(config: MetaConfig, stage: Stage) -> MetaConfig:
+    """The configuration of a stage."""
+    of_stage = ("steps", "rate", "seed", "judged", "views")
+    return config.model_copy(update={name: getattr(stage, name) for name in of_stage})
 
 
 def _street(seed: int, k: int, more: str = "") -> str:
