@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from genre_tasks.logs.types import CuboidTrack, Float32, Float64
 from genre_tasks.scene.chunk import Mark
 from genre_tasks.scene.geometry import interpolate_pose, rigid, se3_inverse
+from genre_tasks.scene.graph import ActorNode
 
 MARGIN_M = 0.15
 """Boxes are enlarged by this to the sides and above before points are cut out: annotations are tight."""
@@ -20,19 +21,8 @@ GROUND_M = 0.08
 
 
 @dataclass(frozen=True)
-class Path:
-    """A track inside a chunk: ``frames`` [F] log frames, ``chunk_SE3_box`` [F, 4, 4] float64."""
-
-    track_id: str
-    label: str
-    size_m: tuple[float, float, float]
-    frames: NDArray[np.int64]
-    chunk_SE3_box: Float64
-
-    def pose(self, frame: int) -> Float64 | None:
-        """[4, 4] at a log frame, or ``None`` where the object does not exist."""
-        at = np.flatnonzero(self.frames == frame)
-        return self.chunk_SE3_box[at[0]] if len(at) else None
+class Path(ActorNode):
+    """A track inside a chunk, before it is known whether it becomes an actor."""
 
     @property
     def travel_m(self) -> float:

@@ -15,21 +15,21 @@ from storage import local
 
 def arm(stage: str, count: int) -> None:
     """Kill this process at the ``count``-th sync while ``stage`` is committed."""
-    commit, sync = local.LocalStore.commit, local.sync
+    commit, fsync = local.LocalStore.commit, os.fsync
     left = {"syncs": -1}
 
     def counting_commit(self: local.LocalStore, address: Any, *args: Any, **kwargs: Any) -> Any:
         left["syncs"] = count if address.stage == stage else -1
         return commit(self, address, *args, **kwargs)
 
-    def counting_sync(path: Any) -> None:
+    def counting_fsync(file: Any) -> None:
         left["syncs"] -= 1
         if left["syncs"] == 0:
             os.kill(os.getpid(), signal.SIGKILL)
-        sync(path)
+        fsync(file)
 
     local.LocalStore.commit = counting_commit  # type: ignore[method-assign,assignment]
-    local.sync = counting_sync  # type: ignore[assignment]
+    os.fsync = counting_fsync
 
 
 if __name__ == "__main__":

@@ -37,7 +37,15 @@ def test_ctrl_c_ends_cleanly_and_the_run_goes_on(tmp_path: Path) -> None:
     with tiny.prefect_server(tmp_path) as url:
         env = tiny.environment(tmp_path, PREFECT_API_URL=url)
         command = [tiny.GENRE, *tiny.arguments(store)]
-        process = subprocess.Popen(command, env=env, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+        # a shell that starts the tests in the background lets them ignore SIGINT, which children would inherit
+        process = subprocess.Popen(
+            command,
+            env=env,
+            cwd=tmp_path,
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )
         while not list(store.rglob("initial/*/manifest.json")):
             assert process.poll() is None
             time.sleep(0.05)

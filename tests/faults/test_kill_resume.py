@@ -17,7 +17,7 @@ from tests.faults import tiny
 pytestmark = pytest.mark.fault
 RANDOM_KILLS = 80
 SYNCS = (1, 3)
-"""Per stage: killed before the first payload file is synced, and in the middle (20 kills over the ten stages)."""
+"""Per stage: killed at the first and at the third sync of its commit (20 kills over the ten stages)."""
 
 
 @pytest.fixture(scope="module")
