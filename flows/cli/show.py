@@ -74,7 +74,7 @@ def _show_one(what: str, store: str, picture: Path | None) -> None:
 
     for run in recorded_runs(store):
         if run["run"].startswith(what):
-            print_fields(f"run {run['run']}", {k: run[k] for k in ("log", "preset", "report", "differs")})
+            print_fields(f"run {run['run']}", {k: run[k] for k in ("log", "preset", "report", "differs", "config")})
             for chunk in run["chunks"]:
                 rows = [
                     {"stage": s["stage"], "key": s["key"][:12], "seconds": s["seconds"], **s["metrics"]}
