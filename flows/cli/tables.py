@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -36,7 +37,8 @@ def _text(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, Mapping):
-        return "\n".join(f"{k}: {_text(v)}" for k, v in value.items())
+        parts = [(k, _text(v), isinstance(v, Mapping)) for k, v in value.items()]
+        return "\n".join(f"{k}:\n{textwrap.indent(v, '  ')}" if nested else f"{k}: {v}" for k, v, nested in parts)
     if isinstance(value, list | tuple):
         scalars = all(not isinstance(v, Mapping | list | tuple) for v in value)
         return (", " if scalars and len(str(value)) < 90 else "\n").join(
