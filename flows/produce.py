@@ -246,11 +246,6 @@ def _ref(artifact: Artifact, cached: bool, note: str = "") -> ArtifactRef:
     return ArtifactRef(manifest.stage, manifest.key, manifest.payload_digest, str(artifact.path), cached, note)
 
 
-def short(key: str) -> str:
-    """The first 12 characters of a key, for tables."""
-    return key[:12]
-
-
 def run_id(uri: str, preset: str, keys: Mapping[str, str]) -> str:
     """A name for a run that is the same when everything it made is the same."""
     text = "\n".join([uri, preset, *(f"{k}={v}" for k, v in sorted(keys.items()))])

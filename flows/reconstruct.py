@@ -14,6 +14,7 @@ from flows.pipeline import PIPELINE
 from flows.produce import ArtifactRef, Job
 from flows.runs import Run, finish_run, summary_of
 from flows.stage_task import stage_task
+from flows.summary import RunSummary
 from genre_tasks.errors import GenreError, InputError
 from storage.local import open_store
 
@@ -58,11 +59,12 @@ def reconstruct_log(
     if not done and failed:
         raise failed[0]
     run = Run(log, preset, store, values, differences(effective, preset), done)
-    summary = finish_run(run)
-    _publish(run)
+    summary = summary_of(run)
+    record = finish_run(run, summary)
+    _publish(summary)
     if failed:
         raise failed[0]
-    return summary
+    return record
 
 
 def _reconstruct_chunk(job: Job) -> dict[str, ArtifactRef]:
@@ -74,15 +76,15 @@ def _reconstruct_chunk(job: Job) -> dict[str, ArtifactRef]:
     return refs
 
 
-def _publish(run: Run) -> None:
+def _publish(summary: RunSummary) -> None:
     """Tables and pictures in Prefect's UI; the store has the same and more."""
-    for chunk in summary_of(run).chunks:
+    for chunk in summary.chunks:
         rows = [
             {"stage": s.stage, "served": "cache" if s.cached else "computed", "seconds": round(s.seconds, 2)}
             | {k: round(v, 4) for k, v in s.metrics.items()}
             for s in chunk.stages
         ]
-        create_table_artifact(table=rows, key=f"chunk-{chunk.chunk}", description=f"{run.log}, chunk {chunk.chunk}")
+        create_table_artifact(table=rows, key=f"chunk-{chunk.chunk}", description=f"{summary.log}, chunk {chunk.chunk}")
         for stage in chunk.stages:
             for name, png in sorted(stage.pictures.items())[:1]:
                 create_image_artifact(

@@ -43,11 +43,10 @@ class Run:
         return open_store(self.store).root / _FOLDER / self.name
 
 
-def finish_run(run: Run) -> dict[str, Any]:
+def finish_run(run: Run, summary: RunSummary) -> dict[str, Any]:
     """Writes the run's record and report into the store and returns the record (``--json`` prints a part of it)."""
     from flows.report import write_report
 
-    summary = summary_of(run)
     run.folder.mkdir(parents=True, exist_ok=True)
     report = write_report(run.folder / "report.html", summary)
     record = {

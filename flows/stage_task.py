@@ -6,7 +6,6 @@ state named ``Cached``.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 from prefect import task
@@ -59,13 +58,3 @@ def stage_task(stage: str, chunk: int, job: Job, inputs: dict[str, ArtifactRef])
     if ref.cached:
         return Completed(name="Cached", message="served from the store", data=ref)
     return ref
-
-
-def without_prefect(stage: str, job: Job, inputs: dict[str, ArtifactRef]) -> ArtifactRef:
-    """The same work as a plain call, for notebooks and tests."""
-    return produce(stage, job, inputs)
-
-
-def as_plain(ref: ArtifactRef) -> dict[str, Any]:
-    """A reference as JSON-able values."""
-    return dataclasses.asdict(ref)

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-app = typer.Typer(help="Train the networks (an hour each on a CPU; resumable).", no_args_is_help=True)
+app = typer.Typer(help="Train the networks (tens of minutes each on a CPU; resumable).", no_args_is_help=True)
 
 Folder = Annotated[Path, typer.Option(help="Where pairs, scenes, checkpoints and curves are kept.")]
 Seeds = Annotated[str, typer.Option(help="Training seeds of the synthetic street, first:last:step.")]
