@@ -19,7 +19,8 @@ Arrays = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 Images = tuple[Tensor, Tensor, Tensor]
 
 
-def _check(status: int) -> None:
+def check_status(status: int) -> None:
+    """Raises ``ResourceError`` for what a kernel function returned, unless it is 0."""
     if status == 1:
         raise ResourceError("not enough memory to render", remedy="Render fewer views a call, or smaller images")
     if status:
@@ -54,7 +55,7 @@ def _forward(
         len(arrays[0]), *(a.data_ptr() for a in arrays), views, poses.data_ptr(), lenses.data_ptr(), width, height,
         threads, color.data_ptr(), alpha.data_ptr(), depth.data_ptr(), culled, ctypes.byref(handle) if keep else None,
     )  # fmt: skip
-    _check(status)
+    check_status(status)
     counts = {reason: n for reason, n in zip(CULL_REASONS, culled, strict=True) if n}
     return (color, alpha, depth), counts, _Batch(handle) if keep else None
 
@@ -86,8 +87,24 @@ class _Rasterise(torch.autograd.Function):
             batch.handle, len(arrays[0]), *(a.data_ptr() for a in arrays), *(a.data_ptr() for a in images),
             *(x.data_ptr() for x in v), ctx.threads, *(g.data_ptr() for g in grads),
         )  # fmt: skip
-        _check(status)
+        check_status(status)
         return (None, None, None, *grads)
+
+
+def _arrays(splats: Splats) -> Arrays:
+    arrays = (splats.means, splats.scales, splats.quats, splats.opacities, splats.colors)
+    if any(a.device.type != "cpu" for a in arrays):
+        raise ValueError(f"expected tensors on the cpu for backend cpu, got {splats.means.device}")
+    means, scales, quats, opacities, colors = (a.to(torch.float32).contiguous() for a in arrays)
+    return means, scales, quats, opacities, colors
+
+
+def forward_state(splats: Splats, cameras: Cameras) -> _Batch:
+    """The kernel's state after a forward pass on one thread."""
+    with torch.no_grad():
+        state = _forward(_arrays(splats), cameras, 1, keep=True)[2]
+    assert state is not None
+    return state
 
 
 def render_cpu(splats: Splats, cameras: Cameras, threads: int | None) -> tuple[Images, dict[str, int]]:
@@ -95,11 +112,6 @@ def render_cpu(splats: Splats, cameras: Cameras, threads: int | None) -> tuple[I
 
     ``threads`` ``None`` takes torch's number. The bits of images and gradients do not depend on it.
     """
-    arrays = (splats.means, splats.scales, splats.quats, splats.opacities, splats.colors)
-    if any(a.device.type != "cpu" for a in arrays):
-        raise ValueError(f"expected tensors on the cpu for backend cpu, got {splats.means.device}")
     culled: dict[str, int] = {}
-    images = _Rasterise.apply(
-        cameras, threads or torch.get_num_threads(), culled, *(a.to(torch.float32).contiguous() for a in arrays)
-    )
+    images = _Rasterise.apply(cameras, threads or torch.get_num_threads(), culled, *_arrays(splats))
     return images, culled

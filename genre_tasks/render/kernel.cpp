@@ -11,6 +11,10 @@
 #include <thread>
 #include <vector>
 
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
+
 #include "kernel_blend.h"
 
 // Threads live for one call: no pool to survive a fork, no OpenMP runtime beside the one that torch brings.
@@ -42,6 +46,8 @@ static void parallel(int threads, F f) {
 
 static size_t share(size_t n, int worker, int threads) { return n * worker / threads; }
 
+constexpr size_t HUGE_PAGE = 2u << 20;
+
 // Grows, never shrinks, is never initialised.
 template <class T>
 struct Buffer {
@@ -52,15 +58,20 @@ struct Buffer {
   ~Buffer() { std::free(p); }
   void reserve(size_t m, size_t keep_first = 0) {
     if (m <= capacity) return;
-    size_t bytes = ((m + m / 4 + 64) * sizeof(T) + 63) / 64 * 64;
-    T* fresh = static_cast<T*>(std::aligned_alloc(64, bytes));
+    size_t page = (m + m / 4) * sizeof(T) < HUGE_PAGE ? 64 : HUGE_PAGE;
+    size_t bytes = ((m + m / 4 + 64) * sizeof(T) + page - 1) / page * page;
+    T* fresh = static_cast<T*>(std::aligned_alloc(page, bytes));
     if (!fresh) throw std::bad_alloc();
+#if defined(MADV_HUGEPAGE)
+    if (page == HUGE_PAGE) madvise(fresh, bytes, MADV_HUGEPAGE);  // read and written all over: small pages miss the TLB
+#endif
     if (keep_first) std::memcpy(static_cast<void*>(fresh), p, keep_first * sizeof(T));
     std::free(p);
     p = fresh, capacity = bytes / sizeof(T);
   }
   void resize(size_t m) { reserve(m), n = m; }
   T& operator[](size_t i) { return p[i]; }
+  const T& operator[](size_t i) const { return p[i]; }
   size_t bytes() const { return capacity * sizeof(T); }
 };
 
@@ -71,9 +82,13 @@ struct View {
   Buffer<Footprint> input, sorted;       // drawn footprints in input order, and in depth order
   Buffer<uint32_t> id, slot_end, tile_begin;  // by input place: Gaussian, end of its pair slots; by tile: first pair
   Buffer<Pair> pairs;                    // tile after tile, each front to back
+  Buffer<uint16_t> visited;              // by pair: blocks that the forward pass visited
+  Buffer<uint8_t> reached;               // by slot: whether it visited any
+  Buffer<int> taken;                     // by tile: pairs until all rays had ended
   long long culled[CULL_REASONS];
   size_t bytes() const {
-    return input.bytes() + sorted.bytes() + id.bytes() + slot_end.bytes() + tile_begin.bytes() + pairs.bytes();
+    return input.bytes() + sorted.bytes() + id.bytes() + slot_end.bytes() + tile_begin.bytes() + pairs.bytes() +
+           visited.bytes() + reached.bytes() + taken.bytes();
   }
 };
 
@@ -84,7 +99,8 @@ struct Scratch {
   std::vector<std::vector<uint32_t>> histogram;          // per thread, per tile
   Buffer<uint32_t> order;
   Buffer<Lanes> slots;
-  Buffer<float> gradient;  // [drawn, 14]
+  std::vector<uint32_t> reached;  // Gaussians whose gradient waits to be added, ascending
+  Buffer<Lanes> gradient;         // [reached / LANES, ATTRIBUTES], a Gaussian a lane
   size_t bytes() const { return keys.bytes() + other.bytes() + order.bytes() + slots.bytes() + gradient.bytes(); }
 };
 
@@ -111,11 +127,6 @@ struct Shelf {
 static Shelf<View>& views_shelf() { static auto* s = new Shelf<View>; return *s; }
 static Shelf<Scratch>& scratch_shelf() { static auto* s = new Shelf<Scratch>; return *s; }
 
-struct Gaussians {
-  int count;
-  const float *means, *scales, *quats, *opacities, *colors;
-};
-
 static int clamp_tile(float pixel, int low, int high) {
   return (int)std::min((float)high, std::max((float)low, std::floor((pixel - 0.5f) * (1.f / TILE))));
 }
@@ -124,34 +135,28 @@ static int clamp_tile(float pixel, int low, int high) {
 template <class F>
 static inline void for_tiles(const Footprint& g, int tiles_x, int tiles_y, F f) {
   int last_row = clamp_tile(g.y + g.half_y, -1, tiles_y - 1);
-  float reach = 4 * g.a * cut_level(g);
   for (int j = clamp_tile(g.y - g.half_y, 0, tiles_y); j <= last_row; j++) {
     float from = std::max(j * TILE + 0.5f - g.y, -g.half_y), to = std::min(j * TILE + TILE - 0.5f - g.y, g.half_y);
     float right = std::min(std::max(g.dy_at_right, from), to), left = std::min(std::max(-g.dy_at_right, from), to);
-    float sr = std::sqrt(std::max(0.f, reach - g.discriminant * right * right));
-    float sl = std::sqrt(std::max(0.f, reach - g.discriminant * left * left));
-    int first = clamp_tile(g.x + (-g.b * left - sl) * g.inv_2a, 0, tiles_x);
-    int last = clamp_tile(g.x + (-g.b * right + sr) * g.inv_2a, -1, tiles_x - 1);
+    float sr = std::sqrt(std::max(0.f, (g.level - g.m * right * right) * g.inv_a));
+    float sl = std::sqrt(std::max(0.f, (g.level - g.m * left * left) * g.inv_a));
+    int first = clamp_tile(g.x - g.k * left - sl, 0, tiles_x);
+    int last = clamp_tile(g.x - g.k * right + sr, -1, tiles_x - 1);
     for (int i = first; i <= last; i++) f(j * tiles_x + i);
   }
 }
 
-static void project_all(View& v, const Gaussians& in, int threads) {
+static void project_all(View& v, const GaussianArrays& in, int threads) {
   v.input.resize(in.count), v.id.resize(in.count);
   std::vector<size_t> begin(threads), count(threads);
-  std::vector<long long> culled((size_t)threads * (CULL_REASONS + 2), 0);
+  std::vector<long long> culled((size_t)threads * CULL_REASONS, 0);
   parallel(threads, [&](int w) {
     size_t at = begin[w] = share(in.count, w, threads), end = share(in.count, w + 1, threads);
-    long long tally[CULL_REASONS + 2] = {};
-    Projection p;
-    for (size_t i = at; i < end; i++) {
-      int verdict = footprint(v.camera, in.means + 3 * i, in.scales + 3 * i, in.quats + 4 * i, in.opacities[i],
-                              in.colors + 3 * i, p, v.input[at]);
-      tally[verdict]++;
-      if (verdict == DRAWN) v.id[at++] = (uint32_t)i;
-    }
+    long long tally[CULL_REASONS] = {};
+    for (size_t i = at; i < end; i += LANES)
+      at += footprints(v.camera, in, (uint32_t)i, (int)std::min<size_t>(LANES, end - i), tally, &v.input[at], &v.id[at]);
     count[w] = at - begin[w];
-    std::copy(tally, tally + CULL_REASONS + 2, &culled[(size_t)w * (CULL_REASONS + 2)]);
+    std::copy(tally, tally + CULL_REASONS, &culled[(size_t)w * CULL_REASONS]);
   });
   size_t n = count[0];
   for (int w = 1; w < threads; w++) {
@@ -162,7 +167,7 @@ static void project_all(View& v, const Gaussians& in, int threads) {
   v.input.n = v.id.n = n;
   for (int r = 0; r < CULL_REASONS; r++) {
     v.culled[r] = 0;
-    for (int w = 0; w < threads; w++) v.culled[r] += culled[(size_t)w * (CULL_REASONS + 2) + r];
+    for (int w = 0; w < threads; w++) v.culled[r] += culled[(size_t)w * CULL_REASONS + r];
   }
 }
 
@@ -244,14 +249,26 @@ static void for_each_tile(const View& v, int threads, F f) {
   });
 }
 
-static void forward(View& v, Scratch& s, const Gaussians& in, int threads, float* color, float* alpha, float* depth) {
+template <bool COUNT = false>
+static long long blend(View& v, int threads, float* color, float* alpha, float* depth) {
+  std::atomic<long long> contributions{0};
+  for_each_tile(v, threads, [&](int t, int X, int Y) {
+    const Pair* pairs = v.pairs.p + v.tile_begin[t];
+    long long changed = 0;
+    v.taken[t] = blend_forward<COUNT>(v.sorted.p, pairs, v.pairs.p + v.tile_begin[t + 1], X, Y, v.camera.width, v.camera.height,
+                                      v.visited.p + v.tile_begin[t], v.reached.p, color, alpha, depth, changed);
+    if (COUNT) contributions += changed;
+  });
+  return contributions;
+}
+
+static void forward(View& v, Scratch& s, const GaussianArrays& in, int threads, float* color, float* alpha, float* depth) {
   project_all(v, in, threads);
   sort_by_depth(v, s);
   bin(v, s, threads);
-  for_each_tile(v, threads, [&](int t, int X, int Y) {
-    blend_forward(v.sorted.p, v.pairs.p + v.tile_begin[t], v.pairs.p + v.tile_begin[t + 1], X, Y, v.camera.width,
-                  v.camera.height, color, alpha, depth);
-  });
+  v.visited.resize(v.pairs.n), v.reached.resize(v.pairs.n), v.taken.resize((size_t)v.tiles_x * v.tiles_y);
+  std::memset(v.reached.p, 0, v.reached.n);
+  blend(v, threads, color, alpha, depth);
 }
 
 // Which lane of `sums` holds which sum: found by trying, the folds permute.
@@ -267,42 +284,53 @@ static std::vector<int> lane_of_sums() {
   return lane;
 }
 
-// Leaves the gradient of each drawn Gaussian in s.gradient.
-static void backward(View& v, Scratch& s, const Gaussians& in, int threads, Images out, Images grad) {
-  static const std::vector<int> lane = lane_of_sums();
-  s.slots.resize(v.pairs.n), s.gradient.resize(v.input.n * ATTRIBUTES);
-  for_each_tile(v, threads, [&](int t, int X, int Y) {
-    blend_backward(v.sorted.p, v.pairs.p + v.tile_begin[t], v.pairs.p + v.tile_begin[t + 1], X, Y, v.camera.width,
-                   v.camera.height, out, grad, s.slots.p);
-  });
-  parallel(threads, [&](int w) {
-    for (size_t i = share(v.input.n, w, threads), end = share(v.input.n, w + 1, threads); i < end; i++) {
-      Lanes total{};
-      for (uint32_t k = i ? v.slot_end[i - 1] : 0; k < v.slot_end[i]; k++) total += s.slots[k];
-      float sum[SUMS];
-      for (int k = 0; k < SUMS; k++) sum[k] = total[lane[k]];
-      size_t id = v.id[i];
-      project_backward(v.camera, v.input[i], in.means + 3 * id, in.scales + 3 * id, in.quats + 4 * id, sum,
-                       s.gradient.p + i * ATTRIBUTES);
-    }
-  });
-}
-
 struct Gradients {
   float *means, *scales, *quats, *opacities, *colors;
+
+  void add(uint32_t id, const Lanes* attribute, int lane) {
+    auto x = [&](int k) { return attribute[k][lane]; };
+    const size_t i = id;
+    for (int k = 0; k < 3; k++)
+      means[3 * i + k] += x(MEAN + k), scales[3 * i + k] += x(SCALE + k), colors[3 * i + k] += x(COLOR + k);
+    for (int k = 0; k < 4; k++) quats[4 * i + k] += x(QUAT + k);
+    opacities[i] += x(OPACITY);
+  }
 };
 
-// Adds the view's gradients; called in the order of the views, so that sums do not depend on threads.
-static void accumulate(View& v, const Scratch& s, Gradients g) {
-  for (size_t i = 0; i < v.input.n; i++) {
-    const float* x = s.gradient.p + i * ATTRIBUTES;
-    size_t id = v.id[i];
-    for (int k = 0; k < 3; k++) {
-      g.means[3 * id + k] += x[MEAN + k], g.scales[3 * id + k] += x[SCALE + k], g.colors[3 * id + k] += x[COLOR + k];
+// Hands the gradients of the Gaussians that some ray reached to `take(ids, how many, Lanes[ATTRIBUTES])`, in ascending
+// order within a thread. What is hidden has no gradient.
+template <class F>
+static void backward(View& v, Scratch& s, const GaussianArrays& in, int threads, Images out, Images grad, F take) {
+  static const std::vector<int> lane = lane_of_sums();
+  s.slots.resize(v.pairs.n);
+  for_each_tile(v, threads, [&](int t, int X, int Y) {
+    const Pair* pairs = v.pairs.p + v.tile_begin[t];
+    blend_backward(v.sorted.p, pairs, pairs + v.taken[t], X, Y, v.camera.width, v.camera.height,
+                   v.visited.p + v.tile_begin[t], out, grad, s.slots.p);
+  });
+  parallel(threads, [&](int w) {
+    uint32_t place[LANES], id[LANES];
+    Lanes sum[SUMS] = {}, gradient[ATTRIBUTES];
+    int filled = 0;
+    auto flush = [&] {
+      for (int i = filled; i < LANES; i++) place[i] = place[0];
+      for (int i = 0; i < LANES; i++) id[i] = v.id[place[i]];
+      project_backward(v.camera, in, id, v.input.p, place, sum, gradient);
+      take(id, filled, gradient);
+      filled = 0;
+    };
+    for (size_t i = share(v.input.n, w, threads), end = share(v.input.n, w + 1, threads); i < end; i++) {
+      Lanes total{};
+      bool any = false;
+      for (uint32_t k = i ? v.slot_end[i - 1] : 0; k < v.slot_end[i]; k++)
+        if (v.reached[k]) total += s.slots[k], any = true;
+      if (!any) continue;
+      for (int k = 0; k < SUMS; k++) sum[k][filled] = total[lane[k]];
+      place[filled++] = (uint32_t)i;
+      if (filled == LANES) flush();
     }
-    for (int k = 0; k < 4; k++) g.quats[4 * id + k] += x[QUAT + k];
-    g.opacities[id] += x[OPACITY];
-  }
+    if (filled) flush();
+  });
 }
 
 struct Batch {
@@ -314,8 +342,8 @@ template <class F, class G>
 static void for_each_view(int views, int threads, F work, G finish) {
   for (int v = 0; v < views;) {
     int together = views - v >= threads ? threads : 1;
-    parallel(together, [&](int w) { work(v + w, w, together > 1 ? 1 : threads); });
-    for (int w = 0; w < together; w++) finish(v + w, w);
+    parallel(together, [&](int w) { work(v + w, w, together > 1 ? 1 : threads, together > 1); });
+    finish(v, together);
     v += together;
   }
 }
@@ -348,20 +376,22 @@ int genre_forward(int count, const float* means, const float* scales, const floa
                   const float* colors, int views, const float* poses, const float* lenses, int width, int height, int threads,
                   float* color, float* alpha, float* depth, long long* culled, void** batch) {
   return guarded([&] {
-    Gaussians in{count, means, scales, quats, opacities, colors};
+    GaussianArrays in{count, means, scales, quats, opacities, colors};
     ScratchSet scratch(std::max(1, threads));
     auto kept = std::make_unique<Batch>();
     kept->views.resize(views);
     size_t pixels = (size_t)width * height;
-    for_each_view(views, std::max(1, threads), [&](int v, int w, int inner) {
+    for_each_view(views, std::max(1, threads), [&](int v, int w, int inner, bool) {
       auto view = views_shelf().take();
       view->camera = make_camera(poses + 16 * v, lenses + 4 * v, width, height);
       view->tiles_x = (width + TILE - 1) / TILE, view->tiles_y = (height + TILE - 1) / TILE;
       forward(*view, *scratch.of[w], in, inner, color + 3 * pixels * v, alpha + pixels * v, depth + pixels * v);
       kept->views[v] = std::move(view);
-    }, [&](int v, int) {
-      for (int r = 0; r < CULL_REASONS; r++) culled[r] += kept->views[v]->culled[r];
-      if (!batch) views_shelf().give(std::move(kept->views[v]));
+    }, [&](int first, int together) {
+      for (int v = first; v < first + together; v++) {
+        for (int r = 0; r < CULL_REASONS; r++) culled[r] += kept->views[v]->culled[r];
+        if (!batch) views_shelf().give(std::move(kept->views[v]));
+      }
     });
     if (batch) *batch = kept.release();
   });
@@ -374,14 +404,50 @@ int genre_backward(void* batch, int count, const float* means, const float* scal
                    float* grad_scales, float* grad_quats, float* grad_opacities, float* grad_colors) {
   return guarded([&] {
     auto& views = static_cast<Batch*>(batch)->views;
-    Gaussians in{count, means, scales, quats, opacities, colors};
+    GaussianArrays in{count, means, scales, quats, opacities, colors};
     Gradients g{grad_means, grad_scales, grad_quats, grad_opacities, grad_colors};
     ScratchSet scratch(std::max(1, threads));
-    for_each_view((int)views.size(), std::max(1, threads), [&](int v, int w, int inner) {
+    threads = std::max(1, threads);
+    for_each_view((int)views.size(), threads, [&](int v, int w, int inner, bool beside_others) {
       size_t at = (size_t)views[v]->camera.width * views[v]->camera.height * v;
-      backward(*views[v], *scratch.of[w], in, inner, Images{color + 3 * at, alpha + at, depth + at},
-               Images{v_color + 3 * at, v_alpha + at, v_depth + at});
-    }, [&](int v, int w) { accumulate(*views[v], *scratch.of[w], g); });
+      Scratch& s = *scratch.of[w];
+      s.reached.clear(), s.gradient.resize(beside_others ? views[v]->input.n / LANES * ATTRIBUTES + ATTRIBUTES : 0);
+      backward(*views[v], s, in, inner, Images{color + 3 * at, alpha + at, depth + at},
+               Images{v_color + 3 * at, v_alpha + at, v_depth + at}, [&](const uint32_t* id, int n, const Lanes* gradient) {
+        if (beside_others) {
+          std::copy(gradient, gradient + ATTRIBUTES, &s.gradient[s.reached.size() / LANES * ATTRIBUTES]);
+          s.reached.insert(s.reached.end(), id, id + n);
+        } else {
+          for (int i = 0; i < n; i++) g.add(id[i], gradient, i);
+        }
+      });
+    }, [&](int, int together) {
+      // In the order of the views, so that sums do not depend on threads; each thread for its own Gaussians.
+      if (together > 1) parallel(threads, [&](int w) {
+        for (int k = 0; k < together; k++) {
+          Scratch& s = *scratch.of[k];
+          auto from = std::lower_bound(s.reached.begin(), s.reached.end(), (uint32_t)share(count, w, threads));
+          auto to = std::lower_bound(from, s.reached.end(), (uint32_t)share(count, w + 1, threads));
+          for (size_t i = from - s.reached.begin(), end = to - s.reached.begin(); i < end; i++)
+            g.add(s.reached[i], &s.gradient[i / LANES * ATTRIBUTES], (int)(i % LANES));
+        }
+      });
+    });
+  });
+}
+
+// Adds to work [4] what the forward pass did: footprints drawn, (tile, footprint) pairs, pixels computed, pixels changed.
+int genre_work(void* batch, long long* work) {
+  return guarded([&] {
+    for (auto& view : static_cast<Batch*>(batch)->views) {
+      View& v = *view;
+      std::vector<float> image((size_t)v.camera.width * v.camera.height * 5);
+      float* alpha = image.data() + image.size() / 5 * 3;
+      work[3] += blend<true>(v, 1, image.data(), alpha, alpha + image.size() / 5);
+      work[0] += v.input.n, work[1] += v.pairs.n;
+      for (size_t t = 0; t < v.taken.n; t++)
+        for (int i = 0; i < v.taken[t]; i++) work[2] += LANES * __builtin_popcount(v.visited[v.tile_begin[t] + i]);
+    }
   });
 }
 

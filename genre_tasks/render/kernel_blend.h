@@ -1,87 +1,139 @@
-// Front-to-back compositing of one 16x16 tile, forward and backward. Row by row: alpha along y is a Gaussian in y, so
-// going down one row is two multiplications instead of an exponential.
+// Front-to-back compositing of one tile of 16x16 pixels, forward and backward. A vector holds a block of 4x4 pixels:
+// blocks that a footprint misses, or whose rays have all ended, are left out before anything is computed for them.
 #pragma once
 #include "kernel_project.h"
 
-constexpr int TILE = LANES;
+constexpr int BLOCK = 4, TILE = 16, BLOCKS = 16;  // pixels a side, pixels a side, blocks of a tile
+static_assert(BLOCK * BLOCK == LANES && BLOCKS == LANES, "one vector is one block's pixels, or a value for each block");
 
 struct Pair {
   uint32_t rank, slot;  // place in depth order; place of the pair's gradient, in input order
 };
 
-// Rows [first, last] of the tile that the footprint touches. Clamped as floats: a huge footprint overflows an int.
-INLINE void rows_of(const Footprint& g, int tile_y, int& first, int& last) {
-  first = (int)std::max(0.f, std::min(float(TILE), std::ceil(g.y - g.half_y - 0.5f - tile_y)));
-  last = (int)std::min(TILE - 1.f, std::max(-1.f, std::floor(g.y + g.half_y - 0.5f - tile_y)));
+// Of lane i as a pixel: its place in the block, from the block's centre. Of lane i as a block: the block's centre.
+INLINE Lanes lane_x(float origin, float step) {
+  Lanes r;
+  for (int i = 0; i < LANES; i++) r[i] = origin + step * (i % 4 - 1.5f);
+  return r;
+}
+INLINE Lanes lane_y(float origin, float step) {
+  Lanes r;
+  for (int i = 0; i < LANES; i++) r[i] = origin + step * (i / 4 - 1.5f);
+  return r;
 }
 
-// Alpha of one footprint down the rows of a tile.
-struct RowAlpha {
-  Lanes dx, dy0, u, bx, value, ratio;
-  float c, ratio_ratio;
-  bool direct;
+// Pixels of a tile: block centres, and pixel places within a block.
+struct Grid {
+  Lanes block_x, block_y, x, y;
+  Grid(int X, int Y)
+      : block_x(lane_x(X + 8, 4)), block_y(lane_y(Y + 8, 4)), x(lane_x(0, 1)), y(lane_y(0, 1)) {}
+};
 
-  __attribute__((always_inline)) RowAlpha(const Footprint& g, const Lanes& xs, const Lanes& ys, int first) {
-    dx = xs - g.x, dy0 = ys - g.y, u = g.log2_opacity - (g.a * dx) * dx, bx = g.b * dx, c = g.c;
-    Lanes dy = dy0 + (float)first;
-    Lanes p = min(u - dy * (bx + c * dy), broadcast(g.log2_opacity));  // rounding far from the centre must not exceed the peak
-    direct = any(p < -100.f);  // the recurrence would start from an underflow (needles)
-    value = exp2(p);
-    ratio = exp2(min(broadcast(126.f), -(bx + c * (2.f * dy + 1.f))));
-    ratio_ratio = std::exp2(-2 * c);
+// Of one footprint over a tile: log2 alpha as a polynomial about each block's centre, log2_opacity - a s^2 - m dy^2 with
+// s = dx + k dy. A sum of two squares does not cancel, however long and thin the footprint.
+struct Layer {
+  Lanes s, curve;                // by pixel: s from the block's centre, and the quadratic part
+  Lanes peak, along_s, along_y;  // by block: log2 alpha at its centre, and its slopes
+  float red, green, blue, z;
+
+  INLINE_MEMBER void set(const Footprint& g, const Grid& grid, const Lanes& s0, const Lanes& dy) {
+    Lanes ms = -g.a * s0, my = -g.m * dy;
+    peak = g.log2_opacity + ms * s0 + my * dy;
+    along_s = 2.f * ms, along_y = 2.f * my;
+    s = grid.x + g.k * grid.y;
+    curve = -g.a * s * s - g.m * grid.y * grid.y;
+    red = g.red, green = g.green, blue = g.blue, z = g.z;
   }
-  __attribute__((always_inline)) Lanes next(const Footprint& g, const Lanes& dy) {
-    Lanes alpha = value;
-    value = value * ratio, ratio = ratio * ratio_ratio;
-    if (__builtin_expect(direct, 0)) alpha = exp2(min(u - dy * (bx + c * dy), broadcast(g.log2_opacity)));
-    return alpha;
+  INLINE_MEMBER Lanes alpha(int b, const Grid& grid) const {
+    return exp2(along_s[b] * s + (along_y[b] * grid.y + (curve + peak[b])));
   }
 };
 
+// Blocks with a pixel centre at which the footprint may reach ALPHA_MIN: the least of the quadratic form over a rectangle
+// lies on one of the two edges that face the centre.
+INLINE uint32_t touched(const Footprint& g, const Lanes& dx, const Lanes& dy) {
+  const float reach = .5f * (BLOCK - 1);
+  Lanes left = dx - reach, right = dx + reach, top = dy - reach, bottom = dy + reach;
+  Lanes x1 = clamp(Lanes{}, left, right), y1 = clamp(x1 * g.dy_per_dx, top, bottom);
+  Lanes y2 = clamp(Lanes{}, top, bottom), x2 = clamp(y2 * -g.k, left, right);
+  Lanes s1 = x1 + g.k * y1, s2 = x2 + g.k * y2;
+  return bits(min(g.a * s1 * s1 + g.m * y1 * y1, g.a * s2 * s2 + g.m * y2 * y2) <= g.level);
+}
+
+// Pairs are taken a few at a time: alphas of all their blocks first, then the compositing. Each of the two loops is short
+// enough for the processor to overlap its rounds; in one they would wait for each other.
+constexpr int CHUNK = 8;
+
 // Transmittance of each pixel; negative: the ray has ended (or the pixel is outside of the image).
-INLINE bool all_ended(const Lanes (&T)[TILE]) {
-  Lanes m = T[0];
-  for (int r = 1; r < TILE; r++) m = max(m, T[r]);
-  return !any(m > 0.f);
+INLINE uint32_t alive_blocks(const Lanes (&T)[BLOCKS]) {
+  uint32_t alive = 0;
+  for (int b = 0; b < BLOCKS; b++) alive |= (uint32_t)any(T[b] > 0.f) << b;
+  return alive;
 }
 
-INLINE Lanes lane_centers(int origin) {
-  Lanes x;
-  for (int i = 0; i < LANES; i++) x[i] = origin + i + 0.5f;
-  return x;
-}
-
-static void blend_forward(const Footprint* sorted, const Pair* pair, const Pair* end, int X, int Y, int width, int height,
-                          float* color, float* alpha_out, float* depth) {
-  Lanes T[TILE], R[TILE], G[TILE], B[TILE], D[TILE];
-  for (int r = 0; r < TILE; r++) {
-    R[r] = G[r] = B[r] = D[r] = Lanes{};
-    for (int i = 0; i < LANES; i++) T[r][i] = X + i < width && Y + r < height ? 1.f : -1.f;
+// Pixels of a block that lie on the image: lane, and number in the image.
+template <class F>
+INLINE void for_pixels(int block, int X, int Y, int width, int height, F f) {
+  const int x = X + block % 4 * 4, y = Y + block / 4 * 4;
+  const size_t first = (size_t)y * width + x;
+  if (x + BLOCK <= width && y + BLOCK <= height) {
+    for (int i = 0; i < LANES; i++) f(i, first + (size_t)(i / 4) * width + i % 4);
+  } else {
+    for (int i = 0; i < LANES; i++)
+      if (x + i % 4 < width && y + i / 4 < height) f(i, first + (size_t)(i / 4) * width + i % 4);
   }
-  const Lanes xs = lane_centers(X), ys = broadcast(Y + 0.5f);
-  for (int i = 0; pair < end; pair++, i++) {
-    const Footprint& g = sorted[pair->rank];
-    if (pair + 6 < end) __builtin_prefetch(&sorted[pair[6].rank]);
-    int first, last;
-    rows_of(g, Y, first, last);
-    RowAlpha row(g, xs, ys, first);
-    for (int r = first; r <= last; r++) {
-      Lanes a = row.next(g, row.dy0 + (float)r);
+}
+
+// Writes the blocks that it visited of each pair, for the backward pass, and marks the slots of pairs with any. Returns
+// how many pairs it took until all rays had ended. With COUNT, adds to `contributions` the pixels that they changed.
+template <bool COUNT>
+static int blend_forward(const Footprint* sorted, const Pair* pair, const Pair* end, int X, int Y, int width, int height,
+                         uint16_t* visited, uint8_t* reached, float* color, float* alpha_out, float* depth,
+                         long long& contributions) {
+  Lanes T[BLOCKS], R[BLOCKS], G[BLOCKS], B[BLOCKS], D[BLOCKS];
+  for (int b = 0; b < BLOCKS; b++) {
+    R[b] = G[b] = B[b] = D[b] = Lanes{}, T[b] = broadcast(-1.f);
+    for_pixels(b, X, Y, width, height, [&](int i, size_t) { T[b][i] = 1.f; });
+  }
+  const Grid grid(X, Y);
+  Layer layers[CHUNK];
+  Lanes alphas[CHUNK * BLOCKS];
+  uint32_t work[CHUNK * BLOCKS + LANES];
+  const Pair* const begin = pair;
+  for (uint32_t alive = alive_blocks(T); pair < end && alive; alive = alive_blocks(T)) {
+    int count = 0;
+    for (int n = 0; n < CHUNK && pair < end; n++, pair++) {
+      const Footprint& g = sorted[pair->rank];
+      if (pair + 6 < end) __builtin_prefetch(&sorted[pair[6].rank]);
+      const Lanes dx = grid.block_x - g.x, dy = grid.block_y - g.y;
+      uint32_t visit = touched(g, dx, dy) & alive;
+      *visited++ = (uint16_t)visit;
+      reached[pair->slot] = visit != 0;
+      layers[n].set(g, grid, dx + g.k * dy, dy);
+      count += list_bits(visit, n * BLOCKS, work + count);
+    }
+    for (int i = 0; i < count; i++) alphas[i] = layers[work[i] / BLOCKS].alpha(work[i] % BLOCKS, grid);
+    for (int i = 0; i < count; i++) {
+      const Layer& layer = layers[work[i] / BLOCKS];
+      const int b = work[i] % BLOCKS;
+      Lanes a = alphas[i];
       a = keep(min(a, broadcast(ALPHA_MAX)), a >= ALPHA_MIN);
-      Lanes t = T[r], w = a * t, after = t - w;
+      Lanes t = T[b], w = a * t, after = t - w;
       Mask ended = after < TRANSMITTANCE_STOP;
       w = keep(w, ~ended);
-      T[r] = select(ended, minus_abs(t), after);
-      R[r] += w * g.red, G[r] += w * g.green, B[r] += w * g.blue, D[r] += w * g.z;
+      if (COUNT) contributions += __builtin_popcount(bits(w > 0.f));
+      T[b] = select(ended, minus_abs(t), after);
+      R[b] += w * layer.red, G[b] += w * layer.green, B[b] += w * layer.blue, D[b] += w * layer.z;
     }
-    if ((i & 7) == 7 && all_ended(T)) break;
   }
-  for (int r = 0; r < TILE && Y + r < height; r++)
-    for (int i = 0; i < LANES && X + i < width; i++) {
-      size_t k = (size_t)(Y + r) * width + X + i;
-      color[3 * k] = R[r][i], color[3 * k + 1] = G[r][i], color[3 * k + 2] = B[r][i];
-      depth[k] = D[r][i], alpha_out[k] = 1 - std::fabs(T[r][i]);
-    }
+  for (int b = 0; b < BLOCKS; b++) {
+    T[b] = 1.f - abs(T[b]);
+    for_pixels(b, X, Y, width, height, [&](int i, size_t k) {
+      color[3 * k] = R[b][i], color[3 * k + 1] = G[b][i], color[3 * k + 2] = B[b][i];
+      depth[k] = D[b][i], alpha_out[k] = T[b][i];
+    });
+  }
+  return (int)(pair - begin);
 }
 
 struct Images {
@@ -91,52 +143,66 @@ struct Images {
 // Also front to back: what lies behind a layer is the pixel's value minus what came so far, so no list per pixel is kept.
 // The ten sums of a pair go to its own slot and are added later: no atomics, the same bits at any thread count.
 static void blend_backward(const Footprint* sorted, const Pair* pair, const Pair* end, int X, int Y, int width, int height,
-                           Images out, Images grad, Lanes* slots) {
-  Lanes T[TILE], behind[TILE], vr[TILE], vg[TILE], vb[TILE], vd[TILE];
-  for (int r = 0; r < TILE; r++) {
-    behind[r] = vr[r] = vg[r] = vb[r] = vd[r] = Lanes{};
-    for (int i = 0; i < LANES; i++) {
-      bool inside = X + i < width && Y + r < height;
-      T[r][i] = inside ? 1.f : -1.f;
-      if (!inside) continue;
-      size_t k = (size_t)(Y + r) * width + X + i;
-      const float *v = grad.color + 3 * k, *o = out.color + 3 * k;
-      vr[r][i] = v[0], vg[r][i] = v[1], vb[r][i] = v[2], vd[r][i] = grad.depth[k];
-      behind[r][i] = v[0] * o[0] + v[1] * o[1] + v[2] * o[2] + grad.depth[k] * out.depth[k] - (1 - out.alpha[k]) * grad.alpha[k];
-    }
+                           const uint16_t* visited, Images out, Images grad, Lanes* slots) {
+  Lanes T[BLOCKS], behind[BLOCKS], vr[BLOCKS], vg[BLOCKS], vb[BLOCKS], vd[BLOCKS];
+  for (int b = 0; b < BLOCKS; b++) {
+    Lanes red{}, green{}, blue{}, z{}, alpha{}, v_alpha{};
+    vr[b] = vg[b] = vb[b] = vd[b] = Lanes{}, T[b] = broadcast(-1.f);
+    for_pixels(b, X, Y, width, height, [&](int i, size_t k) {
+      T[b][i] = 1.f;
+      vr[b][i] = grad.color[3 * k], vg[b][i] = grad.color[3 * k + 1], vb[b][i] = grad.color[3 * k + 2];
+      red[i] = out.color[3 * k], green[i] = out.color[3 * k + 1], blue[i] = out.color[3 * k + 2];
+      vd[b][i] = grad.depth[k], v_alpha[i] = grad.alpha[k], z[i] = out.depth[k], alpha[i] = out.alpha[k];
+    });
+    behind[b] = vr[b] * red + vg[b] * green + vb[b] * blue + vd[b] * z - (1.f - alpha) * v_alpha;
   }
-  const Lanes xs = lane_centers(X), ys = broadcast(Y + 0.5f);
-  for (int i = 0; pair < end; pair++, i++) {
-    const Footprint& g = sorted[pair->rank];
-    if (pair + 6 < end) __builtin_prefetch(&sorted[pair[6].rank]);
-    int first, last;
-    rows_of(g, Y, first, last);
-    RowAlpha row(g, xs, ys, first);
-    Lanes s0{}, sy{}, syy{}, red{}, green{}, blue{}, z{};
-    for (int r = first; r <= last; r++) {
-      Lanes dy = row.dy0 + (float)r, a = row.next(g, dy);
+  const Grid grid(X, Y);
+  Layer layers[CHUNK];
+  Lanes s0[CHUNK], dy0[CHUNK], alphas[CHUNK * BLOCKS], ws[CHUNK * BLOCKS];
+  uint32_t work[CHUNK * BLOCKS + LANES], slot[CHUNK];
+  int stop[CHUNK];
+  while (pair < end) {
+    int count = 0, n = 0;
+    for (; n < CHUNK && pair < end; pair++) {
+      uint32_t visit = *visited++;
+      if (pair + 6 < end) __builtin_prefetch(&sorted[pair[6].rank]);
+      if (!visit) continue;
+      const Footprint& g = sorted[pair->rank];
+      dy0[n] = grid.block_y - g.y, s0[n] = grid.block_x - g.x + g.k * dy0[n];
+      layers[n].set(g, grid, s0[n], dy0[n]);
+      slot[n] = pair->slot;
+      count += list_bits(visit, n * BLOCKS, work + count);
+      stop[n++] = count;
+    }
+    for (int i = 0; i < count; i++) alphas[i] = layers[work[i] / BLOCKS].alpha(work[i] % BLOCKS, grid);
+    for (int i = 0; i < count; i++) {
+      const Layer& layer = layers[work[i] / BLOCKS];
+      const int b = work[i] % BLOCKS;
+      Lanes a = alphas[i];
       Mask drawn = a >= ALPHA_MIN, free = a < ALPHA_MAX;
       a = keep(min(a, broadcast(ALPHA_MAX)), drawn);
-      Lanes t = T[r], w = a * t, after = t - w;
+      Lanes t = T[b], w = a * t, after = t - w;
       Mask ended = after < TRANSMITTANCE_STOP;
       w = keep(w, ~ended);
-      T[r] = select(ended, minus_abs(t), after);
-      Lanes wq = w * (g.red * vr[r] + g.green * vg[r] + g.blue * vb[r] + g.z * vd[r]);
-      Lanes rest = behind[r] - wq;
-      behind[r] = rest;
-      red += w * vr[r], green += w * vg[r], blue += w * vb[r], z += w * vd[r];
-      Lanes v = keep(wq - a * rest * (1.f / (1.f - a)), ~ended & free & drawn);  // alpha dL/dalpha
-      s0 += v;
-      Lanes vy = v * dy;
-      sy += vy, syy += vy * dy;
+      T[b] = select(ended, minus_abs(t), after);
+      Lanes wq = w * (layer.red * vr[b] + layer.green * vg[b] + layer.blue * vb[b] + layer.z * vd[b]);
+      Lanes rest = behind[b] - wq;
+      behind[b] = rest;
+      ws[i] = w;
+      alphas[i] = keep(wq - a * rest * reciprocal(1.f - a), ~ended & free & drawn);  // alpha dL/dalpha
     }
-    Lanes sx = s0 * row.dx;
-    stream(&slots[pair->slot], sums({s0, sx, sx * row.dx, sy * row.dx, sy, syy, red, green, blue, z}));
-    if ((i & 7) == 7 && all_ended(T)) {
-      pair++;
-      break;
+    for (int i = 0, k = 0; k < n; k++) {
+      const Layer& layer = layers[k];
+      Lanes sum_v{}, sum_s{}, sum_ss{}, sum_sy{}, sum_y{}, sum_yy{}, red{}, green{}, blue{}, z{};
+      for (; i < stop[k]; i++) {
+        const int b = work[i] % BLOCKS;
+        Lanes w = ws[i], v = alphas[i];
+        red += w * vr[b], green += w * vg[b], blue += w * vb[b], z += w * vd[b];
+        Lanes s = layer.s + s0[k][b], dy = grid.y + dy0[k][b], vs = v * s, vy = v * dy;
+        sum_v += v, sum_s += vs, sum_y += vy, sum_ss += vs * s, sum_sy += vs * dy, sum_yy += vy * dy;
+      }
+      stream(&slots[slot[k]], sums({sum_v, sum_s, sum_ss, sum_sy, sum_y, sum_yy, red, green, blue, z}));
     }
   }
-  for (; pair < end; pair++) stream(&slots[pair->slot], Lanes{});
   stream_end();
 }

@@ -84,5 +84,6 @@ def load_kernel(folder: Path = build_kernel.HERE) -> ctypes.CDLL:
     p, i = ctypes.c_void_p, ctypes.c_int
     library.genre_forward.argtypes = [i, p, p, p, p, p, i, p, p, i, i, i, p, p, p, p, p]
     library.genre_backward.argtypes = [p, i, *[p] * 5, *[p] * 6, i, *[p] * 5]
+    library.genre_work.argtypes = [p, p]
     library.genre_free.argtypes, library.genre_free.restype = [p], None
     return library

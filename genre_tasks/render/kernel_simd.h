@@ -1,13 +1,16 @@
-// Sixteen float lanes: one pixel row of a tile. Compiler vector extensions instead of intrinsics, in vectors of the
-// machine's own width: a 64-byte vector type compiled for AVX2 is five times slower than two 32-byte ones.
+// Sixteen float lanes: the pixels of a block, the blocks of a tile, or sixteen Gaussians. Compiler vector extensions, and
+// intrinsics where they fall short, in vectors of the machine's own width: a 64-byte vector type compiled for AVX2 is five
+// times slower than two 32-byte ones.
 #pragma once
+#include <cmath>
 #include <cstddef>
+#include <cstdint>
 #include <utility>
 #if defined(__SSE2__)
 #include <immintrin.h>
 #endif
 
-#if defined(__AVX512F__)
+#if defined(__AVX512F__) && defined(__AVX512DQ__)
 #define VECTOR_BYTES 64
 #elif defined(__AVX__)
 #define VECTOR_BYTES 32
@@ -15,6 +18,7 @@
 #define VECTOR_BYTES 16
 #endif
 #define INLINE static inline __attribute__((always_inline))
+#define INLINE_MEMBER __attribute__((always_inline)) inline
 
 constexpr int LANES = 16, WIDTH = VECTOR_BYTES / 4, VECTORS = LANES / WIDTH;
 typedef float NativeF __attribute__((vector_size(VECTOR_BYTES)));
@@ -25,9 +29,15 @@ struct Lanes {
   float operator[](int i) const { return reinterpret_cast<const float*>(v)[i]; }
   float& operator[](int i) { return reinterpret_cast<float*>(v)[i]; }
 };
+#if VECTOR_BYTES == 64
+struct Mask {
+  __mmask16 k;
+};
+#else
 struct Mask {
   NativeI v[VECTORS];
 };
+#endif
 
 #define EACH for (int k = 0; k < VECTORS; k++)
 #define BINARY(op)                                                                                        \
@@ -35,36 +45,83 @@ struct Mask {
   INLINE Lanes operator op(const Lanes& a, float b) { Lanes r; EACH r.v[k] = a.v[k] op b; return r; }      \
   INLINE Lanes operator op(float a, const Lanes& b) { Lanes r; EACH r.v[k] = a op b.v[k]; return r; }
 BINARY(+) BINARY(-) BINARY(*) BINARY(/)
-#define COMPARE(op) \
-  INLINE Mask operator op(const Lanes& a, float b) { Mask r; NativeF t = NativeF{} + b; EACH r.v[k] = a.v[k] op t; return r; }
-COMPARE(<) COMPARE(>) COMPARE(>=)
-
 INLINE Lanes& operator+=(Lanes& a, const Lanes& b) { return a = a + b; }
 INLINE Lanes operator-(const Lanes& a) { Lanes r; EACH r.v[k] = -a.v[k]; return r; }
-INLINE Mask operator&(const Mask& a, const Mask& b) { Mask r; EACH r.v[k] = a.v[k] & b.v[k]; return r; }
-INLINE Mask operator~(const Mask& a) { Mask r; EACH r.v[k] = ~a.v[k]; return r; }
-INLINE Lanes select(const Mask& m, const Lanes& a, const Lanes& b) { Lanes r; EACH r.v[k] = m.v[k] ? a.v[k] : b.v[k]; return r; }
 INLINE Lanes broadcast(float x) { Lanes r; EACH r.v[k] = NativeF{} + x; return r; }
 INLINE Lanes max(const Lanes& a, const Lanes& b) { Lanes r; EACH r.v[k] = a.v[k] > b.v[k] ? a.v[k] : b.v[k]; return r; }
 INLINE Lanes min(const Lanes& a, const Lanes& b) { Lanes r; EACH r.v[k] = a.v[k] < b.v[k] ? a.v[k] : b.v[k]; return r; }
-// Bit masks rather than products: they also stop a NaN.
-INLINE Lanes keep(const Lanes& a, const Mask& m) { Lanes r; EACH r.v[k] = (NativeF)((NativeI)a.v[k] & m.v[k]); return r; }
+INLINE Lanes clamp(const Lanes& x, const Lanes& low, const Lanes& high) { return min(max(x, low), high); }
 INLINE Lanes minus_abs(const Lanes& a) { Lanes r; EACH r.v[k] = (NativeF)((NativeI)a.v[k] | (int)0x80000000); return r; }
 
-INLINE bool any(const Mask& m) {
-  NativeI o = m.v[0];
-  for (int k = 1; k < VECTORS; k++) o |= m.v[k];
-#if defined(__AVX512DQ__) && VECTOR_BYTES == 64
-  return _mm512_movepi32_mask((__m512i)o) != 0;
-#elif defined(__AVX__) && VECTOR_BYTES == 32
-  return _mm256_movemask_ps((__m256)o) != 0;
+INLINE Lanes abs(const Lanes& a) { Lanes r; EACH r.v[k] = (NativeF)((NativeI)a.v[k] & 0x7fffffff); return r; }
+INLINE Lanes sqrt(const Lanes& a) {
+  Lanes r;
+#if VECTOR_BYTES == 64
+  r.v[0] = (NativeF)_mm512_sqrt_ps((__m512)a.v[0]);
+#elif VECTOR_BYTES == 32
+  EACH r.v[k] = (NativeF)_mm256_sqrt_ps((__m256)a.v[k]);
 #elif defined(__SSE2__) && VECTOR_BYTES == 16
-  return _mm_movemask_ps((__m128)o) != 0;
+  EACH r.v[k] = (NativeF)_mm_sqrt_ps((__m128)a.v[k]);
 #else
-  int r = 0;
-  for (int i = 0; i < WIDTH; i++) r |= o[i];
-  return r != 0;
+  for (int i = 0; i < LANES; i++) r[i] = std::sqrt(a[i]);
 #endif
+  return r;
+}
+
+// keep: a where m, else 0, also where a is NaN. is_finite looks at the bits: it stays right under any floating-point flags.
+#if VECTOR_BYTES == 64
+#define COMPARE(op, code) \
+  INLINE Mask operator op(const Lanes& a, const Lanes& b) { return {_mm512_cmp_ps_mask((__m512)a.v[0], (__m512)b.v[0], code)}; }
+COMPARE(<, _CMP_LT_OQ) COMPARE(>, _CMP_GT_OQ) COMPARE(>=, _CMP_GE_OQ) COMPARE(<=, _CMP_LE_OQ)
+INLINE Mask operator&(Mask a, Mask b) { return {(__mmask16)(a.k & b.k)}; }
+INLINE Mask operator|(Mask a, Mask b) { return {(__mmask16)(a.k | b.k)}; }
+INLINE Mask operator~(Mask a) { return {(__mmask16)~a.k}; }
+INLINE Lanes select(Mask m, const Lanes& a, const Lanes& b) { return {{(NativeF)_mm512_mask_mov_ps((__m512)b.v[0], m.k, (__m512)a.v[0])}}; }
+INLINE Lanes keep(const Lanes& a, Mask m) { return {{(NativeF)_mm512_maskz_mov_ps(m.k, (__m512)a.v[0])}}; }
+INLINE Mask is_finite(const Lanes& a) {
+  const __m512i exponent = _mm512_set1_epi32(0x7f800000);
+  return {_mm512_cmpneq_epi32_mask(_mm512_and_si512((__m512i)a.v[0], exponent), exponent)};
+}
+INLINE uint32_t bits(Mask m) { return m.k; }
+#else
+#define COMPARE(op) \
+  INLINE Mask operator op(const Lanes& a, const Lanes& b) { Mask r; EACH r.v[k] = a.v[k] op b.v[k]; return r; }
+COMPARE(<) COMPARE(>) COMPARE(>=) COMPARE(<=)
+INLINE Mask operator&(const Mask& a, const Mask& b) { Mask r; EACH r.v[k] = a.v[k] & b.v[k]; return r; }
+INLINE Mask operator|(const Mask& a, const Mask& b) { Mask r; EACH r.v[k] = a.v[k] | b.v[k]; return r; }
+INLINE Mask operator~(const Mask& a) { Mask r; EACH r.v[k] = ~a.v[k]; return r; }
+INLINE Lanes select(const Mask& m, const Lanes& a, const Lanes& b) { Lanes r; EACH r.v[k] = m.v[k] ? a.v[k] : b.v[k]; return r; }
+INLINE Lanes keep(const Lanes& a, const Mask& m) { Lanes r; EACH r.v[k] = (NativeF)((NativeI)a.v[k] & m.v[k]); return r; }
+INLINE Mask is_finite(const Lanes& a) { Mask r; EACH r.v[k] = ((NativeI)a.v[k] & 0x7f800000) != 0x7f800000; return r; }
+INLINE uint32_t bits(const Mask& m) {
+#if VECTOR_BYTES == 32
+  return _mm256_movemask_ps((__m256)m.v[0]) | _mm256_movemask_ps((__m256)m.v[1]) << 8;
+#else
+  uint32_t r = 0;
+#if defined(__SSE2__)
+  EACH r |= _mm_movemask_ps((__m128)m.v[k]) << 4 * k;
+#else
+  for (int i = 0; i < LANES; i++) r |= (uint32_t)(reinterpret_cast<const int*>(m.v)[i] & 1) << i;
+#endif
+  return r;
+#endif
+}
+#endif
+INLINE Mask operator<(const Lanes& a, float b) { return a < broadcast(b); }
+INLINE Mask operator>(const Lanes& a, float b) { return a > broadcast(b); }
+INLINE Mask operator>=(const Lanes& a, float b) { return a >= broadcast(b); }
+INLINE Mask operator<=(const Lanes& a, float b) { return a <= broadcast(b); }
+INLINE bool any(const Mask& m) { return bits(m) != 0; }
+
+// Writes base + i for each bit i that is set, and returns how many; may write up to LANES entries.
+INLINE int list_bits(uint32_t set, uint32_t base, uint32_t* out) {
+#if VECTOR_BYTES == 64
+  const __m512i lane = _mm512_set_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0);
+  _mm512_storeu_si512(out, _mm512_add_epi32(_mm512_maskz_compress_epi32((__mmask16)set, lane), _mm512_set1_epi32(base)));
+#else
+  for (uint32_t left = set; left; left &= left - 1) *out++ = base + __builtin_ctz(left);
+#endif
+  return __builtin_popcount(set);
 }
 
 constexpr float EXP2_0 = 1.000000072f, EXP2_1 = 6.931469671e-1f, EXP2_2 = 2.402211972e-1f, EXP2_3 = 5.550713273e-2f,
@@ -90,11 +147,26 @@ INLINE Lanes exp2(const Lanes& x) {
   return r;
 }
 
+// 1 / x for x in [1 - ALPHA_MAX, 1], relative error below 1e-7: the machine's estimate and a Newton step.
+INLINE Lanes reciprocal(const Lanes& x) {
+  Lanes r;
+#if VECTOR_BYTES == 64
+  r.v[0] = (NativeF)_mm512_rcp14_ps((__m512)x.v[0]);
+#elif VECTOR_BYTES == 32
+  EACH r.v[k] = (NativeF)_mm256_rcp_ps((__m256)x.v[k]);
+#elif defined(__SSE2__) && VECTOR_BYTES == 16
+  EACH r.v[k] = (NativeF)_mm_rcp_ps((__m128)x.v[k]);
+#else
+  return 1.f / x;
+#endif
+  return r * (2.f - x * r);
+}
+
 // Non-temporal: pair gradients are read much later, and would only push the tile's data out of the cache.
 INLINE void stream(Lanes* at, const Lanes& x) {
-#if defined(__AVX512F__) && VECTOR_BYTES == 64
+#if VECTOR_BYTES == 64
   _mm512_stream_ps(reinterpret_cast<float*>(at), (__m512)x.v[0]);
-#elif defined(__AVX__) && VECTOR_BYTES == 32
+#elif VECTOR_BYTES == 32
   EACH _mm256_stream_ps(reinterpret_cast<float*>(at) + 8 * k, (__m256)x.v[k]);
 #elif defined(__SSE2__) && VECTOR_BYTES == 16
   EACH _mm_stream_ps(reinterpret_cast<float*>(at) + 4 * k, (__m128)x.v[k]);
