@@ -1,30 +1,31 @@
 """The main job's claims, measured: claim seeds of the synthetic street and chunk 1 of the real sequence.
 
-python benchmarks/main_job.py --json docs/benchmarks/main_job.json [--store DIR] [--seeds 1001,1002]
+genre bench main_job --json docs/benchmarks/main_job.json [--set seeds=1001,1002] [--set store=DIR]
 
-Each log goes through the pipeline (preset ``small``) without Prefect, from and into a store: a broken-off run goes
-on where it stopped. The tuned-Adam baseline has the same initial scene, renderer, loss and number of view renders.
+Each log goes through the pipeline (preset ``small``) without Prefect, from and into a store: a broken-off log goes on
+where it stopped. The tuned-Adam baseline has the same initial scene, renderer, loss and number of view renders.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import platform
-import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from flows.cli.main import prepare_environment
+from benchmarks.bench import Bench, Cell, NotMeasuredError, Row
+from benchmarks.schema import Claim, Op, claim
 from flows.configuration import load_configuration
-from flows.pipeline import PIPELINE
+from flows.pipeline import PIPELINE, weights_digest, weights_file
 from flows.produce import ArtifactRef, Job, produce
 from storage.local import open_store
 
 SETTINGS = ("evaluate.shifts_m=[3]",)
 """Claims are made at 3 m; the other shifts would only cost time."""
+SECONDS = 300.0
+"""Predicted for one chunk, with evaluation and the baseline."""
 ALL_STAGES = tuple(spec.name for spec in PIPELINE)
 
 
@@ -56,8 +57,11 @@ def seconds_of(job: Job, ref: ArtifactRef) -> tuple[float, float]:
     return artifact.manifest.seconds, artifact.manifest.peak_mib
 
 
-def measure(log: str, chunk: int, store: str) -> dict[str, Any]:
+def measure(log: str, chunk: int, store: str) -> Row:
     """One row: metrics per stage, seconds per stage, and tuned Adam's metrics."""
+    reader, _, path = log.partition(":")
+    if reader == "pandaset" and not Path(path).is_dir():
+        raise NotMeasuredError(f"there is no folder {path}; give it with --set pandaset=PATH")
     values = load_configuration("small", settings=SETTINGS).model_dump(mode="json")
     job = Job(log, chunk, store, values)
     refs = reconstruct(job)
@@ -77,42 +81,54 @@ def measure(log: str, chunk: int, store: str) -> dict[str, Any]:
     }
 
 
-def claims_of(row: dict[str, Any], real: bool) -> Iterator[dict[str, Any]]:
-    """What the row says about each requirement; every claim can fail."""
+@dataclass(frozen=True)
+class Requirement:
+    """A number of one row, and what it has to be."""
+
+    id: str
+    number: Callable[[Row], float]
+    op: Op
+    target: float
+    unit: str
+
+
+def _gain(metric: str, stage: str, before: str) -> Callable[[Row], float]:
+    return lambda row: float(row["metrics"][stage][metric] - row["metrics"][before][metric])
+
+
+def _repair(row: Row) -> float:
+    fixed = row["metrics"]["fnet"]
+    return float(fixed["shift_3m/psnr"] - fixed["shift_3m/render_psnr"])
+
+
+def _perceptual_repair(row: Row) -> float:
+    fixed = row["metrics"]["fnet"]
+    return float(fixed["shift_3m/perceptual"] / fixed["shift_3m/render_perceptual"])
+
+
+def _perceptual_enhancement(row: Row) -> float:
     m = row["metrics"]
-    data = f"{row['log'].split('/')[-1]} chunk {row['chunk']}"
-    psnr = "interpolation/psnr"
-    yield claim("main.gnet_over_initial_db", m["gnet"][psnr] - m["initial"][psnr], ">=", 4.0, "dB", data)
-    yield claim("main.gnet_vs_adam_db", m["gnet"][psnr] - m["adam"][psnr], ">=", 0.0, "dB", data)
-    yield claim("main.enet_interpolation_db", m["enet"][psnr] - m["gnet"][psnr], ">=", -0.5, "dB", data)
-    total = sum(seconds for name, seconds in row["seconds"].items() if name != "adam")
-    yield claim("main.minutes_per_chunk", total / 60, "<", 15.0, "min", data)
-    if real:
-        kernel = "shift_3m/kernel"
-        yield claim("main.enet_kernel_3m", m["enet"][kernel] - m["gnet"][kernel], "<", 0.0, "kernel distance", data)
-        return
-    fixed = m["fnet"]
-    yield claim("main.fnet_psnr_3m_db", fixed["shift_3m/psnr"] - fixed["shift_3m/render_psnr"], ">", 0.0, "dB", data)
-    perceptual = fixed["shift_3m/perceptual"] / fixed["shift_3m/render_perceptual"]
-    yield claim("main.fnet_perceptual_3m", perceptual, "<", 1.0, "ratio", data)
-    perceptual = m["enet"]["shift_3m/perceptual"] / m["gnet"]["shift_3m/perceptual"]
-    yield claim("main.enet_perceptual_3m", perceptual, "<", 1.0, "ratio", data)
+    return float(m["enet"]["shift_3m/perceptual"] / m["gnet"]["shift_3m/perceptual"])
 
 
-def claim(name: str, measured: float, op: str, target: float, unit: str, data: str) -> dict[str, Any]:
-    """One claim in the project's schema."""
-    holds = {">=": measured >= target, ">": measured > target, "<": measured < target}[op]
-    return {
-        "id": name,
-        "measured": measured,
-        "op": op,
-        "target": target,
-        "unit": unit,
-        "n": 1,
-        "spread": None,
-        "data": data,
-        "holds": bool(holds),
-    }
+def _minutes(row: Row) -> float:
+    return float(sum(seconds for name, seconds in row["seconds"].items() if name != "adam") / 60)
+
+
+_PSNR = "interpolation/psnr"
+_EVERYWHERE = (
+    Requirement("main.gnet_over_initial_db", _gain(_PSNR, "gnet", "initial"), ">=", 4.0, "dB"),
+    Requirement("main.gnet_vs_adam_db", _gain(_PSNR, "gnet", "adam"), ">=", 0.0, "dB"),
+    Requirement("main.enet_interpolation_db", _gain(_PSNR, "enet", "gnet"), ">=", -0.5, "dB"),
+    Requirement("main.minutes_per_chunk", _minutes, "<", 15.0, "min"),
+)
+_REAL = (Requirement("main.enet_kernel_3m", _gain("shift_3m/kernel", "enet", "gnet"), "<", 0.0, "kernel distance"),)
+_WITH_TRUTH = (
+    Requirement("main.fnet_psnr_3m_db", _repair, ">", 0.0, "dB"),
+    Requirement("main.fnet_perceptual_3m", _perceptual_repair, "<", 1.0, "ratio"),
+    Requirement("main.enet_perceptual_3m", _perceptual_enhancement, "<", 1.0, "ratio"),
+)
+"""Only the synthetic street has a true image 3 m beside the path."""
 
 
 _STAGES = (("initial", "initial"), ("adam", "tuned Adam"), ("gnet", "GNet"), ("fnet", "FNet"), ("enet", "ENet"))
@@ -124,6 +140,44 @@ _COLUMNS = {
     "perceptual @3m": "shift_3m/perceptual",
     "kernel @3m": "shift_3m/kernel",
 }
+
+
+class MainJob:
+    """One cell per log and chunk."""
+
+    name = "main_job"
+    options: Mapping[str, str] = {
+        "seeds": "1001,1002,1003", "store": "genre-store", "pandaset": "../shared/data/pandaset/002",
+    }  # fmt: skip
+    code: tuple[str, ...] = (
+        "benchmarks.main_job",
+        *(spec.module for spec in PIPELINE),
+        "genre_tasks.logs.pandaset",
+        "genre_tasks.logs.synthetic",
+    )
+
+    def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
+        """The seeds, then the real chunk; ``quick`` takes the first seed and the real chunk."""
+        seeds = [seed for seed in options["seeds"].split(",") if seed][: 1 if quick else None]
+        logs = [(f"synthetic:street?seed={seed}", 0) for seed in seeds] + [(f"pandaset:{options['pandaset']}", 1)]
+        config = load_configuration("small", settings=SETTINGS)
+        weights = [weights_digest(weights_file(spec, config)) for spec in PIPELINE]
+        parameters = {"configuration": config.model_dump(mode="json"), "weights": weights}
+        return [
+            Cell(f"{log} chunk {chunk}", SECONDS, partial(measure, log, chunk, options["store"]), parameters)
+            for log, chunk in logs
+        ]
+
+    def claims(self, rows: Mapping[str, Row]) -> Iterator[Claim]:
+        """What each row says about each requirement."""
+        for cell, row in rows.items():
+            for r in _EVERYWHERE + (_WITH_TRUTH if cell.startswith("synthetic:") else _REAL):
+                number = None if "not_measured" in row else r.number(row)
+                yield claim(r.id, number, r.op, r.target, r.unit, cell.split("/")[-1])
+
+    def table(self, rows: Mapping[str, Row]) -> Iterator[str]:
+        """The table that the README shows."""
+        return markdown([row for row in rows.values() if "not_measured" not in row])
 
 
 def markdown(rows: list[dict[str, Any]]) -> Iterator[str]:
@@ -145,29 +199,4 @@ def say(text: str) -> None:
     sys.stderr.write(text + "\n")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", type=Path, required=True)
-    parser.add_argument("--store", default="genre-store")
-    parser.add_argument("--seeds", default="1001,1002,1003")
-    parser.add_argument("--pandaset", default="../shared/data/pandaset/002")
-    options = parser.parse_args()
-    prepare_environment(debug=False)  # before torch is imported
-    rows = [measure(f"synthetic:street?seed={seed}", 0, options.store) for seed in options.seeds.split(",") if seed]
-    claims = [c for row in rows for c in claims_of(row, real=False)]
-    if Path(options.pandaset).is_dir():
-        rows.append(measure(f"pandaset:{options.pandaset}", 1, options.store))
-        claims += claims_of(rows[-1], real=True)
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
-    result = {"machine": platform.processor() or platform.machine(), "commit": commit, "rows": rows, "claims": claims}
-    options.json.parent.mkdir(parents=True, exist_ok=True)
-    options.json.write_text(json.dumps(result, indent=1) + "\n")
-    for line in markdown(rows):
-        sys.stdout.write(line + "\n")
-    for c in claims:
-        word = "holds" if c["holds"] else "FAILS"
-        say(f"{word}  {c['id']:<28} {c['measured']:9.4f} {c['op']} {c['target']}  {c['data']}")
-
-
-if __name__ == "__main__":
-    main()
+BENCH: Bench = MainJob()

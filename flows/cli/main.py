@@ -8,7 +8,7 @@ from pathlib import Path
 
 import typer
 
-from flows.cli import check, doctor, render, run, show, train, verify
+from flows.cli import bench, check, doctor, render, run, show, train, verify
 
 app = typer.Typer(
     name="genre",
@@ -24,6 +24,7 @@ app.command(name="render")(render.render)
 app.command(name="show")(show.show)
 app.command(name="verify")(verify.verify)
 app.command(name="doctor")(doctor.doctor)
+app.command(name="bench")(bench.bench)
 app.add_typer(train.app, name="train")
 
 

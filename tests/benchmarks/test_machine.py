@@ -1,0 +1,37 @@
+"""What a result says of where it was measured."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import torch
+
+from benchmarks.machine import commit, machine
+from genre_tasks.render.kernel_library import supported_isas
+
+
+def test_machine_names_cores_instruction_set_and_torch() -> None:
+    model, *rest = machine().split(", ")
+    assert len(model) > 2
+    assert rest[0].split()[1] == "cores" and int(rest[0].split()[0]) >= 1
+    assert rest[1:3] == [supported_isas()[0], f"torch {torch.__version__}"]
+
+
+def test_commit_says_whether_the_tree_was_changed(tmp_path: Path) -> None:
+    def git(*arguments: str) -> str:
+        identity = ("-c", "user.name=a", "-c", "user.email=a@example.org", "-c", "commit.gpgsign=false")
+        done = subprocess.run(["git", *identity, *arguments], cwd=tmp_path, capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    assert commit(tmp_path) == "unknown"
+    git("init", "-q")
+    (tmp_path / "file").write_text("a")
+    git("add", "file")
+    git("commit", "-qm", "a")
+    assert commit(tmp_path.resolve()) == git("rev-parse", "HEAD")
+    (tmp_path / "file").write_text("b")
+    assert commit(tmp_path.resolve()) == git("rev-parse", "HEAD") + "+changes"
+    below = tmp_path / "below"
+    below.mkdir()
+    assert commit(below.resolve()) == "unknown"
