@@ -1,0 +1,73 @@
+"""The renderer's claims, measured: beside gsplat's torch reference, and beside what the machine can do at most.
+
+genre bench raster --json docs/benchmarks/raster.json
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+
+from benchmarks.bench import Bench, Cell, Row
+from benchmarks.raster import cells, peers, table
+from benchmarks.raster.scenes import CASES
+from benchmarks.schema import Claim, Op, claim
+
+_CLAIMS: tuple[tuple[str, str, str, Op, float, str, str], ...] = (
+    ("vs_gsplat_torch", "peer/300k", "ratio", ">=", 230.0, "ratio", "forward + backward, 300k, 2 threads"),
+    ("ns_per_pair", "scene/300k", "ns_per_pair", "<=", 2.4, "ns", "forward + backward, 300k, 2 threads"),
+    ("gemm_share", "scene/300k", "gemm_share", ">=", 0.33, "ratio", "executed operations, 300k, 2 threads"),
+    ("many_views", "views", "ratio", "<=", 0.8, "ratio", "32 views of 20k at 180×320, per view, to single calls"),
+    ("threads", "scene/300k", "two_threads_gain", ">=", 1.8, "ratio", "forward + backward, 300k, 1 thread to 2"),
+    ("avx2", "isas", "ratio", "<=", 1.3, "ratio", "forward + backward, 300k, 2 threads, to AVX-512"),
+    ("build_s", "build", "seconds", "<=", 10.0, "s", "all instruction sets, an empty folder"),
+)
+"""Claim, its cell and number, requirement, unit, data."""
+
+
+class Raster:
+    """Cells of the renderer; two of the claims need gsplat or AVX-512."""
+
+    name = "raster"
+    options: Mapping[str, str] = {}
+    code: tuple[str, ...] = (
+        "benchmarks.raster.cells", "benchmarks.raster.ceilings", "benchmarks.raster.gsplat_torch",
+        "benchmarks.raster.isa_child", "benchmarks.raster.isas", "benchmarks.raster.peers", "benchmarks.raster.scenes",
+        "benchmarks.timing", "genre_tasks.render.api",
+    )  # fmt: skip
+
+    def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
+        """Scenes, peers, many views, instruction sets, build, GPU."""
+        largest = CASES[-1]
+        out = []
+        for case, seconds in zip(CASES, (2.0, 2.5, 3.5), strict=True):
+            rounds = 5 if quick else 15
+            out.append(_cell(f"scene/{case.name}", seconds, rounds, partial(cells.measure_scene, case)))
+        for case, seconds, rounds in zip(CASES, (2.0, 8.0, 45.0), (2, 2, 2) if quick else (9, 5, 3), strict=True):
+            out.append(_cell(f"peer/{case.name}", seconds, rounds, partial(peers.measure_peer, case)))
+        out.append(_cell("views", 2.0, 5 if quick else 11, cells.measure_views))
+        out.append(_cell("isas", 1.0, 5 if quick else 15, partial(cells.measure_isas, largest)))
+        out.append(_cell("build", 10.0, 2 if quick else 5, cells.measure_build))
+        out += [_cell(f"cuda/{case.name}", 1.0, 15, partial(peers.measure_cuda, case)) for case in CASES]
+        return out
+
+    def claims(self, rows: Mapping[str, Row]) -> Iterator[Claim]:
+        """Every claim; those whose cell was not measured say so."""
+        for name, cell, number, op, target, unit, data in _CLAIMS:
+            m = rows[cell].get(number)
+            if m is None:
+                yield claim(f"raster.{name}", None, op, target, unit, data)
+            else:
+                yield claim(f"raster.{name}", m["median"], op, target, unit, data, m["n"], (m["low"], m["high"]))
+
+    def table(self, rows: Mapping[str, Row]) -> Iterator[str]:
+        """The tables that the documents show."""
+        return table.markdown(rows)
+
+
+def _cell(name: str, seconds_a_round: float, rounds: int, measure: Callable[[int], Row]) -> Cell:
+    # A round more for warming up.
+    return Cell(name, seconds_a_round * (rounds + 1), partial(measure, rounds), {"rounds": rounds})
+
+
+BENCH: Bench = Raster()

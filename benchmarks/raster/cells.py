@@ -1,0 +1,129 @@
+"""What is measured of the renderer alone, a function per kind of cell."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from benchmarks.bench import NotMeasuredError, Row
+from benchmarks.raster.ceilings import COPY_BYTES, GEMM_FLOP, copy, gemm
+from benchmarks.raster.isas import IsaProcess
+from benchmarks.raster.scenes import MANY, Case, Scene, forward, forward_backward, leaves_of, scene
+from benchmarks.timing import Action, Measured, on_threads, ratio, take_turns
+from genre_tasks.render import Cameras
+from genre_tasks.render.build_kernel import build_kernel
+from genre_tasks.render.kernel_library import supported_isas
+from genre_tasks.render.work import FLOP_PER_LANE_BACKWARD, FLOP_PER_LANE_FORWARD, count_work
+
+THREADS = 2
+"""What every claim is made on; one thread is measured beside it."""
+VIEWS = 32
+
+
+def ours(s: Scene, threads: int) -> tuple[Action, Action]:
+    """Forward, and forward + backward."""
+    leaves = leaves_of(s.splats)
+    return (
+        on_threads(threads, lambda: forward(s, threads)),
+        on_threads(threads, lambda: forward_backward(s, leaves, threads)),
+    )
+
+
+def milliseconds(seconds: dict[str, list[float]]) -> dict[str, Any]:
+    """Medians and quartiles as JSON."""
+    return {name: Measured.of(values).as_row(1e3) for name, values in seconds.items()}
+
+
+def measure_scene(case: Case, rounds: int) -> Row:
+    """The renderer at one and two threads, the machine's ceilings in turn with it, and the work that was done."""
+    s = scene(case)
+    actions: dict[str, Action] = {}
+    for t in (1, THREADS):
+        actions[f"forward {t}"], actions[f"forward+backward {t}"] = ours(s, t)
+        actions[f"gemm {t}"], actions[f"copy {t}"] = gemm(t), copy(t)
+    seconds = take_turns(actions, rounds)
+    work = count_work(s.splats, s.cameras)
+    both, product = seconds[f"forward+backward {THREADS}"], seconds[f"gemm {THREADS}"]
+    flop = float(FLOP_PER_LANE_FORWARD + FLOP_PER_LANE_BACKWARD)
+    share = ratio([x / GEMM_FLOP * flop * work.lanes for x in product], both)
+    useful = ratio([x / GEMM_FLOP * flop * work.contributions for x in product], both)
+    return {
+        "gaussians": case.count,
+        "height_px": case.height_px,
+        "width_px": case.width_px,
+        "milliseconds": milliseconds({k: v for k, v in seconds.items() if k.startswith("forward")}),
+        "gemm_gflop_s": {
+            str(t): Measured.of([GEMM_FLOP / x for x in seconds[f"gemm {t}"]]).as_row(1e-9) for t in (1, THREADS)
+        },
+        "copy_gb_s": {
+            str(t): Measured.of([COPY_BYTES / x for x in seconds[f"copy {t}"]]).as_row(1e-9) for t in (1, THREADS)
+        },
+        "work": {n: getattr(work, n) for n in ("drawn", "tile_pairs", "lanes", "contributions")},
+        "lane_density": work.contributions / work.lanes,
+        "ns_per_pair": Measured.of([x / work.contributions for x in both]).as_row(1e9),
+        "gflop_s": Measured.of([flop * work.lanes / x for x in both]).as_row(1e-9),
+        "gemm_share": share.as_row(),
+        "gemm_share_of_contributing": useful.as_row(),
+        "two_threads_gain": ratio(seconds["forward+backward 1"], both).as_row(),
+    }
+
+
+def measure_views(rounds: int) -> Row:
+    """Many views in one call, against a call for each; both with fresh gradients."""
+    s = scene(MANY, VIEWS)
+    singles = [ours(_view(s, v), THREADS) for v in range(VIEWS)]
+    together = ours(s, THREADS)
+    actions: dict[str, Action] = {
+        "forward, one call": together[0],
+        "forward, single calls": lambda: [one[0]() for one in singles],
+        "forward+backward, one call": together[1],
+        "forward+backward, single calls": lambda: [one[1]() for one in singles],
+    }
+    seconds = take_turns(actions, rounds)
+    per_view = {name: [x / VIEWS for x in values] for name, values in seconds.items()}
+    return {
+        "gaussians": MANY.count,
+        "views": VIEWS,
+        "height_px": MANY.height_px,
+        "width_px": MANY.width_px,
+        "milliseconds_per_view": milliseconds(per_view),
+        "forward_ratio": ratio(seconds["forward, one call"], seconds["forward, single calls"]).as_row(),
+        "ratio": ratio(seconds["forward+backward, one call"], seconds["forward+backward, single calls"]).as_row(),
+    }
+
+
+def _view(s: Scene, v: int) -> Scene:
+    c, one = s.cameras, slice(v, v + 1)
+    camera = Cameras(c.camera_SE3_chunk[one], c.focal_px[one], c.center_px[one], c.width_px, c.height_px)
+    return Scene(s.splats, camera, s.v_color[one], s.v_alpha[one], s.v_depth[one])
+
+
+def measure_isas(case: Case, rounds: int) -> Row:
+    """Forward + backward of the AVX2 and the AVX-512 build in turn, a process each."""
+    if missing := {"avx512", "avx2"} - set(supported_isas()):
+        raise NotMeasuredError(f"this machine does not run {', '.join(sorted(missing))}")
+    with ExitStack() as stack:
+        children = {isa: stack.enter_context(IsaProcess(isa, case.name, THREADS)) for isa in ("avx512", "avx2")}
+        seconds: dict[str, list[float]] = {isa: [] for isa in children}
+        for i in range(rounds):
+            for isa in list(children)[:: -1 if i % 2 else 1]:
+                seconds[isa].append(children[isa].seconds())
+    return {
+        "gaussians": case.count,
+        "milliseconds": milliseconds(seconds),
+        "ratio": ratio(seconds["avx2"], seconds["avx512"]).as_row(),
+    }
+
+
+def measure_build(rounds: int) -> Row:
+    """Seconds to compile the kernel for all instruction sets into an empty folder."""
+    seconds, libraries = [], []
+    for _ in range(rounds):
+        with tempfile.TemporaryDirectory() as folder:
+            start = time.perf_counter()
+            libraries = [path.name for path in build_kernel(Path(folder))]
+            seconds.append(time.perf_counter() - start)
+    return {"libraries": libraries, "seconds": Measured.of(seconds).as_row()}
