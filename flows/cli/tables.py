@@ -37,7 +37,9 @@ def _text(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, Mapping):
-        parts = [(k, _text(v), isinstance(v, Mapping)) for k, v in value.items()]
+        if not value:
+            return "none"
+        parts = [(k, _text(v), isinstance(v, Mapping) and len(v) > 0) for k, v in value.items()]
         return "\n".join(f"{k}:\n{textwrap.indent(v, '  ')}" if nested else f"{k}: {v}" for k, v, nested in parts)
     if isinstance(value, list | tuple):
         scalars = all(not isinstance(v, Mapping | list | tuple) for v in value)

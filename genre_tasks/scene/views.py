@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from torch import Tensor
 
@@ -26,7 +26,11 @@ class NovelView:
 
 @dataclass(frozen=True)
 class NovelViews:
-    """Renders of a scene at V novel views, float32, colour sRGB in [0, 1] premultiplied by alpha."""
+    """Renders of a scene at V novel views, float32, colour sRGB in [0, 1] premultiplied by alpha.
+
+    ``culled`` and ``lidar_culled`` count left-out Gaussians of the scene and of the LiDAR map by reason, summed over
+    the views: measurements, which go into the manifest.
+    """
 
     views: tuple[NovelView, ...]
     color: Tensor  # [V, H, W, 3]
@@ -35,6 +39,8 @@ class NovelViews:
     lidar_color: Tensor  # [V, H, W, 3] the LiDAR map: coloured points rendered as Gaussians
     lidar_alpha: Tensor  # [V, H, W]
     lidar_depth: Tensor  # [V, H, W]
+    culled: dict[str, int] = field(default_factory=dict)
+    lidar_culled: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import torch
@@ -36,8 +37,9 @@ def novel_views(
     lidar = _render(points, views, settings, progress, len(views), "LiDAR maps")
     progress(2 * len(views), 2 * len(views), "novel views")
     images = NovelViews(
-        views, scene.color, scene.alpha, scene.expected_depth(), lidar.color, lidar.alpha, lidar.expected_depth()
-    )
+        views, scene.color, scene.alpha, scene.expected_depth(), lidar.color, lidar.alpha, lidar.expected_depth(),
+        scene.culled, lidar.culled,
+    )  # fmt: skip
     for name in ("color", "alpha", "depth", "lidar_color", "lidar_alpha", "lidar_depth"):
         bad = (~getattr(images, name).isfinite()).nonzero()
         if len(bad):
@@ -66,4 +68,7 @@ def _render(
             parts.append(render_views(scene, views[start:end], settings))
             start = end
     color, alpha, depth = (torch.cat([getattr(p, name) for p in parts]) for name in ("color", "alpha", "depth"))
-    return Render(color, alpha, depth)
+    culled: Counter[str] = Counter()
+    for part in parts:
+        culled.update(part.culled)
+    return Render(color, alpha, depth, dict(culled))

@@ -1,4 +1,7 @@
-"""NovelViews ↔ ``views.parquet`` and one EXR a view: R, G, B, A, Z of the render and ``lidar.*`` of the LiDAR map."""
+"""NovelViews ↔ ``views.parquet`` and one EXR a view: R, G, B, A, Z of the render and ``lidar.*`` of the LiDAR map.
+
+Culled counts are measurements: they live in the manifest and come back from there.
+"""
 
 from __future__ import annotations
 
@@ -31,6 +34,7 @@ VIEWS = schema(
     ],
 )
 LAYERS = ("", "lidar.")
+_COUNTS = ("culled", "lidar_culled")
 CHANNELS: dict[str, Any] = {
     f"{layer}{c}": np.float16 if c in "RGB" else np.float32 for layer in LAYERS for c in ("R", "G", "B", "A", "Z")
 }
@@ -117,8 +121,11 @@ def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> NovelVi
     for i, path in enumerate(files):
         for layer, (color, alpha, depth) in read_image(path, (height, width)).items():
             out[layer][0][i], out[layer][1][i], out[layer][2][i] = color, alpha, depth
-    render, lidar = (tuple(torch.from_numpy(a) for a in out[layer]) for layer in LAYERS)
-    return NovelViews(views, *render, *lidar)
+    (color, alpha, depth), (lidar_color, lidar_alpha, lidar_depth) = (
+        (torch.from_numpy(a) for a in out[layer]) for layer in LAYERS
+    )
+    counts = [dict((measurements or {}).get(name, {})) for name in _COUNTS]
+    return NovelViews(views, color, alpha, depth, lidar_color, lidar_alpha, lidar_depth, *counts)
 
 
 def read_image(path: Path, shape: tuple[int, int]) -> dict[str, tuple[NDArray[np.float32], ...]]:
@@ -132,5 +139,5 @@ def read_image(path: Path, shape: tuple[int, int]) -> dict[str, tuple[NDArray[np
 
 
 def measurements(value: NovelViews) -> dict[str, Any]:
-    """None."""
-    return {}
+    """Culled counts of the scene and of the LiDAR map."""
+    return {name: dict(getattr(value, name)) for name in _COUNTS}

@@ -181,6 +181,7 @@ def test_novel_views_contract(log: FakeLog, chunk: Chunk, reconstruction: Recons
         solid = out.lidar_alpha[n] > 0.95
         lidar_scores.append(_psnr(out.lidar_color[n][solid], truth[solid]))
     assert np.mean(scores) > 18 and np.mean(lidar_scores) > 18
+    assert 0 < out.culled["behind"] < 20 * len(reconstruction.scene) and out.lidar_culled["behind"] > 0
     left_wall = out.lidar_depth[0:10][1::2][:, 28, 48]
     assert torch.allclose(left_wall, torch.tensor(5.0), atol=0.3)
 

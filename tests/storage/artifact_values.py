@@ -97,7 +97,8 @@ def novel_views(rng: np.random.Generator, count: int = 2, width: int = 7, height
         depth = (10 ** rng.uniform(-3, 6, alpha.shape)).astype(np.float32) * (alpha > 0)
         return torch.from_numpy(color), torch.from_numpy(alpha), torch.from_numpy(depth)
 
-    return NovelViews(tuple(novel_view(rng, k, width, height) for k in range(count)), *layer(), *layer())
+    views = tuple(novel_view(rng, k, width, height) for k in range(count))
+    return NovelViews(views, *layer(), *layer(), {"behind": 5}, {"behind": 7, "degenerate": 1})
 
 
 def fixed_views(rng: np.random.Generator, count: int = 2, width: int = 7, height: int = 5) -> FixedViews:
