@@ -79,8 +79,13 @@ struct Buffer {
 struct View {
   Camera camera;
   int tiles_x, tiles_y;
+  struct Segment {
+    size_t begin, end;
+  };
+  size_t drawn;
+  std::vector<Segment> segments;         // places in input order that are taken: each thread leaves a gap behind its own
   Buffer<Footprint> input, sorted;       // drawn footprints in input order, and in depth order
-  Buffer<uint32_t> id, slot_end, tile_begin;  // by input place: Gaussian, end of its pair slots; by tile: first pair
+  Buffer<uint32_t> id, slot_end, tile_begin;  // by place: Gaussian, end of its pair slots; by tile: first pair
   Buffer<Pair> pairs;                    // tile after tile, each front to back
   Buffer<uint16_t> visited;              // by pair: blocks that the forward pass visited
   Buffer<uint8_t> reached;               // by slot: whether it visited any
@@ -147,24 +152,20 @@ static inline void for_tiles(const Footprint& g, int tiles_x, int tiles_y, F f) 
 }
 
 static void project_all(View& v, const GaussianArrays& in, int threads) {
-  v.input.resize(in.count), v.id.resize(in.count);
-  std::vector<size_t> begin(threads), count(threads);
+  v.input.resize(in.count), v.id.resize(in.count), v.slot_end.resize(in.count);
+  std::fill(v.slot_end.p, v.slot_end.p + in.count, 0);
+  v.segments.resize(threads);
   std::vector<long long> culled((size_t)threads * CULL_REASONS, 0);
   parallel(threads, [&](int w) {
-    size_t at = begin[w] = share(in.count, w, threads), end = share(in.count, w + 1, threads);
+    size_t first = share(in.count, w, threads), at = first, end = share(in.count, w + 1, threads);
     long long tally[CULL_REASONS] = {};
-    for (size_t i = at; i < end; i += LANES)
+    for (size_t i = first; i < end; i += LANES)
       at += footprints(v.camera, in, (uint32_t)i, (int)std::min<size_t>(LANES, end - i), tally, &v.input[at], &v.id[at]);
-    count[w] = at - begin[w];
+    v.segments[w] = {first, at};
     std::copy(tally, tally + CULL_REASONS, &culled[(size_t)w * CULL_REASONS]);
   });
-  size_t n = count[0];
-  for (int w = 1; w < threads; w++) {
-    std::memmove(static_cast<void*>(v.input.p + n), v.input.p + begin[w], count[w] * sizeof(Footprint));
-    std::memmove(v.id.p + n, v.id.p + begin[w], count[w] * 4);
-    n += count[w];
-  }
-  v.input.n = v.id.n = n;
+  v.drawn = 0;
+  for (auto& segment : v.segments) v.drawn += segment.end - segment.begin;
   for (int r = 0; r < CULL_REASONS; r++) {
     v.culled[r] = 0;
     for (int w = 0; w < threads; w++) v.culled[r] += culled[(size_t)w * CULL_REASONS + r];
@@ -172,30 +173,45 @@ static void project_all(View& v, const GaussianArrays& in, int threads) {
 }
 
 // Stable, so Gaussians of one depth keep their input order. Depths are positive: their bits sort as integers.
-static void sort_by_depth(View& v, Scratch& s) {
-  size_t n = v.input.n;
-  s.keys.resize(n), s.other.resize(n);
-  for (size_t i = 0; i < n; i++) {
-    uint32_t u;
-    std::memcpy(&u, &v.input[i].z, 4);
-    s.keys[i] = (uint64_t)u << 32 | (uint32_t)i;
-  }
+static void sort_by_depth(View& v, Scratch& s, int threads) {
+  constexpr int DIGIT = 11, VALUES = 1 << DIGIT;
+  s.keys.resize(v.drawn), s.other.resize(v.drawn), s.order.resize(v.drawn);
+  std::vector<size_t> begin(threads, 0);
+  for (int w = 1; w < threads; w++) begin[w] = begin[w - 1] + v.segments[w - 1].end - v.segments[w - 1].begin;
+  parallel(threads, [&](int w) {
+    uint64_t* key = s.keys.p + begin[w];
+    for (size_t i = v.segments[w].begin; i < v.segments[w].end; i++) {
+      uint32_t u;
+      std::memcpy(&u, &v.input[i].z, 4);
+      *key++ = (uint64_t)u << 32 | (uint32_t)i;
+    }
+  });
   uint64_t *from = s.keys.p, *to = s.other.p;
-  for (int shift = 32; shift < 64; shift += 11) {
-    uint32_t start[2049] = {0};
-    for (size_t i = 0; i < n; i++) start[((from[i] >> shift) & 2047) + 1]++;
-    for (int i = 0; i < 2048; i++) start[i + 1] += start[i];
-    for (size_t i = 0; i < n; i++) to[start[(from[i] >> shift) & 2047]++] = from[i];
+  std::vector<uint32_t> next((size_t)threads * VALUES);
+  for (int shift = 32; shift < 64; shift += DIGIT) {
+    auto digit = [&](uint64_t key) { return (key >> shift) & (VALUES - 1); };
+    parallel(threads, [&](int w) {
+      uint32_t* histogram = &next[(size_t)w * VALUES];
+      std::fill(histogram, histogram + VALUES, 0);
+      for (size_t i = share(v.drawn, w, threads), end = share(v.drawn, w + 1, threads); i < end; i++) histogram[digit(from[i])]++;
+    });
+    uint32_t sum = 0;
+    for (int value = 0; value < VALUES; value++)
+      for (int w = 0; w < threads; w++) sum += std::exchange(next[(size_t)w * VALUES + value], sum);
+    parallel(threads, [&](int w) {
+      uint32_t* place = &next[(size_t)w * VALUES];
+      for (size_t i = share(v.drawn, w, threads), end = share(v.drawn, w + 1, threads); i < end; i++)
+        to[place[digit(from[i])]++] = from[i];
+    });
     std::swap(from, to);
   }
-  s.order.resize(n);
-  for (size_t i = 0; i < n; i++) s.order[i] = (uint32_t)from[i];
+  for (size_t i = 0; i < v.drawn; i++) s.order[i] = (uint32_t)from[i];
 }
 
 // One counting sort of (tile, footprint) pairs in depth order: tiles need no sort of their own.
 static void bin(View& v, Scratch& s, int threads) {
-  size_t n = v.input.n, tiles = (size_t)v.tiles_x * v.tiles_y;
-  v.sorted.resize(n), v.slot_end.resize(n), v.tile_begin.resize(tiles + 1);
+  const size_t n = v.drawn, tiles = (size_t)v.tiles_x * v.tiles_y;
+  v.sorted.resize(n), v.tile_begin.resize(tiles + 1);
   while ((int)s.tiles.size() < threads) s.tiles.push_back(std::make_unique<Buffer<uint32_t>>());
   s.histogram.resize(std::max((size_t)threads, s.histogram.size()));
   std::vector<size_t> totals(threads);
@@ -218,13 +234,12 @@ static void bin(View& v, Scratch& s, int threads) {
   for (size_t t : totals) total += t;
   if (total >= UINT32_MAX) throw std::bad_alloc();
   uint32_t sum = 0;
-  for (size_t i = 0; i < n; i++) v.slot_end[i] = sum += v.slot_end[i];
+  for (size_t i = 0; i < v.slot_end.n; i++) v.slot_end[i] = sum += v.slot_end[i];
   sum = 0;
   for (size_t t = 0; t < tiles; t++) {
     v.tile_begin[t] = sum;
     for (int w = 0; w < threads; w++) {
-      uint32_t c = s.histogram[w][t];
-      s.histogram[w][t] = sum, sum += c;
+      sum += std::exchange(s.histogram[w][t], sum);
     }
   }
   v.tile_begin[tiles] = sum;
@@ -264,7 +279,7 @@ static long long blend(View& v, int threads, float* color, float* alpha, float* 
 
 static void forward(View& v, Scratch& s, const GaussianArrays& in, int threads, float* color, float* alpha, float* depth) {
   project_all(v, in, threads);
-  sort_by_depth(v, s);
+  sort_by_depth(v, s, threads);
   bin(v, s, threads);
   v.visited.resize(v.pairs.n), v.reached.resize(v.pairs.n), v.taken.resize((size_t)v.tiles_x * v.tiles_y);
   std::memset(v.reached.p, 0, v.reached.n);
@@ -411,7 +426,7 @@ int genre_backward(void* batch, int count, const float* means, const float* scal
     for_each_view((int)views.size(), threads, [&](int v, int w, int inner, bool beside_others) {
       size_t at = (size_t)views[v]->camera.width * views[v]->camera.height * v;
       Scratch& s = *scratch.of[w];
-      s.reached.clear(), s.gradient.resize(beside_others ? views[v]->input.n / LANES * ATTRIBUTES + ATTRIBUTES : 0);
+      s.reached.clear(), s.gradient.resize(beside_others ? views[v]->drawn / LANES * ATTRIBUTES + ATTRIBUTES : 0);
       backward(*views[v], s, in, inner, Images{color + 3 * at, alpha + at, depth + at},
                Images{v_color + 3 * at, v_alpha + at, v_depth + at}, [&](const uint32_t* id, int n, const Lanes* gradient) {
         if (beside_others) {
@@ -444,7 +459,7 @@ int genre_work(void* batch, long long* work) {
       std::vector<float> image((size_t)v.camera.width * v.camera.height * 5);
       float* alpha = image.data() + image.size() / 5 * 3;
       work[3] += blend<true>(v, 1, image.data(), alpha, alpha + image.size() / 5);
-      work[0] += v.input.n, work[1] += v.pairs.n;
+      work[0] += v.drawn, work[1] += v.pairs.n;
       for (size_t t = 0; t < v.taken.n; t++)
         for (int i = 0; i < v.taken[t]; i++) work[2] += LANES * __builtin_popcount(v.visited[v.tile_begin[t] + i]);
     }
