@@ -99,7 +99,7 @@ def section_of(spec: StageSpec, config: PipelineConfig) -> Any:
 def weights_file(spec: StageSpec, config: PipelineConfig) -> Path | None:
     """The weights that the stage will load, or ``None`` if it loads none."""
     section = section_of(spec, config)
-    if spec.weights is None or getattr(section, "method", "learned") != "learned":
+    if spec.weights is None or getattr(section, "method", "learned") not in ("learned", "g3r"):
         return None
     from genre_tasks.weights import resolve_weights
 

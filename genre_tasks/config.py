@@ -56,17 +56,69 @@ class LossConfig(Section):
     perceptual_every: int = Field(4, ge=1, description="The perceptual term is taken in every n-th iteration.")
 
 
+class AdamConfig(Section):
+    """Tuned Adam, to be tuned for the horizon that it is used at (``configs/baselines.yaml``)."""
+
+    rates: tuple[float, float, float, float, float] | None = Field(
+        None,
+        description="Of means (in units of the initial size), log-scales, quaternions, logit opacities and colours; "
+        "null: the stage's own, tuned for 24 iterations of 6 views.",
+    )
+    schedule: Literal["cosine", "constant"] = Field("cosine", description="Of all rates, over the iterations.")
+
+
+class DensityConfig(Section):
+    """When and how per-scene 3DGS adds and removes Gaussians; iterations count in a run of 30 000."""
+
+    start: int = Field(500, ge=0, description="No growth up to this iteration.")
+    stop: int = Field(15_000, ge=0, description="No growth, pruning or reset from this iteration on.")
+    every: int = Field(100, ge=1, description="Grow and prune in every n-th iteration.")
+    reset_every: int = Field(3000, ge=1, description="Opacities are lowered in every n-th iteration.")
+    grow_gradient: float = Field(2e-4, ge=0, description="Screen-space gradient, the image from −1 to 1.")
+    grow_scale: float = Field(0.01, gt=0, description="Of the extent: clones up to this size, splits above.")
+    prune_opacity: float = Field(0.005, gt=0, lt=0.5)
+    prune_scale: float = Field(0.1, gt=0, description="Of the extent; larger ones go, after the first reset.")
+    max_gaussians: int = Field(1_000_000, ge=1, description="Growth stops here; the published recipe has no bound.")
+
+
+class PerSceneConfig(Section):
+    """Per-scene 3DGS as published (Kerbl et al. 2023; gsplat's ``simple_trainer`` and ``DefaultStrategy``)."""
+
+    iterations: int = Field(30_000, ge=1, le=200_000, description="One view each; all schedules scale with it.")
+    means_rate: float = Field(1.6e-4, ge=0, description="Metres per step and metre of the scene's extent.")
+    means_rate_end: float = Field(0.01, gt=0, le=1, description="The means' rate at the end, of that at the start.")
+    log_scales_rate: float = Field(5e-3, ge=0)
+    quats_rate: float = Field(1e-3, ge=0)
+    logit_opacities_rate: float = Field(5e-2, ge=0)
+    sh_rate: float = Field(2.5e-3, ge=0, description="Of the spherical harmonics' constant term: colours × 1/C0.")
+    rgb: float = Field(0.8, ge=0, description="Weight of L1.")
+    ssim: float = Field(0.2, ge=0, description="Weight of 1 − SSIM.")
+    density: DensityConfig = DensityConfig()
+
+
 class OptimiserConfig(Section):
     """GNet and ENet: the unrolled learned optimiser (paper Sec. III-C, III-D)."""
 
-    iterations: int = Field(24, ge=1, le=1000, description="T.")
+    iterations: int = Field(24, ge=1, le=10_000, description="T.")
     views_per_iteration: int = Field(6, ge=1, description="Source views rendered in each iteration.")
     novel_views_per_iteration: int = Field(0, ge=0, description="Fixed novel views rendered in each iteration.")
     loss: LossConfig = LossConfig()
     method: Literal["learned", "adam"] = Field("learned", description="adam: the tuned per-attribute baseline.")
+    adam: AdamConfig = AdamConfig()
     weights: str = Field("builtin", description="builtin, or a path to a .safetensors file.")
     snapshots: int = Field(6, ge=0, description="Intermediate scenes kept for the curve of accuracy against seconds.")
     seed: int = Field(0, ge=0)
+
+
+class GnetConfig(OptimiserConfig):
+    """GNet, or in its place a baseline that reconstructs from source views too (``configs/baselines.yaml``)."""
+
+    method: Literal["learned", "adam", "standard_3dgs", "street_gs", "g3r"] = Field(  # type: ignore[assignment]
+        "learned",
+        description="adam: tuned per attribute; standard_3dgs, street_gs: per-scene 3DGS without and with actors; "
+        "g3r: learned from recorded views alone, with weights of its own.",
+    )
+    per_scene: PerSceneConfig = PerSceneConfig()
 
 
 class NovelViewsConfig(Section):
@@ -101,7 +153,7 @@ class PipelineConfig(Section):
 
     ingest: IngestConfig = IngestConfig()
     initial: InitialConfig = InitialConfig()
-    gnet: OptimiserConfig = OptimiserConfig()
+    gnet: GnetConfig = GnetConfig()
     novel_views: NovelViewsConfig = NovelViewsConfig()
     fnet: FnetConfig = FnetConfig()
     enet: OptimiserConfig = OptimiserConfig(iterations=12, novel_views_per_iteration=6)

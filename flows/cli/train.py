@@ -15,6 +15,7 @@ app = typer.Typer(help="Train the networks (tens of minutes each on a CPU; resum
 Folder = Annotated[Path, typer.Option(help="Where pairs, scenes, checkpoints and curves are kept.")]
 Seeds = Annotated[str, typer.Option(help="Training seeds of the synthetic street, first:last:step.")]
 Real = Annotated[str | None, typer.Option(help="A real log whose chunk 0 is trained on too, e.g. pandaset:PATH/002.")]
+Novel = Annotated[float, typer.Option(min=0, help="λ_novel; 0: recorded views alone, for gnet.method=g3r.")]
 
 
 def _seeds(text: str) -> list[int]:
@@ -54,7 +55,7 @@ def fnet(folder: Folder = Path("training")) -> None:
 
 
 @app.command()
-def gnet(folder: Folder = Path("training"), real: Real = None) -> None:
+def gnet(folder: Folder = Path("training"), real: Real = None, novel: Novel = 0.1) -> None:
     """Train GNet on streets made on the spot; FNet is not needed."""
     from flows.cli.terminal import TerminalReporter
     from flows.train.recipes import train_gnet
@@ -62,7 +63,7 @@ def gnet(folder: Folder = Path("training"), real: Real = None) -> None:
     from storage.local import LocalStore
 
     with TerminalReporter("training gnet") as reporter:
-        network = train_gnet(LocalStore(folder / "store"), folder / "gnet", real, reporter.progress)
+        network = train_gnet(LocalStore(folder / "store"), folder / "gnet", real, reporter.progress, novel)
     save(network, folder / "gnet.safetensors")
     typer.echo(
         f"weights in {folder / 'gnet.safetensors'}; use them with --set gnet.weights={folder / 'gnet.safetensors'}"

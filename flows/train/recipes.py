@@ -100,15 +100,23 @@ def fine_scenes(count: int = 15, real: str | None = None) -> list[SceneRecipe]:
 
 
 def train_gnet(
-    store: LocalStore, folder: Path, real: str | None = None, progress: Progress = silent
+    store: LocalStore,
+    folder: Path,
+    real: str | None = None,
+    progress: Progress = silent,
+    novel: float = GNET_JUDGE.novel,
 ) -> LearnedOptimiser:
-    """GNet from nothing, in the stages of ``GNET_STAGES``; each resumes. ``real``: the URI of a log with a chunk 0."""
+    """GNet from nothing, in the stages of ``GNET_STAGES``; each resumes. ``real``: the URI of a log with a chunk 0.
+
+    ``novel``: λ_novel; 0 trains on recorded views alone, as G3R.
+    """
+    judge = GNET_JUDGE.model_copy(update={"novel": novel})
     network = network_from(NetworkConfig(rates=GNET_RATES), seed=0)
     for stage in GNET_STAGES:
         recipes = fine_scenes(real=real) if stage.fine else coarse_scenes(real=real)
         recipes = [r for r in recipes if stage.more_real and r.uri == real] + recipes
         scenes = [training_scene(prepare(store, r)) for r in recipes]
-        config = MetaConfig(pool=6, loss=GNET_LOSS, judge_loss=GNET_JUDGE)
+        config = MetaConfig(pool=6, loss=GNET_LOSS, judge_loss=judge)
         train_optimiser(network, scenes, _at(config, stage), folder / stage.name, progress=progress)
     return network
 

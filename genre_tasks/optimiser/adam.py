@@ -1,9 +1,10 @@
-"""The baseline: Adam with per-attribute rates and a cosine schedule, tuned for the horizon it is used at."""
+"""The baseline: Adam with per-attribute rates and one schedule, tuned for the horizon it is used at."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 from torch import Tensor
 
@@ -16,18 +17,21 @@ ENET_RATES = (0.1, 0.1, 0.025, 0.15, 0.01)
 
 @dataclass(frozen=True)
 class TunedAdam:
-    """Δ = −rate · schedule(t / T) · u, with moments that count only the iterations that saw a Gaussian.
+    """Δ = −rate · decay(t / T) · u, with moments that count only the iterations that saw a Gaussian.
 
     ``rates``: one for each of means (in units of the initial scale), log-scales, quaternions, logit opacities, colours.
+    ``decay``: the learned optimiser's cosine, or none.
     """
 
     rates: Sequence[float] = GNET_RATES
+    decay: Literal["cosine", "constant"] = "cosine"
 
     def start(self, frame: Frame, centre: Tensor) -> Step:
         """Nothing to prepare."""
         rates = rate_vector(self.rates)
 
         def step(state: State, gradient: Tensor, total: int) -> Tensor:
-            return -rates * schedule(state.iteration, total) * state.direction()
+            part = schedule(state.iteration, total) if self.decay == "cosine" else 1.0
+            return -rates * part * state.direction()
 
         return step

@@ -1,15 +1,19 @@
-"""From a stage's configuration to the unrolled optimisation: rule, targets, plan."""
+"""From a stage's configuration to its optimisation: method, targets, plan."""
 
 from __future__ import annotations
 
 from typing import Literal
 
-from genre_tasks.config import OptimiserConfig
+from genre_tasks.config import GnetConfig, OptimiserConfig
+from genre_tasks.errors import ConfigError
 from genre_tasks.optimiser import targets
 from genre_tasks.optimiser.adam import ENET_RATES, GNET_RATES, TunedAdam
 from genre_tasks.optimiser.learned import LearnedOptimiser
 from genre_tasks.optimiser.loss import Distance
 from genre_tasks.optimiser.objective import Objective
+from genre_tasks.optimiser.per_scene import PerSceneTraining
+from genre_tasks.optimiser.per_scene_run import reconstruct
+from genre_tasks.optimiser.per_scene_start import world_static
 from genre_tasks.optimiser.rules import StepRule
 from genre_tasks.optimiser.unroll import Plan, unroll
 from genre_tasks.progress import Progress, silent
@@ -20,6 +24,7 @@ from genre_tasks.scene.views import FixedViews
 from genre_tasks.weights import resolve_weights
 
 StageName = Literal["gnet", "enet"]
+PER_SCENE = ("standard_3dgs", "street_gs")
 
 
 def optimise(
@@ -31,6 +36,8 @@ def optimise(
     progress: Progress = silent,
 ) -> Reconstruction:
     """Source views of ``chunk`` and, where given, ``fixed`` novel views; see the stages for what is raised."""
+    if isinstance(config, GnetConfig) and config.method in PER_SCENE:
+        return per_scene(stage, config, chunk, scene, progress)
     rule = step_rule(stage, config)
     source = targets.of_source(chunk, depth=config.loss.depth > 0)
     novel = () if fixed is None else targets.of_fixed(fixed)
@@ -45,10 +52,31 @@ def optimise(
     return unroll(rule, scene, source, novel, Objective(config.loss, distance(config)), plan, progress)
 
 
+def per_scene(
+    stage: StageName, config: GnetConfig, chunk: Chunk, scene: SceneGraph, progress: Progress = silent
+) -> Reconstruction:
+    """Per-scene 3DGS on the source views: on the scene graph as Street Gaussians, or with everything static."""
+    start = scene if config.method == "street_gs" else world_static(scene)
+    source = targets.of_source(chunk, depth=False)
+    training = PerSceneTraining(config.per_scene, start, source, config.seed, stage)
+    plan = Plan(config.per_scene.iterations, 1, snapshots=config.snapshots)
+    return reconstruct(training, plan.snapshot_iterations(), progress)
+
+
 def step_rule(stage: StageName, config: OptimiserConfig) -> StepRule:
-    """The learned optimiser with the configured weights, or tuned Adam."""
+    """The learned optimiser with the configured weights, or tuned Adam.
+
+    Raises ``ConfigError`` for g3r without weights of its own, ``InputError`` for weights missing or unfit.
+    """
+    if isinstance(config, GnetConfig) and config.method == "g3r" and config.weights == "builtin":
+        raise ConfigError(
+            "no weights of g3r ship: the built-in ones of gnet have met novel views in training (λ_novel = 0.1)",
+            remedy="Train some with `genre train gnet --novel 0` and name them by gnet.weights.",
+            stage=stage,
+        )
     if config.method == "adam":
-        return TunedAdam(GNET_RATES if stage == "gnet" else ENET_RATES)
+        rates = GNET_RATES if stage == "gnet" else ENET_RATES
+        return TunedAdam(config.adam.rates or rates, config.adam.schedule)
     return LearnedOptimiser.load(resolve_weights(stage, config.weights))
 
 
