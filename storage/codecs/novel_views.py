@@ -121,11 +121,9 @@ def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> NovelVi
     for i, path in enumerate(files):
         for layer, (color, alpha, depth) in read_image(path, (height, width)).items():
             out[layer][0][i], out[layer][1][i], out[layer][2][i] = color, alpha, depth
-    (color, alpha, depth), (lidar_color, lidar_alpha, lidar_depth) = (
-        (torch.from_numpy(a) for a in out[layer]) for layer in LAYERS
-    )
+    render, lidar = ([torch.from_numpy(a) for a in out[layer]] for layer in LAYERS)
     counts = [dict((measurements or {}).get(name, {})) for name in _COUNTS]
-    return NovelViews(views, color, alpha, depth, lidar_color, lidar_alpha, lidar_depth, *counts)
+    return NovelViews(views, render[0], render[1], render[2], lidar[0], lidar[1], lidar[2], *counts)
 
 
 def read_image(path: Path, shape: tuple[int, int]) -> dict[str, tuple[NDArray[np.float32], ...]]:

@@ -1,4 +1,4 @@
-"""The same bits: from run to run, at any number of threads, with other views or alone, with or without the culled."""
+"""The same bits: from run to run, at any number of threads, with other views or alone."""
 
 from __future__ import annotations
 
@@ -44,30 +44,6 @@ def test_many_views_are_the_single_views(scene, gradients):
         alone = render(splats, replace(cameras, **{n: t[v : v + 1] for n, t in parts.items()}), ONE)
         assert all(torch.equal(getattr(together, n)[v], getattr(alone, n)[0]) for n in IMAGES)
     assert all(torch.isfinite(g).all() for g in grads.values())
-
-
-def test_identical_depths_keep_the_input_order(scene, gradients):
-    splats, cameras = scene(200)
-    level = replace(splats, means=splats.means * torch.tensor([1.0, 1.0, 0.0]) + torch.tensor([0.0, 0.0, 9.0]))
-    straight = replace(cameras, camera_SE3_chunk=torch.eye(4)[None])
-    first = gradients(level, straight, ONE)
-    assert _same(gradients(level, straight, RenderSettings("cpu", 2)), first)
-    truth = render(level.to(torch.float64), straight, RenderSettings("reference"))
-    assert torch.allclose(first[0].color.double(), truth.color, atol=1e-5)
-    flipped = Splats(*(getattr(level, n).flip(0) for n in first[1]))
-    assert not torch.allclose(render(flipped, straight, ONE).color, first[0].color, atol=1e-3)
-
-
-def test_adding_what_is_culled_changes_no_bit(scene):
-    splats, cameras = scene(500)
-    extra, _ = scene(100, seed=9)
-    hidden = [replace(extra, means=extra.means * -1.0), replace(extra, opacities=extra.opacities * 0)]
-    hidden.append(replace(extra, quats=extra.quats * 0))
-    all_of = Splats(
-        *(torch.cat([getattr(s, n) for s in (hidden[0], splats, *hidden[1:])]) for n in Splats.__annotations__)
-    )
-    image, more = render(splats, cameras, ONE), render(all_of, cameras, RenderSettings("cpu", 2))
-    assert all(torch.equal(getattr(image, n), getattr(more, n)) for n in IMAGES)
 
 
 def test_a_retained_graph_gives_the_same_gradient_twice(scene):
