@@ -84,7 +84,7 @@ struct View {
   };
   size_t drawn;
   std::vector<Segment> segments;         // places in input order that are taken: each thread leaves a gap behind its own
-  Buffer<Footprint> input, sorted;       // drawn footprints in input order, and in depth order
+  Buffer<Footprint> input;               // drawn footprints, by place
   Buffer<uint32_t> id, slot_end, tile_begin;  // by place: Gaussian, end of its pair slots; by tile: first pair
   Buffer<Pair> pairs;                    // tile after tile, each front to back
   Buffer<uint16_t> visited;              // by pair: blocks that the forward pass visited
@@ -92,7 +92,7 @@ struct View {
   Buffer<int> taken;                     // by tile: pairs until all rays had ended
   long long culled[CULL_REASONS];
   size_t bytes() const {
-    return input.bytes() + sorted.bytes() + id.bytes() + slot_end.bytes() + tile_begin.bytes() + pairs.bytes() +
+    return input.bytes() + id.bytes() + slot_end.bytes() + tile_begin.bytes() + pairs.bytes() +
            visited.bytes() + reached.bytes() + taken.bytes();
   }
 };
@@ -211,7 +211,7 @@ static void sort_by_depth(View& v, Scratch& s, int threads) {
 // One counting sort of (tile, footprint) pairs in depth order: tiles need no sort of their own.
 static void bin(View& v, Scratch& s, int threads) {
   const size_t n = v.drawn, tiles = (size_t)v.tiles_x * v.tiles_y;
-  v.sorted.resize(n), v.tile_begin.resize(tiles + 1);
+  v.tile_begin.resize(tiles + 1);
   while ((int)s.tiles.size() < threads) s.tiles.push_back(std::make_unique<Buffer<uint32_t>>());
   s.histogram.resize(std::max((size_t)threads, s.histogram.size()));
   std::vector<size_t> totals(threads);
@@ -222,10 +222,9 @@ static void bin(View& v, Scratch& s, int threads) {
     size_t at = 0, end = share(n, w + 1, threads);
     for (size_t i = share(n, w, threads); i < end; i++) {
       if (i + 8 < end) __builtin_prefetch(&v.input[s.order[i + 8]]);
-      v.sorted[i] = v.input[s.order[i]];
       size_t before = at;
       if (at + tiles > list.capacity) list.reserve(2 * list.capacity + tiles + 1024, at);
-      for_tiles(v.sorted[i], v.tiles_x, v.tiles_y, [&](int t) { histogram[t]++, list[at++] = t; });
+      for_tiles(v.input[s.order[i]], v.tiles_x, v.tiles_y, [&](int t) { histogram[t]++, list[at++] = t; });
       v.slot_end[s.order[i]] = (uint32_t)(at - before);
     }
     totals[w] = at;
@@ -249,7 +248,7 @@ static void bin(View& v, Scratch& s, int threads) {
     const uint32_t* tile = s.tiles[w]->p;
     for (size_t i = share(n, w, threads), end = share(n, w + 1, threads); i < end; i++) {
       uint32_t place = s.order[i], slot = place ? v.slot_end[place - 1] : 0;
-      for (; slot < v.slot_end[place]; slot++) v.pairs[next[*tile++]++] = Pair{(uint32_t)i, slot};
+      for (; slot < v.slot_end[place]; slot++) v.pairs[next[*tile++]++] = Pair{place, slot};
     }
   });
 }
@@ -270,7 +269,7 @@ static long long blend(View& v, int threads, float* color, float* alpha, float* 
   for_each_tile(v, threads, [&](int t, int X, int Y) {
     const Pair* pairs = v.pairs.p + v.tile_begin[t];
     long long changed = 0;
-    v.taken[t] = blend_forward<COUNT>(v.sorted.p, pairs, v.pairs.p + v.tile_begin[t + 1], X, Y, v.camera.width, v.camera.height,
+    v.taken[t] = blend_forward<COUNT>(v.input.p, pairs, v.pairs.p + v.tile_begin[t + 1], X, Y, v.camera.width, v.camera.height,
                                       v.visited.p + v.tile_begin[t], v.reached.p, color, alpha, depth, changed);
     if (COUNT) contributions += changed;
   });
@@ -320,7 +319,7 @@ static void backward(View& v, Scratch& s, const GaussianArrays& in, int threads,
   s.slots.resize(v.pairs.n);
   for_each_tile(v, threads, [&](int t, int X, int Y) {
     const Pair* pairs = v.pairs.p + v.tile_begin[t];
-    blend_backward(v.sorted.p, pairs, pairs + v.taken[t], X, Y, v.camera.width, v.camera.height,
+    blend_backward(v.input.p, pairs, pairs + v.taken[t], X, Y, v.camera.width, v.camera.height,
                    v.visited.p + v.tile_begin[t], out, grad, s.slots.p);
   });
   parallel(threads, [&](int w) {

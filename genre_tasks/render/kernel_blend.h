@@ -7,7 +7,7 @@ constexpr int BLOCK = 4, TILE = 16, BLOCKS = 16;  // pixels a side, pixels a sid
 static_assert(BLOCK * BLOCK == LANES && BLOCKS == LANES, "one vector is one block's pixels, or a value for each block");
 
 struct Pair {
-  uint32_t rank, slot;  // place in depth order; place of the pair's gradient, in input order
+  uint32_t place, slot;  // of the footprint; of the pair's gradient
 };
 
 // Of lane i as a pixel: its place in the block, from the block's centre. Of lane i as a block: the block's centre.
@@ -29,23 +29,21 @@ struct Grid {
       : block_x(lane_x(X + 8, 4)), block_y(lane_y(Y + 8, 4)), x(lane_x(0, 1)), y(lane_y(0, 1)) {}
 };
 
-// Of one footprint over a tile: log2 alpha as a polynomial about each block's centre, log2_opacity - a s^2 - m dy^2 with
-// s = dx + k dy. A sum of two squares does not cancel, however long and thin the footprint.
+// One footprint over a tile: alpha = 2^(log2_opacity - a s^2 - m dy^2) with s = dx + k dy. A sum of squares does not cancel,
+// however long and thin the footprint.
 struct Layer {
-  Lanes s, curve;                // by pixel: s from the block's centre, and the quadratic part
-  Lanes peak, along_s, along_y;  // by block: log2 alpha at its centre, and its slopes
-  float red, green, blue, z;
+  Lanes s0, dy0, s;  // s and dy at each block's centre; by pixel: s from there
+  float a, m, log2_opacity, red, green, blue, z;
 
-  INLINE_MEMBER void set(const Footprint& g, const Grid& grid, const Lanes& s0, const Lanes& dy) {
-    Lanes ms = -g.a * s0, my = -g.m * dy;
-    peak = g.log2_opacity + ms * s0 + my * dy;
-    along_s = 2.f * ms, along_y = 2.f * my;
-    s = grid.x + g.k * grid.y;
-    curve = -g.a * s * s - g.m * grid.y * grid.y;
-    red = g.red, green = g.green, blue = g.blue, z = g.z;
+  INLINE_MEMBER void set(const Footprint& g, const Grid& grid, const Lanes& dx, const Lanes& dy) {
+    s0 = dx + g.k * dy, dy0 = dy, s = grid.x + g.k * grid.y;
+    a = g.a, m = g.m, log2_opacity = g.log2_opacity, red = g.red, green = g.green, blue = g.blue, z = g.z;
   }
+  INLINE_MEMBER Lanes s_at(int b) const { return s + s0[b]; }
+  INLINE_MEMBER Lanes dy_at(int b, const Grid& grid) const { return grid.y + dy0[b]; }
   INLINE_MEMBER Lanes alpha(int b, const Grid& grid) const {
-    return exp2(along_s[b] * s + (along_y[b] * grid.y + (curve + peak[b])));
+    const Lanes s = s_at(b), dy = dy_at(b, grid);
+    return exp2(log2_opacity - a * s * s - m * dy * dy);
   }
 };
 
@@ -57,7 +55,8 @@ INLINE uint32_t touched(const Footprint& g, const Lanes& dx, const Lanes& dy) {
   Lanes x1 = clamp(Lanes{}, left, right), y1 = clamp(x1 * g.dy_per_dx, top, bottom);
   Lanes y2 = clamp(Lanes{}, top, bottom), x2 = clamp(y2 * -g.k, left, right);
   Lanes s1 = x1 + g.k * y1, s2 = x2 + g.k * y2;
-  return bits(min(g.a * s1 * s1 + g.m * y1 * y1, g.a * s2 * s2 + g.m * y2 * y2) <= g.level);
+  const float ratio = g.m * g.inv_a;
+  return bits(min(s1 * s1 + ratio * y1 * y1, s2 * s2 + ratio * y2 * y2) <= g.level * g.inv_a);
 }
 
 // Pairs are taken a few at a time: alphas of all their blocks first, then the compositing. Each of the two loops is short
@@ -87,7 +86,7 @@ INLINE void for_pixels(int block, int X, int Y, int width, int height, F f) {
 // Writes the blocks that it visited of each pair, for the backward pass, and marks the slots of pairs with any. Returns
 // how many pairs it took until all rays had ended. With COUNT, adds to `contributions` the pixels that they changed.
 template <bool COUNT>
-static int blend_forward(const Footprint* sorted, const Pair* pair, const Pair* end, int X, int Y, int width, int height,
+static int blend_forward(const Footprint* footprints, const Pair* pair, const Pair* end, int X, int Y, int width, int height,
                          uint16_t* visited, uint8_t* reached, float* color, float* alpha_out, float* depth,
                          long long& contributions) {
   Lanes T[BLOCKS], R[BLOCKS], G[BLOCKS], B[BLOCKS], D[BLOCKS];
@@ -103,13 +102,13 @@ static int blend_forward(const Footprint* sorted, const Pair* pair, const Pair* 
   for (uint32_t alive = alive_blocks(T); pair < end && alive; alive = alive_blocks(T)) {
     int count = 0;
     for (int n = 0; n < CHUNK && pair < end; n++, pair++) {
-      const Footprint& g = sorted[pair->rank];
-      if (pair + 6 < end) __builtin_prefetch(&sorted[pair[6].rank]);
+      const Footprint& g = footprints[pair->place];
+      if (pair + 6 < end) __builtin_prefetch(&footprints[pair[6].place]);
       const Lanes dx = grid.block_x - g.x, dy = grid.block_y - g.y;
       uint32_t visit = touched(g, dx, dy) & alive;
       *visited++ = (uint16_t)visit;
       reached[pair->slot] = visit != 0;
-      layers[n].set(g, grid, dx + g.k * dy, dy);
+      layers[n].set(g, grid, dx, dy);
       count += list_bits(visit, n * BLOCKS, work + count);
     }
     for (int i = 0; i < count; i++) alphas[i] = layers[work[i] / BLOCKS].alpha(work[i] % BLOCKS, grid);
@@ -142,7 +141,7 @@ struct Images {
 
 // Also front to back: what lies behind a layer is the pixel's value minus what came so far, so no list per pixel is kept.
 // The ten sums of a pair go to its own slot and are added later: no atomics, the same bits at any thread count.
-static void blend_backward(const Footprint* sorted, const Pair* pair, const Pair* end, int X, int Y, int width, int height,
+static void blend_backward(const Footprint* footprints, const Pair* pair, const Pair* end, int X, int Y, int width, int height,
                            const uint16_t* visited, Images out, Images grad, Lanes* slots) {
   Lanes T[BLOCKS], behind[BLOCKS], vr[BLOCKS], vg[BLOCKS], vb[BLOCKS], vd[BLOCKS];
   for (int b = 0; b < BLOCKS; b++) {
@@ -158,18 +157,17 @@ static void blend_backward(const Footprint* sorted, const Pair* pair, const Pair
   }
   const Grid grid(X, Y);
   Layer layers[CHUNK];
-  Lanes s0[CHUNK], dy0[CHUNK], alphas[CHUNK * BLOCKS], ws[CHUNK * BLOCKS];
+  Lanes alphas[CHUNK * BLOCKS], ws[CHUNK * BLOCKS];
   uint32_t work[CHUNK * BLOCKS + LANES], slot[CHUNK];
   int stop[CHUNK];
   while (pair < end) {
     int count = 0, n = 0;
     for (; n < CHUNK && pair < end; pair++) {
       uint32_t visit = *visited++;
-      if (pair + 6 < end) __builtin_prefetch(&sorted[pair[6].rank]);
+      if (pair + 6 < end) __builtin_prefetch(&footprints[pair[6].place]);
       if (!visit) continue;
-      const Footprint& g = sorted[pair->rank];
-      dy0[n] = grid.block_y - g.y, s0[n] = grid.block_x - g.x + g.k * dy0[n];
-      layers[n].set(g, grid, s0[n], dy0[n]);
+      const Footprint& g = footprints[pair->place];
+      layers[n].set(g, grid, grid.block_x - g.x, grid.block_y - g.y);
       slot[n] = pair->slot;
       count += list_bits(visit, n * BLOCKS, work + count);
       stop[n++] = count;
@@ -198,7 +196,7 @@ static void blend_backward(const Footprint* sorted, const Pair* pair, const Pair
         const int b = work[i] % BLOCKS;
         Lanes w = ws[i], v = alphas[i];
         red += w * vr[b], green += w * vg[b], blue += w * vb[b], z += w * vd[b];
-        Lanes s = layer.s + s0[k][b], dy = grid.y + dy0[k][b], vs = v * s, vy = v * dy;
+        Lanes s = layer.s_at(b), dy = layer.dy_at(b, grid), vs = v * s, vy = v * dy;
         sum_v += v, sum_s += vs, sum_y += vy, sum_ss += vs * s, sum_sy += vs * dy, sum_yy += vy * dy;
       }
       stream(&slots[slot[k]], sums({sum_v, sum_s, sum_ss, sum_sy, sum_y, sum_yy, red, green, blue, z}));

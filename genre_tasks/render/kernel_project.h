@@ -168,12 +168,18 @@ INLINE void project_backward(const Camera& c, const GaussianArrays& in, const ui
               k = gather(fields + offsetof(Footprint, k) / 4, 16, place);
   const Lanes vx = A * sum[S_S], vy = k * vx + M * sum[S_Y];
   const Lanes ss = .5f * A * A * sum[S_SS], sy = .5f * A * M * sum[S_SY], yy = .5f * M * M * sum[S_YY];
-  const Lanes v00 = ss, v01 = k * ss + sy, v11 = k * (k * ss + 2.f * sy) + yy;  // dL/dcovariance
   const Geometry g(in, id);
   const Projection p(c, g);
   Lanes vM[6], vU[6], vR[9], vW[6];
+  // What M's first row has beyond the second, M0 + k M1, by Lagrange's identity: the difference cancels for long thin
+  // footprints. dL/dcovariance is ss (1, k)(1, k)^T + sy ((1, k)(0, 1)^T + (0, 1)(1, k)^T) + yy (0, 1)(0, 1)^T.
+  const Lanes *M0 = p.M, *M1 = p.M + 3;
+  const Lanes n[3] = {M0[1] * M1[2] - M0[2] * M1[1], M0[2] * M1[0] - M0[0] * M1[2], M0[0] * M1[1] - M0[1] * M1[0]};
+  const Lanes inv_c11 = 1.f / p.c11;
   for (int i = 0; i < 3; i++) {
-    vM[i] = 2.f * (v00 * p.M[i] + v01 * p.M[3 + i]), vM[3 + i] = 2.f * (v01 * p.M[i] + v11 * p.M[3 + i]);
+    const int j = (i + 1) % 3, l = (i + 2) % 3;
+    const Lanes beyond = (M1[j] * n[l] - M1[l] * n[j] + BLUR_PX2 * M0[i]) * inv_c11;
+    vM[i] = 2.f * (ss * beyond + sy * M1[i]), vM[3 + i] = k * vM[i] + 2.f * (sy * beyond + yy * M1[i]);
     out[SCALE + i] = vM[i] * p.U[i] + vM[3 + i] * p.U[3 + i];
     vU[i] = vM[i] * g.scale[i], vU[3 + i] = vM[3 + i] * g.scale[i];
   }
