@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 
 from benchmarks.bench import Bench, Cell, Row
-from benchmarks.raster import cells, peers, table
+from benchmarks.raster import cells, peers, table, without
 from benchmarks.raster.scenes import CASES
 from benchmarks.schema import Claim, Op, claim
 
@@ -33,7 +33,7 @@ class Raster:
     code: tuple[str, ...] = (
         "benchmarks.raster.cells", "benchmarks.raster.ceilings", "benchmarks.raster.gsplat_torch",
         "benchmarks.raster.isa_child", "benchmarks.raster.isas", "benchmarks.raster.peers", "benchmarks.raster.scenes",
-        "benchmarks.timing", "genre_tasks.render.api",
+        "benchmarks.raster.without", "benchmarks.timing", "genre_tasks.render.api",
     )  # fmt: skip
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
@@ -47,6 +47,7 @@ class Raster:
             out.append(_cell(f"peer/{case.name}", seconds, rounds, partial(peers.measure_peer, case)))
         out.append(_cell("views", 2.0, 5 if quick else 11, cells.measure_views))
         out.append(_cell("isas", 1.0, 5 if quick else 15, partial(cells.measure_isas, largest)))
+        out.append(_cell("without", 2.0, 5 if quick else 15, partial(without.measure_without, largest, cells.THREADS)))
         out.append(_cell("build", 10.0, 2 if quick else 5, cells.measure_build))
         out += [_cell(f"cuda/{case.name}", 1.0, 15, partial(peers.measure_cuda, case)) for case in CASES]
         return out

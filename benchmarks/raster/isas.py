@@ -5,16 +5,23 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 from types import TracebackType
 
 
 class IsaProcess:
-    """A running child that measures the case with this name under ``GENRE_RENDER_ISA``."""
+    """A running child that measures the case with this name under ``GENRE_RENDER_ISA``.
 
-    def __init__(self, isa: str, case: str, threads: int) -> None:
+    ``packages``: a folder whose packages come before the installed ones.
+    """
+
+    def __init__(self, isa: str, case: str, threads: int, packages: Path | None = None) -> None:
+        env = os.environ | {"GENRE_RENDER_ISA": isa}
+        if packages is not None:
+            env["PYTHONPATH"] = str(packages)
         self._child = subprocess.Popen(
             [sys.executable, "-m", "benchmarks.raster.isa_child", case, str(threads)],
-            env=os.environ | {"GENRE_RENDER_ISA": isa}, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            env=env, cwd=packages, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
 
     def __enter__(self) -> IsaProcess:

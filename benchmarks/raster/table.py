@@ -71,6 +71,10 @@ def _rest(rows: Mapping[str, Row]) -> Iterator[str]:
     if "ratio" in isas:
         m = isas["milliseconds"]
         yield f"| AVX2 ÷ AVX-512 | {_of(isas, 'ratio', '.3f')}: {_ms(m['avx2'])} to {_ms(m['avx512'])} ms |"
+    for name in rows["without"].get("cost", ()):
+        m = rows["without"]["milliseconds"]
+        times = f"{_ms(m['ordinary'])} to {_ms(m[name])} ms"
+        yield f"| with ÷ without {name} | {_of(rows['without']['cost'], name, '.3f')}: {times} |"
     if "seconds" in build:
         yield f"| building {len(build['libraries'])} libraries | {_of(build, 'seconds', '.1f')} s |"
 

@@ -10,11 +10,12 @@ from genre_tasks.render.kernel_library import load_kernel
 from genre_tasks.render.types import Cameras
 from genre_tasks.scene.gaussians import Splats
 
-FLOP_PER_LANE_FORWARD = 29
-"""log2 α 5, 2^x 13, min 1, w and T 2, colour and depth 8; comparisons, masks and moves are not counted."""
+FLOP_PER_LANE_FORWARD = 31
+"""log2 α 8, 2^x 13, w and T 2, colour and depth 8. A multiply-add counts two; comparisons, masks, integer operations
+and what is done once a footprint (finding its blocks) are not counted."""
 
-FLOP_PER_LANE_BACKWARD = 59
-"""log2 α 5, 2^x 13, min 1, w and T 2, dL/dα 8 + 2 + 8, offsets 2, ten sums 18."""
+FLOP_PER_LANE_BACKWARD = 60
+"""α again 21, w and T 2, dL/dw 9, dL/dα 7, s and dy again 2, ten sums 19; once a footprint (folding the sums): not."""
 
 
 @dataclass(frozen=True)
