@@ -81,7 +81,7 @@ class _Rasterise(torch.autograd.Function):
         batch, ctx.batch = ctx.batch, None
         if batch is None:  # a second backward through a retained graph: the state was given back after the first
             batch = _forward(arrays, ctx.cameras, ctx.threads, keep=True)[2]
-        grads = [torch.zeros_like(a) for a in arrays]
+        grads = [torch.empty_like(a) for a in arrays]
         v = [x.contiguous() for x in (v_color, v_alpha, v_depth)]
         status = load_kernel().genre_backward(
             batch.handle, len(arrays[0]), *(a.data_ptr() for a in arrays), *(a.data_ptr() for a in images),

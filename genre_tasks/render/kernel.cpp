@@ -1,6 +1,7 @@
 // The CPU rasteriser behind a plain C interface. Every result has the same bits at any number of threads.
 #include <algorithm>
 #include <atomic>
+#include <condition_variable>
 #include <cstdint>
 #include <cstdlib>
 #include <exception>
@@ -48,6 +49,14 @@ static size_t share(size_t n, int worker, int threads) { return n * worker / thr
 
 constexpr size_t HUGE_PAGE = 2u << 20;
 
+// Memory that is read and written all over: small pages miss the TLB, and each costs a fault when it is new.
+static void prefer_huge_pages(void* p, size_t bytes) {
+#if defined(MADV_HUGEPAGE)
+  const size_t begin = ((size_t)p + HUGE_PAGE - 1) / HUGE_PAGE * HUGE_PAGE, end = ((size_t)p + bytes) / HUGE_PAGE * HUGE_PAGE;
+  if (begin < end) madvise(reinterpret_cast<void*>(begin), end - begin, MADV_HUGEPAGE);
+#endif
+}
+
 // Grows, never shrinks, is never initialised.
 template <class T>
 struct Buffer {
@@ -62,9 +71,7 @@ struct Buffer {
     size_t bytes = ((m + m / 4 + 64) * sizeof(T) + page - 1) / page * page;
     T* fresh = static_cast<T*>(std::aligned_alloc(page, bytes));
     if (!fresh) throw std::bad_alloc();
-#if defined(MADV_HUGEPAGE)
-    if (page == HUGE_PAGE) madvise(fresh, bytes, MADV_HUGEPAGE);  // read and written all over: small pages miss the TLB
-#endif
+    prefer_huge_pages(fresh, bytes);
     if (keep_first) std::memcpy(static_cast<void*>(fresh), p, keep_first * sizeof(T));
     std::free(p);
     p = fresh, capacity = bytes / sizeof(T);
@@ -104,9 +111,14 @@ struct Scratch {
   std::vector<std::vector<uint32_t>> histogram;          // per thread, per tile
   Buffer<uint32_t> order;
   Buffer<Lanes> slots;
-  std::vector<uint32_t> reached;  // Gaussians whose gradient waits to be added, ascending
-  Buffer<Lanes> gradient;         // [reached / LANES, ATTRIBUTES], a Gaussian a lane
-  size_t bytes() const { return keys.bytes() + other.bytes() + order.bytes() + slots.bytes() + gradient.bytes(); }
+  std::vector<std::vector<uint32_t>> reached;             // per thread: Gaussians whose gradient waits to be added
+  std::vector<std::unique_ptr<Buffer<Lanes>>> gradient;   // per thread: [reached / LANES, ATTRIBUTES], a Gaussian a lane
+  size_t bytes() const {
+    size_t sum = keys.bytes() + other.bytes() + order.bytes() + slots.bytes();
+    for (auto& t : tiles) sum += t->bytes();
+    for (auto& g : gradient) sum += g->bytes();
+    return sum;
+  }
 };
 
 // Used memory is handed on: fresh pages cost more than the work on a small view.
@@ -301,6 +313,13 @@ static std::vector<int> lane_of_sums() {
 struct Gradients {
   float *means, *scales, *quats, *opacities, *colors;
 
+  void clear(size_t count, int threads) {
+    const std::pair<float*, size_t> all[] = {{means, 3}, {scales, 3}, {quats, 4}, {opacities, 1}, {colors, 3}};
+    for (auto [p, entries] : all) prefer_huge_pages(p, 4 * entries * count);
+    parallel(threads, [&](int w) {
+      for (auto [p, entries] : all) std::fill(p + share(entries * count, w, threads), p + share(entries * count, w + 1, threads), 0.f);
+    });
+  }
   void add(uint32_t id, const Lanes* attribute, int lane) {
     auto x = [&](int k) { return attribute[k][lane]; };
     const size_t i = id;
@@ -311,12 +330,12 @@ struct Gradients {
   }
 };
 
-// Hands the gradients of the Gaussians that some ray reached to `take(ids, how many, Lanes[ATTRIBUTES])`, in ascending
-// order within a thread. What is hidden has no gradient.
-template <class F>
-static void backward(View& v, Scratch& s, const GaussianArrays& in, int threads, Images out, Images grad, F take) {
+// Leaves in the scratch, by thread, the gradients of the Gaussians that some ray reached: what is hidden has none.
+static void backward(View& v, Scratch& s, const GaussianArrays& in, int threads, Images out, Images grad) {
   static const std::vector<int> lane = lane_of_sums();
   s.slots.resize(v.pairs.n);
+  s.reached.resize(threads);
+  while ((int)s.gradient.size() < threads) s.gradient.push_back(std::make_unique<Buffer<Lanes>>());
   for_each_tile(v, threads, [&](int t, int X, int Y) {
     const Pair* pairs = v.pairs.p + v.tile_begin[t];
     blend_backward(v.input.p, pairs, pairs + v.taken[t], X, Y, v.camera.width, v.camera.height,
@@ -326,14 +345,19 @@ static void backward(View& v, Scratch& s, const GaussianArrays& in, int threads,
     uint32_t place[LANES], id[LANES];
     Lanes sum[SUMS] = {}, gradient[ATTRIBUTES];
     int filled = 0;
+    const size_t begin = share(v.input.n, w, threads), end = share(v.input.n, w + 1, threads);
+    auto& reached = s.reached[w];
+    auto& all = *s.gradient[w];
+    reached.clear(), all.resize(((end - begin) / LANES + 1) * ATTRIBUTES);
     auto flush = [&] {
       for (int i = filled; i < LANES; i++) place[i] = place[0];
       for (int i = 0; i < LANES; i++) id[i] = v.id[place[i]];
       project_backward(v.camera, in, id, v.input.p, place, sum, gradient);
-      take(id, filled, gradient);
+      std::copy(gradient, gradient + ATTRIBUTES, &all[reached.size() / LANES * ATTRIBUTES]);
+      reached.insert(reached.end(), id, id + filled);
       filled = 0;
     };
-    for (size_t i = share(v.input.n, w, threads), end = share(v.input.n, w + 1, threads); i < end; i++) {
+    for (size_t i = begin; i < end; i++) {
       Lanes total{};
       bool any = false;
       for (uint32_t k = i ? v.slot_end[i - 1] : 0; k < v.slot_end[i]; k++)
@@ -351,15 +375,51 @@ struct Batch {
   std::vector<std::unique_ptr<View>> views;
 };
 
-// Whole views side by side where there are enough of them; the rest one by one, with all threads inside.
+// Lets views have something done in their order, whichever thread they are on.
+class Turns {
+ public:
+  template <class F>
+  void take(int view, F f) {
+    std::unique_lock<std::mutex> lock(guard_);
+    changed_.wait(lock, [&] { return next_ == view || broken_; });
+    if (broken_) return;
+    f();
+    next_++;
+    changed_.notify_all();
+  }
+  // A view has failed: nobody waits for it.
+  void break_off() {
+    std::lock_guard<std::mutex> lock(guard_);
+    broken_ = true;
+    changed_.notify_all();
+  }
+
+ private:
+  std::mutex guard_;
+  std::condition_variable changed_;
+  int next_ = 0;
+  bool broken_ = false;
+};
+
+// Whole views side by side, a thread each, as far as they go round; the rest one by one, with all threads inside.
+// work(view, worker, threads inside), then finish(view, worker) in the order of the views.
 template <class F, class G>
 static void for_each_view(int views, int threads, F work, G finish) {
-  for (int v = 0; v < views;) {
-    int together = views - v >= threads ? threads : 1;
-    parallel(together, [&](int w) { work(v + w, w, together > 1 ? 1 : threads, together > 1); });
-    finish(v, together);
-    v += together;
-  }
+  const int beside = threads > 1 ? views / threads * threads : 0;
+  std::atomic<int> next{0};
+  Turns turns;
+  if (beside) parallel(threads, [&](int w) {
+    try {
+      for (int v; (v = next++) < beside;) {
+        work(v, w, 1);
+        turns.take(v, [&] { finish(v, w); });
+      }
+    } catch (...) {
+      turns.break_off();
+      throw;
+    }
+  });
+  for (int v = beside; v < views; v++) work(v, 0, threads), finish(v, 0);
 }
 
 struct ScratchSet {
@@ -395,23 +455,23 @@ int genre_forward(int count, const float* means, const float* scales, const floa
     auto kept = std::make_unique<Batch>();
     kept->views.resize(views);
     size_t pixels = (size_t)width * height;
-    for_each_view(views, std::max(1, threads), [&](int v, int w, int inner, bool) {
+    prefer_huge_pages(color, 12 * pixels * views), prefer_huge_pages(alpha, 4 * pixels * views);
+    prefer_huge_pages(depth, 4 * pixels * views);
+    for_each_view(views, std::max(1, threads), [&](int v, int w, int inside) {
       auto view = views_shelf().take();
       view->camera = make_camera(poses + 16 * v, lenses + 4 * v, width, height);
       view->tiles_x = (width + TILE - 1) / TILE, view->tiles_y = (height + TILE - 1) / TILE;
-      forward(*view, *scratch.of[w], in, inner, color + 3 * pixels * v, alpha + pixels * v, depth + pixels * v);
+      forward(*view, *scratch.of[w], in, inside, color + 3 * pixels * v, alpha + pixels * v, depth + pixels * v);
       kept->views[v] = std::move(view);
-    }, [&](int first, int together) {
-      for (int v = first; v < first + together; v++) {
-        for (int r = 0; r < CULL_REASONS; r++) culled[r] += kept->views[v]->culled[r];
-        if (!batch) views_shelf().give(std::move(kept->views[v]));
-      }
+    }, [&](int v, int) {
+      for (int r = 0; r < CULL_REASONS; r++) culled[r] += kept->views[v]->culled[r];
+      if (!batch) views_shelf().give(std::move(kept->views[v]));
     });
     if (batch) *batch = kept.release();
   });
 }
 
-// Gradients are added to grad_* (zero them first). `color`, `alpha`, `depth` are what genre_forward wrote.
+// `color`, `alpha`, `depth` are what genre_forward wrote.
 int genre_backward(void* batch, int count, const float* means, const float* scales, const float* quats,
                    const float* opacities, const float* colors, const float* color, const float* alpha, const float* depth,
                    const float* v_color, const float* v_alpha, const float* v_depth, int threads, float* grad_means,
@@ -420,31 +480,18 @@ int genre_backward(void* batch, int count, const float* means, const float* scal
     auto& views = static_cast<Batch*>(batch)->views;
     GaussianArrays in{count, means, scales, quats, opacities, colors};
     Gradients g{grad_means, grad_scales, grad_quats, grad_opacities, grad_colors};
+    g.clear((size_t)count, std::max(1, threads));
     ScratchSet scratch(std::max(1, threads));
-    threads = std::max(1, threads);
-    for_each_view((int)views.size(), threads, [&](int v, int w, int inner, bool beside_others) {
+    for_each_view((int)views.size(), std::max(1, threads), [&](int v, int w, int inside) {
       size_t at = (size_t)views[v]->camera.width * views[v]->camera.height * v;
-      Scratch& s = *scratch.of[w];
-      s.reached.clear(), s.gradient.resize(beside_others ? views[v]->drawn / LANES * ATTRIBUTES + ATTRIBUTES : 0);
-      backward(*views[v], s, in, inner, Images{color + 3 * at, alpha + at, depth + at},
-               Images{v_color + 3 * at, v_alpha + at, v_depth + at}, [&](const uint32_t* id, int n, const Lanes* gradient) {
-        if (beside_others) {
-          std::copy(gradient, gradient + ATTRIBUTES, &s.gradient[s.reached.size() / LANES * ATTRIBUTES]);
-          s.reached.insert(s.reached.end(), id, id + n);
-        } else {
-          for (int i = 0; i < n; i++) g.add(id[i], gradient, i);
-        }
-      });
-    }, [&](int, int together) {
-      // In the order of the views, so that sums do not depend on threads; each thread for its own Gaussians.
-      if (together > 1) parallel(threads, [&](int w) {
-        for (int k = 0; k < together; k++) {
-          Scratch& s = *scratch.of[k];
-          auto from = std::lower_bound(s.reached.begin(), s.reached.end(), (uint32_t)share(count, w, threads));
-          auto to = std::lower_bound(from, s.reached.end(), (uint32_t)share(count, w + 1, threads));
-          for (size_t i = from - s.reached.begin(), end = to - s.reached.begin(); i < end; i++)
-            g.add(s.reached[i], &s.gradient[i / LANES * ATTRIBUTES], (int)(i % LANES));
-        }
+      backward(*views[v], *scratch.of[w], in, inside, Images{color + 3 * at, alpha + at, depth + at},
+               Images{v_color + 3 * at, v_alpha + at, v_depth + at});
+    }, [&](int v, int w) {  // in the order of the views, so that sums do not depend on threads
+      const Scratch& s = *scratch.of[w];
+      const int inside = (int)s.reached.size();
+      parallel(inside, [&](int i) {
+        for (size_t k = 0; k < s.reached[i].size(); k++)
+          g.add(s.reached[i][k], s.gradient[i]->p + k / LANES * ATTRIBUTES, (int)(k % LANES));
       });
     });
   });
