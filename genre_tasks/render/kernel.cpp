@@ -121,10 +121,10 @@ struct Scratch {
   }
 };
 
-// Used memory is handed on: fresh pages cost more than the work on a small view.
+// Used memory is handed on, up to LIMIT of each kind: fresh pages cost more than the work on a small view.
 template <class T>
 struct Shelf {
-  static constexpr size_t LIMIT = 256u << 20;
+  static constexpr size_t LIMIT = 512u << 20;
   std::mutex guard;
   std::vector<std::unique_ptr<T>> free;
   size_t held = 0;
@@ -425,7 +425,9 @@ static void for_each_view(int views, int threads, F work, G finish) {
 struct ScratchSet {
   std::vector<std::unique_ptr<Scratch>> of;
   explicit ScratchSet(int n) { while (n--) of.push_back(scratch_shelf().take()); }
-  ~ScratchSet() { for (auto& s : of) scratch_shelf().give(std::move(s)); }
+  ~ScratchSet() {
+    for (; !of.empty(); of.pop_back()) scratch_shelf().give(std::move(of.back()));  // the first is taken first again
+  }
 };
 
 enum Status { OK = 0, OUT_OF_MEMORY = 1, FAILED = 2 };
