@@ -1,10 +1,10 @@
 // The CPU rasteriser behind a plain C interface. Every result has the same bits at any number of threads.
 #include <algorithm>
 #include <atomic>
-#include <condition_variable>
 #include <cstdint>
 #include <cstdlib>
 #include <exception>
+#include <map>
 #include <memory>
 #include <mutex>
 #include <new>
@@ -104,6 +104,13 @@ struct View {
   }
 };
 
+// The gradients of one view's Gaussians that some ray reached: what is hidden has none.
+struct GradientList {
+  std::vector<uint32_t> id;
+  Buffer<Lanes> gradient;  // [id / LANES, ATTRIBUTES], a Gaussian a lane
+  size_t bytes() const { return gradient.bytes() + id.capacity() * sizeof(uint32_t); }
+};
+
 // What a pass needs only while it runs.
 struct Scratch {
   Buffer<uint64_t> keys, other;
@@ -111,12 +118,11 @@ struct Scratch {
   std::vector<std::vector<uint32_t>> histogram;          // per thread, per tile
   Buffer<uint32_t> order;
   Buffer<Lanes> slots;
-  std::vector<std::vector<uint32_t>> reached;             // per thread: Gaussians whose gradient waits to be added
-  std::vector<std::unique_ptr<Buffer<Lanes>>> gradient;   // per thread: [reached / LANES, ATTRIBUTES], a Gaussian a lane
+  std::vector<std::unique_ptr<GradientList>> gradients;  // per thread
   size_t bytes() const {
     size_t sum = keys.bytes() + other.bytes() + order.bytes() + slots.bytes();
     for (auto& t : tiles) sum += t->bytes();
-    for (auto& g : gradient) sum += g->bytes();
+    for (auto& g : gradients) sum += g->bytes();
     return sum;
   }
 };
@@ -143,6 +149,7 @@ struct Shelf {
 // Never destroyed: a handle may be freed while the process ends.
 static Shelf<View>& views_shelf() { static auto* s = new Shelf<View>; return *s; }
 static Shelf<Scratch>& scratch_shelf() { static auto* s = new Shelf<Scratch>; return *s; }
+static Shelf<GradientList>& gradients_shelf() { static auto* s = new Shelf<GradientList>; return *s; }
 
 static int clamp_tile(float pixel, int low, int high) {
   return (int)std::min((float)high, std::max((float)low, std::floor((pixel - 0.5f) * (1.f / TILE))));
@@ -320,22 +327,23 @@ struct Gradients {
       for (auto [p, entries] : all) std::fill(p + share(entries * count, w, threads), p + share(entries * count, w + 1, threads), 0.f);
     });
   }
-  void add(uint32_t id, const Lanes* attribute, int lane) {
-    auto x = [&](int k) { return attribute[k][lane]; };
-    const size_t i = id;
-    for (int k = 0; k < 3; k++)
-      means[3 * i + k] += x(MEAN + k), scales[3 * i + k] += x(SCALE + k), colors[3 * i + k] += x(COLOR + k);
-    for (int k = 0; k < 4; k++) quats[4 * i + k] += x(QUAT + k);
-    opacities[i] += x(OPACITY);
+  void add(const GradientList& list) {
+    for (size_t at = 0; at < list.id.size(); at++) {
+      auto x = [&](int k) { return list.gradient[at / LANES * ATTRIBUTES + k][(int)(at % LANES)]; };
+      const size_t i = list.id[at];
+      for (int k = 0; k < 3; k++)
+        means[3 * i + k] += x(MEAN + k), scales[3 * i + k] += x(SCALE + k), colors[3 * i + k] += x(COLOR + k);
+      for (int k = 0; k < 4; k++) quats[4 * i + k] += x(QUAT + k);
+      opacities[i] += x(OPACITY);
+    }
   }
 };
 
-// Leaves in the scratch, by thread, the gradients of the Gaussians that some ray reached: what is hidden has none.
+// Leaves a list of gradients for each thread in the scratch.
 static void backward(View& v, Scratch& s, const GaussianArrays& in, int threads, Images out, Images grad) {
   static const std::vector<int> lane = lane_of_sums();
   s.slots.resize(v.pairs.n);
-  s.reached.resize(threads);
-  while ((int)s.gradient.size() < threads) s.gradient.push_back(std::make_unique<Buffer<Lanes>>());
+  while ((int)s.gradients.size() < threads) s.gradients.push_back(gradients_shelf().take());
   for_each_tile(v, threads, [&](int t, int X, int Y) {
     const Pair* pairs = v.pairs.p + v.tile_begin[t];
     blend_backward(v.input.p, pairs, pairs + v.taken[t], X, Y, v.camera.width, v.camera.height,
@@ -346,15 +354,14 @@ static void backward(View& v, Scratch& s, const GaussianArrays& in, int threads,
     Lanes sum[SUMS] = {}, gradient[ATTRIBUTES];
     int filled = 0;
     const size_t begin = share(v.input.n, w, threads), end = share(v.input.n, w + 1, threads);
-    auto& reached = s.reached[w];
-    auto& all = *s.gradient[w];
-    reached.clear(), all.resize(((end - begin) / LANES + 1) * ATTRIBUTES);
+    GradientList& list = *s.gradients[w];
+    list.id.clear(), list.gradient.resize(((end - begin) / LANES + 1) * ATTRIBUTES);
     auto flush = [&] {
       for (int i = filled; i < LANES; i++) place[i] = place[0];
       for (int i = 0; i < LANES; i++) id[i] = v.id[place[i]];
       project_backward(v.camera, in, id, v.input.p, place, sum, gradient);
-      std::copy(gradient, gradient + ATTRIBUTES, &all[reached.size() / LANES * ATTRIBUTES]);
-      reached.insert(reached.end(), id, id + filled);
+      std::copy(gradient, gradient + ATTRIBUTES, &list.gradient[list.id.size() / LANES * ATTRIBUTES]);
+      list.id.insert(list.id.end(), id, id + filled);
       filled = 0;
     };
     for (size_t i = begin; i < end; i++) {
@@ -375,52 +382,43 @@ struct Batch {
   std::vector<std::unique_ptr<View>> views;
 };
 
-// Lets views have something done in their order, whichever thread they are on.
-class Turns {
+// work(view, worker, threads inside): whole views side by side, a thread each, as far as they go round; the rest one by
+// one, with all threads inside.
+template <class F>
+static void for_each_view(int views, int threads, F work) {
+  const int beside = threads > 1 ? views / threads * threads : 0;
+  std::atomic<int> next{0};
+  if (beside) parallel(threads, [&](int w) {
+    for (int v; (v = next++) < beside;) work(v, w, 1);
+  });
+  for (int v = beside; v < views; v++) work(v, 0, threads);
+}
+
+// Adds up the views' gradients in the order of the views, so that sums do not depend on threads. Nobody waits: what comes
+// before its turn is kept.
+class InOrder {
  public:
-  template <class F>
-  void take(int view, F f) {
-    std::unique_lock<std::mutex> lock(guard_);
-    changed_.wait(lock, [&] { return next_ == view || broken_; });
-    if (broken_) return;
-    f();
-    next_++;
-    changed_.notify_all();
-  }
-  // A view has failed: nobody waits for it.
-  void break_off() {
+  explicit InOrder(Gradients sum) : sum_(sum) {}
+  void add(int view, Scratch& s, int threads) {
+    if (threads > 1) {  // alone: each thread has Gaussians of its own
+      parallel(threads, [&](int w) { sum_.add(*s.gradients[w]); });
+      next_ = view + 1;
+      return;
+    }
     std::lock_guard<std::mutex> lock(guard_);
-    broken_ = true;
-    changed_.notify_all();
+    waiting_[view] = std::exchange(s.gradients[0], gradients_shelf().take());
+    for (auto first = waiting_.begin(); first != waiting_.end() && first->first == next_; first = waiting_.erase(first), next_++) {
+      sum_.add(*first->second);
+      gradients_shelf().give(std::move(first->second));
+    }
   }
 
  private:
+  Gradients sum_;
   std::mutex guard_;
-  std::condition_variable changed_;
+  std::map<int, std::unique_ptr<GradientList>> waiting_;
   int next_ = 0;
-  bool broken_ = false;
 };
-
-// Whole views side by side, a thread each, as far as they go round; the rest one by one, with all threads inside.
-// work(view, worker, threads inside), then finish(view, worker) in the order of the views.
-template <class F, class G>
-static void for_each_view(int views, int threads, F work, G finish) {
-  const int beside = threads > 1 ? views / threads * threads : 0;
-  std::atomic<int> next{0};
-  Turns turns;
-  if (beside) parallel(threads, [&](int w) {
-    try {
-      for (int v; (v = next++) < beside;) {
-        work(v, w, 1);
-        turns.take(v, [&] { finish(v, w); });
-      }
-    } catch (...) {
-      turns.break_off();
-      throw;
-    }
-  });
-  for (int v = beside; v < views; v++) work(v, 0, threads), finish(v, 0);
-}
 
 struct ScratchSet {
   std::vector<std::unique_ptr<Scratch>> of;
@@ -459,15 +457,16 @@ int genre_forward(int count, const float* means, const float* scales, const floa
     size_t pixels = (size_t)width * height;
     prefer_huge_pages(color, 12 * pixels * views), prefer_huge_pages(alpha, 4 * pixels * views);
     prefer_huge_pages(depth, 4 * pixels * views);
+    std::mutex counting;
     for_each_view(views, std::max(1, threads), [&](int v, int w, int inside) {
       auto view = views_shelf().take();
       view->camera = make_camera(poses + 16 * v, lenses + 4 * v, width, height);
       view->tiles_x = (width + TILE - 1) / TILE, view->tiles_y = (height + TILE - 1) / TILE;
       forward(*view, *scratch.of[w], in, inside, color + 3 * pixels * v, alpha + pixels * v, depth + pixels * v);
-      kept->views[v] = std::move(view);
-    }, [&](int v, int) {
-      for (int r = 0; r < CULL_REASONS; r++) culled[r] += kept->views[v]->culled[r];
-      if (!batch) views_shelf().give(std::move(kept->views[v]));
+      std::lock_guard<std::mutex> lock(counting);
+      for (int r = 0; r < CULL_REASONS; r++) culled[r] += view->culled[r];
+      if (batch) kept->views[v] = std::move(view);
+      else views_shelf().give(std::move(view));
     });
     if (batch) *batch = kept.release();
   });
@@ -484,17 +483,12 @@ int genre_backward(void* batch, int count, const float* means, const float* scal
     Gradients g{grad_means, grad_scales, grad_quats, grad_opacities, grad_colors};
     g.clear((size_t)count, std::max(1, threads));
     ScratchSet scratch(std::max(1, threads));
+    InOrder sum(g);
     for_each_view((int)views.size(), std::max(1, threads), [&](int v, int w, int inside) {
       size_t at = (size_t)views[v]->camera.width * views[v]->camera.height * v;
       backward(*views[v], *scratch.of[w], in, inside, Images{color + 3 * at, alpha + at, depth + at},
                Images{v_color + 3 * at, v_alpha + at, v_depth + at});
-    }, [&](int v, int w) {  // in the order of the views, so that sums do not depend on threads
-      const Scratch& s = *scratch.of[w];
-      const int inside = (int)s.reached.size();
-      parallel(inside, [&](int i) {
-        for (size_t k = 0; k < s.reached[i].size(); k++)
-          g.add(s.reached[i][k], s.gradient[i]->p + k / LANES * ATTRIBUTES, (int)(k % LANES));
-      });
+      sum.add(v, *scratch.of[w], inside);
     });
   });
 }
