@@ -1,0 +1,98 @@
+"""What is measured on one log: GNet beside a baseline, and GNet far past its length."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import torch
+
+from benchmarks.bench import Row
+from benchmarks.optimiser import race
+from benchmarks.optimiser.race import Point
+from benchmarks.optimiser.task import Task, task_of
+from flows.baselines import load_baselines
+from flows.configuration import load_configuration
+from genre_tasks.config import GnetConfig
+from genre_tasks.optimiser.objective import Objective
+
+THREADS = 2
+METHODS = ("tuned_adam", "standard_3dgs", "street_gs")
+PAST = 10
+
+
+def measure_race(log: str, chunk: int, store: str, order: int, method: str, cap: float) -> Row:
+    """GNet, then every variant of the method with the same scene, views and order seed, up to ``cap`` × GNet's time."""
+    task, gnet = task_of(log, chunk, store), load_configuration("small").gnet
+    with threads():
+        return {"log": log, "chunk": chunk, "order": order} | race_row(task, gnet, variants(method), order, method, cap)
+
+
+def race_row(task: Task, gnet: GnetConfig, configs: dict[str, GnetConfig], order: int, method: str, cap: float) -> Row:
+    """The row but for where it is from."""
+    curve = race.learned(task, gnet, order)
+    goal = curve[-1]
+    cap_s = cap * goal.seconds
+    run = race.adam if method == "tuned_adam" else race.per_scene
+    out = {name: variant_row(run(task, config, order, goal, cap_s), goal, cap_s) for name, config in configs.items()}
+    sizes = {"gaussians": len(task.scene), "source_views": len(task.source), "heldout_views": len(task.heldout)}
+    goals = {"seconds": goal.seconds, "renders": goal.renders, "psnr": goal.psnr, "curve": as_rows(curve)}
+    return sizes | {"method": method, "threads": torch.get_num_threads(), "cap": cap, "gnet": goals, "variants": out}
+
+
+def variant_row(curve: Sequence[Point], goal: Point, cap_s: float) -> Row:
+    """When a variant reached the goal (null: never), why it ended, and the best it came to."""
+    found = race.reached(curve, goal.psnr)
+    end = curve[-1]
+    return {
+        "reached_s": found,
+        "ended": "reached" if found is not None else "cap" if end.seconds >= cap_s else "length",
+        "ended_s": end.seconds,
+        "renders": end.renders,
+        "gaussians": end.gaussians,
+        "best_psnr": max(p.psnr for p in curve),
+        "psnr_at_equal_renders": race.at_renders(curve, goal.renders),
+        "curve": as_rows(curve),
+    }
+
+
+def as_rows(curve: Sequence[Point]) -> list[list[float]]:
+    """Seconds, renders, PSNR, Gaussians."""
+    return [[round(p.seconds, 3), p.renders, round(p.psnr, 3), p.gaussians] for p in curve]
+
+
+def variants(method: str) -> dict[str, GnetConfig]:
+    """Of ``configs/baselines.yaml``, on the preset ``small``."""
+    return dict(load_baselines("small")[method].variants)
+
+
+def measure_stability(log: str, chunk: int, store: str) -> Row:
+    """GNet to ten times its length, still told its length: the loss on all source views there and at T."""
+    task, config = task_of(log, chunk, store), load_configuration("small").gnet
+    with threads():
+        return {"log": log, "chunk": chunk} | stability_row(task, config)
+
+
+def stability_row(task: Task, config: GnetConfig) -> Row:
+    """Loss and held-out PSNR at T, 2T, 5T and 10T, each beside T's."""
+    objective, total = Objective(config.loss), config.iterations
+    steps = race.configured(task, config, 0)
+    losses, psnrs = {}, {}
+    for moment in itertools.islice(steps, PAST * total):
+        if moment.iteration in (total, 2 * total, 5 * total, PAST * total):
+            times = str(moment.iteration // total)
+            losses[times] = objective(moment.frame, moment.state.offsets, task.source, 0, torch.Generator()).loss
+            psnrs[times] = task.psnr(moment.scene)
+    return {"iterations": total, "loss": losses, "heldout_psnr": psnrs, "ratio": losses[str(PAST)] / losses["1"]}
+
+
+@contextmanager
+def threads(count: int = THREADS) -> Iterator[None]:
+    """Torch and the renderer on so many threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,0 +1,65 @@
+"""From rows to claims: a ratio for each log and order, the median over them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+from benchmarks.bench import Row
+from benchmarks.schema import Claim, Op, claim
+from benchmarks.timing import Measured
+
+Races = Sequence[Row]
+
+
+def races(rows: Mapping[str, Row], method: str) -> list[Row]:
+    """The measured rows of one method."""
+    return [row for row in rows.values() if row.get("method") == method]
+
+
+def times_gnet(row: Row) -> tuple[float, bool]:
+    """The earliest of the variants' times over GNet's, and whether it was reached; where none was, the cap stands."""
+    found = [v["reached_s"] for v in row["variants"].values() if v["reached_s"] is not None]
+    return (min(found) / row["gnet"]["seconds"], True) if found else (float(row["cap"]), False)
+
+
+def gain_db(row: Row) -> float | None:
+    """GNet's PSNR over that of the best variant at as many renders; ``None`` where no variant made so many."""
+    found = [v["psnr_at_equal_renders"] for v in row["variants"].values() if v["psnr_at_equal_renders"] is not None]
+    return row["gnet"]["psnr"] - max(found) if found else None
+
+
+def claims(rows: Mapping[str, Row]) -> Iterator[Claim]:
+    """Every claim; those without a row say that they were not measured."""
+    for method, name, target in (("standard_3dgs", "vs_standard_3dgs", 10.0), ("tuned_adam", "vs_tuned_adam", 2.0)):
+        ratios = [times_gnet(row) for row in races(rows, method)]
+        never = sum(not hit for _, hit in ratios)
+        note = f"{method}, all variants: wall time to GNet's held-out PSNR over GNet's"
+        note += f"; in {never} of {len(ratios)} cells not within the cap, which then counts"
+        yield _claim(name, [r for r, _ in ratios], ">=", target, "ratio", f"{note}; {_where(races(rows, method))}")
+    adam = races(rows, "tuned_adam")
+    gains = [g for row in adam if (g := gain_db(row)) is not None]
+    yield _claim("equal_renders_db", gains, ">=", 1.5, "dB", f"to the best variant of tuned Adam; {_where(adam)}")
+    stable = [row for name, row in rows.items() if name.startswith("stability/") and "ratio" in row]
+    note = "loss at 10 T over loss at T, steps past T at 0.05 of the rates"
+    yield _claim("stable_10x", [r["ratio"] for r in stable], "<=", 1.02, "ratio", f"{note}; {_where(stable)}")
+    m = rows.get("network", {}).get("seconds", {}).get("100000")
+    spread = None if m is None else (m["low"], m["high"])
+    data = "100k Gaussians, features included, one thread"
+    yield claim("optimiser.network_100k", m and m["median"], "<=", 0.5, "s", data, m["n"] if m else 0, spread)
+
+
+def _claim(name: str, values: Sequence[float], op: Op, target: float, unit: str, data: str) -> Claim:
+    if not values:
+        return claim(f"optimiser.{name}", None, op, target, unit, data)
+    m = Measured.of(values)
+    return claim(f"optimiser.{name}", m.median, op, target, unit, data, m.n, m.spread)
+
+
+def _where(rows: Races) -> str:
+    return ", ".join(place(row) for row in rows) or "not measured"
+
+
+def place(row: Row) -> str:
+    """The log's short name with chunk and order."""
+    name = f"{row['log'].split('/')[-1].removeprefix('synthetic:')} chunk {row['chunk']}"
+    return f"{name} order {row['order']}" if "order" in row else name
