@@ -3,6 +3,7 @@ FROM python:3.11-slim AS build
 RUN apt-get update && apt-get install -y --no-install-recommends g++ make && rm -rf /var/lib/apt/lists/*
 WORKDIR /opt/genre
 COPY pyproject.toml constraints.txt setup.py README.md ./
+COPY benchmarks benchmarks
 COPY configs configs
 COPY flows flows
 COPY genre_tasks genre_tasks

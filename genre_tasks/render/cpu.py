@@ -110,7 +110,10 @@ def forward_state(splats: Splats, cameras: Cameras) -> _Batch:
 def render_cpu(splats: Splats, cameras: Cameras, threads: int | None) -> tuple[Images, dict[str, int]]:
     """Colour [V, H, W, 3], alpha and depth [V, H, W], float32, and the culled counts; differentiable in the splats.
 
-    ``threads`` ``None`` takes torch's number. The bits of images and gradients do not depend on it.
+    ``threads`` ``None`` takes torch's number. The bits of images and gradients do not depend on it. Memory, with N
+    Gaussians and P pairs of a footprint and a tile of 16×16 pixels in a view: 72 N + 11 P bytes a view from forward to
+    backward, and 76 N + 68 P a thread while it works on one, each up to a quarter more; up to 512 MB of either is kept
+    for the next call.
     """
     culled: dict[str, int] = {}
     images = _Rasterise.apply(cameras, threads or torch.get_num_threads(), culled, *_arrays(splats))
