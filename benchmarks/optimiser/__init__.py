@@ -8,10 +8,13 @@ A baseline's run ends where it reaches GNet's held-out PSNR, or at ``cap`` times
 
 from __future__ import annotations
 
+import itertools
+import time
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 
-from benchmarks.bench import Bench, Cell, Row
+from benchmarks.bench import Bench, Cell, NotMeasuredError, Row
 from benchmarks.optimiser import summary, table
 from benchmarks.optimiser.cells import METHODS, measure_race, measure_stability, variants
 from benchmarks.optimiser.network import COUNTS, measure_network
@@ -31,7 +34,7 @@ class Optimiser:
     name = "optimiser"
     options: Mapping[str, str] = {
         "seeds": "1001,1002,1003,1004,1005", "orders": "0,1,2", "methods": ",".join(METHODS), "cap": "50",
-        "store": "genre-store", "pandaset": "../shared/data/pandaset/002",
+        "minutes": "", "store": "genre-store", "pandaset": "../shared/data/pandaset/002",
     }  # fmt: skip
     code: tuple[str, ...] = (
         "benchmarks.optimiser.cells", "benchmarks.optimiser.network", "benchmarks.optimiser.race",
@@ -41,9 +44,9 @@ class Optimiser:
     )  # fmt: skip
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
-        """The network; then for each order all logs with each method; ``quick``: one seed, one order, a lower cap.
+        """The network; then for each order each method on all logs; ``quick``: one seed, one order, a lower cap.
 
-        An empty ``pandaset`` leaves the real log out, an empty ``methods`` all races.
+        An empty ``pandaset`` leaves the real log out; with ``minutes`` cells that would not end by then are left out.
         """
         logs = [(f"synthetic:street?seed={seed}", 0, GNET_S) for seed in _parts(options["seeds"])]
         if options["pandaset"]:
@@ -56,22 +59,18 @@ class Optimiser:
         rounds = 3 if quick else 9
         network = partial(measure_network, partial(step_rule, "gnet", config.gnet), COUNTS, rounds)
         out = [Cell("network", 5.0 * (rounds + 2), network, shared | {"rounds": rounds})]
-        for order in map(int, orders):
+        for order, method in itertools.product(map(int, orders), _parts(options["methods"])):
+            configs = {name: c.model_dump(mode="json") for name, c in variants(method).items()}
             for log, chunk, gnet_s in logs:
-                for method in _parts(options["methods"]):
-                    configs = variants(method)
-                    parameters = shared | {
-                        "cap": cap, "variants": {k: c.model_dump(mode="json") for k, c in configs.items()}
-                    }  # fmt: skip
-                    measure = partial(measure_race, log, chunk, store, order, method, cap)
-                    seconds = 1.2 * gnet_s * (1 + cap * len(configs))
-                    out.append(Cell(f"{log} chunk {chunk} order {order} {method}", seconds, measure, parameters))
+                measure = partial(measure_race, log, chunk, store, order, method, cap)
+                seconds = 1.2 * gnet_s * (1 + cap * len(configs))
+                parameters = shared | {"cap": cap, "variants": configs}
+                out.append(Cell(f"{log} chunk {chunk} order {order} {method}", seconds, measure, parameters))
         for log, chunk, gnet_s in logs:
-            out.append(
-                Cell(
-                    f"stability/{log} chunk {chunk}", 11 * gnet_s, partial(measure_stability, log, chunk, store), shared
-                )
-            )
+            stability = partial(measure_stability, log, chunk, store)
+            out.append(Cell(f"stability/{log} chunk {chunk}", 11 * gnet_s, stability, shared))
+        if options["minutes"]:
+            out = [_before(time.monotonic() + 60 * float(options["minutes"]), cell) for cell in out]
         return out
 
     def claims(self, rows: Mapping[str, Row]) -> Iterator[Claim]:
@@ -81,6 +80,17 @@ class Optimiser:
     def table(self, rows: Mapping[str, Row]) -> Iterator[str]:
         """The tables that the documents show."""
         return table.markdown(rows)
+
+
+def _before(deadline: float, cell: Cell) -> Cell:
+    """The cell, which refuses to be measured where it would end after the deadline."""
+
+    def measure() -> Row:
+        if time.monotonic() + cell.seconds > deadline:
+            raise NotMeasuredError("left out: it would not have ended in the minutes given")
+        return cell.measure()
+
+    return replace(cell, measure=measure)
 
 
 def _parts(text: str) -> list[str]:

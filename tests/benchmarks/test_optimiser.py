@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from benchmarks import run
+from benchmarks.bench import NotMeasuredError
 from benchmarks.optimiser import BENCH, cells, race, summary
 from benchmarks.optimiser.network import measure_network, scene_of
 from benchmarks.optimiser.picture import draw
@@ -153,3 +154,9 @@ def test_options_choose_cells_and_a_quick_run_ends_in_time() -> None:
     quick, full = (BENCH.cells(BENCH.options, q) for q in (True, False))
     assert sum(c.seconds for c in quick) <= run.QUICK_S < sum(c.seconds for c in full)
     assert len({c.name for c in full}) == len(full)
+
+
+def test_what_would_not_end_in_the_minutes_given_is_left_out() -> None:
+    given = {**BENCH.options, "seeds": "900", "pandaset": "", "minutes": "0.1"}
+    with pytest.raises(NotMeasuredError, match="minutes given"):
+        BENCH.cells(given, False)[1].measure()
