@@ -16,6 +16,7 @@ from benchmarks.optimiser.network import measure_network, scene_of
 from benchmarks.optimiser.picture import draw
 from benchmarks.optimiser.race import Point
 from benchmarks.optimiser.task import Task
+from benchmarks.schema import Result
 from genre_tasks.config import AdamConfig, GnetConfig, LossConfig, PerSceneConfig
 from genre_tasks.optimiser.adam import TunedAdam
 from genre_tasks.optimiser.learned import LearnedOptimiser
@@ -160,3 +161,10 @@ def test_what_would_not_end_in_the_minutes_given_is_left_out() -> None:
     given = {**BENCH.options, "seeds": "900", "pandaset": "", "minutes": "0.1"}
     with pytest.raises(NotMeasuredError, match="minutes given"):
         BENCH.cells(given, False)[1].measure()
+
+
+def test_committed_rows_make_the_committed_claims() -> None:
+    path = Path(__file__).parents[2] / "docs/benchmarks/optimiser.json"
+    result = Result.model_validate_json(path.read_text(encoding="utf-8"))
+    rows = {str(row["cell"]): dict(row) for row in result.rows}
+    assert list(BENCH.claims(rows)) == result.claims
