@@ -21,6 +21,7 @@ def draw(rows: Sequence[Row], picture: Path) -> None:
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import LogLocator, NullFormatter
 
     panels: dict[str, list[Row]] = {}
     for row in rows:
@@ -35,8 +36,11 @@ def draw(rows: Sequence[Row], picture: Path) -> None:
             for name, variant in row["variants"].items():
                 _curve(axis, f"{row['method']} {name}", variant, linewidth=1)
         axis.set(title=title, xscale="log", xlabel="seconds", ylabel="held-out PSNR, dB")
+        axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.xaxis.set_major_formatter("{x:g}")
+        axis.xaxis.set_minor_formatter(NullFormatter())
         axis.grid(alpha=0.3)
-    axes[0][-1].legend(fontsize=7)
+        axis.legend(fontsize=6)
     figure.savefig(picture, dpi=110)
     plt.close(figure)
 
