@@ -33,12 +33,12 @@ WITHOUT: dict[str, tuple[Edit, ...]] = {
         ("kernel_blend.h", "slot[n] = pair->slot;", "slot[n] = pair->place;"),
         ("kernel_blend.h", "stream(&slots[slot[k]], sums(", "slots[slot[k]] += (sums("),
         (
-            "kernel.cpp",
+            "kernel_view.h",
             "s.slots.resize(v.pairs.n);",
             "s.slots.resize(v.input.n), std::fill(s.slots.p, s.slots.p + s.slots.n, Lanes{});",
         ),
         (
-            "kernel.cpp",
+            "kernel_view.h",
             "if (v.reached[k]) total += s.slots[k], any = true;",
             "any |= v.reached[k];\n      if (any) total = s.slots[i];",
         ),

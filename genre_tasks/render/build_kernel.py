@@ -18,7 +18,10 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-SOURCES = ("kernel.cpp", "kernel_blend.h", "kernel_project.h", "kernel_simd.h", "constants.py", "build_kernel.py")
+SOURCES = (
+    "kernel.cpp", "kernel_view.h", "kernel_blend.h", "kernel_project.h", "kernel_simd.h", "kernel_memory.h",
+    "constants.py", "build_kernel.py",
+)  # fmt: skip
 CONSTANTS = (
     "NEAR_M", "BLUR_PX2", "ALPHA_MIN", "ALPHA_MAX", "TRANSMITTANCE_STOP", "JACOBIAN_MARGIN", "QUAT_MIN_NORM2",
     "MAX_VARIANCE_PX2", "MAX_CENTER_PX",

@@ -104,7 +104,7 @@ BANDS = {"street": (8, 19, 27), "needles": (5, 11, 15)}
 
 
 def test_a_large_street_against_direct_exponentials(stability):
-    """The kernel steps alpha down the rows of a tile; plain float32 takes each exponential by itself."""
+    """The kernel has an exponential of its own and leaves blocks out; plain float32 does neither."""
     splats, cameras = street(300_000, 960, 540)
     mask = band_mask(torch.zeros(1, 540, 960), BANDS["street"])
     direct, expected = gradients(splats, cameras, REFERENCE, mask=mask, bands=BANDS["street"])
@@ -120,7 +120,7 @@ def test_needles_against_direct_exponentials(stability):
     direct, expected = gradients(splats, cameras, REFERENCE, mask=mask, bands=bands)
     image, found = gradients(splats, cameras, SETTINGS["cpu"], mask=mask)
     assert float(direct.alpha.detach()[mask].mean()) > 0.3
-    error = max(_image_error(image, direct, mask), worst(found, expected, ("opacities", "colors")))
+    error = max(_image_error(image, direct, mask), worst(found, expected))
     stability.record(NEEDLES_DIRECT, "cpu", error)
 
 

@@ -1,0 +1,101 @@
+// Threads, memory that grows, and shelves on which used memory waits.
+#pragma once
+#include <cstdint>
+#include <cstdlib>
+#include <cstring>
+#include <exception>
+#include <memory>
+#include <mutex>
+#include <new>
+#include <stdexcept>
+#include <system_error>
+#include <thread>
+#include <vector>
+
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
+
+// Threads live for one call: no pool to survive a fork, no OpenMP runtime beside the one that torch brings.
+template <class F>
+static void parallel(int threads, F f) {
+  std::mutex guard;
+  std::exception_ptr error;
+  auto run = [&](int worker) {
+    try {
+      f(worker);
+    } catch (...) {
+      std::lock_guard<std::mutex> lock(guard);
+      error = std::current_exception();
+    }
+  };
+  std::vector<std::thread> crew;
+  crew.reserve(threads);
+  for (int w = 1; w < threads; w++) {
+    try {
+      crew.emplace_back(run, w);
+    } catch (const std::system_error&) {
+      run(w);  // no more threads to be had: do it here
+    }
+  }
+  run(0);
+  for (auto& t : crew) t.join();
+  if (error) std::rethrow_exception(error);
+}
+
+static size_t share(size_t n, int worker, int threads) { return n * worker / threads; }
+
+constexpr size_t HUGE_PAGE = 2u << 20;
+
+// Memory that is read and written all over: small pages miss the TLB, and each costs a fault when it is new.
+static void prefer_huge_pages(void* p, size_t bytes) {
+#if defined(MADV_HUGEPAGE)
+  const size_t begin = ((size_t)p + HUGE_PAGE - 1) / HUGE_PAGE * HUGE_PAGE, end = ((size_t)p + bytes) / HUGE_PAGE * HUGE_PAGE;
+  if (begin < end) madvise(reinterpret_cast<void*>(begin), end - begin, MADV_HUGEPAGE);
+#endif
+}
+
+// Grows, never shrinks, is never initialised.
+template <class T>
+struct Buffer {
+  T* p = nullptr;
+  size_t n = 0, capacity = 0;
+  Buffer() = default;
+  Buffer(const Buffer&) = delete;
+  ~Buffer() { std::free(p); }
+  void reserve(size_t m, size_t keep_first = 0) {
+    if (m <= capacity) return;
+    size_t page = (m + m / 4) * sizeof(T) < HUGE_PAGE ? 64 : HUGE_PAGE;
+    size_t bytes = ((m + m / 4 + 64) * sizeof(T) + page - 1) / page * page;
+    T* fresh = static_cast<T*>(std::aligned_alloc(page, bytes));
+    if (!fresh) throw std::bad_alloc();
+    prefer_huge_pages(fresh, bytes);
+    if (keep_first) std::memcpy(static_cast<void*>(fresh), p, keep_first * sizeof(T));
+    std::free(p);
+    p = fresh, capacity = bytes / sizeof(T);
+  }
+  void resize(size_t m) { reserve(m), n = m; }
+  T& operator[](size_t i) { return p[i]; }
+  const T& operator[](size_t i) const { return p[i]; }
+  size_t bytes() const { return capacity * sizeof(T); }
+};
+
+// Used memory is handed on, up to LIMIT of each kind: fresh pages cost more than the work on a small view.
+template <class T>
+struct Shelf {
+  static constexpr size_t LIMIT = 512u << 20;
+  std::mutex guard;
+  std::vector<std::unique_ptr<T>> free;
+  size_t held = 0;
+  std::unique_ptr<T> take() {
+    std::lock_guard<std::mutex> lock(guard);
+    if (free.empty()) return std::make_unique<T>();
+    auto x = std::move(free.back());
+    free.pop_back(), held -= x->bytes();
+    return x;
+  }
+  void give(std::unique_ptr<T> x) {
+    std::lock_guard<std::mutex> lock(guard);
+    if (held + x->bytes() <= LIMIT) held += x->bytes(), free.push_back(std::move(x));
+  }
+};
