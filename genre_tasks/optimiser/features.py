@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -10,7 +11,9 @@ from torch import Tensor
 from genre_tasks.optimiser.state import GROUPS, Frame, State
 from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR
 
-FEATURES = 65
+FEATURES = 66
+USUAL_ITERATIONS = 24
+"""T as a feature is the octaves from here."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ def features(
     gradient: Tensor,  # [N, 14]
     total: int,
 ) -> Tensor:  # [N, FEATURES]
-    """Direction, latest gradient and its usual size, the Gaussian itself, what saw it, and t / T; all of order 1.
+    """Direction, latest gradient and its usual size, the Gaussian itself, what saw it, t / T and T; all of order 1.
 
     Gradients enter detached and normalised (no second derivative of the renderer, paper Sec. III-C): a loss scaled by
     any factor gives the same features.
@@ -55,7 +58,8 @@ def features(
     size = torch.log10((deviation / (usual_row + 1e-30)).clamp(1e-4, 1e4)) / 2
     start, offsets = frame.scene.gaussians, state.offsets
     part = min(state.iteration / total, 1.0)
-    time = offsets.new_tensor([part, (1 - part) ** 2, min(state.iteration, 4) / 4])
+    octaves = math.log2(total / USUAL_ITERATIONS)
+    time = offsets.new_tensor([part, (1 - part) ** 2, min(state.iteration, 4) / 4, octaves / 4])
     columns = [
         state.direction().clamp(-4, 4),
         (gradient / deviation).clamp(-4, 4) / 2,
@@ -68,6 +72,6 @@ def features(
         fixed.columns,
         state.seen_now,
         torch.log1p(state.seen) / 3,
-        time.expand(len(offsets), 3),
+        time.expand(len(offsets), 4),
     ]
     return torch.cat(columns, 1).detach()
