@@ -1,34 +1,43 @@
-"""Compiles the renderer's CPU kernel while the package is installed; everything else is in pyproject.toml."""
+"""Compiles the CPU kernels while the package is installed; everything else is in pyproject.toml."""
 
 from __future__ import annotations
 
 import runpy
+import sys
 from pathlib import Path
 
 from setuptools import Distribution, Extension, setup
 from setuptools.command.build_ext import build_ext
 
-ROOM = Path("genre_tasks/render")
+ROOT = Path(__file__).resolve().parent
+sys.path.insert(0, str(ROOT))  # a build backend leaves it out
+
+from genre_tasks.compiled import recipe  # noqa: E402 — imports no torch
+
+# By path: a room's __init__ may import torch, which an isolated build lacks.
+KERNELS = [
+    runpy.run_path(str(ROOT / "genre_tasks" / file))["KERNEL"]
+    for file in ("render/build_kernel.py", "optimiser/build_image_loss.py")
+]
 
 
-class BuildKernel(build_ext):
+class BuildKernels(build_ext):
     """Puts the libraries beside their sources (editable install) or into the build tree (wheel)."""
 
     def run(self) -> None:
         """Compiles; without a compiler one clear line instead of a trace."""
-        target = ROOM if self.inplace or self.editable_mode else Path(self.build_lib) / ROOM
-        recipe = runpy.run_path(str(ROOM / "build_kernel.py"))
+        target = ROOT if self.inplace or self.editable_mode else Path(self.build_lib).resolve()
         try:
-            recipe["build_kernel"](Path(__file__).parent / target if not target.is_absolute() else target)
+            recipe.build([(kernel, target / kernel.folder.relative_to(ROOT)) for kernel in KERNELS])
         except RuntimeError as error:
             raise SystemExit(f"error: {error}") from None
 
     def get_outputs(self) -> list[str]:
         """Files that a wheel takes."""
-        recipe = runpy.run_path(str(ROOM / "build_kernel.py"))
         return [
-            str(Path(self.build_lib) / ROOM / recipe["library_name"](isa))
-            for isa in recipe["isas_for"](recipe["find_compiler"]())
+            str(Path(self.build_lib) / kernel.folder.relative_to(ROOT) / kernel.library_name(isa))
+            for kernel in KERNELS
+            for isa in recipe.isas_for(recipe.find_compiler())
         ]
 
     def get_output_mapping(self) -> dict[str, str]:
@@ -40,12 +49,12 @@ class BinaryDistribution(Distribution):
     """Marks the wheel as belonging to one platform."""
 
     def has_ext_modules(self) -> bool:
-        """There is a compiled library."""
+        """There are compiled libraries."""
         return True
 
 
 setup(
-    cmdclass={"build_ext": BuildKernel},
+    cmdclass={"build_ext": BuildKernels},
     ext_modules=[Extension("genre_tasks.render.kernel", sources=[])],
     distclass=BinaryDistribution,
 )

@@ -14,7 +14,7 @@ def machine() -> str:
     """CPU model, cores that this process may use, instruction set of the kernel, torch version, GPU if there is one."""
     import torch
 
-    from genre_tasks.render.kernel_library import supported_isas
+    from genre_tasks.compiled.loader import supported_isas
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     parts = [_cpu_model(), f"{cores} cores", supported_isas()[0], f"torch {torch.__version__}"]

@@ -17,7 +17,6 @@ from pathlib import Path
 from genre_tasks.errors import ConfigError
 
 PACKAGE = "genre_tasks"
-KERNEL_PACKAGE = "render"
 KERNEL_SUFFIXES = (".c", ".cc", ".cpp", ".cxx", ".h", ".hpp", ".cu", ".cuh")
 
 NUMERIC_PACKAGES = {
@@ -44,8 +43,8 @@ def code_digest(module: str, also: Sequence[str] = (), root: Path | None = None)
     """sha256 (hex) over the code that ``module`` can run.
 
     Covered: every module of the package in the import closure (imports at any level, also inside functions), without
-    comments and docstrings; the C++ sources of the renderer, comments removed, when the renderer is in the closure; the
-    versions of the numeric packages that the closure imports.
+    comments and docstrings; the C++ sources in every room that the closure enters, comments removed; the versions of
+    the numeric packages that the closure imports.
 
     Args:
         module: ``genre_tasks.stages.gnet``.
@@ -64,10 +63,9 @@ def _cached(module: str, also: tuple[str, ...], root: Path | None) -> str:
     digest = hashlib.sha256()
     for name in sorted(files):
         _add(digest, name, _source(name, files[name]).text)
-    if any(name.startswith(f"{PACKAGE}.{KERNEL_PACKAGE}") for name in files):
-        folder = base / PACKAGE / KERNEL_PACKAGE
-        for path in sorted(p for p in folder.rglob("*") if p.suffix in KERNEL_SUFFIXES):
-            _add(digest, path.relative_to(base).as_posix(), strip_cpp_comments(path.read_text(encoding="utf-8")))
+    rooms = {base / PACKAGE / name.split(".")[1] for name in files if "." in name}
+    for path in sorted(p for room in rooms if room.is_dir() for p in room.rglob("*") if p.suffix in KERNEL_SUFFIXES):
+        _add(digest, path.relative_to(base).as_posix(), strip_cpp_comments(path.read_text(encoding="utf-8")))
     for name in sorted(packages & set(NUMERIC_PACKAGES)):
         _add(digest, f"version of {NUMERIC_PACKAGES[name]}", _version(NUMERIC_PACKAGES[name]))
     return digest.hexdigest()

@@ -13,9 +13,10 @@ from benchmarks.raster.ceilings import COPY_BYTES, GEMM_FLOP, copy, gemm
 from benchmarks.raster.isas import IsaProcess
 from benchmarks.raster.scenes import MANY, Case, Scene, forward, forward_backward, leaves_of, scene
 from benchmarks.timing import Action, Measured, on_threads, ratio, take_turns
+from genre_tasks.compiled.loader import supported_isas
+from genre_tasks.compiled.recipe import build
 from genre_tasks.render import Cameras
-from genre_tasks.render.build_kernel import build_kernel
-from genre_tasks.render.kernel_library import supported_isas
+from genre_tasks.render.build_kernel import KERNEL
 from genre_tasks.render.work import FLOP_PER_LANE_BACKWARD, FLOP_PER_LANE_FORWARD, count_work
 
 THREADS = 2
@@ -124,6 +125,6 @@ def measure_build(rounds: int) -> Row:
     for _ in range(rounds):
         with tempfile.TemporaryDirectory() as folder:
             start = time.perf_counter()
-            libraries = [path.name for path in build_kernel(Path(folder))]
+            libraries = [path.name for path in build([(KERNEL, Path(folder))])]
             seconds.append(time.perf_counter() - start)
     return {"libraries": libraries, "seconds": Measured.of(seconds).as_row()}

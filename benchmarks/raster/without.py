@@ -16,8 +16,8 @@ from benchmarks.bench import Row
 from benchmarks.raster.isas import IsaProcess
 from benchmarks.raster.scenes import Case
 from benchmarks.timing import Measured, ratio
-from genre_tasks.render import build_kernel
-from genre_tasks.render.kernel_library import candidate_isas
+from genre_tasks.compiled.loader import candidate_isas
+from genre_tasks.render.build_kernel import KERNEL
 
 Edit = tuple[str, str, str]
 """A file of the kernel, text in it, and what stands there instead."""
@@ -72,7 +72,7 @@ def measure_without(case: Case, threads: int, rounds: int) -> Row:
 
 def _build_edited(folder: Path, edits: tuple[Edit, ...]) -> None:
     """A copy of the package in ``folder`` whose kernel has the edits, compiled."""
-    package = build_kernel.HERE.parent
+    package = KERNEL.folder.parent
     copy = folder / package.name
     shutil.copytree(package, copy, ignore=shutil.ignore_patterns("weights", "__pycache__", "*.so"))
     for name, old, new in edits:
@@ -81,5 +81,9 @@ def _build_edited(folder: Path, edits: tuple[Edit, ...]) -> None:
         if text.count(old) != 1:
             raise ValueError(f"expected once in {name}, found {text.count(old)} times: {old}")
         path.write_text(text.replace(old, new))
-    script = "import sys; sys.path.insert(0, sys.argv[1]); import build_kernel as b; b.build_kernel(b.HERE)"
-    subprocess.run([sys.executable, "-c", script, str(copy / "render")], check=True)
+    # The copy's recipe on the copy's kernel; by path, since the renderer's package imports torch.
+    script = (
+        "import sys, runpy; sys.path.insert(0, sys.argv[1]); from genre_tasks.compiled.recipe import build; "
+        "k = runpy.run_path(sys.argv[1] + '/genre_tasks/render/build_kernel.py')['KERNEL']; build([(k, k.folder)])"
+    )
+    subprocess.run([sys.executable, "-c", script, str(folder)], check=True)

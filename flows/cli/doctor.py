@@ -68,7 +68,8 @@ def _renderer() -> str:
     from genre_tasks.errors import GenreError
 
     try:
-        from genre_tasks.render.kernel_library import candidate_isas, load_kernel
+        from genre_tasks.compiled.loader import candidate_isas
+        from genre_tasks.render.kernel_library import load_kernel
 
         load_kernel()
         return f"cpu kernel, {candidate_isas()[0]}"

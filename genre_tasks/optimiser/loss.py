@@ -1,9 +1,8 @@
 """The rendering loss (paper Eq. 9–11) over a batch of views, and its gradient at the rendered images.
 
 Each view's loss is taken on its own, on one thread, so that the sums have one order at any thread count; views are
-spread over the threads. The perceptual distance costs about ten times as much as the other terms together: it is taken
-in every ``perceptual_every``-th iteration, on one random crop of at most ``CROP_PX`` of one source view and one novel
-view.
+spread over the threads. The perceptual distance costs far more than the other terms together: it is taken in every
+``perceptual_every``-th iteration, on one random crop of at most ``CROP_PX`` of one source view and one novel view.
 """
 
 from __future__ import annotations
@@ -16,6 +15,8 @@ from torch import Tensor
 
 from genre_tasks.config import LossConfig
 from genre_tasks.metrics.threads import map_single_threaded
+from genre_tasks.optimiser.image_loss import ImageLoss, image_loss, takes
+from genre_tasks.optimiser.image_loss_constants import DEPTH_LOSS_MAX, DEPTH_MIN_M
 from genre_tasks.optimiser.ssim import ssim
 from genre_tasks.optimiser.targets import Target
 
@@ -62,21 +63,17 @@ def view_loss(
     color: Tensor,  # [H, W, 3]
     depth: Tensor,  # [H, W] metres, 0 where nothing was rendered
     target: Target,
-    crop: Crop | None = None,
-    distance: Distance | None = None,
 ) -> Tensor:
-    """The weighted sum of one view's terms, a scalar; finite for any finite input, also without LiDAR returns."""
+    """The weighted sum of one view's terms except for the perceptual one, a scalar.
+
+    Finite for any finite input, also without LiDAR returns.
+    """
     image = target.image.image
     loss = config.rgb * (color - image).abs().mean()
     if config.ssim > 0:
         loss = loss + config.ssim * (1.0 - ssim(color, target.image))
     if config.depth > 0 and target.depth is not None:
         loss = loss + config.depth * depth_loss(depth, target.depth)
-    if crop is not None and distance is not None:
-        row, column, height, width = crop
-        window = slice(row, row + height), slice(column, column + width)
-        value = distance(color[window][None].clamp(0, 1), image[window][None])[0]
-        loss = loss + config.perceptual * value
     return loss
 
 
@@ -89,7 +86,7 @@ def depth_loss(depth: Tensor, target: Tensor) -> Tensor:
     valid = torch.isfinite(target) & (target > 0) & (depth > 0)
     if not bool(valid.any()):
         return depth.new_zeros(())
-    return (target[valid] / depth[valid].clamp_min(1e-3) - 1.0).abs().clamp_max(1.0).mean()
+    return (target[valid] / depth[valid].clamp_min(DEPTH_MIN_M) - 1.0).abs().clamp_max(DEPTH_LOSS_MAX).mean()
 
 
 def image_gradients(
@@ -100,18 +97,50 @@ def image_gradients(
     plan: LossPlan,
     distance: Distance | None = None,
 ) -> tuple[float, Tensor, Tensor]:
-    """The batch's loss and its gradients with respect to ``color`` and ``depth``."""
+    """The batch's loss and its gradients with respect to ``color`` and ``depth``.
+
+    In float32 on the CPU all but the perceptual term is the compiled kernel's work; elsewhere it is torch's.
+    """
+    take = image_loss if takes(color, depth, targets) else torch_image_loss
+    sums = take(config, color, depth, targets, plan.weights)
+    loss = float(sums.losses.sum())
+    if distance is not None:
+        loss += _add_perceptual(config, color, targets, plan, distance, sums.by_color)
+    return loss, sums.by_color, sums.by_depth
+
+
+def torch_image_loss(
+    config: LossConfig, color: Tensor, depth: Tensor, targets: Sequence[Target], weights: Sequence[float]
+) -> ImageLoss:
+    """As :func:`genre_tasks.optimiser.image_loss.image_loss`, from :func:`view_loss`: for any device and precision."""
 
     def one(i: int) -> tuple[Tensor, Tensor, Tensor]:
         c, d = color[i].detach().requires_grad_(), depth[i].detach().requires_grad_()
         with torch.enable_grad():
-            loss = plan.weights[i] * view_loss(config, c, d, targets[i], plan.crops[i], distance)
+            loss = weights[i] * view_loss(config, c, d, targets[i])
         by_color, by_depth = torch.autograd.grad(loss, (c, d), allow_unused=True)
-        return loss.detach(), by_color, torch.zeros_like(d) if by_depth is None else by_depth
+        return loss.detach().double(), by_color, torch.zeros_like(d) if by_depth is None else by_depth
 
     parts = map_single_threaded(one, range(len(targets)))
-    losses, by_color, by_depth = zip(*parts, strict=True)
-    return float(torch.stack(losses).double().sum()), torch.stack(by_color), torch.stack(by_depth)
+    return ImageLoss(*(torch.stack(column) for column in zip(*parts, strict=True)))
+
+
+def _add_perceptual(
+    config: LossConfig, color: Tensor, targets: Sequence[Target], plan: LossPlan, distance: Distance, by_color: Tensor
+) -> float:
+    """The perceptual term of the views that have a crop; adds its gradient to ``by_color`` in place."""
+
+    def one(view_crop: tuple[int, Crop]) -> float:
+        i, (row, column, height, width) = view_crop
+        window = slice(row, row + height), slice(column, column + width)
+        rendered = color[i][window].detach().requires_grad_()
+        with torch.enable_grad():
+            value = distance(rendered[None].clamp(0, 1), targets[i].image.image[window][None])[0]
+            loss = plan.weights[i] * config.perceptual * value
+        by_color[i][window] += torch.autograd.grad(loss, rendered)[0]
+        return float(loss.detach())
+
+    return sum(map_single_threaded(one, [(i, crop) for i, crop in enumerate(plan.crops) if crop is not None]))
 
 
 def _below(limit: int, generator: torch.Generator) -> int:

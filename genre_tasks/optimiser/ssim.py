@@ -14,9 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-RADIUS, SIGMA = 5, 1.5
-C1, C2 = 0.01**2, 0.03**2
-"""Wang's constants for images in [0, 1]: they keep constant and black images finite."""
+from genre_tasks.optimiser.image_loss_constants import C1, C2, RADIUS, SIGMA
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 // The CPU rasteriser behind a plain C interface. Every result has the same bits at any number of threads.
 #include <map>
 
+#include "../compiled/calls.h"
 #include "kernel_view.h"
 
 // Never destroyed: a handle may be freed while the process ends.
@@ -80,20 +81,6 @@ struct ScratchSet {
   }
 };
 
-enum Status { OK = 0, OUT_OF_MEMORY = 1, FAILED = 2 };
-
-template <class F>
-static int guarded(F f) {
-  try {
-    f();
-    return OK;
-  } catch (const std::bad_alloc&) {
-    return OUT_OF_MEMORY;
-  } catch (...) {
-    return FAILED;
-  }
-}
-
 extern "C" {
 
 // poses [V, 4, 4] chunk to camera, lenses [V, 4] fx fy cx cy; color [V, H, W, 3], alpha and depth [V, H, W];
@@ -165,7 +152,4 @@ void genre_free(void* batch) {
   for (auto& v : b->views) views_shelf().give(std::move(v));
   delete b;
 }
-
-// Of what this library was built, so that a stale one is noticed.
-const char* genre_digest() { return SOURCE_DIGEST; }
 }

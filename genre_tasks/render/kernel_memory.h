@@ -1,47 +1,17 @@
-// Threads, memory that grows, and shelves on which used memory waits.
+// Shares of work, memory that grows, and shelves on which used memory waits.
 #pragma once
 #include <cstdint>
 #include <cstdlib>
 #include <cstring>
-#include <exception>
 #include <memory>
 #include <mutex>
 #include <new>
 #include <stdexcept>
-#include <system_error>
-#include <thread>
 #include <vector>
 
 #if defined(__linux__)
 #include <sys/mman.h>
 #endif
-
-// Threads live for one call: no pool to survive a fork, no OpenMP runtime beside the one that torch brings.
-template <class F>
-static void parallel(int threads, F f) {
-  std::mutex guard;
-  std::exception_ptr error;
-  auto run = [&](int worker) {
-    try {
-      f(worker);
-    } catch (...) {
-      std::lock_guard<std::mutex> lock(guard);
-      error = std::current_exception();
-    }
-  };
-  std::vector<std::thread> crew;
-  crew.reserve(threads);
-  for (int w = 1; w < threads; w++) {
-    try {
-      crew.emplace_back(run, w);
-    } catch (const std::system_error&) {
-      run(w);  // no more threads to be had: do it here
-    }
-  }
-  run(0);
-  for (auto& t : crew) t.join();
-  if (error) std::rethrow_exception(error);
-}
 
 static size_t share(size_t n, int worker, int threads) { return n * worker / threads; }
 

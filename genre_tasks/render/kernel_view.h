@@ -4,6 +4,7 @@
 #include <atomic>
 #include <utility>
 
+#include "../compiled/calls.h"
 #include "kernel_blend.h"
 #include "kernel_memory.h"
 

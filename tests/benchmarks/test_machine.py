@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.machine import commit, machine
-from genre_tasks.render.kernel_library import supported_isas
+from genre_tasks.compiled.loader import supported_isas
 
 
 def test_machine_names_cores_instruction_set_and_torch() -> None:

@@ -10,8 +10,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from genre_tasks.compiled import loader, recipe
+from genre_tasks.compiled.recipe import Kernel
 from genre_tasks.errors import ConfigError, ResourceError
-from genre_tasks.render import RenderSettings, build_kernel, constants, cpu, kernel_library, render
+from genre_tasks.render import RenderSettings, constants, cpu, kernel_library, render
+from genre_tasks.render.build_kernel import KERNEL
 
 
 @pytest.fixture
@@ -28,17 +31,17 @@ def test_missing_library_says_what_to_run(tmp_path, fresh_loader):
 
 
 def test_stale_library_is_refused(tmp_path, fresh_loader, monkeypatch):
-    for isa in kernel_library.supported_isas():
-        shutil.copy(build_kernel.HERE / build_kernel.library_name(isa), tmp_path)
+    for isa in loader.supported_isas():
+        shutil.copy(KERNEL.folder / KERNEL.library_name(isa), tmp_path)
     assert fresh_loader(tmp_path)
     fresh_loader.cache_clear()
-    monkeypatch.setattr(build_kernel, "source_digest", lambda: "0" * 16)
+    monkeypatch.setattr(Kernel, "source_digest", lambda self: "0" * 16)
     with pytest.raises(ResourceError, match="older than its sources"):
         fresh_loader(tmp_path)
 
 
 def test_broken_library_is_refused(tmp_path, fresh_loader):
-    (tmp_path / build_kernel.library_name(kernel_library.supported_isas()[0])).write_bytes(b"not a library")
+    (tmp_path / KERNEL.library_name(loader.supported_isas()[0])).write_bytes(b"not a library")
     with pytest.raises(ResourceError, match="does not load"):
         fresh_loader(tmp_path)
 
@@ -48,12 +51,12 @@ def test_an_instruction_set_that_is_lacking_is_never_loaded(fresh_loader, monkey
     with pytest.raises(ConfigError, match="GENRE_RENDER_ISA=avx10"):
         fresh_loader()
     monkeypatch.delenv("GENRE_RENDER_ISA")
-    monkeypatch.setattr(kernel_library, "_cpu_flags", lambda: {"sse4_2", "popcnt", "ssse3"})
-    if "generic" not in build_kernel.isas():
-        assert kernel_library.candidate_isas() == ["sse42"]
+    monkeypatch.setattr(loader, "_cpu_flags", lambda: {"sse4_2", "popcnt", "ssse3"})
+    if "generic" not in recipe.isas():
+        assert loader.candidate_isas() == ["sse42"]
 
 
-@pytest.mark.parametrize("isa", kernel_library.supported_isas())
+@pytest.mark.parametrize("isa", loader.supported_isas())
 def test_every_instruction_set_draws_the_same_picture(isa, scene, gradients, fresh_loader, monkeypatch):
     splats, cameras = scene(300)
     truth, exact = gradients(splats, cameras, RenderSettings("reference"), torch.float64)
@@ -71,32 +74,28 @@ def test_no_compiler_is_one_clear_line(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(RuntimeError, match=r"install g\+\+ or clang\+\+.*ziglang") as caught:
-        build_kernel.build_kernel(tmp_path)
+        recipe.build([(KERNEL, tmp_path)])
     assert "\n" not in str(caught.value)
 
 
 def test_a_failing_compiler_leaves_nothing(tmp_path, monkeypatch):
     monkeypatch.setenv("CXX", "false")
-    with pytest.raises(RuntimeError, match="false failed on the kernel"):
-        build_kernel.build_kernel(tmp_path)
+    with pytest.raises(RuntimeError, match="false failed on the renderer"):
+        recipe.build([(KERNEL, tmp_path)])
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
 def test_a_fresh_build_loads(tmp_path, fresh_loader):
-    paths = build_kernel.build_kernel(tmp_path)
-    assert [p.name for p in paths] == [
-        build_kernel.library_name(i) for i in build_kernel.isas_for(build_kernel.find_compiler())
-    ]
-    assert fresh_loader(tmp_path).genre_digest().decode() == build_kernel.source_digest()
+    paths = recipe.build([(KERNEL, tmp_path)])
+    assert [p.name for p in paths] == [KERNEL.library_name(i) for i in recipe.isas_for(recipe.find_compiler())]
+    assert fresh_loader(tmp_path).genre_digest().decode() == KERNEL.source_digest()
 
 
 def test_constants_live_in_one_place():
-    text = "".join(
-        (build_kernel.HERE / s).read_text() for s in build_kernel.SOURCES if Path(s).suffix in (".cpp", ".h")
-    )
+    text = "".join((KERNEL.folder / s).read_text() for s in KERNEL.sources if Path(s).suffix in (".cpp", ".h"))
     numeric = {n for n in vars(constants) if n.isupper() and isinstance(getattr(constants, n), float)}
-    assert numeric == set(build_kernel.CONSTANTS)
+    assert numeric == set(KERNEL.constants)
     assert all(re.search(rf"\b{name}\b", text) for name in numeric)
     for literal in (r"0?\.99f", r"0?\.999f", r"1\.?f? */ *255", r"0\.01f", r"(?<![\d.])0?\.3f", r"1e-4f \?"):
         assert not re.search(literal, text), literal

@@ -26,9 +26,12 @@ TREE = {
     "render/api.py": "import torch\n\n\ndef draw(x):\n    return x\n",
     "render/lazy.py": "Y = 2\n",
     "render/kernel.cpp": '// a kernel\nint f() { return 1; /* one */ } const char *s = "// no comment";\n',
+    "optimiser/__init__.py": "",
+    "optimiser/loss.py": "from genre_tasks.scene import graph\n",
+    "optimiser/image_loss.cpp": "int g() { return 3; }\n",
     "cycle.py": "import genre_tasks.stages.gnet\n",
 }
-GNET = "genre_tasks.stages.gnet"
+GNET, LOSS = "genre_tasks.stages.gnet", "genre_tasks.optimiser.loss"
 
 
 @pytest.fixture
@@ -89,9 +92,17 @@ def test_lazily_named_modules_count_when_they_are_named(digest_with) -> None:
     assert digest_with() != digest_with(also=lazy) != digest_with(also=lazy, changed=changed)
 
 
-def test_kernel_counts_only_with_the_renderer(digest_with) -> None:
-    changed = changed_line("render/kernel.cpp", "return 1", "return 2")
-    assert digest_with("genre_tasks.scene.graph") == digest_with("genre_tasks.scene.graph", changed=changed)
+@pytest.mark.parametrize(
+    ("kernel", "user", "others"),
+    [
+        (changed_line("render/kernel.cpp", "return 1", "return 2"), GNET, ("scene.graph", "optimiser.loss")),
+        (changed_line("optimiser/image_loss.cpp", "3", "4"), LOSS, ("scene.graph", "render.api")),
+    ],
+)
+def test_a_kernel_counts_only_with_its_room(digest_with, kernel: dict[str, str], user: str, others: tuple[str]) -> None:
+    assert digest_with(user) != digest_with(user, changed=kernel)
+    for other in others:
+        assert digest_with(f"genre_tasks.{other}") == digest_with(f"genre_tasks.{other}", changed=kernel)
 
 
 def test_versions_of_imported_packages_count(digest_with, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -114,6 +125,15 @@ def test_closure_of_the_real_package() -> None:
     files, packages = closure("genre_tasks.scene.results", (), Path(module.__file__).parents[1])
     assert {"genre_tasks", "genre_tasks.scene.graph", "genre_tasks.logs.types"} <= set(files)
     assert "genre_tasks.config" not in files and {"torch", "numpy", "kornia"} <= packages
+
+
+def test_every_kernel_of_the_real_package_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    covered: set[str] = set()
+    monkeypatch.setattr(module, "_add", lambda digest, name, text: covered.add(name))
+    module._cached.__wrapped__("genre_tasks.stages.gnet", ("genre_tasks.render.cpu",), None)
+    root = Path(module.__file__).parents[1]
+    sources = {p.relative_to(root).as_posix() for p in (root / "genre_tasks").rglob("*") if p.suffix in (".cpp", ".h")}
+    assert "genre_tasks/optimiser/image_loss.cpp" in sources and sources <= covered
 
 
 def test_cpp_comments() -> None:

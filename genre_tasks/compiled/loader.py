@@ -1,0 +1,83 @@
+"""Finds and loads a compiled kernel's best library for this machine."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+from pathlib import Path
+
+from genre_tasks.compiled import recipe
+from genre_tasks.compiled.recipe import Kernel
+from genre_tasks.errors import ConfigError, ResourceError
+
+REMEDY = "Run `pip install -e .` in the repository (it needs g++ or clang++, or the ziglang package)"
+_NEEDED_FLAGS = {
+    "avx512": {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl", "avx2", "fma", "bmi2"},
+    "avx2": {"avx", "avx2", "fma", "bmi1", "bmi2", "f16c", "movbe"},
+    "sse42": {"sse4_2", "popcnt", "ssse3"},
+}
+"""What /proc/cpuinfo must list for the x86-64 level that the library was compiled for."""
+
+
+def _cpu_flags() -> set[str]:
+    try:
+        text = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        return set()
+    return next((set(line.split(":", 1)[1].split()) for line in text.splitlines() if line.startswith("flags")), set())
+
+
+def supported_isas() -> list[str]:
+    """The instruction sets of the kernels that this machine can run, best first (never one that it lacks)."""
+    if "generic" in recipe.isas():
+        return ["generic"]
+    flags = _cpu_flags()
+    if not flags and platform.system() != "Linux":
+        # No list to read: torch knows the machine's level by other means.
+        import torch
+
+        known = {"AVX512": ["avx512", "avx2", "sse42"], "AVX2": ["avx2", "sse42"]}
+        return known.get(torch.backends.cpu.get_cpu_capability(), ["sse42"])
+    return [isa for isa, needed in _NEEDED_FLAGS.items() if needed <= flags]
+
+
+def candidate_isas() -> list[str]:
+    """What to look for, best first: ``GENRE_RENDER_ISA`` alone if it is set, else all that run here.
+
+    Raises:
+        ConfigError: ``GENRE_RENDER_ISA`` names what this machine cannot run.
+        ResourceError: the machine runs none.
+    """
+    supported = supported_isas()
+    asked = os.environ.get("GENRE_RENDER_ISA")
+    if asked and asked not in supported:
+        raise ConfigError(
+            f"GENRE_RENDER_ISA={asked} cannot run on this machine", remedy=f"Unset it, or choose from {supported}"
+        )
+    if not supported:
+        raise ResourceError(
+            "the CPU is older than the kernel's oldest instruction set (SSE4.2)", remedy="Use backend reference"
+        )
+    return [asked] if asked else supported
+
+
+def load(kernel: Kernel, folder: Path) -> ctypes.CDLL:
+    """The best library of ``kernel`` in ``folder`` that this machine can run.
+
+    Raises:
+        ResourceError: it was never compiled, is older than its sources, or does not load.
+    """
+    paths = [folder / kernel.library_name(isa) for isa in candidate_isas()]
+    path = next((p for p in paths if p.exists()), None)
+    if path is None:
+        raise ResourceError(f"{kernel.title} is not compiled", remedy=REMEDY, file=paths[0])
+    try:
+        library = ctypes.CDLL(str(path))
+        library.genre_digest.restype = ctypes.c_char_p
+        digest = library.genre_digest().decode()
+    except (OSError, AttributeError) as error:
+        raise ResourceError(f"{kernel.title} does not load: {error}", remedy=REMEDY, file=path) from error
+    if digest != kernel.source_digest():
+        raise ResourceError(f"{kernel.title} is older than its sources", remedy=REMEDY, file=path)
+    return library
