@@ -20,6 +20,12 @@ class Reporter(Protocol):
 
     def stage_ended(self, stage: str, chunk: int, ref: ArtifactRef) -> None: ...
 
+    def began(self, what: str) -> None:
+        """A part of a training."""
+        ...
+
+    def ended(self, outcome: str) -> None: ...
+
 
 class LogReporter:
     """Writes one log line per stage and per ``every_s`` seconds of progress: what a worker does."""
@@ -27,6 +33,7 @@ class LogReporter:
     def __init__(self, every_s: float = 10.0) -> None:
         self._every_s = every_s
         self._said = 0.0
+        self._what = ""
 
     def stage_started(self, stage: str, chunk: int) -> None:
         self._said = time.monotonic()
@@ -41,6 +48,13 @@ class LogReporter:
         _log.info(
             "chunk %d %s: %s%s", chunk, stage, "cached" if ref.cached else "done", f" ({ref.note})" * bool(ref.note)
         )
+
+    def began(self, what: str) -> None:
+        self._said, self._what = time.monotonic(), what
+        _log.info("%s: started", what)
+
+    def ended(self, outcome: str) -> None:
+        _log.info("%s: %s", self._what, outcome)
 
 
 _current: Reporter = LogReporter()

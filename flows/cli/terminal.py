@@ -34,6 +34,7 @@ class TerminalReporter:
         self._live = sys.stderr.isatty()
         self._started = self._said = time.monotonic()
         self._what = what
+        self._total, self._first, self._counting = -1, 0, 0.0
 
     def __enter__(self) -> TerminalReporter:
         self._write(self._what, end=not self._live)
@@ -47,17 +48,26 @@ class TerminalReporter:
             raise typer.Exit(130)
 
     def stage_started(self, stage: str, chunk: int) -> None:
+        self.began(f"chunk {chunk}  {stage}")
+
+    def began(self, what: str) -> None:
         self._started = self._said = time.monotonic()
-        self._what = f"chunk {chunk}  {stage}"
+        self._what, self._total = what, -1
         if self._live:
-            self._write(self._what)
+            self._write(what)
+
+    def ended(self, outcome: str) -> None:
+        self._write(f"{self._what:<28} {outcome} in {time.monotonic() - self._started:.1f} s", end=True)
 
     def progress(self, done: int, total: int, note: str = "") -> None:
         now = time.monotonic()
+        if total != self._total:  # what was done before, by a run that was stopped, says nothing about speed
+            self._total, self._first, self._counting = total, done, now
         if now - self._said < (0.2 if self._live else 10.0):
             return
         self._said = now
-        left = (now - self._started) / done * (total - done) if done else None
+        fresh = done - self._first
+        left = (now - self._counting) / fresh * (total - done) if fresh > 0 else None
         ahead = "" if left is None else f"  {left:.0f} s left"
         self._write(f"{self._what}  {done}/{total}  {note}{ahead}", end=not self._live)
 

@@ -1,12 +1,15 @@
-"""``genre train``: the commands behind the shipped weights, in their order: pairs, fnet, gnet, enet.
+"""``genre train``: the commands behind the shipped weights: pairs, fnet; scenes, gnet, enet.
 
 Everything goes into one folder and is resumable: a command that was stopped goes on where it was.
 """
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -15,7 +18,17 @@ app = typer.Typer(help="Train the networks (tens of minutes each on a CPU; resum
 Folder = Annotated[Path, typer.Option(help="Where pairs, scenes, checkpoints and curves are kept.")]
 Seeds = Annotated[str, typer.Option(help="Training seeds of the synthetic street, first:last:step.")]
 Real = Annotated[str | None, typer.Option(help="A real log whose chunk 0 is trained on too, e.g. pandaset:PATH/002.")]
-Novel = Annotated[float, typer.Option(min=0, help="λ_novel; 0: recorded views alone, for gnet.method=g3r.")]
+Recipe = Annotated[str, typer.Option(help="shipped, or paper: ENet on 3DGS scenes, GNet from it, ENet on GNet's.")]
+Novel = Annotated[
+    float | None, typer.Option(min=0, help="λ_novel, 0.1 if not given; 0: recorded views alone, for gnet.method=g3r.")
+]
+Fixer = Annotated[str, typer.Option(help="FNet's weights: builtin, or a path.")]
+Device = Annotated[str, typer.Option(help="auto (a GPU where there is one), cpu or cuda.")]
+SaveEvery = Annotated[int, typer.Option(min=1, help="Weight updates between checkpoints.")]
+ValidateEvery = Annotated[
+    int, typer.Option(min=0, help="Weight updates between validations against tuned Adam (seeds 900–902); 0: none.")
+]
+OneStage = Annotated[str | None, typer.Option(help="This stage alone, e.g. gnet/fine; without it all, in their order.")]
 
 
 def _seeds(text: str) -> list[int]:
@@ -55,36 +68,52 @@ def fnet(folder: Folder = Path("training")) -> None:
 
 
 @app.command()
-def gnet(folder: Folder = Path("training"), real: Real = None, novel: Novel = 0.1) -> None:
-    """Train GNet on streets made on the spot; FNet is not needed."""
-    from flows.cli.terminal import TerminalReporter
-    from flows.train.recipes import train_gnet
-    from genre_tasks.optimiser.weights import save
-    from storage.local import LocalStore
+def scenes(
+    folder: Folder = Path("training"), recipe: Recipe = "shipped", real: Real = None, fnet: Fixer = "builtin"
+) -> None:
+    """Make the scenes that GNet and ENet train on: chunks, true views, per-scene 3DGS, FNet's images of it."""
+    with _reported("training scenes"):
+        from flows.train.flow import train_scenes
 
-    with TerminalReporter("training gnet") as reporter:
-        network = train_gnet(LocalStore(folder / "store"), folder / "gnet", real, reporter.progress, novel)
-    save(network, folder / "gnet.safetensors")
-    typer.echo(
-        f"weights in {folder / 'gnet.safetensors'}; use them with --set gnet.weights={folder / 'gnet.safetensors'}"
-    )
+        made = train_scenes(str(folder), recipe, real, fnet)
+    typer.echo(f"{made['scenes']} scenes in {folder / 'store'}, {made['made']} artifacts of them made now")
 
 
 @app.command()
-def enet(folder: Folder = Path("training"), real: Real = None) -> None:
-    """Train ENet from GNet's weights, on scenes that GNet made and with FNet's images of them."""
-    from flows.cli.terminal import TerminalReporter
-    from flows.train.recipes import train_enet
-    from genre_tasks.errors import InputError
-    from genre_tasks.optimiser.weights import save
-    from storage.local import LocalStore
+def gnet(
+    folder: Folder = Path("training"), recipe: Recipe = "shipped", real: Real = None, novel: Novel = None,
+    fnet: Fixer = "builtin", device: Device = "auto", save_every: SaveEvery = 50, validate_every: ValidateEvery = 0,
+    stage: OneStage = None,
+) -> None:  # fmt: skip
+    """Train GNet, in the stages of the recipe; scenes that are not there yet are made."""
+    _train("gnet", folder, recipe, real, novel, fnet, device, save_every, validate_every, stage)
 
-    start = folder / "gnet" / "fine" / "weights.safetensors"
-    if not start.is_file():
-        raise InputError("GNet is not trained yet", remedy="Run `genre train gnet` first.", file=start)
-    with TerminalReporter("training enet") as reporter:
-        network = train_enet(LocalStore(folder / "store"), folder / "enet", folder / "gnet", real, reporter.progress)
-    save(network, folder / "enet.safetensors")
-    typer.echo(
-        f"weights in {folder / 'enet.safetensors'}; use them with --set enet.weights={folder / 'enet.safetensors'}"
-    )
+
+@app.command()
+def enet(
+    folder: Folder = Path("training"), recipe: Recipe = "shipped", real: Real = None, fnet: Fixer = "builtin",
+    device: Device = "auto", save_every: SaveEvery = 50, validate_every: ValidateEvery = 0, stage: OneStage = None,
+) -> None:  # fmt: skip
+    """Train ENet, in the stages of the recipe, after those of GNet that they need."""
+    _train("enet", folder, recipe, real, None, fnet, device, save_every, validate_every, stage)
+
+
+def _train(network: str, folder: Path, *values: Any) -> None:
+    with _reported(f"training {network}"):
+        from flows.train.flow import train_network
+
+        result = train_network(network, str(folder), *values)
+    typer.echo(f"weights in {result['weights']}; use them with --set {network}.weights={result['weights']}")
+
+
+@contextmanager
+def _reported(what: str) -> Iterator[None]:
+    """The flow's progress on the terminal, and a home for Prefect."""
+    from flows.cli.terminal import TerminalReporter
+    from flows.reporting import report_to
+
+    Path(os.environ["PREFECT_HOME"]).mkdir(parents=True, exist_ok=True)
+    reporter = TerminalReporter(what)
+    report_to(reporter)
+    with reporter:
+        yield

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,11 @@ from genre_tasks.optimiser.weights import write_atomically
 STATE = ("offsets", "first", "second", "seen", "seen_now")
 
 
-def save(training: MetaTraining, path: Path) -> None:
-    """One file, complete or not at all."""
+REMEDY = "Train with the same settings, or into an empty folder."
+
+
+def save(training: MetaTraining, path: Path, origin: Mapping[str, str] | None = None) -> None:
+    """One file, complete or not at all. ``origin``: what else the training depends on, name → digest."""
     from safetensors.torch import save as serialise
 
     tensors = {f"weights.{k}": v for k, v in training.network.state_dict().items()}
@@ -35,30 +39,57 @@ def save(training: MetaTraining, path: Path) -> None:
         "done": training.done,
         "scenes": [s.name for s in training.scenes],
         "config": training.config.model_dump(mode="json"),
+        "network": training.network.config.model_dump(mode="json"),
+        "origin": dict(origin or {}),
         "pool": [_described(e) for e in training.pool],
     }
     own = {k: v.detach().clone().contiguous() for k, v in tensors.items()}
     write_atomically(path, serialise(own, {"training": json.dumps(described)}))
 
 
-def resume(training: MetaTraining, path: Path) -> None:
+def describe(path: Path) -> dict[str, Any]:
+    """What the checkpoint says of itself: ``done`` updates, ``config``, ``network``, ``scenes``, ``origin``, ``pool``.
+
+    Raises ``InputError`` where it is no checkpoint.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, "pt") as file:
+            described: dict[str, Any] = json.loads((file.metadata() or {})["training"])
+    except (SafetensorError, OSError, KeyError, ValueError) as error:
+        raise InputError(
+            f"The checkpoint cannot be read: {error}", remedy="Delete it to train the stage anew.", file=path
+        ) from error
+    return described
+
+
+def resume(training: MetaTraining, path: Path, origin: Mapping[str, str] | None = None) -> None:
     """Takes ``training``, made anew with the same network, scenes and configuration, to where ``path`` was saved.
 
-    Raises ``InputError`` where it was saved with others.
+    Raises ``InputError`` where it was saved with others, or is no checkpoint.
     """
     from safetensors import safe_open
 
-    with safe_open(path, "pt") as file:
-        described: dict[str, Any] = json.loads(file.metadata()["training"])
-        tensors = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118 - not a dictionary
-    now = {"scenes": [s.name for s in training.scenes], "config": training.config.model_dump(mode="json")}
+    described = describe(path)
+    now = {
+        "scenes": [s.name for s in training.scenes],
+        "config": training.config.model_dump(mode="json"),
+        "network": training.network.config.model_dump(mode="json"),
+    }
     changed = [name for name, value in now.items() if described[name] != value]
+    changed += [name for name, value in (origin or {}).items() if described["origin"].get(name) != value]
     if changed:
         raise InputError(
-            f"The checkpoint was made with other {' and '.join(changed)}",
-            remedy="Train with the same settings, or into an empty folder.",
-            file=path,
+            f"The checkpoint was made with other {' and '.join(dict.fromkeys(changed))}", remedy=REMEDY, file=path
         )
+    device = next(training.network.parameters()).device
+    with safe_open(path, "pt") as file:
+        tensors = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118 - not a dictionary
+    # Adam counts its steps, and generators keep their state, on the CPU.
+    tensors = {
+        k: v if k == "generator" or k.startswith("optimiser.step.") else v.to(device) for k, v in tensors.items()
+    }
     training.network.load_state_dict({k.removeprefix("weights."): v for k, v in _under(tensors, "weights.")})
     _restore_moments(training, dict(_under(tensors, "optimiser.")))
     training.done = described["done"]

@@ -1,30 +1,23 @@
-"""The recipes behind the shipped weights of GNet and ENet: which scenes, in which order, for how many steps."""
+"""The recipes behind the weights of GNet and ENet: tables of stages, each a row that says all there is to say of it.
+
+A stage's name is its network and its part (``gnet/coarse``): the folder it is trained in, and what later stages call
+its weights. A table lists a stage after those that it needs.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-import torch
-
-from flows.train.optimiser import AGES, network_from, train_optimiser, train_scenes
-from flows.train.scenes import PreparedScene, SceneRecipe, prepare, training_scene
-from genre_tasks.config import FnetConfig, LossConfig, NovelViewsConfig, OptimiserConfig
+from flows.train.begins import Adam, Begin, ByGnet, Initial, PerScene
+from flows.train.images import Images
+from flows.train.scenes import SceneRecipe
+from genre_tasks.config import LossConfig
+from genre_tasks.errors import ConfigError
 from genre_tasks.optimiser.adam import ENET_RATES, GNET_RATES
-from genre_tasks.optimiser.episodes import TrainingScene
-from genre_tasks.optimiser.learned import LearnedOptimiser, NetworkConfig
-from genre_tasks.optimiser.ssim import blur
+from genre_tasks.optimiser.learned import NetworkConfig
 from genre_tasks.optimiser.training import MetaConfig
-from genre_tasks.progress import Progress, silent
-from genre_tasks.render import render_views
-from genre_tasks.scene.results import Reconstruction
-from genre_tasks.scene.views import FixedViews
-from genre_tasks.stages.fnet import fnet
-from genre_tasks.stages.gnet import gnet
-from genre_tasks.stages.novel_views import novel_views
-from storage.local import LocalStore
 
 CAMERAS = (3, 3, 3, 6, 3, 3, 2, 3)
 COARSE_POINTS, FINE_POINTS = (6_000, 8_000, 5_000, 10_000), (18_000, 20_000, 14_000, 24_000)
@@ -33,158 +26,200 @@ GNET_LOSS = LossConfig(perceptual=0.0)
 """What the optimiser sees in GNet's training."""
 GNET_JUDGE = LossConfig(perceptual=0.0, depth=0.0, novel=0.1)
 """What judges it: held-out frames, and true novel views with λ_novel = 0.1 (paper Sec. III-D)."""
-STAND_IN_TRUTH = 0.6
 ENET_LOSS = LossConfig(perceptual=0.02, perceptual_every=2)
 ENET_JUDGE = LossConfig(perceptual=0.05, perceptual_every=1, depth=0.0)
+
+GNET_NETWORK, ENET_NETWORK = NetworkConfig(rates=GNET_RATES), NetworkConfig(rates=ENET_RATES)
+
+
+@dataclass(frozen=True)
+class SceneList:
+    """Which chunks: ``count`` streets of a size, and before them the real log's scenes, ``real`` times.
+
+    All of them ``rounds`` times: scene k of a round begins at the stage's begin k, in turn, and each round moves
+    them on by one.
+    """
+
+    size: Literal["coarse", "fine"]
+    count: int
+    real: int = 1
+    rounds: int = 1
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A stage of a training: its folder, whether at 320×180, weight updates, their rate, the seed.
+    """One stage of a training.
 
-    ``judged`` weighs the unseen views, ``views`` are drawn in an iteration, ``more_real`` doubles the real log's part.
+    ``start``: the stage whose weights it starts from; ``None``: new weights. ``network`` has the rates. ``begins``:
+    where scenes begin, in turn. ``images``: what is seen beside the path. ``config``: T, views, losses, steps, rate.
     """
 
     name: str
-    fine: bool
-    steps: int
-    rate: float
-    seed: int
-    judged: float = 1.0
-    views: tuple[int, ...] = (4, 6, 6, 8)
-    more_real: bool = False
+    start: str | None
+    network: NetworkConfig
+    scenes: SceneList
+    config: MetaConfig
+    begins: tuple[Begin, ...] = (Initial(),)
+    images: Images | None = None
 
+    @property
+    def of(self) -> str:
+        """The network: gnet or enet."""
+        return self.name.split("/", maxsplit=1)[0]
+
+    def needs(self) -> tuple[str, ...]:
+        """Names of the stages whose weights take part."""
+        begins = [*self.begins, *([self.images.of] if self.images and self.images.of else [])]
+        by = [begin.stage for begin in begins if isinstance(begin, ByGnet)]
+        return tuple(dict.fromkeys([*([self.start] if self.start else []), *by]))
+
+
+def _gnet(**more: Any) -> MetaConfig:
+    return MetaConfig(**{"pool": 6, "loss": GNET_LOSS, "judge_loss": GNET_JUDGE, **more})
+
+
+def _enet(**more: Any) -> MetaConfig:
+    usual: dict[str, Any] = {
+        "pool": 5, "iterations": (8, 12, 12, 16), "views": (4, 6, 6), "novel_views": 6, "judged": 2.0,
+        "log_scale_spread": 0.0, "logit_spread": 0.0, "loss": ENET_LOSS, "judge_loss": ENET_JUDGE,
+    }  # fmt: skip
+    return MetaConfig(**{**usual, **more})
+
+
+COARSE, FINE = SceneList("coarse", 40), SceneList("fine", 15)
 
 GNET_STAGES = (
-    Stage("coarse", False, 1200, 2.5e-3, 0),
-    Stage("fine", True, 240, 5e-4, 1),
-    Stage("finer", True, 240, 5e-4, 2),
-    Stage("unseen", True, 200, 7e-4, 3, judged=4.0),
-    Stage("many", True, 110, 6e-4, 4, judged=4.0, views=(6, 15, 30), more_real=True),
-)
+    Stage("gnet/coarse", None, GNET_NETWORK, COARSE, _gnet(steps=1200, rate=2.5e-3, seed=0)),
+    Stage("gnet/fine", "gnet/coarse", GNET_NETWORK, FINE, _gnet(steps=240, rate=5e-4, seed=1)),
+    Stage("gnet/finer", "gnet/fine", GNET_NETWORK, FINE, _gnet(steps=240, rate=5e-4, seed=2)),
+    Stage("gnet/unseen", "gnet/finer", GNET_NETWORK, FINE, _gnet(steps=200, rate=7e-4, seed=3, judged=4.0)),
+    Stage(
+        "gnet/many", "gnet/unseen", GNET_NETWORK, replace(FINE, real=2),
+        _gnet(steps=110, rate=6e-4, seed=4, judged=4.0, views=(6, 15, 30)),
+    ),
+)  # fmt: skip
+"""GNet from nothing."""
+
+
+def _of_gnet(stage: str) -> tuple[Begin, ...]:
+    """Two of three scenes as a GNet leaves them, the others as tuned Adam does at several ages."""
+    gnet = ByGnet(stage)
+    return (gnet, gnet, Adam(24), gnet, gnet, Adam(48), gnet, gnet, Adam(96))
+
+
 ENET_STAGES = (
-    Stage("coarse", False, 300, 1e-3, 0, judged=2.0, views=(4, 6, 6)),
-    Stage("fine", True, 160, 5e-4, 1, judged=2.0, views=(4, 6, 6)),
-)
-ENET_COARSE = 24
-ENET_CONFIG = MetaConfig(
-    pool=5,
-    iterations=(8, 12, 12, 16),
-    novel_views=6,
-    log_scale_spread=0.0,
-    logit_spread=0.0,
-    loss=ENET_LOSS,
-    judge_loss=ENET_JUDGE,
-)
+    Stage(
+        "enet/coarse", "gnet/coarse", ENET_NETWORK, SceneList("coarse", 24, real=0),
+        _enet(steps=300, rate=1e-3, seed=0), _of_gnet("gnet/coarse"), Images("stand_in"),
+    ),
+    Stage(
+        "enet/fine", "enet/coarse", ENET_NETWORK, FINE,
+        _enet(steps=160, rate=5e-4, seed=1), _of_gnet("gnet/fine"), Images("fnet"),
+    ),
+)  # fmt: skip
+"""ENet from GNet's weights after their coarse stage: at 160×90 with stand-ins for FNet's images, then with those."""
+
+AGED: tuple[Begin, ...] = (PerScene(120, 960), Adam(24), PerScene(480, 960), Adam(48), PerScene(960, 960), Adam(96))
+
+PAPER_STAGES = (
+    Stage(
+        "enet/coarse_3dgs", None, ENET_NETWORK, SceneList("coarse", 24, real=0, rounds=2),
+        _enet(steps=900, rate=2.5e-3, seed=0), AGED, Images("stand_in"),
+    ),
+    Stage(
+        "enet/3dgs", "enet/coarse_3dgs", ENET_NETWORK, replace(FINE, rounds=2),
+        _enet(steps=240, rate=5e-4, seed=1), AGED, Images("fnet"),
+    ),
+    Stage("gnet/coarse", "enet/3dgs", GNET_NETWORK, COARSE, _gnet(steps=900, rate=2e-3, seed=2)),
+    Stage("gnet/fine", "gnet/coarse", GNET_NETWORK, FINE, _gnet(steps=400, rate=6e-4, seed=3, judged=4.0)),
+    Stage(
+        "enet/gnet", "enet/3dgs", ENET_NETWORK, FINE,
+        _enet(steps=200, rate=5e-4, seed=4), _of_gnet("gnet/fine"), Images("fnet"),
+    ),
+)  # fmt: skip
+"""The paper's order (Sec. III-D): ENet on 3DGS scenes, GNet fine-tuned from it, ENet on GNet's scenes too.
+
+Lengths and rates are not tuned yet; no weights that ship were trained so.
+"""
+
+RECIPES: dict[str, tuple[Stage, ...]] = {"shipped": GNET_STAGES + ENET_STAGES, "paper": PAPER_STAGES}
 
 
-def coarse_scenes(count: int = 40, real: str | None = None) -> list[SceneRecipe]:
+def table_of(recipe: str, novel: float | None = None) -> tuple[Stage, ...]:
+    """A recipe's stages, checked; ``novel`` is λ_novel of GNet's, 0: G3R, trained on recorded views alone.
+
+    G3R's stages are called ``g3r/…``: they see no image beside the path, nor weights that were trained with one.
+    Raises ``ConfigError`` for an unknown recipe, a name given twice, and a stage before one that it needs.
+    """
+    if recipe not in RECIPES:
+        raise ConfigError(f"no recipe is called {recipe!r}", remedy=f"Known: {', '.join(RECIPES)}.")
+    table = RECIPES[recipe]
+    if novel is not None:
+        table = tuple(_with_novel(stage, novel) for stage in table if novel or stage.of == "gnet")
+    listed: list[str] = []
+    for stage in table:
+        if stage.name in listed:
+            raise ConfigError(f"two stages are called {stage.name}", remedy="Rename one of them.")
+        if missing := [name for name in stage.needs() if name not in listed]:
+            raise ConfigError(
+                f"{stage.name} needs {' and '.join(missing)}, which the recipe {recipe} does not list before it",
+                remedy="List the stages in the order of training.",
+            )
+        listed.append(stage.name)
+    return table
+
+
+def _with_novel(stage: Stage, novel: float) -> Stage:
+    """A stage of GNet with another λ_novel; others as they are."""
+    if stage.of != "gnet":
+        return stage
+    judge = stage.config.judge_loss.model_copy(update={"novel": novel})
+    config = stage.config.model_copy(update={"judge_loss": judge})
+    if novel > 0:
+        return replace(stage, config=config)
+    config = config.model_copy(update={"novel_views": 0})
+    start = stage.start.replace("gnet/", "g3r/") if stage.start and stage.start.startswith("gnet/") else None
+    return replace(stage, name=stage.name.replace("gnet/", "g3r/"), start=start, config=config, images=None)
+
+
+def ordered(table: Sequence[Stage], network: str) -> list[Stage]:
+    """The stages of a network and all that they need, in the table's order. Raises ``ConfigError`` for none."""
+    wanted = {stage.name for stage in table if stage.of == network}
+    if not wanted:
+        raise ConfigError(f"the recipe has no stage of {network}", remedy="Choose another recipe or network.")
+    for stage in reversed(table):
+        if stage.name in wanted:
+            wanted.update(stage.needs())
+    return [stage for stage in table if stage.name in wanted]
+
+
+def scene_recipes(scenes: SceneList, real: str | None) -> list[SceneRecipe]:
+    """One round of the list; ``real`` is the URI of a log with a chunk 0, or ``None``."""
+    if scenes.size == "coarse":
+        return coarse_scenes(scenes.count, real, scenes.real)
+    return fine_scenes(scenes.count, real, scenes.real)
+
+
+def coarse_scenes(count: int = 40, real: str | None = None, times: int = 1) -> list[SceneRecipe]:
     """Streets at 160×90, a quarter of the pixels and Gaussians: four times as many steps in the same time."""
     sizes: dict[str, Any] = {"distant_count": 800, "width_px": 160, "height_px": 90}
     out = []
     if real is not None:
         dense = {**sizes, "distant_count": 1_500}
-        out = 2 * [SceneRecipe(real, max_points=6_000, **sizes), SceneRecipe(real, max_points=12_000, **dense)]
+        out = 2 * times * [SceneRecipe(real, max_points=6_000, **sizes), SceneRecipe(real, max_points=12_000, **dense)]
     for k in range(count):
         uri = _street((k * 37 + 11) % 900, k, "&width=160&height=90")
         out.append(SceneRecipe(uri, max_points=COARSE_POINTS[k % 4], novel_every=1, **sizes))
     return out
 
 
-def fine_scenes(count: int = 15, real: str | None = None) -> list[SceneRecipe]:
+def fine_scenes(count: int = 15, real: str | None = None, times: int = 1) -> list[SceneRecipe]:
     """Streets at 320×180."""
     out = []
     if real is not None:
-        out = [SceneRecipe(real, max_points=18_000), SceneRecipe(real, max_points=36_000, distant_count=4_000)]
+        pair = [SceneRecipe(real, max_points=18_000), SceneRecipe(real, max_points=36_000, distant_count=4_000)]
+        out = times * pair
     return out + [SceneRecipe(_street(k * 37 % 900, k), max_points=FINE_POINTS[k % 4]) for k in range(count)]
-
-
-def train_gnet(
-    store: LocalStore,
-    folder: Path,
-    real: str | None = None,
-    progress: Progress = silent,
-    novel: float = GNET_JUDGE.novel,
-) -> LearnedOptimiser:
-    """GNet from nothing, in the stages of ``GNET_STAGES``; each resumes. ``real``: the URI of a log with a chunk 0.
-
-    ``novel``: λ_novel; 0 trains on recorded views alone, as G3R.
-    """
-    judge = GNET_JUDGE.model_copy(update={"novel": novel})
-    network = network_from(NetworkConfig(rates=GNET_RATES), seed=0)
-    for stage in GNET_STAGES:
-        recipes = fine_scenes(real=real) if stage.fine else coarse_scenes(real=real)
-        recipes = [r for r in recipes if stage.more_real and r.uri == real] + recipes
-        scenes = [training_scene(prepare(store, r)) for r in recipes]
-        config = MetaConfig(pool=6, loss=GNET_LOSS, judge_loss=judge)
-        train_optimiser(network, scenes, _at(config, stage), folder / stage.name, progress=progress)
-    return network
-
-
-def train_enet(
-    store: LocalStore, folder: Path, gnet_folder: Path, real: str | None = None, progress: Progress = silent
-) -> LearnedOptimiser:
-    """ENet from GNet's weights after their coarse stage, at ENet's rates, on scenes that GNet or tuned Adam made.
-
-    First at 160×90 on streets with stand-ins for FNet's images (see :func:`stand_in_views`), then at 320×180 with
-    FNet's images, on the real log too. ``gnet_folder`` is where :func:`train_gnet` trained.
-    """
-    from genre_tasks.metrics.perceptual import perceptual_distance
-
-    network = network_from(NetworkConfig(rates=ENET_RATES), 0, gnet_folder / "coarse" / "weights.safetensors")
-    for stage in ENET_STAGES:
-        recipes = fine_scenes(real=real) if stage.fine else coarse_scenes(ENET_COARSE)
-        made_by = gnet_folder / stage.name / "weights.safetensors"
-        prepared = [prepare(store, r) for r in recipes]
-        scenes = enet_scenes(prepared, made_by, fixed_views if stage.fine else stand_in_views)
-        config = _at(ENET_CONFIG, stage)
-        train_optimiser(network, scenes, config, folder / stage.name, perceptual_distance(), progress=progress)
-    return network
-
-
-def enet_scenes(
-    prepared: Sequence[PreparedScene],
-    gnet_weights: Path,
-    fix: Callable[[PreparedScene, Reconstruction], FixedViews],
-) -> list[TrainingScene]:
-    """Two of three scenes as GNet leaves them, the others as tuned Adam does at several ages, with fixed views."""
-    config = OptimiserConfig(loss=GNET_LOSS, weights=str(gnet_weights), snapshots=0)
-    aged = train_scenes([p for k, p in enumerate(prepared) if k % 3 == 2], AGES)
-    out = []
-    for k, scene in enumerate(prepared):
-        start = aged[k // 3] if k % 3 == 2 else gnet(config.model_copy(update={"seed": k}), scene.chunk, scene.start)
-        out.append(training_scene(scene, start, fix(scene, start)))
-    return out
-
-
-def fixed_views(scene: PreparedScene, start: Reconstruction) -> FixedViews:
-    """FNet's images of the scene at ±3 m; on a street, of the views whose true image is not kept to judge."""
-    rendered = novel_views(NovelViewsConfig(lidar_max_points=40_000), scene.chunk, start)
-    fixed = fnet(FnetConfig(), scene.chunk, rendered)
-    if scene.truth is None:
-        return fixed
-    judged = {(v.camera, v.frame, v.shift_m) for v in scene.truth.views}
-    kept = [i for i, v in enumerate(fixed.views) if (v.camera, v.frame, v.shift_m) not in judged]
-    return replace(fixed, views=tuple(fixed.views[i] for i in kept), color=fixed.color[torch.tensor(kept)])
-
-
-def stand_in_views(scene: PreparedScene, start: Reconstruction) -> FixedViews:
-    """What stands in for FNet's images before FNet is trained: true images, blurred and mixed with the render.
-
-    Every other view of a street's truth is taken; the views between them remain to judge.
-    """
-    assert scene.truth is not None
-    views = scene.truth.views[::2]
-    with torch.no_grad():
-        render = render_views(start.scene, views).color.clamp(0, 1)
-    truth = torch.stack([blur(image) for image in scene.truth.color[::2]])
-    return FixedViews(views, STAND_IN_TRUTH * truth + (1 - STAND_IN_TRUTH) * render)
-
-
-def _at(config: MetaConfig, stage: Stage) -> MetaConfig:
-    """The configuration of a stage."""
-    of_stage = ("steps", "rate", "seed", "judged", "views")
-    return config.model_copy(update={name: getattr(stage, name) for name in of_stage})
 
 
 def _street(seed: int, k: int, more: str = "") -> str:

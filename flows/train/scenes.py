@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -11,6 +11,7 @@ import torch
 
 from flows.train.thinned import ThinnedLog
 from genre_tasks.config import IngestConfig, InitialConfig
+from genre_tasks.errors import ArtifactCorruptError
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.types import DrivingLog
 from genre_tasks.optimiser.episodes import TrainingScene
@@ -56,24 +57,35 @@ class PreparedScene:
 
 
 def prepare(store: LocalStore, recipe: SceneRecipe) -> PreparedScene:
-    """Reads the scene from the store, or makes and stores it."""
+    """Reads the scene from the store, or makes and stores it.
+
+    The key is the recipe's alone, not the code's: after a change of how scenes are made, take an empty store.
+    """
     log = open_log(recipe.uri)
     key = digest_value(asdict(recipe))
 
-    def kept(stage: str, kind: str, make: Any) -> Any:
-        address = Address(log.dataset, log.name, recipe.chunk, stage, key)
-        artifact = store.find(address) or store.commit(address, kind, make())
-        return store.read(artifact)
+    def part(stage: str, kind: str, make: Callable[[], Any]) -> Any:
+        return kept(store, Address(log.dataset, log.name, recipe.chunk, stage, key), kind, make)
 
     sizes = {"width_px": recipe.width_px, "height_px": recipe.height_px}
     thinned: Any = ThinnedLog(log, recipe.every)
-    chunk = kept("ingest", "chunk", lambda: ingest(IngestConfig(**sizes), thinned, recipe.chunk))
+    chunk = part("ingest", "chunk", lambda: ingest(IngestConfig(**sizes), thinned, recipe.chunk))
     points = InitialConfig(max_points=recipe.max_points, distant_count=recipe.distant_count)
-    start = kept("initial", "reconstruction", lambda: initial(points, chunk))
+    start = part("initial", "reconstruction", lambda: initial(points, chunk))
     truth = None
     if log.truth is not None:
-        truth = kept("truth", "fixed_views", lambda: true_views(log, chunk, recipe))
+        truth = part("truth", "fixed_views", lambda: true_views(log, chunk, recipe))
     return PreparedScene(recipe, chunk, start, truth)
+
+
+def kept(store: LocalStore, address: Address, kind: str, make: Callable[[], Any]) -> Any:
+    """What the store has at ``address``, read back; made and stored where it has nothing, or nothing sound."""
+    try:
+        if (artifact := store.find(address)) is not None:
+            return store.read(artifact)
+    except ArtifactCorruptError:
+        store.discard(address)
+    return store.read(store.commit(address, kind, make()))
 
 
 def true_views(log: DrivingLog, chunk: Chunk, recipe: SceneRecipe) -> FixedViews:

@@ -17,6 +17,7 @@ from genre_tasks.optimiser.learned import NetworkConfig
 from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.training import MetaConfig, MetaTraining
 from genre_tasks.optimiser.unroll import Plan, unroll
+from storage.curve import LEARNING, read_rows
 from tests.optimiser import street
 
 RATES = tuple(0.3 * r for r in TunedAdam().rates)
@@ -89,5 +90,6 @@ def test_an_interrupted_training_goes_on_and_writes_its_curve(tmp_path: Path) ->
         run(tmp_path / "parts", 2)
     resumed = run(tmp_path / "parts", None)
     assert all(torch.equal(a, b) for a, b in zip(whole, resumed, strict=True))
-    curves = [(tmp_path / name / "curve.csv").read_text() for name in ("whole", "parts")]
-    assert curves[0] == curves[1] and curves[0].count("\n") == 5
+    curves = [read_rows(tmp_path / name / "curve.parquet", LEARNING) for name in ("whole", "parts")]
+    steps, again = ([{**row, "seconds": 0.0} for row in rows] for rows in curves)
+    assert steps == again and [row["step"] for row in steps] == [0, 1, 2, 3]

@@ -1,0 +1,191 @@
+"""Training as flows: stages in their order, scenes made once, stop and resume, faults that are said."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flows.train import recipes, stages, validation
+from flows.train.begins import Adam, ByGnet, Initial, PerScene
+from flows.train.flow import train_network, train_scenes
+from flows.train.images import Images
+from flows.train.recipes import SceneList, Stage
+from flows.train.scenes import SceneRecipe
+from flows.train.stages import TrainJob, places, train_stage
+from genre_tasks.config import LossConfig
+from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.optimiser.adam import GNET_RATES
+from genre_tasks.optimiser.learned import NetworkConfig
+from genre_tasks.optimiser.training import MetaConfig
+from storage.curve import LEARNING, VALIDATION, read_rows
+from storage.files import digest_file
+
+SMALL = "&frames=8&cameras=1&width=32&height=18&lidar_beams=16&lidar_azimuths=150"
+NETWORK = NetworkConfig(hidden=8, channels=(4, 6), rates=GNET_RATES)
+PLAIN = LossConfig(perceptual=0.0)
+CONFIG = MetaConfig(
+    steps=3, segment=2, pool=2, iterations=(4,), views=(2,), novel_views=1, warm_up=2, loss=PLAIN, judge_loss=PLAIN
+)
+TWO = SceneList("coarse", 2)
+AGES = (Adam(2), PerScene(2, 4), PerScene(4, 4))
+TABLE = (
+    Stage("enet/3dgs", None, NETWORK, replace(TWO, rounds=2), CONFIG, AGES, Images("fnet")),
+    Stage("gnet/only", "enet/3dgs", NETWORK, TWO, CONFIG.model_copy(update={"seed": 1})),
+    Stage(
+        "enet/gnet", "enet/3dgs", NETWORK, TWO, CONFIG,
+        (ByGnet("gnet/only", 2, 2), Adam(2)), Images("stand_in", Initial()),
+    ),
+)  # fmt: skip
+"""The paper's order."""
+
+
+Said = tuple[Path, list[dict[str, Any]]]
+
+
+def tiny_scenes(count: int, real: str | None = None, times: int = 1) -> list[SceneRecipe]:
+    return [
+        SceneRecipe(f"synthetic:street?seed={k}{SMALL}", max_points=150, distant_count=20, width_px=32, height_px=18)
+        for k in range(count)
+    ]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def prefect() -> Iterator[None]:
+    from prefect.testing.utilities import prefect_test_harness
+
+    with prefect_test_harness(server_startup_timeout=120):
+        yield
+
+
+@pytest.fixture(autouse=True)
+def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
+    make_tiny(monkeypatch)
+
+
+def make_tiny(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(recipes, "coarse_scenes", tiny_scenes)
+    patch.setattr(recipes, "RECIPES", {"tiny": TABLE})
+    patch.setattr(validation, "SEEDS", (900,))
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Said:
+    """A folder with everything trained in the paper's order, and what the flows said, each called twice."""
+    folder = tmp_path_factory.mktemp("training")
+    with pytest.MonkeyPatch.context() as patch:
+        make_tiny(patch)
+        said: list[dict[str, Any]] = [train_scenes(str(folder), "tiny"), train_scenes(str(folder), "tiny")]
+        said.append(train_network("gnet", str(folder), "tiny", save_every=2, validate_every=2))
+        said.append(train_network("enet", str(folder), "tiny"))
+    return folder, said
+
+
+def test_scenes_are_made_once(trained: Said) -> None:
+    folder, (first, second, *_) = trained
+    # Of each chunk: itself, its start, its truth; two ages, and FNet's images of both. One has Adam's for ENet's end.
+    kinds = sorted(path.parent.parent.name for path in (folder / "store").glob("synthetic/*/0000/**/manifest.json"))
+    assert first["scenes"] == second["scenes"] == 2
+    assert first["made"] > 10 and second["made"] == 0
+    assert {"ingest", "initial", "truth", "adam", "standard_3dgs", "fnet"} <= set(kinds)
+
+
+def test_stages_are_trained_in_their_order_and_once(trained: Said) -> None:
+    folder, (*_, gnet, enet) = trained
+    assert gnet["stages"] == [("enet/3dgs", False), ("gnet/only", False)]
+    assert enet["stages"] == [("enet/3dgs", True), ("gnet/only", True), ("enet/gnet", False)]
+    for network, last in ((gnet, "gnet/only"), (enet, "enet/gnet")):
+        assert digest_file(Path(network["weights"])) == digest_file(folder / last / "weights.safetensors")
+
+
+def test_curves_are_kept(trained: Said) -> None:
+    folder, _ = trained
+    rows = read_rows(folder / "gnet/only/curve.parquet", LEARNING)
+    assert [row["step"] for row in rows] == [0, 1, 2] and all(row["seconds"] > 0 for row in rows)
+    assert (folder / "gnet/only/curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_validation_beside_tuned_adam(trained: Said) -> None:
+    rows = read_rows(trained[0] / "gnet/only/validation.parquet", VALIDATION)
+    assert [row["step"] for row in rows] == [2, 3] and all("seed=900" in row["scene"] for row in rows)
+    assert rows[0]["start_db"] == rows[1]["start_db"] and rows[0]["learned_db"] != rows[1]["learned_db"]
+    assert all(5 < row["start_db"] < row["adam_db"] < 60 and 5 < row["learned_db"] < 60 for row in rows)
+    assert not (trained[0] / "enet/gnet/validation.parquet").exists()
+
+
+def test_a_stopped_stage_resumes_to_the_same_bytes(trained: Said, tmp_path: Path) -> None:
+    folder = tmp_path / "again"
+    shutil.copytree(trained[0], folder)
+    shutil.rmtree(folder / "gnet")
+
+    def stop(done: int, total: int, note: str = "") -> None:
+        if "loss" in note and done == 2:
+            raise KeyboardInterrupt
+
+    job = TrainJob(str(folder), "tiny", save_every=1)
+    with pytest.raises(KeyboardInterrupt):
+        train_stage(job, TABLE[1], stop)
+    with pytest.raises(InputError, match="gnet/only has made 1 of 3 weight updates"):
+        train_stage(job, TABLE[2])
+    again = train_stage(job, TABLE[1])
+    assert not again.cached
+    for name in ("weights.safetensors", "checkpoint.safetensors"):
+        assert digest_file(folder / "gnet/only" / name) == digest_file(trained[0] / "gnet/only" / name)
+    curves = [read_rows(where / "gnet/only/curve.parquet", LEARNING) for where in (trained[0], folder)]
+    assert [{**row, "seconds": 0} for row in curves[0]] == [{**row, "seconds": 0} for row in curves[1]]
+
+
+def test_a_checkpoint_of_another_training_is_refused(trained: Said, tmp_path: Path) -> None:
+    folder = tmp_path / "other"
+    shutil.copytree(trained[0], folder)
+    job = TrainJob(str(folder), "tiny")
+    with pytest.raises(InputError, match=r"made with other config .*empty folder"):
+        train_stage(job, replace(TABLE[1], config=CONFIG))
+    with pytest.raises(InputError, match="other start"):
+        train_stage(job, replace(TABLE[1], start=None))
+    with pytest.raises(InputError, match="other scenes and training scenes"):
+        train_stage(job, replace(TABLE[1], begins=(Adam(2),)))
+    with pytest.raises(InputError, match="a network with other hidden"):
+        train_stage(job, replace(TABLE[1], network=NetworkConfig(hidden=9, channels=(4, 6))))
+    (folder / "gnet/only/checkpoint.safetensors").write_bytes(b"no checkpoint")
+    with pytest.raises(InputError, match="checkpoint cannot be read"):
+        train_stage(job, TABLE[1])
+
+
+def test_a_stage_alone_needs_those_before_it(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"enet/3dgs is not trained yet .*genre train enet --stage enet/3dgs"):
+        train_network("gnet", str(tmp_path), "tiny", stage="gnet/only")
+    with pytest.raises(ConfigError, match="no stage 'gnet/none'"):
+        train_network("gnet", str(tmp_path), "tiny", stage="gnet/none")
+    with pytest.raises(ConfigError, match="no recipe is called 'none'"):
+        train_network("gnet", str(tmp_path), "none")
+
+
+def test_other_seeds_and_chunks_do_not_train(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(recipes, "coarse_scenes", lambda *_: [SceneRecipe("synthetic:street?cameras=1&seed=900")])
+    with pytest.raises(ConfigError, match=r"seed 900 .* not for training. Use seeds 0 to 899"):
+        train_scenes(str(tmp_path), "tiny")
+    monkeypatch.setattr(recipes, "coarse_scenes", lambda *_: [SceneRecipe("pandaset:002", chunk=1)])
+    with pytest.raises(ConfigError, match=r"chunk 1 .* not for training"):
+        train_scenes(str(tmp_path), "tiny")
+
+
+def test_rounds_move_the_begins_on() -> None:
+    at = places(TABLE[0], None)
+    assert [place.begin for place in at] == [AGES[0], AGES[1], AGES[1], AGES[2]]
+    assert at[0].recipe == at[2].recipe
+
+
+def test_an_unsound_scene_is_made_anew(trained: Said, tmp_path: Path) -> None:
+    shutil.copytree(trained[0] / "store", tmp_path / "store")
+    job = TrainJob(str(tmp_path), "tiny")
+    (recipe, *_) = tiny_scenes(2)
+    file = next((tmp_path / "store").glob("synthetic/*seed=0*/0000/initial/*/gaussians.parquet"))
+    before = file.read_bytes()
+    file.write_bytes(before[:-9] + b"x" + before[-8:])
+    stages.make_scene(job, recipe, stages.works(TABLE, None)[recipe])
+    assert file.read_bytes() == before

@@ -1,0 +1,77 @@
+"""The tables behind the weights: their order is sound, and they say what the model cards say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from flows.train import recipes
+from flows.train.begins import Adam, ByGnet, PerScene
+from flows.train.device import chosen_device
+from flows.train.recipes import GNET_STAGES, ordered, table_of
+from flows.train.stages import places
+from flows.train.validation import validation_recipes
+from genre_tasks.errors import ConfigError
+
+REAL = "pandaset:002"
+
+
+@pytest.mark.parametrize("recipe", recipes.RECIPES)
+def test_every_recipe_is_in_order_and_of_training_chunks(recipe: str) -> None:
+    table = table_of(recipe)
+    assert {stage.of for stage in table} == {"gnet", "enet"}
+    for stage in table:
+        at = places(stage, REAL)
+        assert len(at) == stage.scenes.rounds * len(
+            places(replace(stage, scenes=replace(stage.scenes, rounds=1)), REAL)
+        )
+        assert [r.uri.count("seed=90") for r in validation_recipes(stage.scenes)] == [1, 1, 1]
+
+
+def test_the_shipped_weights_are_described() -> None:
+    table = {stage.name: stage for stage in table_of("shipped")}
+    assert [table[s.name].config.steps for s in GNET_STAGES] == [1200, 240, 240, 200, 110]
+    streets = [len(places(table[name], None)) for name in ("gnet/coarse", "gnet/fine", "enet/coarse")]
+    assert streets == [40, 15, 24]
+    assert len(places(table["gnet/many"], REAL)) == 15 + 4
+    begins = [place.begin for place in places(table["enet/fine"], REAL)]
+    gnet = ByGnet("gnet/fine")
+    assert begins[:6] == [gnet, gnet, Adam(24), gnet, gnet, Adam(48)]
+    names = [stage.name for stage in ordered(table_of("shipped"), "enet")]
+    assert names == ["gnet/coarse", "gnet/fine", "enet/coarse", "enet/fine"]
+
+
+def test_the_paper_begins_with_enet() -> None:
+    names = [stage.name for stage in ordered(table_of("paper"), "gnet")]
+    assert names == ["enet/coarse_3dgs", "enet/3dgs", "gnet/coarse", "gnet/fine"]
+
+
+@pytest.mark.parametrize("recipe", recipes.RECIPES)
+def test_g3r_sees_recorded_views_alone(recipe: str) -> None:
+    table = table_of(recipe, novel=0)
+    assert {stage.of for stage in table} == {"g3r"}
+    for stage in table:
+        assert stage.config.judge_loss.novel == 0 and stage.config.novel_views == 0 and stage.images is None
+        assert all(name.startswith("g3r/") for name in stage.needs())
+    assert table_of(recipe, novel=0.2)[-1].name == table_of(recipe)[-1].name
+
+
+def test_a_table_out_of_order_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recipes, "RECIPES", {"turned": tuple(reversed(GNET_STAGES)), "twice": 2 * GNET_STAGES[:1]})
+    with pytest.raises(ConfigError, match="gnet/many needs gnet/unseen"):
+        table_of("turned")
+    with pytest.raises(ConfigError, match="two stages are called gnet/coarse"):
+        table_of("twice")
+
+
+def test_an_age_beyond_its_run_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"standard_3dgs@9/8"):
+        PerScene(9, 8)
+
+
+def test_devices(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    assert chosen_device("cpu").type == "cpu"
+    with pytest.raises(ConfigError, match="Give auto, cpu or cuda"):
+        chosen_device("tpu")
