@@ -82,8 +82,10 @@ def image_loss(
         _pointers(variances), _pointers(sparse), factors.data_ptr(), config.rgb, config.ssim, config.depth,
         torch.get_num_threads(), terms.data_ptr(), by_color.data_ptr(), by_depth.data_ptr(),
     )  # fmt: skip
-    if status:
+    if status == 1:
         raise ResourceError("not enough memory for the image loss", remedy="Take fewer views or smaller images")
+    if status:
+        raise ResourceError(f"{KERNEL.title} failed", remedy="Report the images' size and the number of views")
     of_terms = torch.tensor([config.rgb, config.ssim, config.depth], dtype=torch.float64)
     return ImageLoss((terms * of_terms).sum(1) * factors, by_color, by_depth)
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -13,6 +16,8 @@ from genre_tasks.compiled.loader import supported_isas
 from genre_tasks.config import LossConfig
 from genre_tasks.errors import ResourceError
 from genre_tasks.optimiser import image_loss as module
+from genre_tasks.optimiser import image_loss_constants as constants
+from genre_tasks.optimiser.build_image_loss import KERNEL
 from genre_tasks.optimiser.image_loss import ImageLoss, image_loss, load_image_loss, takes
 from genre_tasks.optimiser.loss import torch_image_loss
 from genre_tasks.optimiser.ssim import SsimTarget
@@ -185,6 +190,20 @@ def test_it_is_for_float32_on_the_cpu() -> None:
     assert not takes(color, depth, [replace(targets[0], image=SsimTarget.of(targets[0].image.image.double()))])
 
 
-def test_a_missing_library_says_what_to_run(tmp_path) -> None:
+@pytest.mark.parametrize(("status", "match"), [(1, "not enough memory.*fewer views"), (2, "kernel failed")])
+def test_a_failing_kernel_is_an_error(status: int, match: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    kernel = SimpleNamespace(genre_image_loss=lambda *arguments: status)
+    monkeypatch.setattr(module, "load_image_loss", lambda: kernel)
+    with pytest.raises(ResourceError, match=match):
+        image_loss(CONFIG, *_batch())
+
+
+def test_constants_live_in_one_place() -> None:
+    text = (KERNEL.folder / "image_loss.cpp").read_text()
+    assert {n for n in vars(constants) if n.isupper()} == set(KERNEL.constants)
+    assert all(re.search(rf"\b{name}\b", text) for name in KERNEL.constants)
+
+
+def test_a_missing_library_says_what_to_run(tmp_path: Path) -> None:
     with pytest.raises(ResourceError, match=r"image loss's CPU kernel is not compiled.*pip install -e \."):
         load_image_loss(tmp_path)
