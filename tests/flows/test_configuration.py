@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.mark.parametrize("preset", PRESETS)
 def test_presets_are_valid(preset: str) -> None:
     config = load_configuration(preset)
-    assert config.gnet.iterations == 24 and config.enet.iterations == 12
+    assert config.gnet.iterations == (120 if preset == "long" else 24) and config.enet.iterations == 12
     assert differences(config, preset) == {}
 
 
