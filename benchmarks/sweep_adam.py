@@ -1,10 +1,11 @@
 """Tunes Adam for each length on validation seeds: rates and schedule, for ``tuned_adam`` in ``configs/baselines.yaml``.
 
-python -m benchmarks.sweep_adam --folder sweep [--seeds 900,901,902] [--lengths 24x6,24x30,240x1,960x1,2880x1]
+python -m benchmarks.sweep_adam --folder sweep [--seeds 900,901,902] [--lengths 24x6,48x3,240x1] [--start 240x1]
 
-A pattern search by factors of two from the rates in use: all together, the schedule, then each by itself, each as long
-as it helps, again until a round brings less than ``ENOUGH_DB``. Scores and scenes are kept in the folder: a sweep that
-was stopped goes on where it was. Prints the variants as YAML with their mean held-out PSNR.
+A pattern search by factors of two from the rates in use, or from those of a variant (``--start``): all together, the
+schedule, then each by itself, each as long as it helps, again until a round brings less than ``ENOUGH_DB``. Scores and
+scenes are kept in the folder: a sweep that was stopped goes on where it was. Prints the variants as YAML with their
+mean held-out PSNR.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from typing import Literal
 
 import yaml
 
+from flows.baselines import load_baselines
 from flows.train.optimiser import score
 from flows.train.scenes import SceneRecipe, prepare, training_scene
 from genre_tasks.config import LossConfig
@@ -31,7 +33,7 @@ from genre_tasks.optimiser.unroll import Plan
 from genre_tasks.optimiser.weights import write_atomically
 from storage.local import LocalStore
 
-LENGTHS = "24x6,24x30,240x1,960x1,2880x1"
+LENGTHS = "24x6,48x3,72x2,144x1,240x1,24x30,960x1,2880x1"
 ENOUGH_DB = 0.02
 LOSS = LossConfig(perceptual=0.0)
 """What GNet sees in the presets demo and small."""
@@ -102,6 +104,12 @@ def search(measure: Callable[[Setting], float], start: Setting, rounds: int) -> 
     return best, found
 
 
+def setting_of(variant: str) -> Setting:
+    """What ``configs/baselines.yaml`` has for tuned Adam. Raises ``ConfigError`` for an unknown variant."""
+    adam = load_baselines("small")["tuned_adam"].at(variant).adam
+    return Setting(adam.rates or GNET_RATES, adam.schedule)
+
+
 def validation_seeds(text: str) -> list[int]:
     """Raises ``ConfigError`` for a seed that is not of validation: claims are never tuned on."""
     low, high = yaml.safe_load(SEEDS_FILE.read_text())["validation"]
@@ -130,13 +138,14 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--seeds", default="900,901,902")
     parser.add_argument("--lengths", default=LENGTHS, help="iterations x views of each, with commas")
+    parser.add_argument("--start", help="a variant of tuned_adam in configs/baselines.yaml to search from")
     parser.add_argument("--points", type=int, default=40_000)
     parser.add_argument("--rounds", type=int, default=4)
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     makers = scenes_of(LocalStore(options.folder / "store"), validation_seeds(options.seeds), options.points)
     scores = Scores(options.folder / "scores.json", makers)
-    best = Setting()
+    best = Setting() if options.start is None else setting_of(options.start)
     for length in options.lengths.split(","):
         iterations, views = (int(part) for part in length.split("x"))
 

@@ -1,14 +1,15 @@
-"""The learned optimiser's claims, measured: GNet's wall time and renders beside those of its baselines.
+"""The learned optimiser's claims, measured: wall time and renders of GNet and ENet beside those of their baselines.
 
 genre bench optimiser --json docs/benchmarks/optimiser.json [--set seeds=1001 --set orders=0 --set cap=10]
 
 A log and an order of views (a seed) make a cell with each method; GNet runs in each of them anew, before the method.
-A baseline's run ends where it reaches GNet's held-out PSNR, or at ``cap`` times GNet's seconds.
+A baseline's run ends where it reaches GNet's held-out PSNR, or at ``cap`` times GNet's seconds. A log and an order make
+also a cell of enhancement, one of distillation and one of convergence. The two latter run baselines to their ends and
+are the dearest: ``long_orders`` chooses their orders. All cells of the first order come first.
 """
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -17,15 +18,23 @@ from functools import partial
 from benchmarks.bench import Bench, Cell, NotMeasuredError, Row
 from benchmarks.optimiser import summary, table
 from benchmarks.optimiser.cells import METHODS, measure_race, measure_stability, variants
+from benchmarks.optimiser.converged import PRESET, long_variants, measure_converged
+from benchmarks.optimiser.distillation import MOST_TIMES, STANDARD_ITERATIONS, adam_variants, measure_distillation
+from benchmarks.optimiser.enhancement import as_enhancer, measure_enhancement
 from benchmarks.optimiser.network import COUNTS, measure_network
 from benchmarks.schema import Claim
 from flows.configuration import load_configuration
 from flows.pipeline import BY_NAME, weights_digest, weights_file
+from genre_tasks.config import GnetConfig, OptimiserConfig, PipelineConfig
+from genre_tasks.errors import ConfigError
 from genre_tasks.optimiser.run import step_rule
 
-GNET_S = 10.0
-"""Predicted for GNet on a synthetic street; the real one has twice the views."""
+RENDER_S, STEP_S, JUDGE_S = 0.012, 0.1, 0.4
+"""Predicted for a view with its gradient at 40k Gaussians, a step of a network, and a look at a scene."""
 QUICK_CAP = 10.0
+PARTS = ("race", "enhancement", "distillation", "converged", "stability")
+SLOWER_3DGS = 4.0
+"""Per-scene 3DGS grows to several times as many Gaussians."""
 
 
 class Optimiser:
@@ -33,42 +42,45 @@ class Optimiser:
 
     name = "optimiser"
     options: Mapping[str, str] = {
-        "seeds": "1001,1002,1003,1004,1005", "orders": "0,1,2", "methods": ",".join(METHODS), "cap": "50",
-        "minutes": "", "store": "genre-store", "pandaset": "../shared/data/pandaset/002",
+        "seeds": "1001,1002,1003,1004,1005", "orders": "0,1,2", "long_orders": "0,1,2", "methods": ",".join(METHODS),
+        "parts": ",".join(PARTS), "cap": "50", "minutes": "", "store": "genre-store",
+        "pandaset": "../shared/data/pandaset/002",
     }  # fmt: skip
     code: tuple[str, ...] = (
         "benchmarks.optimiser.cells", "benchmarks.optimiser.network", "benchmarks.optimiser.race",
         "benchmarks.optimiser.task", "benchmarks.raster.scenes", "benchmarks.timing", "genre_tasks.optimiser.run",
-        "genre_tasks.stages.ingest", "genre_tasks.stages.initial", "genre_tasks.logs.pandaset",
-        "genre_tasks.logs.synthetic",
+        "benchmarks.optimiser.beside", "benchmarks.optimiser.converged", "benchmarks.optimiser.distillation",
+        "benchmarks.optimiser.enhancement", "benchmarks.optimiser.steps", "genre_tasks.stages.novel_views",
+        "genre_tasks.stages.fnet", "genre_tasks.stages.ingest", "genre_tasks.stages.initial",
+        "genre_tasks.logs.pandaset", "genre_tasks.logs.synthetic",
     )  # fmt: skip
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
-        """The network; then for each order each method on all logs; ``quick``: one seed, one order, a lower cap.
+        """The network; then for each order every part on all logs; ``quick``: one seed, one order, a lower cap.
 
         An empty ``pandaset`` leaves the real log out; with ``minutes`` cells that would not end by then are left out.
+        Raises ``ConfigError`` for an unknown part.
         """
-        logs = [(f"synthetic:street?seed={seed}", 0, GNET_S) for seed in _parts(options["seeds"])]
+        logs = [(f"synthetic:street?seed={seed}", 0) for seed in _parts(options["seeds"])]
         if options["pandaset"]:
-            logs.append((f"pandaset:{options['pandaset']}", 1, 2 * GNET_S))
-        logs, orders = (logs[:1], _parts(options["orders"])[:1]) if quick else (logs, _parts(options["orders"]))
+            logs.append((f"pandaset:{options['pandaset']}", 1))
+        orders, parts = _parts(options["orders"]), _parts(options["parts"])
+        if unknown := set(parts) - set(PARTS):
+            raise ConfigError(f"the benchmark has no part {sorted(unknown)}", remedy=f"Known: {', '.join(PARTS)}.")
+        logs, orders = (logs[:1], orders[:1]) if quick else (logs, orders)
         cap = min(float(options["cap"]), QUICK_CAP) if quick else float(options["cap"])
-        config, store = load_configuration("small"), options["store"]
-        digest = weights_digest(weights_file(BY_NAME["gnet"], config))
-        shared = {"configuration": config.model_dump(mode="json"), "weights": digest}
-        rounds = 3 if quick else 9
-        network = partial(measure_network, partial(step_rule, "gnet", config.gnet), COUNTS, rounds)
-        out = [Cell("network", 5.0 * (rounds + 2), network, shared | {"rounds": rounds})]
-        for order, method in itertools.product(map(int, orders), _parts(options["methods"])):
-            configs = {name: c.model_dump(mode="json") for name, c in variants(method).items()}
-            for log, chunk, gnet_s in logs:
-                measure = partial(measure_race, log, chunk, store, order, method, cap)
-                seconds = 1.2 * gnet_s * (1 + cap * len(configs))
-                parameters = shared | {"cap": cap, "variants": configs}
-                out.append(Cell(f"{log} chunk {chunk} order {order} {method}", seconds, measure, parameters))
-        for log, chunk, gnet_s in logs:
-            stability = partial(measure_stability, log, chunk, store)
-            out.append(Cell(f"stability/{log} chunk {chunk}", 11 * gnet_s, stability, shared))
+        made = _Maker(load_configuration("small"), load_configuration(PRESET), options["store"], cap)
+        out = [made.network(3 if quick else 9)]
+        for order in map(int, orders):
+            if "race" in parts:
+                out += [made.race(*log, order, m) for m in _parts(options["methods"]) for log in logs]
+            if "enhancement" in parts:
+                out += [made.enhancement(*log, order) for log in logs]
+            if str(order) in _parts(options["long_orders"]):
+                out += [made.distillation(*log, order) for log in logs if "distillation" in parts]
+                out += [made.converged(*log, order) for log in logs if "converged" in parts]
+            if order == int(orders[0]) and "stability" in parts:
+                out += [made.stability(*log) for log in logs]
         if options["minutes"]:
             out = [_before(time.monotonic() + 60 * float(options["minutes"]), cell) for cell in out]
         return out
@@ -80,6 +92,71 @@ class Optimiser:
     def table(self, rows: Mapping[str, Row]) -> Iterator[str]:
         """The tables that the documents show."""
         return table.markdown(rows)
+
+
+class _Maker:
+    """Makes the cells, each with a prediction of its seconds from its renders and steps."""
+
+    def __init__(self, small: PipelineConfig, long: PipelineConfig, store: str, cap: float) -> None:
+        self._small, self._long, self._store, self._cap = small, long, store, cap
+        self._gnet_s = _learned_s(small.gnet)
+        digests = [weights_digest(weights_file(BY_NAME[name], small)) for name in ("gnet", "fnet", "enet")]
+        self._gnet = {"configuration": small.model_dump(mode="json"), "weights": digests[0]}
+        self._all = {"configuration": small.model_dump(mode="json"), "weights": digests}
+
+    def network(self, rounds: int) -> Cell:
+        rule = partial(step_rule, "gnet", self._small.gnet)
+        measure = partial(measure_network, rule, COUNTS, rounds)
+        return Cell("network", 5.0 * (rounds + 2), measure, self._gnet | {"rounds": rounds})
+
+    def race(self, log: str, chunk: int, order: int, method: str) -> Cell:
+        configs = variants(method)
+        seconds = self._gnet_s + sum(_baseline_s(c, self._gnet_s, self._cap) for c in configs.values())
+        measure = partial(measure_race, log, chunk, self._store, order, method, self._cap)
+        values = {name: config.model_dump(mode="json") for name, config in configs.items()}
+        parameters = self._gnet | {"cap": self._cap, "variants": values}
+        return Cell(f"{log} chunk {chunk} order {order} {method}", seconds, measure, parameters)
+
+    def enhancement(self, log: str, chunk: int, order: int) -> Cell:
+        own = self._gnet_s + _learned_s(self._small.enet) + _learned_s(as_enhancer(self._small))
+        measure = partial(measure_enhancement, log, chunk, self._store, order)
+        return Cell(f"enhancement/{log} chunk {chunk} order {order}", own + 25.0, measure, self._all)
+
+    def distillation(self, log: str, chunk: int, order: int) -> Cell:
+        enet_s, configs = _learned_s(self._small.enet), adam_variants(self._small.enet)
+        seconds = enet_s * (1 + MOST_TIMES * len(configs)) + SLOWER_3DGS * RENDER_S * STANDARD_ITERATIONS
+        measure = partial(measure_distillation, log, chunk, self._store, order, self._cap)
+        values = {name: config.model_dump(mode="json") for name, config in configs.items()}
+        name = f"distillation/{log} chunk {chunk} order {order}"
+        return Cell(name, seconds + 20.0, measure, self._all | {"cap": self._cap, "variants": values})
+
+    def converged(self, log: str, chunk: int, order: int) -> Cell:
+        configs = long_variants(variants("tuned_adam"))
+        renders = [c.iterations * c.views_per_iteration for c in configs.values() if c.adam.schedule == "cosine"]
+        renders += [max(renders, default=0)] * (len(configs) - len(renders))
+        seconds = _learned_s(self._long.gnet) + RENDER_S * sum(renders) + 15 * JUDGE_S * len(configs)
+        measure = partial(measure_converged, log, chunk, self._store, order, self._cap)
+        values = {name: config.model_dump(mode="json") for name, config in configs.items()}
+        parameters = self._gnet | {"cap": self._cap, "variants": values, "long": self._long.model_dump(mode="json")}
+        return Cell(f"converged/{log} chunk {chunk} order {order}", seconds, measure, parameters)
+
+    def stability(self, log: str, chunk: int) -> Cell:
+        measure = partial(measure_stability, log, chunk, self._store)
+        return Cell(f"stability/{log} chunk {chunk}", 11 * self._gnet_s, measure, self._gnet)
+
+
+def _learned_s(config: OptimiserConfig) -> float:
+    """Of a learned optimiser to its end."""
+    views = config.views_per_iteration + config.novel_views_per_iteration
+    return config.iterations * (RENDER_S * views + STEP_S)
+
+
+def _baseline_s(config: GnetConfig, gnet_s: float, cap: float) -> float:
+    """Of a baseline's race: tuned Adam gets there early or has its length; per-scene 3DGS needs the cap at worst."""
+    if config.method == "adam":
+        length = RENDER_S * config.iterations * config.views_per_iteration
+        return min(cap * gnet_s, length if config.adam.schedule == "cosine" else 4 * gnet_s) + 15 * JUDGE_S
+    return cap * gnet_s + 20 * JUDGE_S
 
 
 def _before(deadline: float, cell: Cell) -> Cell:

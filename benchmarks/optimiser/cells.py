@@ -58,8 +58,12 @@ def variant_row(curve: Sequence[Point], goal: Point, cap_s: float) -> Row:
 
 
 def as_rows(curve: Sequence[Point]) -> list[list[float]]:
-    """Seconds, renders, PSNR, Gaussians."""
-    return [[round(p.seconds, 3), p.renders, round(p.psnr, 3), p.gaussians] for p in curve]
+    """Seconds, renders, PSNR, Gaussians, and where there is truth PSNR 3 m beside the path."""
+    return [
+        [round(p.seconds, 3), p.renders, round(p.psnr, 3), p.gaussians]
+        + ([] if p.beside is None else [round(p.beside, 3)])
+        for p in curve
+    ]
 
 
 def variants(method: str) -> dict[str, GnetConfig]:
@@ -85,6 +89,12 @@ def stability_row(task: Task, config: GnetConfig) -> Row:
             losses[times] = objective(moment.frame, moment.state.offsets, task.source, 0, torch.Generator()).loss
             psnrs[times] = task.psnr(moment.scene)
     return {"iterations": total, "loss": losses, "heldout_psnr": psnrs, "ratio": losses[str(PAST)] / losses["1"]}
+
+
+def place(row: Row) -> str:
+    """The log's short name with chunk and order."""
+    name = f"{row['log'].split('/')[-1].removeprefix('synthetic:')} chunk {row['chunk']}"
+    return f"{name} order {row['order']}" if "order" in row else name
 
 
 @contextmanager

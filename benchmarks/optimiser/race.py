@@ -23,7 +23,8 @@ from genre_tasks.optimiser.rules import StepRule
 from genre_tasks.optimiser.run import step_rule
 from genre_tasks.optimiser.sampler import ViewSampler
 from genre_tasks.optimiser.state import Frame, State
-from genre_tasks.optimiser.unroll import camera_centre, moved_scene
+from genre_tasks.optimiser.targets import Target
+from genre_tasks.optimiser.unroll import Plan, camera_centre, moved_scene
 from genre_tasks.scene.graph import SceneGraph
 
 LOOK_FACTOR = 1.25
@@ -49,35 +50,36 @@ class Moment:
 
 @dataclass(frozen=True)
 class Point:
-    """One point of a curve."""
+    """One point of a curve; ``beside``: PSNR 3 m beside the path, where there is truth."""
 
     seconds: float
     renders: int
     psnr: float
     gaussians: int
+    beside: float | None = None
 
 
 def walk(
-    make: Callable[[], StepRule], task: Task, objective: Objective, views: int, seed: int, total: int
+    make: Callable[[], tuple[StepRule, Objective]], task: Task, plan: Plan, novel: Sequence[Target] = ()
 ) -> Iterator[Moment]:
-    """``genre_tasks.optimiser.unroll.unroll`` step by step and without end; ``total`` is the T that the rule is told.
+    """``genre_tasks.optimiser.unroll.unroll`` step by step and without end; the plan's T is what the rule is told.
 
-    ``make`` loads the rule: its time counts.
+    ``make`` loads the rule and what its objective needs: its time counts.
     """
     began = time.perf_counter()
-    rule = make()
-    generator = torch.Generator().manual_seed(seed)
-    sampler = ViewSampler(task.source, views, generator)
+    rule, objective = make()
+    generator = torch.Generator().manual_seed(plan.seed)
+    samplers = ViewSampler(task.source, plan.views, generator), ViewSampler(novel, plan.novel_views, generator)
     frame, state = Frame.of(task.scene), State.start(len(task.scene), task.scene.gaussians.means)
     step = rule.start(frame, camera_centre(task.source))
     seconds, renders = time.perf_counter() - began, 0
     for i in itertools.count():
         began = time.perf_counter()
-        batch = sampler.draw()
+        batch = [target for sampler in samplers for target in sampler.draw()]
         sight = objective(frame, state.offsets, batch, i, generator)
         check_finite(sight.gradient, "gradient", "bench")
         state = state.saw(sight.gradient)
-        state = state.moved(frame, step(state, sight.gradient, total))
+        state = state.moved(frame, step(state, sight.gradient, plan.iterations))
         check_finite(state.offsets, "updated Gaussians", "bench")
         renders += len(batch)
         seconds += time.perf_counter() - began
@@ -86,18 +88,18 @@ def walk(
 
 def configured(task: Task, config: GnetConfig, seed: int) -> Iterator[Moment]:
     """The stage's own rule, loss, views and T, without its perceptual term: the preset has none."""
-    objective = Objective(config.loss)
-    return walk(lambda: step_rule("gnet", config), task, objective, config.views_per_iteration, seed, config.iterations)
+    plan = Plan(config.iterations, config.views_per_iteration, seed=seed)
+    return walk(lambda: (step_rule("gnet", config), Objective(config.loss)), task, plan)
 
 
 def learned(task: Task, config: GnetConfig, seed: int) -> list[Point]:
     """GNet to its end, judged at each quarter of its way."""
     quarters = {round(config.iterations * k / 4) for k in (1, 2, 3, 4)}
     steps = configured(task, config, seed)
-    out = [_start(task)]
+    out = [start(task)]
     for moment in itertools.islice(steps, config.iterations):
         if moment.iteration in quarters:
-            out.append(_point(task, moment.seconds, moment.renders, moment.scene))
+            out.append(point(task, moment.seconds, moment.renders, moment.scene))
     return out
 
 
@@ -108,13 +110,13 @@ def adam(task: Task, config: GnetConfig, seed: int, goal: Point, cap_s: float) -
     """
     steps = configured(task, config, seed)
     length = config.iterations if config.adam.schedule == "cosine" else None
-    due, out = looks(goal.seconds, cap_s), [_start(task)]
+    due, out = looks(goal.seconds, cap_s), [start(task)]
     for moment in itertools.islice(steps, length):
         equal = out[-1].renders < goal.renders <= moment.renders
         capped = out[-1].seconds < cap_s <= moment.seconds
         passed = bool(due) and due[0] <= moment.seconds
         if passed or equal or capped or moment.iteration == length:
-            out.append(_point(task, moment.seconds, moment.renders, moment.scene))
+            out.append(point(task, moment.seconds, moment.renders, moment.scene))
             due = [s for s in due if s > moment.seconds]
         if out[-1].renders >= goal.renders and (moment.seconds >= cap_s or _best(out) >= goal.psnr):
             break
@@ -124,12 +126,12 @@ def adam(task: Task, config: GnetConfig, seed: int, goal: Point, cap_s: float) -
 def per_scene(task: Task, config: GnetConfig, seed: int, goal: Point, cap_s: float) -> list[Point]:
     """Per-scene 3DGS until it has reached the goal's PSNR, or to its end, or the cap. One view a step."""
     began = time.perf_counter()
-    start = task.scene if config.method == "street_gs" else world_static(task.scene)
-    training = PerSceneTraining(config.per_scene, start, task.source, seed)
+    scene = task.scene if config.method == "street_gs" else world_static(task.scene)
+    training = PerSceneTraining(config.per_scene, scene, task.source, seed)
     training.seconds = time.perf_counter() - began
-    out = [_point(task, 0.0, 0, start)]
+    out = [point(task, 0.0, 0, scene)]
     for s in snapshots(training, seconds=looks(goal.seconds, cap_s), budget_s=cap_s):
-        out.append(_point(task, s.seconds, s.iteration, s.scene))
+        out.append(point(task, s.seconds, s.iteration, s.scene))
         if out[-1].psnr >= goal.psnr:
             break
     return out
@@ -159,9 +161,11 @@ def _best(points: Sequence[Point]) -> float:
     return max(p.psnr for p in points)
 
 
-def _start(task: Task) -> Point:
-    return _point(task, 0.0, 0, task.scene)
+def start(task: Task) -> Point:
+    """Before the first step."""
+    return point(task, 0.0, 0, task.scene)
 
 
-def _point(task: Task, seconds: float, renders: int, scene: SceneGraph) -> Point:
-    return Point(seconds, renders, task.psnr(scene), len(scene))
+def point(task: Task, seconds: float, renders: int, scene: SceneGraph) -> Point:
+    """The scene judged; the clock stands meanwhile."""
+    return Point(seconds, renders, task.psnr(scene), len(scene), task.psnr_beside(scene))

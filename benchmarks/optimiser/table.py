@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 from benchmarks.bench import Row
-from benchmarks.optimiser.summary import place
+from benchmarks.optimiser import beyond
+from benchmarks.optimiser.cells import place
 
 
 def markdown(rows: Mapping[str, Row]) -> Iterator[str]:
-    """A line for each race and variant, GNet before each race; the network; stability; what was not measured."""
+    """A line for each race and variant, GNet before each race; the network; what lies beyond; what is not measured."""
     yield "| log | method | seconds | renders | best PSNR | at equal renders | reached GNet's PSNR after | × GNet |"
     yield "|---|---|---|---|---|---|---|---|"
     for row in (r for r in rows.values() if "variants" in r):
@@ -25,6 +26,10 @@ def markdown(rows: Mapping[str, Row]) -> Iterator[str]:
         fit = network["fit"]
         line = f"{fit['seconds']:.3f} s + {fit['us_per_gaussian']:.2f} µs a Gaussian"
         yield f"| a line through them | {line} (R² {fit['r2']:.4f}) | | |"
+    for rows_of, kind in ((_converged, "converged"), (_distillation, "distillation"), (_enhancement, "enhancement")):
+        if found := beyond.of_kind(rows, kind):
+            yield ""
+            yield from rows_of(found)
     for name, row in rows.items():
         if "ratio" in row:
             losses = ", ".join(f"{k} T: {v:.5f}" for k, v in row["loss"].items())
@@ -44,3 +49,50 @@ def _race(row: Row) -> Iterator[str]:
             when, times = f"{v['reached_s']:.1f} s", f"{v['reached_s'] / g['seconds']:.2f}"
         cells = (f"{v['ended_s']:.1f}", v["renders"], f"{v['best_psnr']:.2f}", "" if equal is None else f"{equal:.2f}")
         yield f"| | {row['method']} {name} | " + " | ".join(map(str, cells)) + f" | {when} | {times} |"
+
+
+def _converged(rows: Sequence[Row]) -> Iterator[str]:
+    yield "| log | GNet, preset long: best PSNR | Adam converged | GNet within 0.2 dB after | Adam after | ratio |"
+    yield "|---|---|---|---|---|---|"
+    for row in rows:
+        reached = row["gnet"]["reached_s"]
+        own = f"{row['gnet']['best_psnr']:.2f} in {row['gnet']['seconds']:.1f} s"
+        when = ("never", "") if reached is None else (f"{reached:.1f} s", f"{beyond.times_adam(row):.2f}")
+        yield f"| {place(row)} | {own} | {row['plateau']:.2f} | {when[0]} | {row['adam_s']:.1f} s | {when[1]} |"
+
+
+def _distillation(rows: Sequence[Row]) -> Iterator[str]:
+    yield "| log | from GNet's scene | seconds | kernel at 3 m | PSNR at 3 m | held-out PSNR | ENet's time over its |"
+    yield "|---|---|---|---|---|---|---|"
+    for row in rows:
+        yield f"| {place(row)} | as it is | " + " | ".join(_mark(row["start"])) + " | |"
+        yield "| | ENet | " + " | ".join(_mark(row["enet"])) + " | |"
+        for family in ("adam", "standard"):
+            found = row[family]
+            times = f"{beyond.times_distillation(row, family):.2f}" if found["enet_as_good"] else "no"
+            yield f"| | {family}, at its best | " + " | ".join(_mark(found["best"])) + f" | {times} |"
+            seconds = found["reached_s"]
+            yield f"| | {family}, first as good as that | {seconds:.1f} | | | | |"
+
+
+def _mark(mark: Sequence[float | None]) -> tuple[str, ...]:
+    seconds, _, kernel, beside, heldout = mark
+    return f"{seconds:.1f}", f"{kernel:.4f}", "" if beside is None else f"{beside:.2f}", f"{heldout:.2f}"
+
+
+def _enhancement(rows: Sequence[Row]) -> Iterator[str]:
+    yield "| log | scene | held-out PSNR | " + " | ".join(f"at {s} m" for s in beyond.SHIFTS) + " |"
+    yield "|---|---|---|" + "---|" * len(beyond.SHIFTS)
+    names = {"gnet": "GNet", "enet": "GNet→FNet→ENet", "gnet_again": "GNet→FNet→GNet"}
+    for row in rows:
+        for scene, name in names.items():
+            cells = " | ".join(_at(row["shifts"][s][scene]) for s in beyond.SHIFTS)
+            yield f"| {place(row) if scene == 'gnet' else ''} | {name} | {row['heldout_psnr'][scene]:.2f} | {cells} |"
+
+
+def _at(found: Mapping[str, float]) -> str:
+    """PSNR and perceptual distance, or kernel distance and the interval of its difference to GNet's."""
+    if "kernel" not in found:
+        return f"{found['psnr']:.2f} dB, {found['perceptual']:.3f}"
+    interval = f" ({found['low']:+.4f} to {found['high']:+.4f})" if "low" in found else ""
+    return f"{found['kernel']:.4f}{interval}"

@@ -1,13 +1,15 @@
-"""What every method is given: one chunk's initial scene, its source views, and views held out to judge by."""
+"""What every method is given: one chunk's initial scene, its source views, and views to judge by that none sees."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 from benchmarks.bench import NotMeasuredError
 from benchmarks.main_job import reconstruct
+from benchmarks.optimiser.beside import true_targets
 from flows.configuration import load_configuration
 from flows.produce import ArtifactRef, Job
 from flows.train.optimiser import psnr
@@ -18,38 +20,57 @@ from storage.local import open_store
 
 HELDOUT_VIEWS = 12
 """So many held-out views judge, spread evenly: a curve has some twenty points."""
+SIDE_M = 3.0
+"""Where curves are judged beside the path: where the fixer works."""
 
 
 @dataclass(frozen=True)
 class Task:
     """A scene in memory, with its targets decoded: the clock starts here.
 
-    ``source``: with LiDAR depth, which per-scene 3DGS does not look at.
+    ``source``: with LiDAR depth, which per-scene 3DGS does not look at. ``beside``: ray-cast at ±3 m; none on a real
+    log.
     """
 
     scene: SceneGraph
     source: tuple[Target, ...]
     heldout: tuple[Target, ...]
+    beside: tuple[Target, ...] = ()
 
     def psnr(self, scene: SceneGraph) -> float:
         """Mean over the held-out views, dB."""
         return psnr(scene, self.heldout)
 
+    def psnr_beside(self, scene: SceneGraph) -> float | None:
+        """Mean over the views at ±3 m, dB; ``None`` where there is no truth."""
+        return psnr(scene, self.beside) if self.beside else None
+
 
 @lru_cache(maxsize=1)
 def task_of(log: str, chunk: int, store: str) -> Task:
     """The preset ``small`` up to the initial scene, from and into a store. Raises ``NotMeasuredError`` without data."""
+    job = job_of(log, chunk, store)
+    refs = reconstruct(job, ("ingest", "initial"))
+    read, initial = value_of(job, refs["ingest"]), value_of(job, refs["initial"])
+    heldout = of_views(read, spread(read.of_role("heldout"), HELDOUT_VIEWS))
+    beside = true_targets(log, store, read, SIDE_M)
+    return Task(initial.scene, of_source(read, depth=True), heldout, beside)
+
+
+def job_of(log: str, chunk: int, store: str, order: int | None = None) -> Job:
+    """The preset ``small``, with ``order`` as the seed of GNet's and ENet's views and without snapshots.
+
+    Raises ``NotMeasuredError`` where the log's folder is missing.
+    """
     reader, _, path = log.partition(":")
     if reader == "pandaset" and not Path(path).is_dir():
         raise NotMeasuredError(f"there is no folder {path}; give it with --set pandaset=PATH")
-    job = Job(log, chunk, store, load_configuration("small").model_dump(mode="json"))
-    refs = reconstruct(job, ("ingest", "initial"))
-    read, initial = _value(job, refs["ingest"]), _value(job, refs["initial"])
-    heldout = of_views(read, spread(read.of_role("heldout"), HELDOUT_VIEWS))
-    return Task(initial.scene, of_source(read, depth=True), heldout)
+    seeds = [] if order is None else [f"{s}.{k}" for s in ("gnet", "enet") for k in (f"seed={order}", "snapshots=0")]
+    return Job(log, chunk, store, load_configuration("small", settings=seeds).model_dump(mode="json"))
 
 
-def _value(job: Job, ref: ArtifactRef):  # type: ignore[no-untyped-def]  # of the artifact's kind
+def value_of(job: Job, ref: ArtifactRef) -> Any:
+    """The artifact's value, read back from the store."""
     store = open_store(job.store)
     (artifact,) = store.artifacts(key=ref.key, chunk=job.chunk)
     return store.read(artifact)

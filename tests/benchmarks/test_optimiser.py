@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,24 +12,35 @@ import torch
 
 from benchmarks import run
 from benchmarks.bench import NotMeasuredError
-from benchmarks.optimiser import BENCH, cells, race, summary
+from benchmarks.optimiser import BENCH, beyond, cells, converged, distillation, enhancement, race, summary
+from benchmarks.optimiser.distillation import Judge, Mark
 from benchmarks.optimiser.network import measure_network, scene_of
-from benchmarks.optimiser.picture import draw
+from benchmarks.optimiser.picture import draw, draw_network
 from benchmarks.optimiser.race import Point
-from benchmarks.optimiser.task import Task
+from benchmarks.optimiser.steps import images_of
+from benchmarks.optimiser.task import Task, psnr
 from benchmarks.schema import Result
-from genre_tasks.config import AdamConfig, GnetConfig, LossConfig, PerSceneConfig
+from flows.configuration import load_configuration
+from genre_tasks.config import AdamConfig, GnetConfig, LossConfig, OptimiserConfig, PerSceneConfig
+from genre_tasks.errors import ConfigError
+from genre_tasks.metrics.collect import FeatureSet
+from genre_tasks.metrics.perceptual import perceptual_distance
 from genre_tasks.optimiser.adam import TunedAdam
 from genre_tasks.optimiser.learned import LearnedOptimiser
 from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.unroll import Plan, unroll
 from genre_tasks.scene.graph import DISTANT
+from genre_tasks.scene.views import NovelView
 from tests.optimiser import street
 
 LOSS = LossConfig(perceptual=0.0)
 ADAM = GnetConfig(method="adam", iterations=6, views_per_iteration=2, loss=LOSS)
 NEVER = Point(0.05, 8, 99.0, 300)
 """A goal that nobody reaches."""
+
+
+def learned(iterations: int) -> GnetConfig:
+    return GnetConfig(iterations=iterations, views_per_iteration=4, loss=LOSS)
 
 
 @pytest.fixture(scope="module")
@@ -39,11 +51,11 @@ def task() -> Task:
 
 
 def test_walking_is_unrolling(task: Task) -> None:
-    objective = Objective(LOSS)
-    expected = unroll(TunedAdam(), task.scene, task.source, (), objective, Plan(5, 2, seed=3))
-    moments = list(itertools.islice(race.walk(TunedAdam, task, objective, 2, 3, 5), 5))
+    plan, novel, objective = Plan(5, 2, 1, seed=3), street.targets(street.scene(), novel=True), Objective(LOSS)
+    expected = unroll(TunedAdam(), task.scene, task.source, novel, objective, plan)
+    moments = list(itertools.islice(race.walk(lambda: (TunedAdam(), objective), task, plan, novel), 5))
     assert torch.equal(moments[-1].scene.gaussians.packed(), expected.scene.gaussians.packed())
-    assert [m.renders for m in moments] == [2, 4, 6, 8, 10]
+    assert [m.renders for m in moments] == [3, 6, 9, 12, 15]
     assert all(a.seconds < b.seconds for a, b in itertools.pairwise(moments))
 
 
@@ -51,11 +63,11 @@ def test_loading_counts_and_judging_does_not(task: Task, monkeypatch: pytest.Mon
     now = [0.0]
     monkeypatch.setattr(race.time, "perf_counter", lambda: now[0])
 
-    def load() -> TunedAdam:
+    def load() -> tuple[TunedAdam, Objective]:
         now[0] += 7.0
-        return TunedAdam()
+        return TunedAdam(), Objective(LOSS)
 
-    steps = race.walk(load, task, Objective(LOSS), 2, 0, 5)
+    steps = race.walk(load, task, Plan(5, 2))
     first = next(steps)
     now[0] += 100.0
     assert (first.seconds, next(steps).seconds) == (7.0, 7.0)
@@ -71,12 +83,14 @@ def test_a_curve_is_read_between_its_points() -> None:
     assert race.looks(4.0, 2.0) == pytest.approx([1.0, 1.25, 1.5625, 1.953125])
 
 
-def test_adam_stops_at_its_goal_its_length_or_the_cap(task: Task) -> None:
+def test_adam_stops_at_its_goal_its_length_or_the_cap(task: Task, monkeypatch: pytest.MonkeyPatch) -> None:
     easy = Point(0.05, 8, task.psnr(task.scene) + 0.05, 300)
     early = race.adam(task, ADAM, 0, easy, 60.0)
     assert race.reached(early, easy.psnr) is not None and early[-1].renders >= 8
     assert race.adam(task, ADAM, 0, NEVER, 60.0)[-1].renders == 12  # the cosine ends with its length
     endless = ADAM.model_copy(update={"adam": AdamConfig(schedule="constant")})
+    ticks = itertools.count()
+    monkeypatch.setattr(race.time, "perf_counter", lambda: 0.01 * next(ticks))  # a step takes a hundredth of a second
     capped = race.adam(task, endless, 0, NEVER, 0.2)
     assert capped[-1].seconds >= 0.2 > capped[-2].seconds and capped[-1].renders > 12
 
@@ -92,8 +106,7 @@ def test_per_scene_training_stops_at_its_goal_its_length_or_the_cap(task: Task, 
 
 
 def test_a_race_says_how_each_variant_ended(task: Task, tmp_path: Path) -> None:
-    gnet = GnetConfig(iterations=4, views_per_iteration=4, loss=LOSS)
-    row = cells.race_row(task, gnet, {"short": ADAM}, 0, "tuned_adam", 1000.0)
+    row = cells.race_row(task, learned(4), {"short": ADAM}, 0, "tuned_adam", 1000.0)
     assert row["gnet"]["renders"] == 16 and row["gnet"]["curve"][0][:2] == [0.0, 0]
     short = row["variants"]["short"]
     assert short["ended"] in ("reached", "length") and (short["reached_s"] is None) == (short["ended"] == "length")
@@ -104,7 +117,7 @@ def test_a_race_says_how_each_variant_ended(task: Task, tmp_path: Path) -> None:
 
 
 def test_far_past_its_length_the_loss_is_compared_with_that_at_t(task: Task) -> None:
-    row = cells.stability_row(task, GnetConfig(iterations=2, views_per_iteration=4, loss=LOSS))
+    row = cells.stability_row(task, learned(2))
     assert list(row["loss"]) == ["1", "2", "5", "10"]
     assert row["ratio"] == pytest.approx(row["loss"]["10"] / row["loss"]["1"])
 
@@ -142,6 +155,174 @@ def test_claims_take_the_earliest_variant_and_the_cap_where_there_is_none() -> N
     assert claims["optimiser.network_100k"].measured is None
 
 
+def test_a_race_is_judged_beside_the_path_where_there_is_truth(task: Task, tmp_path: Path) -> None:
+    with_truth = replace(task, beside=street.targets(street.scene(), novel=True))
+    row = cells.race_row(with_truth, learned(4), {"short": ADAM}, 0, "tuned_adam", 1000.0)
+    assert all(len(point) == 5 for point in row["gnet"]["curve"] + row["variants"]["short"]["curve"])
+    assert row["gnet"]["curve"][0][4] == pytest.approx(with_truth.psnr_beside(task.scene), abs=1e-3)
+    rows = [{"log": name, "chunk": 0, "order": k, **row} for name, k in (("a", 0), ("a", 1), ("b", 1))]
+    draw(rows, tmp_path / "curves.png")
+    draw_network(measure_network(LearnedOptimiser, (200, 400), 2), tmp_path / "network.png")
+    assert min((tmp_path / f"{name}.png").stat().st_size for name in ("curves", "network")) > 1000
+
+
+def test_tuned_adam_runs_until_it_has_settled(task: Task) -> None:
+    endless = ADAM.model_copy(update={"adam": AdamConfig(schedule="constant")})
+    row = converged.converged_row(task, learned(3), {"cosine": ADAM, "endless": endless}, 0)
+    assert row["adam"]["cosine"]["renders"] == 12 and row["adam"]["endless"]["renders"] <= 12
+    assert row["plateau"] == max(v["best_psnr"] for v in row["adam"].values())
+    assert row["goal"] == pytest.approx(row["plateau"] - 0.2)
+    assert row["adam_s"] == min(v["reached_s"] for v in row["adam"].values() if v["reached_s"] is not None)
+    own = row["gnet"]
+    assert (own["reached_s"] is None) == (own["best_psnr"] < row["goal"])
+    rising = [Point(float(t), t, 20.0 + t, 1) for t in range(10)]
+    assert not converged.settled(rising)
+    assert converged.settled([*rising, Point(15.0, 15, 29.04, 1)]) and not converged.settled(rising[:1])
+
+
+def test_long_variants_are_constant_or_of_many_renders() -> None:
+    short, long = ADAM, ADAM.model_copy(update={"iterations": 480})
+    constant = ADAM.model_copy(update={"adam": AdamConfig(schedule="constant")})
+    assert list(converged.long_variants({"short": short, "long": long, "constant": constant})) == ["long", "constant"]
+
+
+def test_the_long_preset_is_small_with_a_longer_gnet() -> None:
+    small, long = (load_configuration(name).model_dump() for name in ("small", "long"))
+    longer = {"iterations", "views_per_iteration"}
+    assert {k for k in small["gnet"] if small["gnet"][k] != long["gnet"][k]} <= longer
+    assert {k for k in small if small[k] != long[k]} == {"gnet"}
+    assert long["gnet"]["iterations"] > small["gnet"]["iterations"]
+
+
+def _mark(seconds: float, kernel: float, beside: float | None = None) -> Mark:
+    return Mark(seconds, 0, kernel, beside, 25.0)
+
+
+def test_as_good_means_within_a_hundredth_and_a_tenth_of_a_decibel() -> None:
+    best = _mark(4.0, 0.2, 22.0)
+    assert _mark(1.0, 0.2019, 21.91).as_good_as(best)
+    assert not _mark(1.0, 0.2021, 23.0).as_good_as(best) and not _mark(1.0, 0.1, 21.89).as_good_as(best)
+    assert _mark(1.0, 0.2019).as_good_as(_mark(4.0, 0.2))
+    assert not _mark(1.0, -0.11).as_good_as(_mark(1.0, -0.2))  # an unbiased distance may be below zero
+
+
+def test_a_distillation_is_timed_to_its_own_best_and_not_from_its_start() -> None:
+    start, better = _mark(0.0, 0.40, 21.0), _mark(2.0, 0.30, 22.0)
+    runs = {"a": [start, better, _mark(4.0, 0.20, 22.0), _mark(8.0, 0.25, 22.0)], "b": [start, _mark(9.0, 0.2, 22.0)]}
+    found = distillation.family(runs, _mark(1.0, 0.201, 21.95))
+    assert found["best"][2] == 0.2 and found["enet_as_good"]
+    assert found["reached_s"] == pytest.approx(2 + 2 * 0.098 / 0.1)  # at 0.202 between the second and third mark
+    assert not distillation.family(runs, _mark(1.0, 0.201, 21.8))["enet_as_good"]
+    useless = distillation.family({"a": [start, _mark(3.0, 0.5, 20.0)]}, _mark(1.0, 0.4, 21.0))
+    assert useless["reached_s"] == 3.0 and useless["best"][2] == 0.5 and useless["enet_as_good"]
+
+
+def test_enet_beside_distillations_of_the_same_images(task: Task) -> None:
+    novel = street.targets(street.scene(), novel=True)
+    views = tuple(NovelView(t.camera, t.frame, 3.0, t.chunk_SE3_camera, t.lens, ("c0", 0)) for t in novel)
+    features = perceptual_distance().pooled_features(images_of(street.scene(), task.source))
+    judge = Judge(views, FeatureSet(features, (0, 0, 1, 1)), replace(task, beside=novel))
+    enet = OptimiserConfig(
+        iterations=2, views_per_iteration=2, novel_views_per_iteration=2, loss=LossConfig(perceptual=0.1)
+    )
+    row = distillation.distillation_row(enet, PerSceneConfig(iterations=6), judge, novel)
+    assert row["enet"][1] == 8 and row["enet"][0] > 0
+    assert list(row["adam"]["curves"]) == ["2+2", "1+1"] and list(row["standard"]["curves"]) == ["6"]
+    for family in ("adam", "standard"):
+        assert all(curve[0] == row["start"] for curve in row[family]["curves"].values())
+        assert row[family]["reached_s"] > 0
+        assert row[family]["best"][2] == min(m[2] for c in row[family]["curves"].values() for m in c[1:])
+
+
+def test_scenes_are_compared_with_the_truth_or_as_sets(task: Task) -> None:
+    truth = street.scene()
+    scenes = {"gnet": task.scene, "enet": truth, "gnet_again": task.scene}
+    novel = street.targets(truth, novel=True)
+    found = enhancement.against_truth(scenes, novel)
+    assert found["enet"]["perceptual"] < 1e-6 < found["gnet"]["perceptual"] == found["gnet_again"]["perceptual"]
+    assert found["enet"]["psnr"] > found["gnet"]["psnr"] == pytest.approx(psnr(task.scene, novel), abs=1e-4)
+    views = tuple(NovelView(t.camera, t.frame, 3.0, t.chunk_SE3_camera, t.lens, ("c0", 0)) for t in novel)
+    real = FeatureSet(perceptual_distance().pooled_features(images_of(truth, novel)), (0, 0, 1, 1))
+    sets = enhancement.as_sets(scenes, views, real)
+    assert sets["enet"]["difference"] == pytest.approx(sets["enet"]["kernel"] - sets["gnet"]["kernel"], abs=1e-9)
+    assert sets["gnet_again"]["difference"] == pytest.approx(0.0, abs=1e-12) and "low" not in sets["gnet"]
+
+
+def test_gnets_network_enhances_with_its_own_length_and_weights() -> None:
+    config = load_configuration("small")
+    own = enhancement.as_enhancer(config)
+    assert (own.iterations, own.loss) == (config.gnet.iterations, config.enet.loss)
+    assert Path(own.weights).name == "gnet.safetensors" and own.novel_views_per_iteration == own.views_per_iteration
+
+
+def _at(psnr: float, perceptual: float) -> dict[str, float]:
+    return {"psnr": psnr, "perceptual": perceptual}
+
+
+def _enhanced(order: int, enet: dict[str, float], loss: float = 0.0) -> dict[str, Any]:
+    at = {"gnet": _at(22.0, 0.8), "enet": enet, "gnet_again": _at(22.0, 0.76)}
+    where = {"log": "synthetic:street?seed=900", "chunk": 0, "order": order}
+    shifts = dict.fromkeys(beyond.SHIFTS, at)
+    return where | {"shifts": shifts, "heldout_psnr": {"gnet": 26.0, "enet": 26.0 - loss, "gnet_again": 26.0}}
+
+
+def test_enhancement_must_be_better_in_all_that_is_measured_in_every_cell() -> None:
+    rows = {f"enhancement/{k}": _enhanced(k, _at(22.1, 0.72), 0.2) for k in range(3)}
+    claims = {c.id.removeprefix("optimiser."): c for c in summary.claims(rows)}
+    assert all(claims[f"enhance_{s}m"].holds and claims[f"enhance_{s}m"].n == 3 for s in beyond.SHIFTS)
+    versus = claims["enet_vs_gnet"]
+    assert versus.measured == pytest.approx(0.05) and versus.holds  # 10 % less against 5 % less
+    assert claims["interpolation"].measured == pytest.approx(-0.2) and claims["interpolation"].holds
+
+    rows["enhancement/3"] = _enhanced(3, _at(21.9, 0.72), 0.4)  # nearer as seen, farther in PSNR
+    claims = {c.id.removeprefix("optimiser."): c for c in summary.claims(rows)}
+    assert claims["enhance_2m"].measured == 0.75 and not claims["enhance_2m"].holds
+    assert "not in: street?seed=900 chunk 0 order 3" in claims["enhance_2m"].data
+    assert claims["interpolation"].measured == pytest.approx(-0.4) and not claims["interpolation"].holds
+
+
+@pytest.mark.parametrize(("high", "better"), [(-0.001, True), (0.001, False), (None, False)])
+def test_on_a_real_log_the_interval_decides(high: float | None, better: bool) -> None:
+    at = {"gnet": {"kernel": 0.3}, "enet": {"kernel": 0.28, "difference": -0.02, "low": -0.04, "high": high}}
+    assert beyond.better({"shifts": {"3": at}}, "3") is better
+
+
+def _converged(reached_s: float | None) -> dict[str, Any]:
+    gnet = {"reached_s": reached_s, "best_psnr": 27.5, "seconds": 9.0}
+    where = {"log": "pandaset:002", "chunk": 0, "order": 0, "cap": 50.0}
+    return where | {"gnet": gnet, "adam_s": 20.0, "plateau": 28.0}
+
+
+def test_where_gnet_never_converges_the_cap_counts_and_both_plateaus_are_said() -> None:
+    claim = next(c for c in summary.claims({"converged/a": _converged(8.0)}) if c.id == "optimiser.converged")
+    assert (claim.measured, claim.holds) == (0.4, True)
+    rows = {"converged/a": _converged(None), "converged/b": {"not_measured": "no time"}}
+    claim = next(c for c in summary.claims(rows) if c.id == "optimiser.converged")
+    assert (claim.measured, claim.n, claim.holds) == (50.0, 1, False)
+    assert "in 1 of 1 cells" in claim.data and "GNet 27.50 dB, Adam 28.00 dB" in claim.data
+    assert any("never" in line for line in BENCH.table(rows))
+
+
+def test_where_enet_is_not_as_good_the_cap_counts() -> None:
+    best = [9.0, 100, 0.2, None, 25.0]
+    good = {"best": best, "reached_s": 10.0, "enet_as_good": True}
+    bad = good | {"enet_as_good": False}
+    where = {"log": "pandaset:002", "chunk": 0, "order": 0, "cap": 50.0, "start": best, "enet": [4.0, *best[1:]]}
+    rows = {"distillation/a": where | {"adam": good, "standard": bad}}
+    claims = {c.id.removeprefix("optimiser."): c for c in summary.claims(rows)}
+    assert (claims["distillation"].measured, claims["distillation"].holds) == (0.4, True)
+    standard = claims["distillation_standard"]
+    assert (standard.measured, standard.holds) == (50.0, False)
+    assert "in 1 of 1 cells ENet does not reach it" in standard.data
+    assert any("| no |" in line for line in BENCH.table(rows))
+
+
+def test_the_worst_of_the_stable_cells_counts() -> None:
+    rows = {f"stability/{k}": {"log": "a", "chunk": k, "ratio": 1.0 + 0.015 * k} for k in range(3)}
+    claim = next(c for c in summary.claims(rows) if c.id == "optimiser.stable_10x")
+    assert (claim.measured, claim.holds) == (1.03, False)
+
+
 def test_what_is_not_measured_does_not_count() -> None:
     rows = {cell.name: {"not_measured": "no time"} for cell in BENCH.cells(BENCH.options, quick=False)}
     assert not any(c.holds or c.n for c in BENCH.claims(rows))
@@ -149,9 +330,15 @@ def test_what_is_not_measured_does_not_count() -> None:
 
 
 def test_options_choose_cells_and_a_quick_run_ends_in_time() -> None:
-    names = [c.name for c in BENCH.cells({**BENCH.options, "seeds": "900", "orders": "2", "pandaset": ""}, False)]
-    races = [f"synthetic:street?seed=900 chunk 0 order 2 {m}" for m in cells.METHODS]
-    assert names == ["network", *races, "stability/synthetic:street?seed=900 chunk 0"]
+    given = {**BENCH.options, "seeds": "900", "orders": "2", "pandaset": ""}
+    log = "synthetic:street?seed=900 chunk 0"
+    races = [f"{log} order 2 {m}" for m in cells.METHODS]
+    parts = [f"{part}/{log} order 2" for part in ("enhancement", "distillation", "converged")]
+    assert [c.name for c in BENCH.cells(given, False)] == ["network", *races, *parts, f"stability/{log}"]
+    few = given | {"parts": "enhancement,converged", "long_orders": "0"}
+    assert [c.name for c in BENCH.cells(few, False)] == ["network", parts[0]]
+    with pytest.raises(ConfigError, match=r"no part.*races"):
+        BENCH.cells(given | {"parts": "races"}, False)
     quick, full = (BENCH.cells(BENCH.options, q) for q in (True, False))
     assert sum(c.seconds for c in quick) <= run.QUICK_S < sum(c.seconds for c in full)
     assert len({c.name for c in full}) == len(full)

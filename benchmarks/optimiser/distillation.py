@@ -1,0 +1,196 @@
+"""ENet beside per-scene distillation of the same fixed images, from the same scene: GNet's.
+
+Judged at 3 m, at views that neither is given: the kernel distance to the chunk's real images and, on synthetic logs,
+the PSNR against ray-cast truth.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from benchmarks.bench import Row
+from benchmarks.optimiser import race
+from benchmarks.optimiser.beside import true_targets, views_at
+from benchmarks.optimiser.cells import threads
+from benchmarks.optimiser.steps import images_of, steps_of
+from benchmarks.optimiser.task import HELDOUT_VIEWS, SIDE_M, Task
+from flows.train.scenes import spread
+from genre_tasks.config import AdamConfig, OptimiserConfig, PerSceneConfig
+from genre_tasks.metrics.collect import FeatureSet, real_images
+from genre_tasks.metrics.distribution import kernel_distance
+from genre_tasks.metrics.perceptual import perceptual_distance
+from genre_tasks.optimiser.adam import ENET_RATES
+from genre_tasks.optimiser.objective import Objective
+from genre_tasks.optimiser.per_scene import PerSceneTraining
+from genre_tasks.optimiser.per_scene_run import snapshots
+from genre_tasks.optimiser.run import distance, step_rule
+from genre_tasks.optimiser.targets import Target
+from genre_tasks.optimiser.unroll import Plan
+from genre_tasks.scene.graph import SceneGraph
+from genre_tasks.scene.views import NovelView
+
+KERNEL_VIEWS = 48
+"""Of the views at ±3 m, spread evenly over sides, frames and cameras: an unbiased distance at any number."""
+KERNEL_PART, PSNR_DB = 0.01, 0.1
+"""As good as: the kernel distance at most this part above, the PSNR at most so much below."""
+MOST_TIMES = 8.0
+"""Tuned Adam distils for at most so many times ENet's seconds."""
+SETTLED_FACTOR = 2.0
+"""Tuned Adam has settled where its time grew by this factor since it was last better by ``KERNEL_PART``."""
+ADAM_VIEWS = ((15, 1.0), (3, 0.5), (1, 0.25))
+"""Views of each kind in an iteration, and the part of the rates that the baseline has at ENet's T."""
+STANDARD_ITERATIONS = 1500
+"""One view each: every source and every fixed view some thirty times. All schedules of the recipe scale with it."""
+LOOK_UNTIL_S = 1e5
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Looks at a scene from 3 m beside the path."""
+
+    views: tuple[NovelView, ...]
+    real: FeatureSet
+    task: Task  # its truth beside the path, its held-out views
+
+    def mark(self, scene: SceneGraph, seconds: float, renders: int) -> Mark:
+        """The scene's quality after so many seconds."""
+        features = perceptual_distance().pooled_features(images_of(scene, self.views))
+        frames = [v.frame for v in self.views]
+        found = kernel_distance(features, self.real.features, frames, self.real.frames, bootstrap=0)
+        assert found is not None
+        return Mark(seconds, renders, found.value, self.task.psnr_beside(scene), self.task.psnr(scene))
+
+
+@dataclass(frozen=True)
+class Mark:
+    """Quality after so many seconds and view renders; ``beside``: PSNR at 3 m, ``None`` on a real log."""
+
+    seconds: float
+    renders: int
+    kernel: float
+    beside: float | None
+    heldout: float
+
+    def lacks(self, other: Mark) -> tuple[float, float]:
+        """How far it is from being as good as the other, in kernel distance and in dB; ≤ 0: it is."""
+        kernel = self.kernel - other.kernel - KERNEL_PART * abs(other.kernel)
+        if self.beside is None or other.beside is None:
+            return kernel, 0.0
+        return kernel, other.beside - PSNR_DB - self.beside
+
+    def as_good_as(self, other: Mark) -> bool:
+        return max(self.lacks(other)) <= 0
+
+    def as_row(self) -> list[float | None]:
+        """Seconds, renders, kernel distance, PSNR at 3 m, held-out PSNR."""
+        beside = None if self.beside is None else round(self.beside, 3)
+        return [round(self.seconds, 3), self.renders, round(self.kernel, 5), beside, round(self.heldout, 3)]
+
+
+Marks = Sequence[Mark]
+
+
+def measure_distillation(log: str, chunk: int, store: str, order: int, cap: float) -> Row:
+    """One cell: ENet, then tuned Adam's variants, then the standard recipe."""
+    with threads():
+        steps = steps_of(log, chunk, store, order, enet=False)
+        heldout = spread(steps.heldout, HELDOUT_VIEWS)
+        task = Task(steps.gnet, steps.source, heldout, true_targets(log, store, steps.chunk, SIDE_M))
+        judge = Judge(views_at(steps.chunk, SIDE_M, KERNEL_VIEWS), real_images(steps.chunk), task)
+        row = distillation_row(steps.config.enet, PerSceneConfig(iterations=STANDARD_ITERATIONS), judge, steps.fixed)
+        return {"log": log, "chunk": chunk, "order": order, "cap": cap} | row
+
+
+def adam_variants(enet: OptimiserConfig) -> dict[str, OptimiserConfig]:
+    """ENet's objective with tuned Adam at constant rates: on as many views an iteration as ENet, and on fewer."""
+    views, novel = enet.views_per_iteration, enet.novel_views_per_iteration
+    out = {}
+    for count, part in ADAM_VIEWS:
+        few = {"views_per_iteration": min(count, views), "novel_views_per_iteration": min(count, novel)}
+        adam = AdamConfig(rates=[part * rate for rate in ENET_RATES], schedule="constant")
+        out[f"{few['views_per_iteration']}+{few['novel_views_per_iteration']}"] = enet.model_copy(
+            update=few | {"method": "adam", "adam": adam}
+        )
+    return out
+
+
+def distillation_row(enet: OptimiserConfig, standard: PerSceneConfig, judge: Judge, fixed: Sequence[Target]) -> Row:
+    """Each family of distillations: the best it came to, when it first was as good as that, whether ENet is."""
+    task = judge.task
+    start = judge.mark(task.scene, 0.0, 0)
+    *_, last = itertools.islice(walked(enet, task, fixed), enet.iterations)
+    own = judge.mark(last.scene, last.seconds, last.renders)
+    budget_s = MOST_TIMES * own.seconds
+    adam = {
+        name: [start, *distilled(walked(config, task, fixed), judge, own.seconds, budget_s)]
+        for name, config in adam_variants(enet).items()
+    }
+    recipe = {str(standard.iterations): [start, *by_recipe(standard, judge, fixed, own.seconds, enet.seed)]}
+    return {
+        "start": start.as_row(),
+        "enet": own.as_row(),
+        "adam": family(adam, own),
+        "standard": family(recipe, own),
+    }
+
+
+def walked(config: OptimiserConfig, task: Task, fixed: Sequence[Target]) -> Iterator[race.Moment]:
+    """The stage enet from the task's scene, without end; loading of networks counts, that for the loss too."""
+    if distance(config) is not None:  # modules are imported here, before the clock starts; weights are loaded again
+        perceptual_distance.cache_clear()
+    views, novel = config.views_per_iteration, config.novel_views_per_iteration
+    plan = Plan(config.iterations, views, novel, seed=config.seed)
+    return race.walk(lambda: (step_rule("enet", config), Objective(config.loss, distance(config))), task, plan, fixed)
+
+
+def distilled(moments: Iterator[race.Moment], judge: Judge, unit_s: float, budget_s: float) -> Iterator[Mark]:
+    """Marks at growing intervals until it has settled, or the budget is spent."""
+    due, best, since = unit_s * race.FIRST_LOOK, math.inf, 0.0
+    for moment in moments:
+        over = moment.seconds >= budget_s
+        if moment.seconds < due and not over:
+            continue
+        mark = judge.mark(moment.scene, moment.seconds, moment.renders)
+        yield mark
+        due = moment.seconds * race.LOOK_FACTOR
+        if mark.kernel < best - KERNEL_PART * abs(best):
+            best, since = mark.kernel, moment.seconds
+        if over or moment.seconds >= max(SETTLED_FACTOR * since, unit_s):
+            return
+
+
+def by_recipe(
+    config: PerSceneConfig, judge: Judge, fixed: Sequence[Target], unit_s: float, seed: int
+) -> Iterator[Mark]:
+    """Marks of the published recipe on source and fixed views to its end; actors stay in their boxes."""
+    training = PerSceneTraining(config, judge.task.scene, [*judge.task.source, *fixed], seed, "enet")
+    due = itertools.takewhile(lambda s: s < LOOK_UNTIL_S, (unit_s * race.LOOK_FACTOR**k for k in itertools.count(-6)))
+    for s in snapshots(training, seconds=list(due)):
+        yield judge.mark(s.scene, s.seconds, s.iteration)
+
+
+def family(runs: Mapping[str, Marks], own: Mark) -> Row:
+    """What the runs came to after their start, all together, and whether ``own`` is as good."""
+    best = min((m for marks in runs.values() for m in marks[1:]), key=lambda m: m.kernel)
+    times = [t for marks in runs.values() if (t := first_as_good(marks, best)) is not None]
+    return {
+        "best": best.as_row(),
+        "reached_s": min(times),
+        "enet_as_good": own.as_good_as(best),
+        "enet_lacks": list(own.lacks(best)),
+        "curves": {name: [m.as_row() for m in marks] for name, marks in runs.items()},
+    }
+
+
+def first_as_good(marks: Marks, best: Mark) -> float | None:
+    """Seconds at which the curve, linear between its marks, first is as good as ``best``; the start does not count."""
+    for before, after in itertools.pairwise(marks):
+        if after.as_good_as(best):
+            if before.as_good_as(best):  # the start was so good already: distillation brought nothing
+                return after.seconds
+            parts = [a / (a - b) if a > 0 else 0.0 for a, b in zip(before.lacks(best), after.lacks(best), strict=True)]
+            return before.seconds + max(parts) * (after.seconds - before.seconds)
+    return None
