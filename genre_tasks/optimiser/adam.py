@@ -8,6 +8,7 @@ from typing import Literal
 
 from torch import Tensor
 
+from genre_tasks.optimiser.fused_library import adam_step, takes
 from genre_tasks.optimiser.rules import Step, rate_vector, schedule
 from genre_tasks.optimiser.state import Frame, State
 
@@ -32,6 +33,8 @@ class TunedAdam:
 
         def step(state: State, gradient: Tensor, total: int) -> Tensor:
             part = schedule(state.iteration, total) if self.decay == "cosine" else 1.0
+            if takes(state.first):
+                return adam_step(state, -rates * part)
             return -rates * part * state.direction()
 
         return step

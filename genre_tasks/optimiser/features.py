@@ -57,9 +57,7 @@ def features(
     usual_row = torch.cat([u.expand(b - a) for u, (a, b) in zip(usual, GROUPS.values(), strict=True)])
     size = torch.log10((deviation / (usual_row + 1e-30)).clamp(1e-4, 1e4)) / 2
     start, offsets = frame.scene.gaussians, state.offsets
-    part = min(state.iteration / total, 1.0)
-    octaves = math.log2(total / USUAL_ITERATIONS)
-    time = offsets.new_tensor([part, (1 - part) ** 2, min(state.iteration, 4) / 4, octaves / 4])
+    time = offsets.new_tensor(times(state.iteration, total))
     columns = [
         state.direction().clamp(-4, 4),
         (gradient / deviation).clamp(-4, 4) / 2,
@@ -75,3 +73,10 @@ def features(
         time.expand(len(offsets), 4),
     ]
     return torch.cat(columns, 1).detach()
+
+
+def times(iteration: int, total: int) -> list[float]:
+    """The last features, the same for all Gaussians: of t / T, of t and of T."""
+    part = min(iteration / total, 1.0)
+    octaves = math.log2(total / USUAL_ITERATIONS)
+    return [part, (1 - part) ** 2, min(iteration, 4) / 4, octaves / 4]

@@ -16,6 +16,8 @@ from torch import Tensor, nn
 from genre_tasks.metrics.threads import map_single_threaded
 from genre_tasks.optimiser.adam import GNET_RATES
 from genre_tasks.optimiser.features import FEATURES, Fixed, features
+from genre_tasks.optimiser.fused import FusedStep
+from genre_tasks.optimiser.fused_library import takes
 from genre_tasks.optimiser.rules import Step, rate_vector, schedule
 from genre_tasks.optimiser.sparse_unet import SparseUNet, VoxelPyramid
 from genre_tasks.optimiser.state import GROUPS, Frame, State
@@ -83,8 +85,13 @@ class LearnedOptimiser(nn.Module):
         return -rates * schedule(state.iteration, total) * learned
 
     def start(self, frame: Frame, centre: Tensor) -> Step:
-        """See :class:`genre_tasks.optimiser.rules.StepRule`. Runs on one thread: the same bytes at any count."""
+        """See :class:`genre_tasks.optimiser.rules.StepRule`. The same bytes at any number of threads.
+
+        float32 on the CPU is the compiled kernel's, with the weights as they are now; all else torch's, on one thread.
+        """
         pyramid, fixed = self.pyramid(frame, centre), Fixed.of(frame, centre)
+        if takes(frame.unit, fixed.columns, *self.parameters()):
+            return FusedStep(self, frame, fixed, pyramid)
 
         def step(state: State, gradient: Tensor, total: int) -> Tensor:
             def one(_: int) -> Tensor:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from genre_tasks.optimiser.network_constants import DEVIATION_FLOOR
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import DISTANT, SceneGraph
 
@@ -14,8 +15,6 @@ GROUPS = {"means": (0, 3), "log_scales": (3, 6), "quats": (6, 10), "logit_opacit
 """Columns of the 14 attributes, in the order of ``Gaussians.packed``."""
 
 FIRST_DECAY, SECOND_DECAY = 0.9, 0.99
-FLOOR = 1e-20
-"""Added to the root of the second moment, so that an attribute without gradient has none, instead of 0/0."""
 
 MIN_UNIT_M, MAX_UNIT_M = 0.005, 50.0
 LOG_SCALE_BOUNDS, DISTANT_LOG_SCALE_BOUNDS = (-8.0, 1.0986), (-8.0, 4.6)
@@ -104,7 +103,7 @@ class State:
 
     def deviation(self) -> Tensor:
         """Root of the unbiased second moment, [N, 14], > 0."""
-        return (self.second / (1 - SECOND_DECAY ** self.seen.clamp_min(1))).sqrt() + FLOOR
+        return (self.second / (1 - SECOND_DECAY ** self.seen.clamp_min(1))).sqrt() + DEVIATION_FLOOR
 
     def direction(self) -> Tensor:
         """Adam's normalised step, [N, 14], of order 1; exactly 0 where nothing has been seen."""

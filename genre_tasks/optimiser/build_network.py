@@ -1,0 +1,23 @@
+"""What the optimiser's CPU kernel is compiled from. Imports no torch: ``setup.py`` runs this file by its path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from genre_tasks.compiled.recipe import Kernel
+
+SOURCES = (
+    "network.cpp", "network_features.h", "network_rows.h", "network_crew.h", "../render/kernel_simd.h",
+    "network_constants.py", "build_network.py",
+)  # fmt: skip
+
+KERNEL = Kernel(
+    title="the optimiser's CPU kernel",
+    stem="network",
+    folder=Path(__file__).resolve().parent,
+    sources=SOURCES,
+    constants_file="network_constants.py",
+    constants=("BLOCK", "DEVIATION_FLOOR", "VARYING"),
+    flags=("-fno-signed-zeros",),
+)
+"""No -freciprocal-math: tuned Adam's step and that of an untrained network are the same bits."""

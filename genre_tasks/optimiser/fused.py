@@ -1,0 +1,85 @@
+"""The learned optimiser's step as one compiled call, for inference on the CPU.
+
+``LearnedOptimiser.delta`` with :func:`genre_tasks.optimiser.features.features` defines the step and is its oracle.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from genre_tasks.optimiser.features import FEATURES, Fixed, times
+from genre_tasks.optimiser.fused_layers import LANES, ByOwner, Layers, Memory, Pairs, padded, round_up
+from genre_tasks.optimiser.fused_library import Network, Scene, learned_step
+from genre_tasks.optimiser.network_constants import BLOCK
+from genre_tasks.optimiser.rules import rate_vector, schedule
+from genre_tasks.optimiser.sparse_unet import VoxelPyramid
+from genre_tasks.optimiser.state import Frame, State
+
+if TYPE_CHECKING:
+    from genre_tasks.optimiser.learned import LearnedOptimiser
+
+
+class FusedStep:
+    """``step(state, gradient, total)`` of one scene, float32 on the CPU, by ``network`` as it is when this is made.
+
+    Runs on ``torch.get_num_threads()`` threads; the bits do not depend on their number.
+    """
+
+    def __init__(self, network: LearnedOptimiser, frame: Frame, fixed: Fixed, pyramid: VoxelPyramid) -> None:
+        self._memory = Memory()
+        self._rates = -rate_vector(network.config.rates)
+        self._count = len(pyramid.voxel_of)
+        hidden = round_up(network.config.hidden, 2 * LANES)
+        self._network = _dense_layers(network, hidden, self._memory)
+        self._scene = _scene(network, hidden, frame, fixed, pyramid, self._memory)
+
+    def __call__(self, state: State, gradient: Tensor, total: int) -> Tensor:
+        """Delta [N, 14]; see :class:`genre_tasks.optimiser.rules.Step`.
+
+        Raises ``ValueError`` for tensors of another scene or not float32 on the CPU, ``ResourceError`` where the kernel
+        is not compiled or memory is short.
+        """
+        if len(gradient) != self._count:
+            raise ValueError(f"expected the gradient of {self._count} Gaussians, got {len(gradient)}")
+        rates, time = self._rates * schedule(state.iteration, total), torch.tensor(times(state.iteration, total))
+        return learned_step(self._network, self._scene, state, gradient, rates, time)
+
+
+def _dense_layers(network: LearnedOptimiser, hidden: int, memory: Memory) -> Network:
+    at, entry, head = memory.address, network.entry, network.head
+    own = network.mix.weight[:, : network.config.hidden].T
+    column = torch.cat([torch.arange(14), LANES + torch.arange(14)])  # gains and offsets have a row of lanes each
+    weight, bias = torch.zeros(hidden, 2 * LANES), torch.zeros(2 * LANES)
+    weight[: head.in_features, column], bias[column] = head.weight.detach().T, head.bias.detach()
+    return Network(
+        hidden, at(padded(entry.weight.T, FEATURES, hidden)), at(padded(entry.bias, hidden)),
+        at(padded(own, hidden, hidden)), at(weight), at(bias),
+    )  # fmt: skip
+
+
+def _scene(
+    network: LearnedOptimiser, hidden: int, frame: Frame, fixed: Fixed, pyramid: VoxelPyramid, memory: Memory
+) -> Scene:
+    """What the mixing layer takes from around is the same for all Gaussians of a voxel: it is a layer of voxels."""
+    voxels, layers, at = len(pyramid.counts), Layers(memory), memory.address
+    pooled, own = torch.zeros(voxels, hidden), torch.zeros(round_up(len(pyramid.voxel_of), BLOCK), hidden)
+    around = network.mix.weight[:, network.config.hidden :].T[None]
+    out = layers.add(
+        layers.unet(network.unet, pooled, pyramid), around, network.mix.bias, Pairs.identity(voxels),
+        multiple=2 * LANES, activated=False,
+    )  # fmt: skip
+    points, program = ByOwner.of(pyramid.voxel_of, voxels), layers.program()
+    return Scene(
+        voxels, at(_base(frame)), at(fixed.columns), at(pyramid.voxel_of.int()), at(points.starts), at(points.order),
+        at(own), at(pooled), at(out), program, len(program),
+    )  # fmt: skip
+
+
+def _base(frame: Frame) -> Tensor:
+    """What offsets are added to in the features, [N, 14]."""
+    g = frame.scene.gaussians
+    start = [torch.zeros_like(g.means), g.log_scales - frame.unit.log(), g.quats, g.logit_opacities[:, None]]
+    return torch.cat([*start, g.colors - 0.5], 1)

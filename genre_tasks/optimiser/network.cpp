@@ -1,0 +1,153 @@
+// The learned optimiser's step in one call: features, a dense layer for each Gaussian, the UNet over voxels, the head. The
+// torch code in learned.py, features.py and sparse_unet.py is its oracle. Every number is made by one thread, in an order
+// that does not depend on how many there are.
+#include "../compiled/calls.h"
+#include "network_crew.h"
+#include "network_features.h"
+
+// The structures hold pointers and 64-bit numbers only, in the order of fused_library.py.
+
+// output[o] = residual[o] + silu(bias + sum over the pairs (i, k) of o: input[i] @ weight[k]).
+struct Layer {
+  const float *input, *weight, *bias;  // weight [K, in, out], bias [out]; channels are multiples of LANES
+  const float* residual;               // or null
+  float* output;                       // [outputs, out]
+  const int32_t *starts, *pairs;       // [outputs + 1], and [P, 2] by output: input voxel, kernel offset
+  int64_t outputs, in, out, activated;
+};
+
+struct Network {
+  int64_t hidden;                   // a multiple of 2 * LANES
+  const float *entry, *entry_bias;  // [VARYING + TIMES, hidden]
+  const float* mix;                 // [hidden, hidden]: of the own row; voxels bring the bias
+  const float *head, *head_bias;    // [hidden, HEAD]: 14 gains, two zeros, 14 offsets, two zeros
+};
+
+struct Scene {
+  int64_t voxels;
+  const float *base, *fixed;                // [N, 14] and [N, 4], see features()
+  const int32_t *voxel_of, *starts, *points;  // [N]; [voxels + 1] and [N]: each voxel's Gaussians
+  float *own, *pooled;                      // [N up to a whole BLOCK, hidden], [voxels, hidden]
+  const float* around;                      // [voxels, hidden]: what the last layer writes, the mixing layer's bias included
+  const Layer* layers;
+  int64_t layer_count;
+};
+
+constexpr int HEAD = 2 * LANES;
+constexpr int SUMMED = 1024;  // Gaussians summed in float32 before double takes over
+constexpr int VOXELS = 8;     // that a thread takes at once
+
+static size_t pieces(int64_t n, int size) { return ((size_t)n + size - 1) / size; }
+
+static void pool(const Scene& scene, size_t hidden, size_t voxel) {
+  const int32_t *begin = scene.points + scene.starts[voxel], *end = scene.points + scene.starts[voxel + 1];
+  const Lanes count = broadcast((float)(end - begin));
+  for (size_t c = 0; c < hidden; c += 2 * LANES) {
+    Lanes a{}, b{};
+    for (const int32_t* p = begin; p < end; p++) {
+      const float* own = scene.own + *p * hidden + c;
+      a += load(own), b += load(own + LANES);
+    }
+    float* out = scene.pooled + voxel * hidden + c;
+    store(out, a / count), store(out + LANES, b / count);
+  }
+}
+
+static void convolve(const Layer& layer, size_t o) {
+  for (int64_t column = 0; column < layer.out; column += LANES) {
+    Lanes sum[4] = {load(layer.bias + column)};  // one chain of additions would wait for itself
+    for (int32_t p = layer.starts[o]; p < layer.starts[o + 1]; p++) {
+      const float* x = layer.input + layer.pairs[2 * p] * layer.in;
+      const float* w = layer.weight + layer.pairs[2 * p + 1] * layer.in * layer.out + column;
+      for (int64_t c = 0; c < layer.in; c += 4)
+        for (int j = 0; j < 4; j++) sum[j] += x[c + j] * load(w + (c + j) * layer.out);
+    }
+    Lanes y = (sum[0] + sum[1]) + (sum[2] + sum[3]);
+    if (layer.activated) y = silu(y);
+    const size_t at = o * layer.out + column;
+    store(layer.output + at, layer.residual ? load(layer.residual + at) + y : y);
+  }
+}
+
+// A thread's own rows.
+struct Rows {
+  std::vector<Lanes> features, hidden, head;
+  explicit Rows(size_t width) : features(BLOCK * STRIDE / LANES), hidden(BLOCK * width / LANES), head(BLOCK * HEAD / LANES) {}
+  static float* of(std::vector<Lanes>& rows) { return reinterpret_cast<float*>(rows.data()); }
+};
+static_assert(BLOCK % TILE_ROWS == 0, "whole tiles");
+
+static void enter(const Network& net, const Scene& scene, const Now& now, const Lanes& usual, const float* bias, size_t block,
+                  Rows& rows) {
+  const size_t begin = block * BLOCK, n = std::min<size_t>(BLOCK, now.count - begin);
+  float *x = Rows::of(rows.features), *own = scene.own + begin * net.hidden;
+  for (size_t r = 0; r < n; r++) features(now, scene.base, scene.fixed, usual, begin + r, x + STRIDE * r);
+  dense((int)n, x, STRIDE, VARYING, net.entry, net.hidden, [&](int) { return bias; }, own);
+  silu_rows(own, n * net.hidden);
+}
+
+static void leave(const Network& net, const Scene& scene, const Now& now, size_t block, Rows& rows) {
+  const size_t begin = block * BLOCK, n = std::min<size_t>(BLOCK, now.count - begin);
+  const int depth = (int)net.hidden;
+  float *hidden = Rows::of(rows.hidden), *head = Rows::of(rows.head);
+  auto around = [&](int r) { return scene.around + scene.voxel_of[begin + std::min<size_t>(r, n - 1)] * net.hidden; };
+  dense((int)n, scene.own + begin * net.hidden, net.hidden, depth, net.mix, net.hidden, around, hidden);
+  silu_rows(hidden, n * net.hidden);
+  dense((int)n, hidden, net.hidden, depth, net.head, HEAD, [&](int) { return net.head_bias; }, head);
+  const Lanes rates = load_attributes(now.rates);
+  for (size_t r = 0; r < n; r++) {
+    const Lanes gain = load(head + HEAD * r), offset = load(head + HEAD * r + LANES);
+    const Lanes factor = power_of_2(tanh(gain * (1 / 3.f)) * (3 * LOG2_E));
+    float* delta = now.delta + ATTRIBUTES * (begin + r);  // holds the direction
+    store_attributes(delta, rates * (factor * load_attributes(delta) + tanh(offset)));
+  }
+}
+
+static void evaluate(const Network& net, const Scene& scene, const Now& now, int threads) {
+  std::vector<Usual> parts(pieces(now.count, SUMMED));
+  std::vector<float> bias(net.entry_bias, net.entry_bias + net.hidden);
+  for (int t = 0; t < TIMES; t++)
+    for (int64_t c = 0; c < net.hidden; c++) bias[c] += now.times[t] * net.entry[(VARYING + t) * net.hidden + c];
+  std::vector<Rows> rows(threads, Rows(net.hidden));
+  const size_t blocks = pieces(now.count, BLOCK);
+  Crew crew;
+  crew.run(threads, [&](int worker) {
+    auto each_voxel = [&](int64_t voxels, auto f) {
+      crew.each(pieces(voxels, VOXELS), [&](size_t p) {
+        for (size_t v = p * VOXELS; v < std::min<size_t>((p + 1) * VOXELS, voxels); v++) f(v);
+      });
+    };
+    crew.each(parts.size(), [&](size_t p) {
+      parts[p] = sum_of_squares(now, p * SUMMED, std::min<size_t>((p + 1) * SUMMED, now.count));
+    });
+    const Lanes usual = inverse_usual(parts);
+    crew.each(blocks, [&](size_t b) { enter(net, scene, now, usual, bias.data(), b, rows[worker]); });
+    each_voxel(scene.voxels, [&](size_t v) { pool(scene, net.hidden, v); });
+    for (int64_t l = 0; l < scene.layer_count; l++)
+      each_voxel(scene.layers[l].outputs, [&](size_t v) { convolve(scene.layers[l], v); });
+    crew.each(blocks, [&](size_t b) { leave(net, scene, now, b, rows[worker]); });
+  });
+}
+
+extern "C" {
+
+// Writes now->delta, the learned optimiser's step.
+int genre_network_step(const Network* network, const Scene* scene, const Now* now, int threads) {
+  return guarded([&] { evaluate(*network, *scene, *now, std::max(1, threads)); });
+}
+
+// Writes now->delta, tuned Adam's step; the bits of an untrained network's.
+int genre_adam_step(const Now* now, int threads) {
+  return guarded([&] {
+    const Lanes rates = load_attributes(now->rates);
+    const int crew = std::max(1, threads);
+    parallel(crew, [&](int w) {
+      for (int64_t i = now->count * w / crew; i < now->count * (w + 1) / crew; i++) {
+        const float* by_seen = counted(*now, i);
+        store_attributes(now->delta + ATTRIBUTES * i, rates * direction(*now, i, by_seen, deviation(*now, i, by_seen)));
+      }
+    });
+  });
+}
+
+}  // extern "C"
