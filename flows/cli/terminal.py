@@ -44,8 +44,11 @@ class TerminalReporter:
         if self._live:
             self._write("")
         if kind is KeyboardInterrupt:
-            self._write("stopped; what is finished is kept: run the same command again to go on", end=True)
+            self.stopped()
             raise typer.Exit(130)
+
+    def stopped(self) -> None:
+        self._write("stopped; what is finished is kept: run the same command again to go on", end=True)
 
     def stage_started(self, stage: str, chunk: int) -> None:
         self.began(f"chunk {chunk}  {stage}")
