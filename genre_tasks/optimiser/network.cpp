@@ -90,6 +90,8 @@ static void leave(const Network& net, const Scene& scene, const Now& now, size_t
   const size_t begin = block * BLOCK, n = std::min<size_t>(BLOCK, now.count - begin);
   const int depth = (int)net.hidden;
   float *hidden = Rows::of(rows.hidden), *head = Rows::of(rows.head);
+  const size_t ahead = std::min<size_t>(2 * BLOCK, now.count - begin) * net.hidden;  // this block and the next
+  for (size_t i = 0; i < ahead; i += LANES) __builtin_prefetch(scene.own + begin * net.hidden + i);
   auto around = [&](int r) { return scene.around + scene.voxel_of[begin + std::min<size_t>(r, n - 1)] * net.hidden; };
   dense((int)n, scene.own + begin * net.hidden, net.hidden, depth, net.mix, net.hidden, around, hidden);
   silu_rows(hidden, n * net.hidden);
