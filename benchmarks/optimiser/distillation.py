@@ -7,7 +7,6 @@ the PSNR against ray-cast truth.
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -40,11 +39,12 @@ MOST_TIMES = 8.0
 """Tuned Adam distils for at most so many times ENet's seconds."""
 SETTLED_FACTOR = 2.0
 """Tuned Adam has settled where its time grew by this factor since it was last better by ``KERNEL_PART``."""
-ADAM_VIEWS = ((15, 1.0), (3, 0.5), (1, 0.25))
-"""Views of each kind in an iteration, and the part of the rates that the baseline has at ENet's T."""
+ADAM_VARIANTS = ((15, 1.0, 1.0), (3, 0.5, 1.0), (1, 0.25, 1.0), (3, 0.5, 0.0))
+"""Views of each kind in an iteration, the part of the rates that the baseline has at ENet's T, and the part of the
+perceptual term: with few views it is most of an iteration's time."""
 STANDARD_ITERATIONS = 1500
 """One view each: every source and every fixed view some thirty times. All schedules of the recipe scale with it."""
-LOOK_UNTIL_S = 1e5
+STANDARD_LOOKS = 16
 
 
 @dataclass(frozen=True)
@@ -106,14 +106,17 @@ def measure_distillation(log: str, chunk: int, store: str, order: int, cap: floa
 
 def adam_variants(enet: OptimiserConfig) -> dict[str, OptimiserConfig]:
     """ENet's objective with tuned Adam at constant rates: on as many views an iteration as ENet, and on fewer."""
-    views, novel = enet.views_per_iteration, enet.novel_views_per_iteration
     out = {}
-    for count, part in ADAM_VIEWS:
-        few = {"views_per_iteration": min(count, views), "novel_views_per_iteration": min(count, novel)}
-        adam = AdamConfig(rates=[part * rate for rate in ENET_RATES], schedule="constant")
-        out[f"{few['views_per_iteration']}+{few['novel_views_per_iteration']}"] = enet.model_copy(
-            update=few | {"method": "adam", "adam": adam}
-        )
+    for count, part, perceptual in ADAM_VARIANTS:
+        views, novel = min(count, enet.views_per_iteration), min(count, enet.novel_views_per_iteration)
+        changes = {
+            "views_per_iteration": views,
+            "novel_views_per_iteration": novel,
+            "method": "adam",
+            "adam": AdamConfig(rates=tuple(part * r for r in ENET_RATES), schedule="constant"),  # type: ignore[arg-type]
+            "loss": enet.loss.model_copy(update={"perceptual": perceptual * enet.loss.perceptual}),
+        }
+        out[f"{views}+{novel} at {part:g}{'' if perceptual else ', no perceptual'}"] = enet.model_copy(update=changes)
     return out
 
 
@@ -125,10 +128,10 @@ def distillation_row(enet: OptimiserConfig, standard: PerSceneConfig, judge: Jud
     own = judge.mark(last.scene, last.seconds, last.renders)
     budget_s = MOST_TIMES * own.seconds
     adam = {
-        name: [start, *distilled(walked(config, task, fixed), judge, own.seconds, budget_s)]
+        name: distilled(walked(config, task, fixed), judge, start, own.seconds, budget_s)
         for name, config in adam_variants(enet).items()
     }
-    recipe = {str(standard.iterations): [start, *by_recipe(standard, judge, fixed, own.seconds, enet.seed)]}
+    recipe = {str(standard.iterations): [start, *by_recipe(standard, judge, fixed, enet.seed)]}
     return {
         "start": start.as_row(),
         "enet": own.as_row(),
@@ -146,41 +149,41 @@ def walked(config: OptimiserConfig, task: Task, fixed: Sequence[Target]) -> Iter
     return race.walk(lambda: (step_rule("enet", config), Objective(config.loss, distance(config))), task, plan, fixed)
 
 
-def distilled(moments: Iterator[race.Moment], judge: Judge, unit_s: float, budget_s: float) -> Iterator[Mark]:
-    """Marks at growing intervals until it has settled, or the budget is spent."""
-    due, best, since = unit_s * race.FIRST_LOOK, math.inf, 0.0
+def distilled(moments: Iterator[race.Moment], judge: Judge, start: Mark, unit_s: float, budget_s: float) -> list[Mark]:
+    """Marks from the start at growing intervals until it has settled, or the budget is spent."""
+    out, best, due = [start], start, unit_s * race.FIRST_LOOK
     for moment in moments:
         over = moment.seconds >= budget_s
         if moment.seconds < due and not over:
             continue
-        mark = judge.mark(moment.scene, moment.seconds, moment.renders)
-        yield mark
+        out.append(judge.mark(moment.scene, moment.seconds, moment.renders))
         due = moment.seconds * race.LOOK_FACTOR
-        if mark.kernel < best - KERNEL_PART * abs(best):
-            best, since = mark.kernel, moment.seconds
-        if over or moment.seconds >= max(SETTLED_FACTOR * since, unit_s):
-            return
+        if out[-1].kernel < best.kernel - KERNEL_PART * abs(best.kernel):
+            best = out[-1]
+        if over or moment.seconds >= max(SETTLED_FACTOR * best.seconds, unit_s):
+            break
+    return out
 
 
-def by_recipe(
-    config: PerSceneConfig, judge: Judge, fixed: Sequence[Target], unit_s: float, seed: int
-) -> Iterator[Mark]:
+def by_recipe(config: PerSceneConfig, judge: Judge, fixed: Sequence[Target], seed: int) -> Iterator[Mark]:
     """Marks of the published recipe on source and fixed views to its end; actors stay in their boxes."""
     training = PerSceneTraining(config, judge.task.scene, [*judge.task.source, *fixed], seed, "enet")
-    due = itertools.takewhile(lambda s: s < LOOK_UNTIL_S, (unit_s * race.LOOK_FACTOR**k for k in itertools.count(-6)))
-    for s in snapshots(training, seconds=list(due)):
+    looks = [max(1, round(config.iterations / race.LOOK_FACTOR**k)) for k in range(STANDARD_LOOKS)]
+    for s in snapshots(training, iterations=looks):
         yield judge.mark(s.scene, s.seconds, s.iteration)
 
 
 def family(runs: Mapping[str, Marks], own: Mark) -> Row:
-    """What the runs came to after their start, all together, and whether ``own`` is as good."""
+    """What the runs came to after their start, all together, when, whether ``own`` is as good, when they were as it."""
     best = min((m for marks in runs.values() for m in marks[1:]), key=lambda m: m.kernel)
     times = [t for marks in runs.values() if (t := first_as_good(marks, best)) is not None]
+    own_times = [t for marks in runs.values() if (t := first_as_good(marks, own)) is not None]
     return {
         "best": best.as_row(),
         "reached_s": min(times),
         "enet_as_good": own.as_good_as(best),
         "enet_lacks": list(own.lacks(best)),
+        "as_good_as_enet_s": min(own_times, default=None),
         "curves": {name: [m.as_row() for m in marks] for name, marks in runs.items()},
     }
 

@@ -53,7 +53,7 @@ def draw_network(row: Row, picture: Path) -> None:
     memory = axis.twinx()
     memory.plot(counts, list(row["peak_mib"].values()), "s--", color="grey", markersize=4, label="memory added, MiB")
     memory.set(ylabel="MiB", ylim=(0, None))
-    axis.xaxis.set_major_formatter("{x:,.0f}")
+    axis.set_xticks(counts, [f"{n // 1000}k" for n in counts], fontsize=7)
     axis.grid(alpha=0.3)
     axis.legend(loc="upper left", fontsize=8)
     memory.legend(loc="lower right", fontsize=8)

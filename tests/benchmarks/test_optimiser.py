@@ -28,6 +28,7 @@ from genre_tasks.metrics.perceptual import perceptual_distance
 from genre_tasks.optimiser.adam import TunedAdam
 from genre_tasks.optimiser.learned import LearnedOptimiser
 from genre_tasks.optimiser.objective import Objective
+from genre_tasks.optimiser.state import Frame, State
 from genre_tasks.optimiser.unroll import Plan, unroll
 from genre_tasks.scene.graph import DISTANT
 from genre_tasks.scene.views import NovelView
@@ -212,9 +213,34 @@ def test_a_distillation_is_timed_to_its_own_best_and_not_from_its_start() -> Non
     found = distillation.family(runs, _mark(1.0, 0.201, 21.95))
     assert found["best"][2] == 0.2 and found["enet_as_good"]
     assert found["reached_s"] == pytest.approx(2 + 2 * 0.098 / 0.1)  # at 0.202 between the second and third mark
-    assert not distillation.family(runs, _mark(1.0, 0.201, 21.8))["enet_as_good"]
+    assert found["as_good_as_enet_s"] == pytest.approx(2 + 2 * (0.3 - 0.201 * 1.01) / 0.1)
+    behind = distillation.family(runs, _mark(1.0, 0.30, 21.95))
+    assert not behind["enet_as_good"] and behind["as_good_as_enet_s"] == pytest.approx(0.97 / 0.1 * 0.2)
+    assert distillation.family(runs, _mark(1.0, 0.1, 22.0))["as_good_as_enet_s"] is None
     useless = distillation.family({"a": [start, _mark(3.0, 0.5, 20.0)]}, _mark(1.0, 0.4, 21.0))
     assert useless["reached_s"] == 3.0 and useless["best"][2] == 0.5 and useless["enet_as_good"]
+
+
+def test_a_distillation_ends_when_it_has_settled_or_its_budget_is_spent(task: Task) -> None:
+    class Fading:
+        """Better by a tenth a second until ``since``."""
+
+        def __init__(self, since: float) -> None:
+            self.since = since
+
+        def mark(self, scene: object, seconds: float, renders: int) -> Mark:
+            return _mark(seconds, 1.0 - 0.1 * min(seconds, self.since))
+
+    frame, state = Frame.of(task.scene), State.start(len(task.scene), task.scene.gaussians.means)
+    moments = [race.Moment(0.1 * k, k, k, frame, state) for k in range(1, 200)]
+
+    def end(since: float, budget_s: float) -> float:
+        judge: Any = Fading(since)
+        return distillation.distilled(iter(moments), judge, _mark(0.0, 1.0), 2.0, budget_s)[-1].seconds
+
+    assert 4.0 <= end(2.0, 16.0) < 6.4  # twice two seconds, at the next look
+    assert 2.0 <= end(0.0, 16.0) < 3.2  # no better at all: after the unit
+    assert end(8.0, 9.0) == pytest.approx(9.0)
 
 
 def test_enet_beside_distillations_of_the_same_images(task: Task) -> None:
@@ -227,7 +253,8 @@ def test_enet_beside_distillations_of_the_same_images(task: Task) -> None:
     )
     row = distillation.distillation_row(enet, PerSceneConfig(iterations=6), judge, novel)
     assert row["enet"][1] == 8 and row["enet"][0] > 0
-    assert list(row["adam"]["curves"]) == ["2+2", "1+1"] and list(row["standard"]["curves"]) == ["6"]
+    variants = ["2+2 at 1", "2+2 at 0.5", "1+1 at 0.25", "2+2 at 0.5, no perceptual"]
+    assert list(row["adam"]["curves"]) == variants and list(row["standard"]["curves"]) == ["6"]
     for family in ("adam", "standard"):
         assert all(curve[0] == row["start"] for curve in row[family]["curves"].values())
         assert row[family]["reached_s"] > 0
@@ -305,8 +332,8 @@ def test_where_gnet_never_converges_the_cap_counts_and_both_plateaus_are_said() 
 
 def test_where_enet_is_not_as_good_the_cap_counts() -> None:
     best = [9.0, 100, 0.2, None, 25.0]
-    good = {"best": best, "reached_s": 10.0, "enet_as_good": True}
-    bad = good | {"enet_as_good": False}
+    good = {"best": best, "reached_s": 10.0, "enet_as_good": True, "as_good_as_enet_s": 9.5}
+    bad = good | {"enet_as_good": False, "as_good_as_enet_s": None}
     where = {"log": "pandaset:002", "chunk": 0, "order": 0, "cap": 50.0, "start": best, "enet": [4.0, *best[1:]]}
     rows = {"distillation/a": where | {"adam": good, "standard": bad}}
     claims = {c.id.removeprefix("optimiser."): c for c in summary.claims(rows)}
