@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from urllib.parse import parse_qs
 
+import torch
+
 from flows.pipeline import weights_digest
 from flows.train import checkpoint
 from flows.train.begins import Begin, ByGnet, begin_key, begun, make_ages
@@ -182,7 +184,7 @@ def train_stage(job: TrainJob, stage: Stage, progress: Progress = silent) -> Tra
     device = chosen_device(job.device)
     network = network_from(stage.network, 0, start).to(device)
     scenes = [scene_on(scene, device) for scene in load_scenes(job, stage, at, progress)]
-    distance, watch = _distance(stage), None
+    distance, watch = _distance(stage, device), None
     if job.validate_every:
         watch = _validation(job, stage, folder, distance).at_checkpoint
     train_optimiser(network, scenes, stage.config, folder, distance, job.save_every, watch, progress, origin)
@@ -225,13 +227,13 @@ def _rendered(stage: Stage, begin: Begin) -> Begin:
     return begin if stage.images is None or stage.images.of is None else stage.images.of
 
 
-def _distance(stage: Stage) -> Distance | None:
+def _distance(stage: Stage, device: torch.device) -> Distance | None:
     """The perceptual distance, where a loss of the stage has a term for it."""
     if stage.config.loss.perceptual == 0 and stage.config.judge_loss.perceptual == 0:
         return None
     from genre_tasks.metrics.perceptual import perceptual_distance
 
-    return perceptual_distance()
+    return perceptual_distance().to(device)
 
 
 def _validation(job: TrainJob, stage: Stage, folder: Path, distance: Distance | None) -> Validation:
