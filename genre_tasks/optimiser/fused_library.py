@@ -104,7 +104,7 @@ def _step(call: Callable[[Now, int], int], state: State, gradient: Tensor, rates
     if not takes(*arrays):
         raise ValueError("expected float32 tensors on the CPU")
     arrays = [t.detach().contiguous() for t in arrays]
-    by_seen, delta = _by_seen(state.seen), torch.empty_like(arrays[0])
+    by_seen, delta = _by_seen(arrays[3]), torch.empty_like(arrays[0])
     pointers = [t.data_ptr() for t in (*arrays, by_seen)]
     now = Now(rows, *pointers, len(by_seen), time.data_ptr(), rates.data_ptr(), delta.data_ptr())
     status = call(now, torch.get_num_threads())
@@ -117,6 +117,7 @@ def _step(call: Callable[[Now, int], int], state: State, gradient: Tensor, rates
 
 def _by_seen(seen: Tensor) -> Tensor:
     """What depends on how often a Gaussian was seen, for 0 … the most: [counts, 3], as state.py and features.py say."""
-    counts = torch.arange(int(seen.max()) + 1 if len(seen) else 1, dtype=torch.float32)
+    most = int(seen.numpy().max(initial=0))  # torch would wake its threads, which then spin beside the kernel's
+    counts = torch.arange(most + 1, dtype=torch.float32)
     n = counts.clamp_min(1)
     return torch.stack([1 - FIRST_DECAY**n, 1 - SECOND_DECAY**n, torch.log1p(counts) / 3], 1)
