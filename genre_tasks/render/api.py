@@ -11,7 +11,7 @@ from torch import Tensor
 
 from genre_tasks.errors import NonFiniteError
 from genre_tasks.logs.types import Float64, Lens
-from genre_tasks.render.types import Cameras, Render, RenderSettings
+from genre_tasks.render.types import Cameras, Render, RenderSettings, Shown
 from genre_tasks.scene.gaussians import Splats
 from genre_tasks.scene.geometry import matrix_to_quat, quat_multiply
 from genre_tasks.scene.graph import SceneGraph
@@ -30,8 +30,8 @@ class PosedView(Protocol):
     def lens(self) -> Lens: ...
 
 
-def render(splats: Splats, cameras: Cameras, settings: RenderSettings = DEFAULT) -> Render:
-    """Renders N Gaussians at V cameras; N and V may be 0.
+def render(splats: Splats, cameras: Cameras, settings: RenderSettings = DEFAULT, shown: Shown | None = None) -> Render:
+    """Renders N Gaussians at V cameras; N and V may be 0. ``shown`` says which of them each view has; default: all.
 
     Differentiable in means, scales, quaternions, opacities and colours, and in ``cameras.camera_SE3_chunk`` (as a
     rigid motion: three translations, three rotations) where it requires grad. Colour is premultiplied, depth is
@@ -39,7 +39,7 @@ def render(splats: Splats, cameras: Cameras, settings: RenderSettings = DEFAULT)
     counted in ``Render.culled``. The ``cpu`` backend gives the same bits at any number of threads and of views a call.
 
     Raises:
-        ValueError: a tensor has another shape than expected.
+        ValueError: a tensor has another shape than expected, or ``shown`` does not fit.
         NonFiniteError: a camera is not finite.
         ResourceError: the backend is not installed, or memory does not suffice.
     """
@@ -47,44 +47,72 @@ def render(splats: Splats, cameras: Cameras, settings: RenderSettings = DEFAULT)
     backend = settings.backend
     if backend == "auto":
         backend = "cpu" if splats.means.device.type == "cpu" else "cuda"
-    if backend == "reference":
-        from genre_tasks.render.reference import render_reference
-
-        return _result(*render_reference(splats, cameras))
-    if cameras.focal_px.requires_grad or cameras.center_px.requires_grad:
+    if shown is None:
+        shown = Shown.all_of(len(splats), len(cameras))
+    else:
+        _check_shown(shown, len(splats), len(cameras))
+    if backend != "reference" and (cameras.focal_px.requires_grad or cameras.center_px.requires_grad):
         raise ValueError(f"backend {backend} has no gradient in focal length or principal point; use reference")
-    if backend == "cuda":
-        from genre_tasks.render.cuda import render_cuda
-
-        return _result(*render_cuda(splats, cameras))
-    from genre_tasks.render.cpu import render_cpu
-
-    if not (cameras.camera_SE3_chunk.requires_grad and torch.is_grad_enabled()):
-        return _result(*render_cpu(splats, cameras, settings.threads))
-    parts = [render_cpu(*_in_camera_frame(splats, cameras, v), settings.threads) for v in range(len(cameras))]
-    color, alpha, depth = (torch.cat(images) for images in zip(*(images for images, _ in parts), strict=True))
-    return Render(color, alpha, depth, _summed([counts for _, counts in parts]))
+    if backend == "cpu":
+        return _on_cpu(splats, cameras, settings.threads, shown)
+    groups: dict[tuple[int, int], list[int]] = {}
+    for v, own in enumerate(shown.own):
+        groups.setdefault(own, []).append(v)
+    if all(begin == end for begin, end in groups) and shown.shared == len(splats):
+        return _elsewhere(backend, splats, cameras)
+    parts = []
+    for (begin, end), members in groups.items():
+        rows = torch.cat([torch.arange(shown.shared), torch.arange(begin, end)]).to(splats.means.device)
+        parts.append(_elsewhere(backend, splats.select(rows), cameras.select(members)))
+    return _in_order(parts, [v for members in groups.values() for v in members])
 
 
 def render_views(scene: SceneGraph, views: Sequence[PosedView], settings: RenderSettings = DEFAULT) -> Render:
     """Renders a scene graph at views of one image size, in their order; actors stand where their frame puts them.
 
-    A call of :func:`render` for each frame, or a single one where the scene has no actors. Raises as :func:`render`.
+    Raises as :func:`render`.
     """
-    groups: dict[int, list[int]] = {}
-    for i, view in enumerate(views):
-        groups.setdefault(view.frame if scene.actors else 0, []).append(i)
-    if len({(v.lens.width_px, v.lens.height_px) for v in views}) != 1:
-        raise ValueError("expected one or more views of one image size")
-    parts = []
-    for frame, members in groups.items():
-        cameras = Cameras.of([views[i].chunk_SE3_camera for i in members], [views[i].lens for i in members])
-        parts.append(render(scene.at(frame).activated(), _on(cameras, scene.gaussians.means), settings))
-    if len(parts) == 1:
-        return parts[0]
-    order = torch.argsort(torch.tensor([i for members in groups.values() for i in members]))
+    cameras = Cameras.of([v.chunk_SE3_camera for v in views], [v.lens for v in views])
+    frames = list(dict.fromkeys(v.frame for v in views))
+    posed, moving = scene.posed(frames)
+    shared, own = len(scene) - len(moving), len(moving)
+    begins = [shared + frames.index(v.frame) * own for v in views]
+    shown = Shown(shared, tuple((begin, begin + own) for begin in begins))
+    return render(posed.activated(), _on(cameras, scene.gaussians.means), settings, shown if own else None)
+
+
+def _on_cpu(splats: Splats, cameras: Cameras, threads: int | None, shown: Shown) -> Render:
+    from genre_tasks.render.cpu import render_cpu
+
+    if not (cameras.camera_SE3_chunk.requires_grad and torch.is_grad_enabled()):
+        return _result(*render_cpu(splats, cameras, shown, threads))
+    parts = [
+        _result(*render_cpu(*_in_camera_frame(splats, cameras, v), shown.of(v), threads)) for v in range(len(cameras))
+    ]
+    return _in_order(parts, range(len(parts)))
+
+
+def _elsewhere(backend: str, splats: Splats, cameras: Cameras) -> Render:
+    if backend == "reference":
+        from genre_tasks.render.reference import render_reference
+
+        return _result(*render_reference(splats, cameras))
+    from genre_tasks.render.cuda import render_cuda
+
+    return _result(*render_cuda(splats, cameras))
+
+
+def _in_order(parts: Sequence[Render], views: Sequence[int]) -> Render:
+    """One result of several, whose images, one part after the other, are those of ``views``."""
+    order = torch.argsort(torch.tensor(views))
     color, alpha, depth = (torch.cat([getattr(p, n) for p in parts])[order] for n in ("color", "alpha", "depth"))
     return Render(color, alpha, depth, _summed([p.culled for p in parts]))
+
+
+def _check_shown(shown: Shown, gaussians: int, views: int) -> None:
+    sound = all(shown.shared <= begin <= end <= gaussians for begin, end in shown.own)
+    if len(shown.own) != views or not sound or not 0 <= shown.shared <= gaussians:
+        raise ValueError(f"expected ranges of {gaussians} Gaussians for {views} views, got {shown}")
 
 
 def _summed(counts: Sequence[dict[str, int]]) -> dict[str, int]:

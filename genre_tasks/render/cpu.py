@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import itertools
 from typing import Any
 
 import torch
@@ -12,7 +13,7 @@ from torch.autograd.function import once_differentiable
 from genre_tasks.errors import ResourceError
 from genre_tasks.render.constants import CULL_REASONS
 from genre_tasks.render.kernel_library import load_kernel
-from genre_tasks.render.types import Cameras
+from genre_tasks.render.types import Cameras, Shown
 from genre_tasks.scene.gaussians import Splats
 
 Arrays = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
@@ -41,7 +42,7 @@ class _Batch:
 
 
 def _forward(
-    arrays: Arrays, cameras: Cameras, threads: int, keep: bool
+    arrays: Arrays, cameras: Cameras, shown: Shown, threads: int, keep: bool
 ) -> tuple[Images, dict[str, int], _Batch | None]:
     kernel = load_kernel()
     views, height, width = len(cameras), cameras.height_px, cameras.width_px
@@ -50,10 +51,12 @@ def _forward(
     color, alpha = torch.empty(views, height, width, 3), torch.empty(views, height, width)
     depth = torch.empty_like(alpha)
     culled = (ctypes.c_longlong * len(CULL_REASONS))()
+    own = (ctypes.c_int * (2 * views))(*itertools.chain(*shown.own))
     handle = ctypes.c_void_p()
     status = kernel.genre_forward(
         len(arrays[0]), *(a.data_ptr() for a in arrays), views, poses.data_ptr(), lenses.data_ptr(), width, height,
-        threads, color.data_ptr(), alpha.data_ptr(), depth.data_ptr(), culled, ctypes.byref(handle) if keep else None,
+        threads, shown.shared, own, color.data_ptr(), alpha.data_ptr(), depth.data_ptr(), culled,
+        ctypes.byref(handle) if keep else None,
     )  # fmt: skip
     check_status(status)
     counts = {reason: n for reason, n in zip(CULL_REASONS, culled, strict=True) if n}
@@ -63,13 +66,13 @@ def _forward(
 class _Rasterise(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, cameras: Cameras, threads: int, culled: dict[str, int], means: Tensor, scales: Tensor, quats: Tensor,
-        opacities: Tensor, colors: Tensor,
+        ctx: Any, cameras: Cameras, shown: Shown, threads: int, culled: dict[str, int], means: Tensor, scales: Tensor,
+        quats: Tensor, opacities: Tensor, colors: Tensor,
     ) -> Images:  # fmt: skip
         arrays = (means, scales, quats, opacities, colors)
-        images, counts, ctx.batch = _forward(arrays, cameras, threads, keep=any(ctx.needs_input_grad))
+        images, counts, ctx.batch = _forward(arrays, cameras, shown, threads, keep=any(ctx.needs_input_grad))
         culled.update(counts)
-        ctx.cameras, ctx.threads = cameras, threads
+        ctx.cameras, ctx.shown, ctx.threads = cameras, shown, threads
         ctx.save_for_backward(*arrays, *images)
         return images
 
@@ -80,7 +83,7 @@ class _Rasterise(torch.autograd.Function):
         arrays, images = saved[:5], saved[5:]
         batch, ctx.batch = ctx.batch, None
         if batch is None:  # a second backward through a retained graph: the state was given back after the first
-            batch = _forward(arrays, ctx.cameras, ctx.threads, keep=True)[2]
+            batch = _forward(arrays, ctx.cameras, ctx.shown, ctx.threads, keep=True)[2]
         grads = [torch.empty_like(a) for a in arrays]
         v = [x.contiguous() for x in (v_color, v_alpha, v_depth)]
         status = load_kernel().genre_backward(
@@ -88,7 +91,7 @@ class _Rasterise(torch.autograd.Function):
             *(x.data_ptr() for x in v), ctx.threads, *(g.data_ptr() for g in grads),
         )  # fmt: skip
         check_status(status)
-        return (None, None, None, *grads)
+        return (None, None, None, None, *grads)
 
 
 def _arrays(splats: Splats) -> Arrays:
@@ -102,12 +105,12 @@ def _arrays(splats: Splats) -> Arrays:
 def forward_state(splats: Splats, cameras: Cameras) -> _Batch:
     """The kernel's state after a forward pass on one thread."""
     with torch.no_grad():
-        state = _forward(_arrays(splats), cameras, 1, keep=True)[2]
+        state = _forward(_arrays(splats), cameras, Shown.all_of(len(splats), len(cameras)), 1, keep=True)[2]
     assert state is not None
     return state
 
 
-def render_cpu(splats: Splats, cameras: Cameras, threads: int | None) -> tuple[Images, dict[str, int]]:
+def render_cpu(splats: Splats, cameras: Cameras, shown: Shown, threads: int | None) -> tuple[Images, dict[str, int]]:
     """Colour [V, H, W, 3], alpha and depth [V, H, W], float32, and the culled counts; differentiable in the splats.
 
     ``threads`` ``None`` takes torch's number. The bits of images and gradients do not depend on it. Memory, with N
@@ -116,5 +119,5 @@ def render_cpu(splats: Splats, cameras: Cameras, threads: int | None) -> tuple[I
     for the next call.
     """
     culled: dict[str, int] = {}
-    images = _Rasterise.apply(cameras, threads or torch.get_num_threads(), culled, *_arrays(splats))
+    images = _Rasterise.apply(cameras, shown, threads or torch.get_num_threads(), culled, *_arrays(splats))
     return images, culled

@@ -84,10 +84,10 @@ struct ScratchSet {
 extern "C" {
 
 // poses [V, 4, 4] chunk to camera, lenses [V, 4] fx fy cx cy; color [V, H, W, 3], alpha and depth [V, H, W];
-// culled [4] is added to. With `batch`, the state for genre_backward is kept there until genre_free.
+// A view shows the first `shared` Gaussians and those of its range in own [V, 2]. culled [4] is added to. With `batch`, the state for genre_backward is kept there until genre_free.
 int genre_forward(int count, const float* means, const float* scales, const float* quats, const float* opacities,
                   const float* colors, int views, const float* poses, const float* lenses, int width, int height, int threads,
-                  float* color, float* alpha, float* depth, long long* culled, void** batch) {
+                  int shared, const int* own, float* color, float* alpha, float* depth, long long* culled, void** batch) {
   return guarded([&] {
     GaussianArrays in{count, means, scales, quats, opacities, colors};
     ScratchSet scratch(std::max(1, threads));
@@ -100,6 +100,7 @@ int genre_forward(int count, const float* means, const float* scales, const floa
     for_each_view(views, std::max(1, threads), [&](int v, int w, int inside) {
       auto view = views_shelf().take();
       view->camera = make_camera(poses + 16 * v, lenses + 4 * v, width, height);
+      view->shown = {(uint32_t)shared, (uint32_t)own[2 * v], (uint32_t)(own[2 * v + 1] - own[2 * v])};
       view->tiles_x = (width + TILE - 1) / TILE, view->tiles_y = (height + TILE - 1) / TILE;
       forward(*view, *scratch.of[w], in, inside, color + 3 * pixels * v, alpha + pixels * v, depth + pixels * v);
       std::lock_guard<std::mutex> lock(counting);

@@ -11,6 +11,9 @@
 // What the backward pass needs of one view.
 struct View {
   Camera camera;
+  struct Shown {
+    uint32_t shared, begin, own;         // Gaussians: the first ones, and where its own begin and how many they are
+  } shown;
   int tiles_x, tiles_y;
   struct Segment {
     size_t begin, end;
@@ -73,15 +76,20 @@ static inline void for_tiles(const Footprint& g, int tiles_x, int tiles_y, F f) 
 }
 
 static void project_all(View& v, const GaussianArrays& in, int threads) {
-  v.input.resize(in.count), v.id.resize(in.count), v.slot_end.resize(in.count);
-  std::fill(v.slot_end.p, v.slot_end.p + in.count, 0);
+  const size_t count = (size_t)v.shown.shared + v.shown.own;
+  v.input.resize(count), v.id.resize(count), v.slot_end.resize(count);
+  std::fill(v.slot_end.p, v.slot_end.p + count, 0);
   v.segments.resize(threads);
   std::vector<long long> culled((size_t)threads * CULL_REASONS, 0);
   parallel(threads, [&](int w) {
-    size_t first = share(in.count, w, threads), at = first, end = share(in.count, w + 1, threads);
+    size_t first = share(count, w, threads), at = first, end = share(count, w + 1, threads);
     long long tally[CULL_REASONS] = {};
-    for (size_t i = first; i < end; i += LANES)
-      at += footprints(v.camera, in, (uint32_t)i, (int)std::min<size_t>(LANES, end - i), tally, &v.input[at], &v.id[at]);
+    for (size_t i = first, n; i < end; i += n) {
+      const bool shared = i < v.shown.shared;
+      n = std::min<size_t>(LANES, (shared ? std::min<size_t>(end, v.shown.shared) : end) - i);
+      const size_t id = shared ? i : i - v.shown.shared + v.shown.begin;
+      at += footprints(v.camera, in, (uint32_t)id, (int)n, tally, &v.input[at], &v.id[at]);
+    }
     v.segments[w] = {first, at};
     std::copy(tally, tally + CULL_REASONS, &culled[(size_t)w * CULL_REASONS]);
   });

@@ -29,6 +29,12 @@ class Cameras:
     def __len__(self) -> int:
         return self.camera_SE3_chunk.shape[0]
 
+    def select(self, views: Sequence[int]) -> Cameras:
+        """The cameras of some views, in that order."""
+        at = torch.tensor(views, device=self.focal_px.device)
+        pose, focal, center = (x.index_select(0, at) for x in (self.camera_SE3_chunk, self.focal_px, self.center_px))
+        return Cameras(pose, focal, center, self.width_px, self.height_px)
+
     @staticmethod
     def of(poses: Sequence[Float64], lenses: Sequence[Lens], dtype: torch.dtype = torch.float32) -> Cameras:
         """From ``chunk_SE3_camera`` poses and lenses of one size. Raises ``ValueError`` for mixed sizes."""
@@ -44,6 +50,23 @@ class Cameras:
             width,
             height,
         )
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Which of N Gaussians each view shows: the first ``shared``, and view v those in ``range(*own[v])``."""
+
+    shared: int
+    own: tuple[tuple[int, int], ...]
+
+    @staticmethod
+    def all_of(count: int, views: int) -> Shown:
+        """Everything in every view."""
+        return Shown(count, ((count, count),) * views)
+
+    def of(self, v: int) -> Shown:
+        """For view v alone."""
+        return Shown(self.shared, (self.own[v],))
 
 
 @dataclass(frozen=True)

@@ -60,6 +60,10 @@ class Splats:
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    def select(self, rows: Tensor) -> Splats:
+        """The Gaussians ``rows`` [M], in that order."""
+        return Splats(*(getattr(self, f.name).index_select(0, rows) for f in fields(self)))
+
     def to(self, *args: object, **kwargs: object) -> Splats:
         """Each tensor moved as ``Tensor.to`` moves it."""
         return Splats(*(getattr(self, f.name).to(*args, **kwargs) for f in fields(self)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -52,6 +53,34 @@ class SceneGraph:
         """The same graph with other Gaussians (same N and order)."""
         return replace(self, gaussians=gaussians)
 
+    def posed(self, frames: Sequence[int]) -> tuple[Gaussians, Tensor]:
+        """All Gaussians in chunk coordinates at several log frames at once, differentiable.
+
+        First those that do not move, then those of the actors as they are at the first frame, at the second, and so on;
+        with them the numbers [M] of the actors' Gaussians. Those of an absent actor are as in :meth:`at`.
+        """
+        g = self.gaussians
+        moves = self.nodes >= FIRST_ACTOR if self.actors else torch.zeros_like(self.nodes, dtype=torch.bool)
+        moving = torch.nonzero(moves)[:, 0]
+        if not len(moving):
+            return g, moving
+        still = torch.nonzero(~moves)[:, 0]
+        means, quats, opacities = self._actors_at(moving, frames)
+
+        def joined(values: Tensor, moved: Tensor | None = None) -> Tensor:
+            if moved is None:
+                own = values.index_select(0, moving)
+                moved = own.expand(len(frames), *own.shape)
+            return torch.cat([values.index_select(0, still), moved.flatten(0, 1)])
+
+        return Gaussians(
+            joined(g.means, means),
+            joined(g.log_scales),
+            joined(g.quats, quats),
+            joined(g.logit_opacities, opacities),
+            joined(g.colors),
+        ), moving
+
     def at(self, frame: int) -> Gaussians:
         """All Gaussians in chunk coordinates at a log frame, N kept and order kept, differentiable.
 
@@ -61,27 +90,36 @@ class SceneGraph:
         g = self.gaussians
         if not self.actors:
             return g
-        count = FIRST_ACTOR + len(self.actors)
-        rotation = np.broadcast_to(np.eye(3), (count, 3, 3)).copy()
-        translation = np.zeros((count, 3))
-        present = np.ones(count, dtype=bool)
-        for k, actor in enumerate(self.actors):
-            pose = actor.pose(frame)
-            present[FIRST_ACTOR + k] = pose is not None
-            if pose is not None:
-                rotation[FIRST_ACTOR + k], translation[FIRST_ACTOR + k] = pose[:3, :3], pose[:3, 3]
-        turns = torch.as_tensor(rotation).to(g.means)
         moving = torch.nonzero(self.nodes >= FIRST_ACTOR)[:, 0]
-        node = self.nodes[moving]
-        turn = turns[node]
-        quats = matrix_to_quat(turns)[node]
-        means = (turn @ g.means[moving, :, None])[..., 0] + torch.as_tensor(translation).to(g.means)[node]
-        absent = ~torch.as_tensor(present, device=node.device)[node]
-        opacity = torch.where(absent, torch.full_like(g.logit_opacities[moving], -30.0), g.logit_opacities[moving])
+        (means,), (quats,), (opacities,) = self._actors_at(moving, (frame,))
         return Gaussians(
             g.means.index_copy(0, moving, means),
             g.log_scales,
-            g.quats.index_copy(0, moving, quat_multiply(quats, g.quats[moving])),
-            g.logit_opacities.index_copy(0, moving, opacity),
+            g.quats.index_copy(0, moving, quats),
+            g.logit_opacities.index_copy(0, moving, opacities),
             g.colors,
+        )
+
+    def _actors_at(self, moving: Tensor, frames: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
+        """Means [F, M, 3], quaternions [F, M, 4] and logit opacities [F, M] of the actors' Gaussians ``moving`` [M]."""
+        g = self.gaussians
+        rotation = np.broadcast_to(np.eye(3), (len(frames), len(self.actors), 3, 3)).copy()
+        translation = np.zeros((len(frames), len(self.actors), 3))
+        present = np.zeros((len(frames), len(self.actors)), dtype=bool)
+        for k, actor in enumerate(self.actors):
+            for f, frame in enumerate(frames):
+                pose = actor.pose(frame)
+                if pose is not None:
+                    rotation[f, k], translation[f, k], present[f, k] = pose[:3, :3], pose[:3, 3], True
+        actor_of = self.nodes[moving] - FIRST_ACTOR
+        turns = torch.as_tensor(rotation).to(g.means)
+        turn, quat = turns[:, actor_of], matrix_to_quat(turns)[:, actor_of]
+        means, quats, opacities = g.means[moving], g.quats[moving], g.logit_opacities[moving]
+        # Written out: the bits of a batched product depend on the size of its batch.
+        turned = turn[..., 0] * means[:, None, 0] + turn[..., 1] * means[:, None, 1] + turn[..., 2] * means[:, None, 2]
+        there = torch.as_tensor(present, device=means.device)[:, actor_of]
+        return (
+            turned + torch.as_tensor(translation).to(means)[:, actor_of],
+            quat_multiply(quat, quats.expand_as(quat)),
+            torch.where(there, opacities, torch.full_like(opacities, -30.0)),
         )
