@@ -34,7 +34,7 @@ def reconstruct_log(
 
     Args:
         log: ``pandaset:PATH/002`` or ``synthetic:street?seed=1000``.
-        preset: demo, small or paper. store: a folder or URI.
+        preset: demo, small, long or paper. store: a folder or URI.
         chunks: which chunks; all if None. config: a whole effective configuration (it overrides the preset's).
         settings: ``section.key=value`` strings, applied last.
 
