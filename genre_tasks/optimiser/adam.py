@@ -8,7 +8,8 @@ from typing import Literal
 
 from torch import Tensor
 
-from genre_tasks.optimiser.fused_library import adam_step, takes
+from genre_tasks.optimiser.fused_calls import adam_step
+from genre_tasks.optimiser.fused_library import takes
 from genre_tasks.optimiser.rules import Step, rate_vector, schedule
 from genre_tasks.optimiser.state import Frame, State
 

@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from genre_tasks.optimiser.features import FEATURES, Fixed, times
+from genre_tasks.optimiser.fused_calls import learned_step
 from genre_tasks.optimiser.fused_layers import LANES, ByOwner, Layers, Memory, Pairs, padded, round_up
-from genre_tasks.optimiser.fused_library import Network, Scene, learned_step
+from genre_tasks.optimiser.fused_library import Network, Scene
 from genre_tasks.optimiser.network_constants import BLOCK
 from genre_tasks.optimiser.rules import rate_vector, schedule
 from genre_tasks.optimiser.sparse_unet import VoxelPyramid

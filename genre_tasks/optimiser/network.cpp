@@ -131,6 +131,15 @@ static void evaluate(const Network& net, const Scene& scene, const Now& now, int
   });
 }
 
+// f(i) for each Gaussian.
+template <class F>
+static void each_gaussian(int64_t count, int threads, F f) {
+  const int crew = std::max(1, threads);
+  parallel(crew, [&](int w) {
+    for (int64_t i = count * w / crew; i < count * (w + 1) / crew; i++) f(i);
+  });
+}
+
 extern "C" {
 
 // Writes now->delta, the learned optimiser's step.
@@ -142,12 +151,45 @@ int genre_network_step(const Network* network, const Scene* scene, const Now* no
 int genre_adam_step(const Now* now, int threads) {
   return guarded([&] {
     const Lanes rates = load_attributes(now->rates);
-    const int crew = std::max(1, threads);
-    parallel(crew, [&](int w) {
-      for (int64_t i = now->count * w / crew; i < now->count * (w + 1) / crew; i++) {
-        const float* by_seen = counted(*now, i);
-        store_attributes(now->delta + ATTRIBUTES * i, rates * direction(*now, i, by_seen, deviation(*now, i, by_seen)));
+    each_gaussian(now->count, threads, [&](int64_t i) {
+      const float* by_seen = counted(*now, i);
+      store_attributes(now->delta + ATTRIBUTES * i, rates * direction(*now, i, by_seen, deviation(*now, i, by_seen)));
+    });
+  });
+}
+
+// State.saw: [N, 14] and [N]; the rates are 1 - decay.
+int genre_saw(int64_t count, const float* gradient, const float* first, const float* second, const float* seen,
+              float first_rate, float second_rate, int threads, float* new_first, float* new_second, float* new_seen,
+              float* seen_now) {
+  return guarded([&] {
+    each_gaussian(count, threads, [&](int64_t i) {
+      const int64_t at = ATTRIBUTES * i;
+      const Lanes g = load_attributes(gradient + at), m = load_attributes(first + at), v = load_attributes(second + at);
+      const float now = any(~((g >= 0.f) & (g <= 0.f))) ? 1.f : 0.f;  // also where it is NaN
+      store_attributes(new_first + at, m + (g - m) * (now * first_rate));
+      store_attributes(new_second + at, v + (g * g - v) * (now * second_rate));
+      new_seen[i] = seen[i] + now;
+      seen_now[i] = now;
+    });
+  });
+}
+
+// State.moved and Frame.bounded: [N, 14], seen [N]. Additions and choices only: torch's bits.
+int genre_moved(int64_t count, const float* offsets, const float* delta, const float* seen, const float* start,
+                const float* low, const float* high, int threads, float* out) {
+  return guarded([&] {
+    each_gaussian(count, threads, [&](int64_t i) {
+      const int64_t at = ATTRIBUTES * i;
+      Lanes moved = load_attributes(offsets + at);
+      if (seen[i] > 0) {
+        moved = moved + load_attributes(delta + at);
+        const Lanes from = load_attributes(start + at), least = load_attributes(low + at), there = from + moved;
+        const Lanes held = bounded(there, least, load_attributes(high + at)), back = held - from;
+        const Mask inside = ((there >= held) & (there <= held)) | (least <= -INFINITY);
+        moved = select(inside, moved, back);
       }
+      store_attributes(out + at, moved);
     });
   });
 }

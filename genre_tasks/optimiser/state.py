@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from genre_tasks.optimiser import fused_state
 from genre_tasks.optimiser.network_constants import DEVIATION_FLOOR
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import DISTANT, SceneGraph
@@ -91,6 +92,10 @@ class State:
 
     def saw(self, gradient: Tensor) -> State:
         """With this iteration's gradient [N, 14] with respect to ``offsets`` taken into the moments."""
+        if fused_state.fits(gradient, self.first, self.second, self.seen):
+            decays = (FIRST_DECAY, SECOND_DECAY)
+            first, second, seen, now = fused_state.saw(gradient, self.first, self.second, self.seen, decays)
+            return replace(self, first=first, second=second, seen=seen, seen_now=now)
         now = (gradient != 0).any(1, keepdim=True).to(gradient.dtype)
         first = self.first + now * (1 - FIRST_DECAY) * (gradient - self.first)
         second = self.second + now * (1 - SECOND_DECAY) * (gradient * gradient - self.second)
@@ -98,6 +103,10 @@ class State:
 
     def moved(self, frame: Frame, delta: Tensor) -> State:
         """With ``delta`` [N, 14] applied to what any view has seen so far; the rest stays the same bytes."""
+        start, low, high = frame.scene.gaussians.packed(), frame.low, frame.high
+        if fused_state.fits(self.offsets, delta, self.seen, start, low, high):
+            offsets = fused_state.moved(self.offsets, delta, self.seen, start, low, high)
+            return replace(self, offsets=offsets, iteration=self.iteration + 1)
         offsets = torch.where(self.seen > 0, frame.bounded(self.offsets + delta), self.offsets)
         return replace(self, offsets=offsets, iteration=self.iteration + 1)
 

@@ -154,8 +154,11 @@ def test_the_same_bits_at_any_thread_count_and_in_any_run() -> None:
     for threads in (1, 2, 3, 2):
         with _threads(threads):
             rules: list[StepRule] = [_random(), TunedAdam()]
-            steps = [rule.start(Frame.of(scene), CENTRE) for rule in rules]
+            frame = Frame.of(scene)
+            steps = [rule.start(frame, CENTRE) for rule in rules]
             results.append([step(state, gradient, TOTAL) for step in steps for state, gradient in states])
+            results[-1] += [state.saw(gradient).first for state, gradient in states]
+            results[-1] += [state.moved(frame, gradient).offsets for state, gradient in states]
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
@@ -175,6 +178,44 @@ def test_adams_step_is_torchs_direction() -> None:
         step = TunedAdam(decay="constant").start(Frame.of(scene), CENTRE)(state, gradient, TOTAL)
         torch.testing.assert_close(step, expected, atol=0, rtol=1e-6)
         assert not step[:5].any()
+
+
+def _detached(state: State) -> State:
+    return replace(state, **{n: getattr(state, n).detach() for n in ("offsets", "first", "second", "seen", "seen_now")})
+
+
+@pytest.mark.parametrize("isa", supported_isas())
+def test_the_states_updates_are_torchs(isa: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GENRE_RENDER_ISA", isa)
+    monkeypatch.setattr(library, "load_network", library.load_network.__wrapped__)
+    scene = street.scene(1030)
+    frame, g = Frame.of(scene), torch.Generator().manual_seed(3)
+    for state, gradient in _states(scene):
+        gradient[100, 1:], gradient[101, :13] = 0, 0  # one attribute is enough to be seen
+        for fresh in (State.start(len(scene), gradient), state):
+            ours, torchs = fresh.saw(gradient), _detached(fresh.saw(gradient.clone().requires_grad_()))
+            for name in ("first", "second"):
+                torch.testing.assert_close(getattr(ours, name), getattr(torchs, name), atol=1e-6, rtol=1e-6)
+            assert torch.equal(ours.seen, torchs.seen) and torch.equal(ours.seen_now, torchs.seen_now)
+            delta = 3 * torch.randn(gradient.shape, generator=g)
+            far = replace(ours, offsets=ours.offsets + 2 * torch.randn(delta.shape, generator=g))
+            same = far.moved(frame, delta), _detached(far.moved(frame, delta.clone().requires_grad_()))
+            assert torch.equal(same[0].offsets, same[1].offsets) and same[0].iteration == same[1].iteration
+            assert bool((same[0].offsets != far.offsets + delta)[far.seen[:, 0] > 0].any())  # bounds were met
+            assert torch.equal(same[0].offsets[:5], far.offsets[:5])
+
+
+def test_what_is_not_a_number_stays_seen_in_the_state() -> None:
+    scene = street.scene()
+    frame, gradient = Frame.of(scene), torch.zeros(len(scene), 14)
+    gradient[7, 3] = torch.nan
+    state = State.start(len(scene), gradient).saw(gradient)
+    assert bool(torch.isnan(state.first[7, 3])) and state.seen[:, 0].nonzero().tolist() == [[7]]
+    delta = torch.zeros(len(scene), 14)
+    delta[7, :] = torch.nan
+    assert bool(torch.isnan(state.moved(frame, delta).offsets[7]).all())
+    with pytest.raises(ValueError, match="expected 300 rows of 14 or 1 columns"):
+        state.saw(gradient[:, :13])
 
 
 class _Torch:

@@ -1,0 +1,52 @@
+"""Steps by the compiled kernel: the learned optimiser's and tuned Adam's, which share Adam's direction."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from genre_tasks.optimiser import fused_library as library
+from genre_tasks.optimiser.state import FIRST_DECAY, SECOND_DECAY, State
+
+
+def learned_step(
+    network: library.Network, scene: library.Scene, state: State, gradient: Tensor, rates: Tensor, time: Tensor
+) -> Tensor:
+    """The learned optimiser's step [N, 14] with the signed ``rates`` [14]; ``time`` [4]: the last features."""
+    kernel = library.load_network()
+    return _step(
+        lambda now, threads: kernel.genre_network_step(network, scene, now, threads), state, gradient, rates, time
+    )
+
+
+def adam_step(state: State, rates: Tensor) -> Tensor:
+    """Tuned Adam's step [N, 14] with the signed ``rates`` [14]; float32 on the CPU."""
+    return _step(library.load_network().genre_adam_step, state, state.first, rates, rates)
+
+
+def _step(
+    call: Callable[[library.Now, int], int], state: State, gradient: Tensor, rates: Tensor, time: Tensor
+) -> Tensor:
+    of_attributes = [state.offsets, state.first, state.second, gradient]
+    rows = len(state.offsets)
+    if any(t.shape != (rows, 14) for t in of_attributes) or any(len(t) != rows for t in (state.seen, state.seen_now)):
+        raise ValueError(f"expected a state and a gradient [{rows}, 14], got {[list(t.shape) for t in of_attributes]}")
+    arrays = [*of_attributes[:3], state.seen, state.seen_now, gradient]
+    if not library.takes(*arrays):
+        raise ValueError("expected float32 tensors on the CPU")
+    arrays = [t.detach().contiguous() for t in arrays]
+    by_seen, delta = _by_seen(arrays[3]), torch.empty_like(arrays[0])
+    pointers = [t.data_ptr() for t in (*arrays, by_seen)]
+    now = library.Now(rows, *pointers, len(by_seen), time.data_ptr(), rates.data_ptr(), delta.data_ptr())
+    library.check(call(now, torch.get_num_threads()))
+    return delta
+
+
+def _by_seen(seen: Tensor) -> Tensor:
+    """What depends on how often a Gaussian was seen, for 0 … the most: [counts, 3], as state.py and features.py say."""
+    most = int(seen.numpy().max(initial=0))  # torch would wake its threads, which then spin beside the kernel's
+    counts = torch.arange(most + 1, dtype=torch.float32)
+    n = counts.clamp_min(1)
+    return torch.stack([1 - FIRST_DECAY**n, 1 - SECOND_DECAY**n, torch.log1p(counts) / 3], 1)
