@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from benchmarks import run
 from benchmarks.bench import NotMeasuredError
-from benchmarks.optimiser import BENCH, beyond, cells, converged, distillation, enhancement, race, summary
+from benchmarks.optimiser import BENCH, beside, beyond, cells, converged, distillation, enhancement, race, summary
+from benchmarks.optimiser import task as task_module
 from benchmarks.optimiser.distillation import Judge, Mark
 from benchmarks.optimiser.network import measure_network, scene_of
 from benchmarks.optimiser.picture import draw, draw_network
@@ -21,8 +24,17 @@ from benchmarks.optimiser.steps import images_of
 from benchmarks.optimiser.task import Task, psnr
 from benchmarks.schema import Result
 from flows.configuration import load_configuration
-from genre_tasks.config import AdamConfig, GnetConfig, LossConfig, OptimiserConfig, PerSceneConfig
+from genre_tasks.config import (
+    AdamConfig,
+    GnetConfig,
+    IngestConfig,
+    LossConfig,
+    OptimiserConfig,
+    PerSceneConfig,
+    PipelineConfig,
+)
 from genre_tasks.errors import ConfigError
+from genre_tasks.logs.registry import open_log
 from genre_tasks.metrics.collect import FeatureSet
 from genre_tasks.metrics.perceptual import perceptual_distance
 from genre_tasks.optimiser.adam import TunedAdam
@@ -32,8 +44,10 @@ from genre_tasks.optimiser.state import Frame, State
 from genre_tasks.optimiser.unroll import Plan, unroll
 from genre_tasks.scene.graph import DISTANT
 from genre_tasks.scene.views import NovelView
+from genre_tasks.stages.ingest import ingest
 from tests.optimiser import street
 
+TINY_LOG = "synthetic:street?seed=903&width=96&height=54&samples=1&lidar_beams=32&lidar_azimuths=450&frames=9&cameras=2"
 LOSS = LossConfig(perceptual=0.0)
 ADAM = GnetConfig(method="adam", iterations=6, views_per_iteration=2, loss=LOSS)
 NEVER = Point(0.05, 8, 99.0, 300)
@@ -259,6 +273,45 @@ def test_enet_beside_distillations_of_the_same_images(task: Task) -> None:
         assert all(curve[0] == row["start"] for curve in row[family]["curves"].values())
         assert row[family]["reached_s"] > 0
         assert row[family]["best"][2] == min(m[2] for c in row[family]["curves"].values() for m in c[1:])
+
+
+def test_truth_beside_the_path_is_cast_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    chunk = ingest(IngestConfig(width_px=96, height_px=54), open_log(TINY_LOG), 0)
+    views = beside.views_at(chunk, 3.0)
+    assert len(views) == 2 * len(chunk.views) and {v.shift_m for v in views} == {3.0, -3.0}
+    cast = beside.true_targets(TINY_LOG, str(tmp_path), chunk, 3.0, 4)
+    few = beside.views_at(chunk, 3.0, 4)
+    assert [(t.camera, t.frame) for t in cast] == [(v.camera, v.frame) for v in few] and all(t.novel for t in cast)
+    truth = open_log(TINY_LOG).truth
+    assert truth is not None
+    expected = truth.image(few[0].frame, chunk.world_SE3_chunk @ few[0].chunk_SE3_camera, few[0].lens)
+    assert np.abs(cast[0].image.image.numpy() - expected / 255).max() < 0.003  # half floats in the store
+
+    opened = beside.opened_log(TINY_LOG)
+    monkeypatch.setattr(type(opened.truth), "image", None)
+    again = beside.true_targets(TINY_LOG, str(tmp_path), chunk, 3.0, 4)
+    assert all(torch.equal(a.image.image, b.image.image) for a, b in zip(cast, again, strict=True))
+
+
+@pytest.mark.slow
+def test_a_cell_of_enhancement_goes_through_the_pipeline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tiny = ["ingest.width_px=96", "ingest.height_px=54", "initial.max_points=2000", "initial.distant_count=200"]
+    tiny += ["novel_views.lidar_max_points=2000"] + [f"{s}.iterations=2" for s in ("gnet", "enet")]
+
+    def load(preset: str, settings: Sequence[str] = ()) -> PipelineConfig:
+        return load_configuration(preset, settings=[*tiny, *settings])
+
+    monkeypatch.setattr(task_module, "load_configuration", load)
+    row = enhancement.measure_enhancement(TINY_LOG, 0, str(tmp_path), 1)
+    assert list(row["shifts"]) == list(beyond.SHIFTS) and row["order"] == 1
+    scenes = {"gnet", "enet", "gnet_again"}
+    assert all(set(at) == scenes | {"n"} and at["n"] == 12 for at in row["shifts"].values())
+    assert set(row["heldout_psnr"]) == scenes and len(set(row["heldout_psnr"].values())) == 3
+    job = task_module.job_of(TINY_LOG, 0, str(tmp_path), 1)
+    assert (job.config["gnet"]["seed"], job.config["enet"]["seed"], job.config["enet"]["snapshots"]) == (1, 1, 0)
+    assert any(
+        line.startswith("| street") and "GNet→FNet→ENet" not in line for line in BENCH.table({"enhancement/a": row})
+    )
 
 
 def test_scenes_are_compared_with_the_truth_or_as_sets(task: Task) -> None:
