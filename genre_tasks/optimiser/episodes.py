@@ -9,6 +9,7 @@ import torch
 from genre_tasks.optimiser.features import Fixed, features
 from genre_tasks.optimiser.learned import LearnedOptimiser
 from genre_tasks.optimiser.objective import Objective, Sight
+from genre_tasks.optimiser.rules import Step
 from genre_tasks.optimiser.sampler import ViewSampler
 from genre_tasks.optimiser.sparse_unet import VoxelPyramid
 from genre_tasks.optimiser.state import Frame, State
@@ -82,15 +83,32 @@ class Episode:
         batch = [*self.samplers[2].draw(), *self.samplers[3].draw()]
         return objective(self.frame, self.state.offsets, batch, 0, generator)
 
-    def step(self, network: LearnedOptimiser) -> torch.Tensor:
-        """Moves the state by the network's step and returns the step [N, 14], differentiable in the weights."""
+    def step(self, network: LearnedOptimiser, move: Step, rows: torch.Tensor) -> torch.Tensor:
+        """Moves the state by ``move`` (see :meth:`mover`); returns the rows [M, 14] of the step with their gradient."""
+        inputs, total = self._see(), self.course.iterations
+        delta = network.sampled_delta(self.state, inputs, self.pyramid, total, rows)
+        self._move(move)
+        return delta
+
+    def step_only(self, move: Step) -> None:
+        """As :meth:`step`, without a gradient."""
         assert self.sight is not None
         self.state = self.state.saw(self.sight.gradient)
-        total = self.course.iterations
-        inputs = features(self.frame, self.columns, self.state, self.sight.gradient, total)
-        delta = network.delta(self.state, inputs, self.pyramid, total)
-        self.state = self.state.moved(self.frame, delta.detach())
-        return delta
+        self._move(move)
+
+    def mover(self, network: LearnedOptimiser) -> Step:
+        """The network's step without gradient, with its weights as they are now."""
+        with torch.no_grad():
+            return network.step_of(self.frame, self.columns, self.pyramid)
+
+    def _see(self) -> torch.Tensor:
+        assert self.sight is not None
+        self.state = self.state.saw(self.sight.gradient)
+        return features(self.frame, self.columns, self.state, self.sight.gradient, self.course.iterations)
+
+    def _move(self, move: Step) -> None:
+        assert self.sight is not None
+        self.state = self.state.moved(self.frame, move(self.state, self.sight.gradient, self.course.iterations))
 
 
 JUDGES = 3

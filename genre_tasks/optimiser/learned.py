@@ -84,12 +84,32 @@ class LearnedOptimiser(nn.Module):
         learned = torch.exp(3 * torch.tanh(gain / 3)) * state.direction() + torch.tanh(offset)
         return -rates * schedule(state.iteration, total) * learned
 
+    def sampled_delta(self, state: State, inputs: Tensor, pyramid: VoxelPyramid, total: int, rows: Tensor) -> Tensor:
+        """The rows ``rows`` [M] of :meth:`delta`, differentiable through these Gaussians alone.
+
+        What the others pool into the voxels has the right value but no gradient; that of the rows counts N / M times,
+        so that over random rows the gradient in the weights of a sum is right on average.
+        """
+        with torch.no_grad():
+            everyone = pyramid.pool(F.silu(self.entry(inputs)))
+        own = F.silu(self.entry(inputs[rows]))
+        voxel = pyramid.voxel_of[rows]
+        change = torch.zeros_like(everyone).index_add(0, voxel, own - own.detach()) / pyramid.counts
+        around = self.unet(everyone + change * (len(inputs) / len(rows)), pyramid)
+        gain, offset = self.head(F.silu(self.mix(torch.cat([own, around[voxel]], 1)))).split(14, 1)
+        rates = rate_vector(self.config.rates).to(inputs.device)
+        learned = torch.exp(3 * torch.tanh(gain / 3)) * state.direction()[rows] + torch.tanh(offset)
+        return -rates * schedule(state.iteration, total) * learned
+
     def start(self, frame: Frame, centre: Tensor) -> Step:
         """See :class:`genre_tasks.optimiser.rules.StepRule`. The same bytes at any number of threads.
 
         float32 on the CPU is the compiled kernel's, with the weights as they are now; all else torch's, on one thread.
         """
-        pyramid, fixed = self.pyramid(frame, centre), Fixed.of(frame, centre)
+        return self.step_of(frame, Fixed.of(frame, centre), self.pyramid(frame, centre))
+
+    def step_of(self, frame: Frame, fixed: Fixed, pyramid: VoxelPyramid) -> Step:
+        """As :meth:`start`, with what does not change over the iterations given."""
         if takes(frame.unit, fixed.columns, *self.parameters()):
             return FusedStep(self, frame, fixed, pyramid)
 

@@ -23,10 +23,14 @@ from genre_tasks.optimiser.objective import Objective
 
 
 class MetaConfig(Section):
-    """Settings of meta-training; ``steps`` weight updates in all."""
+    """Settings of meta-training; ``steps`` weight updates in all.
+
+    ``sample``: the share of a scene's Gaussians, drawn anew for each update, through which the gradient is taken.
+    """
 
     steps: int = 1000
     segment: int = 6
+    sample: float = 1.0
     pool: int = 4
     iterations: tuple[int, ...] = (12, 24, 24, 36)
     views: tuple[int, ...] = (4, 6, 6, 8)
@@ -102,26 +106,29 @@ class MetaTraining:
         """K steps; the sum over steps of step · gradient of all later losses, whose derivative is the meta-gradient."""
         deltas: list[Tensor] = []
         gradients: list[Tensor] = []
+        count = len(episode.frame.scene)
+        rows = torch.randperm(count, generator=self.generator)[: max(1, round(self.config.sample * count))]
+        move = episode.mover(self.network)
         for _ in range(self.config.segment):
-            deltas.append(episode.step(self.network))
+            deltas.append(episode.step(self.network, move, rows))
             episode.sight = episode.look(self.seen, self.generator)
-            gradients.append(episode.sight.gradient / (episode.sight.loss * self.config.segment))
+            gradients.append(episode.sight.gradient[rows] / (episode.sight.loss * self.config.segment))
         judged = episode.judge(self.unseen, self.generator)
-        later = self.config.judged * judged.gradient / judged.loss
+        later = self.config.judged * judged.gradient[rows] / judged.loss
         total = deltas[0].new_zeros(())
         for delta, gradient in zip(reversed(deltas), reversed(gradients), strict=True):
             later = later + gradient
-            total = total + (delta * later).sum()
+            total = total + (delta * later).sum() * (count / len(rows))
         return total, episode.sight.loss, judged.loss  # type: ignore[union-attr]
 
     def _fill(self) -> None:
         """A pool at random ages, so that early and late iterations are trained from the start."""
         for _ in range(self.config.pool):
             episode = self._fresh()
+            move = episode.mover(self.network)
             for _ in range(self._below(episode.course.iterations)):
                 episode.sight = episode.look(self.seen, self.generator)
-                with torch.no_grad():
-                    episode.step(self.network)
+                episode.step_only(move)
             episode.sight = None
             self.pool.append(episode)
 

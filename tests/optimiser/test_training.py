@@ -12,7 +12,8 @@ from flows.train.optimiser import network_from, train_optimiser
 from genre_tasks.config import LossConfig
 from genre_tasks.errors import InputError
 from genre_tasks.optimiser.adam import TunedAdam
-from genre_tasks.optimiser.episodes import TrainingScene
+from genre_tasks.optimiser.episodes import Course, Episode, TrainingScene
+from genre_tasks.optimiser.features import features
 from genre_tasks.optimiser.learned import NetworkConfig
 from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.training import MetaConfig, MetaTraining
@@ -46,6 +47,35 @@ def test_training_beats_the_rates_it_starts_from() -> None:
         run = unroll(rule, unseen.scene, unseen.source, (), Objective(LOSS), Plan(8, 3))
         results.append(run.losses[-1])
     assert results[1] < 0.97 * results[0]
+
+
+def test_a_share_of_the_gaussians_gives_the_gradient_of_all_on_average() -> None:
+    network, generator = network_from(NETWORK, 0), torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        network.head.weight.normal_(generator=generator)
+    scene = _scene(0)
+    course = Course(0, 6, 3, 0, 0.0, 0.0)
+    episode = Episode.start(course, scene, network, generator)
+    sight = episode.look(Objective(LOSS), generator)
+    state, count = episode.state.saw(sight.gradient), len(scene.scene)
+    inputs = features(episode.frame, episode.columns, state, sight.gradient, 6)
+
+    def gradients(delta: torch.Tensor, rows: torch.Tensor) -> list[torch.Tensor]:
+        total = (delta * sight.gradient[rows]).sum() * (count / len(rows))
+        return list(torch.autograd.grad(total, list(network.parameters())))
+
+    order = torch.randperm(count, generator=generator)
+    whole = network.delta(state, inputs, episode.pyramid, 6)
+    full = gradients(whole, torch.arange(count))
+    every = network.sampled_delta(state, inputs, episode.pyramid, 6, order)
+    torch.testing.assert_close(every, whole[order])
+    for ours, theirs in zip(gradients(every, order), full, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-6 + 1e-4 * float(theirs.abs().max()))
+    halves = [order[: count // 2], order[count // 2 :]]
+    parts = [gradients(network.sampled_delta(state, inputs, episode.pyramid, 6, rows), rows) for rows in halves]
+    for (name, _), a, b, theirs in zip(network.named_parameters(), *parts, full, strict=True):
+        if not name.startswith("entry"):  # there products of two rows' shares come in: right for many Gaussians alone
+            torch.testing.assert_close((a + b) / 2, theirs, rtol=1e-3, atol=1e-6 + 1e-4 * float(theirs.abs().max()))
 
 
 def _weights(training: MetaTraining) -> list[torch.Tensor]:
