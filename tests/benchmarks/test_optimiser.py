@@ -391,6 +391,8 @@ def test_where_enet_is_not_as_good_the_cap_counts() -> None:
     rows = {"distillation/a": where | {"adam": good, "standard": bad}}
     claims = {c.id.removeprefix("optimiser."): c for c in summary.claims(rows)}
     assert (claims["distillation"].measured, claims["distillation"].holds) == (0.4, True)
+    at_once = where | {"adam": good | {"reached_s": 0.001}, "standard": bad}
+    assert beyond.times_distillation(at_once, "adam") == 50.0
     standard = claims["distillation_standard"]
     assert (standard.measured, standard.holds) == (50.0, False)
     assert "in 1 of 1 cells ENet does not reach it" in standard.data
