@@ -112,22 +112,22 @@ static void evaluate(const Network& net, const Scene& scene, const Now& now, int
     for (int64_t c = 0; c < net.hidden; c++) bias[c] += now.times[t] * net.entry[(VARYING + t) * net.hidden + c];
   std::vector<Rows> rows(threads, Rows(net.hidden));
   const size_t blocks = pieces(now.count, BLOCK);
-  Crew crew;
-  crew.run(threads, [&](int worker) {
+  Crew crew(4 + scene.layer_count);
+  crew.run(threads, [&](Crew::Member& member) {
     auto each_voxel = [&](int64_t voxels, auto f) {
-      crew.each(pieces(voxels, VOXELS), [&](size_t p) {
+      member.each(pieces(voxels, VOXELS), [&](size_t p) {
         for (size_t v = p * VOXELS; v < std::min<size_t>((p + 1) * VOXELS, voxels); v++) f(v);
       });
     };
-    crew.each(parts.size(), [&](size_t p) {
+    member.each(parts.size(), [&](size_t p) {
       parts[p] = sum_of_squares(now, p * SUMMED, std::min<size_t>((p + 1) * SUMMED, now.count));
     });
     const Lanes usual = inverse_usual(parts);
-    crew.each(blocks, [&](size_t b) { enter(net, scene, now, usual, bias.data(), b, rows[worker]); });
+    member.each(blocks, [&](size_t b) { enter(net, scene, now, usual, bias.data(), b, rows[member.number]); });
     each_voxel(scene.voxels, [&](size_t v) { pool(scene, net.hidden, v); });
     for (int64_t l = 0; l < scene.layer_count; l++)
       each_voxel(scene.layers[l].outputs, [&](size_t v) { convolve(scene.layers[l], v); });
-    crew.each(blocks, [&](size_t b) { leave(net, scene, now, b, rows[worker]); });
+    member.each(blocks, [&](size_t b) { leave(net, scene, now, b, rows[member.number]); });
   });
 }
 
