@@ -5,7 +5,8 @@ genre bench optimiser --json docs/benchmarks/optimiser.json [--set seeds=1001 --
 A log and an order of views (a seed) make a cell with each method; GNet runs in each of them anew, before the method.
 A baseline's run ends where it reaches GNet's held-out PSNR, or at ``cap`` times GNet's seconds. A log and an order make
 also a cell of enhancement, one of distillation and one of convergence. The two latter run baselines to their ends and
-are the dearest: ``long_orders`` chooses their orders. All cells of the first order come first.
+are the dearest: ``long_orders`` chooses their orders. All cells of the first order come first. What GNet's length and
+views bring and cost is measured on validation streets.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from benchmarks.optimiser.converged import LONG_RENDERS, PRESET, long_variants, 
 from benchmarks.optimiser.distillation import MOST_TIMES, STANDARD_ITERATIONS, adam_variants, measure_distillation
 from benchmarks.optimiser.enhancement import as_enhancer, measure_enhancement
 from benchmarks.optimiser.network import COUNTS, measure_network
+from benchmarks.optimiser.trade import SEEDS, measure_trade, settings
 from benchmarks.schema import Claim
 from flows.configuration import load_configuration
 from flows.pipeline import BY_NAME, weights_digest, weights_file
@@ -32,7 +34,7 @@ from genre_tasks.optimiser.run import step_rule
 RENDER_S, STEP_S, JUDGE_S = 0.012, 0.1, 0.2
 """Predicted for a view with its gradient at 40k Gaussians, a step of a network, and a look at a scene."""
 QUICK_CAP = 10.0
-PARTS = ("race", "enhancement", "distillation", "converged", "stability")
+PARTS = ("race", "enhancement", "distillation", "converged", "stability", "trade")
 SLOWER_3DGS = 4.0
 """Per-scene 3DGS grows to several times as many Gaussians."""
 CLAIMED = ("tuned_adam", "standard_3dgs")
@@ -52,7 +54,8 @@ class Optimiser:
         "benchmarks.optimiser.cells", "benchmarks.optimiser.network", "benchmarks.optimiser.race",
         "benchmarks.optimiser.task", "benchmarks.raster.scenes", "benchmarks.timing", "genre_tasks.optimiser.run",
         "benchmarks.optimiser.beside", "benchmarks.optimiser.converged", "benchmarks.optimiser.distillation",
-        "benchmarks.optimiser.enhancement", "benchmarks.optimiser.steps", "genre_tasks.stages.novel_views",
+        "benchmarks.optimiser.enhancement", "benchmarks.optimiser.steps", "benchmarks.optimiser.trade",
+        "genre_tasks.stages.novel_views",
         "genre_tasks.stages.fnet", "genre_tasks.stages.ingest", "genre_tasks.stages.initial",
         "genre_tasks.logs.pandaset", "genre_tasks.logs.synthetic",
     )  # fmt: skip
@@ -75,6 +78,8 @@ class Optimiser:
         cap = min(float(options["cap"]), QUICK_CAP) if quick else float(options["cap"])
         made = _Maker(load_configuration("small"), load_configuration(PRESET), options["store"], cap)
         out = [made.network(3 if quick else 9)]
+        if "trade" in parts:
+            out += [made.trade(seed) for seed in SEEDS[: 1 if quick else None]]
         for order in map(int, orders):
             if "race" in parts:
                 out += [made.race(*log, order, m) for m in methods for log in logs]
@@ -112,6 +117,13 @@ class _Maker:
         rule = partial(step_rule, "gnet", self._small.gnet)
         measure = partial(measure_network, rule, COUNTS, rounds)
         return Cell("network", 5.0 * (rounds + 2), measure, self._gnet | {"rounds": rounds})
+
+    def trade(self, seed: int) -> Cell:
+        configs = settings(self._small.gnet)
+        measure = partial(measure_trade, f"synthetic:street?seed={seed}", self._store, configs)
+        values = {name: config.model_dump(mode="json") for name, config in configs.items()}
+        seconds = sum(map(_learned_s, configs.values()))
+        return Cell(f"trade/street {seed}", seconds, measure, self._gnet | {"settings": values})
 
     def race(self, log: str, chunk: int, order: int, method: str) -> Cell:
         configs = variants(method)

@@ -43,6 +43,6 @@ def claims(rows: Mapping[str, Row]) -> Iterator[Claim]:
     yield over_cells("stable_10x", [r["ratio"] for r in stable], "<=", 1.02, "ratio", f"{note}; {where(stable)}", max)
     m = rows.get("network", {}).get("seconds", {}).get("100000")
     spread = None if m is None else (m["low"], m["high"])
-    data = "100k Gaussians, features included, one thread"
+    data = "100k Gaussians, features included, two threads"
     yield claim("optimiser.network_100k", m and m["median"], "<=", 0.5, "s", data, m["n"] if m else 0, spread)
     yield from beyond.claims(rows)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Iterator, Mapping, Sequence
 
 from benchmarks.bench import Row
@@ -15,6 +16,9 @@ def markdown(rows: Mapping[str, Row]) -> Iterator[str]:
     yield "|---|---|---|---|---|---|---|---|"
     for row in (r for r in rows.values() if "variants" in r):
         yield from _race(row)
+    if trades := [row["trade"] for row in rows.values() if "trade" in row]:
+        yield ""
+        yield from _trade(trades)
     network = rows.get("network", {})
     if "seconds" in network:
         yield ""
@@ -49,6 +53,16 @@ def _race(row: Row) -> Iterator[str]:
             when, times = f"{v['reached_s']:.1f} s", f"{v['reached_s'] / g['seconds']:.2f}"
         cells = (f"{v['ended_s']:.1f}", v["renders"], f"{v['best_psnr']:.2f}", "" if equal is None else f"{equal:.2f}")
         yield f"| | {row['method']} {name} | " + " | ".join(map(str, cells)) + f" | {when} | {times} |"
+
+
+def _trade(rows: Sequence[Mapping[str, Mapping[str, float]]]) -> Iterator[str]:
+    yield "| GNet, iterations x views, or beside the preset | seconds | renders | held-out PSNR | PSNR at 3 m |"
+    yield "|---|---|---|---|---|"
+    for name in rows[0]:
+        seconds, renders, psnr, beside = (
+            statistics.fmean(row[name][k] for row in rows) for k in ("seconds", "renders", "psnr", "psnr_3m")
+        )
+        yield f"| {name} | {seconds:.2f} | {renders:.0f} | {psnr:.2f} | {beside:.2f} |"
 
 
 def _converged(rows: Sequence[Row]) -> Iterator[str]:

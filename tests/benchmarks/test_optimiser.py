@@ -14,7 +14,18 @@ import torch
 
 from benchmarks import run
 from benchmarks.bench import NotMeasuredError
-from benchmarks.optimiser import BENCH, beside, beyond, cells, converged, distillation, enhancement, race, summary
+from benchmarks.optimiser import (
+    BENCH,
+    beside,
+    beyond,
+    cells,
+    converged,
+    distillation,
+    enhancement,
+    race,
+    summary,
+    trade,
+)
 from benchmarks.optimiser import task as task_module
 from benchmarks.optimiser.distillation import Judge, Mark
 from benchmarks.optimiser.network import measure_network, scene_of
@@ -45,6 +56,7 @@ from genre_tasks.optimiser.unroll import Plan, unroll
 from genre_tasks.scene.graph import DISTANT
 from genre_tasks.scene.views import NovelView
 from genre_tasks.stages.ingest import ingest
+from genre_tasks.weights import resolve_weights
 from tests.optimiser import street
 
 TINY_LOG = "synthetic:street?seed=903&width=96&height=54&samples=1&lidar_beams=32&lidar_azimuths=450&frames=9&cameras=2"
@@ -411,12 +423,26 @@ def test_what_is_not_measured_does_not_count() -> None:
     assert "no time" in "\n".join(BENCH.table(rows))
 
 
+def test_the_trade_counts_renders_and_judges_the_end(task: Task) -> None:
+    named = trade.settings(learned(4))
+    assert [named[n].loss.perceptual_every for n in trade.PERCEPTUAL] == [1, 4]
+    config = learned(4).model_copy(update={"views_per_iteration": 1000})
+    found = trade.trade(replace(task, beside=task.heldout), config)
+    rule, plan = LearnedOptimiser.load(resolve_weights("gnet", "builtin")), Plan(4, 1000)
+    expected = unroll(rule, task.scene, task.source, (), Objective(LOSS), plan).scene
+    assert found["renders"] == 4 * len(task.source) and found["seconds"] > 0
+    assert found["psnr"] == found["psnr_3m"] == task.psnr(expected)
+    rows = {f"trade/{k}": {"log": "a", "chunk": 0, "trade": {"4x30": found | {"seconds": k}}} for k in (1.0, 2.0)}
+    assert f"| 4x30 | 1.50 | {found['renders']} |" in "\n".join(BENCH.table(rows))
+
+
 def test_options_choose_cells_and_a_quick_run_ends_in_time() -> None:
     given = {**BENCH.options, "seeds": "900", "orders": "2", "pandaset": ""}
     log = "synthetic:street?seed=900 chunk 0"
     races = [f"{log} order 2 {m}" for m in cells.METHODS]
     parts = [f"{part}/{log} order 2" for part in ("enhancement", "distillation", "converged")]
-    assert [c.name for c in BENCH.cells(given, False)] == ["network", *races, *parts, f"stability/{log}"]
+    trades = [f"trade/street {seed}" for seed in trade.SEEDS]
+    assert [c.name for c in BENCH.cells(given, False)] == ["network", *trades, *races, *parts, f"stability/{log}"]
     few = given | {"parts": "enhancement,converged", "long_orders": "0"}
     assert [c.name for c in BENCH.cells(few, False)] == ["network", parts[0]]
     with pytest.raises(ConfigError, match=r"no part.*races"):
