@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from genre_tasks.errors import InputError
 from genre_tasks.optimiser.objective import Objective, check_finite
 from genre_tasks.optimiser.rules import StepRule
 from genre_tasks.optimiser.sampler import ViewSampler
@@ -52,8 +53,8 @@ def unroll(
     """Runs ``plan.iterations`` steps of ``rule`` from ``scene``.
 
     In each, ``plan.views`` of ``source`` and ``plan.novel_views`` of ``novel`` are rendered, drawn with the plan's
-    seed. The same inputs give the same bytes at any thread count. Raises ``NonFiniteError`` naming the first tensor
-    that is not finite.
+    seed. The same inputs give the same bytes at any thread count. An empty scene stays empty. Raises
+    ``NonFiniteError`` naming the first tensor that is not finite, ``InputError`` where no Gaussian is in any view.
     """
     generator = torch.Generator().manual_seed(plan.seed)
     samplers = [ViewSampler(source, plan.views, generator), ViewSampler(novel, plan.novel_views, generator)]
@@ -62,6 +63,7 @@ def unroll(
     step = rule.start(frame, camera_centre(source))
     keep = plan.snapshot_iterations()
     losses, seconds, snapshots, culled = [], [], {}, {}
+    seen = not len(scene)
     for i in range(plan.iterations):
         began = time.perf_counter()
         sight = objective(frame, state.offsets, [t for s in samplers for t in s.draw()], i, generator)
@@ -71,11 +73,26 @@ def unroll(
         check_finite(state.offsets, "updated Gaussians", plan.stage)
         losses.append(sight.loss)
         culled = sight.culled
+        if not seen:
+            seen = bool((state.seen > 0).any())
+            if not seen and (i + 1) * plan.views >= len(source):
+                raise _out_of_view(len(scene), source, plan.stage)
         if i + 1 in keep:
             snapshots[i + 1] = moved_scene(frame, state)
         seconds.append(time.perf_counter() - began)
         progress(i + 1, plan.iterations, f"loss {sight.loss:.3f}")
     return Reconstruction(moved_scene(frame, state), tuple(losses), snapshots, tuple(seconds), culled)
+
+
+def _out_of_view(count: int, source: Sequence[Target], stage: str) -> InputError:
+    cameras = ", ".join(sorted({t.camera for t in source}))
+    frames = sorted({t.frame for t in source})
+    return InputError(
+        f"None of the scene's {count} Gaussians is in any of the {len(source)} source views (cameras {cameras}, frames "
+        f"{frames[0]}–{frames[-1]})",
+        remedy="Check that poses and points are of one log and in metres (genre check), and opacities above 0.",
+        stage=stage,
+    )
 
 
 def camera_centre(targets: Sequence[Target]) -> Tensor:

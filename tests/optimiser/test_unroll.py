@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from genre_tasks.config import LossConfig
-from genre_tasks.errors import NonFiniteError
+from genre_tasks.errors import InputError, NonFiniteError
 from genre_tasks.optimiser.adam import TunedAdam
 from genre_tasks.optimiser.features import FEATURES, Fixed, features
 from genre_tasks.optimiser.learned import LearnedOptimiser, NetworkConfig
@@ -178,6 +178,17 @@ def test_all_gaussians_in_one_voxel() -> None:
     scene = full.with_gaussians(replace(g, means=torch.tensor([0.0, 0.0, 6.0]).expand(len(full), 3).clone()))
     result = unroll(_network(), scene, street.targets(full), (), OBJECTIVE, Plan(2, 2))
     assert bool(torch.isfinite(result.scene.gaussians.packed()).all())
+
+
+@pytest.mark.parametrize("rule", [_network(), TunedAdam()])
+def test_a_scene_out_of_every_view_is_an_error_that_says_so(rule: StepRule) -> None:
+    full = street.scene(actor=False)
+    behind = full.with_gaussians(replace(full.gaussians, means=full.gaussians.means - torch.tensor([0.0, 0.0, 1e3])))
+    with pytest.raises(
+        InputError, match=rf"None of the scene's {len(full)} Gaussians .* source views .* frames \d"
+    ) as hit:
+        unroll(rule, behind, street.targets(full), (), OBJECTIVE, Plan(9, 2, stage="gnet"))
+    assert "genre check" in str(hit.value.remedy)
 
 
 def test_a_step_that_is_not_finite_is_named(truth: SceneGraph) -> None:
