@@ -21,6 +21,7 @@ from genre_tasks.optimiser.training import MetaConfig
 
 CAMERAS = (3, 3, 3, 6, 3, 3, 2, 3)
 COARSE_POINTS, FINE_POINTS = (6_000, 8_000, 5_000, 10_000), (18_000, 20_000, 14_000, 24_000)
+DENSE_POINTS, DENSE_REAL_POINTS = (18_000, 36_000, 14_000, 40_000), (18_000, 36_000, 40_000)
 
 GNET_LOSS = LossConfig(perceptual=0.0)
 """What the optimiser sees in GNet's training."""
@@ -40,7 +41,7 @@ class SceneList:
     them on by one.
     """
 
-    size: Literal["coarse", "fine"]
+    size: Literal["coarse", "fine", "dense"]
     count: int
     real: int = 1
     rounds: int = 1
@@ -86,7 +87,7 @@ def _enet(**more: Any) -> MetaConfig:
     return MetaConfig(**{**usual, **more})
 
 
-COARSE, FINE = SceneList("coarse", 40), SceneList("fine", 15)
+COARSE, FINE, DENSE = SceneList("coarse", 40), SceneList("fine", 15), SceneList("dense", 28, real=3)
 
 GNET_STAGES = (
     Stage("gnet/coarse", None, GNET_NETWORK, COARSE, _gnet(steps=1200, rate=2.5e-3, seed=0)),
@@ -96,6 +97,13 @@ GNET_STAGES = (
     Stage(
         "gnet/many", "gnet/unseen", GNET_NETWORK, replace(FINE, real=2),
         _gnet(steps=110, rate=6e-4, seed=4, judged=4.0, views=(6, 15, 30)),
+    ),
+    Stage(
+        "gnet/dense", "gnet/many", GNET_NETWORK, DENSE,
+        _gnet(
+            steps=420, rate=5e-4, seed=41, judged=4.0, judges=6, sample=0.2, iterations=(24, 48, 48, 72),
+            views=(6, 15, 15, 30),
+        ),
     ),
 )  # fmt: skip
 """GNet from nothing."""
@@ -197,6 +205,8 @@ def scene_recipes(scenes: SceneList, real: str | None) -> list[SceneRecipe]:
     """One round of the list; ``real`` is the URI of a log with a chunk 0, or ``None``."""
     if scenes.size == "coarse":
         return coarse_scenes(scenes.count, real, scenes.real)
+    if scenes.size == "dense":
+        return dense_scenes(scenes.count, real, scenes.real)
     return fine_scenes(scenes.count, real, scenes.real)
 
 
@@ -220,6 +230,17 @@ def fine_scenes(count: int = 15, real: str | None = None, times: int = 1) -> lis
         pair = [SceneRecipe(real, max_points=18_000), SceneRecipe(real, max_points=36_000, distant_count=4_000)]
         out = times * pair
     return out + [SceneRecipe(_street(k * 37 % 900, k), max_points=FINE_POINTS[k % 4]) for k in range(count)]
+
+
+def dense_scenes(count: int = 28, real: str | None = None, times: int = 1) -> list[SceneRecipe]:
+    """Streets at 320×180 with up to as many Gaussians as the preset ``small`` has."""
+    out = []
+    if real is not None:
+        out = times * [SceneRecipe(real, max_points=n, distant_count=n // 10) for n in DENSE_REAL_POINTS]
+    for k in range(count):
+        points = DENSE_POINTS[(k + k // 4) % 4]
+        out.append(SceneRecipe(_street(k * 37 % 900, k), max_points=points, distant_count=points // 10))
+    return out
 
 
 def _street(seed: int, k: int, more: str = "") -> str:

@@ -37,7 +37,10 @@ class TrainingScene:
 
 @dataclass(frozen=True)
 class Course:
-    """How an episode goes: which scene, T, views in each iteration, and the start's change of size and opacity."""
+    """How an episode goes: which scene, T, views in each iteration, and the start's change of size and opacity.
+
+    ``judges``: held-out views, and as many true novel views, in each judgement.
+    """
 
     scene: int
     iterations: int
@@ -45,6 +48,7 @@ class Course:
     novel_views: int
     log_scale_shift: float
     logit_shift: float
+    judges: int = 3
 
 
 @dataclass
@@ -67,8 +71,8 @@ class Episode:
         samplers = (
             ViewSampler(scene.source, course.views, generator),
             ViewSampler(scene.fixed, course.novel_views, generator),
-            ViewSampler(scene.heldout, JUDGES, generator),
-            ViewSampler(scene.truth, JUDGES, generator),
+            ViewSampler(scene.heldout, course.judges, generator),
+            ViewSampler(scene.truth, course.judges, generator),
         )
         state = State.start(len(scene.scene), scene.scene.gaussians.means)
         return Episode(course, frame, network.pyramid(frame, centre), Fixed.of(frame, centre), samplers, state)
@@ -109,10 +113,6 @@ class Episode:
     def _move(self, move: Step) -> None:
         assert self.sight is not None
         self.state = self.state.moved(self.frame, move(self.state, self.sight.gradient, self.course.iterations))
-
-
-JUDGES = 3
-"""Held-out views, and true novel views, in each judgement."""
 
 
 def shifted(scene: SceneGraph, course: Course) -> SceneGraph:

@@ -39,6 +39,7 @@ class MetaConfig(Section):
     warm_up: int = 30
     clip: float = 0.3
     judged: float = 1.0
+    judges: int = 3
     log_scale_spread: float = 0.15
     logit_spread: float = 0.3
     loss: LossConfig = LossConfig()
@@ -143,6 +144,7 @@ class MetaTraining:
             config.novel_views,
             config.log_scale_spread * spread[0],
             config.logit_spread * spread[1],
+            config.judges,
         )
         return Episode.start(course, self.scenes[scene], self.network, self.generator)
 

@@ -31,10 +31,11 @@ def test_every_recipe_is_in_order_and_of_training_chunks(recipe: str) -> None:
 
 def test_the_shipped_weights_are_described() -> None:
     table = {stage.name: stage for stage in table_of("shipped")}
-    assert [table[s.name].config.steps for s in GNET_STAGES] == [1200, 240, 240, 200, 110]
+    assert [table[s.name].config.steps for s in GNET_STAGES] == [1200, 240, 240, 200, 110, 420]
     streets = [len(places(table[name], None)) for name in ("gnet/coarse", "gnet/fine", "enet/coarse")]
     assert streets == [40, 15, 24]
     assert len(places(table["gnet/many"], REAL)) == 15 + 4
+    assert len(places(table["gnet/dense"], REAL)) == 28 + 9
     begins = [place.begin for place in places(table["enet/fine"], REAL)]
     gnet = ByGnet("gnet/fine")
     assert begins[:6] == [gnet, gnet, Adam(24), gnet, gnet, Adam(48)]
@@ -59,7 +60,7 @@ def test_g3r_sees_recorded_views_alone(recipe: str) -> None:
 
 def test_a_table_out_of_order_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recipes, "RECIPES", {"turned": tuple(reversed(GNET_STAGES)), "twice": 2 * GNET_STAGES[:1]})
-    with pytest.raises(ConfigError, match="gnet/many needs gnet/unseen"):
+    with pytest.raises(ConfigError, match="gnet/dense needs gnet/many"):
         table_of("turned")
     with pytest.raises(ConfigError, match="two stages are called gnet/coarse"):
         table_of("twice")
