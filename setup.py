@@ -17,7 +17,12 @@ from genre_tasks.compiled import recipe  # noqa: E402 — imports no torch
 # By path: a room's __init__ may import torch, which an isolated build lacks.
 KERNELS = [
     runpy.run_path(str(ROOT / "genre_tasks" / file))["KERNEL"]
-    for file in ("render/build_kernel.py", "optimiser/build_image_loss.py", "optimiser/build_network.py")
+    for file in (
+        "render/build_kernel.py",
+        "optimiser/build_image_loss.py",
+        "optimiser/build_network.py",
+        "optimiser/build_posing.py",
+    )
 ]
 
 

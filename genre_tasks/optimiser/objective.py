@@ -11,9 +11,9 @@ from torch import Tensor
 from genre_tasks.config import LossConfig
 from genre_tasks.errors import NonFiniteError
 from genre_tasks.optimiser.loss import Distance, image_gradients, plan_loss
+from genre_tasks.optimiser.passes import begin
 from genre_tasks.optimiser.state import Frame
 from genre_tasks.optimiser.targets import Target
-from genre_tasks.render.api import render_views
 from genre_tasks.render.types import RenderSettings
 
 
@@ -46,15 +46,10 @@ class Objective:
         generator: torch.Generator,
     ) -> Sight:
         """``iteration`` and ``generator`` decide where the perceptual term is taken."""
-        leaf = offsets.detach().requires_grad_()
         plan = plan_loss(self.config, targets, iteration, generator, self.distance is not None)
-        with torch.enable_grad():
-            image = render_views(frame.scene.with_gaussians(frame.gaussians(leaf)), targets, self.settings)
-            depth = image.expected_depth()
-        loss, by_color, by_depth = image_gradients(self.config, image.color, depth, targets, plan, self.distance)
-        torch.autograd.backward([image.color, depth], [by_color, by_depth])
-        assert leaf.grad is not None
-        return Sight(loss, leaf.grad, image.culled)
+        image = begin(frame, offsets, targets, self.settings)
+        loss, by_color, by_depth = image_gradients(self.config, image.color, image.depth, targets, plan, self.distance)
+        return Sight(loss, image.gradient(by_color, by_depth), image.culled)
 
 
 def check_finite(values: Tensor, name: str, stage: str, **where: object) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from genre_tasks.optimiser import fused_state
 from genre_tasks.optimiser.network_constants import DEVIATION_FLOOR
+from genre_tasks.optimiser.posing import Posing
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import DISTANT, SceneGraph
 
@@ -50,6 +52,16 @@ class Frame:
         low[:, 11:14], high[:, 11:14] = COLOR_BOUNDS
         return Frame(scene, unit, torch.minimum(low, start), torch.maximum(high, start))
 
+    @cached_property
+    def start(self) -> Tensor:
+        """[N, 14] the attributes at the start."""
+        return self.scene.gaussians.packed()
+
+    @cached_property
+    def posing(self) -> Posing:
+        """What the compiled way from offsets to splats keeps over the iterations; float32 on the CPU only."""
+        return Posing(self.scene, self.start.detach(), self.unit.detach())
+
     def gaussians(self, offsets: Tensor) -> Gaussians:
         """The Gaussians at ``offsets`` [N, 14] from the start: means in units, all else in raw space."""
         start = self.scene.gaussians
@@ -64,7 +76,7 @@ class Frame:
 
     def bounded(self, offsets: Tensor) -> Tensor:
         """Offsets held inside the bounds; those inside stay the same bytes."""
-        start = self.scene.gaussians.packed()
+        start = self.start
         clamped = torch.minimum(torch.maximum(start + offsets, self.low), self.high)
         outside = (start + offsets != clamped) & (self.low > -torch.inf)
         return torch.where(outside, clamped - start, offsets)
@@ -103,7 +115,7 @@ class State:
 
     def moved(self, frame: Frame, delta: Tensor) -> State:
         """With ``delta`` [N, 14] applied to what any view has seen so far; the rest stays the same bytes."""
-        start, low, high = frame.scene.gaussians.packed(), frame.low, frame.high
+        start, low, high = frame.start, frame.low, frame.high
         if fused_state.fits(self.offsets, delta, self.seen, start, low, high):
             offsets = fused_state.moved(self.offsets, delta, self.seen, start, low, high)
             return replace(self, offsets=offsets, iteration=self.iteration + 1)

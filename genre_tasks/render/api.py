@@ -72,13 +72,18 @@ def render_views(scene: SceneGraph, views: Sequence[PosedView], settings: Render
 
     Raises as :func:`render`.
     """
+    cameras = cameras_of(views)
+    frames = [v.frame for v in views]
+    posed, moving = scene.posed(list(dict.fromkeys(frames)))
+    shown = Shown.of_frames(len(scene) - len(moving), len(moving), frames)
+    return render(posed.activated(), _on(cameras, scene.gaussians.means), settings, shown)
+
+
+def cameras_of(views: Sequence[PosedView]) -> Cameras:
+    """The cameras of views. Raises ``NonFiniteError`` for one that is not finite, ``ValueError`` for mixed sizes."""
     cameras = Cameras.of([v.chunk_SE3_camera for v in views], [v.lens for v in views])
-    frames = list(dict.fromkeys(v.frame for v in views))
-    posed, moving = scene.posed(frames)
-    shared, own = len(scene) - len(moving), len(moving)
-    begins = [shared + frames.index(v.frame) * own for v in views]
-    shown = Shown(shared, tuple((begin, begin + own) for begin in begins))
-    return render(posed.activated(), _on(cameras, scene.gaussians.means), settings, shown if own else None)
+    _check_finite(cameras)
+    return cameras
 
 
 def _on_cpu(splats: Splats, cameras: Cameras, threads: int | None, shown: Shown) -> Render:
@@ -141,6 +146,10 @@ def _check_shapes(splats: Splats, cameras: Cameras) -> None:
             raise ValueError(f"expected {name} of shape {shape}, got {tuple(tensor.shape)}")
     if cameras.width_px < 1 or cameras.height_px < 1:
         raise ValueError(f"expected an image of at least 1 × 1, got {cameras.width_px} × {cameras.height_px}")
+    _check_finite(cameras)
+
+
+def _check_finite(cameras: Cameras) -> None:
     for name in ("camera_SE3_chunk", "focal_px", "center_px"):
         bad = ~torch.isfinite(getattr(cameras, name))
         if bool(bad.any()):

@@ -41,9 +41,10 @@ class _Batch:
         self._free(self.handle)
 
 
-def _forward(
+def forward(
     arrays: Arrays, cameras: Cameras, shown: Shown, threads: int, keep: bool
 ) -> tuple[Images, dict[str, int], _Batch | None]:
+    """The images of contiguous ``arrays``, the culled counts, and with ``keep`` the state for :func:`backward`."""
     kernel = load_kernel()
     views, height, width = len(cameras), cameras.height_px, cameras.width_px
     poses = cameras.camera_SE3_chunk.detach().to("cpu", torch.float32).contiguous()
@@ -63,6 +64,16 @@ def _forward(
     return (color, alpha, depth), counts, _Batch(handle) if keep else None
 
 
+def backward(batch: _Batch, arrays: Arrays, images: Images, by_images: Images, threads: int, out: Arrays) -> None:
+    """Writes the gradients of ``arrays`` to ``out``, from those of the images."""
+    v = [x.contiguous() for x in by_images]
+    status = load_kernel().genre_backward(
+        batch.handle, len(arrays[0]), *(a.data_ptr() for a in arrays), *(a.data_ptr() for a in images),
+        *(x.data_ptr() for x in v), threads, *(g.data_ptr() for g in out),
+    )  # fmt: skip
+    check_status(status)
+
+
 class _Rasterise(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -70,7 +81,7 @@ class _Rasterise(torch.autograd.Function):
         quats: Tensor, opacities: Tensor, colors: Tensor,
     ) -> Images:  # fmt: skip
         arrays = (means, scales, quats, opacities, colors)
-        images, counts, ctx.batch = _forward(arrays, cameras, shown, threads, keep=any(ctx.needs_input_grad))
+        images, counts, ctx.batch = forward(arrays, cameras, shown, threads, keep=any(ctx.needs_input_grad))
         culled.update(counts)
         ctx.cameras, ctx.shown, ctx.threads = cameras, shown, threads
         ctx.save_for_backward(*arrays, *images)
@@ -83,14 +94,10 @@ class _Rasterise(torch.autograd.Function):
         arrays, images = saved[:5], saved[5:]
         batch, ctx.batch = ctx.batch, None
         if batch is None:  # a second backward through a retained graph: the state was given back after the first
-            batch = _forward(arrays, ctx.cameras, ctx.shown, ctx.threads, keep=True)[2]
-        grads = [torch.empty_like(a) for a in arrays]
-        v = [x.contiguous() for x in (v_color, v_alpha, v_depth)]
-        status = load_kernel().genre_backward(
-            batch.handle, len(arrays[0]), *(a.data_ptr() for a in arrays), *(a.data_ptr() for a in images),
-            *(x.data_ptr() for x in v), ctx.threads, *(g.data_ptr() for g in grads),
-        )  # fmt: skip
-        check_status(status)
+            batch = forward(arrays, ctx.cameras, ctx.shown, ctx.threads, keep=True)[2]
+        means, scales, quats, opacities, colors = (torch.empty_like(a) for a in arrays)
+        grads = (means, scales, quats, opacities, colors)
+        backward(batch, arrays, images, (v_color, v_alpha, v_depth), ctx.threads, grads)
         return (None, None, None, None, *grads)
 
 
@@ -105,7 +112,7 @@ def _arrays(splats: Splats) -> Arrays:
 def forward_state(splats: Splats, cameras: Cameras) -> _Batch:
     """The kernel's state after a forward pass on one thread."""
     with torch.no_grad():
-        state = _forward(_arrays(splats), cameras, Shown.all_of(len(splats), len(cameras)), 1, keep=True)[2]
+        state = forward(_arrays(splats), cameras, Shown.all_of(len(splats), len(cameras)), 1, keep=True)[2]
     assert state is not None
     return state
 

@@ -64,6 +64,13 @@ class Shown:
         """Everything in every view."""
         return Shown(count, ((count, count),) * views)
 
+    @staticmethod
+    def of_frames(shared: int, moving: int, frames: Sequence[int]) -> Shown:
+        """For views at these log frames: what stays, then what moves once for each frame, as ``SceneGraph.posed``."""
+        place = {frame: i for i, frame in enumerate(dict.fromkeys(frames))}
+        begins = [shared + place[frame] * moving for frame in frames]
+        return Shown(shared, tuple((begin, begin + moving) for begin in begins))
+
     def of(self, v: int) -> Shown:
         """For view v alone."""
         return Shown(self.shared, (self.own[v],))

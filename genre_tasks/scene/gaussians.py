@@ -7,6 +7,8 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from genre_tasks.scene.constants import LOWEST_LOGIT
+
 OPACITY_CLAMP = 1e-6
 """Opacities are kept in [1e-6, 1 − 1e-6] when they are taken to logits, so that the logit is finite."""
 
@@ -14,10 +16,10 @@ OPACITY_CLAMP = 1e-6
 def sigmoid(logits: Tensor) -> Tensor:
     """1 / (1 + e^−x), elementwise, the same bits at any thread count.
 
-    ``torch.sigmoid`` rounds differently at the ends of the pieces that its threads take. Below −80, where the value is
-    under 1e-34, it is constant, so that neither value nor gradient overflows.
+    ``torch.sigmoid`` rounds differently at the ends of the pieces that its threads take. Below ``LOWEST_LOGIT`` it is
+    constant.
     """
-    return 1.0 / (1.0 + torch.exp(-logits.clamp_min(-80.0)))
+    return 1.0 / (1.0 + torch.exp(-logits.clamp_min(LOWEST_LOGIT)))
 
 
 @dataclass(frozen=True)

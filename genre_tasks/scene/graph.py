@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from genre_tasks.logs.types import Float64
+from genre_tasks.scene.constants import ABSENT_LOGIT
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.geometry import matrix_to_quat, quat_multiply
 
@@ -100,9 +101,11 @@ class SceneGraph:
             g.colors,
         )
 
-    def _actors_at(self, moving: Tensor, frames: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
-        """Means [F, M, 3], quaternions [F, M, 4] and logit opacities [F, M] of the actors' Gaussians ``moving`` [M]."""
-        g = self.gaussians
+    def actor_poses(self, frames: Sequence[int]) -> tuple[Float64, Float64, NDArray[np.bool_]]:
+        """Rotations [F, A, 3, 3] and translations [F, A, 3] of the actors' boxes, and whether the actors exist [F, A].
+
+        The pose of an absent actor is the identity.
+        """
         rotation = np.broadcast_to(np.eye(3), (len(frames), len(self.actors), 3, 3)).copy()
         translation = np.zeros((len(frames), len(self.actors), 3))
         present = np.zeros((len(frames), len(self.actors)), dtype=bool)
@@ -111,6 +114,12 @@ class SceneGraph:
                 pose = actor.pose(frame)
                 if pose is not None:
                     rotation[f, k], translation[f, k], present[f, k] = pose[:3, :3], pose[:3, 3], True
+        return rotation, translation, present
+
+    def _actors_at(self, moving: Tensor, frames: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
+        """Means [F, M, 3], quaternions [F, M, 4] and logit opacities [F, M] of the actors' Gaussians ``moving`` [M]."""
+        g = self.gaussians
+        rotation, translation, present = self.actor_poses(frames)
         actor_of = self.nodes[moving] - FIRST_ACTOR
         turns = torch.as_tensor(rotation).to(g.means)
         turn, quat = turns[:, actor_of], matrix_to_quat(turns)[:, actor_of]
@@ -121,5 +130,5 @@ class SceneGraph:
         return (
             turned + torch.as_tensor(translation).to(means)[:, actor_of],
             quat_multiply(quat, quats.expand_as(quat)),
-            torch.where(there, opacities, torch.full_like(opacities, -30.0)),
+            torch.where(there, opacities, torch.full_like(opacities, ABSENT_LOGIT)),
         )

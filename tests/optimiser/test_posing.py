@@ -1,0 +1,263 @@
+"""The compiled way from offsets to splats and back against torch's, which defines it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from genre_tasks.compiled.loader import supported_isas
+from genre_tasks.config import LossConfig
+from genre_tasks.errors import NonFiniteError, ResourceError
+from genre_tasks.optimiser import objective as objective_module
+from genre_tasks.optimiser import posing as module
+from genre_tasks.optimiser.adam import TunedAdam
+from genre_tasks.optimiser.build_posing import KERNEL
+from genre_tasks.optimiser.objective import Objective
+from genre_tasks.optimiser.passes import CompiledPass, TorchPass, begin
+from genre_tasks.optimiser.posing import arrays, load_posing
+from genre_tasks.optimiser.state import Frame
+from genre_tasks.optimiser.unroll import Plan, unroll
+from genre_tasks.render.types import Render, RenderSettings
+from genre_tasks.scene import constants
+from genre_tasks.scene.gaussians import Gaussians
+from genre_tasks.scene.geometry import se3
+from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR, ActorNode, SceneGraph
+from tests.optimiser import street
+
+NAMES = ("means", "scales", "quats", "opacities", "colors")
+FRAMES = (1, 7, 0, 2)
+"""Both actors, none, the first alone, the second alone."""
+SETTINGS = RenderSettings()
+
+
+def _scene(count: int = 3000, actors: int = 2) -> SceneGraph:
+    """Actors that turn, each absent at times, whose Gaussians lie among the others."""
+    plain = street.scene(count, actor=False)
+    paths = []
+    for k in range(actors):
+        turns = Rotation.from_euler("zyx", [[0.3 + k, 0.1, -0.2], [2.9, -0.4, 0.5 * k]]).as_matrix()
+        poses = se3(turns, np.array([[0.5, 0.2, 7.0 + k], [1.0, -0.1 * k, 6.0]]))
+        paths.append(ActorNode(f"a{k}", "Car", (1.0, 1.0, 1.0), np.array([k, k + 1]), poses))
+    nodes, at = plain.nodes.clone(), torch.arange(count)
+    for k in range(actors):
+        nodes[at % 5 == 2 * k + 1] = FIRST_ACTOR + k
+    means = torch.where((nodes >= FIRST_ACTOR)[:, None], plain.gaussians.means / 10, plain.gaussians.means)
+    return SceneGraph(replace(plain.gaussians, means=means), nodes, tuple(paths))
+
+
+def _offsets(scene: SceneGraph) -> Tensor:
+    return 0.1 * torch.randn(len(scene), 14, generator=torch.Generator().manual_seed(5))
+
+
+def _exact(scene: SceneGraph) -> Frame:
+    wide = Gaussians.unpacked(scene.gaussians.packed().double())
+    return replace(Frame.of(scene), scene=scene.with_gaussians(wide), unit=Frame.of(scene).unit.double())
+
+
+def _both(scene: SceneGraph, frames: tuple[int, ...] = FRAMES) -> list[tuple[list[Tensor], Tensor]]:
+    """Splats, and the gradient of a random linear function of them, compiled and as torch has them in float64."""
+    offsets, frame = _offsets(scene), Frame.of(scene)
+    leaf, exact = offsets.double().requires_grad_(), _exact(scene)
+    splats = exact.scene.with_gaussians(exact.gaussians(leaf)).posed(frames)[0].activated()
+    theirs = [getattr(splats, name) for name in NAMES]
+    generator = torch.Generator().manual_seed(6)
+    by_splats = [torch.randn(t.shape, generator=generator) for t in theirs]
+    torch.autograd.backward(theirs, [g.double() for g in by_splats])
+    posed = frame.posing.splats(offsets, frames, 2)
+    gradient = frame.posing.gradient(posed, tuple(by_splats), 2)
+    assert leaf.grad is not None
+    return [(list(posed.splats), gradient), ([t.detach() for t in theirs], leaf.grad)]
+
+
+def _close(ours: Tensor, exact: Tensor, bound: float) -> None:
+    assert ours.shape == exact.shape and ours.dtype == torch.float32
+    assert float((ours - exact).abs().max()) <= bound * float(exact.abs().max())
+
+
+def _check(scene: SceneGraph, frames: tuple[int, ...] = FRAMES) -> None:
+    (ours, gradient), (exact, expected) = _both(scene, frames)
+    for a, b in zip(ours, exact, strict=True):
+        _close(a, b, 1e-6)
+    for k in (1, 3):  # scales and opacities, each by its own size
+        assert float(((ours[k] - exact[k]) / exact[k]).abs().max()) <= 2e-6
+    for columns in ((0, 3), (3, 6), (6, 10), (10, 11), (11, 14)):
+        _close(gradient[:, slice(*columns)], expected[:, slice(*columns)], 1e-5)
+
+
+@pytest.mark.parametrize("actors", [0, 1, 2])
+def test_values_and_gradients_are_the_oracles(actors: int) -> None:
+    scene = _scene(actors=actors)
+    assert bool((scene.nodes == DISTANT).any()) and int((scene.nodes >= FIRST_ACTOR).sum()) == 600 * actors
+    _check(scene)
+
+
+@pytest.mark.parametrize("frames", [(1,), (0,), (7,), (0, 2, 1)])
+def test_at_any_frames(frames: tuple[int, ...]) -> None:
+    _check(_scene(200), frames)
+
+
+@pytest.mark.parametrize("count", [1, 5, 63, 64, 65])
+def test_at_the_ends_of_blocks(count: int) -> None:
+    _check(_scene(count))
+
+
+def test_every_gaussian_an_actors() -> None:
+    scene = _scene(100)
+    _check(replace(scene, nodes=torch.full_like(scene.nodes, FIRST_ACTOR)))
+
+
+def test_actors_without_gaussians_and_gaussians_of_no_actor() -> None:
+    scene = _scene(100)
+    _check(replace(scene, nodes=torch.zeros_like(scene.nodes)))
+    (ours, _), (exact, _) = _both(replace(scene, actors=()))
+    assert len(ours[0]) == len(exact[0]) == 100
+
+
+@pytest.mark.parametrize("isa", supported_isas())
+def test_every_instruction_set_is_right(isa: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GENRE_RENDER_ISA", isa)
+    monkeypatch.setattr(module, "load_posing", load_posing.__wrapped__)
+    _check(_scene())
+
+
+def test_no_gaussian_at_all() -> None:
+    full = _scene(100)
+    frame = Frame.of(replace(full, gaussians=Gaussians.unpacked(torch.empty(0, 14)), nodes=full.nodes[:0]))
+    posed = frame.posing.splats(torch.empty(0, 14), FRAMES, 2)
+    assert frame.posing.gradient(posed, arrays(0), 2).shape == (0, 14)
+
+
+def test_the_same_bits_at_any_thread_count() -> None:
+    scene = _scene()
+    frame, offsets = Frame.of(scene), _offsets(scene)
+    results = []
+    for threads in (1, 2, 3):
+        posed = frame.posing.splats(offsets, FRAMES, threads)
+        results.append([*posed.splats, frame.posing.gradient(posed, posed.splats, threads)])
+    assert all(torch.equal(a, b) for r in results[1:] for a, b in zip(results[0], r, strict=True))
+
+
+def test_extreme_and_broken_values_are_torchs() -> None:
+    scene = _scene(12, actors=0)
+    packed = scene.gaussians.packed()
+    packed[:, 3:6] = torch.tensor([-100.0, -80, -30, 0, 30, 80, 87, 90, 200, torch.nan, torch.inf, -torch.inf])[:, None]
+    packed[:, 10] = torch.tensor([-200.0, -80.1, -80, -79.9, -30, -9, 0, 9, 30, torch.nan, torch.inf, -torch.inf])
+    packed[9, 0], packed[10, 12] = torch.nan, torch.inf
+    scene = scene.with_gaussians(Gaussians.unpacked(packed))
+    frame, leaf = Frame.of(scene), torch.zeros(12, 14, requires_grad=True)
+    frame = replace(frame, unit=torch.ones(12, 1))
+    splats = frame.gaussians(leaf).activated()
+    theirs = [getattr(splats, name) for name in NAMES]
+    ones = arrays(12)
+    for t in ones:
+        t.fill_(1.0)
+    torch.autograd.backward(theirs, list(ones))
+    assert leaf.grad is not None
+    posed = frame.posing.splats(torch.zeros(12, 14), FRAMES, 1)
+    ours = [*posed.splats, frame.posing.gradient(posed, ones, 1)]
+    for a, b in zip(ours, [*theirs, leaf.grad], strict=True):
+        torch.testing.assert_close(a, b, rtol=4e-5, atol=2e-35, equal_nan=True)
+
+
+def test_expected_depth_and_its_gradient_are_torchs() -> None:
+    generator = torch.Generator().manual_seed(0)
+    alpha, depth, by_expected = (torch.rand(2, 7, 9, generator=generator) + 0.1 for _ in range(3))
+    alpha[:, ::2] = 0
+    depth[:, ::2] = 0
+    a, d = alpha.clone().requires_grad_(), depth.clone().requires_grad_()
+    expected = Render(torch.zeros(2, 7, 9, 3), a, d).expected_depth()
+    expected.backward(by_expected)
+    ours = module.expected_depth(alpha, depth)
+    assert torch.equal(ours, expected)
+    by_alpha, by_depth = module.expected_depth_gradient(alpha, ours, by_expected)
+    torch.testing.assert_close(by_alpha, a.grad, rtol=1e-6, atol=0)
+    torch.testing.assert_close(by_depth, d.grad, rtol=1e-6, atol=0)
+
+
+def _passes(scene: SceneGraph, settings: RenderSettings = SETTINGS) -> list[CompiledPass | TorchPass]:
+    views = [replace(t, frame=f) for t, f in zip(street.targets(street.scene()), (1, 7, 1, 2), strict=True)]
+    return [p(Frame.of(scene), _offsets(scene), views, settings) for p in (CompiledPass, TorchPass)]
+
+
+def test_a_whole_pass_is_torchs() -> None:
+    ours, torchs = _passes(_scene())
+    assert ours.culled == torchs.culled
+    torch.testing.assert_close(ours.color, torchs.color, atol=1e-4, rtol=0)
+    by_color, by_depth = torch.randn(ours.color.shape), torch.randn(ours.depth.shape)
+    expected = torchs.gradient(by_color, by_depth.clone())
+    _close(ours.gradient(by_color, by_depth), expected, 1e-3)
+
+
+@contextmanager
+def _by_torch(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    with monkeypatch.context() as patch:
+        patch.setattr(objective_module, "begin", TorchPass)
+        yield
+
+
+@pytest.mark.parametrize("depth", [0.0, 0.1])
+def test_an_unrolled_optimisation_with_actors_is_torchs(depth: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    truth = _scene(600)
+    start, views, plan = street.blurred(truth), street.targets(truth), Plan(6, 3)
+    objective = Objective(LossConfig(perceptual=0, depth=depth))
+    ours = unroll(TunedAdam(), start, views, (), objective, plan)
+    with _by_torch(monkeypatch):
+        torchs = unroll(TunedAdam(), start, views, (), objective, plan)
+    assert ours.losses == pytest.approx(torchs.losses, rel=1e-4)
+    assert ours.losses[-1] < ours.losses[0] and ours.culled == torchs.culled
+    difference = (ours.scene.gaussians.packed() - torchs.scene.gaussians.packed()).abs()
+    assert float(difference.median()) < 1e-5 and float(difference.mean()) < 1e-3
+
+
+def test_it_is_for_float32_on_the_cpu_and_its_backend() -> None:
+    scene, views = _scene(50), street.targets(street.scene())[:1]
+    frame, offsets = Frame.of(scene), torch.zeros(50, 14)
+    for settings in (SETTINGS, RenderSettings("cpu", 1)):
+        assert isinstance(begin(frame, offsets, views, settings), CompiledPass)
+    assert isinstance(begin(frame, offsets, views, RenderSettings("reference")), TorchPass)
+    assert isinstance(begin(_exact(scene), offsets.double(), views, SETTINGS), TorchPass)
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    frame = Frame.of(_scene(50))
+    with pytest.raises(ValueError, match=r"expected offsets of shape \[50, 14\], got \[49, 14\]"):
+        frame.posing.splats(torch.zeros(49, 14), FRAMES, 1)
+    pose = street.pose(torch.nan)
+    view = replace(street.targets(street.scene())[0], chunk_SE3_camera=pose)
+    with pytest.raises((NonFiniteError, np.linalg.LinAlgError)):
+        CompiledPass(frame, torch.zeros(50, 14), [view], SETTINGS)
+
+
+def test_offsets_need_not_be_contiguous() -> None:
+    scene = _scene(100)
+    frame, offsets = Frame.of(scene), _offsets(scene)
+    a, b = (frame.posing.splats(o, FRAMES, 1) for o in (offsets, offsets.T.contiguous().T))
+    assert all(torch.equal(x, y) for x, y in zip(a.splats, b.splats, strict=True))
+
+
+def test_a_failing_kernel_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    frame = Frame.of(_scene(50))
+    monkeypatch.setattr(module, "load_posing", lambda: SimpleNamespace(genre_pose=lambda *arguments: 2))
+    with pytest.raises(ResourceError, match="posing of Gaussians on the CPU failed"):
+        frame.posing.splats(torch.zeros(50, 14), FRAMES, 1)
+
+
+def test_constants_live_in_one_place() -> None:
+    text = (KERNEL.folder / "posing.cpp").read_text()
+    assert {n for n in vars(constants) if n.isupper()} == set(KERNEL.constants)
+    assert all(re.search(rf"\b{name}\b", text) for name in KERNEL.constants)
+
+
+def test_a_missing_library_says_what_to_run(tmp_path: Path) -> None:
+    with pytest.raises(ResourceError, match=r"posing of Gaussians on the CPU is not compiled.*pip install -e \."):
+        load_posing(tmp_path)
