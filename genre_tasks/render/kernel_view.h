@@ -104,15 +104,20 @@ static void project_all(View& v, const GaussianArrays& in, int threads) {
 // Stable, so Gaussians of one depth keep their input order. Depths are positive: their bits sort as integers.
 static void sort_by_depth(View& v, Scratch& s, int threads) {
   constexpr int DIGIT = 11, VALUES = 1 << DIGIT;
+  constexpr size_t WORTH_A_THREAD = 1 << 17;  // its start costs more than a pass over fewer
   s.keys.resize(v.drawn), s.other.resize(v.drawn), s.order.resize(v.drawn);
-  std::vector<size_t> begin(threads, 0);
-  for (int w = 1; w < threads; w++) begin[w] = begin[w - 1] + v.segments[w - 1].end - v.segments[w - 1].begin;
+  threads = (int)std::min<size_t>(threads, 1 + v.drawn / WORTH_A_THREAD);
+  const size_t segments = v.segments.size();
+  std::vector<size_t> begin(segments, 0);
+  for (size_t k = 1; k < segments; k++) begin[k] = begin[k - 1] + v.segments[k - 1].end - v.segments[k - 1].begin;
   parallel(threads, [&](int w) {
-    uint64_t* key = s.keys.p + begin[w];
-    for (size_t i = v.segments[w].begin; i < v.segments[w].end; i++) {
-      uint32_t u;
-      std::memcpy(&u, &v.input[i].z, 4);
-      *key++ = (uint64_t)u << 32 | (uint32_t)i;
+    for (size_t k = w; k < segments; k += threads) {
+      uint64_t* key = s.keys.p + begin[k];
+      for (size_t i = v.segments[k].begin; i < v.segments[k].end; i++) {
+        uint32_t u;
+        std::memcpy(&u, &v.input[i].z, 4);
+        *key++ = (uint64_t)u << 32 | (uint32_t)i;
+      }
     }
   });
   uint64_t *from = s.keys.p, *to = s.other.p;

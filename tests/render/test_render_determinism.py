@@ -11,6 +11,7 @@ import torch
 
 from genre_tasks.logs.types import Lens
 from genre_tasks.render import Cameras, RenderSettings, render, render_views
+from genre_tasks.render.work import count_work
 from genre_tasks.scene.gaussians import Gaussians, Splats
 from genre_tasks.scene.graph import FIRST_ACTOR, STATIC, ActorNode, SceneGraph
 from genre_tasks.scene.views import NovelView
@@ -33,6 +34,14 @@ def test_same_bits_at_any_thread_count_and_again(scene, gradients, n, width, hei
     assert n == 1 or first[0].alpha.mean() > 0.1
     assert _same(gradients(splats, cameras, ONE), first)
     for threads in (2, 3, 5):
+        assert _same(gradients(splats, cameras, RenderSettings("cpu", threads)), first), threads
+
+
+def test_same_bits_where_the_sort_takes_several_threads(scene, gradients):
+    splats, cameras = scene(300_000)
+    first = gradients(splats, cameras, ONE)
+    assert count_work(splats, cameras).drawn > 200_000
+    for threads in (2, 3):
         assert _same(gradients(splats, cameras, RenderSettings("cpu", threads)), first), threads
 
 
