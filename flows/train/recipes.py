@@ -115,6 +115,12 @@ def _of_gnet(stage: str) -> tuple[Begin, ...]:
     return (gnet, gnet, Adam(24), gnet, gnet, Adam(48), gnet, gnet, Adam(96))
 
 
+def _long(stage: str) -> tuple[Begin, ...]:
+    """Three of four scenes as a GNet leaves them after 48 or 72 iterations of three views, the others by tuned Adam."""
+    gnet, longer = ByGnet(stage, 48, 3), ByGnet(stage, 72, 3)
+    return tuple(begin for age in (24, 48, 96) for begin in (gnet, gnet, longer, Adam(age)))
+
+
 ENET_STAGES = (
     Stage(
         "enet/coarse", "gnet/coarse", ENET_NETWORK, SceneList("coarse", 24, real=0),
@@ -123,6 +129,15 @@ ENET_STAGES = (
     Stage(
         "enet/fine", "enet/coarse", ENET_NETWORK, FINE,
         _enet(steps=160, rate=5e-4, seed=1), _of_gnet("gnet/fine"), Images("fnet"),
+    ),
+    Stage(
+        "enet/dense", "enet/fine", ENET_NETWORK, replace(DENSE, count=19, real=2),
+        _enet(
+            steps=500, rate=6e-4, seed=51, judged=3.0, judges=6, sample=0.25, views=(4, 6), novel_views=8,
+            loss=LossConfig(perceptual=0.1, perceptual_every=1),
+            judge_loss=LossConfig(perceptual=0.3, perceptual_every=1, depth=0.0),
+        ),
+        _long("gnet/many"), Images("fnet"),
     ),
 )  # fmt: skip
 """ENet from GNet's weights after their coarse stage: at 160×90 with stand-ins for FNet's images, then with those."""
