@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -198,21 +196,14 @@ def test_a_whole_pass_is_torchs() -> None:
     _close(ours.gradient(by_color, by_depth), expected, 1e-3)
 
 
-@contextmanager
-def _by_torch(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    with monkeypatch.context() as patch:
-        patch.setattr(objective_module, "begin", TorchPass)
-        yield
-
-
 @pytest.mark.parametrize("depth", [0.0, 0.1])
 def test_an_unrolled_optimisation_with_actors_is_torchs(depth: float, monkeypatch: pytest.MonkeyPatch) -> None:
     truth = _scene(600)
     start, views, plan = street.blurred(truth), street.targets(truth), Plan(6, 3)
     objective = Objective(LossConfig(perceptual=0, depth=depth))
     ours = unroll(TunedAdam(), start, views, (), objective, plan)
-    with _by_torch(monkeypatch):
-        torchs = unroll(TunedAdam(), start, views, (), objective, plan)
+    monkeypatch.setattr(objective_module, "begin", TorchPass)
+    torchs = unroll(TunedAdam(), start, views, (), objective, plan)
     assert ours.losses == pytest.approx(torchs.losses, rel=1e-4)
     assert ours.losses[-1] < ours.losses[0] and ours.culled == torchs.culled
     difference = (ours.scene.gaussians.packed() - torchs.scene.gaussians.packed()).abs()
@@ -234,7 +225,7 @@ def test_what_does_not_fit_is_refused() -> None:
         frame.posing.splats(torch.zeros(49, 14), FRAMES, 1)
     pose = street.pose(torch.nan)
     view = replace(street.targets(street.scene())[0], chunk_SE3_camera=pose)
-    with pytest.raises((NonFiniteError, np.linalg.LinAlgError)):
+    with pytest.raises(NonFiniteError):
         CompiledPass(frame, torch.zeros(50, 14), [view], SETTINGS)
 
 
