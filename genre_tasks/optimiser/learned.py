@@ -68,8 +68,10 @@ class LearnedOptimiser(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Log-gains a and offsets b, each [N, 14]."""
         own = F.silu(self.entry(inputs))
-        around = self.unet(pyramid.pool(own), pyramid)
-        both = torch.cat([own, around.index_select(0, pyramid.voxel_of)], 1)
+        return self._heads(own, self.unet(pyramid.pool(own), pyramid), pyramid.voxel_of)
+
+    def _heads(self, own: Tensor, around: Tensor, voxel: Tensor) -> tuple[Tensor, Tensor]:
+        both = torch.cat([own, around.index_select(0, voxel)], 1)
         gain, offset = self.head(F.silu(self.mix(both))).split(14, 1)
         return gain, offset
 
@@ -80,9 +82,11 @@ class LearnedOptimiser(nn.Module):
     def delta(self, state: State, inputs: Tensor, pyramid: VoxelPyramid, total: int) -> Tensor:
         """The step [N, 14], differentiable in the network's weights."""
         gain, offset = self(inputs, pyramid)
-        rates = rate_vector(self.config.rates).to(inputs.device)
-        learned = torch.exp(3 * torch.tanh(gain / 3)) * state.direction() + torch.tanh(offset)
-        return -rates * schedule(state.iteration, total) * learned
+        return self._step(gain, offset, state.direction(), schedule(state.iteration, total))
+
+    def _step(self, gain: Tensor, offset: Tensor, direction: Tensor, part: float) -> Tensor:
+        rates = rate_vector(self.config.rates).to(direction.device)
+        return -rates * part * (torch.exp(3 * torch.tanh(gain / 3)) * direction + torch.tanh(offset))
 
     def sampled_delta(self, state: State, inputs: Tensor, pyramid: VoxelPyramid, total: int, rows: Tensor) -> Tensor:
         """The rows ``rows`` [M] of :meth:`delta`, differentiable through these Gaussians alone.
@@ -96,10 +100,8 @@ class LearnedOptimiser(nn.Module):
         voxel = pyramid.voxel_of[rows]
         change = torch.zeros_like(everyone).index_add(0, voxel, own - own.detach()) / pyramid.counts
         around = self.unet(everyone + change * (len(inputs) / len(rows)), pyramid)
-        gain, offset = self.head(F.silu(self.mix(torch.cat([own, around[voxel]], 1)))).split(14, 1)
-        rates = rate_vector(self.config.rates).to(inputs.device)
-        learned = torch.exp(3 * torch.tanh(gain / 3)) * state.direction()[rows] + torch.tanh(offset)
-        return -rates * schedule(state.iteration, total) * learned
+        heads = self._heads(own, around, voxel)
+        return self._step(*heads, state.direction()[rows], schedule(state.iteration, total))
 
     def start(self, frame: Frame, centre: Tensor) -> Step:
         """See :class:`genre_tasks.optimiser.rules.StepRule`. The same bytes at any number of threads.
