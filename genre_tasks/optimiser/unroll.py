@@ -54,7 +54,7 @@ def unroll(
 
     In each, ``plan.views`` of ``source`` and ``plan.novel_views`` of ``novel`` are rendered, drawn with the plan's
     seed. The same inputs give the same bytes at any thread count. An empty scene stays empty. Raises
-    ``NonFiniteError`` naming the first tensor that is not finite, ``InputError`` where no Gaussian is in any view.
+    ``NonFiniteError`` naming the first tensor that is not finite, ``InputError`` where no view saw any Gaussian.
     """
     generator = torch.Generator().manual_seed(plan.seed)
     samplers = [ViewSampler(source, plan.views, generator), ViewSampler(novel, plan.novel_views, generator)]
@@ -63,7 +63,6 @@ def unroll(
     step = rule.start(frame, camera_centre(source))
     keep = plan.snapshot_iterations()
     losses, seconds, snapshots, culled = [], [], {}, {}
-    seen = not len(scene)
     for i in range(plan.iterations):
         began = time.perf_counter()
         sight = objective(frame, state.offsets, [t for s in samplers for t in s.draw()], i, generator)
@@ -73,14 +72,12 @@ def unroll(
         check_finite(state.offsets, "updated Gaussians", plan.stage)
         losses.append(sight.loss)
         culled = sight.culled
-        if not seen:
-            seen = bool((state.seen > 0).any())
-            if not seen and (i + 1) * plan.views >= len(source):
-                raise _out_of_view(len(scene), source, plan.stage)
         if i + 1 in keep:
             snapshots[i + 1] = moved_scene(frame, state)
         seconds.append(time.perf_counter() - began)
         progress(i + 1, plan.iterations, f"loss {sight.loss:.3f}")
+    if len(scene) and plan.iterations and not bool((state.seen > 0).any()):
+        raise _out_of_view(len(scene), source, plan.stage)
     return Reconstruction(moved_scene(frame, state), tuple(losses), snapshots, tuple(seconds), culled)
 
 
@@ -88,16 +85,17 @@ def _out_of_view(count: int, source: Sequence[Target], stage: str) -> InputError
     cameras = ", ".join(sorted({t.camera for t in source}))
     frames = sorted({t.frame for t in source})
     return InputError(
-        f"None of the scene's {count} Gaussians is in any of the {len(source)} source views (cameras {cameras}, frames "
-        f"{frames[0]}–{frames[-1]})",
+        f"None of the scene's {count} Gaussians was seen by any view that was drawn of the {len(source)} source views "
+        f"(cameras {cameras}, frames {frames[0]}–{frames[-1]})",
         remedy="Check that poses and points are of one log and in metres (genre check), and opacities above 0.",
         stage=stage,
     )
 
 
 def camera_centre(targets: Sequence[Target]) -> Tensor:
-    """Mean camera position [3] in chunk coordinates."""
-    return torch.as_tensor(np.mean([t.chunk_SE3_camera[:3, 3] for t in targets], axis=0), dtype=torch.float32)
+    """Mean camera position [3] in chunk coordinates, on the device of the targets."""
+    centre = np.mean([t.chunk_SE3_camera[:3, 3] for t in targets], axis=0)
+    return torch.as_tensor(centre, dtype=torch.float32, device=targets[0].image.image.device)
 
 
 def moved_scene(frame: Frame, state: State) -> SceneGraph:

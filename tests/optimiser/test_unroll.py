@@ -7,15 +7,17 @@ from dataclasses import replace
 import pytest
 import torch
 
+from flows.train.device import scene_on
 from genre_tasks.config import LossConfig
 from genre_tasks.errors import InputError, NonFiniteError
 from genre_tasks.optimiser.adam import TunedAdam
+from genre_tasks.optimiser.episodes import TrainingScene
 from genre_tasks.optimiser.features import FEATURES, Fixed, features
 from genre_tasks.optimiser.learned import LearnedOptimiser, NetworkConfig
 from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.rules import StepRule
 from genre_tasks.optimiser.state import Frame, State
-from genre_tasks.optimiser.unroll import Plan, unroll
+from genre_tasks.optimiser.unroll import Plan, camera_centre, unroll
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.results import Reconstruction
@@ -185,10 +187,18 @@ def test_a_scene_out_of_every_view_is_an_error_that_says_so(rule: StepRule) -> N
     full = street.scene(actor=False)
     behind = full.with_gaussians(replace(full.gaussians, means=full.gaussians.means - torch.tensor([0.0, 0.0, 1e3])))
     with pytest.raises(
-        InputError, match=rf"None of the scene's {len(full)} Gaussians .* source views .* frames \d"
+        InputError, match=rf"None of the scene's {len(full)} Gaussians .* source views .*frames \d"
     ) as hit:
         unroll(rule, behind, street.targets(full), (), OBJECTIVE, Plan(9, 2, stage="gnet"))
     assert "genre check" in str(hit.value.remedy)
+
+
+def test_cameras_and_rates_are_where_the_scene_is(truth: SceneGraph) -> None:
+    elsewhere = torch.device("meta")  # any device but the CPU
+    targets = scene_on(TrainingScene("s", truth, street.targets(truth), ()), elsewhere).source
+    assert camera_centre(targets).device == elsewhere
+    state = State.start(4, torch.empty(0, device=elsewhere))
+    assert TunedAdam().start(Frame.of(truth), torch.zeros(3))(state, state.first, 4).device == elsewhere
 
 
 def test_a_step_that_is_not_finite_is_named(truth: SceneGraph) -> None:
