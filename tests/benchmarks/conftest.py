@@ -5,8 +5,10 @@ import os
 import pytest
 
 from benchmarks import run
+from benchmarks.optimiser.task import Task
 from flows.cli import bench as command
 from tests.benchmarks import tiny
+from tests.optimiser import street
 
 
 @pytest.fixture
@@ -19,3 +21,10 @@ def bench(monkeypatch: pytest.MonkeyPatch, tmp_path: os.PathLike[str]) -> tiny.T
     command.register("tiny", "tests.benchmarks.tiny:BENCH")
     monkeypatch.chdir(tmp_path)
     return made
+
+
+@pytest.fixture(scope="module")
+def task() -> Task:
+    truth = street.scene()
+    views = street.targets(truth)
+    return Task(street.blurred(truth), views, views[:2])

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
@@ -16,65 +14,30 @@ from benchmarks import run
 from benchmarks.bench import NotMeasuredError
 from benchmarks.optimiser import (
     BENCH,
-    beside,
-    beyond,
     cells,
-    converged,
-    distillation,
-    enhancement,
     race,
     summary,
     trade,
 )
-from benchmarks.optimiser import task as task_module
-from benchmarks.optimiser.distillation import Judge, Mark
 from benchmarks.optimiser.network import measure_network, scene_of
 from benchmarks.optimiser.picture import draw, draw_network
 from benchmarks.optimiser.race import Point
-from benchmarks.optimiser.steps import images_of
-from benchmarks.optimiser.task import Task, psnr
+from benchmarks.optimiser.task import Task
 from benchmarks.schema import Result
-from flows.configuration import load_configuration
 from genre_tasks.config import (
     AdamConfig,
     GnetConfig,
-    IngestConfig,
-    LossConfig,
-    OptimiserConfig,
     PerSceneConfig,
-    PipelineConfig,
 )
 from genre_tasks.errors import ConfigError
-from genre_tasks.logs.registry import open_log
-from genre_tasks.metrics.collect import FeatureSet
-from genre_tasks.metrics.perceptual import perceptual_distance
 from genre_tasks.optimiser.adam import TunedAdam
 from genre_tasks.optimiser.learned import LearnedOptimiser
 from genre_tasks.optimiser.objective import Objective
-from genre_tasks.optimiser.state import Frame, State
 from genre_tasks.optimiser.unroll import Plan, unroll
 from genre_tasks.scene.graph import DISTANT
-from genre_tasks.scene.views import NovelView
-from genre_tasks.stages.ingest import ingest
 from genre_tasks.weights import resolve_weights
+from tests.benchmarks.tiny_races import ADAM, LOSS, NEVER, learned
 from tests.optimiser import street
-
-TINY_LOG = "synthetic:street?seed=903&width=96&height=54&samples=1&lidar_beams=32&lidar_azimuths=450&frames=9&cameras=2"
-LOSS = LossConfig(perceptual=0.0)
-ADAM = GnetConfig(method="adam", iterations=6, views_per_iteration=2, loss=LOSS)
-NEVER = Point(0.05, 8, 99.0, 300)
-"""A goal that nobody reaches."""
-
-
-def learned(iterations: int) -> GnetConfig:
-    return GnetConfig(iterations=iterations, views_per_iteration=4, loss=LOSS)
-
-
-@pytest.fixture(scope="module")
-def task() -> Task:
-    truth = street.scene()
-    views = street.targets(truth)
-    return Task(street.blurred(truth), views, views[:2])
 
 
 def test_walking_is_unrolling(task: Task) -> None:
@@ -191,224 +154,6 @@ def test_a_race_is_judged_beside_the_path_where_there_is_truth(task: Task, tmp_p
     draw(rows, tmp_path / "curves.png")
     draw_network(measure_network(LearnedOptimiser, (200, 400), 2), tmp_path / "network.png")
     assert min((tmp_path / f"{name}.png").stat().st_size for name in ("curves", "network")) > 1000
-
-
-def test_tuned_adam_runs_until_it_has_settled(task: Task) -> None:
-    endless = ADAM.model_copy(update={"adam": AdamConfig(schedule="constant")})
-    row = converged.converged_row(task, learned(3), {"cosine": ADAM, "endless": endless}, 0)
-    assert row["adam"]["cosine"]["renders"] == 12 and row["adam"]["endless"]["renders"] <= 12
-    assert row["plateau"] == max(v["best_psnr"] for v in row["adam"].values())
-    assert row["goal"] == pytest.approx(row["plateau"] - 0.2)
-    assert row["adam_s"] == min(v["reached_s"] for v in row["adam"].values() if v["reached_s"] is not None)
-    own = row["gnet"]
-    assert (own["reached_s"] is None) == (own["best_psnr"] < row["goal"])
-    rising = [Point(float(t), t, 20.0 + t, 1) for t in range(10)]
-    assert not converged.settled(rising)
-    assert converged.settled([*rising, Point(15.0, 15, 29.04, 1)]) and not converged.settled(rising[:1])
-
-
-def test_long_variants_are_constant_or_of_many_renders() -> None:
-    short, long = ADAM, ADAM.model_copy(update={"iterations": 480})
-    constant = ADAM.model_copy(update={"adam": AdamConfig(schedule="constant")})
-    assert list(converged.long_variants({"short": short, "long": long, "constant": constant})) == ["long", "constant"]
-
-
-def test_the_long_preset_is_small_with_a_longer_gnet() -> None:
-    small, long = (load_configuration(name).model_dump() for name in ("small", "long"))
-    longer = {"iterations", "views_per_iteration"}
-    assert {k for k in small["gnet"] if small["gnet"][k] != long["gnet"][k]} <= longer
-    assert {k for k in small if small[k] != long[k]} == {"gnet"}
-    assert long["gnet"]["iterations"] > small["gnet"]["iterations"]
-
-
-def _mark(seconds: float, kernel: float, beside: float | None = None) -> Mark:
-    return Mark(seconds, 0, kernel, beside, 25.0)
-
-
-def test_as_good_means_within_a_hundredth_and_a_tenth_of_a_decibel() -> None:
-    best = _mark(4.0, 0.2, 22.0)
-    assert _mark(1.0, 0.2019, 21.91).as_good_as(best)
-    assert not _mark(1.0, 0.2021, 23.0).as_good_as(best) and not _mark(1.0, 0.1, 21.89).as_good_as(best)
-    assert _mark(1.0, 0.2019).as_good_as(_mark(4.0, 0.2))
-    assert not _mark(1.0, -0.11).as_good_as(_mark(1.0, -0.2))  # an unbiased distance may be below zero
-
-
-def test_a_distillation_is_timed_to_its_own_best_and_not_from_its_start() -> None:
-    start, better = _mark(0.0, 0.40, 21.0), _mark(2.0, 0.30, 22.0)
-    runs = {"a": [start, better, _mark(4.0, 0.20, 22.0), _mark(8.0, 0.25, 22.0)], "b": [start, _mark(9.0, 0.2, 22.0)]}
-    found = distillation.family(runs, _mark(1.0, 0.201, 21.95))
-    assert found["best"][2] == 0.2 and found["enet_as_good"]
-    assert found["reached_s"] == pytest.approx(2 + 2 * 0.098 / 0.1)  # at 0.202 between the second and third mark
-    assert found["as_good_as_enet_s"] == pytest.approx(2 + 2 * (0.3 - 0.201 * 1.01) / 0.1)
-    behind = distillation.family(runs, _mark(1.0, 0.30, 21.95))
-    assert not behind["enet_as_good"] and behind["as_good_as_enet_s"] == pytest.approx(0.97 / 0.1 * 0.2)
-    assert distillation.family(runs, _mark(1.0, 0.1, 22.0))["as_good_as_enet_s"] is None
-    useless = distillation.family({"a": [start, _mark(3.0, 0.5, 20.0)]}, _mark(1.0, 0.4, 21.0))
-    assert useless["reached_s"] == 3.0 and useless["best"][2] == 0.5 and useless["enet_as_good"]
-
-
-def test_a_distillation_ends_when_it_has_settled_or_its_budget_is_spent(task: Task) -> None:
-    class Fading:
-        """Better by a tenth a second until ``since``."""
-
-        def __init__(self, since: float) -> None:
-            self.since = since
-
-        def mark(self, scene: object, seconds: float, renders: int) -> Mark:
-            return _mark(seconds, 1.0 - 0.1 * min(seconds, self.since))
-
-    frame, state = Frame.of(task.scene), State.start(len(task.scene), task.scene.gaussians.means)
-    moments = [race.Moment(0.1 * k, k, k, frame, state) for k in range(1, 200)]
-
-    def end(since: float, budget_s: float) -> float:
-        judge: Any = Fading(since)
-        return distillation.distilled(iter(moments), judge, _mark(0.0, 1.0), 2.0, budget_s)[-1].seconds
-
-    assert 6.0 <= end(3.0, 16.0) < 9.4  # twice three seconds, at the next look
-    assert 4.0 <= end(0.0, 16.0) < 6.3  # no better at all: after twice the unit
-    assert end(8.0, 9.0) == pytest.approx(9.0)
-
-
-def test_enet_beside_distillations_of_the_same_images(task: Task) -> None:
-    novel = street.targets(street.scene(), novel=True)
-    views = tuple(NovelView(t.camera, t.frame, 3.0, t.chunk_SE3_camera, t.lens, ("c0", 0)) for t in novel)
-    features = perceptual_distance().pooled_features(images_of(street.scene(), task.source))
-    judge = Judge(views, FeatureSet(features, (0, 0, 1, 1)), replace(task, beside=novel))
-    enet = OptimiserConfig(
-        iterations=2, views_per_iteration=2, novel_views_per_iteration=2, loss=LossConfig(perceptual=0.1)
-    )
-    row = distillation.distillation_row(enet, PerSceneConfig(iterations=6), judge, novel)
-    assert row["enet"][1] == 8 and row["enet"][0] > 0
-    variants = ["1+1 at 0.25", "2+2 at 0.5, no perceptual"]
-    assert list(row["adam"]["curves"]) == variants and list(row["standard"]["curves"]) == ["6"]
-    for family in ("adam", "standard"):
-        assert all(curve[0] == row["start"] for curve in row[family]["curves"].values())
-        assert row[family]["reached_s"] > 0
-        assert row[family]["best"][2] == min(m[2] for c in row[family]["curves"].values() for m in c[1:])
-
-
-def test_truth_beside_the_path_is_cast_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    chunk = ingest(IngestConfig(width_px=96, height_px=54), open_log(TINY_LOG), 0)
-    views = beside.views_at(chunk, 3.0)
-    assert len(views) == 2 * len(chunk.views) and {v.shift_m for v in views} == {3.0, -3.0}
-    cast = beside.true_targets(TINY_LOG, str(tmp_path), chunk, 3.0, 4)
-    few = beside.views_at(chunk, 3.0, 4)
-    assert [(t.camera, t.frame) for t in cast] == [(v.camera, v.frame) for v in few] and all(t.novel for t in cast)
-    truth = open_log(TINY_LOG).truth
-    assert truth is not None
-    expected = truth.image(few[0].frame, chunk.world_SE3_chunk @ few[0].chunk_SE3_camera, few[0].lens)
-    assert np.abs(cast[0].image.image.numpy() - expected / 255).max() < 0.003  # half floats in the store
-
-    opened = beside.opened_log(TINY_LOG)
-    monkeypatch.setattr(type(opened.truth), "image", None)
-    again = beside.true_targets(TINY_LOG, str(tmp_path), chunk, 3.0, 4)
-    assert all(torch.equal(a.image.image, b.image.image) for a, b in zip(cast, again, strict=True))
-
-
-@pytest.mark.slow
-def test_a_cell_of_enhancement_goes_through_the_pipeline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    tiny = ["ingest.width_px=96", "ingest.height_px=54", "initial.max_points=2000", "initial.distant_count=200"]
-    tiny += ["novel_views.lidar_max_points=2000"] + [f"{s}.iterations=2" for s in ("gnet", "enet")]
-
-    def load(preset: str, settings: Sequence[str] = ()) -> PipelineConfig:
-        return load_configuration(preset, settings=[*tiny, *settings])
-
-    monkeypatch.setattr(task_module, "load_configuration", load)
-    row = enhancement.measure_enhancement(TINY_LOG, 0, str(tmp_path), 1)
-    assert list(row["shifts"]) == list(beyond.SHIFTS) and row["order"] == 1
-    scenes = {"gnet", "enet", "gnet_again"}
-    assert all(set(at) == scenes | {"n"} and at["n"] == 12 for at in row["shifts"].values())
-    assert set(row["heldout_psnr"]) == scenes and len(set(row["heldout_psnr"].values())) == 3
-    job = task_module.job_of(TINY_LOG, 0, str(tmp_path), 1)
-    assert (job.config["gnet"]["seed"], job.config["enet"]["seed"], job.config["enet"]["snapshots"]) == (1, 1, 0)
-    assert any(
-        line.startswith("| street") and "GNet→FNet→ENet" not in line for line in BENCH.table({"enhancement/a": row})
-    )
-
-
-def test_scenes_are_compared_with_the_truth_or_as_sets(task: Task) -> None:
-    truth = street.scene()
-    scenes = {"gnet": task.scene, "enet": truth, "gnet_again": task.scene}
-    novel = street.targets(truth, novel=True)
-    found = enhancement.against_truth(scenes, novel)
-    assert found["enet"]["perceptual"] < 1e-6 < found["gnet"]["perceptual"] == found["gnet_again"]["perceptual"]
-    assert found["enet"]["psnr"] > found["gnet"]["psnr"] == pytest.approx(psnr(task.scene, novel), abs=1e-4)
-    views = tuple(NovelView(t.camera, t.frame, 3.0, t.chunk_SE3_camera, t.lens, ("c0", 0)) for t in novel)
-    real = FeatureSet(perceptual_distance().pooled_features(images_of(truth, novel)), (0, 0, 1, 1))
-    sets = enhancement.as_sets(scenes, views, real)
-    assert sets["enet"]["difference"] == pytest.approx(sets["enet"]["kernel"] - sets["gnet"]["kernel"], abs=1e-9)
-    assert sets["gnet_again"]["difference"] == pytest.approx(0.0, abs=1e-12) and "low" not in sets["gnet"]
-
-
-def test_gnets_network_enhances_with_its_own_length_and_weights() -> None:
-    config = load_configuration("small")
-    own = enhancement.as_enhancer(config)
-    assert (own.iterations, own.loss) == (config.gnet.iterations, config.enet.loss)
-    assert Path(own.weights).name == "gnet.safetensors" and own.novel_views_per_iteration == own.views_per_iteration
-
-
-def _at(psnr: float, perceptual: float) -> dict[str, float]:
-    return {"psnr": psnr, "perceptual": perceptual}
-
-
-def _enhanced(order: int, enet: dict[str, float], loss: float = 0.0) -> dict[str, Any]:
-    at = {"gnet": _at(22.0, 0.8), "enet": enet, "gnet_again": _at(22.0, 0.76)}
-    where = {"log": "synthetic:street?seed=900", "chunk": 0, "order": order}
-    shifts = dict.fromkeys(beyond.SHIFTS, at)
-    return where | {"shifts": shifts, "heldout_psnr": {"gnet": 26.0, "enet": 26.0 - loss, "gnet_again": 26.0}}
-
-
-def test_enhancement_must_be_better_in_all_that_is_measured_in_every_cell() -> None:
-    rows = {f"enhancement/{k}": _enhanced(k, _at(22.1, 0.72), 0.2) for k in range(3)}
-    claims = {c.id.removeprefix("optimiser."): c for c in summary.claims(rows)}
-    assert all(claims[f"enhance_{s}m"].holds and claims[f"enhance_{s}m"].n == 3 for s in beyond.SHIFTS)
-    versus = claims["enet_vs_gnet"]
-    assert versus.measured == pytest.approx(0.05) and versus.holds  # 10 % less against 5 % less
-    assert claims["interpolation"].measured == pytest.approx(-0.2) and claims["interpolation"].holds
-
-    rows["enhancement/3"] = _enhanced(3, _at(21.9, 0.72), 0.4)  # nearer as seen, farther in PSNR
-    claims = {c.id.removeprefix("optimiser."): c for c in summary.claims(rows)}
-    assert claims["enhance_2m"].measured == 0.75 and not claims["enhance_2m"].holds
-    assert "not in: street?seed=900 chunk 0 order 3" in claims["enhance_2m"].data
-    assert claims["interpolation"].measured == pytest.approx(-0.4) and not claims["interpolation"].holds
-
-
-@pytest.mark.parametrize(("high", "better"), [(-0.001, True), (0.001, False), (None, False)])
-def test_on_a_real_log_the_interval_decides(high: float | None, better: bool) -> None:
-    at = {"gnet": {"kernel": 0.3}, "enet": {"kernel": 0.28, "difference": -0.02, "low": -0.04, "high": high}}
-    assert beyond.better({"shifts": {"3": at}}, "3") is better
-
-
-def _converged(reached_s: float | None) -> dict[str, Any]:
-    gnet = {"reached_s": reached_s, "best_psnr": 27.5, "seconds": 9.0}
-    where = {"log": "pandaset:002", "chunk": 0, "order": 0, "cap": 50.0}
-    return where | {"gnet": gnet, "adam_s": 20.0, "plateau": 28.0}
-
-
-def test_where_gnet_never_converges_the_cap_counts_and_both_plateaus_are_said() -> None:
-    claim = next(c for c in summary.claims({"converged/a": _converged(8.0)}) if c.id == "optimiser.converged")
-    assert (claim.measured, claim.holds) == (0.4, True)
-    rows = {"converged/a": _converged(None), "converged/b": {"not_measured": "no time"}}
-    claim = next(c for c in summary.claims(rows) if c.id == "optimiser.converged")
-    assert (claim.measured, claim.n, claim.holds) == (50.0, 1, False)
-    assert "in 1 of 1 cells" in claim.data and "GNet 27.50 dB, Adam 28.00 dB" in claim.data
-    assert any("never" in line for line in BENCH.table(rows))
-
-
-def test_where_enet_is_not_as_good_the_cap_counts() -> None:
-    best = [9.0, 100, 0.2, None, 25.0]
-    good = {"best": best, "reached_s": 10.0, "enet_as_good": True, "as_good_as_enet_s": 9.5}
-    bad = good | {"enet_as_good": False, "as_good_as_enet_s": None}
-    where = {"log": "pandaset:002", "chunk": 0, "order": 0, "cap": 50.0, "start": best, "enet": [4.0, *best[1:]]}
-    rows = {"distillation/a": where | {"adam": good, "standard": bad}}
-    claims = {c.id.removeprefix("optimiser."): c for c in summary.claims(rows)}
-    assert (claims["distillation"].measured, claims["distillation"].holds) == (0.4, True)
-    at_once = where | {"adam": good | {"reached_s": 0.001}, "standard": bad}
-    assert beyond.times_distillation(at_once, "adam") == 50.0
-    standard = claims["distillation_standard"]
-    assert (standard.measured, standard.holds) == (50.0, False)
-    assert "in 1 of 1 cells ENet does not reach it" in standard.data
-    assert any("| no |" in line for line in BENCH.table(rows))
 
 
 def test_the_worst_of_the_stable_cells_counts() -> None:
