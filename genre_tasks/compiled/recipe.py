@@ -19,7 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-SHARED_SOURCES = ("calls.h", "recipe.py")
+SHARED_SOURCES = ("calls.h", "vectors.h", "recipe.py")
 """Files of this folder that every library depends on."""
 SHARED_FLAGS = (
     "-O3", "-std=c++17", "-shared", "-fPIC", "-pthread", "-Wno-psabi", "-fno-math-errno", "-fno-trapping-math",

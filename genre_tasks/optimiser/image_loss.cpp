@@ -12,14 +12,8 @@
 #include <memory>
 
 #include "../compiled/calls.h"
+#include "../compiled/vectors.h"
 
-#if defined(__AVX512F__)
-#define VECTOR_BYTES 64
-#elif defined(__AVX__)
-#define VECTOR_BYTES 32
-#else
-#define VECTOR_BYTES 16
-#endif
 #define UNROLLED _Pragma("GCC unroll 16")
 typedef float Vector __attribute__((vector_size(VECTOR_BYTES)));
 

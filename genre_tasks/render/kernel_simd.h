@@ -10,13 +10,8 @@
 #include <immintrin.h>
 #endif
 
-#if defined(__AVX512F__) && defined(__AVX512DQ__)
-#define VECTOR_BYTES 64
-#elif defined(__AVX__)
-#define VECTOR_BYTES 32
-#else
-#define VECTOR_BYTES 16
-#endif
+#include "../compiled/vectors.h"
+
 #define INLINE static inline __attribute__((always_inline))
 #define INLINE_MEMBER __attribute__((always_inline)) inline
 

@@ -14,7 +14,7 @@ from genre_tasks.optimiser.adam import TunedAdam
 from genre_tasks.optimiser.episodes import TrainingScene
 from genre_tasks.optimiser.features import FEATURES, Fixed, features
 from genre_tasks.optimiser.learned import LearnedOptimiser, NetworkConfig
-from genre_tasks.optimiser.objective import Objective
+from genre_tasks.optimiser.objective import Objective, check_finite
 from genre_tasks.optimiser.rules import StepRule
 from genre_tasks.optimiser.state import Frame, State
 from genre_tasks.optimiser.unroll import Plan, camera_centre, unroll
@@ -214,6 +214,16 @@ def test_a_step_that_is_not_finite_is_named(truth: SceneGraph) -> None:
     with pytest.raises(NonFiniteError) as raised:
         unroll(Broken(), street.blurred(truth), street.targets(truth), (), OBJECTIVE, Plan(2, 2, stage="gnet"))
     assert raised.value.stage == "gnet" and raised.value.first_index == (len(truth) - 1, 4)
+
+
+def test_a_sum_that_overflows_is_no_fault_and_infinities_do_not_cancel() -> None:
+    values = torch.full((3, 14), 3e38)
+    assert not torch.isfinite(values.sum())
+    check_finite(values, "gradient", "gnet")
+    values[1, 2], values[2, 5] = torch.inf, -torch.inf
+    with pytest.raises(NonFiniteError) as raised:
+        check_finite(values, "gradient", "gnet")
+    assert raised.value.first_index == (1, 2)
 
 
 def test_bounds_hold_and_what_starts_outside_may_stay() -> None:
