@@ -26,6 +26,7 @@ class IngestConfig(Section):
     height_px: int = Field(720, ge=16, le=4096, description="Working height of all images.")
     cameras: tuple[str, ...] | None = Field(None, description="Cameras to use, by name; null: all.")
     points: str | None = Field(None, description="A PLY file with coloured points, for a log without LiDAR.")
+    walls: bool = Field(True, description="Complete façades above the LiDAR's view as far as the images bear it out.")
     strict: bool = Field(False, description="Fail on a missing or unreadable image or sweep instead of marking it.")
     min_actor_travel_m: float = Field(0.5, ge=0, description="A track that moves less is part of the background.")
     min_actor_points: int = Field(10, ge=1, description="An actor with fewer LiDAR points is left out and counted.")

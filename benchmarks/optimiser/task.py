@@ -47,9 +47,12 @@ class Task:
 
 
 @lru_cache(maxsize=1)
-def task_of(log: str, chunk: int, store: str) -> Task:
-    """The preset ``small`` up to the initial scene, from and into a store. Raises ``NotMeasuredError`` without data."""
-    job = job_of(log, chunk, store)
+def task_of(log: str, chunk: int, store: str, *settings: str) -> Task:
+    """The preset ``small`` up to the initial scene, from and into a store; ``settings`` as for ``genre run --set``.
+
+    Raises ``NotMeasuredError`` without data.
+    """
+    job = job_of(log, chunk, store, None, *settings)
     refs = reconstruct(job, ("ingest", "initial"))
     read, initial = value_of(job, refs["ingest"]), value_of(job, refs["initial"])
     heldout = of_views(read, spread(read.of_role("heldout"), HELDOUT_VIEWS))
@@ -57,8 +60,8 @@ def task_of(log: str, chunk: int, store: str) -> Task:
     return Task(initial.scene, of_source(read, depth=True), heldout, beside)
 
 
-def job_of(log: str, chunk: int, store: str, order: int | None = None) -> Job:
-    """The preset ``small``, with ``order`` as the seed of GNet's and ENet's views and without snapshots.
+def job_of(log: str, chunk: int, store: str, order: int | None = None, *settings: str) -> Job:
+    """The preset ``small``, with ``order`` as the seed of GNet's and ENet's views and then without snapshots.
 
     Raises ``NotMeasuredError`` where the log's folder is missing.
     """
@@ -66,7 +69,7 @@ def job_of(log: str, chunk: int, store: str, order: int | None = None) -> Job:
     if reader == "pandaset" and not Path(path).is_dir():
         raise NotMeasuredError(f"there is no folder {path}; give it with --set pandaset=PATH")
     seeds = [] if order is None else [f"{s}.{k}" for s in ("gnet", "enet") for k in (f"seed={order}", "snapshots=0")]
-    return Job(log, chunk, store, load_configuration("small", settings=seeds).model_dump(mode="json"))
+    return Job(log, chunk, store, load_configuration("small", settings=[*seeds, *settings]).model_dump(mode="json"))
 
 
 def value_of(job: Job, ref: ArtifactRef) -> Any:

@@ -23,6 +23,7 @@ class BenchEntry:
 
 
 _BENCHES: dict[str, BenchEntry] = {
+    "facades": BenchEntry("benchmarks.facades:BENCH", "what completing façades above the LiDAR's view brings"),
     "main_job": BenchEntry("benchmarks.main_job:BENCH", "the pipeline on claim seeds and a real chunk"),
     "optimiser": BenchEntry(
         "benchmarks.optimiser:BENCH", "GNet's seconds and renders beside per-scene 3DGS and tuned Adam"
@@ -57,7 +58,7 @@ def load(name: str) -> Any:
 
 
 def bench(
-    name: Annotated[str, typer.Argument(help="main_job, optimiser or raster")],
+    name: Annotated[str, typer.Argument(help="facades, main_job, optimiser or raster")],
     json_file: Annotated[Path | None, typer.Option("--json", help="File to write rows and claims to.")] = None,
     quick: Annotated[bool, typer.Option(help="Fewer runs; ends within 20 minutes.")] = False,
     dry_run: Annotated[bool, typer.Option(help="List the cells with predicted seconds, measure nothing.")] = False,

@@ -46,6 +46,10 @@ class Lens:
             height_px=height_px,
         )
 
+    def of_width(self, width_px: int) -> Lens:
+        """The same lens for an image resampled to ``width_px``, its sides in proportion."""
+        return self.resized(width_px, max(1, round(width_px * self.height_px / self.width_px)))
+
 
 @dataclass(frozen=True)
 class Camera:

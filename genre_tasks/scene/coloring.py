@@ -80,7 +80,7 @@ def color_clouds(
 
 def buffer_lens(lens: Lens) -> Lens:
     """The lens of the occlusion depth maps."""
-    return lens.resized(_BUFFER_WIDTH_PX, max(1, round(_BUFFER_WIDTH_PX * lens.height_px / lens.width_px)))
+    return lens.of_width(_BUFFER_WIDTH_PX)
 
 
 def visible(points: Float32, view: View) -> tuple[NDArray[np.int64], Float32, Float32]:

@@ -84,8 +84,7 @@ def open_pixels(view: View, chunk: Chunk, background: Cloud) -> tuple[Float64, F
 
     Sampled at a width of 160 pixels. Only pixels above ``LOWEST_SINE`` count: below, the road would colour the shell.
     """
-    width = _SAMPLE_WIDTH_PX
-    lens = view.lens.resized(width, max(1, round(width * view.lens.height_px / view.lens.width_px)))
+    lens = view.lens.of_width(_SAMPLE_WIDTH_PX)
     points = [background.positions]
     for actor in chunk.actors:
         at = np.flatnonzero(actor.frames == view.frame)

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from genre_tasks.logs.types import Float64
+from genre_tasks.logs.types import Float32, Float64
 
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
@@ -87,3 +87,12 @@ def rigid(pose: Float64, tolerance: float = 1e-3) -> bool:
         return False
     turn = pose[:3, :3]
     return bool(np.abs(turn.T @ turn - np.eye(3)).max() < tolerance and np.linalg.det(turn) > 0)
+
+
+def path_distance(positions: Float32, chunk_SE3_ego: Float64) -> Float32:
+    """Distance [P] of points [P, 3] to the nearest ego position."""
+    best = np.full(len(positions), np.inf, np.float32)
+    for ego in chunk_SE3_ego[:, :3, 3].astype(np.float32):
+        offset = positions - ego
+        np.minimum(best, np.einsum("pk,pk->p", offset, offset), out=best)
+    return np.sqrt(best)

@@ -20,6 +20,7 @@ _PLANE_TOLERANCE_M = 0.35
 """A coarse cell's lowest point this near to the fitted road plane is road: kerbs and camber stay, cars do not."""
 
 _MIN_COARSE_CELLS = 20
+_LOWEST_PERCENT = 2.0
 _PLANE_WEIGHT = 1e-3
 """Weight of the plane in a cell's height, where a cell with road points has 1: it decides far from all of them."""
 
@@ -58,6 +59,17 @@ def road_fill(positions: Float32, chunk_SE3_ego: Float64) -> Float32:
     empty = (maximum_filter(count, 3) == 0) & (distance < REACH_M)
     ground = centres[empty]
     return np.column_stack([ground, _at(plane, ground) + smooth[empty]]).astype(np.float32)
+
+
+def height_over_road(positions: Float64, chunk_SE3_ego: Float64) -> Float64:
+    """Metres [P] above the road plane near the path; above the lowest points where they show no road."""
+    path = chunk_SE3_ego[:, :2, 3]
+    low, high = path.min(0) - REACH_M, path.max(0) + REACH_M
+    inside = ((positions[:, :2] >= low) & (positions[:, :2] < high)).all(1)
+    plane = _road_plane(positions[inside], low)
+    if plane is None:
+        return positions[:, 2] - (np.percentile(positions[:, 2], _LOWEST_PERCENT) if len(positions) else 0.0)
+    return positions[:, 2] - _at(plane, positions[:, :2])
 
 
 def _at(plane: Float64, xy: Float64) -> Float64:

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from genre_tasks.config import InitialConfig
 from genre_tasks.errors import InputError
-from genre_tasks.logs.types import Float32, Float64
+from genre_tasks.logs.types import Float64
 from genre_tasks.scene.chunk import Chunk, Points
 from genre_tasks.scene.distant import distant_region
 from genre_tasks.scene.gaussians import Gaussians
-from genre_tasks.scene.geometry import matrix_to_quat
+from genre_tasks.scene.geometry import matrix_to_quat, path_distance
 from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR, STATIC, ActorNode, SceneGraph
 from genre_tasks.scene.ground import CELL_M
 from genre_tasks.scene.voxels import Voxels, group, levels, voxel_size_for
@@ -71,15 +71,6 @@ def _actor_cap(config: InitialConfig, chunk: Chunk) -> int:
 def select(points: Points, which: NDArray) -> Points:
     """The chosen points."""
     return Points(points.positions[which], points.colors[which], points.colored[which], points.frames[which])
-
-
-def path_distance(positions: Float32, chunk_SE3_ego: Float64) -> Float32:
-    """Distance [P] of points [P, 3] to the nearest ego position."""
-    best = np.full(len(positions), np.inf, np.float32)
-    for ego in chunk_SE3_ego[:, :3, 3].astype(np.float32):
-        offset = positions - ego
-        np.minimum(best, np.einsum("pk,pk->p", offset, offset), out=best)
-    return np.sqrt(best)
 
 
 def node_gaussians(points: Points, distance: NDArray, max_count: int, config: InitialConfig) -> Gaussians:

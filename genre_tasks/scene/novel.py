@@ -10,10 +10,10 @@ import torch
 from genre_tasks.logs.types import Float64
 from genre_tasks.scene.chunk import Chunk, Points, View
 from genre_tasks.scene.gaussians import Gaussians
-from genre_tasks.scene.geometry import shift_laterally
+from genre_tasks.scene.geometry import path_distance, shift_laterally
 from genre_tasks.scene.graph import FIRST_ACTOR, STATIC, ActorNode, SceneGraph
 from genre_tasks.scene.ground import CELL_M
-from genre_tasks.scene.initialise import MAX_SCALE_VOXELS, SPACING, neighbour_spacing, path_distance
+from genre_tasks.scene.initialise import MAX_SCALE_VOXELS, SPACING, neighbour_spacing
 from genre_tasks.scene.views import NovelView
 from genre_tasks.scene.voxels import group, levels, voxel_size_for
 

@@ -19,6 +19,7 @@ from genre_tasks.scene.geometry import se3_inverse
 from genre_tasks.scene.ground import road_fill
 from genre_tasks.scene.images import decode_pixels, encoded_size
 from genre_tasks.scene.ply import read_ply
+from genre_tasks.scene.walls import wall_fill
 
 STANDSTILL_M = 0.1
 """An ego vehicle that travels less than this in a chunk stands still: there is no parallax."""
@@ -83,7 +84,7 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
     if config.points is not None:
         static, actors, given = _from_file(reading, config.points)
     else:
-        (static, actors), given = _from_sweeps(reading), None
+        (static, actors), given = _from_sweeps(reading, [v for v in views if v.role == "source"]), None
     clouds = [static, *actors]
     colored = color_clouds(clouds, _reported(reading, views, pixels))
     if given is not None:
@@ -185,8 +186,8 @@ def _from_file(reading: _Reading, file: str) -> tuple[Cloud, list[Cloud], NDArra
     return Cloud(local, np.full(len(local), NO_SWEEP, np.int16)), [], colors
 
 
-def _from_sweeps(reading: _Reading) -> tuple[Cloud, list[Cloud]]:
-    """(background, actors) of the chunk's LiDAR sweeps."""
+def _from_sweeps(reading: _Reading, sources: Sequence[View]) -> tuple[Cloud, list[Cloud]]:
+    """(background, actors) of the chunk's LiDAR sweeps, and what the background is completed by."""
     moving = _movers(reading)
     static: list[tuple[int, Float32]] = []
     own: list[list[tuple[int, Float32]]] = [[] for _ in moving.kept]
@@ -207,7 +208,10 @@ def _from_sweeps(reading: _Reading) -> tuple[Cloud, list[Cloud]]:
     if not static:
         remedy = "Give points by ingest.points=FILE.ply, or choose other chunks with --chunks."
         raise reading.error("the chunk has no LiDAR sweep", remedy)
-    static.append((NO_SWEEP, road_fill(np.concatenate([p for _, p in static]), reading.chunk_SE3_ego)))
+    swept = np.concatenate([p for _, p in static])
+    static.append((NO_SWEEP, road_fill(swept, reading.chunk_SE3_ego)))
+    if reading.config.walls:
+        static.append((NO_SWEEP, wall_fill(swept, reading.chunk_SE3_ego, sources)))
     actors = []
     for parts, path in zip(own, moving.kept, strict=True):
         count = sum(len(p) for _, p in parts)

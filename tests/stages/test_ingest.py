@@ -11,8 +11,9 @@ import pytest
 from genre_tasks.config import IngestConfig
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.scene.chunk import Chunk, Mark
+from genre_tasks.scene.walls import STEP_M
 from genre_tasks.stages.ingest import NO_SWEEP, chunk_count, ingest
-from tests.fakes import SENSOR_HEIGHT_M, FakeLog
+from tests.fakes import SENSOR_HEIGHT_M, WALL_HEIGHT_M, FakeLog
 
 CONFIG = IngestConfig(width_px=96, height_px=64)
 
@@ -47,8 +48,10 @@ def test_points_lie_on_the_world_and_have_its_colours(chunk: Chunk) -> None:
     parked = (np.abs(world - [14.0, -4.0, 0.75]) < [2.01, 0.91, 0.76]).all(1)
     returns = ~parked & (chunk.static.frames != NO_SWEEP)
     assert (known[returns] < 0.02).mean() > 0.999
-    filled = np.abs(world[chunk.static.frames == NO_SWEEP, 2])
-    assert len(filled) > 1000 and np.percentile(filled, 99) < 0.05
+    filled = chunk.static.frames == NO_SWEEP
+    assert filled.sum() > 1000 and np.percentile(known[filled], 99) < 0.05, "on the road and on the walls"
+    above = filled & (world[:, 2] > 1)
+    assert above.sum() > 100 and world[above, 2].max() < WALL_HEIGHT_M + STEP_M
     far_wall = (np.abs(world[:, 1] - 8) < 0.01) & (world[:, 2] > 0.5) & chunk.static.colored
     mean = chunk.static.colors[far_wall].mean(0) / 255
     assert np.allclose(mean, [0.7, 0.45, 0.3], atol=0.04)
