@@ -1,16 +1,24 @@
 """What completing façades above the LiDAR's view brings: the initial scene and GNet's with it and without.
 
 genre bench facades --json docs/benchmarks/facades.json [--set seeds=1001] [--set pandaset=]
+python -m benchmarks.facades LOG STORE PICTURE.png    # GNet's scene at ±3 m: without, with, and the truth
 """
 
 from __future__ import annotations
 
+import itertools
+import sys
 from collections.abc import Iterator, Mapping
 from functools import partial
+from pathlib import Path
+
+import torch
+from PIL import Image
 
 from benchmarks.bench import Bench, Cell, Row
 from benchmarks.optimiser import race
 from benchmarks.optimiser.cells import place, threads
+from benchmarks.optimiser.steps import images_of
 from benchmarks.optimiser.summary import over_cells
 from benchmarks.optimiser.task import Task, task_of
 from benchmarks.schema import Claim
@@ -90,4 +98,19 @@ class Facades:
             yield f"\n{name}: not measured: {rows[name]['not_measured']}"
 
 
+def picture(log: str, store: str, path: Path) -> None:
+    """A row for each of three views beside the path of a synthetic log's chunk 0: without, with, and the truth."""
+    gnet, columns = load_configuration("small").gnet, []
+    for setting in KINDS.values():
+        task = task_of(log, 0, store, setting)
+        views = task.beside[:: max(1, len(task.beside) // 3)][:3]
+        *_, end = itertools.islice(race.configured(task, gnet, gnet.seed), gnet.iterations)
+        columns.append(images_of(end.scene, views).flatten(0, 1))
+    columns.append(torch.cat([view.image.image for view in views]))
+    Image.fromarray((torch.cat(columns, 1) * 255).round().byte().numpy()).save(path)
+
+
 BENCH: Bench = Facades()
+
+if __name__ == "__main__":
+    picture(sys.argv[1], sys.argv[2], Path(sys.argv[3]))
