@@ -17,9 +17,9 @@ from PIL import Image
 
 from benchmarks.bench import Bench, Cell, Row
 from benchmarks.optimiser import race
+from benchmarks.optimiser.beyond import over_cells
 from benchmarks.optimiser.cells import place, threads
 from benchmarks.optimiser.steps import images_of
-from benchmarks.optimiser.summary import over_cells
 from benchmarks.optimiser.task import Task, task_of
 from benchmarks.schema import Claim
 from flows.configuration import load_configuration
@@ -82,8 +82,7 @@ class Facades:
         for name, of, k in sets:
             gains = [row["with"]["gnet"][k] - row["without"]["gnet"][k] for row in of]
             data = f"GNet's PSNR with façades completed less without; {', '.join(map(place, of)) or 'not measured'}"
-            claim = over_cells(name, gains, ">", 0.0, "dB", data)
-            yield claim.model_copy(update={"id": f"facades.{name}"})
+            yield over_cells(name, gains, ">", 0.0, "dB", data, bench=self.name)
 
     def table(self, rows: Mapping[str, Row]) -> Iterator[str]:
         """A line for each log and kind."""

@@ -99,12 +99,13 @@ def over_cells(
     unit: str,
     data: str,
     pick: Callable[[Sequence[float]], float] | None = None,
+    bench: str = "optimiser",
 ) -> Claim:
     """The median over the cells, or what ``pick`` takes; quartiles as the spread; not measured without a value."""
     if not values:
-        return claim(f"optimiser.{name}", None, op, target, unit, data)
+        return claim(f"{bench}.{name}", None, op, target, unit, data)
     m = Measured.of(values)
-    return claim(f"optimiser.{name}", pick(values) if pick else m.median, op, target, unit, data, m.n, m.spread)
+    return claim(f"{bench}.{name}", pick(values) if pick else m.median, op, target, unit, data, m.n, m.spread)
 
 
 def where(rows: Sequence[Row]) -> str:

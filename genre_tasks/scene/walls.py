@@ -22,7 +22,7 @@ from genre_tasks.scene.images import decode_pixels
 from genre_tasks.scene.projection import project
 
 REACH_M = 45.0
-"""Only this near to the path: farther away a storey is a few pixels, and its parallax less than one."""
+"""Only this near to the path: farther away the LiDAR itself looks twelve metres up."""
 
 CELL_M, STEP_M = 0.4, 0.4
 """Columns stand on cells of this width; their height is judged in such steps."""
@@ -155,7 +155,7 @@ def _difference(a: Float32, b: Float32) -> Float32:
 def _extents(columns: Columns, evidence: Float64, known: Float64) -> Float64:
     """Metres [C] by which each column grows: where the sum of its evidence from the top on is largest.
 
-    Evidence of the columns around counts at the same height above the road.
+    Evidence of the columns around counts at the same height above the road; it is 0 where it is not known.
     """
     from scipy.sparse import csr_array
     from scipy.spatial import cKDTree
@@ -164,7 +164,7 @@ def _extents(columns: Columns, evidence: Float64, known: Float64) -> Float64:
     start = np.round(columns.top / STEP_M).astype(np.int64)
     row, level = np.arange(count)[:, None], start[:, None] + np.arange(steps)
     by_height = np.zeros((2, count, int(start.max()) + steps))
-    by_height[0][row, level], by_height[1][row, level] = evidence * known, known
+    by_height[0][row, level], by_height[1][row, level] = evidence, known
     pairs = cKDTree(columns.xy).query_pairs(_NEIGHBOURHOOD_M, output_type="ndarray")
     a, b = np.concatenate([pairs, pairs[:, ::-1], np.arange(count)[:, None].repeat(2, 1)]).T
     around = csr_array((np.ones(len(a)), (a, b)), shape=(count, count))
