@@ -36,6 +36,6 @@ class TunedAdam:
             part = schedule(state.iteration, total) if self.decay == "cosine" else 1.0
             if takes(state.first):
                 return adam_step(state, -rates * part)
-            return -rates.to(state.first.device) * part * state.direction()
+            return -rates.to(state.first.device) * part * state.direction() * state.seen_now
 
         return step

@@ -65,8 +65,10 @@ def _scene(
     network: LearnedOptimiser, hidden: int, frame: Frame, fixed: Fixed, pyramid: VoxelPyramid, memory: Memory
 ) -> Scene:
     """What the mixing layer takes from around is the same for all Gaussians of a voxel: it is a layer of voxels."""
-    voxels, layers, at = len(pyramid.counts), Layers(memory), memory.address
-    pooled, own = torch.zeros(voxels, hidden), torch.zeros(round_up(len(pyramid.voxel_of), BLOCK), hidden)
+    voxels, layers, at = pyramid.count, Layers(memory), memory.address
+    count = len(pyramid.voxel_of)
+    pooled, own = torch.zeros(voxels, hidden), torch.zeros(round_up(count, BLOCK), hidden)
+    active, slot = torch.zeros(2, count, dtype=torch.int32)
     around = network.mix.weight[:, network.config.hidden :].T[None]
     out = layers.add(
         layers.unet(network.unet, pooled, pyramid), around, network.mix.bias, Pairs.identity(voxels),
@@ -75,7 +77,7 @@ def _scene(
     points, program = ByOwner.of(pyramid.voxel_of, voxels), layers.program()
     return Scene(
         voxels, at(_base(frame)), at(fixed.columns), at(pyramid.voxel_of.int()), at(points.starts), at(points.order),
-        at(own), at(pooled), at(out), program, len(program),
+        at(active), at(slot), at(own), at(pooled), at(out), program, len(program),
     )  # fmt: skip
 
 

@@ -14,7 +14,10 @@ from genre_tasks.optimiser.state import FIRST_DECAY, SECOND_DECAY, State
 def learned_step(
     network: library.Network, scene: library.Scene, state: State, gradient: Tensor, rates: Tensor, time: Tensor
 ) -> Tensor:
-    """The learned optimiser's step [N, 14] with the signed ``rates`` [14]; ``time`` [4]: the last features."""
+    """The learned optimiser's step [N, 14] with the signed ``rates`` [14]; ``time`` [4]: the last features.
+
+    0 where ``state.seen_now`` is.
+    """
     kernel = library.load_network()
     return _step(
         lambda now, threads: kernel.genre_network_step(network, scene, now, threads), state, gradient, rates, time
@@ -22,7 +25,7 @@ def learned_step(
 
 
 def adam_step(state: State, rates: Tensor) -> Tensor:
-    """Tuned Adam's step [N, 14] with the signed ``rates`` [14]; float32 on the CPU."""
+    """Tuned Adam's step [N, 14] with the signed ``rates`` [14], 0 where nothing was seen now; float32 on the CPU."""
     return _step(library.load_network().genre_adam_step, state, state.first, rates, rates)
 
 

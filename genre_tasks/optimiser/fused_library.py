@@ -45,7 +45,7 @@ class Scene(ctypes.Structure):
 
     _fields_ = [
         *_numbers("voxels"),
-        *_pointers("base fixed voxel_of starts points own pooled around"),
+        *_pointers("base fixed voxel_of starts points active slot own pooled around"),
         ("layers", ctypes.POINTER(Layer)),
         *_numbers("layer_count"),
     ]

@@ -32,13 +32,13 @@ def saw(
 def moved(
     offsets: Tensor,  # [N, 14]
     delta: Tensor,  # [N, 14]
-    seen: Tensor,  # [N, 1]
+    seen_now: Tensor,  # [N, 1]
     start: Tensor,  # [N, 14]
     low: Tensor,  # [N, 14]
     high: Tensor,  # [N, 14]
 ) -> Tensor:
-    """Offsets after ``delta``, held inside the bounds where anything was seen; see ``State.moved``."""
-    arrays, out = _contiguous(offsets, delta, seen, start, low, high), torch.empty_like(offsets)
+    """Offsets after ``delta``, held inside the bounds, where anything was seen now; see ``State.moved``."""
+    arrays, out = _contiguous(offsets, delta, seen_now, start, low, high), torch.empty_like(offsets)
     pointers = [t.data_ptr() for t in arrays]
     library.check(library.load_network().genre_moved(len(offsets), *pointers, torch.get_num_threads(), out.data_ptr()))
     return out

@@ -63,12 +63,14 @@ class LearnedOptimiser(nn.Module):
 
     def forward(
         self,
-        inputs: Tensor,  # [N, FEATURES]
+        inputs: Tensor,  # [M, FEATURES]
         pyramid: VoxelPyramid,
+        points: Tensor,  # [M]
     ) -> tuple[Tensor, Tensor]:
-        """Log-gains a and offsets b, each [N, 14]."""
+        """Log-gains a and offsets b of the ``points``, each [M, 14]; the others are as if they were not there."""
         own = F.silu(self.entry(inputs))
-        return self._heads(own, self.unet(pyramid.pool(own), pyramid), pyramid.voxel_of)
+        pooled, _ = pyramid.pool(own, points)
+        return self._heads(own, self.unet(pooled, pyramid), pyramid.voxel_of[points])
 
     def _heads(self, own: Tensor, around: Tensor, voxel: Tensor) -> tuple[Tensor, Tensor]:
         both = torch.cat([own, around.index_select(0, voxel)], 1)
@@ -80,9 +82,11 @@ class LearnedOptimiser(nn.Module):
         return voxel_pyramid(frame.scene, centre, self.config.voxel_m, len(self.config.channels))
 
     def delta(self, state: State, inputs: Tensor, pyramid: VoxelPyramid, total: int) -> Tensor:
-        """The step [N, 14], differentiable in the network's weights."""
-        gain, offset = self(inputs, pyramid)
-        return self._step(gain, offset, state.direction(), schedule(state.iteration, total))
+        """The step [N, 14], differentiable in the network's weights; 0 where ``state.seen_now`` is."""
+        seen = state.seen_now[:, 0].nonzero()[:, 0]
+        gain, offset = self(inputs[seen], pyramid, seen)
+        step = self._step(gain, offset, state.direction()[seen], schedule(state.iteration, total))
+        return step.new_zeros(state.offsets.shape).index_copy(0, seen, step)
 
     def _step(self, gain: Tensor, offset: Tensor, direction: Tensor, part: float) -> Tensor:
         rates = rate_vector(self.config.rates).to(direction.device)
@@ -94,14 +98,18 @@ class LearnedOptimiser(nn.Module):
         What the others pool into the voxels has the right value but no gradient; that of the rows counts N / M times,
         so that over random rows the gradient in the weights of a sum is right on average.
         """
+        now = state.seen_now[:, 0]
         with torch.no_grad():
-            everyone = pyramid.pool(F.silu(self.entry(inputs)))
-        own = F.silu(self.entry(inputs[rows]))
-        voxel = pyramid.voxel_of[rows]
-        change = torch.zeros_like(everyone).index_add(0, voxel, own - own.detach()) / pyramid.counts
+            seen = now.nonzero()[:, 0]
+            everyone, counts = pyramid.pool(F.silu(self.entry(inputs[seen])), seen)
+        place = now[rows].nonzero()[:, 0]
+        part = rows[place]
+        own = F.silu(self.entry(inputs[part]))
+        voxel = pyramid.voxel_of[part]
+        change = torch.zeros_like(everyone).index_add(0, voxel, own - own.detach()) / counts
         around = self.unet(everyone + change * (len(inputs) / len(rows)), pyramid)
-        heads = self._heads(own, around, voxel)
-        return self._step(*heads, state.direction()[rows], schedule(state.iteration, total))
+        step = self._step(*self._heads(own, around, voxel), state.direction()[part], schedule(state.iteration, total))
+        return step.new_zeros((len(rows), 14)).index_copy(0, place, step)
 
     def start(self, frame: Frame, centre: Tensor) -> Step:
         """See :class:`genre_tasks.optimiser.rules.StepRule`. The same bytes at any number of threads.

@@ -27,7 +27,8 @@ struct Scene {
   int64_t voxels;
   const float *base, *fixed;                // [N, 14] and [N, 4], see features()
   const int32_t *voxel_of, *starts, *points;  // [N]; [voxels + 1] and [N]: each voxel's Gaussians
-  float *own, *pooled;                      // [N up to a whole BLOCK, hidden], [voxels, hidden]
+  int32_t *active, *slot;                   // [N]: Gaussians that are seen now, and the place of each of all there or -1
+  float *own, *pooled;                      // [N up to a whole BLOCK, hidden] by slot, [voxels, hidden]
   const float* around;                      // [voxels, hidden]: what the last layer writes, the mixing layer's bias included
   const Layer* layers;
   int64_t layer_count;
@@ -41,11 +42,14 @@ static size_t pieces(int64_t n, int size) { return ((size_t)n + size - 1) / size
 
 static void pool(const Scene& scene, size_t hidden, size_t voxel) {
   const int32_t *begin = scene.points + scene.starts[voxel], *end = scene.points + scene.starts[voxel + 1];
-  const Lanes count = broadcast((float)(end - begin));
+  int seen = 0;
+  for (const int32_t* p = begin; p < end; p++) seen += scene.slot[*p] >= 0;
+  const Lanes count = broadcast((float)std::max(seen, 1));
   for (size_t c = 0; c < hidden; c += 2 * LANES) {
     Lanes a{}, b{};
     for (const int32_t* p = begin; p < end; p++) {
-      const float* own = scene.own + *p * hidden + c;
+      if (scene.slot[*p] < 0) continue;
+      const float* own = scene.own + scene.slot[*p] * hidden + c;
       a += load(own), b += load(own + LANES);
     }
     float* out = scene.pooled + voxel * hidden + c;
@@ -77,22 +81,37 @@ struct Rows {
 };
 static_assert(BLOCK % TILE_ROWS == 0, "whole tiles");
 
-static void enter(const Network& net, const Scene& scene, const Now& now, const Lanes& usual, const float* bias, size_t block,
-                  Rows& rows) {
-  const size_t begin = block * BLOCK, n = std::min<size_t>(BLOCK, now.count - begin);
+// What this iteration's views saw is all that moves; the rest has no part in the network. Returns how many these are.
+static size_t find_active(const Scene& scene, const Now& now) {
+  size_t n = 0;
+  for (int64_t i = 0; i < now.count; i++) {
+    const bool seen = now.seen_now[i] > 0;
+    scene.slot[i] = seen ? (int32_t)n : -1;
+    if (seen)
+      scene.active[n++] = (int32_t)i;
+    else
+      store_attributes(now.delta + ATTRIBUTES * i, Lanes{});
+  }
+  return n;
+}
+
+static void enter(const Network& net, const Scene& scene, const Now& now, const Lanes& usual, const float* bias, size_t active,
+                  size_t block, Rows& rows) {
+  const size_t begin = block * BLOCK, n = std::min<size_t>(BLOCK, active - begin);
   float *x = Rows::of(rows.features), *own = scene.own + begin * net.hidden;
-  for (size_t r = 0; r < n; r++) features(now, scene.base, scene.fixed, usual, begin + r, x + STRIDE * r);
+  for (size_t r = 0; r < n; r++) features(now, scene.base, scene.fixed, usual, scene.active[begin + r], x + STRIDE * r);
   dense((int)n, x, STRIDE, VARYING, net.entry, net.hidden, [&](int) { return bias; }, own);
   silu_rows(own, n * net.hidden);
 }
 
-static void leave(const Network& net, const Scene& scene, const Now& now, size_t block, Rows& rows) {
-  const size_t begin = block * BLOCK, n = std::min<size_t>(BLOCK, now.count - begin);
+static void leave(const Network& net, const Scene& scene, const Now& now, size_t active, size_t block, Rows& rows) {
+  const size_t begin = block * BLOCK, n = std::min<size_t>(BLOCK, active - begin);
   const int depth = (int)net.hidden;
   float *hidden = Rows::of(rows.hidden), *head = Rows::of(rows.head);
-  const size_t ahead = std::min<size_t>(2 * BLOCK, now.count - begin) * net.hidden;  // this block and the next
+  const size_t ahead = std::min<size_t>(2 * BLOCK, active - begin) * net.hidden;  // this block and the next
   for (size_t i = 0; i < ahead; i += LANES) __builtin_prefetch(scene.own + begin * net.hidden + i);
-  auto around = [&](int r) { return scene.around + scene.voxel_of[begin + std::min<size_t>(r, n - 1)] * net.hidden; };
+  const int32_t* points = scene.active + begin;
+  auto around = [&](int r) { return scene.around + scene.voxel_of[points[std::min<size_t>(r, n - 1)]] * net.hidden; };
   dense((int)n, scene.own + begin * net.hidden, net.hidden, depth, net.mix, net.hidden, around, hidden);
   silu_rows(hidden, n * net.hidden);
   dense((int)n, hidden, net.hidden, depth, net.head, HEAD, [&](int) { return net.head_bias; }, head);
@@ -100,7 +119,7 @@ static void leave(const Network& net, const Scene& scene, const Now& now, size_t
   for (size_t r = 0; r < n; r++) {
     const Lanes gain = load(head + HEAD * r), offset = load(head + HEAD * r + LANES);
     const Lanes factor = power_of_2(tanh(gain * (1 / 3.f)) * (3 * LOG2_E));
-    float* delta = now.delta + ATTRIBUTES * (begin + r);  // holds the direction
+    float* delta = now.delta + ATTRIBUTES * (size_t)points[r];  // holds the direction
     store_attributes(delta, rates * (factor * load_attributes(delta) + tanh(offset)));
   }
 }
@@ -111,7 +130,7 @@ static void evaluate(const Network& net, const Scene& scene, const Now& now, int
   for (int t = 0; t < TIMES; t++)
     for (int64_t c = 0; c < net.hidden; c++) bias[c] += now.times[t] * net.entry[(VARYING + t) * net.hidden + c];
   std::vector<Rows> rows(threads, Rows(net.hidden));
-  const size_t blocks = pieces(now.count, BLOCK);
+  const size_t active = find_active(scene, now), blocks = pieces(active, BLOCK);
   Crew crew(4 + scene.layer_count);
   crew.run(threads, [&](Crew::Member& member) {
     auto each_voxel = [&](int64_t voxels, auto f) {
@@ -123,11 +142,11 @@ static void evaluate(const Network& net, const Scene& scene, const Now& now, int
       parts[p] = sum_of_squares(now, p * SUMMED, std::min<size_t>((p + 1) * SUMMED, now.count));
     });
     const Lanes usual = inverse_usual(parts);
-    member.each(blocks, [&](size_t b) { enter(net, scene, now, usual, bias.data(), b, rows[member.number]); });
+    member.each(blocks, [&](size_t b) { enter(net, scene, now, usual, bias.data(), active, b, rows[member.number]); });
     each_voxel(scene.voxels, [&](size_t v) { pool(scene, net.hidden, v); });
     for (int64_t l = 0; l < scene.layer_count; l++)
       each_voxel(scene.layers[l].outputs, [&](size_t v) { convolve(scene.layers[l], v); });
-    member.each(blocks, [&](size_t b) { leave(net, scene, now, b, rows[member.number]); });
+    member.each(blocks, [&](size_t b) { leave(net, scene, now, active, b, rows[member.number]); });
   });
 }
 
@@ -142,16 +161,17 @@ static void each_gaussian(int64_t count, int threads, F f) {
 
 extern "C" {
 
-// Writes now->delta, the learned optimiser's step.
+// Writes now->delta, the learned optimiser's step: 0 where nothing was seen now.
 int genre_network_step(const Network* network, const Scene* scene, const Now* now, int threads) {
   return guarded([&] { evaluate(*network, *scene, *now, std::max(1, threads)); });
 }
 
-// Writes now->delta, tuned Adam's step; the bits of an untrained network's.
+// Writes now->delta, tuned Adam's step, 0 where nothing was seen now: the bits of an untrained network's.
 int genre_adam_step(const Now* now, int threads) {
   return guarded([&] {
     const Lanes rates = load_attributes(now->rates);
     each_gaussian(now->count, threads, [&](int64_t i) {
+      if (!(now->seen_now[i] > 0)) return store_attributes(now->delta + ATTRIBUTES * i, Lanes{});
       const float* by_seen = counted(*now, i);
       store_attributes(now->delta + ATTRIBUTES * i, rates * direction(*now, i, by_seen, deviation(*now, i, by_seen)));
     });
@@ -175,14 +195,14 @@ int genre_saw(int64_t count, const float* gradient, const float* first, const fl
   });
 }
 
-// State.moved and Frame.bounded: [N, 14], seen [N]. Additions and choices only: torch's bits.
-int genre_moved(int64_t count, const float* offsets, const float* delta, const float* seen, const float* start,
+// State.moved and Frame.bounded: [N, 14], seen_now [N]. Additions and choices only: torch's bits.
+int genre_moved(int64_t count, const float* offsets, const float* delta, const float* seen_now, const float* start,
                 const float* low, const float* high, int threads, float* out) {
   return guarded([&] {
     each_gaussian(count, threads, [&](int64_t i) {
       const int64_t at = ATTRIBUTES * i;
       Lanes moved = load_attributes(offsets + at);
-      if (seen[i] > 0) {
+      if (seen_now[i] > 0) {
         moved = moved + load_attributes(delta + at);
         const Lanes from = load_attributes(start + at), least = load_attributes(low + at), there = from + moved;
         const Lanes held = bounded(there, least, load_attributes(high + at)), back = held - from;

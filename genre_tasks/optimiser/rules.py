@@ -16,7 +16,10 @@ SCHEDULE_END = 0.05
 
 
 class Step(Protocol):
-    """One scene's rule: ``step(state, gradient, total)`` → delta [N, 14]; ``gradient`` is already in the state."""
+    """One scene's rule: ``step(state, gradient, total)`` → delta [N, 14]; ``gradient`` is already in the state.
+
+    The delta is 0 where ``state.seen_now`` is.
+    """
 
     def __call__(self, state: State, gradient: Tensor, total: int) -> Tensor: ...
 

@@ -17,12 +17,12 @@ from genre_tasks.optimiser.sparse import KernelMap, coarsen, neighbour_map, spar
 class VoxelPyramid:
     """The structure that the UNet works on: levels of voxels, each twice as wide as the one before.
 
-    ``voxel_of`` [N]: the finest voxel of each point; ``counts`` [n, 1]: points per finest voxel; ``neighbours``: one
-    3×3×3 map a level; ``down``: one 2×2×2 map between a level and the next.
+    ``voxel_of`` [N]: the finest voxel of each point; ``count``: finest voxels; ``neighbours``: one 3×3×3 map a level;
+    ``down``: one 2×2×2 map between a level and the next.
     """
 
     voxel_of: Tensor
-    counts: Tensor
+    count: int
     neighbours: tuple[KernelMap, ...]
     down: tuple[KernelMap, ...]
 
@@ -30,18 +30,21 @@ class VoxelPyramid:
     def of(keys: Tensor, levels: int) -> VoxelPyramid:
         """From the voxel key [N] of each point (see :func:`genre_tasks.optimiser.sparse.pack`); N may be 0."""
         voxels, voxel_of = unique_voxels(keys)
-        counts = torch.bincount(voxel_of, minlength=len(voxels)).to(torch.float32)[:, None]
-        neighbours, down = [neighbour_map(voxels)], []
+        count, neighbours, down = len(voxels), [neighbour_map(voxels)], []
         for _ in range(levels - 1):
             voxels, kernel_map = coarsen(voxels)
             down.append(kernel_map)
             neighbours.append(neighbour_map(voxels))
-        return VoxelPyramid(voxel_of, counts, tuple(neighbours), tuple(down))
+        return VoxelPyramid(voxel_of, count, tuple(neighbours), tuple(down))
 
-    def pool(self, features: Tensor) -> Tensor:
-        """Mean of the points' features [N, C] in each finest voxel, [n, C]."""
-        out = features.new_zeros((len(self.counts), features.shape[1]))
-        return out.index_add(0, self.voxel_of, features) / self.counts
+    def pool(self, features: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean of the features [M, C] of the ``points`` [M] in each finest voxel, [n, C], 0 where there are none.
+
+        And their number, [n, 1], at least 1.
+        """
+        voxel = self.voxel_of[points]
+        counts = torch.bincount(voxel, minlength=self.count).clamp_min(1).to(features.dtype)[:, None]
+        return features.new_zeros((self.count, features.shape[1])).index_add(0, voxel, features) / counts, counts
 
 
 class SparseConv(nn.Module):

@@ -114,12 +114,16 @@ class State:
         return replace(self, first=first, second=second, seen=self.seen + now, seen_now=now)
 
     def moved(self, frame: Frame, delta: Tensor) -> State:
-        """With ``delta`` [N, 14] applied to what any view has seen so far; the rest stays the same bytes."""
+        """With ``delta`` [N, 14] applied to what this iteration's views saw; the rest stays the same bytes.
+
+        A direction kept from earlier views would lead on and on what nothing corrects: moving by it costs tuned Adam
+        0.1 dB and brings the learned optimiser nothing.
+        """
         start, low, high = frame.start, frame.low, frame.high
-        if fused_state.fits(self.offsets, delta, self.seen, start, low, high):
-            offsets = fused_state.moved(self.offsets, delta, self.seen, start, low, high)
+        if fused_state.fits(self.offsets, delta, self.seen_now, start, low, high):
+            offsets = fused_state.moved(self.offsets, delta, self.seen_now, start, low, high)
             return replace(self, offsets=offsets, iteration=self.iteration + 1)
-        offsets = torch.where(self.seen > 0, frame.bounded(self.offsets + delta), self.offsets)
+        offsets = torch.where(self.seen_now > 0, frame.bounded(self.offsets + delta), self.offsets)
         return replace(self, offsets=offsets, iteration=self.iteration + 1)
 
     def deviation(self) -> Tensor:

@@ -65,12 +65,13 @@ def _fused_step(network: LearnedOptimiser, frame: Frame) -> Step:
 
 
 def _states(scene: SceneGraph, unseen: int = 5, size: float = 1.0) -> Iterator[tuple[State, Tensor]]:
-    """Five iterations with gradients of many sizes; some Gaussians are never seen, others not at first."""
+    """Five iterations with gradients of many sizes; some Gaussians are never seen, others not always."""
     g, count = torch.Generator().manual_seed(0), len(scene)
     frame, state = Frame.of(scene), State.start(count, scene.gaussians.means)
     for i in range(5):
         gradient = size * torch.randn(count, 14, generator=g) * 10 ** (3 * torch.rand(count, 14, generator=g) - 2)
         gradient[: max(unseen, 40 - 10 * i)] = 0
+        gradient[i::5] = 0
         state = state.saw(gradient)
         yield state, gradient
         state = state.moved(frame, 0.1 * torch.randn(count, 14, generator=g))
@@ -174,10 +175,10 @@ def test_a_step_does_not_depend_on_the_steps_before() -> None:
 def test_adams_step_is_torchs_direction() -> None:
     scene, adam = street.scene(), TunedAdam()
     for state, gradient in _states(scene):
-        expected = -rate_vector(adam.rates) * state.direction()
+        expected = -rate_vector(adam.rates) * state.direction() * state.seen_now
         step = TunedAdam(decay="constant").start(Frame.of(scene), CENTRE)(state, gradient, TOTAL)
         torch.testing.assert_close(step, expected, atol=0, rtol=1e-6)
-        assert not step[:5].any()
+        assert not step[:5].any() and bool(step[state.seen_now[:, 0] > 0].any(1).all())
 
 
 def _detached(state: State) -> State:
@@ -201,8 +202,10 @@ def test_the_states_updates_are_torchs(isa: str, monkeypatch: pytest.MonkeyPatch
             far = replace(ours, offsets=ours.offsets + 2 * torch.randn(delta.shape, generator=g))
             same = far.moved(frame, delta), _detached(far.moved(frame, delta.clone().requires_grad_()))
             assert torch.equal(same[0].offsets, same[1].offsets) and same[0].iteration == same[1].iteration
-            assert bool((same[0].offsets != far.offsets + delta)[far.seen[:, 0] > 0].any())  # bounds were met
-            assert torch.equal(same[0].offsets[:5], far.offsets[:5])
+            assert bool((same[0].offsets != far.offsets + delta)[far.seen_now[:, 0] > 0].any())  # bounds were met
+            unseen = far.seen_now[:, 0] == 0
+            assert torch.equal(same[0].offsets[unseen], far.offsets[unseen])
+    assert bool((state.seen[state.seen_now == 0] > 0).any())  # some were seen before and not now
 
 
 def test_what_is_not_a_number_stays_seen_in_the_state() -> None:
@@ -247,10 +250,10 @@ def test_what_is_not_a_number_stays_seen(where: str) -> None:
     state, gradient = next(_states(scene))
     if where == "gradient":
         gradient = gradient.clone()
-        gradient[60, 3] = torch.nan
+        gradient[61, 3] = torch.nan
     elif where == "offsets":
         state = replace(state, offsets=state.offsets.clone())
-        state.offsets[60, 3] = torch.nan
+        state.offsets[61, 3] = torch.nan
     else:
         network.head.bias[3] = torch.nan
     ours, torchs = (make(network, Frame.of(scene))(state, gradient, TOTAL) for make in (_fused_step, _torch_step))

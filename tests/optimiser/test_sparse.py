@@ -131,10 +131,22 @@ def test_unet_on_degenerate_inputs(points: int) -> None:
     pyramid = VoxelPyramid.of(pack(torch.zeros(points, dtype=torch.long), torch.zeros(points, 3, dtype=torch.long)), 3)
     unet = SparseUNet(6, (4, 6, 8))
     features = torch.randn(points, 6)
-    out = unet(pyramid.pool(features), pyramid)
+    mean, counts = pyramid.pool(features, torch.arange(points))
+    out = unet(mean, pyramid)
     assert out.shape == (min(points, 1), 4)
     assert bool(torch.isfinite(out).all())
-    torch.testing.assert_close(pyramid.pool(features), features.mean(0, keepdim=True)[: min(points, 1)])
+    torch.testing.assert_close(mean, features.mean(0, keepdim=True)[: min(points, 1)])
+    assert counts.flatten().tolist() == [points] * min(points, 1)
+
+
+def test_a_voxel_s_mean_is_over_the_given_points_and_zero_without_any() -> None:
+    pyramid = VoxelPyramid.of(pack(torch.zeros(4, dtype=torch.long), torch.tensor([[0, 0, 0]] * 3 + [[5, 0, 0]])), 1)
+    points = torch.tensor([0, 2])
+    mean, counts = pyramid.pool(torch.tensor([[1.0], [4.0]]), points)
+    own, other = (int(pyramid.voxel_of[i]) for i in (0, 3))
+    assert mean[own].item() == 2.5
+    assert mean[other].item() == 0
+    assert (counts[own].item(), counts[other].item()) == (2, 1)
 
 
 def test_unet_follows_a_permutation_of_the_points() -> None:
@@ -145,7 +157,7 @@ def test_unet_follows_a_permutation_of_the_points() -> None:
 
     def per_point(c: torch.Tensor, f: torch.Tensor) -> torch.Tensor:
         pyramid = VoxelPyramid.of(pack(torch.zeros(len(c), dtype=torch.long), c), 3)
-        return unet(pyramid.pool(f), pyramid)[pyramid.voxel_of]
+        return unet(pyramid.pool(f, torch.arange(len(f)))[0], pyramid)[pyramid.voxel_of]
 
     torch.testing.assert_close(
         per_point(coordinates, features)[order], per_point(coordinates[order], features[order]), atol=1e-5, rtol=1e-5
@@ -159,6 +171,6 @@ def test_unet_is_unmoved_by_a_shift_of_whole_coarse_voxels() -> None:
     results = []
     for shift in (0, 4, -12):
         pyramid = VoxelPyramid.of(pack(torch.zeros(300, dtype=torch.long), coordinates + shift), 3)
-        results.append(unet(pyramid.pool(features), pyramid)[pyramid.voxel_of])
+        results.append(unet(pyramid.pool(features, torch.arange(300))[0], pyramid)[pyramid.voxel_of])
     torch.testing.assert_close(results[1], results[0], atol=1e-5, rtol=1e-5)
     torch.testing.assert_close(results[2], results[0], atol=1e-5, rtol=1e-5)

@@ -104,6 +104,19 @@ def test_a_gaussian_that_no_view_has_seen_gets_exactly_no_update(rule: StepRule,
     assert bool((before[5:] != after[5:]).any())
 
 
+@pytest.mark.parametrize("rule", [TunedAdam(), _network()], ids=["adam", "learned"])
+def test_what_this_iterations_views_do_not_see_stays_where_it_is(rule: StepRule, truth: SceneGraph) -> None:
+    frame, generator = Frame.of(truth), torch.Generator().manual_seed(0)
+    state, step = State.start(len(truth), truth.gaussians.means), rule.start(Frame.of(truth), torch.zeros(3))
+    for seen in (slice(None), slice(0, None, 2)):
+        gradient = torch.zeros(len(truth), 14)
+        gradient[seen] = torch.randn(gradient[seen].shape, generator=generator)
+        before, state = state.offsets, state.saw(gradient)
+        state = state.moved(frame, step(state, gradient, 8))
+    assert torch.equal(state.offsets[1::2], before[1::2])
+    assert bool((state.offsets[::2] != before[::2]).any(1).all())
+
+
 def _step(network: LearnedOptimiser, scene: SceneGraph, gradient: torch.Tensor, shift: float = 0.0) -> torch.Tensor:
     frame = Frame.of(scene)
     centre = torch.tensor([shift, 0.0, 0.0])
