@@ -24,6 +24,7 @@ class BenchEntry:
 
 _BENCHES: dict[str, BenchEntry] = {
     "facades": BenchEntry("benchmarks.facades:BENCH", "what completing façades above the LiDAR's view brings"),
+    "fixer": BenchEntry("benchmarks.fixer:BENCH", "what FNet brings beside the path, and what it costs"),
     "main_job": BenchEntry("benchmarks.main_job:BENCH", "the pipeline on claim seeds and a real chunk"),
     "optimiser": BenchEntry(
         "benchmarks.optimiser:BENCH", "GNet's seconds and renders beside per-scene 3DGS and tuned Adam"

@@ -32,13 +32,25 @@ def novel_views(
     All cameras, in the order of ``novel_view_poses``. Raises ``NonFiniteError`` if an image is not finite.
     """
     views = novel_view_poses(chunk, config.shifts_m)
-    points = lidar_scene(chunk, config.lidar_max_points)
-    scene = _render(reconstruction.scene, views, settings, progress, 0, "novel views")
+    return render_novel(chunk, reconstruction.scene, views, config.lidar_max_points, progress, settings)
+
+
+def render_novel(
+    chunk: Chunk,
+    scene: SceneGraph,
+    views: Sequence[NovelView],
+    lidar_max_points: int,
+    progress: Progress = silent,
+    settings: RenderSettings = DEFAULT_SETTINGS,
+) -> NovelViews:
+    """As :func:`novel_views`, at any ``views``."""
+    image = _render(scene, views, settings, progress, 0, "novel views")
+    points = lidar_scene(chunk, lidar_max_points)
     lidar = _render(points, views, settings, progress, len(views), "LiDAR maps")
     progress(2 * len(views), 2 * len(views), "novel views")
     images = NovelViews(
-        views, scene.color, scene.alpha, scene.expected_depth(), lidar.color, lidar.alpha, lidar.expected_depth(),
-        scene.culled, lidar.culled,
+        tuple(views), image.color, image.alpha, image.expected_depth(),
+        lidar.color, lidar.alpha, lidar.expected_depth(), image.culled, lidar.culled,
     )  # fmt: skip
     for name in ("color", "alpha", "depth", "lidar_color", "lidar_alpha", "lidar_depth"):
         bad = (~getattr(images, name).isfinite()).nonzero()

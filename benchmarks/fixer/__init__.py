@@ -1,0 +1,166 @@
+"""What FNet brings beside the path and what it costs, as the preset ``small`` uses it.
+
+genre bench fixer --json docs/benchmarks/fixer.json [--set seeds=1001] [--set pandaset=]
+
+A log makes a cell. Views at 3 m are those that the optimiser's benchmark judges by: spread over sides, frames and
+cameras, none of them seen by any stage.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+
+import numpy as np
+
+from benchmarks.bench import Bench, Cell, Row
+from benchmarks.fixer.cells import KERNEL_SHIFTS_M, measure_fixer
+from benchmarks.optimiser.cells import place
+from benchmarks.schema import Claim, claim
+from benchmarks.timing import Measured
+from flows.configuration import load_configuration
+from flows.pipeline import BY_NAME, weights_digest, weights_file
+from genre_tasks.metrics.collect import BOOTSTRAP_SEED
+
+CELL_S = 90.0
+"""Predicted: the steps before FNet, twelve ray-cast views, a few hundred fixed ones."""
+RESAMPLES = 2000
+
+
+class Fixer:
+    """A cell for each log."""
+
+    name = "fixer"
+    options: Mapping[str, str] = {
+        "seeds": "1001,1002,1003,1004,1005", "store": "genre-store", "pandaset": "../shared/data/pandaset/002",
+    }  # fmt: skip
+    code: tuple[str, ...] = (
+        "benchmarks.fixer.cells", "genre_tasks.optimiser.run", "genre_tasks.stages.novel_views",
+        "genre_tasks.stages.fnet", "genre_tasks.stages.ingest", "genre_tasks.stages.initial",
+        "genre_tasks.logs.pandaset", "genre_tasks.logs.synthetic",
+    )  # fmt: skip
+
+    def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
+        """``quick``: one street. An empty ``pandaset`` leaves the real log out."""
+        logs = [(f"synthetic:street?seed={seed}", 0) for seed in options["seeds"].split(",") if seed]
+        if options["pandaset"]:
+            logs.append((f"pandaset:{options['pandaset']}", 1))
+        small = load_configuration("small")
+        digests = [weights_digest(weights_file(BY_NAME[name], small)) for name in ("gnet", "fnet")]
+        parameters = {"configuration": small.model_dump(mode="json"), "weights": digests}
+        return [
+            Cell(f"{log} chunk {chunk}", CELL_S, partial(measure_fixer, log, chunk, options["store"]), parameters)
+            for log, chunk in (logs[:1] if quick else logs)
+        ]
+
+    def claims(self, rows: Mapping[str, Row]) -> Iterator[Claim]:
+        """Over the views of all synthetic logs; on the real one at each shift; flicker and time over all logs."""
+        found = measured(rows)
+        streets, reals = [r for r in found if "truth" in r], [r for r in found if "kernel" in r]
+        views = f"{len(of_views(streets, 'render', 'psnr'))} views at 3 m; {_of(streets)}"
+        gains, part = differences(streets, "psnr"), reduced(streets)
+        note = "mean over views, 95 % interval by bootstrap over views"
+        data = f"PSNR of the fixed less that of the render, {note}; {views}"
+        yield claim("fixer.psnr_3m", mean(gains), ">=", 1.0, "dB", data, len(gains), interval(gains))
+        data = f"perceptual distance, the part of the render's that fixing takes away, {note}; {views}"
+        yield claim("fixer.perceptual_3m", mean(part), ">=", 0.25, "part", data, len(part), interval(part))
+        clean = of_views(streets, "clean", "psnr")
+        data = f"the truth given as the render: PSNR of what comes back, the worst view; {views}"
+        yield claim("fixer.identity", min(clean, default=None), ">=", 35.0, "dB", data, len(clean))
+        for shift in KERNEL_SHIFTS_M:
+            yield _kernel(reals, f"{shift:g}")
+        ratios = [r["flicker"]["fixed"] / r["flicker"]["render"] for r in found]
+        note = "difference between consecutive frames, the next warped by rendered depth: fixed over render"
+        data = f"{note}, the worst log; {_of(found)}"
+        yield claim("fixer.flicker", max(ratios, default=None), "<=", 1.0, "ratio", data, len(ratios))
+        yield _seconds(found)
+
+    def table(self, rows: Mapping[str, Row]) -> Iterator[str]:
+        """A line for each log."""
+        yield "| log | PSNR at 3 m: render | fixed | perceptual: render | fixed | clean, fixed | flicker | s a view |"
+        yield "|---|---|---|---|---|---|---|---|"
+        for row in measured(rows):
+            pairs = [(kind, key) for key in ("psnr", "perceptual") for kind in ("render", "fixed")]
+            values = [f"{_mean(row, *p):.3f}" if "truth" in row else "" for p in pairs]
+            values.append(f"{_mean(row, 'clean', 'psnr'):.2f}" if "truth" in row else "")
+            ratio = row["flicker"]["fixed"] / row["flicker"]["render"]
+            yield f"| {place(row)} | {' | '.join(values)} | {ratio:.3f} | {seconds_a_view(row):.3f} |"
+        yield ""
+        yield "| log | shift, m | kernel distance: render | fixed | difference, 95 % interval |"
+        yield "|---|---|---|---|---|"
+        for row in (r for r in measured(rows) if "kernel" in r):
+            for shift, k in row["kernel"].items():
+                spread = f"{k['difference']:+.4f} ({k['low']:+.4f} … {k['high']:+.4f})"
+                yield f"| {place(row)} | {shift} | {k['render']:.4f} | {k['render'] + k['difference']:.4f} | {spread} |"
+        for name in (n for n, r in rows.items() if "not_measured" in r):
+            yield f"\n{name}: not measured: {rows[name]['not_measured']}"
+
+
+def measured(rows: Mapping[str, Row]) -> list[Row]:
+    """Those that were."""
+    return [row for row in rows.values() if "not_measured" not in row]
+
+
+def of_views(streets: Sequence[Row], kind: str, key: str) -> list[float]:
+    """One number for each view of all logs."""
+    return [x for row in streets for x in row["truth"][kind][key]]
+
+
+def differences(streets: Sequence[Row], key: str) -> list[float]:
+    """The fixed view's number less the render's."""
+    pairs = zip(of_views(streets, "fixed", key), of_views(streets, "render", key), strict=True)
+    return [after - before for after, before in pairs]
+
+
+def reduced(streets: Sequence[Row]) -> list[float]:
+    """For each view, by how much fixing lessens the perceptual distance, in parts of the renders' mean."""
+    base = of_views(streets, "render", "perceptual")
+    return [-d / statistics.fmean(base) for d in differences(streets, "perceptual")]
+
+
+def mean(values: Sequence[float]) -> float | None:
+    """The mean, or ``None`` where nothing was measured."""
+    return statistics.fmean(values) if values else None
+
+
+def interval(values: Sequence[float]) -> tuple[float, float] | None:
+    """95 % of the means of resampled views; ``None`` without any."""
+    if not values:
+        return None
+    drawn = np.random.default_rng(BOOTSTRAP_SEED).choice(values, (RESAMPLES, len(values)))
+    low, high = np.quantile(drawn.mean(1), [0.025, 0.975])
+    return float(low), float(high)
+
+
+def seconds_a_view(row: Row) -> float:
+    """The median run's."""
+    return float(statistics.median(row["time"]["seconds"]) / row["time"]["views"])
+
+
+def _kernel(reals: Sequence[Row], shift: str) -> Claim:
+    at = [row["kernel"][shift] for row in reals]
+    high = max((k["high"] for k in at), default=None)
+    said = "; ".join(f"{k['difference'] / k['render']:+.1%} of {k['render']:.4f}" for k in at) or "not measured"
+    note = f"upper end of the 95 % interval of the kernel distance's difference at {shift} m: {said}; {_of(reals)}"
+    return claim(f"fixer.real_kernel_{shift}m", high, "<", 0.0, "distance", note, len(at))
+
+
+def _seconds(found: Sequence[Row]) -> Claim:
+    spent = [seconds_a_view(row) for row in found]
+    if not spent:
+        return claim("fixer.seconds_per_frame", None, "<=", 0.6, "s", "not measured")
+    m, run = Measured.of(spent), found[0]["time"]
+    data = f"{run['size'][1]}×{run['size'][0]}, batches of {run['batch']}, two threads; median over logs; {_of(found)}"
+    return claim("fixer.seconds_per_frame", m.median, "<=", 0.6, "s", data, m.n, m.spread)
+
+
+def _of(rows: Sequence[Row]) -> str:
+    return ", ".join(map(place, rows)) or "not measured"
+
+
+def _mean(row: Row, kind: str, key: str) -> float:
+    return statistics.fmean(row["truth"][kind][key])
+
+
+BENCH: Bench = Fixer()

@@ -1,0 +1,124 @@
+"""What is measured of the fixer on one log: GNet's renders beside the path before and after it.
+
+On a synthetic log the ray-cast truth judges each view; on a real one the kernel distance to the chunk's real images.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from benchmarks.bench import Row
+from benchmarks.optimiser.beside import TRUE_VIEWS, true_targets, views_at
+from benchmarks.optimiser.cells import threads
+from benchmarks.optimiser.enhancement import BOOTSTRAP, psnr_of
+from benchmarks.optimiser.steps import Steps, steps_of
+from benchmarks.optimiser.task import SIDE_M
+from genre_tasks.config import FnetConfig
+from genre_tasks.fixer.conditioning import warp_reference
+from genre_tasks.fixer.network import Fnet
+from genre_tasks.metrics.collect import BOOTSTRAP_SEED, FeatureSet, real_images
+from genre_tasks.metrics.distribution import kernel_difference, kernel_distance
+from genre_tasks.metrics.perceptual import perceptual_distance
+from genre_tasks.scene.chunk import Chunk
+from genre_tasks.scene.views import NovelView, NovelViews
+from genre_tasks.stages.fnet import fix_views, load_configured
+from genre_tasks.stages.novel_views import render_novel
+
+KERNEL_SHIFTS_M = (1.0, 2.0, 3.0)
+TIMED_RUNS = 3
+
+
+def measure_fixer(log: str, chunk: int, store: str) -> Row:
+    """One cell: quality beside the path, flicker, what becomes of clean images, seconds a view."""
+    with threads():
+        steps = steps_of(log, chunk, store, 0, enet=False)
+        config = steps.config.fnet
+        network = load_configured(config)
+        out: Row = {"log": log, "chunk": chunk, "flicker": flicker_row(network, config, steps)}
+        truth = true_targets(log, store, steps.chunk, SIDE_M)
+        if truth:
+            novel = _rendered(steps, views_at(steps.chunk, SIDE_M, TRUE_VIEWS))
+            images = torch.stack([t.image.image for t in truth])
+            out["truth"] = truth_row(network, config, steps.chunk, novel, images)
+        else:
+            real = real_images(steps.chunk)
+            out["kernel"] = {
+                f"{shift:g}": kernel_row(network, config, steps, views_at(steps.chunk, shift), real)
+                for shift in KERNEL_SHIFTS_M
+            }
+        novel = _rendered(steps, views_at(steps.chunk, SIDE_M))
+        return out | {"time": time_row(network, config, steps.chunk, novel)}
+
+
+def _rendered(steps: Steps, views: Sequence[NovelView]) -> NovelViews:
+    return render_novel(steps.chunk, steps.gnet, views, steps.config.novel_views.lidar_max_points)
+
+
+@torch.no_grad()
+def truth_row(network: Fnet, config: FnetConfig, chunk: Chunk, novel: NovelViews, truth: Tensor) -> Row:
+    """PSNR (dB) and perceptual distance of each view to ``truth`` [V, H, W, 3]: the render, the fixed, the truth itself
+    given as the render.
+    """
+    clean = replace(novel, color=truth, alpha=torch.ones_like(novel.alpha))
+    images = {
+        "render": novel.color.clamp(0, 1),
+        "fixed": fix_views(network, config, chunk, novel).color,
+        "clean": fix_views(network, config, chunk, clean).color,
+    }
+    distance = perceptual_distance()
+    return {
+        name: {"psnr": psnr_of(image, truth).tolist(), "perceptual": distance(image, truth).tolist()}
+        for name, image in images.items()
+    }
+
+
+@torch.no_grad()
+def kernel_row(network: Fnet, config: FnetConfig, steps: Steps, views: Sequence[NovelView], real: FeatureSet) -> Row:
+    """Kernel distance of renders and fixed images to the real ones, and the difference with its paired interval."""
+    novel, frames = _rendered(steps, views), [v.frame for v in views]
+    fixed = fix_views(network, config, steps.chunk, novel).color
+    before, after = (perceptual_distance().pooled_features(i) for i in (novel.color.clamp(0, 1), fixed))
+    render = kernel_distance(before, real.features, frames, real.frames, bootstrap=0)
+    less = kernel_difference(after, before, real.features, frames, frames, real.frames, BOOTSTRAP, BOOTSTRAP_SEED)
+    assert render is not None and less is not None
+    return {"n": len(views), "render": render.value, "difference": less.value, "low": less.low, "high": less.high}
+
+
+@torch.no_grad()
+def flicker_row(network: Fnet, config: FnetConfig, steps: Steps) -> Row:
+    """Flicker of the first camera's renders and fixed images, over the chunk's frames at one side."""
+    camera = steps.chunk.views[0].camera
+    views = [v for v in views_at(steps.chunk, SIDE_M) if v.camera == camera and v.shift_m > 0]
+    novel = _rendered(steps, sorted(views, key=lambda v: v.frame))
+    fixed = fix_views(network, config, steps.chunk, novel).color
+    return {"frames": len(views), "render": flicker(novel.color.clamp(0, 1), novel), "fixed": flicker(fixed, novel)}
+
+
+def flicker(images: Tensor, novel: NovelViews) -> float:
+    """Mean absolute difference between each image [V, H, W, 3] and the next one, warped to it by rendered depth.
+
+    ``novel``: the views, in the order of frames, with their depth. Where a point is out of the next image or hidden
+    there it does not count.
+    """
+    poses = [(a.chunk_SE3_camera, b.chunk_SE3_camera) for a, b in zip(novel.views, novel.views[1:], strict=False)]
+    lenses = [(a.lens, b.lens) for a, b in zip(novel.views, novel.views[1:], strict=False)]
+    after, depth, alpha = images[1:].permute(0, 3, 1, 2), novel.depth[:-1, None], novel.alpha[:-1, None]
+    warped, mask = warp_reference(after, depth, alpha, poses, lenses)
+    difference = (warped - images[:-1].permute(0, 3, 1, 2)).abs() * mask
+    return float(difference.sum() / (3 * mask.sum()).clamp_min(1))
+
+
+def time_row(network: Fnet, config: FnetConfig, chunk: Chunk, novel: NovelViews) -> Row:
+    """Seconds of the whole stage but for loading the weights, the fastest and the median run."""
+    seconds = []
+    for _ in range(TIMED_RUNS):
+        began = time.perf_counter()
+        fix_views(network, config, chunk, novel)
+        seconds.append(time.perf_counter() - began)
+    size = [int(x) for x in novel.color.shape[1:3]]
+    return {"views": len(novel.views), "size": size, "batch": config.batch_views, "seconds": sorted(seconds)}
