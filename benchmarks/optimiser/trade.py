@@ -17,7 +17,7 @@ from genre_tasks.optimiser.unroll import Plan, unroll
 SEEDS = (900, 901, 902)
 """Of validation: the preset is chosen by these rows."""
 
-SHAPES = ((24, 30), (24, 6), (48, 3), (72, 2), (144, 1), (96, 3), (48, 6))
+SHAPES = ((24, 30), (24, 6), (48, 3), (72, 2), (144, 1), (72, 3), (36, 6), (96, 3), (48, 6))
 """Iterations × source views an iteration; 30 is all of them. Four of the shapes render 144 views."""
 
 PERCEPTUAL = {"perceptual 0.1": (0.1, 1), "perceptual 0.1 every fourth": (0.1, 4)}

@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.mark.parametrize("preset", PRESETS)
 def test_presets_are_valid(preset: str) -> None:
     config = load_configuration(preset)
-    assert config.gnet.iterations == {"long": 120, "paper": 24}.get(preset, 48) and config.enet.iterations == 12
+    assert config.gnet.iterations == {"long": 120, "paper": 24}.get(preset, 72) and config.enet.iterations == 12
     assert differences(config, preset) == {}
 
 
@@ -36,7 +36,7 @@ def test_settings_win_over_file_over_preset(tmp_path: Path) -> None:
     file.write_text("gnet: {iterations: 7, seed: 5}\n")
     config = load_configuration("demo", file, ["gnet.iterations=8", "evaluate.shifts_m=[1, 2]"])
     assert (config.gnet.iterations, config.gnet.seed, config.evaluate.shifts_m) == (8, 5, (1.0, 2.0))
-    assert differences(config, "demo")["gnet.iterations"] == (48, 8)
+    assert differences(config, "demo")["gnet.iterations"] == (72, 8)
 
 
 @pytest.mark.parametrize(
