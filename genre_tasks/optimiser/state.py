@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -22,6 +23,9 @@ FIRST_DECAY, SECOND_DECAY = 0.9, 0.99
 MIN_UNIT_M, MAX_UNIT_M = 0.005, 50.0
 LOG_SCALE_BOUNDS, DISTANT_LOG_SCALE_BOUNDS = (-8.0, 1.0986), (-8.0, 4.6)
 """ln metres: 0.3 mm to 3 m near, to 100 m in the distant region. What starts outside stays where it started."""
+GROWTH = 8.0
+"""No side grows beyond so many times the longest one at the start. A spike along a car's outline, thin in every source
+view and twenty times as long as it began, is a fog over the whole image of a camera that it passes beside the path."""
 LOGIT_BOUND = 9.0
 COLOR_BOUNDS = (-0.5, 1.5)
 
@@ -48,6 +52,8 @@ class Frame:
         distant = (scene.nodes == DISTANT)[:, None]
         for bound, near, far in zip((low, high), LOG_SCALE_BOUNDS, DISTANT_LOG_SCALE_BOUNDS, strict=True):
             bound[:, 3:6] = torch.where(distant, far, near)
+        longest = scene.gaussians.log_scales.max(1, keepdim=True).values
+        high[:, 3:6] = torch.minimum(high[:, 3:6], longest + math.log(GROWTH))
         low[:, 10], high[:, 10] = -LOGIT_BOUND, LOGIT_BOUND
         low[:, 11:14], high[:, 11:14] = COLOR_BOUNDS
         return Frame(scene, unit, torch.minimum(low, start), torch.maximum(high, start))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -248,3 +249,16 @@ def test_bounds_hold_and_what_starts_outside_may_stay() -> None:
     assert float(g.logit_opacities.max()) <= 9.0 + 1e-5
     assert float(g.log_scales[30:].max()) <= 1.0987 and float(g.log_scales[:30].max()) <= 4.6001
     assert float(g.colors.max()) <= 1.5 + 1e-5
+
+
+def test_no_side_grows_beyond_eight_times_the_longest_one_at_the_start() -> None:
+    scene = street.scene(actor=False)
+    start = scene.gaussians.log_scales
+    frame, gradient = Frame.of(scene), torch.ones(len(scene), 14)
+    far = State.start(len(scene), scene.gaussians.means).saw(gradient).moved(frame, 100 * gradient)
+    grown = frame.gaussians(far.offsets).log_scales
+    longest = start.max(1, keepdim=True).values
+    assert bool((grown <= longest + math.log(8) + 1e-5).all())
+    assert bool((grown > longest + math.log(8) - 1e-3).any())  # the bound was met
+    held = far.moved(frame, torch.zeros(len(scene), 14))
+    assert torch.equal(held.offsets, far.offsets)
