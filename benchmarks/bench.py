@@ -29,6 +29,15 @@ class Cell:
     parameters: Mapping[str, Any] = field(default_factory=dict)
 
 
+def logs_of(options: Mapping[str, str]) -> list[tuple[str, int]]:
+    """URI and chunk of each log that the options name: chunk 0 of streets of the ``seeds``, chunk 1 of ``pandaset``.
+
+    An empty ``pandaset`` leaves the real log out.
+    """
+    logs = [(f"synthetic:street?seed={seed}", 0) for seed in options["seeds"].split(",") if seed]
+    return logs + ([(f"pandaset:{options['pandaset']}", 1)] if options["pandaset"] else [])
+
+
 class Bench(Protocol):
     """One set of claims."""
 

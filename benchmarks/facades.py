@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 from PIL import Image
 
-from benchmarks.bench import Bench, Cell, Row
+from benchmarks.bench import Bench, Cell, Row, logs_of
 from benchmarks.optimiser import race
 from benchmarks.optimiser.beyond import over_cells
 from benchmarks.optimiser.cells import place, threads
@@ -60,9 +60,7 @@ class Facades:
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
         """``quick``: one street. An empty ``pandaset`` leaves the real log out."""
-        logs = [(f"synthetic:street?seed={seed}", 0) for seed in options["seeds"].split(",") if seed]
-        if options["pandaset"]:
-            logs.append((f"pandaset:{options['pandaset']}", 1))
+        logs = logs_of(options)
         small = load_configuration("small")
         parameters = {
             "configuration": small.model_dump(mode="json"),

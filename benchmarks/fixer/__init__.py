@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.bench import Bench, Cell, Row
+from benchmarks.bench import Bench, Cell, Row, logs_of
 from benchmarks.fixer.cells import KERNEL_SHIFTS_M, measure_fixer
 from benchmarks.optimiser.cells import place
 from benchmarks.schema import Claim, claim
@@ -43,9 +43,7 @@ class Fixer:
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
         """``quick``: one street. An empty ``pandaset`` leaves the real log out."""
-        logs = [(f"synthetic:street?seed={seed}", 0) for seed in options["seeds"].split(",") if seed]
-        if options["pandaset"]:
-            logs.append((f"pandaset:{options['pandaset']}", 1))
+        logs = logs_of(options)
         small = load_configuration("small")
         digests = [weights_digest(weights_file(BY_NAME[name], small)) for name in ("gnet", "fnet")]
         parameters = {"configuration": small.model_dump(mode="json"), "weights": digests}

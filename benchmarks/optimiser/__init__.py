@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 
-from benchmarks.bench import Bench, Cell, NotMeasuredError, Row
+from benchmarks.bench import Bench, Cell, NotMeasuredError, Row, logs_of
 from benchmarks.optimiser import summary, table
 from benchmarks.optimiser.cells import METHODS, measure_race, measure_stability, variants
 from benchmarks.optimiser.converged import LONG_RENDERS, PRESET, long_variants, measure_converged
@@ -67,9 +67,7 @@ class Optimiser:
         An empty ``pandaset`` leaves the real log out; with ``minutes`` cells that would not end by then are left out.
         Raises ``ConfigError`` for an unknown part.
         """
-        logs = [(f"synthetic:street?seed={seed}", 0) for seed in _parts(options["seeds"])]
-        if options["pandaset"]:
-            logs.append((f"pandaset:{options['pandaset']}", 1))
+        logs = logs_of(options)
         orders, parts, methods = (_parts(options[name]) for name in ("orders", "parts", "methods"))
         if unknown := set(parts) - set(PARTS):
             raise ConfigError(f"the benchmark has no part {sorted(unknown)}", remedy=f"Known: {', '.join(PARTS)}.")

@@ -59,7 +59,7 @@ def load(name: str) -> Any:
 
 
 def bench(
-    name: Annotated[str, typer.Argument(help="facades, main_job, optimiser or raster")],
+    name: Annotated[str, typer.Argument(help=f"One of {', '.join(_BENCHES)}.")],
     json_file: Annotated[Path | None, typer.Option("--json", help="File to write rows and claims to.")] = None,
     quick: Annotated[bool, typer.Option(help="Fewer runs; ends within 20 minutes.")] = False,
     dry_run: Annotated[bool, typer.Option(help="List the cells with predicted seconds, measure nothing.")] = False,

@@ -122,8 +122,7 @@ class State:
     def moved(self, frame: Frame, delta: Tensor) -> State:
         """With ``delta`` [N, 14] applied to what this iteration's views saw; the rest stays the same bytes.
 
-        A direction kept from earlier views would lead on and on what nothing corrects: moving by it costs tuned Adam
-        0.1 dB and brings the learned optimiser nothing.
+        A direction kept from earlier views would lead on and on what nothing corrects.
         """
         start, low, high = frame.start, frame.low, frame.high
         if fused_state.fits(self.offsets, delta, self.seen_now, start, low, high):
