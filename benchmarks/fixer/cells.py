@@ -114,7 +114,7 @@ def flicker(images: Tensor, novel: NovelViews) -> float:
 
 
 def time_row(network: Fnet, config: FnetConfig, chunk: Chunk, novel: NovelViews) -> Row:
-    """Seconds of the whole stage but for loading the weights, the fastest and the median run."""
+    """Seconds of the whole stage but for loading the weights, of each run, ascending."""
     seconds = []
     for _ in range(TIMED_RUNS):
         began = time.perf_counter()
