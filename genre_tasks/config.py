@@ -137,6 +137,13 @@ class FnetConfig(Section):
     timestep: int = Field(200, ge=1, le=999, description="τ.")
     batch_views: int = Field(4, ge=1)
     seed: int = Field(0, ge=0)
+    gate: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="A view is fixed where more than this share of it is thin or not borne out by images.",
+    )
+    half: bool | None = Field(None, description="bfloat16; null: where the device is faster with it.")
 
 
 class EvaluateConfig(Section):

@@ -34,6 +34,26 @@ VALIDATION = schema(
         column("seconds", pa.float64(), "wall time of the network's run"),
     ],
 )
+FIXING = schema(
+    "fixing_curve/1",
+    [
+        column("step", pa.int64(), "weight updates before this one"),
+        column("loss", pa.float64(), "of this update's crops"),
+        column("seconds", pa.float64(), "wall time, a mean over the updates between two checkpoints"),
+    ],
+)
+FIXING_SCORES = schema(
+    "fixing_scores/1",
+    [
+        column("step", pa.int64(), "weight updates so far"),
+        column("views", pa.int64(), "beside the path of validation streets"),
+        column("psnr_render", pa.float64(), "dB against the truth, a mean over views"),
+        column("psnr_fixed", pa.float64(), "the same of the fixed images"),
+        column("perceptual_render", pa.float64(), "distance to the truth, a mean over views"),
+        column("perceptual_fixed", pa.float64(), "the same of the fixed images"),
+        column("psnr_identity", pa.float64(), "dB of the truth given as the render"),
+    ],
+)
 
 
 def write_rows(path: Path, declared: pa.Schema, rows: Sequence[Mapping[str, Any]]) -> None:

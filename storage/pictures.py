@@ -118,6 +118,15 @@ def _fixed_views(folder: Path) -> Image8 | None:
     return contact_sheet([as_uint8(read_image(files[i], shape)) for i in evenly(len(files), _MAX_TILES)], 6)
 
 
+def _pairs(folder: Path) -> Image8 | None:
+    """Render beside truth."""
+    from storage.codecs.pairs import read
+
+    pairs = read(folder)
+    tensors = [t[i] for i in evenly(len(pairs), _MAX_TILES // 2) for t in (pairs.views.color, pairs.truth)]
+    return contact_sheet([t.permute(1, 2, 0).numpy() for t in tensors], 6)
+
+
 def _evaluation(folder: Path) -> Image8 | None:
     from storage.codecs.evaluation import read
 
@@ -130,6 +139,7 @@ PICTURES: dict[str, Callable[[Path], Image8 | None]] = {
     "reconstruction": _reconstruction,
     "novel_views": _novel_views,
     "fixed_views": _fixed_views,
+    "pairs": _pairs,
     "evaluation": _evaluation,
 }
 """Kind of artifact → what draws it from its folder."""

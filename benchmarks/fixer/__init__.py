@@ -3,7 +3,8 @@
 genre bench fixer --json docs/benchmarks/fixer.json [--set seeds=1001] [--set pandaset=]
 
 A log makes a cell. Views at 3 m are those that the optimiser's benchmark judges by: spread over sides, frames and
-cameras, none of them seen by any stage.
+cameras, none of them seen by any stage. Fixers of fewer inputs are measured too where ``--set ablations=FOLDER`` has
+them, each trained as long as the others by ``genre train fnet --inputs …``.
 """
 
 from __future__ import annotations
@@ -15,13 +16,16 @@ from functools import partial
 import numpy as np
 
 from benchmarks.bench import Bench, Cell, Row, logs_of
-from benchmarks.fixer.cells import KERNEL_SHIFTS_M, measure_fixer
+from benchmarks.fixer.cells import ABLATIONS, EVERYTHING, GATE_SHIFTS_M, KERNEL_SHIFTS_M, ablated, measure_fixer
 from benchmarks.optimiser.cells import place
 from benchmarks.schema import Claim, claim
 from benchmarks.timing import Measured
 from flows.configuration import load_configuration
 from flows.pipeline import BY_NAME, weights_digest, weights_file
 from genre_tasks.metrics.collect import BOOTSTRAP_SEED
+
+FEWER = {"render": "src", "render+reference": "src_ref", "reference+lidar": "ref_lidar"}
+"""Inputs that all three are held against, and what the paper's Table 3 calls them."""
 
 CELL_S = 90.0
 """Predicted: the steps before FNet, twelve ray-cast views, a few hundred fixed ones."""
@@ -34,6 +38,7 @@ class Fixer:
     name = "fixer"
     options: Mapping[str, str] = {
         "seeds": "1001,1002,1003,1004,1005", "store": "genre-store", "pandaset": "../shared/data/pandaset/002",
+        "ablations": "training",
     }  # fmt: skip
     code: tuple[str, ...] = (
         "benchmarks.fixer.cells", "genre_tasks.optimiser.run", "genre_tasks.stages.novel_views",
@@ -46,9 +51,11 @@ class Fixer:
         logs = logs_of(options)
         small = load_configuration("small")
         digests = [weights_digest(weights_file(BY_NAME[name], small)) for name in ("gnet", "fnet")]
-        parameters = {"configuration": small.model_dump(mode="json"), "weights": digests}
+        fewer = {inputs: weights_digest(path) for inputs, path in ablated(options["ablations"]).items()}
+        parameters = {"configuration": small.model_dump(mode="json"), "weights": digests, "ablations": fewer}
+        told = (options["store"], options["ablations"])
         return [
-            Cell(f"{log} chunk {chunk}", CELL_S, partial(measure_fixer, log, chunk, options["store"]), parameters)
+            Cell(f"{log} chunk {chunk}", CELL_S, partial(measure_fixer, log, chunk, *told), parameters)
             for log, chunk in (logs[:1] if quick else logs)
         ]
 
@@ -66,12 +73,19 @@ class Fixer:
         clean = of_views(streets, "clean", "psnr")
         data = f"the truth given as the render: PSNR of what comes back, the worst view; {views}"
         yield claim("fixer.identity", min(clean, default=None), ">=", 35.0, "dB", data, len(clean))
+        for other, name in FEWER.items():
+            yield _against(streets, other, name)
         for shift in KERNEL_SHIFTS_M:
             yield _kernel(reals, f"{shift:g}")
         ratios = [r["flicker"]["fixed"] / r["flicker"]["render"] for r in found]
         note = "difference between consecutive frames, the next warped by rendered depth: fixed over render"
         data = f"{note}, the worst log; {_of(found)}"
         yield claim("fixer.flicker", max(ratios, default=None), "<=", 1.0, "ratio", data, len(ratios))
+        lost = [b / a - 1 for row in streets for g in row["gate"] for a, b in zip(g["render"], g["fixed"], strict=True)]
+        data = (
+            f"perceptual distance of a fixed view over its render's, less 1: the worst at 0.25 to 3 m; {_of(streets)}"
+        )
+        yield claim("fixer.no_view_worse", max(lost, default=None), "<=", 0.02, "part", data, len(lost))
         yield _seconds(found)
 
     def table(self, rows: Mapping[str, Row]) -> Iterator[str]:
@@ -84,6 +98,26 @@ class Fixer:
             values.append(f"{_mean(row, 'clean', 'psnr'):.2f}" if "truth" in row else "")
             ratio = row["flicker"]["fixed"] / row["flicker"]["render"]
             yield f"| {place(row)} | {' | '.join(values)} | {ratio:.3f} | {seconds_a_view(row):.3f} |"
+        yield ""
+        yield "| inputs, trained as long | PSNR at 3 m | perceptual | s a view |"
+        yield "|---|---|---|---|"
+        for inputs in ABLATIONS:
+            found = [row["inputs"][inputs] for row in measured(rows) if inputs in row.get("inputs", {})]
+            if found:
+                means = [statistics.fmean(x for row in found for x in row[key]) for key in ("psnr", "perceptual")]
+                spent = statistics.median(row["seconds"] for row in found)
+                yield f"| {inputs} | {means[0]:.3f} | {means[1]:.3f} | {spent:.3f} |"
+        yield ""
+        yield "| shift, m | views | calls for fixing: least | median | most | perceptual: render | fixed | worst view |"
+        yield "|---|---|---|---|---|---|---|---|"
+        for shift in GATE_SHIFTS_M:
+            at = [g for row in measured(rows) for g in row.get("gate", []) if g["shift"] == shift]
+            if at:
+                calls, before, after = ([x for g in at for x in g[key]] for key in ("need", "render", "fixed"))
+                worst = max(b / a - 1 for a, b in zip(before, after, strict=True))
+                middle = [f"{f(calls):.3f}" for f in (min, statistics.median, max)]
+                middle += [f"{statistics.fmean(x):.3f}" for x in (before, after)]
+                yield f"| {shift:g} | {len(calls)} | {' | '.join(middle)} | {worst:+.1%} |"
         yield ""
         yield "| log | shift, m | kernel distance: render | fixed | difference, 95 % interval |"
         yield "|---|---|---|---|---|"
@@ -134,6 +168,30 @@ def interval(values: Sequence[float]) -> tuple[float, float] | None:
 def seconds_a_view(row: Row) -> float:
     """The median run's."""
     return float(statistics.median(row["time"]["seconds"]) / row["time"]["views"])
+
+
+def lessened(streets: Sequence[Row], other: str) -> list[float]:
+    """For each view, how much lower all inputs bring the perceptual distance than ``other`` do, in parts of its mean.
+
+    Empty where a log lacks one of the two.
+    """
+    if not all({other, EVERYTHING} <= set(row["inputs"]) for row in streets):
+        return []
+    fewer, every = ([x for row in streets for x in row["inputs"][i]["perceptual"]] for i in (other, EVERYTHING))
+    return [(a - b) / statistics.fmean(fewer) for a, b in zip(fewer, every, strict=True)]
+
+
+def _against(streets: Sequence[Row], other: str, name: str) -> Claim:
+    """All inputs against fewer, trained as long: the lower end of the paired interval, and of 5 % for src + ref."""
+    part = lessened(streets, other)
+    bounds = interval(part)
+    said = f"mean {statistics.fmean(part):+.1%}" if part else "not measured"
+    note = f"perceptual distance with all inputs against {other}, trained as long: part that it is lower, {said}"
+    if name == "src_ref":
+        data = f"{note}; interval by paired bootstrap over views; {_of(streets)}"
+        return claim("fixer.vs_src_ref", mean(part), ">=", 0.05, "part", data, len(part), bounds)
+    data = f"lower end of the 95 % interval (paired bootstrap over views): {note}; {_of(streets)}"
+    return claim(f"fixer.vs_{name}", None if bounds is None else bounds[0], ">", 0.0, "part", data, len(part), bounds)
 
 
 def _kernel(reals: Sequence[Row], shift: str) -> Claim:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -18,23 +19,33 @@ from benchmarks.optimiser.cells import threads
 from benchmarks.optimiser.enhancement import BOOTSTRAP, psnr_of
 from benchmarks.optimiser.steps import Steps, steps_of
 from benchmarks.optimiser.task import SIDE_M
+from flows.train.fixer import WEIGHTS, FixerJob
 from genre_tasks.config import FnetConfig
-from genre_tasks.fixer.conditioning import warp_reference
+from genre_tasks.fixer.conditioning import recorded
 from genre_tasks.fixer.network import Fnet
+from genre_tasks.fixer.warping import MIN_ALPHA, SourceImage, surface_of, warp
+from genre_tasks.fixer.weights import load_fnet
 from genre_tasks.metrics.collect import BOOTSTRAP_SEED, FeatureSet, real_images
 from genre_tasks.metrics.distribution import kernel_difference, kernel_distance
 from genre_tasks.metrics.perceptual import perceptual_distance
-from genre_tasks.scene.chunk import Chunk
+from genre_tasks.scene.chunk import Actor, Chunk
 from genre_tasks.scene.views import NovelView, NovelViews
-from genre_tasks.stages.fnet import fix_views, load_configured
+from genre_tasks.stages.fnet import fix_views, load_configured, need
 from genre_tasks.stages.novel_views import render_novel
 
 KERNEL_SHIFTS_M = (1.0, 2.0, 3.0)
 TIMED_RUNS = 3
 
+GATE_SHIFTS_M, GATE_VIEWS = (0.25, 0.5, 1.0, 2.0, SIDE_M), 6
+"""Where it is looked at whether views call for fixing, and how many views there."""
 
-def measure_fixer(log: str, chunk: int, store: str) -> Row:
-    """One cell: quality beside the path, flicker, what becomes of clean images, seconds a view."""
+EVERYTHING = "render+reference+lidar"
+ABLATIONS = ("render", "render+reference", "reference+lidar", EVERYTHING)
+"""Which inputs a fixer is trained with: paper Table 3's rows src, src + ref, ref + LiDAR, and all."""
+
+
+def measure_fixer(log: str, chunk: int, store: str, ablations: str) -> Row:
+    """One cell: quality beside the path, flicker, what becomes of clean images, seconds a view, fewer inputs."""
     with threads():
         steps = steps_of(log, chunk, store, 0, enet=False)
         config = steps.config.fnet
@@ -45,6 +56,11 @@ def measure_fixer(log: str, chunk: int, store: str) -> Row:
             novel = _rendered(steps, views_at(steps.chunk, SIDE_M, TRUE_VIEWS))
             images = torch.stack([t.image.image for t in truth])
             out["truth"] = truth_row(network, config, steps.chunk, novel, images)
+            out["inputs"] = {
+                inputs: inputs_row(load_fnet(path), config, steps.chunk, novel, images)
+                for inputs, path in ablated(ablations).items()
+            }
+            out["gate"] = [gate_row(network, config, steps, log, store, shift) for shift in GATE_SHIFTS_M]
         else:
             real = real_images(steps.chunk)
             out["kernel"] = {
@@ -78,6 +94,41 @@ def truth_row(network: Fnet, config: FnetConfig, chunk: Chunk, novel: NovelViews
 
 
 @torch.no_grad()
+def gate_row(network: Fnet, config: FnetConfig, steps: Steps, log: str, store: str, shift_m: float) -> Row:
+    """How much views near the path call for fixing, and their perceptual distance without and with it."""
+    truth = true_targets(log, store, steps.chunk, shift_m, GATE_VIEWS)
+    images = torch.stack([t.image.image for t in truth])
+    novel = _rendered(steps, views_at(steps.chunk, shift_m, GATE_VIEWS))
+    sources, distance = recorded(steps.chunk), perceptual_distance()
+    fixed = fix_views(network, config.model_copy(update={"gate": 0.0}), steps.chunk, novel).color
+    return {
+        "shift": shift_m,
+        "need": [need(steps.chunk, novel, i, sources) for i in range(len(novel.views))],
+        "render": distance(novel.color.clamp(0, 1), images).tolist(),
+        "fixed": distance(fixed, images).tolist(),
+    }
+
+
+def ablated(folder: str) -> dict[str, Path]:
+    """Weights trained as long as each other with some of the inputs, where ``genre train fnet --inputs …`` puts them.
+
+    From inputs, joined by "+", to the file; those that are not there are left out.
+    """
+    places = {inputs: FixerJob(folder, inputs=inputs).place / WEIGHTS for inputs in ABLATIONS}
+    return {inputs: path for inputs, path in places.items() if path.is_file()}
+
+
+@torch.no_grad()
+def inputs_row(network: Fnet, config: FnetConfig, chunk: Chunk, novel: NovelViews, truth: Tensor) -> Row:
+    """PSNR (dB) and perceptual distance of each fixed view, and seconds a view of the stage."""
+    began = time.perf_counter()
+    fixed = fix_views(network, config, chunk, novel).color
+    seconds = (time.perf_counter() - began) / len(novel.views)
+    perceptual = perceptual_distance()(fixed, truth).tolist()
+    return {"psnr": psnr_of(fixed, truth).tolist(), "perceptual": perceptual, "seconds": seconds}
+
+
+@torch.no_grad()
 def kernel_row(network: Fnet, config: FnetConfig, steps: Steps, views: Sequence[NovelView], real: FeatureSet) -> Row:
     """Kernel distance of renders and fixed images to the real ones, and the difference with its paired interval."""
     novel, frames = _rendered(steps, views), [v.frame for v in views]
@@ -95,22 +146,31 @@ def flicker_row(network: Fnet, config: FnetConfig, steps: Steps) -> Row:
     camera = steps.chunk.views[0].camera
     views = [v for v in views_at(steps.chunk, SIDE_M) if v.camera == camera and v.shift_m > 0]
     novel = _rendered(steps, sorted(views, key=lambda v: v.frame))
-    fixed = fix_views(network, config, steps.chunk, novel).color
-    return {"frames": len(views), "render": flicker(novel.color.clamp(0, 1), novel), "fixed": flicker(fixed, novel)}
+    fixed, actors = fix_views(network, config, steps.chunk, novel).color, steps.chunk.actors
+    return {
+        "frames": len(views),
+        "render": flicker(novel.color.clamp(0, 1), novel, actors),
+        "fixed": flicker(fixed, novel, actors),
+    }
 
 
-def flicker(images: Tensor, novel: NovelViews) -> float:
+def flicker(images: Tensor, novel: NovelViews, actors: Sequence[Actor] = ()) -> float:
     """Mean absolute difference between each image [V, H, W, 3] and the next one, warped to it by rendered depth.
 
-    ``novel``: the views, in the order of frames, with their depth. Where a point is out of the next image or hidden
-    there it does not count.
+    ``novel``: the views, in the order of frames, with their depth. Points on actors move along. Where a point is out
+    of the next image or hidden there it does not count.
     """
-    poses = [(a.chunk_SE3_camera, b.chunk_SE3_camera) for a, b in zip(novel.views, novel.views[1:], strict=False)]
-    lenses = [(a.lens, b.lens) for a, b in zip(novel.views, novel.views[1:], strict=False)]
-    after, depth, alpha = images[1:].permute(0, 3, 1, 2), novel.depth[:-1, None], novel.alpha[:-1, None]
-    warped, mask = warp_reference(after, depth, alpha, poses, lenses)
-    difference = (warped - images[:-1].permute(0, 3, 1, 2)).abs() * mask
-    return float(difference.sum() / (3 * mask.sum()).clamp_min(1))
+    total, count = 0.0, 0.0
+    for k in range(len(images) - 1):
+        view, after = novel.views[k], novel.views[k + 1]
+        hides = torch.where(novel.alpha[k + 1] >= MIN_ALPHA, novel.depth[k + 1], torch.zeros_like(novel.depth[k + 1]))
+        image = images[k + 1].permute(2, 0, 1)
+        source = SourceImage(after.camera, after.frame, after.chunk_SE3_camera, after.lens, image, hides)
+        surface = surface_of(novel.depth[k], novel.alpha[k], view.chunk_SE3_camera, view.lens, actors, view.frame)
+        found = warp(surface, [source], actors, view.frame)
+        total += float(((found.color - images[k].permute(2, 0, 1)).abs() * found.mask).sum())
+        count += float(3 * found.mask.sum())
+    return total / max(count, 1.0)
 
 
 def time_row(network: Fnet, config: FnetConfig, chunk: Chunk, novel: NovelViews) -> Row:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 app = typer.Typer(help="Train the networks (tens of minutes each on a CPU; resumable).", no_args_is_help=True)
 
 Folder = Annotated[Path, typer.Option(help="Where pairs, scenes, checkpoints and curves are kept.")]
-Seeds = Annotated[str, typer.Option(help="Training seeds of the synthetic street, first:last:step.")]
+Streets = Annotated[int, typer.Option(min=0, help="How many synthetic streets.")]
 Real = Annotated[str | None, typer.Option(help="A real log whose chunk 0 is trained on too, e.g. pandaset:PATH/002.")]
 Recipe = Annotated[str, typer.Option(help="shipped, or paper: ENet on 3DGS scenes, GNet from it, ENet on GNet's.")]
 Novel = Annotated[
@@ -35,39 +35,32 @@ ValidateEvery = Annotated[
 OneStage = Annotated[str | None, typer.Option(help="This stage alone, e.g. gnet/fine; without it all, in their order.")]
 
 
-def _seeds(text: str) -> list[int]:
-    try:
-        first, last, step = (int(part) for part in text.split(":"))
-    except ValueError:
-        from genre_tasks.errors import ConfigError
+@app.command()
+def pairs(folder: Folder = Path("training"), real: Real = None, streets: Streets = 28) -> None:
+    """Make FNet's training pairs: degraded render and truth, with reference images and LiDAR map."""
+    with _reported("training pairs"):
+        from flows.train.fixer_flow import train_pairs
 
-        raise ConfigError(f"cannot read --seeds {text!r}", remedy="Write first:last:step, e.g. 0:899:30.") from None
-    return list(range(first, last + 1, step))
+        made = train_pairs(str(folder), real, streets)
+    typer.echo(f"{made['pairs']} pairs of {made['scenes']} scenes in {folder / 'store'}")
+    for kind, share in made["shares"].items():
+        typer.echo(f"  {kind:>13} {100 * share:5.1f} %")
 
 
 @app.command()
-def pairs(folder: Folder = Path("training"), seeds: Seeds = "0:899:30", real: Real = None) -> None:
-    """Make FNet's training pairs: degraded render and truth, with reference image and LiDAR map."""
-    from flows.cli.terminal import TerminalReporter
-    from flows.train.fixer import make_pairs
+def fnet(
+    folder: Folder = Path("training"), real: Real = None, streets: Streets = 28,
+    inputs: Annotated[str, typer.Option(help="What it is given, joined by +.")] = "render+reference+lidar",
+    preset: Annotated[str, typer.Option(help="small; further, from its weights; paper: LoRA on SD-Turbo.")] = "small",
+    start: Annotated[str | None, typer.Option(help="Weights to train further; SD-Turbo's for paper.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Weight updates; the preset's if not given.")] = None,
+    validate: Annotated[bool, typer.Option(help="Scores and a picture of seeds 900–902 at each checkpoint.")] = False,
+) -> None:  # fmt: skip
+    """Train FNet on the pairs; those that are not there yet are made."""
+    with _reported("training fnet"):
+        from flows.train.fixer_flow import train_fnet
 
-    with TerminalReporter("training pairs") as reporter:
-        made = make_pairs(folder / "pairs", _seeds(seeds), real=real, progress=reporter.progress)
-    typer.echo(f"{len(made)} files of pairs in {folder / 'pairs'}")
-
-
-@app.command()
-def fnet(folder: Folder = Path("training")) -> None:
-    """Train FNet on the pairs."""
-    from flows.cli.terminal import TerminalReporter
-    from flows.train.fixer import train_fnet
-    from genre_tasks.errors import InputError
-
-    files = sorted((folder / "pairs").glob("*.npz"))
-    if not files:
-        raise InputError("there are no training pairs", remedy="Run `genre train pairs` first.", file=folder / "pairs")
-    with TerminalReporter("training fnet") as reporter:
-        weights = train_fnet(files, folder / "fnet", progress=reporter.progress)
+        weights = train_fnet(str(folder), real, streets, inputs, preset, start, steps, validate)["weights"]
     typer.echo(f"weights in {weights}; use them with --set fnet.weights={weights}")
 
 

@@ -1,54 +1,89 @@
-"""Training of FNet: its pairs, the network, its numbers on validation seeds. What `genre train` calls."""
+"""Training of FNet as plain functions: its pairs, the network, its scores on validation streets."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flows.train.thinned import ThinnedLog
-from genre_tasks.config import IngestConfig, InitialConfig, OptimiserConfig
-from genre_tasks.errors import ConfigError
+from flows.train.pairs import VALIDATION, pair_scenes, pairs_of, validation_scenes
+from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.fixer.network import INPUTS, sd_turbo, small_architecture
+from genre_tasks.fixer.training import PRESETS, TrainingSettings, train
+from genre_tasks.fixer.weights import load_fnet, save_fnet
 from genre_tasks.progress import Progress, silent
+from storage.curve import FIXING, FIXING_SCORES, read_rows, write_rows
+from storage.local import LocalStore
 
 if TYPE_CHECKING:
     import torch
 
     from genre_tasks.fixer.network import Fnet
     from genre_tasks.fixer.pairs import Pairs
-    from genre_tasks.fixer.training import TrainingSettings
-    from genre_tasks.scene.chunk import Chunk
-    from genre_tasks.scene.graph import SceneGraph
-    from genre_tasks.scene.views import NovelView
 
-TRAINING_SEEDS = range(0, 900)
-VALIDATION_SEEDS = range(900, 1000)
-"""Seeds of the synthetic street (configs/seeds.yaml): no other may be used to train or to tune."""
-
-SHIFTS_M = (1.0, 2.0, 3.0, 3.0, 3.0, 4.0, 5.0)
-"""Lateral shifts of training pairs, drawn with a random sign: fixing is done at 3 m, so it is drawn most."""
-
-ITERATIONS = 24
+CURVE, SCORES, WEIGHTS = "curve.parquet", "validation.parquet", "fnet.safetensors"
+RANK = 16
+"""Of the LoRA adapters on SD-Turbo."""
 
 
 @dataclass(frozen=True)
-class PairSettings:
-    """How pairs are made. A log gives ``optimised`` + ``underfitted`` + ``perturbed`` pairs."""
+class FixerJob:
+    """What a training of FNet is told: plain values.
 
-    width_px: int = 320
-    height_px: int = 180
-    optimised: int = 14
-    underfitted: int = 8
-    perturbed: int = 6
-    real_every: tuple[int, ...] = (4, 10)
+    ``folder`` holds the store of scenes and pairs and a folder for each set of inputs. ``real``: the URI of a log whose
+    chunk 0 is trained on. ``streets``: how many synthetic streets. ``inputs``: what the fixer is given, joined by "+".
+    ``preset``: small, further (from the small one's weights or from ``start``) or paper (from SD-Turbo, at ``start``).
+    ``validate``: score on validation streets at each checkpoint, with a picture.
+    """
+
+    folder: str
+    real: str | None = None
+    streets: int = 28
+    inputs: str = "+".join(INPUTS)
+    preset: str = "small"
+    start: str | None = None
+    steps: int | None = None
+    validate: bool = False
+
+    def __post_init__(self) -> None:
+        stray = sorted(set(self.inputs.split("+")) - set(INPUTS))
+        if stray:
+            raise ConfigError(f"no input is called {' or '.join(stray)}", remedy=f"Join by +: {', '.join(INPUTS)}.")
+        if self.preset not in PRESETS:
+            raise ConfigError(f"no preset is called {self.preset!r}", remedy=f"Known: {', '.join(PRESETS)}.")
+        if self.preset == "paper" and self.start is None:
+            raise ConfigError(
+                "the paper's fixer starts from SD-Turbo",
+                remedy="Give a folder with its vae and unet in diffusers' layout, or a hub id, by --start.",
+            )
+
+    @property
+    def store(self) -> LocalStore:
+        """Where scenes and pairs are kept."""
+        return LocalStore(Path(self.folder) / "store")
+
+    @property
+    def place(self) -> Path:
+        """The training's folder."""
+        parts = ["fnet", *([] if self.inputs == "+".join(INPUTS) else [self.inputs])]
+        return Path(self.folder) / "-".join([*parts, *([] if self.preset == "small" else [self.preset])])
+
+    @property
+    def settings(self) -> TrainingSettings:
+        """The preset's, with the job's length."""
+        settings = PRESETS[self.preset]
+        return settings if self.steps is None else replace(settings, steps=self.steps)
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Means over views at 3 m of validation seeds: render against truth, fixed against truth."""
+    """Means over views at ± 3 m of validation streets: render and fixed against the truth; ``identity``: the truth as
+    the render, fixed.
+    """
 
     views: int
     psnr_render: float
@@ -58,125 +93,82 @@ class Scores:
     psnr_identity: float
 
 
-def make_pairs(
-    folder: Path,
-    seeds: Sequence[int],
-    settings: PairSettings = PairSettings(),
-    real: str | None = None,
-    progress: Progress = silent,
-) -> list[Path]:
-    """One file of pairs per training seed of the synthetic street, and one per sparsity of a real log's chunk 0.
+def load_pairs(job: FixerJob, progress: Progress = silent) -> Pairs:
+    """All pairs of the job; what the store lacks is made."""
+    from genre_tasks.fixer.pairs import joined
 
-    Files that exist are left: an interrupted run goes on where it was. Raises ``ConfigError`` for other seeds.
-    """
-    from genre_tasks.fixer.pairs import save_pairs
-
-    stray = [s for s in seeds if s not in TRAINING_SEEDS]
-    if stray:
-        raise ConfigError(
-            f"seeds {stray} are not for training", remedy=f"Use seeds {TRAINING_SEEDS[0]} to {TRAINING_SEEDS[-1]}."
-        )
-    jobs: list[tuple[Path, Callable[[], Pairs]]] = []
-    for seed in seeds:
-        jobs.append((folder / f"street-{seed:04d}.npz", lambda seed=seed: street_pairs(seed, settings)))  # type: ignore[misc]
-    for every in settings.real_every if real is not None else ():
-        jobs.append((folder / f"real-{every:02d}.npz", lambda every=every: real_pairs(str(real), every, settings)))  # type: ignore[misc]
-    for done, (path, make) in enumerate(jobs):
-        progress(done, len(jobs), path.stem)
-        if not path.exists():
-            save_pairs(make(), path)
-    progress(len(jobs), len(jobs), "pairs")
-    return [path for path, _ in jobs]
-
-
-def street_pairs(seed: int, settings: PairSettings) -> Pairs:
-    """Pairs beside the path of one synthetic street: from an optimised, an under-trained and a perturbed scene."""
-    import torch
-
-    from genre_tasks.fixer.pairs import perturbed
-    from genre_tasks.logs.registry import open_log
-
-    rng = np.random.default_rng(seed)
-    log = ThinnedLog(open_log(f"synthetic:street?seed={seed}"), 4)
-    points = (20_000, 40_000)[seed % 2]
-    chunk, scenes = _optimised(log, settings, 4, points, seed)
-    ages = sorted(k for k in scenes if k < ITERATIONS)
-    young = scenes[ages[int(rng.integers(len(ages)))]]
-    worse = perturbed(scenes[ITERATIONS], torch.Generator().manual_seed(seed), float(rng.uniform(0.3, 1.0)))
+    scenes = pair_scenes(job.streets, job.real)
     parts = []
-    for scene, count in (
-        (scenes[ITERATIONS], settings.optimised), (young, settings.underfitted), (worse, settings.perturbed),
-    ):  # fmt: skip
-        parts.append(_beside(log, chunk, scene, count, 2 * points, rng))
+    for k, scene in enumerate(scenes):
+        progress(k, len(scenes), scene.uri)
+        parts.append(pairs_of(job.store, scene))
     return joined(parts)
 
 
-def validation_pairs(seeds: Sequence[int], settings: PairSettings, views: int = 10) -> Pairs:
-    """Pairs at ± 3 m of validation seeds, from fully optimised scenes; held in memory only."""
-    from genre_tasks.logs.registry import open_log
-
-    parts = []
-    for seed in seeds:
-        log = ThinnedLog(open_log(f"synthetic:street?seed={seed}"), 4)
-        chunk, scenes = _optimised(log, settings, 4, 20_000, seed)
-        rng = np.random.default_rng(seed)
-        parts.append(_beside(log, chunk, scenes[ITERATIONS], views, 40_000, rng, shifts=(3.0,)))
-    return joined(parts)
+def shares(pairs: Pairs) -> dict[str, float]:
+    """The share of each kind of pair, and of those beside the path (``lateral``) and of perturbed scenes' not."""
+    kinds = np.array(pairs.kinds)
+    out = {str(kind): float((kinds == kind).mean()) for kind in sorted(set(pairs.kinds))}
+    return {**out, "optimiser": float((kinds != "perturbed").mean()), "lateral": float((pairs.shift_m != 0).mean())}
 
 
-def real_pairs(uri: str, source_every: int, settings: PairSettings) -> Pairs:
-    """Pairs at the held-out frames of a real log's chunk 0, from a reconstruction of every n-th frame.
+def train_fixer(job: FixerJob, progress: Progress = silent) -> Path:
+    """Trains FNet to the end of its preset; goes on from the checkpoint in ``job.place``. Returns the weights' path.
 
-    Chunk 0 only: the others are for claims.
+    Writes there at each checkpoint ``fnet.safetensors`` with its JSON, ``curve.parquet`` (a row for each step) and,
+    with ``job.validate``, a sample picture and the scores.
     """
-    from genre_tasks.fixer.pairs import render_pairs
-    from genre_tasks.logs.registry import open_log
-    from genre_tasks.scene.images import decode_pixels
-    from genre_tasks.scene.novel import nearest_reference
-    from genre_tasks.scene.views import NovelView
+    from genre_tasks.fixer.pairs import joined
+    from genre_tasks.metrics.perceptual import perceptual_distance
 
-    chunk, scenes = _optimised(open_log(uri), settings, source_every, 40_000, source_every)
-    sources = chunk.of_role("source")
-    views, truth = [], []
-    for view in chunk.of_role("heldout"):
-        near = nearest_reference(view.camera, view.chunk_SE3_camera, sources)
-        reference = (near.camera, near.frame)
-        views.append(NovelView(view.camera, view.frame, 0.0, view.chunk_SE3_camera, view.lens, reference))
-        truth.append(decode_pixels(view.image, view.lens.width_px, view.lens.height_px))
-    return render_pairs(chunk, scenes[ITERATIONS], views, truth, 60_000)
+    folder, settings = job.place, job.settings
+    pairs = load_pairs(job, progress)
+    validation = None
+    if job.validate:
+        validation = joined([pairs_of(job.store, scene, VALIDATION) for scene in validation_scenes()])
+    began, rows = time.perf_counter(), read_rows(folder / CURVE, FIXING)
+    base = job.start if job.preset == "paper" else None
 
-
-def train_fnet(
-    pairs: Sequence[Path],
-    folder: Path,
-    settings: TrainingSettings | None = None,
-    validation: Pairs | None = None,
-    progress: Progress = silent,
-    start: Path | None = None,
-) -> Path:
-    """Trains the small fixer on files of pairs; writes ``fnet.safetensors`` and ``fnet.json`` into ``folder``.
-
-    Resumes from the checkpoints in ``folder``; with ``validation`` a sample picture (render | fixed | truth) is written
-    at each of them. ``start``: weights to train further instead of beginning with the autoencoder.
-    """
-    from genre_tasks.fixer.pairs import load_pairs
-    from genre_tasks.fixer.training import TrainingSettings, train
-    from genre_tasks.fixer.weights import load_fnet, save_fnet
-    from genre_tasks.metrics.perceptual import CHEAP_TAPS, perceptual_distance
-
-    def checkpoint(fnet: Fnet, step: int) -> None:
-        save_fnet(fnet, folder / "fnet.safetensors")
+    def checkpoint(fnet: Fnet, step: int, losses: Sequence[float]) -> None:
+        nonlocal began
+        save_fnet(fnet, folder / WEIGHTS, base, None if base is None else RANK)
+        known = [row for row in rows if row["step"] < step][: len(losses)]
+        each = (time.perf_counter() - began) / max(1, len(losses) - len(known))
+        new = [{"step": k, "loss": losses[k], "seconds": each} for k in range(len(known), len(losses))]
+        rows[:] = known + new
+        write_rows(folder / CURVE, FIXING, rows)
         if validation is not None:
             save_picture(fnet, validation, folder / f"sample-{step:06d}.png")
+            scores = [row for row in read_rows(folder / SCORES, FIXING_SCORES) if row["step"] < step]
+            write_rows(folder / SCORES, FIXING_SCORES, [*scores, {"step": step, **asdict(score(fnet, validation))}])
+        began = time.perf_counter()
 
-    settings = settings or TrainingSettings()
-    fixer = None if start is None else load_fnet(start)
-    train(load_pairs(pairs), settings, folder, perceptual_distance(CHEAP_TAPS), progress, checkpoint, start=fixer)
-    return folder / "fnet.safetensors"
+    start, architecture = None, replace(small_architecture(), inputs=tuple(job.inputs.split("+")))
+    before = job.start
+    if job.preset == "further" and before is None:
+        before = str(replace(job, preset="small").place / WEIGHTS)
+    if base is not None:
+        start = sd_turbo(base, rank=RANK)
+    elif before is not None:
+        start = load_fnet(Path(before))
+        if start.architecture.inputs != architecture.inputs:
+            raise InputError("the weights to start from have other inputs", remedy="Give the same.", file=Path(before))
+    train(
+        pairs,
+        settings,
+        folder,
+        perceptual_distance(),
+        progress,
+        checkpoint,
+        architecture,
+        start,
+        Path(job.folder) / "fnet",
+    )
+    return folder / WEIGHTS
 
 
 def score(fnet: Fnet, pairs: Pairs, seed: int = 0) -> Scores:
-    """PSNR and perceptual distance to the truth, before and after fixing; and PSNR of a clean image that is fixed."""
+    """PSNR (dB) and perceptual distance to the truth, before and after fixing; PSNR of a clean image that is fixed."""
     from genre_tasks.fixer.inference import fix, noise_of
     from genre_tasks.metrics.perceptual import perceptual_distance
 
@@ -196,7 +188,7 @@ def score(fnet: Fnet, pairs: Pairs, seed: int = 0) -> Scores:
 
 
 def save_picture(fnet: Fnet, pairs: Pairs, path: Path, rows: int = 6, seed: int = 0) -> None:
-    """A picture of some pairs: render | LiDAR map | the two warps of the reference | fixed | truth."""
+    """A picture of some pairs: render | LiDAR map | images by rendered depth | by the map's | fixed | truth."""
     import torch
     from PIL import Image
 
@@ -208,56 +200,9 @@ def save_picture(fnet: Fnet, pairs: Pairs, path: Path, rows: int = 6, seed: int 
         fixed = fix(fnet, views, noise_of(fnet, seed, range(k, k + 1), *truth.shape[-2:]))
         lines.append(torch.cat([views.color, views.lidar_color, views.warped, views.lidar_warped, fixed, truth], -1))
     image = (torch.cat(lines, -2)[0].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
-    Image.fromarray(image).save(path)
-
-
-def joined(parts: Sequence[Pairs]) -> Pairs:
-    """All pairs in one, in order."""
-    import torch
-
-    from genre_tasks.fixer.conditioning import Degraded
-    from genre_tasks.fixer.pairs import NAMES, Pairs
-
-    views = Degraded(*(torch.cat([getattr(p.views, n) for p in parts]) for n in NAMES))
-    return Pairs(views, torch.cat([p.truth for p in parts]), np.concatenate([p.shift_m for p in parts]))
-
-
-def _optimised(
-    log: Any, settings: PairSettings, source_every: int, max_points: int, seed: int
-) -> tuple[Chunk, dict[int, SceneGraph]]:
-    """Chunk 0 and its scene after several numbers of iterations of tuned Adam, the last at ``ITERATIONS``."""
-    from genre_tasks.stages.gnet import gnet
-    from genre_tasks.stages.ingest import ingest
-    from genre_tasks.stages.initial import initial
-
-    size = {"width_px": settings.width_px, "height_px": settings.height_px}
-    chunk = ingest(IngestConfig(source_every=source_every, **size), log, 0)
-    start = initial(InitialConfig(max_points=max_points, distant_count=max_points // 10), chunk)
-    config = OptimiserConfig(method="adam", iterations=ITERATIONS, snapshots=6, seed=seed)
-    result = gnet(config, chunk, start)
-    return chunk, {**result.snapshots, ITERATIONS: result.scene}
-
-
-def _beside(
-    log: Any,
-    chunk: Chunk,
-    scene: SceneGraph,
-    count: int,
-    lidar_max_points: int,
-    rng: np.random.Generator,
-    shifts: Sequence[float] = SHIFTS_M,
-) -> Pairs:
-    """Pairs at ``count`` random source poses, each shifted to a random side, with the ray-cast truth."""
-    from genre_tasks.fixer.pairs import render_pairs
-    from genre_tasks.scene.novel import novel_view_poses
-
-    views: list[NovelView] = []
-    for _ in range(count):
-        shift = float(rng.choice(shifts) * rng.choice((-1, 1)))
-        poses = novel_view_poses(chunk, (shift,))
-        views.append(poses[int(rng.integers(len(poses)))])
-    truth = [log.truth.image(v.frame, chunk.world_SE3_chunk @ v.chunk_SE3_camera, v.lens) for v in views]
-    return render_pairs(chunk, scene, views, truth, lidar_max_points)
+    temporary = path.with_name(f".{path.name}")
+    Image.fromarray(image).save(temporary, "PNG")
+    temporary.replace(path)
 
 
 def _psnr(a: torch.Tensor, b: torch.Tensor) -> float:

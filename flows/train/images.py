@@ -26,7 +26,7 @@ from storage.keys import digest_value
 from storage.local import LocalStore
 
 STAND_IN_TRUTH = 0.6
-NOVEL = NovelViewsConfig(lidar_max_points=40_000)
+NOVEL = NovelViewsConfig()
 
 
 @dataclass(frozen=True)

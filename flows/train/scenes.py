@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
+from urllib.parse import parse_qs
 
 import numpy as np
 import torch
 
 from flows.train.thinned import ThinnedLog
 from genre_tasks.config import IngestConfig, InitialConfig
-from genre_tasks.errors import ArtifactCorruptError
+from genre_tasks.errors import ArtifactCorruptError, ConfigError
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.types import DrivingLog
 from genre_tasks.optimiser.episodes import TrainingScene
@@ -25,6 +26,9 @@ from genre_tasks.stages.initial import initial
 from storage.address import Address
 from storage.keys import digest_value
 from storage.local import LocalStore
+
+TRAINING_SEEDS = range(0, 900)
+"""Seeds of the synthetic street (configs/seeds.yaml): no other may be used to train."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,19 @@ class PreparedScene:
     chunk: Chunk
     start: Reconstruction
     truth: FixedViews | None
+
+
+def check_training(recipe: SceneRecipe) -> None:
+    """Raises ``ConfigError`` for a synthetic seed outside 0–899 and for any chunk but 0: those are for claims."""
+    reader, _, query = recipe.uri.partition("?")
+    seed = int(parse_qs(query).get("seed", ["0"])[0])
+    if reader.startswith("synthetic:") and seed not in TRAINING_SEEDS:
+        raise ConfigError(
+            f"seed {seed} of {recipe.uri} is not for training",
+            remedy=f"Use seeds {TRAINING_SEEDS[0]} to {TRAINING_SEEDS[-1]}.",
+        )
+    if recipe.chunk != 0:
+        raise ConfigError(f"chunk {recipe.chunk} of {recipe.uri} is not for training", remedy="Use chunk 0.")
 
 
 def prepare(store: LocalStore, recipe: SceneRecipe) -> PreparedScene:
@@ -121,7 +138,9 @@ def training_scene(
 
 
 def spread(items: Sequence[Any], count: int) -> tuple[Any, ...]:
-    """At most ``count`` of the items, evenly spread."""
+    """At most ``count`` of the items, evenly spread; the middle one where it is one."""
     if len(items) <= count:
         return tuple(items)
+    if count == 1:
+        return (items[len(items) // 2],)
     return tuple(items[round(i * (len(items) - 1) / (count - 1))] for i in range(count))

@@ -6,7 +6,6 @@ import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from urllib.parse import parse_qs
 
 import torch
 
@@ -14,11 +13,10 @@ from flows.pipeline import weights_digest
 from flows.train import checkpoint
 from flows.train.begins import Begin, ByGnet, begin_key, begun, make_ages
 from flows.train.device import chosen_device, scene_on
-from flows.train.fixer import TRAINING_SEEDS
 from flows.train.images import fixed_views, images_key, stand_in_views
 from flows.train.optimiser import CHECKPOINT, WEIGHTS, network_from, train_optimiser
 from flows.train.recipes import Stage, scene_recipes, table_of
-from flows.train.scenes import PreparedScene, SceneRecipe, prepare, training_scene
+from flows.train.scenes import PreparedScene, SceneRecipe, check_training, prepare, training_scene
 from flows.train.validation import Validation, validation_recipes
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.logs.registry import open_log
@@ -105,19 +103,6 @@ def places(stage: Stage, real: str | None) -> list[Place]:
     begins = stage.begins
     rounds = range(stage.scenes.rounds)
     return [Place(r, begins[(k + turn) % len(begins)]) for turn in rounds for k, r in enumerate(recipes)]
-
-
-def check_training(recipe: SceneRecipe) -> None:
-    """Raises ``ConfigError`` for a synthetic seed outside 0–899 and for any chunk but 0: those are for claims."""
-    reader, _, query = recipe.uri.partition("?")
-    seed = int(parse_qs(query).get("seed", ["0"])[0])
-    if reader.startswith("synthetic:") and seed not in TRAINING_SEEDS:
-        raise ConfigError(
-            f"seed {seed} of {recipe.uri} is not for training",
-            remedy=f"Use seeds {TRAINING_SEEDS[0]} to {TRAINING_SEEDS[-1]}.",
-        )
-    if recipe.chunk != 0:
-        raise ConfigError(f"chunk {recipe.chunk} of {recipe.uri} is not for training", remedy="Use chunk 0.")
 
 
 def works(table: Sequence[Stage], real: str | None) -> dict[SceneRecipe, list[tuple[Stage, Begin]]]:

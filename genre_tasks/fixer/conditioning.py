@@ -5,8 +5,8 @@ Images are sRGB in [0, 1], [B, 3, H, W]; masks and alphas are [B, 1, H, W].
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -15,39 +15,22 @@ from torch import Tensor
 
 from genre_tasks.errors import InputError
 from genre_tasks.fixer.network import Conditions
-from genre_tasks.logs.types import Float64, Lens
-from genre_tasks.scene.chunk import Chunk, View
+from genre_tasks.fixer.warping import MIN_ALPHA, SourceImage, Warp, choose, surface_of, warp
+from genre_tasks.render.surface import render_surfaces
+from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.images import decode_image
+from genre_tasks.scene.novel import lidar_scene
 from genre_tasks.scene.views import NovelView, NovelViews
 
 MAX_COLOUR_SHIFT = 0.03
 """Largest change of an image's mean per channel, where the render is more than half opaque. A fixer repairs structure;
 a larger drift of the whole image is an error of the network (about 8 of 255 levels, just visible side by side)."""
 
-HIDDEN_PX = 5.0
-"""Parallax at which a point counts as hidden. A road seen from 1.6 m above changes by about 2 px of parallax (at 3 m
-of shift) from one row of pixels to the next, and must not hide itself."""
+OCCLUDING_POINTS = 60_000
+"""LiDAR points whose discs hide things from source images."""
 
 HOLE_ALPHA = 0.5
 """What is thinner than this is a hole, the more so the thinner."""
-
-MIN_WARP_ALPHA = 0.5
-"""Rendered depth is trusted for the warp where at least half of the ray's light is accounted for."""
-
-
-def _hidden(x: Tensor, y: Tensor, z: Tensor, inside: Tensor, baseline_px: float) -> Tensor:
-    """Where a point [H, W], at ``x, y`` in [−1, 1] of the reference's image and depth ``z`` there, lies behind another.
-
-    Behind: a point within one pixel is nearer by ``HIDDEN_PX`` of parallax between view and reference.
-    """
-    height, width = z.shape
-    row = ((y + 1) / 2 * height).long().clamp(0, height - 1)
-    column = ((x + 1) / 2 * width).long().clamp(0, width - 1)
-    cell = (row * width + column).reshape(-1)
-    nearness = torch.where(inside, 1 / z, torch.zeros_like(z))
-    nearest = torch.zeros(height * width).to(z).scatter_reduce(0, cell, nearness.reshape(-1), "amax")
-    spread = F.max_pool2d(nearest.reshape(1, 1, height, width), 3, 1, 1).reshape(-1)
-    return baseline_px * (spread[cell].reshape(height, width) - nearness) > HIDDEN_PX
 
 
 @dataclass(frozen=True)
@@ -59,10 +42,13 @@ class Degraded:
     lidar_color: Tensor  # [B, 3, H, W]
     lidar_alpha: Tensor  # [B, 1, H, W]
     reference: Tensor  # [B, 3, H, W] the nearest source image, from its own viewpoint
-    warped: Tensor  # [B, 3, H, W] the reference warped to the view by rendered depth, black where that is undefined
+    warped: Tensor  # [B, 3, H, W] source images looked up by rendered depth, black where none sees the point
     warp_mask: Tensor  # [B, 1, H, W]
+    warp_spread: Tensor  # [B, 1, H, W] how far the images that see a point disagree
     lidar_warped: Tensor  # [B, 3, H, W] the same by the LiDAR map's depth: sparser, free of floaters
     lidar_warp_mask: Tensor  # [B, 1, H, W]
+    lidar_warp_spread: Tensor  # [B, 1, H, W]
+    depth_gap: Tensor  # [B, 1, H, W] between rendered depth and the LiDAR map's, see :func:`depth_gap`
 
     def at(self, index: slice) -> Degraded:
         """The views of a slice."""
@@ -106,51 +92,27 @@ def _pull_push(color: Tensor, weight: Tensor) -> Tensor:
     return torch.where(weight > 1e-4, trust * local + (1 - trust) * coarse, coarse)
 
 
-def warp_reference(
-    reference: Tensor,  # [B, 3, H, W]
-    depth: Tensor,  # [B, 1, H, W] metres along z, 0 where unknown
-    alpha: Tensor,  # [B, 1, H, W]
-    poses: list[tuple[Float64, Float64]],  # B × (chunk_SE3_camera of the view, of the reference)
-    lenses: list[tuple[Lens, Lens]],  # B × (of the view, of the reference)
-) -> tuple[Tensor, Tensor]:  # [B, 3, H, W], [B, 1, H, W]
-    """The reference as the view would see it, by the rendered depth, and where that is defined (elsewhere black).
+def recorded(chunk: Chunk) -> tuple[SourceImage, ...]:
+    """The chunk's source images at the working resolution, with the depth from which LiDAR's points hide things.
 
-    Defined is a pixel whose point lies in the reference's image and is not hidden there by a nearer point of the view
-    (the view's depth, splatted into the reference; what the view does not see cannot be found to hide anything).
+    Raises ``InputError`` for an unreadable image.
     """
-    batch, _, height, width = depth.shape
-    grids, valid = [], []
-    rows = torch.arange(height, device=depth.device) + 0.5
-    columns = torch.arange(width, device=depth.device) + 0.5
-    v, u = torch.meshgrid(rows, columns, indexing="ij")
-    for k in range(batch):
-        (view_pose, source_pose), (lens, source) = poses[k], lenses[k]
-        z = depth[k, 0]
-        known = torch.isfinite(z) & (z > 0) & (alpha[k, 0] >= MIN_WARP_ALPHA)
-        z = torch.where(known, z, torch.ones_like(z))
-        source_SE3_view = torch.as_tensor(np.linalg.inv(source_pose) @ view_pose).to(depth)
-        rays = torch.stack([(u - lens.cx_px) / lens.fx_px, (v - lens.cy_px) / lens.fy_px, torch.ones_like(u)], -1)
-        points = (rays * z[..., None]) @ source_SE3_view[:3, :3].T + source_SE3_view[:3, 3]
-        ahead = points[..., 2] > 0.1
-        safe = torch.where(ahead, points[..., 2], torch.ones_like(z))
-        x = (points[..., 0] / safe * source.fx_px + source.cx_px) / source.width_px * 2 - 1
-        y = (points[..., 1] / safe * source.fy_px + source.cy_px) / source.height_px * 2 - 1
-        inside = known & ahead & (x.abs() < 1) & (y.abs() < 1)
-        baseline_px = float(np.linalg.norm(view_pose[:3, 3] - source_pose[:3, 3])) * source.fx_px
-        inside &= ~_hidden(x, y, safe, inside, baseline_px)
-        grids.append(torch.stack([x, y], -1).clamp(-2, 2))
-        valid.append(inside)
-    mask = torch.stack(valid)[:, None].to(reference.dtype)
-    grid = torch.stack(grids).to(reference.dtype)
-    warped = F.grid_sample(reference, grid, mode="bilinear", padding_mode="border", align_corners=False)
-    return warped * mask, mask
+    views = chunk.of_role("source")
+    with torch.no_grad():
+        map_ = render_surfaces(lidar_scene(chunk, OCCLUDING_POINTS), views)
+    depth = torch.where(map_.alpha >= MIN_ALPHA, map_.expected_depth(), torch.zeros_like(map_.alpha))
+    out = []
+    for view, hidden_at in zip(views, depth, strict=True):
+        image = decode_image(view.image, view.lens.width_px, view.lens.height_px).permute(2, 0, 1)
+        out.append(SourceImage(view.camera, view.frame, view.chunk_SE3_camera, view.lens, image, hidden_at))
+    return tuple(out)
 
 
-def source_views(chunk: Chunk, novel: Sequence[NovelView]) -> dict[tuple[str, int], View]:
-    """The references of novel views, each once, in order of appearance. Raises ``InputError`` for a stranger."""
-    views = {(v.camera, v.frame): v for v in chunk.views}
-    for view in novel:
-        if view.reference not in views:
+def references(chunk: Chunk, views: Sequence[NovelView], sources: Sequence[SourceImage]) -> list[SourceImage]:
+    """The reference of each view. Raises ``InputError`` for one that is no source view of the chunk."""
+    known = {(s.camera, s.frame): s for s in sources}
+    for view in views:
+        if view.reference not in known:
             raise InputError(
                 "the reference of a novel view is no view of the chunk",
                 remedy="Render the novel views of this chunk again.",
@@ -160,46 +122,73 @@ def source_views(chunk: Chunk, novel: Sequence[NovelView]) -> dict[tuple[str, in
                 frame=view.reference[1],
                 stage="fnet",
             )
-    return {v.reference: views[v.reference] for v in novel}
+    return [known[v.reference] for v in views]
 
 
-def source_images(sources: Mapping[tuple[str, int], View]) -> dict[tuple[str, int], Tensor]:
-    """Their images [3, H, W] at the working resolution. Raises ``InputError`` for an unreadable one."""
-    return {
-        key: decode_image(view.image, view.lens.width_px, view.lens.height_px).permute(2, 0, 1)
-        for key, view in sources.items()
-    }
-
-
-def degraded(
-    novel: NovelViews,
-    indices: range,
-    sources: Mapping[tuple[str, int], View],
-    images: Mapping[tuple[str, int], Tensor],
-) -> Degraded:
-    """The views ``indices`` with what they are fixed from; ``images`` are the references [3, H, W]."""
-    at = slice(indices.start, indices.stop)
-    views = novel.views[at]
-    reference = torch.stack([images[v.reference] for v in views]).to(novel.color)
-    poses = [(v.chunk_SE3_camera, sources[v.reference].chunk_SE3_camera) for v in views]
-    lenses = [(v.lens, sources[v.reference].lens) for v in views]
-    alpha, lidar_alpha = novel.alpha[at, None], novel.lidar_alpha[at, None]
+def degraded(chunk: Chunk, novel: NovelViews, indices: Sequence[int], sources: Sequence[SourceImage]) -> Degraded:
+    """The views ``indices`` with what they are fixed from; ``sources`` are the chunk's (see :func:`recorded`)."""
+    at = list(indices)
+    near = references(chunk, [novel.views[i] for i in at], sources)
+    warps = [_warps(chunk, novel, i, sources) for i in at]
+    by_render, by_lidar = ([pair[k] for pair in warps] for k in (0, 1))
     return Degraded(
         novel.color[at].permute(0, 3, 1, 2),
-        alpha,
+        novel.alpha[at].unsqueeze(1),
         novel.lidar_color[at].permute(0, 3, 1, 2),
-        lidar_alpha,
-        reference,
-        *warp_reference(reference, novel.depth[at, None], alpha, poses, lenses),
-        *warp_reference(reference, novel.lidar_depth[at, None], lidar_alpha, poses, lenses),
+        novel.lidar_alpha[at].unsqueeze(1),
+        torch.stack([s.image for s in near]).to(novel.color),
+        *_stacked(by_render),
+        *_stacked(by_lidar),
+        depth_gap(novel.depth[at], novel.alpha[at], novel.lidar_depth[at], novel.lidar_alpha[at]).unsqueeze(1),
     )
+
+
+def _warps(chunk: Chunk, novel: NovelViews, index: int, sources: Sequence[SourceImage]) -> tuple[Warp, Warp]:
+    """The sources as a view would see them, by rendered depth and by the LiDAR map's."""
+    view, actors = novel.views[index], chunk.actors
+    by_render, by_lidar = (
+        surface_of(depth[index], alpha[index], view.chunk_SE3_camera, view.lens, actors, view.frame)
+        for depth, alpha in ((novel.depth, novel.alpha), (novel.lidar_depth, novel.lidar_alpha))
+    )
+    chosen = choose(by_lidar, sources, view.reference, actors, view.frame)
+    return warp(by_render, chosen, actors, view.frame), warp(by_lidar, chosen, actors, view.frame)
+
+
+def _stacked(warps: Sequence[Warp]) -> tuple[Tensor, Tensor, Tensor]:
+    return (
+        torch.stack([w.color for w in warps]), torch.stack([w.mask for w in warps]),
+        torch.stack([w.spread for w in warps]),
+    )  # fmt: skip
+
+
+def depth_gap(depth: Tensor, alpha: Tensor, lidar_depth: Tensor, lidar_alpha: Tensor) -> Tensor:
+    """How far the render's depth is from the LiDAR map's, in [0, 1]: 1 from a quarter on; 0 where either is unknown."""
+    known = (alpha >= MIN_ALPHA) & (lidar_alpha >= MIN_ALPHA) & (depth > 0) & (lidar_depth > 0)
+    ratio = torch.where(known, depth / lidar_depth.clamp_min(1e-6), torch.ones_like(depth)).clamp_min(1e-6)
+    return (4 * ratio.log().abs()).clamp(0, 1)
+
+
+def given(views: Degraded, inputs: Collection[str]) -> Degraded:
+    """The views without what follows from an input that is not among ``inputs`` (see ``network.INPUTS``): that is 0."""
+    from_ = {
+        "render": ("color", "alpha", "warped", "warp_mask", "warp_spread", "depth_gap"),
+        "reference": (
+            "reference", "warped", "warp_mask", "warp_spread", "lidar_warped", "lidar_warp_mask", "lidar_warp_spread",
+        ),
+        "lidar": (
+            "lidar_color", "lidar_alpha", "lidar_warped", "lidar_warp_mask", "lidar_warp_spread", "depth_gap",
+        ),
+    }  # fmt: skip
+    blank = {name for source, names in from_.items() if source not in inputs for name in names}
+    return replace(views, **{name: torch.zeros_like(getattr(views, name)) for name in blank})
 
 
 def conditions(views: Degraded) -> Conditions:
     """The network's input, of the same size."""
     render = fill_holes(views.color, views.alpha, views.lidar_color, views.lidar_alpha)
     aligned = [views.alpha, views.lidar_alpha, views.warped, views.warp_mask, views.lidar_warped, views.lidar_warp_mask]
-    hints = torch.cat([*aligned, *_evidence(render, views)], 1)
+    spread = [4 * views.warp_spread, 4 * views.lidar_warp_spread, views.depth_gap]
+    hints = torch.cat([*aligned, *_evidence(render, views), *spread], 1)
     return Conditions(render, views.reference, views.lidar_color, hints)
 
 

@@ -15,12 +15,17 @@ from torch import Tensor, nn
 
 from genre_tasks.fixer.attention import mix_views, remove_text_attention
 
-HINTS = 16
-"""Channels of ``Conditions.hints``: render alpha, LiDAR alpha; the reference warped by rendered depth (3) and where
-that is valid; the same by the LiDAR map's depth; six maps of agreement and sharpness (``conditioning``)."""
+HINTS = 19
+"""Channels of ``Conditions.hints``: render alpha, LiDAR alpha; source images looked up by rendered depth (3) and where
+they see it; the same by the LiDAR map's depth; six maps of agreement and sharpness, three of how sure the depths are
+(``conditioning``)."""
 
 GATES = 3
-"""Sources that a corrected render may copy from: LiDAR map, reference by rendered depth, reference by LiDAR depth."""
+"""Sources that a corrected render may copy from: LiDAR map, images by rendered depth, images by the map's depth."""
+
+
+INPUTS = ("render", "reference", "lidar")
+"""What a view can be fixed from (paper Table 3)."""
 
 
 @dataclass(frozen=True)
@@ -28,13 +33,21 @@ class FnetArchitecture:
     """What makes a network: the configurations of the two diffusers models, and how the output is formed.
 
     ``residual``: the decoder predicts a correction of the render (see :func:`corrected`), so that an untrained fixer is
-    the identity; without it the decoder's image is the output, as in SD-Turbo.
+    the identity; without it the decoder's image is the output, as in SD-Turbo. ``inputs``: those of ``INPUTS`` that it
+    is trained with; the others are blank.
     """
 
     vae: dict[str, Any]
     unet: dict[str, Any]
     residual: bool
     timestep: int = 200
+    inputs: tuple[str, ...] = INPUTS
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "inputs", tuple(self.inputs))  # a list, from JSON
+        stray = [name for name in self.inputs if name not in INPUTS]
+        if stray or not self.inputs:
+            raise ValueError(f"expected inputs among {', '.join(INPUTS)}, got {', '.join(stray) or 'none'}")
 
     def as_json(self) -> dict[str, Any]:
         """Plain values for the JSON beside the weights."""
@@ -131,7 +144,7 @@ class Fnet(nn.Module):
             pooled = F.adaptive_avg_pool2d(inputs.hints, (ours.shape[-2], ours.shape[-1]))
             added = skip(torch.cat([ours, points, pooled], 1))
             x = block(_unit(x) + _unit(added) if self.architecture.residual else x + added)
-        x = decoder.conv_out(decoder.conv_act(decoder.conv_norm_out(x))) / 2
+        x = decoder.conv_out(decoder.conv_act(decoder.conv_norm_out(x))).to(inputs.render.dtype) / 2  # autocast ends
         return corrected(x, inputs) if self.architecture.residual else x + 0.5
 
     def forward(self, conditions: Conditions, noise: Tensor, reference: Encoded | None = None) -> Tensor:
@@ -156,13 +169,13 @@ class Fnet(nn.Module):
 def _unit(x: Tensor) -> Tensor:
     """Each sample at root mean square 1, so that latent and skip are of one weight: a decoder trained for hundreds of
     steps grows its activations from level to level into the thousands (its normalisations hide that)."""
-    return x / x.square().mean((1, 2, 3), keepdim=True).clamp_min(1e-12).sqrt()
+    return x / x.float().square().mean((1, 2, 3), keepdim=True).clamp_min(1e-12).sqrt().to(x.dtype)
 
 
 def corrected(output: Tensor, inputs: Conditions) -> Tensor:
     """The render plus a residual, plus gates times what the aligned sources have that the render has not.
 
-    ``output`` [B, 3 + GATES, H, W]. A gate of 1 copies its source's pixel (LiDAR map, the two warps of the reference):
+    ``output`` [B, 3 + GATES, H, W]. A gate of 1 copies its source's pixel (LiDAR map, the two warps):
     sharp detail that exists is carried over and not drawn anew.
     """
     out = inputs.render + output[:, :3]

@@ -5,23 +5,21 @@ Kept as bytes: images are rounded to 8 bits, which is far below what the fixer c
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from genre_tasks.errors import ArtifactCorruptError
-from genre_tasks.fixer.conditioning import Degraded, degraded, source_images, source_views
+from genre_tasks.fixer.conditioning import Degraded, degraded
+from genre_tasks.fixer.warping import SourceImage
 from genre_tasks.render import render_views
+from genre_tasks.render.surface import render_surfaces
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.novel import lidar_scene
 from genre_tasks.scene.views import NovelView, NovelViews
 
 NAMES = tuple(f.name for f in fields(Degraded))
@@ -30,10 +28,14 @@ NAMES = tuple(f.name for f in fields(Degraded))
 
 @dataclass(frozen=True)
 class Pairs:
-    """N pairs of one image size, uint8. ``shift_m`` [N] tells how far beside the path each is (0: on it)."""
+    """N pairs of one image size, uint8.
+
+    ``kinds`` say how each came to be degraded, ``shift_m`` [N] how far beside the path it is (0: on it).
+    """
 
     views: Degraded  # [N, 3 or 1, H, W] uint8
     truth: Tensor  # [N, 3, H, W] uint8
+    kinds: tuple[str, ...]
     shift_m: NDArray[np.float32]
 
     def __len__(self) -> int:
@@ -45,25 +47,37 @@ class Pairs:
 
 
 def render_pairs(
+    kind: str,
     chunk: Chunk,
     scene: SceneGraph,
+    lidar: SceneGraph,
     views: Sequence[NovelView],
     truth: Sequence[NDArray[np.uint8]],
-    lidar_max_points: int,
+    sources: Sequence[SourceImage],
 ) -> Pairs:
-    """Pairs of a scene's renders at ``views`` and the true images [H, W, 3] there."""
+    """Pairs of a scene's renders at ``views`` and the true images [H, W, 3] there.
+
+    ``lidar`` is the LiDAR map's scene, ``sources`` the recorded images that the fixer may look at.
+    """
     with torch.no_grad():
-        render = render_views(scene, views)
-        lidar = render_views(lidar_scene(chunk, lidar_max_points), views)
+        render, points = render_views(scene, views), render_surfaces(lidar, views)
     novel = NovelViews(
         tuple(views), render.color, render.alpha, render.expected_depth(),
-        lidar.color, lidar.alpha, lidar.expected_depth(),
+        points.color, points.alpha, points.expected_depth(),
     )  # fmt: skip
-    sources = source_views(chunk, views)
-    every = degraded(novel, range(len(views)), sources, source_images(sources))
+    every = degraded(chunk, novel, range(len(views)), sources)
     images = torch.from_numpy(np.stack(truth)).permute(0, 3, 1, 2).contiguous()
     shifts = np.array([v.shift_m for v in views], np.float32)
-    return Pairs(Degraded(*(_bytes(getattr(every, n)) for n in NAMES)), images, shifts)
+    return Pairs(Degraded(*(_bytes(getattr(every, n)) for n in NAMES)), images, (kind,) * len(views), shifts)
+
+
+def joined(parts: Sequence[Pairs]) -> Pairs:
+    """All pairs in one, in order. Raises ``ValueError`` for none, ``RuntimeError`` for mixed sizes."""
+    if not parts:
+        raise ValueError("expected at least one set of pairs")
+    views = Degraded(*(torch.cat([getattr(p.views, n) for p in parts]) for n in NAMES))
+    kinds = tuple(kind for p in parts for kind in p.kinds)
+    return Pairs(views, torch.cat([p.truth for p in parts]), kinds, np.concatenate([p.shift_m for p in parts]))
 
 
 def perturbed(scene: SceneGraph, generator: torch.Generator, strength: float = 1.0) -> SceneGraph:
@@ -85,26 +99,6 @@ def perturbed(scene: SceneGraph, generator: torch.Generator, strength: float = 1
             g.colors + 0.03 * noise(3),
         )
     )
-
-
-def save_pairs(pairs: Pairs, path: Path) -> None:
-    """Writes one compressed file, renamed into place."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".tmp")
-    arrays = {n: getattr(pairs.views, n).numpy() for n in NAMES}
-    with part.open("wb") as file:
-        np.savez_compressed(file, truth=pairs.truth.numpy(), shift_m=pairs.shift_m, **arrays)
-    part.replace(path)
-
-
-def load_pairs(paths: Sequence[Path]) -> Pairs:
-    """The pairs of several files of one image size, in order.
-
-    Raises ``ArtifactCorruptError`` for a file that is not whole, ``ValueError`` for mixed sizes or no file.
-    """
-    parts = [_load(path) for path in paths]
-    views = Degraded(*(torch.cat([getattr(p.views, n) for p in parts]) for n in NAMES))
-    return Pairs(views, torch.cat([p.truth for p in parts]), np.concatenate([p.shift_m for p in parts]))
 
 
 def sample(
@@ -133,18 +127,6 @@ def sample(
 
 def _below(bound: int, generator: torch.Generator) -> int:
     return int(torch.randint(bound, (), generator=generator))
-
-
-def _load(path: Path) -> Pairs:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        views = Degraded(*(torch.from_numpy(arrays[n]) for n in NAMES))
-        return Pairs(views, torch.from_numpy(arrays["truth"]), arrays["shift_m"])
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise ArtifactCorruptError(
-            f"training pairs cannot be read: {error}", remedy="Delete the file: the command makes it again.", file=path
-        ) from error
 
 
 def _bytes(image: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,10 @@ import torch
 from torch import Tensor, nn
 
 from genre_tasks.errors import InputError, NonFiniteError
-from genre_tasks.fixer.conditioning import conditions
+from genre_tasks.fixer.conditioning import conditions, given
 from genre_tasks.fixer.network import Fnet, FnetArchitecture, build, restart_residual, small_architecture
 from genre_tasks.fixer.pairs import Pairs, sample
+from genre_tasks.fixer.weights import trainable_state
 from genre_tasks.progress import Progress, silent
 
 
@@ -28,24 +29,35 @@ class TrainingSettings:
     """How long and with what. The paper trains 20 000 steps of batch 8 at 720 × 1280 from SD-Turbo.
 
     ``perceptual`` is small because the distance is steep: its gradient has about a hundred times the size of L1's, most
-    of it fine noise, and at 0.1 it drowns L1's.
+    of it fine noise, and at 0.1 it drowns L1's. ``squared`` is the squared error's weight beside L1: from errors of
+    1 / (2 · squared) on it weighs more. ``half``: bfloat16 where torch has it for an operation.
     """
 
     autoencoder_steps: int = 200
     autoencoder_batch: int = 4
-    steps: int = 1800
+    steps: int = 2600
     batch: int = 2
     crop: tuple[int, int] = (128, 192)
     learning_rate: float = 1e-3
     autoencoder_learning_rate: float = 2e-3
     warmup: int = 50
-    perceptual: float = 0.02
-    clean_share: float = 0.12
+    perceptual: float = 0.03
+    squared: float = 4.0
+    half: bool = True
+    clean_share: float = 0.2
     average: float = 0.995
     kl: float = 1e-5
     seed: int = 0
     checkpoint_every: int = 100
 
+
+PRESETS = {
+    "small": TrainingSettings(),
+    "further": TrainingSettings(steps=2200, learning_rate=6e-4, perceptual=0.1, clean_share=0.3, seed=1),
+    "paper": TrainingSettings(steps=20_000, batch=8, crop=(720, 1280), learning_rate=2e-5, perceptual=1.0),
+}
+"""``small``: half an hour on a core from nothing. ``further``: as long, from its weights. ``paper`` (Sec. III-B):
+SD-Turbo's LoRA adapters and skips; the paper gives steps, batch and size, rate and weight are Difix3D's."""
 
 AUTOENCODER_SETTINGS = ("autoencoder_steps", "autoencoder_batch", "autoencoder_learning_rate", "crop", "kl", "seed")
 """Settings on which the first part depends: with others of these its result is not used again."""
@@ -56,7 +68,7 @@ class TrainingState:
     """Everything that the next step depends on."""
 
     fnet: Fnet
-    average: dict[str, Tensor]
+    average: dict[str, Tensor]  # of what is trained
     optimiser: torch.optim.Optimizer
     generator: torch.Generator
     step: int
@@ -72,16 +84,19 @@ def train(
     folder: Path,
     distance: Distance,
     progress: Progress = silent,
-    on_checkpoint: Callable[[Fnet, int], None] | None = None,
+    on_checkpoint: Callable[[Fnet, int, Sequence[float]], None] | None = None,
     architecture: FnetArchitecture | None = None,
     start: Fnet | None = None,
+    autoencoder: Path | None = None,
 ) -> Fnet:
     """A trained fixer (averaged weights); continues from ``folder`` where a checkpoint of the same settings lies there.
 
     Args:
-        start: a fixer to train further; without it training begins with the autoencoder.
+        start: a fixer to train further; without it training begins with the autoencoder. Of one with LoRA adapters
+            those and the skips alone are trained.
+        autoencoder: the folder of the trained autoencoder, if fixers of several inputs share it; else ``folder``.
         distance: perceptual distance of [B, H, W, 3] images, [B].
-        on_checkpoint: called with the averaged network and the step at each checkpoint (a sample picture, say).
+        on_checkpoint: called with the averaged network, the step and all losses at each checkpoint.
 
     Raises:
         InputError: the checkpoint is of other settings. NonFiniteError: a loss is not finite.
@@ -90,28 +105,35 @@ def train(
     first = settings.autoencoder_steps if start is None else 0
     total = first + settings.steps
     if start is None:
-        fnet = _pretrained(pairs, settings, architecture or small_architecture(), folder, progress, total)
+        fnet = _pretrained(
+            pairs, settings, architecture or small_architecture(), autoencoder or folder, progress, total
+        )
     else:
-        fnet = copy.deepcopy(start).requires_grad_(True).train()
+        fnet = copy.deepcopy(start).train()
+        if fnet.architecture.residual:
+            fnet.requires_grad_(True)
     state = _fixer_state(fnet, settings)
     _restore(state, folder / "fixer.pt", settings)
     report = _Reporter(progress, first, total, state.step)
     while state.step < settings.steps:
         views, truth = sample(pairs, state.generator, settings.batch, settings.crop, settings.clean_share)
-        inputs = conditions(views)
+        inputs = conditions(given(views, fnet.architecture.inputs))
         noise = torch.randn(settings.batch, *fnet.noise_shape(*settings.crop), generator=state.generator)
-        out = fnet(inputs, noise)
-        perceived = distance(_last(out.clamp(0, 1)), _last(truth)).mean()
-        _step(state, (out - truth).abs().mean() + settings.perceptual * perceived, settings, settings.learning_rate)
+        with torch.autocast("cpu", torch.bfloat16, enabled=settings.half):
+            out = fnet(inputs, noise)
+        loss = (out - truth).abs().mean() + settings.squared * (out - truth).square().mean()
+        if settings.perceptual:
+            loss = loss + settings.perceptual * distance(_last(out.clamp(0, 1)), _last(truth)).mean()
+        _step(state, loss, settings, settings.learning_rate)
         with torch.no_grad():
             decay = min(settings.average, (1 + state.step) / (10 + state.step))
-            for name, parameter in fnet.named_parameters():
+            for name, parameter in trainable_state(fnet).items():
                 state.average[name].lerp_(parameter, 1 - decay)
         report(state)
         if state.step % settings.checkpoint_every == 0 or state.step == settings.steps:
             _save(state, folder / "fixer.pt", settings)
             if on_checkpoint is not None:
-                on_checkpoint(averaged(state), state.step)
+                on_checkpoint(averaged(state), state.step, state.losses)
     return averaged(state)
 
 
@@ -145,10 +167,10 @@ def train_autoencoder(
 
 
 def averaged(state: TrainingState) -> Fnet:
-    """A copy of the network with the averaged weights, for inference."""
-    fnet = build(state.fnet.architecture)
-    fnet.load_state_dict(state.average)
-    return fnet.eval().requires_grad_(False)
+    """A copy of the network with the averaged weights."""
+    fnet = copy.deepcopy(state.fnet)
+    fnet.load_state_dict(state.average, strict=False)
+    return fnet.eval()
 
 
 def _pretrained(
@@ -177,12 +199,7 @@ def _pretrained(
 
 def scaled(architecture: FnetArchitecture, scaling_factor: float) -> FnetArchitecture:
     """The architecture with a latent scale."""
-    return FnetArchitecture(
-        {**architecture.vae, "scaling_factor": scaling_factor},
-        architecture.unet,
-        architecture.residual,
-        architecture.timestep,
-    )
+    return replace(architecture, vae={**architecture.vae, "scaling_factor": scaling_factor})
 
 
 def _fixer_state(fnet: Fnet, settings: TrainingSettings) -> TrainingState:
@@ -191,7 +208,7 @@ def _fixer_state(fnet: Fnet, settings: TrainingSettings) -> TrainingState:
         fnet.vae.quant_conv.requires_grad_(False)
     trained = [p for p in fnet.parameters() if p.requires_grad]
     optimiser = torch.optim.AdamW(trained, lr=settings.learning_rate, weight_decay=1e-4)
-    average = {name: value.detach().clone() for name, value in fnet.state_dict().items()}
+    average = {name: value.detach().clone() for name, value in trainable_state(fnet).items()}
     return TrainingState(fnet, average, optimiser, torch.Generator().manual_seed(settings.seed + 1), 0, [])
 
 
@@ -233,7 +250,7 @@ class _Reporter:
 def _save(state: TrainingState, path: Path, settings: TrainingSettings) -> None:
     document = {
         "settings": _plain(settings),
-        "weights": state.fnet.state_dict(),
+        "weights": {name: value.detach() for name, value in trainable_state(state.fnet).items()},
         "average": state.average,
         "optimiser": state.optimiser.state_dict(),
         "generator": state.generator.get_state(),
@@ -248,7 +265,7 @@ def _restore(state: TrainingState, path: Path, settings: TrainingSettings) -> No
         return
     stored = torch.load(path, weights_only=True)
     _require_same(stored["settings"], settings, path, tuple(_plain(settings)))
-    state.fnet.load_state_dict(stored["weights"])
+    state.fnet.load_state_dict(stored["weights"], strict=False)
     state.average = stored["average"]
     state.optimiser.load_state_dict(stored["optimiser"])
     state.generator.set_state(stored["generator"])

@@ -23,9 +23,6 @@ from genre_tasks.metrics.threads import map_single_threaded
 TAPS = (0, 2, 4, 10, 14)
 """Blocks whose outputs are compared: strides 2, 4, 8, 16 and 32, the last block of each resolution but the head's."""
 
-CHEAP_TAPS = (0, 2, 4)
-"""Strides 2, 4 and 8 only: about half the cost of ``TAPS``, for a loss that is taken often."""
-
 STRIDE = 32
 """Overall stride of the network: smaller images are padded to it by repeating their edge."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -37,9 +39,8 @@ COLOR_REACH = 4.0
 
 def initial_scene(config: InitialConfig, chunk: Chunk) -> SceneGraph:
     """Background, actors and distant region of a chunk, deterministic. Raises ``InputError`` without near points."""
-    actors = [
-        node_gaussians(a.points, np.zeros(len(a.points)), _actor_cap(config, chunk), config) for a in chunk.actors
-    ]
+    cap = actor_cap(config.max_points, chunk)
+    actors = [node_gaussians(a.points, np.zeros(len(a.points)), cap, config) for a in chunk.actors]
     distance = path_distance(chunk.static.positions, chunk.chunk_SE3_ego)
     near = distance < config.max_range_m
     left = config.max_points - sum(len(a) for a in actors)
@@ -52,6 +53,11 @@ def initial_scene(config: InitialConfig, chunk: Chunk) -> SceneGraph:
         )
     static = node_gaussians(select(chunk.static, near), distance[near], left, config)
     distant = distant_region(chunk, config.distant_count, config.distant_radius_m)
+    return assembled(chunk, static, distant, actors)
+
+
+def assembled(chunk: Chunk, static: Gaussians, distant: Gaussians, actors: Sequence[Gaussians]) -> SceneGraph:
+    """The scene graph of its parts; ``actors`` in the chunk's order, in box coordinates."""
     parts = [static, distant, *actors]
     ids = [STATIC, DISTANT, *(FIRST_ACTOR + k for k in range(len(actors)))]
     nodes = torch.cat([torch.full((len(p),), k, dtype=torch.int64) for p, k in zip(parts, ids, strict=True)])
@@ -64,8 +70,9 @@ def _fields(g: Gaussians) -> tuple[torch.Tensor, ...]:
     return g.means, g.log_scales, g.quats, g.logit_opacities, g.colors
 
 
-def _actor_cap(config: InitialConfig, chunk: Chunk) -> int:
-    return max(1, int(config.max_points * min(ACTOR_SHARE, 0.5 / len(chunk.actors))))
+def actor_cap(max_points: int, chunk: Chunk) -> int:
+    """How many of ``max_points`` one actor may take."""
+    return max(1, int(max_points * min(ACTOR_SHARE, 0.5 / max(len(chunk.actors), 1))))
 
 
 def select(points: Points, which: NDArray) -> Points:

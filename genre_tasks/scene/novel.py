@@ -6,21 +6,18 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from genre_tasks.config import InitialConfig
 from genre_tasks.logs.types import Float64
 from genre_tasks.scene.chunk import Chunk, Points, View
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.geometry import path_distance, shift_laterally
-from genre_tasks.scene.graph import FIRST_ACTOR, STATIC, ActorNode, SceneGraph
-from genre_tasks.scene.ground import CELL_M
-from genre_tasks.scene.initialise import MAX_SCALE_VOXELS, SPACING, neighbour_spacing
+from genre_tasks.scene.graph import SceneGraph
+from genre_tasks.scene.initialise import actor_cap, assembled, node_gaussians, select
 from genre_tasks.scene.views import NovelView
-from genre_tasks.scene.voxels import group, levels, voxel_size_for
 
 LIDAR_OPACITY = 0.95
-_LIDAR_SCALE_M = (0.01, 1.0)
-_ACTOR_SHARE = 0.02
-"""Of the LiDAR map's points, at most this share is one actor's, and at most half all actors'."""
 
 
 def novel_view_poses(
@@ -63,37 +60,19 @@ def nearest_reference(camera: str, chunk_SE3_camera: Float64, sources: Sequence[
 
 
 def lidar_scene(chunk: Chunk, max_points: int) -> SceneGraph:
-    """The coloured LiDAR points as small isotropic Gaussians in a scene graph: actors move, nothing is distant.
+    """The coloured LiDAR points as discs on the surfaces they lie on, nearly opaque: actors move, nothing is distant.
 
-    Points without colour are left out. Sizes follow from the spacing of the thinned points.
+    Discs, because the fixer looks images up by the map's depth: a ball as wide as its neighbours are far would stand
+    out of a road that is seen at a grazing angle. Points without colour are left out.
     """
-    cap = max(1, int(max_points * min(_ACTOR_SHARE, 0.5 / max(len(chunk.actors), 1))))
-    actors = [_blobs(a.points, np.zeros(len(a.points)), cap) for a in chunk.actors]
-    left = max_points - sum(len(a) for a in actors)
-    static = _blobs(chunk.static, path_distance(chunk.static.positions, chunk.chunk_SE3_ego), left)
-    parts = [static, *actors]
-    ids = [STATIC, *(FIRST_ACTOR + k for k in range(len(actors)))]
-    nodes = torch.cat([torch.full((len(p),), k, dtype=torch.int64) for p, k in zip(parts, ids, strict=True)])
-    paths = tuple(ActorNode(a.track_id, a.label, a.size_m, a.frames, a.chunk_SE3_box) for a in chunk.actors)
-    return SceneGraph(Gaussians.unpacked(torch.cat([p.packed() for p in parts])), nodes, paths)
+    config, cap = InitialConfig(opacity=LIDAR_OPACITY), actor_cap(max_points, chunk)
+    nothing = Gaussians.unpacked(torch.zeros(0, 14))
 
+    def discs(points: Points, distance: NDArray[np.floating], count: int) -> Gaussians:
+        colored = points.colored
+        return node_gaussians(select(points, colored), distance[colored], count, config) if colored.any() else nothing
 
-def _blobs(points: Points, distance: np.ndarray, max_count: int) -> Gaussians:
-    positions, colors = points.positions[points.colored], points.colors[points.colored]
-    level = levels(distance[points.colored])
-    size = voxel_size_for(positions, level, max_count)
-    voxels = group(positions, level, size)
-    means = voxels.mean(positions)
-    count = len(means)
-    own = size * np.exp2(voxels.mean(level[:, None])[:, 0])
-    spacing = neighbour_spacing(means, size) if count else np.empty(0)
-    scale = np.minimum(SPACING * spacing, MAX_SCALE_VOXELS * np.maximum(own, CELL_M)).clip(*_LIDAR_SCALE_M)
-    quats = torch.zeros(count, 4)
-    quats[:, 0] = 1.0
-    return Gaussians(
-        torch.from_numpy(means.astype(np.float32)),
-        torch.from_numpy(np.log(scale).astype(np.float32))[:, None].expand(count, 3),
-        quats,
-        torch.full((count,), float(np.log(LIDAR_OPACITY / (1 - LIDAR_OPACITY)))),
-        torch.from_numpy((voxels.mean(colors) / 255.0).astype(np.float32)),
-    )
+    actors = [discs(a.points, np.zeros(len(a.points)), cap) for a in chunk.actors]
+    distance = path_distance(chunk.static.positions, chunk.chunk_SE3_ego)
+    static = discs(chunk.static, distance, max_points - sum(len(a) for a in actors))
+    return assembled(chunk, static, nothing, actors)

@@ -36,16 +36,22 @@ class NovelViews:
     color: Tensor  # [V, H, W, 3]
     alpha: Tensor  # [V, H, W]
     depth: Tensor  # [V, H, W] Σ w z / Σ w in metres, 0 where Σ w = 0
-    lidar_color: Tensor  # [V, H, W, 3] the LiDAR map: coloured points rendered as Gaussians
+    lidar_color: Tensor  # [V, H, W, 3] the LiDAR map: coloured points rendered as discs on their surfaces
     lidar_alpha: Tensor  # [V, H, W]
-    lidar_depth: Tensor  # [V, H, W]
+    lidar_depth: Tensor  # [V, H, W] where rays meet the planes of the discs
     culled: dict[str, int] = field(default_factory=dict)
     lidar_culled: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class FixedViews:
-    """The fixer's images of the same views."""
+    """The fixer's images of the same views.
+
+    ``copied`` are the indices of views that did not call for fixing and are their renders, ``seconds_saved`` about what
+    that saved: measurements, which go into the manifest.
+    """
 
     views: tuple[NovelView, ...]
     color: Tensor  # [V, H, W, 3] sRGB in [0, 1]
+    copied: tuple[int, ...] = ()
+    seconds_saved: float = 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from threading import Lock
 
@@ -11,13 +12,14 @@ from torch import Tensor
 
 from genre_tasks.config import FnetConfig
 from genre_tasks.errors import InputError
-from genre_tasks.fixer.conditioning import degraded, source_images, source_views
-from genre_tasks.fixer.inference import fix, noise_of
+from genre_tasks.fixer.conditioning import degraded, recorded, references
+from genre_tasks.fixer.inference import fix, noise_of, prefers_half, require_finite
 from genre_tasks.fixer.network import Encoded, Fnet
+from genre_tasks.fixer.warping import SourceImage, surface_of, unseen_share
 from genre_tasks.fixer.weights import load_fnet
 from genre_tasks.metrics.threads import map_single_threaded
 from genre_tasks.progress import Progress, silent
-from genre_tasks.scene.chunk import Chunk, View
+from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.views import FixedViews, NovelViews
 from genre_tasks.weights import resolve_weights
 
@@ -26,7 +28,7 @@ def fnet(config: FnetConfig, chunk: Chunk, novel: NovelViews, progress: Progress
     """Each novel view repaired from its render, its LiDAR map and its reference image.
 
     The result depends on ``config.seed`` and a view's place in ``novel``, not on the batch size (to float
-    tolerance) nor on the number of threads (exactly).
+    tolerance) nor on the number of threads (exactly). A view that does not call for it (``config.gate``) is its render.
 
     Raises:
         InputError: the weights are missing or do not fit, or a reference is no view of the chunk.
@@ -60,53 +62,52 @@ def fix_views(
     total = len(novel.views)
     if not total:
         return FixedViews(novel.views, novel.color.clone())
-    sources = source_views(chunk, novel.views)
-    images = source_images(sources)
-    encoded = _encode_references(network, images, list(images))
+    require_finite("render", novel.color)
+    sources = recorded(chunk)
+    near = references(chunk, novel.views, sources)
+    called = [i for i in range(total) if config.gate == 0 or need(chunk, novel, i, sources) > config.gate]
+    color = novel.color.clamp(0, 1)
+    if not called:
+        return FixedViews(novel.views, color, tuple(range(total)))
+    encoded = _encode(network, [near[i] for i in called])
     done, lock = 0, Lock()
+    half = prefers_half(novel.color.device) if config.half is None else config.half
 
-    def run(indices: range) -> Tensor:
+    def run(indices: Sequence[int]) -> Tensor:
         nonlocal done
-        fixed = _fix_batch(network, config.seed, novel, indices, sources, images, encoded)
+        views = degraded(chunk, novel, indices, sources)
+        noise = noise_of(network, config.seed, indices, *novel.alpha.shape[1:])
+        latent = torch.cat([encoded[novel.views[i].reference].latent for i in indices])
+        fixed = fix(network, views, noise, Encoded(latent, ()), half)
         with lock:
             done += len(indices)
-            progress(done, total, "fixing views")
+            progress(done, len(called), "fixing views")
         return fixed
 
     size = config.batch_views
-    batches = [range(start, min(start + size, total)) for start in range(0, total, size)]
-    color = torch.cat(map_single_threaded(run, batches))
-    return FixedViews(novel.views, color.permute(0, 2, 3, 1).contiguous())
+    began = time.perf_counter()
+    fixed = map_single_threaded(run, [called[start : start + size] for start in range(0, len(called), size)])
+    color[called] = torch.cat(fixed).permute(0, 2, 3, 1)
+    copied = tuple(sorted(set(range(total)) - set(called)))
+    return FixedViews(novel.views, color, copied, len(copied) * (time.perf_counter() - began) / len(called))
 
 
-def _fix_batch(
-    network: Fnet,
-    seed: int,
-    novel: NovelViews,
-    indices: range,
-    sources: dict[tuple[str, int], View],
-    images: dict[tuple[str, int], Tensor],
-    encoded: dict[tuple[str, int], Encoded],
-) -> Tensor:
-    """[B, 3, H, W] of one batch."""
-    views = degraded(novel, indices, sources, images)
-    noise = noise_of(network, seed, indices, *novel.alpha.shape[1:])
-    each = [encoded[novel.views[i].reference] for i in indices]
-    latent = torch.cat([e.latent for e in each])
-    return fix(network, views, noise, Encoded(latent, ()))
+def need(chunk: Chunk, novel: NovelViews, index: int, sources: Sequence[SourceImage]) -> float:
+    """How much a view calls for fixing, in [0, 1]: what of it is thin, or shows points that no source image shows."""
+    view, alpha = novel.views[index], novel.alpha[index]
+    surface = surface_of(novel.depth[index], alpha, view.chunk_SE3_camera, view.lens, chunk.actors, view.frame)
+    return unseen_share(surface, alpha, sources, chunk.actors, view.frame)
 
 
 @torch.no_grad()
-def _encode_references(
-    network: Fnet, images: dict[tuple[str, int], Tensor], keys: Sequence[tuple[str, int]]
-) -> dict[tuple[str, int], Encoded]:
-    """Latents of the references, each encoded once."""
+def _encode(network: Fnet, images: Sequence[SourceImage]) -> dict[tuple[str, int], Encoded]:
+    """Latents of source images, each encoded once."""
 
-    def encode(key: tuple[str, int]) -> Encoded:
-        image = images[key][None]
+    def encode(image: Tensor) -> Encoded:
         height, width = image.shape[-2:]
         pad = (0, -width % network.stride, 0, -height % network.stride)
         with torch.no_grad():
-            return Encoded(network.encode(F.pad(image, pad, mode="replicate")).latent, ())
+            return Encoded(network.encode(F.pad(image[None], pad, mode="replicate")).latent, ())
 
-    return dict(zip(keys, map_single_threaded(encode, keys), strict=True))
+    each = {(s.camera, s.frame): s.image for s in images}
+    return dict(zip(each, map_single_threaded(encode, list(each.values())), strict=True))

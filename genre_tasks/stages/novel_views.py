@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 
@@ -11,6 +11,7 @@ from genre_tasks.config import NovelViewsConfig
 from genre_tasks.errors import NonFiniteError
 from genre_tasks.progress import Progress, silent
 from genre_tasks.render import Render, RenderSettings, render_views
+from genre_tasks.render.surface import render_surfaces
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.novel import lidar_scene, novel_view_poses
@@ -44,9 +45,9 @@ def render_novel(
     settings: RenderSettings = DEFAULT_SETTINGS,
 ) -> NovelViews:
     """As :func:`novel_views`, at any ``views``."""
-    image = _render(scene, views, settings, progress, 0, "novel views")
+    image = _render(render_views, scene, views, settings, progress, 0, "novel views")
     points = lidar_scene(chunk, lidar_max_points)
-    lidar = _render(points, views, settings, progress, len(views), "LiDAR maps")
+    lidar = _render(render_surfaces, points, views, settings, progress, len(views), "LiDAR maps")
     progress(2 * len(views), 2 * len(views), "novel views")
     images = NovelViews(
         tuple(views), image.color, image.alpha, image.expected_depth(),
@@ -61,6 +62,7 @@ def render_novel(
 
 
 def _render(
+    draw: Callable[[SceneGraph, Sequence[NovelView], RenderSettings], Render],
     scene: SceneGraph,
     views: Sequence[NovelView],
     settings: RenderSettings,
@@ -77,7 +79,7 @@ def _render(
             while end < len(views) and views[end].frame == views[start].frame:
                 end += 1
             progress(done + start, 2 * len(views), note)
-            parts.append(render_views(scene, views[start:end], settings))
+            parts.append(draw(scene, views[start:end], settings))
             start = end
     color, alpha, depth = (torch.cat([getattr(p, name) for p in parts]) for name in ("color", "alpha", "depth"))
     culled: Counter[str] = Counter()

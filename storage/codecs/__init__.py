@@ -18,6 +18,7 @@ KINDS: dict[str, str] = {
     "reconstruction": "storage.codecs.reconstruction",
     "novel_views": "storage.codecs.novel_views",
     "fixed_views": "storage.codecs.fixed_views",
+    "pairs": "storage.codecs.pairs",
     "evaluation": "storage.codecs.evaluation",
 }
 """Kind of artifact → module of its codec. A new kind is one file and one line."""

@@ -35,8 +35,8 @@ def random_views(count: int, height: int, width: int, seed: int = 0) -> Degraded
         return torch.rand(count, channels, height, width, generator=generator)
 
     alpha, lidar_alpha, mask, other = rand(1), rand(1), (rand(1) > 0.5).float(), (rand(1) > 0.5).float()
-    warps = (rand(3) * mask, mask, rand(3) * other, other)
-    return Degraded(rand(3) * alpha, alpha, rand(3) * lidar_alpha, lidar_alpha, rand(3), *warps)
+    warps = (rand(3) * mask, mask, rand(1), rand(3) * other, other, rand(1))
+    return Degraded(rand(3) * alpha, alpha, rand(3) * lidar_alpha, lidar_alpha, rand(3), *warps, rand(1))
 
 
 @pytest.fixture

@@ -22,7 +22,14 @@ def _street(seed: int, gain_db: float, part: float) -> Row:
         "perceptual": [x * (1 - part) for x in before["perceptual"]],
     }
     truth = {"render": before, "fixed": after, "clean": {"psnr": [36.0, 40.0], "perceptual": [0.0, 0.0]}}
-    return _log(f"synthetic:street?seed={seed}", 0.9) | {"truth": truth}
+    spent = {"psnr": [24.0, 25.0], "seconds": 0.2}
+    inputs = {
+        "render": spent | {"perceptual": [0.40, 0.50]},
+        "render+reference": spent | {"perceptual": [0.38, 0.46]},
+        "render+reference+lidar": spent | {"perceptual": [0.36, 0.43]},
+    }
+    gate = [{"shift": 0.5, "need": [0.1, 0.3], "render": [0.2, 0.4], "fixed": [0.21, 0.3]}]
+    return _log(f"synthetic:street?seed={seed}", 0.9) | {"truth": truth, "inputs": inputs, "gate": gate}
 
 
 def _log(log: str, flicker_ratio: float) -> Row:
@@ -48,7 +55,13 @@ def test_claims_are_means_over_views_and_the_worst_log() -> None:
     assert claims["fixer.real_kernel_1m"].holds and not claims["fixer.real_kernel_3m"].holds
     assert "-25.0% of 0.2000" in claims["fixer.real_kernel_3m"].data
     assert claims["fixer.seconds_per_frame"].measured == pytest.approx(0.2)
+    assert claims["fixer.vs_src_ref"].measured == pytest.approx(0.025 / 0.42) and claims["fixer.vs_src_ref"].holds
+    assert claims["fixer.vs_src"].measured == pytest.approx(0.04 / 0.45) and claims["fixer.vs_src"].holds
+    assert claims["fixer.vs_ref_lidar"].measured is None and not claims["fixer.vs_ref_lidar"].holds
+    assert claims["fixer.no_view_worse"].measured == pytest.approx(0.05) and not claims["fixer.no_view_worse"].holds
     text = "\n".join(BENCH.table(rows))
+    assert "| 0.5 | 4 | 0.100 | 0.200 | 0.300 | 0.300 | 0.255 | +5.0% |" in text
+    assert "| render+reference | 24.500 | 0.420 | 0.200 |" in text
     assert "| 21.000 | 22.000 | 0.500 | 0.400 | 38.00 | 0.900 | 0.200 |" in text and "(-0.0600 … +0.0100)" in text
 
 

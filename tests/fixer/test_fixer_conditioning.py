@@ -1,4 +1,4 @@
-"""Holes, the warp of the reference, and the bound on colour shift (hard case 37)."""
+"""Holes, what is told and what is left out, and the bound on colour shift (hard case 37)."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from genre_tasks.fixer.conditioning import Degraded, bound_colour_shift, conditions, fill_holes, warp_reference
-from genre_tasks.fixer.network import HINTS
-from genre_tasks.logs.types import Lens
+from genre_tasks.fixer.conditioning import Degraded, bound_colour_shift, conditions, depth_gap, fill_holes, given
+from genre_tasks.fixer.network import HINTS, INPUTS
+from genre_tasks.fixer.pairs import NAMES
+from tests.fixer.conftest import random_views
 
 
 def test_an_opaque_render_is_not_touched():
@@ -33,44 +34,6 @@ def test_holes_take_the_lidar_map_and_then_the_surroundings():
 def test_nothing_drawn_is_black_and_finite():
     zero3, zero1 = torch.zeros(1, 3, 5, 7), torch.zeros(1, 1, 5, 7)
     assert torch.equal(fill_holes(zero3, zero1, zero3, zero1), zero3)
-
-
-def lens(width: int = 40, height: int = 24) -> Lens:
-    return Lens(30.0, 30.0, width / 2, height / 2, width, height)
-
-
-def test_the_same_viewpoint_warps_to_itself():
-    image, one = torch.rand(1, 3, 24, 40), torch.ones(1, 1, 24, 40)
-    warped, mask = warp_reference(image, one * 7, one, [(np.eye(4), np.eye(4))], [(lens(), lens())])
-    torch.testing.assert_close(warped, image, atol=1e-5, rtol=0)
-    assert mask.all()
-
-
-def test_a_shifted_plane_moves_by_its_disparity():
-    # the view stands 2 m to the right; a plane at 10 m is 30 · 2 / 10 = 6 pixels further left in it
-    image, one = torch.rand(1, 3, 24, 40), torch.ones(1, 1, 24, 40)
-    pose = np.eye(4)
-    pose[0, 3] = 2.0
-    warped, mask = warp_reference(image, one * 10, one, [(pose, np.eye(4))], [(lens(), lens())])
-    torch.testing.assert_close(warped[..., :34], image[..., 6:], atol=1e-4, rtol=0)
-    assert mask[..., :34].all() and not mask[..., 34:].any() and not warped[..., 34:].any()
-
-
-def test_unknown_depth_and_thin_renders_are_not_warped():
-    image, one = torch.rand(1, 3, 24, 40), torch.ones(1, 1, 24, 40)
-    depth, alpha = one * 10, one.clone()
-    depth[..., 0], depth[..., 1], depth[..., 2], alpha[..., 3] = 0, float("nan"), float("inf"), 0.2
-    warped, mask = warp_reference(image, depth, alpha, [(np.eye(4), np.eye(4))], [(lens(), lens())])
-    assert torch.isfinite(warped).all()
-    assert not mask[..., :4].any() and mask[..., 4:].all()
-
-
-def test_what_lies_behind_the_reference_is_not_warped():
-    image, one = torch.rand(1, 3, 24, 40), torch.ones(1, 1, 24, 40)
-    ahead = np.eye(4)
-    ahead[2, 3] = 20.0  # the reference stands 20 m further ahead than the view
-    warped, mask = warp_reference(image, one * 5, one, [(np.eye(4), ahead)], [(lens(), lens())])
-    assert not mask.any() and torch.isfinite(warped).all()
 
 
 def mean(image: torch.Tensor, alpha: torch.Tensor) -> torch.Tensor:
@@ -99,27 +62,39 @@ def test_without_opaque_pixels_nothing_is_corrected():
     assert torch.equal(bound_colour_shift(fixed, torch.zeros(1, 3, 4, 4), torch.zeros(1, 1, 4, 4)), fixed)
 
 
-def test_what_a_nearer_thing_hides_is_not_warped():
-    # a post at 4 m before a wall at 20 m; the reference stands 2 m to the left of the view, and sees the post where the
-    # view's wall pixels (30 · 2 / 4 − 30 · 2 / 20 = 12 px beside the view's post) lie behind it
-    image, one = torch.rand(1, 3, 24, 40), torch.ones(1, 1, 24, 40)
-    depth = one * 20
-    depth[..., 10:14] = 4
-    pose = np.eye(4)
-    pose[0, 3] = 2.0
-    _, mask = warp_reference(image, depth, one, [(pose, np.eye(4))], [(lens(), lens())])
-    assert mask[..., 10:14].all()
-    assert not mask[..., 22:26].any()
-    assert mask[..., 28:36].all() and mask[..., :10].all()
-
-
 def test_agreement_and_sharpness_are_told():
     sharp = torch.rand(1, 3, 16, 24)
     one, zero = torch.ones(1, 1, 16, 24), torch.zeros(1, 1, 16, 24)
-    views = Degraded(sharp * 0 + 0.5, one, sharp * 0, zero, sharp, sharp, one, sharp * 0, zero)
+    views = Degraded(
+        sharp * 0 + 0.5, one, sharp * 0, zero, sharp, sharp, one, one / 8, sharp * 0, zero, zero, one / 2
+    )  # fmt: skip
     hints = conditions(views).hints
     assert hints.shape == (1, HINTS, 16, 24)
-    lidar, warp, lidar_warp, render_sharp, warp_sharp, lidar_warp_sharp = hints[0, 10:]
+    lidar, warp, lidar_warp, render_sharp, warp_sharp, lidar_warp_sharp = hints[0, 10:16]
     assert not lidar.any() and not lidar_warp.any()  # nothing there, nothing that disagrees
     assert warp.mean() > 0.1 and warp_sharp.mean() > 2
     assert not render_sharp.any() and not lidar_warp_sharp.any()
+    assert hints[0, 16:].flatten(1).mean(1).tolist() == [0.5, 0.0, 0.5]  # spreads, and how far the depths are apart
+
+
+def test_what_a_fixer_is_not_given_is_blank():
+    views = random_views(2, 16, 24)
+    alone = given(views, ("render",))
+    kept = {name for name in NAMES if torch.equal(getattr(alone, name), getattr(views, name))}
+    assert kept == {"color", "alpha"}
+    assert all(not getattr(alone, name).any() for name in set(NAMES) - kept)
+    pair = given(views, ("reference", "lidar"))
+    assert not pair.color.any() and not pair.warped.any() and torch.equal(pair.lidar_warped, views.lidar_warped)
+    assert not given(views, ("render", "reference")).lidar_warped.any()
+    assert given(views, INPUTS) == views
+
+
+def test_depths_that_differ_are_told_where_both_are_known():
+    one = torch.ones(1, 1, 4, 6)
+    lidar_alpha = one.clone()
+    lidar_alpha[..., 0] = 0.3
+    gap = depth_gap(10 * one, one, 11 * one, lidar_alpha)
+    assert not gap[..., 0].any()
+    torch.testing.assert_close(gap[..., 1:], 4 * (one * 1.1).log()[..., 1:])
+    assert depth_gap(10 * one, one, 30 * one, one).min() == 1
+    assert not depth_gap(0 * one, one, 30 * one, one).any()

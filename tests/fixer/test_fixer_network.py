@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
+import torch.nn.functional as F
 
 from genre_tasks.errors import NonFiniteError
 from genre_tasks.fixer.attention import ViewMixingProcessor
-from genre_tasks.fixer.conditioning import Degraded, conditions, padded
-from genre_tasks.fixer.inference import fix, noise_of
+from genre_tasks.fixer.conditioning import Degraded, conditions, given, padded
+from genre_tasks.fixer.inference import OVERLAP_PX, _fade, _windows, fix, noise_of
 from genre_tasks.fixer.network import add_lora, build, noise_level, small_architecture
 from tests.fixer.conftest import random_views, toy
 
@@ -145,7 +147,9 @@ def test_black_and_saturated_images_stay_finite(level, dtype):
     fnet = toy().to(dtype)
     full, one = torch.full((1, 3, 32, 48), level, dtype=dtype), torch.full((1, 1, 32, 48), level, dtype=dtype)
     out = fix(
-        fnet, Degraded(full, one, full, one, full, full, one, full, one), noise_of(fnet, 0, range(1), 32, 48).to(dtype)
+        fnet,
+        Degraded(full, one, full, one, full, full, one, one, full, one, one, one),
+        noise_of(fnet, 0, range(1), 32, 48).to(dtype),
     )
     assert out.dtype == dtype and torch.isfinite(out).all() and out.min() >= 0 and out.max() <= 1
 
@@ -182,3 +186,44 @@ def test_building_leaves_the_global_random_state_alone():
     assert all(
         torch.equal(a, b) for a, b in zip(first.state_dict().values(), second.state_dict().values(), strict=True)
     )
+
+
+def test_large_images_are_fixed_in_tiles():
+    """A tile cuts off what the network sees around a pixel: away from seams the whole image's values come back."""
+    fnet, views = toy(), random_views(1, 300, 520)
+    noise = noise_of(fnet, 0, range(1), 300, 520)
+    whole = fix(fnet, views, noise)
+    reference = fnet.encode(F.pad(views.reference, (0, -520 % fnet.stride, 0, -300 % fnet.stride), mode="replicate"))
+    tiled = fix(fnet, views, noise, reference, tile_px=256)
+    assert tiled.shape == whole.shape and torch.isfinite(tiled).all()
+    assert (tiled - whole).abs().mean() < 0.02
+    with pytest.raises(ValueError, match="tiles of at least 256 px"):
+        fix(fnet, views, noise, tile_px=128)
+
+
+@pytest.mark.parametrize(
+    ("size", "tile", "stride"), [(256, 256, 16), (272, 256, 16), (1088, 512, 16), (2000, 1024, 16)]
+)
+def test_windows_cover_and_overlap(size, tile, stride):
+    windows = _windows(size, tile, stride)
+    assert windows[0][0] == 0 and windows[-1][1] == size
+    assert all(a % stride == 0 and b % stride == 0 and b - a <= tile for a, b in windows)
+    assert all(b - c >= min(OVERLAP_PX, size) - stride for (_, b), (c, _) in pairwise(windows))
+    weight = torch.zeros(size)
+    for a, b in windows:
+        weight[a:b] += _fade(a, b, size)
+    assert weight.min() > 0.5
+
+
+def test_an_input_that_is_not_given_changes_nothing():
+    views = random_views(1, 32, 48)
+    noise = noise_of(toy(), 0, range(1), 32, 48)
+    for inputs in (("render",), ("render", "reference"), ("reference", "lidar")):
+        architecture = replace(small_architecture((8, 8, 16, 16), 4, (16, 16)), inputs=inputs)
+        fnet = build(architecture).eval()
+        fnet.load_state_dict(toy().state_dict())
+        blank = given(views, inputs)
+        first, second = (fix(fnet, v, noise, fnet.encode(v.reference)) for v in (views, blank))
+        assert torch.equal(first, second)
+    with pytest.raises(ValueError, match="expected inputs among"):
+        replace(small_architecture(), inputs=("radar",))

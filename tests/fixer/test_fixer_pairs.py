@@ -1,18 +1,18 @@
-"""Training pairs: to bytes and back, crops, perturbed scenes."""
+"""Training pairs: joined, crops, perturbed scenes."""
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import torch
 
-from genre_tasks.errors import ArtifactCorruptError
-from genre_tasks.fixer.conditioning import Degraded
-from genre_tasks.fixer.pairs import Pairs, load_pairs, perturbed, render_pairs, sample, save_pairs
+from genre_tasks.fixer.conditioning import Degraded, recorded
+from genre_tasks.fixer.pairs import Pairs, joined, perturbed, render_pairs, sample
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import SceneGraph
+from genre_tasks.scene.novel import lidar_scene
 from tests.fixer.conftest import random_views
 
 NAMES = [f.name for f in fields(Degraded)]
@@ -23,27 +23,18 @@ def some_pairs(count: int = 3, height: int = 48, width: int = 64) -> Pairs:
     generator = torch.Generator().manual_seed(9)
     truth = torch.randint(0, 256, (count, 3, height, width), generator=generator, dtype=torch.uint8)
     as_bytes = Degraded(*((getattr(views, n) * 255).round().to(torch.uint8) for n in NAMES))
-    return Pairs(as_bytes, truth, np.arange(count, dtype=np.float32))
+    return Pairs(as_bytes, truth, ("beside",) * count, np.arange(count, dtype=np.float32))
 
 
-def test_files_of_pairs_come_back_joined(tmp_path):
+def test_sets_of_pairs_are_joined_in_order():
     pairs = some_pairs()
-    save_pairs(pairs, tmp_path / "a.npz")
-    save_pairs(pairs, tmp_path / "b.npz")
-    back = load_pairs([tmp_path / "a.npz", tmp_path / "b.npz"])
-    assert len(back) == 6 and back.shift_m.tolist() == [0, 1, 2, 0, 1, 2]
-    assert torch.equal(back.truth[3:], pairs.truth)
-    assert all(torch.equal(getattr(back.views, n)[:3], getattr(pairs.views, n)) for n in NAMES)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npz", "b.npz"]
-
-
-def test_a_truncated_file_is_named(tmp_path):
-    path = tmp_path / "a.npz"
-    save_pairs(some_pairs(), path)
-    path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(ArtifactCorruptError, match=r"a\.npz") as caught:
-        load_pairs([path])
-    assert "makes it again" in caught.value.remedy
+    both = joined([pairs, replace(pairs, kinds=("sparse",) * 3)])
+    assert len(both) == 6 and both.shift_m.tolist() == [0, 1, 2, 0, 1, 2]
+    assert both.kinds == ("beside",) * 3 + ("sparse",) * 3
+    assert torch.equal(both.truth[3:], pairs.truth)
+    assert all(torch.equal(getattr(both.views, n)[:3], getattr(pairs.views, n)) for n in NAMES)
+    with pytest.raises(ValueError, match="at least one"):
+        joined([])
 
 
 def test_crops_follow_their_seed():
@@ -58,7 +49,7 @@ def test_a_crop_is_the_same_window_of_every_image():
     pairs = some_pairs()
     ramp = torch.arange(48 * 64, dtype=torch.float32).reshape(48, 64).remainder(251).to(torch.uint8)
     same = {n: ramp.expand_as(getattr(pairs.views, n)).contiguous() for n in NAMES}
-    pairs = Pairs(Degraded(**same), ramp.expand_as(pairs.truth).contiguous(), pairs.shift_m)
+    pairs = replace(pairs, views=Degraded(**same), truth=ramp.expand_as(pairs.truth).contiguous())
     views, truth = sample(pairs, torch.Generator().manual_seed(3), 6, (32, 48), 0.0)
     for name in NAMES:
         assert torch.equal(getattr(views, name)[:, :1], truth[:, :1])
@@ -95,8 +86,8 @@ def test_perturbation_follows_its_seed_and_strength():
 def test_rendered_pairs_hold_render_reference_and_truth(scene):
     chunk, novel = scene
     truth = [np.full((36, 52, 3), 10 * k, np.uint8) for k in range(5)]
-    pairs = render_pairs(chunk, scene_of(), novel.views, truth, 100)
-    assert len(pairs) == 5 and pairs.shift_m.tolist() == [3.0] * 5
+    pairs = render_pairs("beside", chunk, scene_of(), lidar_scene(chunk, 100), novel.views, truth, recorded(chunk))
+    assert len(pairs) == 5 and pairs.kinds == ("beside",) * 5 and pairs.shift_m.tolist() == [3.0] * 5
     assert pairs.truth[3].unique().tolist() == [30]
     assert pairs.views.color.float().std() > 1 and pairs.views.alpha.max() > 100
     assert not pairs.views.lidar_alpha.any()  # the chunk has no points

@@ -7,8 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from flows.train.fixer import make_pairs
-from genre_tasks.errors import ConfigError, InputError, NonFiniteError
+from genre_tasks.errors import InputError, NonFiniteError
 from genre_tasks.fixer.network import small_architecture
 from genre_tasks.fixer.training import TrainingSettings, train
 from tests.fixer.test_fixer_pairs import some_pairs
@@ -30,7 +29,7 @@ class StoppedError(Exception):
 def test_a_stopped_training_resumes_to_the_same_bytes(tmp_path):
     whole = train(some_pairs(), SETTINGS, tmp_path / "whole", distance, architecture=TOY)
 
-    def stop(fnet, step):
+    def stop(fnet, step, losses):
         if step == 3:
             raise StoppedError
 
@@ -83,17 +82,6 @@ def test_other_settings_are_refused(tmp_path):
 def test_a_loss_that_is_not_finite_stops_it(tmp_path):
     with pytest.raises(NonFiniteError, match="loss of step 0"):
         train(some_pairs(), SETTINGS, tmp_path, lambda a, b: distance(a, b) * float("nan"), architecture=TOY)
-
-
-def test_only_training_seeds_make_pairs(tmp_path):
-    with pytest.raises(ConfigError, match=r"seeds \[900, 1001\] are not for training"):
-        make_pairs(tmp_path, [3, 900, 1001])
-
-
-def test_pairs_that_exist_are_left(tmp_path):
-    (tmp_path / "street-0005.npz").write_bytes(b"there")
-    assert make_pairs(tmp_path, [5]) == [tmp_path / "street-0005.npz"]
-    assert (tmp_path / "street-0005.npz").read_bytes() == b"there"
 
 
 def test_a_fixer_is_trained_further(tmp_path):

@@ -12,9 +12,10 @@ from safetensors.torch import load_file, save_file
 
 from genre_tasks.config import FnetConfig
 from genre_tasks.errors import InputError
+from genre_tasks.fixer.conditioning import recorded
 from genre_tasks.fixer.network import Fnet, FnetArchitecture, add_lora, sd_turbo, small_architecture
 from genre_tasks.fixer.weights import load_fnet, save_fnet
-from genre_tasks.stages.fnet import fnet
+from genre_tasks.stages.fnet import fnet, need
 from genre_tasks.weights import resolve_weights
 from tests.fixer.conftest import toy
 
@@ -177,3 +178,35 @@ def test_adapters_can_be_put_on_the_small_network_too():
     network = toy()
     add_lora(network, 2)
     assert sum(p.requires_grad for p in network.parameters()) > 8
+
+
+def test_views_that_do_not_call_for_it_are_copied(scene, weights):
+    chunk, novel = scene
+    alpha = novel.alpha.clone()
+    alpha[:] = 1
+    alpha[1] = 0.4  # what is thin calls for fixing
+    novel = replace(novel, alpha=alpha, color=novel.color.clamp(0, 1))
+    sources = recorded(chunk)
+    needs = [need(chunk, novel, i, sources) for i in range(5)]
+    assert needs[1] > max(n for i, n in enumerate(needs) if i != 1)
+    gate = 0.5 * (needs[1] + max(n for i, n in enumerate(needs) if i != 1))
+    every = fnet(FnetConfig(weights=str(weights)), chunk, novel)
+    gated = fnet(FnetConfig(weights=str(weights), gate=gate), chunk, novel)
+    assert every.copied == () and every.seconds_saved == 0
+    assert gated.copied == (0, 2, 3, 4) and gated.seconds_saved > 0
+    assert torch.equal(gated.color[1], every.color[1])
+    assert all(torch.equal(gated.color[i], novel.color[i]) for i in gated.copied)
+
+
+def test_a_gate_that_nothing_passes_costs_no_network(scene, weights, monkeypatch):
+    chunk, novel = scene
+    monkeypatch.setattr(Fnet, "forward", lambda *_: pytest.fail("the network was called"))
+    out = fnet(FnetConfig(weights=str(weights), gate=1.0), chunk, novel)
+    assert out.copied == (0, 1, 2, 3, 4) and torch.equal(out.color, novel.color.clamp(0, 1))
+
+
+def test_half_precision_can_be_chosen(scene, weights):
+    chunk, novel = scene
+    whole, half = (fnet(FnetConfig(weights=str(weights), half=h), chunk, novel).color for h in (False, True))
+    assert not torch.equal(whole, half)
+    assert (whole - half).abs().mean() < 0.02  # random weights on noise; the shipped ones are held to a grey level

@@ -33,8 +33,9 @@ def views_of(render: torch.Tensor, warped: torch.Tensor | None = None) -> Degrad
     """An opaque render, without LiDAR; the reference is the warp, or the render itself."""
     one, zero = torch.ones_like(render[:, :1]), torch.zeros_like(render[:, :1])
     if warped is None:
-        return Degraded(render, one, render * 0, zero, render, render * 0, zero, render * 0, zero)
-    return Degraded(render, one, render * 0, zero, warped, warped, one, warped, one)
+        nothing = (render * 0, zero, zero)
+        return Degraded(render, one, render * 0, zero, render, *nothing, *nothing, zero)
+    return Degraded(render, one, render * 0, zero, warped, *(2 * (warped, one, zero)), zero)
 
 
 def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
@@ -61,6 +62,13 @@ def test_a_blurred_render_beside_a_sharp_reference_is_repaired(shipped, image):
     fixed = repair(shipped, views_of(blurred, image))
     assert psnr(fixed, image) >= psnr(blurred, image) + 1
     assert (fixed.mean((2, 3)) - blurred.mean((2, 3))).abs().max() <= MAX_COLOUR_SHIFT + 1e-5
+
+
+def test_half_precision_changes_less_than_a_grey_level(shipped, image):
+    blurred = F.avg_pool2d(F.pad(image, (4, 4, 4, 4), mode="replicate"), 9, 1)
+    views, noise = views_of(blurred, image), noise_of(shipped, 0, range(1), *image.shape[-2:])
+    whole, half = (fix(shipped, views, noise, half=h) for h in (False, True))
+    assert 0 < (whole - half).abs().mean() < 1 / 255
 
 
 @pytest.mark.parametrize("level", [0.0, 1.0])

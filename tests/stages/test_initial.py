@@ -17,7 +17,7 @@ from genre_tasks.scene.distant import fibonacci_directions
 from genre_tasks.scene.geometry import quat_to_matrix
 from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR, STATIC
 from genre_tasks.scene.images import decode_image
-from genre_tasks.scene.initialise import surface_frames
+from genre_tasks.scene.initialise import MAX_SCALE_M, surface_frames
 from genre_tasks.scene.novel import lidar_scene, nearest_reference, novel_view_poses
 from genre_tasks.scene.results import Reconstruction
 from genre_tasks.stages.ingest import ingest
@@ -188,6 +188,8 @@ def test_novel_views_contract(log: FakeLog, chunk: Chunk, reconstruction: Recons
 
 def test_lidar_scene_is_thinned_and_coloured(chunk: Chunk) -> None:
     scene = lidar_scene(chunk, 3000)
-    assert 2500 < len(scene) <= 3000 and float(scene.gaussians.log_scales.exp().max()) <= 1.0
+    scales = scene.gaussians.log_scales.exp()
+    assert 2500 < len(scene) <= 3000 and float(scales.max()) <= MAX_SCALE_M
+    assert float((scales[:, 2] / scales[:, 0]).median()) < 0.3  # discs on surfaces, not balls
     empty = Points(*(getattr(chunk.static, n)[:0] for n in ("positions", "colors", "colored", "frames")))
     assert len(lidar_scene(replace(chunk, static=empty, actors=()), 3000)) == 0

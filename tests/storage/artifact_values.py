@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from genre_tasks.fixer.conditioning import Degraded
+from genre_tasks.fixer.pairs import NAMES, Pairs
 from genre_tasks.logs.types import Lens
 from genre_tasks.scene.chunk import Actor, Chunk, Mark, Points, Role, View
 from genre_tasks.scene.gaussians import Gaussians
@@ -103,7 +105,17 @@ def novel_views(rng: np.random.Generator, count: int = 2, width: int = 7, height
 
 def fixed_views(rng: np.random.Generator, count: int = 2, width: int = 7, height: int = 5) -> FixedViews:
     color = torch.from_numpy(rng.random((count, height, width, 3)).astype(np.float32))
-    return FixedViews(tuple(novel_view(rng, k, width, height) for k in range(count)), color)
+    views = tuple(novel_view(rng, k, width, height) for k in range(count))
+    return FixedViews(views, color, tuple(range(0, count, 2)), 0.5 if count else 0.0)
+
+
+def pairs(rng: np.random.Generator, count: int = 2, width: int = 7, height: int = 5) -> Pairs:
+    def image(channels: int) -> torch.Tensor:
+        return torch.from_numpy(rng.integers(0, 256, (count, channels, height, width), dtype=np.uint8))
+
+    colours = ("color", "lidar_color", "reference", "warped", "lidar_warped")
+    views = Degraded(**{name: image(3 if name in colours else 1) for name in NAMES})
+    return Pairs(views, image(3), tuple(f"kind {k}" for k in range(count)), rng.random(count).astype(np.float32))
 
 
 def evaluation(rng: np.random.Generator, count: int = 3) -> Evaluation:
@@ -123,6 +135,7 @@ MAKERS = {
     "reconstruction": reconstruction,
     "novel_views": novel_views,
     "fixed_views": fixed_views,
+    "pairs": pairs,
     "evaluation": evaluation,
 }
 

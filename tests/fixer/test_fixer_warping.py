@@ -1,0 +1,120 @@
+"""Recorded images looked up from beside the path: geometry, what hides what, actors, which images are looked at."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from genre_tasks.fixer.warping import SourceImage, Surface, choose, look_up, surface_of, warp
+from genre_tasks.logs.types import Lens
+from genre_tasks.scene.chunk import Actor, Points
+
+HEIGHT, WIDTH = 24, 40
+LENS = Lens(30.0, 30.0, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
+NO_POINTS = Points(
+    np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.bool_), np.zeros(0, np.int16)
+)
+
+
+def at(x: float = 0.0, z: float = 0.0) -> np.ndarray:
+    pose = np.eye(4)
+    pose[0, 3], pose[2, 3] = x, z
+    return pose
+
+
+def source(pose: np.ndarray, frame: int = 0, seed: int = 0, depth: torch.Tensor | float = 0.0) -> SourceImage:
+    image = torch.rand(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(seed))
+    depth = depth if isinstance(depth, torch.Tensor) else torch.full((HEIGHT, WIDTH), depth)
+    return SourceImage("front", frame, pose, LENS, image, depth)
+
+
+def plane(depth: float | torch.Tensor, pose: np.ndarray | None = None, actors: tuple[Actor, ...] = ()) -> Surface:
+    full = torch.full((HEIGHT, WIDTH), 1.0) * depth
+    return surface_of(full, torch.ones(HEIGHT, WIDTH), at() if pose is None else pose, LENS, actors, 0)
+
+
+def test_the_same_viewpoint_shows_the_image_itself():
+    image = source(at())
+    color, seen = look_up(plane(7.0), image, (), 0)
+    torch.testing.assert_close(color, image.image, atol=1e-5, rtol=0)
+    assert seen.all()
+
+
+def test_a_plane_moves_by_its_disparity():
+    # the view stands 2 m to the right; a plane at 10 m is 30 · 2 / 10 = 6 pixels further left in it
+    image = source(at())
+    out = warp(plane(10.0, at(2.0)), [image], (), 0)
+    torch.testing.assert_close(out.color[..., :34], image.image[..., 6:], atol=1e-4, rtol=0)
+    assert out.mask[..., :34].all() and not out.mask[..., 34:].any() and not out.color[..., 34:].any()
+
+
+def test_unknown_depth_and_thin_renders_show_nothing():
+    depth, alpha = torch.full((HEIGHT, WIDTH), 10.0), torch.ones(HEIGHT, WIDTH)
+    depth[:, 0], depth[:, 1], depth[:, 2], alpha[:, 3] = 0, float("nan"), float("inf"), 0.2
+    out = warp(surface_of(depth, alpha, at(), LENS, (), 0), [source(at())], (), 0)
+    assert torch.isfinite(out.color).all()
+    assert not out.mask[..., :4].any() and out.mask[..., 4:].all()
+
+
+def test_what_lies_behind_a_camera_is_not_seen():
+    out = warp(plane(5.0), [source(at(z=20.0))], (), 0)
+    assert not out.mask.any() and torch.isfinite(out.color).all()
+
+
+def test_what_a_source_sees_something_nearer_before_is_hidden():
+    depth = torch.full((HEIGHT, WIDTH), 20.0)
+    depth[:, 10:14] = 4.0  # a post; what the source has no depth for hides nothing
+    depth[:, 30:] = 0.0
+    _, seen = look_up(plane(20.0), source(at(), depth=depth), (), 0)
+    assert not seen[:, 10:14].any() and seen[:, :10].all() and seen[:, 14:].all()
+
+
+def test_a_pixel_is_taken_from_the_first_image_that_sees_it_and_others_are_compared():
+    blind = torch.zeros(HEIGHT, WIDTH)
+    blind[:, :20] = 2.0  # something stands before the left half
+    first, second, third = source(at(), 0, 1, blind), source(at(), 1, 2), source(at(), 2, 2)
+    out = warp(plane(10.0), [first, second, third], (), 0)
+    assert out.mask.all()
+    torch.testing.assert_close(out.color[..., 20:], first.image[..., 20:], atol=1e-5, rtol=0)
+    torch.testing.assert_close(out.color[..., :20], second.image[..., :20], atol=1e-5, rtol=0)
+    assert out.spread[..., :20].abs().max() < 1e-5  # the third agrees with the second
+    differing = (second.image - first.image).abs().mean(0)[:, 20:]
+    torch.testing.assert_close(out.spread[0, :, 20:], differing, atol=1e-5, rtol=0)
+
+
+def moving() -> Actor:
+    """A box two metres wide, 8 to 12 m ahead, that has moved 3 m to the right from frame 0 to 1 and is gone at 2."""
+    boxes = np.stack([at(0.0, 10.0), at(3.0, 10.0)])
+    return Actor("a", "car", (4.0, 4.0, 4.0), np.array([0, 1]), boxes, NO_POINTS)
+
+
+def test_points_on_an_actor_are_looked_up_where_it_is():
+    actor = moving()
+    surface = plane(9.0, actors=(actor,))
+    on = surface.on == 0
+    assert on[12, 20] and not on[12, 0] and not on[12, 39]
+    color, seen = look_up(surface, source(at(), 1), (actor,), 0)
+    image = source(at(), 1).image
+    assert seen[12, 20]
+    torch.testing.assert_close(color[:, 12, 20], image[:, 12, 30], atol=1e-4, rtol=0)  # 30 · 3 / 9 = 10 px to the right
+    torch.testing.assert_close(color[:, 12, 2], image[:, 12, 2], atol=1e-4, rtol=0)
+    gone = look_up(surface, source(at(), 2), (actor,), 0)[1]
+    assert not gone[on].any() and gone[~on].all()
+
+
+def test_images_are_chosen_for_what_is_still_unseen():
+    left, right = torch.zeros(HEIGHT, WIDTH), torch.zeros(HEIGHT, WIDTH)
+    left[:, :20], right[:, 20:] = 1.0, 1.0  # what stands before them hides one half
+    sources = [source(at(), 0, 0, left), source(at(), 1, 1, left), source(at(), 2, 2, right), source(at(), 3, 3)]
+    found = choose(plane(10.0), sources, ("front", 0), (), 0)
+    assert [s.frame for s in found] == [0, 2]  # the second of two that bring the same does not come
+    assert [s.frame for s in choose(plane(10.0), sources, ("front", 3), (), 0)] == [3]
+    assert [s.frame for s in choose(plane(10.0), sources, ("front", 0), (), 0, count=1)] == [0]
+
+
+def test_faults_are_said():
+    with pytest.raises(ValueError, match="none of the sources"):
+        choose(plane(5.0), [source(at())], ("front", 7), (), 0)
+    with pytest.raises(ValueError, match="at least one source"):
+        warp(plane(5.0), [], (), 0)
