@@ -53,7 +53,7 @@ class TrainingSettings:
 
 PRESETS = {
     "small": TrainingSettings(),
-    "further": TrainingSettings(steps=2200, learning_rate=6e-4, perceptual=0.1, clean_share=0.3, seed=1),
+    "further": TrainingSettings(steps=1500, learning_rate=6e-4, perceptual=0.1, clean_share=0.3, seed=1),
     "paper": TrainingSettings(steps=20_000, batch=8, crop=(720, 1280), learning_rate=2e-5, perceptual=1.0),
 }
 """``small``: half an hour on a core from nothing. ``further``: as long, from its weights. ``paper`` (Sec. III-B):
