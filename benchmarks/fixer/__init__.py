@@ -79,7 +79,9 @@ class Fixer:
             yield _kernel(reals, f"{shift:g}")
         ratios = [r["flicker"]["fixed"] / r["flicker"]["render"] for r in found]
         note = "difference between consecutive frames, the next warped by rendered depth: fixed over render"
-        data = f"{note}, the worst log; {_of(found)}"
+        true = [r["flicker"]["truth"] / r["flicker"]["render"] for r in found if "truth" in r["flicker"]]
+        said = f" (of true images: {min(true):.2f} to {max(true):.2f})" if true else ""
+        data = f"{note}, the worst log{said}; {_of(found)}"
         yield claim("fixer.flicker", max(ratios, default=None), "<=", 1.0, "ratio", data, len(ratios))
         lost = [b / a - 1 for row in streets for g in row["gate"] for a, b in zip(g["render"], g["fixed"], strict=True)]
         data = (
@@ -90,14 +92,15 @@ class Fixer:
 
     def table(self, rows: Mapping[str, Row]) -> Iterator[str]:
         """A line for each log."""
-        yield "| log | PSNR at 3 m: render | fixed | perceptual: render | fixed | clean, fixed | flicker | s a view |"
-        yield "|---|---|---|---|---|---|---|---|"
+        yield "| log | PSNR at 3 m: render | fixed | perceptual: render | fixed | clean | flicker | true | s a view |"
+        yield "|---|---|---|---|---|---|---|---|---|"
         for row in measured(rows):
             pairs = [(kind, key) for key in ("psnr", "perceptual") for kind in ("render", "fixed")]
             values = [f"{_mean(row, *p):.3f}" if "truth" in row else "" for p in pairs]
             values.append(f"{_mean(row, 'clean', 'psnr'):.2f}" if "truth" in row else "")
             ratio = row["flicker"]["fixed"] / row["flicker"]["render"]
-            yield f"| {place(row)} | {' | '.join(values)} | {ratio:.3f} | {seconds_a_view(row):.3f} |"
+            true = f"{row['flicker']['truth'] / row['flicker']['render']:.3f}" if "truth" in row["flicker"] else ""
+            yield f"| {place(row)} | {' | '.join(values)} | {ratio:.3f} | {true} | {seconds_a_view(row):.3f} |"
         yield ""
         yield "| inputs, trained as long | PSNR at 3 m | perceptual | s a view |"
         yield "|---|---|---|---|"

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,6 +20,7 @@ from benchmarks.optimiser.cells import threads
 from benchmarks.optimiser.enhancement import BOOTSTRAP, psnr_of
 from benchmarks.optimiser.steps import Steps, steps_of
 from benchmarks.optimiser.task import SIDE_M
+from flows.logs import opened_log
 from flows.train.fixer import WEIGHTS, FixerJob
 from genre_tasks.config import FnetConfig
 from genre_tasks.fixer.conditioning import recorded
@@ -50,7 +52,7 @@ def measure_fixer(log: str, chunk: int, store: str, ablations: str) -> Row:
         steps = steps_of(log, chunk, store, 0, enet=False)
         config = steps.config.fnet
         network = load_configured(config)
-        out: Row = {"log": log, "chunk": chunk, "flicker": flicker_row(network, config, steps)}
+        out: Row = {"log": log, "chunk": chunk, "flicker": flicker_row(network, config, steps, log)}
         truth = true_targets(log, store, steps.chunk, SIDE_M)
         if truth:
             novel = _rendered(steps, views_at(steps.chunk, SIDE_M, TRUE_VIEWS))
@@ -141,17 +143,20 @@ def kernel_row(network: Fnet, config: FnetConfig, steps: Steps, views: Sequence[
 
 
 @torch.no_grad()
-def flicker_row(network: Fnet, config: FnetConfig, steps: Steps) -> Row:
-    """Flicker of the first camera's renders and fixed images, over the chunk's frames at one side."""
-    camera = steps.chunk.views[0].camera
-    views = [v for v in views_at(steps.chunk, SIDE_M) if v.camera == camera and v.shift_m > 0]
-    novel = _rendered(steps, sorted(views, key=lambda v: v.frame))
-    fixed, actors = fix_views(network, config, steps.chunk, novel).color, steps.chunk.actors
-    return {
-        "frames": len(views),
-        "render": flicker(novel.color.clamp(0, 1), novel, actors),
-        "fixed": flicker(fixed, novel, actors),
-    }
+def flicker_row(network: Fnet, config: FnetConfig, steps: Steps, log: str) -> Row:
+    """Flicker of the first camera's renders and fixed images, and of the true ones, over the chunk's frames at a side.
+
+    A sharp image differs more from its resampled neighbour than a blurred one: the truth's tells what that is worth.
+    """
+    chunk, truth = steps.chunk, opened_log(log).truth
+    camera, actors = chunk.views[0].camera, chunk.actors
+    views = sorted((v for v in views_at(chunk, SIDE_M) if v.camera == camera and v.shift_m > 0), key=lambda v: v.frame)
+    novel = _rendered(steps, views)
+    images = {"render": novel.color.clamp(0, 1), "fixed": fix_views(network, config, chunk, novel).color}
+    if truth is not None:
+        cast = [truth.image(v.frame, chunk.world_SE3_chunk @ v.chunk_SE3_camera, v.lens) for v in views]
+        images["truth"] = torch.from_numpy(np.stack(cast).astype(np.float32) / np.float32(255))
+    return {"frames": len(views)} | {name: flicker(image, novel, actors) for name, image in images.items()}
 
 
 def flicker(images: Tensor, novel: NovelViews, actors: Sequence[Actor] = ()) -> float:

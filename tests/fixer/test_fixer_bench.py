@@ -37,7 +37,7 @@ def _log(log: str, flicker_ratio: float) -> Row:
     return {
         "log": log,
         "chunk": 0,
-        "flicker": {"frames": 20, "render": 0.1, "fixed": 0.1 * flicker_ratio},
+        "flicker": {"frames": 20, "render": 0.1, "fixed": 0.1 * flicker_ratio, "truth": 0.3},
         "time": spent,
     }
 
@@ -52,6 +52,7 @@ def test_claims_are_means_over_views_and_the_worst_log() -> None:
     assert claims["fixer.perceptual_3m"].measured == pytest.approx(0.3)
     assert claims["fixer.identity"].measured == 36.0
     assert claims["fixer.flicker"].measured == pytest.approx(1.1) and not claims["fixer.flicker"].holds
+    assert "of true images: 3.00 to 3.00" in claims["fixer.flicker"].data
     assert claims["fixer.real_kernel_1m"].holds and not claims["fixer.real_kernel_3m"].holds
     assert "-25.0% of 0.2000" in claims["fixer.real_kernel_3m"].data
     assert claims["fixer.seconds_per_frame"].measured == pytest.approx(0.2)
@@ -62,7 +63,9 @@ def test_claims_are_means_over_views_and_the_worst_log() -> None:
     text = "\n".join(BENCH.table(rows))
     assert "| 0.5 | 4 | 0.100 | 0.200 | 0.300 | 0.300 | 0.255 | +5.0% |" in text
     assert "| render+reference | 24.500 | 0.420 | 0.200 |" in text
-    assert "| 21.000 | 22.000 | 0.500 | 0.400 | 38.00 | 0.900 | 0.200 |" in text and "(-0.0600 … +0.0100)" in text
+    assert (
+        "| 21.000 | 22.000 | 0.500 | 0.400 | 38.00 | 0.900 | 3.000 | 0.200 |" in text and "(-0.0600 … +0.0100)" in text
+    )
 
 
 def test_what_is_not_measured_is_said() -> None:
