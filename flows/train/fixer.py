@@ -105,11 +105,12 @@ def load_pairs(job: FixerJob, progress: Progress = silent) -> Pairs:
     return joined(parts)
 
 
-def shares(pairs: Pairs) -> dict[str, float]:
-    """The share of each kind of pair, and of those beside the path (``lateral``) and of perturbed scenes' not."""
-    kinds = np.array(pairs.kinds)
-    out = {str(kind): float((kinds == kind).mean()) for kind in sorted(set(pairs.kinds))}
-    return {**out, "optimiser": float((kinds != "perturbed").mean()), "lateral": float((pairs.shift_m != 0).mean())}
+def shares(pairs: Sequence[tuple[str, float]]) -> dict[str, float]:
+    """Of pairs' kinds and shifts: the share of each kind, of the ``optimiser``'s own output, of ``lateral`` shifts."""
+    kinds = [kind for kind, _ in pairs]
+    out = {kind: kinds.count(kind) / len(kinds) for kind in sorted(set(kinds))}
+    lateral = sum(shift != 0 for _, shift in pairs) / len(kinds)
+    return {**out, "optimiser": 1 - out.get("perturbed", 0.0), "lateral": lateral}
 
 
 def train_fixer(job: FixerJob, progress: Progress = silent) -> Path:

@@ -11,7 +11,7 @@ from prefect.cache_policies import NO_CACHE
 from prefect.states import Completed
 
 from flows.reporting import current_reporter
-from flows.train.fixer import CURVE, WEIGHTS, FixerJob, load_pairs, shares, train_fixer
+from flows.train.fixer import CURVE, WEIGHTS, FixerJob, shares, train_fixer
 from flows.train.pairs import pair_scenes, pairs_of
 from flows.train.scenes import SceneRecipe
 from storage.curve import FIXING, read_rows
@@ -30,10 +30,10 @@ def train_pairs(folder: str = "training", real: str | None = None, streets: int 
     scenes = pair_scenes(streets, real)
     reporter = current_reporter()
     reporter.began("pairs")
+    pairs: list[tuple[str, float]] = []
     for k, scene in enumerate(scenes):
         reporter.progress(k, len(scenes), scene.uri)
-        pairs_task(scene.uri, job, scene, return_state=True).result()
-    pairs = load_pairs(job)
+        pairs += pairs_task(scene.uri, job, scene, return_state=True).result()
     reporter.ended(f"{len(pairs)} pairs of {len(scenes)} scenes")
     return {"scenes": len(scenes), "pairs": len(pairs), "shares": shares(pairs)}
 
@@ -61,9 +61,10 @@ def train_fnet(
 
 
 @task(name="training pairs", task_run_name="{uri}", persist_result=False, cache_policy=NO_CACHE)
-def pairs_task(uri: str, job: FixerJob, scene: SceneRecipe) -> int:
-    """Makes what the store lacks of a scene's pairs; how many they are."""
-    return len(pairs_of(job.store, scene))
+def pairs_task(uri: str, job: FixerJob, scene: SceneRecipe) -> list[tuple[str, float]]:
+    """Makes what the store lacks of a scene's pairs; the kind and the shift of each."""
+    pairs = pairs_of(job.store, scene)
+    return list(zip(pairs.kinds, pairs.shift_m.tolist(), strict=True))
 
 
 @task(name="training fixer", task_run_name="{name}", persist_result=False, cache_policy=NO_CACHE)

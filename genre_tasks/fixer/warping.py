@@ -26,8 +26,8 @@ MIN_ALPHA = 0.5
 """A depth is trusted where at least half of the ray's light is accounted for."""
 
 HIDDEN_SHARE, HIDDEN_M = 0.03, 0.05
-"""A point is hidden from an image that sees something nearer by more than this share and distance: a depth is a
-splat's, not a surface's, and at grazing angles as far off as that."""
+"""A point is hidden from an image that sees something nearer by more than this share and distance: at edges
+and between the discs of the LiDAR map depths are as far off as that."""
 
 _NEAREST_M = 0.1
 _COARSE = 8

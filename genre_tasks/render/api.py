@@ -76,7 +76,7 @@ def render_views(scene: SceneGraph, views: Sequence[PosedView], settings: Render
     frames = [v.frame for v in views]
     posed, moving = scene.posed(list(dict.fromkeys(frames)))
     shown = Shown.of_frames(len(scene) - len(moving), len(moving), frames)
-    return render(posed.activated(), _on(cameras, scene.gaussians.means), settings, shown)
+    return render(posed.activated(), on_device_of(cameras, scene.gaussians.means), settings, shown)
 
 
 def cameras_of(views: Sequence[PosedView]) -> Cameras:
@@ -128,7 +128,8 @@ def _result(images: tuple[Tensor, Tensor, Tensor], culled: dict[str, int]) -> Re
     return Render(*images, culled)
 
 
-def _on(cameras: Cameras, like: Tensor) -> Cameras:
+def on_device_of(cameras: Cameras, like: Tensor) -> Cameras:
+    """The cameras on another tensor's device."""
     names = ("camera_SE3_chunk", "focal_px", "center_px")
     return replace(cameras, **{n: getattr(cameras, n).to(like.device) for n in names})
 

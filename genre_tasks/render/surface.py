@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from genre_tasks.logs.types import Lens
-from genre_tasks.render.api import DEFAULT, PosedView, cameras_of, render, render_views
+from genre_tasks.render.api import DEFAULT, PosedView, cameras_of, on_device_of, render, render_views
 from genre_tasks.render.types import Render, RenderSettings
 from genre_tasks.scene.gaussians import Splats
 from genre_tasks.scene.graph import SceneGraph
@@ -43,7 +43,7 @@ def render_surfaces(scene: SceneGraph, views: Sequence[PosedView], settings: Ren
             posed = {view.frame: (splats, normals(splats))}
         splats, across = posed[view.frame]
         planes = replace(splats, colors=_planes(splats.means, across, view))
-        image = render(planes, cameras_of([view]), settings)
+        image = render(planes, on_device_of(cameras_of([view]), splats.means), settings)
         inverse = (image.color[0] * _rays(view.lens, image.color)).sum(-1) / image.alpha[0].clamp_min(1e-6)
         plane = 1 / inverse.clamp_min(1e-6)
         meets = (inverse > 0) & ((plane - centre[k]).abs() <= MOST_APART * centre[k])

@@ -57,6 +57,7 @@ def test_claims_are_means_over_views_and_the_worst_log() -> None:
     assert "-25.0% of 0.2000" in claims["fixer.real_kernel_3m"].data
     assert claims["fixer.seconds_per_frame"].measured == pytest.approx(0.2)
     assert claims["fixer.vs_src_ref"].measured == pytest.approx(0.025 / 0.42) and claims["fixer.vs_src_ref"].holds
+    assert 0 < claims["fixer.vs_src_ref_low"].measured < claims["fixer.vs_src_ref"].measured
     assert claims["fixer.vs_src"].measured == pytest.approx(0.04 / 0.45) and claims["fixer.vs_src"].holds
     assert claims["fixer.vs_ref_lidar"].measured is None and not claims["fixer.vs_ref_lidar"].holds
     assert claims["fixer.no_view_worse"].measured == pytest.approx(0.05) and not claims["fixer.no_view_worse"].holds

@@ -79,6 +79,11 @@ def test_other_settings_are_refused(tmp_path):
         train(some_pairs(), replace(SETTINGS, kl=1.0), tmp_path, distance, architecture=TOY)
 
 
+def test_pairs_smaller_than_a_crop_are_refused(tmp_path):
+    with pytest.raises(InputError, match=r"the pairs are 64 × 48 pixels, crops of 96 × 32"):
+        train(some_pairs(), replace(SETTINGS, crop=(32, 96)), tmp_path, distance, architecture=TOY)
+
+
 def test_a_loss_that_is_not_finite_stops_it(tmp_path):
     with pytest.raises(NonFiniteError, match="loss of step 0"):
         train(some_pairs(), SETTINGS, tmp_path, lambda a, b: distance(a, b) * float("nan"), architecture=TOY)
