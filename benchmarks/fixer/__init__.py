@@ -27,7 +27,7 @@ from genre_tasks.metrics.collect import BOOTSTRAP_SEED
 FEWER = {"render": "src", "render+reference": "src_ref", "reference+lidar": "ref_lidar"}
 """Inputs that all three are held against, and what the paper's Table 3 calls them."""
 
-CELL_S = 90.0
+CELL_S = 200.0
 """Predicted: the steps before FNet, twelve ray-cast views, a few hundred fixed ones."""
 RESAMPLES = 2000
 
@@ -74,7 +74,7 @@ class Fixer:
         data = f"the truth given as the render: PSNR of what comes back, the worst view; {views}"
         yield claim("fixer.identity", min(clean, default=None), ">=", 35.0, "dB", data, len(clean))
         for other, name in FEWER.items():
-            yield _against(streets, other, name)
+            yield from _against(streets, other, name)
         for shift in KERNEL_SHIFTS_M:
             yield _kernel(reals, f"{shift:g}")
         ratios = [r["flicker"]["fixed"] / r["flicker"]["render"] for r in found]
@@ -184,17 +184,18 @@ def lessened(streets: Sequence[Row], other: str) -> list[float]:
     return [(a - b) / statistics.fmean(fewer) for a, b in zip(fewer, every, strict=True)]
 
 
-def _against(streets: Sequence[Row], other: str, name: str) -> Claim:
-    """All inputs against fewer, trained as long: the lower end of the paired interval, and of 5 % for src + ref."""
+def _against(streets: Sequence[Row], other: str, name: str) -> Iterator[Claim]:
+    """All inputs against fewer, trained as long: the paired interval excludes 0; for src + ref the mean is 5 % too."""
     part = lessened(streets, other)
     bounds = interval(part)
     said = f"mean {statistics.fmean(part):+.1%}" if part else "not measured"
     note = f"perceptual distance with all inputs against {other}, trained as long: part that it is lower, {said}"
     if name == "src_ref":
         data = f"{note}; interval by paired bootstrap over views; {_of(streets)}"
-        return claim("fixer.vs_src_ref", mean(part), ">=", 0.05, "part", data, len(part), bounds)
+        yield claim("fixer.vs_src_ref", mean(part), ">=", 0.05, "part", data, len(part), bounds)
+        name = "src_ref_low"
     data = f"lower end of the 95 % interval (paired bootstrap over views): {note}; {_of(streets)}"
-    return claim(f"fixer.vs_{name}", None if bounds is None else bounds[0], ">", 0.0, "part", data, len(part), bounds)
+    yield claim(f"fixer.vs_{name}", None if bounds is None else bounds[0], ">", 0.0, "part", data, len(part), bounds)
 
 
 def _kernel(reals: Sequence[Row], shift: str) -> Claim:
