@@ -107,6 +107,7 @@ class OptimiserConfig(Section):
     method: Literal["learned", "adam"] = Field("learned", description="adam: the tuned per-attribute baseline.")
     adam: AdamConfig = AdamConfig()
     weights: str = Field("builtin", description="builtin, or a path to a .safetensors file.")
+    hold_ground: bool = Field(True, description="Flat discs that lie on the ground move and turn in their plane only.")
     snapshots: int = Field(6, ge=0, description="Intermediate scenes kept for the curve of accuracy against seconds.")
     seed: int = Field(0, ge=0)
 

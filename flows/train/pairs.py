@@ -17,7 +17,8 @@ from flows.train.scenes import PreparedScene, SceneRecipe, check_training, kept,
 from genre_tasks.config import GnetConfig, LossConfig
 from genre_tasks.logs.registry import open_log
 from genre_tasks.scene.chunk import Chunk, View
-from genre_tasks.scene.novel import lidar_scene, nearest_reference, novel_view_poses
+from genre_tasks.scene.lidar_map import lidar_scene
+from genre_tasks.scene.novel import nearest_reference, novel_view_poses
 from genre_tasks.scene.views import NovelView
 from genre_tasks.weights import resolve_weights
 from storage.address import Address

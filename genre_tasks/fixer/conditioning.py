@@ -19,7 +19,7 @@ from genre_tasks.fixer.warping import MIN_ALPHA, SourceImage, Warp, choose, surf
 from genre_tasks.render.surface import render_surfaces
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.images import decode_image
-from genre_tasks.scene.novel import lidar_scene
+from genre_tasks.scene.lidar_map import lidar_scene
 from genre_tasks.scene.views import NovelView, NovelViews
 
 MAX_COLOUR_SHIFT = 0.03

@@ -74,7 +74,7 @@ def load_network(folder: Path = KERNEL.folder) -> ctypes.CDLL:
     library.genre_adam_step.argtypes = [now, ctypes.c_int]
     p, n, f = ctypes.c_void_p, ctypes.c_int64, ctypes.c_float
     library.genre_saw.argtypes = [n, p, p, p, p, f, f, ctypes.c_int, p, p, p, p]
-    library.genre_moved.argtypes = [n, *[p] * 6, ctypes.c_int, p]
+    library.genre_moved.argtypes = [n, *[p] * 7, ctypes.c_int, p]
     return library
 
 

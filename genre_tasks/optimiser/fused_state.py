@@ -36,9 +36,10 @@ def moved(
     start: Tensor,  # [N, 14]
     low: Tensor,  # [N, 14]
     high: Tensor,  # [N, 14]
+    planes: Tensor,  # [N, 11]
 ) -> Tensor:
-    """Offsets after ``delta``, held inside the bounds, where anything was seen now; see ``State.moved``."""
-    arrays, out = _contiguous(offsets, delta, seen_now, start, low, high), torch.empty_like(offsets)
+    """Offsets after ``delta``, along the ground and inside the bounds, where anything was seen now; see ``State``."""
+    arrays, out = _contiguous(offsets, delta, seen_now, start, low, high, planes), torch.empty_like(offsets)
     pointers = [t.data_ptr() for t in arrays]
     library.check(library.load_network().genre_moved(len(offsets), *pointers, torch.get_num_threads(), out.data_ptr()))
     return out
@@ -46,6 +47,6 @@ def moved(
 
 def _contiguous(*tensors: Tensor) -> list[Tensor]:
     rows = len(tensors[0])
-    if any(t.shape not in ((rows, 14), (rows, 1)) for t in tensors):
-        raise ValueError(f"expected {rows} rows of 14 or 1 columns, got {[list(t.shape) for t in tensors]}")
+    if any(t.shape not in ((rows, 14), (rows, 11), (rows, 1)) for t in tensors):
+        raise ValueError(f"expected {rows} rows of 14, 11 or 1 columns, got {[list(t.shape) for t in tensors]}")
     return [t.contiguous() for t in tensors]

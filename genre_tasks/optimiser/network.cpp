@@ -159,6 +159,22 @@ static void each_gaussian(int64_t count, int threads, F f) {
   });
 }
 
+constexpr int PLANE = 11;
+
+// ground.along_ground: what of a row of 14 leads along its plane (normal, quaternion, the same turned within it), in
+// `along`; the row itself off the ground, where the plane is 0.
+static const float* along_ground(const float* delta, const float* plane, float* along) {
+  const float *normal = plane, *own = plane + 3, *turned = plane + 7;
+  if (normal[0] == 0.f && normal[1] == 0.f && normal[2] == 0.f) return delta;
+  std::copy(delta, delta + ATTRIBUTES, along);
+  float off = 0.f, by_own = 0.f, by_turned = 0.f;
+  for (int c = 0; c < 3; c++) off += normal[c] * delta[c];
+  for (int c = 0; c < 3; c++) along[c] = delta[c] - normal[c] * off;
+  for (int c = 0; c < 4; c++) by_own += own[c] * delta[6 + c], by_turned += turned[c] * delta[6 + c];
+  for (int c = 0; c < 4; c++) along[6 + c] = own[c] * by_own + turned[c] * by_turned;
+  return along;
+}
+
 extern "C" {
 
 // Writes now->delta, the learned optimiser's step: 0 where nothing was seen now.
@@ -195,15 +211,17 @@ int genre_saw(int64_t count, const float* gradient, const float* first, const fl
   });
 }
 
-// State.moved and Frame.bounded: [N, 14], seen_now [N]. Additions and choices only: torch's bits.
+// State.moved and Frame.bounded: [N, 14], seen_now [N], planes [N, 11]. Off the ground additions and choices only:
+// torch's bits.
 int genre_moved(int64_t count, const float* offsets, const float* delta, const float* seen_now, const float* start,
-                const float* low, const float* high, int threads, float* out) {
+                const float* low, const float* high, const float* planes, int threads, float* out) {
   return guarded([&] {
     each_gaussian(count, threads, [&](int64_t i) {
       const int64_t at = ATTRIBUTES * i;
       Lanes moved = load_attributes(offsets + at);
       if (seen_now[i] > 0) {
-        moved = moved + load_attributes(delta + at);
+        float along[ATTRIBUTES];
+        moved = moved + load_attributes(along_ground(delta + at, planes + PLANE * i, along));
         const Lanes from = load_attributes(start + at), least = load_attributes(low + at), there = from + moved;
         const Lanes held = bounded(there, least, load_attributes(high + at)), back = held - from;
         const Mask inside = ((there >= held) & (there <= held)) | (least <= -INFINITY);

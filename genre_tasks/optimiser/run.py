@@ -48,6 +48,7 @@ def optimise(
         config.snapshots,
         config.seed,
         stage,
+        config.hold_ground,
     )
     return unroll(rule, scene, source, novel, Objective(config.loss, distance(config)), plan, progress)
 

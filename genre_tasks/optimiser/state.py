@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from genre_tasks.optimiser import fused_state
+from genre_tasks.optimiser.ground import along_ground, ground_planes
 from genre_tasks.optimiser.network_constants import DEVIATION_FLOOR
 from genre_tasks.optimiser.posing import Posing
 from genre_tasks.scene.gaussians import Gaussians
@@ -35,17 +36,18 @@ class Frame:
     """The fixed frame of an unrolled optimisation: the scene at its start, and the unit of each Gaussian's mean.
 
     ``unit`` [N, 1] metres: the median of the three initial scales (for a disc its radius), bounded. In these units
-    the distant shell and a lane marking share one rate.
+    the distant shell and a lane marking share one rate. ``planes`` [N, 11]: see ``ground.ground_planes``.
     """
 
     scene: SceneGraph
     unit: Tensor
     low: Tensor  # [N, 14] bounds of the packed attributes
     high: Tensor  # [N, 14]
+    planes: Tensor
 
     @staticmethod
-    def of(scene: SceneGraph) -> Frame:
-        """From the scene at the start."""
+    def of(scene: SceneGraph, hold_ground: bool = True) -> Frame:
+        """From the scene at the start; ``hold_ground``: steps keep what lies on the ground in its plane."""
         start = scene.gaussians.packed()
         unit = scene.gaussians.log_scales.median(1).values.exp().clamp(MIN_UNIT_M, MAX_UNIT_M)[:, None]
         low, high = torch.full_like(start, -torch.inf), torch.full_like(start, torch.inf)
@@ -56,7 +58,8 @@ class Frame:
         high[:, 3:6] = torch.minimum(high[:, 3:6], longest + math.log(GROWTH))
         low[:, 10], high[:, 10] = -LOGIT_BOUND, LOGIT_BOUND
         low[:, 11:14], high[:, 11:14] = COLOR_BOUNDS
-        return Frame(scene, unit, torch.minimum(low, start), torch.maximum(high, start))
+        planes = ground_planes(scene) if hold_ground else start.new_zeros((len(start), 11))
+        return Frame(scene, unit, torch.minimum(low, start), torch.maximum(high, start), planes)
 
     @cached_property
     def start(self) -> Tensor:
@@ -120,14 +123,17 @@ class State:
         return replace(self, first=first, second=second, seen=self.seen + now, seen_now=now)
 
     def moved(self, frame: Frame, delta: Tensor) -> State:
-        """With ``delta`` [N, 14] applied to what this iteration's views saw; the rest stays the same bytes.
+        """With ``delta`` [N, 14] applied to what this iteration's views saw, in the ground's plane where it lies there.
+
+        The rest stays the same bytes.
 
         A direction kept from earlier views would lead on and on what nothing corrects.
         """
-        start, low, high = frame.start, frame.low, frame.high
-        if fused_state.fits(self.offsets, delta, self.seen_now, start, low, high):
-            offsets = fused_state.moved(self.offsets, delta, self.seen_now, start, low, high)
+        fixed = frame.start, frame.low, frame.high, frame.planes
+        if fused_state.fits(self.offsets, delta, self.seen_now, *fixed):
+            offsets = fused_state.moved(self.offsets, delta, self.seen_now, *fixed)
             return replace(self, offsets=offsets, iteration=self.iteration + 1)
+        delta = along_ground(delta, frame.planes)
         offsets = torch.where(self.seen_now > 0, frame.bounded(self.offsets + delta), self.offsets)
         return replace(self, offsets=offsets, iteration=self.iteration + 1)
 

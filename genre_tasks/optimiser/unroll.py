@@ -25,7 +25,7 @@ from genre_tasks.scene.results import Reconstruction
 class Plan:
     """How far and how often to look: ``iterations`` T, views drawn in each, snapshots kept on the way, the seed.
 
-    ``stage`` names the run in errors.
+    ``stage`` names the run in errors; ``hold_ground``: see ``Frame.of``.
     """
 
     iterations: int
@@ -34,6 +34,7 @@ class Plan:
     snapshots: int = 0
     seed: int = 0
     stage: str = "optimiser"
+    hold_ground: bool = True
 
     def snapshot_iterations(self) -> frozenset[int]:
         """Evenly spaced, without 0 and T."""
@@ -58,7 +59,7 @@ def unroll(
     """
     generator = torch.Generator().manual_seed(plan.seed)
     samplers = [ViewSampler(source, plan.views, generator), ViewSampler(novel, plan.novel_views, generator)]
-    frame = Frame.of(scene)
+    frame = Frame.of(scene, plan.hold_ground)
     state = State.start(len(scene), scene.gaussians.means)
     step = rule.start(frame, camera_centre(source))
     keep = plan.snapshot_iterations()

@@ -80,14 +80,16 @@ def select(points: Points, which: NDArray) -> Points:
     return Points(points.positions[which], points.colors[which], points.colored[which], points.frames[which])
 
 
-def node_gaussians(points: Points, distance: NDArray, max_count: int, config: InitialConfig) -> Gaussians:
+def node_gaussians(
+    points: Points, distance: NDArray, max_count: int, config: InitialConfig, min_voxel_m: float = 0.0
+) -> Gaussians:
     """At most ``max_count`` discs on a node's points; voxels grow with ``distance`` [P] in octaves."""
     level = levels(distance)
-    size = voxel_size_for(points.positions, level, max_count)
+    size = max(voxel_size_for(points.positions, level, max_count), min_voxel_m)
     voxels = group(points.positions, level, size)
     means = voxels.mean(points.positions)
     spacing = neighbour_spacing(means, size)
-    fine = group(points.positions, level, NEIGHBOURHOOD * size).mean(points.positions)
+    fine = group(points.positions, level, max(NEIGHBOURHOOD * size, min_voxel_m)).mean(points.positions)
     rotation, spread = surface_frames(means, fine, config.neighbours)
     own = size * np.exp2(voxels.mean(level[:, None])[:, 0])
     plane = np.minimum(SPACING * spacing, MAX_SCALE_VOXELS * np.maximum(own, CELL_M))

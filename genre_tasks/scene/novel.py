@@ -1,23 +1,15 @@
-"""Viewpoints beside the path, their nearest reference images, and the coloured points of the LiDAR map."""
+"""Viewpoints beside the path, and their nearest reference images."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
-from genre_tasks.config import InitialConfig
 from genre_tasks.logs.types import Float64
-from genre_tasks.scene.chunk import Chunk, Points, View
-from genre_tasks.scene.gaussians import Gaussians
-from genre_tasks.scene.geometry import path_distance, shift_laterally
-from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.initialise import actor_cap, assembled, node_gaussians, select
+from genre_tasks.scene.chunk import Chunk, View
+from genre_tasks.scene.geometry import shift_laterally
 from genre_tasks.scene.views import NovelView
-
-LIDAR_OPACITY = 0.95
 
 
 def novel_view_poses(
@@ -57,22 +49,3 @@ def nearest_reference(camera: str, chunk_SE3_camera: Float64, sources: Sequence[
         return view.camera != camera, round(distance, 3), round(angle, 4), view.frame
 
     return min(sources, key=rank)
-
-
-def lidar_scene(chunk: Chunk, max_points: int) -> SceneGraph:
-    """The coloured LiDAR points as discs on the surfaces they lie on, nearly opaque: actors move, nothing is distant.
-
-    Discs, because the fixer looks images up by the map's depth: a ball as wide as its neighbours are far would stand
-    out of a road that is seen at a grazing angle. Points without colour are left out.
-    """
-    config, cap = InitialConfig(opacity=LIDAR_OPACITY), actor_cap(max_points, chunk)
-    nothing = Gaussians.unpacked(torch.zeros(0, 14))
-
-    def discs(points: Points, distance: NDArray[np.floating], count: int) -> Gaussians:
-        colored = points.colored
-        return node_gaussians(select(points, colored), distance[colored], count, config) if colored.any() else nothing
-
-    actors = [discs(a.points, np.zeros(len(a.points)), cap) for a in chunk.actors]
-    distance = path_distance(chunk.static.positions, chunk.chunk_SE3_ego)
-    static = discs(chunk.static, distance, max_points - sum(len(a) for a in actors))
-    return assembled(chunk, static, nothing, actors)

@@ -14,7 +14,8 @@ from genre_tasks.render import Render, RenderSettings, render_views
 from genre_tasks.render.surface import render_surfaces
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.novel import lidar_scene, novel_view_poses
+from genre_tasks.scene.lidar_map import lidar_scene
+from genre_tasks.scene.novel import novel_view_poses
 from genre_tasks.scene.results import Reconstruction
 from genre_tasks.scene.views import NovelView, NovelViews
 

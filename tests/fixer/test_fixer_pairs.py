@@ -12,7 +12,7 @@ from genre_tasks.fixer.conditioning import Degraded, recorded
 from genre_tasks.fixer.pairs import Pairs, joined, perturbed, render_pairs, sample
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.novel import lidar_scene
+from genre_tasks.scene.lidar_map import lidar_scene
 from tests.fixer.conftest import random_views
 
 NAMES = [f.name for f in fields(Degraded)]

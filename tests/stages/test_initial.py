@@ -18,7 +18,8 @@ from genre_tasks.scene.geometry import quat_to_matrix
 from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR, STATIC
 from genre_tasks.scene.images import decode_image
 from genre_tasks.scene.initialise import MAX_SCALE_M, surface_frames
-from genre_tasks.scene.novel import lidar_scene, nearest_reference, novel_view_poses
+from genre_tasks.scene.lidar_map import lidar_scene
+from genre_tasks.scene.novel import nearest_reference, novel_view_poses
 from genre_tasks.scene.results import Reconstruction
 from genre_tasks.stages.ingest import ingest
 from genre_tasks.stages.initial import initial
