@@ -7,8 +7,9 @@ takes the same steps as one that was never stopped.
 from __future__ import annotations
 
 import copy
+import hashlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -99,7 +100,7 @@ def train(
         on_checkpoint: called with the averaged network, the step and all losses at each checkpoint.
 
     Raises:
-        InputError: the checkpoint is of other settings, or the pairs are smaller than a crop.
+        InputError: the checkpoint is of other settings, pairs or weights, or the pairs are smaller than a crop.
         NonFiniteError: a loss is not finite.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -120,8 +121,8 @@ def train(
         fnet = copy.deepcopy(start).train()
         if fnet.architecture.residual:
             fnet.requires_grad_(True)
-    state = _fixer_state(fnet, settings)
-    _restore(state, folder / "fixer.pt", settings)
+    state, origin = _fixer_state(fnet, settings), {"pairs": pairs.digest(), "start": _digest(fnet)}
+    _restore(state, folder / "fixer.pt", settings, origin)
     report = _Reporter(progress, first, total, state.step)
     while state.step < settings.steps:
         views, truth = sample(pairs, state.generator, settings.batch, settings.crop, settings.clean_share)
@@ -139,7 +140,7 @@ def train(
                 state.average[name].lerp_(parameter, 1 - decay)
         report(state)
         if state.step % settings.checkpoint_every == 0 or state.step == settings.steps:
-            _save(state, folder / "fixer.pt", settings)
+            _save(state, folder / "fixer.pt", settings, origin)
             if on_checkpoint is not None:
                 on_checkpoint(averaged(state), state.step, state.losses)
     return averaged(state)
@@ -255,9 +256,18 @@ class _Reporter:
         self.progress(done, self.total, f"loss {sum(recent) / len(recent):.4f}, {left / 60:.1f} min left")
 
 
-def _save(state: TrainingState, path: Path, settings: TrainingSettings) -> None:
+def _digest(fnet: Fnet) -> str:
+    """Of a network's inputs and of all its weights."""
+    found = hashlib.sha256("+".join(fnet.architecture.inputs).encode())
+    for name, value in sorted(fnet.state_dict().items()):
+        found.update(name.encode() + value.detach().contiguous().numpy().tobytes())
+    return found.hexdigest()
+
+
+def _save(state: TrainingState, path: Path, settings: TrainingSettings, origin: Mapping[str, str]) -> None:
     document = {
         "settings": _plain(settings),
+        "origin": dict(origin),
         "weights": {name: value.detach() for name, value in trainable_state(state.fnet).items()},
         "average": state.average,
         "optimiser": state.optimiser.state_dict(),
@@ -268,11 +278,17 @@ def _save(state: TrainingState, path: Path, settings: TrainingSettings) -> None:
     _write(document, path)
 
 
-def _restore(state: TrainingState, path: Path, settings: TrainingSettings) -> None:
+def _restore(state: TrainingState, path: Path, settings: TrainingSettings, origin: Mapping[str, str]) -> None:
     if not path.exists():
         return
     stored = torch.load(path, weights_only=True)
     _require_same(stored["settings"], settings, path, tuple(_plain(settings)))
+    if other := [name for name, value in origin.items() if stored.get("origin", {}).get(name) != value]:
+        raise InputError(
+            f"the checkpoint was trained with other {' and '.join(other)}",
+            remedy="Delete it, or train into another folder.",
+            file=path,
+        )
     state.fnet.load_state_dict(stored["weights"], strict=False)
     state.average = stored["average"]
     state.optimiser.load_state_dict(stored["optimiser"])

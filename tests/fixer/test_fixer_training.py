@@ -79,6 +79,20 @@ def test_other_settings_are_refused(tmp_path):
         train(some_pairs(), replace(SETTINGS, kl=1.0), tmp_path, distance, architecture=TOY)
 
 
+def test_a_training_on_other_pairs_or_from_other_weights_is_not_taken_for_this_one(tmp_path):
+    first = train(some_pairs(), SETTINGS, tmp_path / "first", distance, architecture=TOY)
+    train(some_pairs(), SETTINGS, tmp_path / "first", distance, architecture=TOY)  # finished: the same
+    pairs = some_pairs()
+    other = replace(pairs, truth=255 - pairs.truth)
+    with pytest.raises(InputError, match=r"other pairs \(file .*fixer\.pt"):
+        train(other, SETTINGS, tmp_path / "first", distance, architecture=TOY)
+    further = replace(SETTINGS, steps=1)
+    train(pairs, further, tmp_path / "further", distance, start=first)
+    again = train(pairs, replace(further, seed=5), tmp_path / "again", distance, start=first)
+    with pytest.raises(InputError, match=r"other start \(file .*fixer\.pt"):
+        train(pairs, further, tmp_path / "further", distance, start=again)
+
+
 def test_pairs_smaller_than_a_crop_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"the pairs are 64 × 48 pixels, crops of 96 × 32"):
         train(some_pairs(), replace(SETTINGS, crop=(32, 96)), tmp_path, distance, architecture=TOY)
