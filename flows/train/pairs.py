@@ -48,7 +48,8 @@ class PairSet:
     or a camera left out (``camera``).
 
     ``keep_every``: of the source frames every n-th is kept. ``young``: the scene is what GNet has after a sixth or a
-    third of its iterations. ``perturbed``: strengths between which one is drawn.
+    third of its iterations. ``loose``: its ground is not held, as in scenes by other methods. ``perturbed``: strengths
+    between which one is drawn.
     """
 
     kind: str
@@ -57,6 +58,7 @@ class PairSet:
     real: int = 0
     keep_every: int = 1
     young: bool = False
+    loose: bool = False
     perturbed: tuple[float, float] | None = None
 
 
@@ -71,6 +73,7 @@ class PairRecipe:
         PairSet("sparse", 6, "unseen", real=30, keep_every=2),
         PairSet("cross-camera", 3, "camera"),
         PairSet("perturbed", 5, "beside", perturbed=(0.3, 1.0)),
+        PairSet("loose ground", 10, "beside", loose=True),
     )
     iterations: int = 72
     views: int = 3
@@ -143,11 +146,11 @@ class _Scenes:
         from genre_tasks.fixer.pairs import perturbed
         from genre_tasks.stages.gnet import gnet
 
-        key = tuple((v.camera, v.frame) for v in seen.of_role("source"))
+        key = (wanted.loose, *((v.camera, v.frame) for v in seen.of_role("source")))
         if key not in self._made:
             config = GnetConfig(
                 iterations=self._recipe.iterations, views_per_iteration=self._recipe.views,
-                loss=LossConfig(perceptual=0.0), snapshots=6,
+                loss=LossConfig(perceptual=0.0), snapshots=6, hold_ground=not wanted.loose,
             )  # fmt: skip
             self._made[key] = gnet(config, seen, self._start)
         made = self._made[key]

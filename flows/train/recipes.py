@@ -105,13 +105,6 @@ GNET_STAGES = (
             views=(6, 15, 15, 30),
         ),
     ),
-    Stage(
-        "gnet/ground", "gnet/dense", GNET_NETWORK, DENSE,
-        _gnet(
-            steps=420, rate=3e-4, seed=42, judged=4.0, judges=6, sample=0.2, iterations=(24, 48, 72, 72),
-            views=(6, 15, 15, 30),
-        ),
-    ),
 )  # fmt: skip
 """GNet from nothing."""
 
