@@ -149,9 +149,19 @@ ENET_STAGES = (
         ),
         _long("gnet/many"), Images("fnet"),
     ),
+    Stage(
+        "enet/held", "enet/strides", GNET_NETWORK, replace(DENSE, count=19, real=2),
+        _enet(
+            steps=300, rate=2.5e-4, seed=81, judged=3.0, judges=6, sample=0.25, views=(4, 6), novel_views=8,
+            iterations=(8, 12, 12, 16, 24),
+            loss=LossConfig(perceptual=0.1, perceptual_every=1),
+            judge_loss=LossConfig(perceptual=1.0, perceptual_every=1, depth=0.0),
+        ),
+        _long("gnet/dense"), Images("fnet"),
+    ),
 )  # fmt: skip
 """ENet from GNet's weights after their coarse stage: at 160×90 with stand-ins for FNet's images, then with those; last
-at GNet's rates, twice as far a step."""
+at GNet's rates, twice as far a step, and there once more on scenes whose ground was held."""
 
 AGED: tuple[Begin, ...] = (PerScene(120, 960), Adam(24), PerScene(480, 960), Adam(48), PerScene(960, 960), Adam(96))
 

@@ -40,8 +40,8 @@ def test_the_shipped_weights_are_described() -> None:
     gnet = ByGnet("gnet/fine")
     assert begins[:6] == [gnet, gnet, Adam(24), gnet, gnet, Adam(48)]
     names = [stage.name for stage in ordered(table_of("shipped"), "enet")]
-    gnet = ["gnet/coarse", "gnet/fine", "gnet/finer", "gnet/unseen", "gnet/many"]
-    assert names == [*gnet, "enet/coarse", "enet/fine", "enet/dense", "enet/strides"]
+    gnet = ["gnet/coarse", "gnet/fine", "gnet/finer", "gnet/unseen", "gnet/many", "gnet/dense"]
+    assert names == [*gnet, "enet/coarse", "enet/fine", "enet/dense", "enet/strides", "enet/held"]
 
 
 def test_the_paper_begins_with_enet() -> None:
