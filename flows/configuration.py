@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from genre_tasks.config import PipelineConfig
+from genre_tasks.config import EffectsConfig, PipelineConfig
 from genre_tasks.errors import ConfigError
 
 PRESETS = ("demo", "small", "long", "paper")
@@ -24,9 +24,9 @@ def load_configuration(preset: str, file: Path | None = None, settings: Sequence
     """
     values = preset_values(preset)
     if file is not None:
-        values = _merged(values, _read_yaml(file))
+        values = _merged(values, _spelled_out(_read_yaml(file)))
     for setting in settings:
-        values = _merged(values, _parse_setting(setting))
+        values = _merged(values, _spelled_out(_parse_setting(setting)))
     return validated(values, source=str(file or f"preset {preset}"))
 
 
@@ -95,6 +95,13 @@ def _parse_setting(setting: str) -> dict[str, Any]:
     for part in reversed(key.strip().split(".")):
         value = {part: value}
     return value
+
+
+def _spelled_out(change: Mapping[str, Any]) -> Mapping[str, Any]:
+    """``effects`` given as one word (YAML's true and false are on and off) becomes that word for each effect."""
+    word = change.get("effects")
+    word = {True: "on", False: "off", "none": "off"}.get(word, word) if isinstance(word, str | bool) else None
+    return change if word is None else {**change, "effects": dict.fromkeys(EffectsConfig.model_fields, word)}
 
 
 def _merged(base: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:

@@ -6,9 +6,9 @@ change and why.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 
 class Section(BaseModel):
@@ -157,6 +157,35 @@ class EvaluateConfig(Section):
     pictures: int = Field(3, ge=0, description="Pictures kept for the report.")
 
 
+def _word(value: object) -> object:
+    """YAML reads on and off as true and false."""
+    return {True: "on", False: "off"}[value] if isinstance(value, bool) else value
+
+
+EffectSetting = Annotated[Literal["auto", "on", "off"], BeforeValidator(_word)]
+
+
+class EffectsConfig(Section):
+    """Parts of the forward model that a scene may or may not need: on, off, or as its plan decides.
+
+    ``effects=none`` (or ``auto``, ``on``, ``off``) sets them all.
+    """
+
+    rigid_actors: EffectSetting = "auto"
+    nonrigid_actors: EffectSetting = "auto"
+    distant_region: EffectSetting = "auto"
+    rolling_shutter: EffectSetting = "auto"
+    lens_distortion: EffectSetting = "auto"
+    exposure: EffectSetting = "auto"
+    motion_blur: EffectSetting = "auto"
+    view_dependent_colour: EffectSetting = "auto"
+    lidar_depth: EffectSetting = "auto"
+    anti_aliasing: EffectSetting = "auto"
+    ego_mask: EffectSetting = "auto"
+    fixer_per_view: EffectSetting = "auto"
+    darkness: EffectSetting = "auto"
+
+
 class PipelineConfig(Section):
     """The whole configuration: one section per stage."""
 
@@ -167,3 +196,4 @@ class PipelineConfig(Section):
     fnet: FnetConfig = FnetConfig()
     enet: OptimiserConfig = OptimiserConfig(iterations=12, novel_views_per_iteration=6)
     evaluate: EvaluateConfig = EvaluateConfig()
+    effects: EffectsConfig = EffectsConfig()

@@ -53,11 +53,15 @@ class Lens:
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera of the rig: its name, its lens at native resolution, and the rolling shutter's readout (0 = global)."""
+    """A camera of the rig: its name and its lens at native resolution.
+
+    ``readout_s``: the rolling shutter's readout (0: global); ``exposure_s``: of an image (0: not stated).
+    """
 
     name: str
     lens: Lens
     readout_s: float = 0.0
+    exposure_s: float = 0.0
 
 
 @dataclass(frozen=True)

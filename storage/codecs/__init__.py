@@ -20,6 +20,7 @@ KINDS: dict[str, str] = {
     "fixed_views": "storage.codecs.fixed_views",
     "pairs": "storage.codecs.pairs",
     "evaluation": "storage.codecs.evaluation",
+    "effects": "storage.codecs.effects",
 }
 """Kind of artifact → module of its codec. A new kind is one file and one line."""
 

@@ -1,0 +1,65 @@
+"""The plan of a chunk's effects: what each measures, the threshold, the decision, and why."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from importlib import import_module
+
+from genre_tasks.config import EffectsConfig
+from genre_tasks.effects.seen import Seen
+from genre_tasks.effects.types import Choice, Decision, Effect, EffectsPlan, Measured
+from genre_tasks.errors import ConfigError
+from genre_tasks.logs.types import Camera
+from genre_tasks.progress import Progress, silent
+from genre_tasks.scene.chunk import Chunk
+
+EFFECTS = tuple(EffectsConfig.model_fields)
+"""Names, in the order of a plan: that of the configuration. Each is a module of this package with an ``EFFECT``."""
+
+
+def effect_of(name: str) -> Effect:
+    """The effect; its module is imported when it is asked for."""
+    found: Effect = import_module(f"genre_tasks.effects.{name}").EFFECT
+    return found
+
+
+def plan(config: EffectsConfig, chunk: Chunk, cameras: Sequence[Camera], progress: Progress = silent) -> EffectsPlan:
+    """Asks each effect that is not set off. Raises ``ConfigError`` for one set on that the log makes impossible."""
+    seen, rows = Seen(chunk, cameras), []
+    for k, name in enumerate(EFFECTS):
+        progress(k, len(EFFECTS), name)
+        rows.append(_decided(name, getattr(config, name), seen))
+    return EffectsPlan(tuple(rows))
+
+
+def _decided(name: str, setting: str, seen: Seen) -> Decision:
+    if setting == "off":
+        return Decision(name, "", math.nan, "", math.nan, "off", "off", "set off: not measured", "")
+    effect = effect_of(name)
+    missing = effect.needs(seen)
+    if setting == "on" and missing is not None:
+        raise ConfigError(
+            f"the effect {name} is set on, and {missing}",
+            remedy=f"Set effects.{name} to auto or off, or give the log what it lacks.",
+            log=seen.chunk.log,
+            chunk=seen.chunk.index,
+        )
+    found = Measured(None, missing) if missing is not None else effect.measure(seen)
+    choice, reason = _choice(effect, found, setting)
+    value = math.nan if found.value is None else found.value
+    return Decision(
+        name, effect.property, value, effect.unit, effect.threshold, "on" if setting == "on" else "auto", choice,
+        reason, effect.cost,
+    )  # fmt: skip
+
+
+def _choice(effect: Effect, found: Measured, setting: str) -> tuple[Choice, str]:
+    if setting == "on":
+        return "on", f"set on; {found.said}"
+    if found.value is None:
+        return "off", found.said
+    if found.value <= effect.threshold:
+        return "off", f"{found.value:.3g} is not above {effect.threshold:g} {effect.unit}: {found.said}"
+    called: Choice = "mark" if effect.marks else "on"
+    return called, f"{found.value:.3g} is above {effect.threshold:g} {effect.unit}: {found.said}"

@@ -1,0 +1,31 @@
+"""View-dependent colour: the same point differs in colour from place to place, gain apart."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from genre_tasks.effects.seen import Seen
+from genre_tasks.effects.types import Effect, Measured
+
+MIN_VIEWS = 3
+
+
+def measure(seen: Seen) -> Measured:
+    """The median spread of a point's log colour over its views, after the exposure fit, per its spread within pixels.
+
+    A point's neighbourhood tells what noise and a wrong pixel would make of it: below 1 nothing is left to explain.
+    """
+    left = seen.unexplained
+    often = np.isfinite(left).all(2).sum(0) >= MIN_VIEWS
+    if not often.any():
+        return Measured(None, f"no point is seen by {MIN_VIEWS} images")
+    spread = np.nanstd(left[:, often], 0).mean(1)
+    noise = np.nanmean(seen.colours.texture[:, often], 0)
+    ratio = float(np.median(spread) / max(float(np.median(noise)), 1e-6))
+    return Measured(ratio, f"{int(often.sum())} points in {MIN_VIEWS} or more images")
+
+
+EFFECT = Effect(
+    "view_dependent_colour", "spread of a point's colour per its texture's", "ratio", 1.0,
+    "spherical harmonics: 3.4 × the memory at degree 3", measure,
+)  # fmt: skip

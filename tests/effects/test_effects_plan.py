@@ -1,0 +1,213 @@
+"""The plan: gates flip at their thresholds, what is off is not imported, what is impossible is refused."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from genre_tasks.config import EffectsConfig, IngestConfig
+from genre_tasks.effects.plan import EFFECTS, effect_of, plan
+from genre_tasks.effects.seen import Seen
+from genre_tasks.effects.types import EffectsPlan
+from genre_tasks.errors import ConfigError
+from genre_tasks.logs.registry import open_log
+from genre_tasks.logs.types import Camera
+from genre_tasks.scene.chunk import Chunk
+from genre_tasks.stages.ingest import ingest
+from storage.codecs import effects as codec
+
+STREET = "synthetic:street?seed=1020&frames=8&cameras=2&width=160&height=90&samples=1"
+
+
+@cache
+def chunk(uri: str = STREET) -> Chunk:
+    return ingest(IngestConfig(width_px=160, height_px=90), open_log(uri), 0)
+
+
+@cache
+def cameras(uri: str = STREET) -> tuple[Camera, ...]:
+    return open_log(uri).cameras
+
+
+def only(*names: str, setting: str = "auto") -> EffectsConfig:
+    return EffectsConfig(**{n: setting if n in names else "off" for n in EFFECTS})
+
+
+def planned(name: str, of: Chunk | None = None, rig: tuple[Camera, ...] | None = None) -> EffectsPlan:
+    return plan(only(name), of or chunk(), rig or cameras())
+
+
+def test_every_effect_is_asked_and_says_why() -> None:
+    found = plan(EffectsConfig(), chunk(), cameras())
+    assert tuple(d.name for d in found.decisions) == EFFECTS
+    for d in found.decisions:
+        assert d.reason and d.cost and d.property and d.setting == "auto"
+        called = d.value > d.threshold  # False for NaN
+        assert (d.choice == "off") == (not called)
+    on = {d.name for d in found.decisions if d.choice == "on"}
+    assert {"rigid_actors", "distant_region", "lidar_depth"} <= on
+    assert not on & {"rolling_shutter", "lens_distortion", "motion_blur", "ego_mask", "darkness"}
+
+
+def test_what_is_off_is_not_measured_nor_imported() -> None:
+    code = (
+        "import sys\n"
+        "from genre_tasks.effects.plan import EFFECTS, plan\n"
+        "from genre_tasks.config import EffectsConfig\n"
+        "from tests.effects.test_effects_plan import STREET, chunk, cameras\n"
+        "found = plan(EffectsConfig(**dict.fromkeys(EFFECTS, 'off')), chunk(), cameras())\n"
+        "assert all(d.choice == 'off' for d in found.decisions)\n"
+        "loaded = [n for n in EFFECTS if f'genre_tasks.effects.{n}' in sys.modules]\n"
+        "assert not loaded, loaded\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def test_set_on_needs_no_measure_to_be_chosen_and_what_the_log_lacks_is_refused() -> None:
+    assert plan(only("exposure", setting="on"), chunk(), cameras())["exposure"].choice == "on"
+    with pytest.raises(ConfigError, match=r"is set on, and the log states no readout time.*auto or off"):
+        plan(only("rolling_shutter", setting="on"), chunk(), cameras())
+    with pytest.raises(ConfigError, match="no exposure time"):
+        plan(only("motion_blur", setting="on"), chunk(), cameras())
+
+
+@pytest.mark.parametrize(("name", "field"), [("rolling_shutter", "readout_s"), ("motion_blur", "exposure_s")])
+def test_shutter_gates_flip_at_their_threshold(name: str, field: str) -> None:
+    limit = effect_of(name).threshold
+    at_a_second = planned(name, rig=tuple(replace(c, **{field: 1.0}) for c in cameras()))[name].value
+    assert at_a_second > limit
+    for factor, choice in ((0.98, "off"), (1.02, "on")):
+        rig = tuple(replace(c, **{field: factor * limit / at_a_second}) for c in cameras())
+        assert planned(name, rig=rig)[name].choice == choice
+
+
+def test_a_standing_camera_has_no_shutter_displacement() -> None:
+    still = chunk(STREET + "&standstill=1")
+    rig = tuple(replace(c, readout_s=0.03) for c in cameras())
+    assert planned("rolling_shutter", still, rig)["rolling_shutter"].value == pytest.approx(0, abs=0.05)
+
+
+def test_displacement_grows_with_speed_over_depth() -> None:
+    rig = tuple(replace(c, readout_s=0.03) for c in cameras())
+    side = planned("rolling_shutter", rig=rig)["rolling_shutter"]
+    ego = chunk().chunk_SE3_ego
+    speed = float(np.linalg.norm(ego[1, :3, 3] - ego[0, :3, 3]) / 0.1)
+    assert 0 < side.value < 0.03 * speed * 400 / 1.0  # f = 400 px at most, nothing nearer than a metre
+
+
+def test_distortion_gate_flips_with_the_coefficient() -> None:
+    def bent(k1: float) -> Chunk:
+        views = [replace(v, lens=replace(v.lens, distortion=(k1, 0.0, 0.0, 0.0, 0.0))) for v in chunk().views]
+        return replace(chunk(), views=tuple(views))
+
+    per_unit = planned("lens_distortion", bent(1.0))["lens_distortion"].value
+    for factor, choice in ((0.98, "off"), (1.02, "on")):
+        assert planned("lens_distortion", bent(factor * 0.5 / per_unit))["lens_distortion"].choice == choice
+
+
+def _brightened(image: np.ndarray, gain: float) -> np.ndarray:
+    return (255 * (np.clip((image / 255.0) ** 2.2 * gain, 0, 1)) ** (1 / 2.2)).round().astype(np.uint8)
+
+
+def test_exposure_reads_the_gains_that_images_were_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = Seen(chunk(), cameras()).gains
+    given = np.random.default_rng(0).normal(0, 0.25, len(plain))
+    each = iter(given)
+    decoded = Seen.decoded
+    monkeypatch.setattr(Seen, "decoded", lambda self, view: _brightened(decoded(self, view), math.exp(next(each))))
+    found = Seen(chunk(), cameras()).gains
+    np.testing.assert_allclose(found - plain, np.repeat((given - given.mean())[:, None], 3, 1), atol=0.06)
+
+
+def test_exposure_is_called_for_where_gains_vary_and_not_on_a_plain_street(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert planned("exposure")["exposure"].choice == "off"
+    decoded, count = Seen.decoded, [0]
+
+    def alternating(self: Seen, view: object) -> np.ndarray:
+        count[0] += 1
+        return _brightened(decoded(self, view), 1.2 if count[0] % 2 else 0.8)
+
+    monkeypatch.setattr(Seen, "decoded", alternating)
+    assert planned("exposure")["exposure"].choice == "on"
+
+
+def test_actors_gate_flips_at_half_a_metre() -> None:
+    first = chunk().actors[0]
+
+    def moving(way_m: float) -> Chunk:
+        poses = np.repeat(first.chunk_SE3_box[:1], 2, 0).copy()
+        poses[1, 0, 3] += way_m
+        return replace(chunk(), actors=(replace(first, frames=first.frames[:2], chunk_SE3_box=poses),))
+
+    assert planned("rigid_actors", moving(0.49))["rigid_actors"].choice == "off"
+    assert planned("rigid_actors", moving(0.51))["rigid_actors"].choice == "on"
+    assert planned("rigid_actors", replace(chunk(), actors=()))["rigid_actors"].value == 0
+
+
+def test_pedestrians_count_by_their_area() -> None:
+    actor, view = chunk().actors[0], chunk().of_role("source")[0]
+    ahead = view.chunk_SE3_camera @ np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 10.0], [0, 0, 0, 1]])
+    at = np.array([view.frame])
+
+    def sized(side_m: float, label: str) -> Chunk:
+        own = replace(actor, label=label, frames=at, chunk_SE3_box=ahead[None], size_m=(side_m, side_m, 0.01))
+        return replace(chunk(), actors=(own,), views=(view,))
+
+    area = view.lens.width_px * view.lens.height_px
+    per_m2 = view.lens.fx_px * view.lens.fy_px / 100 / area * 100  # percent
+    limit = (0.5 / per_m2) ** 0.5
+    assert planned("nonrigid_actors", sized(0.97 * limit, "Pedestrian"))["nonrigid_actors"].choice == "off"
+    assert planned("nonrigid_actors", sized(1.03 * limit, "Pedestrian"))["nonrigid_actors"].choice == "on"
+    assert planned("nonrigid_actors", sized(3 * limit, "Car"))["nonrigid_actors"].choice == "off"
+
+
+def test_without_lidar_the_depth_term_is_off_and_all_is_distant() -> None:
+    points = chunk().static
+    none = replace(points, **{n: getattr(points, n)[:0] for n in ("positions", "colors", "colored", "frames")})
+    empty = replace(chunk(), static=none, actors=())
+    found = plan(
+        only("lidar_depth", "distant_region", "exposure", "anti_aliasing", "rolling_shutter"), empty, cameras()
+    )
+    assert found["lidar_depth"].choice == "off" and found["lidar_depth"].value == 0
+    assert found["distant_region"].value == pytest.approx(100)
+    assert found["exposure"].choice == "off" and math.isnan(found["exposure"].value)
+
+
+def test_the_bonnet_is_found_and_a_vehicle_that_stands_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert planned("ego_mask")["ego_mask"].choice == "off"
+    decoded = Seen.decoded
+
+    def with_bonnet(rows: int):
+        def seen(self: Seen, view: object) -> np.ndarray:
+            image = decoded(self, view).copy()
+            image[len(image) - rows :, 40:120] = 30
+            return image
+
+        return seen
+
+    for rows, choice in ((0, "off"), (2, "on")):  # 80 of 160 pixels of 2 of 90 rows are 1.1 %
+        monkeypatch.setattr(Seen, "decoded", with_bonnet(rows))
+        assert planned("ego_mask")["ego_mask"].choice == choice
+    still = planned("ego_mask", chunk(STREET + "&standstill=1"))["ego_mask"]
+    assert still.choice == "off" and "stands still" in still.reason
+
+
+def test_dark_images_are_marked(monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded = Seen.decoded
+    monkeypatch.setattr(Seen, "decoded", lambda self, view: decoded(self, view) // 8)
+    assert planned("darkness")["darkness"].choice == "mark"
+
+
+def test_a_plan_is_the_same_twice_and_comes_back_from_its_file(tmp_path) -> None:
+    found = plan(EffectsConfig(), chunk(), cameras())
+    again = plan(EffectsConfig(), chunk(), cameras())
+    assert repr(found) == repr(again)
+    codec.write(tmp_path, found)
+    assert repr(codec.read(tmp_path)) == repr(found)

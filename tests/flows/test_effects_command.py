@@ -1,0 +1,42 @@
+"""``genre effects``: a table, a Parquet file and a picture; words in the configuration."""
+
+from __future__ import annotations
+
+import pyarrow.parquet as pq
+import pytest
+from typer.testing import CliRunner
+
+from flows.cli.main import app
+from flows.configuration import load_configuration
+from genre_tasks.config import EffectsConfig
+from genre_tasks.errors import ConfigError
+
+STREET = "synthetic:street?seed=1020&frames=8&cameras=1&width=96&height=54&samples=1"
+SMALL = ["--set", "ingest.width_px=96", "--set", "ingest.height_px=54"]
+
+
+def test_the_command_says_why_and_writes_what_anyone_can_open(tmp_path) -> None:
+    told = [STREET, *SMALL, "--store", str(tmp_path / "store"), "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, ["effects", *told, "--set", "effects.darkness=off"], terminal_width=200)
+    assert done.exit_code == 0, done.output
+    assert "rolling_shutter" in done.output and "96×54" in done.output
+    table = pq.read_table(tmp_path / "out" / "effects.parquet").to_pydict()
+    assert table["name"] == list(EffectsConfig.model_fields)
+    assert table["choice"][table["name"].index("darkness")] == "off"
+    assert (tmp_path / "out" / "effects.png").read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.parametrize(
+    ("setting", "word"),
+    [("effects=none", "off"), ("effects=off", "off"), ("effects=on", "on"), ("effects=auto", "auto")],
+)
+def test_one_word_sets_all_effects(setting: str, word: str) -> None:
+    found = load_configuration("small", settings=[setting, "effects.exposure=auto"]).effects
+    assert found.exposure == "auto" and found.rigid_actors == word
+
+
+def test_other_words_and_names_are_refused() -> None:
+    with pytest.raises(ConfigError, match="rigid_actors"):
+        load_configuration("small", settings=["effects=sometimes"])
+    with pytest.raises(ConfigError, match=r"no configuration key 'effects.rolling_shuter'.*rolling_shutter"):
+        load_configuration("small", settings=["effects.rolling_shuter=on"])
