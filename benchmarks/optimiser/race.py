@@ -70,7 +70,7 @@ def walk(
     rule, objective = make()
     generator = torch.Generator().manual_seed(plan.seed)
     samplers = ViewSampler(task.source, plan.views, generator), ViewSampler(novel, plan.novel_views, generator)
-    frame, state = Frame.of(task.scene), State.start(len(task.scene), task.scene.gaussians.means)
+    frame, state = Frame.of(task.scene, plan.hold_ground), State.start(len(task.scene), task.scene.gaussians.means)
     step = rule.start(frame, camera_centre(task.source))
     seconds, renders = time.perf_counter() - began, 0
     for i in itertools.count():
@@ -88,7 +88,7 @@ def walk(
 
 def configured(task: Task, config: GnetConfig, seed: int) -> Iterator[Moment]:
     """The stage's own rule, loss, views and T, without its perceptual term: the preset has none."""
-    plan = Plan(config.iterations, config.views_per_iteration, seed=seed)
+    plan = Plan(config.iterations, config.views_per_iteration, seed=seed, hold_ground=config.hold_ground)
     return walk(lambda: (step_rule("gnet", config), Objective(config.loss)), task, plan)
 
 

@@ -23,8 +23,9 @@ class BenchEntry:
 
 
 _BENCHES: dict[str, BenchEntry] = {
-    "facades": BenchEntry("benchmarks.facades:BENCH", "what completing façades above the LiDAR's view brings"),
+    "facades": BenchEntry("benchmarks.with_without:FACADES", "what completing façades above the LiDAR's view brings"),
     "fixer": BenchEntry("benchmarks.fixer:BENCH", "what FNet brings beside the path, and what it costs"),
+    "ground": BenchEntry("benchmarks.with_without:GROUND", "what holding the ground in its plane brings"),
     "main_job": BenchEntry("benchmarks.main_job:BENCH", "the pipeline on claim seeds and a real chunk"),
     "optimiser": BenchEntry(
         "benchmarks.optimiser:BENCH", "GNet's seconds and renders beside per-scene 3DGS and tuned Adam"

@@ -1,7 +1,8 @@
-"""What completing façades above the LiDAR's view brings: the initial scene and GNet's with it and without.
+"""What one setting brings: the initial scene and GNet's with it and without.
 
 genre bench facades --json docs/benchmarks/facades.json [--set seeds=1001] [--set pandaset=]
-python -m benchmarks.facades LOG STORE PICTURE.png    # GNet's scene at ±3 m: without, with, and the truth
+genre bench ground --json docs/benchmarks/ground.json
+python -m benchmarks.with_without ground LOG STORE PICTURE.png    # GNet's scene at ±3 m: without, with, and the truth
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import itertools
 import sys
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -24,38 +26,48 @@ from benchmarks.optimiser.task import Task, task_of
 from benchmarks.schema import Claim
 from flows.configuration import load_configuration
 from flows.pipeline import BY_NAME, weights_digest, weights_file
+from genre_tasks.config import GnetConfig
 
-KINDS = {"without": "ingest.walls=false", "with": "ingest.walls=true"}
+KINDS = {"without": "false", "with": "true"}
 CELL_S = 90.0
 """Predicted; most of it ray-casts a street's images."""
 
 
-def measure(log: str, chunk: int, store: str) -> Row:
+def measure(setting: str, log: str, chunk: int, store: str) -> Row:
     """PSNR in dB on held-out frames and at 3 m, of the initial scene and of GNet's, and GNet's seconds."""
-    gnet = load_configuration("small").gnet
     out: Row = {"log": log, "chunk": chunk}
     with threads():
-        for kind, setting in KINDS.items():
-            task = task_of(log, chunk, store, setting)
+        for kind, value in KINDS.items():
+            task, gnet = _posed(setting, value, log, chunk, store)
             end = race.learned(task, gnet, gnet.seed)[-1]
             out[kind] = {"initial": _psnr(task), "gnet": [end.psnr, end.beside], "gnet_s": end.seconds}
     return out
+
+
+def _posed(setting: str, value: str, log: str, chunk: int, store: str) -> tuple[Task, GnetConfig]:
+    told = f"{setting}={value}"
+    return task_of(log, chunk, store, told), load_configuration("small", settings=[told]).gnet
 
 
 def _psnr(task: Task) -> list[float | None]:
     return [task.psnr(task.scene), task.psnr_beside(task.scene)]
 
 
-class Facades:
-    """A cell for each log."""
+@dataclass
+class WithWithout:
+    """A cell for each log. ``setting``: a switch of the configuration; ``subject``: what it is called in tables."""
 
-    name = "facades"
-    options: Mapping[str, str] = {
-        "seeds": "1001,1002,1003", "store": "genre-store", "pandaset": "../shared/data/pandaset/002",
-    }  # fmt: skip
+    name: str
+    setting: str
+    subject: str
+    options: Mapping[str, str] = field(
+        default_factory=lambda: {
+            "seeds": "1001,1002,1003", "store": "genre-store", "pandaset": "../shared/data/pandaset/002",
+        }
+    )  # fmt: skip
     code: tuple[str, ...] = (
-        "benchmarks.facades", "genre_tasks.optimiser.run", "genre_tasks.stages.ingest", "genre_tasks.stages.initial",
-        "genre_tasks.logs.pandaset", "genre_tasks.logs.synthetic",
+        "benchmarks.with_without", "genre_tasks.optimiser.run", "genre_tasks.stages.ingest",
+        "genre_tasks.stages.initial", "genre_tasks.logs.pandaset", "genre_tasks.logs.synthetic",
     )  # fmt: skip
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
@@ -66,8 +78,11 @@ class Facades:
             "configuration": small.model_dump(mode="json"),
             "weights": weights_digest(weights_file(BY_NAME["gnet"], small)),
         }
+        run = partial(measure, self.setting)
         return [
-            Cell(f"{log} chunk {chunk}", CELL_S, partial(measure, log, chunk, options["store"]), parameters)
+            Cell(
+                f"{log} chunk {chunk}", CELL_S, partial(measure, self.setting, log, chunk, options["store"]), parameters
+            )
             for log, chunk in (logs[:1] if quick else logs)
         ]
 
@@ -79,12 +94,12 @@ class Facades:
         sets = (("street_heldout_db", streets, 0), ("street_3m_db", streets, 1), ("real_heldout_db", reals, 0))
         for name, of, k in sets:
             gains = [row["with"]["gnet"][k] - row["without"]["gnet"][k] for row in of]
-            data = f"GNet's PSNR with façades completed less without; {', '.join(map(place, of)) or 'not measured'}"
+            data = f"GNet's PSNR, {self.subject} less without; {', '.join(map(place, of)) or 'not measured'}"
             yield over_cells(name, gains, ">", 0.0, "dB", data, bench=self.name)
 
     def table(self, rows: Mapping[str, Row]) -> Iterator[str]:
         """A line for each log and kind."""
-        yield "| log | façades | initial: held out | at 3 m | GNet: held out | at 3 m | GNet, s |"
+        yield f"| log | {self.subject} | initial: held out | at 3 m | GNet: held out | at 3 m | GNet, s |"
         yield "|---|---|---|---|---|---|---|"
         for row in (r for r in rows.values() if "not_measured" not in r):
             for kind in KINDS:
@@ -95,11 +110,11 @@ class Facades:
             yield f"\n{name}: not measured: {rows[name]['not_measured']}"
 
 
-def picture(log: str, store: str, path: Path) -> None:
+def picture(setting: str, log: str, store: str, path: Path) -> None:
     """A row for each of three views beside the path of a synthetic log's chunk 0: without, with, and the truth."""
-    gnet, columns = load_configuration("small").gnet, []
-    for setting in KINDS.values():
-        task = task_of(log, 0, store, setting)
+    columns = []
+    for value in KINDS.values():
+        task, gnet = _posed(setting, value, log, 0, store)
         views = task.beside[:: max(1, len(task.beside) // 3)][:3]
         *_, end = itertools.islice(race.configured(task, gnet, gnet.seed), gnet.iterations)
         columns.append(images_of(end.scene, views).flatten(0, 1))
@@ -107,7 +122,9 @@ def picture(log: str, store: str, path: Path) -> None:
     Image.fromarray((torch.cat(columns, 1) * 255).round().byte().numpy()).save(path)
 
 
-BENCH: Bench = Facades()
+FACADES: Bench = WithWithout("facades", "ingest.walls", "façades completed")
+GROUND: Bench = WithWithout("ground", "gnet.hold_ground", "ground held")
 
 if __name__ == "__main__":
-    picture(sys.argv[1], sys.argv[2], Path(sys.argv[3]))
+    switches = {"facades": "ingest.walls", "ground": "gnet.hold_ground"}
+    picture(switches[sys.argv[1]], sys.argv[2], sys.argv[3], Path(sys.argv[4]))
