@@ -80,9 +80,7 @@ class WithWithout:
         }
         run = partial(measure, self.setting)
         return [
-            Cell(
-                f"{log} chunk {chunk}", CELL_S, partial(measure, self.setting, log, chunk, options["store"]), parameters
-            )
+            Cell(f"{log} chunk {chunk}", CELL_S, partial(run, log, chunk, options["store"]), parameters)
             for log, chunk in (logs[:1] if quick else logs)
         ]
 
