@@ -21,7 +21,7 @@ def measure(seen: Seen) -> Measured:
 
     The 95th percentile over LiDAR points.
     """
-    points = seen.chunk.static.positions[::_EVERY]
+    points = seen.chunk.static.positions[seen.chunk.static.frames >= 0][::_EVERY]
     sizes = np.full((len(seen.sources), len(points)), np.nan)
     for k, view in enumerate(seen.sources):
         index, _, depth = visible(points, view)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from genre_tasks.effects.seen import Seen
 from genre_tasks.effects.types import Effect, Measured
 
 
 def measure(seen: Seen) -> Measured:
-    """The spread of the images' log gains, over images, of the channel where it is widest."""
-    if len(seen.sources) < 2 or not np.isfinite(seen.colours.value).any():
-        return Measured(None, "no two images share a point")
-    spread = seen.gains.std(0)
+    """The spread of log gain over images that share points, of the channel where it is widest."""
+    linked = seen.linked
+    if linked.sum() < 2:
+        return Measured(None, "no two images share enough points of LiDAR sweeps")
+    spread = seen.gains[linked].std(0)
     channel = int(spread.argmax())
-    return Measured(100 * float(spread[channel]), f"of {len(seen.sources)} images, widest in {'RGB'[channel]}")
+    return Measured(100 * float(spread[channel]), f"of {int(linked.sum())} images, widest in {'RGB'[channel]}")
 
 
 HAZE_PERCENT = 8.0

@@ -9,24 +9,27 @@ from genre_tasks.effects.seen import Seen
 from genre_tasks.logs.types import Float64
 from genre_tasks.scene.chunk import View
 
-DEPTH_QUANTILE = 0.05
-"""The near part of a view moves fastest over the image; the nearest point of all would be a stray one."""
+QUANTILE = 0.95
+"""Of the returns in a view: the near part moves fastest over the image, the fastest of all would be a stray one."""
 
 
 def pixel_speeds(seen: Seen) -> dict[str, float]:
     """Pixels a second of each camera at the working resolution, the fastest of its source views.
 
-    f · v⊥ / Z + f · |ω|, with Z the near depth of the view's LiDAR returns; a camera without them is left out.
+    The flow of the view's LiDAR returns under its velocity, at the 95th percentile, and f · |ω|. Driving ahead moves
+    what is off the axis too: (x · v_z − v_x) · f / Z. A camera without returns or a second image is left out.
     """
     out: dict[str, float] = {}
     for view, returns in zip(seen.sources, seen.returns, strict=True):
         later = _next(seen, view)
         if later is None or not len(returns.depth):
             continue
-        velocity, turn = _rates(view, later)
-        focal = max(view.lens.fx_px, view.lens.fy_px)
-        depth = float(np.quantile(returns.depth, DEPTH_QUANTILE))
-        speed = focal * float(np.hypot(velocity[0], velocity[1])) / depth + focal * turn
+        (vx, vy, vz), turn = _rates(view, later)
+        lens = view.lens
+        x = (returns.uv[:, 0] - lens.cx_px) / lens.fx_px
+        y = (returns.uv[:, 1] - lens.cy_px) / lens.fy_px
+        flow = np.hypot(lens.fx_px * (x * vz - vx), lens.fy_px * (y * vz - vy)) / returns.depth
+        speed = float(np.quantile(flow, QUANTILE)) + max(lens.fx_px, lens.fy_px) * turn
         out[view.camera] = max(out.get(view.camera, 0.0), speed)
     return out
 
@@ -34,8 +37,8 @@ def pixel_speeds(seen: Seen) -> dict[str, float]:
 def _next(seen: Seen, view: View) -> View | None:
     """The same camera's next image; the previous one at the chunk's end."""
     others = [v for v in seen.chunk.views if v.camera == view.camera and v.timestamp_s != view.timestamp_s]
-    after = [v for v in others if v.timestamp_s > view.timestamp_s]
-    return min(after or others, key=lambda v: abs(v.timestamp_s - view.timestamp_s), default=None)
+    after = [v for v in others if v.frame > view.frame]
+    return min(after or others, key=lambda v: abs(v.frame - view.frame), default=None)
 
 
 def _rates(view: View, other: View) -> tuple[Float64, float]:

@@ -12,7 +12,7 @@ def measure(seen: Seen) -> Measured:
     exposed = {n: c.exposure_s for n, c in seen.cameras.items() if c.exposure_s > 0}
     moved = {n: speed * exposed[n] for n, speed in pixel_speeds(seen).items() if n in exposed}
     if not moved:
-        return Measured(None, "the log states no exposure time" if not exposed else "no camera moves")
+        return Measured(None, "no camera with an exposure time has two images and LiDAR returns")
     name = max(moved, key=lambda n: moved[n])
     return Measured(moved[name], f"{name} is exposed for {1e3 * exposed[name]:g} ms")
 

@@ -55,11 +55,12 @@ def _decided(name: str, setting: str, seen: Seen) -> Decision:
 
 
 def _choice(effect: Effect, found: Measured, setting: str) -> tuple[Choice, str]:
-    if setting == "on":
-        return "on", f"set on; {found.said}"
-    if found.value is None:
-        return "off", found.said
-    if found.value <= effect.threshold:
-        return "off", f"{found.value:.3g} is not above {effect.threshold:g} {effect.unit}: {found.said}"
     called: Choice = "mark" if effect.marks else "on"
-    return called, f"{found.value:.3g} is above {effect.threshold:g} {effect.unit}: {found.said}"
+    told = found.value is not None and math.isfinite(found.value)
+    if setting == "on":
+        return called, f"set on; {f'{found.value:.3g} {effect.unit}: ' * told}{found.said}"
+    if not told:
+        return "off", found.said
+    above = found.value is not None and found.value > effect.threshold
+    said = f"{found.value:.3g} is {'above' if above else 'not above'} {effect.threshold:g} {effect.unit}: {found.said}"
+    return called if above else "off", said

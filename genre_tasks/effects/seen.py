@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from genre_tasks.logs.types import Camera, Float32, Float64
 from genre_tasks.scene.chunk import Chunk, View
 from genre_tasks.scene.coloring import visible
+from genre_tasks.scene.geometry import path_distance
 from genre_tasks.scene.images import decode_pixels
 from genre_tasks.scene.projection import Projected, project
 
@@ -21,7 +22,7 @@ SAMPLES = 6000
 SAMPLE_RANGE_M = 40.0
 """Farther ones are a pixel among others: their colour is the neighbourhood's."""
 
-_GAMMA, _ROUNDS, _FEW = 2.2, 12, 10
+_GAMMA, _ROUNDS, _FEW = 2.2, 6, 10
 _DARK = 8.0 / 255
 _BRIGHT = 247.0 / 255
 """Outside, a pixel is clipped or mostly noise, and its logarithm says nothing of the gain."""
@@ -29,7 +30,8 @@ _BRIGHT = 247.0 / 255
 
 @dataclass(frozen=True)
 class Colours:
-    """Log of linear colour of V images at P static points: ``value`` [V, P, 3], NaN where a view does not see it.
+    """Log of linear colour of V images at P static points: ``value`` [V, P, 3], NaN where a view does not see it, or
+    sees it clipped or dark.
 
     ``texture`` [V, P]: standard deviation of the same within 3 × 3 pixels, mean over channels.
     """
@@ -70,7 +72,9 @@ class Seen:
     def colours(self) -> Colours:
         """The colours of up to ``SAMPLES`` static points near the path in all source images that see them."""
         points = self.chunk.static
-        near = np.flatnonzero((points.frames >= 0) & points.colored)
+        fit = points.frames >= 0
+        fit &= points.colored & (path_distance(points.positions, self.chunk.chunk_SE3_ego) < SAMPLE_RANGE_M)
+        near = np.flatnonzero(fit)
         chosen = np.sort(np.random.default_rng(0).choice(near, min(SAMPLES, len(near)), replace=False))
         rank = np.full(len(points), -1)
         rank[chosen] = np.arange(len(chosen))
@@ -84,33 +88,48 @@ class Seen:
             value[k, at], texture[k, at] = _logs(image, uv[ours])
         return Colours(self.sources, value, texture)
 
-    @cached_property
+    @property
     def gains(self) -> Float64:
-        """[V, 3] log gain of each source image, zero mean: what best explains the colours of shared points."""
+        """[V, 3] log gain of each source image, zero mean over those in :attr:`linked`: what explains shared points."""
         return self._explained[0]
 
-    @cached_property
+    @property
     def unexplained(self) -> Float64:
-        """[V, P, 3] log colours without a point's own, an image's gain."""
+        """[V, P, 3] log colours without a point's own and an image's gain; NaN where a point is in one image alone."""
         return self._explained[1]
 
     @cached_property
-    def _explained(self) -> tuple[Float64, Float64]:
-        """Gains, and what they leave: log colour = the point's + the image's gain, one after the other in turn.
+    def linked(self) -> NDArray[np.bool_]:
+        """[V]: the image shares enough points with others for its gain to be known."""
+        return _shared(self.colours.value).sum(1) >= _FEW
 
-        Haze lightens what is seen from afar and passes for gain: a street without exposure changes has some 5 %.
+    @cached_property
+    def _explained(self) -> tuple[Float64, Float64]:
+        """Log colour = the point's + the image's gain: by least squares, then by medians in turn against outliers.
+
+        Least squares first: where images overlap in a chain, taking turns would need as many rounds as the chain's
+        square. Haze lightens what is seen from afar and passes for gain: streets without any change have some 5 %.
         """
-        value = self.colours.value
-        shared = np.isfinite(value).all(2)
-        value = np.where((shared & (shared.sum(0) >= 2))[..., None], value, np.nan)
-        gain = np.zeros((len(value), 3))
+        kept = _shared(self.colours.value)
+        value = np.where(kept[..., None], self.colours.value, np.nan)
+        see = kept.astype(np.float64)
+        each = see / np.maximum(see.sum(0), 1)
+        rest = np.where(kept[..., None], value - _nanmean(value, 0), 0).sum(1)
+        gain = np.linalg.pinv(np.diag(see.sum(1)) - each @ see.T, hermitian=True) @ rest
         for _ in range(_ROUNDS):
-            rest = value - gain[:, None]
-            rest -= _nanmean(rest, 0)
-            step = np.stack([_nanmedian(v) for v in rest])
-            gain += step - step.mean(0)
-        rest = value - gain[:, None]
-        return gain, rest - _nanmean(rest, 0)
+            left = value - gain[:, None]
+            left -= _nanmean(left, 0)
+            gain += np.stack([_nanmedian(v) for v in left])
+        known = self.linked
+        gain -= gain[known].mean(0) if known.any() else 0
+        left = value - gain[:, None]
+        return gain, left - _nanmean(left, 0)
+
+
+def _shared(value: Float64) -> NDArray[np.bool_]:
+    """[V, P]: the image sees the point, and another does."""
+    seen = np.isfinite(value).all(2)
+    return seen & (seen.sum(0) >= 2)
 
 
 def _logs(image: NDArray[np.uint8], uv: Float32) -> tuple[Float64, Float64]:

@@ -121,7 +121,7 @@ def train(
         fnet = copy.deepcopy(start).train()
         if fnet.architecture.residual:
             fnet.requires_grad_(True)
-    state, origin = _fixer_state(fnet, settings), {"pairs": pairs.digest(), "start": _digest(fnet)}
+    state, origin = _fixer_state(fnet, settings), {"pairs": pairs.digest(), "starting weights": _digest(fnet)}
     _restore(state, folder / "fixer.pt", settings, origin)
     report = _Reporter(progress, first, total, state.step)
     while state.step < settings.steps:
@@ -195,11 +195,13 @@ def _pretrained(
     if path.exists():
         stored = torch.load(path, weights_only=True)
         _require_same(stored["settings"], settings, path, AUTOENCODER_SETTINGS)
+        _require_origin(stored, {"pairs": pairs.digest()}, path)
         scale, weights = stored["scale"], stored["weights"]
     else:
         trained = train_autoencoder(pairs, settings, architecture, progress, total)
         scale, weights = trained.vae.config.scaling_factor, trained.state_dict()
-        _write({"settings": _plain(settings), "scale": scale, "weights": weights}, path)
+        origin = {"pairs": pairs.digest()}
+        _write({"settings": _plain(settings), "origin": origin, "scale": scale, "weights": weights}, path)
     fnet = build(scaled(architecture, scale), settings.seed)
     fnet.load_state_dict(weights)
     restart_residual(fnet)
@@ -283,12 +285,7 @@ def _restore(state: TrainingState, path: Path, settings: TrainingSettings, origi
         return
     stored = torch.load(path, weights_only=True)
     _require_same(stored["settings"], settings, path, tuple(_plain(settings)))
-    if other := [name for name, value in origin.items() if stored.get("origin", {}).get(name) != value]:
-        raise InputError(
-            f"the checkpoint was trained with other {' and '.join(other)}",
-            remedy="Delete it, or train into another folder.",
-            file=path,
-        )
+    _require_origin(stored, origin, path)
     state.fnet.load_state_dict(stored["weights"], strict=False)
     state.average = stored["average"]
     state.optimiser.load_state_dict(stored["optimiser"])
@@ -314,6 +311,15 @@ def _require_same(stored: dict[str, Any], settings: TrainingSettings, path: Path
         raise InputError(
             f"the checkpoint was trained with other settings: {', '.join(other)}",
             remedy="Train with the same settings, or into another folder.",
+            file=path,
+        )
+
+
+def _require_origin(stored: dict[str, Any], origin: Mapping[str, str], path: Path) -> None:
+    if other := [name for name, value in origin.items() if stored.get("origin", {}).get(name) != value]:
+        raise InputError(
+            f"the checkpoint was trained with other {' and '.join(other)}",
+            remedy="Delete it, or train into another folder.",
             file=path,
         )
 

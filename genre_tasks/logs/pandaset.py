@@ -108,6 +108,7 @@ class PandaSetLog:
         try:
             fx, fy, cx, cy = (float(given[key]) for key in ("fx", "fy", "cx", "cy"))
             readout_s = float(given.get("readout_s", READOUT_S))
+            exposure_s = float(given.get("exposure_s", 0.0))
             distortion = tuple(float(k) for k in given.get("distortion", ()))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             problem = f"fx, fy, cx, cy were expected ({error!r})"
@@ -115,7 +116,9 @@ class PandaSetLog:
         if not (np.isfinite([fx, fy, cx, cy]).all() and fx > 0 and fy > 0):
             problem = "the intrinsics are not finite, or a focal length is not positive"
             raise InputError(problem, remedy="Correct the file.", file=path, log=self.uri, camera=name)
-        return Camera(name, Lens(fx, fy, cx + PIXEL_CENTRE, cy + PIXEL_CENTRE, *size, distortion), readout_s)
+        return Camera(
+            name, Lens(fx, fy, cx + PIXEL_CENTRE, cy + PIXEL_CENTRE, *size, distortion), readout_s, exposure_s
+        )
 
     def _native_size(self, camera: str) -> tuple[int, int] | None:
         """Width and height from the header of the first image that has one."""

@@ -96,7 +96,12 @@ def _write_cameras(log: DrivingLog, root: Path, progress: Progress) -> None:
 def _intrinsics(camera: Camera) -> dict[str, Any]:
     lens = camera.lens
     given: dict[str, Any] = {"fx": lens.fx_px, "fy": lens.fy_px}
-    given |= {"cx": lens.cx_px - PIXEL_CENTRE, "cy": lens.cy_px - PIXEL_CENTRE, "readout_s": camera.readout_s}
+    given |= {
+        "cx": lens.cx_px - PIXEL_CENTRE,
+        "cy": lens.cy_px - PIXEL_CENTRE,
+        "readout_s": camera.readout_s,
+        "exposure_s": camera.exposure_s,
+    }
     return given | ({"distortion": list(lens.distortion)} if lens.distortion else {})
 
 

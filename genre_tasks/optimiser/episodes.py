@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from genre_tasks.optimiser.features import Fixed, features
+from genre_tasks.optimiser.ground import along_ground
 from genre_tasks.optimiser.learned import LearnedOptimiser
 from genre_tasks.optimiser.objective import Objective, Sight
 from genre_tasks.optimiser.rules import Step
@@ -88,11 +89,14 @@ class Episode:
         return objective(self.frame, self.state.offsets, batch, 0, generator)
 
     def step(self, network: LearnedOptimiser, move: Step, rows: torch.Tensor) -> torch.Tensor:
-        """Moves the state by ``move`` (see :meth:`mover`); returns the rows [M, 14] of the step with their gradient."""
+        """Moves the state by ``move`` (see :meth:`mover`); returns the rows [M, 14] of the step with their gradient.
+
+        Without what leads out of the ground's planes, as the state is moved.
+        """
         inputs, total = self._see(), self.course.iterations
         delta = network.sampled_delta(self.state, inputs, self.pyramid, total, rows)
         self._move(move)
-        return delta
+        return along_ground(delta, self.frame.planes[rows])
 
     def step_only(self, move: Step) -> None:
         """As :meth:`step`, without a gradient."""

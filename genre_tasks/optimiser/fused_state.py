@@ -21,7 +21,7 @@ def saw(
     decays: tuple[float, float],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Both moments, ``seen`` and ``seen_now`` after the gradient; see ``State.saw``."""
-    arrays = _contiguous(gradient, first, second, seen)
+    arrays = _contiguous((14, 14, 14, 1), gradient, first, second, seen)
     out = tuple(torch.empty_like(t) for t in (first, second, seen, seen))
     pointers, results = [t.data_ptr() for t in arrays], [t.data_ptr() for t in out]
     rates, kernel = [1 - d for d in decays], library.load_network()
@@ -39,14 +39,15 @@ def moved(
     planes: Tensor,  # [N, 11]
 ) -> Tensor:
     """Offsets after ``delta``, along the ground and inside the bounds, where anything was seen now; see ``State``."""
-    arrays, out = _contiguous(offsets, delta, seen_now, start, low, high, planes), torch.empty_like(offsets)
+    arrays = _contiguous((14, 14, 1, 14, 14, 14, 11), offsets, delta, seen_now, start, low, high, planes)
+    out = torch.empty_like(offsets)
     pointers = [t.data_ptr() for t in arrays]
     library.check(library.load_network().genre_moved(len(offsets), *pointers, torch.get_num_threads(), out.data_ptr()))
     return out
 
 
-def _contiguous(*tensors: Tensor) -> list[Tensor]:
+def _contiguous(widths: tuple[int, ...], *tensors: Tensor) -> list[Tensor]:
     rows = len(tensors[0])
-    if any(t.shape not in ((rows, 14), (rows, 11), (rows, 1)) for t in tensors):
-        raise ValueError(f"expected {rows} rows of 14, 11 or 1 columns, got {[list(t.shape) for t in tensors]}")
+    if [tuple(t.shape) for t in tensors] != [(rows, width) for width in widths]:
+        raise ValueError(f"expected {rows} rows of {widths} columns, got {[list(t.shape) for t in tensors]}")
     return [t.contiguous() for t in tensors]

@@ -13,7 +13,7 @@ import pytest
 
 from genre_tasks.config import EffectsConfig, IngestConfig
 from genre_tasks.effects.plan import EFFECTS, effect_of, plan
-from genre_tasks.effects.seen import Seen
+from genre_tasks.effects.seen import Colours, Seen
 from genre_tasks.effects.types import EffectsPlan
 from genre_tasks.errors import ConfigError
 from genre_tasks.logs.registry import open_log
@@ -70,7 +70,7 @@ def test_what_is_off_is_not_measured_nor_imported() -> None:
     assert done.returncode == 0, done.stderr[-2000:]
 
 
-def test_set_on_needs_no_measure_to_be_chosen_and_what_the_log_lacks_is_refused() -> None:
+def test_set_on_is_on_below_the_threshold_too_and_what_the_log_lacks_is_refused() -> None:
     assert plan(only("exposure", setting="on"), chunk(), cameras())["exposure"].choice == "on"
     with pytest.raises(ConfigError, match=r"is set on, and the log states no readout time.*auto or off"):
         plan(only("rolling_shutter", setting="on"), chunk(), cameras())
@@ -94,12 +94,52 @@ def test_a_standing_camera_has_no_shutter_displacement() -> None:
     assert planned("rolling_shutter", still, rig)["rolling_shutter"].value == pytest.approx(0, abs=0.05)
 
 
-def test_displacement_grows_with_speed_over_depth() -> None:
+def _ahead(metres: float) -> Chunk:
+    """The camera of the first source view again a tenth of a second later, so far along its axis."""
+    view = chunk().of_role("source")[0]
+    pose = view.chunk_SE3_camera.copy()
+    pose[:3, 3] += metres * pose[:3, 2]
+    other = replace(view, frame=view.frame + 1, timestamp_s=view.timestamp_s + 0.1, chunk_SE3_camera=pose)
+    return replace(chunk(), views=(view, replace(other, role="heldout")))
+
+
+def test_driving_straight_ahead_moves_what_is_off_the_axis() -> None:
     rig = tuple(replace(c, readout_s=0.03) for c in cameras())
-    side = planned("rolling_shutter", rig=rig)["rolling_shutter"]
-    ego = chunk().chunk_SE3_ego
-    speed = float(np.linalg.norm(ego[1, :3, 3] - ego[0, :3, 3]) / 0.1)
-    assert 0 < side.value < 0.03 * speed * 400 / 1.0  # f = 400 px at most, nothing nearer than a metre
+    one, two = (planned("rolling_shutter", _ahead(way), rig)["rolling_shutter"].value for way in (1.0, 2.0))
+    assert one > 0.3 and two == pytest.approx(2 * one, rel=1e-6)
+    twice = tuple(replace(c, readout_s=0.06) for c in cameras())
+    assert planned("rolling_shutter", _ahead(1.0), twice)["rolling_shutter"].value == pytest.approx(2 * one)
+
+
+def test_a_drift_along_a_chain_of_images_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twenty images, each sharing points with the next one alone: the hardest case of taking turns."""
+    g = np.random.default_rng(3)
+    drift, each = np.linspace(-0.3, 0.3, 20), 60
+    value = np.full((20, 19 * each, 3), np.nan)
+    for k in range(19):
+        own = g.normal(-2, 0.5, (each, 3))
+        at = slice(k * each, (k + 1) * each)
+        for n in (k, k + 1):
+            value[n, at] = own + drift[n] + g.normal(0, 0.02, (each, 3))
+    view = chunk().of_role("source")[0]
+    seen = Seen(chunk(), cameras())
+    monkeypatch.setattr(Seen, "colours", Colours((view,) * 20, value, np.zeros(value.shape[:2])))
+    np.testing.assert_allclose(seen.gains, np.repeat(drift[:, None], 3, 1), atol=0.03)
+    assert float(np.nanstd(seen.unexplained)) < 0.03
+
+
+def test_images_that_share_nothing_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    g = np.random.default_rng(4)
+    value = np.full((4, 300, 3), np.nan)
+    value[:2, :100] = g.normal(-2, 0.5, (100, 3))
+    value[1, :100] += 0.4
+    value[2, 100:200], value[3, 200:] = -1.0, -3.0
+    view = chunk().of_role("source")[0]
+    monkeypatch.setattr(Seen, "colours", Colours((view,) * 4, value, np.zeros(value.shape[:2])))
+    found = planned("exposure")["exposure"]
+    assert found.value == pytest.approx(20, abs=0.5) and "of 2 images" in found.reason
+    value[1] = np.nan
+    assert "no two images share" in planned("exposure")["exposure"].reason
 
 
 def test_distortion_gate_flips_with_the_coefficient() -> None:
@@ -203,6 +243,7 @@ def test_dark_images_are_marked(monkeypatch: pytest.MonkeyPatch) -> None:
     decoded = Seen.decoded
     monkeypatch.setattr(Seen, "decoded", lambda self, view: decoded(self, view) // 8)
     assert planned("darkness")["darkness"].choice == "mark"
+    assert plan(only("darkness", setting="on"), chunk(), cameras())["darkness"].choice == "mark"
 
 
 def test_a_plan_is_the_same_twice_and_comes_back_from_its_file(tmp_path) -> None:

@@ -84,12 +84,14 @@ def test_a_training_on_other_pairs_or_from_other_weights_is_not_taken_for_this_o
     train(some_pairs(), SETTINGS, tmp_path / "first", distance, architecture=TOY)  # finished: the same
     pairs = some_pairs()
     other = replace(pairs, truth=255 - pairs.truth)
-    with pytest.raises(InputError, match=r"other pairs \(file .*fixer\.pt"):
+    with pytest.raises(InputError, match=r"other pairs \(file .*autoencoder\.pt"):
         train(other, SETTINGS, tmp_path / "first", distance, architecture=TOY)
     further = replace(SETTINGS, steps=1)
     train(pairs, further, tmp_path / "further", distance, start=first)
     again = train(pairs, replace(further, seed=5), tmp_path / "again", distance, start=first)
-    with pytest.raises(InputError, match=r"other start \(file .*fixer\.pt"):
+    with pytest.raises(InputError, match=r"other pairs \(file .*fixer\.pt"):
+        train(other, further, tmp_path / "further", distance, start=first)
+    with pytest.raises(InputError, match=r"other starting weights \(file .*fixer\.pt"):
         train(pairs, further, tmp_path / "further", distance, start=again)
 
 

@@ -23,6 +23,7 @@ def assert_same_log(found: DrivingLog, expected: DrivingLog) -> None:
     assert found.frame_count == expected.frame_count
     assert [c.name for c in found.cameras] == [c.name for c in expected.cameras]
     for one, other in zip(found.cameras, expected.cameras, strict=True):
+        assert one.exposure_s == other.exposure_s
         assert one.readout_s == other.readout_s and one.lens.distortion == other.lens.distortion
         np.testing.assert_allclose(
             [one.lens.fx_px, one.lens.fy_px, one.lens.cx_px, one.lens.cy_px, one.lens.width_px, one.lens.height_px],

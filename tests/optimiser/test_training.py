@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from genre_tasks.errors import InputError
 from genre_tasks.optimiser.adam import TunedAdam
 from genre_tasks.optimiser.episodes import Course, Episode, TrainingScene
 from genre_tasks.optimiser.features import features
-from genre_tasks.optimiser.learned import NetworkConfig
+from genre_tasks.optimiser.learned import LearnedOptimiser, NetworkConfig
 from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.training import MetaConfig, MetaTraining
 from genre_tasks.optimiser.unroll import Plan, unroll
@@ -76,6 +77,24 @@ def test_a_share_of_the_gaussians_gives_the_gradient_of_all_on_average() -> None
     for (name, _), a, b, theirs in zip(network.named_parameters(), *parts, full, strict=True):
         if not name.startswith("entry"):  # there products of two rows' shares come in: right for many Gaussians alone
             torch.testing.assert_close((a + b) / 2, theirs, rtol=1e-3, atol=1e-6 + 1e-4 * float(theirs.abs().max()))
+
+
+def test_the_step_that_training_differentiates_is_the_one_that_is_made() -> None:
+    network, generator = LearnedOptimiser(), torch.Generator().manual_seed(0)
+    scene, count = _scene(0), len(_scene(0).scene)
+    flat = torch.tensor([0.2, 0.1, 0.01]).log().repeat(count, 1)
+    lying = replace(scene.scene.gaussians, log_scales=flat, quats=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1))
+    course = Course(0, 6, 3, 0, 0.0, 0.0)
+    episode = Episode.start(course, replace(scene, scene=scene.scene.with_gaussians(lying)), network, generator)
+    assert bool((episode.frame.planes != 0).any())
+    episode.sight = episode.look(Objective(LOSS), generator)
+    before, rows = episode.state.offsets, torch.arange(count)
+    told = episode.step(network, episode.mover(network), rows)
+    made = episode.state.offsets - before
+    free = (episode.frame.low == -torch.inf) | (made == told.detach())  # attributes without a bound
+    torch.testing.assert_close(made[free], told.detach()[free], atol=1e-5, rtol=1e-4)
+    ground = (episode.frame.planes != 0).any(1)
+    assert bool((told[ground, 2] == 0).all()) and bool((told[ground, 0] != 0).any())
 
 
 def _weights(training: MetaTraining) -> list[torch.Tensor]:

@@ -72,7 +72,8 @@ def test_the_outline_stays_and_what_is_farther_apart_is_left_open() -> None:
     rows = _rows(0.3)
     assert float(alpha[: rows.start - 6].max()) < 0.3 and float(alpha[rows.stop + 6 :].max()) < 0.3
     apart = _discs(_rings(1.5 * MAX_GAP_M, rings=2))
-    torch.testing.assert_close(closed(apart).log_scales.exp().min(1).values, apart.log_scales.exp().min(1).values)
+    wide = [discs.log_scales.exp()[:, :2].median(0).values for discs in (closed(apart), apart)]
+    torch.testing.assert_close(*wide, rtol=0.1, atol=0)
     assert float(_drawn(closed(apart))[0][32, 48]) < 0.1
 
 
