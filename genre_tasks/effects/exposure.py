@@ -17,7 +17,7 @@ def measure(seen: Seen) -> Measured:
 
 
 HAZE_PERCENT = 8.0
-"""What haze alone may read as: a street without any change of exposure reads 4 to 7 %."""
+"""What haze alone may read as: streets without any change of exposure read 5 to 6 %."""
 
 EFFECT = Effect(
     "exposure", "spread of gain between images", "%", HAZE_PERCENT, "an affine colour map an image", measure
