@@ -23,7 +23,8 @@ CLOSING = 0.5
 """In-plane standard deviation per distance to the next disc on either side, on actors."""
 
 MAX_GAP_M = 0.8
-"""Gaps between rings up to this wide are closed."""
+"""What is farther is another part. Of gaps from half a metre on ever less is closed: the next ring is then not among the
+neighbours looked at."""
 
 _AROUND, _ONE_SURFACE = 32, 0.7
 """Neighbours looked at, and how far from a disc's plane they may be, per distance along it, to lie on its surface."""
