@@ -23,8 +23,8 @@ CLOSING = 0.5
 """In-plane standard deviation per distance to the next disc on either side, on actors."""
 
 MAX_GAP_M = 0.8
-"""What is farther is another part. Of gaps from half a metre on ever less is closed: the next ring is then not among the
-neighbours looked at."""
+"""What is farther is another part. From half a metre on ever less of a gap is closed: the next ring is then not among
+the neighbours looked at."""
 
 _AROUND, _ONE_SURFACE = 32, 0.7
 """Neighbours looked at, and how far from a disc's plane they may be, per distance along it, to lie on its surface."""
