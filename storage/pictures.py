@@ -1,4 +1,4 @@
-"""A picture of each kind of artifact, without a plotting library: contact sheets, and a scene seen from above."""
+"""A picture of each kind of artifact: contact sheets, a scene seen from above, a plan's bars."""
 
 from __future__ import annotations
 
@@ -134,6 +134,13 @@ def _evaluation(folder: Path) -> Image8 | None:
     return contact_sheet([pictures[name] for name in sorted(pictures)], 4)
 
 
+def _effects(folder: Path) -> Image8 | None:
+    from storage.codecs.effects import read
+    from storage.effects_picture import drawn
+
+    return drawn(read(folder))
+
+
 PICTURES: dict[str, Callable[[Path], Image8 | None]] = {
     "chunk": _chunk,
     "reconstruction": _reconstruction,
@@ -141,5 +148,6 @@ PICTURES: dict[str, Callable[[Path], Image8 | None]] = {
     "fixed_views": _fixed_views,
     "pairs": _pairs,
     "evaluation": _evaluation,
+    "effects": _effects,
 }
 """Kind of artifact → what draws it from its folder."""

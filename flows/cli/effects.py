@@ -23,9 +23,11 @@ def effects(
     """Say for each effect what of the log decides, its threshold, the decision and what enabling would cost."""
     from flows.cli.tables import print_rows
     from flows.configuration import load_configuration
-    from flows.effects import effects_of, picture_of
+    from flows.effects import effects_of
     from flows.produce import Job
     from storage.codecs import codec_of
+    from storage.codecs.png import write_png
+    from storage.effects_picture import drawn
 
     config = load_configuration(preset, settings=settings or [])
     found = effects_of(Job(log, chunk, store, config.model_dump(mode="json")))
@@ -37,5 +39,5 @@ def effects(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         codec_of("effects").write(out, found)
-        picture_of(found, out / "effects.png", f"{log} chunk {chunk}")
+        write_png(out / "effects.png", drawn(found, f"{log} chunk {chunk}"))
         typer.echo(f"wrote {out / 'effects.parquet'} and effects.png")

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from genre_tasks.effects.types import Decision, EffectsPlan
 from genre_tasks.fixer.conditioning import Degraded
 from genre_tasks.fixer.pairs import NAMES, Pairs
 from genre_tasks.logs.types import Lens
@@ -130,6 +131,24 @@ def evaluation(rng: np.random.Generator, count: int = 3) -> Evaluation:
     )
 
 
+def effects(rng: np.random.Generator, count: int = 3) -> EffectsPlan:
+    rows = [
+        Decision(
+            f"effect_{k}",
+            "a property",
+            float(rng.random()),
+            "px",
+            0.5,
+            "auto",
+            ("on", "off", "mark")[k % 3],
+            "why",
+            "cost",
+        )
+        for k in range(count)
+    ]
+    return EffectsPlan(tuple(rows))
+
+
 MAKERS = {
     "chunk": chunk,
     "reconstruction": reconstruction,
@@ -137,6 +156,7 @@ MAKERS = {
     "fixed_views": fixed_views,
     "pairs": pairs,
     "evaluation": evaluation,
+    "effects": effects,
 }
 
 
