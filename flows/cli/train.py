@@ -51,7 +51,7 @@ def pairs(folder: Folder = Path("training"), real: Real = None, streets: Streets
 def fnet(
     folder: Folder = Path("training"), real: Real = None, streets: Streets = 28,
     inputs: Annotated[str, typer.Option(help="What it is given, joined by +.")] = "render+reference+lidar",
-    preset: Annotated[str, typer.Option(help="small; further, from its weights; paper: LoRA on SD-Turbo.")] = "small",
+    preset: Annotated[str, typer.Option(help="small; further and last, each from the one before; paper.")] = "small",
     start: Annotated[str | None, typer.Option(help="Weights to train further; SD-Turbo's for paper.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Weight updates; the preset's if not given.")] = None,
     validate: Annotated[bool, typer.Option(help="Scores and a picture of seeds 900–902 at each checkpoint.")] = False,

@@ -13,7 +13,7 @@ import numpy as np
 from flows.train.pairs import VALIDATION, pair_scenes, pairs_of, validation_scenes
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.fixer.network import INPUTS, sd_turbo, small_architecture
-from genre_tasks.fixer.training import PRESETS, TrainingSettings, train
+from genre_tasks.fixer.training import FOLLOWS, PRESETS, TrainingSettings, train
 from genre_tasks.fixer.weights import load_fnet, save_fnet
 from genre_tasks.progress import Progress, silent
 from storage.curve import FIXING, FIXING_SCORES, read_rows, write_rows
@@ -36,7 +36,8 @@ class FixerJob:
 
     ``folder`` holds the store of scenes and pairs and a folder for each set of inputs. ``real``: the URI of a log whose
     chunk 0 is trained on. ``streets``: how many synthetic streets. ``inputs``: what the fixer is given, joined by "+".
-    ``preset``: small, further (from the small one's weights or from ``start``) or paper (from SD-Turbo, at ``start``).
+    ``preset``: small, further and last (from the weights of the one before or from ``start``) or paper (from SD-Turbo,
+    at ``start``).
     ``validate``: score on validation streets at each checkpoint, with a picture.
     """
 
@@ -146,8 +147,8 @@ def train_fixer(job: FixerJob, progress: Progress = silent) -> Path:
 
     start, architecture = None, replace(small_architecture(), inputs=tuple(job.inputs.split("+")))
     before = job.start
-    if job.preset == "further" and before is None:
-        before = str(replace(job, preset="small").place / WEIGHTS)
+    if job.preset in FOLLOWS and before is None:
+        before = str(replace(job, preset=FOLLOWS[job.preset]).place / WEIGHTS)
     if base is not None:
         start = sd_turbo(base, rank=RANK)
     elif before is not None:

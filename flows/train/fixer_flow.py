@@ -53,7 +53,7 @@ def train_fnet(
 
     Args:
         inputs: what it is given, of render, reference and lidar.
-        preset: small; further, which starts from its weights; paper, which starts from SD-Turbo.
+        preset: small; further, which starts from its weights; last, from those; paper, from SD-Turbo.
         start: weights to start from. steps: the preset's if not given. validate: score at each checkpoint.
     """
     job = FixerJob(folder, real, streets, inputs, preset, start, steps, validate)

@@ -55,10 +55,15 @@ class TrainingSettings:
 PRESETS = {
     "small": TrainingSettings(),
     "further": TrainingSettings(steps=1500, learning_rate=6e-4, perceptual=0.1, clean_share=0.3, seed=1),
+    "last": TrainingSettings(steps=2000, learning_rate=6e-4, perceptual=0.05, clean_share=0.3, seed=2),
     "paper": TrainingSettings(steps=20_000, batch=8, crop=(720, 1280), learning_rate=2e-5, perceptual=1.0),
 }
-"""``small``: half an hour on a core from nothing. ``further``: 18 minutes from its weights. ``paper`` (Sec. III-B):
+"""``small``: half an hour on a core from nothing. ``further``: 18 minutes from its weights; ``last``: 24 from
+those. ``paper`` (Sec. III-B):
 SD-Turbo's LoRA adapters and skips; the paper gives steps, batch and size, rate and weight are Difix3D's."""
+
+FOLLOWS = {"further": "small", "last": "further"}
+"""The preset whose weights a preset starts from."""
 
 AUTOENCODER_SETTINGS = ("autoencoder_steps", "autoencoder_batch", "autoencoder_learning_rate", "crop", "kl", "seed")
 """Settings on which the first part depends: with others of these its result is not used again."""

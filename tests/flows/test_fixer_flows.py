@@ -59,7 +59,8 @@ def make_tiny(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(pairs, "PAIRS", SETS)
     patch.setattr(fixer, "VALIDATION", PairRecipe(sets=(PairSet("side", 1, "side"),), iterations=6))
     patch.setattr(fixer, "validation_scenes", lambda: [tiny_scene(900)])
-    patch.setattr(fixer, "PRESETS", {"small": SETTINGS, "further": replace(SETTINGS, steps=2), "paper": SETTINGS})
+    further = replace(SETTINGS, steps=2)
+    patch.setattr(fixer, "PRESETS", {"small": SETTINGS, "further": further, "last": further, "paper": SETTINGS})
     patch.setattr(fixer, "small_architecture", lambda: small_architecture((8, 8, 16, 16), 4, (16, 16)))
 
 
@@ -158,6 +159,9 @@ def test_a_fixer_is_trained_further_in_a_folder_of_its_own(trained) -> None:
     before, after = (load_fnet(folder / name).state_dict() for name in ("fnet", "fnet-further"))
     assert torch.equal(before["vae.encoder.conv_in.weight"], after["vae.encoder.conv_in.weight"])
     assert not torch.equal(before["skips.0.weight"], after["skips.0.weight"])
+    last = Path(train_fnet(str(folder), None, 2, preset="last")["weights"])
+    assert last == folder / "fnet-last" / "fnet.safetensors"
+    assert not torch.equal(load_fnet(last.parent).state_dict()["skips.0.weight"], after["skips.0.weight"])
 
 
 def test_faults_are_said(monkeypatch) -> None:
