@@ -98,10 +98,11 @@ def _parse_setting(setting: str) -> dict[str, Any]:
 
 
 def _spelled_out(change: Mapping[str, Any]) -> Mapping[str, Any]:
-    """``effects`` given as one word (YAML's true and false are on and off) becomes that word for each effect."""
+    """``effects`` given as one word becomes that word for each effect; none is off."""
     word = change.get("effects")
-    word = {True: "on", False: "off", "none": "off"}.get(word, word) if isinstance(word, str | bool) else None
-    return change if word is None else {**change, "effects": dict.fromkeys(EffectsConfig.model_fields, word)}
+    if not isinstance(word, str | bool):
+        return change
+    return {**change, "effects": dict.fromkeys(EffectsConfig.model_fields, "off" if word == "none" else word)}
 
 
 def _merged(base: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from genre_tasks.effects.seen import Seen
+from genre_tasks.effects.types import Measured
 from genre_tasks.logs.types import Float64
 from genre_tasks.scene.chunk import View
 
@@ -32,6 +35,15 @@ def pixel_speeds(seen: Seen) -> dict[str, float]:
         speed = float(np.quantile(flow, QUANTILE)) + max(lens.fx_px, lens.fy_px) * turn
         out[view.camera] = max(out.get(view.camera, 0.0), speed)
     return out
+
+
+def displaced(seen: Seen, seconds: Mapping[str, float], said: str) -> Measured:
+    """Displacement in the image over each camera's time, of the fastest camera; ``said`` is of what the time is."""
+    moved = {name: speed * seconds[name] for name, speed in pixel_speeds(seen).items() if name in seconds}
+    if not moved:
+        return Measured(None, f"no camera that is {said} for a stated time has two images and LiDAR returns")
+    name = max(moved, key=lambda n: moved[n])
+    return Measured(moved[name], f"{name} is {said} for {1e3 * seconds[name]:g} ms")
 
 
 def _next(seen: Seen, view: View) -> View | None:

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from genre_tasks.effects.motion import pixel_speeds
+from genre_tasks.effects.motion import displaced
 from genre_tasks.effects.seen import Seen
 from genre_tasks.effects.types import Effect, Measured
 
 
 def measure(seen: Seen) -> Measured:
     """Displacement in the image between the first and the last row, of the fastest camera."""
-    moved = {name: speed * seen.cameras[name].readout_s for name, speed in pixel_speeds(seen).items()}
-    if not moved:
-        return Measured(None, "no camera has two images and LiDAR returns")
-    name = max(moved, key=lambda n: moved[n])
-    return Measured(moved[name], f"{name} is read in {1e3 * seen.cameras[name].readout_s:g} ms")
+    return displaced(seen, {n: c.readout_s for n, c in seen.cameras.items() if c.readout_s > 0}, "read out")
 
 
 def needs(seen: Seen) -> str | None:
