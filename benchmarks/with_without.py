@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 from PIL import Image
 
-from benchmarks.bench import Bench, Cell, Row, logs_of
+from benchmarks.bench import Cell, Row, logs_of
 from benchmarks.optimiser import race
 from benchmarks.optimiser.beyond import over_cells
 from benchmarks.optimiser.cells import place, threads
@@ -120,9 +120,9 @@ def picture(setting: str, log: str, store: str, path: Path) -> None:
     Image.fromarray((torch.cat(columns, 1) * 255).round().byte().numpy()).save(path)
 
 
-FACADES: Bench = WithWithout("facades", "ingest.walls", "façades completed")
-GROUND: Bench = WithWithout("ground", "gnet.hold_ground", "ground held")
+FACADES = WithWithout("facades", "ingest.walls", "façades completed")
+GROUND = WithWithout("ground", "gnet.hold_ground", "ground held")
 
 if __name__ == "__main__":
-    switches = {"facades": "ingest.walls", "ground": "gnet.hold_ground"}
-    picture(switches[sys.argv[1]], sys.argv[2], sys.argv[3], Path(sys.argv[4]))
+    setting = {bench.name: bench.setting for bench in (FACADES, GROUND)}[sys.argv[1]]
+    picture(setting, sys.argv[2], sys.argv[3], Path(sys.argv[4]))

@@ -147,7 +147,7 @@ def walked(config: OptimiserConfig, task: Task, fixed: Sequence[Target]) -> Iter
     if distance(config) is not None:  # modules are imported here, before the clock starts; weights are loaded again
         perceptual_distance.cache_clear()
     views, novel = config.views_per_iteration, config.novel_views_per_iteration
-    plan = Plan(config.iterations, views, novel, seed=config.seed)
+    plan = Plan(config.iterations, views, novel, seed=config.seed, hold_ground=config.hold_ground)
     return race.walk(lambda: (step_rule("enet", config), Objective(config.loss, distance(config))), task, plan, fixed)
 
 

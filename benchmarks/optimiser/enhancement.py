@@ -62,7 +62,12 @@ def enhanced_by_gnet(steps: Steps) -> SceneGraph:
     """GNet's network on the same fixed images, from the same scene."""
     config = as_enhancer(steps.config)
     plan = Plan(
-        config.iterations, config.views_per_iteration, config.novel_views_per_iteration, seed=config.seed, stage="enet"
+        config.iterations,
+        config.views_per_iteration,
+        config.novel_views_per_iteration,
+        seed=config.seed,
+        stage="enet",
+        hold_ground=config.hold_ground,
     )
     objective = Objective(config.loss, distance(config))
     return unroll(step_rule("enet", config), steps.gnet, steps.source, steps.fixed, objective, plan).scene

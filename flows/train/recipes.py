@@ -121,6 +121,17 @@ def _long(stage: str) -> tuple[Begin, ...]:
     return tuple(begin for age in (24, 48, 96) for begin in (gnet, gnet, longer, Adam(age)))
 
 
+def _strides(name: str, start: str, gnet: str, **own: Any) -> Stage:
+    """ENet at GNet's rates, on scenes as that stage of GNet leaves them."""
+    config = _enet(
+        judged=3.0, judges=6, sample=0.25, views=(4, 6), novel_views=8, iterations=(8, 12, 12, 16, 24),
+        loss=LossConfig(perceptual=0.1, perceptual_every=1),
+        judge_loss=LossConfig(perceptual=1.0, perceptual_every=1, depth=0.0), **own,
+    )  # fmt: skip
+    scenes = replace(DENSE, count=19, real=2)
+    return Stage(name, start, GNET_NETWORK, scenes, config, _long(gnet), Images("fnet"))
+
+
 ENET_STAGES = (
     Stage(
         "enet/coarse", "gnet/coarse", ENET_NETWORK, SceneList("coarse", 24, real=0),
@@ -139,26 +150,8 @@ ENET_STAGES = (
         ),
         _long("gnet/many"), Images("fnet"),
     ),
-    Stage(
-        "enet/strides", "enet/dense", GNET_NETWORK, replace(DENSE, count=19, real=2),
-        _enet(
-            steps=300, rate=5e-4, seed=71, judged=3.0, judges=6, sample=0.25, views=(4, 6), novel_views=8,
-            iterations=(8, 12, 12, 16, 24),
-            loss=LossConfig(perceptual=0.1, perceptual_every=1),
-            judge_loss=LossConfig(perceptual=1.0, perceptual_every=1, depth=0.0),
-        ),
-        _long("gnet/many"), Images("fnet"),
-    ),
-    Stage(
-        "enet/held", "enet/strides", GNET_NETWORK, replace(DENSE, count=19, real=2),
-        _enet(
-            steps=300, rate=2.5e-4, seed=81, judged=3.0, judges=6, sample=0.25, views=(4, 6), novel_views=8,
-            iterations=(8, 12, 12, 16, 24),
-            loss=LossConfig(perceptual=0.1, perceptual_every=1),
-            judge_loss=LossConfig(perceptual=1.0, perceptual_every=1, depth=0.0),
-        ),
-        _long("gnet/dense"), Images("fnet"),
-    ),
+    _strides("enet/strides", "enet/dense", "gnet/many", steps=300, rate=5e-4, seed=71),
+    _strides("enet/held", "enet/strides", "gnet/dense", steps=300, rate=2.5e-4, seed=81),
 )  # fmt: skip
 """ENet from GNet's weights after their coarse stage: at 160×90 with stand-ins for FNet's images, then with those; last
 at GNet's rates, twice as far a step, and there once more on scenes whose ground was held."""

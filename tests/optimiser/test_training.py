@@ -91,7 +91,7 @@ def test_the_step_that_training_differentiates_is_the_one_that_is_made() -> None
     before, rows = episode.state.offsets, torch.arange(count)
     told = episode.step(network, episode.mover(network), rows)
     made = episode.state.offsets - before
-    free = (episode.frame.low == -torch.inf) | (made == told.detach())  # attributes without a bound
+    free = episode.frame.low == -torch.inf  # attributes without a bound
     torch.testing.assert_close(made[free], told.detach()[free], atol=1e-5, rtol=1e-4)
     ground = (episode.frame.planes != 0).any(1)
     assert bool((told[ground, 2] == 0).all()) and bool((told[ground, 0] != 0).any())
