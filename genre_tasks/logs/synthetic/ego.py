@@ -31,12 +31,13 @@ _MOUNTS: dict[str, tuple[tuple[float, float, float], float, tuple[float, float, 
 
 
 def rig(parameters: StreetParameters) -> tuple[Camera, ...]:
-    """The first N cameras, at the size asked for."""
+    """The first N cameras, at the size asked for, with the shutter and the lens of the parameters."""
     cameras = []
     for name in CAMERA_NAMES[: parameters.cameras]:
         focal, cx, cy = _MOUNTS[name][2]
-        lens = Lens(focal, focal, cx, cy, 1920, 1080).resized(parameters.width, parameters.height)
-        cameras.append(Camera(name, lens))
+        bent = (parameters.distortion, 0.0, 0.0, 0.0, 0.0) if parameters.distortion else ()
+        lens = Lens(focal, focal, cx, cy, 1920, 1080, bent).resized(parameters.width, parameters.height)
+        cameras.append(Camera(name, lens, parameters.rolling_shutter_s, parameters.exposure_s))
     return tuple(cameras)
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.logs.synthetic.ego import FRAME_S, draw_ego, ego_SE3_camera, rig
+from genre_tasks.logs.synthetic.imaging import Imaging
 from genre_tasks.logs.synthetic.layout import Layout, lay_out
 from genre_tasks.logs.synthetic.lidar import sweep
 from genre_tasks.logs.synthetic.noise import rotated
@@ -99,6 +100,7 @@ class SyntheticStreet:
         self._cameras = rig(self.parameters)
         self._road = Road(self.parameters.seed)
         self._ego = draw_ego(self.parameters, self._road)
+        self.imaging = Imaging(self.parameters, self._ego)
         rng = generator(self.parameters.seed, "origin")
         self.offset_m = np.add(rng.uniform([-40, -40, -10], [40, 40, 10]), [self.parameters.origin_m, 0.0, 0.0])
         self._start_s = _EPOCH_S + 60.0 * (self.parameters.seed % 100_000)
@@ -135,7 +137,7 @@ class SyntheticStreet:
         return self._start_s + frame * FRAME_S
 
     def camera_timestamp_s(self, camera: str, frame: int) -> float:
-        """The frame's own time: the shutter is global and all cameras fire together."""
+        """The frame's own time: all cameras fire together; a rolling shutter reads its middle row then."""
         self._lens(camera)
         return self.frame_timestamp_s(frame)
 
@@ -149,12 +151,15 @@ class SyntheticStreet:
         return self.world_SE3_lidar(frame) @ ego_SE3_camera(camera)
 
     def image_bytes(self, camera: str, frame: int) -> bytes:
-        """PNG; its pixels are ``truth.image`` at the recorded pose."""
+        """PNG; its pixels are ``truth.image`` at the recorded pose, unless a parameter says how the camera errs."""
         lens = self._lens(camera)
         self.check_frame(frame)
 
         def encode() -> bytes:
-            return _png(self._truth.image(frame, self.world_SE3_camera(camera, frame), lens))
+            if self.imaging.plain:
+                return _png(self._truth.image(frame, self.world_SE3_camera(camera, frame), lens))
+            light = draw_light(self.parameters.seed)
+            return _png(self.imaging.image(self._scene, light, camera, frame * FRAME_S, lens))
 
         return self._png.get((camera, frame), encode)
 

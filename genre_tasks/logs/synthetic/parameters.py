@@ -27,6 +27,11 @@ class StreetParameters:
     number); ``moving`` and ``pedestrians`` count actors; ``cuboids=0`` leaves annotations out, ``lidar=0`` the sweeps;
     ``standstill=1`` parks the ego vehicle; ``origin_m`` is added to the world's x; ``sweep_s`` is the time a LiDAR turn
     takes (0: a snapshot at the frame's time); ``noise_m`` is the standard deviation of the range.
+
+    How the cameras record it (the truth has none of it but the lens): ``rolling_shutter_s`` from the first row to the
+    last, ``exposure_s`` of motion blur, ``exposure_jitter`` and ``white_balance_jitter`` standard deviations of the
+    log gain over cameras and time, ``bonnet`` the share of the front and back images that the vehicle itself covers,
+    ``distortion`` the lens's k1 (below −0.08 the widest lens would fold).
     """
 
     seed: int = 0
@@ -45,6 +50,12 @@ class StreetParameters:
     noise_m: float = 0.01
     standstill: int = 0
     origin_m: float = 0.0
+    rolling_shutter_s: float = 0.0
+    exposure_s: float = 0.0
+    exposure_jitter: float = 0.0
+    white_balance_jitter: float = 0.0
+    bonnet: float = 0.0
+    distortion: float = 0.0
 
     def query(self, *, all_keys: bool = False, separator: str = "&") -> str:
         """``seed=…`` and what differs from the defaults (or everything), in a fixed order."""
@@ -73,6 +84,12 @@ _RANGES: dict[str, tuple[float, float]] = {
     "noise_m": (0.0, 1.0),
     "standstill": (0, 1),
     "origin_m": (-1e8, 1e8),
+    "rolling_shutter_s": (0.0, 0.1),
+    "exposure_s": (0.0, 0.1),
+    "exposure_jitter": (0.0, 1.0),
+    "white_balance_jitter": (0.0, 0.5),
+    "bonnet": (0.0, 0.5),
+    "distortion": (-0.08, 0.5),
 }
 
 

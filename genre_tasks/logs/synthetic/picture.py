@@ -143,17 +143,34 @@ def picture(
     scene: Scene, light: Light, time: float, world_SE3_camera: Float64, lens: Lens, samples: int
 ) -> NDArray[np.uint8]:
     """[H, W, 3] sRGB; the mean of ``samples`` rays a pixel, taken in linear light."""
+    return to_srgb(radiance(scene, light, time, world_SE3_camera, lens, samples))
+
+
+def radiance(
+    scene: Scene,
+    light: Light,
+    time: float,
+    world_SE3_camera: Float64,
+    lens: Lens,
+    samples: int,
+    gain: Float32 | None = None,  # [3]
+    rows: slice = slice(None),
+) -> Float32:
+    """Linear light of the chosen rows of an image, [rows, W, 3] in 0 to 1, times the light's exposure and ``gain``."""
     origin = world_SE3_camera[:3, 3]
     spread = 1.0 / (max(lens.fx_px, 1e-6) * samples**0.5)
     band = max(1, _BAND_RAYS // (lens.width_px * samples))
-    rows = []
-    for first in range(0, lens.height_px, band):
-        rays = camera_rays(lens, samples, slice(first, first + band))
+    start, stop, _ = rows.indices(lens.height_px)
+    out = []
+    for first in range(start, stop, band):
+        rays = camera_rays(lens, samples, slice(first, min(first + band, stop)))
         d = rotated(world_SE3_camera[:3, :3], rays)
-        value = shade(scene, light, scene.cast(origin, d, time), origin, d, time, spread)
+        value = shade(scene, light, scene.cast(origin, d, time), origin, d, time, spread) * np.float32(light.exposure)
+        if gain is not None:
+            value = value * gain
         # Bright samples are clipped first, so that an edge against the sky stays as smooth as a camera's.
-        rows.append(np.minimum(value * np.float32(light.exposure), 1.0).reshape(-1, samples, 3).mean(1))
-    return to_srgb(np.concatenate(rows)).reshape(lens.height_px, lens.width_px, 3)
+        out.append(np.minimum(value, 1.0).reshape(-1, samples, 3).mean(1))
+    return np.concatenate(out).reshape(stop - start, lens.width_px, 3)
 
 
 def to_srgb(value: Reals) -> NDArray[np.uint8]:
