@@ -67,9 +67,9 @@ def measure(log: str, chunk: int, store: str) -> Row:
     refs = reconstruct(job)
     adam_values = values | {"gnet": values["gnet"] | {"method": "adam"}}
     adam_job = Job(log, chunk, store, adam_values)
-    adam = reconstruct(adam_job, ("ingest", "initial", "gnet", "evaluate/gnet"))
+    adam = reconstruct(adam_job, ("ingest", "effects", "initial", "gnet", "evaluate/gnet"))
     names = ("initial", "gnet", "fnet", "enet")
-    stages = ("ingest", "initial", "gnet", "novel_views", "fnet", "enet")
+    stages = ("ingest", "effects", "initial", "gnet", "novel_views", "fnet", "enet")
     return {
         "log": log,
         "chunk": chunk,

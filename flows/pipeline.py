@@ -16,7 +16,7 @@ from storage import keys
 from storage.code_digest import code_digest
 from storage.keys import digest_file, digest_value
 
-RECONSTRUCTING = ("ingest", "initial", "gnet", "novel_views", "fnet", "enet")
+RECONSTRUCTING = ("ingest", "effects", "initial", "gnet", "novel_views", "fnet", "enet")
 
 
 @dataclass(frozen=True)
@@ -57,26 +57,33 @@ _STAGES = "genre_tasks.stages"
 
 PIPELINE: tuple[StageSpec, ...] = (
     StageSpec("ingest", "chunk", "ingest", f"{_STAGES}.ingest:ingest", ("log", "chunk_index")),
-    StageSpec("initial", "reconstruction", "initial", f"{_STAGES}.initial:initial", ("ingest",)),
-    StageSpec("gnet", "reconstruction", "gnet", f"{_STAGES}.gnet:gnet", ("ingest", "initial"), weights="gnet"),
-    StageSpec("novel_views", "novel_views", "novel_views", f"{_STAGES}.novel_views:novel_views", ("ingest", "gnet")),
+    StageSpec("effects", "effects", "effects", f"{_STAGES}.effects:effects", ("ingest", "log")),
+    StageSpec("initial", "reconstruction", "initial", f"{_STAGES}.initial:initial", ("ingest", "effects")),
+    StageSpec(
+        "gnet", "reconstruction", "gnet", f"{_STAGES}.gnet:gnet", ("ingest", "initial", "effects"), weights="gnet"
+    ),
+    StageSpec(
+        "novel_views", "novel_views", "novel_views", f"{_STAGES}.novel_views:novel_views", ("ingest", "gnet", "effects")
+    ),
     StageSpec(
         "fnet",
         "fixed_views",
         "fnet",
         f"{_STAGES}.fnet:fnet",
-        ("ingest", "novel_views"),
+        ("ingest", "novel_views", "effects"),
         weights="fnet",
         splits="batch_views",
     ),
-    StageSpec("enet", "reconstruction", "enet", f"{_STAGES}.enet:enet", ("ingest", "gnet", "fnet"), weights="enet"),
+    StageSpec(
+        "enet", "reconstruction", "enet", f"{_STAGES}.enet:enet", ("ingest", "gnet", "fnet", "effects"), weights="enet"
+    ),
     *(
         StageSpec(
             f"evaluate/{name}",
             "evaluation",
             "evaluate",
             f"{_STAGES}.evaluate:evaluate_scene",
-            ("ingest", "stage_name", name, "truth"),
+            ("ingest", "stage_name", name, "truth", "effects"),
         )
         for name in ("initial", "gnet", "enet")
     ),

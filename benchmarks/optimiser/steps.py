@@ -36,7 +36,7 @@ class Steps:
 def steps_of(log: str, chunk: int, store: str, order: int, enet: bool, *settings: str) -> Steps:
     """The preset ``small`` up to FNet, or to ENet, from and into a store. Raises ``NotMeasuredError`` without data."""
     job = job_of(log, chunk, store, order, *settings)
-    names = ("ingest", "initial", "gnet", "novel_views", "fnet")
+    names = ("ingest", "effects", "initial", "gnet", "novel_views", "fnet")
     refs = reconstruct(job, (*names, "enet") if enet else names)
     read, config = value_of(job, refs["ingest"]), PipelineConfig.model_validate(job.config)
     return Steps(

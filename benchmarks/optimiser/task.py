@@ -14,12 +14,15 @@ from flows.configuration import load_configuration
 from flows.produce import ArtifactRef, Job
 from flows.train.optimiser import psnr
 from flows.train.scenes import spread
+from genre_tasks.effects.types import BASIC
 from genre_tasks.optimiser.targets import Target, of_source, of_views
 from genre_tasks.scene.graph import SceneGraph
 from storage.local import open_store
 
 HELDOUT_VIEWS = 12
 """So many held-out views judge, spread evenly: a curve has some twenty points."""
+WITHOUT_EFFECTS = ("effects=none", *(f"effects.{name}=on" for name in sorted(BASIC)))
+"""Optimisers are compared on what all of them model; ``genre bench effects`` measures the rest."""
 SIDE_M = 3.0
 """Where curves are judged beside the path: where the fixer works."""
 
@@ -53,7 +56,7 @@ def task_of(log: str, chunk: int, store: str, *settings: str) -> Task:
     Raises ``NotMeasuredError`` without data.
     """
     job = job_of(log, chunk, store, None, *settings)
-    refs = reconstruct(job, ("ingest", "initial"))
+    refs = reconstruct(job, ("ingest", "effects", "initial"))
     read, initial = value_of(job, refs["ingest"]), value_of(job, refs["initial"])
     heldout = of_views(read, spread(read.of_role("heldout"), HELDOUT_VIEWS))
     beside = true_targets(log, store, read, SIDE_M)
@@ -69,7 +72,12 @@ def job_of(log: str, chunk: int, store: str, order: int | None = None, *settings
     if reader == "pandaset" and not Path(path).is_dir():
         raise NotMeasuredError(f"there is no folder {path}; give it with --set pandaset=PATH")
     seeds = [] if order is None else [f"{s}.{k}" for s in ("gnet", "enet") for k in (f"seed={order}", "snapshots=0")]
-    return Job(log, chunk, store, load_configuration("small", settings=[*seeds, *settings]).model_dump(mode="json"))
+    return Job(
+        log,
+        chunk,
+        store,
+        load_configuration("small", settings=[*WITHOUT_EFFECTS, *seeds, *settings]).model_dump(mode="json"),
+    )
 
 
 def value_of(job: Job, ref: ArtifactRef) -> Any:

@@ -8,7 +8,7 @@ from importlib import import_module
 
 from genre_tasks.config import EffectsConfig
 from genre_tasks.effects.seen import Seen
-from genre_tasks.effects.types import Choice, Decision, Effect, EffectsPlan, Measured
+from genre_tasks.effects.types import Choice, Decision, Effect, EffectsPlan, Fitted, Measured
 from genre_tasks.errors import ConfigError
 from genre_tasks.logs.types import Camera
 from genre_tasks.progress import Progress, silent
@@ -26,11 +26,14 @@ def effect_of(name: str) -> Effect:
 
 def plan(config: EffectsConfig, chunk: Chunk, cameras: Sequence[Camera], progress: Progress = silent) -> EffectsPlan:
     """Asks each effect that is not set off. Raises ``ConfigError`` for one set on that the log makes impossible."""
-    seen, rows = Seen(chunk, cameras), []
+    seen, rows, fitted = Seen(chunk, cameras), [], Fitted()
     for k, name in enumerate(EFFECTS):
         progress(k, len(EFFECTS), name)
         rows.append(_decided(name, getattr(config, name), seen))
-    return EffectsPlan(tuple(rows))
+        if rows[-1].choice == "on":
+            fitted = fitted.with_those_of(effect_of(name).fit(seen))
+    progress(len(EFFECTS), len(EFFECTS), "effects")
+    return EffectsPlan(tuple(rows), fitted)
 
 
 def _decided(name: str, setting: str, seen: Seen) -> Decision:

@@ -19,10 +19,16 @@ from genre_tasks.scene.projection import Projected, project
 SAMPLES = 6000
 """Static points whose colours are compared between images."""
 
-SAMPLE_RANGE_M = 40.0
+SAMPLE_RANGE_M = 25.0
 """Farther ones are a pixel among others: their colour is the neighbourhood's."""
 
-_GAMMA, _ROUNDS, _FEW = 2.2, 6, 10
+_ROUNDS, _FEW, _LEAST = 12, 10, 1e-6
+_SKY = 0.9
+"""What haze looks like: as bright as the sky, which this quantile of the images stands for."""
+
+_OUTLIER = 0.1
+"""Residuals of log colour from here on count less and less (Cauchy): wrong pixels, reflections, moving shadows."""
+
 _DARK = 8.0 / 255
 _BRIGHT = 247.0 / 255
 """Outside, a pixel is clipped or mostly noise, and its logarithm says nothing of the gain."""
@@ -33,12 +39,14 @@ class Colours:
     """Log of linear colour of V images at P static points: ``value`` [V, P, 3], NaN where a view does not see it, or
     sees it clipped or dark.
 
-    ``texture`` [V, P]: standard deviation of the same within 3 × 3 pixels, mean over channels.
+    ``texture`` [V, P]: standard deviation of the same within 3 × 3 pixels, mean over channels. ``distance`` [V, P]
+    metres along the camera's axis.
     """
 
     views: tuple[View, ...]
     value: Float64
     texture: Float64
+    distance: Float64
 
 
 class Seen:
@@ -79,14 +87,15 @@ class Seen:
         rank = np.full(len(points), -1)
         rank[chosen] = np.arange(len(chosen))
         value = np.full((len(self.sources), len(chosen), 3), np.nan)
-        texture = np.full(value.shape[:2], np.nan)
+        texture, distance = np.full(value.shape[:2], np.nan), np.zeros(value.shape[:2])
         for k, view in enumerate(self.sources):
             index, uv, depth = visible(points.positions, view)
             ours = (rank[index] >= 0) & (depth < SAMPLE_RANGE_M)
             image = self.pixels[view.camera, view.frame]
             at = rank[index[ours]]
             value[k, at], texture[k, at] = _logs(image, uv[ours])
-        return Colours(self.sources, value, texture)
+            distance[k, at] = depth[ours]
+        return Colours(self.sources, value, texture, distance)
 
     @property
     def gains(self) -> Float64:
@@ -105,25 +114,55 @@ class Seen:
 
     @cached_property
     def _explained(self) -> tuple[Float64, Float64]:
-        """Log colour = the point's + the image's gain: by least squares, then by medians in turn against outliers.
+        """Log colour = the point's + the image's gain + haze, by least squares that outliers count little in.
 
-        Least squares first: where images overlap in a chain, taking turns would need as many rounds as the chain's
-        square. Haze lightens what is seen from afar and passes for gain: streets without any change have some 5 %.
+        Haze lightens what is seen from afar: left out, it would pass for gain, as one camera, or one moment, sees from
+        afar what another sees from nearby.
         """
         kept = _shared(self.colours.value)
-        value = np.where(kept[..., None], self.colours.value, np.nan)
-        see = kept.astype(np.float64)
-        each = see / np.maximum(see.sum(0), 1)
-        rest = np.where(kept[..., None], value - _nanmean(value, 0), 0).sum(1)
-        gain = np.linalg.pinv(np.diag(see.sum(1)) - each @ see.T, hermitian=True) @ rest
-        for _ in range(_ROUNDS):
-            left = value - gain[:, None]
-            left -= _nanmean(left, 0)
-            gain += np.stack([_nanmedian(v) for v in left])
+        sky = np.quantile([_linear(p[::4, ::4].reshape(-1, 3) / 255.0) for p in self.pixels.values()], _SKY, (0, 1))
+        gain, left = _explain(np.where(kept[..., None], self.colours.value, 0.0), self.colours.distance, kept, sky)
         known = self.linked
         gain -= gain[known].mean(0) if known.any() else 0
-        left = value - gain[:, None]
-        return gain, left - _nanmean(left, 0)
+        return gain, left
+
+
+def _explain(value: Float64, distance: Float64, kept: NDArray[np.bool_], sky: Float64) -> tuple[Float64, Float64]:
+    """([V, 3] gain, [V, P, 3] what is left, NaN where not ``kept``) of log colours [V, P, 3]. Gauss–Newton.
+
+    Over a distance d, haze of strength h makes a colour c to c + h d (sky − c). One h holds for all: with a number
+    for each channel it would be free to trade a drift of gain for haze while the vehicle drives ahead.
+    """
+    light = value.transpose(2, 0, 1)  # [3, V, P]
+    weight = kept.astype(np.float64)
+    own, gain, haze = _mean(light, weight), np.zeros((3, len(kept), 1)), 0.0
+    for _ in range(_ROUNDS):
+        term = distance * (sky[:, None, None] * np.exp(-own) - 1)
+        share = np.maximum(1 + haze * term, _LEAST)
+        slope = term / share
+        y = light - np.log(share) + haze * slope
+        y, slope = y - _mean(y, weight), slope - _mean(slope, weight)
+        among = np.linalg.pinv(np.diag(weight.sum(1)) - (weight / np.maximum(weight.sum(0), _LEAST)) @ weight.T)
+        by_gain, crossed = (weight * y).sum(2), (weight * slope).sum(2)  # [3, V]
+        up = (weight * slope * y).sum() - np.einsum("cv,vw,cw->", crossed, among, by_gain)
+        down = (weight * slope**2).sum() - np.einsum("cv,vw,cw->", crossed, among, crossed)
+        haze = max(0.0, float(up / max(down, _LEAST)))
+        gain = ((by_gain - haze * crossed) @ among)[..., None]
+        hazed = np.log(np.maximum(1 + haze * term, _LEAST))
+        own = _mean(light - gain - hazed, weight)
+        left = light - gain - hazed - own
+        weight = kept / (1 + np.square(left / _OUTLIER).mean(0))
+    return gain[..., 0].T, np.where(kept[..., None], left.transpose(1, 2, 0), np.nan)
+
+
+def _linear(coded: Float64) -> Float64:
+    """sRGB in [0, 1] to linear light, above its toe."""
+    return np.asarray(((coded + 0.055) / 1.055) ** 2.4)
+
+
+def _mean(values: Float64, weight: Float64) -> Float64:
+    """Weighted mean over views of [..., V, P] → [..., 1, P]; 0 where nothing counts."""
+    return np.asarray((weight * values).sum(-2, keepdims=True) / np.maximum(weight.sum(0), _LEAST))
 
 
 def _shared(value: Float64) -> NDArray[np.bool_]:
@@ -139,18 +178,7 @@ def _logs(image: NDArray[np.uint8], uv: Float32) -> tuple[Float64, Float64]:
     row = uv[:, 1].astype(np.int64).clip(1, height - 2)
     cells = np.stack([image[row + y, column + x] for y in (-1, 0, 1) for x in (-1, 0, 1)]) / 255.0
     clipped = ((cells < _DARK) | (cells > _BRIGHT)).any((0, 2))
-    light = _GAMMA * np.log(cells.clip(_DARK, 1))
+    light = np.log(_linear(cells.clip(_DARK, 1)))
     middle, spread = light.mean(0), light.std(0).mean(1)
     middle[clipped], spread[clipped] = np.nan, np.nan
     return middle, spread
-
-
-def _nanmean(values: Float64, axis: int) -> Float64:
-    known = np.isfinite(values)
-    return np.where(known, values, 0).sum(axis) / np.where(known.any(axis), known.sum(axis), np.nan)
-
-
-def _nanmedian(values: Float64) -> Float64:
-    """Over points, 0 where fewer than ten are known."""
-    known = np.isfinite(values).all(1)
-    return np.median(values[known], 0) if known.sum() >= _FEW else np.zeros(values.shape[1])

@@ -17,9 +17,10 @@ from genre_tasks.errors import InputError
 from genre_tasks.fixer.network import Conditions
 from genre_tasks.fixer.warping import MIN_ALPHA, SourceImage, Warp, choose, surface_of, warp
 from genre_tasks.render.surface import render_surfaces
-from genre_tasks.scene.chunk import Chunk
+from genre_tasks.scene.chunk import Chunk, View
 from genre_tasks.scene.images import decode_image
 from genre_tasks.scene.lidar_map import lidar_scene
+from genre_tasks.scene.projection import NEAR_M
 from genre_tasks.scene.views import NovelView, NovelViews
 
 MAX_COLOUR_SHIFT = 0.03
@@ -103,9 +104,21 @@ def recorded(chunk: Chunk) -> tuple[SourceImage, ...]:
     depth = torch.where(map_.alpha >= MIN_ALPHA, map_.expected_depth(), torch.zeros_like(map_.alpha))
     out = []
     for view, hidden_at in zip(views, depth, strict=True):
-        image = decode_image(view.image, view.lens.width_px, view.lens.height_px).permute(2, 0, 1)
+        image = _own_colours(view).permute(2, 0, 1)
+        if view.own is not None:  # what lies behind the vehicle is hidden by it
+            hidden_at = torch.where(torch.from_numpy(view.own), NEAR_M, hidden_at)
         out.append(SourceImage(view.camera, view.frame, view.chunk_SE3_camera, view.lens, image, hidden_at))
     return tuple(out)
+
+
+def _own_colours(view: View) -> Tensor:
+    """[H, W, 3] the image, at the scene's own exposure where its gain is known."""
+    image = decode_image(view.image, view.lens.width_px, view.lens.height_px)
+    if view.log_gain is None:
+        return image
+    from genre_tasks.effects.exposure import neutral
+
+    return neutral(image, image.new_tensor(view.log_gain))
 
 
 def references(chunk: Chunk, views: Sequence[NovelView], sources: Sequence[SourceImage]) -> list[SourceImage]:

@@ -143,11 +143,18 @@ class Collector:
         ]
 
 
+def _where(shown: NDArray[np.bool_] | None, image: Tensor, truth: Tensor) -> Tensor:
+    return image if shown is None else torch.where(torch.from_numpy(shown)[..., None], image, truth)
+
+
 def scored(views: Sequence[View | NovelView], images: Tensor, truths: Tensor) -> list[ViewScore]:
-    """PSNR, SSIM and perceptual distance of each image [V, H, W, 3] against its truth."""
+    """PSNR, SSIM and perceptual distance of each image [V, H, W, 3] against its truth, outside of ``View.own``."""
+    shown = [~v.own if isinstance(v, View) and v.own is not None else None for v in views]
+    if any(s is not None for s in shown):  # the vehicle itself is no error, nor no merit
+        images = torch.stack([_where(s, a, b) for s, a, b in zip(shown, images, truths, strict=True)])
     with torch.no_grad():
         perceptual = perceptual_distance()(images, truths).tolist()
-    pairs = [(a.numpy(), b.numpy()) for a, b in zip(images, truths, strict=True)]
+    pairs = [(a.numpy(), b.numpy(), s) for a, b, s in zip(images, truths, shown, strict=True)]
     both = map_single_threaded(lambda pair: (psnr(*pair), ssim(*pair)), pairs)
     return [
         ViewScore(v.camera, v.frame, v.shift_m if isinstance(v, NovelView) else 0.0, p, s, d)

@@ -99,14 +99,30 @@ def image_gradients(
 ) -> tuple[float, Tensor, Tensor]:
     """The batch's loss and its gradients with respect to ``color`` and ``depth``.
 
-    In float32 on the CPU all but the perceptual term is the compiled kernel's work; elsewhere it is torch's.
+    In float32 on the CPU all but the perceptual term is the compiled kernel's work; elsewhere it is torch's. A target
+    with a gain is compared with the render at that gain; where the vehicle itself is in its image nothing pulls.
     """
+    gains = _gains(targets, color)
+    if gains is not None:
+        from genre_tasks.effects.exposure import slope, toned
+
+        color = toned(color, gains)
     take = image_loss if takes(color, depth, targets) else torch_image_loss
     sums = take(config, color, depth, targets, plan.weights)
     loss = float(sums.losses.sum())
     if distance is not None:
         loss += _add_perceptual(config, color, targets, plan, distance, sums.by_color)
-    return loss, sums.by_color, sums.by_depth
+    for i, target in enumerate(targets):
+        if target.own is not None:
+            sums.by_color[i][target.own], sums.by_depth[i][target.own] = 0.0, 0.0
+    return loss, sums.by_color if gains is None else sums.by_color * slope(gains), sums.by_depth
+
+
+def _gains(targets: Sequence[Target], like: Tensor) -> Tensor | None:
+    """[V, 1, 1, 3] log gains, ``None`` where no target has one."""
+    if all(t.log_gain is None for t in targets):
+        return None
+    return like.new_tensor([t.log_gain or (0.0, 0.0, 0.0) for t in targets])[:, None, None]
 
 
 def torch_image_loss(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from genre_tasks.config import GnetConfig, OptimiserConfig
+from genre_tasks.effects.types import EffectsPlan
 from genre_tasks.errors import ConfigError
 from genre_tasks.optimiser import targets
 from genre_tasks.optimiser.adam import ENET_RATES, GNET_RATES, TunedAdam
@@ -51,6 +52,13 @@ def optimise(
         config.hold_ground,
     )
     return unroll(rule, scene, source, novel, Objective(config.loss, distance(config)), plan, progress)
+
+
+def planned(config: OptimiserConfig, plan: EffectsPlan) -> OptimiserConfig:
+    """The configuration without the loss terms that the plan leaves out."""
+    if plan.on("lidar_depth"):
+        return config
+    return config.model_copy(update={"loss": config.loss.model_copy(update={"depth": 0.0})})
 
 
 def per_scene(

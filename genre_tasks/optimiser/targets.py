@@ -11,7 +11,7 @@ from torch import Tensor
 from genre_tasks.errors import InputError
 from genre_tasks.logs.types import Float64, Lens
 from genre_tasks.optimiser.ssim import SsimTarget
-from genre_tasks.scene.chunk import Chunk, View
+from genre_tasks.scene.chunk import Chunk, Gain, View
 from genre_tasks.scene.images import decode_image
 from genre_tasks.scene.views import FixedViews
 
@@ -21,7 +21,8 @@ class Target:
     """A view that supervises.
 
     ``image`` [H, W, 3] sRGB float32 with its SSIM terms; ``depth`` [H, W] metres along the optical axis, 0 where the
-    LiDAR returned nothing, or ``None`` where depth does not supervise (novel views, paper Eq. 11).
+    LiDAR returned nothing, or ``None`` where depth does not supervise (novel views, paper Eq. 11). ``log_gain`` and
+    ``own`` [H, W]: as a ``View`` has them.
     """
 
     camera: str
@@ -31,6 +32,8 @@ class Target:
     image: SsimTarget
     depth: Tensor | None = None
     novel: bool = False
+    log_gain: Gain | None = None
+    own: Tensor | None = None
 
 
 def of_views(chunk: Chunk, views: Sequence[View], depth: bool = False) -> tuple[Target, ...]:
@@ -48,8 +51,9 @@ def of_views(chunk: Chunk, views: Sequence[View], depth: bool = False) -> tuple[
             where = {"log": chunk.log, "chunk": chunk.index, "camera": view.camera, "frame": view.frame}
             raise InputError(error.problem, remedy=error.remedy, **where) from error  # type: ignore[arg-type]
         sparse = torch.as_tensor(lidar_depth(chunk, view)).float() if depth else None
-        pose = view.chunk_SE3_camera
-        out.append(Target(view.camera, view.frame, pose, view.lens, SsimTarget.of(image), sparse))
+        own = None if view.own is None else torch.from_numpy(view.own)
+        pose, seen = view.chunk_SE3_camera, SsimTarget.of(image)
+        out.append(Target(view.camera, view.frame, pose, view.lens, seen, sparse, False, view.log_gain, own))
     return tuple(out)
 
 

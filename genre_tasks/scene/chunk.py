@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from genre_tasks.logs.types import Float32, Float64, Lens
 
 Role = Literal["source", "heldout"]
+Gain = tuple[float, float, float]
+"""Logarithm of an image's gain in linear light: red, green, blue."""
 MarkKind = Literal[
     "missing_image", "unreadable_image", "missing_sweep", "unreadable_sweep", "cuboid_outside", "cuboid_invalid",
     "actor_few_points", "timestamps", "standstill",
@@ -23,6 +25,9 @@ class View:
 
     ``frame`` counts in the log; ``chunk_SE3_camera`` [4, 4] float64; ``lens`` at the *working* resolution; ``image``
     the encoded bytes as they came (native resolution), never ``None``: a view without an image is not in the chunk.
+
+    What effects say of the image, ``None`` where they are off (``ingest`` knows nothing of it): ``log_gain`` of its
+    exposure, ``own`` [H, W] where the vehicle itself is in it.
     """
 
     camera: str
@@ -32,6 +37,8 @@ class View:
     chunk_SE3_camera: Float64
     lens: Lens
     image: bytes
+    log_gain: Gain | None = None
+    own: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from genre_tasks.config import OptimiserConfig
-from genre_tasks.optimiser.run import optimise
+from genre_tasks.effects.applied import applied
+from genre_tasks.effects.types import UNPLANNED, EffectsPlan
+from genre_tasks.optimiser.run import optimise, planned
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.results import Reconstruction
@@ -15,10 +17,11 @@ def enet(
     chunk: Chunk,
     reconstruction: Reconstruction,
     fixed: FixedViews,
+    plan: EffectsPlan = UNPLANNED,
     progress: Progress = silent,
 ) -> Reconstruction:
     """The enhanced scene, optimised against source views and fixed novel views.
 
     Raises ``InputError`` (no source view, an unreadable image, weights that do not fit), ``NonFiniteError``.
     """
-    return optimise("enet", config, chunk, reconstruction.scene, fixed, progress)
+    return optimise("enet", planned(config, plan), applied(chunk, plan), reconstruction.scene, fixed, progress)

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from genre_tasks.config import EvaluateConfig
+from genre_tasks.effects.applied import applied
+from genre_tasks.effects.types import UNPLANNED, EffectsPlan
 from genre_tasks.logs.types import Truth
 from genre_tasks.metrics.collect import Collector, real_images, true_pixels, view_image
 from genre_tasks.metrics.image import psnr
@@ -44,6 +46,7 @@ def evaluate_scene(
     stage: str,
     reconstruction: Reconstruction,
     truth: Truth | None,
+    plan: EffectsPlan = UNPLANNED,
     progress: Progress = silent,
     settings: RenderSettings = _AUTO,
 ) -> Evaluation:
@@ -56,6 +59,7 @@ def evaluate_scene(
     Raises:
         InputError: an image of the chunk cannot be decoded. NonFiniteError: a render is not finite.
     """
+    chunk = applied(chunk, plan)
     heldout = chunk.of_role("heldout")
     shifts = _shifts(config, truth)
     frames = chunk.frames[:: config.every]
@@ -178,10 +182,23 @@ def _rendered(
     for start in range(0, len(views), size):
         batch = list(views[start : start + size])
         with torch.no_grad():
-            color = render_views(scene, batch, settings).color
-        yield batch, color.cpu().clamp(0, 1)
+            color = as_recorded(render_views(scene, batch, settings).color.cpu(), batch)
+        yield batch, color.clamp(0, 1)
         if steps is not None:
             steps.add(len(batch))
+
+
+def as_recorded(color: Tensor, views: Sequence[View | NovelView]) -> Tensor:
+    """Renders [V, H, W, 3] as the cameras would have recorded them: with each view's gain, where it has one."""
+    gains = {k: v.log_gain for k, v in enumerate(views) if isinstance(v, View) and v.log_gain is not None}
+    if not gains:
+        return color
+    from genre_tasks.effects.exposure import toned
+
+    color = color.clone()
+    for k, gain in gains.items():
+        color[k] = toned(color[k], color.new_tensor(gain))
+    return color
 
 
 def _true_images(chunk: Chunk, truth: Truth | None, views: Sequence[NovelView]) -> Tensor | None:
@@ -193,7 +210,7 @@ def _true_images(chunk: Chunk, truth: Truth | None, views: Sequence[NovelView]) 
 
 def _mean_psnr(scene: SceneGraph, views: Sequence[View], settings: RenderSettings, steps: _Steps) -> float:
     values = [
-        psnr(image.numpy(), view_image(view).numpy())
+        psnr(image.numpy(), view_image(view).numpy(), None if view.own is None else ~view.own)
         for batch, images in _rendered(scene, views, settings, steps)
         for view, image in zip(batch, images, strict=True)
     ]

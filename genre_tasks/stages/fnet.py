@@ -11,6 +11,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from genre_tasks.config import FnetConfig
+from genre_tasks.effects.applied import applied
+from genre_tasks.effects.types import UNPLANNED, EffectsPlan
 from genre_tasks.errors import InputError
 from genre_tasks.fixer.conditioning import degraded, recorded, references
 from genre_tasks.fixer.inference import fix, noise_of, prefers_half, require_finite
@@ -24,7 +26,13 @@ from genre_tasks.scene.views import FixedViews, NovelViews
 from genre_tasks.weights import resolve_weights
 
 
-def fnet(config: FnetConfig, chunk: Chunk, novel: NovelViews, progress: Progress = silent) -> FixedViews:
+def fnet(
+    config: FnetConfig,
+    chunk: Chunk,
+    novel: NovelViews,
+    plan: EffectsPlan = UNPLANNED,
+    progress: Progress = silent,
+) -> FixedViews:
     """Each novel view repaired from its render, its LiDAR map and its reference image.
 
     The result depends on ``config.seed`` and a view's place in ``novel``, not on the batch size (to float
@@ -34,7 +42,7 @@ def fnet(config: FnetConfig, chunk: Chunk, novel: NovelViews, progress: Progress
         InputError: the weights are missing or do not fit, or a reference is no view of the chunk.
         NonFiniteError: a render is not finite.
     """
-    return fix_views(load_configured(config), config, chunk, novel, progress)
+    return fix_views(load_configured(config), config, applied(chunk, plan), novel, progress)
 
 
 def load_configured(config: FnetConfig) -> Fnet:

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from genre_tasks.config import OptimiserConfig
-from genre_tasks.optimiser.run import optimise
+from genre_tasks.effects.applied import applied
+from genre_tasks.effects.types import UNPLANNED, EffectsPlan
+from genre_tasks.optimiser.run import optimise, planned
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.results import Reconstruction
 
 
-def gnet(config: OptimiserConfig, chunk: Chunk, initial: Reconstruction, progress: Progress = silent) -> Reconstruction:
+def gnet(
+    config: OptimiserConfig,
+    chunk: Chunk,
+    initial: Reconstruction,
+    plan: EffectsPlan = UNPLANNED,
+    progress: Progress = silent,
+) -> Reconstruction:
     """The reconstructed scene. Source views only: fixed novel views enter GNet's training alone.
 
     Raises ``InputError`` (no source view, an unreadable image, weights that do not fit), ``NonFiniteError``.
     """
-    return optimise("gnet", config, chunk, initial.scene, None, progress)
+    return optimise("gnet", planned(config, plan), applied(chunk, plan), initial.scene, None, progress)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from genre_tasks.config import InitialConfig
+from genre_tasks.effects.applied import applied
+from genre_tasks.effects.types import UNPLANNED, EffectsPlan
 from genre_tasks.errors import NonFiniteError
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.chunk import Chunk
@@ -10,9 +12,14 @@ from genre_tasks.scene.initialise import initial_scene
 from genre_tasks.scene.results import Reconstruction
 
 
-def initial(config: InitialConfig, chunk: Chunk, progress: Progress = silent) -> Reconstruction:
+def initial(
+    config: InitialConfig, chunk: Chunk, plan: EffectsPlan = UNPLANNED, progress: Progress = silent
+) -> Reconstruction:
     """Gaussians on the chunk's LiDAR points and far away. Raises ``InputError`` if no point is near the path."""
     progress(0, 1, "initial scene")
+    chunk = applied(chunk, plan)
+    if not plan.on("distant_region"):
+        config = config.model_copy(update={"distant_count": 0})
     scene = initial_scene(config, chunk)
     packed = scene.gaussians.packed()
     bad = (~packed.isfinite()).nonzero()

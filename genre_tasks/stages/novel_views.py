@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 import torch
 
 from genre_tasks.config import NovelViewsConfig
+from genre_tasks.effects.applied import applied
+from genre_tasks.effects.types import UNPLANNED, EffectsPlan
 from genre_tasks.errors import NonFiniteError
 from genre_tasks.progress import Progress, silent
 from genre_tasks.render import Render, RenderSettings, render_views
@@ -26,6 +28,7 @@ def novel_views(
     config: NovelViewsConfig,
     chunk: Chunk,
     reconstruction: Reconstruction,
+    plan: EffectsPlan = UNPLANNED,
     progress: Progress = silent,
     settings: RenderSettings = DEFAULT_SETTINGS,
 ) -> NovelViews:
@@ -33,6 +36,7 @@ def novel_views(
 
     All cameras, in the order of ``novel_view_poses``. Raises ``NonFiniteError`` if an image is not finite.
     """
+    chunk = applied(chunk, plan)
     views = novel_view_poses(chunk, config.shifts_m)
     return render_novel(chunk, reconstruction.scene, views, config.lidar_max_points, progress, settings)
 

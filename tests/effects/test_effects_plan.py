@@ -123,7 +123,7 @@ def test_a_drift_along_a_chain_of_images_is_found(monkeypatch: pytest.MonkeyPatc
             value[n, at] = own + drift[n] + g.normal(0, 0.02, (each, 3))
     view = chunk().of_role("source")[0]
     seen = Seen(chunk(), cameras())
-    monkeypatch.setattr(Seen, "colours", Colours((view,) * 20, value, np.zeros(value.shape[:2])))
+    monkeypatch.setattr(Seen, "colours", Colours((view,) * 20, value, *np.zeros((2, *value.shape[:2]))))
     np.testing.assert_allclose(seen.gains, np.repeat(drift[:, None], 3, 1), atol=0.03)
     assert float(np.nanstd(seen.unexplained)) < 0.03
 
@@ -135,7 +135,7 @@ def test_images_that_share_nothing_are_not_counted(monkeypatch: pytest.MonkeyPat
     value[1, :100] += 0.4
     value[2, 100:200], value[3, 200:] = -1.0, -3.0
     view = chunk().of_role("source")[0]
-    monkeypatch.setattr(Seen, "colours", Colours((view,) * 4, value, np.zeros(value.shape[:2])))
+    monkeypatch.setattr(Seen, "colours", Colours((view,) * 4, value, *np.zeros((2, *value.shape[:2]))))
     found = planned("exposure")["exposure"]
     assert found.value == pytest.approx(20, abs=0.5) and "of 2 images" in found.reason
     value[1] = np.nan
@@ -153,7 +153,8 @@ def test_distortion_gate_flips_with_the_coefficient() -> None:
 
 
 def _brightened(image: np.ndarray, gain: float) -> np.ndarray:
-    return (255 * (np.clip((image / 255.0) ** 2.2 * gain, 0, 1)) ** (1 / 2.2)).round().astype(np.uint8)
+    coded = (image / 255.0 + 0.055) * gain ** (1 / 2.4) - 0.055
+    return (255 * coded.clip(0, 1)).round().astype(np.uint8)
 
 
 def test_exposure_reads_the_gains_that_images_were_given(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -30,7 +30,7 @@ def weights(tmp_path) -> Path:
 def test_every_view_comes_back_fixed(scene, weights):
     chunk, novel = scene
     calls = []
-    out = fnet(FnetConfig(weights=str(weights)), chunk, novel, lambda *call: calls.append(call))
+    out = fnet(FnetConfig(weights=str(weights)), chunk, novel, progress=lambda *call: calls.append(call))
     assert out.views is novel.views
     assert out.color.shape == novel.color.shape and out.color.dtype == torch.float32
     assert out.color.min() >= 0 and out.color.max() <= 1

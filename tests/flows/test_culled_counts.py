@@ -20,7 +20,7 @@ def refs(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, dict[str, Artif
     store = str(tmp_path_factory.mktemp("culled") / "store")
     job = Job(LOG, 0, store, load_configuration("demo", settings=SETTINGS).model_dump(mode="json"))
     made: dict[str, ArtifactRef] = {}
-    for stage in ("ingest", "initial", "gnet", "novel_views", "fnet", "enet"):
+    for stage in ("ingest", "effects", "initial", "gnet", "novel_views", "fnet", "enet"):
         made[stage] = produce(stage, job, {name: made[name] for name in BY_NAME[stage].inputs})
     return store, made
 

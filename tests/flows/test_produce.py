@@ -15,6 +15,8 @@ from flows.produce import ArtifactRef, Job, key_of, measured, produce
 from genre_tasks.errors import InputError, ResourceError
 from tests.faults.tiny import LOG, SETTINGS
 
+EARLY = ("ingest", "effects", "initial")
+
 
 def job(store: Path, *settings: str, log: str = LOG) -> Job:
     config = load_configuration("demo", settings=[*SETTINGS, *settings])
@@ -31,7 +33,7 @@ def run(work: Job, *stages: str) -> dict[str, ArtifactRef]:
 @pytest.fixture(scope="module")
 def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     store = tmp_path_factory.mktemp("filled") / "store"
-    run(job(store), "ingest", "initial")
+    run(job(store), *EARLY)
     return store
 
 
@@ -52,14 +54,22 @@ def test_the_pipeline_is_in_order() -> None:
 
 
 def test_a_second_run_is_served_from_the_store(store: Path) -> None:
-    assert cached(run(job(store), "ingest", "initial")) == {"ingest": True, "initial": True}
+    assert cached(run(job(store), *EARLY)) == {"ingest": True, "effects": True, "initial": True}
 
 
 def test_an_unrelated_setting_keeps_the_key_and_a_related_one_changes_it(store: Path) -> None:
-    other = run(job(store, "gnet.iterations=3", "evaluate.every=2"), "ingest", "initial")
-    assert cached(other) == {"ingest": True, "initial": True}
-    changed = run(job(store, "initial.opacity=0.5"), "ingest", "initial")
-    assert cached(changed) == {"ingest": True, "initial": False}
+    other = run(job(store, "gnet.iterations=3", "evaluate.every=2"), *EARLY)
+    assert cached(other) == {"ingest": True, "effects": True, "initial": True}
+    changed = run(job(store, "initial.opacity=0.5"), *EARLY)
+    assert cached(changed) == {"ingest": True, "effects": True, "initial": False}
+
+
+def test_a_plan_of_effects_is_part_of_later_keys(store: Path) -> None:
+    other = run(job(store, "effects.lidar_depth=off"), *EARLY)
+    assert cached(other) == {"ingest": True, "effects": False, "initial": False}
+    spec, config = BY_NAME["gnet"], load_configuration("demo")
+    keys = {stage_key(spec, config, {"ingest": "a", "initial": "b", "effects": e}, "w") for e in "cd"}
+    assert len(keys) == 2
 
 
 def test_a_setting_that_only_bounds_memory_keeps_the_key(store: Path) -> None:
@@ -89,16 +99,16 @@ def test_the_key_follows_the_logs_content_and_the_chunk(store: Path) -> None:
 
 
 def test_deleting_an_artifact_computes_it_again_and_nothing_else(store: Path) -> None:
-    refs = run(job(store), "ingest", "initial")
+    refs = run(job(store), *EARLY)
     shutil.rmtree(refs["ingest"].path)
-    again = run(job(store), "ingest", "initial")
-    assert cached(again) == {"ingest": False, "initial": True}
+    again = run(job(store), *EARLY)
+    assert cached(again) == {"ingest": False, "effects": True, "initial": True}
     assert again["ingest"].payload_digest == refs["ingest"].payload_digest
 
 
 @pytest.mark.parametrize("damage", ["flip", "truncate", "remove", "add"])
 def test_a_damaged_file_is_found_named_and_computed_again(store: Path, damage: str) -> None:
-    refs = run(job(store), "ingest", "initial")
+    refs = run(job(store), *EARLY)
     file = sorted(Path(refs["initial"].path).glob("*.parquet"))[0]
     data = bytearray(file.read_bytes())
     if damage == "flip":
@@ -110,8 +120,8 @@ def test_a_damaged_file_is_found_named_and_computed_again(store: Path, damage: s
         file.unlink()
     else:
         (file.parent / "stray.bin").write_bytes(b"x")
-    again = run(job(store), "ingest", "initial")
-    assert cached(again) == {"ingest": True, "initial": False}
+    again = run(job(store), *EARLY)
+    assert cached(again) == {"ingest": True, "effects": True, "initial": False}
     assert ("stray.bin" if damage == "add" else file.name) in again["initial"].note
     assert again["initial"].payload_digest == refs["initial"].payload_digest
 

@@ -28,9 +28,9 @@ def prefect() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def two_stages(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first two stages are enough to see how the flow treats any stage."""
-    short = tuple(spec for spec in PIPELINE if spec.name in ("ingest", "initial"))
+def early_stages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first three stages are enough to see how the flow treats any stage."""
+    short = tuple(spec for spec in PIPELINE if spec.name in ("ingest", "effects", "initial"))
     monkeypatch.setattr(reconstruct, "PIPELINE", short)
     monkeypatch.setattr(runs, "PIPELINE", short)
 
@@ -45,7 +45,7 @@ def served(summary: dict[str, Any]) -> list[bool]:
 
 def test_a_second_run_is_cached_and_says_so(tmp_path: Path) -> None:
     first, second = run(tmp_path), run(tmp_path)
-    assert (served(first), served(second)) == ([False, False], [True, True])
+    assert (served(first), served(second)) == ([False] * 3, [True] * 3)
     assert first["run"] == second["run"]
     assert Path(second["report"]).read_text().startswith("<!doctype html>")
 
@@ -65,13 +65,13 @@ def test_what_a_retry_can_cure_is_retried(tmp_path: Path, monkeypatch: pytest.Mo
 
     def failing(stage: str, job: Job, inputs: Any, attempt: int, progress: Any) -> Any:
         attempts.append(attempt)
-        if stage == "initial" and len(attempts) < 4:
+        if stage == "initial" and len(attempts) < 5:
             raise kind("not now", remedy="Wait.")
         return real(stage, job, inputs, attempt, progress)
 
     monkeypatch.setattr(stage_task, "produce", failing)
-    assert served(run(tmp_path)) == [False, False]
-    assert attempts == [0, 0, 1, 2]
+    assert served(run(tmp_path)) == [False] * 3
+    assert attempts == [0, 0, 0, 1, 2]
 
 
 def test_what_no_retry_can_cure_is_not_retried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

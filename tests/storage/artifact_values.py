@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from genre_tasks.effects.types import Decision, EffectsPlan
+from genre_tasks.effects.types import Decision, EffectsPlan, Fitted
 from genre_tasks.fixer.conditioning import Degraded
 from genre_tasks.fixer.pairs import NAMES, Pairs
 from genre_tasks.logs.types import Lens
@@ -146,7 +146,9 @@ def effects(rng: np.random.Generator, count: int = 3) -> EffectsPlan:
         )
         for k in range(count)
     ]
-    return EffectsPlan(tuple(rows))
+    own = {f"camera_{k}": rng.random((4, 6)) < 0.5 for k in range(count)}
+    gains = {(f"camera_{k}", k): tuple(float(x) for x in rng.normal(size=3)) for k in range(count)}
+    return EffectsPlan(tuple(rows), Fitted(gains, own))
 
 
 MAKERS = {

@@ -1,0 +1,212 @@
+"""What is on is applied, to the gradient and back; what is off costs nothing and changes no bit."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from genre_tasks.config import EffectsConfig, GnetConfig, IngestConfig, InitialConfig, LossConfig
+from genre_tasks.effects import exposure
+from genre_tasks.effects.applied import applied
+from genre_tasks.effects.plan import EFFECTS, plan
+from genre_tasks.effects.types import UNPLANNED, Decision, EffectsPlan, Fitted
+from genre_tasks.fixer.conditioning import recorded
+from genre_tasks.logs.registry import open_log
+from genre_tasks.logs.synthetic.imaging import bonnet
+from genre_tasks.logs.synthetic.parameters import StreetParameters
+from genre_tasks.metrics.collect import scored, view_image
+from genre_tasks.optimiser.loss import image_gradients, plan_loss
+from genre_tasks.optimiser.targets import Target, of_views
+from genre_tasks.scene.chunk import Chunk
+from genre_tasks.stages.evaluate import as_recorded
+from genre_tasks.stages.gnet import gnet
+from genre_tasks.stages.ingest import ingest
+from genre_tasks.stages.initial import initial
+
+SMALL = "&frames=8&cameras=2&width=160&height=90&samples=1"
+STREET = "synthetic:street?seed=1020" + SMALL
+
+
+@cache
+def chunk(uri: str = STREET) -> Chunk:
+    return ingest(IngestConfig(width_px=160, height_px=90), open_log(uri), 0)
+
+
+def with_(*on: str, fitted: Fitted | None = None) -> EffectsPlan:
+    rows = [Decision(n, "", 1.0, "", 0.0, "auto", "on" if n in on else "off", "", "") for n in EFFECTS]
+    return EffectsPlan(tuple(rows), fitted or Fitted())
+
+
+BASIC = ("rigid_actors", "distant_region", "lidar_depth")
+
+
+def test_a_plan_without_anything_to_apply_leaves_the_chunk_itself() -> None:
+    assert applied(chunk(), UNPLANNED) is chunk()
+    assert applied(chunk(), with_(*BASIC)) is chunk()
+
+
+def test_what_is_off_gives_the_same_bytes_as_no_plan() -> None:
+    first = initial(InitialConfig(max_points=2000, distant_count=200), chunk())
+    again = initial(InitialConfig(max_points=2000, distant_count=200), chunk(), with_(*BASIC))
+    assert torch.equal(first.scene.gaussians.packed(), again.scene.gaussians.packed())
+    config = GnetConfig(iterations=3, views_per_iteration=2, method="adam", loss=LossConfig(perceptual=0))
+    one, two = gnet(config, chunk(), first), gnet(config, chunk(), first, with_(*BASIC))
+    assert torch.equal(one.scene.gaussians.packed(), two.scene.gaussians.packed()) and one.losses == two.losses
+
+
+def test_stages_of_a_plan_without_effects_import_none() -> None:
+    code = (
+        "import sys\n"
+        "import tests.effects.test_effects_plan as t\n"
+        "from genre_tasks.effects.plan import EFFECTS, plan\n"
+        "from genre_tasks.config import *\n"
+        "from genre_tasks.stages.initial import initial\n"
+        "from genre_tasks.stages.gnet import gnet\n"
+        "from genre_tasks.stages.novel_views import novel_views\n"
+        "from genre_tasks.stages.evaluate import evaluate_scene\n"
+        "none = plan(EffectsConfig(**dict.fromkeys(EFFECTS, 'off')), t.chunk(), t.cameras())\n"
+        "first = initial(InitialConfig(max_points=2000, distant_count=200), t.chunk(), none)\n"
+        "config = GnetConfig(iterations=1, method='adam', loss=LossConfig(perceptual=0))\n"
+        "scene = gnet(config, t.chunk(), first, none)\n"
+        "novel_views(NovelViewsConfig(), t.chunk(), scene, none)\n"
+        "judged = EvaluateConfig(distributions=False, shifts_m=(), pictures=0)\n"
+        "evaluate_scene(judged, t.chunk(), 'gnet', scene, None, none)\n"
+        "loaded = [n for n in EFFECTS if f'genre_tasks.effects.{n}' in sys.modules]\n"
+        "assert not loaded, loaded\n"
+        "assert not (scene.scene.nodes > 0).any()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def test_without_rigid_actors_their_points_stand_where_the_sweeps_saw_them() -> None:
+    still = applied(chunk(), with_("distant_region", "lidar_depth"))
+    assert not still.actors
+    assert len(still.static) == len(chunk().static) + sum(len(a.points) for a in chunk().actors)
+    actor = chunk().actors[0]
+    own = still.static.positions[len(chunk().static) : len(chunk().static) + len(actor.points)]
+    at = int(actor.points.frames[0])
+    pose = actor.chunk_SE3_box[list(actor.frames).index(at)]
+    np.testing.assert_allclose(own[0], pose[:3, :3] @ actor.points.positions[0] + pose[:3, 3], atol=1e-4)
+
+
+def test_without_the_depth_term_no_depth_pulls() -> None:
+    config = GnetConfig(iterations=2, method="adam", loss=LossConfig(perceptual=0, depth=5.0))
+    first = initial(InitialConfig(max_points=2000, distant_count=200), chunk())
+    pulled = gnet(config, chunk(), first, with_(*BASIC))
+    left = gnet(config, chunk(), first, with_("rigid_actors", "distant_region"))
+    assert left.losses[0] < pulled.losses[0]
+
+
+def test_the_exposures_derivatives_are_those_of_finite_differences() -> None:
+    g = torch.Generator().manual_seed(0)
+    color = torch.rand(2, 5, 4, 3, generator=g, dtype=torch.float64, requires_grad=True)
+    gains = torch.randn(2, 1, 1, 3, generator=g, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(exposure.toned, (color, gains))
+
+
+def test_the_loss_takes_its_gradient_through_the_gain() -> None:
+    view = chunk().of_role("source")[0]
+    (target,) = of_views(chunk(), [replace(view, log_gain=(0.5, -0.3, 0.1))])
+    g = torch.Generator().manual_seed(1)
+    color = torch.rand(1, 90, 160, 3, generator=g)
+    config = LossConfig(perceptual=0)
+    loss_plan = plan_loss(config, [target], 0, g, perceptual=False)
+    depth = torch.zeros(1, 90, 160)
+
+    def loss(at: torch.Tensor) -> float:
+        return image_gradients(config, at, depth, [target], loss_plan)[0]
+
+    by_color = image_gradients(config, color, depth, [target], loss_plan)[1]
+    way = by_color / by_color.abs().max()
+    step = 1e-3
+    found = (loss(color + step * way) - loss(color - step * way)) / (2 * step)
+    assert float((by_color * way).sum()) == pytest.approx(found, rel=0.02)
+    (plain,) = of_views(chunk(), [view])
+    assert image_gradients(config, color, depth, [plain], loss_plan)[0] != pytest.approx(loss(color), rel=0.01)
+
+
+def test_nothing_pulls_where_the_vehicle_itself_is() -> None:
+    view = chunk().of_role("source")[0]
+    own = np.zeros((90, 160), bool)
+    own[70:] = True
+    (target,) = of_views(chunk(), [replace(view, own=own)])
+    color = torch.rand(1, 90, 160, 3, generator=torch.Generator().manual_seed(2))
+    config = LossConfig(perceptual=0)
+    loss_plan = plan_loss(config, [target], 0, torch.Generator(), perceptual=False)
+    by_color = image_gradients(config, color, torch.ones(1, 90, 160), [target], loss_plan)[1]
+    assert not by_color[0, 70:].any() and by_color[0, :60].any()
+    images = torch.rand(1, 90, 160, 3, generator=torch.Generator().manual_seed(3))
+    worse = images.clone()
+    worse[:, 70:] = 0
+    kept = [scored([replace(view, own=own)], i, view_image(view)[None])[0] for i in (images, worse)]
+    assert kept[0] == kept[1]
+    assert scored([view], images, view_image(view)[None])[0].psnr != kept[0].psnr
+
+
+@pytest.mark.parametrize("gain", [0.0, 1.5, -1.5, -30.0, 30.0])
+def test_neutral_undoes_what_a_gain_does_and_stays_finite(gain: float) -> None:
+    """Hard case 52: a gain towards zero, or without bound, is applied up to a factor of 55."""
+    own = torch.rand(40, 30, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    gains = own.new_tensor([gain, 0.5 * gain, 0.0])
+    shown = exposure.toned(own, gains)
+    assert torch.isfinite(shown).all()
+    back = exposure.neutral(shown, gains)
+    seen = shown < 1
+    torch.testing.assert_close(back[seen], own[seen])
+    assert torch.isfinite(back).all() and (back >= 0).all() and (back <= 1).all()
+
+
+def test_gains_of_a_street_are_found_and_held_out_views_take_their_neighbours() -> None:
+    uri = "synthetic:street?seed=1020&cameras=2&width=160&height=90&samples=1&exposure_jitter=0.3"
+    log = open_log(uri)
+    found = plan(EffectsConfig(**{n: "on" if n == "exposure" else "off" for n in EFFECTS}), chunk(uri), log.cameras)
+    views = chunk(uri).views
+    true = np.array([log.imaging.log_gain(v.camera, v.frame * 0.1) for v in views])
+    gains = np.array([found.fitted.gains[v.camera, v.frame] for v in views])
+    assert true.std() > 0.1
+    assert np.sqrt(np.square((gains - gains.mean(0)) - (true - true.mean(0))).mean()) < 0.06
+    held = [k for k, v in enumerate(views) if v.role == "heldout"]
+    assert np.abs((gains - gains.mean(0) - true + true.mean(0))[held]).max() < 0.2
+    source = [gains[k] for k, v in enumerate(views) if v.role == "source"]
+    np.testing.assert_allclose(np.mean(source, 0), 0, atol=1e-9)
+
+
+def test_renders_take_a_views_gain_and_recorded_images_lose_it() -> None:
+    view = chunk().of_role("source")[0]
+    color = torch.rand(2, 90, 160, 3, generator=torch.Generator().manual_seed(5))
+    gained = replace(view, log_gain=(0.4, 0.4, 0.4))
+    assert as_recorded(color, [view, view]) is color
+    shown = as_recorded(color, [view, gained])
+    assert torch.equal(shown[0], color[0]) and (shown[1] > color[1]).all()
+    gains = {(v.camera, v.frame): (0.4, 0.4, 0.4) for v in chunk().views}
+    own = {view.camera: np.ones((90, 160), bool)}
+    plain, planned = recorded(chunk()), recorded(applied(chunk(), with_(*BASIC, fitted=Fitted(gains, own))))
+    assert all(b.image.mean() < a.image.mean() for a, b in zip(plain, planned, strict=True))
+    assert all((b.depth <= 0.11).all() == (b.camera == view.camera) for b in planned)
+
+
+def test_the_streets_bonnet_is_found_where_it_is() -> None:
+    uri = STREET + "&bonnet=0.08"
+    log = open_log(uri)
+    found = plan(EffectsConfig(**{n: "auto" if n == "ego_mask" else "off" for n in EFFECTS}), chunk(uri), log.cameras)
+    assert found["ego_mask"].choice == "on" and list(found.fitted.own) == ["front_camera"]
+    lens = chunk(uri).views[0].lens
+    true = bonnet(StreetParameters(bonnet=0.08), "front_camera", lens)
+    mask = found.fitted.own["front_camera"]
+    assert (mask & true).sum() > 0.97 * true.sum() and (mask & ~true).sum() < 0.6 * true.sum()
+    truth = log.truth.image(0, log.world_SE3_camera("front_camera", 0), lens).astype(float)
+    image = view_image(chunk(uri).views[0]).numpy() * 255
+    assert np.abs(image - truth)[~true].max() <= 1 and np.abs(image - truth)[true].mean() > 20
+
+
+def test_targets_carry_what_effects_say() -> None:
+    view = replace(chunk().of_role("source")[0], log_gain=(0.1, 0.2, 0.3), own=np.zeros((90, 160), bool))
+    (target,) = of_views(chunk(), [view])
+    assert isinstance(target, Target) and target.log_gain == (0.1, 0.2, 0.3) and target.own is not None
