@@ -75,6 +75,7 @@ static inline void for_tiles(const Footprint& g, int tiles_x, int tiles_y, F f) 
   }
 }
 
+template <bool ROLLS, bool BENDS>
 static void project_all(View& v, const GaussianArrays& in, int threads) {
   const size_t count = (size_t)v.shown.shared + v.shown.own;
   v.input.resize(count), v.id.resize(count), v.slot_end.resize(count);
@@ -88,7 +89,7 @@ static void project_all(View& v, const GaussianArrays& in, int threads) {
       const bool shared = i < v.shown.shared;
       n = std::min<size_t>(LANES, (shared ? std::min<size_t>(end, v.shown.shared) : end) - i);
       const size_t id = shared ? i : i - v.shown.shared + v.shown.begin;
-      at += footprints(v.camera, in, (uint32_t)id, (int)n, tally, &v.input[at], &v.id[at]);
+      at += footprints<ROLLS, BENDS>(v.camera, in, (uint32_t)id, (int)n, tally, &v.input[at], &v.id[at]);
     }
     v.segments[w] = {first, at};
     std::copy(tally, tally + CULL_REASONS, &culled[(size_t)w * CULL_REASONS]);
@@ -211,7 +212,7 @@ static long long blend(View& v, int threads, float* color, float* alpha, float* 
 }
 
 static void forward(View& v, Scratch& s, const GaussianArrays& in, int threads, float* color, float* alpha, float* depth) {
-  project_all(v, in, threads);
+  specialised(v.camera, [&](auto rolls, auto bends) { project_all<rolls, bends>(v, in, threads); });
   sort_by_depth(v, s, threads);
   bin(v, s, threads);
   v.visited.resize(v.pairs.n), v.reached.resize(v.pairs.n), v.taken.resize((size_t)v.tiles_x * v.tiles_y);
@@ -232,16 +233,9 @@ static std::vector<int> lane_of_sums() {
   return lane;
 }
 
-// Leaves a list of gradients for each thread in the scratch.
-static void backward(View& v, Scratch& s, const GaussianArrays& in, int threads, Images out, Images grad) {
+template <bool ROLLS, bool BENDS>
+static void project_all_backward(const View& v, Scratch& s, const GaussianArrays& in, int threads) {
   static const std::vector<int> lane = lane_of_sums();
-  s.slots.resize(v.pairs.n);
-  while ((int)s.gradients.size() < threads) s.gradients.push_back(std::make_unique<GradientList>());
-  for_each_tile(v, threads, [&](int t, int X, int Y) {
-    const Pair* pairs = v.pairs.p + v.tile_begin[t];
-    blend_backward(v.input.p, pairs, pairs + v.taken[t], X, Y, v.camera.width, v.camera.height,
-                   v.visited.p + v.tile_begin[t], out, grad, s.slots.p);
-  });
   parallel(threads, [&](int w) {
     uint32_t place[LANES], id[LANES];
     Lanes sum[SUMS] = {}, gradient[ATTRIBUTES];
@@ -252,7 +246,7 @@ static void backward(View& v, Scratch& s, const GaussianArrays& in, int threads,
     auto flush = [&] {
       for (int i = filled; i < LANES; i++) place[i] = place[0];
       for (int i = 0; i < LANES; i++) id[i] = v.id[place[i]];
-      project_backward(v.camera, in, id, v.input.p, place, sum, gradient);
+      project_backward<ROLLS, BENDS>(v.camera, in, id, v.input.p, place, sum, gradient);
       std::copy(gradient, gradient + ATTRIBUTES, &list.gradient[list.id.size() / LANES * ATTRIBUTES]);
       list.id.insert(list.id.end(), id, id + filled);
       filled = 0;
@@ -269,4 +263,16 @@ static void backward(View& v, Scratch& s, const GaussianArrays& in, int threads,
     }
     if (filled) flush();
   });
+}
+
+// Leaves a list of gradients for each thread in the scratch.
+static void backward(View& v, Scratch& s, const GaussianArrays& in, int threads, Images out, Images grad) {
+  s.slots.resize(v.pairs.n);
+  while ((int)s.gradients.size() < threads) s.gradients.push_back(std::make_unique<GradientList>());
+  for_each_tile(v, threads, [&](int t, int X, int Y) {
+    const Pair* pairs = v.pairs.p + v.tile_begin[t];
+    blend_backward(v.input.p, pairs, pairs + v.taken[t], X, Y, v.camera.width, v.camera.height,
+                   v.visited.p + v.tile_begin[t], out, grad, s.slots.p);
+  });
+  specialised(v.camera, [&](auto rolls, auto bends) { project_all_backward<rolls, bends>(v, s, in, threads); });
 }
