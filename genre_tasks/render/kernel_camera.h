@@ -80,7 +80,9 @@ struct Place {
     const Lanes(&m)[3] = g.mean;
     for (int i = 0; i < 3; i++) at[i] = c.R[3 * i] * m[0] + c.R[3 * i + 1] * m[1] + c.R[3 * i + 2] * m[2] + c.t[i];
   }
-  INLINE_MEMBER void backward(const Camera&, Lanes (&)[3]) const {}
+  INLINE_MEMBER void shear(Lanes (&)[6]) const {}
+  INLINE_MEMBER void shear_backward(const Lanes (&)[3], Lanes (&)[6], Lanes (&)[2]) const {}
+  INLINE_MEMBER void backward(const Camera&, const Lanes (&)[2], Lanes (&)[3]) const {}
   INLINE_MEMBER Mask ahead() const { return at[2] >= NEAR_M; }
   INLINE_MEMBER Mask unfolded(const Camera& c) const { return within(c, at); }
   static INLINE_MEMBER Mask within(const Camera& c, const Lanes (&p)[3]) {
@@ -89,11 +91,14 @@ struct Place {
   }
 };
 
-// With a rolling shutter: where they are when their rows are exposed (see Shutter in types.py for the formula).
+// With a rolling shutter: where they are when their rows are exposed, and how their footprints are sheared as lower rows
+// come later (see Shutter in types.py for the formulas).
 template <bool BENDS>
 struct Exposure {
   Place posed;
-  Lanes at[3], motion[3], rz, u, v, u_rate, v_rate, rate, time;  // rate: 1 - T dy/dt / H
+  Lanes at[3], motion[3], rz, u, v, u_rate, v_rate, time;
+  Lanes column_rate, row_rate;  // px/s
+  Lanes rate, later;            // 1 - T row_rate / H, at least SHUTTER_MIN_RATE; s a row
   Mask rate_limited, time_limited;
 
   template <class Geometry>
@@ -104,35 +109,54 @@ struct Exposure {
                   (c.turn[j] * p[k] - c.turn[k] * p[j]);
     rz = 1.f / p[2], u = p[0] * rz, v = p[1] * rz;
     u_rate = (motion[0] - u * motion[2]) * rz, v_rate = (motion[1] - v * motion[2]) * rz;
-    Lanes row, row_rate;
+    Lanes row;
     if constexpr (BENDS) {
       const Bend bend(c, u, v);
       row = c.fy * bend.y + c.cy, row_rate = c.fy * (bend.xy * u_rate + bend.yy * v_rate);
+      column_rate = c.fx * (bend.xx * u_rate + bend.xy * v_rate);
     } else {
-      row = c.fy * v + c.cy, row_rate = c.fy * v_rate;
+      row = c.fy * v + c.cy, row_rate = c.fy * v_rate, column_rate = c.fx * u_rate;
     }
     const float per_row = c.readout / c.height, half = .5f * c.readout;
     const Lanes free = 1.f - per_row * row_rate;
     rate_limited = free < SHUTTER_MIN_RATE, rate = max(free, broadcast(SHUTTER_MIN_RATE));
     const Lanes due = (per_row * row - half) / rate;
     time_limited = (due > half) | (due < -half), time = clamp(due, broadcast(-half), broadcast(half));
+    later = keep(per_row / rate, ~time_limited);
     for (int i = 0; i < 3; i++) at[i] = p[i] + time * motion[i];
   }
   INLINE_MEMBER Mask ahead() const { return posed.ahead() & (at[2] >= NEAR_M); }
   INLINE_MEMBER Mask unfolded(const Camera& c) const { return posed.unfolded(c) & Place::within(c, at); }
 
-  // Turns the gradient by `at` into that by the place at the pose's time.
-  INLINE_MEMBER void backward(const Camera& c, Lanes (&g)[3]) const {
+  // Of W's rows, the pixel's column and row by chunk axes: what lies a row lower is seen `later`.
+  INLINE_MEMBER void shear(Lanes (&W)[6]) const {
+    for (int k = 0; k < 3; k++) W[k] += later * column_rate * W[3 + k], W[3 + k] += later * row_rate * W[3 + k];
+  }
+  // Turns the gradient by the sheared W into that by W, whose second row was `row`, and by the shear's two entries.
+  INLINE_MEMBER void shear_backward(const Lanes (&row)[3], Lanes (&vW)[6], Lanes (&by_shear)[2]) const {
+    by_shear[0] = by_shear[1] = Lanes{};
+    for (int k = 0; k < 3; k++) {
+      by_shear[0] += vW[k] * row[k], by_shear[1] += vW[3 + k] * row[k];
+      vW[3 + k] += later * (column_rate * vW[k] + row_rate * vW[3 + k]);
+    }
+  }
+  // Turns the gradient g by `at` into that by the place at the pose's time.
+  INLINE_MEMBER void backward(const Camera& c, const Lanes (&by_shear)[2], Lanes (&g)[3]) const {
     const float per_row = c.readout / c.height;
     const Lanes by_due = keep((g[0] * motion[0] + g[1] * motion[1] + g[2] * motion[2]) / rate, ~time_limited);
-    const Lanes by_row = per_row * c.fy * by_due, by_row_rate = keep(per_row * c.fy * time * by_due, ~rate_limited);
+    const Lanes by_later = by_shear[0] * column_rate + by_shear[1] * row_rate;
+    const Lanes by_row = per_row * c.fy * by_due, by_column_rate = c.fx * later * by_shear[0];
+    const Lanes by_row_rate =
+        c.fy * (later * by_shear[1] + per_row * keep(time * by_due + later / rate * by_later, ~rate_limited));
     Lanes vu{}, vv{}, vu_rate{}, vv_rate{};
     if constexpr (BENDS) {
       const Bend bend(c, u, v);
-      vu = by_row * bend.xy, vv = by_row * bend.yy, vu_rate = by_row_rate * bend.xy, vv_rate = by_row_rate * bend.yy;
-      Bend::slopes_backward(c, u, v, Lanes{}, by_row_rate * u_rate, by_row_rate * v_rate, vu, vv);
+      vu = by_row * bend.xy, vv = by_row * bend.yy;
+      vu_rate = by_column_rate * bend.xx + by_row_rate * bend.xy, vv_rate = by_column_rate * bend.xy + by_row_rate * bend.yy;
+      Bend::slopes_backward(c, u, v, by_column_rate * u_rate, by_column_rate * v_rate + by_row_rate * u_rate,
+                            by_row_rate * v_rate, vu, vv);
     } else {
-      vv = by_row, vv_rate = by_row_rate;
+      vv = by_row, vu_rate = by_column_rate, vv_rate = by_row_rate;
     }
     vu_rate = vu_rate * rz, vv_rate = vv_rate * rz;
     vu = (vu - vu_rate * motion[2]) * rz, vv = (vv - vv_rate * motion[2]) * rz;

@@ -53,6 +53,7 @@ template <bool BENDS>
 struct Projection {
   Lanes px, py, pz, rz, u, v, x, y;  // camera coordinates, 1 / pz, the point of linearisation, and the centre's pixel
   Mask u_limited, v_limited;
+  Lanes unsheared[3];          // second row of W
   Lanes W[6], Rq[9], U[6], M[6], c00, c01, c11, q[4], inv_norm;
 
   INLINE_MEMBER void rotate(const Lanes (&quat)[4]) {
@@ -67,9 +68,9 @@ struct Projection {
     Rq[3] = 2.f * (x * y + w * z), Rq[4] = 1.f - 2.f * (x * x + z * z), Rq[5] = 2.f * (y * z - w * x);
     Rq[6] = 2.f * (x * z - w * y), Rq[7] = 2.f * (y * z + w * x), Rq[8] = 1.f - 2.f * (x * x + y * y);
   }
-  template <class Geometry>
-  INLINE_MEMBER Projection(const Camera& c, const Geometry& g, const Lanes (&at)[3]) {
-    px = at[0], py = at[1], pz = at[2], rz = 1.f / pz;
+  template <class Geometry, class Seen>
+  INLINE_MEMBER Projection(const Camera& c, const Geometry& g, const Seen& seen) {
+    px = seen.at[0], py = seen.at[1], pz = seen.at[2], rz = 1.f / pz;
     Lanes ux = px * rz, uy = py * rz;
     u = clamp(ux, broadcast(-c.left), broadcast(c.right)), v = clamp(uy, broadcast(-c.top), broadcast(c.bottom));
     u_limited = (ux > c.right) | (ux < -c.left), v_limited = (uy > c.bottom) | (uy < -c.top);
@@ -86,6 +87,8 @@ struct Projection {
       Lanes j00 = c.fx * rz, j02 = -j00 * u, j11 = c.fy * rz, j12 = -j11 * v;
       for (int k = 0; k < 3; k++) W[k] = j00 * c.R[k] + j02 * c.R[6 + k], W[3 + k] = j11 * c.R[3 + k] + j12 * c.R[6 + k];
     }
+    for (int k = 0; k < 3; k++) unsheared[k] = W[3 + k];
+    seen.shear(W);
     rotate(g.quat);
     for (int k = 0; k < 3; k++) {
       U[k] = W[0] * Rq[k] + W[1] * Rq[3 + k] + W[2] * Rq[6 + k];
@@ -143,11 +146,11 @@ struct Projection {
 
 enum Cull { NON_FINITE, QUATERNION, BEHIND, DEGENERATE, FOLDED, CULL_REASONS };
 
-// Writes the footprints of those of the `count` Gaussians from `first` on (up to LANES) that are drawn, and their numbers;
-// returns how many. Counts by reason what is left out. Comparisons are written so that a NaN culls.
+// Writes the footprints of those of the `count` Gaussians from `first` on (up to LANES) that are drawn, and their numbers,
+// with a rolling shutter also their depths at the pose's time; returns how many. Counts by reason what is left out. Comparisons are written so that a NaN culls.
 template <bool ROLLS, bool BENDS>
 INLINE int footprints(const Camera& c, const GaussianArrays& in, uint32_t first, int count, long long* culled,
-                      Footprint* out, uint32_t* ids) {
+                      Footprint* out, uint32_t* ids, float* posed_z) {
   uint32_t id[LANES];
   for (int i = 0; i < LANES; i++) id[i] = first + std::min(i, count - 1);
   const Geometry<ROLLS> g(in, id);
@@ -168,7 +171,7 @@ INLINE int footprints(const Camera& c, const GaussianArrays& in, uint32_t first,
   if constexpr (BENDS) drop(bits(seen.unfolded(c)), FOLDED);
   left &= bits(opacity >= ALPHA_MIN);
   if (!left) return 0;
-  const Projection<BENDS> p(c, g, seen.at);
+  const Projection<BENDS> p(c, g, seen);
   const Lanes det = p.determinant(), &x = p.x, &y = p.y;
   drop(bits((det > 0.f) & (p.c00 <= MAX_VARIANCE_PX2) & (p.c11 <= MAX_VARIANCE_PX2) & (abs(x) <= MAX_CENTER_PX) &
             (abs(y) <= MAX_CENTER_PX)), DEGENERATE);
@@ -187,6 +190,7 @@ INLINE int footprints(const Camera& c, const GaussianArrays& in, uint32_t first,
     float* at = reinterpret_cast<float*>(out + n);
     for (int k = 0; k < 16; k++) at[k] = fields[k][lane];
     ids[n] = first + lane;
+    if constexpr (ROLLS) posed_z[n] = seen.posed.at[2][lane];
   }
   return n;
 }
@@ -210,7 +214,7 @@ INLINE void project_backward(const Camera& c, const GaussianArrays& in, const ui
   const Lanes ss = .5f * A * A * sum[S_SS], sy = .5f * A * M * sum[S_SY], yy = .5f * M * M * sum[S_YY];
   const Geometry<ROLLS> g(in, id);
   const Seen<ROLLS, BENDS> seen(c, g);
-  const Projection<BENDS> p(c, g, seen.at);
+  const Projection<BENDS> p(c, g, seen);
   Lanes vM[6], vU[6], vR[9], vW[6];
   // What M's first row has beyond the second, M0 + k M1, by Lagrange's identity: the difference cancels for long thin
   // footprints. dL/dcovariance is ss (1, k)(1, k)^T + sy ((1, k)(0, 1)^T + (0, 1)(1, k)^T) + yy (0, 1)(0, 1)^T.
@@ -237,8 +241,9 @@ INLINE void project_backward(const Camera& c, const GaussianArrays& in, const ui
   Lanes along = gw * w + gx * x + gy * y + gz * z;  // (v - (v.q)q) / |q|: the length has no gradient
   out[QUAT] = (gw - along * w) * p.inv_norm, out[QUAT + 1] = (gx - along * x) * p.inv_norm;
   out[QUAT + 2] = (gy - along * y) * p.inv_norm, out[QUAT + 3] = (gz - along * z) * p.inv_norm;
-  Lanes at[3];
+  Lanes at[3], by_shear[2];
+  seen.shear_backward(p.unsheared, vW, by_shear);
   p.backward(c, vx, vy, sum[S_Z], vW, at);
-  seen.backward(c, at);
+  seen.backward(c, by_shear, at);
   for (int i = 0; i < 3; i++) out[MEAN + i] = c.R[i] * at[0] + c.R[3 + i] * at[1] + c.R[6 + i] * at[2];
 }

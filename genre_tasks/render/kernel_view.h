@@ -21,6 +21,7 @@ struct View {
   size_t drawn;
   std::vector<Segment> segments;         // places in input order that are taken: each thread leaves a gap behind its own
   Buffer<Footprint> input;               // drawn footprints, by place
+  Buffer<float> posed_z;                 // by place, with a rolling shutter: depth at the pose's time
   Buffer<uint32_t> id, slot_end, tile_begin;  // by place: Gaussian, end of its pair slots; by tile: first pair
   Buffer<Pair> pairs;                    // tile after tile, each front to back
   Buffer<uint16_t> visited;              // by pair: blocks that the forward pass visited
@@ -28,7 +29,7 @@ struct View {
   Buffer<int> taken;                     // by tile: pairs until all rays had ended
   long long culled[CULL_REASONS];
   size_t bytes() const {
-    return input.bytes() + id.bytes() + slot_end.bytes() + tile_begin.bytes() + pairs.bytes() +
+    return input.bytes() + posed_z.bytes() + id.bytes() + slot_end.bytes() + tile_begin.bytes() + pairs.bytes() +
            visited.bytes() + reached.bytes() + taken.bytes();
   }
 };
@@ -79,6 +80,7 @@ template <bool ROLLS, bool BENDS>
 static void project_all(View& v, const GaussianArrays& in, int threads) {
   const size_t count = (size_t)v.shown.shared + v.shown.own;
   v.input.resize(count), v.id.resize(count), v.slot_end.resize(count);
+  if (ROLLS) v.posed_z.resize(count);
   std::fill(v.slot_end.p, v.slot_end.p + count, 0);
   v.segments.resize(threads);
   std::vector<long long> culled((size_t)threads * CULL_REASONS, 0);
@@ -89,7 +91,7 @@ static void project_all(View& v, const GaussianArrays& in, int threads) {
       const bool shared = i < v.shown.shared;
       n = std::min<size_t>(LANES, (shared ? std::min<size_t>(end, v.shown.shared) : end) - i);
       const size_t id = shared ? i : i - v.shown.shared + v.shown.begin;
-      at += footprints<ROLLS, BENDS>(v.camera, in, (uint32_t)id, (int)n, tally, &v.input[at], &v.id[at]);
+      at += footprints<ROLLS, BENDS>(v.camera, in, (uint32_t)id, (int)n, tally, &v.input[at], &v.id[at], ROLLS ? &v.posed_z[at] : nullptr);
     }
     v.segments[w] = {first, at};
     std::copy(tally, tally + CULL_REASONS, &culled[(size_t)w * CULL_REASONS]);
@@ -102,7 +104,8 @@ static void project_all(View& v, const GaussianArrays& in, int threads) {
   }
 }
 
-// Stable, so Gaussians of one depth keep their input order. Depths are positive: their bits sort as integers.
+// Stable, so Gaussians of one depth keep their input order. Depths are positive: their bits sort as integers. Depths of one
+// time: in each row of a rolling shutter all are seen at once, and relative to each other they barely move.
 static void sort_by_depth(View& v, Scratch& s, int threads) {
   constexpr int DIGIT = 11, VALUES = 1 << DIGIT;
   constexpr size_t WORTH_A_THREAD = 1 << 17;  // its start costs more than a pass over fewer
@@ -116,7 +119,7 @@ static void sort_by_depth(View& v, Scratch& s, int threads) {
       uint64_t* key = s.keys.p + begin[k];
       for (size_t i = v.segments[k].begin; i < v.segments[k].end; i++) {
         uint32_t u;
-        std::memcpy(&u, &v.input[i].z, 4);
+        std::memcpy(&u, v.camera.rolls ? &v.posed_z[i] : &v.input[i].z, 4);
         *key++ = (uint64_t)u << 32 | (uint32_t)i;
       }
     }

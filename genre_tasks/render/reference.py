@@ -101,7 +101,7 @@ def _project(splats: Splats, cameras: Cameras, v: int, culled: dict[str, int]) -
         culled["behind"] += int((turned & ~ahead).sum())
         culled["folded"] += int((ahead & ~valid).sum())
         at = torch.nonzero(valid & (splats.opacities >= const.ALPHA_MIN))[:, 0]
-        center, (xx, _, yy), det, z = _geometry(splats, camera, at)
+        center, (xx, _, yy), det, (_, posed_z) = _geometry(splats, camera, at)
         sound = (det > 0) & (torch.maximum(xx, yy) <= const.MAX_VARIANCE_PX2)
         sound &= (center.abs() <= const.MAX_CENTER_PX).all(1)
         culled["degenerate"] += int((~sound).sum())
@@ -109,26 +109,33 @@ def _project(splats: Splats, cameras: Cameras, v: int, culled: dict[str, int]) -
         half = torch.sqrt(level[:, None] * torch.stack([xx, yy], 1))
         size = center.new_tensor([cameras.width_px, cameras.height_px])
         seen = sound & ((center + half >= 0.5) & (center - half <= size - 0.5)).all(1)
-        order = torch.argsort(z[seen], stable=True)
+        # Depths of one time: in each row all are seen at once, and relative to each other they barely move.
+        order = torch.argsort(posed_z[seen], stable=True)
         at, half = at[seen][order], half[seen][order]
-    center, (xx, xy, yy), det, z = _geometry(splats, camera, at)
+    center, (xx, xy, yy), det, (z, _) = _geometry(splats, camera, at)
     conic = torch.stack([yy, -xy, xx], 1) / det[:, None]
     return _Footprints(center, conic, splats.opacities[at], torch.cat([splats.colors[at], z[:, None]], 1), half)
 
 
 def _geometry(
     splats: Splats, camera: OneCamera, at: Tensor
-) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], Tensor, Tensor]:
-    """Of the Gaussians ``at``: centres [K, 2] px, blurred covariance xx, xy, yy in px², its determinant, camera z."""
+) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], Tensor, tuple[Tensor, Tensor]]:
+    """Of the Gaussians ``at``: centres [K, 2] px, blurred covariance xx, xy, yy in px², its determinant, camera z.
+
+    And camera z at the time of the pose.
+    """
     velocities = camera.velocities_of(splats)
-    points = camera.exposed(camera.posed(splats.means[at]), None if velocities is None else velocities[at])
-    turned = camera.jacobian(points) @ camera.rotation @ rotation_matrices(splats.quats[at])
+    own = None if velocities is None else velocities[at]
+    posed = camera.posed(splats.means[at])
+    points, shear = camera.exposure(posed, own)
+    jacobian = camera.jacobian(points) if shear is None else shear @ camera.jacobian(points)
+    turned = jacobian @ camera.rotation @ rotation_matrices(splats.quats[at])
     m = turned * splats.scales[at][:, None, :]
     xx, yy = m.square().sum(2).unbind(1)
     xx, yy, xy = xx + const.BLUR_PX2, yy + const.BLUR_PX2, (m[:, 0] * m[:, 1]).sum(1)
     # Lagrange's identity: xx·yy − xy² cancels for long thin footprints.
     det = torch.linalg.cross(m[:, 0], m[:, 1]).square().sum(1) + const.BLUR_PX2 * (xx + yy - const.BLUR_PX2)
-    return camera.pixels(points), (xx, xy, yy), det, points[:, 2]
+    return camera.pixels(points), (xx, xy, yy), det, (points[:, 2], posed[:, 2])
 
 
 def _composite(

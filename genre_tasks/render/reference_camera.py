@@ -36,20 +36,29 @@ class OneCamera:
 
     def exposed(self, posed: Tensor, velocities: Tensor | None) -> Tensor:
         """Camera coordinates [K, 3] when the rows on which the points lie are exposed: see ``Shutter``."""
+        return self.exposure(posed, velocities)[0]
+
+    def exposure(self, posed: Tensor, velocities: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """As :meth:`exposed`, and what happens to pixels around, [K, 2, 2], to first order: lower rows come later."""
         if not self.rolls:
-            return posed
+            return posed, None
         motion = -self._velocity - torch.linalg.cross(self._turn.expand_as(posed), posed)
         if velocities is not None:
             motion = motion + velocities.to(posed) @ self.rotation.T
         z = posed[:, 2]
         x, y = posed[:, 0] / z, posed[:, 1] / z
         x_rate, y_rate = (motion[:, 0] - x * motion[:, 2]) / z, (motion[:, 1] - y * motion[:, 2]) / z
-        _, xy, yy = self.slopes(x, y)
+        xx, xy, yy = self.slopes(x, y)
         row, row_rate = self.fy * self.bent(x, y)[1] + self.cy, self.fy * (xy * x_rate + yy * y_rate)
+        column_rate = self.fx * (xx * x_rate + xy * y_rate)
         slowed = (1 - self._readout * row_rate / self.height).clamp(min=const.SHUTTER_MIN_RATE)
         half = self._readout / 2
-        time = (self._readout * (row / self.height - 0.5) / slowed).clamp(-half, half)
-        return posed + time[:, None] * motion
+        due = self._readout * (row / self.height - 0.5) / slowed
+        time = due.clamp(-half, half)
+        later = torch.where(time == due, self._readout / self.height / slowed, 0.0)  # s a row
+        one, zero = torch.ones_like(later), torch.zeros_like(later)
+        shear = torch.stack([one, later * column_rate, zero, 1 + later * row_rate], 1).view(-1, 2, 2)
+        return posed + time[:, None] * motion, shear
 
     def unfolded(self, points: Tensor) -> Tensor:
         """[K] bool: the lens is one-to-one from the axis to there."""

@@ -17,11 +17,15 @@ from genre_tasks.logs.types import Float64, Lens, RollingShutter
 class Shutter:
     """How V cameras move while their images are read out, top row first; the poses hold for the middle row.
 
-    A Gaussian is projected once, from where the camera sees it at the time τ of its row (row r of H, continuous, is
-    exposed (r / H − ½) · ``readout_s`` after the pose's time): from p = p₀ + τ d, for p₀ at the pose's time and
+    A Gaussian is projected from where the camera sees it at the time τ of its row (row r of H, continuous, is exposed
+    (r / H − ½) · ``readout_s`` after the pose's time): from p = p₀ + τ d, for p₀ at the pose's time and
     d = R w − (v + ω × p₀), with the camera's velocity v and turn ω and the Gaussian's own velocity w. The row y moves
     with τ, too: one Newton step from τ = 0 gives τ = T (y₀ / H − ½) / (1 − T ẏ₀ / H), limited to ± T / 2, and exact
-    where ẏ does not change. The divisor is at least ``SHUTTER_MIN_RATE``. Readout 0 is no shutter, to the bit.
+    where ẏ does not change. The divisor is at least ``SHUTTER_MIN_RATE``.
+
+    A footprint is sheared, as its lower rows come later: by [[1, λ ẋ₀], [0, 1 + λ ẏ₀]] with λ = ∂τ/∂y₀, which is 0
+    where τ is limited. Gaussians are drawn in the order of their depths at the pose's time; the depth image has those
+    at τ. Readout 0 is no shutter, to the bit.
     """
 
     readout_s: Tensor  # [V] T

@@ -17,7 +17,7 @@ from genre_tasks.errors import ConfigError, NonFiniteError, ResourceError
 from genre_tasks.logs.types import Lens, RollingShutter
 from genre_tasks.render import Cameras, RenderSettings, constants, render, render_views
 from genre_tasks.render.cuda import _effects
-from genre_tasks.render.oracles import relative_l2
+from genre_tasks.render.oracles import agreement, relative_l2, survey
 from genre_tasks.render.reference_camera import OneCamera
 from genre_tasks.render.types import Shutter
 from genre_tasks.scene import projection
@@ -58,8 +58,8 @@ def test_values_and_gradients_against_the_reference(scene, gradients, width, hei
     assert image.culled == truth.culled
     still = render(splats, replace(cameras, shutter=None), CPU)
     assert (still.color - image.color).detach().abs().max() > 0.05
-    for name, bound in (("color", 1e-5), ("alpha", 1e-5), ("depth", 3e-4)):
-        assert (getattr(image, name).double() - getattr(truth, name)).abs().max() < bound, name
+    found = agreement(image, truth, survey(splats, cameras).band)
+    assert found.outside < 1e-5 and found.share < 0.02
     for name, grad in grads.items():
         assert relative_l2(grad, exact[name]) <= 1e-5, name
 
@@ -147,7 +147,6 @@ def _pose_after(cameras: Cameras, time_s: float, how: RollingShutter = MOTION) -
 def test_each_row_is_seen_from_where_the_camera_then_is(scene, settings, distortion):
     """The truth: row r of the image that a global shutter takes (r + ½) / H − ½ of the readout later."""
     splats, cameras = scene(2000, 64, 48)
-    splats = replace(splats, scales=splats.scales * 0.5)
     if distortion is not None:
         cameras = replace(cameras, distortion=torch.tensor([distortion]))
     rows = []
@@ -157,7 +156,7 @@ def test_each_row_is_seen_from_where_the_camera_then_is(scene, settings, distort
     truth = torch.stack(rows, 1)
     rolled, still = render(splats, rolling(cameras), settings).color, render(splats, cameras, settings).color
     wrong, left = (still - truth).square().mean().sqrt(), (rolled - truth).square().mean().sqrt()
-    assert wrong > 0.02 and left < wrong / 8
+    assert wrong > 0.04 and left < wrong / 10
 
 
 @pytest.mark.parametrize("distortion", [None, BARREL], ids=["pinhole", "lens"])
@@ -180,7 +179,7 @@ def test_one_newton_step_finds_the_row(distortion):
     time = motion / speed.norm(dim=1) * torch.sign(before[:, 1] - 540)
     inside = (pixels[:, 1] > 0) & (pixels[:, 1] < 1080)
     late_px = (time * 1080 / MOTION.readout_s + 540 - pixels[:, 1])[inside]
-    assert int(inside.sum()) > 300 and moved.abs().max() > 15
+    assert int(inside.sum()) > 300 and moved.abs().max() > 8
     assert late_px.abs().max() < 1.5, "a row is 28 µs, in which the image moves by less than 0.1 px"
 
 
