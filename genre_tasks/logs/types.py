@@ -61,12 +61,14 @@ class RollingShutter:
     """How a camera moves while an image is read out, row after row from the top; the pose holds for the middle row.
 
     Row r (continuous, 0 to the height) is exposed (r / height − ½) · ``readout_s`` after the pose's time.
-    ``velocity_m_s`` and ``turn_rad_s`` are the camera's own, in camera axes.
+    ``velocity_m_s`` and ``turn_rad_s`` are the camera's own, in camera axes. ``frame_s`` is the time from one log frame
+    to the next, which makes velocities of the poses of actors; 0: not stated, actors rest while an image is read out.
     """
 
     readout_s: float
     velocity_m_s: tuple[float, float, float]
     turn_rad_s: tuple[float, float, float]
+    frame_s: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from genre_tasks.errors import NonFiniteError
-from genre_tasks.logs.types import Float64, Lens
+from genre_tasks.logs.types import Float64, Lens, RollingShutter
 from genre_tasks.render.types import Cameras, Render, RenderSettings, Shown
 from genre_tasks.scene.gaussians import Splats
 from genre_tasks.scene.geometry import matrix_to_quat, quat_multiply
@@ -77,19 +77,47 @@ def render(splats: Splats, cameras: Cameras, settings: RenderSettings = DEFAULT,
 def render_views(scene: SceneGraph, views: Sequence[PosedView], settings: RenderSettings = DEFAULT) -> Render:
     """Renders a scene graph at views of one image size, in their order; actors stand where their frame puts them.
 
-    Raises as :func:`render`.
+    While a view with a rolling shutter is read out, actors move on as from frame to frame. Raises as :func:`render`.
     """
     cameras = cameras_of(views)
     frames = [v.frame for v in views]
     posed, moving = scene.posed(list(dict.fromkeys(frames)))
     shown = Shown.of_frames(len(scene) - len(moving), len(moving), frames)
-    return render(posed.activated(), on_device_of(cameras, scene.gaussians.means), settings, shown)
+    splats = replace(posed.activated(), velocities=velocities_of(scene, posed.means, views))
+    return render(splats, on_device_of(cameras, scene.gaussians.means), settings, shown)
+
+
+def velocities_of(scene: SceneGraph, means: Tensor, views: Sequence[PosedView]) -> Tensor | None:
+    """How actors move while views are read out, as ``Splats.velocities``; ``None`` where no view's shutter asks.
+
+    ``means`` are laid out as by ``SceneGraph.posed`` at the views' frames. Raises ``ValueError`` for shutters that do
+    not agree on the time to the next frame.
+    """
+    frames_s = dict.fromkeys((v.frame for v in views), 0.0)
+    for view in views:
+        stated = frame_s_of(view)
+        if stated and frames_s[view.frame] not in (0.0, stated):
+            raise ValueError(f"expected one frame_s at frame {view.frame}, got {frames_s[view.frame]} and {stated}")
+        frames_s[view.frame] = stated or frames_s[view.frame]
+    if not scene.actors or not any(frames_s.values()):
+        return None
+    return scene.velocities(means, list(frames_s), list(frames_s.values()))
+
+
+def frame_s_of(view: PosedView) -> float:
+    """Seconds to the next log frame where actors move while a view is read out, else 0."""
+    shutter = _shutter_of(view)
+    return shutter.frame_s if shutter is not None and shutter.readout_s else 0.0
+
+
+def _shutter_of(view: PosedView) -> RollingShutter | None:
+    return getattr(view, "shutter", None)
 
 
 def cameras_of(views: Sequence[PosedView]) -> Cameras:
     """The cameras of views. Raises ``NonFiniteError`` for one that is not finite, ``ValueError`` for mixed sizes."""
-    shutters = [getattr(v, "shutter", None) for v in views]
-    cameras = Cameras.of([v.chunk_SE3_camera for v in views], [v.lens for v in views], shutters=shutters)
+    poses, lenses = [v.chunk_SE3_camera for v in views], [v.lens for v in views]
+    cameras = Cameras.of(poses, lenses, shutters=[_shutter_of(v) for v in views])
     _check_finite(cameras)
     return cameras
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from genre_tasks.logs.types import Lens
-from genre_tasks.render.api import DEFAULT, PosedView, cameras_of, on_device_of, render, render_views
+from genre_tasks.render.api import DEFAULT, PosedView, cameras_of, frame_s_of, on_device_of, render, render_views
 from genre_tasks.render.reference_camera import OneCamera
 from genre_tasks.render.types import Render, RenderSettings
 from genre_tasks.scene.distortion import undistort
@@ -44,6 +44,8 @@ def render_surfaces(scene: SceneGraph, views: Sequence[PosedView], settings: Ren
             splats = scene.at(view.frame).activated()
             posed = {view.frame: (splats, normals(splats))}
         splats, across = posed[view.frame]
+        if scene.actors and (frame_s := frame_s_of(view)):
+            splats = replace(splats, velocities=scene.velocities_at(splats.means, view.frame, frame_s))
         camera = on_device_of(cameras_of([view]), splats.means)
         planes = replace(splats, colors=_planes(splats, across, view, OneCamera(camera, 0, splats.means)))
         image = render(planes, camera, settings)

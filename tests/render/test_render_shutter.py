@@ -12,6 +12,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from genre_tasks.errors import ConfigError, NonFiniteError, ResourceError
 from genre_tasks.logs.types import Lens, RollingShutter
@@ -22,8 +23,8 @@ from genre_tasks.render.reference_camera import OneCamera
 from genre_tasks.render.types import Shutter
 from genre_tasks.scene import projection
 from genre_tasks.scene.gaussians import Gaussians, Splats
-from genre_tasks.scene.graph import SceneGraph
-from tests.scenes import NAMES, moved_loss, smooth, twist
+from genre_tasks.scene.graph import FIRST_ACTOR, ActorNode, SceneGraph
+from tests.scenes import NAMES, cloud, moved_loss, smooth, twist
 
 CPU, REFERENCE = RenderSettings("cpu", 1), RenderSettings("reference")
 BOTH = pytest.mark.parametrize("settings", [CPU, REFERENCE], ids=lambda s: s.backend)
@@ -219,6 +220,13 @@ def test_points_are_projected_to_the_centres_of_gaussians(distortion):
     assert projection.SHUTTER_MIN_RATE == constants.SHUTTER_MIN_RATE
 
 
+LENS = Lens(45.0, 45.0, 32.0, 24.0, 64, 48)
+
+
+def _logits(splats: Splats) -> Gaussians:
+    return Gaussians(splats.means, splats.scales.log(), splats.quats, splats.opacities.logit(), splats.colors)
+
+
 @dataclass(frozen=True)
 class Seen:
     frame: int
@@ -229,14 +237,85 @@ class Seen:
 
 def test_views_say_their_shutter(scene):
     splats, _ = scene(300)
-    colors = Gaussians(splats.means, splats.scales.log(), splats.quats, splats.opacities.logit(), splats.colors)
-    graph = SceneGraph(colors, torch.zeros(300, dtype=torch.int64), ())
-    lens = Lens(45.0, 45.0, 32.0, 24.0, 64, 48)
-    still, rolled = Seen(0, np.eye(4), lens), Seen(0, np.eye(4), lens, MOTION)
+    graph = SceneGraph(_logits(splats), torch.zeros(300, dtype=torch.int64), ())
+    still, rolled = Seen(0, np.eye(4), LENS), Seen(0, np.eye(4), LENS, MOTION)
     both = render_views(graph, [still, rolled], CPU).color
     assert torch.equal(both[0], render_views(graph, [still], CPU).color[0])
     assert torch.equal(both[1], render_views(graph, [rolled], CPU).color[0])
     assert (both[0] - both[1]).abs().max() > 0.02
+
+
+def _driving(count: int = 200) -> SceneGraph:
+    """Half of the Gaussians are still, half on an actor that crosses the view at 12 m/s and turns at 1 rad/s."""
+    splats = cloud(count)[0]
+    nodes = torch.where(torch.arange(count) % 2 == 0, 0, FIRST_ACTOR)
+    means = torch.where(nodes[:, None] > 0, splats.means * torch.tensor([0.1, 0.1, 0.05]), splats.means)
+    splats = replace(splats, means=means, scales=splats.scales.clamp(max=0.4))
+    poses = np.stack([_actor_pose(0.1 * f) for f in range(5)])
+    actor = ActorNode("a", "car", (4.0, 2.0, 1.5), np.arange(5), poses)
+    return SceneGraph(_logits(splats), nodes, (actor,))
+
+
+def _actor_pose(time_s: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec([0, time_s, 0]).as_matrix()
+    pose[:3, 3] = 12.0 * time_s - 2.4, 0.5, 8.0
+    return pose
+
+
+PARKED = RollingShutter(0.06, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), frame_s=0.1)
+
+
+@pytest.mark.parametrize("frame", range(5))
+def test_actors_move_on_as_from_frame_to_frame(frame):
+    scene = _driving()
+    posed, moving = scene.posed([frame])
+    velocities = scene.velocities(posed.means, [frame], [0.1])
+    still = len(scene) - len(moving)
+    assert not velocities[:still].any() and len(moving) == 100
+    step = 1e-4
+    after = replace(scene.actors[0], chunk_SE3_box=np.stack([_actor_pose(0.1 * f + step) for f in range(5)]))
+    moved = replace(scene, actors=(after,)).posed([frame])[0].means
+    expected = (moved.double() - posed.means.double())[still:] / step
+    # One-sided at the ends of the path: the turn's direction is that of 0.05 s off.
+    assert (velocities[still:] - expected).abs().max() < 0.3 and expected.abs().max() > 12
+    at = scene.at(frame).means
+    assert torch.equal(scene.velocities_at(at, frame, 0.1)[moving], velocities[still:])
+    assert not scene.velocities_at(at, frame, 0.0).any() and not scene.velocities(posed.means, [frame], [0.0]).any()
+
+
+def test_an_actor_is_rendered_as_it_moves_during_the_readout():
+    """The truth: row r of the image of the scene with the actor where it is at the row's time."""
+    scene, view = _driving(), Seen(2, np.eye(4), LENS, PARKED)
+    rows = []
+    for r in range(48):
+        time = 0.2 + ((r + 0.5) / 48 - 0.5) * PARKED.readout_s
+        then = replace(scene.actors[0], chunk_SE3_box=np.stack([_actor_pose(time)] * 5))
+        rows.append(render_views(replace(scene, actors=(then,)), [Seen(2, np.eye(4), LENS)], CPU).color[:, r])
+    truth = torch.stack(rows, 1)
+    rolled = render_views(scene, [view], CPU).color
+    resting = render_views(scene, [replace(view, shutter=replace(PARKED, frame_s=0.0))], CPU).color
+    wrong, left = (resting - truth).square().mean().sqrt(), (rolled - truth).square().mean().sqrt()
+    assert wrong > 0.01 and left < wrong / 6, (wrong, left)
+    assert torch.equal(resting, render_views(scene, [Seen(2, np.eye(4), LENS)], CPU).color), "a parked camera"
+
+
+def test_an_actor_of_one_frame_rests_and_an_absent_one_too():
+    scene = _driving()
+    one = replace(scene.actors[0], frames=np.array([2]), chunk_SE3_box=scene.actors[0].chunk_SE3_box[2:3])
+    for frame in (2, 3):
+        assert not any(x.any() for x in one.motion(frame))
+
+
+def test_views_of_a_frame_agree_on_the_time_to_the_next():
+    scene = _driving()
+    views = [Seen(2, np.eye(4), LENS, PARKED), Seen(2, np.eye(4), LENS, replace(PARKED, frame_s=0.2))]
+    with pytest.raises(ValueError, match=r"expected one frame_s at frame 2, got 0\.1 and 0\.2"):
+        render_views(scene, views, CPU)
+    other = [Seen(3, np.eye(4), LENS, PARKED), Seen(2, np.eye(4), LENS), views[0]]
+    together = render_views(scene, other, CPU).color
+    assert torch.equal(together[0], render_views(scene, other[:1], CPU).color[0])
+    assert torch.equal(together[2], render_views(scene, other[2:], CPU).color[0])
 
 
 @BOTH
