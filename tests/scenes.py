@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
@@ -88,7 +90,7 @@ def gradients(
     Pixels where ``mask`` [V, H, W] is false have no weight. With ``bands`` only these are rendered, by the reference.
     """
     leaves = {n: getattr(splats, n).detach().to(dtype).clone().requires_grad_() for n in NAMES}
-    moved = Splats(**leaves)
+    moved = replace(splats.to(dtype), **leaves)
     out = render(moved, cameras, settings) if bands is None else reference_bands(moved, cameras, bands)
     g = torch.Generator().manual_seed(1)
     shape = (len(cameras), cameras.height_px, cameras.width_px)
@@ -101,3 +103,28 @@ def gradients(
     images = (out.color, out.alpha, out.depth)
     torch.autograd.backward(images, [w.to(i) for w, i in zip(weights, images, strict=True)])
     return out, {n: leaf.grad for n, leaf in leaves.items() if leaf.grad is not None}
+
+
+def smooth() -> tuple[Splats, Cameras]:
+    """Gaussians that fill the image without reaching the cut or the clamp, so that finite differences are valid."""
+    g = torch.Generator().manual_seed(5)
+    means = torch.randn(5, 3, generator=g, dtype=torch.float64) * 0.3 + torch.tensor([0.1, -0.1, 4.0])
+    scales = 1.5 + torch.rand(5, 3, generator=g, dtype=torch.float64)
+    quats, colors = torch.randn(5, 4, generator=g).double(), torch.rand(5, 3, generator=g).double()
+    splats = Splats(means, scales, quats, torch.full((5,), 0.5, dtype=torch.float64), colors)
+    pose = torch.linalg.matrix_exp(twist(torch.tensor([0.2, -0.1, 0.15, 0.1, 0.2, -0.3], dtype=torch.float64)))
+    return splats, Cameras(pose[None], torch.tensor([[20.0, 22.0]]), torch.tensor([[12.5, 7.5]]), 24, 16)
+
+
+def twist(v: Tensor) -> Tensor:
+    """[4, 4] the generator of a rigid motion: three of rotation, three of translation."""
+    zero = v.new_zeros(())
+    rows = [[zero, -v[2], v[1], v[3]], [v[2], zero, -v[0], v[4]], [-v[1], v[0], zero, v[5]], [zero] * 4]
+    return torch.stack([torch.stack(r) for r in rows])
+
+
+def moved_loss(splats: Splats, cameras: Cameras, xi: Tensor, settings: RenderSettings) -> Tensor:
+    """Of the images, with the first camera moved by ``xi`` [6]."""
+    pose = torch.linalg.matrix_exp(twist(xi)) @ cameras.camera_SE3_chunk[0].to(xi.dtype)
+    out = render(splats.to(xi.dtype), replace(cameras, camera_SE3_chunk=pose[None]), settings)
+    return (out.color.square().sum() + (out.alpha - 0.3).square().sum() + 0.1 * out.depth.sum()).double()

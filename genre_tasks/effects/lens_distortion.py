@@ -6,7 +6,7 @@ import numpy as np
 
 from genre_tasks.effects.seen import Seen
 from genre_tasks.effects.types import Effect, Measured
-from genre_tasks.scene.projection import distort
+from genre_tasks.scene.distortion import distort
 
 _GRID = 33
 
@@ -18,7 +18,7 @@ def measure(seen: Seen) -> Measured:
         lens = view.lens
         u, v = np.meshgrid(np.linspace(0, lens.width_px, _GRID), np.linspace(0, lens.height_px, _GRID))
         x, y = ((u - lens.cx_px) / lens.fx_px).astype(np.float32), ((v - lens.cy_px) / lens.fy_px).astype(np.float32)
-        bent = distort(x, y, lens.distortion) if any(lens.distortion) else (x, y)
+        bent = distort(x, y, lens.coefficients) if any(lens.distortion) else (x, y)
         shifts[view.camera] = float(np.hypot((bent[0] - x) * lens.fx_px, (bent[1] - y) * lens.fy_px).max())
     name = max(shifts, key=lambda n: shifts[n])
     return Measured(shifts[name], f"at the corner of {name}" if shifts[name] else "images are undistorted")

@@ -33,6 +33,11 @@ class Lens:
     height_px: int
     distortion: tuple[float, ...] = ()
 
+    @property
+    def coefficients(self) -> tuple[float, ...]:
+        """``distortion`` as five numbers, 0 where none is stated."""
+        return (*self.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
+
     def resized(self, width_px: int, height_px: int) -> Lens:
         """The same lens for an image resampled to ``width_px × height_px`` (whole field of view kept)."""
         sx, sy = width_px / self.width_px, height_px / self.height_px
@@ -49,6 +54,21 @@ class Lens:
     def of_width(self, width_px: int) -> Lens:
         """The same lens for an image resampled to ``width_px``, its sides in proportion."""
         return self.resized(width_px, max(1, round(width_px * self.height_px / self.width_px)))
+
+
+@dataclass(frozen=True)
+class RollingShutter:
+    """How a camera moves while an image is read out, row after row from the top; the pose holds for the middle row.
+
+    Row r (continuous, 0 to the height) is exposed (r / height − ½) · ``readout_s`` after the pose's time.
+    ``velocity_m_s`` and ``turn_rad_s`` are the camera's own, in camera axes. ``frame_s`` is the time from one log frame
+    to the next, which makes velocities of the poses of actors; 0: not stated, actors rest while an image is read out.
+    """
+
+    readout_s: float
+    velocity_m_s: tuple[float, float, float]
+    turn_rad_s: tuple[float, float, float]
+    frame_s: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from genre_tasks.optimiser import posing
 from genre_tasks.optimiser.fused_library import takes
 from genre_tasks.optimiser.state import Frame
 from genre_tasks.render import cpu
-from genre_tasks.render.api import PosedView, cameras_of, render_views
+from genre_tasks.render.api import PosedView, cameras_of, render_views, velocities_of
 from genre_tasks.render.types import RenderSettings
 
 
@@ -52,8 +52,10 @@ class CompiledPass:
         self._posing, self._threads = frame.posing, settings.threads or torch.get_num_threads()
         frames = [v.frame for v in views]
         self._posed = self._posing.splats(offsets.detach(), list(dict.fromkeys(frames)), self._threads)
+        splats, shown = self._posed.splats, self._posing.shown(frames)
+        velocities = velocities_of(frame.scene, splats[0], views)
         self._images, self.culled, self._batch = cpu.forward(
-            self._posed.splats, cameras_of(views), self._posing.shown(frames), self._threads, keep=True
+            splats, cameras_of(views), shown, self._threads, keep=True, velocities=velocities
         )
         self.color, self._alpha = self._images[:2]
         self.depth = posing.expected_depth(*self._images[1:])

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from genre_tasks.errors import NonFiniteError
-from genre_tasks.logs.types import Float64, Lens
+from genre_tasks.logs.types import Float64, Lens, RollingShutter
 from genre_tasks.render.types import Cameras, Render, RenderSettings, Shown
 from genre_tasks.scene.gaussians import Splats
 from genre_tasks.scene.geometry import matrix_to_quat, quat_multiply
@@ -20,7 +20,10 @@ DEFAULT = RenderSettings()
 
 
 class PosedView(Protocol):
-    """What is asked of a view: a log frame, a pose [4, 4] and a lens."""
+    """What is asked of a view: a log frame, a pose [4, 4] and a lens.
+
+    A view with a rolling shutter has an attribute ``shutter``, a ``RollingShutter`` or ``None``.
+    """
 
     @property
     def frame(self) -> int: ...
@@ -34,14 +37,18 @@ def render(splats: Splats, cameras: Cameras, settings: RenderSettings = DEFAULT,
     """Renders N Gaussians at V cameras; N and V may be 0. ``shown`` says which of them each view has; default: all.
 
     Differentiable in means, scales, quaternions, opacities and colours, and in ``cameras.camera_SE3_chunk`` (as a
-    rigid motion: three translations, three rotations) where it requires grad. Colour is premultiplied, depth is
-    Σ w z. A Gaussian with a non-finite value or a quaternion without direction is left out, gets zero gradient, and is
-    counted in ``Render.culled``. The ``cpu`` backend gives the same bits at any number of threads and of views a call.
+    rigid motion: three translations, three rotations; the motion during a readout is constant in camera axes) where it
+    requires grad. Colour is premultiplied, depth is Σ w z. A Gaussian with a non-finite value or a quaternion without
+    direction is left out, gets zero gradient, and is counted in ``Render.culled``; so is one that is not ahead of a
+    camera both at its pose's time and when its row is read out (``behind``), or that lies where a lens's distortion
+    folds back (``folded``). The ``cpu`` backend gives the same bits at any number of threads and of views a call.
 
     Raises:
-        ValueError: a tensor has another shape than expected, or ``shown`` does not fit.
+        ValueError: a tensor has another shape than expected, ``shown`` does not fit, or a gradient is asked for that
+            the backend does not have.
         NonFiniteError: a camera is not finite.
         ResourceError: the backend is not installed, or memory does not suffice.
+        ConfigError: the backend cannot render such a camera.
     """
     _check_shapes(splats, cameras)
     backend = settings.backend
@@ -51,8 +58,8 @@ def render(splats: Splats, cameras: Cameras, settings: RenderSettings = DEFAULT,
         shown = Shown.all_of(len(splats), len(cameras))
     else:
         _check_shown(shown, len(splats), len(cameras))
-    if backend != "reference" and (cameras.focal_px.requires_grad or cameras.center_px.requires_grad):
-        raise ValueError(f"backend {backend} has no gradient in focal length or principal point; use reference")
+    if backend != "reference":
+        _check_gradients(backend, splats, cameras)
     if backend == "cpu":
         return _on_cpu(splats, cameras, settings.threads, shown)
     groups: dict[tuple[int, int], list[int]] = {}
@@ -70,18 +77,47 @@ def render(splats: Splats, cameras: Cameras, settings: RenderSettings = DEFAULT,
 def render_views(scene: SceneGraph, views: Sequence[PosedView], settings: RenderSettings = DEFAULT) -> Render:
     """Renders a scene graph at views of one image size, in their order; actors stand where their frame puts them.
 
-    Raises as :func:`render`.
+    While a view with a rolling shutter is read out, actors move on as from frame to frame. Raises as :func:`render`.
     """
     cameras = cameras_of(views)
     frames = [v.frame for v in views]
     posed, moving = scene.posed(list(dict.fromkeys(frames)))
     shown = Shown.of_frames(len(scene) - len(moving), len(moving), frames)
-    return render(posed.activated(), on_device_of(cameras, scene.gaussians.means), settings, shown)
+    splats = replace(posed.activated(), velocities=velocities_of(scene, posed.means, views))
+    return render(splats, on_device_of(cameras, scene.gaussians.means), settings, shown)
+
+
+def velocities_of(scene: SceneGraph, means: Tensor, views: Sequence[PosedView]) -> Tensor | None:
+    """How actors move while views are read out, as ``Splats.velocities``; ``None`` where no view's shutter asks.
+
+    ``means`` are laid out as by ``SceneGraph.posed`` at the views' frames. Raises ``ValueError`` for shutters that do
+    not agree on the time to the next frame.
+    """
+    frames_s = dict.fromkeys((v.frame for v in views), 0.0)
+    for view in views:
+        stated = frame_s_of(view)
+        if stated and frames_s[view.frame] not in (0.0, stated):
+            raise ValueError(f"expected one frame_s at frame {view.frame}, got {frames_s[view.frame]} and {stated}")
+        frames_s[view.frame] = stated or frames_s[view.frame]
+    if not scene.actors or not any(frames_s.values()):
+        return None
+    return scene.velocities(means, list(frames_s), list(frames_s.values()))
+
+
+def frame_s_of(view: PosedView) -> float:
+    """Seconds to the next log frame where actors move while a view is read out, else 0."""
+    shutter = _shutter_of(view)
+    return shutter.frame_s if shutter is not None and shutter.readout_s else 0.0
+
+
+def _shutter_of(view: PosedView) -> RollingShutter | None:
+    return getattr(view, "shutter", None)
 
 
 def cameras_of(views: Sequence[PosedView]) -> Cameras:
     """The cameras of views. Raises ``NonFiniteError`` for one that is not finite, ``ValueError`` for mixed sizes."""
-    cameras = Cameras.of([v.chunk_SE3_camera for v in views], [v.lens for v in views])
+    poses, lenses = [v.chunk_SE3_camera for v in views], [v.lens for v in views]
+    cameras = Cameras.of(poses, lenses, shutters=[_shutter_of(v) for v in views])
     _check_finite(cameras)
     return cameras
 
@@ -130,39 +166,52 @@ def _result(images: tuple[Tensor, Tensor, Tensor], culled: dict[str, int]) -> Re
 
 def on_device_of(cameras: Cameras, like: Tensor) -> Cameras:
     """The cameras on another tensor's device."""
-    names = ("camera_SE3_chunk", "focal_px", "center_px")
-    return replace(cameras, **{n: getattr(cameras, n).to(like.device) for n in names})
+    return cameras.map(lambda x: x.to(like.device))
 
 
 def _check_shapes(splats: Splats, cameras: Cameras) -> None:
     n, v = len(splats), len(cameras)
-    expected = {
+    expected: dict[str, tuple[Tensor | None, tuple[int, ...]]] = {
         "means": (splats.means, (n, 3)), "scales": (splats.scales, (n, 3)), "quats": (splats.quats, (n, 4)),
         "opacities": (splats.opacities, (n,)), "colors": (splats.colors, (n, 3)),
         "camera_SE3_chunk": (cameras.camera_SE3_chunk, (v, 4, 4)), "focal_px": (cameras.focal_px, (v, 2)),
-        "center_px": (cameras.center_px, (v, 2)),
+        "center_px": (cameras.center_px, (v, 2)), "velocities": (splats.velocities, (n, 3)),
+        "distortion": (cameras.distortion, (v, 5)),
     }  # fmt: skip
+    if (shutter := cameras.shutter) is not None:
+        expected["readout_s"] = shutter.readout_s, (v,)
+        expected |= {"velocity_m_s": (shutter.velocity_m_s, (v, 3)), "turn_rad_s": (shutter.turn_rad_s, (v, 3))}
     for name, (tensor, shape) in expected.items():
-        if tuple(tensor.shape) != shape:
+        if tensor is not None and tuple(tensor.shape) != shape:
             raise ValueError(f"expected {name} of shape {shape}, got {tuple(tensor.shape)}")
     if cameras.width_px < 1 or cameras.height_px < 1:
         raise ValueError(f"expected an image of at least 1 × 1, got {cameras.width_px} × {cameras.height_px}")
     _check_finite(cameras)
+    if shutter is not None and bool((shutter.readout_s < 0).any()):
+        raise ValueError(f"expected readout_s of at least 0, got {float(shutter.readout_s.min())}")
 
 
 def _check_finite(cameras: Cameras) -> None:
-    for name in ("camera_SE3_chunk", "focal_px", "center_px"):
-        bad = ~torch.isfinite(getattr(cameras, name))
+    for name, tensor in cameras.tensors().items():
+        bad = ~torch.isfinite(tensor)
         if bool(bad.any()):
             first = tuple(torch.nonzero(bad)[0].tolist())
             raise NonFiniteError("render", name, int(bad.sum()), first)
+
+
+def _check_gradients(backend: str, splats: Splats, cameras: Cameras) -> None:
+    asked = cameras.tensors() | ({} if splats.velocities is None else {"velocities": splats.velocities})
+    for name, tensor in asked.items():
+        if tensor.requires_grad and name != "camera_SE3_chunk":
+            raise ValueError(f"backend {backend} has no gradient in {name}; use reference")
 
 
 def _in_camera_frame(splats: Splats, cameras: Cameras, v: int) -> tuple[Splats, Cameras]:
     """The splats in coordinates of camera v, and that camera at the origin, so that autograd reaches the pose.
 
     The rotation's gradient goes through a small turn beside the constant rotation, whose quaternion is (1, ω/2) to
-    first order: exact for rigid motions, and without the square roots of a matrix-to-quaternion conversion.
+    first order: exact for rigid motions, and without the square roots of a matrix-to-quaternion conversion. Velocities
+    are constants.
     """
     pose = cameras.camera_SE3_chunk[v]
     rotation = pose[:3, :3]
@@ -172,12 +221,7 @@ def _in_camera_frame(splats: Splats, cameras: Cameras, v: int) -> tuple[Splats, 
     fixed = matrix_to_quat(rotation.detach())
     quats = quat_multiply(quat_multiply(delta, fixed).to(splats.quats.dtype).expand(len(splats), 4), splats.quats)
     like = splats.means.dtype
-    moved = replace(splats, means=splats.means @ rotation.T.to(like) + pose[:3, 3].to(like), quats=quats)
-    camera = Cameras(
-        torch.eye(4)[None],
-        cameras.focal_px[v : v + 1],
-        cameras.center_px[v : v + 1],
-        cameras.width_px,
-        cameras.height_px,
-    )
-    return moved, camera
+    means = splats.means @ rotation.T.to(like) + pose[:3, 3].to(like)
+    velocities = None if splats.velocities is None else splats.velocities @ rotation.detach().T.to(like)
+    moved = replace(splats, means=means, quats=quats, velocities=velocities)
+    return moved, replace(cameras.select([v]), camera_SE3_chunk=torch.eye(4)[None])

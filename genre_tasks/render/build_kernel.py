@@ -8,11 +8,11 @@ from genre_tasks.compiled.recipe import Kernel
 
 CONSTANTS = (
     "NEAR_M", "BLUR_PX2", "ALPHA_MIN", "ALPHA_MAX", "TRANSMITTANCE_STOP", "JACOBIAN_MARGIN", "QUAT_MIN_NORM2",
-    "MAX_VARIANCE_PX2", "MAX_CENTER_PX",
+    "MAX_VARIANCE_PX2", "MAX_CENTER_PX", "SHUTTER_MIN_RATE",
 )  # fmt: skip
 SOURCES = (
-    "kernel.cpp", "kernel_view.h", "kernel_blend.h", "kernel_project.h", "kernel_simd.h", "kernel_memory.h",
-    "constants.py", "build_kernel.py",
+    "kernel.cpp", "kernel_view.h", "kernel_blend.h", "kernel_project.h", "kernel_camera.h", "kernel_simd.h",
+    "kernel_memory.h", "constants.py", "build_kernel.py",
 )  # fmt: skip
 
 KERNEL = Kernel(

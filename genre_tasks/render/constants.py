@@ -36,5 +36,13 @@ MAX_VARIANCE_PX2 = 1e18
 MAX_CENTER_PX = 1e7
 """Projected centres farther off are culled: from 2^24 ≈ 1.7e7 on a float32 pixel coordinate misses whole pixels."""
 
-CULL_REASONS = ("non_finite", "quaternion", "behind", "degenerate")
+SHUTTER_MIN_RATE = 0.1
+"""Least rate, against a resting point's, at which a rolling shutter's rows pass a point: see ``Shutter``.
+
+A point whose row moves down as fast as the rows are read is exposed for ever, and one that moves faster is passed
+backwards; only a point that crosses the whole image within the readout comes near to either. Its time is limited to the
+readout in any case; this keeps the quotient and its gradient finite.
+"""
+
+CULL_REASONS = ("non_finite", "quaternion", "behind", "degenerate", "folded")
 """Reasons counted in ``Render.culled``. Being outside of the image or below ``ALPHA_MIN`` is ordinary, not counted."""

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from genre_tasks.errors import ResourceError
+from genre_tasks.render.bent import Domain, domain_of
 from genre_tasks.render.constants import CULL_REASONS
 from genre_tasks.render.kernel_library import load_kernel
 from genre_tasks.render.types import Cameras, Shown
@@ -31,10 +32,10 @@ def check_status(status: int) -> None:
 
 
 class _Batch:
-    """The kernel's state after a forward pass, freed with this object."""
+    """The kernel's state after a forward pass, freed with this object, and the velocities that it was given."""
 
-    def __init__(self, handle: ctypes.c_void_p) -> None:
-        self.handle = handle
+    def __init__(self, handle: ctypes.c_void_p, velocities: Tensor | None) -> None:
+        self.handle, self.velocities = handle, velocities
         self._free = load_kernel().genre_free
 
     def __del__(self) -> None:
@@ -42,48 +43,77 @@ class _Batch:
 
 
 def forward(
-    arrays: Arrays, cameras: Cameras, shown: Shown, threads: int, keep: bool
+    arrays: Arrays, cameras: Cameras, shown: Shown, threads: int, keep: bool, velocities: Tensor | None = None
 ) -> tuple[Images, dict[str, int], _Batch | None]:
-    """The images of contiguous ``arrays``, the culled counts, and with ``keep`` the state for :func:`backward`."""
+    """The images of contiguous ``arrays``, the culled counts, and with ``keep`` the state for :func:`backward`.
+
+    ``velocities`` [N, 3] float32, contiguous, as in ``Splats``.
+    """
     kernel = load_kernel()
     views, height, width = len(cameras), cameras.height_px, cameras.width_px
     poses = cameras.camera_SE3_chunk.detach().to("cpu", torch.float32).contiguous()
     lenses = torch.cat([cameras.focal_px, cameras.center_px], 1).detach().to("cpu", torch.float32).contiguous()
+    distortions, shutters = _distortions(cameras), _shutters(cameras)
     color, alpha = torch.empty(views, height, width, 3), torch.empty(views, height, width)
     depth = torch.empty_like(alpha)
     culled = (ctypes.c_longlong * len(CULL_REASONS))()
     own = (ctypes.c_int * (2 * views))(*itertools.chain(*shown.own))
     handle = ctypes.c_void_p()
+    of_cameras = poses.data_ptr(), lenses.data_ptr(), _pointer(distortions), _pointer(shutters)
     status = kernel.genre_forward(
-        len(arrays[0]), *(a.data_ptr() for a in arrays), views, poses.data_ptr(), lenses.data_ptr(), width, height,
+        len(arrays[0]), *(a.data_ptr() for a in arrays), _pointer(velocities), views, *of_cameras, width, height,
         threads, shown.shared, own, color.data_ptr(), alpha.data_ptr(), depth.data_ptr(), culled,
         ctypes.byref(handle) if keep else None,
     )  # fmt: skip
     check_status(status)
     counts = {reason: n for reason, n in zip(CULL_REASONS, culled, strict=True) if n}
-    return (color, alpha, depth), counts, _Batch(handle) if keep else None
+    return (color, alpha, depth), counts, _Batch(handle, velocities) if keep else None
 
 
 def backward(batch: _Batch, arrays: Arrays, images: Images, by_images: Images, threads: int, out: Arrays) -> None:
     """Writes the gradients of ``arrays`` to ``out``, from those of the images."""
     v = [x.contiguous() for x in by_images]
     status = load_kernel().genre_backward(
-        batch.handle, len(arrays[0]), *(a.data_ptr() for a in arrays), *(a.data_ptr() for a in images),
-        *(x.data_ptr() for x in v), threads, *(g.data_ptr() for g in out),
+        batch.handle, len(arrays[0]), *(a.data_ptr() for a in arrays), _pointer(batch.velocities),
+        *(a.data_ptr() for a in images), *(x.data_ptr() for x in v), threads, *(g.data_ptr() for g in out),
     )  # fmt: skip
     check_status(status)
+
+
+def _pointer(tensor: Tensor | None) -> int | None:
+    return None if tensor is None else tensor.data_ptr()
+
+
+def _distortions(cameras: Cameras) -> Tensor | None:
+    """[V, 10] as the kernel takes them: coefficients, square of the fold radius, limits of the linearisation."""
+    domains = [domain_of(cameras, v) for v in range(len(cameras))]
+    if cameras.distortion is None or not any(domains):
+        return None
+    straight = Domain(torch.inf, 0.0, 0.0, 0.0, 0.0)
+    each = [d or straight for d in domains]
+    limits = torch.tensor([[d.fold_radius**2, d.left, d.right, d.top, d.bottom] for d in each])
+    return torch.cat([cameras.distortion.detach().to("cpu", torch.float32), limits], 1).contiguous()
+
+
+def _shutters(cameras: Cameras) -> Tensor | None:
+    """[V, 7] as the kernel takes them: readout, velocity, turn."""
+    if (shutter := cameras.shutter) is None:
+        return None
+    parts = shutter.readout_s[:, None], shutter.velocity_m_s, shutter.turn_rad_s
+    return torch.cat(parts, 1).detach().to("cpu", torch.float32).contiguous()
 
 
 class _Rasterise(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, cameras: Cameras, shown: Shown, threads: int, culled: dict[str, int], means: Tensor, scales: Tensor,
-        quats: Tensor, opacities: Tensor, colors: Tensor,
+        quats: Tensor, opacities: Tensor, colors: Tensor, velocities: Tensor | None,
     ) -> Images:  # fmt: skip
         arrays = (means, scales, quats, opacities, colors)
-        images, counts, ctx.batch = forward(arrays, cameras, shown, threads, keep=any(ctx.needs_input_grad))
+        keep = any(ctx.needs_input_grad)
+        images, counts, ctx.batch = forward(arrays, cameras, shown, threads, keep, velocities)
         culled.update(counts)
-        ctx.cameras, ctx.shown, ctx.threads = cameras, shown, threads
+        ctx.cameras, ctx.shown, ctx.threads, ctx.velocities = cameras, shown, threads, velocities
         ctx.save_for_backward(*arrays, *images)
         return images
 
@@ -94,11 +124,11 @@ class _Rasterise(torch.autograd.Function):
         arrays, images = saved[:5], saved[5:]
         batch, ctx.batch = ctx.batch, None
         if batch is None:  # a second backward through a retained graph: the state was given back after the first
-            batch = forward(arrays, ctx.cameras, ctx.shown, ctx.threads, keep=True)[2]
+            batch = forward(arrays, ctx.cameras, ctx.shown, ctx.threads, True, ctx.velocities)[2]
         means, scales, quats, opacities, colors = (torch.empty_like(a) for a in arrays)
         grads = (means, scales, quats, opacities, colors)
         backward(batch, arrays, images, (v_color, v_alpha, v_depth), ctx.threads, grads)
-        return (None, None, None, None, *grads)
+        return (None, None, None, None, *grads, None)
 
 
 def _arrays(splats: Splats) -> Arrays:
@@ -109,10 +139,15 @@ def _arrays(splats: Splats) -> Arrays:
     return means, scales, quats, opacities, colors
 
 
+def _velocities(splats: Splats) -> Tensor | None:
+    return None if splats.velocities is None else splats.velocities.detach().to("cpu", torch.float32).contiguous()
+
+
 def forward_state(splats: Splats, cameras: Cameras) -> _Batch:
     """The kernel's state after a forward pass on one thread."""
     with torch.no_grad():
-        state = forward(_arrays(splats), cameras, Shown.all_of(len(splats), len(cameras)), 1, keep=True)[2]
+        shown = Shown.all_of(len(splats), len(cameras))
+        state = forward(_arrays(splats), cameras, shown, 1, True, _velocities(splats))[2]
     assert state is not None
     return state
 
@@ -126,5 +161,6 @@ def render_cpu(splats: Splats, cameras: Cameras, shown: Shown, threads: int | No
     for the next call.
     """
     culled: dict[str, int] = {}
-    images = _Rasterise.apply(cameras, shown, threads or torch.get_num_threads(), culled, *_arrays(splats))
+    threads = threads or torch.get_num_threads()
+    images = _Rasterise.apply(cameras, shown, threads, culled, *_arrays(splats), _velocities(splats))
     return images, culled

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
-from genre_tasks.errors import ResourceError
+from genre_tasks.errors import ConfigError, ResourceError
 from genre_tasks.render import constants as const
 from genre_tasks.render.types import Cameras
 from genre_tasks.scene.gaussians import Splats
@@ -15,10 +17,14 @@ def render_cuda(splats: Splats, cameras: Cameras) -> tuple[tuple[Tensor, Tensor,
     """Colour [V, H, W, 3], alpha and depth [V, H, W], float32, on the splats' device, and the culled counts.
 
     gsplat clamps alpha at 0.999 where this project's other backends clamp at 0.99, and takes the plain determinant of
-    the projected covariance: images differ where layers are nearly opaque (up to 0.009 of a layer's colour).
+    the projected covariance: images differ where layers are nearly opaque (up to 0.009 of a layer's colour). With a
+    distortion or a shutter it projects by the unscented transform, evaluates Gaussians along rays, finds each pixel's
+    time itself, and depth has no gradient in positions.
 
     Raises:
-        ResourceError: gsplat or a GPU is missing.
+        ResourceError: gsplat or a GPU is missing, or this gsplat has neither distortion nor rolling shutter.
+        ConfigError: a shutter, and Gaussians with velocities of their own, which gsplat does not know.
+        ValueError: the gradient in a pose is asked for with a distortion or a shutter; gsplat has none.
     """
     try:
         from gsplat import rasterization
@@ -30,18 +36,67 @@ def render_cuda(splats: Splats, cameras: Cameras) -> tuple[tuple[Tensor, Tensor,
         raise ResourceError("the cuda backend found no GPU", remedy="Use backend cpu")
     if splats.means.device.type != "cuda":
         raise ResourceError("the cuda backend got tensors on the CPU", remedy="Move the splats to the GPU, or use cpu")
+    effects = _effects(splats, cameras)
     safe, culled = _without_unsound(splats, len(cameras))
     like = safe.means
     intrinsics = torch.zeros(len(cameras), 3, 3, device=like.device)
     intrinsics[:, 0, 0], intrinsics[:, 1, 1] = cameras.focal_px.to(like).unbind(1)
     intrinsics[:, :2, 2], intrinsics[:, 2, 2] = cameras.center_px.to(like), 1.0
     image, alpha, _ = rasterization(
-        safe.means, safe.quats, safe.scales, safe.opacities, safe.colors, cameras.camera_SE3_chunk.to(like), intrinsics,
-        cameras.width_px, cameras.height_px, near_plane=const.NEAR_M, eps2d=const.BLUR_PX2, render_mode="RGB+D",
-        packed=False,
+        safe.means, safe.quats, safe.scales, safe.opacities, safe.colors, Ks=intrinsics, width=cameras.width_px,
+        height=cameras.height_px, near_plane=const.NEAR_M, eps2d=const.BLUR_PX2, render_mode="RGB+D",
+        packed=False, **({"viewmats": cameras.camera_SE3_chunk.to(like)} | effects),
     )  # fmt: skip
     # "D" is the accumulated Σ w z; "ED" would be divided by alpha.
     return (image[..., :3], alpha[..., 0], image[..., 3]), culled
+
+
+def _effects(splats: Splats, cameras: Cameras) -> dict[str, Any]:
+    """What ``rasterization`` is told of distortion and shutter; nothing where there is neither."""
+    bends = cameras.distortion is not None and bool(cameras.distortion.any())
+    rolls = cameras.shutter is not None and bool(cameras.shutter.readout_s.any())
+    if not bends and not rolls:
+        return {}
+    import gsplat
+
+    if not hasattr(gsplat, "RollingShutterType"):
+        raise ResourceError(
+            "this gsplat renders neither lens distortion nor rolling shutter",
+            remedy="Run `pip install 'gsplat>=1.5.3'` or use backend cpu",
+        )
+    if rolls and splats.velocities is not None:
+        raise ConfigError(
+            "the cuda backend cannot move Gaussians during a readout", remedy="Use backend cpu, or leave velocities out"
+        )
+    if cameras.camera_SE3_chunk.requires_grad:
+        raise ValueError("backend cuda has no gradient in camera_SE3_chunk with a distortion or a shutter; use cpu")
+    like = splats.means.detach().to(torch.float32)
+    told: dict[str, Any] = {"with_ut": True, "with_eval3d": True}
+    if cameras.distortion is not None and bends:
+        k1, k2, p1, p2, k3 = cameras.distortion.to(like).unbind(1)
+        zero = torch.zeros_like(k1)  # OpenCV's rational model: (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + …)
+        told["radial_coeffs"] = torch.stack([k1, k2, k3, zero, zero, zero], 1)
+        told["tangential_coeffs"] = torch.stack([p1, p2], 1)
+    if rolls:
+        told["rolling_shutter"] = gsplat.RollingShutterType.ROLLING_TOP_TO_BOTTOM
+        # gsplat's times end at the centres of the first and of the last row.
+        end = 0.5 - 0.5 / cameras.height_px
+        told["viewmats"], told["viewmats_rs"] = (_pose_at(cameras, share).to(like) for share in (-end, end))
+    return told
+
+
+def _pose_at(cameras: Cameras, share: float) -> Tensor:
+    """[V, 4, 4] chunk to camera, ``share`` of the readout after the pose's time: the motion of ``Shutter``."""
+    assert cameras.shutter is not None
+    time = share * cameras.shutter.readout_s[:, None]
+    x, y, z = (cameras.shutter.turn_rad_s * time).unbind(1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).view(-1, 3, 3)
+    moved_SE3_camera = torch.zeros_like(cameras.camera_SE3_chunk)
+    moved_SE3_camera[:, :3, :3] = torch.linalg.matrix_exp(-cross)
+    moved_SE3_camera[:, :3, 3] = -cameras.shutter.velocity_m_s * time
+    moved_SE3_camera[:, 3, 3] = 1
+    return moved_SE3_camera @ cameras.camera_SE3_chunk
 
 
 def _without_unsound(splats: Splats, views: int) -> tuple[Splats, dict[str, int]]:

@@ -6,30 +6,10 @@
 #include <cstdint>
 #include <cstring>
 
-#include "kernel_simd.h"
+#include "kernel_camera.h"
 
 constexpr float LOG2E = 1.4426950408889634f;
 const float LOG2_ALPHA_MIN = std::log2(ALPHA_MIN);
-
-struct Camera {
-  float R[9], t[3], fx, fy, cx, cy;
-  int width, height;
-  float right, left, bottom, top;  // limits of x/z and y/z at which the projection is linearised
-};
-
-// pose: row-major 4x4, chunk to camera; lens: fx, fy, cx, cy.
-static Camera make_camera(const float* pose, const float* lens, int width, int height) {
-  Camera c;
-  for (int i = 0; i < 3; i++) {
-    for (int j = 0; j < 3; j++) c.R[3 * i + j] = pose[4 * i + j];
-    c.t[i] = pose[4 * i + 3];
-  }
-  c.fx = lens[0], c.fy = lens[1], c.cx = lens[2], c.cy = lens[3], c.width = width, c.height = height;
-  float mx = JACOBIAN_MARGIN * .5f * width / c.fx, my = JACOBIAN_MARGIN * .5f * height / c.fy;
-  c.right = (width - c.cx) / c.fx + mx, c.left = c.cx / c.fx + mx;
-  c.bottom = (height - c.cy) / c.fy + my, c.top = c.cy / c.fy + my;
-  return c;
-}
 
 // A footprint: alpha(d) = 2^(log2_opacity - a (dx + k dy)^2 - m dy^2). One cache line.
 struct alignas(64) Footprint {
@@ -50,22 +30,30 @@ INLINE Lanes gather(const float* entries, int stride, const uint32_t* id) {
 struct GaussianArrays {
   int count;
   const float *means, *scales, *quats, *opacities, *colors;
+  const float* velocities;  // m/s in chunk axes; null: nothing moves
 };
 
+template <bool ROLLS>
 struct Geometry {
-  Lanes mean[3], scale[3], quat[4];
+  Lanes mean[3], scale[3], quat[4], velocity[3];  // the last for a rolling shutter only
   INLINE_MEMBER Geometry(const GaussianArrays& in, const uint32_t* id) {
     for (int k = 0; k < 3; k++) mean[k] = gather(in.means + k, 3, id), scale[k] = gather(in.scales + k, 3, id);
     for (int k = 0; k < 4; k++) quat[k] = gather(in.quats + k, 4, id);
+    if constexpr (ROLLS)
+      for (int k = 0; k < 3; k++) velocity[k] = in.velocities ? gather(in.velocities + k, 3, id) : Lanes{};
   }
 };
 
 INLINE Lanes norm2(const Lanes (&q)[4]) { return q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]; }
-INLINE Lanes depth_of(const Camera& c, const Lanes (&m)[3]) { return c.R[6] * m[0] + c.R[7] * m[1] + c.R[8] * m[2] + c.t[2]; }
 
+template <bool ROLLS, bool BENDS>
+using Seen = std::conditional_t<ROLLS, Exposure<BENDS>, Place>;
+
+template <bool BENDS>
 struct Projection {
-  Lanes px, py, pz, rz, u, v;  // camera coordinates, 1 / pz, and the point of linearisation
+  Lanes px, py, pz, rz, u, v, x, y;  // camera coordinates, 1 / pz, the point of linearisation, and the centre's pixel
   Mask u_limited, v_limited;
+  Lanes unsheared[3];          // second row of W
   Lanes W[6], Rq[9], U[6], M[6], c00, c01, c11, q[4], inv_norm;
 
   INLINE_MEMBER void rotate(const Lanes (&quat)[4]) {
@@ -80,16 +68,27 @@ struct Projection {
     Rq[3] = 2.f * (x * y + w * z), Rq[4] = 1.f - 2.f * (x * x + z * z), Rq[5] = 2.f * (y * z - w * x);
     Rq[6] = 2.f * (x * z - w * y), Rq[7] = 2.f * (y * z + w * x), Rq[8] = 1.f - 2.f * (x * x + y * y);
   }
-  INLINE_MEMBER Projection(const Camera& c, const Geometry& g) {
-    const Lanes(&m)[3] = g.mean;
-    px = c.R[0] * m[0] + c.R[1] * m[1] + c.R[2] * m[2] + c.t[0];
-    py = c.R[3] * m[0] + c.R[4] * m[1] + c.R[5] * m[2] + c.t[1];
-    pz = depth_of(c, m), rz = 1.f / pz;
+  template <class Geometry, class Seen>
+  INLINE_MEMBER Projection(const Camera& c, const Geometry& g, const Seen& seen) {
+    px = seen.at[0], py = seen.at[1], pz = seen.at[2], rz = 1.f / pz;
     Lanes ux = px * rz, uy = py * rz;
     u = clamp(ux, broadcast(-c.left), broadcast(c.right)), v = clamp(uy, broadcast(-c.top), broadcast(c.bottom));
     u_limited = (ux > c.right) | (ux < -c.left), v_limited = (uy > c.bottom) | (uy < -c.top);
-    Lanes j00 = c.fx * rz, j02 = -j00 * u, j11 = c.fy * rz, j12 = -j11 * v;
-    for (int k = 0; k < 3; k++) W[k] = j00 * c.R[k] + j02 * c.R[6 + k], W[3 + k] = j11 * c.R[3 + k] + j12 * c.R[6 + k];
+    if constexpr (BENDS) {
+      const Bend there(c, ux, uy), bend(c, u, v);
+      x = c.fx * there.x + c.cx, y = c.fy * there.y + c.cy;
+      const Lanes fx = c.fx * rz, fy = c.fy * rz;
+      const Lanes J[4] = {fx * bend.xx, fx * bend.xy, fy * bend.xy, fy * bend.yy};
+      for (int k = 0; k < 3; k++)
+        for (int row = 0; row < 2; row++)
+          W[3 * row + k] = J[2 * row] * (c.R[k] - u * c.R[6 + k]) + J[2 * row + 1] * (c.R[3 + k] - v * c.R[6 + k]);
+    } else {
+      x = c.fx * px * rz + c.cx, y = c.fy * py * rz + c.cy;
+      Lanes j00 = c.fx * rz, j02 = -j00 * u, j11 = c.fy * rz, j12 = -j11 * v;
+      for (int k = 0; k < 3; k++) W[k] = j00 * c.R[k] + j02 * c.R[6 + k], W[3 + k] = j11 * c.R[3 + k] + j12 * c.R[6 + k];
+    }
+    for (int k = 0; k < 3; k++) unsheared[k] = W[3 + k];
+    seen.shear(W);
     rotate(g.quat);
     for (int k = 0; k < 3; k++) {
       U[k] = W[0] * Rq[k] + W[1] * Rq[3 + k] + W[2] * Rq[6 + k];
@@ -100,6 +99,44 @@ struct Projection {
     c11 = M[3] * M[3] + M[4] * M[4] + M[5] * M[5] + BLUR_PX2;
     c01 = M[0] * M[3] + M[1] * M[4] + M[2] * M[5];
   }
+  // The gradient by the camera coordinates, from those by the centre's pixel, by pz itself and by W.
+  INLINE_MEMBER void backward(const Camera& c, const Lanes& vx, const Lanes& vy, const Lanes& vz, const Lanes (&vW)[6],
+                              Lanes (&out)[3]) const {
+    if constexpr (BENDS) return bent_backward(c, vx, vy, vz, vW, out);
+    Lanes j00{}, j02{}, j11{}, j12{};
+    for (int i = 0; i < 3; i++) {
+      j00 += vW[i] * c.R[i], j02 += vW[i] * c.R[6 + i];
+      j11 += vW[3 + i] * c.R[3 + i], j12 += vW[3 + i] * c.R[6 + i];
+    }
+    const Lanes rz2 = rz * rz;
+    Lanes vpx = vx * c.fx * rz, vpy = vy * c.fy * rz, vpz = vz - (vx * c.fx * px + vy * c.fy * py) * rz2;
+    vpz += (j02 * c.fx * u + j12 * c.fy * v) * rz2 - (j00 * c.fx + j11 * c.fy) * rz2;
+    // A limited point of linearisation does not move with the Gaussian.
+    const Lanes vu = keep(-j02 * c.fx * rz, ~u_limited), vv = keep(-j12 * c.fy * rz, ~v_limited);
+    vpx += vu * rz, vpy += vv * rz, vpz = vpz - (vu * px + vv * py) * rz2;
+    out[0] = vpx, out[1] = vpy, out[2] = vpz;
+  }
+  INLINE_MEMBER void bent_backward(const Camera& c, const Lanes& vx, const Lanes& vy, const Lanes& vz, const Lanes (&vW)[6],
+                                   Lanes (&out)[3]) const {
+    const Lanes ux = px * rz, uy = py * rz, fx = c.fx * rz, fy = c.fy * rz;
+    const Bend there(c, ux, uy), bend(c, u, v);
+    const Lanes J[4] = {fx * bend.xx, fx * bend.xy, fy * bend.xy, fy * bend.yy};
+    // J's columns on x and y, and what its third one, -u and -v times these, adds to them.
+    Lanes vJ[4] = {}, third[2] = {};
+    for (int row = 0; row < 2; row++) {
+      for (int i = 0; i < 3; i++) {
+        vJ[2 * row] += vW[3 * row + i] * c.R[i], vJ[2 * row + 1] += vW[3 * row + i] * c.R[3 + i];
+        third[row] += vW[3 * row + i] * c.R[6 + i];
+      }
+      vJ[2 * row] = vJ[2 * row] - u * third[row], vJ[2 * row + 1] = vJ[2 * row + 1] - v * third[row];
+    }
+    Lanes vu = -(J[0] * third[0] + J[2] * third[1]), vv = -(J[1] * third[0] + J[3] * third[1]);
+    Bend::slopes_backward(c, u, v, fx * vJ[0], fx * vJ[1] + fy * vJ[2], fy * vJ[3], vu, vv);
+    const Lanes bx = c.fx * vx, by = c.fy * vy;
+    vu = keep(vu, ~u_limited) + bx * there.xx + by * there.xy, vv = keep(vv, ~v_limited) + bx * there.xy + by * there.yy;
+    out[0] = vu * rz, out[1] = vv * rz;
+    out[2] = vz - (vu * ux + vv * uy + J[0] * vJ[0] + J[1] * vJ[1] + J[2] * vJ[2] + J[3] * vJ[3]) * rz;
+  }
   // det(M M^T + blur) by Lagrange's identity: c00 c11 - c01^2 loses everything to cancellation for long thin footprints.
   INLINE_MEMBER Lanes determinant() const {
     Lanes x = M[1] * M[5] - M[2] * M[4], y = M[2] * M[3] - M[0] * M[5], z = M[0] * M[4] - M[1] * M[3];
@@ -107,15 +144,17 @@ struct Projection {
   }
 };
 
-enum Cull { NON_FINITE, QUATERNION, BEHIND, DEGENERATE, CULL_REASONS };
+enum Cull { NON_FINITE, QUATERNION, BEHIND, DEGENERATE, FOLDED, CULL_REASONS };
 
-// Writes the footprints of those of the `count` Gaussians from `first` on (up to LANES) that are drawn, and their numbers;
-// returns how many. Counts by reason what is left out. Comparisons are written so that a NaN culls.
+// Writes the footprints of those of the `count` Gaussians from `first` on (up to LANES) that are drawn, and their numbers,
+// with a rolling shutter also their depths at the pose's time; returns how many. Counts by reason what is left out. Comparisons are written so that a NaN culls.
+template <bool ROLLS, bool BENDS>
 INLINE int footprints(const Camera& c, const GaussianArrays& in, uint32_t first, int count, long long* culled,
-                      Footprint* out, uint32_t* ids) {
+                      Footprint* out, uint32_t* ids, float* posed_z) {
   uint32_t id[LANES];
   for (int i = 0; i < LANES; i++) id[i] = first + std::min(i, count - 1);
-  const Geometry g(in, id);
+  const Geometry<ROLLS> g(in, id);
+  const Seen<ROLLS, BENDS> seen(c, g);
   const Lanes opacity = gather(in.opacities, 1, id);
   const Lanes color[3] = {gather(in.colors, 3, id), gather(in.colors + 1, 3, id), gather(in.colors + 2, 3, id)};
   uint32_t left = count == LANES ? 0xffffu : (1u << count) - 1;
@@ -124,13 +163,16 @@ INLINE int footprints(const Camera& c, const GaussianArrays& in, uint32_t first,
   Mask finite = is_finite(opacity);
   for (int k = 0; k < 3; k++) finite = finite & is_finite(g.mean[k]) & is_finite(g.scale[k]) & is_finite(color[k]);
   for (int k = 0; k < 4; k++) finite = finite & is_finite(g.quat[k]);
+  if constexpr (ROLLS)
+    for (int k = 0; k < 3; k++) finite = finite & is_finite(g.velocity[k]);
   drop(bits(finite), NON_FINITE);
   drop(bits(norm2(g.quat) >= QUAT_MIN_NORM2), QUATERNION);
-  drop(bits(depth_of(c, g.mean) >= NEAR_M), BEHIND);
+  drop(bits(seen.ahead()), BEHIND);
+  if constexpr (BENDS) drop(bits(seen.unfolded(c)), FOLDED);
   left &= bits(opacity >= ALPHA_MIN);
   if (!left) return 0;
-  const Projection p(c, g);
-  const Lanes det = p.determinant(), x = c.fx * p.px * p.rz + c.cx, y = c.fy * p.py * p.rz + c.cy;
+  const Projection<BENDS> p(c, g, seen);
+  const Lanes det = p.determinant(), &x = p.x, &y = p.y;
   drop(bits((det > 0.f) & (p.c00 <= MAX_VARIANCE_PX2) & (p.c11 <= MAX_VARIANCE_PX2) & (abs(x) <= MAX_CENTER_PX) &
             (abs(y) <= MAX_CENTER_PX)), DEGENERATE);
   Lanes log2_opacity;
@@ -148,6 +190,7 @@ INLINE int footprints(const Camera& c, const GaussianArrays& in, uint32_t first,
     float* at = reinterpret_cast<float*>(out + n);
     for (int k = 0; k < 16; k++) at[k] = fields[k][lane];
     ids[n] = first + lane;
+    if constexpr (ROLLS) posed_z[n] = seen.posed.at[2][lane];
   }
   return n;
 }
@@ -157,6 +200,7 @@ enum Sum { S_V, S_S, S_SS, S_SY, S_Y, S_YY, S_RED, S_GREEN, S_BLUE, S_Z };
 enum Attribute { MEAN = 0, SCALE = 3, QUAT = 6, OPACITY = 10, COLOR = 11, ATTRIBUTES = 14 };
 
 // Gradient of the 14 attributes of the Gaussians `id` (LANES of them), whose footprints are at `place`, from their sums.
+template <bool ROLLS, bool BENDS>
 INLINE void project_backward(const Camera& c, const GaussianArrays& in, const uint32_t* id, const Footprint* drawn,
                              const uint32_t* place, const Lanes (&sum)[SUMS], Lanes (&out)[ATTRIBUTES]) {
   const float* fields = reinterpret_cast<const float*>(drawn);
@@ -168,8 +212,9 @@ INLINE void project_backward(const Camera& c, const GaussianArrays& in, const ui
               k = gather(fields + offsetof(Footprint, k) / 4, 16, place);
   const Lanes vx = A * sum[S_S], vy = k * vx + M * sum[S_Y];
   const Lanes ss = .5f * A * A * sum[S_SS], sy = .5f * A * M * sum[S_SY], yy = .5f * M * M * sum[S_YY];
-  const Geometry g(in, id);
-  const Projection p(c, g);
+  const Geometry<ROLLS> g(in, id);
+  const Seen<ROLLS, BENDS> seen(c, g);
+  const Projection<BENDS> p(c, g, seen);
   Lanes vM[6], vU[6], vR[9], vW[6];
   // What M's first row has beyond the second, M0 + k M1, by Lagrange's identity: the difference cancels for long thin
   // footprints. dL/dcovariance is ss (1, k)(1, k)^T + sy ((1, k)(0, 1)^T + (0, 1)(1, k)^T) + yy (0, 1)(0, 1)^T.
@@ -196,16 +241,9 @@ INLINE void project_backward(const Camera& c, const GaussianArrays& in, const ui
   Lanes along = gw * w + gx * x + gy * y + gz * z;  // (v - (v.q)q) / |q|: the length has no gradient
   out[QUAT] = (gw - along * w) * p.inv_norm, out[QUAT + 1] = (gx - along * x) * p.inv_norm;
   out[QUAT + 2] = (gy - along * y) * p.inv_norm, out[QUAT + 3] = (gz - along * z) * p.inv_norm;
-  Lanes j00{}, j02{}, j11{}, j12{};
-  for (int i = 0; i < 3; i++) {
-    j00 += vW[i] * c.R[i], j02 += vW[i] * c.R[6 + i];
-    j11 += vW[3 + i] * c.R[3 + i], j12 += vW[3 + i] * c.R[6 + i];
-  }
-  const Lanes rz = p.rz, rz2 = rz * rz;
-  Lanes vpx = vx * c.fx * rz, vpy = vy * c.fy * rz, vpz = sum[S_Z] - (vx * c.fx * p.px + vy * c.fy * p.py) * rz2;
-  vpz += (j02 * c.fx * p.u + j12 * c.fy * p.v) * rz2 - (j00 * c.fx + j11 * c.fy) * rz2;
-  // A limited point of linearisation does not move with the Gaussian.
-  const Lanes vu = keep(-j02 * c.fx * rz, ~p.u_limited), vv = keep(-j12 * c.fy * rz, ~p.v_limited);
-  vpx += vu * rz, vpy += vv * rz, vpz = vpz - (vu * p.px + vv * p.py) * rz2;
-  for (int i = 0; i < 3; i++) out[MEAN + i] = c.R[i] * vpx + c.R[3 + i] * vpy + c.R[6 + i] * vpz;
+  Lanes at[3], by_shear[2];
+  seen.shear_backward(p.unsheared, vW, by_shear);
+  p.backward(c, vx, vy, sum[S_Z], vW, at);
+  seen.backward(c, by_shear, at);
+  for (int i = 0; i < 3; i++) out[MEAN + i] = c.R[i] * at[0] + c.R[3 + i] * at[1] + c.R[6 + i] * at[2];
 }

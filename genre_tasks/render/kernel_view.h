@@ -21,6 +21,7 @@ struct View {
   size_t drawn;
   std::vector<Segment> segments;         // places in input order that are taken: each thread leaves a gap behind its own
   Buffer<Footprint> input;               // drawn footprints, by place
+  Buffer<float> posed_z;                 // by place, with a rolling shutter: depth at the pose's time
   Buffer<uint32_t> id, slot_end, tile_begin;  // by place: Gaussian, end of its pair slots; by tile: first pair
   Buffer<Pair> pairs;                    // tile after tile, each front to back
   Buffer<uint16_t> visited;              // by pair: blocks that the forward pass visited
@@ -28,7 +29,7 @@ struct View {
   Buffer<int> taken;                     // by tile: pairs until all rays had ended
   long long culled[CULL_REASONS];
   size_t bytes() const {
-    return input.bytes() + id.bytes() + slot_end.bytes() + tile_begin.bytes() + pairs.bytes() +
+    return input.bytes() + posed_z.bytes() + id.bytes() + slot_end.bytes() + tile_begin.bytes() + pairs.bytes() +
            visited.bytes() + reached.bytes() + taken.bytes();
   }
 };
@@ -75,9 +76,11 @@ static inline void for_tiles(const Footprint& g, int tiles_x, int tiles_y, F f) 
   }
 }
 
+template <bool ROLLS, bool BENDS>
 static void project_all(View& v, const GaussianArrays& in, int threads) {
   const size_t count = (size_t)v.shown.shared + v.shown.own;
   v.input.resize(count), v.id.resize(count), v.slot_end.resize(count);
+  if (ROLLS) v.posed_z.resize(count);
   std::fill(v.slot_end.p, v.slot_end.p + count, 0);
   v.segments.resize(threads);
   std::vector<long long> culled((size_t)threads * CULL_REASONS, 0);
@@ -88,7 +91,7 @@ static void project_all(View& v, const GaussianArrays& in, int threads) {
       const bool shared = i < v.shown.shared;
       n = std::min<size_t>(LANES, (shared ? std::min<size_t>(end, v.shown.shared) : end) - i);
       const size_t id = shared ? i : i - v.shown.shared + v.shown.begin;
-      at += footprints(v.camera, in, (uint32_t)id, (int)n, tally, &v.input[at], &v.id[at]);
+      at += footprints<ROLLS, BENDS>(v.camera, in, (uint32_t)id, (int)n, tally, &v.input[at], &v.id[at], ROLLS ? &v.posed_z[at] : nullptr);
     }
     v.segments[w] = {first, at};
     std::copy(tally, tally + CULL_REASONS, &culled[(size_t)w * CULL_REASONS]);
@@ -101,7 +104,8 @@ static void project_all(View& v, const GaussianArrays& in, int threads) {
   }
 }
 
-// Stable, so Gaussians of one depth keep their input order. Depths are positive: their bits sort as integers.
+// Stable, so Gaussians of one depth keep their input order. Depths are positive: their bits sort as integers. Depths of one
+// time: in each row of a rolling shutter all are seen at once, and relative to each other they barely move.
 static void sort_by_depth(View& v, Scratch& s, int threads) {
   constexpr int DIGIT = 11, VALUES = 1 << DIGIT;
   constexpr size_t WORTH_A_THREAD = 1 << 17;  // its start costs more than a pass over fewer
@@ -115,7 +119,7 @@ static void sort_by_depth(View& v, Scratch& s, int threads) {
       uint64_t* key = s.keys.p + begin[k];
       for (size_t i = v.segments[k].begin; i < v.segments[k].end; i++) {
         uint32_t u;
-        std::memcpy(&u, &v.input[i].z, 4);
+        std::memcpy(&u, v.camera.rolls ? &v.posed_z[i] : &v.input[i].z, 4);
         *key++ = (uint64_t)u << 32 | (uint32_t)i;
       }
     }
@@ -211,7 +215,7 @@ static long long blend(View& v, int threads, float* color, float* alpha, float* 
 }
 
 static void forward(View& v, Scratch& s, const GaussianArrays& in, int threads, float* color, float* alpha, float* depth) {
-  project_all(v, in, threads);
+  specialised(v.camera, [&](auto rolls, auto bends) { project_all<rolls, bends>(v, in, threads); });
   sort_by_depth(v, s, threads);
   bin(v, s, threads);
   v.visited.resize(v.pairs.n), v.reached.resize(v.pairs.n), v.taken.resize((size_t)v.tiles_x * v.tiles_y);
@@ -232,16 +236,9 @@ static std::vector<int> lane_of_sums() {
   return lane;
 }
 
-// Leaves a list of gradients for each thread in the scratch.
-static void backward(View& v, Scratch& s, const GaussianArrays& in, int threads, Images out, Images grad) {
+template <bool ROLLS, bool BENDS>
+static void project_all_backward(const View& v, Scratch& s, const GaussianArrays& in, int threads) {
   static const std::vector<int> lane = lane_of_sums();
-  s.slots.resize(v.pairs.n);
-  while ((int)s.gradients.size() < threads) s.gradients.push_back(std::make_unique<GradientList>());
-  for_each_tile(v, threads, [&](int t, int X, int Y) {
-    const Pair* pairs = v.pairs.p + v.tile_begin[t];
-    blend_backward(v.input.p, pairs, pairs + v.taken[t], X, Y, v.camera.width, v.camera.height,
-                   v.visited.p + v.tile_begin[t], out, grad, s.slots.p);
-  });
   parallel(threads, [&](int w) {
     uint32_t place[LANES], id[LANES];
     Lanes sum[SUMS] = {}, gradient[ATTRIBUTES];
@@ -252,7 +249,7 @@ static void backward(View& v, Scratch& s, const GaussianArrays& in, int threads,
     auto flush = [&] {
       for (int i = filled; i < LANES; i++) place[i] = place[0];
       for (int i = 0; i < LANES; i++) id[i] = v.id[place[i]];
-      project_backward(v.camera, in, id, v.input.p, place, sum, gradient);
+      project_backward<ROLLS, BENDS>(v.camera, in, id, v.input.p, place, sum, gradient);
       std::copy(gradient, gradient + ATTRIBUTES, &list.gradient[list.id.size() / LANES * ATTRIBUTES]);
       list.id.insert(list.id.end(), id, id + filled);
       filled = 0;
@@ -269,4 +266,16 @@ static void backward(View& v, Scratch& s, const GaussianArrays& in, int threads,
     }
     if (filled) flush();
   });
+}
+
+// Leaves a list of gradients for each thread in the scratch.
+static void backward(View& v, Scratch& s, const GaussianArrays& in, int threads, Images out, Images grad) {
+  s.slots.resize(v.pairs.n);
+  while ((int)s.gradients.size() < threads) s.gradients.push_back(std::make_unique<GradientList>());
+  for_each_tile(v, threads, [&](int t, int X, int Y) {
+    const Pair* pairs = v.pairs.p + v.tile_begin[t];
+    blend_backward(v.input.p, pairs, pairs + v.taken[t], X, Y, v.camera.width, v.camera.height,
+                   v.visited.p + v.tile_begin[t], out, grad, s.slots.p);
+  });
+  specialised(v.camera, [&](auto rolls, auto bends) { project_all_backward<rolls, bends>(v, s, in, threads); });
 }

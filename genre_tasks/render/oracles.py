@@ -52,7 +52,8 @@ def survey(
 
     ``ulps`` float32 roundings (2^−24) are allowed in each of the quantities that a layer is made of; ``margin`` widens
     the thresholds by a relative amount, for finite differences. ``bands`` as in :func:`reference_bands`; outside of
-    them nothing is looked at, and no Gaussian is called ``absent`` or ``drawn`` for what happens there.
+    them nothing is looked at, and no Gaussian is called ``absent`` or ``drawn`` for what happens there. What a lens's
+    distortion and a rolling shutter add to rounding is not looked at, nor depths that tie under a shutter.
     """
     splats = splats.to(torch.float64)
     count, shape = len(splats), (len(cameras), cameras.height_px, cameras.width_px)

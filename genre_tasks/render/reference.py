@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from genre_tasks.render import constants as const
+from genre_tasks.render.reference_camera import OneCamera
 from genre_tasks.render.types import Cameras
 from genre_tasks.scene.gaussians import Splats
 
@@ -34,7 +35,7 @@ class _Footprints:
 def render_reference(splats: Splats, cameras: Cameras) -> tuple[tuple[Tensor, Tensor, Tensor], dict[str, int]]:
     """Colour [V, H, W, 3], alpha and depth [V, H, W] in the splats' dtype, and the culled counts.
 
-    Differentiable in the splats, in the poses and in focal lengths and principal points.
+    Differentiable in the splats, velocities among them, and in all of the cameras.
     """
     culled = dict.fromkeys(const.CULL_REASONS, 0)
     views = [_view(splats, cameras, v, culled) for v in range(len(cameras))]
@@ -83,17 +84,24 @@ def _block(front: _Footprints, inside: Tensor, box: tuple[int, int, int, int]) -
 
 def _project(splats: Splats, cameras: Cameras, v: int, culled: dict[str, int]) -> _Footprints:
     """Culls, counts and projects. No derivative ever passes through a culled Gaussian, so no NaN can leak from it."""
+    camera = OneCamera(cameras, v, splats.means)
     with torch.no_grad():
-        pose = cameras.camera_SE3_chunk[v].to(splats.means)
-        values = (splats.means, splats.scales, splats.quats, splats.opacities[:, None], splats.colors)
+        values = [splats.means, splats.scales, splats.quats, splats.opacities[:, None], splats.colors]
+        velocities = camera.velocities_of(splats)
+        if velocities is not None:
+            values.append(velocities)
         finite = torch.isfinite(torch.cat(values, 1)).all(1)
         turned = finite & (splats.quats.square().sum(1) >= const.QUAT_MIN_NORM2)
-        ahead = turned & (splats.means @ pose[2, :3] + pose[2, 3] >= const.NEAR_M)
+        posed = camera.posed(splats.means)
+        exposed = camera.exposed(posed, velocities)
+        ahead = turned & (posed[:, 2] >= const.NEAR_M) & (exposed[:, 2] >= const.NEAR_M)
+        valid = ahead & camera.unfolded(posed) & camera.unfolded(exposed)
         culled["non_finite"] += int((~finite).sum())
         culled["quaternion"] += int((finite & ~turned).sum())
         culled["behind"] += int((turned & ~ahead).sum())
-        at = torch.nonzero(ahead & (splats.opacities >= const.ALPHA_MIN))[:, 0]
-        center, (xx, _, yy), det, z = _geometry(splats, cameras, v, at)
+        culled["folded"] += int((ahead & ~valid).sum())
+        at = torch.nonzero(valid & (splats.opacities >= const.ALPHA_MIN))[:, 0]
+        center, (xx, _, yy), det, (_, posed_z) = _geometry(splats, camera, at)
         sound = (det > 0) & (torch.maximum(xx, yy) <= const.MAX_VARIANCE_PX2)
         sound &= (center.abs() <= const.MAX_CENTER_PX).all(1)
         culled["degenerate"] += int((~sound).sum())
@@ -101,33 +109,33 @@ def _project(splats: Splats, cameras: Cameras, v: int, culled: dict[str, int]) -
         half = torch.sqrt(level[:, None] * torch.stack([xx, yy], 1))
         size = center.new_tensor([cameras.width_px, cameras.height_px])
         seen = sound & ((center + half >= 0.5) & (center - half <= size - 0.5)).all(1)
-        order = torch.argsort(z[seen], stable=True)
+        # Depths of one time: in each row all are seen at once, and relative to each other they barely move.
+        order = torch.argsort(posed_z[seen], stable=True)
         at, half = at[seen][order], half[seen][order]
-    center, (xx, xy, yy), det, z = _geometry(splats, cameras, v, at)
+    center, (xx, xy, yy), det, (z, _) = _geometry(splats, camera, at)
     conic = torch.stack([yy, -xy, xx], 1) / det[:, None]
     return _Footprints(center, conic, splats.opacities[at], torch.cat([splats.colors[at], z[:, None]], 1), half)
 
 
 def _geometry(
-    splats: Splats, cameras: Cameras, v: int, at: Tensor
-) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], Tensor, Tensor]:
-    """Of the Gaussians ``at``: centres [K, 2] px, blurred covariance xx, xy, yy in px², its determinant, camera z."""
-    like = splats.means
-    pose = cameras.camera_SE3_chunk[v].to(like)
-    (fx, fy), (cx, cy) = cameras.focal_px[v].to(like), cameras.center_px[v].to(like)
-    width, height = cameras.width_px, cameras.height_px
-    x, y, z = (splats.means[at] @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
-    mx, my = (const.JACOBIAN_MARGIN * size / (2 * f) for size, f in ((width, fx), (height, fy)))
-    x_limited = (x / z).clamp(-cx / fx - mx, (width - cx) / fx + mx)
-    y_limited = (y / z).clamp(-cy / fy - my, (height - cy) / fy + my)
-    zero = torch.zeros_like(z)
-    jacobian = torch.stack([fx / z, zero, -fx * x_limited / z, zero, fy / z, -fy * y_limited / z], 1).view(-1, 2, 3)
-    m = jacobian @ pose[:3, :3] @ rotation_matrices(splats.quats[at]) * splats.scales[at][:, None, :]
+    splats: Splats, camera: OneCamera, at: Tensor
+) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], Tensor, tuple[Tensor, Tensor]]:
+    """Of the Gaussians ``at``: centres [K, 2] px, blurred covariance xx, xy, yy in px², its determinant, camera z.
+
+    And camera z at the time of the pose.
+    """
+    velocities = camera.velocities_of(splats)
+    own = None if velocities is None else velocities[at]
+    posed = camera.posed(splats.means[at])
+    points, shear = camera.exposure(posed, own)
+    jacobian = camera.jacobian(points) if shear is None else shear @ camera.jacobian(points)
+    turned = jacobian @ camera.rotation @ rotation_matrices(splats.quats[at])
+    m = turned * splats.scales[at][:, None, :]
     xx, yy = m.square().sum(2).unbind(1)
     xx, yy, xy = xx + const.BLUR_PX2, yy + const.BLUR_PX2, (m[:, 0] * m[:, 1]).sum(1)
     # Lagrange's identity: xx·yy − xy² cancels for long thin footprints.
     det = torch.linalg.cross(m[:, 0], m[:, 1]).square().sum(1) + const.BLUR_PX2 * (xx + yy - const.BLUR_PX2)
-    return torch.stack([fx * x / z + cx, fy * y / z + cy], 1), (xx, xy, yy), det, z
+    return camera.pixels(points), (xx, xy, yy), det, (points[:, 2], posed[:, 2])
 
 
 def _composite(

@@ -15,8 +15,10 @@ import torch
 from torch import Tensor
 
 from genre_tasks.logs.types import Lens
-from genre_tasks.render.api import DEFAULT, PosedView, cameras_of, on_device_of, render, render_views
+from genre_tasks.render.api import DEFAULT, PosedView, cameras_of, frame_s_of, on_device_of, render, render_views
+from genre_tasks.render.reference_camera import OneCamera
 from genre_tasks.render.types import Render, RenderSettings
+from genre_tasks.scene.distortion import undistort
 from genre_tasks.scene.gaussians import Splats
 from genre_tasks.scene.graph import SceneGraph
 
@@ -42,8 +44,11 @@ def render_surfaces(scene: SceneGraph, views: Sequence[PosedView], settings: Ren
             splats = scene.at(view.frame).activated()
             posed = {view.frame: (splats, normals(splats))}
         splats, across = posed[view.frame]
-        planes = replace(splats, colors=_planes(splats.means, across, view))
-        image = render(planes, on_device_of(cameras_of([view]), splats.means), settings)
+        if scene.actors and (frame_s := frame_s_of(view)):
+            splats = replace(splats, velocities=scene.velocities_at(splats.means, view.frame, frame_s))
+        camera = on_device_of(cameras_of([view]), splats.means)
+        planes = replace(splats, colors=_planes(splats, across, view, OneCamera(camera, 0, splats.means)))
+        image = render(planes, camera, settings)
         inverse = (image.color[0] * _rays(view.lens, image.color)).sum(-1) / image.alpha[0].clamp_min(1e-6)
         plane = 1 / inverse.clamp_min(1e-6)
         meets = (inverse > 0) & ((plane - centre[k]).abs() <= MOST_APART * centre[k])
@@ -60,10 +65,11 @@ def normals(splats: Splats) -> Tensor:
     return shortest + w * turned + torch.linalg.cross(axis, turned)
 
 
-def _planes(means: Tensor, across: Tensor, view: PosedView) -> Tensor:
-    """n/c of each Gaussian's plane n · x = c in the camera's frame, [N, 3]."""
-    pose = torch.as_tensor(view.chunk_SE3_camera).to(means)
-    at, n = (means - pose[:3, 3]) @ pose[:3, :3], across @ pose[:3, :3]
+def _planes(splats: Splats, across: Tensor, view: PosedView, camera: OneCamera) -> Tensor:
+    """n/c of each Gaussian's plane n · x = c in the camera's frame when its row is exposed, [N, 3]."""
+    pose = torch.as_tensor(view.chunk_SE3_camera).to(splats.means)
+    posed, n = (splats.means - pose[:3, 3]) @ pose[:3, :3], across @ pose[:3, :3]
+    at = camera.exposed(posed, splats.velocities)
     c = (n * at).sum(1, keepdim=True)
     facing = torch.zeros_like(at)
     facing[:, 2] = 1 / at[:, 2].clamp_min(1e-3)
@@ -75,4 +81,6 @@ def _rays(lens: Lens, like: Tensor) -> Tensor:
     """[H, W, 3] through pixel centres, z = 1."""
     v, u = torch.meshgrid(torch.arange(lens.height_px) + 0.5, torch.arange(lens.width_px) + 0.5, indexing="ij")
     x, y = (u - lens.cx_px) / lens.fx_px, (v - lens.cy_px) / lens.fy_px
+    if any(lens.distortion):
+        x, y = (torch.from_numpy(w) for w in undistort(x.double().numpy(), y.double().numpy(), lens.coefficients))
     return torch.stack([x, y, torch.ones_like(x)], -1).to(like)

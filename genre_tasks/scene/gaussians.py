@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import torch
@@ -51,21 +52,29 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class Splats:
-    """N Gaussians as a renderer takes them."""
+    """N Gaussians as a renderer takes them.
+
+    ``velocities``: how they move in chunk axes while an image is read out; only a camera with a shutter asks for them.
+    """
 
     means: Tensor  # [N, 3] metres
     scales: Tensor  # [N, 3] metres, > 0
     quats: Tensor  # [N, 4] w, x, y, z; normalised by the renderer
     opacities: Tensor  # [N] in [0, 1]
     colors: Tensor  # [N, 3]
+    velocities: Tensor | None = None  # [N, 3] m/s; None: nothing moves
 
     def __len__(self) -> int:
         return self.means.shape[0]
 
     def select(self, rows: Tensor) -> Splats:
         """The Gaussians ``rows`` [M], in that order."""
-        return Splats(*(getattr(self, f.name).index_select(0, rows) for f in fields(self)))
+        return self._map(lambda x: x.index_select(0, rows))
 
     def to(self, *args: object, **kwargs: object) -> Splats:
         """Each tensor moved as ``Tensor.to`` moves it."""
-        return Splats(*(getattr(self, f.name).to(*args, **kwargs) for f in fields(self)))
+        return self._map(lambda x: x.to(*args, **kwargs))  # type: ignore[call-overload]
+
+    def _map(self, f: Callable[[Tensor], Tensor]) -> Splats:
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return Splats(**{name: f(x) for name, x in values.items() if x is not None})

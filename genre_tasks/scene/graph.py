@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from genre_tasks.logs.types import Float64
@@ -33,6 +34,20 @@ class ActorNode:
         """[4, 4] at a log frame, or ``None`` where the actor does not exist."""
         at = np.flatnonzero(self.frames == frame)
         return self.chunk_SE3_box[at[0]] if len(at) else None
+
+    def motion(self, frame: int) -> tuple[Float64, Float64]:
+        """Velocity of the centre [3] and turn [3] at a log frame, in m and rad a frame, in chunk axes.
+
+        From the poses before and after, from its own pose at an end of the path; zero where there is no other one.
+        """
+        at = np.flatnonzero(self.frames == frame)
+        if not len(at):
+            return np.zeros(3), np.zeros(3)
+        first, last = max(at[0] - 1, 0), min(at[0] + 1, len(self.frames) - 1)
+        span = max(int(self.frames[last] - self.frames[first]), 1)
+        before, after = self.chunk_SE3_box[first], self.chunk_SE3_box[last]
+        turned = Rotation.from_matrix(after[:3, :3] @ before[:3, :3].T).as_rotvec()
+        return (after[:3, 3] - before[:3, 3]) / span, turned / span
 
 
 @dataclass(frozen=True)
@@ -82,6 +97,26 @@ class SceneGraph:
             joined(g.colors),
         ), moving
 
+    def velocities(self, means: Tensor, frames: Sequence[int], frames_s: Sequence[float]) -> Tensor:
+        """[S + F · M, 3] m/s in chunk axes, of Gaussians at ``means`` that are laid out as by :meth:`posed`.
+
+        ``frames_s`` [F]: the time from each of the log frames to the next; 0 where actors count as resting. Constants:
+        no gradient.
+        """
+        out = torch.zeros_like(means)
+        moving = torch.nonzero(self.nodes >= FIRST_ACTOR)[:, 0] if self.actors else self.nodes[:0]
+        begin = len(self) - len(moving)
+        for f, (frame, frame_s) in enumerate(zip(frames, frames_s, strict=True)):
+            rows = slice(begin + f * len(moving), begin + (f + 1) * len(moving))
+            out[rows] = self._actor_velocities(means.detach()[rows], moving, frame, frame_s)
+        return out
+
+    def velocities_at(self, means: Tensor, frame: int, frame_s: float) -> Tensor:
+        """As :meth:`velocities`, [N, 3], of Gaussians that are laid out as by :meth:`at`."""
+        moving = torch.nonzero(self.nodes >= FIRST_ACTOR)[:, 0] if self.actors else self.nodes[:0]
+        moved = self._actor_velocities(means.detach()[moving], moving, frame, frame_s)
+        return torch.zeros_like(means).index_copy(0, moving, moved)
+
     def at(self, frame: int) -> Gaussians:
         """All Gaussians in chunk coordinates at a log frame, N kept and order kept, differentiable.
 
@@ -115,6 +150,16 @@ class SceneGraph:
                 if pose is not None:
                     rotation[f, k], translation[f, k], present[f, k] = pose[:3, :3], pose[:3, 3], True
         return rotation, translation, present
+
+    def _actor_velocities(self, means: Tensor, moving: Tensor, frame: int, frame_s: float) -> Tensor:
+        if not frame_s or not len(moving):
+            return torch.zeros_like(means)
+        centres = self.actor_poses((frame,))[1][0]
+        motions = [actor.motion(frame) for actor in self.actors]
+        actor_of = self.nodes[moving] - FIRST_ACTOR
+        parts = (centres, np.stack([m[0] for m in motions]), np.stack([m[1] for m in motions]))
+        centre, velocity, turn = (torch.as_tensor(x).to(means)[actor_of] for x in parts)
+        return (velocity + torch.linalg.cross(turn, means - centre)) / frame_s
 
     def _actors_at(self, moving: Tensor, frames: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
         """Means [F, M, 3], quaternions [F, M, 4] and logit opacities [F, M] of the actors' Gaussians ``moving`` [M]."""

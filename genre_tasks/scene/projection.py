@@ -1,4 +1,4 @@
-"""Points into images: pinhole projection with optional lens distortion, and depth maps splatted from points."""
+"""Points into images: pinhole projection with lens distortion and rolling shutter, and depth maps from points."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from genre_tasks.logs.types import Float32, Float64, Lens
+from genre_tasks.logs.types import Float32, Float64, Lens, RollingShutter
+from genre_tasks.scene.distortion import Reals, distort, fold_radius, slopes
 
 NEAR_M = 0.1
 """Points nearer to the camera plane than this are behind it."""
 
-_MAX_DISTORTED_TAN = 1.5
-"""Brown–Conrady polynomials fold back outside their valid radius; rays beyond are taken as unseen."""
+SHUTTER_MIN_RATE = 0.1
+"""As in ``genre_tasks/render/constants.py``, which says why."""
 
 
 @dataclass(frozen=True)
@@ -25,8 +26,12 @@ class Projected:
     depth: Float32
 
 
-def project(points: Float32, chunk_SE3_camera: Float64, lens: Lens) -> Projected:
-    """Which points [P, 3] (chunk coordinates) fall into an image, and where; occlusion is not considered."""
+def project(points: Float32, chunk_SE3_camera: Float64, lens: Lens, shutter: RollingShutter | None = None) -> Projected:
+    """Which points [P, 3] (chunk coordinates) fall into an image, and where; occlusion is not considered.
+
+    With a ``shutter``, from where the camera is when a point's row is exposed; the points themselves rest. A point is
+    seen if it is ahead of the camera, and within the lens's fold radius, both then and at the pose's time.
+    """
     inverse = np.linalg.inv(chunk_SE3_camera).astype(np.float32)
     depth = points @ inverse[2, :3] + inverse[2, 3]
     index = np.flatnonzero(depth > NEAR_M)
@@ -36,22 +41,35 @@ def project(points: Float32, chunk_SE3_camera: Float64, lens: Lens) -> Projected
     y = (near @ inverse[1, :3] + inverse[1, 3]) / depth
     inside = np.ones(len(index), dtype=bool)
     if any(lens.distortion):
-        inside = x * x + y * y < _MAX_DISTORTED_TAN**2
-        x, y = distort(x, y, lens.distortion)
+        inside &= x * x + y * y < fold_radius(lens.coefficients) ** 2
+    if shutter is not None and shutter.readout_s:
+        x, y, depth = _exposed(x, y, depth, lens, shutter)
+        inside &= depth > NEAR_M
+    if any(lens.distortion):
+        inside &= x * x + y * y < fold_radius(lens.coefficients) ** 2
+        x, y = distort(x, y, lens.coefficients)
     u, v = x * np.float32(lens.fx_px) + np.float32(lens.cx_px), y * np.float32(lens.fy_px) + np.float32(lens.cy_px)
     inside &= (u >= 0) & (u < lens.width_px) & (v >= 0) & (v < lens.height_px)
     return Projected(index[inside], np.stack([u[inside], v[inside]], 1), depth[inside])
 
 
-def distort(x: Float32, y: Float32, coefficients: tuple[float, ...]) -> tuple[Float32, Float32]:
-    """Brown–Conrady (k1, k2, p1, p2, k3) on normalised image coordinates."""
-    k1, k2, p1, p2, k3 = (np.float32(c) for c in (*coefficients, 0.0, 0.0, 0.0, 0.0, 0.0)[:5])
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return (
-        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-    )
+def _exposed(x: Reals, y: Reals, z: Reals, lens: Lens, shutter: RollingShutter) -> tuple[Reals, Reals, Reals]:
+    """x/z, y/z and z when the points' rows are exposed: the formula of the renderer's ``Shutter``."""
+    moving, turning = np.array(shutter.velocity_m_s, np.float32), np.array(shutter.turn_rad_s, np.float32)
+    posed = np.stack([x * z, y * z, z], 1)
+    motion = -moving - np.cross(turning, posed)
+    x_rate, y_rate = (motion[:, 0] - x * motion[:, 2]) / z, (motion[:, 1] - y * motion[:, 2]) / z
+    row, row_rate = distort(x, y, lens.coefficients)[1] * lens.fy_px + lens.cy_px, lens.fy_px * y_rate
+    if any(lens.distortion):
+        _, xy, yy = slopes(x, y, lens.coefficients)
+        row_rate = lens.fy_px * (xy * x_rate + yy * y_rate)
+    rate = np.maximum(1 - shutter.readout_s * row_rate / lens.height_px, SHUTTER_MIN_RATE)
+    half = shutter.readout_s / 2
+    time = np.clip(shutter.readout_s * (row / lens.height_px - 0.5) / rate, -half, half)
+    at = posed + time[:, None] * motion
+    depth = at[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return at[:, 0] / depth, at[:, 1] / depth, depth
 
 
 def splat_depth(projected: Projected, lens: Lens, footprint_m: float, max_radius_px: int = 10) -> Float32:

@@ -1,4 +1,4 @@
-"""Sections of the list of hard cases, and the tests of cases that have no measured error in ``docs/stability.md``.
+"""Sections of the list of hard cases, and the tests that have no measured error in ``docs/stability.md``.
 
 A plain string says why there is no test. A test holds that what is named here exists.
 """
@@ -19,6 +19,7 @@ SECTIONS: dict[str, range] = {
 
 _POSES = "tests/hard_cases/test_time_poses_actors.py"
 _LOGS = "tests/hard_cases/test_logs_as_delivered.py"
+_EFFECTS = "tests/hard_cases/test_effects.py"
 _LOSS = "tests/optimiser/test_loss.py"
 _SSIM = "tests/optimiser/test_ssim.py"
 _UNROLL = "tests/optimiser/test_unroll.py"
@@ -180,10 +181,14 @@ LISTED: dict[int, tuple[str, tuple[str, ...] | str]] = {
         ("tests/logs/test_frame_unpickler.py", "tests/faults/test_bad_input.py::test_a_pickle_that_tries_to_run_code"),
     ),
     50: (
-        "distortion that folds back outside its valid radius (LiDAR colouring; renders are pinhole)",
-        ("tests/scene/test_scene_points.py::test_distortion_that_folds_back_is_unseen",),
+        "distortion that folds back outside its valid radius: what it would bring into the image; LiDAR colouring",
+        (f"{_EFFECTS}::test_what_would_fold_back_touches_no_pixel",
+         "tests/scene/test_scene_points.py::test_distortion_that_folds_back_is_unseen"),
     ),
-    51: ("a Gaussian that crosses the near plane during the readout; readout 0", _NO_EFFECTS),
+    51: (
+        "a point that moves down the image as fast as its rows are read, or faster",
+        ("tests/render/test_render_shutter.py::test_points_that_outrun_the_rows_stay_within_the_readout",),
+    ),
     52: ("gain towards 0", _NO_EFFECTS),
     53: ("view direction at zero distance", _NO_EFFECTS),
     54: ("exposure time 0", _NO_EFFECTS),

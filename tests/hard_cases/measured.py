@@ -39,8 +39,14 @@ HALF = {
     for name in ("bfloat16", "float16")
 }
 
+FOLDING = Row(
+    50, "Gaussians just within and beyond the radius where a distortion folds back", "image and gradient", 1e-5
+)
+CROSSING = Row(51, "Gaussians that the near plane passes during the readout", "image and gradient", 1e-5)
+NO_READOUT = Row(51, "readout 0", "changed values", 0.0)
+
 ROWS = (
     *(row for rows in SCENES.values() for row in rows),
     FAR_WORLD, STREET_DIRECT, NEEDLES_DIRECT, ORDER, HIDDEN, POISON,
-    *DIFFERENCES.values(), ALPHA_BOUND, NO_WEIGHT, *HALF.values(),
+    *DIFFERENCES.values(), ALPHA_BOUND, NO_WEIGHT, *HALF.values(), FOLDING, CROSSING, NO_READOUT,
 )  # fmt: skip

@@ -16,8 +16,9 @@ BACKENDS = ("reference", "cpu")
 HEAD = """# Hard cases: what stays stable, by how much, and where it is tested
 
 Written by `pytest -m "slow or not slow" tests/hard_cases/test_geometry.py tests/hard_cases/test_compositing.py
---stability-report docs/stability.md`; a test holds that rows, bounds and named tests are those of the suite. To add a
-case, add a line to a table in `tests/hard_cases/` (`render_cases.py`, `measured.py`, `listed.py`).
+tests/hard_cases/test_effects.py --stability-report docs/stability.md`; a test holds that rows, bounds and named tests
+are those of the suite. To add a case, add a line to a table in `tests/hard_cases/` (`render_cases.py`, `measured.py`,
+`listed.py`).
 
 Errors are against the float64 reference of the same input, the largest found. *image*: colour, alpha, and depth as a
 share of the farthest, absolute, outside of the band of pixels where rounding may decide (alpha beside 1/255 or the

@@ -27,7 +27,7 @@ def test_the_document_has_the_rows_of_the_tests():
 
 def test_every_case_is_there_once():
     assert [n for numbers in SECTIONS.values() for n in numbers] == list(range(1, 55))
-    assert {row.number for row in ROWS} == set(range(1, 17)) and set(LISTED) == set(range(17, 55))
+    assert {row.number for row in ROWS} == {*range(1, 17), 50, 51} and set(LISTED) == set(range(17, 55))
     assert len({(r.number, r.words, r.quantity) for r in ROWS}) == len(ROWS)
 
 

@@ -7,8 +7,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from genre_tasks.render import Cameras, RenderSettings, render
+from genre_tasks.render import RenderSettings, render
 from genre_tasks.scene.gaussians import Splats
+from tests.scenes import moved_loss, smooth
 
 CPU, REFERENCE = RenderSettings("cpu", 1), RenderSettings("reference")
 
@@ -28,41 +29,18 @@ def test_values_and_gradients_of_300(scene, gradients, seed, width, height):
         assert relative <= 1e-5, (name, float(relative))
 
 
-def _smooth() -> tuple[Splats, Cameras]:
-    """Gaussians that fill the image without reaching the cut or the clamp, so that finite differences are valid."""
-    g = torch.Generator().manual_seed(5)
-    means = torch.randn(5, 3, generator=g, dtype=torch.float64) * 0.3 + torch.tensor([0.1, -0.1, 4.0])
-    scales = 1.5 + torch.rand(5, 3, generator=g, dtype=torch.float64)
-    quats, colors = torch.randn(5, 4, generator=g).double(), torch.rand(5, 3, generator=g).double()
-    splats = Splats(means, scales, quats, torch.full((5,), 0.5, dtype=torch.float64), colors)
-    pose = torch.linalg.matrix_exp(_twist(torch.tensor([0.2, -0.1, 0.15, 0.1, 0.2, -0.3], dtype=torch.float64)))
-    return splats, Cameras(pose[None], torch.tensor([[20.0, 22.0]]), torch.tensor([[12.5, 7.5]]), 24, 16)
-
-
-def _twist(v: torch.Tensor) -> torch.Tensor:
-    zero = v.new_zeros(())
-    rows = [[zero, -v[2], v[1], v[3]], [v[2], zero, -v[0], v[4]], [-v[1], v[0], zero, v[5]], [zero] * 4]
-    return torch.stack([torch.stack(r) for r in rows])
-
-
-def _moved_loss(splats: Splats, cameras: Cameras, xi: torch.Tensor, settings: RenderSettings) -> torch.Tensor:
-    pose = torch.linalg.matrix_exp(_twist(xi)) @ cameras.camera_SE3_chunk[0].to(xi.dtype)
-    out = render(splats.to(xi.dtype), replace(cameras, camera_SE3_chunk=pose[None]), settings)
-    return (out.color.square().sum() + (out.alpha - 0.3).square().sum() + 0.1 * out.depth.sum()).double()
-
-
 @pytest.mark.parametrize(("settings", "dtype", "bound"), [(CPU, torch.float32, 1e-5), (REFERENCE, torch.float64, 1e-7)])
 def test_pose_gradient_against_finite_differences(settings, dtype, bound):
-    splats, cameras = _smooth()
+    splats, cameras = smooth()
     xi = torch.zeros(6, dtype=dtype, requires_grad=True)
-    _moved_loss(splats, cameras, xi, settings).backward()
+    moved_loss(splats, cameras, xi, settings).backward()
     step = 1e-5
     expected = torch.zeros(6, dtype=torch.float64)
     with torch.no_grad():
         for k in range(6):
             e = torch.zeros(6, dtype=torch.float64)
             e[k] = step
-            ahead, back = (_moved_loss(splats, cameras, s * e, REFERENCE) for s in (1, -1))
+            ahead, back = (moved_loss(splats, cameras, s * e, REFERENCE) for s in (1, -1))
             expected[k] = (ahead - back) / (2 * step)
     assert xi.grad is not None
     relative = torch.linalg.vector_norm(xi.grad.double() - expected) / torch.linalg.vector_norm(expected)
@@ -83,7 +61,7 @@ def test_pose_gradient_leaves_the_image_and_other_gradients(scene, gradients):
 
 
 def test_reference_gradients_against_finite_differences():
-    splats, cameras = _smooth()
+    splats, cameras = smooth()
     inputs = [x.requires_grad_() for x in (splats.means, splats.scales, splats.quats, splats.opacities, splats.colors)]
 
     def images(*x: torch.Tensor) -> torch.Tensor:
