@@ -95,9 +95,14 @@ def _per_cent(name: str) -> float:
     return effect_of(name).threshold / 100
 
 
+SHUTTER_S, DISTORTION = 0.002, 0.002
+"""Readout and k1 that bring a street near the thresholds; what they read there is in the rows."""
+
 CASES: dict[str, Case] = {
     "rigid_actors": Case(lambda _: "", heldout_psnr, plain="&moving=0&pedestrians=0"),
     "exposure": Case(lambda x: f"&exposure_jitter={x * _per_cent('exposure'):.4g}", heldout_psnr),
+    "rolling_shutter": Case(lambda x: f"&rolling_shutter_s={x * SHUTTER_S:.4g}", heldout_psnr),
+    "lens_distortion": Case(lambda x: f"&distortion={x * DISTORTION:.4g}", heldout_psnr),
     "lidar_depth": Case(lambda _: "", heldout_depth, "%", plain="&lidar_beams=1&lidar_azimuths=90"),
     "ego_mask": Case(lambda x: f"&bonnet={x * _per_cent('ego_mask'):.4g}", heldout_psnr),
 }

@@ -10,18 +10,27 @@ from dataclasses import replace
 import numpy as np
 
 from genre_tasks.effects.types import EffectsPlan
-from genre_tasks.scene.chunk import Actor, Chunk, Points
+from genre_tasks.scene.chunk import Actor, Chunk, Points, View
 
 
 def applied(chunk: Chunk, plan: EffectsPlan) -> Chunk:
     """The chunk itself where no effect has anything to say of it."""
     if chunk.actors and not plan.on("rigid_actors"):
         chunk = replace(chunk, static=_standing(chunk), actors=())
-    gains, own = plan.fitted.gains, plan.fitted.own
-    if not gains and not own:
-        return chunk
-    views = [replace(v, log_gain=gains.get((v.camera, v.frame)), own=own.get(v.camera)) for v in chunk.views]
-    return replace(chunk, views=tuple(views))
+    straight = bool(plan.decisions) and not plan.on("lens_distortion")
+    views = tuple(_as_planned(v, plan, straight) for v in chunk.views)
+    return chunk if all(a is b for a, b in zip(views, chunk.views, strict=True)) else replace(chunk, views=views)
+
+
+def _as_planned(view: View, plan: EffectsPlan, straight: bool) -> View:
+    """The view itself where nothing is said of it; ``straight``: with its lens taken to be free of distortion."""
+    fitted, key = plan.fitted, (view.camera, view.frame)
+    gain, own, shutter = fitted.gains.get(key), fitted.own.get(view.camera), fitted.shutters.get(key)
+    straight = straight and any(view.lens.distortion)
+    if gain is None and own is None and shutter is None and not straight:
+        return view
+    lens = replace(view.lens, distortion=()) if straight else view.lens
+    return replace(view, lens=lens, log_gain=gain, own=own, shutter=shutter)
 
 
 def _standing(chunk: Chunk) -> Points:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from scipy.spatial.transform import Rotation
+
 from genre_tasks.effects.motion import displaced
 from genre_tasks.effects.seen import Seen
-from genre_tasks.effects.types import Effect, Measured
+from genre_tasks.effects.types import Effect, Fitted, Measured
+from genre_tasks.logs.types import RollingShutter
+from genre_tasks.scene.chunk import View
 
 
 def measure(seen: Seen) -> Measured:
@@ -17,4 +21,33 @@ def needs(seen: Seen) -> str | None:
     return None if any(c.readout_s > 0 for c in seen.cameras.values()) else "the log states no readout time"
 
 
-EFFECT = Effect("rolling_shutter", "displacement during the readout", "px", 0.5, "a pose for each row", measure, needs)
+def fit(seen: Seen) -> Fitted:
+    """How each camera that states a readout time moves, from its poses before and after an image.
+
+    A camera with one image, or with two at one time, is left without a shutter.
+    """
+    out: dict[tuple[str, int], RollingShutter] = {}
+    for name, camera in seen.cameras.items():
+        views = sorted((v for v in seen.chunk.views if v.camera == name), key=lambda v: v.frame)
+        for k, view in enumerate(views):
+            before, after = views[max(k - 1, 0)], views[min(k + 1, len(views) - 1)]
+            seconds = after.timestamp_s - before.timestamp_s
+            if camera.readout_s > 0 and seconds > 0:
+                out[name, view.frame] = _moving(view, before, after, camera.readout_s)
+    return Fitted(shutters=out)
+
+
+def _moving(view: View, before: View, after: View, readout_s: float) -> RollingShutter:
+    seconds = after.timestamp_s - before.timestamp_s
+    axes = view.chunk_SE3_camera[:3, :3].T
+    way = after.chunk_SE3_camera[:3, 3] - before.chunk_SE3_camera[:3, 3]
+    turned = after.chunk_SE3_camera[:3, :3] @ before.chunk_SE3_camera[:3, :3].T
+    vx, vy, vz = axes @ way / seconds
+    wx, wy, wz = axes @ Rotation.from_matrix(turned).as_rotvec() / seconds
+    frame_s = seconds / max(after.frame - before.frame, 1)
+    return RollingShutter(readout_s, (float(vx), float(vy), float(vz)), (float(wx), float(wy), float(wz)), frame_s)
+
+
+EFFECT = Effect(
+    "rolling_shutter", "displacement during the readout", "px", 0.5, "a pose for each row", measure, needs, fit=fit
+)

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from genre_tasks.logs.types import RollingShutter
+
 if TYPE_CHECKING:
     from genre_tasks.effects.seen import Seen
 
@@ -32,15 +34,18 @@ class Fitted:
     """What applying an effect needs to know of the chunk's images, beside the log itself.
 
     ``gains``: by camera and frame, the log of an image's gain in linear light, red, green and blue, of mean zero over
-    source images. ``own``: by camera, where the vehicle itself is in the image, [H, W].
+    source images. ``own``: by camera, where the vehicle itself is in the image, [H, W]. ``shutters``: by camera and
+    frame, how the camera moves while the image is read out.
     """
 
     gains: Mapping[tuple[str, int], tuple[float, float, float]] = field(default_factory=dict)
     own: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
+    shutters: Mapping[tuple[str, int], RollingShutter] = field(default_factory=dict)
 
     def with_those_of(self, other: Fitted) -> Fitted:
         """Both."""
-        return Fitted({**self.gains, **other.gains}, {**self.own, **other.own})
+        gains, own = {**self.gains, **other.gains}, {**self.own, **other.own}
+        return Fitted(gains, own, {**self.shutters, **other.shutters})
 
 
 @dataclass(frozen=True)

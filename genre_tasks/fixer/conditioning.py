@@ -107,7 +107,9 @@ def recorded(chunk: Chunk) -> tuple[SourceImage, ...]:
         image = _own_colours(view).permute(2, 0, 1)
         if view.own is not None:  # what lies behind the vehicle is hidden by it
             hidden_at = torch.where(torch.from_numpy(view.own), NEAR_M, hidden_at)
-        out.append(SourceImage(view.camera, view.frame, view.chunk_SE3_camera, view.lens, image, hidden_at))
+        out.append(
+            SourceImage(view.camera, view.frame, view.chunk_SE3_camera, view.lens, image, hidden_at, view.shutter)
+        )
     return tuple(out)
 
 

@@ -16,7 +16,9 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from genre_tasks.logs.types import Float64, Lens
+from genre_tasks.logs.types import Float64, Lens, RollingShutter
+from genre_tasks.render.reference_camera import OneCamera
+from genre_tasks.render.types import Cameras
 from genre_tasks.scene.chunk import Actor
 
 SOURCES = 5
@@ -43,6 +45,7 @@ class SourceImage:
     """A recorded image with what hides points from it.
 
     ``pose`` is chunk_SE3_camera [4, 4]; ``image`` [3, H, W] in [0, 1]; ``depth`` [H, W] in metres, 0 where unknown.
+    ``shutter``: as a ``View`` has it.
     """
 
     camera: str
@@ -51,6 +54,7 @@ class SourceImage:
     lens: Lens
     image: Tensor
     depth: Tensor
+    shutter: RollingShutter | None = None
 
 
 @dataclass(frozen=True)
@@ -92,8 +96,8 @@ def surface_of(depth: Tensor, alpha: Tensor, pose: Float64, lens: Lens, actors: 
 def look_up(surface: Surface, source: SourceImage, actors: Sequence[Actor], frame: int) -> tuple[Tensor, Tensor]:
     """What ``source`` shows at a surface of log frame ``frame``: colours [3, ...], and where it sees it [...]."""
     points, there = _at_frame(surface, actors, frame, source.frame)
-    x, y, z = _moved(points, np.linalg.inv(source.pose)).unbind(-1)
-    ahead = there & (z > _NEAREST_M)
+    x, y, z, unfolded = _as_exposed(_moved(points, np.linalg.inv(source.pose)), source)
+    ahead = there & unfolded & (z > _NEAREST_M)
     z = torch.where(ahead, z, torch.ones_like(z))
     u = (x / z * source.lens.fx_px + source.lens.cx_px) / source.lens.width_px * 2 - 1
     v = (y / z * source.lens.fy_px + source.lens.cy_px) / source.lens.height_px * 2 - 1
@@ -103,6 +107,24 @@ def look_up(surface: Surface, source: SourceImage, actors: Sequence[Actor], fram
     seen = ahead & (u.abs() < 1) & (v.abs() < 1) & ~hidden
     color = F.grid_sample(source.image[None].to(z), grid, "bilinear", "border", align_corners=False)[0]
     return color, seen
+
+
+def _as_exposed(points: Tensor, source: SourceImage) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """x, y, z [...] such that x/z and y/z are where a plain lens would show camera coordinates [..., 3]; which may be.
+
+    With the source's distortion, and from where its camera is when a point's row is exposed; actors rest meanwhile.
+    """
+    x, y, z = points.unbind(-1)
+    if source.shutter is None and not any(source.lens.distortion):
+        return x, y, z, torch.ones_like(z, dtype=torch.bool)
+    cameras = Cameras.of([np.eye(4)], [source.lens], shutters=[source.shutter])
+    camera = OneCamera(cameras, 0, points)
+    safe = torch.where((z > _NEAREST_M)[..., None], points, torch.ones_like(points)).flatten(0, -2)
+    exposed = camera.exposed(safe, None)
+    bent = camera.bent(exposed[:, 0] / exposed[:, 2], exposed[:, 1] / exposed[:, 2])
+    then = torch.where(z > _NEAREST_M, exposed[:, 2].view(z.shape), z)
+    may = (camera.unfolded(safe) & camera.unfolded(exposed)).view(z.shape)
+    return bent[0].view(z.shape) * then, bent[1].view(z.shape) * then, then, may
 
 
 def warp(surface: Surface, sources: Sequence[SourceImage], actors: Sequence[Actor], frame: int) -> Warp:

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from genre_tasks.logs.types import Float32, Float64, Lens
+from genre_tasks.logs.types import Float32, Float64, Lens, RollingShutter
 
 Role = Literal["source", "heldout"]
 Gain = tuple[float, float, float]
@@ -27,7 +27,7 @@ class View:
     the encoded bytes as they came (native resolution), never ``None``: a view without an image is not in the chunk.
 
     What effects say of the image, ``None`` where they are off (``ingest`` knows nothing of it): ``log_gain`` of its
-    exposure, ``own`` [H, W] where the vehicle itself is in it.
+    exposure, ``own`` [H, W] where the vehicle itself is in it, ``shutter`` how the camera moves while it is read out.
     """
 
     camera: str
@@ -39,6 +39,7 @@ class View:
     image: bytes
     log_gain: Gain | None = None
     own: NDArray[np.bool_] | None = None
+    shutter: RollingShutter | None = None
 
 
 @dataclass(frozen=True)

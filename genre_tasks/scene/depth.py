@@ -24,12 +24,12 @@ def lidar_depth(chunk: Chunk, view: View) -> Tensor:
     height, width = view.lens.height_px, view.lens.width_px
     points = frame_points(chunk, view.frame)
     coarse = buffer_lens(view.lens)
-    seen = project(points, view.chunk_SE3_camera, coarse)
+    seen = project(points, view.chunk_SE3_camera, coarse, view.shutter)
     nearest = splat_depth(seen, coarse, _FOOTPRINT_SCALE * FOOTPRINT_M)
     front = nearest[seen.uv[:, 1].astype(np.int64), seen.uv[:, 0].astype(np.int64)]
     tolerance = np.float32(1 + _FOOTPRINT_SCALE * RELATIVE_TOLERANCE)
     kept = project(points[seen.index[seen.depth <= front * tolerance + np.float32(ABSOLUTE_TOLERANCE_M)]],
-                   view.chunk_SE3_camera, view.lens)  # fmt: skip
+                   view.chunk_SE3_camera, view.lens, view.shutter)  # fmt: skip
     out = np.full(height * width, np.inf, np.float32)
     np.minimum.at(out, kept.uv[:, 1].astype(np.int64) * width + kept.uv[:, 0].astype(np.int64), kept.depth)
     out[np.isinf(out)] = 0.0

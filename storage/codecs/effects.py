@@ -1,4 +1,5 @@
-"""Plan of effects ↔ ``effects.parquet``, a row an effect; ``gains.parquet`` and ``own/CAMERA.png`` of those applied."""
+"""Plan of effects ↔ ``effects.parquet``, a row an effect; what those that are on need to be
+applied: ``gains.parquet``, ``shutters.parquet``, ``own/CAMERA.png``."""
 
 from __future__ import annotations
 
@@ -10,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from genre_tasks.effects.types import Decision, EffectsPlan, Fitted
+from genre_tasks.logs.types import RollingShutter
 from storage.codecs.png import read_png, write_png
 from storage.codecs.tables import column, read_table, schema, write_table
 
@@ -38,6 +40,18 @@ GAINS = schema(
     ],
 )
 
+_MOTION = ("velocity_x", "velocity_y", "velocity_z", "turn_x", "turn_y", "turn_z")
+SHUTTERS = schema(
+    "shutters/1",
+    [
+        column("camera", pa.string(), "name"),
+        column("frame", pa.int64(), "frame of the log"),
+        column("readout_s", pa.float64(), "seconds from the first row to the last"),
+        column("frame_s", pa.float64(), "seconds to the next frame; 0: not stated"),
+        *(column(n, pa.float64(), "of the camera in its own axes, m/s or rad/s") for n in _MOTION),
+    ],
+)
+
 
 def write(folder: Path, value: EffectsPlan) -> None:
     """Write the table, the gains and a picture of the vehicle itself a camera: white where it is."""
@@ -46,6 +60,11 @@ def write(folder: Path, value: EffectsPlan) -> None:
     images, gains = list(value.fitted.gains), np.array(list(value.fitted.gains.values())).reshape(-1, 3)
     which = {"camera": [camera for camera, _ in images], "frame": [frame for _, frame in images]}
     write_table(folder / "gains.parquet", GAINS, which | {c: gains[:, k] for k, c in enumerate(_CHANNELS)})
+    shutters = value.fitted.shutters
+    moving = np.array([[*s.velocity_m_s, *s.turn_rad_s] for s in shutters.values()]).reshape(-1, 6)
+    rows = {"camera": [camera for camera, _ in shutters], "frame": [frame for _, frame in shutters]}
+    rows |= {name: [getattr(s, name) for s in shutters.values()] for name in ("readout_s", "frame_s")}
+    write_table(folder / "shutters.parquet", SHUTTERS, rows | {n: moving[:, k] for k, n in enumerate(_MOTION)})
     if value.fitted.own:
         (folder / "own").mkdir()
     for camera, own in value.fitted.own.items():
@@ -58,7 +77,16 @@ def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> Effects
     rows = read_table(folder / "gains.parquet", GAINS)[0].to_pylist()
     gains = {(row["camera"], row["frame"]): (row["red"], row["green"], row["blue"]) for row in rows}
     own = {path.stem: read_png(path)[..., 0] > 0 for path in sorted((folder / "own").glob("*.png"))}
-    return EffectsPlan(tuple(Decision(**row) for row in table.to_pylist()), Fitted(gains, own))
+    shutters = {
+        (row["camera"], row["frame"]): _shutter(row)
+        for row in read_table(folder / "shutters.parquet", SHUTTERS)[0].to_pylist()
+    }
+    return EffectsPlan(tuple(Decision(**row) for row in table.to_pylist()), Fitted(gains, own, shutters))
+
+
+def _shutter(row: Mapping[str, Any]) -> RollingShutter:
+    vx, vy, vz, wx, wy, wz = (row[n] for n in _MOTION)
+    return RollingShutter(row["readout_s"], (vx, vy, vz), (wx, wy, wz), row["frame_s"])
 
 
 def measurements(value: EffectsPlan) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import torch
 from genre_tasks.effects.types import Decision, EffectsPlan, Fitted
 from genre_tasks.fixer.conditioning import Degraded
 from genre_tasks.fixer.pairs import NAMES, Pairs
-from genre_tasks.logs.types import Lens
+from genre_tasks.logs.types import Lens, RollingShutter
 from genre_tasks.scene.chunk import Actor, Chunk, Mark, Points, Role, View
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import ActorNode, SceneGraph
@@ -148,7 +148,12 @@ def effects(rng: np.random.Generator, count: int = 3) -> EffectsPlan:
     ]
     own = {f"camera_{k}": rng.random((4, 6)) < 0.5 for k in range(count)}
     gains = {(f"camera_{k}", k): tuple(float(x) for x in rng.normal(size=3)) for k in range(count)}
-    return EffectsPlan(tuple(rows), Fitted(gains, own))
+    numbers = rng.normal(size=(count, 8)).tolist()
+    shutters = {
+        (f"camera_{k}", k): RollingShutter(x[0], (x[1], x[2], x[3]), (x[4], x[5], x[6]), x[7])
+        for k, x in enumerate(numbers)
+    }
+    return EffectsPlan(tuple(rows), Fitted(gains, own, shutters))
 
 
 MAKERS = {
