@@ -18,6 +18,7 @@ from torch import Tensor
 
 from genre_tasks.logs.types import Float64, Lens
 from genre_tasks.scene.chunk import Actor
+from genre_tasks.scene.distortion import distort, fold_radius, rays_at
 
 SOURCES = 5
 """Images looked at for a view, the reference among them: from six on, what is gained is under a tenth of a decibel."""
@@ -85,6 +86,8 @@ def surface_of(depth: Tensor, alpha: Tensor, pose: Float64, lens: Lens, actors: 
     z = torch.where(known, depth, torch.ones_like(depth))
     v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     x, y = (u.to(z) - lens.cx_px) / lens.fx_px * z, (v.to(z) - lens.cy_px) / lens.fy_px * z
+    if any(lens.distortion):
+        x, y = (torch.from_numpy(ray).to(z) * z for ray in rays_at(u.double().numpy(), v.double().numpy(), lens))
     points = _moved(torch.stack([x, y, z], -1), pose)
     return Surface(points, known, _actor_of(points, known, actors, frame))
 
@@ -94,9 +97,13 @@ def look_up(surface: Surface, source: SourceImage, actors: Sequence[Actor], fram
     points, there = _at_frame(surface, actors, frame, source.frame)
     x, y, z = _moved(points, np.linalg.inv(source.pose)).unbind(-1)
     ahead = there & (z > _NEAREST_M)
-    z = torch.where(ahead, z, torch.ones_like(z))
-    u = (x / z * source.lens.fx_px + source.lens.cx_px) / source.lens.width_px * 2 - 1
-    v = (y / z * source.lens.fy_px + source.lens.cy_px) / source.lens.height_px * 2 - 1
+    z, lens = torch.where(ahead, z, torch.ones_like(z)), source.lens
+    x, y = x / z, y / z
+    if any(lens.distortion):
+        ahead = ahead & (x.square() + y.square() < fold_radius(lens.coefficients) ** 2)
+        x, y = distort(x, y, lens.coefficients)
+    u = (x * lens.fx_px + lens.cx_px) / lens.width_px * 2 - 1
+    v = (y * lens.fy_px + lens.cy_px) / lens.height_px * 2 - 1
     grid = torch.stack([u, v], -1).clamp(-2, 2)[None]
     nearest = F.grid_sample(source.depth[None, None].to(z), grid, "nearest", "zeros", align_corners=False)[0, 0]
     hidden = (nearest > 0) & (z > nearest * (1 + HIDDEN_SHARE) + HIDDEN_M)

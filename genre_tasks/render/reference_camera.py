@@ -8,6 +8,7 @@ from torch import Tensor
 from genre_tasks.render import constants as const
 from genre_tasks.render.bent import domain_of
 from genre_tasks.render.types import Cameras
+from genre_tasks.scene.distortion import distort, slopes
 from genre_tasks.scene.gaussians import Splats
 
 
@@ -20,7 +21,7 @@ class OneCamera:
         (self.fx, self.fy), (self.cx, self.cy) = cameras.focal_px[v].to(like), cameras.center_px[v].to(like)
         self.width, self.height = cameras.width_px, cameras.height_px
         self.domain = domain_of(cameras, v)
-        self._distortion = like.new_zeros(5) if cameras.distortion is None else cameras.distortion[v].to(like)
+        self._distortion = () if cameras.distortion is None else cameras.distortion[v].to(like).unbind()
         shutter = cameras.shutter
         self.rolls = shutter is not None and bool(shutter.readout_s[v] != 0)
         if shutter is not None:
@@ -70,26 +71,13 @@ class OneCamera:
         """Normalised image coordinates after the lens's distortion."""
         if self.domain is None:
             return x, y
-        k1, k2, p1, p2, k3 = self._distortion
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        return (
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        )
+        return distort(x, y, self._distortion)
 
     def slopes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """∂x'/∂x, ∂x'/∂y = ∂y'/∂x and ∂y'/∂y of :meth:`bent`."""
         if self.domain is None:
             return torch.ones_like(x), torch.zeros_like(x), torch.ones_like(x)
-        k1, k2, p1, p2, k3 = self._distortion
-        r2 = x * x + y * y
-        radial, slope = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), k1 + r2 * (2 * k2 + r2 * 3 * k3)
-        return (
-            radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x,
-            2 * x * y * slope + 2 * p1 * x + 2 * p2 * y,
-            radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x,
-        )
+        return slopes(x, y, self._distortion)
 
     def jacobian(self, points: Tensor) -> Tensor:
         """[K, 2, 3] of pixels by camera coordinates, at a point of linearisation that is limited."""
