@@ -79,10 +79,9 @@ class OneCamera:
             return torch.ones_like(x), torch.zeros_like(x), torch.ones_like(x)
         return slopes(x, y, self._distortion)
 
-    def jacobian(self, points: Tensor) -> Tensor:
+    def jacobian(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         """[K, 2, 3] of pixels by camera coordinates, at a point of linearisation that is limited."""
-        z = points[:, 2]
-        x, y = self._limited(points[:, 0] / z, points[:, 1] / z)
+        x, y = self._limited(x / z, y / z)
         fx, fy, zero = self.fx, self.fy, torch.zeros_like(z)
         if self.domain is None:
             return torch.stack([fx / z, zero, -fx * x / z, zero, fy / z, -fy * y / z], 1).view(-1, 2, 3)
@@ -91,9 +90,8 @@ class OneCamera:
         lens = torch.stack([fx * xx, fx * xy, fy * xy, fy * yy], 1).view(-1, 2, 2)
         return lens @ ray
 
-    def pixels(self, points: Tensor) -> Tensor:
-        """[K, 2] px."""
-        x, y, z = points.unbind(1)
+    def pixels(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+        """[K, 2] px, of camera coordinates."""
         if self.domain is None:
             return torch.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], 1)
         x, y = self.bent(x / z, y / z)
