@@ -20,6 +20,7 @@ from genre_tasks.logs.types import Float64, Lens, RollingShutter
 from genre_tasks.render.reference_camera import OneCamera
 from genre_tasks.render.types import Cameras
 from genre_tasks.scene.chunk import Actor
+from genre_tasks.scene.distortion import rays_at
 
 SOURCES = 5
 """Images looked at for a view, the reference among them: from six on, what is gained is under a tenth of a decibel."""
@@ -89,6 +90,8 @@ def surface_of(depth: Tensor, alpha: Tensor, pose: Float64, lens: Lens, actors: 
     z = torch.where(known, depth, torch.ones_like(depth))
     v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     x, y = (u.to(z) - lens.cx_px) / lens.fx_px * z, (v.to(z) - lens.cy_px) / lens.fy_px * z
+    if any(lens.distortion):
+        x, y = (torch.from_numpy(ray).to(z) * z for ray in rays_at(u.double().numpy(), v.double().numpy(), lens))
     points = _moved(torch.stack([x, y, z], -1), pose)
     return Surface(points, known, _actor_of(points, known, actors, frame))
 

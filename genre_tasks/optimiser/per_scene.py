@@ -25,8 +25,7 @@ from genre_tasks.optimiser.objective import check_finite
 from genre_tasks.optimiser.per_scene_start import node_extents, timetable
 from genre_tasks.optimiser.screen import screen_pull
 from genre_tasks.optimiser.targets import Target
-from genre_tasks.render.api import render
-from genre_tasks.render.types import Cameras
+from genre_tasks.render.api import cameras_of, moving, render
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import SceneGraph
 
@@ -118,10 +117,11 @@ class PerSceneTraining:
         """Loss and gradient; takes the pull on the image into the statistics of density control."""
         leaves = each(lambda x: x.detach().requires_grad_(), self._population.gaussians)
         with torch.enable_grad():
-            placed = SceneGraph(leaves, self._population.nodes, self._actors).at(target.frame)
+            scene = SceneGraph(leaves, self._population.nodes, self._actors)
+            placed = scene.at(target.frame)
             placed.means.retain_grad()
-            splats = placed.activated()
-            image = render(splats, Cameras.of([target.chunk_SE3_camera], [target.lens]))
+            splats = moving(placed.activated(), scene, target)
+            image = render(splats, cameras_of([target]))
         plan = plan_loss(self._loss, [target], self.iteration, self._generator, perceptual=False)
         loss, by_color, _ = image_gradients(self._loss, image.color, image.depth, [target], plan)
         image.color.backward(by_color)

@@ -95,7 +95,7 @@ def velocities_of(scene: SceneGraph, means: Tensor, views: Sequence[PosedView]) 
     """
     frames_s = dict.fromkeys((v.frame for v in views), 0.0)
     for view in views:
-        stated = frame_s_of(view)
+        stated = _frame_s_of(view)
         if stated and frames_s[view.frame] not in (0.0, stated):
             raise ValueError(f"expected one frame_s at frame {view.frame}, got {frames_s[view.frame]} and {stated}")
         frames_s[view.frame] = stated or frames_s[view.frame]
@@ -104,7 +104,15 @@ def velocities_of(scene: SceneGraph, means: Tensor, views: Sequence[PosedView]) 
     return scene.velocities(means, list(frames_s), list(frames_s.values()))
 
 
-def frame_s_of(view: PosedView) -> float:
+def moving(splats: Splats, scene: SceneGraph, view: PosedView) -> Splats:
+    """The splats of ``scene.at(view.frame)``, with velocities where the view's shutter asks for them."""
+    frame_s = _frame_s_of(view)
+    if not scene.actors or not frame_s:
+        return splats
+    return replace(splats, velocities=scene.velocities_at(splats.means, view.frame, frame_s))
+
+
+def _frame_s_of(view: PosedView) -> float:
     """Seconds to the next log frame where actors move while a view is read out, else 0."""
     shutter = _shutter_of(view)
     return shutter.frame_s if shutter is not None and shutter.readout_s else 0.0

@@ -157,8 +157,8 @@ def render_cpu(splats: Splats, cameras: Cameras, shown: Shown, threads: int | No
 
     ``threads`` ``None`` takes torch's number. The bits of images and gradients do not depend on it. Memory, with N
     Gaussians and P pairs of a footprint and a tile of 16×16 pixels in a view: 72 N + 11 P bytes a view from forward to
-    backward, and 76 N + 68 P a thread while it works on one, each up to a quarter more; up to 512 MB of either is kept
-    for the next call.
+    backward (4 N more with a rolling shutter), and 76 N + 68 P a thread while it works on one, each up to a quarter
+    more; up to 512 MB of either is kept for the next call.
     """
     culled: dict[str, int] = {}
     threads = threads or torch.get_num_threads()

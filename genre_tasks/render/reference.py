@@ -127,15 +127,16 @@ def _geometry(
     velocities = camera.velocities_of(splats)
     own = None if velocities is None else velocities[at]
     posed = camera.posed(splats.means[at])
-    points, shear = camera.exposure(posed, own)
-    jacobian = camera.jacobian(points) if shear is None else shear @ camera.jacobian(points)
+    exposed, shear = camera.exposure(posed, own)
+    x, y, z = exposed.unbind(1)
+    jacobian = camera.jacobian(x, y, z) if shear is None else shear @ camera.jacobian(x, y, z)
     turned = jacobian @ camera.rotation @ rotation_matrices(splats.quats[at])
     m = turned * splats.scales[at][:, None, :]
     xx, yy = m.square().sum(2).unbind(1)
     xx, yy, xy = xx + const.BLUR_PX2, yy + const.BLUR_PX2, (m[:, 0] * m[:, 1]).sum(1)
     # Lagrange's identity: xx·yy − xy² cancels for long thin footprints.
     det = torch.linalg.cross(m[:, 0], m[:, 1]).square().sum(1) + const.BLUR_PX2 * (xx + yy - const.BLUR_PX2)
-    return camera.pixels(points), (xx, xy, yy), det, (points[:, 2], posed[:, 2])
+    return camera.pixels(x, y, z), (xx, xy, yy), det, (z, posed[:, 2])
 
 
 def _composite(

@@ -8,6 +8,7 @@ from torch import Tensor
 from genre_tasks.render import constants as const
 from genre_tasks.render.bent import domain_of
 from genre_tasks.render.types import Cameras
+from genre_tasks.scene.distortion import distort, slopes
 from genre_tasks.scene.gaussians import Splats
 
 
@@ -20,7 +21,7 @@ class OneCamera:
         (self.fx, self.fy), (self.cx, self.cy) = cameras.focal_px[v].to(like), cameras.center_px[v].to(like)
         self.width, self.height = cameras.width_px, cameras.height_px
         self.domain = domain_of(cameras, v)
-        self._distortion = like.new_zeros(5) if cameras.distortion is None else cameras.distortion[v].to(like)
+        self._distortion = () if cameras.distortion is None else cameras.distortion[v].to(like).unbind()
         shutter = cameras.shutter
         self.rolls = shutter is not None and bool(shutter.readout_s[v] != 0)
         if shutter is not None:
@@ -70,31 +71,17 @@ class OneCamera:
         """Normalised image coordinates after the lens's distortion."""
         if self.domain is None:
             return x, y
-        k1, k2, p1, p2, k3 = self._distortion
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        return (
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        )
+        return distort(x, y, self._distortion)
 
     def slopes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """∂x'/∂x, ∂x'/∂y = ∂y'/∂x and ∂y'/∂y of :meth:`bent`."""
         if self.domain is None:
             return torch.ones_like(x), torch.zeros_like(x), torch.ones_like(x)
-        k1, k2, p1, p2, k3 = self._distortion
-        r2 = x * x + y * y
-        radial, slope = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), k1 + r2 * (2 * k2 + r2 * 3 * k3)
-        return (
-            radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x,
-            2 * x * y * slope + 2 * p1 * x + 2 * p2 * y,
-            radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x,
-        )
+        return slopes(x, y, self._distortion)
 
-    def jacobian(self, points: Tensor) -> Tensor:
+    def jacobian(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         """[K, 2, 3] of pixels by camera coordinates, at a point of linearisation that is limited."""
-        z = points[:, 2]
-        x, y = self._limited(points[:, 0] / z, points[:, 1] / z)
+        x, y = self._limited(x / z, y / z)
         fx, fy, zero = self.fx, self.fy, torch.zeros_like(z)
         if self.domain is None:
             return torch.stack([fx / z, zero, -fx * x / z, zero, fy / z, -fy * y / z], 1).view(-1, 2, 3)
@@ -103,9 +90,8 @@ class OneCamera:
         lens = torch.stack([fx * xx, fx * xy, fy * xy, fy * yy], 1).view(-1, 2, 2)
         return lens @ ray
 
-    def pixels(self, points: Tensor) -> Tensor:
-        """[K, 2] px."""
-        x, y, z = points.unbind(1)
+    def pixels(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+        """[K, 2] px, of camera coordinates."""
         if self.domain is None:
             return torch.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], 1)
         x, y = self.bent(x / z, y / z)

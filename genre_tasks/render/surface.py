@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from genre_tasks.logs.types import Lens
-from genre_tasks.render.api import DEFAULT, PosedView, cameras_of, frame_s_of, on_device_of, render, render_views
+from genre_tasks.render.api import DEFAULT, PosedView, cameras_of, moving, on_device_of, render, render_views
 from genre_tasks.render.reference_camera import OneCamera
 from genre_tasks.render.types import Render, RenderSettings
-from genre_tasks.scene.distortion import undistort
+from genre_tasks.scene.distortion import rays_at
 from genre_tasks.scene.gaussians import Splats
 from genre_tasks.scene.graph import SceneGraph
 
@@ -44,8 +44,7 @@ def render_surfaces(scene: SceneGraph, views: Sequence[PosedView], settings: Ren
             splats = scene.at(view.frame).activated()
             posed = {view.frame: (splats, normals(splats))}
         splats, across = posed[view.frame]
-        if scene.actors and (frame_s := frame_s_of(view)):
-            splats = replace(splats, velocities=scene.velocities_at(splats.means, view.frame, frame_s))
+        splats = moving(splats, scene, view)
         camera = on_device_of(cameras_of([view]), splats.means)
         planes = replace(splats, colors=_planes(splats, across, view, OneCamera(camera, 0, splats.means)))
         image = render(planes, camera, settings)
@@ -82,5 +81,5 @@ def _rays(lens: Lens, like: Tensor) -> Tensor:
     v, u = torch.meshgrid(torch.arange(lens.height_px) + 0.5, torch.arange(lens.width_px) + 0.5, indexing="ij")
     x, y = (u - lens.cx_px) / lens.fx_px, (v - lens.cy_px) / lens.fy_px
     if any(lens.distortion):
-        x, y = (torch.from_numpy(w) for w in undistort(x.double().numpy(), y.double().numpy(), lens.coefficients))
+        x, y = (torch.from_numpy(w) for w in rays_at(u.double().numpy(), v.double().numpy(), lens))
     return torch.stack([x, y, torch.ones_like(x)], -1).to(like)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from genre_tasks.logs.types import Float64
 from genre_tasks.scene.chunk import Chunk, View
 from genre_tasks.scene.coloring import Cloud
+from genre_tasks.scene.distortion import rays_at
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.images import decode_pixels
 from genre_tasks.scene.projection import project, splat_depth
@@ -93,7 +94,7 @@ def open_pixels(view: View, chunk: Chunk, background: Cloud) -> tuple[Float64, F
             points.append(actor.points.positions @ pose[:3, :3].T + pose[:3, 3])
     depth = splat_depth(project(np.concatenate(points), view.chunk_SE3_camera, lens), lens, SKY_FOOTPRINT_M)
     u, v = np.meshgrid(np.arange(lens.width_px) + 0.5, np.arange(lens.height_px) + 0.5)
-    rays = np.stack([(u - lens.cx_px) / lens.fx_px, (v - lens.cy_px) / lens.fy_px, np.ones_like(u)], -1)
+    rays = np.stack([*rays_at(u, v, lens), np.ones_like(u)], -1)
     rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)) @ view.chunk_SE3_camera[:3, :3].T
     ok: NDArray[np.bool_] = np.isinf(depth) & (rays[..., 2] > LOWEST_SINE)
     colors = decode_pixels(view.image, lens.width_px, lens.height_px)

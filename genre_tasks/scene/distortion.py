@@ -6,18 +6,23 @@ Coefficients are k1, k2, p1, p2, k3: ``Lens.coefficients``.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from genre_tasks.logs.types import Float64
+from genre_tasks.logs.types import Float64, Lens
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Reals = NDArray[np.floating]
-_NEWTON_STEPS = 25
+Numbers = TypeVar("Numbers", "NDArray[np.floating]", "Tensor")
+_NEWTON_STEPS, _CONVERGED = 25, 1e-14
 
 
-def distort(x: Reals, y: Reals, coefficients: Sequence[float]) -> tuple[Reals, Reals]:
-    """Normalised image coordinates as the lens bends them, in their precision."""
+def distort(x: Numbers, y: Numbers, coefficients: Sequence[Any]) -> tuple[Numbers, Numbers]:
+    """Normalised image coordinates as the lens bends them, in their precision; tensors with their gradients."""
     k1, k2, p1, p2, k3 = coefficients
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -27,7 +32,7 @@ def distort(x: Reals, y: Reals, coefficients: Sequence[float]) -> tuple[Reals, R
     )
 
 
-def slopes(x: Reals, y: Reals, coefficients: Sequence[float]) -> tuple[Reals, Reals, Reals]:
+def slopes(x: Numbers, y: Numbers, coefficients: Sequence[Any]) -> tuple[Numbers, Numbers, Numbers]:
     """∂x'/∂x, ∂x'/∂y and ∂y'/∂y of :func:`distort`; ∂y'/∂x is ∂x'/∂y: the distortion is a potential's gradient."""
     k1, k2, p1, p2, k3 = coefficients
     r2 = x * x + y * y
@@ -66,7 +71,15 @@ def undistort(x: Float64, y: Float64, coefficients: Sequence[float]) -> tuple[Fl
     for _ in range(_NEWTON_STEPS):
         found_x, found_y = distort(u, v, coefficients)
         off_x, off_y = found_x - x, found_y - y
+        if max(np.abs(off_x).max(initial=0.0), np.abs(off_y).max(initial=0.0)) < _CONVERGED:
+            break
         xx, xy, yy = slopes(u, v, coefficients)
         det = np.maximum(xx * yy - xy * xy, 1e-6)  # 0 on the fold
         u, v = limited(u - (yy * off_x - xy * off_y) / det, v - (xx * off_y - xy * off_x) / det)
     return u, v
+
+
+def rays_at(u: Float64, v: Float64, lens: Lens) -> tuple[Float64, Float64]:
+    """x/z and y/z of the rays that arrive at pixels (u, v)."""
+    x, y = (u - lens.cx_px) / lens.fx_px, (v - lens.cy_px) / lens.fy_px
+    return undistort(x, y, lens.coefficients) if any(lens.distortion) else (x, y)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -18,7 +17,7 @@ def novel_view_poses(
 ) -> tuple[NovelView, ...]:
     """The chunk's views moved ``shift_m`` to the left with the whole rig, ordered by (shift, frame, camera).
 
-    Novel cameras are ideal: without distortion, with a global shutter. ``frames`` are log frames; by default those of
+    Novel cameras have the lenses of the rig, and a global shutter. ``frames`` are log frames; by default those of
     source views. A camera without an image at a frame has no novel view there. Raises ``ValueError`` for a frame
     outside the chunk.
     """
@@ -37,8 +36,7 @@ def novel_view_poses(
                 pose = shift_laterally(view.chunk_SE3_camera, ego, shift_m)
                 near = nearest_reference(view.camera, pose, sources)
                 reference = (near.camera, near.frame)
-                lens = replace(view.lens, distortion=())
-                out.append(NovelView(view.camera, view.frame, shift_m, pose, lens, reference))
+                out.append(NovelView(view.camera, view.frame, shift_m, pose, view.lens, reference))
     return tuple(out)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -39,6 +41,19 @@ def test_the_same_viewpoint_shows_the_image_itself():
     color, seen = look_up(plane(7.0), image, (), 0)
     torch.testing.assert_close(color, image.image, atol=1e-5, rtol=0)
     assert seen.all()
+
+
+def test_a_lens_bends_both_ways():
+    bent = replace(LENS, distortion=(-0.2, 0.02, 0.001, -0.002, 0.0))
+    same = surface_of(torch.full((HEIGHT, WIDTH), 7.0), torch.ones(HEIGHT, WIDTH), at(), bent, (), 0)
+    image = replace(source(at()), lens=bent)
+    color, seen = look_up(same, image, (), 0)
+    torch.testing.assert_close(color, image.image, atol=1e-4, rtol=0)
+    assert seen.all() and float((same.points - plane(7.0).points).abs().max()) > 0.1
+    assert not torch.allclose(look_up(plane(7.0), image, (), 0)[0], image.image, atol=0.1)
+    folded = replace(bent, distortion=(-0.9, 0.0, 0.0, 0.0, 0.0))  # r (1 - 0.9 r²) is 0 at 1.05
+    beside = Surface(torch.tensor([[[1.05, 0.0, 1.0]]]), torch.ones(1, 1, dtype=torch.bool), torch.full((1, 1), -1))
+    assert not look_up(beside, replace(image, lens=folded), (), 0)[1].any()
 
 
 def test_a_plane_moves_by_its_disparity():

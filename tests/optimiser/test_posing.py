@@ -16,6 +16,7 @@ from torch import Tensor
 from genre_tasks.compiled.loader import supported_isas
 from genre_tasks.config import LossConfig
 from genre_tasks.errors import NonFiniteError, ResourceError
+from genre_tasks.logs.types import RollingShutter
 from genre_tasks.optimiser import objective as objective_module
 from genre_tasks.optimiser import posing as module
 from genre_tasks.optimiser.adam import TunedAdam
@@ -24,6 +25,7 @@ from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.passes import CompiledPass, TorchPass, begin
 from genre_tasks.optimiser.posing import arrays, load_posing
 from genre_tasks.optimiser.state import Frame
+from genre_tasks.optimiser.targets import Target
 from genre_tasks.optimiser.unroll import Plan, unroll
 from genre_tasks.render.types import Render, RenderSettings
 from genre_tasks.scene import constants
@@ -182,13 +184,36 @@ def test_expected_depth_and_its_gradient_are_torchs() -> None:
     torch.testing.assert_close(by_depth, d.grad, rtol=1e-6, atol=0)
 
 
-def _passes(scene: SceneGraph, settings: RenderSettings = SETTINGS) -> list[CompiledPass | TorchPass]:
-    views = [replace(t, frame=f) for t, f in zip(street.targets(street.scene()), (1, 7, 1, 2), strict=True)]
+ROLLING = RollingShutter(0.05, (1.0, 0.2, 4.0), (0.1, -0.3, 0.2), frame_s=0.1)
+
+
+def _passes(
+    scene: SceneGraph, settings: RenderSettings = SETTINGS, shutter: RollingShutter | None = None
+) -> list[CompiledPass | TorchPass]:
+    views = [_Rolling(t, f, shutter) for t, f in zip(street.targets(street.scene()), (1, 7, 1, 2), strict=True)]
     return [p(Frame.of(scene), _offsets(scene), views, settings) for p in (CompiledPass, TorchPass)]
 
 
-def test_a_whole_pass_is_torchs() -> None:
-    ours, torchs = _passes(_scene())
+class _Rolling:
+    """A target at another frame, with a shutter and, if it has one, a lens that distorts."""
+
+    def __init__(self, target: Target, frame: int, shutter: RollingShutter | None) -> None:
+        self.frame, self.chunk_SE3_camera, self.shutter = frame, target.chunk_SE3_camera, shutter
+        self.lens = replace(target.lens, distortion=(-0.2, 0.03, 0.001, 0.0, 0.0) if shutter else ())
+
+
+def test_lens_shutter_and_moving_actors_are_in_the_pass() -> None:
+    scene = _scene()
+    still, rolled = (_passes(scene, shutter=s)[0] for s in (None, ROLLING))
+    resting = _passes(scene, shutter=replace(ROLLING, frame_s=0.0))[0]
+    assert (still.color - rolled.color).abs().max() > 0.1
+    assert (resting.color - rolled.color)[[0, 2, 3]].abs().max() > 0.01
+    assert torch.equal(resting.color[1], rolled.color[1]), "no actor at that frame"
+
+
+@pytest.mark.parametrize("shutter", [None, ROLLING], ids=["global", "rolling"])
+def test_a_whole_pass_is_torchs(shutter: RollingShutter | None) -> None:
+    ours, torchs = _passes(_scene(), shutter=shutter)
     assert ours.culled == torchs.culled
     torch.testing.assert_close(ours.color, torchs.color, atol=1e-4, rtol=0)
     by_color, by_depth = torch.randn(ours.color.shape), torch.randn(ours.depth.shape)

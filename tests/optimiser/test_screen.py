@@ -10,6 +10,7 @@ import torch
 from genre_tasks.logs.types import Lens
 from genre_tasks.optimiser.screen import screen_pull
 from genre_tasks.render import Cameras, reference
+from genre_tasks.render.reference_camera import OneCamera
 from genre_tasks.scene.gaussians import Splats
 from tests.optimiser import street
 
@@ -21,8 +22,8 @@ def _truth(splats: Splats, pose: torch.Tensor, lens: Lens, monkeypatch: pytest.M
     nudge = torch.zeros(len(splats), 2, dtype=splats.means.dtype, requires_grad=True)
     geometry = reference._geometry
 
-    def nudged(splats: Splats, cameras: Cameras, v: int, at: torch.Tensor):
-        center, *rest = geometry(splats, cameras, v, at)
+    def nudged(splats: Splats, camera: OneCamera, at: torch.Tensor):
+        center, *rest = geometry(splats, camera, at)
         return (center + nudge[at], *rest)
 
     with monkeypatch.context() as patch:

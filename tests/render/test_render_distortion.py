@@ -15,7 +15,7 @@ from genre_tasks.render.bent import domain_of
 from genre_tasks.render.constants import JACOBIAN_MARGIN
 from genre_tasks.render.oracles import agreement, relative_l2, survey
 from genre_tasks.render.surface import render_surfaces
-from genre_tasks.scene.distortion import distort, fold_radius, slopes, undistort
+from genre_tasks.scene.distortion import distort, fold_radius, rays_at, slopes, undistort
 from genre_tasks.scene.gaussians import Gaussians, Splats
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.projection import project
@@ -130,6 +130,8 @@ def test_centres_are_where_points_are_projected(lens):
     points = np.array([[0.9, -0.4, 4.0], [-0.5, 0.6, 3.0]], np.float32)
     at = Lens(55.0, 60.0, 31.0, 25.0, 64, 48, lens)
     seen = project(points, np.eye(4), at)
+    rays = np.stack(rays_at(*seen.uv.astype(np.float64).T, at), 1)
+    assert np.allclose(rays, points[seen.index, :2] / points[seen.index, 2:], atol=1e-5) and len(rays) == 2
     for k, uv in zip(seen.index, seen.uv, strict=True):
         out = render(_dot(points[k]), Cameras.of([np.eye(4)], [at], torch.float64), REFERENCE)
         assert np.allclose(_centroid(out.alpha[0]), uv, atol=0.05)

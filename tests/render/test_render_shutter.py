@@ -170,8 +170,8 @@ def test_one_newton_step_finds_the_row(distortion):
     g = torch.Generator().manual_seed(3)
     posed = (torch.rand(500, 3, generator=g, dtype=torch.float64) * 2 - 1) * torch.tensor([8.0, 4.0, 0.0])
     posed[:, 2] = 8 + 30 * torch.rand(500, generator=g, dtype=torch.float64)
-    pixels = camera.pixels(camera.exposed(posed, None))
-    before = camera.pixels(posed)
+    pixels = camera.pixels(*camera.exposed(posed, None).unbind(1))
+    before = camera.pixels(*posed.unbind(1))
     moved = pixels - before
     motion = (camera.exposed(posed, None) - posed).norm(dim=1)
     speed = torch.tensor(MOTION.velocity_m_s).double() + torch.linalg.cross(
@@ -207,7 +207,7 @@ def test_points_are_projected_to_the_centres_of_gaussians(distortion):
     seen = projection.project(points, pose, lens, MOTION)
     camera = OneCamera(Cameras.of([pose], [lens], torch.float64, [MOTION]), 0, torch.zeros((), dtype=torch.float64))
     exposed = camera.exposed(camera.posed(torch.from_numpy(points).double()), None)
-    pixels = camera.pixels(exposed).numpy()
+    pixels = camera.pixels(*exposed.unbind(1)).numpy()
     assert len(seen.index) > 100
     assert np.abs(pixels[seen.index] - seen.uv).max() < 1e-3
     assert np.allclose(exposed[seen.index, 2], seen.depth, rtol=1e-5)
