@@ -51,22 +51,26 @@ class Case:
     """
 
     calls: Callable[[float], str]
-    measure: Callable[[Chunk, SceneGraph], float]
+    measure: Callable[[Chunk, SceneGraph, Truth | None], float]
     unit: str = "dB"
     plain: str = ""
 
 
-def heldout_psnr(chunk: Chunk, scene: SceneGraph) -> float:
-    """Mean over held-out views, as the cameras recorded them, outside of the vehicle itself."""
+def heldout_psnr(chunk: Chunk, scene: SceneGraph, _: Truth | None) -> float:
+    """Mean over held-out views, as the cameras recorded them, outside of the vehicle itself, dB.
+
+    Where the vehicle is in a camera's images, of such cameras alone.
+    """
+    masked = {v.camera for v in chunk.views if v.own is not None}
     out = []
-    for view in chunk.of_role("heldout"):
+    for view in (v for v in chunk.of_role("heldout") if not masked or v.camera in masked):
         with torch.no_grad():
             image = as_recorded(render_views(scene, [view]).color, [view]).clamp(0, 1)[0]
         out.append(psnr(image.numpy(), view_image(view).numpy(), None if view.own is None else ~view.own))
     return float(np.mean(out))
 
 
-def heldout_depth(chunk: Chunk, scene: SceneGraph) -> float:
+def heldout_depth(chunk: Chunk, scene: SceneGraph, _: Truth | None) -> float:
     """Minus the median relative error of depth in per cent, against the LiDAR returns of held-out frames."""
     errors = []
     for view in chunk.of_role("heldout"):
@@ -78,10 +82,10 @@ def heldout_depth(chunk: Chunk, scene: SceneGraph) -> float:
     return -100 * float(torch.cat(errors).median())
 
 
-def _beside(chunk: Chunk, scene: SceneGraph, truth: Truth | None) -> float | None:
-    """PSNR at ±3 m against what a plain camera would have seen, dB; ``None`` where there is no truth."""
+def beside_psnr(chunk: Chunk, scene: SceneGraph, truth: Truth | None) -> float:
+    """Mean at ±3 m against what an ideal camera would have seen, dB; held-out frames where there is no truth."""
     if truth is None:
-        return None
+        return heldout_psnr(chunk, scene, truth)
     views = novel_view_poses(chunk, (SIDE_M, -SIDE_M))
     out = []
     for view in views[:: max(1, len(views) // SIDE_VIEWS)]:
@@ -95,19 +99,24 @@ def _per_cent(name: str) -> float:
     return effect_of(name).threshold / 100
 
 
-SHUTTER_S, DISTORTION = 0.002, 0.002
-"""Readout and k1 that bring a street near the thresholds; what they read there is in the rows."""
+PX_PER_S, PX_PER_K1 = 340.0, 265.0
+"""About what a street's displacement is for a second of readout, and a pixel's shift for a k1 of 1."""
 
 CASES: dict[str, Case] = {
     "rigid_actors": Case(lambda _: "", heldout_psnr, plain="&moving=0&pedestrians=0"),
+    "rolling_shutter": Case(
+        lambda x: f"&rolling_shutter_s={x * effect_of('rolling_shutter').threshold / PX_PER_S:.4g}", beside_psnr
+    ),
+    "lens_distortion": Case(
+        lambda x: f"&distortion={x * effect_of('lens_distortion').threshold / PX_PER_K1:.4g}", heldout_psnr
+    ),
     "exposure": Case(lambda x: f"&exposure_jitter={x * _per_cent('exposure'):.4g}", heldout_psnr),
-    "rolling_shutter": Case(lambda x: f"&rolling_shutter_s={x * SHUTTER_S:.4g}", heldout_psnr),
-    "lens_distortion": Case(lambda x: f"&distortion={x * DISTORTION:.4g}", heldout_psnr),
     "lidar_depth": Case(lambda _: "", heldout_depth, "%", plain="&lidar_beams=1&lidar_azimuths=90"),
     "ego_mask": Case(lambda x: f"&bonnet={x * _per_cent('ego_mask'):.4g}", heldout_psnr),
 }
 """Those that are modelled and that a street can be made to call for or not. Every street has a sky: there is none that
-does not call for the distant region."""
+does not call for the distant region. Rolling shutter is judged beside the path: held-out frames are sheared as source
+frames are, and a scene that is sheared too fits them."""
 
 
 def measure(name: str, log: str, chunk: int, store: str, factor: float) -> Row:
@@ -143,9 +152,11 @@ def _with(name: str, log: str, chunk: int, store: str, word: str, on: Fitted) ->
     # The vehicle itself is left out of the judgement of both.
     judged = replace(plan, fitted=replace(plan.fitted, own=on.own))
     shown = applied(read, judged)
+    truth = opened_log(log).truth
     return {
-        "measure": CASES[name].measure(shown, scene.scene),
-        "beside_db": _beside(shown, scene.scene, opened_log(log).truth),
+        "measure": CASES[name].measure(shown, scene.scene, truth),
+        "heldout_db": heldout_psnr(shown, scene.scene, truth),
+        "beside_db": None if truth is None else beside_psnr(shown, scene.scene, truth),
         "gnet_s": seconds_of(job, refs["gnet"])[0],
         "plan_s": seconds_of(job, refs["effects"])[0],
     }
@@ -201,16 +212,16 @@ class Effects:
 
     def table(self, rows: Mapping[str, Row]) -> Iterator[str]:
         """A line for each cell."""
-        sides, took = "at 3 m: with | without", "GNet, s: with | without"
-        yield f"| effect | log | measured | plan | with | without | gain | {sides} | {took} |"
-        yield "|---|---|---|---|---|---|---|---|---|---|---|"
+        views, took = "held out: with | without | at 3 m: with | without", "GNet, s: with | without"
+        yield f"| effect | log | measured | plan | with | without | gain | {views} | {took} |"
+        yield "|---|---|---|---|---|---|---|---|---|---|---|---|---|"
         for r in (r for r in rows.values() if "not_measured" not in r):
             value = "" if r["value"] is None else f"{r['value']:.3g} {r['property_unit']} (> {r['threshold']:g})"
-            beside = " | ".join(_db(r[word]["beside_db"]) for word in ("on", "off"))
+            views = " | ".join(_db(r[word][k]) for k in ("heldout_db", "beside_db") for word in ("on", "off"))
             log = f"{r['log'].rpartition('/')[2].removeprefix('synthetic:')} chunk {r['chunk']}"
             measured = f"{abs(r['on']['measure']):.2f} | {abs(r['off']['measure']):.2f} | {_gain(r):+.2f} {r['unit']}"
             took = f"{r['on']['gnet_s']:.2f} | {r['off']['gnet_s']:.2f}"
-            yield f"| {r['effect']} | {log} | {value} | {r['choice']} | {measured} | {beside} | {took} |"
+            yield f"| {r['effect']} | {log} | {value} | {r['choice']} | {measured} | {views} | {took} |"
         for name in (n for n, r in rows.items() if "not_measured" in r):
             yield f"\n{name}: not measured: {rows[name]['not_measured']}"
 

@@ -17,6 +17,9 @@ road stands still too, but blurs into what passes by."""
 
 MARGIN_PX = 3
 
+LEAST_PERCENT = 0.3
+"""Smaller parts are as often road as vehicle."""
+
 MIN_TRAVEL_M = 2.0
 MIN_FRAMES = 4
 
@@ -35,12 +38,12 @@ def measure(seen: Seen) -> Measured:
 
 
 def fit(seen: Seen) -> Fitted:
-    """The parts that call for it, grown by ``MARGIN_PX``: an edge is blurred into the road. Others have no mask."""
+    """The parts above ``LEAST_PERCENT``, grown by ``MARGIN_PX``: an edge is blurred into the road."""
     if _travel(seen) < MIN_TRAVEL_M:
         return Fitted()
     from scipy import ndimage
 
-    called = {c: p for c, p in _parts(seen).items() if 100 * p.mean() > EFFECT.threshold}
+    called = {c: p for c, p in _parts(seen).items() if 100 * p.mean() > LEAST_PERCENT}
     own = {c: ndimage.binary_dilation(p, iterations=MARGIN_PX) for c, p in called.items()}
     return Fitted(own=own)
 

@@ -63,5 +63,5 @@ def _at(view: View, known: list[tuple[float, Gain]]) -> Gain:
 
 
 EFFECT = Effect(
-    "exposure", "spread of gain between images", "%", 4.0, "an affine colour map an image", measure, fit=fit
+    "exposure", "spread of gain between images", "%", 8.0, "an affine colour map an image", measure, fit=fit
 )
