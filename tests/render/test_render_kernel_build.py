@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,8 +14,10 @@ import torch
 from genre_tasks.compiled import loader, recipe
 from genre_tasks.compiled.recipe import Kernel
 from genre_tasks.errors import ConfigError, ResourceError
+from genre_tasks.logs.types import RollingShutter
 from genre_tasks.render import RenderSettings, constants, cpu, kernel_library, render
 from genre_tasks.render.build_kernel import KERNEL
+from genre_tasks.render.types import Shutter
 
 
 @pytest.fixture
@@ -56,9 +59,13 @@ def test_an_instruction_set_that_is_lacking_is_never_loaded(fresh_loader, monkey
         assert loader.candidate_isas() == ["sse42"]
 
 
+@pytest.mark.parametrize("beyond", [False, True], ids=["pinhole", "lens and shutter"])
 @pytest.mark.parametrize("isa", loader.supported_isas())
-def test_every_instruction_set_draws_the_same_picture(isa, scene, gradients, fresh_loader, monkeypatch):
+def test_every_instruction_set_draws_the_same_picture(isa, beyond, scene, gradients, fresh_loader, monkeypatch):
     splats, cameras = scene(300)
+    if beyond:
+        shutter = Shutter.of([RollingShutter(0.03, (9.0, -0.5, 14.0), (0.2, -0.5, 0.3))])
+        cameras = replace(cameras, distortion=torch.tensor([[-0.3, 0.12, 0.002, -0.0015, -0.01]]), shutter=shutter)
     truth, exact = gradients(splats, cameras, RenderSettings("reference"), torch.float64)
     monkeypatch.setenv("GENRE_RENDER_ISA", isa)
     monkeypatch.setattr(cpu, "load_kernel", fresh_loader)
