@@ -17,6 +17,7 @@ from genre_tasks.effects.applied import applied
 from genre_tasks.effects.plan import EFFECTS, plan
 from genre_tasks.effects.types import UNPLANNED, Decision, EffectsPlan, Fitted
 from genre_tasks.fixer.conditioning import recorded
+from genre_tasks.fixer.warping import SourceImage, look_up, surface_of
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.synthetic.imaging import bonnet
 from genre_tasks.logs.synthetic.parameters import StreetParameters
@@ -204,6 +205,59 @@ def test_the_streets_bonnet_is_found_where_it_is() -> None:
     truth = log.truth.image(0, log.world_SE3_camera("front_camera", 0), lens).astype(float)
     image = view_image(chunk(uri).views[0]).numpy() * 255
     assert np.abs(image - truth)[~true].max() <= 1 and np.abs(image - truth)[true].mean() > 20
+
+
+def test_shutters_are_the_cameras_own_motion() -> None:
+    uri = "synthetic:street?seed=1020&frames=8&cameras=2&width=160&height=90&samples=1&rolling_shutter_s=0.03"
+    log = open_log(uri)
+    found = _planned(uri, "rolling_shutter")
+    shutters = found.fitted.shutters
+    assert set(shutters) == {(v.camera, v.frame) for v in chunk(uri).views}
+    for view in chunk(uri).views[2:-2]:
+        near = [log.imaging.camera_pose(view.camera, 0.1 * view.frame + s) for s in (-1e-3, 1e-3)]
+        true = view.chunk_SE3_camera[:3, :3].T @ (near[1][:3, 3] - near[0][:3, 3]) / 2e-3
+        shutter = shutters[view.camera, view.frame]
+        assert np.abs(np.array(shutter.velocity_m_s) - true).max() < 0.05 and shutter.readout_s == 0.03
+        assert shutter.frame_s == pytest.approx(0.1, rel=1e-4)
+    view = applied(chunk(uri), found).views[0]
+    assert view.shutter == shutters[view.camera, view.frame]
+    (target,) = of_views(chunk(uri), [view])
+    assert target.shutter == view.shutter
+    assert float(np.linalg.norm(view.shutter.velocity_m_s)) > 3
+
+
+def test_a_rolling_shutters_images_are_undone_by_what_the_plan_says() -> None:
+    """Looked up at the true depth, recorded rows give what an ideal camera would have seen."""
+    uri = (
+        "synthetic:street?seed=1020&frames=8&cameras=3&width=160&height=90&rolling_shutter_s=0.1&moving=0&pedestrians=0"
+    )
+    log = open_log(uri)
+    views = [v for v in applied(chunk(uri), _planned(uri, "rolling_shutter")).views if v.camera == "front_right_camera"]
+    off = {True: [], False: []}
+    for view in views[1:-1:2]:
+        pose = chunk(uri).world_SE3_chunk @ view.chunk_SE3_camera
+        depth = torch.tensor(log.depth(view.frame, pose, view.lens)).float()
+        near = depth < 60
+        surface = surface_of(depth * near, near.float(), view.chunk_SE3_camera, view.lens, (), view.frame)
+        true = torch.tensor(log.truth.image(view.frame, pose, view.lens) / 255).float()
+        for shutter in (True, False):
+            image = view_image(view).permute(2, 0, 1)
+            rows = SourceImage(view.camera, view.frame, view.chunk_SE3_camera, view.lens, image, torch.zeros(90, 160))
+            color, seen = look_up(surface, replace(rows, shutter=view.shutter if shutter else None), (), view.frame)
+            off[shutter].append(float((color.permute(1, 2, 0) - true).abs()[seen & near].mean()))
+    assert np.mean(off[True]) < 0.65 * np.mean(off[False])  # what is left is blurred by resampling
+    assert np.mean(off[False]) > 0.02
+
+
+def _planned(uri: str, name: str) -> EffectsPlan:
+    return plan(EffectsConfig(**{n: "on" if n == name else "off" for n in EFFECTS}), chunk(uri), open_log(uri).cameras)
+
+
+def test_a_lens_that_is_off_is_taken_to_be_straight() -> None:
+    uri = STREET + "&distortion=0.1"
+    bent = applied(chunk(uri), with_(*BASIC, "lens_distortion"))
+    assert bent is chunk(uri) and applied(chunk(uri), UNPLANNED) is chunk(uri)
+    assert all(not v.lens.distortion for v in applied(chunk(uri), with_(*BASIC)).views)
 
 
 def test_targets_carry_what_effects_say() -> None:

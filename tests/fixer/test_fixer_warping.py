@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from genre_tasks.fixer.warping import SourceImage, Surface, choose, look_up, surface_of, warp
-from genre_tasks.logs.types import Lens
+from genre_tasks.logs.types import Lens, RollingShutter
 from genre_tasks.scene.chunk import Actor, Points
 
 HEIGHT, WIDTH = 24, 40
@@ -54,6 +55,36 @@ def test_a_lens_bends_both_ways():
     folded = replace(bent, distortion=(-0.9, 0.0, 0.0, 0.0, 0.0))  # r (1 - 0.9 r²) is 0 at 1.05
     beside = Surface(torch.tensor([[[1.05, 0.0, 1.0]]]), torch.ones(1, 1, dtype=torch.bool), torch.full((1, 1), -1))
     assert not look_up(beside, replace(image, lens=folded), (), 0)[1].any()
+
+
+def test_rows_are_looked_up_where_the_camera_then_was():
+    """A plane at 10 m with a smooth colour, recorded row by row while the camera moves to the right and turns."""
+    moving = RollingShutter(0.05, (8.0, 0.0, 2.0), (0.0, 0.3, 0.0))
+
+    def colour(points: torch.Tensor) -> torch.Tensor:
+        return torch.stack([(points[..., k] * 1.3 + k).sin() for k in (0, 1, 0)]) * 0.4 + 0.5
+
+    rows = []
+    for row in range(HEIGHT):
+        time = ((row + 0.5) / HEIGHT - 0.5) * moving.readout_s
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_rotvec(np.array(moving.turn_rad_s) * time).as_matrix()
+        pose[:3, 3] = np.array(moving.velocity_m_s) * time
+        v, u = torch.tensor([row + 0.5]), torch.arange(WIDTH) + 0.5
+        ray = torch.stack(
+            [(u - LENS.cx_px) / LENS.fx_px, ((v - LENS.cy_px) / LENS.fy_px).expand(WIDTH), torch.ones(WIDTH)]
+        )
+        ray = torch.tensor(pose[:3, :3]).float() @ ray
+        hit = torch.tensor(pose[:3, 3:]).float() + ray * (10.0 - float(pose[2, 3])) / ray[2]
+        rows.append(colour(hit.T))
+    image = replace(source(at()), image=torch.stack(rows, 1), shutter=moving)
+    surface, inner = plane(10.0), (slice(None), slice(2, -2), slice(3, -3))
+    right, seen = look_up(surface, image, (), 0)
+    wrong, _ = look_up(surface, replace(image, shutter=None), (), 0)
+    true = colour(surface.points)
+    assert seen[inner[1:]].all()
+    off, before = (float((x - true)[inner].abs().max()) for x in (right, wrong))
+    assert off < 0.02 and before > 10 * off
 
 
 def test_a_plane_moves_by_its_disparity():

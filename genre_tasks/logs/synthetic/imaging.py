@@ -66,16 +66,17 @@ class Imaging:
                 for row in range(lens.height_px):
                     at = time_s + moment + ((row + 0.5) / lens.height_px - 0.5) * p.rolling_shutter_s
                     rows = slice(row, row + 1)
-                    total[rows] += radiance(scene, light, at, self._pose(camera, at), lens, p.samples, gain, rows)
+                    total[rows] += radiance(scene, light, at, self.camera_pose(camera, at), lens, p.samples, gain, rows)
             else:
                 at = time_s + moment
-                total += radiance(scene, light, at, self._pose(camera, at), lens, p.samples, gain)
+                total += radiance(scene, light, at, self.camera_pose(camera, at), lens, p.samples, gain)
         total /= np.float32(len(moments))
         if p.bonnet:
             total = _over(bonnet(p, camera, lens), total, gain)
         return to_srgb(total)
 
-    def _pose(self, camera: str, time_s: float) -> Float64:
+    def camera_pose(self, camera: str, time_s: float) -> Float64:
+        """[4, 4] in the street's own coordinates."""
         return self.ego.pose(np.array([time_s]))[0] @ ego_SE3_camera(camera)
 
 
