@@ -260,6 +260,16 @@ def test_a_lens_that_is_off_is_taken_to_be_straight() -> None:
     assert all(not v.lens.distortion for v in applied(chunk(uri), with_(*BASIC)).views)
 
 
+def test_an_exposure_of_no_time_is_no_blur() -> None:
+    """Hard case 54."""
+    log, plain = open_log(STREET + "&exposure_s=0"), open_log(STREET)
+    assert log.image_bytes("front_camera", 3) == plain.image_bytes("front_camera", 3)
+    names = EffectsConfig(**{n: "auto" if n == "motion_blur" else "off" for n in EFFECTS})
+    found = plan(names, chunk(), log.cameras)["motion_blur"]
+    assert found.choice == "off" and "no exposure time" in found.reason
+    assert open_log(STREET + "&exposure_s=0.05").image_bytes("front_camera", 3) != plain.image_bytes("front_camera", 3)
+
+
 def test_targets_carry_what_effects_say() -> None:
     view = replace(chunk().of_role("source")[0], log_gain=(0.1, 0.2, 0.3), own=np.zeros((90, 160), bool))
     (target,) = of_views(chunk(), [view])

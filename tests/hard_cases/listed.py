@@ -189,7 +189,13 @@ LISTED: dict[int, tuple[str, tuple[str, ...] | str]] = {
         "a point that moves down the image as fast as its rows are read, or faster",
         ("tests/render/test_render_shutter.py::test_points_that_outrun_the_rows_stay_within_the_readout",),
     ),
-    52: ("gain towards 0", _NO_EFFECTS),
+    52: (
+        "gain towards 0, and without bound: applied up to a factor of 55",
+        ("tests/effects/test_effects_applied.py::test_neutral_undoes_what_a_gain_does_and_stays_finite",),
+    ),
     53: ("view direction at zero distance", _NO_EFFECTS),
-    54: ("exposure time 0", _NO_EFFECTS),
+    54: (
+        "exposure time 0 (motion blur is measured, not modelled yet)",
+        ("tests/effects/test_effects_applied.py::test_an_exposure_of_no_time_is_no_blur",),
+    ),
 }  # fmt: skip
