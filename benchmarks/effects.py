@@ -39,7 +39,7 @@ from genre_tasks.scene.novel import novel_view_poses
 from genre_tasks.stages.evaluate import as_recorded
 
 CELL_S = 120.0
-SIDE_M, SIDE_VIEWS = 3.0, 10
+SIDE_M = 3.0
 STAGES = ("ingest", "effects", "initial", "gnet")
 
 
@@ -88,7 +88,7 @@ def beside_psnr(chunk: Chunk, scene: SceneGraph, truth: Truth | None) -> float:
         return heldout_psnr(chunk, scene, truth)
     views = novel_view_poses(chunk, (SIDE_M, -SIDE_M))
     out = []
-    for view in views[:: max(1, len(views) // SIDE_VIEWS)]:
+    for view in views:
         with torch.no_grad():
             image = render_views(scene, [view]).color.clamp(0, 1)[0]
         out.append(psnr(image.numpy(), true_pixels(chunk, truth, view).astype(np.float32) / np.float32(255)))

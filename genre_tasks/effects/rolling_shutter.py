@@ -61,5 +61,5 @@ def _moving(view: View, before: View, after: View, readout_s: float, frame_s: fl
 
 
 EFFECT = Effect(
-    "rolling_shutter", "displacement during the readout", "px", 0.5, "a pose for each row", measure, needs, fit=fit
+    "rolling_shutter", "displacement during the readout", "px", 4.0, "a pose for each row", measure, needs, fit=fit
 )

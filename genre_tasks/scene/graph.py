@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from genre_tasks.logs.types import Float64
+from genre_tasks.logs.types import Float32, Float64
 from genre_tasks.scene.constants import ABSENT_LOGIT
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.geometry import matrix_to_quat, quat_multiply
@@ -103,19 +104,19 @@ class SceneGraph:
         ``frames_s`` [F]: the time from each of the log frames to the next; 0 where actors count as resting. Constants:
         no gradient.
         """
-        out = torch.zeros_like(means)
-        moving = torch.nonzero(self.nodes >= FIRST_ACTOR)[:, 0] if self.actors else self.nodes[:0]
+        out = np.zeros((len(means), 3), np.float32)
+        moving = self._actors_rows
         begin = len(self) - len(moving)
         for f, (frame, frame_s) in enumerate(zip(frames, frames_s, strict=True)):
             rows = slice(begin + f * len(moving), begin + (f + 1) * len(moving))
-            out[rows] = self._actor_velocities(means.detach()[rows], moving, frame, frame_s)
-        return out
+            out[rows] = self._actor_velocities(_array(means[rows]), frame, frame_s)
+        return torch.from_numpy(out).to(means)
 
     def velocities_at(self, means: Tensor, frame: int, frame_s: float) -> Tensor:
         """As :meth:`velocities`, [N, 3], of Gaussians that are laid out as by :meth:`at`."""
-        moving = torch.nonzero(self.nodes >= FIRST_ACTOR)[:, 0] if self.actors else self.nodes[:0]
-        moved = self._actor_velocities(means.detach()[moving], moving, frame, frame_s)
-        return torch.zeros_like(means).index_copy(0, moving, moved)
+        out, moving = np.zeros((len(means), 3), np.float32), self._actors_rows
+        out[moving] = self._actor_velocities(_array(means)[moving], frame, frame_s)
+        return torch.from_numpy(out).to(means)
 
     def at(self, frame: int) -> Gaussians:
         """All Gaussians in chunk coordinates at a log frame, N kept and order kept, differentiable.
@@ -151,15 +152,36 @@ class SceneGraph:
                     rotation[f, k], translation[f, k], present[f, k] = pose[:3, :3], pose[:3, 3], True
         return rotation, translation, present
 
-    def _actor_velocities(self, means: Tensor, moving: Tensor, frame: int, frame_s: float) -> Tensor:
-        if not frame_s or not len(moving):
-            return torch.zeros_like(means)
-        centres = self.actor_poses((frame,))[1][0]
-        motions = [actor.motion(frame) for actor in self.actors]
-        actor_of = self.nodes[moving] - FIRST_ACTOR
-        parts = (centres, np.stack([m[0] for m in motions]), np.stack([m[1] for m in motions]))
-        centre, velocity, turn = (torch.as_tensor(x).to(means)[actor_of] for x in parts)
-        return (velocity + torch.linalg.cross(turn, means - centre)) / frame_s
+    def _actor_velocities(self, means: Float32, frame: int, frame_s: float) -> Float32:
+        """[M, 3] of the actors' Gaussians at ``means`` [M, 3]. By numpy: it is asked in every iteration, and torch's
+        threads would wake for it and then spin beside the kernels'."""
+        if not frame_s or not len(means):
+            return np.zeros_like(means)
+        if frame not in self._motions:
+            centres = self.actor_poses((frame,))[1][0]
+            velocity, turn = (np.stack(x) for x in zip(*(a.motion(frame) for a in self.actors), strict=True))
+            rest = velocity - np.cross(turn, centres)  # v + ω × (p − c) = (v − ω × c) + ω × p
+            self._motions[frame] = rest.astype(np.float32), turn.astype(np.float32)
+        rest, turn = (x[self._actors_rows_of] for x in self._motions[frame])
+        x, y, z = means.T
+        wx, wy, wz = turn.T
+        out = rest + np.stack([wy * z - wz * y, wz * x - wx * z, wx * y - wy * x], 1)
+        return np.asarray(out / np.float32(frame_s))
+
+    @cached_property
+    def _motions(self) -> dict[int, tuple[Float32, Float32]]:
+        """By frame, of each actor: what of its velocity does not depend on the place, and its turn [A, 3]."""
+        return {}
+
+    @cached_property
+    def _actors_rows(self) -> NDArray[np.int64]:
+        """The actors' Gaussians."""
+        return np.flatnonzero(self.nodes.cpu().numpy() >= FIRST_ACTOR) if self.actors else np.zeros(0, np.int64)
+
+    @cached_property
+    def _actors_rows_of(self) -> NDArray[np.int64]:
+        """Whose each of :attr:`_actors_rows` is."""
+        return np.asarray(self.nodes.cpu().numpy()[self._actors_rows] - FIRST_ACTOR)
 
     def _actors_at(self, moving: Tensor, frames: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
         """Means [F, M, 3], quaternions [F, M, 4] and logit opacities [F, M] of the actors' Gaussians ``moving`` [M]."""
@@ -177,3 +199,7 @@ class SceneGraph:
             quat_multiply(quat, quats.expand_as(quat)),
             torch.where(there, opacities, torch.full_like(opacities, ABSENT_LOGIT)),
         )
+
+
+def _array(values: Tensor) -> Float32:
+    return np.asarray(values.detach().cpu().float().numpy())
