@@ -25,5 +25,5 @@ def measure(seen: Seen) -> Measured:
 
 
 EFFECT = Effect(
-    "lens_distortion", "shift of a pixel by the lens", "px", 0.5, "a distorted projection of each Gaussian", measure
+    "lens_distortion", "shift of a pixel by the lens", "px", 0.9, "a distorted projection of each Gaussian", measure
 )

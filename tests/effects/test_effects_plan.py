@@ -149,7 +149,12 @@ def test_distortion_gate_flips_with_the_coefficient() -> None:
 
     per_unit = planned("lens_distortion", bent(1.0))["lens_distortion"].value
     for factor, choice in ((0.98, "off"), (1.02, "on")):
-        assert planned("lens_distortion", bent(factor * 0.5 / per_unit))["lens_distortion"].choice == choice
+        assert (
+            planned("lens_distortion", bent(factor * effect_of("lens_distortion").threshold / per_unit))[
+                "lens_distortion"
+            ].choice
+            == choice
+        )
 
 
 def _brightened(image: np.ndarray, gain: float) -> np.ndarray:
