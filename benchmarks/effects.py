@@ -178,7 +178,7 @@ class Effects:
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
         """Factor 0 is the street that does not call for it. ``quick``: one street, no real log."""
         seeds = [s for s in options["seeds"].split(",") if s]
-        names = [n for n in options["effects"].split(",") if n]
+        names, chunks = ([n for n in options[k].split(",") if n] for k in ("effects", "chunks"))
         factors = [float(f) for f in options["factors"].split(",") if f]
         small = load_configuration("small")
         parameters = {
@@ -192,7 +192,7 @@ class Effects:
                     log = f"synthetic:street?seed={seed}{CASES[name].calls(factor) if factor else CASES[name].plain}"
                     run = partial(measure, name, log, 0, options["store"], factor)
                     out.append(Cell(f"{name} {log}", CELL_S, run, parameters))
-            for chunk in options["chunks"].split(",") if options["pandaset"] and not quick else ():
+            for chunk in chunks if options["pandaset"] and not quick else ():
                 log = f"pandaset:{options['pandaset']}"
                 run = partial(measure, name, log, int(chunk), options["store"], -1.0)
                 out.append(Cell(f"{name} {log} chunk {chunk}", CELL_S, run, parameters))
@@ -222,6 +222,11 @@ class Effects:
             measured = f"{abs(r['on']['measure']):.2f} | {abs(r['off']['measure']):.2f} | {_gain(r):+.2f} {r['unit']}"
             took = f"{r['on']['gnet_s']:.2f} | {r['off']['gnet_s']:.2f}"
             yield f"| {r['effect']} | {log} | {value} | {r['choice']} | {measured} | {views} | {took} |"
+        for name, case in CASES.items():
+            own = [r for r in rows.values() if r.get("effect") == name and r["factor"] > 0 and r["value"] is not None]
+            least = 0.1 if case.unit == "dB" else 2.0
+            if len({r["factor"] for r in own}) > 1 and (at := calibrated(own, least)) is not None:
+                yield f"\n{name}: enabling gains {least:g} {case.unit} at {at:.3g} {own[0]['property_unit']}"
         for name in (n for n, r in rows.items() if "not_measured" in r):
             yield f"\n{name}: not measured: {rows[name]['not_measured']}"
 

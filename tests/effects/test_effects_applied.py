@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from genre_tasks.config import EffectsConfig, GnetConfig, IngestConfig, InitialConfig, LossConfig
+from genre_tasks.config import EffectsConfig, GnetConfig, IngestConfig, InitialConfig, LossConfig, NovelViewsConfig
 from genre_tasks.effects import exposure
 from genre_tasks.effects.applied import applied
 from genre_tasks.effects.plan import EFFECTS, plan
@@ -24,11 +24,13 @@ from genre_tasks.logs.synthetic.parameters import StreetParameters
 from genre_tasks.metrics.collect import scored, view_image
 from genre_tasks.optimiser.loss import image_gradients, plan_loss
 from genre_tasks.optimiser.targets import Target, of_views
+from genre_tasks.render import cpu
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.stages.evaluate import as_recorded
 from genre_tasks.stages.gnet import gnet
 from genre_tasks.stages.ingest import ingest
 from genre_tasks.stages.initial import initial
+from genre_tasks.stages.novel_views import novel_views
 
 SMALL = "&frames=8&cameras=2&width=160&height=90&samples=1"
 STREET = "synthetic:street?seed=1020" + SMALL
@@ -268,6 +270,24 @@ def test_an_exposure_of_no_time_is_no_blur() -> None:
     found = plan(names, chunk(), log.cameras)["motion_blur"]
     assert found.choice == "off" and "no exposure time" in found.reason
     assert open_log(STREET + "&exposure_s=0.05").image_bytes("front_camera", 3) != plain.image_bytes("front_camera", 3)
+
+
+def test_a_plain_log_makes_the_kernel_calls_of_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    uri = STREET + "&moving=0&pedestrians=0"
+    calls: list[str] = []
+    for name in ("forward", "backward"):
+        real = getattr(cpu, name)
+        monkeypatch.setattr(cpu, name, lambda *a, _real=real, _name=name, **k: calls.append(_name) or _real(*a, **k))
+    counts = []
+    for setting in ("auto", "off"):
+        found = plan(EffectsConfig(**dict.fromkeys(EFFECTS, setting)), chunk(uri), open_log(uri).cameras)
+        first = initial(InitialConfig(max_points=2000, distant_count=200), chunk(uri), found)
+        config = GnetConfig(iterations=3, views_per_iteration=2, method="adam", loss=LossConfig(perceptual=0))
+        calls.clear()
+        scene = gnet(config, chunk(uri), first, found)
+        novel_views(NovelViewsConfig(), chunk(uri), scene, found)
+        counts.append(list(calls))
+    assert counts[0] == counts[1] and len(counts[0]) > 6
 
 
 def test_targets_carry_what_effects_say() -> None:
