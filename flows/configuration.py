@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -98,11 +98,14 @@ def _parse_setting(setting: str) -> dict[str, Any]:
 
 
 def _spelled_out(change: Mapping[str, Any]) -> Mapping[str, Any]:
-    """``effects`` given as one word becomes that word for each effect; none is off."""
+    """``effects`` given as one word becomes that word for each effect; none: off, on: of those modelled."""
     word = change.get("effects")
     if not isinstance(word, str | bool):
         return change
-    return {**change, "effects": dict.fromkeys(EffectsConfig.model_fields, "off" if word == "none" else word)}
+    value = {"none": "off", True: "on", False: "off"}.get(word, word)
+    told = [name for name, field in EffectsConfig.model_fields.items() if field.annotation == Literal["auto", "off"]]
+    each = dict.fromkeys(EffectsConfig.model_fields, value)
+    return {**change, "effects": each | dict.fromkeys(told, "auto") if value == "on" else each}
 
 
 def _merged(base: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:

@@ -163,27 +163,29 @@ def _word(value: object) -> object:
 
 
 EffectSetting = Annotated[Literal["auto", "on", "off"], BeforeValidator(_word)]
+ToldSetting = Annotated[Literal["auto", "off"], BeforeValidator(_word)]
+"""Of an effect that is measured and told, and not modelled: it cannot be set on."""
 
 
 class EffectsConfig(Section):
     """Parts of the forward model that a scene may or may not need: on, off, or as its plan decides.
 
-    ``effects=none`` (or ``auto``, ``on``, ``off``) sets them all.
+    ``effects=none`` (or ``auto``, ``on``, ``off``) sets them all; on: those that are modelled.
     """
 
     rigid_actors: EffectSetting = "auto"
-    nonrigid_actors: EffectSetting = "auto"
+    nonrigid_actors: ToldSetting = Field("auto", description="Measured and told; not modelled yet.")
     distant_region: EffectSetting = "auto"
     rolling_shutter: EffectSetting = "auto"
     lens_distortion: EffectSetting = "auto"
     exposure: EffectSetting = "auto"
-    motion_blur: EffectSetting = "auto"
-    view_dependent_colour: EffectSetting = "auto"
+    motion_blur: ToldSetting = Field("auto", description="Measured and told; not modelled yet.")
+    view_dependent_colour: ToldSetting = Field("auto", description="Measured and told; not modelled yet.")
     lidar_depth: EffectSetting = "auto"
-    anti_aliasing: EffectSetting = "auto"
+    anti_aliasing: ToldSetting = Field("auto", description="Measured and told; not modelled yet.")
     ego_mask: EffectSetting = "auto"
     fixer_per_view: EffectSetting = "auto"
-    darkness: EffectSetting = "auto"
+    darkness: ToldSetting = Field("auto", description="Measured and told; not modelled.")
 
 
 class PipelineConfig(Section):

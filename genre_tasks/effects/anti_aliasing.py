@@ -41,4 +41,6 @@ def measure(seen: Seen) -> Measured:
     return Measured(float(np.quantile(every, QUANTILE)), f"{QUANTILE:.0%} of points are below it at ±{SHIFT_M:g} m")
 
 
-EFFECT = Effect("anti_aliasing", "ratio of footprints beside the path", "ratio", 2.0, "a filter a Gaussian", measure)
+EFFECT = Effect(
+    "anti_aliasing", "ratio of footprints beside the path", "ratio", 2.0, "a filter a Gaussian", measure, marks=True
+)

@@ -18,5 +18,12 @@ def needs(seen: Seen) -> str | None:
 
 
 EFFECT = Effect(
-    "motion_blur", "displacement during the exposure", "px", 1.0, "some five virtual views an image", measure, needs
+    "motion_blur",
+    "displacement during the exposure",
+    "px",
+    1.0,
+    "some five virtual views an image",
+    measure,
+    needs,
+    marks=True,
 )

@@ -45,4 +45,6 @@ def _outline(actor: Actor, view: View) -> tuple[NDArray[np.int64], NDArray[np.in
     return np.array([round(u.min()), round(v.min())]), np.array([round(u.max()), round(v.max())])
 
 
-EFFECT = Effect("nonrigid_actors", "area of pedestrians and cyclists", "%", 0.5, "a deformation a frame", measure)
+EFFECT = Effect(
+    "nonrigid_actors", "area of pedestrians and cyclists", "%", 0.5, "a deformation a frame", measure, marks=True
+)

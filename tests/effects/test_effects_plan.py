@@ -11,6 +11,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from flows.configuration import load_configuration
 from genre_tasks.config import EffectsConfig, IngestConfig
 from genre_tasks.effects.plan import EFFECTS, effect_of, plan
 from genre_tasks.effects.seen import Colours, Seen
@@ -36,7 +37,7 @@ def cameras(uri: str = STREET) -> tuple[Camera, ...]:
 
 
 def only(*names: str, setting: str = "auto") -> EffectsConfig:
-    return EffectsConfig(**{n: setting if n in names else "off" for n in EFFECTS})
+    return EffectsConfig.model_validate({n: setting if n in names else "off" for n in EFFECTS})
 
 
 def planned(name: str, of: Chunk | None = None, rig: tuple[Camera, ...] | None = None) -> EffectsPlan:
@@ -74,8 +75,6 @@ def test_set_on_is_on_below_the_threshold_too_and_what_the_log_lacks_is_refused(
     assert plan(only("exposure", setting="on"), chunk(), cameras())["exposure"].choice == "on"
     with pytest.raises(ConfigError, match=r"is set on, and the log states no readout time.*auto or off"):
         plan(only("rolling_shutter", setting="on"), chunk(), cameras())
-    with pytest.raises(ConfigError, match="no exposure time"):
-        plan(only("motion_blur", setting="on"), chunk(), cameras())
 
 
 @pytest.mark.parametrize(("name", "field"), [("rolling_shutter", "readout_s"), ("motion_blur", "exposure_s")])
@@ -83,7 +82,8 @@ def test_shutter_gates_flip_at_their_threshold(name: str, field: str) -> None:
     limit = effect_of(name).threshold
     at_a_second = planned(name, rig=tuple(replace(c, **{field: 1.0}) for c in cameras()))[name].value
     assert at_a_second > limit
-    for factor, choice in ((0.98, "off"), (1.02, "on")):
+    called = "mark" if effect_of(name).marks else "on"
+    for factor, choice in ((0.98, "off"), (1.02, called)):
         rig = tuple(replace(c, **{field: factor * limit / at_a_second}) for c in cameras())
         assert planned(name, rig=rig)[name].choice == choice
 
@@ -210,7 +210,7 @@ def test_pedestrians_count_by_their_area() -> None:
     per_m2 = view.lens.fx_px * view.lens.fy_px / 100 / area * 100  # percent
     limit = (0.5 / per_m2) ** 0.5
     assert planned("nonrigid_actors", sized(0.97 * limit, "Pedestrian"))["nonrigid_actors"].choice == "off"
-    assert planned("nonrigid_actors", sized(1.03 * limit, "Pedestrian"))["nonrigid_actors"].choice == "on"
+    assert planned("nonrigid_actors", sized(1.03 * limit, "Pedestrian"))["nonrigid_actors"].choice == "mark"
     assert planned("nonrigid_actors", sized(3 * limit, "Car"))["nonrigid_actors"].choice == "off"
 
 
@@ -249,7 +249,17 @@ def test_dark_images_are_marked(monkeypatch: pytest.MonkeyPatch) -> None:
     decoded = Seen.decoded
     monkeypatch.setattr(Seen, "decoded", lambda self, view: decoded(self, view) // 8)
     assert planned("darkness")["darkness"].choice == "mark"
-    assert plan(only("darkness", setting="on"), chunk(), cameras())["darkness"].choice == "mark"
+
+
+def test_what_is_only_told_cannot_be_set_on() -> None:
+    for name in EFFECTS:
+        if effect_of(name).marks:
+            with pytest.raises(ValueError, match="'auto' or 'off'"):
+                only(name, setting="on")
+            with pytest.raises(ConfigError, match=f"effects.{name} is not allowed"):
+                load_configuration("small", settings=[f"effects.{name}=on"])
+    each = load_configuration("small", settings=["effects=on"]).effects
+    assert {n: getattr(each, n) for n in EFFECTS} == {n: "auto" if effect_of(n).marks else "on" for n in EFFECTS}
 
 
 def test_a_plan_is_the_same_twice_and_comes_back_from_its_file(tmp_path) -> None:
