@@ -102,14 +102,22 @@ def _per_cent(name: str) -> float:
 PX_PER_S, PX_PER_K1 = 340.0, 265.0
 """About what a street's displacement is for a second of readout, and a pixel's shift for a k1 of 1."""
 
+LITTLE = 0.25
+"""Of the threshold: a street that does not call for what cannot be set on where the log states nothing of it."""
+
+
+def _readout(factor: float) -> str:
+    return f"&rolling_shutter_s={factor * effect_of('rolling_shutter').threshold / PX_PER_S:.4g}"
+
+
+def _bent(factor: float) -> str:
+    return f"&distortion={factor * effect_of('lens_distortion').threshold / PX_PER_K1:.4g}"
+
+
 CASES: dict[str, Case] = {
     "rigid_actors": Case(lambda _: "", heldout_psnr, plain="&moving=0&pedestrians=0"),
-    "rolling_shutter": Case(
-        lambda x: f"&rolling_shutter_s={x * effect_of('rolling_shutter').threshold / PX_PER_S:.4g}", beside_psnr
-    ),
-    "lens_distortion": Case(
-        lambda x: f"&distortion={x * effect_of('lens_distortion').threshold / PX_PER_K1:.4g}", heldout_psnr
-    ),
+    "rolling_shutter": Case(_readout, beside_psnr, plain=_readout(LITTLE)),
+    "lens_distortion": Case(_bent, heldout_psnr, plain=_bent(LITTLE)),
     "exposure": Case(lambda x: f"&exposure_jitter={x * _per_cent('exposure'):.4g}", heldout_psnr),
     "lidar_depth": Case(lambda _: "", heldout_depth, "%", plain="&lidar_beams=1&lidar_azimuths=90"),
     "ego_mask": Case(lambda x: f"&bonnet={x * _per_cent('ego_mask'):.4g}", heldout_psnr),
