@@ -106,11 +106,12 @@ def section_of(spec: StageSpec, config: PipelineConfig) -> Any:
 def weights_file(spec: StageSpec, config: PipelineConfig) -> Path | None:
     """The weights that the stage will load, or ``None`` if it loads none."""
     section = section_of(spec, config)
-    if spec.weights is None or getattr(section, "method", "learned") not in ("learned", "g3r"):
+    method = getattr(section, "method", "learned")
+    if spec.weights is None or method not in ("learned", "g3r"):
         return None
-    from genre_tasks.weights import resolve_weights
+    from genre_tasks.weights import network_of, resolve_weights
 
-    return resolve_weights(spec.weights, section.weights)
+    return resolve_weights(network_of(spec.weights, method), section.weights)
 
 
 def weights_digest(path: Path | None) -> str | None:

@@ -6,7 +6,6 @@ from typing import Literal
 
 from genre_tasks.config import GnetConfig, OptimiserConfig
 from genre_tasks.effects.types import EffectsPlan
-from genre_tasks.errors import ConfigError
 from genre_tasks.optimiser import targets
 from genre_tasks.optimiser.adam import ENET_RATES, GNET_RATES, TunedAdam
 from genre_tasks.optimiser.learned import LearnedOptimiser
@@ -22,7 +21,7 @@ from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.results import Reconstruction
 from genre_tasks.scene.views import FixedViews
-from genre_tasks.weights import resolve_weights
+from genre_tasks.weights import network_of, resolve_weights
 
 StageName = Literal["gnet", "enet"]
 PER_SCENE = ("standard_3dgs", "street_gs")
@@ -75,18 +74,12 @@ def per_scene(
 def step_rule(stage: StageName, config: OptimiserConfig) -> StepRule:
     """The learned optimiser with the configured weights, or tuned Adam.
 
-    Raises ``ConfigError`` for g3r without weights of its own, ``InputError`` for weights missing or unfit.
+    Raises ``InputError`` for weights missing or unfit.
     """
-    if isinstance(config, GnetConfig) and config.method == "g3r" and config.weights == "builtin":
-        raise ConfigError(
-            "no weights of g3r ship: the built-in ones of gnet have met novel views in training (λ_novel = 0.1)",
-            remedy="Train some with `genre train gnet --novel 0` and name them by gnet.weights.",
-            stage=stage,
-        )
     if config.method == "adam":
         rates = GNET_RATES if stage == "gnet" else ENET_RATES
         return TunedAdam(config.adam.rates or rates, config.adam.schedule)
-    return LearnedOptimiser.load(resolve_weights(stage, config.weights))
+    return LearnedOptimiser.load(resolve_weights(network_of(stage, config.method), config.weights))
 
 
 def distance(config: OptimiserConfig) -> Distance | None:

@@ -7,11 +7,16 @@ from pathlib import Path
 from genre_tasks.errors import InputError
 
 
+def network_of(stage: str, method: str) -> str:
+    """Whose weights a stage runs with: its own network's, or those of the method that stands in its place."""
+    return "g3r" if method == "g3r" else stage
+
+
 def resolve_weights(name: str, configured: str) -> Path:
     """The file (or folder) that ``configured`` names.
 
     Args:
-        name: the network, as ``fnet``, ``gnet`` or ``enet``: the stem of its built-in file.
+        name: the network, as ``fnet``, ``gnet``, ``g3r`` or ``enet``: the stem of its built-in file.
         configured: ``builtin``, or a path.
 
     Raises:

@@ -11,7 +11,15 @@ import torch
 from flows.baselines import load_baselines
 from flows.configuration import load_configuration
 from flows.pipeline import BY_NAME, weights_file
-from genre_tasks.config import AdamConfig, DensityConfig, GnetConfig, OptimiserConfig, PerSceneConfig, PipelineConfig
+from genre_tasks.config import (
+    AdamConfig,
+    DensityConfig,
+    GnetConfig,
+    LossConfig,
+    OptimiserConfig,
+    PerSceneConfig,
+    PipelineConfig,
+)
 from genre_tasks.errors import ConfigError
 from genre_tasks.optimiser import run
 from genre_tasks.optimiser.adam import ENET_RATES, GNET_RATES, TunedAdam
@@ -63,14 +71,16 @@ def test_only_gnet_can_be_replaced_by_what_knows_no_fixed_views(method: str) -> 
         load_configuration("small", settings=[f"enet.method={method}"])
 
 
-def test_g3r_has_no_weights_of_gnet_but_those_that_are_named(views: tuple[Target, ...]) -> None:
-    with pytest.raises(ConfigError, match=r"λ_novel.*genre train gnet --novel 0"):
-        _gnet(GnetConfig(method="g3r"))
+def test_g3r_has_weights_of_its_own_or_those_that_are_named(views: tuple[Target, ...]) -> None:
+    own = GnetConfig(method="g3r", iterations=2, views_per_iteration=2, loss=LossConfig(perceptual=0.0))
     weights = str(resolve_weights("gnet", "builtin"))
-    named = GnetConfig(method="g3r", weights=weights, iterations=2, views_per_iteration=2)
-    assert len(_gnet(named.model_copy(update={"loss": named.loss.model_copy(update={"perceptual": 0.0})})).losses) == 2
+    named = own.model_copy(update={"weights": weights})
+    g3r, gnet = _gnet(own).scene.gaussians.packed(), _gnet(named).scene.gaussians.packed()
+    assert not torch.equal(g3r, gnet)
+    assert torch.equal(gnet, _gnet(named.model_copy(update={"method": "learned"})).scene.gaussians.packed())
     spec = BY_NAME["gnet"]
     assert weights_file(spec, PipelineConfig(gnet=named)) == Path(weights)  # its bytes are part of the key
+    assert weights_file(spec, PipelineConfig(gnet=own)) == resolve_weights("g3r", "builtin")
     assert weights_file(spec, PipelineConfig(gnet=GnetConfig(method="street_gs"))) is None
 
 
