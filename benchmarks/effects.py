@@ -180,7 +180,8 @@ class Effects:
     }  # fmt: skip
     code: tuple[str, ...] = (
         "benchmarks.effects", "genre_tasks.optimiser.run", "genre_tasks.stages.ingest", "genre_tasks.stages.initial",
-        "genre_tasks.stages.effects", "genre_tasks.logs.pandaset", "genre_tasks.logs.synthetic",
+        "genre_tasks.stages.effects", *BY_NAME["effects"].lazy, "genre_tasks.logs.pandaset",
+        "genre_tasks.logs.synthetic",
     )  # fmt: skip
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:

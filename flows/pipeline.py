@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from genre_tasks.config import PipelineConfig
+from genre_tasks.config import EffectsConfig, PipelineConfig
 from storage import keys
 from storage.code_digest import code_digest
 from storage.keys import digest_file, digest_value
@@ -26,7 +26,8 @@ class StageSpec:
     ``function`` is ``module:name``; it is called as ``function(config section, *arguments, progress=…)``, where each
     argument is the name of an earlier stage (its value) or one of ``log``, ``chunk_index``, ``stage_name``, ``truth``.
     ``weights`` names the weights it loads. ``splits`` names a setting that bounds memory and does not change a
-    payload's bytes: it is halved when memory runs out, and is not part of the key.
+    payload's bytes: it is halved when memory runs out, and is not part of the key. ``lazy`` modules are its code too,
+    though no import of the stage names them.
     """
 
     name: str
@@ -36,6 +37,7 @@ class StageSpec:
     arguments: tuple[str, ...]
     weights: str | None = None
     splits: str | None = None
+    lazy: tuple[str, ...] = ()
 
     @property
     def module(self) -> str:
@@ -57,7 +59,14 @@ _STAGES = "genre_tasks.stages"
 
 PIPELINE: tuple[StageSpec, ...] = (
     StageSpec("ingest", "chunk", "ingest", f"{_STAGES}.ingest:ingest", ("log", "chunk_index")),
-    StageSpec("effects", "effects", "effects", f"{_STAGES}.effects:effects", ("ingest", "log")),
+    StageSpec(
+        "effects",
+        "effects",
+        "effects",
+        f"{_STAGES}.effects:effects",
+        ("ingest", "log"),
+        lazy=tuple(f"genre_tasks.effects.{name}" for name in EffectsConfig.model_fields),
+    ),
     StageSpec("initial", "reconstruction", "initial", f"{_STAGES}.initial:initial", ("ingest", "effects")),
     StageSpec(
         "gnet", "reconstruction", "gnet", f"{_STAGES}.gnet:gnet", ("ingest", "initial", "effects"), weights="gnet"
@@ -138,5 +147,5 @@ def stage_key(
     points = configuration.get("points") if spec.name == "ingest" else None
     if points and Path(points).is_file():  # the file is an input: its bytes count, not its name alone
         configuration["points"] = digest_file(Path(points))
-    code = code_digest(spec.module, also=reader)
+    code = code_digest(spec.module, also=(*spec.lazy, *reader))
     return keys.stage_key(spec.name, code, configuration, inputs, weights)

@@ -133,7 +133,7 @@ def produce(
         value,
         inputs={name: inputs[name].key for name in spec.inputs},
         configuration=section_of(spec, config).model_dump(mode="json"),
-        code_digest=code_digest(spec.module, also=reader_of(spec, job)),
+        code_digest=code_digest(spec.module, also=(*spec.lazy, *reader_of(spec, job))),
         weights_digest=weights_digest(weights_file(spec, config)),
         seconds=usage.seconds,
         peak_mib=usage.peak_mib,

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from genre_tasks.effects.seen import Seen
 from genre_tasks.effects.types import Effect, Fitted, Measured
+from genre_tasks.logs.types import Float32
 
 STILL_LEVELS = 6.0
 """Standard deviation over the frames, of 255, up to which a pixel does not change."""
@@ -16,6 +17,12 @@ EDGE_LEVELS = 8.0
 road stands still too, but blurs into what passes by."""
 
 MARGIN_PX = 3
+ARC_PX = 4
+"""How far an upper outline may be from its arc, a parabola over the image's columns."""
+
+MIN_ARC_COLUMNS, GAP_COLUMNS = 12, 25
+FAINT_LEVELS = EDGE_LEVELS / 2
+"""Where the arc is known a fainter edge along it will do."""
 
 LEAST_PERCENT = 0.3
 """Smaller parts are as often road as vehicle."""
@@ -78,7 +85,44 @@ def _own_part(images: NDArray[np.float32]) -> NDArray[np.bool_]:
         around = ndimage.binary_dilation(own) & ~own
         if around.any() and float(np.median(edge[around])) >= EDGE_LEVELS and own.sum() > best.sum():
             best = own
-    return best
+    return _below_outline(best, edge) if best.any() else best
+
+
+def _below_outline(part: NDArray[np.bool_], edge: Float32) -> NDArray[np.bool_]:
+    """What lies below the part's upper outline, and below that outline's arc as far as a still edge goes on along it.
+
+    Paint mirrors what passes by, and an antenna cuts it in two: the part itself is but a piece of the vehicle.
+    """
+    from scipy import ndimage
+
+    rows, columns = np.arange(len(part))[:, None], np.arange(part.shape[1])
+    found = np.flatnonzero(part.any(0))
+    tops = part.argmax(0)[found]
+    near = ndimage.maximum_filter1d(edge, 2 * ARC_PX + 1, axis=0)
+    on_edge = near[tops, found] >= EDGE_LEVELS
+    if on_edge.sum() < MIN_ARC_COLUMNS:
+        return part | (part.cumsum(0) > 0)
+    arc, kept = np.zeros(3), on_edge
+    for _ in range(3):
+        arc = np.polyfit(found[kept], tops[kept], 2)
+        kept = on_edge & (np.abs(np.polyval(arc, found) - tops) <= ARC_PX)
+        if kept.sum() < MIN_ARC_COLUMNS:
+            return part | (part.cumsum(0) > 0)
+    top = np.polyval(arc, columns)
+    along = np.where(np.abs(rows - top) <= ARC_PX, edge, 0).max(0) >= FAINT_LEVELS
+    reach = found[kept]
+    goes_on = _run(along, int(reach[len(reach) // 2]))
+    return (part.cumsum(0) > 0) | (goes_on & (rows >= top))
+
+
+def _run(along: NDArray[np.bool_], start: int) -> NDArray[np.bool_]:
+    """The columns to both sides of ``start`` up to the first gap of more than ``GAP_COLUMNS``."""
+    from scipy import ndimage
+
+    padded = np.pad(along, GAP_COLUMNS, mode="edge")
+    bridged = ndimage.binary_closing(padded, np.ones(GAP_COLUMNS))[GAP_COLUMNS:-GAP_COLUMNS]
+    labels, _ = ndimage.label(bridged | along)
+    return labels == labels[start] if labels[start] else along & False
 
 
 EFFECT = Effect("ego_mask", "part of an image that never changes", "%", 0.5, "a mask a camera", measure, fit=fit)

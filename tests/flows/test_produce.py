@@ -12,7 +12,9 @@ from flows import produce as room
 from flows.configuration import load_configuration
 from flows.pipeline import BY_NAME, PIPELINE, stage_key
 from flows.produce import ArtifactRef, Job, key_of, measured, produce
+from genre_tasks.config import EffectsConfig
 from genre_tasks.errors import InputError, ResourceError
+from storage.code_digest import closure
 from tests.faults.tiny import LOG, SETTINGS
 
 EARLY = ("ingest", "effects", "initial")
@@ -70,6 +72,13 @@ def test_a_plan_of_effects_is_part_of_later_keys(store: Path) -> None:
     spec, config = BY_NAME["gnet"], load_configuration("demo")
     keys = {stage_key(spec, config, {"ingest": "a", "initial": "b", "effects": e}, "w") for e in "cd"}
     assert len(keys) == 2
+
+
+def test_the_effects_code_is_part_of_the_plans_key() -> None:
+    spec, root = BY_NAME["effects"], Path(room.__file__).parents[1]
+    files, _ = closure(spec.module, spec.lazy, root)
+    assert {f"genre_tasks.effects.{name}" for name in EffectsConfig.model_fields} <= set(files)
+    assert "genre_tasks.effects.exposure" not in closure(spec.module, (), root)[0]  # why it has to be said
 
 
 def test_a_setting_that_only_bounds_memory_keeps_the_key(store: Path) -> None:
