@@ -245,6 +245,23 @@ def test_the_bonnet_is_found_and_a_vehicle_that_stands_tells_nothing(monkeypatch
     assert still.choice == "off" and "stands still" in still.reason
 
 
+def test_paint_that_mirrors_the_world_is_the_vehicles_own_too() -> None:
+    """Half of the bonnet changes as the street does; its outline is one arc from side to side."""
+    from genre_tasks.effects.ego_mask import _own_part
+
+    g = np.random.default_rng(0)
+    columns = np.arange(160)
+    top = 70 + 8 * ((columns - 80) / 80) ** 2
+    covered = np.arange(90)[:, None] >= top
+    images = g.uniform(90, 200, (10, 90, 160, 3)).astype(np.float32)
+    mirrored = 30 + 20 * g.uniform(0, 1, (10, 1, 160, 1)).astype(np.float32) * (columns > 100)[None, None, :, None]
+    images = np.where(covered[None, ..., None], mirrored, images)
+    found = _own_part(images)
+    assert (found & covered).sum() > 0.9 * covered.sum() and (found & ~covered).sum() < 0.02 * covered.sum()
+    elsewhere = np.where(covered[None, ..., None], g.uniform(90, 200, images.shape), images)
+    assert not _own_part(elsewhere.astype(np.float32)).any()
+
+
 def test_dark_images_are_marked(monkeypatch: pytest.MonkeyPatch) -> None:
     decoded = Seen.decoded
     monkeypatch.setattr(Seen, "decoded", lambda self, view: decoded(self, view) // 8)
