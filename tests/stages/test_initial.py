@@ -169,7 +169,7 @@ def test_reference_of_a_camera_without_images_is_the_nearest_other(chunk: Chunk)
 def test_novel_views_contract(log: FakeLog, chunk: Chunk, reconstruction: Reconstruction) -> None:
     calls: list[int] = []
     out = novel_views(
-        NovelViewsConfig(lidar_max_points=20_000), chunk, reconstruction, lambda d, t, n="": calls.append(d)
+        NovelViewsConfig(lidar_max_points=20_000), chunk, reconstruction, progress=lambda d, t, n="": calls.append(d)
     )
     assert out.color.shape == (20, 64, 96, 3) and out.lidar_depth.shape == (20, 64, 96)
     assert float(out.alpha.min()) >= 0 and float(out.alpha.max()) <= 1 and calls == sorted(calls) and calls[-1] == 40
