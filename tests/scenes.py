@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from genre_tasks.render import Cameras, Render, RenderSettings, render
-from genre_tasks.render.oracles import reference_bands
+from genre_tasks.render.oracles import reference_bands, relative_l2
 from genre_tasks.scene.gaussians import Splats
 
 NAMES = ("means", "scales", "quats", "opacities", "colors")
@@ -128,3 +128,16 @@ def moved_loss(splats: Splats, cameras: Cameras, xi: Tensor, settings: RenderSet
     pose = torch.linalg.matrix_exp(twist(xi)) @ cameras.camera_SE3_chunk[0].to(xi.dtype)
     out = render(splats.to(xi.dtype), replace(cameras, camera_SE3_chunk=pose[None]), settings)
     return (out.color.square().sum() + (out.alpha - 0.3).square().sum() + 0.1 * out.depth.sum()).double()
+
+
+def pose_gradient_error(splats: Splats, cameras: Cameras, settings: RenderSettings, dtype: torch.dtype) -> float:
+    """Relative distance of the gradient of :func:`moved_loss` in ``xi`` from the float64 finite difference."""
+    xi = torch.zeros(6, dtype=dtype, requires_grad=True)
+    moved_loss(splats, cameras, xi, settings).backward()
+    assert xi.grad is not None
+    expected, reference = torch.zeros(6, dtype=torch.float64), RenderSettings("reference")
+    with torch.no_grad():
+        for k, e in enumerate(1e-5 * torch.eye(6, dtype=torch.float64)):
+            ahead, back = (moved_loss(splats, cameras, s * e, reference) for s in (1, -1))
+            expected[k] = (ahead - back) / 2e-5
+    return relative_l2(xi.grad, expected)

@@ -64,10 +64,8 @@ def _parts(seen: Seen) -> dict[str, NDArray[np.bool_]]:
     """By camera, [H, W]."""
     found = {}
     for camera in seen.chunk.camera_names:
-        views = [v for v in seen.chunk.views if v.camera == camera]
-        if len(views) >= MIN_FRAMES:
-            images = np.stack([seen.decoded(v) for v in views[:: max(1, len(views) // 10)]]).astype(np.float32)
-            found[camera] = _own_part(images)
+        if len(seen.over_time[camera]) >= MIN_FRAMES:
+            found[camera] = _own_part(seen.over_time[camera].astype(np.float32))
     return found
 
 

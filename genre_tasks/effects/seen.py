@@ -16,6 +16,7 @@ from genre_tasks.scene.geometry import path_distance
 from genre_tasks.scene.images import decode_pixels
 from genre_tasks.scene.projection import Projected, project
 
+MOMENTS = 10
 SAMPLES = 6000
 """Static points whose colours are compared between images."""
 
@@ -69,6 +70,16 @@ class Seen:
     def decoded(self, view: View) -> NDArray[np.uint8]:
         """A view's image at the working resolution."""
         return decode_pixels(view.image, view.lens.width_px, view.lens.height_px)
+
+    @cached_property
+    def over_time(self) -> dict[str, NDArray[np.uint8]]:
+        """By camera, some ``MOMENTS`` of its images spread over the chunk, held-out ones too: [F, H, W, 3]."""
+        out = {}
+        for camera in self.chunk.camera_names:
+            views = [v for v in self.chunk.views if v.camera == camera]
+            chosen = views[:: max(1, len(views) // MOMENTS)]
+            out[camera] = np.stack([self.decoded(v) for v in chosen]) if chosen else np.zeros((0, 1, 1, 3), np.uint8)
+        return out
 
     @cached_property
     def returns(self) -> list[Projected]:

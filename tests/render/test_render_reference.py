@@ -9,7 +9,7 @@ import torch
 
 from genre_tasks.render import RenderSettings, render
 from genre_tasks.scene.gaussians import Splats
-from tests.scenes import moved_loss, smooth
+from tests.scenes import pose_gradient_error, smooth
 
 CPU, REFERENCE = RenderSettings("cpu", 1), RenderSettings("reference")
 
@@ -31,20 +31,7 @@ def test_values_and_gradients_of_300(scene, gradients, seed, width, height):
 
 @pytest.mark.parametrize(("settings", "dtype", "bound"), [(CPU, torch.float32, 1e-5), (REFERENCE, torch.float64, 1e-7)])
 def test_pose_gradient_against_finite_differences(settings, dtype, bound):
-    splats, cameras = smooth()
-    xi = torch.zeros(6, dtype=dtype, requires_grad=True)
-    moved_loss(splats, cameras, xi, settings).backward()
-    step = 1e-5
-    expected = torch.zeros(6, dtype=torch.float64)
-    with torch.no_grad():
-        for k in range(6):
-            e = torch.zeros(6, dtype=torch.float64)
-            e[k] = step
-            ahead, back = (moved_loss(splats, cameras, s * e, REFERENCE) for s in (1, -1))
-            expected[k] = (ahead - back) / (2 * step)
-    assert xi.grad is not None
-    relative = torch.linalg.vector_norm(xi.grad.double() - expected) / torch.linalg.vector_norm(expected)
-    assert relative < bound, (float(relative), xi.grad, expected)
+    assert pose_gradient_error(*smooth(), settings, dtype) < bound
 
 
 def test_pose_gradient_leaves_the_image_and_other_gradients(scene, gradients):
