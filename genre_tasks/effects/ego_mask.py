@@ -16,6 +16,14 @@ EDGE_LEVELS = 8.0
 """A part is the vehicle's own if its outline is an edge of so many levels a pixel in the mean of all frames: a smooth
 road stands still too, but blurs into what passes by."""
 
+MOTIONLESS_LEVELS = 1.5
+"""Standard deviation over the frames of what does not even mirror the world."""
+
+STEP = 4.0
+"""A motionless part is the vehicle's own if what passes by just outside of it changes so many times as much: paint of
+the road's colour has no edge, and a black road at night fades into what moves."""
+
+STEP_PX = 3
 MARGIN_PX = 3
 ARC_PX = 4
 """How far an upper outline may be from its arc, a parabola over the image's columns."""
@@ -73,17 +81,41 @@ def _own_part(images: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Of [F, H, W, 3] in 0 to 255: [H, W], the largest still part at the lower edge with a still outline."""
     from scipy import ndimage
 
-    still = (images.std(0) <= STILL_LEVELS).all(-1)
+    change = images.std(0).max(-1)
     mean = images.mean(0).mean(-1)
     edge = np.hypot(ndimage.sobel(mean, 0), ndimage.sobel(mean, 1)) / 4
-    parts, _ = ndimage.label(still & (edge < EDGE_LEVELS))
-    best = np.zeros_like(still)
-    for part in np.unique(parts[-1][parts[-1] > 0]):
-        own = parts == part
-        around = ndimage.binary_dilation(own) & ~own
-        if around.any() and float(np.median(edge[around])) >= EDGE_LEVELS and own.sum() > best.sum():
-            best = own
+    smooth = _at_lower_edge((change <= STILL_LEVELS) & (edge < EDGE_LEVELS))
+    found = [p for p in smooth if _outlined(p, edge)]
+    found += [p for p in _at_lower_edge(change <= MOTIONLESS_LEVELS) if _stands_out(p, change)]
+    best = max(found, key=lambda p: int(p.sum()), default=np.zeros(change.shape, bool))
     return _below_outline(best, edge) if best.any() else best
+
+
+def _at_lower_edge(where: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+    """Connected parts that reach the last row."""
+    from scipy import ndimage
+
+    parts, _ = ndimage.label(where)
+    return [parts == part for part in np.unique(parts[-1][parts[-1] > 0])]
+
+
+def _outlined(part: NDArray[np.bool_], edge: Float32) -> bool:
+    """Whether the mean of all frames has an edge around the part."""
+    from scipy import ndimage
+
+    around = ndimage.binary_dilation(part) & ~part
+    return bool(around.any()) and float(np.median(edge[around])) >= EDGE_LEVELS
+
+
+def _stands_out(part: NDArray[np.bool_], change: Float32) -> bool:
+    """Whether what is just outside of the part changes far more than what is just inside."""
+    from scipy import ndimage
+
+    wide, narrow = (ndimage.binary_dilation(part, iterations=k) for k in (STEP_PX + 1, 1))
+    outside, inside = wide & ~narrow, part & ~ndimage.binary_erosion(part, iterations=STEP_PX, border_value=1)
+    if not outside.any() or not inside.any():
+        return False
+    return float(np.median(change[outside])) >= STEP * max(float(np.median(change[inside])), MOTIONLESS_LEVELS / 4)
 
 
 def _below_outline(part: NDArray[np.bool_], edge: Float32) -> NDArray[np.bool_]:

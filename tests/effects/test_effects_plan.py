@@ -257,6 +257,19 @@ def test_paint_that_mirrors_the_world_is_the_vehicles_own_too() -> None:
     assert not _own_part(elsewhere.astype(np.float32)).any()
 
 
+def test_paint_of_the_roads_colour_is_found_by_what_moves_beside_it() -> None:
+    """A night's road is as still as the paint, and is not the vehicle."""
+    from genre_tasks.effects.ego_mask import _own_part
+
+    g = np.random.default_rng(0)
+    covered = np.arange(90)[:, None] >= np.full(160, 85)
+    road = 60 + 8 * g.normal(size=(10, 90, 160, 1)).astype(np.float32) * np.ones(3, np.float32)
+    images = np.where(covered[None, ..., None], np.float32(60), road)
+    assert np.array_equal(_own_part(images), covered)
+    fading = (np.arange(90, dtype=np.float32)[::-1] / 40)[None, :, None, None]
+    assert not _own_part((5 + fading * (road - 60) / 8).astype(np.float32)).any()
+
+
 def test_dark_images_are_marked(monkeypatch: pytest.MonkeyPatch) -> None:
     decoded = Seen.decoded
     monkeypatch.setattr(Seen, "decoded", lambda self, view: decoded(self, view) // 8)
