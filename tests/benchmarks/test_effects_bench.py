@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.effects import CASES, EFFECTS, calibrated
+from benchmarks.effects import EFFECTS, calibrated
+from benchmarks.effects.cases import CASES, LITTLE, LONGEST_S
 from flows.cli.bench import load
 from genre_tasks.effects.plan import EFFECTS as NAMES
 from genre_tasks.logs.registry import open_log
@@ -26,8 +27,15 @@ def test_it_is_registered_and_its_cases_are_effects() -> None:
 @pytest.mark.parametrize("name", list(CASES))
 def test_streets_can_be_asked_to_call_for_each(name: str) -> None:
     case = CASES[name]
-    for query in (case.plain, case.calls(1.0), case.calls(4.0)):
-        open_log(f"synthetic:street?seed=1{query}")
+    for factor in (0.0, 1.0, 4.0):
+        open_log(f"synthetic:street?seed=1{case.query(factor, 340.0)}")
+
+
+def test_a_slow_street_takes_longer_for_as_many_pixels() -> None:
+    case = CASES["rolling_shutter"]
+    seconds = [float(case.query(*at).rpartition("=")[2]) for at in ((4.0, 400.0), (4.0, 200.0), (0.0, 200.0))]
+    assert seconds == pytest.approx([seconds[0], 2 * seconds[0], 2 * seconds[0] * LITTLE / 4], rel=1e-3)
+    assert float(case.query(4.0, 1.0).rpartition("=")[2]) == LONGEST_S
 
 
 def test_cells_are_streets_with_and_without_and_the_real_chunks() -> None:
@@ -36,6 +44,8 @@ def test_cells_are_streets_with_and_without_and_the_real_chunks() -> None:
     assert len(EFFECTS.cells(options | {"pandaset": ""}, False)) == 8
     assert len(EFFECTS.cells(options | {"chunks": ""}, False)) == 8
     assert len(EFFECTS.cells(options, True)) == 4
+    whole = [c.name for c in EFFECTS.cells(options | {"effects": "auto_vs_on,plain_cost"}, False)]
+    assert whole == ["auto_vs_on street 1", "auto_vs_on street 2", "plain_cost street 1"]
 
 
 def test_claims_are_of_four_times_the_threshold_and_of_plain_streets() -> None:
@@ -49,8 +59,20 @@ def test_claims_are_of_four_times_the_threshold_and_of_plain_streets() -> None:
     assert claims["effects.loss_exposure"].measured == pytest.approx(0.2) and not claims["effects.loss_exposure"].holds
     assert claims["effects.gain_lidar_depth"].measured == pytest.approx(25.0)
     assert claims["effects.gain_ego_mask"].measured is None and not claims["effects.gain_ego_mask"].holds
+    assert claims["effects.plain_cost"].measured is None and claims["effects.auto_vs_on"].measured is None
     table = list(EFFECTS.table(rows))
     assert len([line for line in table if line.startswith("| ")]) == 5 and "e: not measured: no data" in table[-1]
+
+
+def test_whole_plans_are_claimed_by_what_auto_leaves_and_what_a_plan_adds() -> None:
+    streets = [(25.0, 25.1), (25.0, 24.9), (25.0, 25.3)]
+    each = [{"auto": {"heldout_db": a}, "on": {"heldout_db": b}} for a, b in streets]
+    rows = {str(k): r | {"whole": "auto_vs_on", "log": f"street {k}"} for k, r in enumerate(each)}
+    rows["n"] = {"whole": "plain_cost", "log": "plain", "cost_percent": {"planned": 0.1, "planning": 30.0}}
+    claims = {c.id: c for c in EFFECTS.claims(rows)}
+    assert claims["effects.auto_vs_on"].measured == pytest.approx(0.1) and claims["effects.auto_vs_on"].holds
+    assert claims["effects.plain_cost"].measured == 0.1 and claims["effects.plain_cost"].holds
+    assert any("+30.00 % with making it" in line for line in EFFECTS.table(rows))
 
 
 def test_a_threshold_is_read_between_two_measurements() -> None:

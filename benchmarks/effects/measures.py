@@ -1,0 +1,57 @@
+"""What an effect is judged by. More is better; arguments are the chunk as planned, a scene, and the truth if any."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from genre_tasks.logs.types import Truth
+from genre_tasks.metrics.collect import true_pixels, view_image
+from genre_tasks.metrics.image import psnr
+from genre_tasks.render.api import render_views
+from genre_tasks.scene.chunk import Chunk
+from genre_tasks.scene.depth import lidar_depth
+from genre_tasks.scene.graph import SceneGraph
+from genre_tasks.scene.novel import novel_view_poses
+from genre_tasks.stages.evaluate import as_recorded
+
+SIDE_M = 3.0
+
+
+def heldout_psnr(chunk: Chunk, scene: SceneGraph, _: Truth | None = None) -> float:
+    """Mean over held-out views, as the cameras recorded them, outside of the vehicle itself, dB.
+
+    Where the vehicle is in a camera's images, of such cameras alone.
+    """
+    masked = {v.camera for v in chunk.views if v.own is not None}
+    out = []
+    for view in (v for v in chunk.of_role("heldout") if not masked or v.camera in masked):
+        with torch.no_grad():
+            image = as_recorded(render_views(scene, [view]).color, [view]).clamp(0, 1)[0]
+        out.append(psnr(image.numpy(), view_image(view).numpy(), None if view.own is None else ~view.own))
+    return float(np.mean(out))
+
+
+def heldout_depth(chunk: Chunk, scene: SceneGraph, _: Truth | None = None) -> float:
+    """Minus the median relative error of depth in per cent, against the LiDAR returns of held-out frames."""
+    errors = []
+    for view in chunk.of_role("heldout"):
+        with torch.no_grad():
+            depth = render_views(scene, [view]).expected_depth()[0]
+        true = lidar_depth(chunk, view)
+        known = (true > 0) & (depth > 0)
+        errors.append((depth[known] / true[known] - 1).abs())
+    return -100 * float(torch.cat(errors).median())
+
+
+def beside_psnr(chunk: Chunk, scene: SceneGraph, truth: Truth | None) -> float:
+    """Mean at ±3 m against what an ideal camera would have seen, dB; held-out frames where there is no truth."""
+    if truth is None:
+        return heldout_psnr(chunk, scene)
+    views = novel_view_poses(chunk, (SIDE_M, -SIDE_M))
+    out = []
+    for view in views:
+        with torch.no_grad():
+            image = render_views(scene, [view]).color.clamp(0, 1)[0]
+        out.append(psnr(image.numpy(), true_pixels(chunk, truth, view).astype(np.float32) / np.float32(255)))
+    return float(np.mean(out))

@@ -1,0 +1,73 @@
+"""Whole plans: what ``auto`` leaves of ``on`` where a street has everything, and what it costs where it has nothing."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from benchmarks.bench import NotMeasuredError, Row
+from benchmarks.effects.cells import STAGES, Place, judged
+from benchmarks.effects.measures import heldout_psnr
+from benchmarks.machine import CHECKOUT, commit
+from benchmarks.main_job import reconstruct
+from benchmarks.optimiser.cells import threads
+
+EVERYTHING = (
+    "&rolling_shutter_s=0.03&exposure_s=0.01&exposure_jitter=0.2&white_balance_jitter=0.05&bonnet=0.08&distortion=0.02"
+)
+PLAIN = "&moving=0&pedestrians=0"
+SHORT = ("gnet.iterations=4",)
+"""Counting takes some fifty times as long as running."""
+
+COUNTER = ("valgrind", "--tool=cachegrind", "--cache-sim=no", "--cachegrind-out-file=/dev/null")
+COUNTED = re.compile(r"I\s+refs:\s+([\d,]+)")
+
+
+def auto_vs_on(seed: str, store: str) -> Row:
+    """Held-out PSNR of a street that has every effect, as planned and with all that can be set on."""
+    at = Place(f"synthetic:street?seed={seed}{EVERYTHING}", 0, store)
+    with threads():
+        own = at.plan("effects=on").fitted
+        out: Row = {"whole": "auto_vs_on", "log": at.log, "commit": commit()}
+        return out | {word: judged(at, own, heldout_psnr, f"effects={word}") for word in ("auto", "on")}
+
+
+def plain_cost(seed: str, store: str) -> Row:
+    """Instructions of initial scene and GNet on a street without actors, as planned and with nothing but what it needs.
+
+    Counted in a process each by Valgrind (one thread, AVX2), less those of a process that ends before the plan.
+    ``planned`` is given its plan's artifact, ``planning`` makes it.
+    """
+    if shutil.which("valgrind") is None:
+        raise NotMeasuredError("valgrind is not installed")
+    at = Place(f"synthetic:street?seed={seed}{PLAIN}", 0, store)
+    with threads():
+        reconstruct(at.job(), STAGES[:2])
+    counted = {word: _instructions(at, word) for word in ("start", "none", "planned", "planning")}
+    base = counted["none"] - counted["start"]
+    cost = {word: 100 * (counted[word] - counted["none"]) / base for word in ("planned", "planning")}
+    return {"whole": "plain_cost", "log": at.log, "commit": commit(), "instructions": counted, "cost_percent": cost}
+
+
+def _instructions(at: Place, word: str) -> int:
+    command = [
+        *COUNTER,
+        sys.executable,
+        "-P",
+        "-m",
+        "benchmarks.effects.counted",
+        word,
+        at.log,
+        str(at.chunk),
+        at.store,
+    ]
+    environment = os.environ | {"PYTHONPATH": str(CHECKOUT), "PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, cwd=Path.cwd(), env=environment, capture_output=True, text=True, check=False)
+    found = COUNTED.search(done.stderr)
+    if done.returncode or found is None:
+        raise NotMeasuredError(f"valgrind ended with {done.returncode}: {done.stderr[-500:]}")
+    return int(found[1].replace(",", ""))
