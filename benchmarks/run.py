@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.bench import Bench, Cell, NotMeasuredError, Row
-from benchmarks.machine import commit, machine
 from benchmarks.schema import Result, write_json
+from flows.machine import commit, machine
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
 from storage.code_digest import code_digest
 

@@ -84,6 +84,15 @@ def _measured(store: str, dataset: str) -> dict[str, tuple[float, float]]:
     return {stage: (statistics.median(seconds[stage]), max(memory[stage])) for stage in seconds}
 
 
+def stage_seconds(store: str) -> dict[str, float]:
+    """By stage (``evaluate`` for all of them): the median of those in the store, or a typical value."""
+    seconds = {stage: s for stage, (s, _) in _TYPICAL.items()}
+    found: dict[str, list[float]] = {}
+    for artifact in open_store(store).artifacts():
+        found.setdefault(artifact.manifest.stage.partition("/")[0], []).append(artifact.manifest.seconds)
+    return seconds | {stage: statistics.median(values) for stage, values in found.items()}
+
+
 def _typical(spec: StageSpec, config: PipelineConfig) -> tuple[float, float]:
     scale = config.ingest.width_px * config.ingest.height_px / _TYPICAL_PIXELS
     seconds, gigabytes = _TYPICAL[spec.name.partition("/")[0]]

@@ -138,7 +138,7 @@ def produce(
         seconds=usage.seconds,
         peak_mib=usage.peak_mib,
         environment=environment(),
-        measurements={"marks": _grouped_marks(getattr(value, "marks", ()))},
+        measurements={"cpu_seconds": usage.cpu_seconds, "marks": _grouped_marks(getattr(value, "marks", ()))},
         warnings=(note,) if note else (),
     )
     return _ref(artifact, cached=False, note=note)
@@ -146,9 +146,10 @@ def produce(
 
 @dataclass
 class Usage:
-    """Seconds of wall time and the peak of resident memory of the process meanwhile, MiB."""
+    """Seconds of wall time and of all threads on the CPU, and the process's peak of resident memory meanwhile, MiB."""
 
     seconds: float = 0.0
+    cpu_seconds: float = 0.0
     peak_mib: float = 0.0
 
 
@@ -158,7 +159,7 @@ def measured() -> Iterator[Usage]:
     usage = Usage()
     gc.collect()
     _reset_peak()
-    start = time.perf_counter()
+    start, begun = time.perf_counter(), time.process_time()
     try:
         yield usage
     except (MemoryError, RuntimeError) as error:
@@ -169,7 +170,7 @@ def measured() -> Iterator[Usage]:
             ) from error
         raise
     finally:
-        usage.seconds = time.perf_counter() - start
+        usage.seconds, usage.cpu_seconds = time.perf_counter() - start, time.process_time() - begun
         usage.peak_mib = _peak_mib()
 
 

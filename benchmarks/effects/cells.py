@@ -11,12 +11,12 @@ import numpy as np
 from benchmarks.bench import NotMeasuredError, Row
 from benchmarks.effects.cases import CASES
 from benchmarks.effects.measures import beside_psnr, heldout_psnr
-from benchmarks.machine import commit
 from benchmarks.main_job import reconstruct, seconds_of
 from benchmarks.optimiser.cells import threads
 from benchmarks.optimiser.task import value_of
 from flows.configuration import load_configuration
 from flows.logs import opened_log
+from flows.machine import commit
 from flows.produce import Job
 from genre_tasks.effects.applied import applied
 from genre_tasks.effects.motion import pixel_speeds

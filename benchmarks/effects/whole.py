@@ -12,9 +12,9 @@ from pathlib import Path
 from benchmarks.bench import NotMeasuredError, Row
 from benchmarks.effects.cells import STAGES, Place, judged
 from benchmarks.effects.measures import heldout_psnr
-from benchmarks.machine import CHECKOUT, commit
 from benchmarks.main_job import reconstruct
 from benchmarks.optimiser.cells import threads
+from flows.machine import CHECKOUT, commit
 
 EVERYTHING = (
     "&rolling_shutter_s=0.03&exposure_s=0.01&exposure_jitter=0.2&white_balance_jitter=0.05&bonnet=0.08&distortion=0.02"
@@ -66,6 +66,7 @@ def _instructions(at: Place, word: str) -> int:
         at.store,
     ]
     environment = os.environ | {"PYTHONPATH": str(CHECKOUT), "PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "1"}
+    environment["GENRE_RENDER_ISA"] = "avx2"  # Valgrind knows no AVX-512
     done = subprocess.run(command, cwd=Path.cwd(), env=environment, capture_output=True, text=True, check=False)
     found = COUNTED.search(done.stderr)
     if done.returncode or found is None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import typer
 
-from flows.cli import bench, check, doctor, effects, render, run, show, train, verify
+from flows.cli import bench, check, cost, doctor, effects, render, run, show, train, verify
 
 app = typer.Typer(
     name="genre",
@@ -25,6 +25,7 @@ app.command(name="render")(render.render)
 app.command(name="show")(show.show)
 app.command(name="verify")(verify.verify)
 app.command(name="doctor")(doctor.doctor)
+app.command(name="cost")(cost.cost)
 app.command(name="bench")(bench.bench)
 app.add_typer(train.app, name="train")
 
@@ -34,6 +35,8 @@ def prepare_environment(debug: bool) -> None:
     os.environ.setdefault("PREFECT_HOME", str(Path.cwd() / ".genre" / "prefect"))
     os.environ.setdefault("DO_NOT_TRACK", "1")
     os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
+    # Twenty seconds, its default, are not enough for its server on a busy machine.
+    os.environ.setdefault("PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS", "180")
     os.environ.setdefault("PREFECT_LOGGING_LEVEL", "INFO" if debug else "CRITICAL")
     os.environ.setdefault("PREFECT_LOGGING_TO_API_ENABLED", "false")
     # Idle OpenMP threads would spin and take the cores from the renderer's and the pools' own: ten times as slow here.

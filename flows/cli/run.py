@@ -34,12 +34,13 @@ def run(
 
     Add --debug to any command for tracebacks.
     """
+    from flows.cli.numbers import numbers
     from flows.configuration import load_configuration
     from flows.logs import opened_log
 
     settings = [*(set_ or []), *(["ingest.strict=true"] if strict else [])]
     effective = load_configuration(preset, config, settings)
-    wanted = _numbers(chunks)
+    wanted = numbers(chunks, "--chunks")
     opened_log(log)  # a log that cannot be opened is said before a server is started
     if dry_run:
         _dry_run(log, preset, store, wanted, effective, as_json)
@@ -59,17 +60,6 @@ def run(
         typer.echo(json.dumps({key: summary[key] for key in ("log", "preset", "store", "run", "chunks")}))
     else:
         print_run(summary)
-
-
-def _numbers(text: str | None) -> list[int] | None:
-    if text is None:
-        return None
-    try:
-        return [int(part) for part in text.split(",")]
-    except ValueError:
-        from genre_tasks.errors import ConfigError
-
-        raise ConfigError(f"cannot read --chunks {text!r}", remedy="Write numbers with commas: 0,1.") from None
 
 
 def _dry_run(

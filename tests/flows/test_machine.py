@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.machine import commit, machine
+from flows.machine import commit, machine
 from genre_tasks.compiled.loader import supported_isas
 
 
