@@ -179,7 +179,7 @@ class EffectsConfig(Section):
     rolling_shutter: EffectSetting = "auto"
     lens_distortion: EffectSetting = "auto"
     exposure: EffectSetting = "auto"
-    motion_blur: ToldSetting = Field("auto", description="Measured and told; not modelled yet.")
+    motion_blur: EffectSetting = "auto"
     view_dependent_colour: ToldSetting = Field("auto", description="Measured and told; not modelled yet.")
     lidar_depth: EffectSetting = "auto"
     anti_aliasing: ToldSetting = Field("auto", description="Measured and told; not modelled yet.")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from benchmarks.effects.measures import beside_psnr, heldout_depth, heldout_psnr
+from benchmarks.effects.measures import beside_psnr, heldout_depth, heldout_psnr, sharp_psnr
 from genre_tasks.effects.plan import effect_of
 from genre_tasks.logs.types import Truth
 from genre_tasks.scene.chunk import Chunk
@@ -62,9 +62,11 @@ CASES: dict[str, Case] = {
     "rolling_shutter": Case(_seconds("rolling_shutter_s", "rolling_shutter"), beside_psnr, timed=True),
     "lens_distortion": Case(_bent, heldout_psnr, plain=_bent(LITTLE, 0.0)),
     "exposure": Case(lambda x, _: f"&exposure_jitter={x * _limit('exposure') / 100:.4g}", heldout_psnr),
+    "motion_blur": Case(_seconds("exposure_s", "motion_blur"), sharp_psnr, timed=True),
     "lidar_depth": Case(lambda *_: "", heldout_depth, "%", plain="&lidar_beams=1&lidar_azimuths=90"),
     "ego_mask": Case(lambda x, _: f"&bonnet={x * _limit('ego_mask') / 100:.4g}", heldout_psnr),
 }
 """Those that are modelled and that a street can be made to call for or not. Every street has a sky: there is none that
 does not call for the distant region. Rolling shutter is judged beside the path: held-out frames are sheared as source
-frames are, and a scene that is sheared too fits them."""
+frames are, and a scene that is sheared too fits them. Motion blur is judged by what an ideal camera would have seen in
+place of held-out frames, which are blurred, too: three metres beside, errors of place hide most of what is sharp."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 
@@ -13,6 +15,7 @@ from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.depth import lidar_depth
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.novel import novel_view_poses
+from genre_tasks.scene.views import NovelView
 from genre_tasks.stages.evaluate import as_recorded
 
 SIDE_M = 3.0
@@ -48,7 +51,18 @@ def beside_psnr(chunk: Chunk, scene: SceneGraph, truth: Truth | None) -> float:
     """Mean at ±3 m against what an ideal camera would have seen, dB; held-out frames where there is no truth."""
     if truth is None:
         return heldout_psnr(chunk, scene)
-    views = novel_view_poses(chunk, (SIDE_M, -SIDE_M))
+    return _ideal_psnr(chunk, scene, truth, novel_view_poses(chunk, (SIDE_M, -SIDE_M)))
+
+
+def sharp_psnr(chunk: Chunk, scene: SceneGraph, truth: Truth | None) -> float:
+    """As :func:`beside_psnr`, where held-out frames were taken."""
+    if truth is None:
+        return heldout_psnr(chunk, scene)
+    frames = sorted({v.frame for v in chunk.of_role("heldout")})
+    return _ideal_psnr(chunk, scene, truth, novel_view_poses(chunk, (0.0,), frames))
+
+
+def _ideal_psnr(chunk: Chunk, scene: SceneGraph, truth: Truth, views: Sequence[NovelView]) -> float:
     out = []
     for view in views:
         with torch.no_grad():

@@ -25,12 +25,13 @@ def applied(chunk: Chunk, plan: EffectsPlan) -> Chunk:
 def _as_planned(view: View, plan: EffectsPlan, straight: bool) -> View:
     """The view itself where nothing is said of it; ``straight``: with its lens taken to be free of distortion."""
     fitted, key = plan.fitted, (view.camera, view.frame)
-    gain, own, shutter = fitted.gains.get(key), fitted.own.get(view.camera), fitted.shutters.get(key)
+    gain, own = fitted.gains.get(key), fitted.own.get(view.camera)
+    shutter, blur = fitted.shutters.get(key), fitted.blurs.get(key)
     straight = straight and any(view.lens.distortion)
-    if gain is None and own is None and shutter is None and not straight:
+    if all(said is None for said in (gain, own, shutter, blur)) and not straight:
         return view
     lens = replace(view.lens, distortion=()) if straight else view.lens
-    return replace(view, lens=lens, log_gain=gain, own=own, shutter=shutter)
+    return replace(view, lens=lens, log_gain=gain, own=own, shutter=shutter, blur=blur)
 
 
 def _standing(chunk: Chunk) -> Points:

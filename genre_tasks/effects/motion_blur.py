@@ -1,10 +1,11 @@
-"""Motion blur: what moves over a pixel while the shutter is open."""
+"""Motion blur: what moves over a pixel while the shutter is open. Rendered by ``render.blur``."""
 
 from __future__ import annotations
 
-from genre_tasks.effects.motion import displaced
+from genre_tasks.effects.motion import displaced, motions
 from genre_tasks.effects.seen import Seen
-from genre_tasks.effects.types import Effect, Measured
+from genre_tasks.effects.types import Effect, Fitted, Measured
+from genre_tasks.logs.types import MotionBlur
 
 
 def measure(seen: Seen) -> Measured:
@@ -17,13 +18,24 @@ def needs(seen: Seen) -> str | None:
     return None if any(c.exposure_s > 0 for c in seen.cameras.values()) else "the log states no exposure time"
 
 
+def fit(seen: Seen) -> Fitted:
+    """How each camera that states an exposure time moves, see ``motion.motions``."""
+    moving, frame_s = motions(seen, [n for n, c in seen.cameras.items() if c.exposure_s > 0])
+    return Fitted(
+        blurs={
+            key: MotionBlur(seen.cameras[key[0]].exposure_s, velocity, turn, frame_s)
+            for key, (velocity, turn) in moving.items()
+        }
+    )
+
+
 EFFECT = Effect(
     "motion_blur",
     "displacement during the exposure",
     "px",
-    1.0,
-    "some five virtual views an image",
+    10.0,
+    "five virtual views an image",
     measure,
     needs,
-    marks=True,
+    fit=fit,
 )

@@ -61,7 +61,7 @@ def _choice(effect: Effect, found: Measured, setting: str) -> tuple[Choice, str]
     called: Choice = "mark" if effect.marks else "on"
     told = found.value is not None and math.isfinite(found.value)
     if setting == "on":
-        return called, f"set on; {f'{found.value:.3g} {effect.unit}: ' * told}{found.said}"
+        return called, f"set on; {f'{found.value:.3g} {effect.unit}: ' if told else ''}{found.said}"
     if not told:
         return "off", found.said
     above = found.value is not None and found.value > effect.threshold

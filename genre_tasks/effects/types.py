@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from genre_tasks.logs.types import RollingShutter
+from genre_tasks.logs.types import MotionBlur, RollingShutter
 
 if TYPE_CHECKING:
     from genre_tasks.effects.seen import Seen
@@ -35,17 +35,18 @@ class Fitted:
 
     ``gains``: by camera and frame, the log of an image's gain in linear light, red, green and blue, of mean zero over
     source images. ``own``: by camera, where the vehicle itself is in the image, [H, W]. ``shutters``: by camera and
-    frame, how the camera moves while the image is read out.
+    frame, how the camera moves while the image is read out; ``blurs``: while it is exposed.
     """
 
     gains: Mapping[tuple[str, int], tuple[float, float, float]] = field(default_factory=dict)
     own: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
     shutters: Mapping[tuple[str, int], RollingShutter] = field(default_factory=dict)
+    blurs: Mapping[tuple[str, int], MotionBlur] = field(default_factory=dict)
 
     def with_those_of(self, other: Fitted) -> Fitted:
         """Both."""
         gains, own = {**self.gains, **other.gains}, {**self.own, **other.own}
-        return Fitted(gains, own, {**self.shutters, **other.shutters})
+        return Fitted(gains, own, {**self.shutters, **other.shutters}, {**self.blurs, **other.blurs})
 
 
 @dataclass(frozen=True)

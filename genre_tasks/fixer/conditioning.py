@@ -98,7 +98,7 @@ def recorded(chunk: Chunk) -> tuple[SourceImage, ...]:
 
     Raises ``InputError`` for an unreadable image.
     """
-    views = chunk.of_role("source")
+    views = [v if v.blur is None else replace(v, blur=None) for v in chunk.of_role("source")]  # depth has none
     with torch.no_grad():
         map_ = render_surfaces(lidar_scene(chunk, OCCLUDING_POINTS), views)
     depth = torch.where(map_.alpha >= MIN_ALPHA, map_.expected_depth(), torch.zeros_like(map_.alpha))

@@ -72,6 +72,20 @@ class RollingShutter:
 
 
 @dataclass(frozen=True)
+class MotionBlur:
+    """How a camera moves while its shutter is open; the pose holds for the middle of the exposure.
+
+    ``velocity_m_s``, ``turn_rad_s`` and ``frame_s`` as of a ``RollingShutter``; with one, each row is exposed for so
+    long. ``exposure_s`` 0 is no blur.
+    """
+
+    exposure_s: float
+    velocity_m_s: tuple[float, float, float]
+    turn_rad_s: tuple[float, float, float]
+    frame_s: float = 0.0
+
+
+@dataclass(frozen=True)
 class Camera:
     """A camera of the rig: its name and its lens at native resolution.
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from genre_tasks.metrics.threads import map_single_threaded
 from genre_tasks.optimiser import posing
 from genre_tasks.optimiser.fused_library import takes
 from genre_tasks.optimiser.state import Frame
 from genre_tasks.render import cpu
-from genre_tasks.render.api import PosedView, cameras_of, render_views, velocities_of
+from genre_tasks.render.api import cameras_of, render_views, velocities_of
+from genre_tasks.render.blur import Moments, PosedView, mean, mean_gradient
 from genre_tasks.render.types import RenderSettings
 
 
@@ -70,7 +72,29 @@ class CompiledPass:
         return self._posing.gradient(self._posed, by_splats, self._threads)
 
 
+class BlurredPass:
+    """Of views with motion blur, from a pass of their moments; ``depth`` is that at the poses' own times."""
+
+    def __init__(self, sharp: Pass, moments: Moments) -> None:
+        self._sharp, self._moments = sharp, moments
+        self.color = torch.stack(map_single_threaded(lambda part: mean(sharp.color[part]), moments.parts))
+        self.depth, self.culled = sharp.depth[moments.middle], sharp.culled
+
+    def gradient(self, by_color: Tensor, by_depth: Tensor) -> Tensor:
+        """As in :class:`Pass`."""
+        sharp, parts = self._sharp, self._moments.parts
+        pairs = list(zip(parts, by_color, strict=True))
+        by_moments = torch.cat(map_single_threaded(lambda pair: mean_gradient(sharp.color[pair[0]], pair[1]), pairs))
+        by_depths = torch.zeros_like(sharp.depth)
+        by_depths[self._moments.middle] = by_depth
+        return sharp.gradient(by_moments, by_depths)
+
+
 def begin(frame: Frame, offsets: Tensor, views: Sequence[PosedView], settings: RenderSettings) -> Pass:
     """The render of ``views`` at ``offsets`` [N, 14], by kernels where they are made for it."""
     compiled = settings.backend in ("auto", "cpu") and takes(offsets, frame.start, frame.unit)
-    return (CompiledPass if compiled else TorchPass)(frame, offsets, views, settings)
+    kind: Callable[..., Pass] = CompiledPass if compiled else TorchPass
+    moments = Moments.of(views)
+    if moments is None:
+        return kind(frame, offsets, views, settings)
+    return BlurredPass(kind(frame, offsets, moments.views, settings), moments)

@@ -25,7 +25,8 @@ from genre_tasks.optimiser.objective import check_finite
 from genre_tasks.optimiser.per_scene_start import node_extents, timetable
 from genre_tasks.optimiser.screen import screen_pull
 from genre_tasks.optimiser.targets import Target
-from genre_tasks.render.api import cameras_of, moving, render
+from genre_tasks.render.api import cameras_of, in_order, moving, render
+from genre_tasks.render.blur import Moments
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import SceneGraph
 
@@ -118,19 +119,22 @@ class PerSceneTraining:
         leaves = each(lambda x: x.detach().requires_grad_(), self._population.gaussians)
         with torch.enable_grad():
             scene = SceneGraph(leaves, self._population.nodes, self._actors)
-            placed = scene.at(target.frame)
-            placed.means.retain_grad()
-            splats = moving(placed.activated(), scene, target)
-            image = render(splats, cameras_of([target]))
+            moments = Moments.of([target])
+            views = (target,) if moments is None else moments.views
+            placed = [scene.at(v.frame) for v in views]
+            for each_placed in placed:
+                each_placed.means.retain_grad()
+            splats = [moving(p.activated(), scene, v) for p, v in zip(placed, views, strict=True)]
+            images = [render(s, cameras_of([v])) for s, v in zip(splats, views, strict=True)]
+            image = images[0] if moments is None else moments.recorded(in_order(images, range(len(images))))
         plan = plan_loss(self._loss, [target], self.iteration, self._generator, perceptual=False)
         loss, by_color, _ = image_gradients(self._loss, image.color, image.depth, [target], plan)
         image.color.backward(by_color)
         self.culled = image.culled
         if self.iteration + 1 < self.table.stop:
-            assert placed.means.grad is not None
-            largest = splats.scales.detach().amax(1)
-            pose, lens = target.chunk_SE3_camera, target.lens
-            pull, seen = screen_pull(placed.means.detach(), placed.means.grad, largest, pose, lens)
+            middle = len(views) // 2
+            largest, means = splats[middle].scales.detach().amax(1), placed[middle].means.detach()
+            pull, seen = screen_pull(means, _summed_gradient(placed), largest, target.chunk_SE3_camera, target.lens)
             self._pull += pull
             self._views += seen
         return loss, each(lambda x: x.grad, leaves)
@@ -158,6 +162,12 @@ class PerSceneTraining:
             self._set(density.pruned(self._population, self._extent, table, too_large=t > table.reset_every))
         if t % table.reset_every == 0:
             self._population = density.reset(self._population, table)
+
+
+def _summed_gradient(placed: Sequence[Gaussians]) -> Tensor:
+    """[N, 3] of the means at all moments of a view; a scene without actors is one and the same at all of them."""
+    gradients = [m.grad for m in {id(p.means): p.means for p in placed}.values() if m.grad is not None]
+    return gradients[0] if len(gradients) == 1 else torch.stack(gradients).sum(0)
 
 
 _KINDS = ("gaussians", "first", "second")

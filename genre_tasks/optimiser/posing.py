@@ -88,28 +88,38 @@ class Posing:
         self._actor = torch.where(moves, nodes - FIRST_ACTOR, -1).int()
         self._start, self._unit = start.contiguous(), unit.contiguous()
         self._frames = sorted({int(f) for actor in scene.actors for f in actor.frames})
-        self._poses = _pose_table(scene, self._frames)
-        self._row = {frame: i for i, frame in enumerate(self._frames)}
+        self._scene, self._poses = scene, _pose_table(scene, self._frames)
+        self._row: dict[float, int] = {frame: i for i, frame in enumerate(self._frames)}
         self._in = _Gaussians(
             len(nodes), self.moving, len(scene.actors),
             *(t.data_ptr() for t in (self._start, self._unit, self._slot, self._actor, self._poses)),
         )  # fmt: skip
 
-    def shown(self, frames: Sequence[int]) -> Shown:
+    def shown(self, frames: Sequence[float]) -> Shown:
         """Which splats of :meth:`splats` views at these log frames have."""
         return Shown.of_frames(self.still, self.moving, frames)
 
-    def splats(self, offsets: Tensor, frames: Sequence[int], threads: int) -> Posed:
-        """At ``offsets`` [N, 14] and at distinct log frames."""
+    def splats(self, offsets: Tensor, frames: Sequence[float], threads: int) -> Posed:
+        """At ``offsets`` [N, 14] and at distinct log frames, or moments between them."""
         offsets = offsets.contiguous()
         if offsets.shape != self._start.shape:
             raise ValueError(f"expected offsets of shape {list(self._start.shape)}, got {list(offsets.shape)}")
+        self._know([f for f in frames if f % 1 and f not in self._row])
         nowhere = len(self._frames)
         rows = torch.tensor([self._row.get(f, nowhere) for f in frames], dtype=torch.int64)
         posed = Posed(rows, arrays(self.still + len(frames) * self.moving), torch.empty(len(offsets)))
         pointers = offsets.data_ptr(), threads, _Splats.of(posed.splats), posed.slopes.data_ptr()
         _check(load_posing().genre_pose(self._in, _Frames(len(rows), rows.data_ptr()), *pointers))
         return posed
+
+    def _know(self, between: Sequence[float]) -> None:
+        """Adds rows of poses between log frames to the table; those that it has stay where they are."""
+        if not between or not self._scene.actors:
+            return
+        begin = len(self._poses)
+        self._row |= {frame: begin + i for i, frame in enumerate(between)}
+        self._poses = torch.cat([self._poses, _pose_table(self._scene, between)])
+        self._in.poses = self._poses.data_ptr()
 
     def gradient(self, posed: Posed, by_splats: cpu.Arrays, threads: int) -> Tensor:
         """The gradient [N, 14] with respect to the offsets from that of the splats."""
@@ -142,9 +152,9 @@ def arrays(count: int) -> cpu.Arrays:
     return means, scales, quats, opacities, colors
 
 
-def _pose_table(scene: SceneGraph, frames: Sequence[int]) -> Tensor:
+def _pose_table(scene: SceneGraph, frames: Sequence[float]) -> Tensor:
     """[F + 1, A, 17]: rotation, translation, quaternion and presence; the last row for frames without any actor."""
-    nobody = -1 - max((abs(f) for f in frames), default=0)
+    nobody = -1 - max((abs(round(f)) for f in frames), default=0)
     rotation, translation, present = scene.actor_poses([*frames, nobody])
     turns = torch.as_tensor(rotation).float()
     there = torch.as_tensor(present.astype(np.float32))[..., None]

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from genre_tasks.errors import InputError
-from genre_tasks.logs.types import Float64, Lens, RollingShutter
+from genre_tasks.logs.types import Float64, Lens, MotionBlur, RollingShutter
 from genre_tasks.optimiser.ssim import SsimTarget
 from genre_tasks.scene.chunk import Chunk, Gain, View
 from genre_tasks.scene.images import decode_image
@@ -22,7 +22,7 @@ class Target:
 
     ``image`` [H, W, 3] sRGB float32 with its SSIM terms; ``depth`` [H, W] metres along the optical axis, 0 where the
     LiDAR returned nothing, or ``None`` where depth does not supervise (novel views, paper Eq. 11). ``log_gain``,
-    ``own`` [H, W] and ``shutter``: as a ``View`` has them.
+    ``own`` [H, W], ``shutter`` and ``blur``: as a ``View`` has them.
     """
 
     camera: str
@@ -35,6 +35,7 @@ class Target:
     log_gain: Gain | None = None
     own: Tensor | None = None
     shutter: RollingShutter | None = None
+    blur: MotionBlur | None = None
 
 
 def of_views(chunk: Chunk, views: Sequence[View], depth: bool = False) -> tuple[Target, ...]:
@@ -54,9 +55,8 @@ def of_views(chunk: Chunk, views: Sequence[View], depth: bool = False) -> tuple[
         sparse = torch.as_tensor(lidar_depth(chunk, view)).float() if depth else None
         own = None if view.own is None else torch.from_numpy(view.own)
         pose, seen = view.chunk_SE3_camera, SsimTarget.of(image)
-        out.append(
-            Target(view.camera, view.frame, pose, view.lens, seen, sparse, False, view.log_gain, own, view.shutter)
-        )
+        said = view.log_gain, own, view.shutter, view.blur
+        out.append(Target(view.camera, view.frame, pose, view.lens, seen, sparse, False, *said))
     return tuple(out)
 
 

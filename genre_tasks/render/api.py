@@ -4,33 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from genre_tasks.errors import NonFiniteError
-from genre_tasks.logs.types import Float64, Lens, RollingShutter
+from genre_tasks.logs.types import RollingShutter
+from genre_tasks.render.blur import Moments, PosedView
 from genre_tasks.render.types import Cameras, Render, RenderSettings, Shown
 from genre_tasks.scene.gaussians import Splats
 from genre_tasks.scene.geometry import matrix_to_quat, quat_multiply
 from genre_tasks.scene.graph import SceneGraph
 
 DEFAULT = RenderSettings()
-
-
-class PosedView(Protocol):
-    """What is asked of a view: a log frame, a pose [4, 4] and a lens.
-
-    A view with a rolling shutter has an attribute ``shutter``, a ``RollingShutter`` or ``None``.
-    """
-
-    @property
-    def frame(self) -> int: ...
-    @property
-    def chunk_SE3_camera(self) -> Float64: ...
-    @property
-    def lens(self) -> Lens: ...
 
 
 def render(splats: Splats, cameras: Cameras, settings: RenderSettings = DEFAULT, shown: Shown | None = None) -> Render:
@@ -71,14 +57,18 @@ def render(splats: Splats, cameras: Cameras, settings: RenderSettings = DEFAULT,
     for (begin, end), members in groups.items():
         rows = torch.cat([torch.arange(shown.shared), torch.arange(begin, end)]).to(splats.means.device)
         parts.append(_elsewhere(backend, splats.select(rows), cameras.select(members)))
-    return _in_order(parts, [v for members in groups.values() for v in members])
+    return in_order(parts, [v for members in groups.values() for v in members])
 
 
 def render_views(scene: SceneGraph, views: Sequence[PosedView], settings: RenderSettings = DEFAULT) -> Render:
     """Renders a scene graph at views of one image size, in their order; actors stand where their frame puts them.
 
-    While a view with a rolling shutter is read out, actors move on as from frame to frame. Raises as :func:`render`.
+    While a view with a rolling shutter is read out, actors move on as from frame to frame. A view with motion blur has
+    the mean colour of several moments, and alpha and depth of its pose's own time. Raises as :func:`render`.
     """
+    moments = Moments.of(views)
+    if moments is not None:
+        return moments.recorded(render_views(scene, moments.views, settings))
     cameras = cameras_of(views)
     frames = [v.frame for v in views]
     posed, moving = scene.posed(list(dict.fromkeys(frames)))
@@ -93,7 +83,7 @@ def velocities_of(scene: SceneGraph, means: Tensor, views: Sequence[PosedView]) 
     ``means`` are laid out as by ``SceneGraph.posed`` at the views' frames. Raises ``ValueError`` for shutters that do
     not agree on the time to the next frame.
     """
-    frames_s = dict.fromkeys((v.frame for v in views), 0.0)
+    frames_s: dict[float, float] = dict.fromkeys((v.frame for v in views), 0.0)
     for view in views:
         stated = _frame_s_of(view)
         if stated and frames_s[view.frame] not in (0.0, stated):
@@ -138,7 +128,7 @@ def _on_cpu(splats: Splats, cameras: Cameras, threads: int | None, shown: Shown)
     parts = [
         _result(*render_cpu(*_in_camera_frame(splats, cameras, v), shown.of(v), threads)) for v in range(len(cameras))
     ]
-    return _in_order(parts, range(len(parts)))
+    return in_order(parts, range(len(parts)))
 
 
 def _elsewhere(backend: str, splats: Splats, cameras: Cameras) -> Render:
@@ -151,7 +141,7 @@ def _elsewhere(backend: str, splats: Splats, cameras: Cameras) -> Render:
     return _result(*render_cuda(splats, cameras))
 
 
-def _in_order(parts: Sequence[Render], views: Sequence[int]) -> Render:
+def in_order(parts: Sequence[Render], views: Sequence[int]) -> Render:
     """One result of several, whose images, one part after the other, are those of ``views``."""
     order = torch.argsort(torch.tensor(views))
     color, alpha, depth = (torch.cat([getattr(p, n) for p in parts])[order] for n in ("color", "alpha", "depth"))

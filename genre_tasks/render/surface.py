@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from genre_tasks.logs.types import Lens
-from genre_tasks.render.api import DEFAULT, PosedView, cameras_of, moving, on_device_of, render, render_views
+from genre_tasks.render.api import DEFAULT, cameras_of, moving, on_device_of, render, render_views
+from genre_tasks.render.blur import PosedView
 from genre_tasks.render.reference_camera import OneCamera
 from genre_tasks.render.types import Render, RenderSettings
 from genre_tasks.scene.distortion import rays_at
@@ -38,7 +39,7 @@ def render_surfaces(scene: SceneGraph, views: Sequence[PosedView], settings: Ren
     plain = render_views(scene, views, settings)
     centre = plain.expected_depth()
     depth = torch.empty_like(plain.depth)
-    posed: dict[int, tuple[Splats, Tensor]] = {}
+    posed: dict[float, tuple[Splats, Tensor]] = {}
     for k, view in enumerate(views):
         if view.frame not in posed:
             splats = scene.at(view.frame).activated()

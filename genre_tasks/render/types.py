@@ -134,7 +134,7 @@ class Shown:
         return Shown(count, ((count, count),) * views)
 
     @staticmethod
-    def of_frames(shared: int, moving: int, frames: Sequence[int]) -> Shown:
+    def of_frames(shared: int, moving: int, frames: Sequence[float]) -> Shown:
         """For views at these log frames: what stays, then what moves once for each frame, as ``SceneGraph.posed``."""
         place = {frame: i for i, frame in enumerate(dict.fromkeys(frames))}
         begins = [shared + place[frame] * moving for frame in frames]

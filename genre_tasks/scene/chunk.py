@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from genre_tasks.logs.types import Float32, Float64, Lens, RollingShutter
+from genre_tasks.logs.types import Float32, Float64, Lens, MotionBlur, RollingShutter
 
 Role = Literal["source", "heldout"]
 Gain = tuple[float, float, float]
@@ -27,7 +27,8 @@ class View:
     the encoded bytes as they came (native resolution), never ``None``: a view without an image is not in the chunk.
 
     What effects say of the image, ``None`` where they are off (``ingest`` knows nothing of it): ``log_gain`` of its
-    exposure, ``own`` [H, W] where the vehicle itself is in it, ``shutter`` how the camera moves while it is read out.
+    exposure, ``own`` [H, W] where the vehicle itself is in it, ``shutter`` how the camera moves while it is read out,
+    ``blur`` how it moves while it is exposed.
     """
 
     camera: str
@@ -40,6 +41,7 @@ class View:
     log_gain: Gain | None = None
     own: NDArray[np.bool_] | None = None
     shutter: RollingShutter | None = None
+    blur: MotionBlur | None = None
 
 
 @dataclass(frozen=True)

@@ -31,17 +31,30 @@ class ActorNode:
     frames: NDArray[np.int64]
     chunk_SE3_box: Float64
 
-    def pose(self, frame: int) -> Float64 | None:
-        """[4, 4] at a log frame, or ``None`` where the actor does not exist."""
-        at = np.flatnonzero(self.frames == frame)
-        return self.chunk_SE3_box[at[0]] if len(at) else None
+    def pose(self, frame: float) -> Float64 | None:
+        """[4, 4] at a log frame, or ``None`` where the actor does not exist.
 
-    def motion(self, frame: int) -> tuple[Float64, Float64]:
+        Between frames: where its motion brings it from the nearest one.
+        """
+        at = np.flatnonzero(self.frames == round(frame))
+        if not len(at):
+            return None
+        pose, part = self.chunk_SE3_box[at[0]], frame - round(frame)
+        if not part:
+            return pose
+        velocity, turn = self.motion(frame)
+        moved = pose.copy()
+        moved[:3, :3] = Rotation.from_rotvec(part * turn).as_matrix() @ pose[:3, :3]
+        moved[:3, 3] += part * velocity
+        return moved
+
+    def motion(self, frame: float) -> tuple[Float64, Float64]:
         """Velocity of the centre [3] and turn [3] at a log frame, in m and rad a frame, in chunk axes.
 
         From the poses before and after, from its own pose at an end of the path; zero where there is no other one.
+        Between frames it is that at the nearest one.
         """
-        at = np.flatnonzero(self.frames == frame)
+        at = np.flatnonzero(self.frames == round(frame))
         if not len(at):
             return np.zeros(3), np.zeros(3)
         first, last = max(at[0] - 1, 0), min(at[0] + 1, len(self.frames) - 1)
@@ -70,7 +83,7 @@ class SceneGraph:
         """The same graph with other Gaussians (same N and order)."""
         return replace(self, gaussians=gaussians)
 
-    def posed(self, frames: Sequence[int]) -> tuple[Gaussians, Tensor]:
+    def posed(self, frames: Sequence[float]) -> tuple[Gaussians, Tensor]:
         """All Gaussians in chunk coordinates at several log frames at once, differentiable.
 
         First those that do not move, then those of the actors as they are at the first frame, at the second, and so on;
@@ -98,7 +111,7 @@ class SceneGraph:
             joined(g.colors),
         ), moving
 
-    def velocities(self, means: Tensor, frames: Sequence[int], frames_s: Sequence[float]) -> Tensor:
+    def velocities(self, means: Tensor, frames: Sequence[float], frames_s: Sequence[float]) -> Tensor:
         """[S + F · M, 3] m/s in chunk axes, of Gaussians at ``means`` that are laid out as by :meth:`posed`.
 
         ``frames_s`` [F]: the time from each of the log frames to the next; 0 where actors count as resting. Constants:
@@ -112,13 +125,13 @@ class SceneGraph:
             out[rows] = self._actor_velocities(_array(means[rows]), frame, frame_s)
         return torch.from_numpy(out).to(means)
 
-    def velocities_at(self, means: Tensor, frame: int, frame_s: float) -> Tensor:
+    def velocities_at(self, means: Tensor, frame: float, frame_s: float) -> Tensor:
         """As :meth:`velocities`, [N, 3], of Gaussians that are laid out as by :meth:`at`."""
         out, moving = np.zeros((len(means), 3), np.float32), self._actors_rows
         out[moving] = self._actor_velocities(_array(means)[moving], frame, frame_s)
         return torch.from_numpy(out).to(means)
 
-    def at(self, frame: int) -> Gaussians:
+    def at(self, frame: float) -> Gaussians:
         """All Gaussians in chunk coordinates at a log frame, N kept and order kept, differentiable.
 
         Gaussians of an actor that does not exist at ``frame`` get a logit opacity of −30: no renderer draws them, and
@@ -137,7 +150,7 @@ class SceneGraph:
             g.colors,
         )
 
-    def actor_poses(self, frames: Sequence[int]) -> tuple[Float64, Float64, NDArray[np.bool_]]:
+    def actor_poses(self, frames: Sequence[float]) -> tuple[Float64, Float64, NDArray[np.bool_]]:
         """Rotations [F, A, 3, 3] and translations [F, A, 3] of the actors' boxes, and whether the actors exist [F, A].
 
         The pose of an absent actor is the identity.
@@ -152,7 +165,7 @@ class SceneGraph:
                     rotation[f, k], translation[f, k], present[f, k] = pose[:3, :3], pose[:3, 3], True
         return rotation, translation, present
 
-    def _actor_velocities(self, means: Float32, frame: int, frame_s: float) -> Float32:
+    def _actor_velocities(self, means: Float32, frame: float, frame_s: float) -> Float32:
         """[M, 3] of the actors' Gaussians at ``means`` [M, 3]. By numpy: it is asked in every iteration, and torch's
         threads would wake for it and then spin beside the kernels'."""
         if not frame_s or not len(means):
@@ -169,7 +182,7 @@ class SceneGraph:
         return np.asarray(out / np.float32(frame_s))
 
     @cached_property
-    def _motions(self) -> dict[int, tuple[Float32, Float32]]:
+    def _motions(self) -> dict[float, tuple[Float32, Float32]]:
         """By frame, of each actor: what of its velocity does not depend on the place, and its turn [A, 3]."""
         return {}
 
@@ -183,7 +196,7 @@ class SceneGraph:
         """Whose each of :attr:`_actors_rows` is."""
         return np.asarray(self.nodes.cpu().numpy()[self._actors_rows] - FIRST_ACTOR)
 
-    def _actors_at(self, moving: Tensor, frames: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
+    def _actors_at(self, moving: Tensor, frames: Sequence[float]) -> tuple[Tensor, Tensor, Tensor]:
         """Means [F, M, 3], quaternions [F, M, 4] and logit opacities [F, M] of the actors' Gaussians ``moving`` [M]."""
         g = self.gaussians
         rotation, translation, present = self.actor_poses(frames)

@@ -23,7 +23,9 @@ from genre_tasks.metrics.collect import scored, view_image
 from genre_tasks.optimiser.loss import image_gradients, plan_loss
 from genre_tasks.optimiser.targets import Target, of_views
 from genre_tasks.render import cpu
+from genre_tasks.render.blur import Moments, mean
 from genre_tasks.scene.chunk import Chunk
+from genre_tasks.scene.novel import novel_view_poses
 from genre_tasks.stages.evaluate import as_recorded
 from genre_tasks.stages.gnet import gnet
 from genre_tasks.stages.ingest import ingest
@@ -265,6 +267,52 @@ def test_an_exposure_of_no_time_is_no_blur() -> None:
     found = plan(names, chunk(), log.cameras)["motion_blur"]
     assert found.choice == "off" and "no exposure time" in found.reason
     assert open_log(STREET + "&exposure_s=0.05").image_bytes("front_camera", 3) != plain.image_bytes("front_camera", 3)
+
+
+def test_an_exposed_streets_images_are_the_mean_of_what_the_plans_moments_see() -> None:
+    """Of sharp true images: nothing moves but the camera."""
+    uri = STREET + "&exposure_s=0.05&moving=0&pedestrians=0"
+    log = open_log(uri)
+    views = [v for v in applied(chunk(uri), _planned(uri, "motion_blur")).views if v.camera == "front_left_camera"]
+    off: dict[str, list[float]] = {"moments": [], "pose": []}
+    for view in views[1:-1:2]:
+        moments = Moments.of([view])
+        assert view.blur is not None and view.blur.exposure_s == 0.05 and moments is not None
+        assert view.blur.frame_s == pytest.approx(0.1) and float(np.linalg.norm(view.blur.velocity_m_s)) > 3
+        poses = [chunk(uri).world_SE3_chunk @ v.chunk_SE3_camera for v in moments.views]
+        true = torch.tensor(np.stack([log.truth.image(view.frame, p, view.lens) for p in poses]) / 255).float()
+        for name, image in (("moments", mean(true)), ("pose", true[len(true) // 2])):
+            off[name].append(float((image - view_image(view)).abs().mean()))
+    assert np.mean(off["moments"]) < 0.4 * np.mean(off["pose"]), off
+
+
+def test_a_camera_with_one_image_is_not_blurred() -> None:
+    """No second image, no motion; what the log states of it is not enough."""
+    uri = STREET + "&exposure_s=0.05"
+    first = chunk(uri).of_role("source")[0]
+    alone = replace(chunk(uri), views=(first, *(v for v in chunk(uri).views if v.camera != first.camera)))
+    setting = EffectsConfig(**{n: "on" if n == "motion_blur" else "off" for n in EFFECTS})
+    found = plan(setting, alone, open_log(uri).cameras)
+    assert found.on("motion_blur") and {camera for camera, _ in found.fitted.blurs} == {"front_left_camera"}
+    blurred = applied(alone, found)
+    assert blurred.views[0] is first and all(v.blur is not None for v in blurred.views[1:])
+    (target,) = of_views(blurred, [blurred.views[1]])
+    assert target.blur == blurred.views[1].blur
+    single = plan(setting, replace(chunk(uri), views=(first,)), open_log(uri).cameras)
+    assert not single.fitted.blurs and "two images" in single["motion_blur"].reason
+
+
+def test_novel_views_and_hiding_points_know_no_blur(monkeypatch: pytest.MonkeyPatch) -> None:
+    uri = STREET + "&exposure_s=0.05"
+    blurred = applied(chunk(uri), with_(*BASIC, "motion_blur", fitted=_planned(uri, "motion_blur").fitted))
+    assert Moments.of(blurred.of_role("source")) is not None
+    assert Moments.of(novel_view_poses(blurred, (3.0,))) is None
+    calls: list[int] = []
+    real = cpu.forward
+    monkeypatch.setattr(cpu, "forward", lambda *a, **k: calls.append(len(a[1])) or real(*a, **k))
+    plain, planned = recorded(chunk(uri)), recorded(blurred)
+    assert calls[: len(calls) // 2] == calls[len(calls) // 2 :]
+    assert all(torch.equal(a.depth, b.depth) for a, b in zip(plain, planned, strict=True))
 
 
 def test_a_plain_log_makes_the_kernel_calls_of_none(monkeypatch: pytest.MonkeyPatch) -> None:

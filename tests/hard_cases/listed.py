@@ -195,7 +195,8 @@ LISTED: dict[int, tuple[str, tuple[str, ...] | str]] = {
     ),
     53: ("view direction at zero distance", _NO_EFFECTS),
     54: (
-        "exposure time 0 (motion blur is measured, not modelled yet)",
-        ("tests/effects/test_effects_applied.py::test_an_exposure_of_no_time_is_no_blur",),
+        "exposure time 0: no motion blur, the same bits",
+        ("tests/effects/test_effects_applied.py::test_an_exposure_of_no_time_is_no_blur",
+         "tests/render/test_render_blur.py::test_views_without_blur_are_rendered_as_ever"),
     ),
 }  # fmt: skip

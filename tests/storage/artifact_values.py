@@ -11,7 +11,7 @@ import torch
 from genre_tasks.effects.types import Decision, EffectsPlan, Fitted
 from genre_tasks.fixer.conditioning import Degraded
 from genre_tasks.fixer.pairs import NAMES, Pairs
-from genre_tasks.logs.types import Lens, RollingShutter
+from genre_tasks.logs.types import Lens, MotionBlur, RollingShutter
 from genre_tasks.scene.chunk import Actor, Chunk, Mark, Points, Role, View
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import ActorNode, SceneGraph
@@ -153,7 +153,11 @@ def effects(rng: np.random.Generator, count: int = 3) -> EffectsPlan:
         (f"camera_{k}", k): RollingShutter(x[0], (x[1], x[2], x[3]), (x[4], x[5], x[6]), x[7])
         for k, x in enumerate(numbers)
     }
-    return EffectsPlan(tuple(rows), Fitted(gains, own, shutters))
+    blurs = {
+        (f"camera_{k}", k): MotionBlur(x[7], (x[1], x[2], x[3]), (x[4], x[5], x[6]), x[0])
+        for k, x in enumerate(numbers)
+    }
+    return EffectsPlan(tuple(rows), Fitted(gains, own, shutters, blurs))
 
 
 MAKERS = {
