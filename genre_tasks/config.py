@@ -182,7 +182,7 @@ class EffectsConfig(Section):
     motion_blur: EffectSetting = "auto"
     view_dependent_colour: ToldSetting = Field("auto", description="Measured and told; not modelled yet.")
     lidar_depth: EffectSetting = "auto"
-    anti_aliasing: ToldSetting = Field("auto", description="Measured and told; not modelled yet.")
+    anti_aliasing: EffectSetting = "auto"
     ego_mask: EffectSetting = "auto"
     fixer_per_view: EffectSetting = "auto"
     darkness: ToldSetting = Field("auto", description="Measured and told; not modelled.")

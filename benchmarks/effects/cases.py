@@ -64,9 +64,13 @@ CASES: dict[str, Case] = {
     "exposure": Case(lambda x, _: f"&exposure_jitter={x * _limit('exposure') / 100:.4g}", heldout_psnr),
     "motion_blur": Case(_seconds("exposure_s", "motion_blur"), sharp_psnr, timed=True),
     "lidar_depth": Case(lambda *_: "", heldout_depth, "%", plain="&lidar_beams=1&lidar_azimuths=90"),
+    "anti_aliasing": Case(lambda *_: "", beside_psnr, plain="&standstill=1"),
     "ego_mask": Case(lambda x, _: f"&bonnet={x * _limit('ego_mask') / 100:.4g}", heldout_psnr),
 }
 """Those that are modelled and that a street can be made to call for or not. Every street has a sky: there is none that
-does not call for the distant region. Rolling shutter is judged beside the path: held-out frames are sheared as source
-frames are, and a scene that is sheared too fits them. Motion blur is judged by what an ideal camera would have seen in
-place of held-out frames, which are blurred, too: three metres beside, errors of place hide most of what is sharp."""
+does not call for the distant region; and whoever drives sees one thing from many distances: a street that does not call
+for anti-aliasing is one where the vehicle stands, and no factor is asked for. Rolling shutter is judged beside the
+path: held-out frames are sheared as source frames are, and a scene that is sheared too fits them. So is anti-aliasing:
+there footprints are other than in any image that the scene was made from. Motion blur is judged by what an ideal camera
+would have seen in place of held-out frames, which are blurred, too: three metres beside, errors of place hide most of
+what is sharp."""

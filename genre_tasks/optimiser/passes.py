@@ -57,7 +57,7 @@ class CompiledPass:
         splats, shown = self._posed.splats, self._posing.shown(frames)
         velocities = velocities_of(frame.scene, splats[0], views)
         self._images, self.culled, self._batch = cpu.forward(
-            splats, cameras_of(views), shown, self._threads, keep=True, velocities=velocities
+            splats, cameras_of(views, frame.scene.antialiased), shown, self._threads, keep=True, velocities=velocities
         )
         self.color, self._alpha = self._images[:2]
         self.depth = posing.expected_depth(*self._images[1:])

@@ -52,6 +52,7 @@ class PerSceneTraining:
         self.iteration = 0
         self.culled: dict[str, int] = {}
         self._actors = scene.actors
+        self._antialiased = scene.antialiased
         self._extents = node_extents(scene, source)
         copies = each(lambda x: x.detach().clone(memory_format=torch.contiguous_format), scene.gaussians)
         self._set(Population.newborn(copies, scene.nodes))
@@ -69,7 +70,7 @@ class PerSceneTraining:
         """A copy of the scene as it is now. Raises ``NonFiniteError``."""
         copies = each(lambda x: x.detach().clone(), self._population.gaussians)
         check_finite(copies.packed(), "Gaussians", self.stage)
-        return SceneGraph(copies, self._population.nodes, self._actors)
+        return SceneGraph(copies, self._population.nodes, self._actors, self._antialiased)
 
     def step(self) -> float:
         """One iteration; returns the loss before it. Raises ``NonFiniteError``."""
@@ -118,14 +119,14 @@ class PerSceneTraining:
         """Loss and gradient; takes the pull on the image into the statistics of density control."""
         leaves = each(lambda x: x.detach().requires_grad_(), self._population.gaussians)
         with torch.enable_grad():
-            scene = SceneGraph(leaves, self._population.nodes, self._actors)
+            scene = SceneGraph(leaves, self._population.nodes, self._actors, self._antialiased)
             moments = Moments.of([target])
             views = (target,) if moments is None else moments.views
             placed = [scene.at(v.frame) for v in views]
             for each_placed in placed:
                 each_placed.means.retain_grad()
             splats = [moving(p.activated(), scene, v) for p, v in zip(placed, views, strict=True)]
-            images = [render(s, cameras_of([v])) for s, v in zip(splats, views, strict=True)]
+            images = [render(s, cameras_of([v], self._antialiased)) for s, v in zip(splats, views, strict=True)]
             image = images[0] if moments is None else moments.recorded(in_order(images, range(len(images))))
         plan = plan_loss(self._loss, [target], self.iteration, self._generator, perceptual=False)
         loss, by_color, _ = image_gradients(self._loss, image.color, image.depth, [target], plan)

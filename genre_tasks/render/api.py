@@ -69,7 +69,7 @@ def render_views(scene: SceneGraph, views: Sequence[PosedView], settings: Render
     moments = Moments.of(views)
     if moments is not None:
         return moments.recorded(render_views(scene, moments.views, settings))
-    cameras = cameras_of(views)
+    cameras = cameras_of(views, scene.antialiased)
     frames = [v.frame for v in views]
     posed, moving = scene.posed(list(dict.fromkeys(frames)))
     shown = Shown.of_frames(len(scene) - len(moving), len(moving), frames)
@@ -112,10 +112,13 @@ def _shutter_of(view: PosedView) -> RollingShutter | None:
     return getattr(view, "shutter", None)
 
 
-def cameras_of(views: Sequence[PosedView]) -> Cameras:
-    """The cameras of views. Raises ``NonFiniteError`` for one that is not finite, ``ValueError`` for mixed sizes."""
+def cameras_of(views: Sequence[PosedView], antialiased: bool = False) -> Cameras:
+    """The cameras of views, of a scene that is ``antialiased`` or not.
+
+    Raises ``NonFiniteError`` for one that is not finite, ``ValueError`` for mixed sizes.
+    """
     poses, lenses = [v.chunk_SE3_camera for v in views], [v.lens for v in views]
-    cameras = Cameras.of(poses, lenses, shutters=[_shutter_of(v) for v in views])
+    cameras = Cameras.of(poses, lenses, shutters=[_shutter_of(v) for v in views], antialiased=antialiased)
     _check_finite(cameras)
     return cameras
 

@@ -8,7 +8,7 @@ from genre_tasks.compiled.recipe import Kernel
 
 CONSTANTS = (
     "NEAR_M", "BLUR_PX2", "ALPHA_MIN", "ALPHA_MAX", "TRANSMITTANCE_STOP", "JACOBIAN_MARGIN", "QUAT_MIN_NORM2",
-    "MAX_VARIANCE_PX2", "MAX_CENTER_PX", "SHUTTER_MIN_RATE",
+    "MAX_VARIANCE_PX2", "MAX_CENTER_PX", "SHUTTER_MIN_RATE", "COMPENSATION_MIN",
 )  # fmt: skip
 SOURCES = (
     "kernel.cpp", "kernel_view.h", "kernel_blend.h", "kernel_project.h", "kernel_camera.h", "kernel_simd.h",

@@ -12,6 +12,10 @@ NEAR_M = 0.01
 BLUR_PX2 = 0.3
 """Added to both diagonal entries of the projected covariance: a Gaussian covers at least about one pixel."""
 
+COMPENSATION_MIN = 0.005
+"""Least factor by which anti-aliasing lowers an opacity for what ``BLUR_PX2`` adds to its footprint: where a footprint
+has next to no area its determinant is all rounding, and its gradient ends here (3DGS clamps the square at 0.005²)."""
+
 ALPHA_MIN = 1.0 / 255.0
 """Contributions below one 8-bit level are skipped; a Gaussian whose opacity is below is culled."""
 

@@ -61,7 +61,8 @@ def forward(
     handle = ctypes.c_void_p()
     of_cameras = poses.data_ptr(), lenses.data_ptr(), _pointer(distortions), _pointer(shutters)
     status = kernel.genre_forward(
-        len(arrays[0]), *(a.data_ptr() for a in arrays), _pointer(velocities), views, *of_cameras, width, height,
+        len(arrays[0]), *(a.data_ptr() for a in arrays), _pointer(velocities), views, *of_cameras,
+        cameras.antialiased, width, height,
         threads, shown.shared, own, color.data_ptr(), alpha.data_ptr(), depth.data_ptr(), culled,
         ctypes.byref(handle) if keep else None,
     )  # fmt: skip

@@ -19,11 +19,12 @@ def render_cuda(splats: Splats, cameras: Cameras) -> tuple[tuple[Tensor, Tensor,
     gsplat clamps alpha at 0.999 where this project's other backends clamp at 0.99, and takes the plain determinant of
     the projected covariance: images differ where layers are nearly opaque (up to 0.009 of a layer's colour). With a
     distortion or a shutter it projects by the unscented transform, evaluates Gaussians along rays, finds each pixel's
-    time itself, and depth has no gradient in positions.
+    time itself, and depth has no gradient in positions. Its anti-aliasing has no floor under the compensation.
 
     Raises:
         ResourceError: gsplat or a GPU is missing, or this gsplat has neither distortion nor rolling shutter.
-        ConfigError: a shutter, and Gaussians with velocities of their own, which gsplat does not know.
+        ConfigError: a shutter, and Gaussians with velocities of their own, which gsplat does not know; or anti-aliasing
+            together with a distortion or a shutter.
         ValueError: the gradient in a pose is asked for with a distortion or a shutter; gsplat has none.
     """
     try:
@@ -45,7 +46,8 @@ def render_cuda(splats: Splats, cameras: Cameras) -> tuple[tuple[Tensor, Tensor,
     image, alpha, _ = rasterization(
         safe.means, safe.quats, safe.scales, safe.opacities, safe.colors, Ks=intrinsics, width=cameras.width_px,
         height=cameras.height_px, near_plane=const.NEAR_M, eps2d=const.BLUR_PX2, render_mode="RGB+D",
-        packed=False, **({"viewmats": cameras.camera_SE3_chunk.to(like)} | effects),
+        packed=False, rasterize_mode="antialiased" if cameras.antialiased else "classic",
+        **({"viewmats": cameras.camera_SE3_chunk.to(like)} | effects),
     )  # fmt: skip
     # "D" is the accumulated Σ w z; "ED" would be divided by alpha.
     return (image[..., :3], alpha[..., 0], image[..., 3]), culled
@@ -57,6 +59,11 @@ def _effects(splats: Splats, cameras: Cameras) -> dict[str, Any]:
     rolls = cameras.shutter is not None and bool(cameras.shutter.readout_s.any())
     if not bends and not rolls:
         return {}
+    if cameras.antialiased:  # along rays nothing is blurred, and its compensation would make up for nothing
+        raise ConfigError(
+            "the cuda backend has no anti-aliasing with a lens distortion or a rolling shutter",
+            remedy="Use backend cpu, or set effects.anti_aliasing=off",
+        )
     import gsplat
 
     if not hasattr(gsplat, "RollingShutterType"):

@@ -84,11 +84,11 @@ struct ScratchSet {
 extern "C" {
 
 // poses [V, 4, 4] chunk to camera, lenses [V, 4], distortions [V, 10] or null, shutters [V, 7] or null, as make_camera takes
-// them; velocities [N, 3] or null; color [V, H, W, 3], alpha and depth [V, H, W].
+// them, and `smooths` for all; velocities [N, 3] or null; color [V, H, W, 3], alpha and depth [V, H, W].
 // A view shows the first `shared` Gaussians and those of its range in own [V, 2]. culled [5] is added to. With `batch`, the state for genre_backward is kept there until genre_free.
 int genre_forward(int count, const float* means, const float* scales, const float* quats, const float* opacities,
                   const float* colors, const float* velocities, int views, const float* poses, const float* lenses,
-                  const float* distortions, const float* shutters, int width, int height, int threads, int shared,
+                  const float* distortions, const float* shutters, int smooths, int width, int height, int threads, int shared,
                   const int* own, float* color, float* alpha, float* depth, long long* culled, void** batch) {
   return guarded([&] {
     GaussianArrays in{count, means, scales, quats, opacities, colors, velocities};
@@ -102,7 +102,7 @@ int genre_forward(int count, const float* means, const float* scales, const floa
     for_each_view(views, std::max(1, threads), [&](int v, int w, int inside) {
       auto view = views_shelf().take();
       view->camera = make_camera(poses + 16 * v, lenses + 4 * v, distortions ? distortions + 10 * v : nullptr,
-                                 shutters ? shutters + 7 * v : nullptr, width, height);
+                                 shutters ? shutters + 7 * v : nullptr, smooths, width, height);
       view->shown = {(uint32_t)shared, (uint32_t)own[2 * v], (uint32_t)(own[2 * v + 1] - own[2 * v])};
       view->tiles_x = (width + TILE - 1) / TILE, view->tiles_y = (height + TILE - 1) / TILE;
       forward(*view, *scratch.of[w], in, inside, color + 3 * pixels * v, alpha + pixels * v, depth + pixels * v);

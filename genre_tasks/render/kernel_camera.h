@@ -9,16 +9,18 @@ struct Camera {
   float R[9], t[3], fx, fy, cx, cy;
   int width, height;
   float right, left, bottom, top;  // limits of x/z and y/z at which the projection is linearised
-  bool bends, rolls;
+  bool bends, rolls, smooths;
   float k1, k2, p1, p2, k3, fold_radius2;
   float readout, velocity[3], turn[3];  // s; m/s and rad/s in camera axes
 };
 
 // The linear map of a view (pose: row-major 4x4, chunk to camera; lens: fx, fy, cx, cy), and of its distortion (k1, k2, p1,
 // p2, k3; square of the fold radius; limits left, right, top, bottom) and shutter (readout, velocity, turn) what is there.
-static Camera make_camera(const float* pose, const float* lens, const float* distortion, const float* shutter, int width,
-                          int height) {
+// `smooths`: anti-aliasing.
+static Camera make_camera(const float* pose, const float* lens, const float* distortion, const float* shutter, bool smooths,
+                          int width, int height) {
   Camera c{};
+  c.smooths = smooths;
   for (int i = 0; i < 3; i++) {
     for (int j = 0; j < 3; j++) c.R[3 * i + j] = pose[4 * i + j];
     c.t[i] = pose[4 * i + 3];
@@ -41,13 +43,16 @@ static Camera make_camera(const float* pose, const float* lens, const float* dis
   return c;
 }
 
-// Calls f(rolls, bends) with what a camera has as constants.
+// Calls f(rolls, bends, smooths) with what a camera has as constants.
 template <class F>
 static void specialised(const Camera& c, F f) {
   const std::true_type yes;
   const std::false_type no;
-  if (c.rolls) c.bends ? f(yes, yes) : f(yes, no);
-  else c.bends ? f(no, yes) : f(no, no);
+  auto with = [&](auto smooths) {
+    if (c.rolls) c.bends ? f(yes, yes, smooths) : f(yes, no, smooths);
+    else c.bends ? f(no, yes, smooths) : f(no, no, smooths);
+  };
+  c.smooths ? with(yes) : with(no);
 }
 
 // Normalised image coordinates after the distortion, and its slopes; d y' / d x is xy, too: it is a potential's gradient.

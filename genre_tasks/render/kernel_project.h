@@ -142,13 +142,18 @@ struct Projection {
     Lanes x = M[1] * M[5] - M[2] * M[4], y = M[2] * M[3] - M[0] * M[5], z = M[0] * M[4] - M[1] * M[3];
     return x * x + y * y + z * z + BLUR_PX2 * (c00 + c11 - BLUR_PX2);
   }
+  // det(M M^T) over the determinant above: the square of what anti-aliasing leaves of an opacity.
+  INLINE_MEMBER Lanes kept_area(const Lanes& det) const {
+    Lanes x = M[1] * M[5] - M[2] * M[4], y = M[2] * M[3] - M[0] * M[5], z = M[0] * M[4] - M[1] * M[3];
+    return (x * x + y * y + z * z) / det;
+  }
 };
 
 enum Cull { NON_FINITE, QUATERNION, BEHIND, DEGENERATE, FOLDED, CULL_REASONS };
 
 // Writes the footprints of those of the `count` Gaussians from `first` on (up to LANES) that are drawn, and their numbers,
 // with a rolling shutter also their depths at the pose's time; returns how many. Counts by reason what is left out. Comparisons are written so that a NaN culls.
-template <bool ROLLS, bool BENDS>
+template <bool ROLLS, bool BENDS, bool SMOOTHS>
 INLINE int footprints(const Camera& c, const GaussianArrays& in, uint32_t first, int count, long long* culled,
                       Footprint* out, uint32_t* ids, float* posed_z) {
   uint32_t id[LANES];
@@ -176,7 +181,13 @@ INLINE int footprints(const Camera& c, const GaussianArrays& in, uint32_t first,
   drop(bits((det > 0.f) & (p.c00 <= MAX_VARIANCE_PX2) & (p.c11 <= MAX_VARIANCE_PX2) & (abs(x) <= MAX_CENTER_PX) &
             (abs(y) <= MAX_CENTER_PX)), DEGENERATE);
   Lanes log2_opacity;
-  for (int i = 0; i < LANES; i++) log2_opacity[i] = std::log2(opacity[i]);
+  if constexpr (SMOOTHS) {
+    const Lanes lowered = opacity * max(sqrt(p.kept_area(det)), broadcast(COMPENSATION_MIN));
+    left &= bits(lowered >= ALPHA_MIN);
+    for (int i = 0; i < LANES; i++) log2_opacity[i] = std::log2(lowered[i]);
+  } else {
+    for (int i = 0; i < LANES; i++) log2_opacity[i] = std::log2(opacity[i]);
+  }
   const Lanes level = (log2_opacity - LOG2_ALPHA_MIN) * 1.001f + 1e-4f, t = 2 / LOG2E * level;
   const Lanes half_x = sqrt(t * p.c00), half_y = sqrt(t * p.c11);
   left &= bits((x + half_x >= 0.5f) & (x - half_x <= c.width - 0.5f) & (y + half_y >= 0.5f) & (y - half_y <= c.height - 0.5f));
@@ -200,7 +211,7 @@ enum Sum { S_V, S_S, S_SS, S_SY, S_Y, S_YY, S_RED, S_GREEN, S_BLUE, S_Z };
 enum Attribute { MEAN = 0, SCALE = 3, QUAT = 6, OPACITY = 10, COLOR = 11, ATTRIBUTES = 14 };
 
 // Gradient of the 14 attributes of the Gaussians `id` (LANES of them), whose footprints are at `place`, from their sums.
-template <bool ROLLS, bool BENDS>
+template <bool ROLLS, bool BENDS, bool SMOOTHS>
 INLINE void project_backward(const Camera& c, const GaussianArrays& in, const uint32_t* id, const Footprint* drawn,
                              const uint32_t* place, const Lanes (&sum)[SUMS], Lanes (&out)[ATTRIBUTES]) {
   const float* fields = reinterpret_cast<const float*>(drawn);
@@ -221,10 +232,22 @@ INLINE void project_backward(const Camera& c, const GaussianArrays& in, const ui
   const Lanes *M0 = p.M, *M1 = p.M + 3;
   const Lanes n[3] = {M0[1] * M1[2] - M0[2] * M1[1], M0[2] * M1[0] - M0[0] * M1[2], M0[0] * M1[1] - M0[1] * M1[0]};
   const Lanes inv_c11 = 1.f / p.c11;
+  // Anti-aliasing: log2_opacity moves with half the log of det(M M^T) / det(M M^T + blur), whose slopes by M's rows are
+  // M1 x n and n x M0, times across, less `wider` of the rows themselves. S_V is dL/dlog(opacity).
+  Lanes across, wider;
+  if constexpr (SMOOTHS) {
+    const Lanes det = p.determinant(), kept = p.kept_area(det);
+    const Lanes pull = keep(sum[S_V], kept > COMPENSATION_MIN * COMPENSATION_MIN);
+    across = pull * (1.f - kept) / max(kept * det, broadcast(1e-30f)), wider = pull * BLUR_PX2 / det;
+  }
   for (int i = 0; i < 3; i++) {
     const int j = (i + 1) % 3, l = (i + 2) % 3;
     const Lanes beyond = (M1[j] * n[l] - M1[l] * n[j] + BLUR_PX2 * M0[i]) * inv_c11;
     vM[i] = 2.f * (ss * beyond + sy * M1[i]), vM[3 + i] = k * vM[i] + 2.f * (sy * beyond + yy * M1[i]);
+    if constexpr (SMOOTHS) {
+      vM[i] += across * (M1[j] * n[l] - M1[l] * n[j]) - wider * M0[i];
+      vM[3 + i] += across * (n[j] * M0[l] - n[l] * M0[j]) - wider * M1[i];
+    }
     out[SCALE + i] = vM[i] * p.U[i] + vM[3 + i] * p.U[3 + i];
     vU[i] = vM[i] * g.scale[i], vU[3 + i] = vM[3 + i] * g.scale[i];
   }

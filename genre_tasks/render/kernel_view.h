@@ -76,7 +76,7 @@ static inline void for_tiles(const Footprint& g, int tiles_x, int tiles_y, F f) 
   }
 }
 
-template <bool ROLLS, bool BENDS>
+template <bool ROLLS, bool BENDS, bool SMOOTHS>
 static void project_all(View& v, const GaussianArrays& in, int threads) {
   const size_t count = (size_t)v.shown.shared + v.shown.own;
   v.input.resize(count), v.id.resize(count), v.slot_end.resize(count);
@@ -91,7 +91,7 @@ static void project_all(View& v, const GaussianArrays& in, int threads) {
       const bool shared = i < v.shown.shared;
       n = std::min<size_t>(LANES, (shared ? std::min<size_t>(end, v.shown.shared) : end) - i);
       const size_t id = shared ? i : i - v.shown.shared + v.shown.begin;
-      at += footprints<ROLLS, BENDS>(v.camera, in, (uint32_t)id, (int)n, tally, &v.input[at], &v.id[at], ROLLS ? &v.posed_z[at] : nullptr);
+      at += footprints<ROLLS, BENDS, SMOOTHS>(v.camera, in, (uint32_t)id, (int)n, tally, &v.input[at], &v.id[at], ROLLS ? &v.posed_z[at] : nullptr);
     }
     v.segments[w] = {first, at};
     std::copy(tally, tally + CULL_REASONS, &culled[(size_t)w * CULL_REASONS]);
@@ -215,7 +215,7 @@ static long long blend(View& v, int threads, float* color, float* alpha, float* 
 }
 
 static void forward(View& v, Scratch& s, const GaussianArrays& in, int threads, float* color, float* alpha, float* depth) {
-  specialised(v.camera, [&](auto rolls, auto bends) { project_all<rolls, bends>(v, in, threads); });
+  specialised(v.camera, [&](auto rolls, auto bends, auto smooths) { project_all<rolls, bends, smooths>(v, in, threads); });
   sort_by_depth(v, s, threads);
   bin(v, s, threads);
   v.visited.resize(v.pairs.n), v.reached.resize(v.pairs.n), v.taken.resize((size_t)v.tiles_x * v.tiles_y);
@@ -236,7 +236,7 @@ static std::vector<int> lane_of_sums() {
   return lane;
 }
 
-template <bool ROLLS, bool BENDS>
+template <bool ROLLS, bool BENDS, bool SMOOTHS>
 static void project_all_backward(const View& v, Scratch& s, const GaussianArrays& in, int threads) {
   static const std::vector<int> lane = lane_of_sums();
   parallel(threads, [&](int w) {
@@ -249,7 +249,7 @@ static void project_all_backward(const View& v, Scratch& s, const GaussianArrays
     auto flush = [&] {
       for (int i = filled; i < LANES; i++) place[i] = place[0];
       for (int i = 0; i < LANES; i++) id[i] = v.id[place[i]];
-      project_backward<ROLLS, BENDS>(v.camera, in, id, v.input.p, place, sum, gradient);
+      project_backward<ROLLS, BENDS, SMOOTHS>(v.camera, in, id, v.input.p, place, sum, gradient);
       std::copy(gradient, gradient + ATTRIBUTES, &list.gradient[list.id.size() / LANES * ATTRIBUTES]);
       list.id.insert(list.id.end(), id, id + filled);
       filled = 0;
@@ -277,5 +277,7 @@ static void backward(View& v, Scratch& s, const GaussianArrays& in, int threads,
     blend_backward(v.input.p, pairs, pairs + v.taken[t], X, Y, v.camera.width, v.camera.height,
                    v.visited.p + v.tile_begin[t], out, grad, s.slots.p);
   });
-  specialised(v.camera, [&](auto rolls, auto bends) { project_all_backward<rolls, bends>(v, s, in, threads); });
+  specialised(v.camera, [&](auto rolls, auto bends, auto smooths) {
+    project_all_backward<rolls, bends, smooths>(v, s, in, threads);
+  });
 }

@@ -101,28 +101,29 @@ def _project(splats: Splats, cameras: Cameras, v: int, culled: dict[str, int]) -
         culled["behind"] += int((turned & ~ahead).sum())
         culled["folded"] += int((ahead & ~valid).sum())
         at = torch.nonzero(valid & (splats.opacities >= const.ALPHA_MIN))[:, 0]
-        center, (xx, _, yy), det, (_, posed_z) = _geometry(splats, camera, at)
+        center, (xx, _, yy), det, (_, posed_z), kept = _geometry(splats, camera, at)
+        opacities = splats.opacities[at] * kept
         sound = (det > 0) & (torch.maximum(xx, yy) <= const.MAX_VARIANCE_PX2)
         sound &= (center.abs() <= const.MAX_CENTER_PX).all(1)
         culled["degenerate"] += int((~sound).sum())
-        level = 2 * torch.log(splats.opacities[at] / const.ALPHA_MIN) * (1 + 1e-6)
+        level = 2 * torch.log(opacities / const.ALPHA_MIN) * (1 + 1e-6)
         half = torch.sqrt(level[:, None] * torch.stack([xx, yy], 1))
         size = center.new_tensor([cameras.width_px, cameras.height_px])
-        seen = sound & ((center + half >= 0.5) & (center - half <= size - 0.5)).all(1)
+        seen = sound & (opacities >= const.ALPHA_MIN) & ((center + half >= 0.5) & (center - half <= size - 0.5)).all(1)
         # Depths of one time: in each row all are seen at once, and relative to each other they barely move.
         order = torch.argsort(posed_z[seen], stable=True)
         at, half = at[seen][order], half[seen][order]
-    center, (xx, xy, yy), det, (z, _) = _geometry(splats, camera, at)
+    center, (xx, xy, yy), det, (z, _), kept = _geometry(splats, camera, at)
     conic = torch.stack([yy, -xy, xx], 1) / det[:, None]
-    return _Footprints(center, conic, splats.opacities[at], torch.cat([splats.colors[at], z[:, None]], 1), half)
+    return _Footprints(center, conic, splats.opacities[at] * kept, torch.cat([splats.colors[at], z[:, None]], 1), half)
 
 
 def _geometry(
     splats: Splats, camera: OneCamera, at: Tensor
-) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], Tensor, tuple[Tensor, Tensor]]:
+) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], Tensor, tuple[Tensor, Tensor], Tensor | float]:
     """Of the Gaussians ``at``: centres [K, 2] px, blurred covariance xx, xy, yy in px², its determinant, camera z.
 
-    And camera z at the time of the pose.
+    And camera z at the time of the pose, and what anti-aliasing leaves of opacities.
     """
     velocities = camera.velocities_of(splats)
     own = None if velocities is None else velocities[at]
@@ -135,8 +136,12 @@ def _geometry(
     xx, yy = m.square().sum(2).unbind(1)
     xx, yy, xy = xx + const.BLUR_PX2, yy + const.BLUR_PX2, (m[:, 0] * m[:, 1]).sum(1)
     # Lagrange's identity: xx·yy − xy² cancels for long thin footprints.
-    det = torch.linalg.cross(m[:, 0], m[:, 1]).square().sum(1) + const.BLUR_PX2 * (xx + yy - const.BLUR_PX2)
-    return camera.pixels(x, y, z), (xx, xy, yy), det, (z, posed[:, 2])
+    area = torch.linalg.cross(m[:, 0], m[:, 1]).square().sum(1)
+    det = area + const.BLUR_PX2 * (xx + yy - const.BLUR_PX2)
+    kept: Tensor | float = 1.0
+    if camera.antialiased:  # clamped before the root, whose slope at 0 has no end
+        kept = (area / det).clamp(min=const.COMPENSATION_MIN**2).sqrt()
+    return camera.pixels(x, y, z), (xx, xy, yy), det, (z, posed[:, 2]), kept
 
 
 def _composite(

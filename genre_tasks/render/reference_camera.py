@@ -20,7 +20,7 @@ class OneCamera:
         self.rotation, self.translation = pose[:3, :3], pose[:3, 3]  # chunk to camera
         (self.fx, self.fy), (self.cx, self.cy) = cameras.focal_px[v].to(like), cameras.center_px[v].to(like)
         self.width, self.height = cameras.width_px, cameras.height_px
-        self.domain = domain_of(cameras, v)
+        self.domain, self.antialiased = domain_of(cameras, v), cameras.antialiased
         self._distortion = () if cameras.distortion is None else cameras.distortion[v].to(like).unbind()
         shutter = cameras.shutter
         self.rolls = shutter is not None and bool(shutter.readout_s[v] != 0)

@@ -46,7 +46,7 @@ def render_surfaces(scene: SceneGraph, views: Sequence[PosedView], settings: Ren
             posed = {view.frame: (splats, normals(splats))}
         splats, across = posed[view.frame]
         splats = moving(splats, scene, view)
-        camera = on_device_of(cameras_of([view]), splats.means)
+        camera = on_device_of(cameras_of([view], scene.antialiased), splats.means)
         planes = replace(splats, colors=_planes(splats, across, view, OneCamera(camera, 0, splats.means)))
         image = render(planes, camera, settings)
         inverse = (image.color[0] * _rays(view.lens, image.color)).sum(-1) / image.alpha[0].clamp_min(1e-6)

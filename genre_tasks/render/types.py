@@ -56,6 +56,10 @@ class Cameras:
 
     ``camera_SE3_chunk`` [V, 4, 4] takes chunk coordinates to camera coordinates (x right, y down, z forward). A view
     whose distortion is all 0, or whose readout is 0, has the same bits as without.
+
+    ``antialiased``: opacities are lowered by sqrt(det Σ / det(Σ + ``BLUR_PX2``)) for each projected covariance Σ, at
+    least ``COMPENSATION_MIN``, so that the blur does not make a small footprint brighter than it is (Mip-Splatting,
+    Yu et al. 2024).
     """
 
     camera_SE3_chunk: Tensor  # [V, 4, 4]
@@ -65,6 +69,7 @@ class Cameras:
     height_px: int
     distortion: Tensor | None = None  # [V, 5] Brown–Conrady k1, k2, p1, p2, k3
     shutter: Shutter | None = None
+    antialiased: bool = False
 
     def __len__(self) -> int:
         return self.camera_SE3_chunk.shape[0]
@@ -86,6 +91,7 @@ class Cameras:
             self.height_px,
             None if self.distortion is None else f(self.distortion),
             None if self.shutter is None else self.shutter.map(f),
+            self.antialiased,
         )
 
     def select(self, views: Sequence[int]) -> Cameras:
@@ -99,6 +105,7 @@ class Cameras:
         lenses: Sequence[Lens],
         dtype: torch.dtype = torch.float32,
         shutters: Sequence[RollingShutter | None] = (),
+        antialiased: bool = False,
     ) -> Cameras:
         """From ``chunk_SE3_camera`` poses, lenses of one size and, if any, their shutters.
 
@@ -118,6 +125,7 @@ class Cameras:
             height,
             torch.tensor([lens.coefficients for lens in lenses], dtype=dtype) if bent else None,
             Shutter.of(shutters, dtype),
+            antialiased,
         )
 
 

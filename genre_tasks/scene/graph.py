@@ -69,12 +69,14 @@ class SceneGraph:
     """All Gaussians in one batch, each belonging to one node.
 
     ``nodes`` [N] int64: ``STATIC``, ``DISTANT`` or ``FIRST_ACTOR + k``. Static and distant Gaussians are in chunk
-    coordinates, an actor's in its box frame.
+    coordinates, an actor's in its box frame. ``antialiased``: how it was made, and so how it is rendered: see
+    ``render.Cameras``.
     """
 
     gaussians: Gaussians
     nodes: Tensor  # [N] int64
     actors: tuple[ActorNode, ...]
+    antialiased: bool = False
 
     def __len__(self) -> int:
         return len(self.gaussians)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from genre_tasks.config import InitialConfig
 from genre_tasks.effects.applied import applied
 from genre_tasks.effects.types import UNPLANNED, EffectsPlan
@@ -21,6 +23,8 @@ def initial(
     if not plan.on("distant_region"):
         config = config.model_copy(update={"distant_count": 0})
     scene = initial_scene(config, chunk)
+    if plan.on("anti_aliasing"):
+        scene = replace(scene, antialiased=True)
     packed = scene.gaussians.packed()
     bad = (~packed.isfinite()).nonzero()
     if len(bad):

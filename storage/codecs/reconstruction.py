@@ -1,5 +1,6 @@
 """Reconstruction ↔ ``gaussians.parquet``, ``actors.parquet``, ``losses.parquet``, ``snapshots/iteration_*.parquet``.
 
+``rendering.parquet`` says how the scene is rendered, and is not there where nothing has to be said.
 Seconds per iteration and culled counts are measurements: they live in the manifest and come back from there.
 """
 
@@ -43,6 +44,7 @@ GAUSSIANS = schema(
         column("node", pa.int64(), "0 static, 1 distant (chunk coordinates), 2 + k actor k (box coordinates)"),
     ],
 )
+RENDERING = schema("rendering/1", [column("antialiased", pa.bool_(), "opacities make up for the blur of footprints")])
 LOSSES = schema("losses/1", [column("loss", pa.float64(), "training loss of each iteration, in order")])
 _SNAPSHOT = re.compile(r"iteration_(\d{4,})\.parquet")
 
@@ -52,6 +54,8 @@ def write(folder: Path, value: Reconstruction) -> None:
     _write_scene(folder / "gaussians.parquet", value.scene)
     write_table(folder / "actors.parquet", ACTORS, actor_columns(value.scene.actors))
     write_table(folder / "losses.parquet", LOSSES, {"loss": np.array(value.losses, np.float64)})
+    if value.scene.antialiased:
+        write_table(folder / "rendering.parquet", RENDERING, {"antialiased": [True]})
     if value.snapshots:
         (folder / "snapshots").mkdir()
     for iteration, scene in sorted(value.snapshots.items()):
@@ -69,10 +73,12 @@ def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> Reconst
     actors = tuple(ActorNode(**actor_fields(folder / "actors.parquet", row)) for row in rows)
     losses = read_table(folder / "losses.parquet", LOSSES)[0]
     measured = measurements or {}
+    told = folder / "rendering.parquet"
+    antialiased = told.exists() and bool(read_table(told, RENDERING)[0].column("antialiased")[0].as_py())
     return Reconstruction(
-        scene=_read_scene(folder / "gaussians.parquet", actors),
+        scene=_read_scene(folder / "gaussians.parquet", actors, antialiased),
         losses=tuple(losses.column("loss").to_pylist()),
-        snapshots={n: _read_scene(path, actors) for n, path in sorted(_snapshots(folder))},
+        snapshots={n: _read_scene(path, actors, antialiased) for n, path in sorted(_snapshots(folder))},
         seconds_per_iteration=tuple(measured.get("seconds_per_iteration", ())),
         culled=dict(measured.get("culled", {})),
     )
@@ -92,7 +98,7 @@ def _write_scene(path: Path, scene: SceneGraph) -> None:
     write_table(path, GAUSSIANS, {**columns, "node": nodes})
 
 
-def _read_scene(path: Path, actors: tuple[ActorNode, ...]) -> SceneGraph:
+def _read_scene(path: Path, actors: tuple[ActorNode, ...], antialiased: bool) -> SceneGraph:
     import torch
 
     table = read_table(path, GAUSSIANS)[0]
@@ -102,7 +108,8 @@ def _read_scene(path: Path, actors: tuple[ActorNode, ...]) -> SceneGraph:
     # Each attribute is made contiguous by itself: views into one packed tensor would be strided.
     parts = [torch.from_numpy(np.stack([array_of(table, n) for n in names[a:b]], 1)) for a, b in _RANGES]
     means, log_scales, quats, opacity, colors = parts
-    return SceneGraph(Gaussians(means, log_scales, quats, opacity[:, 0], colors), torch.from_numpy(nodes), actors)
+    gaussians = Gaussians(means, log_scales, quats, opacity[:, 0], colors)
+    return SceneGraph(gaussians, torch.from_numpy(nodes), actors, antialiased)
 
 
 _RANGES = ((0, 3), (3, 6), (6, 10), (10, 11), (11, 14))
