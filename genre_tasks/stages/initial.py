@@ -21,6 +21,10 @@ def initial(
     if not plan.on("distant_region"):
         config = config.model_copy(update={"distant_count": 0})
     scene = initial_scene(config, chunk)
+    if plan.on("nonrigid_actors"):
+        from genre_tasks.effects.nonrigid_actors import rigid_at_first
+
+        scene = rigid_at_first(scene, chunk)
     packed = scene.gaussians.packed()
     bad = (~packed.isfinite()).nonzero()
     if len(bad):

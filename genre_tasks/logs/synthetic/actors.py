@@ -167,7 +167,7 @@ def pedestrian(
     skin = np.array([0.80, 0.60, 0.48]) * rng.uniform(0.5, 1.1)
     cloth = (float(rng.random() < 0.4), 0.0, 0.0, 0.0)
     top = height * 0.84
-    spine = [[0, 0, hip - 0.06], [0, 0, top - 0.16], [0, 0, top]]
+    spine = [[0.0, 0.0, hip - 0.06], [0.0, 0.0, top - 0.16], [0.0, 0.0, top]]
     body = [
         tube(spine, [0.16, 0.21, 0.1], 10, Material.CLOTH, coat, cloth),
         ellipsoid((0.01, 0, height - 0.12), (0.1, 0.085, 0.12), Material.PLAIN, skin),
@@ -176,14 +176,15 @@ def pedestrian(
     limbs = []
     for side in (1, -1):
         if stride:
-            path, shoulder = [[0, 0, 0], [0, side * 0.06, hip - top + 0.05]], (0.02, side * 0.22, top - 0.05)
+            shoulder = (0.02, side * 0.22, top - 0.05)
+            path = [[0.0, 0.0, 0.0], [0.0, side * 0.06, hip - top + 0.05]]
             swing = _swing(-side * stride, shoulder, pace, height)
             limbs.append(Part(tube(path, [0.06, 0.045], 6, Material.CLOTH, coat, cloth), swing))
         else:
             path = [[0.02, side * 0.22, top - 0.05], [0.1 * side, side * 0.28, hip]]
             body.append(tube(path, [0.06, 0.045], 6, Material.CLOTH, coat, cloth))
     for side in (1, -1):
-        path = [[0, 0, 0.02], [0, 0, -hip * 0.5], [0.0, 0, -hip + 0.06]]
+        path = [[0.0, 0.0, 0.02], [0.0, 0.0, -hip * 0.5], [0.0, 0.0, -hip + 0.06]]
         leg = joined(
             [
                 tube(path, [0.09, 0.07, 0.05], 8, Material.CLOTH, trousers),
