@@ -174,7 +174,7 @@ class EffectsConfig(Section):
     """
 
     rigid_actors: EffectSetting = "auto"
-    nonrigid_actors: ToldSetting = Field("auto", description="Measured and told; not modelled yet.")
+    nonrigid_actors: EffectSetting = "auto"
     distant_region: EffectSetting = "auto"
     rolling_shutter: EffectSetting = "auto"
     lens_distortion: EffectSetting = "auto"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from benchmarks.effects.measures import beside_psnr, heldout_depth, heldout_psnr, sharp_psnr
+from benchmarks.effects.measures import beside_psnr, heldout_depth, heldout_people, heldout_psnr, sharp_psnr
 from genre_tasks.effects.plan import effect_of
 from genre_tasks.logs.types import Truth
 from genre_tasks.scene.chunk import Chunk
@@ -57,8 +57,18 @@ def _bent(factor: float, _: float) -> str:
     return f"&distortion={factor * _limit('lens_distortion') / PX_PER_K1:.4g}"
 
 
+PEOPLE_PER_AREA = 3.5
+"""About how many walk beside the lane where they cover a per cent of the images; a street has twenty at most."""
+
+
+def _crowd(factor: float, _: float) -> str:
+    count = min(20, max(1, round(factor * _limit("nonrigid_actors") * PEOPLE_PER_AREA)))
+    return f"&stride=1&pedestrians={count}&pedestrians_aside_m=5.3"
+
+
 CASES: dict[str, Case] = {
     "rigid_actors": Case(lambda *_: "", heldout_psnr, plain="&moving=0&pedestrians=0"),
+    "nonrigid_actors": Case(_crowd, heldout_people, plain="&pedestrians=0"),
     "rolling_shutter": Case(_seconds("rolling_shutter_s", "rolling_shutter"), beside_psnr, timed=True),
     "lens_distortion": Case(_bent, heldout_psnr, plain=_bent(LITTLE, 0.0)),
     "exposure": Case(lambda x, _: f"&exposure_jitter={x * _limit('exposure') / 100:.4g}", heldout_psnr),

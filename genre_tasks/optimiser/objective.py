@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,14 +19,21 @@ from genre_tasks.optimiser.state import Frame
 from genre_tasks.optimiser.targets import Target
 from genre_tasks.render.types import RenderSettings
 
+if TYPE_CHECKING:
+    from genre_tasks.scene.deformation import Deformation
+
 
 @dataclass(frozen=True)
 class Sight:
-    """What an iteration sees: the loss, its gradient [N, 14] with respect to the offsets, and culled Gaussians."""
+    """What an iteration sees: the loss, its gradient [N, 14] with respect to the offsets, and culled Gaussians.
+
+    ``by_deformation``: as its ``offsets``, where actors deform.
+    """
 
     loss: float
     gradient: Tensor
     culled: dict[str, int]
+    by_deformation: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -46,12 +54,14 @@ class Objective:
         targets: Sequence[Target],
         iteration: int,
         generator: torch.Generator,
+        deformation: Deformation | None = None,
     ) -> Sight:
-        """``iteration`` and ``generator`` decide where the perceptual term is taken."""
+        """``iteration`` and ``generator`` decide where the perceptual term is taken. ``deformation``: as it is now."""
         plan = plan_loss(self.config, targets, iteration, generator, self.distance is not None)
-        image = begin(frame, offsets, targets, self.settings)
+        image = begin(frame, offsets, targets, self.settings, deformation)
         loss, by_color, by_depth = image_gradients(self.config, image.color, image.depth, targets, plan, self.distance)
-        return Sight(loss, image.gradient(by_color, by_depth), image.culled)
+        gradient = image.gradient(by_color, by_depth)
+        return Sight(loss, gradient, image.culled, image.by_deformation)
 
 
 def check_finite(values: Tensor, name: str, stage: str, **where: object) -> None:

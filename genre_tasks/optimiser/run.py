@@ -49,6 +49,7 @@ def optimise(
         config.seed,
         stage,
         config.hold_ground,
+        deform=stage == "gnet",  # the fixer's images of people are no measure of their shape
     )
     return unroll(rule, scene, source, novel, Objective(config.loss, distance(config)), plan, progress)
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -20,12 +21,16 @@ from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.results import Reconstruction
 
+if TYPE_CHECKING:
+    from genre_tasks.optimiser.deforming import DeformationFit
+
 
 @dataclass(frozen=True)
 class Plan:
     """How far and how often to look: ``iterations`` T, views drawn in each, snapshots kept on the way, the seed.
 
-    ``stage`` names the run in errors; ``hold_ground``: see ``Frame.of``.
+    ``stage`` names the run in errors; ``hold_ground``: see ``Frame.of``; ``deform``: how actors deform is fitted,
+    else it stays as the scene has it.
     """
 
     iterations: int
@@ -35,6 +40,7 @@ class Plan:
     seed: int = 0
     stage: str = "optimiser"
     hold_ground: bool = True
+    deform: bool = True
 
     def snapshot_iterations(self) -> frozenset[int]:
         """Evenly spaced, without 0 and T."""
@@ -62,24 +68,43 @@ def unroll(
     frame = Frame.of(scene, plan.hold_ground)
     state = State.start(len(scene), scene.gaussians.means)
     step = rule.start(frame, camera_centre(source))
+    fit = _deforming(scene) if plan.deform else None
     keep = plan.snapshot_iterations()
     losses, seconds, snapshots, culled = [], [], {}, {}
     for i in range(plan.iterations):
         began = time.perf_counter()
-        sight = objective(frame, state.offsets, [t for s in samplers for t in s.draw()], i, generator)
+        batch = [t for s in samplers for t in s.draw()]
+        deformation = scene.deformation if fit is None else fit.deformation
+        sight = objective(frame, state.offsets, batch, i, generator, deformation)
         check_finite(sight.gradient, "gradient", plan.stage)
         state = state.saw(sight.gradient)
         state = state.moved(frame, step(state, sight.gradient, plan.iterations))
         check_finite(state.offsets, "updated Gaussians", plan.stage)
+        if fit is not None and sight.by_deformation is not None:
+            check_finite(sight.by_deformation, "gradient of the deformation", plan.stage)
+            fit.step(sight.by_deformation, i, plan.iterations)
         losses.append(sight.loss)
         culled = sight.culled
         if i + 1 in keep:
-            snapshots[i + 1] = moved_scene(frame, state)
+            snapshots[i + 1] = _with(fit, moved_scene(frame, state))
         seconds.append(time.perf_counter() - began)
         progress(i + 1, plan.iterations, f"loss {sight.loss:.3f}")
     if len(scene) and plan.iterations and not bool((state.seen > 0).any()):
         raise _out_of_view(len(scene), source, plan.stage)
-    return Reconstruction(moved_scene(frame, state), tuple(losses), snapshots, tuple(seconds), culled)
+    return Reconstruction(_with(fit, moved_scene(frame, state)), tuple(losses), snapshots, tuple(seconds), culled)
+
+
+def _deforming(scene: SceneGraph) -> DeformationFit | None:
+    """What fits the offsets of a scene whose actors deform."""
+    if scene.deformation is None:
+        return None
+    from genre_tasks.optimiser.deforming import DeformationFit
+
+    return DeformationFit(scene.deformation)
+
+
+def _with(fit: DeformationFit | None, scene: SceneGraph) -> SceneGraph:
+    return scene if fit is None else replace(scene, deformation=fit.deformation)
 
 
 def _out_of_view(count: int, source: Sequence[Target], stage: str) -> InputError:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,6 +17,9 @@ from genre_tasks.logs.types import Float32, Float64
 from genre_tasks.scene.constants import ABSENT_LOGIT
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.geometry import matrix_to_quat, quat_multiply
+
+if TYPE_CHECKING:
+    from genre_tasks.scene.deformation import Deformation
 
 STATIC, DISTANT, FIRST_ACTOR = 0, 1, 2
 """Values of ``SceneGraph.nodes``; actor k has ``FIRST_ACTOR + k``."""
@@ -70,13 +74,15 @@ class SceneGraph:
 
     ``nodes`` [N] int64: ``STATIC``, ``DISTANT`` or ``FIRST_ACTOR + k``. Static and distant Gaussians are in chunk
     coordinates, an actor's in its box frame. ``antialiased``: how it was made, and so how it is rendered: see
-    ``render.Cameras``.
+    ``render.Cameras``. ``deformation``: how actors depart from rigid ones, ``None`` where none does; means alone move
+    with it, and velocities know nothing of it.
     """
 
     gaussians: Gaussians
     nodes: Tensor  # [N] int64
     actors: tuple[ActorNode, ...]
     antialiased: bool = False
+    deformation: Deformation | None = None
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -206,14 +212,24 @@ class SceneGraph:
         turns = torch.as_tensor(rotation).to(g.means)
         turn, quat = turns[:, actor_of], matrix_to_quat(turns)[:, actor_of]
         means, quats, opacities = g.means[moving], g.quats[moving], g.logit_opacities[moving]
+        if self.deformation is not None:
+            means = self._deformed(self.deformation, means, actor_of, frames)
+        x, y, z = (means[..., None, k] for k in range(3))
         # Written out: the bits of a batched product depend on the size of its batch.
-        turned = turn[..., 0] * means[:, None, 0] + turn[..., 1] * means[:, None, 1] + turn[..., 2] * means[:, None, 2]
+        turned = turn[..., 0] * x + turn[..., 1] * y + turn[..., 2] * z
         there = torch.as_tensor(present, device=means.device)[:, actor_of]
         return (
             turned + torch.as_tensor(translation).to(means)[:, actor_of],
             quat_multiply(quat, quats.expand_as(quat)),
             torch.where(there, opacities, torch.full_like(opacities, ABSENT_LOGIT)),
         )
+
+    @staticmethod
+    def _deformed(by: Deformation, means: Tensor, actor_of: Tensor, frames: Sequence[int]) -> Tensor:
+        """[F, M, 3] in box frames, of means [M, 3]."""
+        rows, of = by.rows(actor_of)
+        every = means.expand(len(frames), *means.shape)
+        return every.index_add(1, rows, by.shifts(means[rows], of, frames))
 
 
 def _array(values: Tensor) -> Float32:

@@ -25,6 +25,10 @@ def initial(
     scene = initial_scene(config, chunk)
     if plan.on("anti_aliasing"):
         scene = replace(scene, antialiased=True)
+    if plan.on("nonrigid_actors"):
+        from genre_tasks.effects.nonrigid_actors import rigid_at_first
+
+        scene = rigid_at_first(scene, chunk)
     packed = scene.gaussians.packed()
     bad = (~packed.isfinite()).nonzero()
     if len(bad):

@@ -1,6 +1,8 @@
 """Reconstruction ↔ ``gaussians.parquet``, ``actors.parquet``, ``losses.parquet``, ``snapshots/iteration_*.parquet``.
 
 ``rendering.parquet`` says how the scene is rendered, and is not there where nothing has to be said.
+Where actors deform: ``deformation.parquet``, and ``deformation/iteration_*.parquet`` of the snapshots.
+
 Seconds per iteration and culled counts are measurements: they live in the manifest and come back from there.
 """
 
@@ -8,8 +10,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -20,6 +23,9 @@ from genre_tasks.scene.graph import FIRST_ACTOR, ActorNode, SceneGraph
 from genre_tasks.scene.results import Reconstruction
 from storage.codecs.chunk import ACTORS, actor_columns, actor_fields
 from storage.codecs.tables import REMEDY, array_of, checked, column, read_table, schema, write_table
+
+if TYPE_CHECKING:
+    from genre_tasks.scene.deformation import Deformation
 
 _ATTRIBUTES = {
     "x": "metres",
@@ -46,6 +52,15 @@ GAUSSIANS = schema(
 )
 RENDERING = schema("rendering/1", [column("antialiased", pa.bool_(), "opacities make up for the blur of footprints")])
 LOSSES = schema("losses/1", [column("loss", pa.float64(), "training loss of each iteration, in order")])
+DEFORMATION = schema(
+    "deformation/1",
+    [
+        column("actor", pa.int64(), "row of actors.parquet"),
+        column("frame", pa.int64(), "frame of the log"),
+        column("known", pa.bool_(), "false: in between in time, whatever the offsets"),
+        column("offsets", pa.list_(pa.float32()), "metres in box axes, x y z of each control point, z counts up first"),
+    ],
+)
 _SNAPSHOT = re.compile(r"iteration_(\d{4,})\.parquet")
 
 
@@ -58,13 +73,19 @@ def write(folder: Path, value: Reconstruction) -> None:
         write_table(folder / "rendering.parquet", RENDERING, {"antialiased": [True]})
     if value.snapshots:
         (folder / "snapshots").mkdir()
+    if value.scene.deformation is not None:
+        _write_deformation(folder / "deformation.parquet", value.scene.deformation)
+        (folder / "deformation").mkdir()
     for iteration, scene in sorted(value.snapshots.items()):
         if not _same_actors(scene.actors, value.scene.actors):
             raise ConfigError(
                 f"The snapshot at iteration {iteration} has other actors than the scene",
                 remedy="Fix the stage: snapshots share the scene's actors.",
             )
-        _write_scene(folder / "snapshots" / f"iteration_{iteration:04d}.parquet", scene)
+        name = f"iteration_{iteration:04d}.parquet"
+        _write_scene(folder / "snapshots" / name, scene)
+        if scene.deformation is not None:
+            _write_deformation(folder / "deformation" / name, scene.deformation)
 
 
 def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> Reconstruction:
@@ -76,16 +97,21 @@ def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> Reconst
     told = folder / "rendering.parquet"
     antialiased = told.exists() and bool(read_table(told, RENDERING)[0].column("antialiased")[0].as_py())
     return Reconstruction(
-        scene=_read_scene(folder / "gaussians.parquet", actors, antialiased),
+        scene=_read_scene(folder / "gaussians.parquet", actors, antialiased, folder / "deformation.parquet"),
         losses=tuple(losses.column("loss").to_pylist()),
-        snapshots={n: _read_scene(path, actors, antialiased) for n, path in sorted(_snapshots(folder))},
+        snapshots={
+            n: _read_scene(path, actors, antialiased, folder / "deformation" / path.name)
+            for n, path in sorted(_snapshots(folder))
+        },
         seconds_per_iteration=tuple(measured.get("seconds_per_iteration", ())),
         culled=dict(measured.get("culled", {})),
     )
 
 
 def measurements(value: Reconstruction) -> dict[str, Any]:
-    """Seconds per iteration and culled counts."""
+    """Where actors deform: ``deformation.parquet``, and ``deformation/iteration_*.parquet`` of the snapshots.
+
+    Seconds per iteration and culled counts."""
     return {"seconds_per_iteration": list(value.seconds_per_iteration), "culled": dict(value.culled)}
 
 
@@ -98,7 +124,41 @@ def _write_scene(path: Path, scene: SceneGraph) -> None:
     write_table(path, GAUSSIANS, {**columns, "node": nodes})
 
 
-def _read_scene(path: Path, actors: tuple[ActorNode, ...], antialiased: bool) -> SceneGraph:
+def _write_deformation(path: Path, deformation: Deformation) -> None:
+    shape = len(deformation.actors), len(deformation.frames)
+    offsets = deformation.offsets.detach().cpu().numpy()
+    checked(offsets, f"offsets of {path.name}", np.float32, (*shape, None, 3))
+    columns = {
+        "actor": np.repeat(np.array(deformation.actors, np.int64), shape[1]),
+        "frame": np.tile(np.array(deformation.frames, np.int64), shape[0]),
+        "known": deformation.known.ravel(),
+        "offsets": offsets.reshape(shape[0] * shape[1], -1).tolist(),
+    }
+    write_table(path, DEFORMATION, columns)
+
+
+def _read_deformation(path: Path, paths: tuple[ActorNode, ...]) -> Deformation | None:
+    """``None`` where there is no such file: actors are rigid."""
+    if not path.exists():
+        return None
+    import torch
+
+    from genre_tasks.scene.deformation import NODES, Deformation
+
+    table = read_table(path, DEFORMATION)[0]
+    actors, frames = (tuple(dict.fromkeys(table.column(n).to_pylist())) for n in ("actor", "frame"))
+    values = table.column("offsets").to_pylist()
+    sound = table.num_rows == len(actors) * len(frames) and all(len(v) == 3 * NODES for v in values)
+    if not sound or any(not 0 <= k < len(paths) for k in actors):
+        problem = f"{table.num_rows} rows do not give {len(actors)} of {len(paths)} actors at {len(frames)} frames"
+        raise ArtifactCorruptError(problem, remedy=REMEDY, file=path)
+    zero = Deformation.none(paths, actors, frames)
+    known = np.array(table.column("known").to_pylist(), bool).reshape(len(actors), len(frames))
+    offsets = torch.tensor(values, dtype=torch.float32).reshape(zero.offsets.shape)
+    return replace(zero, known=known, offsets=offsets)
+
+
+def _read_scene(path: Path, actors: tuple[ActorNode, ...], antialiased: bool, deformation: Path) -> SceneGraph:
     import torch
 
     table = read_table(path, GAUSSIANS)[0]
@@ -109,7 +169,7 @@ def _read_scene(path: Path, actors: tuple[ActorNode, ...], antialiased: bool) ->
     parts = [torch.from_numpy(np.stack([array_of(table, n) for n in names[a:b]], 1)) for a, b in _RANGES]
     means, log_scales, quats, opacity, colors = parts
     gaussians = Gaussians(means, log_scales, quats, opacity[:, 0], colors)
-    return SceneGraph(gaussians, torch.from_numpy(nodes), actors, antialiased)
+    return SceneGraph(gaussians, torch.from_numpy(nodes), actors, antialiased, _read_deformation(deformation, actors))
 
 
 _RANGES = ((0, 3), (3, 6), (6, 10), (10, 11), (11, 14))

@@ -203,9 +203,9 @@ def test_pedestrians_count_by_their_area() -> None:
 
     area = view.lens.width_px * view.lens.height_px
     per_m2 = view.lens.fx_px * view.lens.fy_px / 100 / area * 100  # percent
-    limit = (0.5 / per_m2) ** 0.5
+    limit = (effect_of("nonrigid_actors").threshold / per_m2) ** 0.5
     assert planned("nonrigid_actors", sized(0.97 * limit, "Pedestrian"))["nonrigid_actors"].choice == "off"
-    assert planned("nonrigid_actors", sized(1.03 * limit, "Pedestrian"))["nonrigid_actors"].choice == "mark"
+    assert planned("nonrigid_actors", sized(1.03 * limit, "Pedestrian"))["nonrigid_actors"].choice == "on"
     assert planned("nonrigid_actors", sized(3 * limit, "Car"))["nonrigid_actors"].choice == "off"
 
 

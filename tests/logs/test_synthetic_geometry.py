@@ -193,3 +193,27 @@ def test_a_shadow_falls_and_sky_is_sky(street: SyntheticStreet):
     assert 0.02 < sky.mean() < 0.6
     assert (image[sky][:, 2] >= image[sky][:, 0] - 1).mean() > 0.9
     assert np.isfinite(depth[120:]).all() and (depth > 0).all()
+
+
+def test_people_walk_with_their_arms_and_as_near_as_asked_for():
+    near = "street?seed=1020&frames=12&cameras=1&pedestrians=8&pedestrians_aside_m=5.3"
+    still, walking = open_synthetic(near), open_synthetic(near + "&stride=1")
+    assert open_synthetic(near + "&stride=0").image_bytes("front_camera", 7) == still.image_bytes("front_camera", 7)
+    for a, b in zip(still.tracks(), walking.tracks(), strict=True):
+        np.testing.assert_array_equal(a.world_SE3_box, b.world_SE3_box)
+    pose, lens = still.world_SE3_camera("front_camera", 7), still.cameras[0].lens
+    images = [log.truth.image(7, pose, lens) for log in (still, walking)]
+    changed = (images[0] != images[1]).any(2)
+    assert 0.0003 < changed.mean() < 0.05
+    arms = []
+    for log in (still, walking):
+        for track in (t for t in log.tracks() if t.label == "Pedestrian" and t.moving):
+            for frame in range(12):
+                at = np.flatnonzero(track.frames == frame)
+                local = in_box(log.sweep(frame).points_world, track.world_SE3_box[at[0]])
+                hands = (np.abs(local[:, 1]) > 0.2) & (np.abs(local[:, 1]) < 0.34) & (np.abs(local[:, 2]) < 0.25)
+                arms.append((log is walking, local[hands & (np.abs(local[:, 0]) < 0.6), 0]))
+    reach = [np.abs(np.concatenate([x for own, x in arms if own is which])).max() for which in (False, True)]
+    assert reach[0] < 0.2 and reach[1] > 0.2
+    aside = [abs(in_box(t.world_SE3_box[0, None, :3, 3], still.world_SE3_lidar(0))[0, 1]) for t in still.tracks()[:4]]
+    assert all(t.label != "Pedestrian" or 3 < a < 8 for t, a in zip(still.tracks(), aside, strict=False))

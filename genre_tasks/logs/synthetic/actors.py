@@ -153,61 +153,58 @@ def _cabin(shape: CarShape, colour: Float64, free: tuple[float, ...]) -> Mesh:
     return joined([glass, lid, *posts])
 
 
-def pedestrian(rng: np.random.Generator, pace: float) -> tuple[tuple[Part, ...], tuple[float, float, float]]:
-    """Torso with head and arms, and two legs that swing at walking ``pace`` (m/s; 0 stands still). Parts and size."""
+def pedestrian(
+    rng: np.random.Generator, pace: float, stride: float = 0.0
+) -> tuple[tuple[Part, ...], tuple[float, float, float]]:
+    """Torso with head and arms, and two legs that swing at walking ``pace`` (m/s; 0 stands still). Parts and size.
+
+    ``stride``: arms swing against the legs, by so many times the legs' angle; beyond 1 the legs do too. At 0 the arms
+    are part of the torso.
+    """
     height = rng.uniform(1.55, 1.9)
     hip = height * 0.5
     coat, trousers = rng.uniform(0.08, 0.8, 3), rng.uniform(0.05, 0.45, 3)
     skin = np.array([0.80, 0.60, 0.48]) * rng.uniform(0.5, 1.1)
-    striped = float(rng.random() < 0.4)
+    cloth = (float(rng.random() < 0.4), 0.0, 0.0, 0.0)
     top = height * 0.84
-    arms = [
-        tube(
-            [[0.02, s * 0.22, top - 0.05], [0.1 * s, s * 0.28, hip]],
-            [0.06, 0.045],
-            6,
-            Material.CLOTH,
-            coat,
-            (striped, 0, 0, 0),
-        )
-        for s in (1, -1)
+    spine = [[0.0, 0.0, hip - 0.06], [0.0, 0.0, top - 0.16], [0.0, 0.0, top]]
+    body = [
+        tube(spine, [0.16, 0.21, 0.1], 10, Material.CLOTH, coat, cloth),
+        ellipsoid((0.01, 0, height - 0.12), (0.1, 0.085, 0.12), Material.PLAIN, skin),
+        ellipsoid((-0.02, 0, height - 0.075), (0.105, 0.095, 0.09), Material.PLAIN, rng.uniform(0.02, 0.4, 3)),
     ]
-    body = joined(
-        [
-            tube(
-                [[0, 0, hip - 0.06], [0, 0, top - 0.16], [0, 0, top]],
-                [0.16, 0.21, 0.1],
-                10,
-                Material.CLOTH,
-                coat,
-                (striped, 0, 0, 0),
-            ),
-            ellipsoid((0.01, 0, height - 0.12), (0.1, 0.085, 0.12), Material.PLAIN, skin),
-            ellipsoid((-0.02, 0, height - 0.075), (0.105, 0.095, 0.09), Material.PLAIN, rng.uniform(0.02, 0.4, 3)),
-            *arms,
-        ]
-    )
-    legs = []
+    limbs = []
     for side in (1, -1):
-        path = [[0, 0, 0.02], [0, 0, -hip * 0.5], [0.0, 0, -hip + 0.06]]
+        if stride:
+            shoulder = (0.02, side * 0.22, top - 0.05)
+            path = [[0.0, 0.0, 0.0], [0.0, side * 0.06, hip - top + 0.05]]
+            swing = _swing(-side * stride, shoulder, pace, height)
+            limbs.append(Part(tube(path, [0.06, 0.045], 6, Material.CLOTH, coat, cloth), swing))
+        else:
+            path = [[0.02, side * 0.22, top - 0.05], [0.1 * side, side * 0.28, hip]]
+            body.append(tube(path, [0.06, 0.045], 6, Material.CLOTH, coat, cloth))
+    for side in (1, -1):
+        path = [[0.0, 0.0, 0.02], [0.0, 0.0, -hip * 0.5], [0.0, 0.0, -hip + 0.06]]
         leg = joined(
             [
                 tube(path, [0.09, 0.07, 0.05], 8, Material.CLOTH, trousers),
                 boxes((-0.07, -0.045, -hip), (0.17, 0.045, -hip + 0.09), Material.PLAIN, (0.1, 0.08, 0.07)),
             ]
         )
-        legs.append(Part(leg, _swing(side, hip, pace, height)))
-    return (Part(body), *legs), (0.75, 0.68, height)
+        limbs.append(Part(leg, _swing(side * max(1.0, stride), (0.0, side * 0.09, hip), pace, height)))
+    return (Part(joined(body)), *limbs), (0.75, 0.68, height)
 
 
-def _swing(side: int, hip: float, pace: float, height: float) -> PoseAt:
+def _swing(share: float, joint: tuple[float, float, float], pace: float, height: float) -> PoseAt:
+    """About the axis to the left through a joint, by ``share`` of a leg's 24°, twice a pace to and fro."""
+
     def pose(times: Float64) -> Float64:
-        angle = side * 0.42 * np.sin(2 * np.pi * pace / (0.85 * height) * times) if pace else np.zeros_like(times)
+        angle = share * 0.42 * np.sin(2 * np.pi * pace / (0.85 * height) * times) if pace else np.zeros_like(times)
         out = np.zeros((len(times), 4, 4))
         c, s = np.cos(angle), np.sin(angle)
         out[:, 0, 0], out[:, 0, 2], out[:, 2, 0], out[:, 2, 2] = c, s, -s, c
         out[:, 1, 1] = out[:, 3, 3] = 1
-        out[:, 1, 3], out[:, 2, 3] = side * 0.09, hip
+        out[:, :3, 3] = joint
         return out
 
     return pose

@@ -195,17 +195,18 @@ def _drive(road: Road, first: float, speed: float, lane: float) -> PoseAt:
 
 
 def _pedestrians(parameters: StreetParameters, road: Road, ego: Ego) -> Iterator[Actor]:
-    """People on the pavements near the drive; every fourth one stands."""
+    """People on the pavements near the drive, or as far from its lane as asked for; every fourth one stands."""
     rng = generator(parameters.seed, "pedestrians")
     reach = float(ego.travel(np.array([parameters.frames * FRAME_S]))[0])
     for k in range(parameters.pedestrians):
         side = 1 if rng.random() < 0.5 else -1
         kerb, front = road.section.kerb(side), road.section.front(side)
         t = kerb + (front - kerb) * rng.uniform(0.45, 0.8)
+        t = side * parameters.pedestrians_aside_m or t
         pace = 0.0 if k % 4 == 3 else rng.uniform(0.9, 1.7)
         way = 1 if rng.random() < 0.5 else -1
         first = rng.uniform(4, 25 + reach)
-        parts, size = pedestrian(rng, pace)
+        parts, size = pedestrian(rng, pace, parameters.stride)
         yield Actor(f"pedestrian-{k}", "Pedestrian", parts, size, _walk(road, first, way, pace, t))
 
 

@@ -26,7 +26,9 @@ class StreetParameters:
     ``seed`` draws everything; ``cameras`` takes the first N of ``CAMERA_NAMES``; ``samples`` sub-pixel rays (a square
     number); ``moving`` and ``pedestrians`` count actors; ``cuboids=0`` leaves annotations out, ``lidar=0`` the sweeps;
     ``standstill=1`` parks the ego vehicle; ``origin_m`` is added to the world's x; ``sweep_s`` is the time a LiDAR turn
-    takes (0: a snapshot at the frame's time); ``noise_m`` is the standard deviation of the range.
+    takes (0: a snapshot at the frame's time); ``noise_m`` is the standard deviation of the range; ``stride``: walking
+    people's arms swing by so many times their legs' 24°, beyond 1 the legs do too (0: arms are still);
+    ``pedestrians_aside_m``: people are so far to the sides of the ego lane's middle (0: on the pavements).
 
     How the cameras record it (the truth has none of it but the lens): ``rolling_shutter_s`` from the first row to the
     last, ``exposure_s`` of motion blur, ``exposure_jitter`` and ``white_balance_jitter`` standard deviations of the
@@ -48,6 +50,8 @@ class StreetParameters:
     lidar_azimuths: int = 900
     sweep_s: float = 0.1
     noise_m: float = 0.01
+    stride: float = 0.0
+    pedestrians_aside_m: float = 0.0
     standstill: int = 0
     origin_m: float = 0.0
     rolling_shutter_s: float = 0.0
@@ -82,6 +86,8 @@ _RANGES: dict[str, tuple[float, float]] = {
     "lidar_azimuths": (4, 3600),
     "sweep_s": (0.0, 0.1),
     "noise_m": (0.0, 1.0),
+    "stride": (0.0, 2.0),
+    "pedestrians_aside_m": (0.0, 20.0),
     "standstill": (0, 1),
     "origin_m": (-1e8, 1e8),
     "rolling_shutter_s": (0.0, 0.1),
