@@ -27,5 +27,5 @@ def measure(seen: Seen) -> Measured:
 
 EFFECT = Effect(
     "view_dependent_colour", "spread of a point's colour per its texture's", "ratio", 1.0,
-    "spherical harmonics: 3.4 × the memory at degree 3", measure, marks=True,
+    "spherical harmonics: 3.4 × the memory at degree 3", measure,
 )  # fmt: skip

@@ -26,6 +26,7 @@ class Sight:
     loss: float
     gradient: Tensor
     culled: dict[str, int]
+    by_harmonics: Tensor | None = None  # [N, K, 3]
 
 
 @dataclass(frozen=True)
@@ -46,12 +47,14 @@ class Objective:
         targets: Sequence[Target],
         iteration: int,
         generator: torch.Generator,
+        harmonics: Tensor | None = None,  # [N, K, 3]
     ) -> Sight:
         """``iteration`` and ``generator`` decide where the perceptual term is taken."""
         plan = plan_loss(self.config, targets, iteration, generator, self.distance is not None)
-        image = begin(frame, offsets, targets, self.settings)
+        image = begin(frame, offsets, targets, self.settings, harmonics)
         loss, by_color, by_depth = image_gradients(self.config, image.color, image.depth, targets, plan, self.distance)
-        return Sight(loss, image.gradient(by_color, by_depth), image.culled)
+        gradient = image.gradient(by_color, by_depth)
+        return Sight(loss, gradient, image.culled, image.by_harmonics)
 
 
 def check_finite(values: Tensor, name: str, stage: str, **where: object) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Protocol
 
 import torch
@@ -12,7 +13,7 @@ from genre_tasks.optimiser import posing
 from genre_tasks.optimiser.fused_library import takes
 from genre_tasks.optimiser.state import Frame
 from genre_tasks.render import cpu
-from genre_tasks.render.api import PosedView, cameras_of, render_views, velocities_of
+from genre_tasks.render.api import PosedView, cameras_of, colors_of, render_views, velocities_of
 from genre_tasks.render.types import RenderSettings
 
 
@@ -22,43 +23,62 @@ class Pass(Protocol):
     color: Tensor
     depth: Tensor
     culled: dict[str, int]
+    by_harmonics: Tensor | None
 
     def gradient(self, by_color: Tensor, by_depth: Tensor) -> Tensor:
-        """[N, 14] with respect to the offsets, from the gradients of the images; once, and they are used up."""
+        """[N, 14] with respect to the offsets, from the gradients of the images; once, and they are used up.
+
+        Where there are harmonics, ``by_harmonics`` [N, K, 3] is their gradient from then on.
+        """
 
 
 class TorchPass:
     """By torch's autograd, on any device and in any precision: the oracle of :class:`CompiledPass`."""
 
-    def __init__(self, frame: Frame, offsets: Tensor, views: Sequence[PosedView], settings: RenderSettings) -> None:
+    def __init__(
+        self, frame: Frame, offsets: Tensor, views: Sequence[PosedView], settings: RenderSettings,
+        harmonics: Tensor | None = None,
+    ) -> None:  # fmt: skip
         self._leaf = offsets.detach().requires_grad_()
+        self._harmonics = None if harmonics is None else harmonics.detach().requires_grad_()
         with torch.enable_grad():
-            image = render_views(frame.scene.with_gaussians(frame.gaussians(self._leaf)), views, settings)
+            scene = frame.scene.with_gaussians(frame.gaussians(self._leaf)).with_harmonics(self._harmonics)
+            image = render_views(scene, views, settings)
             self._depth = image.expected_depth()
         self._color, self.culled = image.color, image.culled
         self.color, self.depth = image.color.detach(), self._depth.detach()
+        self.by_harmonics: Tensor | None = None
 
     def gradient(self, by_color: Tensor, by_depth: Tensor) -> Tensor:
         """As in :class:`Pass`."""
         torch.autograd.backward([self._color, self._depth], [by_color, by_depth])
         assert self._leaf.grad is not None
+        self.by_harmonics = None if self._harmonics is None else self._harmonics.grad
         return self._leaf.grad
 
 
 class CompiledPass:
     """By kernels only, in float32 on the CPU: torch's autograd around the renderer costs as much as two views."""
 
-    def __init__(self, frame: Frame, offsets: Tensor, views: Sequence[PosedView], settings: RenderSettings) -> None:
+    def __init__(
+        self, frame: Frame, offsets: Tensor, views: Sequence[PosedView], settings: RenderSettings,
+        harmonics: Tensor | None = None,
+    ) -> None:  # fmt: skip
         self._posing, self._threads = frame.posing, settings.threads or torch.get_num_threads()
         frames = [v.frame for v in views]
         self._posed = self._posing.splats(offsets.detach(), list(dict.fromkeys(frames)), self._threads)
         splats, shown = self._posed.splats, self._posing.shown(frames)
         velocities = velocities_of(frame.scene, splats[0], views)
+        self._gloss = None if harmonics is None else Gloss(frame, offsets, harmonics, views)
+        if self._gloss is not None:
+            splats = (*splats[:4], self._gloss.colors.detach())
+        self._splats = splats
         self._images, self.culled, self._batch = cpu.forward(
             splats, cameras_of(views), shown, self._threads, keep=True, velocities=velocities
         )
         self.color, self._alpha = self._images[:2]
         self.depth = posing.expected_depth(*self._images[1:])
+        self.by_harmonics: Tensor | None = None
 
     def gradient(self, by_color: Tensor, by_depth: Tensor) -> Tensor:
         """As in :class:`Pass`."""
@@ -66,11 +86,51 @@ class CompiledPass:
         by_splats = posing.arrays(len(self._posed.splats[0]))
         by_images = by_color, by_alpha, by_depth
         assert self._batch is not None
-        cpu.backward(self._batch, self._posed.splats, self._images, by_images, self._threads, by_splats)
+        if self._gloss is not None:
+            return self._glossy_gradient(self._gloss, by_images, by_splats)
+        cpu.backward(self._batch, self._splats, self._images, by_images, self._threads, by_splats)
         return self._posing.gradient(self._posed, by_splats, self._threads)
 
+    def _glossy_gradient(self, gloss: Gloss, by_images: cpu.Images, by_splats: cpu.Arrays) -> Tensor:
+        by_colors = torch.empty_like(self._splats[4])
+        assert self._batch is not None
+        cpu.backward(self._batch, self._splats, self._images, by_images, self._threads, (*by_splats[:4], by_colors))
+        by_splats[4].zero_()
+        out = self._posing.gradient(self._posed, by_splats, self._threads)
+        by_means, by_own, self.by_harmonics = gloss.gradient(by_colors)
+        out[:, 0:3] += by_means
+        out[:, 11:14] += by_own
+        return out
 
-def begin(frame: Frame, offsets: Tensor, views: Sequence[PosedView], settings: RenderSettings) -> Pass:
-    """The render of ``views`` at ``offsets`` [N, 14], by kernels where they are made for it."""
+
+class Gloss:
+    """What views see of a scene with harmonics, and the way back; by torch's autograd.
+
+    ``colors`` [V, N', 3], laid out as by ``SceneGraph.posed``.
+    """
+
+    def __init__(self, frame: Frame, offsets: Tensor, harmonics: Tensor, views: Sequence[PosedView]) -> None:
+        at = frame.gaussians(offsets.detach())
+        self._unit = frame.unit
+        self._leaves = [t.detach().requires_grad_() for t in (at.means, at.colors, harmonics)]
+        means, colors, harmonics = self._leaves
+        with torch.enable_grad():
+            scene = frame.scene.with_gaussians(replace(at, means=means, colors=colors)).with_harmonics(harmonics)
+            self.colors = colors_of(scene, views)
+
+    def gradient(self, by_colors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """By the offsets of means [N, 3] and of colours [N, 3], and by the harmonics [N, K, 3]."""
+        by_means, by_own, by_harmonics = torch.autograd.grad(self.colors, self._leaves, by_colors)
+        return by_means * self._unit, by_own, by_harmonics
+
+
+def begin(
+    frame: Frame,
+    offsets: Tensor,  # [N, 14]
+    views: Sequence[PosedView],
+    settings: RenderSettings,
+    harmonics: Tensor | None = None,  # [N, K, 3]
+) -> Pass:
+    """The render of ``views``, by kernels where they are made for it."""
     compiled = settings.backend in ("auto", "cpu") and takes(offsets, frame.start, frame.unit)
-    return (CompiledPass if compiled else TorchPass)(frame, offsets, views, settings)
+    return (CompiledPass if compiled else TorchPass)(frame, offsets, views, settings, harmonics)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,13 +13,16 @@ from torch import Tensor
 
 from genre_tasks.errors import InputError
 from genre_tasks.optimiser.objective import Objective, check_finite
-from genre_tasks.optimiser.rules import StepRule
+from genre_tasks.optimiser.rules import StepRule, schedule
 from genre_tasks.optimiser.sampler import ViewSampler
 from genre_tasks.optimiser.state import Frame, State
 from genre_tasks.optimiser.targets import Target
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.results import Reconstruction
+
+if TYPE_CHECKING:
+    from genre_tasks.optimiser.gloss import GlossState
 
 
 @dataclass(frozen=True)
@@ -61,25 +65,30 @@ def unroll(
     samplers = [ViewSampler(source, plan.views, generator), ViewSampler(novel, plan.novel_views, generator)]
     frame = Frame.of(scene, plan.hold_ground)
     state = State.start(len(scene), scene.gaussians.means)
+    gloss = _gloss_of(scene)
     step = rule.start(frame, camera_centre(source))
     keep = plan.snapshot_iterations()
     losses, seconds, snapshots, culled = [], [], {}, {}
     for i in range(plan.iterations):
         began = time.perf_counter()
-        sight = objective(frame, state.offsets, [t for s in samplers for t in s.draw()], i, generator)
+        batch = [t for s in samplers for t in s.draw()]
+        sight = objective(frame, state.offsets, batch, i, generator, None if gloss is None else gloss.harmonics)
         check_finite(sight.gradient, "gradient", plan.stage)
         state = state.saw(sight.gradient)
         state = state.moved(frame, step(state, sight.gradient, plan.iterations))
         check_finite(state.offsets, "updated Gaussians", plan.stage)
+        if gloss is not None and sight.by_harmonics is not None:
+            check_finite(sight.by_harmonics, "gradient in harmonics", plan.stage)
+            gloss = gloss.moved(sight.by_harmonics, schedule(i, plan.iterations))
         losses.append(sight.loss)
         culled = sight.culled
         if i + 1 in keep:
-            snapshots[i + 1] = moved_scene(frame, state)
+            snapshots[i + 1] = moved_scene(frame, state, gloss)
         seconds.append(time.perf_counter() - began)
         progress(i + 1, plan.iterations, f"loss {sight.loss:.3f}")
     if len(scene) and plan.iterations and not bool((state.seen > 0).any()):
         raise _out_of_view(len(scene), source, plan.stage)
-    return Reconstruction(moved_scene(frame, state), tuple(losses), snapshots, tuple(seconds), culled)
+    return Reconstruction(moved_scene(frame, state, gloss), tuple(losses), snapshots, tuple(seconds), culled)
 
 
 def _out_of_view(count: int, source: Sequence[Target], stage: str) -> InputError:
@@ -99,7 +108,17 @@ def camera_centre(targets: Sequence[Target]) -> Tensor:
     return torch.as_tensor(centre, dtype=torch.float32, device=targets[0].image.image.device)
 
 
-def moved_scene(frame: Frame, state: State) -> SceneGraph:
-    """The scene at the state, detached."""
+def _gloss_of(scene: SceneGraph) -> GlossState | None:
+    """What harmonics need, where the scene has any."""
+    if scene.harmonics is None:
+        return None
+    from genre_tasks.optimiser.gloss import GlossState
+
+    return GlossState.start(scene.harmonics)
+
+
+def moved_scene(frame: Frame, state: State, gloss: GlossState | None = None) -> SceneGraph:
+    """The scene at the state, detached; with the harmonics of ``gloss``, or those that it has had all along."""
     packed = frame.gaussians(state.offsets).packed().detach()
-    return frame.scene.with_gaussians(type(frame.scene.gaussians).unpacked(packed))
+    moved = frame.scene.with_gaussians(type(frame.scene.gaussians).unpacked(packed))
+    return moved if gloss is None else moved.with_harmonics(gloss.harmonics)

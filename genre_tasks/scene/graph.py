@@ -20,6 +20,9 @@ from genre_tasks.scene.geometry import matrix_to_quat, quat_multiply
 STATIC, DISTANT, FIRST_ACTOR = 0, 1, 2
 """Values of ``SceneGraph.nodes``; actor k has ``FIRST_ACTOR + k``."""
 
+DEGREE, COUNTS = 1, {1: 3, 2: 8, 3: 15}
+"""Of spherical harmonics, where a reconstruction has any; how many there are up to a degree, without the constant."""
+
 
 @dataclass(frozen=True)
 class ActorNode:
@@ -56,12 +59,13 @@ class SceneGraph:
     """All Gaussians in one batch, each belonging to one node.
 
     ``nodes`` [N] int64: ``STATIC``, ``DISTANT`` or ``FIRST_ACTOR + k``. Static and distant Gaussians are in chunk
-    coordinates, an actor's in its box frame.
+    coordinates, an actor's in its box frame, and so are directions of ``harmonics`` (see ``scene.harmonics``).
     """
 
     gaussians: Gaussians
     nodes: Tensor  # [N] int64
     actors: tuple[ActorNode, ...]
+    harmonics: Tensor | None = None  # [N, K, 3]; None: a Gaussian has one colour wherever it is seen from
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -69,6 +73,10 @@ class SceneGraph:
     def with_gaussians(self, gaussians: Gaussians) -> SceneGraph:
         """The same graph with other Gaussians (same N and order)."""
         return replace(self, gaussians=gaussians)
+
+    def with_harmonics(self, harmonics: Tensor | None) -> SceneGraph:
+        """The same graph with other harmonics [N, K, 3], or none."""
+        return replace(self, harmonics=harmonics)
 
     def posed(self, frames: Sequence[int]) -> tuple[Gaussians, Tensor]:
         """All Gaussians in chunk coordinates at several log frames at once, differentiable.

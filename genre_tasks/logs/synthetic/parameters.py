@@ -26,7 +26,8 @@ class StreetParameters:
     ``seed`` draws everything; ``cameras`` takes the first N of ``CAMERA_NAMES``; ``samples`` sub-pixel rays (a square
     number); ``moving`` and ``pedestrians`` count actors; ``cuboids=0`` leaves annotations out, ``lidar=0`` the sweeps;
     ``standstill=1`` parks the ego vehicle; ``origin_m`` is added to the world's x; ``sweep_s`` is the time a LiDAR turn
-    takes (0: a snapshot at the frame's time); ``noise_m`` is the standard deviation of the range.
+    takes (0: a snapshot at the frame's time); ``noise_m`` is the standard deviation of the range. ``gloss`` is the
+    strength of a sheen, sun and sky as a rough surface mirrors them, in images and truth alike.
 
     How the cameras record it (the truth has none of it but the lens): ``rolling_shutter_s`` from the first row to the
     last, ``exposure_s`` of motion blur, ``exposure_jitter`` and ``white_balance_jitter`` standard deviations of the
@@ -56,6 +57,7 @@ class StreetParameters:
     white_balance_jitter: float = 0.0
     bonnet: float = 0.0
     distortion: float = 0.0
+    gloss: float = 0.0
 
     def query(self, *, all_keys: bool = False, separator: str = "&") -> str:
         """``seed=…`` and what differs from the defaults (or everything), in a fixed order."""
@@ -90,6 +92,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "white_balance_jitter": (0.0, 0.5),
     "bonnet": (0.0, 0.5),
     "distortion": (-0.08, 0.5),
+    "gloss": (0.0, 1.0),
 }
 
 
