@@ -127,9 +127,7 @@ def test_the_kernel_sees_what_torch_sees_to_the_gradient(count: int) -> None:
 @pytest.mark.parametrize("settings", [RenderSettings("reference"), RenderSettings("cpu", 1)], ids=lambda s: s.backend)
 def test_views_see_their_own_colours_whatever_the_backend(settings: RenderSettings) -> None:
     scene = _street()
-    views = [
-        _view(_pose(Rotation.from_euler("y", 0.1 * k), (0.4 * k, 0, 0)), f) for k, f in enumerate((0, 2, 0))
-    ]
+    views = [_view(_pose(Rotation.from_euler("y", 0.1 * k), (0.4 * k, 0, 0)), f) for k, f in enumerate((0, 2, 0))]
     together = render_views(scene, views, settings).color
     alone = torch.cat([render_views(scene, [v], settings).color for v in views])
     assert torch.equal(together, alone)
