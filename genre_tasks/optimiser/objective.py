@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,6 +19,9 @@ from genre_tasks.optimiser.state import Frame
 from genre_tasks.optimiser.targets import Target
 from genre_tasks.render.types import RenderSettings
 
+if TYPE_CHECKING:
+    from genre_tasks.optimiser.gloss import GlossSight
+
 
 @dataclass(frozen=True)
 class Sight:
@@ -26,7 +30,7 @@ class Sight:
     loss: float
     gradient: Tensor
     culled: dict[str, int]
-    by_harmonics: Tensor | None = None  # [N, K, 3]
+    gloss: GlossSight | None = None
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,7 @@ class Objective:
         image = begin(frame, offsets, targets, self.settings, harmonics)
         loss, by_color, by_depth = image_gradients(self.config, image.color, image.depth, targets, plan, self.distance)
         gradient = image.gradient(by_color, by_depth)
-        return Sight(loss, gradient, image.culled, image.by_harmonics)
+        return Sight(loss, gradient, image.culled, image.gloss)
 
 
 def check_finite(values: Tensor, name: str, stage: str, **where: object) -> None:

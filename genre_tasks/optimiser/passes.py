@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import torch
 from torch import Tensor
@@ -16,6 +16,9 @@ from genre_tasks.render import cpu
 from genre_tasks.render.api import PosedView, cameras_of, colors_of, render_views, velocities_of
 from genre_tasks.render.types import RenderSettings
 
+if TYPE_CHECKING:
+    from genre_tasks.optimiser.gloss import GlossSight
+
 
 class Pass(Protocol):
     """``color`` [V, H, W, 3], expected ``depth`` [V, H, W] and ``culled`` as in ``Render``."""
@@ -23,12 +26,12 @@ class Pass(Protocol):
     color: Tensor
     depth: Tensor
     culled: dict[str, int]
-    by_harmonics: Tensor | None
+    gloss: GlossSight | None
 
     def gradient(self, by_color: Tensor, by_depth: Tensor) -> Tensor:
         """[N, 14] with respect to the offsets, from the gradients of the images; once, and they are used up.
 
-        Where there are harmonics, ``by_harmonics`` [N, K, 3] is their gradient from then on.
+        Where there are harmonics, ``gloss`` is what these views tell of them from then on.
         """
 
 
@@ -43,17 +46,26 @@ class TorchPass:
         self._harmonics = None if harmonics is None else harmonics.detach().requires_grad_()
         with torch.enable_grad():
             scene = frame.scene.with_gaussians(frame.gaussians(self._leaf)).with_harmonics(self._harmonics)
-            image = render_views(scene, views, settings)
+            self._seen = None if harmonics is None else colors_of(scene, views)
+            image = render_views(scene, views, settings, self._seen)
             self._depth = image.expected_depth()
         self._color, self.culled = image.color, image.culled
         self.color, self.depth = image.color.detach(), self._depth.detach()
-        self.by_harmonics: Tensor | None = None
+        self.gloss: GlossSight | None = None
 
     def gradient(self, by_color: Tensor, by_depth: Tensor) -> Tensor:
         """As in :class:`Pass`."""
-        torch.autograd.backward([self._color, self._depth], [by_color, by_depth])
+        if self._seen is not None:
+            self._seen.retain_grad()
+        torch.autograd.backward([self._color, self._depth], [by_color, by_depth], retain_graph=self._seen is not None)
         assert self._leaf.grad is not None
-        self.by_harmonics = None if self._harmonics is None else self._harmonics.grad
+        if self._seen is not None and self._seen.grad is not None and self._harmonics is not None:
+            from genre_tasks.optimiser.gloss import GlossSight
+
+            leaves = self._leaf, self._harmonics
+            views, sums = torch.autograd.grad(self._seen, leaves, drawn(self._seen.grad))
+            assert self._harmonics.grad is not None
+            self.gloss = GlossSight(self._harmonics.grad, sums, views[:, 11:14])
         return self._leaf.grad
 
 
@@ -69,16 +81,16 @@ class CompiledPass:
         self._posed = self._posing.splats(offsets.detach(), list(dict.fromkeys(frames)), self._threads)
         splats, shown = self._posed.splats, self._posing.shown(frames)
         velocities = velocities_of(frame.scene, splats[0], views)
-        self._gloss = None if harmonics is None else Gloss(frame, offsets, harmonics, views)
-        if self._gloss is not None:
-            splats = (*splats[:4], self._gloss.colors.detach())
+        self._shown = None if harmonics is None else Shine(frame, offsets, harmonics, views)
+        if self._shown is not None:
+            splats = (*splats[:4], self._shown.colors.detach())
         self._splats = splats
         self._images, self.culled, self._batch = cpu.forward(
             splats, cameras_of(views), shown, self._threads, keep=True, velocities=velocities
         )
         self.color, self._alpha = self._images[:2]
         self.depth = posing.expected_depth(*self._images[1:])
-        self.by_harmonics: Tensor | None = None
+        self.gloss: GlossSight | None = None
 
     def gradient(self, by_color: Tensor, by_depth: Tensor) -> Tensor:
         """As in :class:`Pass`."""
@@ -86,24 +98,24 @@ class CompiledPass:
         by_splats = posing.arrays(len(self._posed.splats[0]))
         by_images = by_color, by_alpha, by_depth
         assert self._batch is not None
-        if self._gloss is not None:
-            return self._glossy_gradient(self._gloss, by_images, by_splats)
+        if self._shown is not None:
+            return self._glossy_gradient(self._shown, by_images, by_splats)
         cpu.backward(self._batch, self._splats, self._images, by_images, self._threads, by_splats)
         return self._posing.gradient(self._posed, by_splats, self._threads)
 
-    def _glossy_gradient(self, gloss: Gloss, by_images: cpu.Images, by_splats: cpu.Arrays) -> Tensor:
+    def _glossy_gradient(self, shown: Shine, by_images: cpu.Images, by_splats: cpu.Arrays) -> Tensor:
         by_colors = torch.empty_like(self._splats[4])
         assert self._batch is not None
         cpu.backward(self._batch, self._splats, self._images, by_images, self._threads, (*by_splats[:4], by_colors))
         by_splats[4].zero_()
         out = self._posing.gradient(self._posed, by_splats, self._threads)
-        by_means, by_own, self.by_harmonics = gloss.gradient(by_colors)
+        by_means, by_own, self.gloss = shown.gradient(by_colors)
         out[:, 0:3] += by_means
         out[:, 11:14] += by_own
         return out
 
 
-class Gloss:
+class Shine:
     """What views see of a scene with harmonics, and the way back; by torch's autograd.
 
     ``colors`` [V, N', 3], laid out as by ``SceneGraph.posed``.
@@ -118,10 +130,19 @@ class Gloss:
             scene = frame.scene.with_gaussians(replace(at, means=means, colors=colors)).with_harmonics(harmonics)
             self.colors = colors_of(scene, views)
 
-    def gradient(self, by_colors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """By the offsets of means [N, 3] and of colours [N, 3], and by the harmonics [N, K, 3]."""
-        by_means, by_own, by_harmonics = torch.autograd.grad(self.colors, self._leaves, by_colors)
-        return by_means * self._unit, by_own, by_harmonics
+    def gradient(self, by_colors: Tensor) -> tuple[Tensor, Tensor, GlossSight]:
+        """By the offsets of means [N, 3] and of colours [N, 3], and what the views tell of harmonics."""
+        from genre_tasks.optimiser.gloss import GlossSight
+
+        of = self.colors, self._leaves
+        by_means, by_own, by_harmonics = torch.autograd.grad(*of, by_colors, retain_graph=True)
+        _, views, sums = torch.autograd.grad(*of, drawn(by_colors))
+        return by_means * self._unit, by_own, GlossSight(by_harmonics, sums, views)
+
+
+def drawn(by_colors: Tensor) -> Tensor:
+    """1 where a view's gradient [V, N', 3] says that it has drawn a Gaussian, else 0."""
+    return (by_colors != 0).any(-1, keepdim=True).to(by_colors.dtype).expand_as(by_colors).contiguous()
 
 
 def begin(

@@ -77,9 +77,10 @@ def unroll(
         state = state.saw(sight.gradient)
         state = state.moved(frame, step(state, sight.gradient, plan.iterations))
         check_finite(state.offsets, "updated Gaussians", plan.stage)
-        if gloss is not None and sight.by_harmonics is not None:
-            check_finite(sight.by_harmonics, "gradient in harmonics", plan.stage)
-            gloss = gloss.moved(sight.by_harmonics, schedule(i, plan.iterations))
+        if gloss is not None and sight.gloss is not None:
+            check_finite(sight.gloss.gradient, "gradient in harmonics", plan.stage)
+            gloss, shift = gloss.moved(sight.gloss, sight.gradient[:, 11:14], schedule(i, plan.iterations))
+            state = state.recoloured(shift)
         losses.append(sight.loss)
         culled = sight.culled
         if i + 1 in keep:

@@ -79,10 +79,13 @@ def render(splats: Splats, cameras: Cameras, settings: RenderSettings = DEFAULT,
     return _in_order(parts, [v for members in groups.values() for v in members])
 
 
-def render_views(scene: SceneGraph, views: Sequence[PosedView], settings: RenderSettings = DEFAULT) -> Render:
+def render_views(
+    scene: SceneGraph, views: Sequence[PosedView], settings: RenderSettings = DEFAULT, colors: Tensor | None = None
+) -> Render:
     """Renders a scene graph at views of one image size, in their order; actors stand where their frame puts them.
 
-    While a view with a rolling shutter is read out, actors move on as from frame to frame. Raises as :func:`render`.
+    While a view with a rolling shutter is read out, actors move on as from frame to frame. ``colors``: those of
+    :func:`colors_of`, where they are at hand. Raises as :func:`render`.
     """
     cameras = cameras_of(views)
     frames = [v.frame for v in views]
@@ -90,7 +93,7 @@ def render_views(scene: SceneGraph, views: Sequence[PosedView], settings: Render
     shown = Shown.of_frames(len(scene) - len(moving), len(moving), frames)
     splats = replace(posed.activated(), velocities=velocities_of(scene, posed.means, views))
     if scene.harmonics is not None:
-        splats = replace(splats, colors=colors_of(scene, views))
+        splats = replace(splats, colors=colors_of(scene, views) if colors is None else colors)
     return render(splats, on_device_of(cameras, scene.gaussians.means), settings, shown)
 
 
