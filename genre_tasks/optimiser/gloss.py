@@ -18,7 +18,7 @@ from genre_tasks.optimiser.network_constants import DEVIATION_FLOOR
 from genre_tasks.optimiser.state import FIRST_DECAY, SECOND_DECAY
 
 RATE = 0.3
-"""Of a step at the start, in sRGB times a harmonic: 1 fits held-out views of a street as well, and those at 3 m worse."""
+"""Of a step at the start, in sRGB times a harmonic: 1 fits held-out views of a street as well, and at 3 m worse."""
 
 
 @dataclass(frozen=True)
