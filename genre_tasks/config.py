@@ -180,7 +180,7 @@ class EffectsConfig(Section):
     lens_distortion: EffectSetting = "auto"
     exposure: EffectSetting = "auto"
     motion_blur: EffectSetting = "auto"
-    view_dependent_colour: ToldSetting = Field("auto", description="Measured and told; not modelled yet.")
+    view_dependent_colour: EffectSetting = "auto"
     lidar_depth: EffectSetting = "auto"
     anti_aliasing: EffectSetting = "auto"
     ego_mask: EffectSetting = "auto"

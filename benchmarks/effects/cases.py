@@ -41,6 +41,9 @@ LONGEST_S = 0.1
 PX_PER_K1 = 265.0
 """About what a pixel is shifted for a k1 of 1."""
 
+GLOSS = 0.25
+"""Of a street, for each factor: its ratio is 0.4 to 0.5 without any and grows with it, but not in proportion."""
+
 
 def _limit(name: str) -> float:
     return effect_of(name).threshold
@@ -73,6 +76,7 @@ CASES: dict[str, Case] = {
     "lens_distortion": Case(_bent, heldout_psnr, plain=_bent(LITTLE, 0.0)),
     "exposure": Case(lambda x, _: f"&exposure_jitter={x * _limit('exposure') / 100:.4g}", heldout_psnr),
     "motion_blur": Case(_seconds("exposure_s", "motion_blur"), sharp_psnr, timed=True),
+    "view_dependent_colour": Case(lambda x, _: f"&gloss={x * GLOSS:.4g}", heldout_psnr),
     "lidar_depth": Case(lambda *_: "", heldout_depth, "%", plain="&lidar_beams=1&lidar_azimuths=90"),
     "anti_aliasing": Case(lambda *_: "", beside_psnr, plain="&standstill=1"),
     "ego_mask": Case(lambda x, _: f"&bonnet={x * _limit('ego_mask') / 100:.4g}", heldout_psnr),

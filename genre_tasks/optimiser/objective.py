@@ -20,6 +20,7 @@ from genre_tasks.optimiser.targets import Target
 from genre_tasks.render.types import RenderSettings
 
 if TYPE_CHECKING:
+    from genre_tasks.optimiser.gloss import GlossSight
     from genre_tasks.scene.deformation import Deformation
 
 
@@ -34,6 +35,7 @@ class Sight:
     gradient: Tensor
     culled: dict[str, int]
     by_deformation: Tensor | None = None
+    gloss: GlossSight | None = None
 
 
 @dataclass(frozen=True)
@@ -55,13 +57,14 @@ class Objective:
         iteration: int,
         generator: torch.Generator,
         deformation: Deformation | None = None,
+        harmonics: Tensor | None = None,  # [N, K, 3]
     ) -> Sight:
         """``iteration`` and ``generator`` decide where the perceptual term is taken. ``deformation``: as it is now."""
         plan = plan_loss(self.config, targets, iteration, generator, self.distance is not None)
-        image = begin(frame, offsets, targets, self.settings, deformation)
+        image = begin(frame, offsets, targets, self.settings, deformation, harmonics)
         loss, by_color, by_depth = image_gradients(self.config, image.color, image.depth, targets, plan, self.distance)
         gradient = image.gradient(by_color, by_depth)
-        return Sight(loss, gradient, image.culled, image.by_deformation)
+        return Sight(loss, gradient, image.culled, image.by_deformation, image.gloss)
 
 
 def check_finite(values: Tensor, name: str, stage: str, **where: object) -> None:

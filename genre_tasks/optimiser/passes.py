@@ -14,12 +14,13 @@ from genre_tasks.optimiser import posing
 from genre_tasks.optimiser.fused_library import takes
 from genre_tasks.optimiser.state import Frame
 from genre_tasks.render import cpu
-from genre_tasks.render.api import cameras_of, render_views, velocities_of
+from genre_tasks.render.api import cameras_of, colors_of, render_views, velocities_of
 from genre_tasks.render.blur import Moments, PosedView, mean, mean_gradient
 from genre_tasks.render.types import RenderSettings
 
 if TYPE_CHECKING:
     from genre_tasks.optimiser.deforming import Shift
+    from genre_tasks.optimiser.gloss import GlossSight
     from genre_tasks.scene.deformation import Deformation
 
 
@@ -33,9 +34,13 @@ class Pass(Protocol):
     depth: Tensor
     culled: dict[str, int]
     by_deformation: Tensor | None
+    gloss: GlossSight | None
 
     def gradient(self, by_color: Tensor, by_depth: Tensor) -> Tensor:
-        """[N, 14] with respect to the offsets, from the gradients of the images; once, and they are used up."""
+        """[N, 14] with respect to the offsets, from the gradients of the images; once, and they are used up.
+
+        Where there are harmonics, ``gloss`` is what these views tell of them from then on.
+        """
 
 
 class TorchPass:
@@ -48,23 +53,37 @@ class TorchPass:
         views: Sequence[PosedView],
         settings: RenderSettings,
         deformation: Deformation | None = None,
+        harmonics: Tensor | None = None,
     ) -> None:
         self._leaf, scene = offsets.detach().requires_grad_(), frame.scene
         self._nodes = None if deformation is None else deformation.offsets.detach().requires_grad_()
+        self._harmonics = None if harmonics is None else harmonics.detach().requires_grad_()
         self.by_deformation: Tensor | None = None
         if deformation is not None and self._nodes is not None:
             scene = replace(scene, deformation=deformation.with_offsets(self._nodes))
         with torch.enable_grad():
-            image = render_views(scene.with_gaussians(frame.gaussians(self._leaf)), views, settings)
+            scene = scene.with_gaussians(frame.gaussians(self._leaf)).with_harmonics(self._harmonics)
+            self._seen = None if harmonics is None else colors_of(scene, views)
+            image = render_views(scene, views, settings, self._seen)
             self._depth = image.expected_depth()
         self._color, self.culled = image.color, image.culled
         self.color, self.depth = image.color.detach(), self._depth.detach()
+        self.gloss: GlossSight | None = None
 
     def gradient(self, by_color: Tensor, by_depth: Tensor) -> Tensor:
         """As in :class:`Pass`."""
-        torch.autograd.backward([self._color, self._depth], [by_color, by_depth])
+        if self._seen is not None:
+            self._seen.retain_grad()
+        torch.autograd.backward([self._color, self._depth], [by_color, by_depth], retain_graph=self._seen is not None)
         assert self._leaf.grad is not None
         self.by_deformation = None if self._nodes is None else self._nodes.grad
+        if self._seen is not None and self._seen.grad is not None and self._harmonics is not None:
+            from genre_tasks.optimiser.gloss import GlossSight
+
+            leaves = self._leaf, self._harmonics
+            views, sums = torch.autograd.grad(self._seen, leaves, drawn(self._seen.grad))
+            assert self._harmonics.grad is not None
+            self.gloss = GlossSight(self._harmonics.grad, sums, views[:, 11:14])
         return self._leaf.grad
 
 
@@ -78,6 +97,7 @@ class CompiledPass:
         views: Sequence[PosedView],
         settings: RenderSettings,
         deformation: Deformation | None = None,
+        harmonics: Tensor | None = None,
     ) -> None:
         self._posing, self._threads = frame.posing, settings.threads or torch.get_num_threads()
         frames = [v.frame for v in views]
@@ -86,11 +106,16 @@ class CompiledPass:
         self.by_deformation: Tensor | None = None
         self._shift = _shift(frame, offsets.detach(), list(dict.fromkeys(frames)), splats[0], deformation)
         velocities = velocities_of(frame.scene, splats[0], views)
+        self._shown = None if harmonics is None else Shine(frame, offsets, harmonics, views)
+        if self._shown is not None:
+            splats = (*splats[:4], self._shown.colors.detach())
+        self._splats = splats
         self._images, self.culled, self._batch = cpu.forward(
             splats, cameras_of(views, frame.scene.antialiased), shown, self._threads, keep=True, velocities=velocities
         )
         self.color, self._alpha = self._images[:2]
         self.depth = posing.expected_depth(*self._images[1:])
+        self.gloss: GlossSight | None = None
 
     def gradient(self, by_color: Tensor, by_depth: Tensor) -> Tensor:
         """As in :class:`Pass`."""
@@ -98,11 +123,55 @@ class CompiledPass:
         by_splats = posing.arrays(len(self._posed.splats[0]))
         by_images = by_color, by_alpha, by_depth
         assert self._batch is not None
-        cpu.backward(self._batch, self._posed.splats, self._images, by_images, self._threads, by_splats)
-        out = self._posing.gradient(self._posed, by_splats, self._threads)
+        if self._shown is None:
+            cpu.backward(self._batch, self._splats, self._images, by_images, self._threads, by_splats)
+            out = self._posing.gradient(self._posed, by_splats, self._threads)
+        else:
+            out = self._glossy_gradient(self._shown, by_images, by_splats)
         if self._shift is not None:
             self.by_deformation = self._shift.gradient(by_splats[0], out)
         return out
+
+    def _glossy_gradient(self, shown: Shine, by_images: cpu.Images, by_splats: cpu.Arrays) -> Tensor:
+        by_colors = torch.empty_like(self._splats[4])
+        assert self._batch is not None
+        cpu.backward(self._batch, self._splats, self._images, by_images, self._threads, (*by_splats[:4], by_colors))
+        by_splats[4].zero_()
+        out = self._posing.gradient(self._posed, by_splats, self._threads)
+        by_means, by_own, self.gloss = shown.gradient(by_colors)
+        out[:, 0:3] += by_means
+        out[:, 11:14] += by_own
+        return out
+
+
+class Shine:
+    """What views see of a scene with harmonics, and the way back; by torch's autograd.
+
+    ``colors`` [V, N', 3], laid out as by ``SceneGraph.posed``.
+    """
+
+    def __init__(self, frame: Frame, offsets: Tensor, harmonics: Tensor, views: Sequence[PosedView]) -> None:
+        at = frame.gaussians(offsets.detach())
+        self._unit = frame.unit
+        self._leaves = [t.detach().requires_grad_() for t in (at.means, at.colors, harmonics)]
+        means, colors, harmonics = self._leaves
+        with torch.enable_grad():
+            scene = frame.scene.with_gaussians(replace(at, means=means, colors=colors)).with_harmonics(harmonics)
+            self.colors = colors_of(scene, views)
+
+    def gradient(self, by_colors: Tensor) -> tuple[Tensor, Tensor, GlossSight]:
+        """By the offsets of means [N, 3] and of colours [N, 3], and what the views tell of harmonics."""
+        from genre_tasks.optimiser.gloss import GlossSight
+
+        of = self.colors, self._leaves
+        by_means, by_own, by_harmonics = torch.autograd.grad(*of, by_colors, retain_graph=True)
+        _, views, sums = torch.autograd.grad(*of, drawn(by_colors))
+        return by_means * self._unit, by_own, GlossSight(by_harmonics, sums, views)
+
+
+def drawn(by_colors: Tensor) -> Tensor:
+    """1 where a view's gradient [V, N', 3] says that it has drawn a Gaussian, else 0."""
+    return (by_colors != 0).any(-1, keepdim=True).to(by_colors.dtype).expand_as(by_colors).contiguous()
 
 
 class BlurredPass:
@@ -111,6 +180,7 @@ class BlurredPass:
     def __init__(self, sharp: Pass, moments: Moments) -> None:
         self._sharp, self._moments = sharp, moments
         self.by_deformation: Tensor | None = None
+        self.gloss: GlossSight | None = None
         self.color = torch.stack(map_single_threaded(lambda part: mean(sharp.color[part]), moments.parts))
         self.depth, self.culled = sharp.depth[moments.middle], sharp.culled
 
@@ -122,7 +192,7 @@ class BlurredPass:
         by_depths = torch.zeros_like(sharp.depth)
         by_depths[self._moments.middle] = by_depth
         out = sharp.gradient(by_moments, by_depths)
-        self.by_deformation = sharp.by_deformation
+        self.by_deformation, self.gloss = sharp.by_deformation, sharp.gloss
         return out
 
 
@@ -143,14 +213,15 @@ def begin(
     views: Sequence[PosedView],
     settings: RenderSettings,
     deformation: Deformation | None = None,
+    harmonics: Tensor | None = None,
 ) -> Pass:
     """The render of ``views`` at ``offsets`` [N, 14], by kernels where they are made for it.
 
-    ``deformation``: how actors deform now; ``None``: they are rigid.
+    ``deformation``: how actors deform now; ``None``: they are rigid. ``harmonics`` [N, K, 3]: of colours now, if any.
     """
     compiled = settings.backend in ("auto", "cpu") and takes(offsets, frame.start, frame.unit)
     kind: Callable[..., Pass] = CompiledPass if compiled else TorchPass
     moments = Moments.of(views)
     if moments is None:
-        return kind(frame, offsets, views, settings, deformation)
-    return BlurredPass(kind(frame, offsets, moments.views, settings, deformation), moments)
+        return kind(frame, offsets, views, settings, deformation, harmonics)
+    return BlurredPass(kind(frame, offsets, moments.views, settings, deformation, harmonics), moments)

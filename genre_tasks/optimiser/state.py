@@ -137,6 +137,12 @@ class State:
         offsets = torch.where(self.seen_now > 0, frame.bounded(self.offsets + delta), self.offsets)
         return replace(self, offsets=offsets, iteration=self.iteration + 1)
 
+    def recoloured(self, shift: Tensor) -> State:
+        """With the colours' offsets moved by ``shift`` [N, 3]."""
+        offsets = self.offsets.clone()
+        offsets[:, 11:14] += shift
+        return replace(self, offsets=offsets)
+
     def deviation(self) -> Tensor:
         """Root of the unbiased second moment, [N, 14], > 0."""
         return (self.second / (1 - SECOND_DECAY ** self.seen.clamp_min(1))).sqrt() + DEVIATION_FLOOR

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from genre_tasks.errors import InputError
 from genre_tasks.optimiser.objective import Objective, check_finite
-from genre_tasks.optimiser.rules import StepRule
+from genre_tasks.optimiser.rules import StepRule, schedule
 from genre_tasks.optimiser.sampler import ViewSampler
 from genre_tasks.optimiser.state import Frame, State
 from genre_tasks.optimiser.targets import Target
@@ -23,6 +23,7 @@ from genre_tasks.scene.results import Reconstruction
 
 if TYPE_CHECKING:
     from genre_tasks.optimiser.deforming import DeformationFit
+    from genre_tasks.optimiser.gloss import GlossState
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,7 @@ def unroll(
     samplers = [ViewSampler(source, plan.views, generator), ViewSampler(novel, plan.novel_views, generator)]
     frame = Frame.of(scene, plan.hold_ground)
     state = State.start(len(scene), scene.gaussians.means)
+    gloss = _gloss_of(scene)
     step = rule.start(frame, camera_centre(source))
     fit = _deforming(scene) if plan.deform else None
     keep = plan.snapshot_iterations()
@@ -75,7 +77,8 @@ def unroll(
         began = time.perf_counter()
         batch = [t for s in samplers for t in s.draw()]
         deformation = scene.deformation if fit is None else fit.deformation
-        sight = objective(frame, state.offsets, batch, i, generator, deformation)
+        harmonics = None if gloss is None else gloss.harmonics
+        sight = objective(frame, state.offsets, batch, i, generator, deformation, harmonics)
         check_finite(sight.gradient, "gradient", plan.stage)
         state = state.saw(sight.gradient)
         state = state.moved(frame, step(state, sight.gradient, plan.iterations))
@@ -83,15 +86,21 @@ def unroll(
         if fit is not None and sight.by_deformation is not None:
             check_finite(sight.by_deformation, "gradient of the deformation", plan.stage)
             fit.step(sight.by_deformation, i, plan.iterations)
+        if gloss is not None and sight.gloss is not None:
+            check_finite(sight.gloss.gradient, "gradient in harmonics", plan.stage)
+            gloss, shift = gloss.moved(sight.gloss, sight.gradient[:, 11:14], schedule(i, plan.iterations))
+            state = state.recoloured(shift)
         losses.append(sight.loss)
         culled = sight.culled
         if i + 1 in keep:
-            snapshots[i + 1] = _with(fit, moved_scene(frame, state))
+            snapshots[i + 1] = _with(fit, moved_scene(frame, state, gloss))
         seconds.append(time.perf_counter() - began)
         progress(i + 1, plan.iterations, f"loss {sight.loss:.3f}")
     if len(scene) and plan.iterations and not bool((state.seen > 0).any()):
         raise _out_of_view(len(scene), source, plan.stage)
-    return Reconstruction(_with(fit, moved_scene(frame, state)), tuple(losses), snapshots, tuple(seconds), culled)
+    return Reconstruction(
+        _with(fit, moved_scene(frame, state, gloss)), tuple(losses), snapshots, tuple(seconds), culled
+    )
 
 
 def _deforming(scene: SceneGraph) -> DeformationFit | None:
@@ -124,7 +133,17 @@ def camera_centre(targets: Sequence[Target]) -> Tensor:
     return torch.as_tensor(centre, dtype=torch.float32, device=targets[0].image.image.device)
 
 
-def moved_scene(frame: Frame, state: State) -> SceneGraph:
-    """The scene at the state, detached."""
+def _gloss_of(scene: SceneGraph) -> GlossState | None:
+    """What harmonics need, where the scene has any."""
+    if scene.harmonics is None:
+        return None
+    from genre_tasks.optimiser.gloss import GlossState
+
+    return GlossState.start(scene.harmonics)
+
+
+def moved_scene(frame: Frame, state: State, gloss: GlossState | None = None) -> SceneGraph:
+    """The scene at the state, detached; with the harmonics of ``gloss``, or those that it has had all along."""
     packed = frame.gaussians(state.offsets).packed().detach()
-    return frame.scene.with_gaussians(type(frame.scene.gaussians).unpacked(packed))
+    moved = frame.scene.with_gaussians(type(frame.scene.gaussians).unpacked(packed))
+    return moved if gloss is None else moved.with_harmonics(gloss.harmonics)

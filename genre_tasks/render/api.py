@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,6 +30,8 @@ def render(splats: Splats, cameras: Cameras, settings: RenderSettings = DEFAULT,
     camera both at its pose's time and when its row is read out (``behind``), or that lies where a lens's distortion
     folds back (``folded``). The ``cpu`` backend gives the same bits at any number of threads and of views a call.
 
+    Colours may differ from view to view: [V, N, 3].
+
     Raises:
         ValueError: a tensor has another shape than expected, ``shown`` does not fit, or a gradient is asked for that
             the backend does not have.
@@ -48,23 +51,28 @@ def render(splats: Splats, cameras: Cameras, settings: RenderSettings = DEFAULT,
         _check_gradients(backend, splats, cameras)
     if backend == "cpu":
         return _on_cpu(splats, cameras, settings.threads, shown)
-    groups: dict[tuple[int, int], list[int]] = {}
+    by_view = splats.colors.dim() == 3
+    groups: dict[tuple[int, int, int], list[int]] = {}
     for v, own in enumerate(shown.own):
-        groups.setdefault(own, []).append(v)
-    if all(begin == end for begin, end in groups) and shown.shared == len(splats):
+        groups.setdefault((*own, v if by_view else -1), []).append(v)
+    if all(begin == end for begin, end, _ in groups) and shown.shared == len(splats) and not by_view:
         return _elsewhere(backend, splats, cameras)
     parts = []
-    for (begin, end), members in groups.items():
+    for (begin, end, v), members in groups.items():
         rows = torch.cat([torch.arange(shown.shared), torch.arange(begin, end)]).to(splats.means.device)
-        parts.append(_elsewhere(backend, splats.select(rows), cameras.select(members)))
+        own_splats = replace(splats, colors=splats.colors[v]) if by_view else splats
+        parts.append(_elsewhere(backend, own_splats.select(rows), cameras.select(members)))
     return in_order(parts, [v for members in groups.values() for v in members])
 
 
-def render_views(scene: SceneGraph, views: Sequence[PosedView], settings: RenderSettings = DEFAULT) -> Render:
+def render_views(
+    scene: SceneGraph, views: Sequence[PosedView], settings: RenderSettings = DEFAULT, colors: Tensor | None = None
+) -> Render:
     """Renders a scene graph at views of one image size, in their order; actors stand where their frame puts them.
 
     While a view with a rolling shutter is read out, actors move on as from frame to frame. A view with motion blur has
-    the mean colour of several moments, and alpha and depth of its pose's own time. Raises as :func:`render`.
+    the mean colour of several moments, and alpha and depth of its pose's own time. ``colors``: those of
+    :func:`colors_of`, where they are at hand. Raises as :func:`render`.
     """
     moments = Moments.of(views)
     if moments is not None:
@@ -74,7 +82,16 @@ def render_views(scene: SceneGraph, views: Sequence[PosedView], settings: Render
     posed, moving = scene.posed(list(dict.fromkeys(frames)))
     shown = Shown.of_frames(len(scene) - len(moving), len(moving), frames)
     splats = replace(posed.activated(), velocities=velocities_of(scene, posed.means, views))
+    if scene.harmonics is not None:
+        splats = replace(splats, colors=colors_of(scene, views) if colors is None else colors)
     return render(splats, on_device_of(cameras, scene.gaussians.means), settings, shown)
+
+
+def colors_of(scene: SceneGraph, views: Sequence[PosedView]) -> Tensor:
+    """What each view sees of a scene with harmonics, [V, N, 3], laid out as by ``SceneGraph.posed``."""
+    from genre_tasks.render.gloss import seen_colors
+
+    return seen_colors(scene, [v.frame for v in views], np.stack([v.chunk_SE3_camera[:3, 3] for v in views]))
 
 
 def velocities_of(scene: SceneGraph, means: Tensor, views: Sequence[PosedView]) -> Tensor | None:
@@ -172,9 +189,10 @@ def on_device_of(cameras: Cameras, like: Tensor) -> Cameras:
 
 def _check_shapes(splats: Splats, cameras: Cameras) -> None:
     n, v = len(splats), len(cameras)
+    colors = (v, n, 3) if splats.colors.dim() == 3 else (n, 3)
     expected: dict[str, tuple[Tensor | None, tuple[int, ...]]] = {
         "means": (splats.means, (n, 3)), "scales": (splats.scales, (n, 3)), "quats": (splats.quats, (n, 4)),
-        "opacities": (splats.opacities, (n,)), "colors": (splats.colors, (n, 3)),
+        "opacities": (splats.opacities, (n,)), "colors": (splats.colors, colors),
         "camera_SE3_chunk": (cameras.camera_SE3_chunk, (v, 4, 4)), "focal_px": (cameras.focal_px, (v, 2)),
         "center_px": (cameras.center_px, (v, 2)), "velocities": (splats.velocities, (n, 3)),
         "distortion": (cameras.distortion, (v, 5)),
@@ -224,5 +242,6 @@ def _in_camera_frame(splats: Splats, cameras: Cameras, v: int) -> tuple[Splats, 
     like = splats.means.dtype
     means = splats.means @ rotation.T.to(like) + pose[:3, 3].to(like)
     velocities = None if splats.velocities is None else splats.velocities @ rotation.detach().T.to(like)
-    moved = replace(splats, means=means, quats=quats, velocities=velocities)
+    colors = splats.colors[v : v + 1] if splats.colors.dim() == 3 else splats.colors
+    moved = replace(splats, means=means, quats=quats, colors=colors, velocities=velocities)
     return moved, replace(cameras.select([v]), camera_SE3_chunk=torch.eye(4)[None])

@@ -12,7 +12,7 @@ CONSTANTS = (
 )  # fmt: skip
 SOURCES = (
     "kernel.cpp", "kernel_view.h", "kernel_blend.h", "kernel_project.h", "kernel_camera.h", "kernel_simd.h",
-    "kernel_memory.h", "constants.py", "build_kernel.py",
+    "kernel_memory.h", "kernel_gloss.h", "constants.py", "build_kernel.py",
 )  # fmt: skip
 
 KERNEL = Kernel(

@@ -47,6 +47,8 @@ def forward(
 ) -> tuple[Images, dict[str, int], _Batch | None]:
     """The images of contiguous ``arrays``, the culled counts, and with ``keep`` the state for :func:`backward`.
 
+    Colours are [N, 3], or [V, N, 3] where they differ from view to view.
+
     ``velocities`` [N, 3] float32, contiguous, as in ``Splats``.
     """
     kernel = load_kernel()
@@ -61,9 +63,9 @@ def forward(
     handle = ctypes.c_void_p()
     of_cameras = poses.data_ptr(), lenses.data_ptr(), _pointer(distortions), _pointer(shutters)
     status = kernel.genre_forward(
-        len(arrays[0]), *(a.data_ptr() for a in arrays), _pointer(velocities), views, *of_cameras,
-        cameras.antialiased, width, height,
-        threads, shown.shared, own, color.data_ptr(), alpha.data_ptr(), depth.data_ptr(), culled,
+        len(arrays[0]), *(a.data_ptr() for a in arrays), arrays[4].dim() == 3, _pointer(velocities), views,
+        *of_cameras, cameras.antialiased, width, height, threads, shown.shared, own,
+        color.data_ptr(), alpha.data_ptr(), depth.data_ptr(), culled,
         ctypes.byref(handle) if keep else None,
     )  # fmt: skip
     check_status(status)
@@ -75,7 +77,7 @@ def backward(batch: _Batch, arrays: Arrays, images: Images, by_images: Images, t
     """Writes the gradients of ``arrays`` to ``out``, from those of the images."""
     v = [x.contiguous() for x in by_images]
     status = load_kernel().genre_backward(
-        batch.handle, len(arrays[0]), *(a.data_ptr() for a in arrays), _pointer(batch.velocities),
+        batch.handle, len(arrays[0]), *(a.data_ptr() for a in arrays), arrays[4].dim() == 3, _pointer(batch.velocities),
         *(a.data_ptr() for a in images), *(x.data_ptr() for x in v), threads, *(g.data_ptr() for g in out),
     )  # fmt: skip
     check_status(status)

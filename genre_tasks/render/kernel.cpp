@@ -2,6 +2,7 @@
 #include <map>
 
 #include "../compiled/calls.h"
+#include "kernel_gloss.h"
 #include "kernel_view.h"
 
 // Never destroyed: a handle may be freed while the process ends.
@@ -11,20 +12,23 @@ static Shelf<GradientList>& gradients_shelf() { static auto* s = new Shelf<Gradi
 
 struct Gradients {
   float *means, *scales, *quats, *opacities, *colors;
+  size_t color_step;  // from a view's colours to the next one's; 0: all views have the same
 
-  void clear(size_t count, int threads) {
-    const std::pair<float*, size_t> all[] = {{means, 3}, {scales, 3}, {quats, 4}, {opacities, 1}, {colors, 3}};
+  void clear(size_t count, size_t views, int threads) {
+    const size_t hues = color_step ? 3 * views : 3;
+    const std::pair<float*, size_t> all[] = {{means, 3}, {scales, 3}, {quats, 4}, {opacities, 1}, {colors, hues}};
     for (auto [p, entries] : all) prefer_huge_pages(p, 4 * entries * count);
     parallel(threads, [&](int w) {
       for (auto [p, entries] : all) std::fill(p + share(entries * count, w, threads), p + share(entries * count, w + 1, threads), 0.f);
     });
   }
-  void add(const GradientList& list) {
+  void add(const GradientList& list, int view) {
+    float* hue = colors + color_step * view;
     for (size_t at = 0; at < list.id.size(); at++) {
       auto x = [&](int k) { return list.gradient[at / LANES * ATTRIBUTES + k][(int)(at % LANES)]; };
       const size_t i = list.id[at];
       for (int k = 0; k < 3; k++)
-        means[3 * i + k] += x(MEAN + k), scales[3 * i + k] += x(SCALE + k), colors[3 * i + k] += x(COLOR + k);
+        means[3 * i + k] += x(MEAN + k), scales[3 * i + k] += x(SCALE + k), hue[3 * i + k] += x(COLOR + k);
       for (int k = 0; k < 4; k++) quats[4 * i + k] += x(QUAT + k);
       opacities[i] += x(OPACITY);
     }
@@ -54,14 +58,14 @@ class InOrder {
   explicit InOrder(Gradients sum) : sum_(sum) {}
   void add(int view, Scratch& s, int threads) {
     if (threads > 1) {  // alone: each thread has Gaussians of its own
-      parallel(threads, [&](int w) { sum_.add(*s.gradients[w]); });
+      parallel(threads, [&](int w) { sum_.add(*s.gradients[w], view); });
       next_ = view + 1;
       return;
     }
     std::lock_guard<std::mutex> lock(guard_);
     waiting_[view] = std::exchange(s.gradients[0], gradients_shelf().take());
     for (auto first = waiting_.begin(); first != waiting_.end() && first->first == next_; first = waiting_.erase(first), next_++) {
-      sum_.add(*first->second);
+      sum_.add(*first->second, first->first);
       gradients_shelf().give(std::move(first->second));
     }
   }
@@ -85,13 +89,14 @@ extern "C" {
 
 // poses [V, 4, 4] chunk to camera, lenses [V, 4], distortions [V, 10] or null, shutters [V, 7] or null, as make_camera takes
 // them, and `smooths` for all; velocities [N, 3] or null; color [V, H, W, 3], alpha and depth [V, H, W].
+// colors [N, 3], or with `by_view` [V, N, 3].
 // A view shows the first `shared` Gaussians and those of its range in own [V, 2]. culled [5] is added to. With `batch`, the state for genre_backward is kept there until genre_free.
 int genre_forward(int count, const float* means, const float* scales, const float* quats, const float* opacities,
-                  const float* colors, const float* velocities, int views, const float* poses, const float* lenses,
+                  const float* colors, int by_view, const float* velocities, int views, const float* poses, const float* lenses,
                   const float* distortions, const float* shutters, int smooths, int width, int height, int threads, int shared,
                   const int* own, float* color, float* alpha, float* depth, long long* culled, void** batch) {
   return guarded([&] {
-    GaussianArrays in{count, means, scales, quats, opacities, colors, velocities};
+    const size_t color_step = by_view ? 3 * (size_t)count : 0;
     ScratchSet scratch(std::max(1, threads));
     auto kept = std::make_unique<Batch>();
     kept->views.resize(views);
@@ -100,6 +105,7 @@ int genre_forward(int count, const float* means, const float* scales, const floa
     prefer_huge_pages(depth, 4 * pixels * views);
     std::mutex counting;
     for_each_view(views, std::max(1, threads), [&](int v, int w, int inside) {
+      const GaussianArrays in{count, means, scales, quats, opacities, colors + color_step * v, velocities};
       auto view = views_shelf().take();
       view->camera = make_camera(poses + 16 * v, lenses + 4 * v, distortions ? distortions + 10 * v : nullptr,
                                  shutters ? shutters + 7 * v : nullptr, smooths, width, height);
@@ -117,24 +123,34 @@ int genre_forward(int count, const float* means, const float* scales, const floa
 
 // `color`, `alpha`, `depth` are what genre_forward wrote.
 int genre_backward(void* batch, int count, const float* means, const float* scales, const float* quats,
-                   const float* opacities, const float* colors, const float* velocities, const float* color,
+                   const float* opacities, const float* colors, int by_view, const float* velocities, const float* color,
                    const float* alpha, const float* depth, const float* v_color, const float* v_alpha, const float* v_depth,
                    int threads, float* grad_means, float* grad_scales, float* grad_quats, float* grad_opacities,
                    float* grad_colors) {
   return guarded([&] {
     auto& views = static_cast<Batch*>(batch)->views;
-    GaussianArrays in{count, means, scales, quats, opacities, colors, velocities};
-    Gradients g{grad_means, grad_scales, grad_quats, grad_opacities, grad_colors};
-    g.clear((size_t)count, std::max(1, threads));
+    const size_t color_step = by_view ? 3 * (size_t)count : 0;
+    Gradients g{grad_means, grad_scales, grad_quats, grad_opacities, grad_colors, color_step};
+    g.clear((size_t)count, views.size(), std::max(1, threads));
     ScratchSet scratch(std::max(1, threads));
     InOrder sum(g);
     for_each_view((int)views.size(), std::max(1, threads), [&](int v, int w, int inside) {
+      const GaussianArrays in{count, means, scales, quats, opacities, colors + color_step * v, velocities};
       size_t at = (size_t)views[v]->camera.width * views[v]->camera.height * v;
       backward(*views[v], *scratch.of[w], in, inside, Images{color + 3 * at, alpha + at, depth + at},
                Images{v_color + 3 * at, v_alpha + at, v_depth + at});
       sum.add(v, *scratch.of[w], inside);
     });
   });
+}
+
+int genre_gloss(const Glossy* in, int threads, float* seen) {
+  return guarded([&] { gloss_forward(*in, threads, seen); });
+}
+
+int genre_gloss_backward(const Glossy* in, int threads, const float* seen, const float* by_seen, float* by_means,
+                         float* by_colors, float* by_waves) {
+  return guarded([&] { gloss_backward(*in, threads, seen, by_seen, by_means, by_colors, by_waves); });
 }
 
 // Adds to work [4] what the forward pass did: footprints drawn, (tile, footprint) pairs, pixels computed, pixels changed.

@@ -18,8 +18,10 @@ def load_kernel(folder: Path = KERNEL.folder) -> ctypes.CDLL:
     """
     library = load(KERNEL, folder)
     p, i = ctypes.c_void_p, ctypes.c_int
-    library.genre_forward.argtypes = [i, *[p] * 6, i, *[p] * 4, i, i, i, i, i, *[p] * 6]
-    library.genre_backward.argtypes = [p, i, *[p] * 6, *[p] * 6, i, *[p] * 5]
+    library.genre_forward.argtypes = [i, *[p] * 5, i, p, i, *[p] * 4, i, i, i, i, i, *[p] * 6]
+    library.genre_backward.argtypes = [p, i, *[p] * 5, i, p, *[p] * 6, i, *[p] * 5]
+    library.genre_gloss.argtypes = [p, i, p]
+    library.genre_gloss_backward.argtypes = [p, i, *[p] * 5]
     library.genre_work.argtypes = [p, p]
     library.genre_free.argtypes, library.genre_free.restype = [p], None
     return library

@@ -61,7 +61,7 @@ class Splats:
     scales: Tensor  # [N, 3] metres, > 0
     quats: Tensor  # [N, 4] w, x, y, z; normalised by the renderer
     opacities: Tensor  # [N] in [0, 1]
-    colors: Tensor  # [N, 3]
+    colors: Tensor  # [N, 3], or [V, N, 3] where V views see different ones
     velocities: Tensor | None = None  # [N, 3] m/s; None: nothing moves
 
     def __len__(self) -> int:
@@ -69,7 +69,7 @@ class Splats:
 
     def select(self, rows: Tensor) -> Splats:
         """The Gaussians ``rows`` [M], in that order."""
-        return self._map(lambda x: x.index_select(0, rows))
+        return self._map(lambda x: x.index_select(-2 if x.dim() == 3 else 0, rows))
 
     def to(self, *args: object, **kwargs: object) -> Splats:
         """Each tensor moved as ``Tensor.to`` moves it."""

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 STATIC, DISTANT, FIRST_ACTOR = 0, 1, 2
 """Values of ``SceneGraph.nodes``; actor k has ``FIRST_ACTOR + k``."""
 
+DEGREE, COUNTS = 1, {1: 3, 2: 8, 3: 15}
+"""Of spherical harmonics, where a reconstruction has any; how many there are up to a degree, without the constant."""
+
 
 @dataclass(frozen=True)
 class ActorNode:
@@ -73,9 +76,9 @@ class SceneGraph:
     """All Gaussians in one batch, each belonging to one node.
 
     ``nodes`` [N] int64: ``STATIC``, ``DISTANT`` or ``FIRST_ACTOR + k``. Static and distant Gaussians are in chunk
-    coordinates, an actor's in its box frame. ``antialiased``: how it was made, and so how it is rendered: see
-    ``render.Cameras``. ``deformation``: how actors depart from rigid ones, ``None`` where none does; means alone move
-    with it, and velocities know nothing of it.
+    coordinates, an actor's in its box frame, and so are directions of ``harmonics`` (see ``scene.harmonics``).
+    ``antialiased``: how it was made, and so how it is rendered: see ``render.Cameras``. ``deformation``: how actors
+    depart from rigid ones, ``None`` where none does; means alone move with it, and velocities know nothing of it.
     """
 
     gaussians: Gaussians
@@ -83,6 +86,7 @@ class SceneGraph:
     actors: tuple[ActorNode, ...]
     antialiased: bool = False
     deformation: Deformation | None = None
+    harmonics: Tensor | None = None  # [N, K, 3]; None: a Gaussian has one colour wherever it is seen from
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -90,6 +94,10 @@ class SceneGraph:
     def with_gaussians(self, gaussians: Gaussians) -> SceneGraph:
         """The same graph with other Gaussians (same N and order)."""
         return replace(self, gaussians=gaussians)
+
+    def with_harmonics(self, harmonics: Tensor | None) -> SceneGraph:
+        """The same graph with other harmonics [N, K, 3], or none."""
+        return replace(self, harmonics=harmonics)
 
     def posed(self, frames: Sequence[float]) -> tuple[Gaussians, Tensor]:
         """All Gaussians in chunk coordinates at several log frames at once, differentiable.
@@ -225,7 +233,7 @@ class SceneGraph:
         )
 
     @staticmethod
-    def _deformed(by: Deformation, means: Tensor, actor_of: Tensor, frames: Sequence[int]) -> Tensor:
+    def _deformed(by: Deformation, means: Tensor, actor_of: Tensor, frames: Sequence[float]) -> Tensor:
         """[F, M, 3] in box frames, of means [M, 3]."""
         rows, of = by.rows(actor_of)
         every = means.expand(len(frames), *means.shape)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from genre_tasks.config import OptimiserConfig
 from genre_tasks.effects.applied import applied
 from genre_tasks.effects.types import UNPLANNED, EffectsPlan
-from genre_tasks.optimiser.run import optimise, planned
+from genre_tasks.optimiser.run import PER_SCENE, optimise, planned
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.chunk import Chunk
+from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.results import Reconstruction
 
 
@@ -22,4 +23,15 @@ def gnet(
 
     Raises ``InputError`` (no source view, an unreadable image, weights that do not fit), ``NonFiniteError``.
     """
-    return optimise("gnet", planned(config, plan), applied(chunk, plan), initial.scene, None, progress)
+    return optimise(
+        "gnet", planned(config, plan), applied(chunk, plan), _start(config, initial.scene, plan), None, progress
+    )
+
+
+def _start(config: OptimiserConfig, scene: SceneGraph, plan: EffectsPlan) -> SceneGraph:
+    """With harmonics where the plan has them; per-scene 3DGS has one colour a Gaussian in any case."""
+    if not plan.on("view_dependent_colour") or config.method in PER_SCENE:
+        return scene
+    from genre_tasks.scene.harmonics import starting
+
+    return starting(scene)

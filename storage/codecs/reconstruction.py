@@ -1,5 +1,6 @@
 """Reconstruction ↔ ``gaussians.parquet``, ``actors.parquet``, ``losses.parquet``, ``snapshots/iteration_*.parquet``.
 
+Where Gaussians have harmonics, ``harmonics/NAME.parquet`` holds those of each table ``NAME.parquet`` of Gaussians.
 ``rendering.parquet`` says how the scene is rendered, and is not there where nothing has to be said.
 Where actors deform: ``deformation.parquet``, and ``deformation/iteration_*.parquet`` of the snapshots.
 
@@ -19,12 +20,14 @@ import pyarrow as pa
 
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
 from genre_tasks.scene.gaussians import Gaussians
-from genre_tasks.scene.graph import FIRST_ACTOR, ActorNode, SceneGraph
+from genre_tasks.scene.graph import COUNTS, DEGREE, FIRST_ACTOR, ActorNode, SceneGraph
 from genre_tasks.scene.results import Reconstruction
 from storage.codecs.chunk import ACTORS, actor_columns, actor_fields
 from storage.codecs.tables import REMEDY, array_of, checked, column, read_table, schema, write_table
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from genre_tasks.scene.deformation import Deformation
 
 _ATTRIBUTES = {
@@ -51,6 +54,10 @@ GAUSSIANS = schema(
     ],
 )
 RENDERING = schema("rendering/1", [column("antialiased", pa.bool_(), "opacities make up for the blur of footprints")])
+_WAVES = tuple(f"{channel}_{k}" for k in range(1, COUNTS[DEGREE] + 1) for channel in ("red", "green", "blue"))
+HARMONICS = schema(
+    f"harmonics/{DEGREE}", [column(n, pa.float32(), "of 3DGS's real spherical harmonic of that number") for n in _WAVES]
+)
 LOSSES = schema("losses/1", [column("loss", pa.float64(), "training loss of each iteration, in order")])
 DEFORMATION = schema(
     "deformation/1",
@@ -122,6 +129,32 @@ def _write_scene(path: Path, scene: SceneGraph) -> None:
     _check_nodes(nodes, len(scene.actors), lambda problem: ConfigError(problem, remedy="Fix the stage that made it."))
     columns = {name: packed[:, i] for i, name in enumerate(_ATTRIBUTES)}
     write_table(path, GAUSSIANS, {**columns, "node": nodes})
+    if scene.harmonics is not None:
+        waves = scene.harmonics.detach().cpu().numpy()
+        checked(waves, f"harmonics of {path.name}", np.float32, (len(packed), COUNTS[DEGREE], 3))
+        at = _harmonics_of(path)
+        at.parent.mkdir(exist_ok=True)
+        flat = waves.reshape(len(waves), -1)
+        write_table(at, HARMONICS, {name: flat[:, i] for i, name in enumerate(_WAVES)})
+
+
+def _harmonics_of(path: Path) -> Path:
+    root = path.parent.parent if path.parent.name == "snapshots" else path.parent
+    return root / "harmonics" / path.name
+
+
+def _read_harmonics(path: Path, count: int) -> Tensor | None:
+    """[N, K, 3], ``None`` where the artifact has none."""
+    import torch
+
+    if not path.parent.is_dir():
+        return None
+    table = read_table(path, HARMONICS)[0]
+    if table.num_rows != count:
+        raise ArtifactCorruptError(
+            f"The table has {table.num_rows} rows for {count} Gaussians", remedy=REMEDY, file=path
+        )
+    return torch.from_numpy(np.stack([array_of(table, n) for n in _WAVES], 1).reshape(count, COUNTS[DEGREE], 3))
 
 
 def _write_deformation(path: Path, deformation: Deformation) -> None:
@@ -169,7 +202,8 @@ def _read_scene(path: Path, actors: tuple[ActorNode, ...], antialiased: bool, de
     parts = [torch.from_numpy(np.stack([array_of(table, n) for n in names[a:b]], 1)) for a, b in _RANGES]
     means, log_scales, quats, opacity, colors = parts
     gaussians = Gaussians(means, log_scales, quats, opacity[:, 0], colors)
-    return SceneGraph(gaussians, torch.from_numpy(nodes), actors, antialiased, _read_deformation(deformation, actors))
+    waves, bent = _read_harmonics(_harmonics_of(path), len(nodes)), _read_deformation(deformation, actors)
+    return SceneGraph(gaussians, torch.from_numpy(nodes), actors, antialiased, bent, waves)
 
 
 _RANGES = ((0, 3), (3, 6), (6, 10), (10, 11), (11, 14))

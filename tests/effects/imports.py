@@ -12,6 +12,7 @@ def assert_imports_no_effect(code: str) -> None:
         "\nimport sys\n"
         "from genre_tasks.effects.plan import EFFECTS\n"
         "loaded = [n for n in EFFECTS if f'genre_tasks.effects.{n}' in sys.modules]\n"
+        "loaded += [n for n in sys.modules if n.endswith(('.gloss', '.harmonics'))]\n"
         "assert not loaded, loaded\n"
     )
     done = subprocess.run([sys.executable, "-c", code + after], capture_output=True, text=True, check=False)

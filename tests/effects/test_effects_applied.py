@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from genre_tasks.config import EffectsConfig, GnetConfig, IngestConfig, InitialConfig, LossConfig, NovelViewsConfig
+from genre_tasks.config import (
+    EffectsConfig,
+    GnetConfig,
+    IngestConfig,
+    InitialConfig,
+    LossConfig,
+    NovelViewsConfig,
+    PerSceneConfig,
+)
 from genre_tasks.effects import exposure
 from genre_tasks.effects.applied import applied
 from genre_tasks.effects.plan import EFFECTS, plan
@@ -331,6 +339,30 @@ def test_a_plain_log_makes_the_kernel_calls_of_none(monkeypatch: pytest.MonkeyPa
         novel_views(NovelViewsConfig(), chunk(uri), scene, found)
         counts.append(list(calls))
     assert counts[0] == counts[1] and len(counts[0]) > 6
+
+
+def test_gloss_is_in_images_and_truth_and_without_it_no_bit_changes() -> None:
+    plain, none, glossy = (open_log(STREET + q) for q in ("", "&gloss=0", "&gloss=0.5"))
+    assert none.image_bytes("front_camera", 3) == plain.image_bytes("front_camera", 3)
+    view = chunk().views[0]
+    pose = chunk().world_SE3_chunk @ view.chunk_SE3_camera
+    images = [log.truth.image(view.frame, pose, view.lens).astype(float) for log in (plain, glossy)]
+    assert (images[1] >= images[0]).all() and np.mean(images[1] > images[0] + 5) > 0.2
+    assert glossy.image_bytes(view.camera, view.frame) != plain.image_bytes(view.camera, view.frame)
+
+
+def test_harmonics_are_where_the_plan_has_them() -> None:
+    uri = STREET + "&gloss=1"
+    first = initial(InitialConfig(max_points=2000, distant_count=200), chunk(uri))
+    assert first.scene.harmonics is None
+    config = GnetConfig(iterations=12, views_per_iteration=4, method="adam", loss=LossConfig(perceptual=0, depth=0))
+    without = gnet(config, chunk(uri), first, with_(*BASIC))
+    within = gnet(config, chunk(uri), first, with_(*BASIC, "view_dependent_colour"))
+    assert without.scene.harmonics is None
+    assert within.scene.harmonics is not None and within.scene.harmonics.any()
+    assert within.losses[0] == without.losses[0] and within.losses[-1] != without.losses[-1]
+    config = config.model_copy(update={"method": "street_gs", "per_scene": PerSceneConfig(iterations=2)})
+    assert gnet(config, chunk(uri), first, with_(*BASIC, "view_dependent_colour")).scene.harmonics is None
 
 
 def test_targets_carry_what_effects_say() -> None:

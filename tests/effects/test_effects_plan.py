@@ -83,6 +83,17 @@ def test_shutter_gates_flip_at_their_threshold(name: str, field: str) -> None:
         assert planned(name, rig=rig)[name].choice == choice
 
 
+def test_the_gate_of_view_dependent_colour_flips_at_its_threshold(monkeypatch: pytest.MonkeyPatch) -> None:
+    name, limit = "view_dependent_colour", effect_of("view_dependent_colour").threshold
+    left, factor = Seen(chunk(), cameras()).unexplained, 1.0
+    monkeypatch.setattr(Seen, "unexplained", property(lambda self: factor * left))
+    plain = planned(name)[name].value
+    assert 0 < plain < limit, "a street without gloss does not call for it"
+    for part, choice in ((0.98, "off"), (1.02, "on")):
+        factor = part * limit / plain
+        assert planned(name)[name].choice == choice
+
+
 def test_a_standing_camera_has_no_shutter_displacement() -> None:
     still = chunk(STREET + "&standstill=1")
     rig = tuple(replace(c, readout_s=0.03) for c in cameras())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -114,6 +115,30 @@ def test_gaussians_columns_are_named_and_documented(tmp_path: Path) -> None:
     scene = values.make("reconstruction").scene
     x = pq.read_table(tmp_path / "gaussians.parquet")["x"].to_numpy()
     assert np.array_equal(x, scene.gaussians.means[:, 0].numpy())
+
+
+def test_harmonics_lie_beside_the_gaussians_and_old_artifacts_have_none(tmp_path: Path) -> None:
+    value, codec = values.make("reconstruction"), codec_of("reconstruction")
+    (tmp_path / "old").mkdir()
+    codec.write(tmp_path / "old", value)
+    assert not (tmp_path / "old" / "harmonics").exists() and codec.read(tmp_path / "old").scene.harmonics is None
+    waves = torch.randn(13, 3, 3, generator=torch.Generator().manual_seed(0))
+    assert len(value.scene) == 13
+    snapshots = {n: s.with_harmonics(torch.full((len(s), 3, 3), float(n))) for n, s in value.snapshots.items()}
+    glossy = replace(value, scene=value.scene.with_harmonics(waves), snapshots=snapshots)
+    (tmp_path / "new").mkdir()
+    codec.write(tmp_path / "new", glossy)
+    back = codec.read(tmp_path / "new")
+    assert torch.equal(back.scene.harmonics, waves)
+    assert {n: float(s.harmonics.mean()) for n, s in back.snapshots.items()} == {8: 8.0, 16: 16.0}
+    names = pq.read_schema(tmp_path / "new" / "harmonics" / "gaussians.parquet").names
+    assert names[:4] == ["red_1", "green_1", "blue_1", "red_2"]
+    (tmp_path / "bad").mkdir()
+    with pytest.raises(ConfigError, match=r"harmonics of gaussians.parquet is float32 \[13, 8, 3\]"):
+        codec.write(tmp_path / "bad", replace(value, scene=value.scene.with_harmonics(torch.zeros(13, 8, 3))))
+    (tmp_path / "new" / "harmonics" / "iteration_0008.parquet").unlink()
+    with pytest.raises(ArtifactCorruptError, match="A table is missing"):
+        codec.read(tmp_path / "new")
 
 
 def test_images_of_a_chunk_lie_uncompressed_as_they_came(tmp_path: Path) -> None:

@@ -158,7 +158,7 @@ class SyntheticStreet:
         def encode() -> bytes:
             if self.imaging.plain:
                 return _png(self._truth.image(frame, self.world_SE3_camera(camera, frame), lens))
-            light = draw_light(self.parameters.seed)
+            light = draw_light(self.parameters.seed, self.parameters.gloss)
             return _png(self.imaging.image(self._scene, light, camera, frame * FRAME_S, lens))
 
         return self._png.get((camera, frame), encode)
@@ -191,7 +191,7 @@ class SyntheticStreet:
 
     def render(self, frame: int, street_SE3_camera: Float64, lens: Lens) -> NDArray[np.uint8]:
         """[H, W, 3] at a pose in the street's own coordinates; not remembered."""
-        light = draw_light(self.parameters.seed)
+        light = draw_light(self.parameters.seed, self.parameters.gloss)
         return picture(self._scene, light, frame * FRAME_S, street_SE3_camera, lens, self.parameters.samples)
 
     def check_frame(self, frame: int) -> None:

@@ -69,6 +69,11 @@ MIRROR = np.zeros(len(Material), np.float32)
 MIRROR[[Material.WINDOW, Material.SHOP, Material.CAR_GLASS]] = 0.10
 MIRROR[Material.PAINT] = 0.04
 
+# What share of a street's gloss a material shows: what mirrors has its own, and a lamp shines.
+ROUGH = np.ones(len(Material), np.float32)
+ROUGH[[Material.WINDOW, Material.SHOP, Material.CAR_GLASS, Material.LAMP]] = 0.0
+ROUGH[[Material.GRASS, Material.LEAF, Material.BARK, Material.CLOTH]] = 0.3
+
 WHITE = linear((0.85, 0.85, 0.82))
 YELLOW = linear((0.85, 0.66, 0.18))
 DARK = linear((0.10, 0.11, 0.12))

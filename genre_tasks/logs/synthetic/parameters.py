@@ -28,7 +28,8 @@ class StreetParameters:
     ``standstill=1`` parks the ego vehicle; ``origin_m`` is added to the world's x; ``sweep_s`` is the time a LiDAR turn
     takes (0: a snapshot at the frame's time); ``noise_m`` is the standard deviation of the range; ``stride``: walking
     people's arms swing by so many times their legs' 24°, beyond 1 the legs do too (0: arms are still);
-    ``pedestrians_aside_m``: people are so far to the sides of the ego lane's middle (0: on the pavements).
+    ``pedestrians_aside_m``: people are so far to the sides of the ego lane's middle (0: on the pavements); ``gloss``:
+    the strength of a sheen, sun and sky as a rough surface mirrors them, in images and truth alike.
 
     How the cameras record it (the truth has none of it but the lens): ``rolling_shutter_s`` from the first row to the
     last, ``exposure_s`` of motion blur, ``exposure_jitter`` and ``white_balance_jitter`` standard deviations of the
@@ -60,6 +61,7 @@ class StreetParameters:
     white_balance_jitter: float = 0.0
     bonnet: float = 0.0
     distortion: float = 0.0
+    gloss: float = 0.0
 
     def query(self, *, all_keys: bool = False, separator: str = "&") -> str:
         """``seed=…`` and what differs from the defaults (or everything), in a fixed order."""
@@ -96,6 +98,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "white_balance_jitter": (0.0, 0.5),
     "bonnet": (0.0, 0.5),
     "distortion": (-0.08, 0.5),
+    "gloss": (0.0, 1.0),
 }
 
 

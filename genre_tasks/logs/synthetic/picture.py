@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from genre_tasks.logs.synthetic.materials import MIRROR, Material
+from genre_tasks.logs.synthetic.materials import MIRROR, ROUGH, Material
 from genre_tasks.logs.synthetic.mesh import linear
 from genre_tasks.logs.synthetic.noise import Reals, dot3, fractal, rotated
 from genre_tasks.logs.synthetic.raycast import Hits, Scene
@@ -17,11 +17,16 @@ from genre_tasks.logs.types import Float32, Float64, Lens
 
 _BAND_RAYS = 1 << 16
 _HAZE_M = 420.0
+SHEEN_EXPONENT = 6
+"""Of Phong's lobe: half as bright about 27° from the mirrored sun."""
 
 
 @dataclass(frozen=True)
 class Light:
-    """Sun and sky of a seed. ``sun`` [3] unit towards it; colours are linear; ``clouds`` the share of them."""
+    """Sun and sky of a seed. ``sun`` [3] unit towards it; colours are linear; ``clouds`` the share of them.
+
+    ``gloss``: strength of the sheen that surfaces have of both.
+    """
 
     sun: Float64
     sun_colour: Float32
@@ -30,9 +35,10 @@ class Light:
     clouds: float
     drift: float
     exposure: float
+    gloss: float = 0.0
 
 
-def draw_light(seed: int) -> Light:
+def draw_light(seed: int, gloss: float = 0.0) -> Light:
     """Late morning to afternoon, clear to broken clouds."""
     rng = generator(seed, "light")
     height, azimuth = np.deg2rad(rng.uniform(28, 62)), rng.uniform(0, 2 * np.pi)
@@ -46,6 +52,7 @@ def draw_light(seed: int) -> Light:
         clouds=float(rng.uniform(0.30, 0.62)),
         drift=float(rng.uniform(0, 200)),
         exposure=float(rng.uniform(0.85, 1.0)),
+        gloss=gloss,
     )
 
 
@@ -121,10 +128,21 @@ def shade(
     ambient = ambient + np.array([0.36, 0.33, 0.28], np.float32) * (1 - up)
     value: Reals = base * (sunlight[:, None] * light.sun_colour + ambient)
     value = np.where((material == Material.LAMP)[:, None], base, value)
+    if light.gloss:
+        value = value + _sheen(light, d, n, sunlight > 0, slant) * ROUGH[material][:, None]
     value = _mirrored(light, value, d, n, MIRROR[material], slant)
     haze = (1 - np.exp(-h.distance_m / np.float32(_HAZE_M)))[:, None]
     out[pick] = value + (light.horizon * np.float32(0.9) - value) * haze
     return out
+
+
+def _sheen(light: Light, d: Reals, n: Reals, sunlit: NDArray[np.bool_], slant: Reals) -> Reals:
+    """Sun and sky as a rough surface mirrors them: Phong's lobe, and Schlick's approximation towards grazing views."""
+    r = d + 2 * slant[:, None] * n
+    lobe = np.clip(dot3(r, light.sun.astype(np.float32)), 0, 1) ** SHEEN_EXPONENT * sunlit
+    grazing = (1 - slant) ** 3 * np.clip(r[:, 2] + np.float32(0.5), 0, 1)
+    bright = lobe[:, None] * light.sun_colour + grazing[:, None] * light.horizon
+    return bright * np.float32(light.gloss)
 
 
 def _mirrored(light: Light, value: Reals, d: Reals, n: Reals, share: Reals, slant: Reals) -> Reals:
