@@ -6,7 +6,7 @@ drive alone, which see the road ahead from 60 m and from 5 m, ask different thin
 
 Three metres to a side change a footprint by little more than driving does anyway, so the gate asks how far footprints
 are apart over all views together, those that a scene is made from and those rendered beside them: a vehicle that drives
-on sees most things at more than twice the size that it first saw them at, one that stands does not.
+on sees most things at about twice the size that it first saw them at, one that stands does not.
 """
 
 from __future__ import annotations
@@ -20,6 +20,10 @@ from genre_tasks.effects.types import Effect, Measured
 from genre_tasks.scene.chunk import View
 from genre_tasks.scene.coloring import visible
 from genre_tasks.scene.geometry import shift_laterally
+
+THRESHOLD = 1.65
+"""Enabling gains 0.1 dB at 3 m there, between a validation street at standstill (ratio 1.55, 0.06 dB) and two that are
+driven through (2.3, 0.4 and 0.6 dB)."""
 
 SHIFT_M = 3.0
 _EVERY = 25
@@ -54,5 +58,10 @@ def _views(seen: Seen) -> list[View]:
 
 
 EFFECT = Effect(
-    "anti_aliasing", "ratio of a point's footprints between views", "ratio", 2.0, "two determinants a Gaussian", measure
+    "anti_aliasing",
+    "ratio of a point's footprints between views",
+    "ratio",
+    THRESHOLD,
+    "two determinants a Gaussian",
+    measure,
 )
