@@ -22,6 +22,8 @@ EVERYTHING = (
 )
 """All but motion blur: drawing its moments row by row takes a quarter of an hour."""
 
+ALL = ("effects=on", "effects.motion_blur=auto")
+
 PLAIN = "&moving=0&pedestrians=0"
 SHORT = ("gnet.iterations=4",)
 """Counting takes some fifty times as long as running."""
@@ -34,9 +36,10 @@ def auto_vs_on(seed: str, store: str) -> Row:
     """Held-out PSNR of a street that has every effect, as planned and with all that can be set on."""
     at = Place(f"synthetic:street?seed={seed}{EVERYTHING}", 0, store)
     with threads():
-        own = at.plan("effects=on").fitted
+        own = at.plan(*ALL).fitted
         out: Row = {"whole": "auto_vs_on", "log": at.log, "commit": commit()}
-        return out | {word: judged(at, own, heldout_psnr, f"effects={word}") for word in ("auto", "on")}
+        settings = {"auto": ("effects=auto",), "on": ALL}
+        return out | {word: judged(at, own, heldout_psnr, *each) for word, each in settings.items()}
 
 
 def plain_cost(seed: str, store: str) -> Row:
