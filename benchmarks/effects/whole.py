@@ -60,17 +60,8 @@ def plain_cost(seed: str, store: str) -> Row:
 
 
 def _instructions(at: Place, word: str) -> int:
-    command = [
-        *COUNTER,
-        sys.executable,
-        "-P",
-        "-m",
-        "benchmarks.effects.counted",
-        word,
-        at.log,
-        str(at.chunk),
-        at.store,
-    ]
+    module = (sys.executable, "-P", "-m", "benchmarks.effects.counted")
+    command = [*COUNTER, *module, word, at.log, str(at.chunk), at.store]
     environment = os.environ | {"PYTHONPATH": str(CHECKOUT), "PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "1"}
     environment["GENRE_RENDER_ISA"] = "avx2"  # Valgrind knows no AVX-512
     done = subprocess.run(command, cwd=Path.cwd(), env=environment, capture_output=True, text=True, check=False)

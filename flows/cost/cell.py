@@ -42,7 +42,7 @@ class Sweep:
         """Other numbers of threads have a store of their own: their payloads, and so their keys, are the same."""
         values = cell.setting.configuration(self.preset, self.settings, cell.seed).model_dump(mode="json")
         threads = cell.setting.threads
-        return Job(cell.log, cell.chunk, f"{self.store}/threads-{threads}" if threads else self.store, values)
+        return Job(cell.log, cell.chunk, f"{self.store}-threads-{threads}" if threads else self.store, values)
 
     def judge(self, cell: Cell) -> Job:
         """The job of the preset itself, whose images are those that every setting is judged by."""

@@ -14,14 +14,13 @@ from torch import Tensor
 from genre_tasks.config import LossConfig
 from genre_tasks.errors import NonFiniteError
 from genre_tasks.optimiser.loss import Distance, image_gradients, plan_loss
-from genre_tasks.optimiser.passes import begin
+from genre_tasks.optimiser.passes import RIGID_AND_DULL, Beside, begin
 from genre_tasks.optimiser.state import Frame
 from genre_tasks.optimiser.targets import Target
 from genre_tasks.render.types import RenderSettings
 
 if TYPE_CHECKING:
     from genre_tasks.optimiser.gloss import GlossSight
-    from genre_tasks.scene.deformation import Deformation
 
 
 @dataclass(frozen=True)
@@ -56,12 +55,11 @@ class Objective:
         targets: Sequence[Target],
         iteration: int,
         generator: torch.Generator,
-        deformation: Deformation | None = None,
-        harmonics: Tensor | None = None,  # [N, K, 3]
+        beside: Beside = RIGID_AND_DULL,
     ) -> Sight:
-        """``iteration`` and ``generator`` decide where the perceptual term is taken. ``deformation``: as it is now."""
+        """``iteration`` and ``generator`` decide where the perceptual term is taken."""
         plan = plan_loss(self.config, targets, iteration, generator, self.distance is not None)
-        image = begin(frame, offsets, targets, self.settings, deformation, harmonics)
+        image = begin(frame, offsets, targets, self.settings, beside)
         loss, by_color, by_depth = image_gradients(self.config, image.color, image.depth, targets, plan, self.distance)
         gradient = image.gradient(by_color, by_depth)
         return Sight(loss, gradient, image.culled, image.by_deformation, image.gloss)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 import torch
@@ -22,6 +22,20 @@ if TYPE_CHECKING:
     from genre_tasks.optimiser.deforming import Shift
     from genre_tasks.optimiser.gloss import GlossSight
     from genre_tasks.scene.deformation import Deformation
+
+
+@dataclass(frozen=True)
+class Beside:
+    """What is fitted beside the offsets, as it is now.
+
+    ``deformation``: how actors deform; ``None``: they are rigid. ``harmonics`` [N, K, 3]: of colours, if any.
+    """
+
+    deformation: Deformation | None = None
+    harmonics: Tensor | None = None
+
+
+RIGID_AND_DULL = Beside()
 
 
 class Pass(Protocol):
@@ -52,9 +66,9 @@ class TorchPass:
         offsets: Tensor,
         views: Sequence[PosedView],
         settings: RenderSettings,
-        deformation: Deformation | None = None,
-        harmonics: Tensor | None = None,
+        beside: Beside = RIGID_AND_DULL,
     ) -> None:
+        deformation, harmonics = beside.deformation, beside.harmonics
         self._leaf, scene = offsets.detach().requires_grad_(), frame.scene
         self._nodes = None if deformation is None else deformation.offsets.detach().requires_grad_()
         self._harmonics = None if harmonics is None else harmonics.detach().requires_grad_()
@@ -96,17 +110,16 @@ class CompiledPass:
         offsets: Tensor,
         views: Sequence[PosedView],
         settings: RenderSettings,
-        deformation: Deformation | None = None,
-        harmonics: Tensor | None = None,
+        beside: Beside = RIGID_AND_DULL,
     ) -> None:
         self._posing, self._threads = frame.posing, settings.threads or torch.get_num_threads()
         frames = [v.frame for v in views]
         self._posed = self._posing.splats(offsets.detach(), list(dict.fromkeys(frames)), self._threads)
         splats, shown = self._posed.splats, self._posing.shown(frames)
         self.by_deformation: Tensor | None = None
-        self._shift = _shift(frame, offsets.detach(), list(dict.fromkeys(frames)), splats[0], deformation)
+        self._shift = _shift(frame, offsets.detach(), list(dict.fromkeys(frames)), splats[0], beside.deformation)
         velocities = velocities_of(frame.scene, splats[0], views)
-        self._shown = None if harmonics is None else Shine(frame, offsets, harmonics, views)
+        self._shown = None if beside.harmonics is None else Shine(frame, offsets, beside.harmonics, views)
         if self._shown is not None:
             splats = (*splats[:4], self._shown.colors.detach())
         self._splats = splats
@@ -212,16 +225,12 @@ def begin(
     offsets: Tensor,
     views: Sequence[PosedView],
     settings: RenderSettings,
-    deformation: Deformation | None = None,
-    harmonics: Tensor | None = None,
+    beside: Beside = RIGID_AND_DULL,
 ) -> Pass:
-    """The render of ``views`` at ``offsets`` [N, 14], by kernels where they are made for it.
-
-    ``deformation``: how actors deform now; ``None``: they are rigid. ``harmonics`` [N, K, 3]: of colours now, if any.
-    """
+    """The render of ``views`` at ``offsets`` [N, 14], by kernels where they are made for it."""
     compiled = settings.backend in ("auto", "cpu") and takes(offsets, frame.start, frame.unit)
     kind: Callable[..., Pass] = CompiledPass if compiled else TorchPass
     moments = Moments.of(views)
     if moments is None:
-        return kind(frame, offsets, views, settings, deformation, harmonics)
-    return BlurredPass(kind(frame, offsets, moments.views, settings, deformation, harmonics), moments)
+        return kind(frame, offsets, views, settings, beside)
+    return BlurredPass(kind(frame, offsets, moments.views, settings, beside), moments)

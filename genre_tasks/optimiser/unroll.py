@@ -13,6 +13,7 @@ from torch import Tensor
 
 from genre_tasks.errors import InputError
 from genre_tasks.optimiser.objective import Objective, check_finite
+from genre_tasks.optimiser.passes import Beside
 from genre_tasks.optimiser.rules import StepRule, schedule
 from genre_tasks.optimiser.sampler import ViewSampler
 from genre_tasks.optimiser.state import Frame, State
@@ -77,8 +78,8 @@ def unroll(
         began = time.perf_counter()
         batch = [t for s in samplers for t in s.draw()]
         deformation = scene.deformation if fit is None else fit.deformation
-        harmonics = None if gloss is None else gloss.harmonics
-        sight = objective(frame, state.offsets, batch, i, generator, deformation, harmonics)
+        beside = Beside(deformation, None if gloss is None else gloss.harmonics)
+        sight = objective(frame, state.offsets, batch, i, generator, beside)
         check_finite(sight.gradient, "gradient", plan.stage)
         state = state.saw(sight.gradient)
         state = state.moved(frame, step(state, sight.gradient, plan.iterations))

@@ -17,7 +17,7 @@ from genre_tasks.errors import ArtifactCorruptError, NonFiniteError
 from genre_tasks.optimiser.adam import TunedAdam
 from genre_tasks.optimiser.deforming import DeformationFit
 from genre_tasks.optimiser.objective import Objective
-from genre_tasks.optimiser.passes import CompiledPass, TorchPass
+from genre_tasks.optimiser.passes import Beside, CompiledPass, TorchPass
 from genre_tasks.optimiser.run import optimise
 from genre_tasks.optimiser.state import Frame
 from genre_tasks.optimiser.unroll import Plan, unroll
@@ -139,7 +139,7 @@ def test_the_compiled_pass_agrees_with_torch() -> None:
     offsets = 0.05 * torch.randn(len(scene), 14, generator=torch.Generator().manual_seed(6))
     found = []
     for kind in (TorchPass, CompiledPass):
-        image = kind(frame, offsets, views, RenderSettings(), scene.deformation)
+        image = kind(frame, offsets, views, RenderSettings(), Beside(scene.deformation))
         by = torch.rand(image.color.shape, generator=torch.Generator().manual_seed(7))
         gradient = image.gradient(by, 0.01 * torch.ones_like(image.depth))
         found.append((image.color, gradient, image.by_deformation))

@@ -14,7 +14,7 @@ from genre_tasks.config import LossConfig
 from genre_tasks.optimiser.adam import TunedAdam
 from genre_tasks.optimiser.gloss import RATE, GlossSight, GlossState
 from genre_tasks.optimiser.objective import Objective
-from genre_tasks.optimiser.passes import CompiledPass, TorchPass
+from genre_tasks.optimiser.passes import Beside, CompiledPass, TorchPass
 from genre_tasks.optimiser.ssim import SsimTarget
 from genre_tasks.optimiser.state import Frame
 from genre_tasks.optimiser.unroll import Plan, unroll
@@ -36,7 +36,8 @@ def test_a_whole_pass_is_torchs() -> None:
     scene = _glossy(_scene())
     views = [replace(t, frame=f) for t, f in zip(street.targets(street.scene()), (1, 7, 1, 2), strict=True)]
     offsets, harmonics = _offsets(scene), scene.harmonics
-    ours, torchs = (p(Frame.of(scene), offsets, views, SETTINGS, None, harmonics) for p in (CompiledPass, TorchPass))
+    fixed = Frame.of(scene), offsets, views, SETTINGS, Beside(harmonics=harmonics)
+    ours, torchs = (p(*fixed) for p in (CompiledPass, TorchPass))
     torch.testing.assert_close(ours.color, torchs.color, atol=2e-4, rtol=0)
     plain = CompiledPass(Frame.of(scene), offsets, views, SETTINGS)
     assert (plain.color - ours.color).abs().max() > 0.05
