@@ -30,6 +30,14 @@ def load_configuration(preset: str, file: Path | None = None, settings: Sequence
     return validated(values, source=str(file or f"preset {preset}"))
 
 
+def with_settings(config: PipelineConfig, settings: Sequence[str]) -> PipelineConfig:
+    """``config`` with each ``section.key=value`` over it. Raises ``ConfigError`` as :func:`load_configuration`."""
+    values: Mapping[str, Any] = config.model_dump(mode="json")
+    for setting in settings:
+        values = _merged(values, _spelled_out(_parse_setting(setting)))
+    return validated(values, source="settings")
+
+
 def preset_values(preset: str) -> dict[str, Any]:
     """What a preset says, as plain values."""
     if preset not in PRESETS:

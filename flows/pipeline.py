@@ -107,6 +107,11 @@ PIPELINE: tuple[StageSpec, ...] = (
 BY_NAME: Mapping[str, StageSpec] = {spec.name: spec for spec in PIPELINE}
 
 
+def reconstructing_until(end: str) -> tuple[str, ...]:
+    """The reconstructing stages up to ``end``, whose scene is the result."""
+    return RECONSTRUCTING[: RECONSTRUCTING.index(end) + 1]
+
+
 def section_of(spec: StageSpec, config: PipelineConfig) -> Any:
     """The configuration subtree that the stage gets."""
     return getattr(config, spec.section)

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import logging
+import time
+from dataclasses import replace
 from typing import Any
 
 from prefect import flow
 from prefect.artifacts import create_image_artifact, create_table_artifact
 
+from flows.budget.budget import Budget
+from flows.budget.chooser import Chooser
 from flows.configuration import differences, load_configuration, validated
 from flows.logs import chosen_chunks, expanded
-from flows.pipeline import PIPELINE
+from flows.pipeline import BY_NAME, PIPELINE, RECONSTRUCTING, StageSpec
 from flows.produce import ArtifactRef, Job
+from flows.reporting import current_reporter
 from flows.runs import Run, finish_run, summary_of
 from flows.stage_task import stage_task
 from flows.summary import RunSummary
@@ -29,6 +34,9 @@ def reconstruct_log(
     chunks: list[int] | None = None,
     config: dict[str, Any] | None = None,
     settings: list[str] | None = None,
+    budget_s: float | None = None,
+    began: float | None = None,
+    table: str | None = None,
 ) -> dict[str, Any]:
     """Reconstructs and enhances one driving log, chunk by chunk; returns the run's summary as plain values.
 
@@ -37,6 +45,9 @@ def reconstruct_log(
         preset: demo, small, long or paper. store: a folder or URI.
         chunks: which chunks; all if None. config: a whole effective configuration (it overrides the preset's).
         settings: ``section.key=value`` strings, applied last.
+        budget_s: seconds that the run may take from ``began`` on (since the epoch; the flow's start without it),
+            evaluation not counted: the most accurate setting of ``table`` (a sweep's cost.parquet; the preset's own
+            without it) that fits is chosen, and again before each stage.
 
     A chunk that its input makes impossible is left out and the others go on; the error is raised at the end.
     """
@@ -49,9 +60,16 @@ def reconstruct_log(
     done: dict[int, dict[str, ArtifactRef]] = {}
     open_store(store).clean_temporaries()  # what killed runs left half-written
     chosen = chosen_chunks(log, effective, chunks)
-    for chunk in chosen:
+    budget = None if budget_s is None else Budget(budget_s, began, table, preset, effective)
+    if budget is not None:
+        current_reporter().said(budget.told())
+    for k, chunk in enumerate(chosen):
+        job = Job(log, chunk, store, values)
         try:
-            done[chunk] = _reconstruct_chunk(Job(log, chunk, store, values))
+            if budget is None:
+                done[chunk] = _reconstruct_chunk(job)
+            else:
+                done[chunk] = _reconstruct_within(job, budget.chooser(log, chunk), 1 / (len(chosen) - k))
         except InputError as error:
             if len(chosen) > 1:  # a single one raises below
                 _log.error("chunk %d is left out: %s", chunk, error)
@@ -60,7 +78,7 @@ def reconstruct_log(
         raise failed[0]
     run = Run(log, preset, store, values, differences(effective, preset), done)
     summary = summary_of(run)
-    record = finish_run(run, summary)
+    record = finish_run(run, summary, {} if budget is None else {"budget": budget.record()})
     _publish(summary)
     if failed:
         raise failed[0]
@@ -70,10 +88,34 @@ def reconstruct_log(
 def _reconstruct_chunk(job: Job) -> dict[str, ArtifactRef]:
     refs: dict[str, ArtifactRef] = {}
     for spec in PIPELINE:
-        inputs = {name: refs[name] for name in spec.inputs}
-        state = stage_task(spec.name, job.chunk, job, inputs, return_state=True)
-        refs[spec.name] = state.result()
+        refs[spec.name] = _staged(spec, job, refs)
     return refs
+
+
+def _reconstruct_within(job: Job, chooser: Chooser, share: float) -> dict[str, ArtifactRef]:
+    """As the chooser chooses: the scene may be GNet's. What is there is evaluated while the clock stands still."""
+    refs: dict[str, ArtifactRef] = {}
+    while True:
+        told, step = len(chooser.choices), chooser.next(share)
+        for choice in chooser.choices[told:]:
+            current_reporter().said(f"chunk {job.chunk}  before {choice.before}: {choice}")
+        if step is None:
+            break
+        stage, config = step
+        job, begun = replace(job, config=config.model_dump(mode="json")), time.monotonic()
+        refs[stage] = _staged(BY_NAME[stage], job, refs)
+        chooser.done(stage, time.monotonic() - begun, refs[stage].cached)
+    with chooser.clock.paused():
+        for spec in PIPELINE:
+            if spec.name not in RECONSTRUCTING and all(name in refs for name in spec.inputs):
+                refs[spec.name] = _staged(spec, job, refs)
+    return refs
+
+
+def _staged(spec: StageSpec, job: Job, refs: dict[str, ArtifactRef]) -> ArtifactRef:
+    inputs = {name: refs[name] for name in spec.inputs}
+    done: ArtifactRef = stage_task(spec.name, job.chunk, job, inputs, return_state=True).result()
+    return done
 
 
 def _publish(summary: RunSummary) -> None:

@@ -26,6 +26,10 @@ class Reporter(Protocol):
 
     def ended(self, outcome: str) -> None: ...
 
+    def said(self, text: str) -> None:
+        """Something the user should know, between parts."""
+        ...
+
 
 class LogReporter:
     """Writes one log line per stage and per ``every_s`` seconds of progress: what a worker does."""
@@ -55,6 +59,9 @@ class LogReporter:
 
     def ended(self, outcome: str) -> None:
         _log.info("%s: %s", self._what, outcome)
+
+    def said(self, text: str) -> None:
+        _log.info("%s", text)
 
 
 _current: Reporter = LogReporter()

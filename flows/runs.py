@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,8 +44,8 @@ class Run:
         return open_store(self.store).root / _FOLDER / self.name
 
 
-def finish_run(run: Run, summary: RunSummary) -> dict[str, Any]:
-    """Writes the run's record and report into the store and returns the record (``--json`` prints a part of it)."""
+def finish_run(run: Run, summary: RunSummary, more: Mapping[str, Any]) -> dict[str, Any]:
+    """Writes the run's record, ``more`` in it, and its report into the store; returns the record."""
     from flows.report import write_report
 
     run.folder.mkdir(parents=True, exist_ok=True)
@@ -75,6 +76,7 @@ def finish_run(run: Run, summary: RunSummary) -> dict[str, Any]:
             }
             for chunk in summary.chunks
         ],
+        **more,
     }
     path = run.folder / "run.json"
     partial = path.with_suffix(".tmp")
@@ -93,7 +95,7 @@ def _chunk_summary(run: Run, chunk: int, refs: dict[str, ArtifactRef]) -> ChunkS
     store = open_store(run.store)
     found = {name: _found(run.store, ref) for name, ref in refs.items()}
     stages = []
-    for spec in PIPELINE:
+    for spec in (s for s in PIPELINE if s.name in found):
         manifest = found[spec.name].manifest
         metrics: dict[str, float] = {}
         pictures: dict[str, bytes] = {}

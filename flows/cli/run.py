@@ -25,6 +25,13 @@ def run(
     strict: Annotated[
         bool, typer.Option("--strict", help="A missing or unreadable image or sweep is an error.")
     ] = False,
+    budget: Annotated[
+        str | None,
+        typer.Option(help="Wall time from the command's start, e.g. 90s or 5m: the best that fits is chosen."),
+    ] = None,
+    table: Annotated[
+        Path | None, typer.Option(help="What --budget chooses from: a cost.parquet of `genre cost` here.")
+    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say what would be computed, and what it would take.")
     ] = False,
@@ -34,15 +41,24 @@ def run(
 
     Add --debug to any command for tracebacks.
     """
-    from flows.cli.numbers import numbers
+    import psutil
+
+    from flows.cli.numbers import numbers, seconds
     from flows.configuration import load_configuration
     from flows.logs import opened_log
+    from genre_tasks.errors import ConfigError
 
+    began = psutil.Process().create_time()
     settings = [*(set_ or []), *(["ingest.strict=true"] if strict else [])]
     effective = load_configuration(preset, config, settings)
-    wanted = numbers(chunks, "--chunks")
+    wanted, budget_s = numbers(chunks, "--chunks"), seconds(budget, "--budget")
     opened_log(log)  # a log that cannot be opened is said before a server is started
+    if table is not None and budget_s is None:
+        raise ConfigError("--table is what --budget chooses from", remedy="Give a --budget, too, or leave it out.")
+    given = None if table is None else str(table)
     if dry_run:
+        if budget_s is not None:
+            effective = _chosen(log, preset, wanted, effective, budget_s, began, given)
         _dry_run(log, preset, store, wanted, effective, as_json)
         return
     Path(os.environ["PREFECT_HOME"]).mkdir(parents=True, exist_ok=True)
@@ -54,12 +70,30 @@ def run(
     report_to(reporter)
     with reporter:
         summary = reconstruct_log(
-            log, preset=preset, store=store, chunks=wanted, config=effective.model_dump(mode="json")
-        )
+            log, preset=preset, store=store, chunks=wanted, config=effective.model_dump(mode="json"),
+            budget_s=budget_s, began=began, table=given,
+        )  # fmt: skip
     if as_json:
-        typer.echo(json.dumps({key: summary[key] for key in ("log", "preset", "store", "run", "chunks")}))
+        shown = ("log", "preset", "store", "run", "chunks", "budget")
+        typer.echo(json.dumps({key: summary[key] for key in shown if key in summary}))
     else:
         print_run(summary)
+
+
+def _chosen(
+    log: str, preset: str, chunks: list[int] | None, config: PipelineConfig, budget_s: float, began: float,
+    table: str | None,
+) -> PipelineConfig:  # fmt: skip
+    """What a budget would begin the first chunk with; said on stderr."""
+    from flows.budget.budget import Budget
+    from flows.logs import chosen_chunks
+
+    budget, wanted = Budget(budget_s, began, table, preset, config), chosen_chunks(log, config, chunks)
+    typer.echo(budget.told(), err=True)
+    chooser = budget.chooser(log, wanted[0])
+    step = chooser.next(1 / len(wanted))
+    typer.echo(f"chunk {wanted[0]}: {chooser.choices[0]} (Prefect's start would be counted, too)", err=True)
+    return config if step is None else step[1]
 
 
 def _dry_run(

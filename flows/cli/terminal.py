@@ -62,6 +62,9 @@ class TerminalReporter:
     def ended(self, outcome: str) -> None:
         self._write(f"{self._what:<28} {outcome} in {time.monotonic() - self._started:.1f} s", end=True)
 
+    def said(self, text: str) -> None:
+        self._write(text, end=True)
+
     def progress(self, done: int, total: int, note: str = "") -> None:
         now = time.monotonic()
         if total != self._total:  # what was done before, by a run that was stopped, says nothing about speed
@@ -83,7 +86,7 @@ class TerminalReporter:
 
     def _write(self, text: str, end: bool = False) -> None:
         if self._live:
-            sys.stderr.write("\r\x1b[2K" + text[:118] + ("\n" if end else ""))
+            sys.stderr.write("\r\x1b[2K" + (text + "\n" if end else text[:118]))
         else:
             sys.stderr.write(text + "\n")
         sys.stderr.flush()
@@ -117,6 +120,9 @@ def print_run(summary: dict[str, Any]) -> None:
     console.print(
         f"{hits} of {len(stages)} stages came from the cache" + (" (all of them)" if hits == len(stages) else "")
     )
+    if "budget" in summary:
+        spent = summary["budget"]
+        console.print(f"{spent['used_s']:.0f} s of a budget of {spent['budget_s']:g} s used; evaluation is not counted")
     console.print(f"run    {summary['run']}")
     console.print(f"report {summary['report']}", soft_wrap=True)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from flows.cost.knobs import PRESET_ITSELF, Setting
-from flows.pipeline import BY_NAME, PIPELINE, RECONSTRUCTING
+from flows.pipeline import BY_NAME, PIPELINE, reconstructing_until
 from flows.produce import ArtifactRef, Job, address_of
 from genre_tasks.errors import InputError
 from storage.local import Artifact, open_store
@@ -51,7 +51,7 @@ class Sweep:
 
 def stages_of(setting: Setting) -> tuple[str, ...]:
     """The reconstructing stages up to the setting's end."""
-    return RECONSTRUCTING[: RECONSTRUCTING.index(setting.end) + 1]
+    return reconstructing_until(setting.end)
 
 
 def run_cell(sweep: Sweep, cell: Cell, produce: Produce) -> dict[str, Any] | None:
@@ -76,7 +76,8 @@ def run_cell(sweep: Sweep, cell: Cell, produce: Produce) -> dict[str, Any] | Non
             judged |= {"ingest": shown, "effects": produce("effects", judge, {"ingest": shown})}
         evaluation = produce(judging.name, job, judged)
     row: dict[str, Any] = {"knob": cell.setting.knob, "value": cell.setting.value, "setting": cell.setting.name}
-    row |= {"log": cell.log, "chunk": cell.chunk, "seed": cell.seed}
+    row |= {"changes": list(cell.setting.changes), "end": cell.setting.end, "threads": cell.setting.threads}
+    row |= {"log": cell.log, "chunk": cell.chunk, "seed": cell.seed, "images": len(_value(job, refs["ingest"]).views)}
     stages = {name: _found(job, ref).manifest for name, ref in refs.items()}
     row["seconds"] = {name: m.seconds for name, m in stages.items()}
     row["cpu_seconds"] = {name: m.measurements.get("cpu_seconds") for name, m in stages.items()}

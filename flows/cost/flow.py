@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
+from flows.calibration import calibration_s
 from flows.cost.cell import Cell, Sweep, cells_of, run_cell
 from flows.cost.knobs import PRESET_ITSELF, settings_of
 from flows.cost.page import page
 from flows.cost.picture import drawn
 from flows.cost.summary import beside, lines_of
 from flows.cost.tables import write_cells, write_lines
+from flows.cost.warm import cold_seconds
 from flows.logs import chosen_chunks, expanded
 from flows.machine import commit, machine
 from flows.produce import ArtifactRef, Job, produce
@@ -53,6 +56,10 @@ def cost_of_accuracy(
     rows: list[dict[str, Any]] = []
     failed: dict[str, GenreError] = {}
     reporter = current_reporter()
+    reporter.began("warming up")
+    cold = cold_seconds(sweep)
+    speed = {"calibration_s": f"{calibration_s():.4f}", "cold_seconds": json.dumps(cold)}
+    reporter.ended(f"{sum(cold.values()):.1f} s more than warm")
     for k, cell in enumerate(cells):
         reporter.began(f"{k + 1}/{len(cells)} {cell.name}")
         try:
@@ -64,7 +71,7 @@ def cost_of_accuracy(
                 raise
             failed[cell.name] = error
             reporter.ended(f"left out: {error}")
-    files = write(Path(out), sweep, rows, [f"{name}: {error}" for name, error in failed.items()])
+    files = write(Path(out), sweep, rows, [f"{name}: {error}" for name, error in failed.items()], speed)
     return {"cells": len(rows), "failed": sorted(failed), "files": files}
 
 
@@ -92,8 +99,13 @@ def cell_task(sweep: Sweep, cell: Cell) -> dict[str, Any] | None:
     return run_cell(sweep, cell, produced)
 
 
-def write(out: Path, sweep: Sweep, rows: Sequence[dict[str, Any]], failed: Sequence[str]) -> list[str]:
-    """``cost.parquet``, ``cost_cells.parquet``, ``cost.png`` and ``cost.md``, each whole or not at all."""
+def write(
+    out: Path, sweep: Sweep, rows: Sequence[dict[str, Any]], failed: Sequence[str], speed: Mapping[str, str]
+) -> list[str]:
+    """``cost.parquet``, ``cost_cells.parquet``, ``cost.png`` and ``cost.md``, each whole or not at all.
+
+    ``speed`` of the machine goes into the tables, for whoever predicts from them.
+    """
     out.mkdir(parents=True, exist_ok=True)
     lines, judged = lines_of(rows), beside(rows)
     where = sorted({f"{r['log']} chunk {r['chunk']}" for r in rows})
@@ -103,8 +115,9 @@ def write(out: Path, sweep: Sweep, rows: Sequence[dict[str, Any]], failed: Seque
         "seeds": ", ".join(map(str, seeds)), "machine": machine(), "commit": commit(),
         "date": time.strftime("%Y-%m-%d", time.gmtime()),
     }  # fmt: skip
-    write_lines(out / "cost.parquet", lines, facts)
-    write_cells(out / "cost_cells.parquet", rows, facts)
+    basis = {"base": sweep.preset, "settings": json.dumps(sweep.settings), "judged": judged.name, **speed}
+    write_lines(out / "cost.parquet", lines, facts | basis)
+    write_cells(out / "cost_cells.parquet", rows, facts | basis)
     write_png(out / "cost.png", drawn(lines, judged, f"{facts['preset']}: {facts['logs']}"))
     said = [f"* {name}: {value}" for name, value in facts.items()] + [f"* left out: {text}" for text in failed]
     write_file(out / "cost.md", page(lines, judged, said, "cost.png").encode())

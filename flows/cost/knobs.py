@@ -122,18 +122,17 @@ def _knobs(base: PipelineConfig) -> Mapping[str, list[Setting]]:
 
 
 def _together(points: int) -> list[Setting]:
-    """Several knobs at once, each of the kinds that save most: what a budget would choose from."""
+    """Several knobs at once: lengths of GNet and ENet, as they share stages; and the cheapest and the costliest."""
     fewer = f"initial.max_points={points // 2}"
     small = ("ingest.width_px=240", "ingest.height_px=136")
-    designed: list[tuple[str, tuple[str, ...], End]] = [
-        ("shortest", (*small, fewer, "gnet.iterations=8"), "gnet"),
-        ("short", ("gnet.iterations=16",), "gnet"),
-        ("short, fixed", ("gnet.iterations=24", "enet.iterations=8", "fnet.gate=0.2"), "enet"),
-        ("half", (fewer, "gnet.iterations=36", "enet.iterations=8"), "enet"),
-        ("long", ("gnet.iterations=144", "enet.iterations=24"), "enet"),
-        ("most", (f"initial.max_points={2 * points}", "gnet.iterations=144", "gnet.views_per_iteration=6",
-                  "enet.iterations=24"), "enet"),
-    ]  # fmt: skip
+    designed: list[tuple[str, tuple[str, ...], End]] = [("least", (*small, fewer, "gnet.iterations=8"), "gnet")]
+    for gnet in (4, 8, 16, 24, 48, 144):
+        designed.append((f"GNet {gnet} alone", (f"gnet.iterations={gnet}",), "gnet"))
+        for enet in (4, 24):
+            changes = (f"gnet.iterations={gnet}", f"enet.iterations={enet}")
+            designed.append((f"GNet {gnet}, ENet {enet}", changes, "enet"))
+    most = (f"initial.max_points={2 * points}", "gnet.iterations=144", "gnet.views_per_iteration=6")
+    designed.append(("most", (*most, "enet.iterations=24"), "enet"))
     return [Setting(TOGETHER, name, changes, end) for name, changes, end in designed]
 
 

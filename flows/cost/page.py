@@ -10,7 +10,8 @@ from flows.cost.summary import COSTS, KERNEL_3M, MEASURES, PSNR, Line, Measure, 
 INCLUDED = (
     "Seconds are the wall time of the stages up to the scene (ingest, plan of effects, initial scene, GNet, and unless "
     "it is off novel views, FNet and ENet), each as measured when it was computed; evaluation, reading artifacts back, "
-    "hashing and the start of Python are not in them. A stage that settings share was computed once. ± is "
+    "hashing, the start of Python, imports and other first calls are not in them (the process was warm). A stage that "
+    "settings share was computed once. ± is "
     "the standard deviation over seeds (order of views, noise of the fixer), pooled over logs."
 )
 

@@ -68,8 +68,9 @@ class Spread:
 class Line:
     """A setting: ``n`` cells; ``values`` by measure; ``gains`` over the preset in the same place with the same seed.
 
-    A gain is in the measure's unit, positive where the setting is better. ``on_front`` names the measures in which no
-    setting is as good in less time.
+    A gain is in the measure's unit, positive where the setting is better. ``images`` are those at 3 m that distances
+    are of, ``source_images`` those of a chunk. ``on_front`` names the measures in which no setting is as good in less
+    time.
     """
 
     knob: str
@@ -80,6 +81,10 @@ class Line:
     gains: Mapping[str, Spread]
     stage_seconds: Mapping[str, float]
     images: float
+    changes: tuple[str, ...]
+    end: str
+    threads: int
+    source_images: float
     on_front: tuple[str, ...] = ()
 
     @property
@@ -131,7 +136,10 @@ def _line(name: str, rows: Sequence[Row], own: Mapping[tuple[Any, ...], Row]) ->
     }
     stages = {s: statistics.median(r["seconds"][s] for r in rows) for s in rows[0]["seconds"]}
     images = statistics.mean(float(r["metrics"].get("shift_3m/n", 0)) for r in rows)
-    return Line(rows[0]["knob"], rows[0]["value"], name, len(rows), values, gains, stages, images)
+    source = statistics.mean(float(r["images"]) for r in rows)
+    first = rows[0]
+    own_setting = tuple(first["changes"]), first["end"], first["threads"]
+    return Line(first["knob"], first["value"], name, len(rows), values, gains, stages, images, *own_setting, source)
 
 
 def _place(row: Row) -> tuple[Any, ...]:

@@ -28,7 +28,8 @@ def row(value: str, seed: int, seconds: float, psnr: float, log: str = "a", **mo
     return {
         "knob": knob, "value": value, "setting": f"{knob}={value}" if value else PRESET_ITSELF, "log": log, "chunk": 0,
         "seed": seed, "seconds": {"ingest": 1.0, "gnet": seconds}, "cpu_seconds": {"ingest": 1.5, "gnet": 2 * seconds},
-        "peak_mib": 500.0, "gaussians": 1000, "metrics": metrics,
+        "peak_mib": 500.0, "gaussians": 1000, "metrics": metrics, "images": 120, "end": "enet", "threads": 0,
+        "changes": [f"gnet.views_per_iteration={value}"] if value else [],
     }  # fmt: skip
 
 
@@ -78,7 +79,7 @@ def test_settings_start_with_the_preset_and_differ_from_it() -> None:
 
 
 def test_the_files_say_the_same(tmp_path: Path) -> None:
-    files = write(tmp_path, Sweep("small", (), "store"), ROWS, ["views=99: memory ran out"])
+    files = write(tmp_path, Sweep("small", (), "store"), ROWS, ["views=99: memory ran out"], {"calibration_s": "0.1"})
     lines, cells, picture, page = (Path(f) for f in files)
     table = pq.read_table(lines).to_pydict()
     assert table["value"] == ["", "1", "9"] and table["psnr_mean"][1] == pytest.approx(22.5)

@@ -1,0 +1,50 @@
+"""The budget of a whole run: one clock and one table, a chooser for each chunk."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from flows.budget.chooser import Chooser, images_of
+from flows.budget.clock import Clock
+from flows.budget.measured import load, shipped_table
+from flows.calibration import calibration_s
+from flows.configuration import differences
+from genre_tasks.config import PipelineConfig
+
+
+class Budget:
+    """``budget_s`` seconds from ``began`` (since the epoch; now without it) for a run with ``config`` over ``preset``.
+
+    ``table`` is the cost.parquet of a sweep; the preset's own without it. Evaluation is not counted.
+    """
+
+    def __init__(
+        self, budget_s: float, began: float | None, table: str | None, preset: str, config: PipelineConfig
+    ) -> None:
+        self.clock = Clock(budget_s, began)
+        self._table = load(Path(table) if table else shipped_table(preset), preset)
+        self._config, self._own = config, tuple(differences(config, preset))
+        self.speed = calibration_s() / self._table.calibration_s
+        self.choosers: dict[int, Chooser] = {}
+
+    def chooser(self, log: str, chunk: int) -> Chooser:
+        """Of a chunk; the first one's stages are also the first of the process."""
+        work = images_of(log, chunk, self._config) / self._table.images
+        made = Chooser(self._table, self._config, self.clock, work, self.speed, not self.choosers, self._own)
+        self.choosers[chunk] = made
+        return made
+
+    def told(self) -> str:
+        """What the clock says before the first choice."""
+        return (
+            f"budget {self.clock.budget_s:g} s, {self.clock.used_s:.1f} s used so far; this machine takes "
+            f"{self.speed:.2f} times as long as that of the table ({self._table.machine})"
+        )
+
+    def record(self) -> dict[str, Any]:
+        """For the run's record, once the last scene is there."""
+        chunks = [{"chunk": c, "choices": [asdict(x) for x in by.choices]} for c, by in self.choosers.items()]
+        used_s = max((by.used_s for by in self.choosers.values()), default=self.clock.used_s)
+        return {"budget_s": self.clock.budget_s, "used_s": used_s, "speed": self.speed, "chunks": chunks}

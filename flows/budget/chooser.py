@@ -1,0 +1,129 @@
+"""Chooses the most accurate setting that fits, and chooses again at every border between stages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from flows.budget.clock import Clock
+from flows.budget.measured import Point, Table
+from flows.configuration import with_settings
+from flows.logs import opened_log
+from flows.pipeline import BY_NAME, reconstructing_until
+from genre_tasks.config import PipelineConfig
+from genre_tasks.errors import ConfigError
+
+BORDER_S = 0.6
+"""Of a stage beyond its own seconds on the table's machine: artifacts read, hashed and written, Prefect's states."""
+
+SPARE = 0.06
+"""Of the predicted time, kept for what no table knows."""
+
+PACING, PACED_S = ("initial", "gnet"), 2.0
+"""Stages whose time tells how fast the machine is, and from how many seconds on: ingest's tells of the log's reader."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a border decided: ``before`` which stage, the point's name, seconds predicted and left, and why."""
+
+    before: str
+    point: str
+    predicted_s: float
+    left_s: float
+    why: str
+
+    def __str__(self) -> str:
+        return f"{self.point}: {self.predicted_s:.0f} s predicted of {self.left_s:.0f} s left; {self.why}"
+
+
+class Chooser:
+    """For one chunk.
+
+    ``base`` is the user's configuration, over which a setting of the table is applied; ``own`` the keys that the user
+    has set. ``work`` is the chunk's images over the table's, ``speed`` this machine's calibration over the table's,
+    ``cold`` whether no stage has run in this process. Raises ``ConfigError`` where the user has set what the table
+    turns.
+    """
+
+    def __init__(
+        self, table: Table, base: PipelineConfig, clock: Clock, work: float, speed: float, cold: bool = True,
+        own: Iterable[str] = (),
+    ) -> None:  # fmt: skip
+        turned = {change.partition("=")[0] for p in table.points for change in p.changes}
+        if both := sorted(turned & set(own)):
+            raise ConfigError(
+                f"{', '.join(both)} is what a budget decides", remedy="Leave out either --budget or that setting."
+            )
+        self.clock, self.choices = clock, list[Choice]()
+        self._table, self._work, self._pace = table, work, speed
+        self._cold = table.cold if cold else {}
+        self._points = [(p, with_settings(base, p.changes)) for p in table.points]
+        self._finished: list[str] = []
+        self._now: tuple[Point, PipelineConfig] | None = None
+        self._taken, self._foreseen = 0.0, 0.0
+        self.used_s = 0.0  # of the budget at the latest border
+
+    def next(self, share: float = 1.0) -> tuple[str, PipelineConfig] | None:
+        """The stage to compute next and its configuration, ``None`` where the chunk is done.
+
+        ``share`` of the time left is this chunk's.
+        """
+        left = self.clock.left_s * share
+        possible = [(p, c) for p, c in self._points if self._reachable(p, c)]
+        ranked = sorted(possible, key=lambda pc: (-pc[0].accuracy, self.predicted_s(pc[0])))
+        chosen = next((pc for pc in ranked if self.predicted_s(pc[0]) <= left), None)
+        why = self._why(ranked, chosen)
+        if chosen is None:
+            chosen = min(ranked, key=lambda pc: self.predicted_s(pc[0]))
+        todo = self._todo(chosen[0])
+        if self._now is None or chosen[0] is not self._now[0]:
+            before = todo[0] if todo else "the end"
+            self.choices.append(Choice(before, chosen[0].name, self.predicted_s(chosen[0]), left, why))
+        self._now, self.used_s = chosen, self.clock.used_s
+        return (todo[0], chosen[1]) if todo else None
+
+    def done(self, stage: str, seconds: float, cached: bool) -> None:
+        """Takes note of what a stage took from border to border: where it was computed, others will go at its pace."""
+        assert self._now is not None
+        if not cached and stage in PACING:
+            self._taken += seconds
+            self._foreseen += self._of(self._now[0], stage)
+            if self._foreseen > PACED_S:
+                self._pace = self._taken / self._foreseen
+        self._finished.append(stage)
+
+    def predicted_s(self, point: Point) -> float:
+        """Of the stages that are not finished, with what is kept for surprises."""
+        return (1 + SPARE) * self._pace * sum(self._of(point, stage) for stage in self._todo(point))
+
+    def _of(self, point: Point, stage: str) -> float:
+        """Seconds on the table's machine. GNet's and ENet's go with their iterations, all others' with the images."""
+        work = 1.0 if stage in ("gnet", "enet") else self._work
+        return point.seconds[stage] * work + self._cold.get(stage, 0.0) + BORDER_S
+
+    def _todo(self, point: Point) -> list[str]:
+        return [s for s in reconstructing_until(point.end) if s not in self._finished]
+
+    def _reachable(self, point: Point, config: PipelineConfig) -> bool:
+        """Whether what is finished is what the point would have made; to stop at GNet's scene is always possible."""
+        if self._now is None:
+            return True
+        sections = {BY_NAME[s].section for s in self._finished if s in reconstructing_until(point.end)}
+        return all(getattr(config, name) == getattr(self._now[1], name) for name in sections)
+
+    def _why(self, ranked: Sequence[tuple[Point, PipelineConfig]], chosen: tuple[Point, PipelineConfig] | None) -> str:
+        if chosen is None:
+            return "nothing fits; this is the shortest"
+        what, better = f"the best {self._table.judged} that fits", ranked[: ranked.index(chosen)]
+        if not better:
+            return f"{what}, and of all {len(ranked)}"
+        nearest = min(better, key=lambda pc: self.predicted_s(pc[0]))[0]
+        return f"{what}; {nearest.name} would take {self.predicted_s(nearest):.0f} s"
+
+
+def images_of(log: str, chunk: int, config: PipelineConfig) -> int:
+    """How many images a chunk of a log has at most: frames times cameras."""
+    opened, frames = opened_log(log), config.ingest.chunk_frames
+    cameras = config.ingest.cameras or tuple(c.name for c in opened.cameras)
+    return len(cameras) * min(frames, opened.frame_count - chunk * frames)
