@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +44,6 @@ class Budget:
 
     def record(self) -> dict[str, Any]:
         """For the run's record, once the last scene is there."""
-        chunks = [{"chunk": c, "choices": [asdict(x) for x in by.choices]} for c, by in self.choosers.items()]
+        chunks = [{"chunk": c, **by.record()} for c, by in self.choosers.items()]
         used_s = max((by.used_s for by in self.choosers.values()), default=self.clock.used_s)
         return {"budget_s": self.clock.budget_s, "used_s": used_s, "speed": self.speed, "chunks": chunks}

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from flows.budget.clock import Clock
 from flows.budget.measured import Point, Table
@@ -92,6 +93,11 @@ class Chooser:
             if self._foreseen > PACED_S:
                 self._pace = self._taken / self._foreseen
         self._finished.append(stage)
+
+    def record(self) -> dict[str, Any]:
+        """The settings over the user's that the chunk was made with, the stage it ends at, and all choices."""
+        settings, end = ([], "") if self._now is None else (list(self._now[0].changes), self._now[0].end)
+        return {"settings": settings, "end": end, "choices": [asdict(c) for c in self.choices]}
 
     def predicted_s(self, point: Point) -> float:
         """Of the stages that are not finished, with what is kept for surprises."""

@@ -1,0 +1,248 @@
+"""A run within a given time: what is chosen, stepping down at borders, the clock, and the command."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from flows import reconstruct
+from flows.budget import budget as budgets
+from flows.budget.chooser import BORDER_S, Chooser, images_of
+from flows.budget.clock import Clock
+from flows.budget.measured import Point, Table, load, shipped_table
+from flows.cli.main import app
+from flows.cli.numbers import seconds
+from flows.configuration import load_configuration
+from flows.cost.summary import lines_of
+from flows.cost.tables import read_lines, write_lines
+from genre_tasks.errors import ArtifactCorruptError, ConfigError
+from tests.faults.tiny import LOG, SETTINGS
+
+EARLY = {"ingest": 5.0, "effects": 1.0, "initial": 2.0}
+LATE = {"novel_views": 2.0, "fnet": 10.0}
+SMALL = load_configuration("small")
+
+
+def point(name: str, gnet: int, enet: int, accuracy: float) -> Point:
+    """GNet takes a second an iteration, ENet two; 0 iterations of ENet: the scene is GNet's."""
+    later = LATE | {"enet": 2.0 * enet} if enet else {}
+    changes = (f"gnet.iterations={gnet}", *((f"enet.iterations={enet}",) if enet else ()))
+    return Point(name, changes, "enet" if enet else "gnet", accuracy, EARLY | {"gnet": float(gnet)} | later)
+
+
+POINTS = (
+    point("least", 2, 0, 20.0), point("alone", 10, 0, 24.0), point("worse", 20, 0, 23.0),
+    point("short", 10, 2, 25.0), point("long", 10, 8, 26.0), point("most", 30, 8, 27.0),
+)  # fmt: skip
+TABLE = Table("small", "accuracy", POINTS, 120.0, 0.1, {"ingest": 3.0}, "somewhere")
+
+
+class Frozen(Clock):
+    """A clock that a test moves."""
+
+    def __init__(self, budget_s: float) -> None:
+        super().__init__(budget_s, 0.0)
+        self.now = 0.0
+
+    @property
+    def used_s(self) -> float:
+        return self.now
+
+
+def chooser(clock: Clock, speed: float = 1.0, **more: Any) -> Chooser:
+    return Chooser(TABLE, SMALL, clock, 1.0, speed, **more)
+
+
+def simulated(budget_s: float, slower: Callable[[str], float], points: Sequence[Point] = POINTS) -> tuple[Frozen, str]:
+    """A run whose stages take ``slower`` times what the table says: the clock at its end, and the last point."""
+    clock = Frozen(budget_s)
+    by = Chooser(replace(TABLE, points=tuple(points)), SMALL, clock, 1.0, 1.0)
+    while (step := by.next()) is not None:
+        own = next(p for p in points if p.name == by.choices[-1].point)
+        took = slower(step[0]) * (own.seconds[step[0]] + TABLE.cold.get(step[0], 0.0) + BORDER_S)
+        clock.now += took
+        by.done(step[0], took, cached=False)
+    return clock, by.choices[-1].point
+
+
+def test_the_most_accurate_that_fits_is_chosen_and_says_why() -> None:
+    by = chooser(Frozen(45.0))
+    step = by.next()
+    assert step is not None and step[0] == "ingest"
+    assert step[1].gnet.iterations == 10 and step[1].enet.iterations == 2
+    (choice,) = by.choices
+    assert choice.point == "short" and choice.predicted_s == pytest.approx(1.06 * (34 + 3 + 7 * BORDER_S))
+    assert "the best accuracy that fits; long would take" in str(choice)
+
+
+def test_a_slower_machine_gets_a_shorter_setting() -> None:
+    fast, slow = chooser(Frozen(60.0), 1.0), chooser(Frozen(60.0), 1.8)
+    assert [by.next() and by.choices[0].point for by in (fast, slow)] == ["long", "alone"]
+
+
+def test_more_than_all_takes_the_best_and_less_than_any_the_shortest() -> None:
+    rich, poor = chooser(Frozen(1000.0)), chooser(Frozen(1.0))
+    assert rich.next() and poor.next()
+    assert rich.choices[0].point == "most" and "of all 6" in rich.choices[0].why
+    assert poor.choices[0].point == "least" and "nothing fits" in poor.choices[0].why
+
+
+def test_what_goes_slower_than_predicted_steps_down_to_what_is_reachable() -> None:
+    clock, end = simulated(65.0, lambda stage: 2.5 if stage == "gnet" else 1.0)
+    assert end == "alone"  # GNet had ten iterations when the time was gone: neither fewer nor fixing
+    assert clock.now < 65.0
+
+
+def test_what_goes_faster_steps_up() -> None:
+    _, end = simulated(62.0, lambda _: 0.5)
+    assert end == "most"
+
+
+def test_a_fixer_that_overran_leaves_the_scene_that_is_there() -> None:
+    clock, end = simulated(45.0, lambda stage: 3.0 if stage == "fnet" else 1.0)
+    assert end == "alone" and clock.now < 65.0
+
+
+@given(st.floats(5.0, 120.0), st.floats(0.3, 3.0))
+def test_accuracy_does_not_fall_as_the_budget_grows(budget_s: float, pace: float) -> None:
+    accuracy = {p.name: p.accuracy for p in POINTS}
+    ends = [simulated(b, lambda _: pace)[1] for b in (budget_s, 1.2 * budget_s, 2 * budget_s)]
+    assert sorted(ends, key=accuracy.__getitem__) == ends
+
+
+def test_stages_from_the_store_tell_nothing_of_the_pace() -> None:
+    by = chooser(Frozen(60.0))
+    while (step := by.next()) is not None:
+        by.done(step[0], 0.01, cached=True)
+    assert by.predicted_s(POINTS[-1]) == 0
+    fresh = chooser(Frozen(60.0))
+    assert fresh.next()
+    assert fresh.predicted_s(POINTS[0]) == pytest.approx(1.06 * (8 + 3 + 2 + 4 * BORDER_S))
+
+
+def test_what_the_user_has_set_is_not_turned() -> None:
+    with pytest.raises(ConfigError, match=r"gnet.iterations is what a budget decides.*Leave out"):
+        chooser(Frozen(60.0), own=("gnet.iterations", "ingest.strict"))
+    assert chooser(Frozen(60.0), own=("ingest.strict",))
+
+
+def test_images_of_a_chunk_are_frames_times_cameras() -> None:
+    assert images_of("synthetic:street?seed=900&frames=25&cameras=2", 1, SMALL) == 10
+    one = load_configuration("small", settings=["ingest.cameras=[front_camera]"])
+    assert images_of("synthetic:street?seed=900&frames=25&cameras=2", 0, one) == 20
+
+
+def test_the_clock_stands_still_while_it_is_paused() -> None:
+    clock = Clock(10.0, time.time() - 4.0)
+    with clock.paused():
+        time.sleep(0.2)
+    assert 3.9 < clock.used_s < 4.15 and clock.left_s == pytest.approx(6.0, abs=0.15)
+
+
+@pytest.mark.parametrize(("text", "value"), [("90", 90), ("90s", 90), ("1.5m", 90), ("2min", 120), ("1h", 3600)])
+def test_times_are_read(text: str, value: float) -> None:
+    assert seconds(text, "--budget") == value and seconds(None, "--budget") is None
+
+
+@pytest.mark.parametrize("text", ["soon", "0", "-3s", "3d", ""])
+def test_other_times_are_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="--budget"):
+        seconds(text, "--budget")
+
+
+def written(path: Path, preset: str = "demo", **facts: str) -> Path:
+    """A table of two settings that take no time to speak of, and one that takes a minute."""
+    said = {"base": preset, "judged": "psnr", "calibration_s": "0.1", "cold_seconds": "{}", "machine": "somewhere"}
+    rows = [
+        table_row("", (), "enet", 60.0, 27.0),
+        table_row("short", ("gnet.iterations=1", "enet.iterations=1"), "enet", 0.01, 25.0),
+        table_row("alone", ("gnet.iterations=1",), "gnet", 0.005, 24.0),
+        table_row("rigid_actors off", ("effects.rigid_actors=off",), "enet", 0.001, 30.0, "effects"),
+    ]
+    write_lines(path, lines_of(rows), said | facts)
+    return path
+
+
+def table_row(
+    value: str, changes: tuple[str, ...], end: str, stage_s: float, psnr: float, knob: str = "together"
+) -> dict[str, Any]:
+    stages = [*EARLY, "gnet", *([*LATE, "enet"] if end == "enet" else [])]
+    return {
+        "knob": knob if value else "preset", "value": value, "setting": f"{knob}={value}" if value else "preset",
+        "changes": changes, "end": end, "threads": 0, "log": "a", "chunk": 0, "seed": 0, "images": 8, "peak_mib": 1.0,
+        "seconds": dict.fromkeys(stages, stage_s), "cpu_seconds": dict.fromkeys(stages, stage_s), "gaussians": 10,
+        "metrics": {"interpolation/psnr": psnr},
+    }  # fmt: skip
+
+
+def test_a_table_comes_back_as_written_and_effects_are_no_choice(tmp_path: Path) -> None:
+    path = written(tmp_path / "cost.parquet")
+    lines, facts = read_lines(path)
+    assert [x.setting for x in lines] == ["preset", "together=short", "together=alone", "effects=rigid_actors off"]
+    assert lines[1].changes == ("gnet.iterations=1", "enet.iterations=1") and facts["machine"] == "somewhere"
+    table = load(path, "demo")
+    assert [p.name for p in table.points] == ["preset", "together=short", "together=alone"]
+    assert table.points[2].accuracy == 24.0 and set(table.points[2].seconds) == {*EARLY, "gnet"}
+
+
+def test_tables_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"of the preset demo.*genre cost LOG --preset small"):
+        load(written(tmp_path / "cost.parquet"), "small")
+    with pytest.raises(ConfigError, match="no times were measured for the preset paper"):
+        shipped_table("paper")
+    (tmp_path / "other.parquet").write_bytes(b"no table")
+    with pytest.raises(ArtifactCorruptError, match=r"other\.parquet"):
+        load(tmp_path / "other.parquet", "demo")
+
+
+@pytest.fixture(scope="module")
+def prefect() -> Iterator[None]:
+    from prefect.testing.utilities import prefect_test_harness
+
+    with prefect_test_harness(server_startup_timeout=120):
+        yield
+
+
+@pytest.mark.usefixtures("prefect")
+def test_a_run_ends_where_its_budget_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = [s for s in SETTINGS if not s.startswith(("gnet.iterations", "enet.iterations"))]
+    table = str(written(tmp_path / "cost.parquet"))
+    monkeypatch.setattr(budgets, "calibration_s", lambda: 0.1)
+
+    def run(budget_s: float) -> tuple[list[str], dict[str, Any]]:
+        done = reconstruct.reconstruct_log(
+            LOG, preset="demo", store=str(tmp_path / "store"), settings=own, budget_s=budget_s, table=table
+        )
+        return [s["stage"] for s in done["chunks"][0]["stages"]], done["budget"]
+
+    stages, record = run(100.0)
+    assert {"enet", "evaluate/enet"} <= set(stages)
+    assert record["chunks"][0]["choices"][0]["point"] == "together=short" and 0 < record["used_s"] < 100
+    assert record["chunks"][0]["settings"] == ["gnet.iterations=1", "enet.iterations=1"]
+    stages, record = run(0.01)
+    assert stages == ["ingest", "effects", "initial", "gnet", "evaluate/initial", "evaluate/gnet"]
+    assert record["chunks"][0]["choices"][0]["point"] == "together=alone"
+    assert "nothing fits" in record["chunks"][0]["choices"][0]["why"]
+
+
+def test_the_command_says_what_it_would_choose(tmp_path: Path) -> None:
+    own = [part for s in SETTINGS if "iterations" not in s for part in ("--set", s)]
+    told = ["run", LOG, "--preset", "demo", *own, "--store", str(tmp_path), "--dry-run"]
+    table = str(written(tmp_path / "cost.parquet"))
+    done = CliRunner().invoke(app, [*told, "--budget", "1h", "--table", table])
+    assert done.exit_code == 0, done.output
+    assert "budget 3600 s" in done.output and "preset:" in done.output
+    with pytest.raises(ConfigError, match="--budget"):
+        CliRunner().invoke(app, [*told, "--table", table], catch_exceptions=False)
+    with pytest.raises(ConfigError, match=r"gnet\.iterations is what a budget decides"):
+        CliRunner().invoke(
+            app, [*told, "--budget", "1h", "--table", table, "--set", "gnet.iterations=3"], catch_exceptions=False
+        )
