@@ -12,8 +12,6 @@ from typing import Any
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from flows.cost.cell import Sweep
-from flows.cost.warm import cold_seconds
 from flows.logs import opened_log
 from flows.machine import commit, machine
 from flows.produce import ArtifactRef, Job, produce
@@ -24,6 +22,7 @@ from flows.tables.page import differences_from_the_paper, page, put_into
 from flows.tables.parquet import write_cells
 from flows.tables.prediction import predicted
 from flows.tables.request import Planned, Request
+from flows.tables.warm import warm_up
 from genre_tasks.errors import GenreError
 from storage.files import write_file
 from storage.local import open_store
@@ -64,8 +63,8 @@ def paper_table(
     reporter = current_reporter()
     if any(row["seconds"] > 0 for row in predicted(plan)):  # else nothing is timed
         reporter.began("warming up")
-        cold = cold_seconds(Sweep(preset, (*plan.layout.protocol, *request.settings), store))
-        reporter.ended(f"{sum(cold.values()):.1f} s more than warm")
+        warm_up(plan.basis, plan.layout)
+        reporter.ended("imports, weights and first calls are in no stage's seconds")
     cells: list[Cell] = []
     failed: dict[str, GenreError] = {}
     rows = [row for row in plan.layout.rows if row.label not in plan.missing]
