@@ -16,6 +16,7 @@ from flows.logs import opened_log
 from flows.machine import commit, machine
 from flows.produce import ArtifactRef, Job, produce
 from flows.reporting import current_reporter
+from flows.tables.files import anew
 from flows.tables.layout import Cell
 from flows.tables.measure import Place, measure
 from flows.tables.page import differences_from_the_paper, page, put_into
@@ -103,14 +104,16 @@ def write(request: Request, plan: Planned, cells: Sequence[Cell], missing: dict[
     out = Path(request.out)
     out.mkdir(parents=True, exist_ok=True)
     facts = facts_of(request, plan, cells)
-    config = plan.config
     datasets = [opened_log(p.log).dataset for p in plan.places]
-    apart = differences_from_the_paper(plan.layout, config, datasets, len(plan.places))
+    apart = differences_from_the_paper(plan.layout, plan.config, datasets, len(plan.places))
     said = [f"* {name}: {value}" for name, value in facts.items()]
     text = page(plan.layout, cells, missing, said, apart)
     written = [out / f"table{request.number}.parquet", out / f"table{request.number}.md"]
-    write_cells(written[0], plan.layout, cells, missing, facts | {"basis": json.dumps(config.model_dump(mode="json"))})
-    write_file(written[1], text.encode())
+    with anew(written[0]) as part:
+        basis = {"basis": json.dumps(plan.config.model_dump(mode="json"))}
+        write_cells(part, plan.layout, cells, missing, facts | basis)
+    with anew(written[1]) as part:
+        write_file(part, text.encode())
     if request.into is not None:
         written.append(Path(request.into))
         put_into(written[-1], request.number, text)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+from flows.tables.files import anew
 from flows.tables.layout import Cell, Column, Layout, Row
 from flows.tables.paper import PAPER
 from genre_tasks.config import PipelineConfig
@@ -98,7 +99,8 @@ def put_into(file: Path, number: int, text: str) -> None:
         at = min(later, default=len(old))
         new = old[:at].rstrip("\n") + f"\n\n{section}\n\n" + old[at:]
     file.parent.mkdir(parents=True, exist_ok=True)
-    write_file(file, (new.rstrip("\n") + "\n").encode())
+    with anew(file) as part:
+        write_file(part, (new.rstrip("\n") + "\n").encode())
 
 
 PREFACE = (
