@@ -15,7 +15,7 @@ def table(
         typer.Argument(help="1 comparison, 2 plug-in, 3 fixers by input, 4 ablation, 5 runtime by phase."),
     ],
     logs: Annotated[
-        list[str], typer.Argument(help="Logs: pandaset:PATH/002, pandaset:PATH/*, synthetic:street?seed=…")
+        list[str], typer.Argument(help="Logs of one dataset: pandaset:PATH/002, pandaset:PATH/*, synthetic:…")
     ],
     preset: Annotated[str, typer.Option(help="demo, small, long or paper.")] = "small",
     chunks: Annotated[str | None, typer.Option(help="Which chunks of each log, e.g. 0; all without it.")] = None,
@@ -31,7 +31,7 @@ def table(
         typer.Option(help="NAME=PATH of weights that do not ship: difix, streetcrafter (fixers), enet-g3r."),
     ] = None,
     store: Annotated[str, typer.Option(help="Where stages are kept and found again.")] = "genre-store",
-    out: Annotated[Path, typer.Option(help="A folder for tableN.md and tableN.parquet.")] = Path("tables"),
+    out: Annotated[Path, typer.Option(help="A folder for tableN_DATASET.md and .parquet.")] = Path("tables"),
     into: Annotated[
         Path | None, typer.Option(help="A Markdown page of several tables; this one's section is written anew.")
     ] = None,

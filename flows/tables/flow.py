@@ -12,7 +12,6 @@ from typing import Any
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from flows.logs import opened_log
 from flows.machine import commit, machine
 from flows.produce import ArtifactRef, Job, produce
 from flows.reporting import current_reporter
@@ -46,7 +45,7 @@ def paper_table(
     """Measures a table of the paper on ``logs``, and writes it into ``out`` with the paper's numbers beside.
 
     Args:
-        number: 1 to 5. logs: URIs; ``pandaset:PATH/*`` stands for every sequence in a folder.
+        number: 1 to 5. logs: URIs, all of one dataset; ``pandaset:PATH/*`` stands for every sequence in a folder.
         chunks: of each; all if None. settings: ``section.key=value`` over the preset and the paper's protocol.
         methods: YAML files of further methods, see ``flows/tables/methods.py``.
         weights: ``NAME=PATH`` of weights that do not ship. into: a Markdown page whose section of this table is
@@ -100,15 +99,14 @@ def cell_task(plan: Planned, label: str, place: Place) -> Cell:
 
 
 def write(request: Request, plan: Planned, cells: Sequence[Cell], missing: dict[str, str]) -> list[str]:
-    """``tableN.parquet`` and ``tableN.md`` in ``out``, and the section of ``into``; each whole or not at all."""
+    """``tableN_DATASET.parquet`` and ``.md`` in ``out``, and the section of ``into``; each whole or not at all."""
     out = Path(request.out)
     out.mkdir(parents=True, exist_ok=True)
     facts = facts_of(request, plan, cells)
-    datasets = [opened_log(p.log).dataset for p in plan.places]
-    apart = differences_from_the_paper(plan.layout, plan.config, datasets, len(plan.places))
+    apart = differences_from_the_paper(plan.layout, plan.config, plan.dataset, len(plan.places))
     said = [f"* {name}: {value}" for name, value in facts.items()]
-    text = page(plan.layout, cells, missing, said, apart)
-    written = [out / f"table{request.number}.parquet", out / f"table{request.number}.md"]
+    text = page(plan.layout, cells, missing, said, apart, plan.dataset)
+    written = [out / f"table{request.number}_{plan.dataset}.{kind}" for kind in ("parquet", "md")]
     with anew(written[0]) as part:
         basis = {"basis": json.dumps(plan.config.model_dump(mode="json"))}
         write_cells(part, plan.layout, cells, missing, facts | basis)
@@ -116,7 +114,7 @@ def write(request: Request, plan: Planned, cells: Sequence[Cell], missing: dict[
         write_file(part, text.encode())
     if request.into is not None:
         written.append(Path(request.into))
-        put_into(written[-1], request.number, text)
+        put_into(written[-1], request.number, plan.dataset, text)
     return [str(path) for path in written]
 
 

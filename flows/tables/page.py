@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -22,14 +23,24 @@ DISTANCES = (
 
 
 def page(
-    layout: Layout, cells: Sequence[Cell], missing: Mapping[str, str], facts: Sequence[str], apart: Sequence[str]
+    layout: Layout,
+    cells: Sequence[Cell],
+    missing: Mapping[str, str],
+    facts: Sequence[str],
+    apart: Sequence[str],
+    dataset: str,
 ) -> str:
     """Title, the table, what else was measured, notes on methods, facts, and ``apart``: what is not comparable.
 
     ``missing``: a method's name → why it was not measured.
     """
     paper = PAPER[layout.number]
-    head = [f"## Table {layout.number}: {paper.caption}", "", "measured / the paper's. " + _ordered(layout), ""]
+    head = [
+        f"## Table {layout.number} on {dataset}: {paper.caption}",
+        "",
+        "measured / the paper's. " + _ordered(layout),
+        "",
+    ]
     return "\n".join(
         [
             *head,
@@ -51,14 +62,11 @@ def page(
     )
 
 
-def differences_from_the_paper(
-    layout: Layout, config: PipelineConfig, datasets: Sequence[str], chunks: int
-) -> list[str]:
+def differences_from_the_paper(layout: Layout, config: PipelineConfig, dataset: str, chunks: int) -> list[str]:
     """What keeps the measured numbers from being compared with the paper's, a sentence each."""
     size = f"{config.ingest.width_px}×{config.ingest.height_px}"
-    real = set(datasets) == {"pandaset"}
-    where = "PandaSet" if real else ", ".join(sorted(set(datasets)))
-    out = [f"the paper's are means over ten test sequences of PandaSet, these over {chunks} chunks of {where}"]
+    over = f"{chunks} chunk{'s' * (chunks > 1)} of {'PandaSet' if dataset == 'pandaset' else dataset}"
+    out = [f"the paper's are means over ten test sequences of PandaSet, these are of {over}"]
     if (config.ingest.width_px, config.ingest.height_px) != (1920, 1080):
         out.append(f"the paper's images are 1920×1080 (its fixer is trained at 1280×720), these {size}")
     if any(c.key.startswith("kernel") for c in layout.columns):
@@ -75,12 +83,14 @@ def differences_from_the_paper(
     return out
 
 
-def put_into(file: Path, number: int, text: str) -> None:
-    """Writes ``text`` as the section of table ``number`` of a page that holds several; the other sections stay.
+def put_into(file: Path, number: int, dataset: str, text: str) -> None:
+    """Writes ``text`` as the section of table ``number`` on ``dataset``, of a page that holds several; others stay.
+
+    Sections are in the order of the tables, those of one table in that of the datasets' names.
 
     Raises ``InputError`` for a page whose marks do not fit.
     """
-    begin, end = f"<!-- genre table {number} -->", f"<!-- end of table {number} -->"
+    begin, end = f"<!-- genre table {number} on {dataset} -->", f"<!-- end of table {number} on {dataset} -->"
     try:
         old = file.read_text(encoding="utf-8") if file.exists() else PREFACE
     except (OSError, UnicodeDecodeError) as error:
@@ -95,8 +105,8 @@ def put_into(file: Path, number: int, text: str) -> None:
             )
         new = old[: old.index(begin)] + section + old[old.index(end) + len(end) :]
     else:
-        later = [old.index(m) for k in PAPER if k > number and (m := f"<!-- genre table {k} -->") in old]
-        at = min(later, default=len(old))
+        found = re.finditer(r"<!-- genre table (\d) on (\S+) -->", old)
+        at = next((m.start() for m in found if (int(m[1]), m[2]) > (number, dataset)), len(old))
         new = old[:at].rstrip("\n") + f"\n\n{section}\n\n" + old[at:]
     file.parent.mkdir(parents=True, exist_ok=True)
     with anew(file) as part:

@@ -7,10 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from flows.configuration import load_configuration
+from flows.logs import opened_log
 from flows.tables.layout import Layout, layout_of
 from flows.tables.measure import Basis, Place, places_of
 from flows.tables.methods import SLOTS, read_method, read_weights
 from genre_tasks.config import PipelineConfig
+from genre_tasks.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -39,13 +41,19 @@ class Request:
         layout, given = layout_of(self.number, own), read_weights(self.weights)
         config = load_configuration(self.preset, settings=(*layout.protocol, *self.settings))
         places = places_of(self.logs, None if self.chunks is None else list(self.chunks), config)
+        datasets = sorted({opened_log(p.log).dataset for p in places})
+        if len(datasets) > 1:
+            raise ConfigError(
+                f"the logs are of several datasets ({', '.join(datasets)}), over which no mean says anything",
+                remedy="Measure them one after the other; --into keeps a section for each.",
+            )
         missing = {
             row.label: f"no weights; give {SLOTS[row.method.slot].about} by --weights {row.method.slot}=PATH."
             for row in layout.rows
             if row.method.needs_weights and row.method.slot not in given
         }
         rows = tuple(replace(row, method=row.method.given(given)) for row in layout.rows)
-        return Planned(basis, replace(layout, rows=rows), tuple(places), missing)
+        return Planned(basis, replace(layout, rows=rows), tuple(places), missing, "".join(datasets))
 
     @property
     def command(self) -> str:
@@ -65,6 +73,7 @@ class Planned:
     layout: Layout
     places: tuple[Place, ...]
     missing: dict[str, str]
+    dataset: str
 
     @property
     def config(self) -> PipelineConfig:

@@ -140,8 +140,8 @@ def test_the_page_has_the_papers_numbers_beside_and_says_what_differs() -> None:
     layout = plan(1).layout
     cells = [cell("GNet", 29.4, 0.1), cell("3DGS", 25.0, 0.3, enet=24.0), cell("StreetGS-style", 25.5, 0.2)]
     config = load_configuration("small", settings=["gnet.per_scene.iterations=3000"])
-    apart = differences_from_the_paper(layout, config, ["synthetic"], 1)
-    text = page(layout, cells, {"SplatAD-style": "it failed: no memory"}, ["* commit: abc"], apart)
+    apart = differences_from_the_paper(layout, config, "synthetic", 1)
+    text = page(layout, cells, {"SplatAD-style": "it failed: no memory"}, ["* commit: abc"], apart, "synthetic")
     first = text.split("Measured beside it")[0]
     rows = {line.split(" | ")[0]: line.split(" | ") for line in first.splitlines() if line.startswith("| ")}
     head = rows["| method"]
@@ -154,7 +154,7 @@ def test_the_page_has_the_papers_numbers_beside_and_says_what_differs() -> None:
                  "FNet with all inputs stands in", "commit: abc"):  # fmt: skip
         assert said in text
     paper = load_configuration("paper")
-    assert not any("iterations" in t for t in differences_from_the_paper(layout, paper, ["pandaset"], 10))
+    assert not any("iterations" in t for t in differences_from_the_paper(layout, paper, "pandaset", 10))
 
 
 def test_rows_without_weights_are_not_measured_and_say_what_to_give() -> None:
@@ -168,16 +168,17 @@ def test_rows_without_weights_are_not_measured_and_say_what_to_give() -> None:
 
 def test_a_section_is_written_anew_and_the_others_stay(tmp_path: Path) -> None:
     file = tmp_path / "tables.md"
-    for number, text in ((4, "four"), (1, "one"), (4, "again"), (5, "five")):
-        put_into(file, number, text)
+    for number, on, text in ((4, "b", "four"), (1, "b", "one"), (4, "b", "again"), (5, "a", "five"), (4, "a", "real")):
+        put_into(file, number, on, text)
     text = file.read_text()
     assert "four" not in text
-    assert text.index("# The paper's tables") < text.index("one") < text.index("again") < text.index("five")
-    put_into(file, 1, "one")
+    places = [text.index(word) for word in ("# The paper's tables", "\none", "\nreal", "\nagain", "\nfive")]
+    assert places == sorted(places)
+    put_into(file, 1, "b", "one")
     assert file.read_text() == text
-    file.write_text(text.replace("<!-- end of table 4 -->", ""))
+    file.write_text(text.replace("<!-- end of table 4 on a -->", ""))
     with pytest.raises(InputError, match="does not hold one section"):
-        put_into(file, 4, "more")
+        put_into(file, 4, "a", "more")
     assert [f.name for f in tmp_path.iterdir()] == ["tables.md"]
 
 
@@ -187,7 +188,7 @@ def test_the_files_say_the_same(tmp_path: Path) -> None:
     planned = request.planned()
     write(request, planned, [cell("3DGS", 20.0, 0.7)], planned.missing)
     files = write(request, planned, [cell("3DGS", 25.0, 0.3)], planned.missing)  # in the place of the first
-    assert [Path(f).name for f in files] == ["table2.parquet", "table2.md", "all.md"]
+    assert [Path(f).name for f in files] == ["table2_synthetic.parquet", "table2_synthetic.md", "all.md"]
     table = pq.read_table(files[0]).to_pydict()
     assert table["method"] == [r.label for r in planned.layout.rows]
     assert table["log"][0] == "synthetic:street?seed=1001" and table["chunk"] == [0, None, None, None, None]
@@ -270,3 +271,17 @@ def test_the_command_lists_what_it_would_run_and_refuses_what_it_does_not_know(t
     for arguments, said in wrong:
         with pytest.raises(GenreError, match=said):
             CliRunner().invoke(app, arguments, catch_exceptions=False)
+
+
+def test_logs_of_several_datasets_make_no_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    both = ("synthetic:street?seed=1001", "synthetic:street?seed=1002")
+    assert plan(4).dataset == "synthetic"
+    assert len(Request(4, both, chunks=(0,)).planned().places) == 2
+
+    class Elsewhere:
+        def __init__(self, uri: str) -> None:
+            self.dataset = uri[-4:]
+
+    monkeypatch.setattr("flows.tables.request.opened_log", Elsewhere)
+    with pytest.raises(ConfigError, match=r"several datasets \(1001, 1002\).*--into keeps a section for each"):
+        Request(4, both, chunks=(0,)).planned()
