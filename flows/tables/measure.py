@@ -52,17 +52,23 @@ def stages_of(layout: Layout, method: Method) -> tuple[str, ...]:
     return tuple(spec.name for spec in PIPELINE if spec.name in stages)
 
 
+def run_stages(names: Sequence[str], job: Job, produce: Produce) -> dict[str, ArtifactRef]:
+    """The artifacts of stages that are named in their order, by stage."""
+    refs: dict[str, ArtifactRef] = {}
+    for name in names:
+        refs[name] = produce(name, job, {i: refs[i] for i in BY_NAME[name].inputs})
+    return refs
+
+
 def measure(basis: Basis, layout: Layout, method: Method, place: Place, produce: Produce) -> Cell:
     """The cell; raises as the stages do."""
     job = basis.job(layout, method, place)
-    refs: dict[str, ArtifactRef] = {}
-    for name in stages_of(layout, method):
-        refs[name] = produce(name, job, {i: refs[i] for i in BY_NAME[name].inputs})
+    refs = run_stages(stages_of(layout, method), job, produce)
     manifests = {name: _found(job, ref).manifest for name, ref in refs.items() if not name.startswith("evaluate/")}
     cpu = {name: m.measurements.get("cpu_seconds") for name, m in manifests.items()}
     metrics: dict[str, float] = {}
     if layout.evaluated:
-        for m in _value(job, refs[f"evaluate/{method.end}"]).metrics:
+        for m in value_of(job, refs[f"evaluate/{method.end}"]).metrics:
             metrics |= {m.name: m.value, m.name.rpartition("/")[0] + "/n": float(m.n)}
             if m.low is not None and m.high is not None:
                 metrics |= {f"{m.name}/low": m.low, f"{m.name}/high": m.high}
@@ -71,8 +77,8 @@ def measure(basis: Basis, layout: Layout, method: Method, place: Place, produce:
         {name: m.seconds for name, m in manifests.items()},
         {name: math.nan if value is None else float(value) for name, value in cpu.items()},
         metrics,
-        len(_value(job, refs["gnet" if method.end == "fnet" else method.end]).scene),
-        len(_value(job, refs["fnet"]).views) if "fnet" in refs else 0,
+        len(value_of(job, refs["gnet" if method.end == "fnet" else method.end]).scene),
+        len(value_of(job, refs["fnet"]).views) if "fnet" in refs else 0,
     )  # fmt: skip
 
 
@@ -88,5 +94,5 @@ def _found(job: Job, ref: ArtifactRef) -> Artifact:
     return artifact
 
 
-def _value(job: Job, ref: ArtifactRef) -> Any:
+def value_of(job: Job, ref: ArtifactRef) -> Any:
     return open_store(job.store).read(_found(job, ref))

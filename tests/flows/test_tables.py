@@ -7,6 +7,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
@@ -14,6 +15,7 @@ from typer.testing import CliRunner
 from flows.cli.main import app
 from flows.configuration import load_configuration
 from flows.produce import ArtifactRef, Job, produce
+from flows.tables.figure import SHIFTS_M, TABLE, Kind, drawn, strips
 from flows.tables.flow import write
 from flows.tables.layout import LAYOUTS, PROTOCOL, Cell, layout_of
 from flows.tables.measure import Basis, Place, measure, stages_of
@@ -266,6 +268,8 @@ def test_the_command_lists_what_it_would_run_and_refuses_what_it_does_not_know(t
     wrong: list[tuple[list[str], str]] = [
         (["table", "7", LOG], "there is no table 7"),
         (["table", "4", LOG, "--chunks", "9"], "no chunk 9"),
+        (["figure", "recons", LOG, "--out", "x.png"], "no figure 'recons'"),
+        (["figure", "recon", LOG, "--out", "x.jpg"], "Give --out x.png"),
         (["table", "4", LOG, "--method", str(tmp_path / "none.yaml")], "cannot be read"),
     ]
     for arguments, said in wrong:
@@ -285,3 +289,23 @@ def test_logs_of_several_datasets_make_no_table(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("flows.tables.request.opened_log", Elsewhere)
     with pytest.raises(ConfigError, match=r"several datasets \(1001, 1002\).*--into keeps a section for each"):
         Request(4, both, chunks=(0,)).planned()
+
+
+@pytest.mark.parametrize(
+    ("kind", "labels"),
+    [("recon", ["3DGS", "GNet", "the truth"]), ("fixers", ["what they are given", "FNet", "the truth"])],
+)
+def test_a_figure_has_a_row_for_each_method_and_the_truth(kind: Kind, labels: list[str], tmp_path: Path) -> None:
+    request = Request(TABLE[kind], (LOG,), "demo", str(tmp_path), settings=TABLE_SETTINGS)
+    planned = request.planned()
+    few = tuple(r for r in planned.layout.rows if r.label in (*labels, *planned.missing))
+    found = strips(kind, replace(planned, layout=replace(planned.layout, rows=few)), produce)
+    assert [s.label for s in found] == labels
+    for strip in found:
+        assert [i.shape for i in strip.images] == [(36, 64, 3)] * len(SHIFTS_M[kind])
+        assert not np.array_equal(strip.images[0], strip.images[-1])
+    assert not np.array_equal(found[0].images[0], found[1].images[0])
+    picture = drawn(kind, found, "a street")
+    assert picture.dtype == np.uint8 and picture.shape[1] > 64 * len(SHIFTS_M[kind])
+    with pytest.raises(InputError, match="no source image of camera back at frame"):
+        strips(kind, planned, produce, camera="back")
