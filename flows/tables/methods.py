@@ -121,7 +121,7 @@ BUILT_IN: Mapping[str, Method] = {
         f"StreetGS-style scene → novel views → fixer → per-scene distillation. {_ONE_SHOT}",
         slot="streetcrafter",
         stand_in="No fixer with StreetCrafter's inputs (reference + LiDAR) is shipped: FNet with all inputs "
-        "stands in.",
+        "stands in, so that this row and Difix3D-style are one recipe.",
     ),
     "difix": Method(
         "Difix3D-style", (*_STREET_GS, *_DISTILLED), "enet",
