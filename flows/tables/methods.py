@@ -92,6 +92,7 @@ _DISTILLED = (
 )  # fmt: skip
 """Per-scene distillation: the variant of tuned Adam that ``genre bench optimiser`` found to distil best (3 + 3 views an
 iteration at half of the rates, no perceptual term), long enough to settle."""
+_LEARNED = ("gnet.method=learned", "enet.method=learned")
 _STREET_GS = ("gnet.method=street_gs", *_AS_PUBLISHED)
 _ONE_SHOT = "Distilled by Adam, 480 iterations of 3 + 3 views; once, at 3 m, not progressively."
 
@@ -115,7 +116,7 @@ BUILT_IN: Mapping[str, Method] = {
         "G3R-style", ("gnet.method=g3r",), "gnet",
         "GNet's network trained on recorded views alone (λ_novel = 0), with weights of its own.",
     ),
-    "gnet": Method("GNet", (), "gnet"),
+    "gnet": Method("GNet", _LEARNED, "gnet"),
     "streetcrafter": Method(
         "StreetCrafter-style", (*_STREET_GS, *_DISTILLED), "enet",
         f"StreetGS-style scene → novel views → fixer → per-scene distillation. {_ONE_SHOT}",
@@ -129,32 +130,32 @@ BUILT_IN: Mapping[str, Method] = {
         slot="difix",
         stand_in="No fixer with Difix3D's inputs (render + reference) is shipped: FNet with all inputs stands in.",
     ),
-    "genre+": Method("GenRe+", (), "enet", "GNet → FNet → ENet, as the preset has them."),
+    "genre+": Method("GenRe+", _LEARNED, "enet", "GNet → FNet → ENet, as the preset has them."),
     "3dgs+genre": Method(
-        "3DGS + GenRe", ("gnet.method=standard_3dgs", *_AS_PUBLISHED), "enet",
+        "3DGS + GenRe", (*_LEARNED, "gnet.method=standard_3dgs", *_AS_PUBLISHED), "enet",
         "The shipped ENet, which was trained on scenes of GNet and of tuned Adam, not on 3DGS's as in the paper.",
     ),
     "g3r+genre": Method(
-        "G3R-style + GenRe (zero-shot)", ("gnet.method=g3r",), "enet",
+        "G3R-style + GenRe (zero-shot)", (*_LEARNED, "gnet.method=g3r"), "enet",
         "The shipped ENet, which was trained on scenes of GNet and of tuned Adam and never saw G3R's.",
     ),
     "g3r+genre-tuned": Method(
-        "G3R-style + GenRe (fine-tuned)", ("gnet.method=g3r",), "enet", slot="enet-g3r", needs_weights=True,
+        "G3R-style + GenRe (fine-tuned)", (*_LEARNED, "gnet.method=g3r"), "enet", slot="enet-g3r", needs_weights=True,
     ),
     "gnet-gnet": Method(
         "GNet → FNet → GNet",
-        ("enet.weights=builtin:gnet", "enet.iterations={gnet.iterations}",
+        (*_LEARNED, "enet.weights=builtin:gnet", "enet.iterations={gnet.iterations}",
          "enet.views_per_iteration={gnet.views_per_iteration}",
          "enet.novel_views_per_iteration={gnet.views_per_iteration}"),
         "enet",
         "ENet's stage and loss with GNet's weights, its number of iterations, and its views of each kind.",
     ),
-    "gnet-enet": Method("GNet → FNet → ENet", (), "enet", "As the preset has them."),
+    "gnet-enet": Method("GNet → FNet → ENet", _LEARNED, "enet", "As the preset has them."),
     "fixer-streetcrafter": Method(
-        "StreetCrafter-V's inputs", (), "fnet", slot="streetcrafter", needs_weights=True,
+        "StreetCrafter-V's inputs", _LEARNED, "fnet", slot="streetcrafter", needs_weights=True,
     ),
-    "fixer-difix": Method("Difix3D's inputs", (), "fnet", slot="difix", needs_weights=True),
-    "fnet": Method("FNet", (), "fnet"),
+    "fixer-difix": Method("Difix3D's inputs", _LEARNED, "fnet", slot="difix", needs_weights=True),
+    "fnet": Method("FNet", _LEARNED, "fnet"),
 }  # fmt: skip
 """By the name that table layouts use."""
 

@@ -52,6 +52,7 @@ def test_built_in_methods_are_settings_that_every_preset_takes(preset: str) -> N
     assert (configs["difix"].enet.method, configs["genre+"].enet.method) == ("adam", "learned")
     again = configs["gnet-gnet"]
     assert again.enet.weights == "builtin:gnet" and again.enet.iterations == base.gnet.iterations
+    assert BUILT_IN["genre+"].configuration(preset, (*PROTOCOL, "gnet.method=adam", "enet.method=adam")) == base
     assert again.gnet == base.gnet and again.enet.loss == base.enet.loss
 
 
