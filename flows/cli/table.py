@@ -38,6 +38,9 @@ def table(
     remarks: Annotated[
         list[str] | None, typer.Option("--remark", help="What else the reader should know, into the page.")
     ] = None,
+    stored: Annotated[
+        bool, typer.Option("--stored", help="Compute nothing: leave out the methods that the store has not whole.")
+    ] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say which cells would run, and what they would take.")
     ] = False,
@@ -56,7 +59,7 @@ def table(
     files = [str(f) for f in methods or ()]
     request = Request(
         number, tuple(logs), preset, store, None if chosen is None else tuple(chosen), tuple(settings or ()),
-        tuple(files), tuple(weights or ()), str(out), None if into is None else str(into), tuple(remarks or ()),
+        tuple(files), tuple(weights or ()), str(out), None if into is None else str(into), tuple(remarks or ()), stored,
     )  # fmt: skip
     plan = request.planned()  # what is wrong is said before a server is started
     if dry_run:
@@ -72,6 +75,6 @@ def table(
     with reporter:
         done = paper_table(
             number, logs, preset=preset, store=store, chunks=chosen, settings=settings, methods=files,
-            weights=weights, out=str(out), into=request.into, remarks=remarks,
+            weights=weights, out=str(out), into=request.into, remarks=remarks, stored=stored,
         )  # fmt: skip
     typer.echo(f"{done['cells']} cells, {len(done['failed'])} left out; wrote {', '.join(done['files'])}")

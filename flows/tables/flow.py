@@ -20,7 +20,7 @@ from flows.tables.layout import Cell
 from flows.tables.measure import Place, measure
 from flows.tables.page import differences_from_the_paper, page, put_into
 from flows.tables.parquet import write_cells
-from flows.tables.prediction import predicted
+from flows.tables.prediction import not_stored, predicted
 from flows.tables.request import Planned, Request
 from flows.tables.warm import warm_up
 from genre_tasks.errors import GenreError
@@ -41,6 +41,7 @@ def paper_table(
     out: str = "tables",
     into: str | None = None,
     remarks: list[str] | None = None,
+    stored: bool = False,
 ) -> dict[str, Any]:
     """Measures a table of the paper on ``logs``, and writes it into ``out`` with the paper's numbers beside.
 
@@ -56,9 +57,11 @@ def paper_table(
     """
     request = Request(
         number, tuple(logs), preset, store, None if chunks is None else tuple(chunks), tuple(settings or ()),
-        tuple(methods or ()), tuple(weights or ()), out, into, tuple(remarks or ()),
+        tuple(methods or ()), tuple(weights or ()), out, into, tuple(remarks or ()), stored,
     )  # fmt: skip
     plan = request.planned()
+    if stored:
+        plan = replace(plan, missing=not_stored(plan) | plan.missing)
     open_store(store).clean_temporaries()
     reporter = current_reporter()
     if any(row["seconds"] > 0 for row in predicted(plan)):  # else nothing is timed

@@ -52,6 +52,23 @@ def predicted(plan: Planned) -> list[dict[str, Any]]:
     return out
 
 
+def not_stored(plan: Planned) -> dict[str, str]:
+    """A method's name → which of its stages the store has not, for those that lack any on any chunk."""
+    out: dict[str, str] = {}
+    for place in plan.places:
+        for row in plan.layout.rows:
+            job = plan.basis.job(plan.layout, row.method, place)
+            refs: dict[str, ArtifactRef] = {}
+            for name in stages_of(plan.layout, row.method):
+                spec = BY_NAME[name]
+                ref = look_up(spec, job, refs, repair=False)[1] if all(i in refs for i in spec.inputs) else None
+                if ref is None:
+                    out.setdefault(row.label, f"the store has no {name} of {place} yet.")
+                    break
+                refs[name] = ref
+    return out
+
+
 def _recipe(stage: str, job: Job) -> list[Any]:
     """The configuration of the stage and of all before it."""
     spec = BY_NAME[stage]

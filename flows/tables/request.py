@@ -30,6 +30,7 @@ class Request:
     out: str = "tables"
     into: str | None = None
     remarks: tuple[str, ...] = ()
+    stored: bool = False
 
     def planned(self) -> Planned:
         """Layout, places, and why a method cannot be measured.
@@ -62,6 +63,7 @@ class Request:
         parts += ["--chunks", ",".join(map(str, self.chunks))] if self.chunks is not None else []
         repeated = {"--set": self.settings, "--method": self.methods, "--weights": self.weights}
         parts += [p for option, values in repeated.items() for value in values for p in (option, value)]
+        parts += ["--stored"] * self.stored
         return shlex.join([*parts, *(["--into", self.into] if self.into else [])])
 
 

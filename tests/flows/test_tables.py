@@ -22,7 +22,7 @@ from flows.tables.measure import Basis, Place, measure, stages_of
 from flows.tables.methods import BUILT_IN, Method, read_method, read_weights
 from flows.tables.page import differences_from_the_paper, mean_of, page, put_into
 from flows.tables.paper import PAPER
-from flows.tables.prediction import predicted
+from flows.tables.prediction import not_stored, predicted
 from flows.tables.request import Planned, Request
 from genre_tasks.errors import ConfigError, GenreError, InputError
 from tests.faults.tiny import LOG, SETTINGS
@@ -239,6 +239,10 @@ def test_a_table_goes_on_where_it_was_stopped_and_methods_share_stages(tmp_path:
     request = Request(4, (LOG,), "demo", str(tmp_path), settings=TABLE_SETTINGS)
     rows = predicted(request.planned())
     assert [r["seconds"] for r in rows] == [0.0] * 3 and rows[0]["cached"] == "5 of 5 stages"
+    assert not_stored(request.planned()) == {}
+    longer = replace(request, settings=(*TABLE_SETTINGS, "enet.seed=7")).planned()
+    assert not_stored(longer)["GNet → FNet → ENet"] == f"the store has no enet of {place} yet."
+    assert set(not_stored(longer)) == {"GNet → FNet → GNet", "GNet → FNet → ENet"}
     before = len(computed)
     assert [measure(basis, layout, row.method, place, counted) for row in layout.rows] == cells
     assert len(computed) == before
