@@ -25,6 +25,7 @@ from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ConfigError, InputError
 
 End = Literal["gnet", "enet", "fnet"]
+PER_SCENE = ("standard_3dgs", "street_gs")
 _REFERENCE = re.compile(r"\{([a-z_.]+)\}")
 
 
@@ -57,11 +58,19 @@ class Method:
     stand_in: str = ""
 
     def configuration(self, preset: str, settings: Sequence[str]) -> PipelineConfig:
-        """The preset, ``settings``, then the method's. Raises ``ConfigError`` for one that is not allowed."""
+        """The preset, ``settings``, then the method's.
+
+        What is set of per-scene training is the preset's where nothing is trained per scene, so that tables of other
+        lengths share the stages of GNet. Raises ``ConfigError`` for a setting that is not allowed.
+        """
         taken = list(settings)
         for setting in self.settings:
             taken.append(_filled(setting, preset, taken))
-        return load_configuration(preset, settings=taken)
+        config = load_configuration(preset, settings=taken)
+        if config.gnet.method in PER_SCENE:
+            return config
+        gnet = config.gnet.model_copy(update={"per_scene": load_configuration(preset).gnet.per_scene})
+        return config.model_copy(update={"gnet": gnet})
 
     def given(self, weights: Mapping[str, str]) -> Method:
         """With the weights that the user gave, and a note that says so, or what stands in for them."""

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from flows.tables.files import anew
 from flows.tables.layout import Cell, Column, Layout, Row
+from flows.tables.methods import PER_SCENE
 from flows.tables.paper import PAPER
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import InputError
@@ -73,7 +74,7 @@ def differences_from_the_paper(layout: Layout, config: PipelineConfig, dataset: 
         out.append(DISTANCES)
     per_scene = config.gnet.per_scene.iterations
     if per_scene != PUBLISHED_ITERATIONS and any(
-        "standard_3dgs" in s or "street_gs" in s for r in layout.rows for s in r.method.settings
+        s == f"gnet.method={m}" for r in layout.rows for s in r.method.settings for m in PER_SCENE
     ):
         short = f"per-scene methods had {per_scene} iterations, of {PUBLISHED_ITERATIONS} as published"
         out.append(f"{short} (all of their schedules scaled): how far longer ones come was not measured")

@@ -9,7 +9,7 @@ from flows.pipeline import BY_NAME
 from flows.predict import stage_seconds
 from flows.produce import ArtifactRef, Job, look_up
 from flows.tables.measure import stages_of
-from flows.tables.methods import Method
+from flows.tables.methods import PER_SCENE, Method
 from flows.tables.request import Planned
 from genre_tasks.config import GnetConfig, PipelineConfig
 
@@ -78,7 +78,7 @@ def _recipe(stage: str, job: Job) -> list[Any]:
 def _seconds(stage: str, config: PipelineConfig, base: PipelineConfig, known: dict[str, float]) -> float:
     spec = BY_NAME[stage]
     section, plain = getattr(config, spec.section), getattr(base, spec.section)
-    if isinstance(section, GnetConfig) and section.method in ("standard_3dgs", "street_gs"):
+    if isinstance(section, GnetConfig) and section.method in PER_SCENE:
         pixels = config.ingest.width_px * config.ingest.height_px / _TYPICAL_PIXELS
         return section.per_scene.iterations * PER_SCENE_S * pixels
     seconds = known[stage.partition("/")[0]]

@@ -53,6 +53,9 @@ def test_built_in_methods_are_settings_that_every_preset_takes(preset: str) -> N
     again = configs["gnet-gnet"]
     assert again.enet.weights == "builtin:gnet" and again.enet.iterations == base.gnet.iterations
     assert BUILT_IN["genre+"].configuration(preset, (*PROTOCOL, "gnet.method=adam", "enet.method=adam")) == base
+    short = (*PROTOCOL, "gnet.per_scene.iterations=9")
+    assert BUILT_IN["genre+"].configuration(preset, short) == base  # it has no per-scene part: its stages are shared
+    assert BUILT_IN["splatad"].configuration(preset, short).gnet.per_scene.iterations == 9
     assert again.gnet == base.gnet and again.enet.loss == base.enet.loss
 
 
