@@ -187,7 +187,7 @@ def _header(column: Column) -> str:
 
 def _ordered(layout: Layout) -> str:
     """What is better, and what bold means."""
-    more = [c.label for c in layout.columns if c.more_is_better]
+    more = [c.label.partition(",")[0] for c in layout.columns if c.more_is_better]
     said = f"More is better in {' and '.join(more)}, less in the others. " if more else "Less is better. "
     return said + "**Bold**: the best measured."
 

@@ -58,12 +58,11 @@ class Request:
 
     @property
     def command(self) -> str:
-        """That makes this table again."""
+        """That makes this table again, wholly also where this one is of what the store has."""
         parts = ["genre", "table", str(self.number), *self.logs, "--preset", self.preset]
         parts += ["--chunks", ",".join(map(str, self.chunks))] if self.chunks is not None else []
         repeated = {"--set": self.settings, "--method": self.methods, "--weights": self.weights}
         parts += [p for option, values in repeated.items() for value in values for p in (option, value)]
-        parts += ["--stored"] * self.stored
         return shlex.join([*parts, *(["--into", self.into] if self.into else [])])
 
 
