@@ -104,6 +104,8 @@ PIPELINE: tuple[StageSpec, ...] = (
         ("ingest", "fnet", "novel_views", "truth"),
     ),
 )
+_FILES = {"ingest": ("points",), "evaluate": ("inception", "lpips")}
+"""Settings that name files, by section."""
 BY_NAME: Mapping[str, StageSpec] = {spec.name: spec for spec in PIPELINE}
 
 
@@ -149,8 +151,8 @@ def stage_key(
     ``reader`` is the module that reads the log, which no import of the stage names but which is part of its code.
     """
     configuration = section_of(spec, config).model_dump(mode="json", exclude={spec.splits} if spec.splits else set())
-    points = configuration.get("points") if spec.name == "ingest" else None
-    if points and Path(points).is_file():  # the file is an input: its bytes count, not its name alone
-        configuration["points"] = digest_file(Path(points))
+    for key in _FILES.get(spec.section, ()):
+        if configuration[key] and Path(configuration[key]).is_file():  # an input: its bytes count, not its name alone
+            configuration[key] = digest_file(Path(configuration[key]))
     code = code_digest(spec.module, also=(*spec.lazy, *reader))
     return keys.stage_key(spec.name, code, configuration, inputs, weights)

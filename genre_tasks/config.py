@@ -158,6 +158,8 @@ class EvaluateConfig(Section):
     every: int = Field(1, ge=1, description="At shifts, every n-th frame of the chunk is rendered.")
     bootstrap: int = Field(200, ge=0, description="Resamples over frames for the 95 % interval of the kernel distance.")
     pictures: int = Field(3, ge=0, description="Pictures kept for the report.")
+    inception: str | None = Field(None, description="TorchScript of InceptionV3 (see metrics/published.py): FID too.")
+    lpips: str | None = Field(None, description="TorchScript of LPIPS on VGG: LPIPS too, where there is a truth.")
 
 
 def _word(value: object) -> object:

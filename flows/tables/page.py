@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from flows.tables.files import anew
@@ -16,11 +17,13 @@ from genre_tasks.errors import InputError
 from storage.files import write_file
 
 PUBLISHED_ITERATIONS = 30_000
-DISTANCES = (
+KERNEL = (
     "the paper's distances are FID, on features of InceptionV3; measured are kernel distances (unbiased at any number "
-    "of images) on features of EfficientNet-Lite0. Neither weights of InceptionV3 nor of LPIPS ship with this project, "
-    "so FID and LPIPS are not measured. The two may be compared in their order alone, not in their size"
+    "of images) on features of EfficientNet-Lite0: they may be compared in their order alone, not in their size. FID "
+    "and LPIPS are not measured: weights of neither ship with this project. Given by path (`--set "
+    "evaluate.inception=PATH`, `--set evaluate.lpips=PATH`), FID takes these columns"
 )
+FID = "FID is biased by the number of images, which the paper does not state and which is a chunk's here"
 
 
 def page(
@@ -36,6 +39,7 @@ def page(
     ``missing``: a method's name → why it was not measured.
     """
     paper = PAPER[layout.number]
+    layout = with_the_papers_own(layout, cells)
     head = [
         f"## Table {layout.number} on {dataset}: {paper.caption}",
         "",
@@ -63,6 +67,19 @@ def page(
     )
 
 
+def with_the_papers_own(layout: Layout, cells: Sequence[Cell]) -> Layout:
+    """The layout with FID in the place of the kernel distance where it was measured, and that beside it."""
+    own: list[Column] = []
+    beside: list[Column] = []
+    for column in layout.columns:
+        if column.proper is None or not any(math.isfinite(column.proper(c)) for c in cells):
+            own.append(column)
+            continue
+        own.append(Column(column.paper, column.paper_label, column.proper, 2, column.paper))
+        beside.append(replace(column, paper="", paper_label="", proper=None))
+    return replace(layout, columns=tuple(own), beside=(*beside, *layout.beside))
+
+
 def differences_from_the_paper(layout: Layout, config: PipelineConfig, dataset: str, chunks: int) -> list[str]:
     """What keeps the measured numbers from being compared with the paper's, a sentence each."""
     size = f"{config.ingest.width_px}×{config.ingest.height_px}"
@@ -70,8 +87,8 @@ def differences_from_the_paper(layout: Layout, config: PipelineConfig, dataset: 
     out = [f"the paper's are means over ten test sequences of PandaSet, these are of {over}"]
     if (config.ingest.width_px, config.ingest.height_px) != (1920, 1080):
         out.append(f"the paper's images are 1920×1080 (its fixer is trained at 1280×720), these {size}")
-    if any(c.key.startswith("kernel") for c in layout.columns):
-        out.append(DISTANCES)
+    if any(c.proper is not None for c in layout.columns):
+        out.append(KERNEL if config.evaluate.inception is None else FID)
     per_scene = config.gnet.per_scene.iterations
     if per_scene != PUBLISHED_ITERATIONS and any(
         s == f"gnet.method={m}" for r in layout.rows for s in r.method.settings for m in PER_SCENE

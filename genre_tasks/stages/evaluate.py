@@ -20,6 +20,7 @@ from genre_tasks.effects.types import UNPLANNED, EffectsPlan
 from genre_tasks.logs.types import Truth
 from genre_tasks.metrics.collect import Collector, real_images, true_pixels, view_image
 from genre_tasks.metrics.image import psnr
+from genre_tasks.metrics.published import inception, lpips
 from genre_tasks.progress import Progress, silent
 from genre_tasks.render import render_views
 from genre_tasks.render.types import RenderSettings
@@ -54,7 +55,8 @@ def evaluate_scene(
 
     ``interpolation/…``: held-out views against their images. ``shift_0m/…``: the same renders as a set against all real
     images. ``shift_Xm/…``: both sides, every ``config.every``-th frame. Colours are clamped to [0, 1]; what no Gaussian
-    covers is black. The curve gives the PSNR of the snapshots and the final scene on ``CURVE_VIEWS`` held-out views.
+    covers is black. ``…/fid`` and ``…/lpips`` are there where the configuration names their networks.
+    The curve gives the PSNR of the snapshots and the final scene on ``CURVE_VIEWS`` held-out views.
 
     Raises:
         InputError: an image of the chunk cannot be decoded. NonFiniteError: a render is not finite.
@@ -68,12 +70,12 @@ def evaluate_scene(
     subset = [heldout[i] for i in _spread(len(heldout), CURVE_VIEWS)]
     steps = _Steps(progress, len(heldout) + sum(map(len, beside.values())) + len(scenes) * len(subset), stage)
 
-    collector = Collector(stage, config.distributions)
+    collector = _collector(config, stage)
     for views, images in _rendered(reconstruction.scene, heldout, settings, steps):
         collector.add(views, images, torch.stack([view_image(v) for v in views]))
     metrics, scores = _collected(config, chunk, "interpolation", "shift_0m", [collector])
     for shift, poses in beside.items():
-        collector = Collector(stage, config.distributions)
+        collector = _collector(config, stage)
         for novel, images in _rendered(reconstruction.scene, poses, settings, steps):
             collector.add(novel, images, _true_images(chunk, truth, novel))
         group = f"shift_{shift:g}m"
@@ -111,7 +113,7 @@ def evaluate_fixed(
     metrics: list[Metric] = []
     scores: list[ViewScore] = []
     for shift, indices in sorted(groups.items()):
-        repaired, rendered = (Collector("fnet", config.distributions, prefix) for prefix in ("", "render_"))
+        repaired, rendered = (_collector(config, "fnet", prefix) for prefix in ("", "render_"))
         for batch in _batches(indices, chunk):
             views = [fixed.views[i] for i in batch]
             true = _true_images(chunk, truth, views)
@@ -136,9 +138,18 @@ class _Steps:
         self._progress(self._done, self._total, self._note)
 
 
+def _collector(config: EvaluateConfig, stage: str, prefix: str = "") -> Collector:
+    """Raises ``InputError`` for a network that cannot be loaded."""
+    networks = (
+        None if config.inception is None else inception(config.inception),
+        None if config.lpips is None else lpips(config.lpips),
+    )
+    return Collector(stage, config.distributions, prefix, *networks)
+
+
 def _shifts(config: EvaluateConfig, truth: Truth | None) -> list[float]:
     """Distinct lateral shifts, if anything can be measured there."""
-    if truth is None and not config.distributions:
+    if truth is None and not config.distributions and config.inception is None:
         return []
     return sorted({abs(s) for s in config.shifts_m if s != 0})
 
@@ -151,6 +162,7 @@ def _collected(
     if config.distributions:
         real = real_images(chunk)
         metrics += [m for c in collectors for m in c.distances(distances, real, config.bootstrap)]
+    metrics += [m for c in collectors for m in c.inception_distance(distances, chunk)]
     return metrics, collectors[0].scores
 
 

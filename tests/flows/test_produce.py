@@ -12,7 +12,7 @@ from flows import produce as room
 from flows.configuration import load_configuration
 from flows.pipeline import BY_NAME, PIPELINE, stage_key
 from flows.produce import ArtifactRef, Job, key_of, measured, produce
-from genre_tasks.config import EffectsConfig
+from genre_tasks.config import EffectsConfig, EvaluateConfig, PipelineConfig
 from genre_tasks.errors import InputError, ResourceError
 from storage.code_digest import closure
 from tests.faults.tiny import LOG, SETTINGS
@@ -155,3 +155,16 @@ def test_an_impossible_chunk_leaves_nothing_behind(tmp_path: Path) -> None:
     with pytest.raises(InputError):
         run(job(tmp_path / "store", "ingest.source_every=20"), "ingest")
     assert not [p for p in (tmp_path / "store").rglob("*") if p.is_file()]
+
+
+def test_the_bytes_of_a_network_are_part_of_an_evaluations_key_and_its_name_is_not(tmp_path: Path) -> None:
+    spec = BY_NAME["evaluate/gnet"]
+    inputs = dict.fromkeys((*spec.inputs, "log", "chunk"), "x")
+
+    def key(file: Path) -> str:
+        return stage_key(spec, PipelineConfig(evaluate=EvaluateConfig(inception=str(file))), inputs, None)
+
+    one, same, other = (tmp_path / name for name in ("one.pt", "same.pt", "other.pt"))
+    for file, data in ((one, b"a"), (same, b"a"), (other, b"b")):
+        file.write_bytes(data)
+    assert key(one) == key(same) != key(other)

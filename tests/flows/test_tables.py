@@ -163,6 +163,20 @@ def test_the_page_has_the_papers_numbers_beside_and_says_what_differs() -> None:
     assert not any("iterations" in t for t in differences_from_the_paper(layout, paper, "pandaset", 10))
 
 
+def test_fid_takes_the_papers_columns_once_it_was_measured() -> None:
+    planned = plan(4)
+    kernel = cell("GNet", 29.4, 0.1)
+    both = replace(kernel, metrics=dict(kernel.metrics) | {f"shift_{n}m/fid": 80.0 + n for n in range(1, 6)})
+    config = load_configuration("small", settings=["evaluate.inception=i.pt"])
+    apart = differences_from_the_paper(planned.layout, config, "synthetic", 1)
+    text = page(planned.layout, [both], {}, [], apart, "synthetic")
+    assert "| FID @1m | FID @2m |" in text and "| 81.00 / 70.04 | 82.00 / 86.43 |" in text
+    assert "not measured: weights" not in text and "FID is biased" in text
+    assert "| kernel @1m |" in text.split("Measured beside it")[1]
+    assert "FID @1m |" in page(planned.layout, [kernel], {}, [], apart, "synthetic")
+    assert "81.00" not in page(planned.layout, [kernel], {}, [], apart, "synthetic")
+
+
 def test_rows_without_weights_are_not_measured_and_say_what_to_give() -> None:
     missing = plan(3).missing
     assert set(missing) == {"StreetCrafter-V's inputs", "Difix3D's inputs"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from genre_tasks.stages import evaluate
 from genre_tasks.stages.evaluate import evaluate_fixed, evaluate_scene
 from genre_tasks.stages.ingest import ingest
 from tests.fakes import FakeLog
+from tests.metrics.test_published import FakeInception, FakeVgg, saved
 
 CONFIG = EvaluateConfig(shifts_m=(1.0, 3.0), bootstrap=20)
 LOG = FakeLog(frame_count=8, width_px=48, height_px=32, world_offset_m=(64.0, -32.0, 2.0))
@@ -241,3 +243,29 @@ def test_same_bytes_at_any_thread_count(chunk: Chunk, scene: SceneGraph) -> None
     finally:
         torch.set_num_threads(before)
     assert results[0] == results[1]
+
+
+def test_fid_and_lpips_are_there_once_their_networks_are_given(
+    chunk: Chunk, scene: SceneGraph, tmp_path: Path, monkeypatch
+) -> None:
+    files = {
+        "inception": saved(FakeInception(), tmp_path / "i.pt"),
+        "lpips": saved(FakeVgg(), tmp_path / "v.pt"),
+    }
+    config = CONFIG.model_copy(update=files)
+    found = []
+    for noise in (0.02, 0.3):
+        monkeypatch.setattr(evaluate, "render_views", oracle(chunk, noise))
+        found.append(by_name(evaluate_scene(config, chunk, "gnet", Reconstruction(scene), FakeTruth(LOG))))
+    better, worse = found
+    assert {n for n in better if n.endswith(("fid", "lpips"))} == {
+        "interpolation/lpips", "shift_0m/fid", "shift_1m/fid", "shift_1m/lpips", "shift_3m/fid", "shift_3m/lpips",
+    }  # fmt: skip
+    assert 0 < better["interpolation/lpips"] < worse["interpolation/lpips"]
+    assert better["shift_0m/fid"] < worse["shift_0m/fid"]
+    fixed, novel = views_of(chunk)
+    values = by_name(evaluate_fixed(config, chunk, fixed, novel, FakeTruth(LOG)))
+    assert values["shift_3m/lpips"] < values["shift_3m/render_lpips"]
+    assert "shift_3m/fid" in values and "shift_3m/render_fid" in values
+    bare = by_name(evaluate_fixed(CONFIG, chunk, fixed, novel, FakeTruth(LOG)))
+    assert bare == {k: v for k, v in values.items() if not k.endswith(("fid", "lpips"))}
