@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -16,7 +17,7 @@ from flows.cli.main import app
 from flows.configuration import load_configuration
 from flows.produce import ArtifactRef, Job, produce
 from flows.tables.figure import SHIFTS_M, TABLE, Kind, drawn, strips
-from flows.tables.flow import write
+from flows.tables.flow import paper_table, write
 from flows.tables.layout import LAYOUTS, PROTOCOL, Cell, layout_of
 from flows.tables.measure import Basis, Place, measure, stages_of
 from flows.tables.methods import BUILT_IN, Method, read_method, read_weights
@@ -331,3 +332,30 @@ def test_a_figure_has_a_row_for_each_method_and_the_truth(kind: Kind, labels: li
     assert picture.dtype == np.uint8 and picture.shape[1] > 64 * len(SHIFTS_M[kind])
     with pytest.raises(InputError, match="no source image of camera back at frame"):
         strips(kind, planned, produce, camera="back")
+
+
+def test_the_flow_leaves_out_what_fails_and_says_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from prefect.testing.utilities import prefect_test_harness
+
+    file = tmp_path / "own.yaml"
+    file.write_text("name: with a shutter\nsettings: [effects.rolling_shutter=on]\nend: gnet\n")
+    warmed: list[str] = []
+    monkeypatch.setattr("flows.tables.flow.warm_up", lambda basis, layout: warmed.append(basis.preset))
+
+    def run() -> dict[str, Any]:
+        return paper_table(
+            4, [LOG], "demo", str(tmp_path / "store"), settings=list(TABLE_SETTINGS), methods=[str(file)],
+            out=str(tmp_path / "out"), into=str(tmp_path / "tables.md"),
+        )  # fmt: skip
+
+    with prefect_test_harness(server_startup_timeout=120):
+        done = run()
+        first = (tmp_path / "tables.md").read_text()
+        monkeypatch.setattr("flows.tables.layout.LAYOUTS", {4: replace(LAYOUTS[4], rows=())})
+        with pytest.raises(GenreError, match="readout"):  # nothing is left
+            run()
+    assert done["failed"] == ["with a shutter"] and done["cells"] == 3 and warmed[0] == "demo"
+    assert "| with a shutter | not measured |" in first and "it failed: " in first
+    assert (tmp_path / "tables.md").read_text() == first
+    table = pq.read_table(done["files"][0]).to_pydict()
+    assert table["method"][-1] == "with a shutter" and "readout" in table["not_measured"][-1]
