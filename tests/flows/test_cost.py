@@ -17,6 +17,7 @@ from flows.cost.flow import write
 from flows.cost.knobs import PRESET_ITSELF, Setting, settings_of
 from flows.cost.prediction import predicted
 from flows.cost.summary import KERNEL_3M, PERCEPTUAL_3M, beside, front, lines_of
+from flows.cost.warm import cold_seconds
 from flows.produce import ArtifactRef, Job, produce
 from genre_tasks.errors import ConfigError
 from tests.faults.tiny import LOG, SETTINGS
@@ -152,3 +153,9 @@ def test_the_command_lists_what_it_would_run_and_refuses_what_it_does_not_know(t
     assert "fixer=off" in done.output and "minutes" in done.output
     with pytest.raises(ConfigError, match="--seeds"):
         CliRunner().invoke(app, ["cost", LOG, "--seeds", "one"], catch_exceptions=False)
+
+
+def test_first_calls_are_told_apart_from_the_stages_own_time() -> None:
+    cold = cold_seconds(Sweep("demo", SWEEP_SETTINGS, "never-used"))
+    assert list(cold) == ["ingest", "effects", "initial", "gnet", "novel_views", "fnet", "enet"]
+    assert all(0 <= s < 60 for s in cold.values()) and not Path("never-used").exists()
