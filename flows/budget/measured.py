@@ -63,8 +63,10 @@ def load(path: Path, preset: str) -> Table:
     Effects and threads are left out: a log's plan decides the former, and the machine has the latter. Raises
     ``ConfigError`` for a table of another preset, or one made by a sweep that did not say how fast its machine was.
     """
-    lines, facts = read_lines(path)
     remedy = f"Give the cost.parquet of `genre cost LOG --preset {preset}`."
+    if not path.is_file():
+        raise ConfigError("there is no table", remedy=remedy, file=path)
+    lines, facts = read_lines(path)
     if facts.get("base") != preset:
         raise ConfigError(f"this table is of the preset {facts.get('base')}", remedy=remedy, file=path)
     if "calibration_s" not in facts:

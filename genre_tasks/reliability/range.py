@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import statistics
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from genre_tasks.config import RangeConfig
@@ -16,6 +16,7 @@ from genre_tasks.reliability.guards import Guards, guards_of
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.novel import novel_view_poses
+from genre_tasks.scene.views import NovelViews
 from genre_tasks.stages.novel_views import render_novel
 
 
@@ -64,16 +65,22 @@ def reliable_range(
     Limits are relative to the path itself: what no image shows there (sky above, what the rig hides) is no fault of the
     shift. Raises ``InputError`` for an image of the chunk that cannot be decoded.
     """
-    chunk = applied(chunk, plan)
+    found = [g for _, guards in measured(config, applied(chunk, plan), scene, progress) for g in guards]
+    return judged(found, config)
+
+
+def measured(
+    config: RangeConfig, chunk: Chunk, scene: SceneGraph, progress: Progress
+) -> Iterator[tuple[NovelViews, list[Guards]]]:
+    """For each shift, 0 first, the renders and their guards; ``chunk`` has its plan's effects applied."""
     frames = chunk.frames[config.every // 2 :: config.every] or chunk.frames[:1]
     shifts = [0.0, *(sign * s for s in sorted(config.shifts_m) for sign in (1, -1))]
-    sources, found = recorded(chunk), []
+    sources = recorded(chunk)
     for k, shift in enumerate(shifts):
         progress(k, len(shifts), f"guards at {shift:+g} m")
-        views = novel_view_poses(chunk, (shift,), frames)
-        found += guards_of(chunk, render_novel(chunk, scene, views, config.lidar_max_points), sources)
+        novel = render_novel(chunk, scene, novel_view_poses(chunk, (shift,), frames), config.lidar_max_points)
+        yield novel, guards_of(chunk, novel, sources)
     progress(len(shifts), len(shifts), "guards")
-    return judged(found, config)
 
 
 def judged(guards: Sequence[Guards], limits: RangeConfig) -> ReliableRange:
