@@ -198,3 +198,14 @@ def last_stage(store: str, run: str, chunk: int) -> str:
     record = _record(store, run)
     stages = {s["stage"] for c in record["chunks"] if c["chunk"] == chunk for s in c["stages"]}
     return next(name for name in ("enet", "gnet", "initial") if name in stages)
+
+
+def next_scene(store: str, run: str, chunk: int, stage: str | None) -> tuple[Any, Any] | None:
+    """The chunk after ``chunk`` and its scene after ``stage`` (its last one without it), where the run has both."""
+    chunks = {c["chunk"] for c in _record(store, run)["chunks"]}
+    if chunk + 1 not in chunks:
+        return None
+    name = stage or last_stage(store, run, chunk + 1)
+    values = (stage_value(store, run, chunk + 1, each)[1] for each in ("ingest", name))
+    ingested, reconstruction = values
+    return ingested, reconstruction.scene

@@ -19,17 +19,19 @@ def reliable(
 ) -> None:
     """Say how far to the left and right of the path the scene's renders agree with what was recorded.
 
-    Guards need no truth: the agreement with recorded images, what none of them shows, holes, and what floats.
+    Guards need no truth: the agreement with recorded images, what none of them shows, holes, and what floats. Where the
+    run has the next chunk too, the same view is rendered from both.
     """
     from pydantic import ValidationError
 
     from flows.cli.tables import print_rows
     from flows.cli.terminal import TerminalReporter
     from flows.reliable import write
-    from flows.runs import last_stage, stage_value
+    from flows.runs import last_stage, next_scene, stage_value
     from genre_tasks.config import RangeConfig
     from genre_tasks.errors import ConfigError
     from genre_tasks.reliability.range import reliable_range
+    from genre_tasks.reliability.seam import medians, seam
 
     try:
         config = RangeConfig(drop_db=drop_db, every=every)
@@ -41,6 +43,7 @@ def reliable(
     _, reconstruction = stage_value(store, run, number, name)
     with TerminalReporter(f"chunk {number}  guards") as reporter:
         found = reliable_range(config, ingested, reconstruction.scene, plan, reporter.progress)
+    beside = next_scene(store, run, number, stage)
     facts = {"log": ingested.log, "chunk": str(number), "stage": name, "run": run}
     files = write(out, found, facts)
     rows = [
@@ -53,3 +56,7 @@ def reliable(
     ]  # fmt: skip
     print_rows(f"{ingested.log}, chunk {number}, after {name}", rows)
     typer.echo(f"{found}; wrote {', '.join(files)}")
+    if beside is not None:
+        jumps = medians(seam((ingested, reconstruction.scene), beside))
+        told = ", ".join(f"{db:.1f} dB at {distance:g} m" for distance, db in jumps.items())
+        typer.echo(f"seam to chunk {number + 1}, the same view from both scenes without actors: {told}")

@@ -26,6 +26,7 @@ from genre_tasks.metrics.collect import true_pixels
 from genre_tasks.metrics.image import psnr
 from genre_tasks.reliability.guards import MOST_DB, Guards, guards_of
 from genre_tasks.reliability.range import judged, reliable_range
+from genre_tasks.reliability.seam import medians, seam
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.novel import novel_view_poses
@@ -166,3 +167,28 @@ def test_the_command_answers_for_a_finished_run(finished: Run, tmp_path: Path) -
 def test_a_record_says_what_a_budget_did(finished: Run) -> None:
     record = finish_run(finished, summary_of(finished), {"budget": {"budget_s": 1.0}})
     assert json.loads((finished.folder / "run.json").read_text())["budget"] == record["budget"] == {"budget_s": 1.0}
+
+
+def test_a_seam_is_the_same_view_from_both_scenes(chunk: Chunk, scene: SceneGraph) -> None:
+    """A chunk cut in two, whose second half lies elsewhere in its own coordinates, and is a little darker."""
+    shift = np.eye(4)
+    shift[:3, 3] = (7.0, -3.0, 0.5)
+    first = replace(chunk, frames=chunk.frames[:4], views=tuple(v for v in chunk.views if v.frame in chunk.frames[:4]))
+    moved = [
+        replace(v, chunk_SE3_camera=shift @ v.chunk_SE3_camera) for v in chunk.views if v.frame in chunk.frames[4:]
+    ]
+    second = replace(
+        chunk, index=1, frames=chunk.frames[4:], views=tuple(moved), chunk_SE3_ego=shift @ chunk.chunk_SE3_ego[4:],
+        world_SE3_chunk=chunk.world_SE3_chunk @ np.linalg.inv(shift),
+    )  # fmt: skip
+    first = replace(first, chunk_SE3_ego=chunk.chunk_SE3_ego[:4])
+    offset = torch.tensor([7.0, -3.0, 0.5])
+    same = replace(scene.gaussians, means=scene.gaussians.means + offset)
+    darker = replace(same, colors=same.colors - 0.05)
+    alike = seam((first, scene), (second, scene.with_gaussians(same)))
+    jump = seam((first, scene), (second, scene.with_gaussians(darker)))
+    assert len(alike) == 6 and {v.frame for v in alike} == {chunk.frames[3], chunk.frames[4]}
+    assert min(medians(alike).values()) > 45  # but for rounding and the order of equal depths
+    assert all(25 < db < 30 for db in medians(jump).values())  # 0.05 is 26 dB; what is black stays black
+    with pytest.raises(ValueError, match="follow each other"):
+        seam((second, scene), (first, scene))
