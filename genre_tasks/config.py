@@ -94,6 +94,7 @@ class PerSceneConfig(Section):
     sh_rate: float = Field(2.5e-3, ge=0, description="Of the spherical harmonics' constant term: colours × 1/C0.")
     rgb: float = Field(0.8, ge=0, description="Weight of L1.")
     ssim: float = Field(0.2, ge=0, description="Weight of 1 − SSIM.")
+    depth: float = Field(0.0, ge=0, description="Weight of the LiDAR depth term, as in loss.depth; published: none.")
     density: DensityConfig = DensityConfig()
 
 
@@ -106,7 +107,9 @@ class OptimiserConfig(Section):
     loss: LossConfig = LossConfig()
     method: Literal["learned", "adam"] = Field("learned", description="adam: the tuned per-attribute baseline.")
     adam: AdamConfig = AdamConfig()
-    weights: str = Field("builtin", description="builtin, or a path to a .safetensors file.")
+    weights: str = Field(
+        "builtin", description="builtin, builtin:NAME (another network's, e.g. gnet), or a path to a .safetensors file."
+    )
     hold_ground: bool = Field(True, description="Flat discs that lie on the ground move and turn in their plane only.")
     snapshots: int = Field(6, ge=0, description="Intermediate scenes kept for the curve of accuracy against seconds.")
     seed: int = Field(0, ge=0)

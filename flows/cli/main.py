@@ -8,7 +8,7 @@ from pathlib import Path
 
 import typer
 
-from flows.cli import bench, check, cost, doctor, effects, reliable, render, run, show, train, verify
+from flows.cli import bench, check, cost, doctor, effects, figure, reliable, render, run, show, table, train, verify
 
 app = typer.Typer(
     name="genre",
@@ -27,6 +27,8 @@ app.command(name="show")(show.show)
 app.command(name="verify")(verify.verify)
 app.command(name="doctor")(doctor.doctor)
 app.command(name="cost")(cost.cost)
+app.command(name="table")(table.table)
+app.command(name="figure")(figure.figure)
 app.command(name="bench")(bench.bench)
 app.add_typer(train.app, name="train")
 

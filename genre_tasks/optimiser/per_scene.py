@@ -58,7 +58,7 @@ class PerSceneTraining:
         self._set(Population.newborn(copies, scene.nodes))
         self._generator = torch.Generator().manual_seed(seed)
         self._waiting: list[int] = []
-        self._loss = LossConfig(rgb=config.rgb, ssim=config.ssim, perceptual=0.0, depth=0.0)
+        self._loss = LossConfig(rgb=config.rgb, ssim=config.ssim, perceptual=0.0, depth=config.depth)
         self.seconds = time.perf_counter() - began
 
     def __len__(self) -> int:
@@ -129,8 +129,15 @@ class PerSceneTraining:
             images = [render(s, cameras_of([v], self._antialiased)) for s, v in zip(splats, views, strict=True)]
             image = images[0] if moments is None else moments.recorded(in_order(images, range(len(images))))
         plan = plan_loss(self._loss, [target], self.iteration, self._generator, perceptual=False)
-        loss, by_color, _ = image_gradients(self._loss, image.color, image.depth, [target], plan)
-        image.color.backward(by_color)
+        depth = image.depth
+        if self._loss.depth > 0:
+            with torch.enable_grad():
+                depth = image.expected_depth()
+        loss, by_color, by_depth = image_gradients(self._loss, image.color, depth, [target], plan)
+        if self._loss.depth > 0:
+            torch.autograd.backward([image.color, depth], [by_color, by_depth])
+        else:
+            image.color.backward(by_color)
         self.culled = image.culled
         if self.iteration + 1 < self.table.stop:
             middle = len(views) // 2

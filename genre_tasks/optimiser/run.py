@@ -58,7 +58,10 @@ def planned(config: OptimiserConfig, plan: EffectsPlan) -> OptimiserConfig:
     """The configuration without the loss terms that the plan leaves out."""
     if plan.on("lidar_depth"):
         return config
-    return config.model_copy(update={"loss": config.loss.model_copy(update={"depth": 0.0})})
+    update: dict[str, object] = {"loss": config.loss.model_copy(update={"depth": 0.0})}
+    if isinstance(config, GnetConfig):
+        update["per_scene"] = config.per_scene.model_copy(update={"depth": 0.0})
+    return config.model_copy(update=update)
 
 
 def per_scene(
@@ -66,7 +69,7 @@ def per_scene(
 ) -> Reconstruction:
     """Per-scene 3DGS on the source views: on the scene graph as Street Gaussians, or with everything static."""
     start = scene if config.method == "street_gs" else world_static(scene)
-    source = targets.of_source(chunk, depth=False)
+    source = targets.of_source(chunk, depth=config.per_scene.depth > 0)
     training = PerSceneTraining(config.per_scene, start, source, config.seed, stage)
     plan = Plan(config.per_scene.iterations, 1, snapshots=config.snapshots)
     return reconstruct(training, plan.snapshot_iterations(), progress)

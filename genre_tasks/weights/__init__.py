@@ -17,14 +17,16 @@ def resolve_weights(name: str, configured: str) -> Path:
 
     Args:
         name: the network, as ``fnet``, ``gnet``, ``g3r`` or ``enet``: the stem of its built-in file.
-        configured: ``builtin``, or a path.
+        configured: ``builtin``, ``builtin:gnet`` for those that ship for another network, or a path.
 
     Raises:
         InputError: it does not exist.
     """
-    if configured == "builtin":
-        path = Path(__file__).parent / f"{name}.safetensors"
-        remedy = f"Reinstall the package, train weights with `genre train {name}`, or give a path by `{name}.weights`."
+    first, colon, other = configured.partition(":")
+    if first == "builtin":
+        path = Path(__file__).parent / f"{other if colon else name}.safetensors"
+        known = ", ".join(sorted(p.stem for p in path.parent.glob("*.safetensors")))
+        remedy = f"Those of {known} ship; train weights with `genre train {name}`, or give a path by `{name}.weights`."
     else:
         path = Path(configured).expanduser()
         remedy = f"Check `{name}.weights`, or leave it at `builtin`."

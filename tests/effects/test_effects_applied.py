@@ -29,6 +29,7 @@ from genre_tasks.logs.synthetic.imaging import bonnet
 from genre_tasks.logs.synthetic.parameters import StreetParameters
 from genre_tasks.metrics.collect import scored, view_image
 from genre_tasks.optimiser.loss import image_gradients, plan_loss
+from genre_tasks.optimiser.run import planned
 from genre_tasks.optimiser.targets import Target, of_views
 from genre_tasks.render import cpu
 from genre_tasks.render.blur import Moments, mean
@@ -363,6 +364,16 @@ def test_harmonics_are_where_the_plan_has_them() -> None:
     assert within.losses[0] == without.losses[0] and within.losses[-1] != without.losses[-1]
     config = config.model_copy(update={"method": "street_gs", "per_scene": PerSceneConfig(iterations=2)})
     assert gnet(config, chunk(uri), first, with_(*BASIC, "view_dependent_colour")).scene.harmonics is None
+
+
+def test_a_per_scene_depth_term_is_there_where_the_plan_has_it() -> None:
+    config = GnetConfig(method="street_gs", per_scene=PerSceneConfig(iterations=2, depth=0.5))
+    assert planned(config, with_("lidar_depth")) == config
+    none = planned(config, with_("rigid_actors"))
+    assert isinstance(none, GnetConfig) and (none.per_scene.depth, none.loss.depth) == (0.0, 0.0)
+    first = initial(InitialConfig(max_points=2000, distant_count=200), chunk(STREET))
+    told, untold = (gnet(config, chunk(STREET), first, with_(*p)) for p in (("lidar_depth",), ()))
+    assert told.losses[0] > untold.losses[0]
 
 
 def test_targets_carry_what_effects_say() -> None:

@@ -20,7 +20,7 @@ from genre_tasks.config import (
     PerSceneConfig,
     PipelineConfig,
 )
-from genre_tasks.errors import ConfigError
+from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.optimiser import run
 from genre_tasks.optimiser.adam import ENET_RATES, GNET_RATES, TunedAdam
 from genre_tasks.optimiser.state import Frame, State
@@ -134,3 +134,11 @@ def test_mistakes_in_the_table_are_named(text: str, said: str, tmp_path: Path) -
     (tmp_path / "b.yaml").write_text(text)
     with pytest.raises(ConfigError, match=said):
         load_baselines("small", tmp_path / "b.yaml")
+
+
+def test_a_stage_can_run_with_the_weights_that_ship_for_another() -> None:
+    assert resolve_weights("enet", "builtin:gnet") == resolve_weights("gnet", "builtin")
+    enet = PipelineConfig(enet=OptimiserConfig(weights="builtin:gnet"))
+    assert weights_file(BY_NAME["enet"], enet) == resolve_weights("gnet", "builtin")
+    with pytest.raises(InputError, match=r"do not exist.*Those of enet, fnet, g3r, gnet ship"):
+        resolve_weights("enet", "builtin:hnet")

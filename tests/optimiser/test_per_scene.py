@@ -10,10 +10,13 @@ import torch
 
 from genre_tasks.config import DensityConfig, PerSceneConfig
 from genre_tasks.errors import NonFiniteError
+from genre_tasks.optimiser.loss import depth_loss
 from genre_tasks.optimiser.per_scene import SH_C0, PerSceneTraining
 from genre_tasks.optimiser.per_scene_run import reconstruct, snapshots
 from genre_tasks.optimiser.per_scene_start import node_extents, timetable, world_static
 from genre_tasks.optimiser.ssim import SsimTarget
+from genre_tasks.optimiser.targets import Target
+from genre_tasks.render import render_views
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR, STATIC, SceneGraph
 from tests.optimiser import street
@@ -178,3 +181,24 @@ def test_an_empty_scene_stays_empty() -> None:
     nobody = SceneGraph(Gaussians.unpacked(full.gaussians.packed()[:0]), full.nodes[:0], ())
     result = reconstruct(PerSceneTraining(ALIVE.model_copy(update={"iterations": 12}), nobody, street.targets(full)))
     assert len(result.scene) == 0 and len(result.losses) == 12
+
+
+def test_without_its_depth_term_lidar_changes_no_bit_and_with_it_depths_come_nearer() -> None:
+    truth = street.scene()
+    views = street.targets(truth)
+    bare = tuple(replace(v, depth=None) for v in views)
+    start = street.blurred(truth)
+    quiet = ALIVE.model_copy(update={"iterations": 60})
+
+    def trained(depth: float, targets: tuple[Target, ...]) -> SceneGraph:
+        return reconstruct(PerSceneTraining(quiet.model_copy(update={"depth": depth}), start, targets)).scene
+
+    plain = trained(0.0, views)
+    assert torch.equal(plain.gaussians.packed(), trained(0.0, bare).gaussians.packed())
+    assert torch.equal(plain.gaussians.packed(), trained(1.0, bare).gaussians.packed())
+
+    def error(scene: SceneGraph) -> float:
+        depth = render_views(scene, views).expected_depth()
+        return sum(float(depth_loss(d, v.depth)) for d, v in zip(depth, views, strict=True) if v.depth is not None)
+
+    assert error(trained(1.0, views)) < 0.8 * error(plain)
