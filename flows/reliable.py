@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from flows.files import anew
 from storage.codecs.png import write_png
 from storage.codecs.tables import column, schema, write_table
 
@@ -36,9 +37,12 @@ def write(out: Path, found: ReliableRange, facts: Mapping[str, str]) -> list[str
     out.mkdir(parents=True, exist_ok=True)
     rows = found.guards
     facts = dict(facts) | {"left_m": f"{found.left_m:.3f}", "right_m": f"{found.right_m:.3f}"}
-    write_table(out / "range.parquet", VIEWS, {f.name: [getattr(g, f.name) for g in rows] for f in VIEWS}, facts)
-    write_png(out / "range.png", drawn(found, f"{facts.get('log', '')} chunk {facts.get('chunk', '')}: {found}"))
-    return [str(out / "range.parquet"), str(out / "range.png")]
+    files = [out / "range.parquet", out / "range.png"]
+    with anew(files[0]) as part:
+        write_table(part, VIEWS, {f.name: [getattr(g, f.name) for g in rows] for f in VIEWS}, facts)
+    with anew(files[1]) as part:
+        write_png(part, drawn(found, f"{facts.get('log', '')} chunk {facts.get('chunk', '')}: {found}"))
+    return [str(file) for file in files]
 
 
 def drawn(found: ReliableRange, title: str) -> NDArray[np.uint8]:

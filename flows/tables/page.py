@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from flows.tables.files import anew
+from flows.files import anew
 from flows.tables.layout import Cell, Column, Layout, Row
 from flows.tables.paper import PAPER
 from genre_tasks.config import PipelineConfig

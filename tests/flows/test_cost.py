@@ -80,6 +80,7 @@ def test_settings_start_with_the_preset_and_differ_from_it() -> None:
 
 
 def test_the_files_say_the_same(tmp_path: Path) -> None:
+    write(tmp_path, Sweep("small", (), "store"), ROWS[:2], [], {})  # an earlier one, whose files are written anew
     files = write(tmp_path, Sweep("small", (), "store"), ROWS, ["views=99: memory ran out"], {"calibration_s": "0.1"})
     lines, cells, picture, page = (Path(f) for f in files)
     table = pq.read_table(lines).to_pydict()

@@ -146,6 +146,7 @@ def test_every_shift_is_rendered_on_both_sides(chunk: Chunk, scene: SceneGraph, 
     found = reliable_range(config, chunk, scene, progress=lambda done, total, note="": told.append(done))
     assert [p.shift_m for p in found.points] == [-4, -1, 0, 1, 4] and {p.views for p in found.points} == {2}
     assert told == [0, 1, 2, 3, 4, 5]
+    write(tmp_path, found, {"log": "an earlier one"})
     table, picture = (Path(p) for p in write(tmp_path, found, {"log": LOG}))
     rows = pq.read_table(table)
     assert rows.num_rows == 10 and rows.schema.metadata[b"left_m"] == f"{found.left_m:.3f}".encode()
