@@ -168,14 +168,18 @@ def recorded_runs(store: str) -> list[dict[str, Any]]:
     return [json.loads(path.read_text()) for path in paths]
 
 
-def stage_value(store: str, run: str, chunk: int | None, stage: str) -> tuple[int, Any]:
-    """The chunk's number and the value of one of its stages, for a run named by (the start of) its name."""
+def _record(store: str, run: str) -> dict[str, Any]:
     found = [r for r in recorded_runs(store) if r["run"].startswith(run)]
     if len(found) != 1:
         raise InputError(
             f"{len(found)} runs of this store begin with '{run}'", remedy="`genre show runs` lists them.", file=store
         )
-    (record,) = found
+    return found[0]
+
+
+def stage_value(store: str, run: str, chunk: int | None, stage: str) -> tuple[int, Any]:
+    """The chunk's number and the value of one of its stages, for a run named by (the start of) its name."""
+    record = _record(store, run)
     chunks = {c["chunk"]: c["stages"] for c in record["chunks"]}
     number = min(chunks) if chunk is None else chunk
     if number not in chunks:
@@ -187,3 +191,21 @@ def stage_value(store: str, run: str, chunk: int | None, stage: str) -> tuple[in
     for artifact in opened.artifacts(key=keys[stage]):
         return number, opened.read(artifact)
     raise InputError("the artifact is gone", remedy="Run the log again.", log=record["log"], stage=stage)
+
+
+def last_stage(store: str, run: str, chunk: int) -> str:
+    """The stage whose scene is the result of a run's chunk: enet, or gnet where nothing was distilled."""
+    record = _record(store, run)
+    stages = {s["stage"] for c in record["chunks"] if c["chunk"] == chunk for s in c["stages"]}
+    return next(name for name in ("enet", "gnet", "initial") if name in stages)
+
+
+def next_scene(store: str, run: str, chunk: int, stage: str | None) -> tuple[Any, Any] | None:
+    """The chunk after ``chunk`` and its scene after ``stage`` (its last one without it), where the run has both."""
+    chunks = {c["chunk"] for c in _record(store, run)["chunks"]}
+    if chunk + 1 not in chunks:
+        return None
+    name = stage or last_stage(store, run, chunk + 1)
+    values = (stage_value(store, run, chunk + 1, each)[1] for each in ("ingest", name))
+    ingested, reconstruction = values
+    return ingested, reconstruction.scene

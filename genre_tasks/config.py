@@ -162,6 +162,20 @@ class EvaluateConfig(Section):
     lpips: str | None = Field(None, description="TorchScript of LPIPS on VGG: LPIPS too, where there is a truth.")
 
 
+class RangeConfig(Section):
+    """Where a scene counts as reliable beside the path: limits on what its guards lose against the path itself."""
+
+    shifts_m: tuple[float, ...] = Field(
+        (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0), min_length=1, description="Each is rendered on both sides."
+    )
+    every: int = Field(4, ge=1, description="Every n-th frame of the chunk is rendered.")
+    drop_db: float = Field(3.0, gt=0, description="The median view's estimated PSNR falls by no more.")
+    hidden: float = Field(0.1, gt=0, le=1, description="No more pixels than this that no recorded image bears out.")
+    thin: float = Field(0.02, gt=0, le=1, description="No more pixels than this that are covered by less than half.")
+    floating: float = Field(0.02, gt=0, le=1, description="No more pixels than this far before the LiDAR's depth.")
+    lidar_max_points: int = Field(20_000, ge=100, description="Points drawn in the LiDAR map.")
+
+
 def _word(value: object) -> object:
     """YAML reads on and off as true and false."""
     return {True: "on", False: "off"}[value] if isinstance(value, bool) else value

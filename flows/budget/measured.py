@@ -60,11 +60,14 @@ def shipped_table(preset: str) -> Path:
 def load(path: Path, preset: str) -> Table:
     """The table of a sweep over ``preset``.
 
-    Effects and threads are left out: a log's plan decides the former, and the machine has the latter. Raises
-    ``ConfigError`` for a table of another preset, or one made by a sweep that did not say how fast its machine was.
+    Effects, threads and the images' size are left out: a log's plan decides the first, the machine has the second, and
+    the third is what the user asked for. Raises ``ConfigError`` for a table of another preset, or one made by a sweep
+    that did not say how fast its machine was.
     """
-    lines, facts = read_lines(path)
     remedy = f"Give the cost.parquet of `genre cost LOG --preset {preset}`."
+    if not path.is_file():
+        raise ConfigError("there is no table", remedy=remedy, file=path)
+    lines, facts = read_lines(path)
     if facts.get("base") != preset:
         raise ConfigError(f"this table is of the preset {facts.get('base')}", remedy=remedy, file=path)
     if "calibration_s" not in facts:
@@ -74,12 +77,16 @@ def load(path: Path, preset: str) -> Table:
     points = tuple(
         Point(x.setting, x.changes, x.end, sign * x.values[judged.name].mean, x.stage_seconds)
         for x in lines
-        if x.knob != EFFECTS and not x.threads and math.isfinite(x.values[judged.name].mean)
+        if _is_a_choice(x) and math.isfinite(x.values[judged.name].mean)
     )
     return Table(
         preset, judged.label, points, _images(lines), float(facts["calibration_s"]),
         json.loads(facts["cold_seconds"]), facts["machine"],
     )  # fmt: skip
+
+
+def _is_a_choice(line: Line) -> bool:
+    return line.knob != EFFECTS and not line.threads and not any(c.startswith("ingest.") for c in line.changes)
 
 
 def _images(lines: list[Line]) -> float:

@@ -24,6 +24,7 @@ class BenchEntry:
 
 _BENCHES: dict[str, BenchEntry] = {
     "effects": BenchEntry("benchmarks.effects:EFFECTS", "what each effect brings where a log calls for it"),
+    "evaluation": BenchEntry("benchmarks.evaluation:EVALUATION", "whether budgets are kept, and what guards tell"),
     "facades": BenchEntry("benchmarks.with_without:FACADES", "what completing façades above the LiDAR's view brings"),
     "fixer": BenchEntry("benchmarks.fixer:BENCH", "what FNet brings beside the path, and what it costs"),
     "ground": BenchEntry("benchmarks.with_without:GROUND", "what holding the ground in its plane brings"),

@@ -33,9 +33,9 @@ def figure(
     Stages that the store has not are computed.
     """
     from flows.cli.terminal import TerminalReporter
+    from flows.files import anew
     from flows.produce import produce
     from flows.tables.figure import TABLE, drawn, kind_of, strips
-    from flows.tables.files import anew
     from flows.tables.request import Request
     from genre_tasks.errors import ConfigError
     from storage.codecs.png import write_png

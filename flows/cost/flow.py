@@ -19,6 +19,7 @@ from flows.cost.picture import drawn
 from flows.cost.summary import beside, lines_of
 from flows.cost.tables import write_cells, write_lines
 from flows.cost.warm import cold_seconds
+from flows.files import anew
 from flows.logs import chosen_chunks, expanded
 from flows.machine import commit, machine
 from flows.produce import ArtifactRef, Job, produce
@@ -116,9 +117,14 @@ def write(
         "date": time.strftime("%Y-%m-%d", time.gmtime()),
     }  # fmt: skip
     basis = {"base": sweep.preset, "settings": json.dumps(sweep.settings), "judged": judged.name, **speed}
-    write_lines(out / "cost.parquet", lines, facts | basis)
-    write_cells(out / "cost_cells.parquet", rows, facts | basis)
-    write_png(out / "cost.png", drawn(lines, judged, f"{facts['preset']}: {facts['logs']}"))
+    files = [out / name for name in ("cost.parquet", "cost_cells.parquet", "cost.png", "cost.md")]
+    with anew(files[0]) as part:
+        write_lines(part, lines, facts | basis)
+    with anew(files[1]) as part:
+        write_cells(part, rows, facts | basis)
+    with anew(files[2]) as part:
+        write_png(part, drawn(lines, judged, f"{facts['preset']}: {facts['logs']}"))
     said = [f"* {name}: {value}" for name, value in facts.items()] + [f"* left out: {text}" for text in failed]
-    write_file(out / "cost.md", page(lines, judged, said, "cost.png").encode())
-    return [str(out / name) for name in ("cost.parquet", "cost_cells.parquet", "cost.png", "cost.md")]
+    with anew(files[3]) as part:
+        write_file(part, page(lines, judged, said, "cost.png").encode())
+    return [str(file) for file in files]

@@ -8,7 +8,7 @@ from flows.cost.cell import Cell, Sweep, run_cell
 from flows.cost.knobs import PRESET_ITSELF, Setting
 from flows.produce import produce
 
-TINY = "synthetic:street?seed=900&frames=4&cameras=1"
+TINY = "synthetic:street?seed=900&frames=8&cameras=1"
 
 
 def cold_seconds(sweep: Sweep) -> dict[str, float]:

@@ -12,10 +12,10 @@ from typing import Any
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
+from flows.files import anew
 from flows.machine import commit, machine
 from flows.produce import ArtifactRef, Job, produce
 from flows.reporting import current_reporter
-from flows.tables.files import anew
 from flows.tables.layout import Cell
 from flows.tables.measure import Place, measure
 from flows.tables.page import differences_from_the_paper, page, put_into

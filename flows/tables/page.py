@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from flows.tables.files import anew
+from flows.files import anew
 from flows.tables.layout import Cell, Column, Layout, Row
 from flows.tables.methods import PER_SCENE
 from flows.tables.paper import PAPER

@@ -20,9 +20,10 @@ from flows.budget.clock import Clock
 from flows.budget.measured import Point, Table, load, shipped_table
 from flows.cli.main import app
 from flows.cli.numbers import seconds
-from flows.configuration import load_configuration
+from flows.configuration import load_configuration, with_settings
 from flows.cost.summary import lines_of
 from flows.cost.tables import read_lines, write_lines
+from flows.pipeline import reconstructing_until
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
 from tests.faults.tiny import LOG, SETTINGS
 
@@ -165,6 +166,7 @@ def written(path: Path, preset: str = "demo", **facts: str) -> Path:
         table_row("", (), "enet", 60.0, 27.0),
         table_row("short", ("gnet.iterations=1", "enet.iterations=1"), "enet", 0.01, 25.0),
         table_row("alone", ("gnet.iterations=1",), "gnet", 0.005, 24.0),
+        table_row("coarse", ("ingest.width_px=32", "ingest.height_px=18"), "gnet", 0.001, 31.0),
         table_row("rigid_actors off", ("effects.rigid_actors=off",), "enet", 0.001, 30.0, "effects"),
     ]
     write_lines(path, lines_of(rows), said | facts)
@@ -183,10 +185,11 @@ def table_row(
     }  # fmt: skip
 
 
-def test_a_table_comes_back_as_written_and_effects_are_no_choice(tmp_path: Path) -> None:
+def test_a_table_comes_back_as_written_and_effects_and_sizes_are_no_choice(tmp_path: Path) -> None:
     path = written(tmp_path / "cost.parquet")
     lines, facts = read_lines(path)
-    assert [x.setting for x in lines] == ["preset", "together=short", "together=alone", "effects=rigid_actors off"]
+    settings = ["preset", "together=short", "together=alone", "together=coarse", "effects=rigid_actors off"]
+    assert [x.setting for x in lines] == settings
     assert lines[1].changes == ("gnet.iterations=1", "enet.iterations=1") and facts["machine"] == "somewhere"
     table = load(path, "demo")
     assert [p.name for p in table.points] == ["preset", "together=short", "together=alone"]
@@ -246,3 +249,14 @@ def test_the_command_says_what_it_would_choose(tmp_path: Path) -> None:
         CliRunner().invoke(
             app, [*told, "--budget", "1h", "--table", table, "--set", "gnet.iterations=3"], catch_exceptions=False
         )
+
+
+def test_the_shipped_table_is_of_today_s_settings() -> None:
+    table = load(shipped_table("small"), "small")
+    lines, facts = read_lines(shipped_table("small"))
+    assert len(table.points) >= 20 and min(x.n for x in lines) >= 3 and facts["machine"] == table.machine
+    for p in table.points:
+        config = with_settings(SMALL, p.changes)
+        assert p.name == "preset" or p.end == "gnet" or config != SMALL, p.name
+        assert set(p.seconds) == set(reconstructing_until(p.end)) and all(s >= 0 for s in p.seconds.values())
+    assert set(table.cold) == set(reconstructing_until("enet")) and table.calibration_s > 0 and table.images > 1

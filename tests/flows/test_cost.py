@@ -17,6 +17,7 @@ from flows.cost.flow import write
 from flows.cost.knobs import PRESET_ITSELF, Setting, settings_of
 from flows.cost.prediction import predicted
 from flows.cost.summary import KERNEL_3M, PERCEPTUAL_3M, beside, front, lines_of
+from flows.cost.warm import cold_seconds
 from flows.produce import ArtifactRef, Job, produce
 from genre_tasks.errors import ConfigError
 from tests.faults.tiny import LOG, SETTINGS
@@ -79,6 +80,7 @@ def test_settings_start_with_the_preset_and_differ_from_it() -> None:
 
 
 def test_the_files_say_the_same(tmp_path: Path) -> None:
+    write(tmp_path, Sweep("small", (), "store"), ROWS[:2], [], {})  # an earlier one, whose files are written anew
     files = write(tmp_path, Sweep("small", (), "store"), ROWS, ["views=99: memory ran out"], {"calibration_s": "0.1"})
     lines, cells, picture, page = (Path(f) for f in files)
     table = pq.read_table(lines).to_pydict()
@@ -152,3 +154,9 @@ def test_the_command_lists_what_it_would_run_and_refuses_what_it_does_not_know(t
     assert "fixer=off" in done.output and "minutes" in done.output
     with pytest.raises(ConfigError, match="--seeds"):
         CliRunner().invoke(app, ["cost", LOG, "--seeds", "one"], catch_exceptions=False)
+
+
+def test_first_calls_are_told_apart_from_the_stages_own_time() -> None:
+    cold = cold_seconds(Sweep("demo", SWEEP_SETTINGS, "never-used"))
+    assert list(cold) == ["ingest", "effects", "initial", "gnet", "novel_views", "fnet", "enet"]
+    assert all(0 <= s < 60 for s in cold.values()) and not Path("never-used").exists()

@@ -1,4 +1,4 @@
-"""Files of a table are written anew each time it is measured; storage's own are written once."""
+"""What commands write beside the store is written anew each time; the store's own files are written once."""
 
 from __future__ import annotations
 

@@ -1,0 +1,80 @@
+"""Guards beside the truth: does a view's estimate rank it as its true PSNR does?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from scipy.stats import spearmanr
+
+from benchmarks.bench import Row
+from benchmarks.main_job import reconstruct
+from benchmarks.optimiser.cells import threads
+from benchmarks.optimiser.task import value_of
+from benchmarks.schema import Claim, claim
+from flows.configuration import load_configuration
+from flows.logs import opened_log
+from flows.machine import commit
+from flows.pipeline import reconstructing_until
+from flows.produce import Job
+from genre_tasks.config import RangeConfig
+from genre_tasks.effects.applied import applied
+from genre_tasks.metrics.collect import true_pixels
+from genre_tasks.metrics.image import psnr
+from genre_tasks.progress import silent
+from genre_tasks.reliability.guards import Guards
+from genre_tasks.reliability.range import judged, measured
+
+CONFIG = RangeConfig(every=8)
+
+
+def ranked(seed: str, stage: str, store: str) -> Row:
+    """Every view of the range on a street: shift, estimate and guards, true PSNR; and the range that was told."""
+    log = f"synthetic:street?seed={seed}"
+    job = Job(log, 0, store, load_configuration("small").model_dump(mode="json"))
+    with threads():
+        refs = reconstruct(job, reconstructing_until(stage))
+        chunk, plan, scene = (value_of(job, refs[k]) for k in ("ingest", "effects", stage))
+        chunk, truth, views, guards = applied(chunk, plan), opened_log(log).truth, list[Row](), list[Guards]()
+        assert truth is not None  # a street has one
+        for novel, own in measured(CONFIG, chunk, scene.scene, silent):
+            for i, (view, guard) in enumerate(zip(novel.views, own, strict=True)):
+                true = (true_pixels(chunk, truth, view) / np.float32(255)).astype(np.float32)
+                image = novel.color[i].clamp(0, 1).numpy()
+                views.append({"psnr": psnr(image, true), "estimate_db": guard.estimate_db, **vars(guard)})
+            guards += own
+    told = judged(guards, CONFIG)
+    out: Row = {"log": log, "stage": stage, "views": views, "left_m": told.left_m, "right_m": told.right_m}
+    return out | {"correlation": _rank(views), "commit": commit()}
+
+
+def _rank(views: Sequence[Row]) -> float:
+    beside = [v for v in views if v["shift_m"]]
+    return float(spearmanr([v["estimate_db"] for v in beside], [v["psnr"] for v in beside]).statistic)
+
+
+def claims_of(rows: Sequence[Row]) -> Iterator[Claim]:
+    """Over all views of all streets, and on the worst street."""
+    where = ", ".join(f"{r['log']} {r['stage']}" for r in rows) or "not measured"
+    for stage in ("gnet", "enet"):
+        own = [r for r in rows if r["stage"] == stage]
+        views = [v for r in own for v in r["views"]]
+        note = f"rank correlation of estimate and true PSNR over the views beside the path; {where}"
+        name = "evaluation.reliability" if stage == "enet" else f"evaluation.reliability_{stage}"
+        yield claim(name, _rank(views) if own else None, ">=", 0.8, "rank correlation", note, len(views))
+    worst = min((r["correlation"] for r in rows), default=None)
+    yield claim(
+        "evaluation.reliability_worst", worst, ">=", 0.8, "rank correlation", f"the worst street; {where}", len(rows)
+    )
+
+
+def table_of(rows: Sequence[Row]) -> Iterator[str]:
+    """A line a street and scene."""
+    yield "| log | scene | views | rank correlation | mean error of the estimate, dB | usable, left / right |"
+    yield "|---|---|---|---|---|---|"
+    for r in rows:
+        beside = [v for v in r["views"] if v["shift_m"]]
+        error = np.mean([abs(v["estimate_db"] - v["psnr"]) for v in beside])
+        reach = f"{r['left_m']:.1f} m / {r['right_m']:.1f} m"
+        street = r["log"].partition("?")[2]
+        yield f"| {street} | {r['stage']} | {len(beside)} | {r['correlation']:.3f} | {error:.2f} | {reach} |"

@@ -1,0 +1,1 @@
+"""How far beside the path a scene can be trusted, told without knowing the truth."""

@@ -1,0 +1,91 @@
+"""The benchmark of budgets and guards: what its claims make of rows, and runs that cannot be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.bench import NotMeasuredError
+from benchmarks.evaluation import EVALUATION
+from benchmarks.evaluation.budgets import claims_of, run_within, table_of
+from benchmarks.evaluation.reliability import claims_of as guard_claims
+from benchmarks.evaluation.reliability import table_of as guard_table
+from benchmarks.schema import Claim
+
+
+def run(budget_s: float, used_s: float, distance: float, log: str = "a", why: str = "x would take 99 s") -> Any:
+    return {
+        "log": log, "budget_s": budget_s, "used_s": used_s, "settings": [], "end": "enet",
+        "choices": [{"point": "preset", "why": f"the best that fits; {why}"}],
+        "metrics": {"interpolation/psnr": 27.0, "shift_3m/perceptual": distance},
+    }  # fmt: skip
+
+
+def by_name(claims: Any) -> dict[str, Claim]:
+    return {c.id.partition(".")[2]: c for c in claims}
+
+
+def test_budgets_are_kept_used_and_worth_it() -> None:
+    rows = [run(10 * k, 9.0 * k, 0.7 - 0.01 * k) for k in range(1, 10)] + [run(100, 104, 0.6)]
+    found = by_name(claims_of(rows))
+    assert all(c.holds for c in found.values())
+    assert found["budget_kept"].measured == pytest.approx(0.9)
+    assert found["budget_overrun"].measured == pytest.approx(1.04)
+    assert found["budget_used"].measured == pytest.approx(0.9)
+
+
+@pytest.mark.parametrize(
+    ("row", "failing"),
+    [
+        (run(10, 12, 0.65), {"budget_overrun", "budget_kept"}),
+        (run(10, 6, 0.65), {"budget_used"}),
+        (run(30, 29, 0.8), {"budget_worth"}),
+        (run(90, 30, 0.55, why="and of all 40"), set()),  # nothing costlier: time may be left
+        (run(90, 85, 0.9, log="b"), set()),  # another street's accuracy is no fall
+    ],
+)
+def test_each_claim_can_fail(row: Any, failing: set[str]) -> None:
+    found = by_name(claims_of([run(20, 19, 0.65), run(60, 55, 0.6), row]))
+    assert {name for name, c in found.items() if not c.holds} == failing
+
+
+def guards(log: str, stage: str, estimates: list[float]) -> Any:
+    views = [{"shift_m": float(k), "psnr": 30.0 - k, "estimate_db": e} for k, e in enumerate(estimates)]
+    from benchmarks.evaluation.reliability import _rank
+
+    return {"log": log, "stage": stage, "views": views, "left_m": 2.0, "right_m": 3.0, "correlation": _rank(views)}
+
+
+def test_guards_are_judged_beside_the_path_over_all_streets_and_on_the_worst() -> None:
+    good, bad = (
+        guards("s?seed=1", "enet", [0.0, 29.0, 28.0, 27.0]),
+        guards("s?seed=2", "enet", [30.0, 27.0, 28.0, 29.0]),
+    )
+    assert good["correlation"] == pytest.approx(1.0) and bad["correlation"] == pytest.approx(-1.0)
+    found = by_name(guard_claims([good]))
+    assert found["reliability"].holds and found["reliability"].n == 4
+    assert found["reliability_gnet"].measured is None and not found["reliability_gnet"].holds
+    both = by_name(guard_claims([good, bad]))
+    assert not both["reliability"].holds and both["reliability_worst"].measured == pytest.approx(-1.0)
+    assert any("2.0 m / 3.0 m" in line for line in guard_table([good]))
+
+
+def test_rounds_bring_every_budget_to_every_seed() -> None:
+    options = dict(EVALUATION.options) | {"budgets": "30,60,90", "seeds": "1,2,3", "stages": "gnet"}
+    names = [c.name for c in EVALUATION.cells(options | {"rounds": "1"}, quick=False)]
+    assert names[3:] == ["budget 30 s street 1", "budget 60 s street 2", "budget 90 s street 3"]
+    all_ = [c.name for c in EVALUATION.cells(options, quick=False)][3:]
+    assert len(set(all_)) == len(all_) == 9
+    assert len(EVALUATION.cells(options, quick=True)) == 4
+
+
+def test_a_run_that_fails_says_what_the_command_said(tmp_path: Path) -> None:
+    with pytest.raises(NotMeasuredError, match=r"there is no table.*nothing\.parquet"):
+        run_within("900", 60.0, str(tmp_path / "nothing.parquet"))
+
+
+def test_the_table_names_what_was_chosen() -> None:
+    lines = list(table_of([run(20, 19, 0.65)]))
+    assert "| 20 | " in lines[2] and "the preset" in lines[2] and "0.95" in lines[-1]

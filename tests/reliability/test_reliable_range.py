@@ -1,0 +1,195 @@
+"""The reliable range: guards that fall where renders get worse, the curve's limits, files and the command."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from flows.cli.main import app
+from flows.configuration import load_configuration
+from flows.logs import opened_log
+from flows.pipeline import BY_NAME
+from flows.produce import ArtifactRef, Job, produce
+from flows.reliable import write
+from flows.runs import Run, finish_run, last_stage, stage_value, summary_of
+from genre_tasks.config import RangeConfig
+from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.fixer.conditioning import recorded
+from genre_tasks.metrics.collect import true_pixels
+from genre_tasks.metrics.image import psnr
+from genre_tasks.reliability.guards import MOST_DB, Guards, guards_of
+from genre_tasks.reliability.range import judged, reliable_range
+from genre_tasks.reliability.seam import medians, seam
+from genre_tasks.scene.chunk import Chunk
+from genre_tasks.scene.graph import SceneGraph
+from genre_tasks.scene.novel import novel_view_poses
+from genre_tasks.scene.views import NovelViews
+from genre_tasks.stages.novel_views import render_novel
+
+LOG = "synthetic:street?seed=900&frames=8&cameras=1&width=128&height=72&moving=0&pedestrians=0"
+SETTINGS = [
+    "ingest.width_px=128", "ingest.height_px=72", "initial.max_points=6000", "initial.distant_count=500",
+    "gnet.iterations=4", "evaluate.shifts_m=[3]", "evaluate.bootstrap=0", "evaluate.every=4",
+]  # fmt: skip
+STAGES = ("ingest", "effects", "initial", "gnet", "evaluate/initial", "evaluate/gnet")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A run that ended with GNet's scene."""
+    store = str(tmp_path_factory.mktemp("store"))
+    config = load_configuration("demo", settings=SETTINGS).model_dump(mode="json")
+    job, refs = Job(LOG, 0, store, config), dict[str, ArtifactRef]()
+    for name in STAGES:
+        refs[name] = produce(name, job, {k: refs[k] for k in BY_NAME[name].inputs})
+    run = Run(LOG, "demo", store, config, {}, {0: refs})
+    finish_run(run, summary_of(run), {})
+    return run
+
+
+@pytest.fixture(scope="module")
+def chunk(finished: Run) -> Chunk:
+    value: Chunk = stage_value(finished.store, finished.name, 0, "ingest")[1]
+    return value
+
+
+@pytest.fixture(scope="module")
+def scene(finished: Run) -> SceneGraph:
+    value: SceneGraph = stage_value(finished.store, finished.name, 0, "gnet")[1].scene
+    return value
+
+
+def rendered(chunk: Chunk, scene: SceneGraph, *shifts: float) -> NovelViews:
+    return render_novel(chunk, scene, novel_view_poses(chunk, shifts), 4000)
+
+
+def test_agreement_falls_as_the_scene_gets_worse(chunk: Chunk, scene: SceneGraph) -> None:
+    sources, g = recorded(chunk), torch.Generator().manual_seed(0)
+    found = []
+    for noise in (0.0, 0.05, 0.2):
+        colors = scene.gaussians.colors + noise * torch.randn(scene.gaussians.colors.shape, generator=g)
+        worse = scene.with_gaussians(replace(scene.gaussians, colors=colors))
+        found.append(guards_of(chunk, rendered(chunk, worse, 1.0), sources)[0].agreement_db)
+    assert found[0] > found[1] + 0.1 and found[1] > found[2] + 1
+
+
+def test_estimates_are_in_the_order_of_the_truth(chunk: Chunk, scene: SceneGraph) -> None:
+    truth = opened_log(LOG).truth
+    novel = rendered(chunk, scene, 0.0, 1.5, 5.0)
+    guards = guards_of(chunk, novel, recorded(chunk))
+    true = {
+        shift: np.mean([
+            psnr(novel.color[i].clamp(0, 1).numpy(), true_pixels(chunk, truth, v).astype(np.float32) / 255)
+            for i, v in enumerate(novel.views) if v.shift_m == shift
+        ]) for shift in (0.0, 1.5, 5.0)
+    }  # fmt: skip
+    ours = {shift: np.mean([g.estimate_db for g in guards if g.shift_m == shift]) for shift in true}
+    assert sorted(true, key=true.__getitem__) == sorted(ours, key=ours.__getitem__) == [5.0, 1.5, 0.0]
+
+
+def test_holes_and_floaters_are_seen(chunk: Chunk, scene: SceneGraph) -> None:
+    sources, novel = recorded(chunk), rendered(chunk, scene, 0.0)
+    whole = guards_of(chunk, novel, sources)[0]
+    hole = replace(novel, alpha=novel.alpha.clone(), depth=novel.depth.clone())
+    hole.alpha[:, :, :64] = 0
+    near = replace(novel, depth=0.1 * novel.depth)
+    assert guards_of(chunk, hole, sources)[0].thin == pytest.approx(0.5, abs=0.05)
+    assert guards_of(chunk, hole, sources)[0].shown < 0.75 * whole.shown
+    assert whole.floating < 0.1 and guards_of(chunk, near, sources)[0].floating > 0.95
+
+
+def test_a_view_that_nothing_speaks_for_has_no_agreement(chunk: Chunk, scene: SceneGraph) -> None:
+    far = novel_view_poses(chunk, (500.0,))[0]
+    (guard,) = guards_of(chunk, render_novel(chunk, scene, [far], 4000), recorded(chunk))
+    assert guard.agreement_db == 0 and guard.shown < 0.05 and np.isfinite(guard.estimate_db)
+    assert Guards("c", 0, 0.0, MOST_DB, 1, 0, 0).estimate_db > guard.estimate_db
+
+
+def view(shift: float, agreement: float, shown: float = 0.7, thin: float = 0.0, floating: float = 0.0) -> Guards:
+    return Guards("front", 0, shift, agreement, shown, thin, floating)
+
+
+def test_the_range_ends_where_the_first_limit_is_crossed() -> None:
+    limits = RangeConfig(shifts_m=(1.0, 2.0), drop_db=1.0, hidden=0.1)
+    drop = 1.0 / 0.416  # of agreement, for one of the estimate
+    flat = [view(0.0, 30.0), view(1.0, 30.0 - (0.2 - 0.566) * drop), view(2.0, 30.0 - (1.8 - 2 * 0.566) * drop)]
+    right = [view(-1.0, 30.0, shown=0.55), view(-2.0, 30.0, shown=0.2)]
+    found = judged([*flat, *right], limits)
+    assert [p.shift_m for p in found.points] == [-2, -1, 0, 1, 2]
+    assert found.left_m == pytest.approx(1.5)  # 0.2 and 1.8 dB lost at 1 and 2 m
+    assert found.right_m == pytest.approx(1.0 / (0.15 * 11.9 + 0.566), abs=1e-2)  # the estimate falls before the share
+    assert str(found).startswith("usable to 1.5 m left")
+
+
+def test_what_holds_everywhere_is_usable_to_the_last_shift_or_more() -> None:
+    limits = RangeConfig(shifts_m=(1.0, 2.0), drop_db=3.0)
+    found = judged([view(s, 30.0) for s in (0.0, 1.0, 2.0, -1.0, -2.0)], limits)
+    assert (found.left_m, found.right_m) == (2.0, 2.0) and "2.0 m or more left" in str(found)
+    later = judged([view(s, 30.0, thin=0.5 * (s == 1.0)) for s in (0.0, 1.0, 2.0)], limits)
+    assert later.left_m < 0.1 and later.points[-1].holds  # what holds behind a gap cannot be reached
+
+
+def test_without_the_path_nothing_can_be_judged() -> None:
+    with pytest.raises(ValueError, match="shift 0"):
+        judged([view(1.0, 30.0)], RangeConfig())
+
+
+def test_every_shift_is_rendered_on_both_sides(chunk: Chunk, scene: SceneGraph, tmp_path: Path) -> None:
+    config, told = RangeConfig(shifts_m=(1.0, 4.0), every=4), list[int]()
+    found = reliable_range(config, chunk, scene, progress=lambda done, total, note="": told.append(done))
+    assert [p.shift_m for p in found.points] == [-4, -1, 0, 1, 4] and {p.views for p in found.points} == {2}
+    assert told == [0, 1, 2, 3, 4, 5]
+    write(tmp_path, found, {"log": "an earlier one"})
+    table, picture = (Path(p) for p in write(tmp_path, found, {"log": LOG}))
+    rows = pq.read_table(table)
+    assert rows.num_rows == 10 and rows.schema.metadata[b"left_m"] == f"{found.left_m:.3f}".encode()
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_the_command_answers_for_a_finished_run(finished: Run, tmp_path: Path) -> None:
+    told = ["range", finished.name, "--store", finished.store, "--out", str(tmp_path)]
+    done = CliRunner().invoke(app, told)
+    assert done.exit_code == 0, done.output
+    assert "usable to" in done.output and "after gnet" in done.output and (tmp_path / "range.png").is_file()
+    assert last_stage(finished.store, finished.name, 0) == "gnet"
+    with pytest.raises(ConfigError, match="range --help"):
+        CliRunner().invoke(app, [*told, "--drop-db", "-1"], catch_exceptions=False)
+    with pytest.raises(InputError, match="runs of this store begin with"):
+        CliRunner().invoke(app, ["range", "zzz", "--store", finished.store], catch_exceptions=False)
+
+
+def test_a_record_says_what_a_budget_did(finished: Run) -> None:
+    record = finish_run(finished, summary_of(finished), {"budget": {"budget_s": 1.0}})
+    assert json.loads((finished.folder / "run.json").read_text())["budget"] == record["budget"] == {"budget_s": 1.0}
+
+
+def test_a_seam_is_the_same_view_from_both_scenes(chunk: Chunk, scene: SceneGraph) -> None:
+    """A chunk cut in two, whose second half lies elsewhere in its own coordinates, and is a little darker."""
+    shift = np.eye(4)
+    shift[:3, 3] = (7.0, -3.0, 0.5)
+    first = replace(chunk, frames=chunk.frames[:4], views=tuple(v for v in chunk.views if v.frame in chunk.frames[:4]))
+    moved = [
+        replace(v, chunk_SE3_camera=shift @ v.chunk_SE3_camera) for v in chunk.views if v.frame in chunk.frames[4:]
+    ]
+    second = replace(
+        chunk, index=1, frames=chunk.frames[4:], views=tuple(moved), chunk_SE3_ego=shift @ chunk.chunk_SE3_ego[4:],
+        world_SE3_chunk=chunk.world_SE3_chunk @ np.linalg.inv(shift),
+    )  # fmt: skip
+    first = replace(first, chunk_SE3_ego=chunk.chunk_SE3_ego[:4])
+    offset = torch.tensor([7.0, -3.0, 0.5])
+    same = replace(scene.gaussians, means=scene.gaussians.means + offset)
+    darker = replace(same, colors=same.colors - 0.05)
+    alike = seam((first, scene), (second, scene.with_gaussians(same)))
+    jump = seam((first, scene), (second, scene.with_gaussians(darker)))
+    assert len(alike) == 6 and {v.frame for v in alike} == {chunk.frames[3], chunk.frames[4]}
+    assert min(medians(alike).values()) > 45  # but for rounding and the order of equal depths
+    assert all(25 < db < 30 for db in medians(jump).values())  # 0.05 is 26 dB; what is black stays black
+    with pytest.raises(ValueError, match="follow each other"):
+        seam((second, scene), (first, scene))
