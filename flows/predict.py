@@ -14,14 +14,14 @@ from storage.local import open_store
 # Measured on two cores at 320×180 with six cameras and 44k Gaussians (preset small), per chunk: seconds, GB.
 # Used where the store holds no finished stage to learn from; scaled with the pixels.
 _TYPICAL = {
-    "ingest": (15.0, 2.5),
-    "initial": (6.0, 1.5),
-    "gnet": (40.0, 2.5),
-    "effects": (10.0, 1.0),
-    "novel_views": (5.0, 2.0),
-    "fnet": (20.0, 2.5),
-    "enet": (40.0, 2.5),
-    "evaluate": (120.0, 3.0),
+    "ingest": (10.0, 2.5),
+    "initial": (4.0, 2.0),
+    "gnet": (5.0, 2.5),
+    "effects": (7.0, 2.0),
+    "novel_views": (10.0, 2.5),
+    "fnet": (24.0, 3.0),
+    "enet": (5.0, 2.5),
+    "evaluate": (40.0, 3.0),
 }
 _TYPICAL_PIXELS = 320 * 180
 
