@@ -20,8 +20,9 @@ BORDER_S = 0.6
 SPARE = 0.06
 """Of the predicted time, kept for what no table knows."""
 
-PACING, PACED_S = ("initial", "gnet"), 2.0
-"""Stages whose time tells how fast the machine is, and from how many seconds on: ingest's tells of the log's reader."""
+TOLD_BY_CALIBRATION_S = 5.0
+"""So many seconds of stages weigh as much as the calibration does. Ingest is not among them: its time tells of the
+log's reader."""
 
 
 @dataclass(frozen=True)
@@ -58,11 +59,11 @@ class Chooser:
             )
         self.clock, self.choices = clock, list[Choice]()
         self._table, self._work, self._pace = table, work, speed
+        self._taken, self._foreseen = speed * TOLD_BY_CALIBRATION_S, TOLD_BY_CALIBRATION_S
         self._cold = table.cold if cold else {}
         self._points = [(p, with_settings(base, p.changes)) for p in table.points]
         self._finished: list[str] = []
         self._now: tuple[Point, PipelineConfig] | None = None
-        self._taken, self._foreseen = 0.0, 0.0
         self.used_s = 0.0  # of the budget at the latest border
 
     def next(self, share: float = 1.0) -> tuple[str, PipelineConfig] | None:
@@ -87,11 +88,10 @@ class Chooser:
     def done(self, stage: str, seconds: float, cached: bool) -> None:
         """Takes note of what a stage took from border to border: where it was computed, others will go at its pace."""
         assert self._now is not None
-        if not cached and stage in PACING:
+        if not cached and stage != "ingest":
             self._taken += seconds
             self._foreseen += self._of(self._now[0], stage)
-            if self._foreseen > PACED_S:
-                self._pace = self._taken / self._foreseen
+            self._pace = self._taken / self._foreseen
         self._finished.append(stage)
 
     def record(self) -> dict[str, Any]:
