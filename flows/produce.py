@@ -231,6 +231,16 @@ def _smaller(spec: StageSpec, section: Any, attempt: int) -> Any:
     return section.model_copy(update={spec.splits: max(1, getattr(section, spec.splits) >> attempt)})
 
 
+def artifact_of(job: Job, ref: ArtifactRef) -> Artifact:
+    """The artifact behind a reference of this job. Raises ``ArtifactCorruptError`` where it is gone."""
+    return _artifact(open_store(job.store), ref, job)
+
+
+def value_of(job: Job, ref: ArtifactRef) -> Any:
+    """Its value, verified while it is read."""
+    return open_store(job.store).read(artifact_of(job, ref))
+
+
 def _artifact(store: Store, ref: ArtifactRef, job: Job) -> Artifact:
     artifact = store.find(address_of(ref.stage, job, ref.key))
     if artifact is None:

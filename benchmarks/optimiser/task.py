@@ -5,19 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 from benchmarks.bench import NotMeasuredError
 from benchmarks.main_job import reconstruct
 from benchmarks.optimiser.beside import true_targets
 from flows.configuration import load_configuration
-from flows.produce import ArtifactRef, Job
+from flows.produce import Job, value_of
 from flows.train.optimiser import psnr
 from flows.train.scenes import spread
 from genre_tasks.effects.types import BASIC
 from genre_tasks.optimiser.targets import Target, of_source, of_views
 from genre_tasks.scene.graph import SceneGraph
-from storage.local import open_store
 
 HELDOUT_VIEWS = 12
 """So many held-out views judge, spread evenly: a curve has some twenty points."""
@@ -78,10 +76,3 @@ def job_of(log: str, chunk: int, store: str, order: int | None = None, *settings
         store,
         load_configuration("small", settings=[*WITHOUT_EFFECTS, *seeds, *settings]).model_dump(mode="json"),
     )
-
-
-def value_of(job: Job, ref: ArtifactRef) -> Any:
-    """The artifact's value, read back from the store."""
-    store = open_store(job.store)
-    (artifact,) = store.artifacts(key=ref.key, chunk=job.chunk)
-    return store.read(artifact)

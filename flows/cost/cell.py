@@ -9,9 +9,7 @@ from typing import Any
 
 from flows.cost.knobs import PRESET_ITSELF, Setting
 from flows.pipeline import BY_NAME, PIPELINE, reconstructing_until
-from flows.produce import ArtifactRef, Job, address_of
-from genre_tasks.errors import InputError
-from storage.local import Artifact, open_store
+from flows.produce import ArtifactRef, Job, artifact_of, value_of
 
 Produce = Callable[[str, Job, dict[str, ArtifactRef]], ArtifactRef]
 
@@ -77,13 +75,13 @@ def run_cell(sweep: Sweep, cell: Cell, produce: Produce) -> dict[str, Any] | Non
         evaluation = produce(judging.name, job, judged)
     row: dict[str, Any] = {"knob": cell.setting.knob, "value": cell.setting.value, "setting": cell.setting.name}
     row |= {"changes": list(cell.setting.changes), "end": cell.setting.end, "threads": cell.setting.threads}
-    row |= {"log": cell.log, "chunk": cell.chunk, "seed": cell.seed, "images": len(_value(job, refs["ingest"]).views)}
-    stages = {name: _found(job, ref).manifest for name, ref in refs.items()}
+    row |= {"log": cell.log, "chunk": cell.chunk, "seed": cell.seed, "images": len(value_of(job, refs["ingest"]).views)}
+    stages = {name: artifact_of(job, ref).manifest for name, ref in refs.items()}
     row["seconds"] = {name: m.seconds for name, m in stages.items()}
     row["cpu_seconds"] = {name: m.measurements.get("cpu_seconds") for name, m in stages.items()}
     row["peak_mib"] = max(m.peak_mib for m in stages.values())
-    row["gaussians"] = len(_value(job, refs[cell.setting.end]).scene)
-    metrics = _value(job, evaluation).metrics
+    row["gaussians"] = len(value_of(job, refs[cell.setting.end]).scene)
+    metrics = value_of(job, evaluation).metrics
     row["metrics"] = {m.name: m.value for m in metrics} | {m.name.rpartition("/")[0] + "/n": m.n for m in metrics}
     return row
 
@@ -110,17 +108,6 @@ def _differs(sweep: Sweep, cell: Cell, produce: Produce) -> bool:
     """Whether the cell's effect is one that its chunk's plan has otherwise, and that can be set at all."""
     judge = sweep.judge(cell)
     planned = produce("effects", judge, {"ingest": produce("ingest", judge, {})})
-    decision = _value(judge, planned)[cell.setting.effect]
+    decision = value_of(judge, planned)[cell.setting.effect]
     impossible = decision.choice == "off" and decision.value != decision.value
     return decision.choice != cell.setting.word and not impossible
-
-
-def _found(job: Job, ref: ArtifactRef) -> Artifact:
-    artifact = open_store(job.store).find(address_of(ref.stage, job, ref.key))
-    if artifact is None:
-        raise InputError("an artifact of this sweep is gone", remedy="Run again: it is computed anew.", file=ref.path)
-    return artifact
-
-
-def _value(job: Job, ref: ArtifactRef) -> Any:
-    return open_store(job.store).read(_found(job, ref))

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from flows.logs import opened_log
 from flows.pipeline import reconstructing_until
-from flows.tables.measure import Produce, run_stages, value_of
+from flows.produce import value_of
+from flows.tables.measure import Produce, run_stages
 from flows.tables.request import Planned
 from genre_tasks.errors import ConfigError, InputError
 

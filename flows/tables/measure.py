@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from flows.logs import chosen_chunks, expanded
 from flows.pipeline import BY_NAME, PIPELINE, reconstructing_until
-from flows.produce import ArtifactRef, Job, address_of
+from flows.produce import ArtifactRef, Job, artifact_of, value_of
 from flows.tables.layout import Cell, Layout
 from flows.tables.methods import Method
 from genre_tasks.config import PipelineConfig
-from genre_tasks.errors import InputError
-from storage.local import Artifact, open_store
 
 Produce = Callable[[str, Job, dict[str, ArtifactRef]], ArtifactRef]
 
@@ -64,7 +61,7 @@ def measure(basis: Basis, layout: Layout, method: Method, place: Place, produce:
     """The cell; raises as the stages do."""
     job = basis.job(layout, method, place)
     refs = run_stages(stages_of(layout, method), job, produce)
-    manifests = {name: _found(job, ref).manifest for name, ref in refs.items() if not name.startswith("evaluate/")}
+    manifests = {name: artifact_of(job, ref).manifest for name, ref in refs.items() if not name.startswith("evaluate/")}
     cpu = {name: m.measurements.get("cpu_seconds") for name, m in manifests.items()}
     metrics: dict[str, float] = {}
     if layout.evaluated:
@@ -85,14 +82,3 @@ def measure(basis: Basis, layout: Layout, method: Method, place: Place, produce:
 def places_of(logs: Sequence[str], chunks: list[int] | None, config: PipelineConfig) -> list[Place]:
     """Every chosen chunk of every log. Raises ``InputError`` for a chunk that a log does not have."""
     return [Place(log, chunk) for log in expanded(list(logs)) for chunk in chosen_chunks(log, config, chunks)]
-
-
-def _found(job: Job, ref: ArtifactRef) -> Artifact:
-    artifact = open_store(job.store).find(address_of(ref.stage, job, ref.key))
-    if artifact is None:
-        raise InputError("an artifact of this table is gone", remedy="Run again: it is computed anew.", file=ref.path)
-    return artifact
-
-
-def value_of(job: Job, ref: ArtifactRef) -> Any:
-    return open_store(job.store).read(_found(job, ref))

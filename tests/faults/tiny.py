@@ -10,9 +10,11 @@ import subprocess
 import sys
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+
+from flows.produce import ArtifactRef, Job, produce
 
 ROOT = Path(__file__).resolve().parents[2]
 GENRE = str(Path(sys.executable).parent / "genre")
@@ -91,3 +93,21 @@ def prefect_server(folder: Path) -> Iterator[str]:
         process.terminate()
         process.wait(20)
         log.close()
+
+
+class Stopped(Exception):
+    """As by a kill."""
+
+
+def stopping(after: int) -> tuple[list[str], Callable[[str, Job, dict[str, ArtifactRef]], ArtifactRef]]:
+    """A ``produce`` that lists what it computes and raises ``Stopped`` while exactly ``after`` are listed."""
+    computed: list[str] = []
+
+    def counted(stage: str, job: Job, inputs: dict[str, ArtifactRef]) -> ArtifactRef:
+        if len(computed) == after:
+            raise Stopped
+        ref = produce(stage, job, inputs)
+        computed.extend([] if ref.cached else [stage])
+        return ref
+
+    return computed, counted

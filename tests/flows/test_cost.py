@@ -18,9 +18,8 @@ from flows.cost.knobs import PRESET_ITSELF, Setting, settings_of
 from flows.cost.prediction import predicted
 from flows.cost.summary import KERNEL_3M, PERCEPTUAL_3M, beside, front, lines_of
 from flows.cost.warm import cold_seconds
-from flows.produce import ArtifactRef, Job, produce
 from genre_tasks.errors import ConfigError
-from tests.faults.tiny import LOG, SETTINGS
+from tests.faults.tiny import LOG, SETTINGS, Stopped, stopping
 
 
 def row(value: str, seed: int, seconds: float, psnr: float, log: str = "a", **more: float) -> dict[str, Any]:
@@ -106,21 +105,9 @@ CELLS = [
 ]
 
 
-class Stopped(Exception):
-    """As by a kill."""
-
-
 def test_a_sweep_goes_on_where_it_was_stopped_and_judges_alike(tmp_path: Path) -> None:
     sweep = Sweep("demo", SWEEP_SETTINGS, str(tmp_path))
-    computed: list[str] = []
-
-    def counted(stage: str, job: Job, inputs: dict[str, ArtifactRef]) -> ArtifactRef:
-        if len(computed) == 6:
-            raise Stopped
-        ref = produce(stage, job, inputs)
-        computed.extend([] if ref.cached else [stage])
-        return ref
-
+    computed, counted = stopping(after=6)
     with pytest.raises(Stopped):
         for cell in CELLS:
             run_cell(sweep, cell, counted)

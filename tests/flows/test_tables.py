@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from flows.cli.main import app
 from flows.configuration import load_configuration
-from flows.produce import ArtifactRef, Job, produce
+from flows.produce import produce
 from flows.tables.figure import SHIFTS_M, TABLE, Kind, drawn, strips
 from flows.tables.flow import paper_table, write
 from flows.tables.layout import LAYOUTS, PROTOCOL, Cell, layout_of
@@ -26,7 +26,7 @@ from flows.tables.paper import PAPER
 from flows.tables.prediction import not_stored, predicted
 from flows.tables.request import Planned, Request
 from genre_tasks.errors import ConfigError, GenreError, InputError
-from tests.faults.tiny import LOG, SETTINGS
+from tests.faults.tiny import LOG, SETTINGS, Stopped, stopping
 
 
 def test_every_row_and_column_of_the_papers_tables_has_a_place() -> None:
@@ -227,21 +227,9 @@ def test_the_files_say_the_same(tmp_path: Path) -> None:
 TABLE_SETTINGS = (*(s for s in SETTINGS if "snapshots" not in s), "gnet.per_scene.iterations=12")
 
 
-class Stopped(Exception):
-    """As by a kill."""
-
-
 def test_a_table_goes_on_where_it_was_stopped_and_methods_share_stages(tmp_path: Path) -> None:
     basis, layout, place = Basis("demo", TABLE_SETTINGS, str(tmp_path)), LAYOUTS[4], Place(LOG, 0)
-    computed: list[str] = []
-
-    def counted(stage: str, job: Job, inputs: dict[str, ArtifactRef]) -> ArtifactRef:
-        if len(computed) == 6:
-            raise Stopped
-        ref = produce(stage, job, inputs)
-        computed.extend([] if ref.cached else [stage])
-        return ref
-
+    computed, counted = stopping(after=6)
     with pytest.raises(Stopped):
         for row in layout.rows:
             measure(basis, layout, row.method, place, counted)
