@@ -81,7 +81,9 @@ def test_rounds_bring_every_budget_to_every_seed() -> None:
     assert len(EVALUATION.cells(options, quick=True)) == 4
 
 
-def test_a_run_that_fails_says_what_the_command_said(tmp_path: Path) -> None:
+def test_a_run_that_fails_says_what_the_command_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / ".genre" / "prefect-budgets").mkdir(parents=True)  # else a whole run would make it
     with pytest.raises(NotMeasuredError, match=r"there is no table.*nothing\.parquet"):
         run_within("900", 60.0, str(tmp_path / "nothing.parquet"))
 
