@@ -76,7 +76,8 @@ def reconstruct_log(
             failed.append(error)
     if not done and failed:
         raise failed[0]
-    run = Run(log, preset, store, values, differences(effective, preset), done)
+    notes = {} if budget is None else {chunk: budget.choosers[chunk].told() for chunk in done}
+    run = Run(log, preset, store, values, differences(effective, preset), done, notes)
     summary = summary_of(run)
     record = finish_run(run, summary, {} if budget is None else {"budget": budget.record()})
     _publish(summary)

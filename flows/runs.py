@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +24,10 @@ _FOLDER = "runs"
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run: what was asked for, and the references of every stage of every chunk."""
+    """A finished run: what was asked for, and the references of every stage of every chunk.
+
+    ``notes``, by chunk, are shown with it: what it was made with, where that is not what was asked for.
+    """
 
     log: str
     preset: str
@@ -32,6 +35,7 @@ class Run:
     config: dict[str, Any]
     differs: dict[str, tuple[Any, Any]]
     chunks: dict[int, dict[str, ArtifactRef]]
+    notes: Mapping[int, str] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -123,7 +127,8 @@ def _chunk_summary(run: Run, chunk: int, refs: dict[str, ArtifactRef]) -> ChunkS
                 intervals=intervals,
             )
         )
-    return ChunkSummary(chunk=chunk, stages=tuple(stages), warnings=_marks(found["ingest"]))
+    notes = (run.notes[chunk],) if chunk in run.notes else ()
+    return ChunkSummary(chunk=chunk, stages=tuple(stages), warnings=(*notes, *_marks(found["ingest"])))
 
 
 def _with_counts(metrics: Any) -> dict[str, float]:
@@ -206,6 +211,5 @@ def next_scene(store: str, run: str, chunk: int, stage: str | None) -> tuple[Any
     if chunk + 1 not in chunks:
         return None
     name = stage or last_stage(store, run, chunk + 1)
-    values = (stage_value(store, run, chunk + 1, each)[1] for each in ("ingest", name))
-    ingested, reconstruction = values
-    return ingested, reconstruction.scene
+    ingested, made = (stage_value(store, run, chunk + 1, each)[1] for each in ("ingest", name))
+    return ingested, made.scene

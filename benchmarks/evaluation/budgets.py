@@ -50,7 +50,7 @@ def run_within(seed: str, budget_s: float, table: str) -> Row:
     (chunk,) = record["chunks"]
     (chosen,) = record["budget"]["chunks"]
     stages = {s["stage"]: s for s in chunk["stages"]}
-    metrics = stages[f"evaluate/{chosen['end']}"]["metrics"] or stages[chosen["end"]]["metrics"]
+    metrics = stages[chosen["end"]]["metrics"]
     return {
         "log": log, "budget_s": budget_s, "used_s": record["budget"]["used_s"], "command_s": command_s,
         "speed": record["budget"]["speed"], "end": chosen["end"], "settings": chosen["settings"],

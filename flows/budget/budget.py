@@ -7,10 +7,18 @@ from typing import Any
 
 from flows.budget.chooser import Chooser, images_of
 from flows.budget.clock import Clock
-from flows.budget.measured import load, shipped_table
+from flows.budget.measured import Table, load, shipped_table
 from flows.calibration import calibration_s
 from flows.configuration import differences
 from genre_tasks.config import PipelineConfig
+
+
+def table_for(table: str | None, preset: str, config: PipelineConfig) -> Table:
+    """What a run with ``config`` over ``preset`` chooses from: the file ``table``, or the preset's own.
+
+    Raises ``ConfigError`` as ``measured.load`` does.
+    """
+    return load(Path(table) if table else shipped_table(preset), preset, differences(config, preset))
 
 
 class Budget:
@@ -23,15 +31,14 @@ class Budget:
         self, budget_s: float, began: float | None, table: str | None, preset: str, config: PipelineConfig
     ) -> None:
         self.clock = Clock(budget_s, began)
-        self._table = load(Path(table) if table else shipped_table(preset), preset)
-        self._config, self._own = config, tuple(differences(config, preset))
+        self._table, self._config = table_for(table, preset, config), config
         self.speed = calibration_s() / self._table.calibration_s
         self.choosers: dict[int, Chooser] = {}
 
     def chooser(self, log: str, chunk: int) -> Chooser:
         """Of a chunk; the first one's stages are also the first of the process."""
         work = images_of(log, chunk, self._config) / self._table.images
-        made = Chooser(self._table, self._config, self.clock, work, self.speed, not self.choosers, self._own)
+        made = Chooser(self._table, self._config, self.clock, work, self.speed, not self.choosers)
         self.choosers[chunk] = made
         return made
 

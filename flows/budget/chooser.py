@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -12,7 +12,6 @@ from flows.configuration import with_settings
 from flows.logs import opened_log
 from flows.pipeline import BY_NAME, reconstructing_until
 from genre_tasks.config import PipelineConfig
-from genre_tasks.errors import ConfigError
 
 BORDER_S = 0.6
 """Of a stage beyond its own seconds on the table's machine: artifacts read, hashed and written, Prefect's states."""
@@ -42,21 +41,14 @@ class Choice:
 class Chooser:
     """For one chunk.
 
-    ``base`` is the user's configuration, over which a setting of the table is applied; ``own`` the keys that the user
-    has set. ``work`` is the chunk's images over the table's, ``speed`` this machine's calibration over the table's,
-    ``cold`` whether no stage has run in this process. Raises ``ConfigError`` where the user has set what the table
-    turns.
+    ``base`` is the user's configuration, over which a setting of the table is applied. ``work`` is the chunk's images
+    over the table's, ``speed`` this machine's calibration over the table's, ``cold`` whether no stage has run in this
+    process.
     """
 
     def __init__(
-        self, table: Table, base: PipelineConfig, clock: Clock, work: float, speed: float, cold: bool = True,
-        own: Iterable[str] = (),
-    ) -> None:  # fmt: skip
-        turned = {change.partition("=")[0] for p in table.points for change in p.changes}
-        if both := sorted(turned & set(own)):
-            raise ConfigError(
-                f"{', '.join(both)} is what a budget decides", remedy="Leave out either --budget or that setting."
-            )
+        self, table: Table, base: PipelineConfig, clock: Clock, work: float, speed: float, cold: bool = True
+    ) -> None:
         self.clock, self.choices = clock, list[Choice]()
         self._table, self._work, self._pace = table, work, speed
         self._taken, self._foreseen = speed * TOLD_BY_CALIBRATION_S, TOLD_BY_CALIBRATION_S
@@ -98,6 +90,11 @@ class Chooser:
         """The settings over the user's that the chunk was made with, the stage it ends at, and all choices."""
         settings, end = ([], "") if self._now is None else (list(self._now[0].changes), self._now[0].end)
         return {"settings": settings, "end": end, "choices": [asdict(c) for c in self.choices]}
+
+    def told(self) -> str:
+        """What the chunk was made with, a line."""
+        made = self.record()
+        return f"within a budget: {', '.join(made['settings']) or 'as configured'}; ends at {made['end']}"
 
     def predicted_s(self, point: Point) -> float:
         """Of the stages that are not finished, with what is kept for surprises."""

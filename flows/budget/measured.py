@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,12 +57,12 @@ def shipped_table(preset: str) -> Path:
     return path
 
 
-def load(path: Path, preset: str) -> Table:
-    """The table of a sweep over ``preset``.
+def load(path: Path, preset: str, own: Iterable[str] = ()) -> Table:
+    """The table of a sweep over ``preset``, for a run whose user has set the keys ``own``.
 
     Effects, threads and the images' size are left out: a log's plan decides the first, the machine has the second, and
-    the third is what the user asked for. Raises ``ConfigError`` for a table of another preset, or one made by a sweep
-    that did not say how fast its machine was.
+    the third is what the user asked for. Raises ``ConfigError`` for a table of another preset, one made by a sweep
+    that did not say how fast its machine was, or one that turns what the user has set.
     """
     remedy = f"Give the cost.parquet of `genre cost LOG --preset {preset}`."
     if not path.is_file():
@@ -79,6 +79,11 @@ def load(path: Path, preset: str) -> Table:
         for x in lines
         if _is_a_choice(x) and math.isfinite(x.values[judged.name].mean)
     )
+    turned = {change.partition("=")[0] for p in points for change in p.changes}
+    if both := sorted(turned & set(own)):
+        raise ConfigError(
+            f"{', '.join(both)} is what a budget decides", remedy="Leave out either --budget or that setting."
+        )
     return Table(
         preset, judged.label, points, _images(lines), float(facts["calibration_s"]),
         json.loads(facts["cold_seconds"]), facts["machine"],

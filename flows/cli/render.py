@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def render(
     run: Annotated[str, typer.Argument(help="A run's name (or its start), as `genre show runs` lists it.")],
     out: Annotated[Path, typer.Option(help="x.mp4 (all frames), x.png or x.exr (one frame).")],
-    stage: Annotated[str, typer.Option(help="initial, gnet or enet.")] = "enet",
+    stage: Annotated[str | None, typer.Option(help="initial, gnet or enet; the run's last without it.")] = None,
     shift: Annotated[float, typer.Option(help="Metres to the left of the path; negative is to the right.")] = 0.0,
     camera: Annotated[str | None, typer.Option(help="A camera of the rig; the first one without it.")] = None,
     chunk: Annotated[int | None, typer.Option(help="A chunk of the run; the first one without it.")] = None,
@@ -28,12 +28,13 @@ def render(
     store: Annotated[str, typer.Option(help="The run's store.")] = "genre-store",
 ) -> None:
     """Render a scene of a finished run at the recorded poses or shifted to the side."""
-    from flows.runs import stage_value
+    from flows.runs import last_stage, stage_value
     from genre_tasks.errors import InputError
 
     if out.suffix not in (".mp4", ".png", ".exr"):
         raise InputError(f"cannot write '{out.suffix}'", remedy="Use .mp4, .png or .exr.", file=out)
     number, ingested = stage_value(store, run, chunk, "ingest")
+    stage = stage or last_stage(store, run, number)
     _, reconstruction = stage_value(store, run, number, stage)
     frames = _frames(ingested, frame, every=out.suffix == ".mp4")
     name = camera or ingested.camera_names[0]

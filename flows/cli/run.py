@@ -56,6 +56,10 @@ def run(
     if table is not None and budget_s is None:
         raise ConfigError("--table is what --budget chooses from", remedy="Give a --budget, too, or leave it out.")
     given = None if table is None else str(table)
+    if budget_s is not None:
+        from flows.budget.budget import table_for
+
+        table_for(given, preset, effective)  # what does not fit is said before a server is started
     if dry_run:
         if budget_s is not None:
             effective = _chosen(log, preset, wanted, effective, budget_s, began, given)

@@ -58,8 +58,8 @@ class Frozen(Clock):
         return self.now
 
 
-def chooser(clock: Clock, speed: float = 1.0, **more: Any) -> Chooser:
-    return Chooser(TABLE, SMALL, clock, 1.0, speed, **more)
+def chooser(clock: Clock, speed: float = 1.0) -> Chooser:
+    return Chooser(TABLE, SMALL, clock, 1.0, speed)
 
 
 def simulated(budget_s: float, slower: Callable[[str], float], points: Sequence[Point] = POINTS) -> tuple[Frozen, str]:
@@ -129,10 +129,21 @@ def test_stages_from_the_store_tell_nothing_of_the_pace() -> None:
     assert fresh.predicted_s(POINTS[0]) == pytest.approx(1.06 * (8 + 3 + 2 + 4 * BORDER_S))
 
 
-def test_what_the_user_has_set_is_not_turned() -> None:
+def test_what_the_user_has_set_is_not_turned(tmp_path: Path) -> None:
+    table = written(tmp_path / "cost.parquet")
     with pytest.raises(ConfigError, match=r"gnet.iterations is what a budget decides.*Leave out"):
-        chooser(Frozen(60.0), own=("gnet.iterations", "ingest.strict"))
-    assert chooser(Frozen(60.0), own=("ingest.strict",))
+        load(table, "demo", own=("gnet.iterations", "ingest.strict"))
+    assert load(table, "demo", own=("ingest.strict",))
+
+
+def test_the_command_says_what_does_not_fit_before_a_server_is_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reconstruct, "reconstruct_log", None)  # would end in a TypeError
+    table = str(written(tmp_path / "cost.parquet"))
+    told = ["run", LOG, "--preset", "demo", "--budget", "1h", "--table", table, "--set", "gnet.iterations=3"]
+    with pytest.raises(ConfigError, match=r"gnet\.iterations is what a budget decides"):
+        CliRunner().invoke(app, told, catch_exceptions=False)
 
 
 def test_images_of_a_chunk_are_frames_times_cameras() -> None:
@@ -221,9 +232,12 @@ def test_a_run_ends_where_its_budget_says(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(budgets, "calibration_s", lambda: 0.1)
 
     def run(budget_s: float) -> tuple[list[str], dict[str, Any]]:
+        """The stages that were made, and the record; the report says, too, what the scene was made with."""
         done = reconstruct.reconstruct_log(
             LOG, preset="demo", store=str(tmp_path / "store"), settings=own, budget_s=budget_s, table=table
         )
+        assert done["chunks"][0]["warnings"][0].startswith("within a budget: gnet.iterations=1")
+        assert "within a budget: gnet.iterations=1" in Path(done["report"]).read_text()
         return [s["stage"] for s in done["chunks"][0]["stages"]], done["budget"]
 
     stages, record = run(100.0)
