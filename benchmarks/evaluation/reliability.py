@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -22,7 +23,7 @@ from genre_tasks.effects.applied import applied
 from genre_tasks.metrics.collect import true_pixels
 from genre_tasks.metrics.image import psnr
 from genre_tasks.progress import silent
-from genre_tasks.reliability.guards import Guards
+from genre_tasks.reliability.guards import ESTIMATE, Guards
 from genre_tasks.reliability.range import judged, measured
 
 CONFIG = RangeConfig(every=8)
@@ -68,6 +69,23 @@ def claims_of(rows: Sequence[Row]) -> Iterator[Claim]:
     )
 
 
+def fitted(rows: Sequence[Row]) -> tuple[dict[str, float], float]:
+    """Least squares of true PSNR on the guards of ``guards.ESTIMATE`` over the views beside the path.
+
+    Also the rank correlation of what each log's views are told by the fit of the others (NaN for fewer than two).
+    """
+    logs, views = zip(*((r["log"], v) for r in rows for v in r["views"] if v["shift_m"]), strict=True)
+    x = np.array([[1.0, v["agreement_db"], v["shown"], abs(v["shift_m"])] for v in views])
+    y, of = np.array([v["psnr"] for v in views]), np.array(logs)
+    whole = np.linalg.lstsq(x, y, rcond=None)[0]
+    if len(set(logs)) < 2:
+        return dict(zip(ESTIMATE, map(float, whole), strict=True)), math.nan
+    told = np.empty_like(y)
+    for log in set(logs):
+        told[of == log] = x[of == log] @ np.linalg.lstsq(x[of != log], y[of != log], rcond=None)[0]
+    return dict(zip(ESTIMATE, map(float, whole), strict=True)), float(spearmanr(told, y).statistic)
+
+
 def table_of(rows: Sequence[Row]) -> Iterator[str]:
     """A line a street and scene."""
     yield "| log | scene | views | rank correlation | mean error of the estimate, dB | usable, left / right |"
@@ -78,3 +96,7 @@ def table_of(rows: Sequence[Row]) -> Iterator[str]:
         reach = f"{r['left_m']:.1f} m / {r['right_m']:.1f} m"
         street = r["log"].partition("?")[2]
         yield f"| {street} | {r['stage']} | {len(beside)} | {r['correlation']:.3f} | {error:.2f} | {reach} |"
+    for stage in sorted({r["stage"] for r in rows}):
+        found, apart = fitted([r for r in rows if r["stage"] == stage])
+        numbers = ", ".join(f"{name} {value:.4g}" for name, value in found.items())
+        yield f"\nFitted on these views of {stage}: {numbers}; rank correlation with one street left out: {apart:.3f}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -65,14 +64,11 @@ def run(
             effective = _chosen(log, preset, wanted, effective, budget_s, began, given)
         _dry_run(log, preset, store, wanted, effective, as_json)
         return
-    Path(os.environ["PREFECT_HOME"]).mkdir(parents=True, exist_ok=True)
-    from flows.cli.terminal import TerminalReporter, print_run
-    from flows.reconstruct import reconstruct_log
-    from flows.reporting import report_to
+    from flows.cli.terminal import print_run, reporting
 
-    reporter = TerminalReporter()
-    report_to(reporter)
-    with reporter:
+    with reporting():
+        from flows.reconstruct import reconstruct_log
+
         summary = reconstruct_log(
             log, preset=preset, store=store, chunks=wanted, config=effective.model_dump(mode="json"),
             budget_s=budget_s, began=began, table=given,

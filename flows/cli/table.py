@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -66,13 +65,9 @@ def table(
         rows = predicted(plan)
         print_rows(f"{len(rows)} cells, {sum(r['seconds'] for r in rows) / 60:.0f} minutes", rows)
         return
-    Path(os.environ["PREFECT_HOME"]).mkdir(parents=True, exist_ok=True)
-    from flows.cli.terminal import TerminalReporter
-    from flows.reporting import report_to
+    from flows.cli.terminal import reporting
 
-    reporter = TerminalReporter()
-    report_to(reporter)
-    with reporter:
+    with reporting():
         done = paper_table(
             number, logs, preset=preset, store=store, chunks=chosen, settings=settings, methods=files,
             weights=weights, out=str(out), into=request.into, remarks=remarks, stored=stored,

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -90,6 +92,16 @@ class TerminalReporter:
         else:
             sys.stderr.write(text + "\n")
         sys.stderr.flush()
+
+
+def reporting(what: str = "starting Prefect") -> TerminalReporter:
+    """Makes Prefect's home and a reporter, and has the process's runs tell it; to be used as a context."""
+    from flows.reporting import report_to
+
+    Path(os.environ["PREFECT_HOME"]).mkdir(parents=True, exist_ok=True)
+    reporter = TerminalReporter(what)
+    report_to(reporter)
+    return reporter
 
 
 def print_run(summary: dict[str, Any]) -> None:

@@ -106,12 +106,9 @@ def _train(network: str, folder: Path, *values: Any) -> None:
 @contextmanager
 def _reported(what: str) -> Iterator[None]:
     """The flow's progress on the terminal, a home for Prefect, and an end at once on Ctrl-C."""
-    from flows.cli.terminal import TerminalReporter
-    from flows.reporting import report_to
+    from flows.cli.terminal import reporting
 
-    Path(os.environ["PREFECT_HOME"]).mkdir(parents=True, exist_ok=True)
-    reporter = TerminalReporter(what)
-    report_to(reporter)
+    reporter = reporting(what)
     if "PREFECT_API_URL" not in os.environ:
         _stop_at_once(reporter)
     with reporter:

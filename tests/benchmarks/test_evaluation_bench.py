@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from benchmarks.bench import NotMeasuredError
 from benchmarks.evaluation import EVALUATION
 from benchmarks.evaluation.budgets import claims_of, run_within, table_of
 from benchmarks.evaluation.reliability import claims_of as guard_claims
+from benchmarks.evaluation.reliability import fitted
 from benchmarks.evaluation.reliability import table_of as guard_table
 from benchmarks.schema import Claim
 from flows.budget.measured import load, shipped_table
@@ -57,7 +60,10 @@ def test_each_claim_can_fail(row: Any, failing: set[str]) -> None:
 
 
 def guards(log: str, stage: str, estimates: list[float]) -> Any:
-    views = [{"shift_m": float(k), "psnr": 30.0 - k, "estimate_db": e} for k, e in enumerate(estimates)]
+    views = [
+        {"shift_m": float(k), "psnr": 30.0 - k, "estimate_db": e, "agreement_db": e, "shown": 0.5}
+        for k, e in enumerate(estimates)
+    ]
     from benchmarks.evaluation.reliability import _rank
 
     return {"log": log, "stage": stage, "views": views, "left_m": 2.0, "right_m": 3.0, "correlation": _rank(views)}
@@ -75,6 +81,23 @@ def test_guards_are_judged_beside_the_path_over_all_streets_and_on_the_worst() -
     both = by_name(guard_claims([good, bad]))
     assert not both["reliability"].holds and both["reliability_worst"].measured == pytest.approx(-1.0)
     assert any("2.0 m / 3.0 m" in line for line in guard_table([good]))
+
+
+def test_the_estimate_can_be_fitted_again() -> None:
+    """On views whose PSNR is linear in the guards the fit is exact, also of a street that it was not made on."""
+    g, rows = np.random.default_rng(0), []
+    for log in ("a", "b", "c"):
+        views = [
+            {"shift_m": s, "agreement_db": 20 + 8 * g.random(), "shown": g.random()} for s in (-2.0, 1.0, 0.0, 3.0)
+        ]
+        for v in views:
+            v["psnr"] = (
+                5 + 0.5 * v["agreement_db"] + 9 * v["shown"] - 0.7 * abs(v["shift_m"]) + 99 * (v["shift_m"] == 0)
+            )
+        rows.append({"log": log, "views": views})
+    found, apart = fitted(rows)
+    assert found == pytest.approx({"constant": 5, "agreement_db": 0.5, "shown": 9, "shift_m": -0.7})
+    assert apart == pytest.approx(1.0) and math.isnan(fitted(rows[:1])[1])
 
 
 def test_rounds_bring_every_budget_to_every_seed() -> None:
