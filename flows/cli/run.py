@@ -91,6 +91,7 @@ def _chosen(
     budget, wanted = Budget(budget_s, began, table, preset, config), chosen_chunks(log, config, chunks)
     typer.echo(budget.told(), err=True)
     chooser = budget.chooser(log, wanted[0])
+    chooser.calibrate()  # nothing else is starting
     step = chooser.next(1 / len(wanted))
     typer.echo(f"chunk {wanted[0]}: {chooser.choices[0]} (Prefect's start would be counted, too)", err=True)
     return config if step is None else step[1]

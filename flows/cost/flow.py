@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -72,7 +73,8 @@ def cost_of_accuracy(
                 raise
             failed[cell.name] = error
             reporter.ended(f"left out: {error}")
-    files = write(Path(out), sweep, rows, [f"{name}: {error}" for name, error in failed.items()], speed)
+    told = command_of(sweep, logs, chunks, seeds, knobs)
+    files = write(Path(out), sweep, rows, [f"{name}: {error}" for name, error in failed.items()], told, speed)
     return {"cells": len(rows), "failed": sorted(failed), "files": files}
 
 
@@ -90,6 +92,20 @@ def planned(
     return cells_of(places, (0, 1, 2) if seeds is None else seeds, settings)
 
 
+def command_of(
+    sweep: Sweep,
+    logs: Sequence[str],
+    chunks: Sequence[int] | None,
+    seeds: Sequence[int] | None,
+    knobs: Sequence[str] | None,
+) -> str:
+    """The command that sweeps the same cells again."""
+    lists = {"--chunks": chunks, "--seeds": seeds, "--knobs": knobs}
+    chosen = [part for name, values in lists.items() if values for part in (name, ",".join(map(str, values)))]
+    sets = [part for setting in sweep.settings for part in ("--set", setting)]
+    return shlex.join(["genre", "cost", *logs, "--preset", sweep.preset, *chosen, *sets])
+
+
 @task(name="cell", task_run_name="{cell.name}", persist_result=False, cache_policy=NO_CACHE)
 def cell_task(sweep: Sweep, cell: Cell) -> dict[str, Any] | None:
     """A row of the sweep, see :func:`flows.cost.cell.run_cell`."""
@@ -101,18 +117,23 @@ def cell_task(sweep: Sweep, cell: Cell) -> dict[str, Any] | None:
 
 
 def write(
-    out: Path, sweep: Sweep, rows: Sequence[dict[str, Any]], failed: Sequence[str], speed: Mapping[str, str]
+    out: Path,
+    sweep: Sweep,
+    rows: Sequence[dict[str, Any]],
+    failed: Sequence[str],
+    command: str,
+    speed: Mapping[str, str],
 ) -> list[str]:
     """``cost.parquet``, ``cost_cells.parquet``, ``cost.png`` and ``cost.md``, each whole or not at all.
 
-    ``speed`` of the machine goes into the tables, for whoever predicts from them.
+    ``command`` makes them again. ``speed`` of the machine goes into the tables, for whoever predicts from them.
     """
     out.mkdir(parents=True, exist_ok=True)
     lines, judged = lines_of(rows), beside(rows)
     where = sorted({f"{r['log']} chunk {r['chunk']}" for r in rows})
     seeds = sorted({r["seed"] for r in rows})
     facts = {
-        "preset": " ".join([sweep.preset, *sweep.settings]), "logs": ", ".join(where),
+        "command": command, "preset": " ".join([sweep.preset, *sweep.settings]), "logs": ", ".join(where),
         "seeds": ", ".join(map(str, seeds)), "machine": machine(), "commit": commit(),
         "date": time.strftime("%Y-%m-%d", time.gmtime()),
     }  # fmt: skip
@@ -124,7 +145,9 @@ def write(
         write_cells(part, rows, facts | basis)
     with anew(files[2]) as part:
         write_png(part, drawn(lines, judged, f"{facts['preset']}: {facts['logs']}"))
-    said = [f"* {name}: {value}" for name, value in facts.items()] + [f"* left out: {text}" for text in failed]
+    said = [f"* {name}: {f'`{value}`' if name == 'command' else value}" for name, value in facts.items()] + [
+        f"* left out: {text}" for text in failed
+    ]
     with anew(files[3]) as part:
         write_file(part, page(lines, judged, said, "cost.png").encode())
     return [str(file) for file in files]

@@ -13,10 +13,11 @@ from benchmarks.bench import NotMeasuredError
 from benchmarks.evaluation import EVALUATION
 from benchmarks.evaluation.budgets import claims_of, run_within, table_of
 from benchmarks.evaluation.reliability import claims_of as guard_claims
-from benchmarks.evaluation.reliability import fitted
+from benchmarks.evaluation.reliability import fitted, true_reach
 from benchmarks.evaluation.reliability import table_of as guard_table
 from benchmarks.schema import Claim
 from flows.budget.measured import load, shipped_table
+from genre_tasks.reliability.guards import ESTIMATE
 
 
 def run(budget_s: float, used_s: float, distance: float, log: str = "a", point: str = "preset") -> Any:
@@ -59,28 +60,31 @@ def test_each_claim_can_fail(row: Any, failing: set[str]) -> None:
     assert {name for name, c in found.items() if not c.holds} == failing
 
 
-def guards(log: str, stage: str, estimates: list[float]) -> Any:
+def guards(log: str, stage: str, agreement: list[float]) -> Any:
+    """Views at 0, 1, 2 … m on both sides, each a dB worse than the one before it in truth."""
     views = [
-        {"shift_m": float(k), "psnr": 30.0 - k, "estimate_db": e, "agreement_db": e, "shown": 0.5}
-        for k, e in enumerate(estimates)
-    ]
-    from benchmarks.evaluation.reliability import _rank
-
-    return {"log": log, "stage": stage, "views": views, "left_m": 2.0, "right_m": 3.0, "correlation": _rank(views)}
+        {"camera": "c", "frame": 4, "shift_m": float(side * k), "agreement_db": a, "shown": 0.5, "thin": 0.0}
+        | {"floating": 0.0, "psnr": 30.0 - k}
+        for k, a in enumerate(agreement) for side in (1, -1)
+    ]  # fmt: skip
+    return {"log": log, "stage": stage, "views": views}
 
 
 def test_guards_are_judged_beside_the_path_over_all_streets_and_on_the_worst() -> None:
     good, bad = (
-        guards("s?seed=1", "enet", [0.0, 29.0, 28.0, 27.0]),
-        guards("s?seed=2", "enet", [30.0, 27.0, 28.0, 29.0]),
+        guards("s?seed=1", "enet", [30.0, 29.0, 28.0, 27.0, 26.0]),
+        guards("s?seed=2", "enet", [30.0, 27.0, 32.0, 37.0, 42.0]),
     )
-    assert good["correlation"] == pytest.approx(1.0) and bad["correlation"] == pytest.approx(-1.0)
     found = by_name(guard_claims([good]))
-    assert found["reliability"].holds and found["reliability"].n == 4
+    assert found["reliability"].measured == pytest.approx(1.0)
+    assert found["reliability"].holds and found["reliability"].n == 10
     assert found["reliability_gnet"].measured is None and not found["reliability_gnet"].holds
     both = by_name(guard_claims([good, bad]))
     assert not both["reliability"].holds and both["reliability_worst"].measured == pytest.approx(-1.0)
-    assert any("2.0 m / 3.0 m" in line for line in guard_table([good]))
+    lost = ESTIMATE["agreement_db"] - ESTIMATE["shift_m"]  # dB told a metre; in truth 1
+    assert any(f"{3 / lost:.1f} m / {3 / lost:.1f} m | 3.0 m / 3.0 m |" in line for line in guard_table([good]))
+    farther = [v | {"psnr": 30.0 - 2 * abs(v["shift_m"])} for v in good["views"]]
+    assert true_reach(farther, 1) == true_reach(farther, -1) == pytest.approx(1.5)
 
 
 def test_the_estimate_can_be_fitted_again() -> None:

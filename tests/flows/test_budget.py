@@ -59,13 +59,15 @@ class Frozen(Clock):
 
 
 def chooser(clock: Clock, speed: float = 1.0) -> Chooser:
-    return Chooser(TABLE, SMALL, clock, 1.0, speed)
+    by = Chooser(TABLE, SMALL, clock, 1.0, lambda: speed)
+    by.calibrate()
+    return by
 
 
 def simulated(budget_s: float, slower: Callable[[str], float], points: Sequence[Point] = POINTS) -> tuple[Frozen, str]:
     """A run whose stages take ``slower`` times what the table says: the clock at its end, and the last point."""
     clock = Frozen(budget_s)
-    by = Chooser(replace(TABLE, points=tuple(points)), SMALL, clock, 1.0, 1.0)
+    by = Chooser(replace(TABLE, points=tuple(points)), SMALL, clock, 1.0, lambda: 1.0)
     while (step := by.next()) is not None:
         own = next(p for p in points if p.name == by.choices[-1].point)
         took = slower(step[0]) * (own.seconds[step[0]] + TABLE.cold.get(step[0], 0.0) + BORDER_S)
@@ -127,6 +129,23 @@ def test_stages_from_the_store_tell_nothing_of_the_pace() -> None:
     fresh = chooser(Frozen(60.0))
     assert fresh.next()
     assert fresh.predicted_s(POINTS[0]) == pytest.approx(1.06 * (8 + 3 + 2 + 4 * BORDER_S))
+
+
+def test_speed_is_asked_for_once_and_only_when_something_was_computed() -> None:
+    asked: list[float] = []
+
+    def speed() -> float:
+        asked.append(1.5)
+        return 1.5
+
+    by = Chooser(TABLE, SMALL, Frozen(80.0), 1.0, speed)
+    assert by.next() and by.choices[0].pace == 1.0
+    by.done("ingest", 0.01, cached=True)
+    assert by.next() and not asked
+    by.done("effects", 1.5 * (1.0 + BORDER_S), cached=False)
+    assert by.next() and asked == [1.5]
+    by.done("initial", 1.5 * (2.0 + BORDER_S), cached=False)
+    assert by.next() and asked == [1.5] and by.choices[-1].pace == pytest.approx(1.5)
 
 
 def test_what_the_user_has_set_is_not_turned(tmp_path: Path) -> None:

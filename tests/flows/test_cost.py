@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from flows.cli.main import app
 from flows.configuration import load_configuration
 from flows.cost.cell import Cell, Sweep, cells_of, run_cell
-from flows.cost.flow import write
+from flows.cost.flow import command_of, write
 from flows.cost.knobs import PRESET_ITSELF, Setting, settings_of
 from flows.cost.prediction import predicted
 from flows.cost.summary import KERNEL_3M, PERCEPTUAL_3M, beside, front, lines_of
@@ -78,9 +78,20 @@ def test_settings_start_with_the_preset_and_differ_from_it() -> None:
         settings_of("small", knobs=["view"])
 
 
+COMMAND = "genre cost 'synthetic:street?seed=900' --preset small --seeds 0,1 --knobs fixer --set enet.snapshots=0"
+
+
+def test_the_command_is_the_one_that_was_given() -> None:
+    sweep = Sweep("small", ("enet.snapshots=0",), "store")
+    assert command_of(sweep, ["synthetic:street?seed=900"], None, [0, 1], ["fixer"]) == COMMAND
+    assert command_of(Sweep("demo", (), "s"), ["a"], [2], None, None) == "genre cost a --preset demo --chunks 2"
+
+
 def test_the_files_say_the_same(tmp_path: Path) -> None:
-    write(tmp_path, Sweep("small", (), "store"), ROWS[:2], [], {})  # an earlier one, whose files are written anew
-    files = write(tmp_path, Sweep("small", (), "store"), ROWS, ["views=99: memory ran out"], {"calibration_s": "0.1"})
+    write(tmp_path, Sweep("small", (), "store"), ROWS[:2], [], "", {})  # an earlier one, whose files are written anew
+    files = write(
+        tmp_path, Sweep("small", (), "store"), ROWS, ["views=99: memory ran out"], COMMAND, {"calibration_s": "0.1"}
+    )
     lines, cells, picture, page = (Path(f) for f in files)
     table = pq.read_table(lines).to_pydict()
     assert table["value"] == ["", "1", "9"] and table["psnr_mean"][1] == pytest.approx(22.5)
@@ -90,6 +101,7 @@ def test_the_files_say_the_same(tmp_path: Path) -> None:
     assert picture.read_bytes()[:4] == b"\x89PNG"
     text = page.read_text()
     assert "**22.50 ± 1.41**" in text and "left out: views=99: memory ran out" in text and "N = 30" in text
+    assert f"* command: `{COMMAND}`" in text
 
 
 SWEEP_SETTINGS = tuple(s for s in SETTINGS if "snapshots" not in s)

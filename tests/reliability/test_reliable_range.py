@@ -24,7 +24,7 @@ from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.fixer.conditioning import recorded
 from genre_tasks.metrics.collect import true_pixels
 from genre_tasks.metrics.image import psnr
-from genre_tasks.reliability.guards import MOST_DB, Guards, guards_of
+from genre_tasks.reliability.guards import ESTIMATE, MOST_DB, Guards, guards_of
 from genre_tasks.reliability.range import judged, reliable_range
 from genre_tasks.reliability.seam import medians, seam
 from genre_tasks.scene.chunk import Chunk
@@ -118,13 +118,14 @@ def view(shift: float, agreement: float, shown: float = 0.7, thin: float = 0.0, 
 
 def test_the_range_ends_where_the_first_limit_is_crossed() -> None:
     limits = RangeConfig(shifts_m=(1.0, 2.0), drop_db=1.0, hidden=0.1)
-    drop = 1.0 / 0.416  # of agreement, for one of the estimate
-    flat = [view(0.0, 30.0), view(1.0, 30.0 - (0.2 - 0.566) * drop), view(2.0, 30.0 - (1.8 - 2 * 0.566) * drop)]
+    drop, a_metre = 1.0 / ESTIMATE["agreement_db"], -ESTIMATE["shift_m"]  # of agreement, for one of the estimate
+    flat = [view(0.0, 30.0), view(1.0, 30.0 - (0.2 - a_metre) * drop), view(2.0, 30.0 - (1.8 - 2 * a_metre) * drop)]
     right = [view(-1.0, 30.0, shown=0.55), view(-2.0, 30.0, shown=0.2)]
     found = judged([*flat, *right], limits)
     assert [p.shift_m for p in found.points] == [-2, -1, 0, 1, 2]
     assert found.left_m == pytest.approx(1.5)  # 0.2 and 1.8 dB lost at 1 and 2 m
-    assert found.right_m == pytest.approx(1.0 / (0.15 * 11.9 + 0.566), abs=1e-2)  # the estimate falls before the share
+    lost = 0.15 * ESTIMATE["shown"] + a_metre
+    assert found.right_m == pytest.approx(1.0 / lost, abs=1e-2)  # the estimate falls before the share
     assert str(found).startswith("usable to 1.5 m left")
 
 
