@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from benchmarks.effects.measures import beside_psnr, heldout_depth, heldout_people, heldout_psnr, sharp_psnr
+from benchmarks.effects.measures import apart_psnr, beside_psnr, heldout_depth, heldout_people, heldout_psnr, sharp_psnr
 from genre_tasks.effects.plan import effect_of
 from genre_tasks.logs.types import Truth
 from genre_tasks.scene.chunk import Chunk
@@ -78,13 +78,14 @@ CASES: dict[str, Case] = {
     "motion_blur": Case(_seconds("exposure_s", "motion_blur"), sharp_psnr, timed=True),
     "view_dependent_colour": Case(lambda x, _: f"&gloss={x * GLOSS:.4g}", heldout_psnr),
     "lidar_depth": Case(lambda *_: "", heldout_depth, "%", plain="&lidar_beams=1&lidar_azimuths=90"),
-    "anti_aliasing": Case(lambda *_: "", beside_psnr, plain="&standstill=1"),
+    "anti_aliasing": Case(lambda *_: "", apart_psnr, plain="&standstill=1"),
     "ego_mask": Case(lambda x, _: f"&bonnet={x * _limit('ego_mask') / 100:.4g}", heldout_psnr),
 }
 """Those that are modelled and that a street can be made to call for or not. Every street has a sky: there is none that
 does not call for the distant region; and whoever drives sees one thing from many distances: a street that does not call
 for anti-aliasing is one where the vehicle stands, and no factor is asked for. Rolling shutter is judged beside the
 path: held-out frames are sheared as source frames are, and a scene that is sheared too fits them. So is anti-aliasing:
-there footprints are other than in any image that the scene was made from. Motion blur is judged by what an ideal camera
+there footprints are other than in any image that the scene was made from, and over what is seen from far and from near
+alone. Motion blur is judged by what an ideal camera
 would have seen in place of held-out frames, which are blurred, too: three metres beside, errors of place hide most of
 what is sharp."""

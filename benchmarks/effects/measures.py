@@ -8,12 +8,14 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from genre_tasks.effects.anti_aliasing import ratios
 from genre_tasks.effects.nonrigid_actors import covered
-from genre_tasks.logs.types import Truth
+from genre_tasks.logs.types import Float32, Truth
 from genre_tasks.metrics.collect import true_pixels, view_image
 from genre_tasks.metrics.image import psnr
 from genre_tasks.render.api import render_views
-from genre_tasks.scene.chunk import Chunk
+from genre_tasks.scene.chunk import Chunk, View
+from genre_tasks.scene.coloring import visible
 from genre_tasks.scene.depth import lidar_depth
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.novel import novel_view_poses
@@ -21,6 +23,7 @@ from genre_tasks.scene.views import NovelView
 from genre_tasks.stages.evaluate import as_recorded
 
 SIDE_M = 3.0
+APART = 2.0
 
 
 def heldout_psnr(chunk: Chunk, scene: SceneGraph, _: Truth | None = None) -> float:
@@ -69,6 +72,34 @@ def beside_psnr(chunk: Chunk, scene: SceneGraph, truth: Truth | None) -> float:
     if truth is None:
         return heldout_psnr(chunk, scene)
     return _ideal_psnr(chunk, scene, truth, novel_view_poses(chunk, (SIDE_M, -SIDE_M)))
+
+
+def apart_psnr(chunk: Chunk, scene: SceneGraph, truth: Truth | None) -> float:
+    """PSNR at ±3 m over pixels that show a LiDAR return whose footprints in the views are more than twice apart, dB.
+
+    Without a truth: of held-out frames.
+    """
+    if truth is None:
+        return _apart(chunk, scene, [(v, view_image(v).numpy()) for v in chunk.of_role("heldout")])
+    ideal = []
+    for v in novel_view_poses(chunk, (SIDE_M, -SIDE_M)):
+        true = true_pixels(chunk, truth, v).astype(np.float32) / np.float32(255)
+        ideal.append((View(v.camera, v.frame, "heldout", 0.0, v.chunk_SE3_camera, v.lens, b""), true))
+    return _apart(chunk, scene, ideal)
+
+
+def _apart(chunk: Chunk, scene: SceneGraph, views: Sequence[tuple[View, Float32]]) -> float:
+    points = chunk.static.positions[chunk.static.frames >= 0]
+    chosen = ratios(chunk, points) > APART
+    error, count = 0.0, 0
+    for view, true in views:
+        index, uv, _ = visible(points, view)
+        u, v = uv[chosen[index]].astype(np.int64).T
+        with torch.no_grad():
+            image = render_views(scene, [view]).color.clamp(0, 1)[0].numpy()
+        error += float(np.square(image[v, u] - true[v, u]).mean(-1).sum(dtype=np.float64))
+        count += len(u)
+    return -10 * math.log10(error / count) if count else math.nan
 
 
 def sharp_psnr(chunk: Chunk, scene: SceneGraph, truth: Truth | None) -> float:

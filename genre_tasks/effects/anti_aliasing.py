@@ -17,7 +17,8 @@ import numpy as np
 
 from genre_tasks.effects.seen import Seen
 from genre_tasks.effects.types import Effect, Measured
-from genre_tasks.scene.chunk import View
+from genre_tasks.logs.types import Float32, Float64
+from genre_tasks.scene.chunk import Chunk, View
 from genre_tasks.scene.coloring import visible
 from genre_tasks.scene.geometry import shift_laterally
 
@@ -36,23 +37,30 @@ def measure(seen: Seen) -> Measured:
     The median over LiDAR points; views are the source images, and those at ±3 m that are rendered from them.
     """
     points = seen.chunk.static.positions[seen.chunk.static.frames >= 0][::_EVERY]
-    largest, smallest = np.full(len(points), -np.inf), np.full(len(points), np.inf)
-    for view in _views(seen):
-        index, _, depth = visible(points, view)
-        size = np.log(view.lens.fx_px / depth)
-        largest[index], smallest[index] = np.maximum(largest[index], size), np.minimum(smallest[index], size)
-    known = np.isfinite(largest)
+    ratio = ratios(seen.chunk, points)
+    known = np.isfinite(ratio)
     if not known.any():
         return Measured(None, "no point is seen")
-    ratio = float(np.exp(np.median(largest[known] - smallest[known])))
-    return Measured(ratio, f"of {int(known.sum())} points, over source images and views at ±{SHIFT_M:g} m")
+    text = f"of {int(known.sum())} points, over source images and views at ±{SHIFT_M:g} m"
+    return Measured(float(np.median(ratio[known])), text)
 
 
-def _views(seen: Seen) -> list[View]:
+def ratios(chunk: Chunk, points: Float32) -> Float64:
+    """Largest over smallest footprint [P] of points [P, 3] in the views, NaN where none sees a point."""
+    largest, smallest = np.full(len(points), np.nan), np.full(len(points), np.nan)
+    for view in _views(chunk):
+        index, _, depth = visible(points, view)
+        size = view.lens.fx_px / depth
+        largest[index], smallest[index] = np.fmax(largest[index], size), np.fmin(smallest[index], size)
+    return np.asarray(largest / smallest)
+
+
+def _views(chunk: Chunk) -> list[View]:
     """Source views, and each at ±3 m."""
-    out = list(seen.sources)
-    for view in seen.sources:
-        ego = seen.chunk.chunk_SE3_ego[seen.chunk.frames.index(view.frame)]
+    sources = chunk.of_role("source")
+    out = list(sources)
+    for view in sources:
+        ego = chunk.chunk_SE3_ego[chunk.frames.index(view.frame)]
         poses = (shift_laterally(view.chunk_SE3_camera, ego, shift) for shift in (-SHIFT_M, SHIFT_M))
         out += [replace(view, chunk_SE3_camera=pose) for pose in poses]
     return out

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from benchmarks.effects import EFFECTS, calibrated
 from benchmarks.effects.cases import CASES, LITTLE, LONGEST_S
+from benchmarks.effects.measures import APART, _apart
 from flows.cli.bench import load
+from genre_tasks.config import IngestConfig, InitialConfig
+from genre_tasks.effects.anti_aliasing import ratios
 from genre_tasks.effects.plan import EFFECTS as NAMES
 from genre_tasks.logs.registry import open_log
+from genre_tasks.metrics.collect import view_image
+from genre_tasks.scene.coloring import visible
+from genre_tasks.stages.ingest import ingest
+from genre_tasks.stages.initial import initial
 
 
 def row(name: str, factor: float, on: float, off: float, value: float = 3.0, unit: str = "dB") -> dict:
@@ -80,3 +88,22 @@ def test_a_threshold_is_read_between_two_measurements() -> None:
     assert calibrated(rows, 0.1) == pytest.approx(3.0)
     assert calibrated(rows[:1], 0.1) is None
     assert any("0.1 dB at 3 px" in line for line in EFFECTS.table(dict(zip("ab", rows, strict=True))))
+
+
+def test_what_is_seen_from_far_and_near_is_judged_alone() -> None:
+    street = open_log("synthetic:street?seed=1020&frames=8&cameras=2&width=160&height=90&samples=1")
+    chunk = ingest(IngestConfig(width_px=160, height_px=90), street, 0)
+    scene = initial(InitialConfig(max_points=2000, distant_count=200), chunk).scene
+    view = chunk.of_role("heldout")[0]
+    image = view_image(view).numpy()
+    points = chunk.static.positions[chunk.static.frames >= 0]
+    index, uv, _ = visible(points, view)
+    u, v = uv[ratios(chunk, points)[index] > APART].astype(int).T
+    judged = np.zeros(image.shape[:2], bool)
+    judged[v, u] = True
+    assert 0.01 < judged.mean() < 0.5
+    inside, outside = image.copy(), image.copy()
+    inside[judged], outside[~judged] = 1 - inside[judged], 1 - outside[~judged]
+    as_it_is, elsewhere, there = (_apart(chunk, scene, [(view, x)]) for x in (image, outside, inside))
+    assert elsewhere == as_it_is and there < as_it_is - 1
+    assert np.isnan(_apart(chunk, scene, []))
