@@ -75,9 +75,9 @@ def load(path: Path, preset: str, own: Iterable[str] = ()) -> Table:
     judged = next((m for m in MEASURES if m.name == facts["judged"]), PSNR)
     sign = 1.0 if judged.more_is_better else -1.0
     points = tuple(
-        Point(x.setting, x.changes, x.end, sign * x.values[judged.name].mean, x.stage_seconds)
+        Point(x.setting, x.changes, x.end, sign * x.values[judged.name].middle, x.stage_seconds)
         for x in lines
-        if _is_a_choice(x) and math.isfinite(x.values[judged.name].mean)
+        if _is_a_choice(x) and math.isfinite(x.values[judged.name].middle)
     )
     turned = {change.partition("=")[0] for p in points for change in p.changes}
     if both := sorted(turned & set(own)):

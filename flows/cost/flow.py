@@ -19,7 +19,7 @@ from flows.cost.page import page
 from flows.cost.picture import drawn
 from flows.cost.summary import beside, lines_of
 from flows.cost.tables import write_cells, write_lines
-from flows.cost.warm import cold_seconds
+from flows.cost.warm import cold_seconds, read_before
 from flows.files import anew
 from flows.logs import chosen_chunks, expanded
 from flows.machine import commit, machine
@@ -60,8 +60,11 @@ def cost_of_accuracy(
     reporter = current_reporter()
     reporter.began("warming up")
     cold = cold_seconds(sweep)
-    speed = {"calibration_s": f"{calibration_s():.4f}", "cold_seconds": json.dumps(cold)}
+    fastest = calibration_s()
     reporter.ended(f"{sum(cold.values()):.1f} s more than warm")
+    reporter.began("reading the logs")
+    read_before(sweep, cells)
+    reporter.ended("each once, before anything is timed")
     for k, cell in enumerate(cells):
         reporter.began(f"{k + 1}/{len(cells)} {cell.name}")
         try:
@@ -73,6 +76,8 @@ def cost_of_accuracy(
                 raise
             failed[cell.name] = error
             reporter.ended(f"left out: {error}")
+    fastest = min(fastest, calibration_s())  # what ran beside the one is seldom there for both
+    speed = {"calibration_s": f"{fastest:.4f}", "cold_seconds": json.dumps(cold)}
     told = command_of(sweep, logs, chunks, seeds, knobs)
     files = write(Path(out), sweep, rows, [f"{name}: {error}" for name, error in failed.items()], told, speed)
     return {"cells": len(rows), "failed": sorted(failed), "files": files}

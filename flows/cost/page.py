@@ -10,9 +10,10 @@ from flows.cost.summary import COSTS, KERNEL_3M, MEASURES, PSNR, Line, Measure, 
 INCLUDED = (
     "Seconds are the wall time of the stages up to the scene (ingest, plan of effects, initial scene, GNet, and unless "
     "it is off novel views, FNet and ENet), each as measured when it was computed; evaluation, reading artifacts back, "
-    "hashing, the start of Python, imports and other first calls are not in them (the process was warm). A stage that "
-    "settings share was computed once. ± is "
-    "the standard deviation over seeds (order of views, noise of the fixer), pooled over logs."
+    "hashing, the start of Python, imports and other first calls are not in them (the process was warm, and had read "
+    "each log once: a synthetic street is drawn when it is first read). A stage that "
+    "settings share was computed once. Seconds, CPU seconds, memory and Gaussians are medians over seeds, all else "
+    "means; ± is the standard deviation over seeds (order of views, noise of the fixer), pooled over logs."
 )
 
 
@@ -32,7 +33,7 @@ def page(lines: Sequence[Line], judged: Measure, facts: Sequence[str], picture: 
 
 
 def _table(lines: Sequence[Line], judged: Measure) -> Iterator[str]:
-    shown = [m for m in MEASURES if any(math.isfinite(x.values[m.name].mean) for x in lines)]
+    shown = [m for m in MEASURES if any(math.isfinite(x.values[m.name].middle) for x in lines)]
     yield "Gains are over the preset in the same place with the same seed, positive where the setting is better. "
     yield f"**Bold**: no setting is as good in less time (held-out PSNR, {judged.label})."
     if KERNEL_3M in shown:
@@ -58,8 +59,8 @@ def _stages(lines: Sequence[Line]) -> Iterator[str]:
 
 
 def _value(spread: Spread, bold: bool = False, sign: str = "") -> str:
-    if math.isnan(spread.mean):
+    if math.isnan(spread.middle):
         return ""
-    digits = 0 if abs(spread.mean) >= 100 else 2 if abs(spread.mean) >= 1 else 3
-    text = f"{spread.mean:{sign}.{digits}f}" + ("" if math.isnan(spread.sd) else f" ± {spread.sd:.{digits}f}")
+    digits = 0 if abs(spread.middle) >= 100 else 2 if abs(spread.middle) >= 1 else 3
+    text = f"{spread.middle:{sign}.{digits}f}" + ("" if math.isnan(spread.sd) else f" ± {spread.sd:.{digits}f}")
     return f"**{text}**" if bold else text

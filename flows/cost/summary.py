@@ -1,4 +1,4 @@
-"""What a sweep's rows say: means, spreads, what each setting gains over the preset, and which none beats."""
+"""What a sweep's rows say: middles, spreads, what each setting gains over the preset, and which none beats."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from flows.cost.knobs import PRESET_ITSELF
 
@@ -15,12 +15,16 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Measure:
-    """A column: its name, how it is read off a row (NaN: the row has none), and whether more is better."""
+    """A column: its name, how it is read off a row (NaN: the row has none), and whether more is better.
+
+    ``middle`` of the seeds: of what a busy machine disturbs (costs) the median.
+    """
 
     name: str
     label: str
     read: Callable[[Row], float]
     more_is_better: bool
+    middle: Literal["mean", "median"] = "mean"
 
 
 def _metric(name: str) -> Callable[[Row], float]:
@@ -49,18 +53,18 @@ MEASURES: tuple[Measure, ...] = (
     Measure("frechet_3m", "Fréchet distance at 3 m", _metric("shift_3m/frechet"), False),
 )
 COSTS: tuple[Measure, ...] = (
-    Measure("seconds", "seconds", total_seconds, False),
-    Measure("cpu_seconds", "CPU seconds", _cpu_seconds, False),
-    Measure("peak_mib", "peak memory, MiB", lambda row: float(row["peak_mib"]), False),
-    Measure("gaussians", "Gaussians", lambda row: float(row["gaussians"]), False),
+    Measure("seconds", "seconds", total_seconds, False, "median"),
+    Measure("cpu_seconds", "CPU seconds", _cpu_seconds, False, "median"),
+    Measure("peak_mib", "peak memory, MiB", lambda row: float(row["peak_mib"]), False, "median"),
+    Measure("gaussians", "Gaussians", lambda row: float(row["gaussians"]), False, "median"),
 )
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Mean, and standard deviation over seeds (pooled over places; NaN with one seed)."""
+    """The middle, and the standard deviation over seeds (pooled over places; NaN with one seed)."""
 
-    mean: float
+    middle: float
     sd: float
 
 
@@ -89,7 +93,7 @@ class Line:
 
     @property
     def seconds(self) -> float:
-        return self.values["seconds"].mean
+        return self.values["seconds"].middle
 
 
 def beside(rows: Sequence[Row]) -> Measure:
@@ -106,7 +110,7 @@ def lines_of(rows: Sequence[Row]) -> list[Line]:
     own = {(*_place(r), r["seed"]): r for r in by.get(PRESET_ITSELF, ())}
     lines = [_line(name, part, own) for name, part in by.items()]
     chosen = (PSNR, beside(rows))
-    fronts = {m.name: front([(x.seconds, x.values[m.name].mean) for x in lines], m.more_is_better) for m in chosen}
+    fronts = {m.name: front([(x.seconds, x.values[m.name].middle) for x in lines], m.more_is_better) for m in chosen}
     return [
         Line(**{**vars(x), "on_front": tuple(m for m, found in fronts.items() if k in found)})
         for k, x in enumerate(lines)
@@ -129,9 +133,9 @@ def front(points: Sequence[tuple[float, float]], more_is_better: bool) -> set[in
 
 def _line(name: str, rows: Sequence[Row], own: Mapping[tuple[Any, ...], Row]) -> Line:
     pairs = [(r, own[(*_place(r), r["seed"])]) for r in rows if (*_place(r), r["seed"]) in own]
-    values = {m.name: _spread([(_place(r), m.read(r)) for r in rows]) for m in (*COSTS, *MEASURES)}
+    values = {m.name: _spread([(_place(r), m.read(r)) for r in rows], m) for m in (*COSTS, *MEASURES)}
     gains = {
-        m.name: _spread([(_place(r), (m.read(r) - m.read(o)) * (1 if m.more_is_better else -1)) for r, o in pairs])
+        m.name: _spread([(_place(r), (m.read(r) - m.read(o)) * (1 if m.more_is_better else -1)) for r, o in pairs], m)
         for m in (*COSTS, *MEASURES)
     }
     stages = {s: statistics.median(r["seconds"][s] for r in rows) for s in rows[0]["seconds"]}
@@ -146,7 +150,8 @@ def _place(row: Row) -> tuple[Any, ...]:
     return row["log"], row["chunk"]
 
 
-def _spread(values: Sequence[tuple[tuple[Any, ...], float]]) -> Spread:
+def _spread(values: Sequence[tuple[tuple[Any, ...], float]], measure: Measure) -> Spread:
+    """The middle of each place's seeds, averaged over places, which may have different numbers of them."""
     if not values or not all(math.isfinite(v) for _, v in values):
         return Spread(math.nan, math.nan)
     by: dict[tuple[Any, ...], list[float]] = {}
@@ -155,4 +160,5 @@ def _spread(values: Sequence[tuple[tuple[Any, ...], float]]) -> Spread:
     freedom = sum(len(v) - 1 for v in by.values())
     within = sum(sum((x - statistics.mean(v)) ** 2 for x in v) for v in by.values())
     sd = math.sqrt(within / freedom) if freedom else math.nan
-    return Spread(statistics.mean(v for _, v in values), sd)
+    middle = statistics.median if measure.middle == "median" else statistics.mean
+    return Spread(statistics.mean(middle(v) for v in by.values()), sd)

@@ -15,7 +15,7 @@ from storage.codecs.tables import column, read_table, schema, write_table
 
 _MEASURES = (*COSTS, *MEASURES)
 LINES = schema(
-    "cost/2",
+    "cost/3",
     [
         column("knob", pa.string(), "what is turned; preset: nothing"),
         column("value", pa.string(), "to what"),
@@ -30,7 +30,7 @@ LINES = schema(
             column(f"{m.name}_{part}", pa.float64(), note, nullable=True)
             for m in _MEASURES
             for part, note in (
-                ("mean", f"{m.label}: {'more' if m.more_is_better else 'less'} is better"),
+                (m.middle, f"{m.label}, {m.middle} over seeds: {'more' if m.more_is_better else 'less'} is better"),
                 ("sd", "over seeds, pooled over places"),
                 ("gain", "over the preset in the same place with the same seed; positive is better"),
                 ("gain_sd", "over seeds, pooled over places"),
@@ -66,7 +66,7 @@ def write_lines(path: Path, lines: Sequence[Line], extra: Mapping[str, str]) -> 
     columns |= {"on_front": [",".join(x.on_front) for x in lines]}
     for m in _MEASURES:
         for part, spreads in (("", [x.values[m.name] for x in lines]), ("gain", [x.gains[m.name] for x in lines])):
-            columns[f"{m.name}_{part or 'mean'}"] = [_number(s.mean) for s in spreads]
+            columns[f"{m.name}_{part or m.middle}"] = [_number(s.middle) for s in spreads]
             columns[f"{m.name}_{part}{'_' * bool(part)}sd"] = [_number(s.sd) for s in spreads]
     write_table(path, LINES, columns, extra)
 
@@ -81,14 +81,17 @@ def read_lines(path: Path) -> tuple[list[Line], dict[str, str]]:
 
 
 def _line(row: Mapping[str, Any]) -> Line:
-    def spreads(part: str, deviation: str) -> dict[str, Spread]:
+    def spreads(part: str) -> dict[str, Spread]:
         return {
-            m.name: Spread(_float(row[f"{m.name}_{part}"]), _float(row[f"{m.name}_{deviation}"])) for m in _MEASURES
+            m.name: Spread(
+                _float(row[f"{m.name}_{part or m.middle}"]), _float(row[f"{m.name}_{part}{'_' * bool(part)}sd"])
+            )
+            for m in _MEASURES
         }
 
     name = row["knob"] if not row["value"] else f"{row['knob']}={row['value']}"
     return Line(
-        row["knob"], row["value"], name, row["n"], spreads("mean", "sd"), spreads("gain", "gain_sd"),
+        row["knob"], row["value"], name, row["n"], spreads(""), spreads("gain"),
         json.loads(row["stage_seconds"]), math.nan, tuple(json.loads(row["changes"])), row["end"], row["threads"],
         row["images"], tuple(m for m in row["on_front"].split(",") if m),
     )  # fmt: skip

@@ -43,12 +43,12 @@ ROWS = [
 def test_lines_are_means_with_spreads_over_seeds_and_gains_in_the_same_place() -> None:
     preset, fewer, more = lines_of(ROWS)
     assert (preset.setting, preset.n, preset.seconds) == (PRESET_ITSELF, 4, 5.0)
-    assert preset.values["psnr"].mean == pytest.approx(23.5)
+    assert preset.values["psnr"].middle == pytest.approx(23.5)
     assert preset.values["psnr"].sd == pytest.approx(math.sqrt(2))  # of the seeds, not of the logs
-    assert fewer.gains["psnr"].mean == pytest.approx(-1.0) and fewer.gains["psnr"].sd == pytest.approx(0.0)
-    assert fewer.gains["seconds"].mean == pytest.approx(2.0)  # less is better
-    assert more.gains["psnr"].mean == pytest.approx(-0.25)
-    assert fewer.values["cpu_seconds"].mean == pytest.approx(5.5)
+    assert fewer.gains["psnr"].middle == pytest.approx(-1.0) and fewer.gains["psnr"].sd == pytest.approx(0.0)
+    assert fewer.gains["seconds"].middle == pytest.approx(2.0)  # less is better
+    assert more.gains["psnr"].middle == pytest.approx(-0.25)
+    assert fewer.values["cpu_seconds"].middle == pytest.approx(5.5)
     assert fewer.on_front and preset.on_front and not more.on_front
     assert math.isnan(lines_of(ROWS[:1])[0].values["psnr"].sd)
 
