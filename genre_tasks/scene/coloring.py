@@ -86,7 +86,7 @@ def buffer_lens(lens: Lens) -> Lens:
 def visible(points: Float32, view: View) -> tuple[NDArray[np.int64], Float32, Float32]:
     """Points [P, 3] that a view sees unoccluded: index [M] (increasing), pixels [M, 2] of its lens, depth [M]."""
     lens = buffer_lens(view.lens)
-    seen = project(points, view.chunk_SE3_camera, lens, view.shutter)
+    seen = project(points, view.chunk_SE3_camera, lens)
     nearest = splat_depth(seen, lens, FOOTPRINT_M)
     column, row = seen.uv[:, 0].astype(np.int64), seen.uv[:, 1].astype(np.int64)
     front = nearest[row, column] * np.float32(1 + RELATIVE_TOLERANCE) + np.float32(ABSOLUTE_TOLERANCE_M)

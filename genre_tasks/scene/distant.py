@@ -92,9 +92,7 @@ def open_pixels(view: View, chunk: Chunk, background: Cloud) -> tuple[Float64, F
         if len(at):
             pose = actor.chunk_SE3_box[at[0]].astype(np.float32)
             points.append(actor.points.positions @ pose[:3, :3].T + pose[:3, 3])
-    depth = splat_depth(
-        project(np.concatenate(points), view.chunk_SE3_camera, lens, view.shutter), lens, SKY_FOOTPRINT_M
-    )
+    depth = splat_depth(project(np.concatenate(points), view.chunk_SE3_camera, lens), lens, SKY_FOOTPRINT_M)
     u, v = np.meshgrid(np.arange(lens.width_px) + 0.5, np.arange(lens.height_px) + 0.5)
     rays = np.stack([*rays_at(u, v, lens), np.ones_like(u)], -1)
     rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)) @ view.chunk_SE3_camera[:3, :3].T

@@ -144,7 +144,7 @@ def _blurred(view: View) -> Float32:
 
 def _sampled(points: Float32, view: View, image: Float32) -> tuple[NDArray[np.int64], Float32, Float32]:
     """Which points [M] are in the image, their colours [M, 3] and depths [M]."""
-    seen = project(points, view.chunk_SE3_camera, view.lens.of_width(_WIDTH_PX), view.shutter)
+    seen = project(points, view.chunk_SE3_camera, view.lens.of_width(_WIDTH_PX))
     return seen.index, image[seen.uv[:, 1].astype(np.int64), seen.uv[:, 0].astype(np.int64)], seen.depth
 
 

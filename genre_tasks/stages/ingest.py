@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,6 @@ from genre_tasks.scene.coloring import Cloud, color_clouds
 from genre_tasks.scene.geometry import se3_inverse
 from genre_tasks.scene.ground import road_fill
 from genre_tasks.scene.images import decode_pixels, encoded_size
-from genre_tasks.scene.moving import shutters
 from genre_tasks.scene.ply import read_ply
 from genre_tasks.scene.walls import wall_fill
 
@@ -82,13 +81,12 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
     if len(sources) < 2:
         problem = f"the chunk has {len(sources)} source frames with images, at least two are needed"
         raise reading.error(problem, "Choose other chunks with --chunks, or a smaller ingest.source_every.")
-    exposed = _as_exposed(views, cameras)
     if config.points is not None:
         static, actors, given = _from_file(reading, config.points)
     else:
-        (static, actors), given = _from_sweeps(reading, [v for v in exposed if v.role == "source"]), None
+        (static, actors), given = _from_sweeps(reading, [v for v in views if v.role == "source"]), None
     clouds = [static, *actors]
-    colored = color_clouds(clouds, _reported(reading, exposed, pixels))
+    colored = color_clouds(clouds, _reported(reading, views, pixels))
     if given is not None:
         colored[0] = (given, np.ones(len(given), dtype=bool))
     points = [Points(c.positions, *colors, c.frames) for c, colors in zip(clouds, colored, strict=True)]
@@ -164,15 +162,6 @@ def _views(reading: _Reading, cameras: Sequence[Camera]) -> tuple[list[View], li
             views.append(View(camera.name, frame, "source" if source else "heldout", time_s, pose, lens, data))
             pixels.append(decoded if source else None)
     return views, pixels
-
-
-def _as_exposed(views: Sequence[View], cameras: Sequence[Camera]) -> list[View]:
-    """The views with the rolling shutters that their log states: a point's colour is where its row saw it.
-
-    What renders do of it is the plan's to decide; the chunk's own views carry none.
-    """
-    found = shutters(views, {c.name: c.readout_s for c in cameras})
-    return [replace(v, shutter=found.get((v.camera, v.frame))) for v in views]
 
 
 def _decode(config: IngestConfig, camera: Camera, data: bytes) -> tuple[str, NDArray[np.uint8] | None]:

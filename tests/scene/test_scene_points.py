@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from genre_tasks.logs.types import Lens, RollingShutter
+from genre_tasks.logs.types import Lens
 from genre_tasks.scene.actors import Path
 from genre_tasks.scene.chunk import View
 from genre_tasks.scene.coloring import GREY, Cloud, color_clouds
@@ -61,20 +59,6 @@ def test_occluded_points_stay_grey() -> None:
     assert not colored[len(front) :][shadow].any() and (colors[len(front) :][shadow] == GREY).all()
     lit = (np.abs(behind[:, 1:]).max(1) > 5) & (np.abs(behind[:, 2]) < 7.5)
     assert colored[len(front) :][lit].all()
-
-
-def test_a_point_has_the_colour_of_the_row_that_saw_it() -> None:
-    points = np.stack(np.meshgrid([8.0, 12.0], [-2.0, 1.0], [-2.0, 0.5, 3.0]), -1).reshape(-1, 3).astype(np.float32)
-    pixels = np.stack([*np.mgrid[:80, :100], np.zeros((80, 100))], -1).astype(np.uint8)  # each says where it is
-    rolling = replace(_view(), shutter=RollingShutter(0.1, (15.0, 0.0, 0.0), (0.0, 0.0, 0.1)))
-    where = []
-    for view in (_view(), rolling):
-        ((colors, colored),) = color_clouds([Cloud(points, np.zeros(len(points), np.int16))], [(view, pixels)])
-        seen = project(points, view.chunk_SE3_camera, LENS, view.shutter)
-        assert colored[seen.index].all() and len(seen.index) > 6
-        assert np.abs(colors[seen.index, 1::-1] - seen.uv.astype(int)).max() <= 1
-        where.append(colors)
-    assert np.abs(where[0].astype(int) - where[1]).max() > 4
 
 
 def test_the_view_that_resolves_best_wins_whatever_the_order() -> None:

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from genre_tasks.logs.types import Lens, RollingShutter
+from genre_tasks.logs.types import Lens
 from genre_tasks.scene.chunk import View
-from genre_tasks.scene.walls import LOWEST_TOP_M, SPACING_M, STEP_M, _evidence, wall_fill
+from genre_tasks.scene.walls import LOWEST_TOP_M, SPACING_M, STEP_M, wall_fill
 from tests.fakes import camera_turn
 
 LENS = Lens(160.0, 160.0, 160.0, 120.0, 320, 240)
-READOUT_S = 0.1
 ROAD_M, WALL_M, BEHIND_M = -1.8, 8.0, 40.0
 SWEPT_M = 3.0
 """Above the road: there the LiDAR's view ends."""
@@ -38,26 +36,21 @@ def _sky(rays: np.ndarray, plain: bool) -> np.ndarray:
     return np.array([0.55, 0.7, 0.9]) + np.zeros_like(rays) + 0.1 * up + clouds
 
 
-def _view(x: float, height: float, behind: float, plain_sky: bool, speed_m_s: float = 0.0) -> View:
-    """Looks left from the path, at a façade of ``height`` over the road, one ``behind`` it, and the sky.
-
-    With a speed the rows are exposed one after the other, while the camera moves to its right.
-    """
+def _view(x: float, height: float, behind: float, plain_sky: bool) -> View:
+    """Looks left from the path, at a façade of ``height`` over the road, one ``behind`` it, and the sky."""
     pose = np.eye(4)
     pose[:3, :3], pose[0, 3] = camera_turn(np.pi / 2), x
     u, v = np.meshgrid(np.arange(LENS.width_px) + 0.5, np.arange(LENS.height_px) + 0.5)
     rays = np.stack([(u - LENS.cx_px) / LENS.fx_px, (v - LENS.cy_px) / LENS.fy_px, np.ones_like(u)], -1)
     rays = rays @ pose[:3, :3].T
     image = _sky(rays, plain_sky)
-    eye = x + speed_m_s * READOUT_S * (v / LENS.height_px - 0.5)
     for seed, (distance, top) in enumerate(((BEHIND_M, behind), (WALL_M, height))):
         at = distance / rays[..., 1].clip(1e-3)
-        across, up = eye + at * rays[..., 0], at * rays[..., 2] - ROAD_M
+        across, up = x + at * rays[..., 0], at * rays[..., 2] - ROAD_M
         image = np.where((up < top)[..., None], _texture(across, up, seed), image)
     file = io.BytesIO()
     Image.fromarray((image.clip(0, 1) * 255).astype(np.uint8)).save(file, "PNG")
-    shutter = RollingShutter(READOUT_S, (speed_m_s, 0.0, 0.0), (0.0, 0.0, 0.0)) if speed_m_s else None
-    return View("left", round(x), "source", 0.0, pose, LENS, file.getvalue(), shutter=shutter)
+    return View("left", round(x), "source", 0.0, pose, LENS, file.getvalue())
 
 
 def _views(height: float, behind: float = 0.0, plain_sky: bool = False) -> list[View]:
@@ -98,18 +91,6 @@ def test_a_facade_grows_to_its_height(height: float, behind: float, plain_sky: b
 def test_a_wall_that_ends_does_not_grow(behind: float, plain_sky: bool) -> None:
     heights = _heights(LOWEST_TOP_M + 0.3, _views(LOWEST_TOP_M + 0.3, behind, plain_sky))
     assert len(heights) == 0 or np.percentile(heights, 99) < LOWEST_TOP_M + 0.3 + 2 * STEP_M
-
-
-def test_rows_that_are_exposed_one_after_the_other_agree_with_their_shutters() -> None:
-    x, z = np.meshgrid(np.arange(2, 10, 0.4), np.arange(SWEPT_M + 0.2, 6.5, 0.4))
-    points = np.stack([x.ravel(), np.full(x.size, WALL_M), ROAD_M + z.ravel()], 1).astype(np.float32)
-    speeds = (10.0, -10.0, 10.0, -10.0, 10.0)  # were they alike, all views would be off alike
-    rolling = [_view(float(x), 7.0, 0.0, False, v) for x, v in zip(PATH[:, 0, 3], speeds, strict=True)]
-    still, known, ignored = (
-        _evidence(points, views)[0].mean()
-        for views in (_views(7.0), rolling, [replace(v, shutter=None) for v in rolling])
-    )
-    assert known > 0.9 * still and ignored < 0.5 * still
 
 
 def test_the_views_have_a_say() -> None:

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from genre_tasks.config import EffectsConfig, IngestConfig
-from genre_tasks.effects.plan import plan
+from genre_tasks.config import IngestConfig
 from genre_tasks.errors import ConfigError, InputError
-from genre_tasks.logs.registry import open_log
-from genre_tasks.scene.chunk import Chunk, Mark, View
-from genre_tasks.scene.coloring import Cloud, color_clouds
+from genre_tasks.scene.chunk import Chunk, Mark
 from genre_tasks.scene.walls import STEP_M
-from genre_tasks.stages import ingest as stage
 from genre_tasks.stages.ingest import NO_SWEEP, chunk_count, ingest
 from tests.fakes import SENSOR_HEIGHT_M, WALL_HEIGHT_M, FakeLog
 
@@ -82,28 +77,6 @@ def test_colours_come_from_source_views_only(log: FakeLog, chunk: Chunk) -> None
     other = log.with_(missing_images=frozenset(heldout))
     again = ingest(CONFIG, other, 0)
     assert np.array_equal(again.static.colors, chunk.static.colors)
-
-
-def test_points_are_looked_up_with_the_shutters_that_the_log_states(monkeypatch: pytest.MonkeyPatch) -> None:
-    log = open_log("synthetic:street?seed=1020&frames=8&cameras=2&width=160&height=90&samples=1&rolling_shutter_s=0.03")
-    given: dict[str, list[View]] = {"walls": [], "colours": []}
-
-    def walls(points: np.ndarray, poses: np.ndarray, views: list[View]) -> np.ndarray:
-        given["walls"] += views
-        return points[:0]
-
-    def colours(clouds: list[Cloud], images: Iterable[tuple[View, np.ndarray]]) -> list:
-        pairs = list(images)
-        given["colours"] += [v for v, _ in pairs]
-        return color_clouds(clouds, pairs)
-
-    monkeypatch.setattr(stage, "wall_fill", walls)
-    monkeypatch.setattr(stage, "color_clouds", colours)
-    chunk = ingest(IngestConfig(width_px=160, height_px=90), log, 0)
-    found = plan(EffectsConfig(rolling_shutter="on"), chunk, log.cameras).fitted.shutters
-    for views in given.values():
-        assert len(views) == 4 and all(v.shutter == found[v.camera, v.frame] for v in views)
-    assert all(v.shutter is None for v in chunk.views), "what renders do of it is the plan's to decide"
 
 
 def test_same_bytes_again(log: FakeLog, chunk: Chunk) -> None:
