@@ -95,8 +95,10 @@ def _apart(chunk: Chunk, scene: SceneGraph, views: Sequence[tuple[View, Float32]
     for view, true in views:
         index, uv, _ = visible(points, view)
         u, v = uv[chosen[index]].astype(np.int64).T
+        if view.own is not None:
+            u, v = u[~view.own[v, u]], v[~view.own[v, u]]
         with torch.no_grad():
-            image = render_views(scene, [view]).color.clamp(0, 1)[0].numpy()
+            image = as_recorded(render_views(scene, [view]).color, [view]).clamp(0, 1)[0].numpy()
         error += float(np.square(image[v, u] - true[v, u]).mean(-1).sum(dtype=np.float64))
         count += len(u)
     return -10 * math.log10(error / count) if count else math.nan
