@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -44,6 +45,44 @@ def displaced(seen: Seen, seconds: Mapping[str, float], said: str) -> Measured:
         return Measured(None, f"no camera that is {said} for a stated time has two images and LiDAR returns")
     name = max(moved, key=lambda n: moved[n])
     return Measured(moved[name], f"{name} is {said} for {1e3 * seconds[name]:g} ms")
+
+
+Vector = tuple[float, float, float]
+
+
+def motions(seen: Seen, cameras: Collection[str]) -> tuple[dict[tuple[str, int], tuple[Vector, Vector]], float]:
+    """Velocity in m/s and turn in rad/s, in camera axes, of the ``cameras`` at their images, by camera and frame.
+
+    And the seconds from a frame to the next. From the poses before and after an image; a camera with one image, or with
+    two at one time, is left out.
+    """
+    out: dict[tuple[str, int], tuple[Vector, Vector]] = {}
+    for name in (n for n in seen.cameras if n in cameras):
+        views = sorted((v for v in seen.chunk.views if v.camera == name), key=lambda v: v.frame)
+        for k, view in enumerate(views):
+            before, after = views[max(k - 1, 0)], views[min(k + 1, len(views) - 1)]
+            if after.timestamp_s > before.timestamp_s:
+                out[name, view.frame] = _moving(view, before, after)
+    return out, _frame_s(seen)
+
+
+def _frame_s(seen: Seen) -> float:
+    """Seconds from a frame to the next: one number for all cameras, whose clocks differ by microseconds."""
+    times: dict[str, list[tuple[int, float]]] = {}
+    for view in seen.chunk.views:
+        times.setdefault(view.camera, []).append((view.frame, view.timestamp_s))
+    pairs = [(a, b) for own in times.values() for a, b in itertools.pairwise(sorted(own))]
+    return float(np.median([(b[1] - a[1]) / (b[0] - a[0]) for a, b in pairs])) if pairs else 0.0
+
+
+def _moving(view: View, before: View, after: View) -> tuple[Vector, Vector]:
+    seconds = after.timestamp_s - before.timestamp_s
+    axes = view.chunk_SE3_camera[:3, :3].T
+    way = after.chunk_SE3_camera[:3, 3] - before.chunk_SE3_camera[:3, 3]
+    turned = after.chunk_SE3_camera[:3, :3] @ before.chunk_SE3_camera[:3, :3].T
+    vx, vy, vz = axes @ way / seconds
+    wx, wy, wz = axes @ Rotation.from_matrix(turned).as_rotvec() / seconds
+    return (float(vx), float(vy), float(vz)), (float(wx), float(wy), float(wz))
 
 
 def _next(seen: Seen, view: View) -> View | None:

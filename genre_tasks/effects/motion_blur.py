@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from genre_tasks.effects.motion import displaced
+from genre_tasks.effects.motion import displaced, motions
 from genre_tasks.effects.seen import Seen
 from genre_tasks.effects.types import Effect, Fitted, Measured
 from genre_tasks.logs.types import MotionBlur
-from genre_tasks.scene.moving import frame_seconds, motions
 
 
 def measure(seen: Seen) -> Measured:
@@ -20,9 +19,8 @@ def needs(seen: Seen) -> str | None:
 
 
 def fit(seen: Seen) -> Fitted:
-    """How each camera that states an exposure time moves, see ``scene.moving``."""
-    views = seen.chunk.views
-    moving, frame_s = motions(views, [n for n, c in seen.cameras.items() if c.exposure_s > 0]), frame_seconds(views)
+    """How each camera that states an exposure time moves, see ``motion.motions``."""
+    moving, frame_s = motions(seen, [n for n, c in seen.cameras.items() if c.exposure_s > 0])
     return Fitted(
         blurs={
             key: MotionBlur(seen.cameras[key[0]].exposure_s, velocity, turn, frame_s)

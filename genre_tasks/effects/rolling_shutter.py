@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from genre_tasks.effects.motion import displaced
+from genre_tasks.effects.motion import displaced, motions
 from genre_tasks.effects.seen import Seen
 from genre_tasks.effects.types import Effect, Fitted, Measured
-from genre_tasks.scene.moving import shutters
+from genre_tasks.logs.types import RollingShutter
 
 
 def measure(seen: Seen) -> Measured:
@@ -19,8 +19,14 @@ def needs(seen: Seen) -> str | None:
 
 
 def fit(seen: Seen) -> Fitted:
-    """How each camera that states a readout time moves, see ``scene.moving``."""
-    return Fitted(shutters=shutters(seen.chunk.views, {n: c.readout_s for n, c in seen.cameras.items()}))
+    """How each camera that states a readout time moves, see ``motion.motions``."""
+    moving, frame_s = motions(seen, [n for n, c in seen.cameras.items() if c.readout_s > 0])
+    return Fitted(
+        shutters={
+            key: RollingShutter(seen.cameras[key[0]].readout_s, velocity, turn, frame_s)
+            for key, (velocity, turn) in moving.items()
+        }
+    )
 
 
 EFFECT = Effect(
