@@ -2,6 +2,7 @@
 
 genre bench effects --json docs/benchmarks/effects.json [--set seeds=1001] [--set effects=exposure] [--set pandaset=]
 genre bench effects --set seeds=900,901 --set factors=0.5,1,2,4    # where a threshold sits: see `Case`
+genre bench effects --set effects=trained --set training=FOLDER    # of `genre train gnet --recipe effects`
 
 Each row says the commit that it was measured at.
 """
@@ -17,7 +18,7 @@ import numpy as np
 from benchmarks.bench import Cell, Row
 from benchmarks.effects.cases import CASES
 from benchmarks.effects.cells import on_real, on_street
-from benchmarks.effects.whole import auto_vs_on, plain_cost
+from benchmarks.effects.whole import SHAPED, auto_vs_on, plain_cost, trained
 from benchmarks.optimiser.beyond import over_cells
 from benchmarks.schema import Claim, Op
 from flows.configuration import load_configuration
@@ -28,6 +29,8 @@ WHOLE: Mapping[str, tuple[Callable[[str, str], Row], float]] = {
     "auto_vs_on": (auto_vs_on, WHOLE_S), "plain_cost": (plain_cost, COUNTED_S),
 }  # fmt: skip
 """Whole plans, and their predicted seconds; the latter is counted on the first street alone."""
+TRAINED = "trained"
+"""Among the effects that are asked for: whether the optimiser gains from training with them; needs ``training``."""
 
 
 class Effects:
@@ -36,7 +39,7 @@ class Effects:
     name = "effects"
     options: Mapping[str, str] = {
         "seeds": "1001,1002,1003", "effects": ",".join((*CASES, *WHOLE)), "factors": "0,4", "store": "genre-store",
-        "pandaset": "../shared/data/pandaset/002", "chunks": "0,1",
+        "pandaset": "../shared/data/pandaset/002", "chunks": "0,1", "training": "",
     }  # fmt: skip
     code: tuple[str, ...] = (
         "benchmarks.effects.cells", "benchmarks.effects.whole", "benchmarks.effects.counted",
@@ -62,7 +65,14 @@ class Effects:
             run, seconds = WHOLE[name]
             for seed in seeds[:1] if name == "plain_cost" else seeds:
                 out.append(Cell(f"{name} street {seed}", seconds, partial(run, seed, store), parameters))
-        for name in (n for n in names if n not in WHOLE):
+        if TRAINED in names:
+            places = [(f"synthetic:street?seed={s}{more}", 0) for s in seeds for more in ("", SHAPED)]
+            if options["pandaset"] and not quick:
+                places += [(f"pandaset:{options['pandaset']}", int(c)) for c in chunks]
+            for log, index in places:
+                both = partial(trained, log, index, store, options["training"])
+                out.append(Cell(f"{TRAINED} {log} chunk {index}", WHOLE_S, both, parameters))
+        for name in (n for n in names if n not in WHOLE and n != TRAINED):
             for seed, factor in itertools.product(seeds, factors):
                 one = partial(on_street, name, seed, store, factor)
                 out.append(Cell(f"{name} street {seed} x {factor:g}", CELL_S, one, parameters))
@@ -107,6 +117,12 @@ class Effects:
         for r in _of(rows, "plain_cost"):
             planned, planning = (r["cost_percent"][k] for k in ("planned", "planning"))
             yield f"\n{r['log']}: {planned:+.2f} % instructions with the plan given, {planning:+.2f} % with making it"
+        for r in _of(rows, TRAINED):
+            told = ", ".join(
+                f"{word} {_db(r[word]['heldout_db'])} and {_db(r[word]['beside_db'])}"
+                for word in ("shipped", "plain", "effects")
+            )
+            yield f"\n{r['log']} chunk {r['chunk']}: held out and at 3 m: {told}"
         for name, case in CASES.items():
             own = [r for r in rows.values() if r.get("effect") == name and r["factor"] > 0 and r["value"] is not None]
             least = 0.1 if case.unit == "dB" else 2.0

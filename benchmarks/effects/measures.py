@@ -32,8 +32,17 @@ def heldout_psnr(chunk: Chunk, scene: SceneGraph, _: Truth | None = None) -> flo
     Where the vehicle is in a camera's images, of such cameras alone.
     """
     masked = {v.camera for v in chunk.views if v.own is not None}
+    return _mean_psnr(scene, [v for v in chunk.of_role("heldout") if not masked or v.camera in masked])
+
+
+def every_heldout_psnr(chunk: Chunk, scene: SceneGraph, _: Truth | None = None) -> float:
+    """As :func:`heldout_psnr`, of all cameras in any case."""
+    return _mean_psnr(scene, chunk.of_role("heldout"))
+
+
+def _mean_psnr(scene: SceneGraph, views: Sequence[View]) -> float:
     out = []
-    for view in (v for v in chunk.of_role("heldout") if not masked or v.camera in masked):
+    for view in views:
         with torch.no_grad():
             image = as_recorded(render_views(scene, [view]).color, [view]).clamp(0, 1)[0]
         out.append(psnr(image.numpy(), view_image(view).numpy(), None if view.own is None else ~view.own))

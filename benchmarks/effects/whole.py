@@ -1,4 +1,5 @@
-"""Whole plans: what ``auto`` leaves of ``on`` where a street has everything, and what it costs where it has nothing."""
+"""Whole plans: what ``auto`` leaves of ``on`` where a street has everything, what it costs where it has nothing, and
+whether the optimiser gains from training on logs that have effects."""
 
 from __future__ import annotations
 
@@ -11,10 +12,11 @@ from pathlib import Path
 
 from benchmarks.bench import NotMeasuredError, Row
 from benchmarks.effects.cells import STAGES, Place, judged
-from benchmarks.effects.measures import heldout_psnr
+from benchmarks.effects.measures import every_heldout_psnr, heldout_psnr
 from benchmarks.main_job import reconstruct
 from benchmarks.optimiser.cells import threads
 from flows.machine import CHECKOUT, commit
+from flows.train.stages import TrainJob
 
 EVERYTHING = (
     "&rolling_shutter_s=0.03&exposure_jitter=0.2&white_balance_jitter=0.05&bonnet=0.08&distortion=0.02"
@@ -23,6 +25,9 @@ EVERYTHING = (
 """All but motion blur: drawing its moments row by row takes a quarter of an hour."""
 
 ALL = ("effects=on", "effects.motion_blur=auto")
+
+SHAPED = "&rolling_shutter_s=0.03&exposure_jitter=0.2&white_balance_jitter=0.05&distortion=0.02"
+"""What training with effects shows the optimiser, but for the bonnet."""
 
 PLAIN = "&moving=0&pedestrians=0"
 SHORT = ("gnet.iterations=4",)
@@ -57,6 +62,21 @@ def plain_cost(seed: str, store: str) -> Row:
     base = counted["none"] - counted["start"]
     cost = {word: 100 * (counted[word] - counted["none"]) / base for word in ("planned", "planning")}
     return {"whole": "plain_cost", "log": at.log, "commit": commit(), "instructions": counted, "cost_percent": cost}
+
+
+def trained(log: str, chunk: int, store: str, folder: str) -> Row:
+    """GNet's scene as planned, by the weights that ship, and by those of ``genre train gnet --recipe effects``."""
+    if not folder:
+        raise NotMeasuredError("no training; run `genre train gnet --recipe effects`, give its folder: training=PATH")
+    job, at = TrainJob(folder, "effects"), Place(log, chunk, store)
+    with threads():
+        own = at.plan().fitted
+        out: Row = {"whole": "trained", "log": log, "chunk": chunk, "commit": commit()}
+        out["shipped"] = judged(at, own, every_heldout_psnr)
+        for stage in job.table():
+            weights = f"gnet.weights={job.weights(stage.name)}"
+            out[stage.name.partition("/")[2]] = judged(at, own, every_heldout_psnr, weights)
+    return out
 
 
 def _instructions(at: Place, word: str) -> int:

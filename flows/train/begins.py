@@ -88,7 +88,7 @@ def begin_key(recipe: SceneRecipe, begin: Begin, weights: Weights) -> str:
     """The artifact's key: the scene's recipe, how it begins, and the bytes of the weights that took part."""
     by = weights_digest(weights(begin.stage)) if isinstance(begin, ByGnet) else None
     what = [type(begin).__name__, asdict(begin) if by is None else {**asdict(begin), "stage": by}]
-    return digest_value({"recipe": asdict(recipe), "begin": what})
+    return digest_value({"recipe": recipe.said(), "begin": what})
 
 
 def begun(store: LocalStore, scene: PreparedScene, begin: Begin, weights: Weights) -> Reconstruction:
@@ -151,7 +151,7 @@ def _per_scene(scene: PreparedScene, ages: Sequence[PerScene]) -> dict[PerScene,
     method, of = ages[0].method, ages[0].of
     by_age = {begin.age: begin for begin in ages}
     start = scene.start.scene if method == "street_gs" else world_static(scene.start.scene)
-    seed = int(digest_value([asdict(scene.recipe), method, of])[:7], 16)
+    seed = int(digest_value([scene.recipe.said(), method, of])[:7], 16)
     training = PerSceneTraining(
         PerSceneConfig(iterations=of), start, of_source(scene.chunk, depth=False), seed, "per_scene"
     )

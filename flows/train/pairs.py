@@ -106,7 +106,7 @@ def pairs_of(store: LocalStore, scene: SceneRecipe, recipe: PairRecipe | None = 
     recipe = recipe or PAIRS
     log = open_log(scene.uri)
     weights = weights_digest(resolve_weights("gnet", "builtin"))
-    key = digest_value({"scene": asdict(scene), "pairs": asdict(recipe), "gnet": weights})
+    key = digest_value({"scene": scene.said(), "pairs": asdict(recipe), "gnet": weights})
     address = Address(log.dataset, log.name, scene.chunk, "pairs", key)
     found: Pairs = kept(store, address, "pairs", lambda: make_pairs(prepare(store, scene), recipe))
     return found

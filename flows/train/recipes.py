@@ -19,7 +19,12 @@ from genre_tasks.optimiser.adam import ENET_RATES, GNET_RATES
 from genre_tasks.optimiser.learned import NetworkConfig
 from genre_tasks.optimiser.training import MetaConfig
 
+SHIPPED = "builtin:"
 CAMERAS = (3, 3, 3, 6, 3, 3, 2, 3)
+EFFECTS = (
+    "&rolling_shutter_s=0.02", "&distortion=0.02", "&exposure_jitter=0.2&white_balance_jitter=0.05", "&bonnet=0.08",
+)  # fmt: skip
+"""What a street may have, as queries: 6 to 12 px of rolling shutter, 5 px of distortion, 15 % of exposure, a bonnet."""
 COARSE_POINTS, FINE_POINTS = (6_000, 8_000, 5_000, 10_000), (18_000, 20_000, 14_000, 24_000)
 DENSE_POINTS, DENSE_REAL_POINTS = (18_000, 36_000, 14_000, 40_000), (18_000, 36_000, 40_000)
 
@@ -38,21 +43,24 @@ class SceneList:
     """Which chunks: ``count`` streets of a size, and before them the real log's scenes, ``real`` times.
 
     All of them ``rounds`` times: scene k of a round begins at the stage's begin k, in turn, and each round moves
-    them on by one.
+    them on by one. ``planned``: scenes are as their plans of effects have them, and streets have up to four of
+    :data:`EFFECTS`.
     """
 
     size: Literal["coarse", "fine", "dense"]
     count: int
     real: int = 1
     rounds: int = 1
+    planned: bool = False
 
 
 @dataclass(frozen=True)
 class Stage:
     """One stage of a training.
 
-    ``start``: the stage whose weights it starts from; ``None``: new weights. ``network`` has the rates. ``begins``:
-    where scenes begin, in turn. ``images``: what is seen beside the path. ``config``: T, views, losses, steps, rate.
+    ``start``: the stage whose weights it starts from, or those that ship (``builtin:gnet``); ``None``: new weights.
+    ``network`` has the rates. ``begins``: where scenes begin, in turn. ``images``: what is seen beside the path.
+    ``config``: T, views, losses, steps, rate.
     """
 
     name: str
@@ -72,7 +80,8 @@ class Stage:
         """Names of the stages whose weights take part."""
         begins = [*self.begins, *([self.images.of] if self.images and self.images.of else [])]
         by = [begin.stage for begin in begins if isinstance(begin, ByGnet)]
-        return tuple(dict.fromkeys([*([self.start] if self.start else []), *by]))
+        start = [self.start] if self.start and not self.start.startswith(SHIPPED) else []
+        return tuple(dict.fromkeys([*start, *by]))
 
 
 def _gnet(**more: Any) -> MetaConfig:
@@ -179,7 +188,23 @@ PAPER_STAGES = (
 Lengths and rates are not tuned yet; no weights that ship were trained so.
 """
 
-RECIPES: dict[str, tuple[Stage, ...]] = {"shipped": GNET_STAGES + ENET_STAGES, "paper": PAPER_STAGES}
+PLAIN = SceneList("dense", 12)
+
+
+def _further(name: str, scenes: SceneList) -> Stage:
+    """The weights that ship, trained further on such scenes."""
+    config = _gnet(
+        steps=200, rate=2.5e-4, seed=91, judged=4.0, judges=6, sample=0.2, iterations=(24, 48, 72), views=(3, 6, 15),
+    )  # fmt: skip
+    return Stage(name, "builtin:gnet", GNET_NETWORK, scenes, config)
+
+
+EFFECTS_STAGES = (_further("gnet/plain", PLAIN), _further("gnet/effects", replace(PLAIN, planned=True)))
+"""Whether it pays to train on logs that have effects: the same training twice, without them and with."""
+
+RECIPES: dict[str, tuple[Stage, ...]] = {
+    "shipped": GNET_STAGES + ENET_STAGES, "paper": PAPER_STAGES, "effects": EFFECTS_STAGES,
+}  # fmt: skip
 
 
 def table_of(recipe: str, novel: float | None = None) -> tuple[Stage, ...]:
@@ -215,7 +240,9 @@ def _with_novel(stage: Stage, novel: float) -> Stage:
     if novel > 0:
         return replace(stage, config=config)
     config = config.model_copy(update={"novel_views": 0})
-    start = stage.start.replace("gnet/", "g3r/") if stage.start and stage.start.startswith("gnet/") else None
+    start = None
+    if stage.start and stage.start.startswith(("gnet/", SHIPPED)):
+        start = stage.start.replace("gnet", "g3r")
     return replace(stage, name=stage.name.replace("gnet/", "g3r/"), start=start, config=config, images=None)
 
 
@@ -235,7 +262,8 @@ def scene_recipes(scenes: SceneList, real: str | None) -> list[SceneRecipe]:
     if scenes.size == "coarse":
         return coarse_scenes(scenes.count, real, scenes.real)
     if scenes.size == "dense":
-        return dense_scenes(scenes.count, real, scenes.real)
+        out = dense_scenes(scenes.count, real, scenes.real)
+        return [_planned(recipe, k) for k, recipe in enumerate(out)] if scenes.planned else out
     return fine_scenes(scenes.count, real, scenes.real)
 
 
@@ -270,6 +298,20 @@ def dense_scenes(count: int = 28, real: str | None = None, times: int = 1) -> li
         points = DENSE_POINTS[(k + k // 4) % 4]
         out.append(SceneRecipe(_street(k * 37 % 900, k), max_points=points, distant_count=points // 10))
     return out
+
+
+EFFECTS = (
+    "&rolling_shutter_s=0.02",
+    "&distortion=0.02",
+    "&exposure_jitter=0.2&white_balance_jitter=0.05",
+    "&bonnet=0.08",
+)
+
+
+def _planned(recipe: SceneRecipe, k: int) -> SceneRecipe:
+    """With its plan, and on a street with the first none to four of the effects."""
+    more = "".join(EFFECTS[: k % (len(EFFECTS) + 1)]) if recipe.uri.startswith("synthetic:") else ""
+    return replace(recipe, uri=recipe.uri + more, planned=True)
 
 
 def _street(seed: int, k: int, more: str = "") -> str:

@@ -11,7 +11,9 @@ import numpy as np
 import torch
 
 from flows.train.thinned import ThinnedLog
-from genre_tasks.config import IngestConfig, InitialConfig
+from genre_tasks.config import EffectsConfig, IngestConfig, InitialConfig
+from genre_tasks.effects.applied import applied
+from genre_tasks.effects.types import UNPLANNED
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.types import DrivingLog
@@ -21,6 +23,7 @@ from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.novel import novel_view_poses
 from genre_tasks.scene.results import Reconstruction
 from genre_tasks.scene.views import FixedViews
+from genre_tasks.stages.effects import effects
 from genre_tasks.stages.ingest import ingest
 from genre_tasks.stages.initial import initial
 from storage.address import Address
@@ -30,13 +33,18 @@ from storage.local import LocalStore
 TRAINING_SEEDS = range(0, 900)
 """Seeds of the synthetic street (configs/seeds.yaml): no other may be used to train."""
 
+PLANNED = EffectsConfig(view_dependent_colour="off", nonrigid_actors="off", motion_blur="off")
+"""What a planned training scene may have: what changes how Gaussians become an image, and not what they hold. Blurred
+images take a quarter of an hour to draw."""
+
 
 @dataclass(frozen=True)
 class SceneRecipe:
     """How a training scene is made.
 
     ``every``: only every n-th frame's images are kept (a ray-cast image costs half a second); a divisor of four keeps
-    the source views. ``novel_every``: every n-th of the views at ±3 m is ray-cast as truth.
+    the source views. ``novel_every``: every n-th of the views at ±3 m is ray-cast as truth. ``planned``: rolling
+    shutter, lens distortion and the like are modelled where the log calls for them (:data:`PLANNED`).
     """
 
     uri: str
@@ -48,11 +56,22 @@ class SceneRecipe:
     every: int = 2
     novel_every: int = 2
     shifts_m: tuple[float, ...] = (3.0, -3.0)
+    planned: bool = False
+
+    def said(self) -> dict[str, Any]:
+        """What makes it this scene, for digests: plain scenes keep those that they had before plans."""
+        own = asdict(self)
+        if not self.planned:
+            del own["planned"]
+        return own
 
 
 @dataclass(frozen=True)
 class PreparedScene:
-    """The parts of a training scene as the stages leave them; ``truth`` is ``None`` for a real log."""
+    """The parts of a training scene as the stages leave them, the chunk with its plan applied where it has one.
+
+    ``truth`` is ``None`` for a real log.
+    """
 
     recipe: SceneRecipe
     chunk: Chunk
@@ -79,7 +98,7 @@ def prepare(store: LocalStore, recipe: SceneRecipe) -> PreparedScene:
     The key is the recipe's alone, not the code's: after a change of how scenes are made, take an empty store.
     """
     log = open_log(recipe.uri)
-    key = digest_value(asdict(recipe))
+    key = digest_value(recipe.said())
 
     def part(stage: str, kind: str, make: Callable[[], Any]) -> Any:
         return kept(store, Address(log.dataset, log.name, recipe.chunk, stage, key), kind, make)
@@ -88,11 +107,12 @@ def prepare(store: LocalStore, recipe: SceneRecipe) -> PreparedScene:
     thinned: Any = ThinnedLog(log, recipe.every)
     chunk = part("ingest", "chunk", lambda: ingest(IngestConfig(**sizes), thinned, recipe.chunk))
     points = InitialConfig(max_points=recipe.max_points, distant_count=recipe.distant_count)
-    start = part("initial", "reconstruction", lambda: initial(points, chunk))
+    plan = part("effects", "effects", lambda: effects(PLANNED, chunk, thinned)) if recipe.planned else UNPLANNED
+    start = part("initial", "reconstruction", lambda: initial(points, chunk, plan))
     truth = None
     if log.truth is not None:
         truth = part("truth", "fixed_views", lambda: true_views(log, chunk, recipe))
-    return PreparedScene(recipe, chunk, start, truth)
+    return PreparedScene(recipe, applied(chunk, plan), start, truth)
 
 
 def kept(store: LocalStore, address: Address, kind: str, make: Callable[[], Any]) -> Any:

@@ -15,7 +15,7 @@ from flows.train.begins import Begin, ByGnet, begin_key, begun, make_ages
 from flows.train.device import chosen_device, scene_on
 from flows.train.images import fixed_views, images_key, stand_in_views
 from flows.train.optimiser import CHECKPOINT, WEIGHTS, network_from, train_optimiser
-from flows.train.recipes import Stage, scene_recipes, table_of
+from flows.train.recipes import SHIPPED, Stage, scene_recipes, table_of
 from flows.train.scenes import PreparedScene, SceneRecipe, check_training, prepare, training_scene
 from flows.train.validation import Validation, validation_recipes
 from genre_tasks.errors import ConfigError, InputError
@@ -26,6 +26,7 @@ from genre_tasks.optimiser.targets import of_fixed
 from genre_tasks.optimiser.unroll import Plan
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.views import FixedViews
+from genre_tasks.weights import resolve_weights
 from storage.keys import digest_value
 from storage.local import LocalStore
 
@@ -65,7 +66,9 @@ class TrainJob:
         return found[name]
 
     def weights(self, name: str) -> Path:
-        """The weights of a stage that is trained to its end. Raises ``InputError`` for any other."""
+        """Those that ship, or of a stage that is trained to its end; raises ``InputError`` for any other."""
+        if name.startswith(SHIPPED):
+            return resolve_weights("gnet", name)
         folder = Path(self.folder) / name
         path = folder / CHECKPOINT
         remedy = f"Run `genre train {name.split('/', maxsplit=1)[0]} --stage {name}` first."

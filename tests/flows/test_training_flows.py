@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from flows.train import recipes, stages, validation
+from flows.train import recipes, scenes, stages, validation
 from flows.train.begins import Adam, ByGnet, Initial, PerScene
 from flows.train.flow import train_network, train_scenes
 from flows.train.images import Images
 from flows.train.recipes import SceneList, Stage
-from flows.train.scenes import SceneRecipe
+from flows.train.scenes import SceneRecipe, prepare, training_scene
 from flows.train.stages import TrainJob, places, train_stage
 from genre_tasks.config import LossConfig
 from genre_tasks.errors import ConfigError, InputError
@@ -178,6 +178,26 @@ def test_rounds_move_the_begins_on() -> None:
     at = places(TABLE[0], None)
     assert [place.begin for place in at] == [AGES[0], AGES[1], AGES[1], AGES[2]]
     assert at[0].recipe == at[2].recipe
+
+
+def test_a_planned_scene_has_its_effects_and_plain_ones_their_old_keys(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    forced = scenes.PLANNED.model_copy(
+        update={"rolling_shutter": "on", "exposure": "on"}
+    )  # tiny images call for little
+    monkeypatch.setattr(scenes, "PLANNED", forced)
+    uri = f"synthetic:street?seed=1{SMALL}&rolling_shutter_s=0.05&exposure_jitter=0.3"
+    plain = SceneRecipe(uri, max_points=150, distant_count=20, width_px=32, height_px=18)
+    planned = replace(plain, planned=True)
+    assert "planned" not in plain.said() and planned.said() == {**plain.said(), "planned": True}
+    store = TrainJob(str(tmp_path)).store
+    for recipe in (plain, planned, planned):  # the last from the store
+        scene = training_scene(prepare(store, recipe))
+        targets = (*scene.source, *scene.heldout)
+        assert {t.shutter is not None for t in targets} == {recipe.planned}
+        assert {t.log_gain is not None for t in targets} == {recipe.planned}
+        assert all(t.shutter is None for t in scene.truth)
 
 
 def test_an_unsound_scene_is_made_anew(trained: Said, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ REAL = "pandaset:002"
 @pytest.mark.parametrize("recipe", recipes.RECIPES)
 def test_every_recipe_is_in_order_and_of_training_chunks(recipe: str) -> None:
     table = table_of(recipe)
-    assert {stage.of for stage in table} == {"gnet", "enet"}
+    assert {stage.of for stage in table} == ({"gnet"} if recipe == "effects" else {"gnet", "enet"})
     for stage in table:
         at = places(stage, REAL)
         assert len(at) == stage.scenes.rounds * len(
@@ -57,6 +57,18 @@ def test_g3r_sees_recorded_views_alone(recipe: str) -> None:
         assert stage.config.judge_loss.novel == 0 and stage.config.novel_views == 0 and stage.images is None
         assert all(name.startswith("g3r/") for name in stage.needs())
     assert table_of(recipe, novel=0.2)[-1].name == table_of(recipe)[-1].name
+
+
+def test_training_with_effects_and_without_differ_in_the_scenes_alone() -> None:
+    plain, effects = table_of("effects")
+    assert plain.config == effects.config and plain.start == effects.start == "builtin:gnet"
+    assert plain.needs() == effects.needs() == ()
+    pairs = list(zip(places(plain, REAL), places(effects, REAL), strict=True))
+    assert all(b.recipe == replace(a.recipe, uri=b.recipe.uri, planned=True) for a, b in pairs)
+    assert all(b.recipe.uri.startswith(a.recipe.uri) and a.begin == b.begin for a, b in pairs)
+    counts = [sum(name in b.recipe.uri for _, b in pairs) for name in ("rolling", "distortion", "exposure", "bonnet")]
+    assert counts == sorted(counts, reverse=True) and counts[-1] > 0
+    assert any(a.recipe.uri == b.recipe.uri for a, b in pairs if "street" in a.recipe.uri)
 
 
 def test_a_table_out_of_order_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
