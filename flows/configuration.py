@@ -13,7 +13,7 @@ from pydantic import BaseModel, ValidationError
 from genre_tasks.config import EffectsConfig, PipelineConfig
 from genre_tasks.errors import ConfigError
 
-PRESETS = ("demo", "small", "long", "paper")
+PRESETS = ("demo", "small", "fine", "long", "paper")
 _FOLDER = Path(__file__).resolve().parent.parent / "configs"
 
 

@@ -12,7 +12,7 @@ def cost(
     logs: Annotated[
         list[str], typer.Argument(help="Logs: pandaset:PATH/002, pandaset:PATH/*, synthetic:street?seed=…")
     ],
-    preset: Annotated[str, typer.Option(help="demo, small, long or paper: where all knobs start.")] = "small",
+    preset: Annotated[str, typer.Option(help="demo, small, fine, long or paper: where all knobs start.")] = "small",
     knobs: Annotated[str | None, typer.Option(help="Which, e.g. gnet_iterations,fixer; all without it.")] = None,
     seeds: Annotated[str, typer.Option(help="Of the order of views and the fixer's noise.")] = "0,1,2",
     chunks: Annotated[str | None, typer.Option(help="Which chunks of each log, e.g. 0; all without it.")] = None,

@@ -12,7 +12,7 @@ def effects(
     log: Annotated[str, typer.Argument(help="pandaset:PATH/002 or synthetic:street?seed=1000")],
     chunk: Annotated[int, typer.Option(help="A chunk of the log.")] = 0,
     preset: Annotated[
-        str, typer.Option(help="demo, small, long or paper: thresholds hold at its resolution.")
+        str, typer.Option(help="demo, small, fine, long or paper: thresholds hold at its resolution.")
     ] = "small",
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="effects.NAME=on|off|auto, or any other setting.")

@@ -15,7 +15,7 @@ def figure(
     kind: Annotated[str, typer.Argument(help="recon: table 1's methods; fixers: table 3's.")],
     log: Annotated[str, typer.Argument(help="A log: pandaset:PATH/002, synthetic:street?seed=…")],
     out: Annotated[Path, typer.Option(help="x.png")],
-    preset: Annotated[str, typer.Option(help="demo, small, long or paper.")] = "small",
+    preset: Annotated[str, typer.Option(help="demo, small, fine, long or paper.")] = "small",
     chunk: Annotated[int, typer.Option(help="Of the log.")] = 0,
     camera: Annotated[str | None, typer.Option(help="A camera; the first front one without it.")] = None,
     frame: Annotated[int | None, typer.Option(help="A source frame; the middle one without it.")] = None,

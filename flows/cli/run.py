@@ -16,7 +16,7 @@ DEFAULT_STORE = "genre-store"
 
 def run(
     log: Annotated[str, typer.Argument(help="pandaset:PATH/002 or synthetic:street?seed=1000")],
-    preset: Annotated[str, typer.Option(help="demo, small, long or paper.")] = "small",
+    preset: Annotated[str, typer.Option(help="demo, small, fine, long or paper.")] = "small",
     config: Annotated[Path | None, typer.Option(help="A YAML file over the preset.")] = None,
     store: Annotated[str, typer.Option(help="A folder (or URI) that keeps every artifact.")] = DEFAULT_STORE,
     chunks: Annotated[str | None, typer.Option(help="Which chunks, e.g. 0,1; all without it.")] = None,

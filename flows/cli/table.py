@@ -16,7 +16,7 @@ def table(
     logs: Annotated[
         list[str], typer.Argument(help="Logs of one dataset: pandaset:PATH/002, pandaset:PATH/*, synthetic:…")
     ],
-    preset: Annotated[str, typer.Option(help="demo, small, long or paper.")] = "small",
+    preset: Annotated[str, typer.Option(help="demo, small, fine, long or paper.")] = "small",
     chunks: Annotated[str | None, typer.Option(help="Which chunks of each log, e.g. 0; all without it.")] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="section.key=value over the preset, for every method.")

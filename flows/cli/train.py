@@ -22,7 +22,12 @@ app = typer.Typer(help="Train the networks (tens of minutes each on a CPU; resum
 Folder = Annotated[Path, typer.Option(help="Where pairs, scenes, checkpoints and curves are kept.")]
 Streets = Annotated[int, typer.Option(min=0, help="How many synthetic streets.")]
 Real = Annotated[str | None, typer.Option(help="A real log whose chunk 0 is trained on too, e.g. pandaset:PATH/002.")]
-Recipe = Annotated[str, typer.Option(help="shipped, or paper: ENet on 3DGS scenes, GNet from it, ENet on GNet's.")]
+Recipe = Annotated[
+    str,
+    typer.Option(
+        help="shipped; paper: ENet on 3DGS scenes, GNet from it, ENet on GNet's; effects: GNet on logs with some."
+    ),
+]
 Novel = Annotated[
     float | None, typer.Option(min=0, help="λ_novel, 0.1 if not given; 0: recorded views alone, for gnet.method=g3r.")
 ]

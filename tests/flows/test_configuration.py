@@ -17,7 +17,8 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.mark.parametrize("preset", PRESETS)
 def test_presets_are_valid(preset: str) -> None:
     config = load_configuration(preset)
-    assert config.gnet.iterations == {"long": 120, "paper": 24}.get(preset, 72) and config.enet.iterations == 12
+    assert config.gnet.iterations == {"fine": 144, "long": 120, "paper": 24}.get(preset, 72)
+    assert config.enet.iterations == {"fine": 24}.get(preset, 12)
     assert differences(config, preset) == {}
 
 

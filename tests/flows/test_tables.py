@@ -28,6 +28,8 @@ from flows.tables.request import Planned, Request
 from genre_tasks.errors import ConfigError, GenreError, InputError
 from tests.faults.tiny import LOG, SETTINGS, Stopped, stopping
 
+EXAMPLES = Path(__file__).resolve().parents[2] / "docs/examples"
+
 
 def test_every_row_and_column_of_the_papers_tables_has_a_place() -> None:
     assert set(LAYOUTS) == set(PAPER) == {1, 2, 3, 4, 5}
@@ -78,6 +80,13 @@ def test_a_method_of_ones_own_is_a_small_file(tmp_path: Path) -> None:
         layout_of(3, [method])
     with pytest.raises(ConfigError, match="two methods have one name"):
         layout_of(4, [method, method])
+
+
+@pytest.mark.parametrize(("name", "end"), [("gnet", "gnet"), ("genre", "enet")])
+def test_the_examples_of_methods_are_the_preset_fine(name: str, end: str) -> None:
+    method = read_method(EXAMPLES / f"method_{name}_fine.yaml", "small")
+    assert method.end == end
+    assert method.configuration("small", ()) == load_configuration("fine")
 
 
 @pytest.mark.parametrize(
