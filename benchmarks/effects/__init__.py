@@ -119,7 +119,7 @@ class Effects:
             yield f"\n{r['log']}: {planned:+.2f} % instructions with the plan given, {planning:+.2f} % with making it"
         for r in _of(rows, TRAINED):
             told = ", ".join(
-                f"{word} {_db(r[word]['heldout_db'])} and {_db(r[word]['beside_db'])}"
+                f"{word} {_db(r[word]['measure'])} and {_db(r[word]['beside_db']) or 'unknown'}"
                 for word in ("shipped", "plain", "effects")
             )
             yield f"\n{r['log']} chunk {r['chunk']}: held out and at 3 m: {told}"
