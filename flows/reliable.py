@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from genre_tasks.reliability.range import ReliableRange
 
 VIEWS = schema(
-    "reliable_range/1",
+    "reliable_range/2",
     [
         column("camera", pa.string(), "of the rig"),
         column("frame", pa.int64(), "of the log"),
@@ -28,6 +29,8 @@ VIEWS = schema(
         column("shown", pa.float64(), "share of pixels that some recorded image bears out"),
         column("thin", pa.float64(), "share of pixels covered by less than half"),
         column("floating", pa.float64(), "share of pixels far before the LiDAR's depth"),
+        column("actors", pa.int64(), "wholly in the image, counted where a detector was given"),
+        column("detected", pa.int64(), "of these by the detector"),
     ],
 )
 
@@ -65,8 +68,10 @@ def drawn(found: ReliableRange, title: str) -> NDArray[np.uint8]:
         (line,) = below.plot(shifts, [getattr(p, name) - getattr(path, name) for p in found.points], "o-", label=name)
         if limit:
             below.axhline(limit, color=line.get_color(), linestyle=":")
+    if math.isfinite(path.detected):
+        below.plot(shifts, [p.detected - path.detected for p in found.points], "s--", color="0.4", label="detected")
     below.axvspan(-found.right_m, found.left_m, color="C2", alpha=0.15)
-    below.set(xlabel="metres beside the path (left is positive)", ylabel="share of pixels, less the path's")
+    below.set(xlabel="metres beside the path (left is positive)", ylabel="share, less the path's")
     below.legend(fontsize=8)
     above.invert_xaxis()  # left is on the left
     figure.suptitle(title, fontsize=9)

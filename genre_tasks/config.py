@@ -173,6 +173,9 @@ class RangeConfig(Section):
     hidden: float = Field(0.1, gt=0, le=1, description="No more pixels than this that no recorded image bears out.")
     thin: float = Field(0.02, gt=0, le=1, description="No more pixels than this that are covered by less than half.")
     floating: float = Field(0.02, gt=0, le=1, description="No more pixels than this far before the LiDAR's depth.")
+    undetected: float = Field(
+        0.3, gt=0, le=1, description="No more of what a detector finds on the path is lost to it."
+    )
     lidar_max_points: int = Field(20_000, ge=100, description="Points drawn in the LiDAR map.")
 
 

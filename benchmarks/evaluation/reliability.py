@@ -49,7 +49,7 @@ def ranked(seed: str, stage: str, store: str) -> Row:
 
 
 def _guards(view: Row) -> Guards:
-    return Guards(**{f.name: view[f.name] for f in fields(Guards)})
+    return Guards(**{f.name: view[f.name] for f in fields(Guards) if f.name in view})
 
 
 def _beside(views: Sequence[Row]) -> tuple[list[float], list[float]]:

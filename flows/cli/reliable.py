@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -15,12 +16,16 @@ def reliable(
     drop_db: Annotated[float, typer.Option(help="How much the median view's estimated PSNR may fall, dB.")] = 3.0,
     every: Annotated[int, typer.Option(help="Every n-th frame is rendered.")] = 4,
     store: Annotated[str, typer.Option(help="The run's store.")] = "genre-store",
+    detector: Annotated[
+        Path | None,
+        typer.Option(help="A detector as ONNX (FastestDet's form): how many actors it finds is a guard too."),
+    ] = None,
     out: Annotated[Path, typer.Option(help="A folder for range.parquet and range.png.")] = Path("range"),
 ) -> None:
     """Say how far to the left and right of the path the scene's renders agree with what was recorded.
 
-    Guards need no truth: the agreement with recorded images, what none of them shows, holes, and what floats. Where the
-    run has the next chunk too, the same view is rendered from both.
+    Guards need no truth: the agreement with recorded images, what none of them shows, holes, what floats, and what a
+    detector does not find any more. Where the run has the next chunk too, the same view is rendered from both.
     """
     from pydantic import ValidationError
 
@@ -37,12 +42,17 @@ def reliable(
         config = RangeConfig(drop_db=drop_db, every=every)
     except ValidationError as error:
         raise ConfigError(f"{error.errors()[0]['msg']}", remedy="See `genre range --help`.") from error
+    network = None
+    if detector is not None:
+        from genre_tasks.reliability.detector import Detector
+
+        network = Detector.load(detector)
     number, ingested = stage_value(store, run, chunk, "ingest")
     name = stage or last_stage(store, run, number)
     _, plan = stage_value(store, run, number, "effects")
     _, reconstruction = stage_value(store, run, number, name)
     with TerminalReporter(f"chunk {number}  guards") as reporter:
-        found = reliable_range(config, ingested, reconstruction.scene, plan, reporter.progress)
+        found = reliable_range(config, ingested, reconstruction.scene, plan, reporter.progress, network)
     beside = next_scene(store, run, number, stage)
     facts = {"log": ingested.log, "chunk": str(number), "stage": name, "run": run}
     files = write(out, found, facts)
@@ -50,7 +60,8 @@ def reliable(
         {
             "shift": f"{p.shift_m:+g} m", "views": p.views, "estimate": f"{p.estimate_db:.1f} dB",
             "agreement": f"{p.agreement_db:.1f} dB", "shown": f"{p.shown:.1%}", "thin": f"{p.thin:.1%}",
-            "floating": f"{p.floating:.1%}", "": "holds" if p.holds else "",
+            "floating": f"{p.floating:.1%}", "detected": "" if math.isnan(p.detected) else f"{p.detected:.0%}",
+            "": "holds" if p.holds else "",
         }
         for p in found.points
     ]  # fmt: skip

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from genre_tasks.effects.seen import Seen
 from genre_tasks.effects.types import Effect, Measured
-from genre_tasks.scene.chunk import Actor, Chunk, View
+from genre_tasks.scene.boxes import outline
+from genre_tasks.scene.chunk import Chunk, View
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.projection import NEAR_M
 
 WORDS = ("pedestrian", "person", "cycl", "rider", "scooter")
 """A label with one of these in it."""
@@ -33,7 +33,7 @@ def covered(chunk: Chunk, view: View) -> NDArray[np.bool_]:
     """[H, W] where those boxes are in a view's image."""
     out = np.zeros((view.lens.height_px, view.lens.width_px), bool)
     for actor in (a for a in chunk.actors if deforms(a.label)):
-        low, high = _outline(actor, view)
+        low, high = outline(actor, view)
         out[low[1] : high[1], low[0] : high[0]] = True
     return out
 
@@ -45,24 +45,6 @@ def rigid_at_first(scene: SceneGraph, chunk: Chunk) -> SceneGraph:
     own = tuple(k for k, actor in enumerate(scene.actors) if deforms(actor.label))
     frames = tuple(sorted({v.frame for v in chunk.of_role("source")}))
     return replace(scene, deformation=Deformation.none(scene.actors, own, frames)) if own else scene
-
-
-def _outline(actor: Actor, view: View) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First and last pixel (x, y) of the box in the image; what is behind the camera plane is cut off there."""
-    at = np.flatnonzero(actor.frames == view.frame)
-    nothing = np.zeros(2, np.int64)
-    if not len(at):
-        return nothing, nothing
-    corner = np.stack(np.meshgrid(*[(-s / 2, s / 2) for s in actor.size_m], indexing="ij"), -1).reshape(-1, 3)
-    pose = np.linalg.inv(view.chunk_SE3_camera) @ actor.chunk_SE3_box[at[0]]
-    points = corner @ pose[:3, :3].T + pose[:3, 3]
-    if (points[:, 2] < NEAR_M).all():
-        return nothing, nothing
-    z = np.maximum(points[:, 2], NEAR_M)
-    lens = view.lens
-    u = (points[:, 0] / z * lens.fx_px + lens.cx_px).clip(0, lens.width_px)
-    v = (points[:, 1] / z * lens.fy_px + lens.cy_px).clip(0, lens.height_px)
-    return np.array([round(u.min()), round(v.min())]), np.array([round(u.max()), round(v.max())])
 
 
 EFFECT = Effect("nonrigid_actors", "area of pedestrians and cyclists", "%", 1.25, "a deformation a frame", measure)

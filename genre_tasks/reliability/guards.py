@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -13,6 +14,9 @@ from genre_tasks.fixer.conditioning import degraded
 from genre_tasks.fixer.warping import SourceImage
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.views import NovelView, NovelViews
+
+if TYPE_CHECKING:
+    from genre_tasks.reliability.detector import Detector
 
 SEEN = 0.5
 """A pixel counts where at least so much of it is shown by recorded images (or, of alpha, is covered)."""
@@ -36,6 +40,7 @@ class Guards:
     ``agreement_db``: PSNR between the render and recorded images looked up by LiDAR's depth, where these show anything.
     ``shown``: share of pixels whose rendered depth some recorded image bears out. ``thin``: share of pixels that are
     covered by less than half. ``floating``: share whose rendered depth is less than half of LiDAR's, where both are.
+    ``actors``: how many of the log's are wholly in the image, ``detected`` by a detector; 0 without one.
     """
 
     camera: str
@@ -45,6 +50,8 @@ class Guards:
     shown: float
     thin: float
     floating: float
+    actors: int = 0
+    detected: int = 0
 
     @property
     def estimate_db(self) -> float:
@@ -57,20 +64,32 @@ class Guards:
         )
 
 
-def guards_of(chunk: Chunk, novel: NovelViews, sources: Sequence[SourceImage]) -> list[Guards]:
+def guards_of(
+    chunk: Chunk, novel: NovelViews, sources: Sequence[SourceImage], detector: Detector | None = None
+) -> list[Guards]:
     """Of each view; ``sources`` are the chunk's, see ``fixer.conditioning.recorded``."""
-    return [_guards(chunk, novel, index, view, sources) for index, view in enumerate(novel.views)]
+    return [_guards(chunk, novel, index, view, sources, detector) for index, view in enumerate(novel.views)]
 
 
-def _guards(chunk: Chunk, novel: NovelViews, index: int, view: NovelView, sources: Sequence[SourceImage]) -> Guards:
+def _guards(
+    chunk: Chunk,
+    novel: NovelViews,
+    index: int,
+    view: NovelView,
+    sources: Sequence[SourceImage],
+    detector: Detector | None,
+) -> Guards:
     found = degraded(chunk, novel, [index], sources)
     shown = found.lidar_warp_mask > SEEN
     own = found.lidar_warped / found.lidar_warp_mask.clamp_min(SEEN)
     error = ((found.color.clamp(0, 1) - own) ** 2).mean(1, keepdim=True)
     near, known = _floating(novel, index)
+    image = found.color[0].clamp(0, 1).permute(1, 2, 0)
+    actors, detected = (0, 0) if detector is None else detector.found(chunk, view, image)
     return Guards(
         view.camera, view.frame, view.shift_m, _decibels(error[shown]),
         _share(found.warp_mask > SEEN), _share(found.alpha < SEEN), float(near.sum()) / max(1, int(known.sum())),
+        actors, detected,
     )  # fmt: skip
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import math
 import statistics
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from genre_tasks.config import RangeConfig
 from genre_tasks.effects.applied import applied
@@ -19,10 +21,16 @@ from genre_tasks.scene.novel import novel_view_poses
 from genre_tasks.scene.views import NovelViews
 from genre_tasks.stages.novel_views import render_novel
 
+if TYPE_CHECKING:
+    from genre_tasks.reliability.detector import Detector
+
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """At one shift (metres, left is positive): medians over the views, and whether they are within the limits."""
+    """At one shift (metres, left is positive): medians over the views, and whether they are within the limits.
+
+    ``detected``: the share of all views' actors that a detector finds; NaN without one, or without actors.
+    """
 
     shift_m: float
     views: int
@@ -32,6 +40,7 @@ class CurvePoint:
     thin: float
     floating: float
     holds: bool
+    detected: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -59,18 +68,20 @@ def reliable_range(
     scene: SceneGraph,
     plan: EffectsPlan = UNPLANNED,
     progress: Progress = silent,
+    detector: Detector | None = None,
 ) -> ReliableRange:
     """The scene rendered at every ``config.every``-th frame of the path and beside it, and its guards.
 
     Limits are relative to the path itself: what no image shows there (sky above, what the rig hides) is no fault of the
-    shift. Raises ``InputError`` for an image of the chunk that cannot be decoded.
+    shift. ``detector``: of road users; how many it finds is a guard, too. Raises ``InputError`` for an image of the
+    chunk that cannot be decoded.
     """
-    found = [g for _, guards in measured(config, applied(chunk, plan), scene, progress) for g in guards]
+    found = [g for _, guards in measured(config, applied(chunk, plan), scene, progress, detector) for g in guards]
     return judged(found, config)
 
 
 def measured(
-    config: RangeConfig, chunk: Chunk, scene: SceneGraph, progress: Progress
+    config: RangeConfig, chunk: Chunk, scene: SceneGraph, progress: Progress, detector: Detector | None = None
 ) -> Iterator[tuple[NovelViews, list[Guards]]]:
     """For each shift, 0 first, the renders and their guards; ``chunk`` has its plan's effects applied."""
     frames = chunk.frames[config.every // 2 :: config.every] or chunk.frames[:1]
@@ -79,7 +90,7 @@ def measured(
     for k, shift in enumerate(shifts):
         progress(k, len(shifts), f"guards at {shift:+g} m")
         novel = render_novel(chunk, scene, novel_view_poses(chunk, (shift,), frames), config.lidar_max_points)
-        yield novel, guards_of(chunk, novel, sources)
+        yield novel, guards_of(chunk, novel, sources, detector)
     progress(len(shifts), len(shifts), "guards")
 
 
@@ -98,7 +109,9 @@ def judged(guards: Sequence[Guards], limits: RangeConfig) -> ReliableRange:
 
 def _median(views: Sequence[Guards]) -> dict[str, float]:
     names = ("estimate_db", "agreement_db", "shown", "thin", "floating")
-    return {name: statistics.median(getattr(v, name) for v in views) for name in names}
+    actors = sum(v.actors for v in views)
+    detected = sum(v.detected for v in views) / actors if actors else math.nan
+    return {name: statistics.median(getattr(v, name) for v in views) for name in names} | {"detected": detected}
 
 
 def _point(shift: float, views: Sequence[Guards], path: dict[str, float], limits: RangeConfig) -> CurvePoint:
@@ -113,7 +126,13 @@ def _excess(here: dict[str, float], path: dict[str, float], limits: RangeConfig)
         path["shown"] - here["shown"] - limits.hidden,
         here["thin"] - path["thin"] - limits.thin,
         here["floating"] - path["floating"] - limits.floating,
+        _lost(path["detected"], here["detected"]) - limits.undetected,
     )
+
+
+def _lost(before: float, now: float) -> float:
+    """Of the share that is detected on the path; 0 where either is not known, or nothing was detected there."""
+    return 1 - now / before if math.isfinite(now) and before > 0 else 0.0
 
 
 def _reach(points: Sequence[CurvePoint], path: dict[str, float], limits: RangeConfig, side: int) -> float:
