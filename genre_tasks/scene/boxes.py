@@ -2,25 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 from numpy.typing import NDArray
 
-from genre_tasks.logs.types import Float64, Lens
-from genre_tasks.scene.chunk import Actor
+from genre_tasks.scene.chunk import Actor, View
 from genre_tasks.scene.projection import NEAR_M
+from genre_tasks.scene.views import NovelView
 
-
-class Seeing(Protocol):
-    """A recorded or novel view."""
-
-    @property
-    def frame(self) -> int: ...
-    @property
-    def chunk_SE3_camera(self) -> Float64: ...
-    @property
-    def lens(self) -> Lens: ...
+Seeing = View | NovelView
 
 
 def outline(actor: Actor, view: Seeing) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
