@@ -74,12 +74,12 @@ def test_actors_are_found_where_they_are(chunk: Chunk) -> None:
     assert Detector(Stub(shares), 352).found(chunk, view, image) == (len(whole), len(whole))
     assert Detector(Stub([]), 352).found(chunk, view, image) == (len(whole), 0)
     aside = [(x0, y0 - 0.6 * (y1 - y0), x1, y1 - 0.6 * (y1 - y0)) for x0, y0, x1, y1 in shares]
-    assert Detector(Stub(aside[:1]), 352).found(replace(chunk, actors=chunk.actors), view, image)[1] == 0
+    assert Detector(Stub(aside[:1]), 352).found(chunk, view, image)[1] == 0
     assert Detector(Stub(shares), 352).found(replace(chunk, actors=()), view, image) == (0, 0)
 
 
 def guard(shift: float, actors: int, detected: int) -> Guards:
-    return Guards("front", 0, shift, 90.0 - 0.0 * shift, 0.7, 0.0, 0.0, actors, detected)
+    return Guards("front", 0, shift, 90.0, 0.7, 0.0, 0.0, actors, detected)
 
 
 def test_the_range_ends_where_too_much_is_no_longer_detected() -> None:
