@@ -76,9 +76,9 @@ def walk(
     for i in itertools.count():
         began = time.perf_counter()
         batch = [target for sampler in samplers for target in sampler.draw()]
-        sight = objective(frame, state.offsets, batch, i, generator)
+        sight = objective(frame, state.offsets, batch, i, generator, residuals=rule.residuals)
         check_finite(sight.gradient, "gradient", "bench")
-        state = state.saw(sight.gradient)
+        state = state.saw(sight.gradient, sight.residuals)
         state = state.moved(frame, step(state, sight.gradient, plan.iterations))
         check_finite(state.offsets, "updated Gaussians", "bench")
         renders += len(batch)

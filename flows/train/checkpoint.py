@@ -35,6 +35,8 @@ def save(training: MetaTraining, path: Path, origin: Mapping[str, str] | None = 
         tensors |= {f"pool.{i}.{name}": getattr(episode.state, name) for name in STATE}
         if episode.sight is not None:
             tensors[f"pool.{i}.gradient"] = episode.sight.gradient
+            if episode.sight.residuals is not None:
+                tensors[f"pool.{i}.residuals"] = episode.sight.residuals
     described = {
         "done": training.done,
         "scenes": [s.name for s in training.scenes],
@@ -131,7 +133,7 @@ def _episode(training: MetaTraining, entry: dict[str, Any], tensors: dict[str, T
     episode = Episode.start(course, training.scenes[course.scene], training.network, training.generator)
     episode.state = replace(episode.state, **{name: tensors[name] for name in STATE}, iteration=entry["iteration"])
     if entry["loss"] is not None:
-        episode.sight = Sight(entry["loss"], tensors["gradient"], {})
+        episode.sight = Sight(entry["loss"], tensors["gradient"], {}, residuals=tensors.get("residuals"))
     for sampler, queues in zip(episode.samplers, entry["samplers"], strict=True):
         sampler.set_queues(queues)
     return episode

@@ -21,7 +21,7 @@ from genre_tasks.optimiser.rules import StepRule
 from genre_tasks.optimiser.targets import Target
 from genre_tasks.optimiser.training import MetaConfig, MetaTraining
 from genre_tasks.optimiser.unroll import Plan, unroll
-from genre_tasks.optimiser.weights import save
+from genre_tasks.optimiser.weights import save, with_residuals
 from genre_tasks.progress import Progress, silent
 from genre_tasks.render.api import render_views
 from genre_tasks.scene.graph import SceneGraph
@@ -39,7 +39,7 @@ class Score:
 
 
 def network_from(config: NetworkConfig, seed: int, weights: Path | None = None) -> LearnedOptimiser:
-    """A new network, or one that starts from ``weights`` with the rates of ``config``.
+    """A new network, or one that starts from ``weights`` with the rates of ``config``, and residuals if that has them.
 
     Raises ``InputError`` for weights that are missing, unreadable, or of a network of another shape.
     """
@@ -48,14 +48,15 @@ def network_from(config: NetworkConfig, seed: int, weights: Path | None = None) 
         network = LearnedOptimiser(config)
     if weights is not None:
         start = LearnedOptimiser.load(weights)
-        other = {name for name, value in config if name != "rates" and value != getattr(start.config, name)}
+        may = {"rates"} | ({"residuals"} if config.residuals else set())
+        other = {name for name, value in config if name not in may and value != getattr(start.config, name)}
         if other:
             raise InputError(
                 f"The weights to start from are of a network with other {' and '.join(sorted(other))}",
                 remedy="Start from weights of the same network, or from none.",
                 file=weights,
             )
-        network.load_state_dict(start.state_dict())
+        network.load_state_dict(with_residuals(start) if config.residuals else start.state_dict())
     return network
 
 

@@ -300,14 +300,6 @@ def dense_scenes(count: int = 28, real: str | None = None, times: int = 1) -> li
     return out
 
 
-EFFECTS = (
-    "&rolling_shutter_s=0.02",
-    "&distortion=0.02",
-    "&exposure_jitter=0.2&white_balance_jitter=0.05",
-    "&bonnet=0.08",
-)
-
-
 def _planned(recipe: SceneRecipe, k: int) -> SceneRecipe:
     """With its plan, and on a street with the first none to four of the effects."""
     more = "".join(EFFECTS[: k % (len(EFFECTS) + 1)]) if recipe.uri.startswith("synthetic:") else ""

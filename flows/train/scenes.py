@@ -65,6 +65,15 @@ class SceneRecipe:
             del own["planned"]
         return own
 
+    def images(self) -> dict[str, Any]:
+        """What its images depend on, and not how many Gaussians begin: scenes of several sizes share them."""
+        own = self.said()
+        return {name: own[name] for name in ("uri", "chunk", "width_px", "height_px", "every")}
+
+    def truths(self) -> dict[str, Any]:
+        """What its true views beside the path depend on."""
+        return self.images() | {"novel_every": self.novel_every, "shifts_m": self.shifts_m}
+
 
 @dataclass(frozen=True)
 class PreparedScene:
@@ -95,23 +104,24 @@ def check_training(recipe: SceneRecipe) -> None:
 def prepare(store: LocalStore, recipe: SceneRecipe) -> PreparedScene:
     """Reads the scene from the store, or makes and stores it.
 
-    The key is the recipe's alone, not the code's: after a change of how scenes are made, take an empty store.
+    Keys are the recipe's alone, not the code's: after a change of how scenes are made, take an empty store.
     """
     log = open_log(recipe.uri)
-    key = digest_value(recipe.said())
 
-    def part(stage: str, kind: str, make: Callable[[], Any]) -> Any:
-        return kept(store, Address(log.dataset, log.name, recipe.chunk, stage, key), kind, make)
+    def part(stage: str, kind: str, said: dict[str, Any], make: Callable[[], Any]) -> Any:
+        return kept(store, Address(log.dataset, log.name, recipe.chunk, stage, digest_value(said)), kind, make)
 
     sizes = {"width_px": recipe.width_px, "height_px": recipe.height_px}
     thinned: Any = ThinnedLog(log, recipe.every)
-    chunk = part("ingest", "chunk", lambda: ingest(IngestConfig(**sizes), thinned, recipe.chunk))
+    chunk = part("ingest", "chunk", recipe.images(), lambda: ingest(IngestConfig(**sizes), thinned, recipe.chunk))
     points = InitialConfig(max_points=recipe.max_points, distant_count=recipe.distant_count)
-    plan = part("effects", "effects", lambda: effects(PLANNED, chunk, thinned)) if recipe.planned else UNPLANNED
-    start = part("initial", "reconstruction", lambda: initial(points, chunk, plan))
+    plan = UNPLANNED
+    if recipe.planned:
+        plan = part("effects", "effects", recipe.said(), lambda: effects(PLANNED, chunk, thinned))
+    start = part("initial", "reconstruction", recipe.said(), lambda: initial(points, chunk, plan))
     truth = None
     if log.truth is not None:
-        truth = part("truth", "fixed_views", lambda: true_views(log, chunk, recipe))
+        truth = part("truth", "fixed_views", recipe.truths(), lambda: true_views(log, chunk, recipe))
     return PreparedScene(recipe, applied(chunk, plan), start, truth)
 
 

@@ -28,6 +28,11 @@ class TunedAdam:
     rates: Sequence[float] = GNET_RATES
     decay: Literal["cosine", "constant"] = "cosine"
 
+    @property
+    def residuals(self) -> bool:
+        """Gradients are enough."""
+        return False
+
     def start(self, frame: Frame, centre: Tensor) -> Step:
         """Nothing to prepare."""
         rates = rate_vector(self.rates)

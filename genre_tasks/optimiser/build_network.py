@@ -17,7 +17,7 @@ KERNEL = Kernel(
     folder=Path(__file__).resolve().parent,
     sources=SOURCES,
     constants_file="network_constants.py",
-    constants=("BLOCK", "DEVIATION_FLOOR", "VARYING"),
+    constants=("BLOCK", "DEVIATION_FLOOR", "SHARE_FLOOR_PX", "VARYING", "RESIDUALS"),
     flags=("-fno-signed-zeros",),
 )
 """No -freciprocal-math: tuned Adam's step and that of an untrained network are the same bits."""

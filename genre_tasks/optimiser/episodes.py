@@ -78,10 +78,11 @@ class Episode:
         state = State.start(len(scene.scene), scene.scene.gaussians.means)
         return Episode(course, frame, network.pyramid(frame, centre), Fixed.of(frame, centre), samplers, state)
 
-    def look(self, objective: Objective, generator: torch.Generator) -> Sight:
-        """Loss and gradient at the present offsets, on the next views that the optimiser may see."""
+    def look(self, objective: Objective, generator: torch.Generator, residuals: bool = False) -> Sight:
+        """Loss and gradient at the present offsets, on the next views that the optimiser may see; with residuals."""
         batch = [*self.samplers[0].draw(), *self.samplers[1].draw()]
-        return objective(self.frame, self.state.offsets, batch, self.state.iteration, generator)
+        at = self.frame, self.state.offsets, batch, self.state.iteration
+        return objective(*at, generator, residuals=residuals)
 
     def judge(self, objective: Objective, generator: torch.Generator) -> Sight:
         """Loss and gradient at the present offsets, on views that the optimiser does not see."""
@@ -101,7 +102,7 @@ class Episode:
     def step_only(self, move: Step) -> None:
         """As :meth:`step`, without a gradient."""
         assert self.sight is not None
-        self.state = self.state.saw(self.sight.gradient)
+        self.state = self.state.saw(self.sight.gradient, self.sight.residuals)
         self._move(move)
 
     def mover(self, network: LearnedOptimiser) -> Step:
@@ -111,7 +112,7 @@ class Episode:
 
     def _see(self) -> torch.Tensor:
         assert self.sight is not None
-        self.state = self.state.saw(self.sight.gradient)
+        self.state = self.state.saw(self.sight.gradient, self.sight.residuals)
         return features(self.frame, self.columns, self.state, self.sight.gradient, self.course.iterations)
 
     def _move(self, move: Step) -> None:

@@ -8,10 +8,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from genre_tasks.optimiser.network_constants import SHARE_FLOOR_PX, VARYING
 from genre_tasks.optimiser.state import GROUPS, Frame, State
 from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR
 
-FEATURES = 66
+TIMES = 4
+FEATURES = VARYING + TIMES
+RESIDUAL_SCALE = 5.0
 USUAL_ITERATIONS = 24
 """T as a feature is the octaves from here."""
 
@@ -44,8 +47,11 @@ def features(
     state: State,
     gradient: Tensor,  # [N, 14]
     total: int,
-) -> Tensor:  # [N, FEATURES]
+) -> Tensor:  # [N, FEATURES], with residuals [N, FEATURES + 5]
     """Direction, latest gradient and its usual size, the Gaussian itself, what saw it, t / T and T; all of order 1.
+
+    Where the state has residuals, before t / T: their mean over the pixels that show the Gaussian, their root mean
+    square and how many pixels that are. Gradients say where to go; these say how far it is.
 
     Gradients enter detached and normalised (no second derivative of the renderer, paper Sec. III-C): a loss scaled by
     any factor gives the same features.
@@ -70,9 +76,22 @@ def features(
         fixed.columns,
         state.seen_now,
         torch.log1p(state.seen) / 3,
-        time.expand(len(offsets), 4),
+        *_of_residuals(state),
+        time.expand(len(offsets), TIMES),
     ]
     return torch.cat(columns, 1).detach()
+
+
+def _of_residuals(state: State) -> list[Tensor]:
+    if state.residuals is None:
+        return []
+    square, share = state.residuals[:, 3:4], state.residuals[:, 4:5]
+    spread = (square / (share + SHARE_FLOOR_PX)).sqrt()
+    return [
+        (RESIDUAL_SCALE * state.mean_residual()).clamp(-2, 2),
+        (RESIDUAL_SCALE * spread).clamp(0, 4),
+        torch.log1p(share) / 4,
+    ]
 
 
 def times(iteration: int, total: int) -> list[float]:

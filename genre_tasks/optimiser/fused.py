@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from genre_tasks.optimiser.features import FEATURES, Fixed, times
+from genre_tasks.optimiser.features import TIMES, Fixed, times
 from genre_tasks.optimiser.fused_calls import learned_step
 from genre_tasks.optimiser.fused_layers import LANES, ByOwner, Layers, Memory, Pairs, padded, round_up
 from genre_tasks.optimiser.fused_library import Network, Scene
@@ -32,7 +32,7 @@ class FusedStep:
     def __init__(self, network: LearnedOptimiser, frame: Frame, fixed: Fixed, pyramid: VoxelPyramid) -> None:
         self._memory = Memory()
         self._rates = -rate_vector(network.config.rates)
-        self._count = len(pyramid.voxel_of)
+        self._count, self._residuals = len(pyramid.voxel_of), network.residuals
         hidden = round_up(network.config.hidden, 2 * LANES)
         self._network = _dense_layers(network, hidden, self._memory)
         self._scene = _scene(network, hidden, frame, fixed, pyramid, self._memory)
@@ -45,8 +45,10 @@ class FusedStep:
         """
         if len(gradient) != self._count:
             raise ValueError(f"expected the gradient of {self._count} Gaussians, got {len(gradient)}")
-        rates, time = self._rates * schedule(state.iteration, total), torch.tensor(times(state.iteration, total))
-        return learned_step(self._network, self._scene, state, gradient, rates, time)
+        part, time = schedule(state.iteration, total), torch.tensor(times(state.iteration, total))
+        if (state.residuals is None) == self._residuals:
+            raise ValueError(f"expected a state {'with' if self._residuals else 'without'} residuals")
+        return learned_step(self._network, self._scene, state, gradient, self._rates * part, time, part)
 
 
 def _dense_layers(network: LearnedOptimiser, hidden: int, memory: Memory) -> Network:
@@ -54,10 +56,12 @@ def _dense_layers(network: LearnedOptimiser, hidden: int, memory: Memory) -> Net
     own = network.mix.weight[:, : network.config.hidden].T
     column = torch.cat([torch.arange(14), LANES + torch.arange(14)])  # gains and offsets have a row of lanes each
     weight, bias = torch.zeros(hidden, 2 * LANES), torch.zeros(2 * LANES)
+    if network.residuals:
+        column = torch.cat([column, torch.tensor([14])])  # beside the gains
     weight[: head.in_features, column], bias[column] = head.weight.detach().T, head.bias.detach()
     return Network(
-        hidden, at(padded(entry.weight.T, FEATURES, hidden)), at(padded(entry.bias, hidden)),
-        at(padded(own, hidden, hidden)), at(weight), at(bias),
+        hidden, entry.in_features - TIMES, at(padded(entry.weight.T, entry.in_features, hidden)),
+        at(padded(entry.bias, hidden)), at(padded(own, hidden, hidden)), at(weight), at(bias),
     )  # fmt: skip
 
 

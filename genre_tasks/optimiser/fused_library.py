@@ -37,7 +37,7 @@ class Layer(ctypes.Structure):
 class Network(ctypes.Structure):
     """The weights of the dense layers."""
 
-    _fields_ = [*_numbers("hidden"), *_pointers("entry entry_bias mix head head_bias")]
+    _fields_ = [*_numbers("hidden varying"), *_pointers("entry entry_bias mix head head_bias")]
 
 
 class Scene(ctypes.Structure):
@@ -58,7 +58,7 @@ class Now(ctypes.Structure):
         *_numbers("count"),
         *_pointers("offsets first second seen seen_now gradient by_seen"),
         *_numbers("counts"),
-        *_pointers("times rates delta"),
+        *_pointers("times rates delta residuals part"),
     ]
 
 

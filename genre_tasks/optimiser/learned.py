@@ -2,6 +2,10 @@
 
 The step is ``Δ = −rate · schedule(t/T) · [exp(3 tanh(a/3)) · u + tanh(b)]`` with ``u`` Adam's normalised direction and
 ``a, b`` [N, 14] from the network, whose last layer starts at zero: untrained, it is tuned Adam to the bit.
+
+A network with ``residuals`` also moves colours by ``schedule(t/T) · (1 + tanh(c)) · r̄``, with r̄ the mean residual of
+the pixels that show a Gaussian and ``c`` [N] from the network: a step of the simultaneous algebraic reconstruction
+technique (Andersen and Kak 1984) with a relaxation of 0 to 2, where it converges.
 """
 
 from __future__ import annotations
@@ -18,6 +22,7 @@ from genre_tasks.optimiser.adam import GNET_RATES
 from genre_tasks.optimiser.features import FEATURES, Fixed, features
 from genre_tasks.optimiser.fused import FusedStep
 from genre_tasks.optimiser.fused_library import takes
+from genre_tasks.optimiser.network_constants import RESIDUALS
 from genre_tasks.optimiser.rules import Step, rate_vector, schedule
 from genre_tasks.optimiser.sparse_unet import SparseUNet, VoxelPyramid
 from genre_tasks.optimiser.state import GROUPS, Frame, State
@@ -32,6 +37,7 @@ class NetworkConfig(BaseModel):
     hidden: int = Field(default=64, ge=4, le=512, description="Width of the head per Gaussian.")
     channels: tuple[int, ...] = Field(default=(16, 32, 48), min_length=1, description="Channels of the UNet's levels.")
     voxel_m: float = Field(default=1.0, gt=0, description="Width of a static voxel near the cameras.")
+    residuals: bool = Field(default=False, description="It is told what images have beyond the render.")
     rates: tuple[float, ...] = Field(
         default=GNET_RATES, min_length=len(GROUPS), max_length=len(GROUPS), description="As TunedAdam's."
     )
@@ -44,10 +50,11 @@ class LearnedOptimiser(nn.Module):
         super().__init__()
         self.config = config or NetworkConfig()
         hidden, channels = self.config.hidden, self.config.channels
-        self.entry = nn.Linear(FEATURES, hidden)
+        self.residuals = self.config.residuals
+        self.entry = nn.Linear(FEATURES + (RESIDUALS if self.residuals else 0), hidden)
         self.unet = SparseUNet(hidden, channels)
         self.mix = nn.Linear(hidden + channels[0], hidden)
-        self.head = nn.Linear(hidden, 28)
+        self.head = nn.Linear(hidden, 29 if self.residuals else 28)
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
 
@@ -63,19 +70,19 @@ class LearnedOptimiser(nn.Module):
 
     def forward(
         self,
-        inputs: Tensor,  # [M, FEATURES]
+        inputs: Tensor,  # [M, FEATURES], or with residuals
         pyramid: VoxelPyramid,
         points: Tensor,  # [M]
-    ) -> tuple[Tensor, Tensor]:
-        """Log-gains a and offsets b of the ``points``, each [M, 14]; the others are as if they were not there."""
+    ) -> Tensor:
+        """Of the ``points`` [M, 28 or 29]: log-gains a, offsets b, c; the others are as if they were not there."""
         own = F.silu(self.entry(inputs))
         pooled, _ = pyramid.pool(own, points)
         return self._heads(own, self.unet(pooled, pyramid), pyramid.voxel_of[points])
 
-    def _heads(self, own: Tensor, around: Tensor, voxel: Tensor) -> tuple[Tensor, Tensor]:
+    def _heads(self, own: Tensor, around: Tensor, voxel: Tensor) -> Tensor:
         both = torch.cat([own, around.index_select(0, voxel)], 1)
-        gain, offset = self.head(F.silu(self.mix(both))).split(14, 1)
-        return gain, offset
+        heads: Tensor = self.head(F.silu(self.mix(both)))
+        return heads
 
     def pyramid(self, frame: Frame, centre: Tensor) -> VoxelPyramid:
         """The voxels of a scene at its start; they serve all iterations."""
@@ -84,13 +91,19 @@ class LearnedOptimiser(nn.Module):
     def delta(self, state: State, inputs: Tensor, pyramid: VoxelPyramid, total: int) -> Tensor:
         """The step [N, 14], differentiable in the network's weights; 0 where ``state.seen_now`` is."""
         seen = state.seen_now[:, 0].nonzero()[:, 0]
-        gain, offset = self(inputs[seen], pyramid, seen)
-        step = self._step(gain, offset, state.direction()[seen], schedule(state.iteration, total))
+        step = self._step(self(inputs[seen], pyramid, seen), state, seen, schedule(state.iteration, total))
         return step.new_zeros(state.offsets.shape).index_copy(0, seen, step)
 
-    def _step(self, gain: Tensor, offset: Tensor, direction: Tensor, part: float) -> Tensor:
+    def _step(self, heads: Tensor, state: State, rows: Tensor, part: float) -> Tensor:
+        """Of the Gaussians ``rows`` [M], from their heads."""
+        direction = state.direction()[rows]
+        gain, offset = heads[:, :14], heads[:, 14:28]
         rates = rate_vector(self.config.rates).to(direction.device)
-        return -rates * part * (torch.exp(3 * torch.tanh(gain / 3)) * direction + torch.tanh(offset))
+        step = -rates * part * (torch.exp(3 * torch.tanh(gain / 3)) * direction + torch.tanh(offset))
+        if self.residuals:
+            relaxed = part * (1 + torch.tanh(heads[:, 28:])) * state.mean_residual()[rows]
+            step = step + F.pad(relaxed, (11, 0))
+        return step
 
     def sampled_delta(self, state: State, inputs: Tensor, pyramid: VoxelPyramid, total: int, rows: Tensor) -> Tensor:
         """The rows ``rows`` [M] of :meth:`delta`, differentiable through these Gaussians alone.
@@ -108,7 +121,7 @@ class LearnedOptimiser(nn.Module):
         voxel = pyramid.voxel_of[part]
         change = torch.zeros_like(everyone).index_add(0, voxel, own - own.detach()) / counts
         around = self.unet(everyone + change * (len(inputs) / len(rows)), pyramid)
-        step = self._step(*self._heads(own, around, voxel), state.direction()[part], schedule(state.iteration, total))
+        step = self._step(self._heads(own, around, voxel), state, part, schedule(state.iteration, total))
         return step.new_zeros((len(rows), 14)).index_copy(0, place, step)
 
     def start(self, frame: Frame, centre: Tensor) -> Step:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -116,6 +117,30 @@ def image_gradients(
         if target.own is not None:
             sums.by_color[i][target.own], sums.by_depth[i][target.own] = 0.0, 0.0
     return loss, sums.by_color if gains is None else sums.by_color * slope(gains), sums.by_depth
+
+
+def residual_image(color: Tensor, targets: Sequence[Target]) -> Tensor:
+    """What each image has beyond the render, in the scene's own colours, [V, H, W, 3]; 0 on the vehicle itself."""
+    gains = _gains(targets, color)
+    shown = color
+    if gains is not None:
+        from genre_tasks.effects.exposure import slope, toned
+
+        shown = toned(color, gains)
+    out = torch.empty_like(color)
+    for i, target in enumerate(targets):
+        _subtract(target.image.image, shown[i], out[i])
+        if target.own is not None:
+            out[i][target.own] = 0.0
+    return out if gains is None else out / slope(gains)
+
+
+def _subtract(a: Tensor, b: Tensor, out: Tensor) -> None:
+    """On the CPU by numpy: torch would wake its threads, which then spin beside the kernels'."""
+    if out.device.type == "cpu":
+        np.subtract(a.numpy(), b.numpy(), out=out.numpy())
+    else:
+        torch.sub(a, b, out=out)
 
 
 def _gains(targets: Sequence[Target], like: Tensor) -> Tensor | None:

@@ -18,9 +18,10 @@ struct Layer {
 
 struct Network {
   int64_t hidden;                   // a multiple of 2 * LANES
-  const float *entry, *entry_bias;  // [VARYING + TIMES, hidden]
+  int64_t varying;                  // VARYING, or with those of residuals
+  const float *entry, *entry_bias;  // [varying + TIMES, hidden]
   const float* mix;                 // [hidden, hidden]: of the own row; voxels bring the bias
-  const float *head, *head_bias;    // [hidden, HEAD]: 14 gains, two zeros, 14 offsets, two zeros
+  const float *head, *head_bias;    // [hidden, HEAD]: 14 gains, the relaxation and a zero, 14 offsets, two zeros
 };
 
 struct Scene {
@@ -100,7 +101,7 @@ static void enter(const Network& net, const Scene& scene, const Now& now, const 
   const size_t begin = block * BLOCK, n = std::min<size_t>(BLOCK, active - begin);
   float *x = Rows::of(rows.features), *own = scene.own + begin * net.hidden;
   for (size_t r = 0; r < n; r++) features(now, scene.base, scene.fixed, usual, scene.active[begin + r], x + STRIDE * r);
-  dense((int)n, x, STRIDE, VARYING, net.entry, net.hidden, [&](int) { return bias; }, own);
+  dense((int)n, x, STRIDE, (int)net.varying, net.entry, net.hidden, [&](int) { return bias; }, own);
   silu_rows(own, n * net.hidden);
 }
 
@@ -120,7 +121,9 @@ static void leave(const Network& net, const Scene& scene, const Now& now, size_t
     const Lanes gain = load(head + HEAD * r), offset = load(head + HEAD * r + LANES);
     const Lanes factor = power_of_2(tanh(gain * (1 / 3.f)) * (3 * LOG2_E));
     float* delta = now.delta + ATTRIBUTES * (size_t)points[r];  // holds the direction
-    store_attributes(delta, rates * (factor * load_attributes(delta) + tanh(offset)));
+    Lanes step = rates * (factor * load_attributes(delta) + tanh(offset));
+    if (now.residuals) step += relaxed(now, (size_t)points[r], tanh(gain)[14]);
+    store_attributes(delta, step);
   }
 }
 
@@ -128,7 +131,7 @@ static void evaluate(const Network& net, const Scene& scene, const Now& now, int
   std::vector<Usual> parts(pieces(now.count, SUMMED));
   std::vector<float> bias(net.entry_bias, net.entry_bias + net.hidden);
   for (int t = 0; t < TIMES; t++)
-    for (int64_t c = 0; c < net.hidden; c++) bias[c] += now.times[t] * net.entry[(VARYING + t) * net.hidden + c];
+    for (int64_t c = 0; c < net.hidden; c++) bias[c] += now.times[t] * net.entry[(net.varying + t) * net.hidden + c];
   std::vector<Rows> rows(threads, Rows(net.hidden));
   const size_t active = find_active(scene, now), blocks = pieces(active, BLOCK);
   Crew crew(4 + scene.layer_count);

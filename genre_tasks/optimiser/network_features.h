@@ -5,10 +5,10 @@
 
 #include "network_rows.h"
 
-constexpr int STRIDE = 64, QUAT = 6, FIXED = 4, TIMES = 4;
+constexpr int STRIDE = 80, QUAT = 6, FIXED = 4, TIMES = 4;
 constexpr int GROUPS = 5, GROUP_STARTS[GROUPS + 1] = {0, 3, 6, 10, 11, ATTRIBUTES};  // means, scales, quats, opacity, colour
 constexpr float LOG10_2_HALF = 0.150514998f;
-static_assert(VARYING <= STRIDE, "a row of features");
+static_assert(VARYING + RESIDUALS <= STRIDE, "a row of features");
 
 // The state and what comes of it; pointers and 64-bit numbers only, in the order of fused_library.py.
 struct Now {
@@ -19,7 +19,18 @@ struct Now {
   const float* times;  // [TIMES]: the features behind the varying ones
   const float* rates;  // [14], their sign and the schedule included
   float* delta;        // [N, 14]
+  const float *residuals, *part;  // [N, RESIDUALS] or null; [1] of the schedule
 };
+
+INLINE float by_share(const Now& now, size_t i) { return 1.f / (now.residuals[RESIDUALS * i + 4] + SHARE_FLOOR_PX); }
+
+// What moves the colours towards the mean residual.
+INLINE Lanes relaxed(const Now& now, size_t i, float relaxation) {
+  const float factor = *now.part * (1.f + relaxation) * by_share(now, i);
+  Lanes r{};
+  for (int k = 0; k < 3; k++) r[GROUP_STARTS[4] + k] = factor * now.residuals[RESIDUALS * i + k];
+  return r;
+}
 
 INLINE const float* counted(const Now& now, size_t i) {
   const int64_t n = (int64_t)now.seen[i];
@@ -95,4 +106,10 @@ INLINE void features(const Now& now, const float* base, const float* fixed, cons
   std::memcpy(x + 56, fixed + FIXED * i, 4 * FIXED);
   x[60] = now.seen_now[i];
   x[61] = by_seen[2];
+  if (!now.residuals) return;
+  const float *residual = now.residuals + RESIDUALS * i, inverse_share = by_share(now, i);
+  auto within = [](float v, float low, float high) { return v < low ? low : v > high ? high : v; };  // NaN stays NaN
+  for (int k = 0; k < 3; k++) x[62 + k] = within(5.f * residual[k] * inverse_share, -2.f, 2.f);
+  x[65] = within(5.f * std::sqrt(residual[3] * inverse_share), 0.f, 4.f);
+  x[66] = std::log1p(residual[4]) * .25f;
 }

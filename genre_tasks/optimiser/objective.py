@@ -13,7 +13,7 @@ from torch import Tensor
 
 from genre_tasks.config import LossConfig
 from genre_tasks.errors import NonFiniteError
-from genre_tasks.optimiser.loss import Distance, image_gradients, plan_loss
+from genre_tasks.optimiser.loss import Distance, image_gradients, plan_loss, residual_image
 from genre_tasks.optimiser.passes import RIGID_AND_DULL, Beside, begin
 from genre_tasks.optimiser.state import Frame
 from genre_tasks.optimiser.targets import Target
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 class Sight:
     """What an iteration sees: the loss, its gradient [N, 14] with respect to the offsets, and culled Gaussians.
 
-    ``by_deformation``: as its ``offsets``, where actors deform.
+    ``by_deformation``: as its ``offsets``, where actors deform. ``residuals``: as a ``Pass`` has them, where asked for.
     """
 
     loss: float
@@ -35,6 +35,7 @@ class Sight:
     culled: dict[str, int]
     by_deformation: Tensor | None = None
     gloss: GlossSight | None = None
+    residuals: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -56,13 +57,14 @@ class Objective:
         iteration: int,
         generator: torch.Generator,
         beside: Beside = RIGID_AND_DULL,
+        residuals: bool = False,
     ) -> Sight:
-        """``iteration`` and ``generator`` decide where the perceptual term is taken."""
+        """``iteration`` and ``generator`` decide where the perceptual term is taken; ``residuals``: see ``Sight``."""
         plan = plan_loss(self.config, targets, iteration, generator, self.distance is not None)
         image = begin(frame, offsets, targets, self.settings, beside)
         loss, by_color, by_depth = image_gradients(self.config, image.color, image.depth, targets, plan, self.distance)
-        gradient = image.gradient(by_color, by_depth)
-        return Sight(loss, gradient, image.culled, image.by_deformation, image.gloss)
+        gradient = image.gradient(by_color, by_depth, residual_image(image.color, targets) if residuals else None)
+        return Sight(loss, gradient, image.culled, image.by_deformation, image.gloss, image.residuals)
 
 
 def check_finite(values: Tensor, name: str, stage: str, **where: object) -> None:

@@ -17,6 +17,7 @@ from genre_tasks.render import cpu
 from genre_tasks.render.api import cameras_of, colors_of, render_views, velocities_of
 from genre_tasks.render.blur import Moments, PosedView, mean, mean_gradient
 from genre_tasks.render.types import RenderSettings
+from genre_tasks.scene.graph import FIRST_ACTOR
 
 if TYPE_CHECKING:
     from genre_tasks.optimiser.deforming import Shift
@@ -42,6 +43,8 @@ class Pass(Protocol):
     """``color`` [V, H, W, 3], expected ``depth`` [V, H, W] and ``culled`` as in ``Render``.
 
     ``by_deformation``: after :meth:`gradient`, as the deformation's ``offsets``; ``None`` where actors are rigid.
+    ``residuals`` [N, 5]: after it, where it was given a residual image r: the sums over all pixels of w r, w ‖r‖² and
+    w, with w a Gaussian's share of the pixel.
     """
 
     color: Tensor
@@ -49,11 +52,13 @@ class Pass(Protocol):
     culled: dict[str, int]
     by_deformation: Tensor | None
     gloss: GlossSight | None
+    residuals: Tensor | None
 
-    def gradient(self, by_color: Tensor, by_depth: Tensor) -> Tensor:
+    def gradient(self, by_color: Tensor, by_depth: Tensor, residual: Tensor | None = None) -> Tensor:
         """[N, 14] with respect to the offsets, from the gradients of the images; once, and they are used up.
 
-        Where there are harmonics, ``gloss`` is what these views tell of them from then on.
+        Where there are harmonics, ``gloss`` is what these views tell of them from then on. ``residual`` [V, H, W, 3]:
+        see ``residuals``.
         """
 
 
@@ -70,6 +75,7 @@ class TorchPass:
     ) -> None:
         deformation, harmonics = beside.deformation, beside.harmonics
         self._leaf, scene = offsets.detach().requires_grad_(), frame.scene
+        self._moves = (scene.nodes >= FIRST_ACTOR) & bool(scene.actors)
         self._nodes = None if deformation is None else deformation.offsets.detach().requires_grad_()
         self._harmonics = None if harmonics is None else harmonics.detach().requires_grad_()
         self.by_deformation: Tensor | None = None
@@ -83,9 +89,12 @@ class TorchPass:
         self._color, self.culled = image.color, image.culled
         self.color, self.depth = image.color.detach(), self._depth.detach()
         self.gloss: GlossSight | None = None
+        self.residuals: Tensor | None = None
 
-    def gradient(self, by_color: Tensor, by_depth: Tensor) -> Tensor:
+    def gradient(self, by_color: Tensor, by_depth: Tensor, residual: Tensor | None = None) -> Tensor:
         """As in :class:`Pass`."""
+        if residual is not None:
+            self.residuals = self._shown_of(residual)
         if self._seen is not None:
             self._seen.retain_grad()
         torch.autograd.backward([self._color, self._depth], [by_color, by_depth], retain_graph=self._seen is not None)
@@ -99,6 +108,24 @@ class TorchPass:
             assert self._harmonics.grad is not None
             self.gloss = GlossSight(self._harmonics.grad, sums, views[:, 11:14])
         return self._leaf.grad
+
+    def _shown_of(self, residual: Tensor) -> Tensor:
+        """[N, 5], by the gradients of the colours: a pixel's colour is linear in them, with w as its slope."""
+        square = residual.square().sum(-1)
+        others = torch.stack([square, torch.ones_like(square), torch.zeros_like(square)], -1)
+        of = self._leaf if self._seen is None else self._seen  # what views see of harmonics is held above 0
+        grads = [torch.autograd.grad(self._color, of, image, retain_graph=True)[0] for image in (residual, others)]
+        found = torch.cat([grads[0][..., -3:], grads[1][..., -3:-1]], -1)
+        return found if self._seen is None else self._own(found.sum(0))
+
+    def _own(self, posed: Tensor) -> Tensor:
+        """Sums [N, C] over the frames of values [N', C] that are laid out as by ``SceneGraph.posed``."""
+        moves = self._moves
+        still = int((~moves).sum())
+        out = posed.new_zeros((len(moves), posed.shape[1]))
+        out[~moves] = posed[:still]
+        out[moves] = posed[still:].reshape(-1, int(moves.sum()), posed.shape[1]).sum(0)
+        return out
 
 
 class CompiledPass:
@@ -129,32 +156,40 @@ class CompiledPass:
         self.color, self._alpha = self._images[:2]
         self.depth = posing.expected_depth(*self._images[1:])
         self.gloss: GlossSight | None = None
+        self.residuals: Tensor | None = None
 
-    def gradient(self, by_color: Tensor, by_depth: Tensor) -> Tensor:
+    def gradient(self, by_color: Tensor, by_depth: Tensor, residual: Tensor | None = None) -> Tensor:
         """As in :class:`Pass`."""
         by_alpha, by_depth = posing.expected_depth_gradient(self._alpha, self.depth, by_depth.contiguous())
         by_splats = posing.arrays(len(self._posed.splats[0]))
         by_images = by_color, by_alpha, by_depth
         assert self._batch is not None
         if self._shown is None:
-            cpu.backward(self._batch, self._splats, self._images, by_images, self._threads, by_splats)
+            shown = self._backward(by_images, by_splats, residual)
             out = self._posing.gradient(self._posed, by_splats, self._threads)
         else:
-            out = self._glossy_gradient(self._shown, by_images, by_splats)
+            out, shown = self._glossy_gradient(self._shown, by_images, by_splats, residual)
+        if shown is not None:
+            self.residuals = self._posing.residuals(self._posed, shown, self._threads)
         if self._shift is not None:
             self.by_deformation = self._shift.gradient(by_splats[0], out)
         return out
 
-    def _glossy_gradient(self, shown: Shine, by_images: cpu.Images, by_splats: cpu.Arrays) -> Tensor:
-        by_colors = torch.empty_like(self._splats[4])
+    def _backward(self, by_images: cpu.Images, by_splats: cpu.Arrays, residual: Tensor | None) -> Tensor | None:
         assert self._batch is not None
-        cpu.backward(self._batch, self._splats, self._images, by_images, self._threads, (*by_splats[:4], by_colors))
+        return cpu.backward(self._batch, self._splats, self._images, by_images, self._threads, by_splats, residual)
+
+    def _glossy_gradient(
+        self, shown: Shine, by_images: cpu.Images, by_splats: cpu.Arrays, residual: Tensor | None
+    ) -> tuple[Tensor, Tensor | None]:
+        by_colors = torch.empty_like(self._splats[4])
+        residuals = self._backward(by_images, (*by_splats[:4], by_colors), residual)
         by_splats[4].zero_()
         out = self._posing.gradient(self._posed, by_splats, self._threads)
         by_means, by_own, self.gloss = shown.gradient(by_colors)
         out[:, 0:3] += by_means
         out[:, 11:14] += by_own
-        return out
+        return out, residuals
 
 
 class Shine:
@@ -194,18 +229,28 @@ class BlurredPass:
         self._sharp, self._moments = sharp, moments
         self.by_deformation: Tensor | None = None
         self.gloss: GlossSight | None = None
+        self.residuals: Tensor | None = None
         self.color = torch.stack(map_single_threaded(lambda part: mean(sharp.color[part]), moments.parts))
         self.depth, self.culled = sharp.depth[moments.middle], sharp.culled
 
-    def gradient(self, by_color: Tensor, by_depth: Tensor) -> Tensor:
-        """As in :class:`Pass`."""
+    def gradient(self, by_color: Tensor, by_depth: Tensor, residual: Tensor | None = None) -> Tensor:
+        """As in :class:`Pass`; a view's residual is that of each of its moments, each an equal share of its pixels."""
         sharp, parts = self._sharp, self._moments.parts
         pairs = list(zip(parts, by_color, strict=True))
         by_moments = torch.cat(map_single_threaded(lambda pair: mean_gradient(sharp.color[pair[0]], pair[1]), pairs))
         by_depths = torch.zeros_like(sharp.depth)
         by_depths[self._moments.middle] = by_depth
-        out = sharp.gradient(by_moments, by_depths)
+        if residual is not None:
+            residual = torch.cat(
+                [
+                    image.expand(part.stop - part.start, *image.shape)
+                    for image, part in zip(residual, parts, strict=True)
+                ]
+            )
+        out = sharp.gradient(by_moments, by_depths, residual)
         self.by_deformation, self.gloss = sharp.by_deformation, sharp.gloss
+        if sharp.residuals is not None:
+            self.residuals = sharp.residuals * (len(parts) / len(sharp.color))
         return out
 
 

@@ -9,7 +9,7 @@
 
 #include "../compiled/calls.h"
 
-constexpr int BLOCK = 64, ATTRIBUTES = 14;
+constexpr int BLOCK = 64, ATTRIBUTES = 14, RESIDUALS = 5;
 enum Attribute { MEAN = 0, SCALE = 3, QUAT = 6, OPACITY = 10, COLOR = 11 };
 
 // An actor at a frame; where it is absent, it does not move.
@@ -158,6 +158,21 @@ int genre_pose_gradient(const Gaussians* in, const Frames* frames, const float* 
     each_block(in->count, threads, [&](int64_t first, int count) {
       for (int64_t i = first; i < first + count; i++)
         gradient_of_one(*in, *frames, i, scales, slopes[i], *by_splats, by_offsets + ATTRIBUTES * i);
+    });
+  });
+}
+
+// What Gaussians show of a residual image, [N, RESIDUALS], from what their splats show.
+int genre_pose_residuals(const Gaussians* in, int64_t frames, const float* by_splats, int threads, float* out) {
+  return guarded([&] {
+    each_block(in->count, threads, [&](int64_t first, int count) {
+      for (int64_t i = first; i < first + count; i++) {
+        float sum[RESIDUALS] = {};
+        int64_t slot = in->slot[i];
+        for (int64_t f = 0; f < (in->actor[i] < 0 ? 1 : frames); f++, slot += in->moving)
+          for (int k = 0; k < RESIDUALS; k++) sum[k] += by_splats[RESIDUALS * slot + k];
+        put<RESIDUALS>(out + RESIDUALS * i, sum);
+      }
     });
   });
 }

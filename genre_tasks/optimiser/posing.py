@@ -56,6 +56,7 @@ def load_posing(folder: Path = KERNEL.folder) -> ctypes.CDLL:
     gaussians, frames, splats = (ctypes.POINTER(s) for s in (_Gaussians, _Frames, _Splats))
     library.genre_pose.argtypes = [gaussians, frames, p, i, splats, p]
     library.genre_pose_gradient.argtypes = [gaussians, frames, p, p, splats, i, p]
+    library.genre_pose_residuals.argtypes = [gaussians, n, p, i, p]
     library.genre_expected_depth.argtypes = [n, p, p, p]
     library.genre_expected_depth_gradient.argtypes = [n, p, p, p]
     return library
@@ -128,6 +129,13 @@ class Posing:
         scales, slopes = posed.splats[1].data_ptr(), posed.slopes.data_ptr()
         pointers = scales, slopes, _Splats.of(by_splats), threads, out.data_ptr()
         _check(load_posing().genre_pose_gradient(self._in, frames, *pointers))
+        return out
+
+    def residuals(self, posed: Posed, by_splats: Tensor, threads: int) -> Tensor:
+        """What the Gaussians show of a residual image, [N, 5], from what their splats show (``cpu.backward``)."""
+        out = torch.empty(len(self._start), by_splats.shape[1])
+        pointers = by_splats.data_ptr(), threads, out.data_ptr()
+        _check(load_posing().genre_pose_residuals(self._in, len(posed.frames), *pointers))
         return out
 
 

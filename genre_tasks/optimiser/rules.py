@@ -25,7 +25,13 @@ class Step(Protocol):
 
 
 class StepRule(Protocol):
-    """How offsets move: the learned optimiser or tuned Adam."""
+    """How offsets move: the learned optimiser or tuned Adam.
+
+    ``residuals``: whether the states that it is given have them.
+    """
+
+    @property
+    def residuals(self) -> bool: ...
 
     def start(self, frame: Frame, centre: Tensor) -> Step:
         """Prepares for one scene; ``centre`` [3] is the mean position of the source cameras."""

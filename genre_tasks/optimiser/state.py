@@ -11,7 +11,7 @@ from torch import Tensor
 
 from genre_tasks.optimiser import fused_state
 from genre_tasks.optimiser.ground import along_ground, ground_planes
-from genre_tasks.optimiser.network_constants import DEVIATION_FLOOR
+from genre_tasks.optimiser.network_constants import DEVIATION_FLOOR, SHARE_FLOOR_PX
 from genre_tasks.optimiser.posing import Posing
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import DISTANT, SceneGraph
@@ -96,6 +96,7 @@ class State:
     """``offsets`` [N, 14]; moments of the gradient over the iterations that saw a Gaussian; how many those are.
 
     ``seen_now`` [N, 1] is 1 where the latest gradient is not zero, ``seen`` [N, 1] counts those iterations.
+    ``residuals`` [N, 5]: of the latest iteration, as a ``Pass`` has them, where the rule asks for them.
     """
 
     offsets: Tensor
@@ -104,6 +105,7 @@ class State:
     seen: Tensor  # [N, 1]
     seen_now: Tensor  # [N, 1]
     iteration: int = 0
+    residuals: Tensor | None = None
 
     @staticmethod
     def start(count: int, like: Tensor) -> State:
@@ -111,16 +113,17 @@ class State:
         zeros, column = like.new_zeros((count, 14)), like.new_zeros((count, 1))
         return State(zeros, zeros, zeros, column, column)
 
-    def saw(self, gradient: Tensor) -> State:
-        """With this iteration's gradient [N, 14] with respect to ``offsets`` taken into the moments."""
+    def saw(self, gradient: Tensor, residuals: Tensor | None = None) -> State:
+        """With this iteration's gradient [N, 14] with respect to ``offsets`` taken into the moments; its residuals."""
         if fused_state.fits(gradient, self.first, self.second, self.seen):
             decays = (FIRST_DECAY, SECOND_DECAY)
             first, second, seen, now = fused_state.saw(gradient, self.first, self.second, self.seen, decays)
-            return replace(self, first=first, second=second, seen=seen, seen_now=now)
+            return replace(self, first=first, second=second, seen=seen, seen_now=now, residuals=residuals)
         now = (gradient != 0).any(1, keepdim=True).to(gradient.dtype)
         first = self.first + now * (1 - FIRST_DECAY) * (gradient - self.first)
         second = self.second + now * (1 - SECOND_DECAY) * (gradient * gradient - self.second)
-        return replace(self, first=first, second=second, seen=self.seen + now, seen_now=now)
+        seen = self.seen + now
+        return replace(self, first=first, second=second, seen=seen, seen_now=now, residuals=residuals)
 
     def moved(self, frame: Frame, delta: Tensor) -> State:
         """With ``delta`` [N, 14] applied to what this iteration's views saw, in the ground's plane where it lies there.
@@ -150,3 +153,8 @@ class State:
     def direction(self) -> Tensor:
         """Adam's normalised step, [N, 14], of order 1; exactly 0 where nothing has been seen."""
         return (self.first / (1 - FIRST_DECAY ** self.seen.clamp_min(1)) / self.deviation()).clamp(-6.0, 6.0)
+
+    def mean_residual(self) -> Tensor:
+        """[N, 3] over the pixels that show a Gaussian, by its share of them; towards 0 below a pixel in all."""
+        assert self.residuals is not None
+        return self.residuals[:, :3] / (self.residuals[:, 4:] + SHARE_FLOOR_PX)

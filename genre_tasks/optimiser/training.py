@@ -19,7 +19,7 @@ from genre_tasks.config import LossConfig, Section
 from genre_tasks.optimiser.episodes import Course, Episode, TrainingScene
 from genre_tasks.optimiser.learned import LearnedOptimiser
 from genre_tasks.optimiser.loss import Distance
-from genre_tasks.optimiser.objective import Objective
+from genre_tasks.optimiser.objective import Objective, Sight
 
 
 class MetaConfig(Section):
@@ -86,7 +86,7 @@ class MetaTraining:
         place = self.done % self.config.pool
         episode = self.pool[place]
         if episode.sight is None:
-            episode.sight = episode.look(self.seen, self.generator)
+            episode.sight = self._look(episode)
         objective, seen_loss, judged_loss = self._segment(episode)
         for group in self.optimiser.param_groups:
             group["lr"] = self._rate()
@@ -112,7 +112,7 @@ class MetaTraining:
         move = episode.mover(self.network)
         for _ in range(self.config.segment):
             deltas.append(episode.step(self.network, move, rows))
-            episode.sight = episode.look(self.seen, self.generator)
+            episode.sight = self._look(episode)
             gradients.append(episode.sight.gradient[rows] / (episode.sight.loss * self.config.segment))
         judged = episode.judge(self.unseen, self.generator)
         later = self.config.judged * judged.gradient[rows] / judged.loss
@@ -122,13 +122,16 @@ class MetaTraining:
             total = total + (delta * later).sum() * (count / len(rows))
         return total, episode.sight.loss, judged.loss  # type: ignore[union-attr]
 
+    def _look(self, episode: Episode) -> Sight:
+        return episode.look(self.seen, self.generator, self.network.residuals)
+
     def _fill(self) -> None:
         """A pool at random ages, so that early and late iterations are trained from the start."""
         for _ in range(self.config.pool):
             episode = self._fresh()
             move = episode.mover(self.network)
             for _ in range(self._below(episode.course.iterations)):
-                episode.sight = episode.look(self.seen, self.generator)
+                episode.sight = self._look(episode)
                 episode.step_only(move)
             episode.sight = None
             self.pool.append(episode)

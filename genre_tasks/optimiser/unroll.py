@@ -79,9 +79,9 @@ def unroll(
         batch = [t for s in samplers for t in s.draw()]
         deformation = scene.deformation if fit is None else fit.deformation
         beside = Beside(deformation, None if gloss is None else gloss.harmonics)
-        sight = objective(frame, state.offsets, batch, i, generator, beside)
+        sight = objective(frame, state.offsets, batch, i, generator, beside, rule.residuals)
         check_finite(sight.gradient, "gradient", plan.stage)
-        state = state.saw(sight.gradient)
+        state = state.saw(sight.gradient, sight.residuals)
         state = state.moved(frame, step(state, sight.gradient, plan.iterations))
         check_finite(state.offsets, "updated Gaussians", plan.stage)
         if fit is not None and sight.by_deformation is not None:

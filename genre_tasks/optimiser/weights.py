@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.optimiser.learned import LearnedOptimiser, NetworkConfig
+from genre_tasks.optimiser.network_constants import RESIDUALS, VARYING
 
 REMEDY = "Give weights made by `genre train gnet` or `genre train enet`, or use `builtin`."
 
@@ -53,6 +54,19 @@ def save(network: LearnedOptimiser, weights: Path) -> None:
     tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
     write_atomically(weights.with_suffix(".json"), (network.config.model_dump_json(indent=2) + "\n").encode())
     write_atomically(weights, serialise(tensors))
+
+
+def with_residuals(network: LearnedOptimiser) -> dict[str, torch.Tensor]:
+    """The weights of a network that is told residuals: those of ``network``, and zeros for what these bring."""
+    weights = dict(network.state_dict())
+    if network.residuals:
+        return weights
+    entry, weight, bias = weights["entry.weight"], weights["head.weight"], weights["head.bias"]
+    told = entry.new_zeros((len(entry), RESIDUALS))
+    weights["entry.weight"] = torch.cat([entry[:, :VARYING], told, entry[:, VARYING:]], 1)
+    weights["head.weight"] = torch.cat([weight, weight.new_zeros((1, weight.shape[1]))])
+    weights["head.bias"] = torch.cat([bias, bias.new_zeros(1)])
+    return weights
 
 
 def write_atomically(path: Path, data: bytes) -> None:

@@ -73,14 +73,30 @@ def forward(
     return (color, alpha, depth), counts, _Batch(handle, velocities) if keep else None
 
 
-def backward(batch: _Batch, arrays: Arrays, images: Images, by_images: Images, threads: int, out: Arrays) -> None:
-    """Writes the gradients of ``arrays`` to ``out``, from those of the images."""
+def backward(
+    batch: _Batch,
+    arrays: Arrays,
+    images: Images,
+    by_images: Images,
+    threads: int,
+    out: Arrays,
+    residual: Tensor | None = None,
+) -> Tensor | None:
+    """Writes the gradients of ``arrays`` to ``out``, from those of the images.
+
+    With a ``residual`` r [V, H, W, 3] it returns what of it each Gaussian shows, [N, 5]: the sums over all pixels of
+    w r, w ‖r‖² and w, where w is the Gaussian's share of the pixel.
+    """
     v = [x.contiguous() for x in by_images]
+    back = None if residual is None else torch.empty(len(arrays[0]), 5)
+    residual = None if residual is None else residual.contiguous()
     status = load_kernel().genre_backward(
         batch.handle, len(arrays[0]), *(a.data_ptr() for a in arrays), arrays[4].dim() == 3, _pointer(batch.velocities),
-        *(a.data_ptr() for a in images), *(x.data_ptr() for x in v), threads, *(g.data_ptr() for g in out),
+        *(a.data_ptr() for a in images), *(x.data_ptr() for x in v), _pointer(residual), threads,
+        *(g.data_ptr() for g in out), _pointer(back),
     )  # fmt: skip
     check_status(status)
+    return back
 
 
 def _pointer(tensor: Tensor | None) -> int | None:

@@ -13,10 +13,12 @@ static Shelf<GradientList>& gradients_shelf() { static auto* s = new Shelf<Gradi
 struct Gradients {
   float *means, *scales, *quats, *opacities, *colors;
   size_t color_step;  // from a view's colours to the next one's; 0: all views have the same
+  float* back;        // [N, BACK_SUMS] of a residual image, or null
 
   void clear(size_t count, size_t views, int threads) {
     const size_t hues = color_step ? 3 * views : 3;
-    const std::pair<float*, size_t> all[] = {{means, 3}, {scales, 3}, {quats, 4}, {opacities, 1}, {colors, hues}};
+    const std::pair<float*, size_t> all[] = {{means, 3}, {scales, 3}, {quats, 4}, {opacities, 1}, {colors, hues},
+                                             {back, back ? BACK_SUMS : 0}};
     for (auto [p, entries] : all) prefer_huge_pages(p, 4 * entries * count);
     parallel(threads, [&](int w) {
       for (auto [p, entries] : all) std::fill(p + share(entries * count, w, threads), p + share(entries * count, w + 1, threads), 0.f);
@@ -25,12 +27,14 @@ struct Gradients {
   void add(const GradientList& list, int view) {
     float* hue = colors + color_step * view;
     for (size_t at = 0; at < list.id.size(); at++) {
-      auto x = [&](int k) { return list.gradient[at / LANES * ATTRIBUTES + k][(int)(at % LANES)]; };
+      auto x = [&](int k) { return list.gradient[at / LANES * list.rows + k][(int)(at % LANES)]; };
       const size_t i = list.id[at];
       for (int k = 0; k < 3; k++)
         means[3 * i + k] += x(MEAN + k), scales[3 * i + k] += x(SCALE + k), hue[3 * i + k] += x(COLOR + k);
       for (int k = 0; k < 4; k++) quats[4 * i + k] += x(QUAT + k);
       opacities[i] += x(OPACITY);
+      if (back)
+        for (int k = 0; k < BACK_SUMS; k++) back[BACK_SUMS * i + k] += x(ATTRIBUTES + k);
     }
   }
 };
@@ -121,16 +125,17 @@ int genre_forward(int count, const float* means, const float* scales, const floa
   });
 }
 
-// `color`, `alpha`, `depth` are what genre_forward wrote.
+// `color`, `alpha`, `depth` are what genre_forward wrote. With a `residual` [V, H, W, 3], `back` [N, 5] gets the sums over
+// pixels and views of w r, w |r|^2 and w, the weights being those of the forward pass; else both are null.
 int genre_backward(void* batch, int count, const float* means, const float* scales, const float* quats,
                    const float* opacities, const float* colors, int by_view, const float* velocities, const float* color,
                    const float* alpha, const float* depth, const float* v_color, const float* v_alpha, const float* v_depth,
-                   int threads, float* grad_means, float* grad_scales, float* grad_quats, float* grad_opacities,
-                   float* grad_colors) {
+                   const float* residual, int threads, float* grad_means, float* grad_scales, float* grad_quats,
+                   float* grad_opacities, float* grad_colors, float* back) {
   return guarded([&] {
     auto& views = static_cast<Batch*>(batch)->views;
     const size_t color_step = by_view ? 3 * (size_t)count : 0;
-    Gradients g{grad_means, grad_scales, grad_quats, grad_opacities, grad_colors, color_step};
+    Gradients g{grad_means, grad_scales, grad_quats, grad_opacities, grad_colors, color_step, back};
     g.clear((size_t)count, views.size(), std::max(1, threads));
     ScratchSet scratch(std::max(1, threads));
     InOrder sum(g);
@@ -138,7 +143,7 @@ int genre_backward(void* batch, int count, const float* means, const float* scal
       const GaussianArrays in{count, means, scales, quats, opacities, colors + color_step * v, velocities};
       size_t at = (size_t)views[v]->camera.width * views[v]->camera.height * v;
       backward(*views[v], *scratch.of[w], in, inside, Images{color + 3 * at, alpha + at, depth + at},
-               Images{v_color + 3 * at, v_alpha + at, v_depth + at});
+               Images{v_color + 3 * at, v_alpha + at, v_depth + at}, residual ? residual + 3 * at : nullptr);
       sum.add(v, *scratch.of[w], inside);
     });
   });

@@ -140,11 +140,20 @@ struct Images {
 };
 
 // Also front to back: what lies behind a layer is the pixel's value minus what came so far, so no list per pixel is kept.
-// The ten sums of a pair go to its own slot and are added later: no atomics, the same bits at any thread count.
+// The sums of a pair go to its own slot and are added later: no atomics, the same bits at any thread count.
+// With BACK also what of `residual` [H, W, 3] each layer shows: the sums of w r, w |r|^2 and w.
+template <bool BACK>
 static void blend_backward(const Footprint* footprints, const Pair* pair, const Pair* end, int X, int Y, int width, int height,
-                           const uint16_t* visited, Images out, Images grad, Lanes* slots) {
+                           const uint16_t* visited, Images out, Images grad, const float* residual, Lanes* slots) {
   Lanes T[BLOCKS], behind[BLOCKS], vr[BLOCKS], vg[BLOCKS], vb[BLOCKS], vd[BLOCKS];
+  Lanes rr[BACK ? BLOCKS : 1], rg[BACK ? BLOCKS : 1], rb[BACK ? BLOCKS : 1];
   for (int b = 0; b < BLOCKS; b++) {
+    if constexpr (BACK) {
+      rr[b] = rg[b] = rb[b] = Lanes{};
+      for_pixels(b, X, Y, width, height, [&](int i, size_t k) {
+        rr[b][i] = residual[3 * k], rg[b][i] = residual[3 * k + 1], rb[b][i] = residual[3 * k + 2];
+      });
+    }
     Lanes red{}, green{}, blue{}, z{}, alpha{}, v_alpha{};
     vr[b] = vg[b] = vb[b] = vd[b] = Lanes{}, T[b] = broadcast(-1.f);
     for_pixels(b, X, Y, width, height, [&](int i, size_t k) {
@@ -192,14 +201,24 @@ static void blend_backward(const Footprint* footprints, const Pair* pair, const 
     for (int i = 0, k = 0; k < n; k++) {
       const Layer& layer = layers[k];
       Lanes sum_v{}, sum_s{}, sum_ss{}, sum_sy{}, sum_y{}, sum_yy{}, red{}, green{}, blue{}, z{};
+      Lanes back_red{}, back_green{}, back_blue{}, back_square{}, weight{};
       for (; i < stop[k]; i++) {
         const int b = work[i] % BLOCKS;
         Lanes w = ws[i], v = alphas[i];
         red += w * vr[b], green += w * vg[b], blue += w * vb[b], z += w * vd[b];
         Lanes s = layer.s_at(b), dy = layer.dy_at(b, grid), vs = v * s, vy = v * dy;
         sum_v += v, sum_s += vs, sum_y += vy, sum_ss += vs * s, sum_sy += vs * dy, sum_yy += vy * dy;
+        if constexpr (BACK) {
+          Lanes wr = w * rr[b], wg = w * rg[b], wb = w * rb[b];
+          back_red += wr, back_green += wg, back_blue += wb, weight += w;
+          back_square += wr * rr[b] + wg * rg[b] + wb * rb[b];
+        }
       }
-      stream(&slots[slot[k]], sums({sum_v, sum_s, sum_ss, sum_sy, sum_y, sum_yy, red, green, blue, z}));
+      if constexpr (BACK)
+        stream(&slots[slot[k]], sums({sum_v, sum_s, sum_ss, sum_sy, sum_y, sum_yy, red, green, blue, z, back_red, back_green,
+                                      back_blue, back_square, weight}));
+      else
+        stream(&slots[slot[k]], sums({sum_v, sum_s, sum_ss, sum_sy, sum_y, sum_yy, red, green, blue, z}));
     }
   }
   stream_end();

@@ -209,6 +209,7 @@ INLINE int footprints(const Camera& c, const GaussianArrays& in, uint32_t first,
 // Sums over pixels for one Gaussian, in the order in which the blend's backward makes them; v = -dL/dsigma.
 enum Sum { S_V, S_S, S_SS, S_SY, S_Y, S_YY, S_RED, S_GREEN, S_BLUE, S_Z };
 enum Attribute { MEAN = 0, SCALE = 3, QUAT = 6, OPACITY = 10, COLOR = 11, ATTRIBUTES = 14 };
+constexpr int BACK_SUMS = ALL_SUMS - SUMS;  // behind these: what of a residual image a Gaussian shows
 
 // Gradient of the 14 attributes of the Gaussians `id` (LANES of them), whose footprints are at `place`, from their sums.
 template <bool ROLLS, bool BENDS, bool SMOOTHS>

@@ -37,7 +37,8 @@ struct View {
 // The gradients of one view's Gaussians that some ray reached: what is hidden has none.
 struct GradientList {
   std::vector<uint32_t> id;
-  Buffer<Lanes> gradient;  // [id / LANES, ATTRIBUTES], a Gaussian a lane
+  int rows = ATTRIBUTES;   // or with the sums of a residual image behind them
+  Buffer<Lanes> gradient;  // [id / LANES, rows], a Gaussian a lane
   size_t bytes() const { return gradient.bytes() + id.capacity() * sizeof(uint32_t); }
 };
 
@@ -225,9 +226,9 @@ static void forward(View& v, Scratch& s, const GaussianArrays& in, int threads, 
 
 // Which lane of `sums` holds which sum: found by trying, the folds permute.
 static std::vector<int> lane_of_sums() {
-  std::vector<int> lane(SUMS);
-  for (int k = 0; k < SUMS; k++) {
-    Lanes x[SUMS] = {};
+  std::vector<int> lane(ALL_SUMS);
+  for (int k = 0; k < ALL_SUMS; k++) {
+    Lanes x[ALL_SUMS] = {};
     x[k] = broadcast(1.f / LANES);
     Lanes r = sums(x);
     for (int i = 0; i < LANES; i++)
@@ -237,20 +238,22 @@ static std::vector<int> lane_of_sums() {
 }
 
 template <bool ROLLS, bool BENDS, bool SMOOTHS>
-static void project_all_backward(const View& v, Scratch& s, const GaussianArrays& in, int threads) {
+static void project_all_backward(const View& v, Scratch& s, const GaussianArrays& in, bool back, int threads) {
   static const std::vector<int> lane = lane_of_sums();
   parallel(threads, [&](int w) {
     uint32_t place[LANES], id[LANES];
-    Lanes sum[SUMS] = {}, gradient[ATTRIBUTES];
+    Lanes sum[SUMS] = {}, gradient[ATTRIBUTES], shown[BACK_SUMS] = {};
+    const int rows = ATTRIBUTES + (back ? BACK_SUMS : 0);
     int filled = 0;
     const size_t begin = share(v.input.n, w, threads), end = share(v.input.n, w + 1, threads);
     GradientList& list = *s.gradients[w];
-    list.id.clear(), list.gradient.resize(((end - begin) / LANES + 1) * ATTRIBUTES);
+    list.id.clear(), list.rows = rows, list.gradient.resize(((end - begin) / LANES + 1) * rows);
     auto flush = [&] {
       for (int i = filled; i < LANES; i++) place[i] = place[0];
       for (int i = 0; i < LANES; i++) id[i] = v.id[place[i]];
       project_backward<ROLLS, BENDS, SMOOTHS>(v.camera, in, id, v.input.p, place, sum, gradient);
-      std::copy(gradient, gradient + ATTRIBUTES, &list.gradient[list.id.size() / LANES * ATTRIBUTES]);
+      Lanes* out = &list.gradient[list.id.size() / LANES * rows];
+      std::copy(gradient, gradient + ATTRIBUTES, out), std::copy(shown, shown + rows - ATTRIBUTES, out + ATTRIBUTES);
       list.id.insert(list.id.end(), id, id + filled);
       filled = 0;
     };
@@ -261,6 +264,8 @@ static void project_all_backward(const View& v, Scratch& s, const GaussianArrays
         if (v.reached[k]) total += s.slots[k], any = true;
       if (!any) continue;
       for (int k = 0; k < SUMS; k++) sum[k][filled] = total[lane[k]];
+      if (back)
+        for (int k = 0; k < BACK_SUMS; k++) shown[k][filled] = total[lane[SUMS + k]];
       place[filled++] = (uint32_t)i;
       if (filled == LANES) flush();
     }
@@ -268,16 +273,18 @@ static void project_all_backward(const View& v, Scratch& s, const GaussianArrays
   });
 }
 
-// Leaves a list of gradients for each thread in the scratch.
-static void backward(View& v, Scratch& s, const GaussianArrays& in, int threads, Images out, Images grad) {
+// Leaves a list of gradients for each thread in the scratch; where there is a `residual` [H, W, 3], with its sums.
+static void backward(View& v, Scratch& s, const GaussianArrays& in, int threads, Images out, Images grad,
+                     const float* residual) {
   s.slots.resize(v.pairs.n);
   while ((int)s.gradients.size() < threads) s.gradients.push_back(std::make_unique<GradientList>());
   for_each_tile(v, threads, [&](int t, int X, int Y) {
     const Pair* pairs = v.pairs.p + v.tile_begin[t];
-    blend_backward(v.input.p, pairs, pairs + v.taken[t], X, Y, v.camera.width, v.camera.height,
-                   v.visited.p + v.tile_begin[t], out, grad, s.slots.p);
+    const auto blend = residual ? blend_backward<true> : blend_backward<false>;
+    blend(v.input.p, pairs, pairs + v.taken[t], X, Y, v.camera.width, v.camera.height, v.visited.p + v.tile_begin[t], out, grad,
+          residual, s.slots.p);
   });
   specialised(v.camera, [&](auto rolls, auto bends, auto smooths) {
-    project_all_backward<rolls, bends, smooths>(v, s, in, threads);
+    project_all_backward<rolls, bends, smooths>(v, s, in, residual != nullptr, threads);
   });
 }

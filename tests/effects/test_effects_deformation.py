@@ -176,8 +176,8 @@ def test_an_actor_outside_of_the_views_keeps_its_shape() -> None:
 def test_a_gradient_that_is_not_finite_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     real = CompiledPass.gradient
 
-    def broken(self: CompiledPass, by_color: Tensor, by_depth: Tensor) -> Tensor:
-        out = real(self, by_color, by_depth)
+    def broken(self: CompiledPass, *by_images: Tensor) -> Tensor:
+        out = real(self, *by_images)
         self.by_deformation[0, 1, 2, 0] = torch.nan
         return out
 

@@ -200,6 +200,14 @@ def test_a_planned_scene_has_its_effects_and_plain_ones_their_old_keys(
         assert all(t.shutter is None for t in scene.truth)
 
 
+def test_scenes_of_several_sizes_share_their_images(tmp_path: Path) -> None:
+    store, recipe = TrainJob(str(tmp_path)).store, tiny_scenes(1)[0]
+    small, large = prepare(store, recipe), prepare(store, replace(recipe, max_points=300))
+    assert len(small.start.scene) < len(large.start.scene)
+    kept = {stage: len(list(tmp_path.glob(f"store/*/*/0000/{stage}/*"))) for stage in ("ingest", "truth", "initial")}
+    assert kept == {"ingest": 1, "truth": 1, "initial": 2}
+
+
 def test_an_unsound_scene_is_made_anew(trained: Said, tmp_path: Path) -> None:
     shutil.copytree(trained[0] / "store", tmp_path / "store")
     job = TrainJob(str(tmp_path), "tiny")

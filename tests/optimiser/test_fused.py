@@ -227,6 +227,8 @@ def test_what_is_not_a_number_stays_seen_in_the_state() -> None:
 class _Torch:
     """The rule without the compiled kernel."""
 
+    residuals = False
+
     def __init__(self, network: LearnedOptimiser) -> None:
         self.network = network
 

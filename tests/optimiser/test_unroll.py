@@ -217,6 +217,8 @@ def test_cameras_and_rates_are_where_the_scene_is(truth: SceneGraph) -> None:
 
 def test_a_step_that_is_not_finite_is_named(truth: SceneGraph) -> None:
     class Broken:
+        residuals = False
+
         def start(self, frame: Frame, centre: torch.Tensor):
             def step(state: State, gradient: torch.Tensor, total: int) -> torch.Tensor:
                 delta = torch.zeros_like(gradient)

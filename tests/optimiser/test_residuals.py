@@ -1,0 +1,213 @@
+"""What Gaussians show of a residual image: the sums, the step towards their mean, and the network that is told them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from flows.train import checkpoint
+from flows.train.optimiser import network_from
+from genre_tasks.compiled.loader import supported_isas
+from genre_tasks.config import LossConfig
+from genre_tasks.errors import InputError
+from genre_tasks.logs.types import MotionBlur
+from genre_tasks.optimiser.adam import TunedAdam
+from genre_tasks.optimiser.episodes import TrainingScene
+from genre_tasks.optimiser.learned import LearnedOptimiser, NetworkConfig
+from genre_tasks.optimiser.loss import residual_image
+from genre_tasks.optimiser.objective import Objective
+from genre_tasks.optimiser.passes import Beside, BlurredPass, CompiledPass, TorchPass, begin
+from genre_tasks.optimiser.ssim import SsimTarget
+from genre_tasks.optimiser.state import Frame, State
+from genre_tasks.optimiser.training import MetaConfig, MetaTraining
+from genre_tasks.optimiser.unroll import Plan, unroll
+from genre_tasks.optimiser.weights import load, save
+from genre_tasks.render import kernel_library as renderer
+from genre_tasks.render import render_views
+from genre_tasks.scene.graph import SceneGraph
+from genre_tasks.weights import resolve_weights
+from tests.optimiser import street
+from tests.optimiser.test_fused import CENTRE, TOTAL, _fused_step, _random, _threads, _torch_step
+from tests.optimiser.test_posing import ROLLING, SETTINGS, _offsets, _passes, _Rolling, _scene
+
+TOLD = NetworkConfig(hidden=16, channels=(8, 12), residuals=True)
+
+
+def _residual(like: torch.Tensor) -> torch.Tensor:
+    return torch.randn(like.shape, generator=torch.Generator().manual_seed(4))
+
+
+@pytest.mark.parametrize("kind", ["plain", "rolling", "glossy"])
+def test_the_sums_are_torchs(kind: str) -> None:
+    """The oracle takes them from autograd: the derivative of an image by a Gaussian's colour is its share."""
+    scene, beside = _scene(), Beside()
+    if kind == "glossy":
+        harmonics = 0.3 * torch.randn(len(scene), 3, 3, generator=torch.Generator().manual_seed(8))
+        scene, beside = scene.with_harmonics(harmonics), Beside(harmonics=harmonics)
+    views = [
+        _Rolling(t, f, ROLLING if kind == "rolling" else None)
+        for t, f in zip(street.targets(street.scene()), (1, 7, 1, 2), strict=True)
+    ]
+    fixed = Frame.of(scene), _offsets(scene), views, SETTINGS, beside
+    ours, torchs = CompiledPass(*fixed), TorchPass(*fixed)
+    residual = _residual(ours.color)
+    for one in (ours, torchs):
+        assert one.residuals is None
+        one.gradient(_residual(ours.color), torch.zeros_like(ours.depth), residual)
+    assert ours.residuals is not None and torchs.residuals is not None
+    assert ours.residuals.shape == (len(scene), 5)
+    torch.testing.assert_close(ours.residuals, torchs.residuals, atol=2e-3, rtol=2e-3)
+    actors = scene.nodes >= 2
+    assert float(ours.residuals[actors, 4].max()) > 1, "actors are seen, at several frames"
+    share = float(ours.residuals[:, 4].sum())
+    assert share == pytest.approx(float(ours._alpha.sum()), rel=1e-3), "all shares make up the images' alpha"
+
+
+@pytest.mark.parametrize("isa", supported_isas())
+def test_gradients_are_the_same_bits_with_them_on_every_instruction_set(
+    isa: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GENRE_RENDER_ISA", isa)
+    monkeypatch.setattr("genre_tasks.render.cpu.load_kernel", renderer.load_kernel.__wrapped__)
+    without, told = (_passes(_scene())[0] for _ in range(2))
+    residual, by_depth = _residual(told.color), torch.zeros_like(told.depth)
+    gradients = [
+        without.gradient(residual.clone(), by_depth.clone()),
+        told.gradient(residual.clone(), by_depth.clone(), residual),
+    ]
+    assert torch.equal(*gradients) and without.residuals is None and told.residuals is not None
+
+
+def test_the_sums_are_the_same_bits_at_any_number_of_threads() -> None:
+    found = []
+    for threads in (1, 2, 3):
+        with _threads(threads):
+            one = _passes(_scene(2000))[0]
+            residual = _residual(one.color)
+            one.gradient(residual.clone(), torch.zeros_like(one.depth), residual)
+            found.append(one.residuals)
+    assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
+
+
+def test_of_blurred_views_each_moment_has_an_equal_share() -> None:
+    scene, still = _scene(), street.targets(street.scene())
+    resting = MotionBlur(1e-6, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.1)
+    plain = [_Rolling(t, 1, None) for t in still]
+    blurred = [_Rolling(t, 1, None) for t in still]
+    for view in blurred[:2]:
+        view.blur = resting
+    sums = []
+    for views in (plain[:2], blurred[:2]):
+        one = begin(Frame.of(scene), _offsets(scene), views, SETTINGS)
+        assert isinstance(one, BlurredPass) == (views[0].blur is not None)
+        residual = _residual(one.color)
+        one.gradient(residual.clone(), torch.zeros_like(one.depth), residual)
+        sums.append(one.residuals)
+    torch.testing.assert_close(sums[1], sums[0], atol=1e-3, rtol=1e-3)
+
+
+def test_the_residual_is_in_the_scenes_own_colours_and_not_of_the_vehicle() -> None:
+    targets = street.targets(street.scene())[:2]
+    own = torch.zeros(32, 48, dtype=torch.bool)
+    own[20:] = True
+    gain = (0.3, 0.0, -0.2)
+    color = torch.stack([t.image.image for t in targets])
+    from genre_tasks.effects.exposure import toned
+
+    shown = toned(color[1], torch.tensor(gain))
+    bright = replace(targets[1], log_gain=gain, image=SsimTarget.of(shown.contiguous()))
+    found = residual_image(color - 0.1, [replace(targets[0], own=own), bright])
+    torch.testing.assert_close(found[0, :20], torch.full((20, 48, 3), 0.1))
+    assert not found[0, 20:].any()
+    torch.testing.assert_close(found[1], torch.full((32, 48, 3), 0.1), atol=1e-5, rtol=0)
+
+
+def test_untrained_steps_bring_colours_home_where_adam_has_a_long_way() -> None:
+    """Every colour is wrong by as much; the mean residual says by how much, a gradient in which direction."""
+    truth = street.scene(600)
+    g = truth.gaussians
+    begun = truth.with_gaussians(replace(g, colors=g.colors + 0.3))
+    objective, plan = Objective(LossConfig(perceptual=0, depth=0.0)), Plan(6, 4)
+    still = (0.0, 0.0, 0.0, 0.0, 0.01)
+    rules = TunedAdam(still), LearnedOptimiser(NetworkConfig(residuals=True, rates=still)).requires_grad_(False)
+    adam, ours = (unroll(r, begun, street.targets(truth), (), objective, plan).scene for r in rules)
+    with torch.no_grad():
+        views = street.targets(truth)
+        error = [
+            float((render_views(s, views).color - render_views(truth, views).color).abs().mean())
+            for s in (begun, adam, ours)
+        ]
+    assert error[0] > 0.15 and error[1] > 0.7 * error[0] and error[2] < 0.1 * error[0]
+
+
+def _told_states(scene: SceneGraph) -> list[tuple[State, torch.Tensor]]:
+    g, count = torch.Generator().manual_seed(0), len(scene)
+    state, out = State.start(count, scene.gaussians.means), []
+    for i in range(5):
+        gradient = torch.randn(count, 14, generator=g) * 10 ** (3 * torch.rand(count, 14, generator=g) - 2)
+        share = 50 * torch.rand(count, 1, generator=g) ** 3
+        residuals = torch.cat([0.3 * share * torch.randn(count, 3, generator=g), 0.2 * share, share], 1)
+        gradient[i::5], residuals[i::5] = 0, 0
+        state = state.saw(gradient, residuals)
+        out.append((state, gradient))
+        state = state.moved(Frame.of(scene), 0.1 * torch.randn(count, 14, generator=g))
+    return out
+
+
+@pytest.mark.parametrize(("hidden", "channels"), [(64, (16, 32, 48)), (33, (17, 3))])
+def test_the_kernels_step_is_torchs(hidden: int, channels: tuple[int, ...]) -> None:
+    scene, network = street.scene(400), _random(NetworkConfig(hidden=hidden, channels=channels, residuals=True))
+    frame = Frame.of(scene)
+    ours, torchs = _fused_step(network, frame), _torch_step(network, frame)
+    for state, gradient in _told_states(scene):
+        step = ours(state, gradient, TOTAL)
+        torch.testing.assert_close(step, torchs(state, gradient, TOTAL), atol=2e-5, rtol=1e-4)
+        blind = replace(state, residuals=torch.zeros_like(state.residuals))
+        assert not torch.equal(step, ours(blind, gradient, TOTAL))
+        assert not step[state.seen_now[:, 0] == 0].any()
+    with pytest.raises(ValueError, match="expected a state with residuals"):
+        ours(replace(state, residuals=None), gradient, TOTAL)
+    with pytest.raises(ValueError, match=r"expected residuals \[400, 5\], got \[400, 4\]"):
+        ours(replace(state, residuals=state.residuals[:, :4]), gradient, TOTAL)
+    with pytest.raises(ValueError, match="expected a state without residuals"):
+        _fused_step(_random(), frame)(state, gradient, TOTAL)
+
+
+def test_weights_without_them_can_be_told_them(tmp_path: Path) -> None:
+    """What is new counts for nothing but the step towards the mean residual."""
+    start = Path(resolve_weights("g3r", "builtin"))
+    plain, told = load(start), network_from(NetworkConfig(residuals=True), 0, start)
+    save(told, tmp_path / "told.safetensors")
+    told = load(tmp_path / "told.safetensors")
+    assert told.residuals and not plain.residuals
+    scene = street.scene(400)
+    steps = [network.start(Frame.of(scene), CENTRE) for network in (plain, told)]
+    for state, gradient in _told_states(scene):
+        moved = [steps[0](replace(state, residuals=None), gradient, TOTAL), steps[1](state, gradient, TOTAL)]
+        expected = state.mean_residual() * state.seen_now
+        torch.testing.assert_close(moved[1][:, :11], moved[0][:, :11], atol=1e-6, rtol=1e-5)
+        part = (moved[1] - moved[0])[:, 11:]
+        ratio = part.norm() / expected.norm()
+        torch.testing.assert_close(part, expected * ratio, atol=1e-5, rtol=1e-3)
+    with pytest.raises(InputError, match="of a network with other residuals"):
+        network_from(NetworkConfig(), 0, tmp_path / "told.safetensors")
+
+
+def test_training_with_them_resumes_to_the_same_bytes(tmp_path: Path) -> None:
+    truth = street.scene(120)
+    views, loss = street.targets(truth), LossConfig(perceptual=0)
+    scene = TrainingScene("s", street.blurred(truth), views[:3], views[3:])
+    config = MetaConfig(steps=40, segment=3, pool=2, iterations=(6, 9), views=(2, 3), loss=loss, judge_loss=loss)
+    whole = MetaTraining(network_from(TOLD, 0), [scene], config)
+    for _ in range(5):
+        whole.step()
+    checkpoint.save(whole, tmp_path / "c.safetensors")
+    again = MetaTraining(network_from(TOLD, 1), [scene], config)
+    checkpoint.resume(again, tmp_path / "c.safetensors")
+    assert [whole.step() for _ in range(4)] == [again.step() for _ in range(4)]
+    pairs = zip(whole.network.parameters(), again.network.parameters(), strict=True)
+    assert all(torch.equal(a, b) for a, b in pairs)
+    assert whole.network.head.weight[28].any(), "the relaxation is trained"
