@@ -111,11 +111,12 @@ def _published(weights: Path, path: Path) -> Path:
 def _show(trained: Trained) -> None:
     """A table in Prefect's UI; the folder has the whole curve."""
     rows = read_rows(Path(trained.weights).with_name(CURVE), LEARNING)
+    last = [r["judged_loss"] for r in rows[-50:]]
     row = {
         "stage": trained.stage,
         "weight updates": len(rows),
         "minutes": round(sum(r["seconds"] for r in rows) / 60, 2),
-        "unseen loss, last updates": round(fmean(r["judged_loss"] for r in rows[-50:]), 4),
+        "unseen loss, last updates": round(fmean(last), 4) if last else None,
     }
     key = "training-" + "".join(c if c.isalnum() else "-" for c in trained.stage.lower())
     create_table_artifact(table=[row], key=key, description=f"Training of {trained.stage}")

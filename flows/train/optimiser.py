@@ -39,7 +39,7 @@ class Score:
 
 
 def network_from(config: NetworkConfig, seed: int, weights: Path | None = None) -> LearnedOptimiser:
-    """A new network, or one that starts from ``weights`` with the rates of ``config``, and residuals if that has them.
+    """A new network, or one that starts from ``weights`` with the rates and, if any, residuals of ``config``.
 
     Raises ``InputError`` for weights that are missing, unreadable, or of a network of another shape.
     """
@@ -48,7 +48,7 @@ def network_from(config: NetworkConfig, seed: int, weights: Path | None = None) 
         network = LearnedOptimiser(config)
     if weights is not None:
         start = LearnedOptimiser.load(weights)
-        may = {"rates"} | ({"residuals"} if config.residuals else set())
+        may = {"rates", "relaxation"} | ({"residuals"} if config.residuals else set())
         other = {name for name, value in config if name not in may and value != getattr(start.config, name)}
         if other:
             raise InputError(
@@ -94,6 +94,10 @@ def train_optimiser(
             checkpoint.save(training, path, origin)
             if watch is not None:
                 watch(training.done, training.network)
+    if not path.is_file():  # no update at all: what it starts from, at the rates of its own configuration
+        write_curve(folder, rows)
+        save(training.network, folder / WEIGHTS)
+        checkpoint.save(training, path, origin)
     return training.network.eval().requires_grad_(False)
 
 

@@ -25,6 +25,7 @@ EFFECTS = (
     "&rolling_shutter_s=0.02", "&distortion=0.02", "&exposure_jitter=0.2&white_balance_jitter=0.05", "&bonnet=0.08",
 )  # fmt: skip
 """What a street may have, as queries: 6 to 12 px of rolling shutter, 5 px of distortion, 15 % of exposure, a bonnet."""
+TOLD_RATES, TOLD_RELAXATION = (0.32, 0.32, 0.05, 0.3, 0.004883), -0.47
 COARSE_POINTS, FINE_POINTS = (6_000, 8_000, 5_000, 10_000), (18_000, 20_000, 14_000, 24_000)
 DENSE_POINTS, DENSE_REAL_POINTS = (18_000, 36_000, 14_000, 40_000), (18_000, 36_000, 40_000)
 
@@ -36,6 +37,7 @@ ENET_LOSS = LossConfig(perceptual=0.02, perceptual_every=2)
 ENET_JUDGE = LossConfig(perceptual=0.05, perceptual_every=1, depth=0.0)
 
 GNET_NETWORK, ENET_NETWORK = NetworkConfig(rates=GNET_RATES), NetworkConfig(rates=ENET_RATES)
+TOLD_NETWORK = NetworkConfig(rates=TOLD_RATES, residuals=True, relaxation=TOLD_RELAXATION)
 
 
 @dataclass(frozen=True)
@@ -114,8 +116,10 @@ GNET_STAGES = (
             views=(6, 15, 15, 30),
         ),
     ),
+    Stage("gnet/told", "gnet/dense", TOLD_NETWORK, SceneList("coarse", 1, real=0), _gnet(steps=0)),
 )  # fmt: skip
-"""GNet from nothing."""
+"""GNet from nothing. The last stage trains nothing: the network is told residuals from there on, at rates that were
+swept for whole optimisations (``benchmarks/sweep_rates.py``)."""
 
 
 def _of_gnet(stage: str) -> tuple[Begin, ...]:
@@ -196,7 +200,7 @@ def _further(name: str, scenes: SceneList) -> Stage:
     config = _gnet(
         steps=200, rate=2.5e-4, seed=91, judged=4.0, judges=6, sample=0.2, iterations=(24, 48, 72), views=(3, 6, 15),
     )  # fmt: skip
-    return Stage(name, "builtin:gnet", GNET_NETWORK, scenes, config)
+    return Stage(name, "builtin:gnet", TOLD_NETWORK, scenes, config)
 
 
 EFFECTS_STAGES = (_further("gnet/plain", PLAIN), _further("gnet/effects", replace(PLAIN, planned=True)))

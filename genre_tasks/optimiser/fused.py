@@ -59,6 +59,7 @@ def _dense_layers(network: LearnedOptimiser, hidden: int, memory: Memory) -> Net
     if network.residuals:
         column = torch.cat([column, torch.tensor([14])])  # beside the gains
     weight[: head.in_features, column], bias[column] = head.weight.detach().T, head.bias.detach()
+    bias[14] += network.config.relaxation
     return Network(
         hidden, entry.in_features - TIMES, at(padded(entry.weight.T, entry.in_features, hidden)),
         at(padded(entry.bias, hidden)), at(padded(own, hidden, hidden)), at(weight), at(bias),

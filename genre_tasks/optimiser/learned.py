@@ -3,9 +3,9 @@
 The step is ``Δ = −rate · schedule(t/T) · [exp(3 tanh(a/3)) · u + tanh(b)]`` with ``u`` Adam's normalised direction and
 ``a, b`` [N, 14] from the network, whose last layer starts at zero: untrained, it is tuned Adam to the bit.
 
-A network with ``residuals`` also moves colours by ``schedule(t/T) · (1 + tanh(c)) · r̄``, with r̄ the mean residual of
-the pixels that show a Gaussian and ``c`` [N] from the network: a step of the simultaneous algebraic reconstruction
-technique (Andersen and Kak 1984) with a relaxation of 0 to 2, where it converges.
+A network with ``residuals`` also moves colours by ``schedule(t/T) · (1 + tanh(c₀ + c)) · r̄``, with r̄ the mean residual
+of the pixels that show a Gaussian, c₀ of the configuration and ``c`` [N] from the network: a step of the simultaneous
+algebraic reconstruction technique (Andersen and Kak 1984) with a relaxation of 0 to 2, where it converges.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ class NetworkConfig(BaseModel):
     channels: tuple[int, ...] = Field(default=(16, 32, 48), min_length=1, description="Channels of the UNet's levels.")
     voxel_m: float = Field(default=1.0, gt=0, description="Width of a static voxel near the cameras.")
     residuals: bool = Field(default=False, description="It is told what images have beyond the render.")
+    relaxation: float = Field(default=0.0, allow_inf_nan=False, description="Of residuals, c₀: 0 is a relaxation of 1.")
     rates: tuple[float, ...] = Field(
         default=GNET_RATES, min_length=len(GROUPS), max_length=len(GROUPS), description="As TunedAdam's."
     )
@@ -101,7 +102,8 @@ class LearnedOptimiser(nn.Module):
         rates = rate_vector(self.config.rates).to(direction.device)
         step = -rates * part * (torch.exp(3 * torch.tanh(gain / 3)) * direction + torch.tanh(offset))
         if self.residuals:
-            relaxed = part * (1 + torch.tanh(heads[:, 28:])) * state.mean_residual()[rows]
+            relaxation = 1 + torch.tanh(self.config.relaxation + heads[:, 28:])
+            relaxed = part * relaxation * state.mean_residual()[rows]
             step = step + F.pad(relaxed, (11, 0))
         return step
 

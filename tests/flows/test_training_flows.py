@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from flows.train import recipes, scenes, stages, validation
 from flows.train.begins import Adam, ByGnet, Initial, PerScene
@@ -20,7 +21,7 @@ from flows.train.stages import TrainJob, places, train_stage
 from genre_tasks.config import LossConfig
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.optimiser.adam import GNET_RATES
-from genre_tasks.optimiser.learned import NetworkConfig
+from genre_tasks.optimiser.learned import LearnedOptimiser, NetworkConfig
 from genre_tasks.optimiser.training import MetaConfig
 from storage.curve import LEARNING, VALIDATION, read_rows
 from storage.files import digest_file
@@ -198,6 +199,18 @@ def test_a_planned_scene_has_its_effects_and_plain_ones_their_old_keys(
         assert {t.shutter is not None for t in targets} == {recipe.planned}
         assert {t.log_gain is not None for t in targets} == {recipe.planned}
         assert all(t.shutter is None for t in scene.truth)
+
+
+def test_a_stage_may_tell_a_network_residuals_and_train_nothing(trained: Said, tmp_path: Path) -> None:
+    shutil.copytree(trained[0], tmp_path / "again")
+    job = TrainJob(str(tmp_path / "again"), "tiny")
+    network = NETWORK.model_copy(update={"residuals": True, "relaxation": -0.5, "rates": (0.1,) * 5})
+    told = replace(TABLE[1], name="gnet/told", start="gnet/only", network=network, config=CONFIG)
+    told = replace(told, config=told.config.model_copy(update={"steps": 0}))
+    done = [train_stage(job, told) for _ in range(2)]
+    assert [d.cached for d in done] == [False, True]
+    before, after = (LearnedOptimiser.load(job.weights(f"gnet/{name}")) for name in ("only", "told"))
+    assert after.config == network and torch.equal(before.mix.weight, after.mix.weight)
 
 
 def test_scenes_of_several_sizes_share_their_images(tmp_path: Path) -> None:

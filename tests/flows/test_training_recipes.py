@@ -13,6 +13,8 @@ from flows.train.recipes import GNET_STAGES, ordered, table_of
 from flows.train.stages import places
 from flows.train.validation import validation_recipes
 from genre_tasks.errors import ConfigError
+from genre_tasks.optimiser.weights import load
+from genre_tasks.weights import resolve_weights
 
 REAL = "pandaset:002"
 
@@ -31,7 +33,7 @@ def test_every_recipe_is_in_order_and_of_training_chunks(recipe: str) -> None:
 
 def test_the_shipped_weights_are_described() -> None:
     table = {stage.name: stage for stage in table_of("shipped")}
-    assert [table[s.name].config.steps for s in GNET_STAGES] == [1200, 240, 240, 200, 110, 420]
+    assert [table[s.name].config.steps for s in GNET_STAGES] == [1200, 240, 240, 200, 110, 420, 0]
     streets = [len(places(table[name], None)) for name in ("gnet/coarse", "gnet/fine", "enet/coarse")]
     assert streets == [40, 15, 24]
     assert len(places(table["gnet/many"], REAL)) == 15 + 4
@@ -41,6 +43,8 @@ def test_the_shipped_weights_are_described() -> None:
     assert begins[:6] == [gnet, gnet, Adam(24), gnet, gnet, Adam(48)]
     names = [stage.name for stage in ordered(table_of("shipped"), "enet")]
     gnet = ["gnet/coarse", "gnet/fine", "gnet/finer", "gnet/unseen", "gnet/many", "gnet/dense"]
+    assert table["gnet/told"].network == load(resolve_weights("gnet", "builtin")).config
+    assert table["gnet/told"].network == load(resolve_weights("g3r", "builtin")).config
     assert names == [*gnet, "enet/coarse", "enet/fine", "enet/dense", "enet/strides", "enet/held"]
 
 
@@ -73,7 +77,7 @@ def test_training_with_effects_and_without_differ_in_the_scenes_alone() -> None:
 
 def test_a_table_out_of_order_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recipes, "RECIPES", {"turned": tuple(reversed(GNET_STAGES)), "twice": 2 * GNET_STAGES[:1]})
-    with pytest.raises(ConfigError, match="gnet/dense needs gnet/many"):
+    with pytest.raises(ConfigError, match="gnet/told needs gnet/dense"):
         table_of("turned")
     with pytest.raises(ConfigError, match="two stages are called gnet/coarse"):
         table_of("twice")

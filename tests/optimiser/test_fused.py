@@ -64,15 +64,24 @@ def _fused_step(network: LearnedOptimiser, frame: Frame) -> Step:
     return step
 
 
-def _states(scene: SceneGraph, unseen: int = 5, size: float = 1.0) -> Iterator[tuple[State, Tensor]]:
-    """Five iterations with gradients of many sizes; some Gaussians are never seen, others not always."""
+def _states(
+    scene: SceneGraph, unseen: int = 5, size: float = 1.0, told: bool = False
+) -> Iterator[tuple[State, Tensor]]:
+    """Five iterations with gradients of many sizes; some Gaussians are never seen, others not always.
+
+    ``told``: with residuals, of shares from next to nothing to many pixels.
+    """
     g, count = torch.Generator().manual_seed(0), len(scene)
     frame, state = Frame.of(scene), State.start(count, scene.gaussians.means)
     for i in range(5):
         gradient = size * torch.randn(count, 14, generator=g) * 10 ** (3 * torch.rand(count, 14, generator=g) - 2)
         gradient[: max(unseen, 40 - 10 * i)] = 0
         gradient[i::5] = 0
-        state = state.saw(gradient)
+        residuals = None
+        if told:
+            share = 50 * torch.rand(count, 1, generator=g) ** 3 * (gradient != 0).any(1, keepdim=True)
+            residuals = torch.cat([0.3 * share * torch.randn(count, 3, generator=g), 0.2 * share, share], 1)
+        state = state.saw(gradient, residuals)
         yield state, gradient
         state = state.moved(frame, 0.1 * torch.randn(count, 14, generator=g))
 
@@ -82,7 +91,7 @@ def _error(network: LearnedOptimiser, scene: SceneGraph, size: float = 1.0) -> f
     frame = Frame.of(scene)
     ours, torchs, rates = _fused_step(network, frame), _torch_step(network, frame), rate_vector(network.config.rates)
     differences = [torch.zeros(1)]
-    for state, gradient in _states(scene, size=size):
+    for state, gradient in _states(scene, size=size, told=network.residuals):
         mine, oracle = ours(state, gradient, TOTAL), torchs(state, gradient, TOTAL)
         assert mine.shape == oracle.shape
         differences.append(((mine - oracle).abs() / rates).flatten())

@@ -21,16 +21,15 @@ from genre_tasks.optimiser.loss import residual_image
 from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.passes import Beside, BlurredPass, CompiledPass, TorchPass, begin
 from genre_tasks.optimiser.ssim import SsimTarget
-from genre_tasks.optimiser.state import Frame, State
+from genre_tasks.optimiser.state import Frame
 from genre_tasks.optimiser.training import MetaConfig, MetaTraining
 from genre_tasks.optimiser.unroll import Plan, unroll
 from genre_tasks.optimiser.weights import load, save
 from genre_tasks.render import kernel_library as renderer
 from genre_tasks.render import render_views
-from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.weights import resolve_weights
 from tests.optimiser import street
-from tests.optimiser.test_fused import CENTRE, TOTAL, _fused_step, _random, _threads, _torch_step
+from tests.optimiser.test_fused import CENTRE, TOTAL, _fused_step, _random, _states, _threads, _torch_step
 from tests.optimiser.test_posing import ROLLING, SETTINGS, _offsets, _passes, _Rolling, _scene
 
 TOLD = NetworkConfig(hidden=16, channels=(8, 12), residuals=True)
@@ -143,26 +142,15 @@ def test_untrained_steps_bring_colours_home_where_adam_has_a_long_way() -> None:
     assert error[0] > 0.15 and error[1] > 0.7 * error[0] and error[2] < 0.1 * error[0]
 
 
-def _told_states(scene: SceneGraph) -> list[tuple[State, torch.Tensor]]:
-    g, count = torch.Generator().manual_seed(0), len(scene)
-    state, out = State.start(count, scene.gaussians.means), []
-    for i in range(5):
-        gradient = torch.randn(count, 14, generator=g) * 10 ** (3 * torch.rand(count, 14, generator=g) - 2)
-        share = 50 * torch.rand(count, 1, generator=g) ** 3
-        residuals = torch.cat([0.3 * share * torch.randn(count, 3, generator=g), 0.2 * share, share], 1)
-        gradient[i::5], residuals[i::5] = 0, 0
-        state = state.saw(gradient, residuals)
-        out.append((state, gradient))
-        state = state.moved(Frame.of(scene), 0.1 * torch.randn(count, 14, generator=g))
-    return out
-
-
 @pytest.mark.parametrize(("hidden", "channels"), [(64, (16, 32, 48)), (33, (17, 3))])
 def test_the_kernels_step_is_torchs(hidden: int, channels: tuple[int, ...]) -> None:
-    scene, network = street.scene(400), _random(NetworkConfig(hidden=hidden, channels=channels, residuals=True))
+    scene, network = (
+        street.scene(400),
+        _random(NetworkConfig(hidden=hidden, channels=channels, residuals=True, relaxation=-0.4)),
+    )
     frame = Frame.of(scene)
     ours, torchs = _fused_step(network, frame), _torch_step(network, frame)
-    for state, gradient in _told_states(scene):
+    for state, gradient in _states(scene, told=True):
         step = ours(state, gradient, TOTAL)
         torch.testing.assert_close(step, torchs(state, gradient, TOTAL), atol=2e-5, rtol=1e-4)
         blind = replace(state, residuals=torch.zeros_like(state.residuals))
@@ -178,14 +166,14 @@ def test_the_kernels_step_is_torchs(hidden: int, channels: tuple[int, ...]) -> N
 
 def test_weights_without_them_can_be_told_them(tmp_path: Path) -> None:
     """What is new counts for nothing but the step towards the mean residual."""
-    start = Path(resolve_weights("g3r", "builtin"))
+    start = Path(resolve_weights("enet", "builtin"))
     plain, told = load(start), network_from(NetworkConfig(residuals=True), 0, start)
     save(told, tmp_path / "told.safetensors")
     told = load(tmp_path / "told.safetensors")
     assert told.residuals and not plain.residuals
     scene = street.scene(400)
     steps = [network.start(Frame.of(scene), CENTRE) for network in (plain, told)]
-    for state, gradient in _told_states(scene):
+    for state, gradient in _states(scene, told=True):
         moved = [steps[0](replace(state, residuals=None), gradient, TOTAL), steps[1](state, gradient, TOTAL)]
         expected = state.mean_residual() * state.seen_now
         torch.testing.assert_close(moved[1][:, :11], moved[0][:, :11], atol=1e-6, rtol=1e-5)

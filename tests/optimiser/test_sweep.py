@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 
 import pytest
 
-from benchmarks.sweep_adam import Scores, Setting, search, validation_seeds
+from benchmarks.sweep_rates import Scores, Setting, network_moves, network_of, search, validation_seeds
 from genre_tasks.errors import ConfigError
 from genre_tasks.optimiser.adam import GNET_RATES
 from genre_tasks.optimiser.episodes import TrainingScene
+from genre_tasks.optimiser.learned import LearnedOptimiser, NetworkConfig
+from genre_tasks.optimiser.weights import save
 from tests.optimiser import street
 
 
@@ -42,6 +45,33 @@ def test_scores_are_kept_and_not_measured_again(tmp_path: Path) -> None:
     for setting, iterations in ((Setting(), 3), (Setting(schedule="constant"), 2)):
         with pytest.raises(AssertionError, match="measured again"):
             again.mean(setting, iterations, 2)
+
+
+def test_a_networks_rates_are_searched_with_its_relaxation(tmp_path: Path) -> None:
+    config = NetworkConfig(hidden=8, channels=(4,), residuals=True, rates=(0.1,) * 5, relaxation=0.2)
+    save(LearnedOptimiser(config), tmp_path / "w.safetensors")
+    start, rule_of = network_of(tmp_path / "w.safetensors")
+    assert start == Setting((0.1,) * 5, relaxation=0.2)
+
+    def measure(setting: Setting) -> float:
+        return -abs(math.log(setting.rates[2] / 0.4)) - abs(setting.relaxation + 0.9)
+
+    found, _ = search(measure, start, 3, partial(network_moves, 1.6))
+    assert found.rates[2] == pytest.approx(0.4, rel=0.3) and found.relaxation == pytest.approx(-0.9, abs=0.24)
+    assert found.rates[:2] == start.rates[:2] and found.schedule == "cosine"
+    tuned = rule_of(found)
+    assert isinstance(tuned, LearnedOptimiser)
+    assert (tuned.config.rates, tuned.config.relaxation) == (found.rates, found.relaxation)
+
+
+def test_what_is_beside_the_path_counts_where_it_is_asked_for(tmp_path: Path) -> None:
+    truth = street.scene()
+    views, novel = street.targets(truth), street.targets(truth, novel=True)
+    scenes = {900: lambda: TrainingScene("s", street.blurred(truth), views, views, truth=novel)}
+    at, there = (
+        Scores(tmp_path / f"{beside}.json", scenes, beside=beside).mean(Setting(), 2, 2) for beside in (0.0, 0.5)
+    )
+    assert there > at + 2.5
 
 
 def test_only_validation_seeds_are_tuned_on() -> None:
