@@ -39,8 +39,10 @@ def step_of(rule: StepRule, count: int) -> tuple[Callable[[], object], float]:
     began = time.perf_counter()
     step = rule.start(frame, torch.zeros(3))
     built = time.perf_counter() - began
-    gradient = torch.randn((count, 14), generator=torch.Generator().manual_seed(0))
-    state = State.start(count, gradient).saw(gradient)
+    generator = torch.Generator().manual_seed(0)
+    gradient = torch.randn((count, 14), generator=generator)
+    residuals = torch.rand((count, 5), generator=generator) if rule.residuals else None
+    state = State.start(count, gradient).saw(gradient, residuals)
     return lambda: step(state, gradient, TOTAL), built
 
 
