@@ -205,17 +205,19 @@ def main() -> None:
     parser.add_argument("--start", help="a variant of tuned_adam in configs/baselines.yaml to search from")
     parser.add_argument("--points", type=int, default=40_000)
     parser.add_argument("--rounds", type=int, default=4)
-    parser.add_argument("--factor", type=float, default=2.0, help="of a move of a network's rates")
+    parser.add_argument("--factor", type=float, default=2.0, help="of a move")
     parser.add_argument("--weights", type=Path, help="a network's, to tune its rates instead of Adam's")
     parser.add_argument("--real", help="a log whose chunk 0 counts as one more scene")
     parser.add_argument("--beside", type=float, default=0.0, help="how much the PSNR at 3 m counts")
     options = parser.parse_args()
+    if options.weights is not None and options.start is not None:
+        parser.error("--start is a variant of Adam; a network's search starts from its own rates")
     options.folder.mkdir(parents=True, exist_ok=True)
     seeds, store = validation_seeds(options.seeds), LocalStore(options.folder / "store")
     makers = scenes_of(store, seeds, options.points, options.real)
     best = Setting() if options.start is None else setting_of(options.start)
     rule_of: Callable[[Setting], StepRule] = adam_of
-    ways: Callable[[], Iterable[Callable[[Setting], Setting]]] = moves
+    ways = partial(moves, options.factor)
     if options.weights is not None:
         best, rule_of = network_of(options.weights)
         ways = partial(network_moves, options.factor)

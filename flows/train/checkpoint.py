@@ -13,6 +13,7 @@ from torch import Tensor
 
 from genre_tasks.errors import InputError
 from genre_tasks.optimiser.episodes import Course, Episode
+from genre_tasks.optimiser.learned import NetworkConfig
 from genre_tasks.optimiser.objective import Sight
 from genre_tasks.optimiser.training import MetaTraining
 from genre_tasks.optimiser.weights import write_atomically
@@ -59,6 +60,7 @@ def describe(path: Path) -> dict[str, Any]:
     try:
         with safe_open(path, "pt") as file:
             described: dict[str, Any] = json.loads((file.metadata() or {})["training"])
+        described["network"] = NetworkConfig(**described["network"]).model_dump(mode="json")  # older ones say less
     except (SafetensorError, OSError, KeyError, ValueError) as error:
         raise InputError(
             f"The checkpoint cannot be read: {error}", remedy="Delete it to train the stage anew.", file=path

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
 
 from flows.train import checkpoint
 from flows.train.optimiser import network_from, train_optimiser
@@ -112,6 +115,20 @@ def test_resuming_gives_the_same_bytes(tmp_path: Path) -> None:
     assert [whole.step() for _ in range(4)] == [again.step() for _ in range(4)]
     for a, b in zip(_weights(whole), _weights(again), strict=True):
         assert torch.equal(a, b)
+
+
+def test_a_checkpoint_from_before_networks_were_told_residuals_resumes(tmp_path: Path) -> None:
+    scenes, path = [_scene(0)], tmp_path / "c.safetensors"
+    whole = MetaTraining(network_from(NETWORK, 0), scenes, CONFIG)
+    whole.step()
+    checkpoint.save(whole, path)
+    with safe_open(path, "pt") as file:
+        described, tensors = json.loads(file.metadata()["training"]), {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118
+    del described["network"]["residuals"], described["network"]["relaxation"]
+    save_file(tensors, path, {"training": json.dumps(described)})
+    again = MetaTraining(network_from(NETWORK, 1), scenes, CONFIG)
+    checkpoint.resume(again, path)
+    assert again.done == 1 and whole.step() == again.step()
 
 
 def test_a_checkpoint_of_other_settings_is_refused(tmp_path: Path) -> None:
