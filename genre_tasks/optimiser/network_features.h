@@ -109,7 +109,7 @@ INLINE void features(const Now& now, const float* base, const float* fixed, cons
   if (!now.residuals) return;
   const float *residual = now.residuals + RESIDUALS * i, inverse_share = by_share(now, i);
   auto within = [](float v, float low, float high) { return v < low ? low : v > high ? high : v; };  // NaN stays NaN
-  for (int k = 0; k < 3; k++) x[62 + k] = within(5.f * residual[k] * inverse_share, -2.f, 2.f);
-  x[65] = within(5.f * std::sqrt(residual[3] * inverse_share), 0.f, 4.f);
-  x[66] = std::log1p(residual[4]) * .25f;
+  for (int k = 0; k < 3; k++) x[VARYING + k] = within(5.f * residual[k] * inverse_share, -2.f, 2.f);
+  x[VARYING + 3] = within(5.f * std::sqrt(residual[3] * inverse_share), 0.f, 4.f);
+  x[VARYING + 4] = std::log1p(residual[4]) * .25f;
 }
