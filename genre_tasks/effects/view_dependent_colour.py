@@ -30,5 +30,5 @@ def measure(seen: Seen) -> Measured:
 
 EFFECT = Effect(
     "view_dependent_colour", "spread of a point's colour per its texture's", "ratio", 0.7,
-    "three harmonics a colour: 9 more numbers a Gaussian beside 14", measure,
+    "eight harmonics a colour: 24 more numbers a Gaussian beside 14", measure,
 )  # fmt: skip

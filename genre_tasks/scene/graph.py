@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 STATIC, DISTANT, FIRST_ACTOR = 0, 1, 2
 """Values of ``SceneGraph.nodes``; actor k has ``FIRST_ACTOR + k``."""
 
-DEGREE, COUNTS = 1, {1: 3, 2: 8, 3: 15}
+DEGREE, COUNTS = 2, {1: 3, 2: 8, 3: 15}
 """Of spherical harmonics, where a reconstruction has any; how many there are up to a degree, without the constant."""
 
 
