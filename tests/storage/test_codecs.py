@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from genre_tasks.errors import ArtifactCorruptError, ConfigError, NonFiniteError
+from genre_tasks.scene.graph import COUNTS, DEGREE
 from storage.codecs import KINDS, codec_of, tables
 from storage.codecs.exr import read_channels, write_channels, write_exr
 from storage.codecs.png import read_png, write_png
@@ -122,9 +123,11 @@ def test_harmonics_lie_beside_the_gaussians_and_old_artifacts_have_none(tmp_path
     (tmp_path / "old").mkdir()
     codec.write(tmp_path / "old", value)
     assert not (tmp_path / "old" / "harmonics").exists() and codec.read(tmp_path / "old").scene.harmonics is None
-    waves = torch.randn(13, 3, 3, generator=torch.Generator().manual_seed(0))
+    waves = torch.randn(13, COUNTS[DEGREE], 3, generator=torch.Generator().manual_seed(0))
     assert len(value.scene) == 13
-    snapshots = {n: s.with_harmonics(torch.full((len(s), 3, 3), float(n))) for n, s in value.snapshots.items()}
+    snapshots = {
+        n: s.with_harmonics(torch.full((len(s), COUNTS[DEGREE], 3), float(n))) for n, s in value.snapshots.items()
+    }
     glossy = replace(value, scene=value.scene.with_harmonics(waves), snapshots=snapshots)
     (tmp_path / "new").mkdir()
     codec.write(tmp_path / "new", glossy)
@@ -134,8 +137,8 @@ def test_harmonics_lie_beside_the_gaussians_and_old_artifacts_have_none(tmp_path
     names = pq.read_schema(tmp_path / "new" / "harmonics" / "gaussians.parquet").names
     assert names[:4] == ["red_1", "green_1", "blue_1", "red_2"]
     (tmp_path / "bad").mkdir()
-    with pytest.raises(ConfigError, match=r"harmonics of gaussians.parquet is float32 \[13, 8, 3\]"):
-        codec.write(tmp_path / "bad", replace(value, scene=value.scene.with_harmonics(torch.zeros(13, 8, 3))))
+    with pytest.raises(ConfigError, match=r"harmonics of gaussians.parquet is float32 \[13, 15, 3\]"):
+        codec.write(tmp_path / "bad", replace(value, scene=value.scene.with_harmonics(torch.zeros(13, 15, 3))))
     (tmp_path / "new" / "harmonics" / "iteration_0008.parquet").unlink()
     with pytest.raises(ArtifactCorruptError, match="A table is missing"):
         codec.read(tmp_path / "new")
