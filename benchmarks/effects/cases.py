@@ -18,8 +18,7 @@ class Case:
 
     ``calls`` is given how far beyond the threshold (a factor) the property shall be, and the pixels a second that the
     street's fastest camera moves over the scene. ``timed``: whether it asks for the latter; ``plain`` is then at the
-    factor ``LITTLE``, for what cannot be set on where the log states nothing of it. ``returns``: it is judged by the
-    returns of the street's own LiDAR, however few the log itself has.
+    factor ``LITTLE``, for what cannot be set on where the log states nothing of it.
     """
 
     calls: Callable[[float, float], str]
@@ -27,7 +26,6 @@ class Case:
     unit: str = "dB"
     plain: str = ""
     timed: bool = False
-    returns: bool = False
 
     def query(self, factor: float, px_per_s: float) -> str:
         """Of a street; factor 0 is the one that does not call for it."""
@@ -62,15 +60,6 @@ def _bent(factor: float, _: float) -> str:
     return f"&distortion={factor * _limit('lens_distortion') / PX_PER_K1:.4g}"
 
 
-RETURNS_PER_AZIMUTH = 1.16e-4
-"""About the per cent of a street's pixels with a return, for each azimuth that one beam is shot at."""
-
-
-def _beam(factor: float) -> str:
-    azimuths = round(factor * _limit("lidar_depth") / RETURNS_PER_AZIMUTH)
-    return f"&lidar_beams=1&lidar_azimuths={min(3600, max(4, azimuths))}"
-
-
 PEOPLE_PER_AREA = 3.5
 """About how many walk beside the lane where they cover a per cent of the images; a street has twenty at most."""
 
@@ -88,13 +77,12 @@ CASES: dict[str, Case] = {
     "exposure": Case(lambda x, _: f"&exposure_jitter={x * _limit('exposure') / 100:.4g}", heldout_psnr),
     "motion_blur": Case(_seconds("exposure_s", "motion_blur"), sharp_psnr, timed=True),
     "view_dependent_colour": Case(lambda x, _: f"&gloss={x * GLOSS:.4g}", heldout_psnr),
-    "lidar_depth": Case(lambda x, _: _beam(x) if x < 4 else "", heldout_depth, "%", plain=_beam(LITTLE), returns=True),
+    "lidar_depth": Case(lambda *_: "", heldout_depth, "%", plain="&lidar_beams=1&lidar_azimuths=90"),
     "anti_aliasing": Case(lambda *_: "", apart_psnr, plain="&standstill=1"),
     "ego_mask": Case(lambda x, _: f"&bonnet={x * _limit('ego_mask') / 100:.4g}", heldout_psnr),
 }
 """Those that are modelled and that a street can be made to call for or not. Every street has a sky: there is none that
-does not call for the distant region; its own LiDAR has 160 times the returns that call for their term, so that it
-stands for four times as well; and whoever drives sees one thing from many distances: a street that does not call
+does not call for the distant region; and whoever drives sees one thing from many distances: a street that does not call
 for anti-aliasing is one where the vehicle stands, and no factor is asked for. Rolling shutter is judged beside the
 path: held-out frames are sheared as source frames are, and a scene that is sheared too fits them. So is anti-aliasing:
 there footprints are other than in any image that the scene was made from, and over what is seen from far and from near

@@ -65,46 +65,33 @@ def on_real(name: str, path: str, chunk: int, store: str) -> Row:
 
 def measure(name: str, at: Place, factor: float) -> Row:
     """The effect on and off: its measure, PSNR at 3 m, seconds of plan and GNet."""
-    case = CASES[name]
-    full = at.log.partition("&lidar_")[0] if case.returns else at.log
     with threads():
         auto = at.plan()[name]
-        out: Row = {"effect": name, "log": at.log, "chunk": at.chunk, "factor": factor, "unit": case.unit}
+        out: Row = {"effect": name, "log": at.log, "chunk": at.chunk, "factor": factor, "unit": CASES[name].unit}
         out |= {"value": None if np.isnan(auto.value) else auto.value, "threshold": auto.threshold}
         out |= {"property_unit": auto.unit, "choice": auto.choice, "commit": commit()}
         own = at.plan(f"effects.{name}=on").fitted
         for word in ("on", "off"):
-            out[word] = judged(at, own, case.measure, f"effects.{name}={word}", full=full)
+            out[word] = judged(at, own, CASES[name].measure, f"effects.{name}={word}")
     return out
 
 
 def judged(
-    at: Place, own: Fitted, by: Callable[[Chunk, SceneGraph, Truth | None], float], *settings: str, full: str = ""
+    at: Place, own: Fitted, by: Callable[[Chunk, SceneGraph, Truth | None], float], *settings: str
 ) -> dict[str, float | None]:
-    """GNet's scene under settings; the vehicle itself, as ``own`` has it, is left out of the judgement.
-
-    ``full``: the log whose LiDAR judges, where it is another.
-    """
+    """GNet's scene under settings; the vehicle itself, as ``own`` has it, is left out of the judgement."""
     job = at.job(*settings)
     refs = reconstruct(job, STAGES)
     read, plan, scene = (value_of(job, refs[k]) for k in ("ingest", "effects", "gnet"))
     shown = applied(read, replace(plan, fitted=replace(plan.fitted, own=own.own)))
-    judge = shown if full in ("", at.log) else _with_returns(shown, replace(at, log=full))
     truth = opened_log(at.log).truth
     return {
-        "measure": by(judge, scene.scene, truth),
+        "measure": by(shown, scene.scene, truth),
         "heldout_db": heldout_psnr(shown, scene.scene),
         "beside_db": None if truth is None else beside_psnr(shown, scene.scene, truth),
         "gnet_s": seconds_of(job, refs["gnet"])[0],
         "plan_s": seconds_of(job, refs["effects"])[0],
     }
-
-
-def _with_returns(chunk: Chunk, at: Place) -> Chunk:
-    """The chunk with what another log's LiDAR saw of the same street."""
-    job = at.job()
-    other: Chunk = value_of(job, reconstruct(job, STAGES[:1])["ingest"])
-    return replace(chunk, static=other.static, actors=other.actors)
 
 
 def _px_per_s(seed: str, store: str) -> float:

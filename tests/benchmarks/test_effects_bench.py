@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from benchmarks.effects import EFFECTS, calibrated
 from benchmarks.effects.cases import CASES, LITTLE, LONGEST_S
-from benchmarks.effects.cells import Place, _with_returns
 from benchmarks.effects.measures import APART, _apart
 from flows.cli.bench import load
 from genre_tasks.config import IngestConfig, InitialConfig
@@ -18,7 +15,6 @@ from genre_tasks.effects.plan import EFFECTS as NAMES
 from genre_tasks.logs.registry import open_log
 from genre_tasks.metrics.collect import view_image
 from genre_tasks.scene.coloring import visible
-from genre_tasks.scene.depth import lidar_depth
 from genre_tasks.stages.ingest import ingest
 from genre_tasks.stages.initial import initial
 
@@ -48,21 +44,6 @@ def test_a_slow_street_takes_longer_for_as_many_pixels() -> None:
     seconds = [float(case.query(*at).rpartition("=")[2]) for at in ((4.0, 800.0), (4.0, 400.0), (0.0, 400.0))]
     assert seconds == pytest.approx([seconds[0], 2 * seconds[0], 2 * seconds[0] * LITTLE / 4], rel=1e-3)
     assert float(case.query(4.0, 1.0).rpartition("=")[2]) == LONGEST_S
-
-
-def test_few_returns_are_of_one_beam_and_judged_by_the_streets_own_lidar(tmp_path: Path) -> None:
-    case = CASES["lidar_depth"]
-    shot = [float(case.query(factor, 0.0).rpartition("=")[2]) for factor in (0.0, 1.0, 2.0)]
-    assert case.returns and [n / shot[1] for n in shot] == pytest.approx([LITTLE, 1, 2], rel=0.01)
-    assert case.query(4.0, 0.0) == ""
-    street = "synthetic:street?seed=1020&frames=8&cameras=1&samples=1"
-    few, full = (
-        ingest(IngestConfig(width_px=320, height_px=180), open_log(street + q), 0) for q in (case.query(0.0, 0.0), "")
-    )
-    lent = _with_returns(few, Place(street, 0, str(tmp_path / "store")))
-    view = few.of_role("heldout")[0]
-    known = [int((lidar_depth(chunk, view) > 0).sum()) for chunk in (few, lent, full)]
-    assert known[0] < 0.01 * known[1] and known[1] == known[2]
 
 
 def test_cells_are_streets_with_and_without_and_the_real_chunks() -> None:
