@@ -2,12 +2,16 @@
 
 python -m benchmarks.sweep_rates --folder sweep [--seeds 900,901,902] [--lengths 24x6,48x3,240x1] [--start 240x1]
 python -m benchmarks.sweep_rates --folder sweep --weights GNET.safetensors --lengths 72x3 [--real LOG] [--beside 0.5]
+python -m benchmarks.sweep_rates --folder sweep --weights ENET.safetensors --lengths 72x3 --enet [--real LOG] --beside 2
 
 A pattern search by factors of two from the rates in use, or from those of a variant (``--start``): all together, the
 schedule, then each by itself, each as long as it helps, again until a round brings less than ``ENOUGH_DB``. A network's
 rates (and c₀ of its residuals) are tuned as they are in its configuration: meta-training looks a few iterations ahead
 and is blind to what pays later. Scores and scenes are kept in the folder: a sweep that was stopped goes on from there.
 Prints the variants as YAML with their mean score: the held-out PSNR, plus ``--beside`` times that at 3 m on streets.
+
+With ``--enet`` scenes are GNet's with FNet's images of the preset ``small``, split as the preset says; as many fixed
+views as source views are rendered, and the score has the kernel distance at 3 m in it, in dB.
 """
 
 from __future__ import annotations
@@ -25,17 +29,25 @@ from typing import Literal
 
 import yaml
 
+from benchmarks.optimiser.beside import true_targets, views_at
+from benchmarks.optimiser.distillation import KERNEL_VIEWS, Judge
+from benchmarks.optimiser.steps import steps_of
+from benchmarks.optimiser.task import HELDOUT_VIEWS, SIDE_M, Task
 from flows.baselines import load_baselines
-from flows.train.optimiser import score
-from flows.train.scenes import SceneRecipe, prepare, training_scene
+from flows.configuration import load_configuration
+from flows.train.optimiser import psnr
+from flows.train.scenes import SceneRecipe, prepare, spread, training_scene
 from genre_tasks.config import LossConfig
 from genre_tasks.errors import ConfigError
+from genre_tasks.metrics.collect import real_images
 from genre_tasks.optimiser.adam import GNET_RATES, TunedAdam
 from genre_tasks.optimiser.episodes import TrainingScene
 from genre_tasks.optimiser.learned import LearnedOptimiser
+from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.rules import StepRule
-from genre_tasks.optimiser.unroll import Plan
+from genre_tasks.optimiser.unroll import Plan, unroll
 from genre_tasks.optimiser.weights import write_atomically
+from genre_tasks.scene.graph import SceneGraph
 from storage.files import digest_file
 from storage.local import LocalStore
 
@@ -109,22 +121,32 @@ def network_of(weights: Path) -> tuple[Setting, Callable[[Setting], StepRule]]:
     return Setting(config.rates, relaxation=config.relaxation), tuned
 
 
+@dataclass(frozen=True)
+class Subject:
+    """A scene to optimise, ``split`` as ENet's; ``closeness`` in dB of its result: what counts beside PSNR, if any."""
+
+    scene: TrainingScene
+    split: float = 0.0
+    closeness: Callable[[SceneGraph], float] | None = None
+
+
 class Scores:
     """Scores in dB of settings, each measured once and then read from the file.
 
     ``rule_of`` makes the rule of a setting; ``beside``: how much the PSNR at the novel views counts, where there is
-    one. A scene's name is the seed of its views' order, or 0.
+    one. A scene's name is the seed of its views' order, or 0. Where a scene has fixed views, as many of them as of the
+    source views are rendered.
     """
 
     def __init__(
         self,
         file: Path,
-        scenes: Mapping[int | str, Callable[[], TrainingScene]],
+        scenes: Mapping[int | str, Callable[[], Subject]],
         rule_of: Callable[[Setting], StepRule] = adam_of,
         beside: float = 0.0,
     ) -> None:
         self.file, self._scenes, self._rule_of, self._beside = file, scenes, rule_of, beside
-        self._made: dict[int | str, TrainingScene] = {}
+        self._made: dict[int | str, Subject] = {}
         self._known: dict[str, float] = json.loads(file.read_text()) if file.is_file() else {}
 
     def mean(self, setting: Setting, iterations: int, views: int) -> float:
@@ -136,12 +158,18 @@ class Scores:
         if key not in self._known:
             if name not in self._made:
                 self._made[name] = self._scenes[name]()
-            plan = Plan(iterations, views, seed=name if isinstance(name, int) else 0)
-            found = score(self._rule_of(setting), self._made[name], LOSS, plan, None)
-            beside = self._beside * found.novel if self._beside and self._made[name].truth else 0.0
-            self._known[key] = found.heldout + beside
+            self._known[key] = self._measured(name, setting, iterations, views)
             write_atomically(self.file, json.dumps(self._known, indent=0).encode())
         return self._known[key]
+
+    def _measured(self, name: int | str, setting: Setting, iterations: int, views: int) -> float:
+        subject = self._made[name]
+        scene = subject.scene
+        seed, novel = name if isinstance(name, int) else 0, views if scene.fixed else 0
+        plan = Plan(iterations, views, novel, seed=seed, split=subject.split)
+        end = unroll(self._rule_of(setting), scene.scene, scene.source, scene.fixed, Objective(LOSS), plan).scene
+        beside = self._beside * psnr(end, scene.truth) if self._beside and scene.truth else 0.0
+        return psnr(end, scene.heldout) + beside + (subject.closeness(end) if subject.closeness else 0.0)
 
 
 def search(
@@ -179,18 +207,34 @@ def validation_seeds(text: str) -> list[int]:
 
 
 def scenes_of(
-    store: LocalStore, seeds: Sequence[int], points: int, real: str | None = None
-) -> dict[int | str, Callable[[], TrainingScene]]:
-    """Makers of the seeds' scenes and of a real chunk 0, at 320×180, with all source views and twelve held-out ones."""
+    seeds: Sequence[int], real: str | None, make: Callable[[str], Subject]
+) -> dict[int | str, Callable[[], Subject]]:
+    """Makers of the seeds' scenes and of a real chunk 0, by their URI."""
+    uris: dict[int | str, str] = {seed: f"synthetic:street?seed={seed}" for seed in seeds}
+    uris |= {} if real is None else {"real": real}
+    return {name: partial(make, uri) for name, uri in uris.items()}
 
-    def maker(uri: str) -> Callable[[], TrainingScene]:
-        recipe = SceneRecipe(uri, max_points=points, distant_count=points // 10)
-        return lambda: training_scene(prepare(store, recipe))
 
-    makers: dict[int | str, Callable[[], TrainingScene]] = {
-        seed: maker(f"synthetic:street?seed={seed}") for seed in seeds
-    }
-    return makers | ({} if real is None else {"real": maker(real)})
+def initial(store: LocalStore, points: int, uri: str) -> Subject:
+    """GNet's task: an initial scene at 320×180, with all source views and twelve held-out ones."""
+    recipe = SceneRecipe(uri, max_points=points, distant_count=points // 10)
+    return Subject(training_scene(prepare(store, recipe)))
+
+
+def enhanced(store: str, split: float | None, uri: str) -> Subject:
+    """ENet's task: GNet's scene and FNet's images in the preset ``small``."""
+    split = load_configuration("small").enet.split if split is None else split
+    steps = steps_of(uri, 0, store, 0, enet=False)
+    heldout, truth = spread(steps.heldout, HELDOUT_VIEWS), true_targets(uri, store, steps.chunk, SIDE_M)
+    scene = TrainingScene(uri, steps.gnet, steps.source, heldout, steps.fixed, truth)
+    task = Task(steps.gnet, steps.source, heldout, truth)
+    judge = Judge(views_at(steps.chunk, SIDE_M, KERNEL_VIEWS), real_images(steps.chunk), task)
+    return Subject(scene, split, partial(kernel_db, judge))
+
+
+def kernel_db(judge: Judge, scene: SceneGraph) -> float:
+    """The kernel distance at 3 m to the real images, in dB: a tenth less is half a decibel."""
+    return -10 * math.log10(max(judge.mark(scene, 0.0, 0).kernel, 1e-3))
 
 
 def say(text: str) -> None:
@@ -208,21 +252,30 @@ def main() -> None:
     parser.add_argument("--factor", type=float, default=2.0, help="of a move")
     parser.add_argument("--weights", type=Path, help="a network's, to tune its rates instead of Adam's")
     parser.add_argument("--real", help="a log whose chunk 0 counts as one more scene")
+    parser.add_argument("--enet", action="store_true", help="tune for ENet's task")
+    parser.add_argument("--split", type=float, help="as enet.split; without it the preset's")
+    parser.add_argument("--rates", help="five with commas, which the search for Adam's starts from, schedule constant")
     parser.add_argument("--beside", type=float, default=0.0, help="how much the PSNR at 3 m counts")
     options = parser.parse_args()
-    if options.weights is not None and options.start is not None:
-        parser.error("--start is a variant of Adam; a network's search starts from its own rates")
+    if options.weights is not None and (options.start is not None or options.rates is not None):
+        parser.error("--start and --rates are Adam's; a network's search starts from its own rates")
     options.folder.mkdir(parents=True, exist_ok=True)
-    seeds, store = validation_seeds(options.seeds), LocalStore(options.folder / "store")
-    makers = scenes_of(store, seeds, options.points, options.real)
+    seeds, store = validation_seeds(options.seeds), options.folder / "store"
+    make: Callable[[str], Subject] = partial(initial, LocalStore(store), options.points)
+    if options.enet:
+        make = partial(enhanced, str(store), options.split)
+    makers = scenes_of(seeds, options.real, make)
     best = Setting() if options.start is None else setting_of(options.start)
+    if options.rates is not None:
+        best = Setting(tuple(float(rate) for rate in options.rates.split(",")), "constant")
     rule_of: Callable[[Setting], StepRule] = adam_of
     ways = partial(moves, options.factor)
     if options.weights is not None:
         best, rule_of = network_of(options.weights)
         ways = partial(network_moves, options.factor)
     digest = "" if options.weights is None else f"-{digest_file(options.weights)[:8]}"
-    file = options.folder / f"scores{digest}{f'-{options.beside}' if options.beside else ''}.json"
+    task = f"-enet{'' if options.split is None else f'-{options.split}'}" if options.enet else ""
+    file = options.folder / f"scores{task}{digest}{f'-{options.beside}' if options.beside else ''}.json"
     scores = Scores(file, makers, rule_of, options.beside)
     for length in options.lengths.split(","):
         iterations, views = (int(part) for part in length.split("x"))

@@ -111,6 +111,12 @@ class OptimiserConfig(Section):
         "builtin", description="builtin, builtin:NAME (another network's, e.g. gnet), or a path to a .safetensors file."
     )
     hold_ground: bool = Field(True, description="Flat discs that lie on the ground move and turn in their plane only.")
+    split: float = Field(
+        0.0,
+        ge=0,
+        le=4,
+        description="So many more Gaussians, per those there are, where images have more to show: split.",
+    )
     snapshots: int = Field(6, ge=0, description="Intermediate scenes kept for the curve of accuracy against seconds.")
     seed: int = Field(0, ge=0)
 

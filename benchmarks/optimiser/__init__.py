@@ -138,6 +138,8 @@ class _Maker:
 
     def distillation(self, log: str, chunk: int, order: int) -> Cell:
         enet_s, configs = _learned_s(self._small.enet), adam_variants(self._small.enet)
+        if split := self._small.enet.split:
+            configs |= adam_variants(self._small.enet, split)
         seconds = enet_s * (1 + MOST_TIMES * len(configs)) + SLOWER_3DGS * RENDER_S * STANDARD_ITERATIONS
         measure = partial(measure_distillation, log, chunk, self._store, order, self._cap)
         values = {name: config.model_dump(mode="json") for name, config in configs.items()}

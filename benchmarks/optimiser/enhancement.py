@@ -20,9 +20,9 @@ from genre_tasks.metrics.collect import BOOTSTRAP_SEED, FeatureSet, real_images
 from genre_tasks.metrics.distribution import kernel_difference, kernel_distance
 from genre_tasks.metrics.perceptual import perceptual_distance
 from genre_tasks.optimiser.objective import Objective
-from genre_tasks.optimiser.run import distance, step_rule
+from genre_tasks.optimiser.run import distance, plan_of, step_rule
 from genre_tasks.optimiser.targets import Target
-from genre_tasks.optimiser.unroll import Plan, unroll
+from genre_tasks.optimiser.unroll import unroll
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.views import NovelView
 from genre_tasks.weights import resolve_weights
@@ -61,16 +61,8 @@ def as_enhancer(config: PipelineConfig) -> OptimiserConfig:
 def enhanced_by_gnet(steps: Steps) -> SceneGraph:
     """GNet's network on the same fixed images, from the same scene."""
     config = as_enhancer(steps.config)
-    plan = Plan(
-        config.iterations,
-        config.views_per_iteration,
-        config.novel_views_per_iteration,
-        seed=config.seed,
-        stage="enet",
-        hold_ground=config.hold_ground,
-    )
-    objective = Objective(config.loss, distance(config))
-    return unroll(step_rule("enet", config), steps.gnet, steps.source, steps.fixed, objective, plan).scene
+    rule, objective = step_rule("enet", config), Objective(config.loss, distance(config))
+    return unroll(rule, steps.gnet, steps.source, steps.fixed, objective, plan_of("enet", config)).scene
 
 
 def against_truth(scenes: Scenes, truth: Sequence[Target]) -> Row:

@@ -22,6 +22,7 @@ from genre_tasks.optimiser.per_scene_start import world_static
 from genre_tasks.optimiser.rules import StepRule
 from genre_tasks.optimiser.run import step_rule
 from genre_tasks.optimiser.sampler import ViewSampler
+from genre_tasks.optimiser.splitting import split_where_images_have_more
 from genre_tasks.optimiser.state import Frame, State
 from genre_tasks.optimiser.targets import Target
 from genre_tasks.optimiser.unroll import Plan, camera_centre, moved_scene
@@ -70,7 +71,8 @@ def walk(
     rule, objective = make()
     generator = torch.Generator().manual_seed(plan.seed)
     samplers = ViewSampler(task.source, plan.views, generator), ViewSampler(novel, plan.novel_views, generator)
-    frame, state = Frame.of(task.scene, plan.hold_ground), State.start(len(task.scene), task.scene.gaussians.means)
+    scene = split_where_images_have_more(task.scene, [*task.source, *novel], plan.split)
+    frame, state = Frame.of(scene, plan.hold_ground), State.start(len(scene), scene.gaussians.means)
     step = rule.start(frame, camera_centre(task.source))
     seconds, renders = time.perf_counter() - began, 0
     for i in itertools.count():

@@ -81,8 +81,9 @@ def _distillation(rows: Sequence[Row]) -> Iterator[str]:
     for row in rows:
         yield f"| {place(row)} | as it is | " + " | ".join(_mark(row["start"])) + " | |"
         yield "| | ENet | " + " | ".join(_mark(row["enet"])) + " | |"
-        for family in ("adam", "standard"):
-            found = row[family]
+        for family in ("adam", "adam_split", "standard"):
+            if (found := row.get(family)) is None:
+                continue
             times = f"{beyond.times_distillation(row, family):.2f}" if found["enet_as_good"] else "no"
             yield f"| | {family}, at its best | " + " | ".join(_mark(found["best"])) + f" | {times} |"
             seconds, as_enet = found["reached_s"], found["as_good_as_enet_s"]

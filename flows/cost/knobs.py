@@ -20,6 +20,8 @@ End = Literal["gnet", "enet"]
 PRESET_ITSELF = "preset"
 TOGETHER, EFFECTS = "together", "effects"
 LENGTHS = (1, 4, 8, 16, 24, 48, 72, 144)
+ENHANCING = (1 / 6, 1 / 3, 2 / 3, 2.0)
+"""ENet's lengths, of the preset's."""
 SIZES = ((160, 90), (240, 136), (320, 180), (480, 270))
 GAUSSIANS = (0.25, 0.5, 1.0, 2.0, 4.0)
 VIEWS = (1, 3, 6, 12)
@@ -88,9 +90,10 @@ def settings_of(preset: str, settings: Sequence[str] = (), knobs: Sequence[str] 
 
 def _knobs(base: PipelineConfig) -> Mapping[str, list[Setting]]:
     points = base.initial.max_points
+    enhancing = [max(1, round(base.enet.iterations * x)) for x in ENHANCING]
     return {
         "gnet_iterations": [Setting("gnet_iterations", f"{t}", (f"gnet.iterations={t}",)) for t in LENGTHS],
-        "enet_iterations": [Setting("enet_iterations", f"{t}", (f"enet.iterations={t}",)) for t in (4, 8, 12, 24)],
+        "enet_iterations": [Setting("enet_iterations", f"{t}", (f"enet.iterations={t}",)) for t in enhancing],
         "resolution": [
             Setting("resolution", f"{w}x{h}", (f"ingest.width_px={w}", f"ingest.height_px={h}")) for w, h in SIZES
         ],
@@ -117,22 +120,22 @@ def _knobs(base: PipelineConfig) -> Mapping[str, list[Setting]]:
             if name not in NOT_SWEPT and field.annotation != Literal["auto", "off"]
         ],
         "threads": [Setting("threads", f"{n}", threads=n) for n in _halved(os.cpu_count() or 1)],
-        TOGETHER: _together(points),
+        TOGETHER: _together(points, (enhancing[0], enhancing[-1])),
     }  # fmt: skip
 
 
-def _together(points: int) -> list[Setting]:
+def _together(points: int, enhancing: tuple[int, int]) -> list[Setting]:
     """Several knobs at once: lengths of GNet and ENet, as they share stages; and the cheapest and the costliest."""
     fewer = f"initial.max_points={points // 2}"
     small = ("ingest.width_px=240", "ingest.height_px=136")
     designed: list[tuple[str, tuple[str, ...], End]] = [("least", (*small, fewer, "gnet.iterations=8"), "gnet")]
     for gnet in (4, 8, 16, 24, 48, 144):
         designed.append((f"GNet {gnet} alone", (f"gnet.iterations={gnet}",), "gnet"))
-        for enet in (4, 24):
+        for enet in enhancing:
             changes = (f"gnet.iterations={gnet}", f"enet.iterations={enet}")
             designed.append((f"GNet {gnet}, ENet {enet}", changes, "enet"))
     most = (f"initial.max_points={2 * points}", "gnet.iterations=144", "gnet.views_per_iteration=6")
-    designed.append(("most", (*most, "enet.iterations=24"), "enet"))
+    designed.append(("most", (*most, f"enet.iterations={enhancing[1]}"), "enet"))
     return [Setting(TOGETHER, name, changes, end) for name, changes, end in designed]
 
 

@@ -98,6 +98,7 @@ _AS_PUBLISHED = ("effects.rolling_shutter=off", "effects.exposure=off", "effects
 _DISTILLED = (
     "enet.method=adam", "enet.iterations=480", "enet.views_per_iteration=3", "enet.novel_views_per_iteration=3",
     "enet.adam.rates=[0.05,0.05,0.0125,0.075,0.005]", "enet.adam.schedule=constant", "enet.loss.perceptual=0",
+    "enet.split=0",
 )  # fmt: skip
 """Per-scene distillation: the variant of tuned Adam that ``genre bench optimiser`` found to distil best (3 + 3 views an
 iteration at half of the rates, no perceptual term), long enough to settle."""

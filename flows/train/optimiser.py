@@ -38,8 +38,12 @@ class Score:
     views: int
 
 
-def network_from(config: NetworkConfig, seed: int, weights: Path | None = None) -> LearnedOptimiser:
+def network_from(
+    config: NetworkConfig, seed: int, weights: Path | None = None, new_head: bool = False
+) -> LearnedOptimiser:
     """A new network, or one that starts from ``weights`` with the rates and, if any, residuals of ``config``.
+
+    ``new_head``: its last layer is a new one, so that its first step is tuned Adam's.
 
     Raises ``InputError`` for weights that are missing, unreadable, or of a network of another shape.
     """
@@ -48,7 +52,7 @@ def network_from(config: NetworkConfig, seed: int, weights: Path | None = None) 
         network = LearnedOptimiser(config)
     if weights is not None:
         start = LearnedOptimiser.load(weights)
-        may = {"rates", "relaxation"} | ({"residuals"} if config.residuals else set())
+        may = {"rates", "relaxation", "schedule"} | ({"residuals"} if config.residuals else set())
         other = {name for name, value in config if name not in may and value != getattr(start.config, name)}
         if other:
             raise InputError(
@@ -56,7 +60,10 @@ def network_from(config: NetworkConfig, seed: int, weights: Path | None = None) 
                 remedy="Start from weights of the same network, or from none.",
                 file=weights,
             )
-        network.load_state_dict(with_residuals(start) if config.residuals else start.state_dict())
+        values = with_residuals(start) if config.residuals else start.state_dict()
+        if new_head:
+            values |= {name: value for name, value in network.state_dict().items() if name.startswith("head.")}
+        network.load_state_dict(values)
     return network
 
 

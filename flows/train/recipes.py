@@ -37,6 +37,8 @@ ENET_LOSS = LossConfig(perceptual=0.02, perceptual_every=2)
 ENET_JUDGE = LossConfig(perceptual=0.05, perceptual_every=1, depth=0.0)
 
 GNET_NETWORK, ENET_NETWORK = NetworkConfig(rates=GNET_RATES), NetworkConfig(rates=ENET_RATES)
+MANY_NETWORK = NetworkConfig(rates=ENET_RATES, residuals=True, relaxation=-1.1)
+SWEPT_NETWORK = MANY_NETWORK.model_copy(update={"rates": (0.256, 0.4096, 0.064, 0.384, 0.016)})
 TOLD_NETWORK = NetworkConfig(rates=TOLD_RATES, residuals=True, relaxation=TOLD_RELAXATION)
 
 
@@ -61,7 +63,8 @@ class Stage:
     """One stage of a training.
 
     ``start``: the stage whose weights it starts from, or those that ship (``builtin:gnet``); ``None``: new weights.
-    ``network`` has the rates. ``begins``: where scenes begin, in turn. ``images``: what is seen beside the path.
+    ``network`` has the rates; ``new_head``: the last layer starts anew. ``begins``: where scenes begin, in turn;
+    ``split``: as ENet's, there. ``images``: what is seen beside the path.
     ``config``: T, views, losses, steps, rate.
     """
 
@@ -72,6 +75,8 @@ class Stage:
     config: MetaConfig
     begins: tuple[Begin, ...] = (Initial(),)
     images: Images | None = None
+    new_head: bool = False
+    split: float = 0.0
 
     @property
     def of(self) -> str:
@@ -145,6 +150,17 @@ def _strides(name: str, start: str, gnet: str, **own: Any) -> Stage:
     return Stage(name, start, GNET_NETWORK, scenes, config, _long(gnet), Images("fnet"))
 
 
+def _many(name: str, start: str, **own: Any) -> Stage:
+    """ENet with many iterations of few views, told residuals, without the perceptual term, which judges it alone."""
+    config = _enet(
+        judged=3.0, judges=6, sample=0.25, views=(3,), novel_views=3, pool=6, segment=8,
+        loss=LossConfig(perceptual=0.0), judge_loss=LossConfig(perceptual=1.0, perceptual_every=1, depth=0.0), **own,
+    )  # fmt: skip
+    begins = (ByGnet("gnet/told", 72, 3),)
+    scenes = replace(DENSE, count=12, real=1)
+    return Stage(name, start, MANY_NETWORK, scenes, config, begins, Images("fnet"), new_head=True, split=0.45)
+
+
 ENET_STAGES = (
     Stage(
         "enet/coarse", "gnet/coarse", ENET_NETWORK, SceneList("coarse", 24, real=0),
@@ -165,9 +181,13 @@ ENET_STAGES = (
     ),
     _strides("enet/strides", "enet/dense", "gnet/many", steps=300, rate=5e-4, seed=71),
     _strides("enet/held", "enet/strides", "gnet/dense", steps=300, rate=2.5e-4, seed=81),
+    _many("enet/many", "enet/held", steps=800, rate=1e-3, seed=91, iterations=(48, 72)),
+    Stage("enet/swept", "enet/many", SWEPT_NETWORK, SceneList("coarse", 1, real=0), _enet(steps=0)),
 )  # fmt: skip
-"""ENet from GNet's weights after their coarse stage: at 160×90 with stand-ins for FNet's images, then with those; last
-at GNet's rates, twice as far a step, and there once more on scenes whose ground was held."""
+"""ENet from GNet's weights after their coarse stage: at 160×90 with stand-ins for FNet's images, then with those; at
+GNet's rates, twice as far a step, and there once more on scenes whose ground was held; with a new last layer for many
+cheap iterations instead of a few dear ones, on scenes whose Gaussians are split. The last stage trains nothing: its
+rates were swept for whole optimisations (``benchmarks/sweep_rates.py``)."""
 
 AGED: tuple[Begin, ...] = (PerScene(120, 960), Adam(24), PerScene(480, 960), Adam(48), PerScene(960, 960), Adam(96))
 

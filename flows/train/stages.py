@@ -22,6 +22,7 @@ from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.logs.registry import open_log
 from genre_tasks.optimiser.episodes import TrainingScene
 from genre_tasks.optimiser.loss import Distance
+from genre_tasks.optimiser.splitting import split_where_images_have_more
 from genre_tasks.optimiser.targets import of_fixed
 from genre_tasks.optimiser.unroll import Plan
 from genre_tasks.progress import Progress, silent
@@ -152,9 +153,8 @@ def load_scenes(job: TrainJob, stage: Stage, at: Sequence[Place], progress: Prog
         start = begun(job.store, prepared, place.begin, job.weights)
         fixed = _images(job, stage, prepared, place.begin)
         seen = () if fixed is None else of_fixed(fixed)
-        out.append(
-            replace(bare, name=f"{bare.name} {place.begin}", scene=start.scene, fixed=seen, truth=bare.truth or seen)
-        )
+        scene = split_where_images_have_more(start.scene, [*bare.source, *seen], stage.split)
+        out.append(replace(bare, name=f"{bare.name} {place.begin}", scene=scene, fixed=seen, truth=bare.truth or seen))
     return out
 
 
@@ -170,7 +170,7 @@ def train_stage(job: TrainJob, stage: Stage, progress: Progress = silent) -> Tra
         return Trained(stage.name, str(weights), cached=True)
     start = None if stage.start is None else job.weights(stage.start)
     device = chosen_device(job.device)
-    network = network_from(stage.network, 0, start).to(device)
+    network = network_from(stage.network, 0, start, stage.new_head).to(device)
     scenes = [scene_on(scene, device) for scene in load_scenes(job, stage, at, progress)]
     distance, watch = _distance(stage, device), None
     if job.validate_every:

@@ -41,7 +41,14 @@ def optimise(
     rule = step_rule(stage, config)
     source = targets.of_source(chunk, depth=config.loss.depth > 0)
     novel = () if fixed is None else targets.of_fixed(fixed)
-    plan = Plan(
+    return unroll(
+        rule, scene, source, novel, Objective(config.loss, distance(config)), plan_of(stage, config), progress
+    )
+
+
+def plan_of(stage: StageName, config: OptimiserConfig) -> Plan:
+    """How far and how often to look, as the configuration says."""
+    return Plan(
         config.iterations,
         config.views_per_iteration,
         config.novel_views_per_iteration,
@@ -50,8 +57,8 @@ def optimise(
         stage,
         config.hold_ground,
         deform=stage == "gnet",  # the fixer's images of people are no measure of their shape
+        split=config.split,
     )
-    return unroll(rule, scene, source, novel, Objective(config.loss, distance(config)), plan, progress)
 
 
 def planned(config: OptimiserConfig, plan: EffectsPlan) -> OptimiserConfig:

@@ -16,6 +16,7 @@ from genre_tasks.optimiser.objective import Objective, check_finite
 from genre_tasks.optimiser.passes import Beside
 from genre_tasks.optimiser.rules import StepRule, schedule
 from genre_tasks.optimiser.sampler import ViewSampler
+from genre_tasks.optimiser.splitting import split_where_images_have_more
 from genre_tasks.optimiser.state import Frame, State
 from genre_tasks.optimiser.targets import Target
 from genre_tasks.progress import Progress, silent
@@ -32,7 +33,8 @@ class Plan:
     """How far and how often to look: ``iterations`` T, views drawn in each, snapshots kept on the way, the seed.
 
     ``stage`` names the run in errors; ``hold_ground``: see ``Frame.of``; ``deform``: how actors deform is fitted,
-    else it stays as the scene has it.
+    else it stays as the scene has it; ``split``: so many more Gaussians, per those there are, before the first
+    iteration, see ``splitting``.
     """
 
     iterations: int
@@ -43,6 +45,7 @@ class Plan:
     stage: str = "optimiser"
     hold_ground: bool = True
     deform: bool = True
+    split: float = 0.0
 
     def snapshot_iterations(self) -> frozenset[int]:
         """Evenly spaced, without 0 and T."""
@@ -62,11 +65,13 @@ def unroll(
     """Runs ``plan.iterations`` steps of ``rule`` from ``scene``.
 
     In each, ``plan.views`` of ``source`` and ``plan.novel_views`` of ``novel`` are rendered, drawn with the plan's
-    seed. The same inputs give the same bytes at any thread count. An empty scene stays empty. Raises
-    ``NonFiniteError`` naming the first tensor that is not finite, ``InputError`` where no view saw any Gaussian.
+    seed; before them the scene is split as the plan says. The same inputs give the same bytes at any thread count. An
+    empty scene stays empty. Raises ``NonFiniteError`` naming the first tensor that is not finite, ``InputError`` where
+    no view saw any Gaussian.
     """
     generator = torch.Generator().manual_seed(plan.seed)
     samplers = [ViewSampler(source, plan.views, generator), ViewSampler(novel, plan.novel_views, generator)]
+    scene = split_where_images_have_more(scene, [*source, *novel], plan.split)
     frame = Frame.of(scene, plan.hold_ground)
     state = State.start(len(scene), scene.gaussians.means)
     gloss = _gloss_of(scene)

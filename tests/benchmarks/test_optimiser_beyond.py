@@ -127,13 +127,16 @@ def test_enet_beside_distillations_of_the_same_images(task: Task) -> None:
     features = perceptual_distance().pooled_features(images_of(street.scene(), task.source))
     judge = Judge(views, FeatureSet(features, (0, 0, 1, 1)), replace(task, beside=novel))
     enet = OptimiserConfig(
-        iterations=2, views_per_iteration=2, novel_views_per_iteration=2, loss=LossConfig(perceptual=0.1)
+        iterations=2, views_per_iteration=2, novel_views_per_iteration=2, split=0.1, loss=LossConfig(perceptual=0.0)
     )
     row = distillation.distillation_row(enet, PerSceneConfig(iterations=6), judge, novel)
     assert row["enet"][1] == 8 and row["enet"][0] > 0
     variants = ["1+1 at 0.25", "2+2 at 0.5, no perceptual"]
     assert list(row["adam"]["curves"]) == variants and list(row["standard"]["curves"]) == ["6"]
-    for family in ("adam", "standard"):
+    assert list(row["adam_split"]["curves"]) == ["2+2 at 0.5, no perceptual, split"]
+    given = distillation.adam_variants(enet)
+    assert [(c.split, c.loss.perceptual) for c in given.values()] == [(0.0, 0.1), (0.0, 0.0)]
+    for family in ("adam", "adam_split", "standard"):
         assert all(curve[0] == row["start"] for curve in row[family]["curves"].values())
         assert row[family]["reached_s"] > 0
         assert row[family]["best"][2] == min(m[2] for c in row[family]["curves"].values() for m in c[1:])

@@ -45,7 +45,9 @@ def test_the_shipped_weights_are_described() -> None:
     gnet = ["gnet/coarse", "gnet/fine", "gnet/finer", "gnet/unseen", "gnet/many", "gnet/dense"]
     assert table["gnet/told"].network == load(resolve_weights("gnet", "builtin")).config
     assert table["gnet/told"].network == load(resolve_weights("g3r", "builtin")).config
-    assert names == [*gnet, "enet/coarse", "enet/fine", "enet/dense", "enet/strides", "enet/held"]
+    enet = ["enet/coarse", "enet/fine", "enet/dense", "enet/strides", "enet/held", "enet/many"]
+    assert names == [*gnet, "gnet/told", *enet, "enet/swept"]
+    assert table["enet/swept"].network == load(resolve_weights("enet", "builtin")).config
 
 
 def test_the_paper_begins_with_enet() -> None:

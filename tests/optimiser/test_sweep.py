@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import pytest
 
-from benchmarks.sweep_rates import Scores, Setting, network_moves, network_of, search, validation_seeds
+from benchmarks.sweep_rates import Scores, Setting, Subject, network_moves, network_of, search, validation_seeds
 from genre_tasks.errors import ConfigError
 from genre_tasks.optimiser.adam import GNET_RATES
 from genre_tasks.optimiser.episodes import TrainingScene
 from genre_tasks.optimiser.learned import LearnedOptimiser, NetworkConfig
 from genre_tasks.optimiser.weights import save
+from genre_tasks.scene.graph import SceneGraph
 from tests.optimiser import street
 
 
@@ -32,11 +34,12 @@ def test_it_finds_rates_that_are_all_far_off_and_a_schedule() -> None:
 
 
 def test_scores_are_kept_and_not_measured_again(tmp_path: Path) -> None:
-    def scene() -> TrainingScene:
+    def scene() -> Subject:
         truth = street.scene()
-        return TrainingScene("tiny", street.blurred(truth), street.targets(truth), street.targets(truth, novel=True))
+        views, novel = street.targets(truth), street.targets(truth, novel=True)
+        return Subject(TrainingScene("tiny", street.blurred(truth), views, novel))
 
-    def never() -> TrainingScene:
+    def never() -> Subject:
         raise AssertionError("measured again")
 
     first = Scores(tmp_path / "scores.json", {900: scene}).mean(Setting(), 2, 2)
@@ -67,11 +70,29 @@ def test_a_networks_rates_are_searched_with_its_relaxation(tmp_path: Path) -> No
 def test_what_is_beside_the_path_counts_where_it_is_asked_for(tmp_path: Path) -> None:
     truth = street.scene()
     views, novel = street.targets(truth), street.targets(truth, novel=True)
-    scenes = {900: lambda: TrainingScene("s", street.blurred(truth), views, views, truth=novel)}
+    scenes = {900: lambda: Subject(TrainingScene("s", street.blurred(truth), views, views, truth=novel))}
     at, there = (
         Scores(tmp_path / f"{beside}.json", scenes, beside=beside).mean(Setting(), 2, 2) for beside in (0.0, 0.5)
     )
     assert there > at + 2.5
+
+
+def test_an_enhancer_is_scored_by_what_it_is_given_and_by_how_close_it_comes(tmp_path: Path) -> None:
+    truth = street.scene()
+    views, novel = street.targets(truth), street.targets(truth, novel=True)
+    scene = TrainingScene("s", street.blurred(truth), views, views, fixed=novel)
+    seen: list[int] = []
+
+    def closeness(result: SceneGraph) -> float:
+        seen.append(len(result))
+        return 7.0
+
+    plain = Scores(tmp_path / "a.json", {900: lambda: Subject(scene)}).mean(Setting(), 2, 2)
+    alone = Scores(tmp_path / "b.json", {900: lambda: Subject(replace(scene, fixed=()))}).mean(Setting(), 2, 2)
+    whole = Scores(tmp_path / "c.json", {900: lambda: Subject(scene, closeness=closeness)}).mean(Setting(), 2, 2)
+    split = Scores(tmp_path / "d.json", {900: lambda: Subject(scene, 0.1, closeness)}).mean(Setting(), 2, 2)
+    assert plain != alone and whole == plain + 7.0 and split != whole
+    assert seen == [300, 330]
 
 
 def test_only_validation_seeds_are_tuned_on() -> None:
