@@ -31,7 +31,7 @@ from genre_tasks.config import GnetConfig, OptimiserConfig, PipelineConfig
 from genre_tasks.errors import ConfigError
 from genre_tasks.optimiser.run import step_rule
 
-RENDER_S, STEP_S, JUDGE_S = 0.012, 0.1, 0.2
+RENDER_S, STEP_S, JUDGE_S = 0.012, 0.02, 0.2
 """Predicted for a view with its gradient at 40k Gaussians, a step of a network, and a look at a scene."""
 QUICK_CAP = 10.0
 PARTS = ("race", "enhancement", "distillation", "converged", "stability", "trade")

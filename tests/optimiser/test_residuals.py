@@ -16,8 +16,10 @@ from genre_tasks.errors import InputError
 from genre_tasks.logs.types import MotionBlur
 from genre_tasks.optimiser.adam import TunedAdam
 from genre_tasks.optimiser.episodes import TrainingScene
+from genre_tasks.optimiser.features import FEATURES
 from genre_tasks.optimiser.learned import LearnedOptimiser, NetworkConfig
 from genre_tasks.optimiser.loss import residual_image
+from genre_tasks.optimiser.network_constants import RESIDUALS, VARYING
 from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.passes import Beside, BlurredPass, CompiledPass, TorchPass, begin
 from genre_tasks.optimiser.ssim import SsimTarget
@@ -166,7 +168,16 @@ def test_the_kernels_step_is_torchs(hidden: int, channels: tuple[int, ...]) -> N
 
 def test_weights_without_them_can_be_told_them(tmp_path: Path) -> None:
     """What is new counts for nothing but the step towards the mean residual."""
-    start = Path(resolve_weights("enet", "builtin"))
+    start = tmp_path / "plain.safetensors"
+    shipped = load(Path(resolve_weights("gnet", "builtin")))
+    values = dict(shipped.state_dict())
+    values["entry.weight"] = values["entry.weight"][
+        :, [*range(VARYING), *range(VARYING + RESIDUALS, FEATURES + RESIDUALS)]
+    ]
+    values |= {name: values[name][:28] for name in ("head.weight", "head.bias")}
+    without = LearnedOptimiser(NetworkConfig())
+    without.load_state_dict(values)
+    save(without, start)
     plain, told = load(start), network_from(NetworkConfig(residuals=True), 0, start)
     save(told, tmp_path / "told.safetensors")
     told = load(tmp_path / "told.safetensors")
