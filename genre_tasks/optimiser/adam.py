@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 from torch import Tensor
 
 from genre_tasks.optimiser.fused_calls import adam_step
 from genre_tasks.optimiser.fused_library import takes
-from genre_tasks.optimiser.rules import Schedule, Step, rate_vector, schedule
+from genre_tasks.optimiser.rules import Step, rate_vector, schedule
 from genre_tasks.optimiser.state import Frame, State
 
 GNET_RATES = (0.2, 0.2, 0.05, 0.3, 0.02)
@@ -25,7 +26,7 @@ class TunedAdam:
     """
 
     rates: Sequence[float] = GNET_RATES
-    decay: Schedule = "cosine"
+    decay: Literal["cosine", "constant"] = "cosine"
 
     @property
     def residuals(self) -> bool:
@@ -37,7 +38,7 @@ class TunedAdam:
         rates = rate_vector(self.rates)
 
         def step(state: State, gradient: Tensor, total: int) -> Tensor:
-            part = schedule(state.iteration, total, self.decay)
+            part = schedule(state.iteration, total) if self.decay == "cosine" else 1.0
             if takes(state.first):
                 return adam_step(state, -rates * part)
             return -rates.to(state.first.device) * part * state.direction() * state.seen_now

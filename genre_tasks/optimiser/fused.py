@@ -15,7 +15,7 @@ from genre_tasks.optimiser.fused_calls import learned_step
 from genre_tasks.optimiser.fused_layers import LANES, ByOwner, Layers, Memory, Pairs, padded, round_up
 from genre_tasks.optimiser.fused_library import Network, Scene
 from genre_tasks.optimiser.network_constants import BLOCK
-from genre_tasks.optimiser.rules import rate_vector
+from genre_tasks.optimiser.rules import rate_vector, schedule
 from genre_tasks.optimiser.sparse_unet import VoxelPyramid
 from genre_tasks.optimiser.state import Frame, State
 
@@ -31,7 +31,7 @@ class FusedStep:
 
     def __init__(self, network: LearnedOptimiser, frame: Frame, fixed: Fixed, pyramid: VoxelPyramid) -> None:
         self._memory = Memory()
-        self._rates, self._scheduled = -rate_vector(network.config.rates), network.scheduled
+        self._rates = -rate_vector(network.config.rates)
         self._count, self._residuals = len(pyramid.voxel_of), network.residuals
         hidden = round_up(network.config.hidden, 2 * LANES)
         self._network = _dense_layers(network, hidden, self._memory)
@@ -45,7 +45,7 @@ class FusedStep:
         """
         if len(gradient) != self._count:
             raise ValueError(f"expected the gradient of {self._count} Gaussians, got {len(gradient)}")
-        part, time = self._scheduled(state.iteration, total), torch.tensor(times(state.iteration, total))
+        part, time = schedule(state.iteration, total), torch.tensor(times(state.iteration, total))
         if (state.residuals is None) == self._residuals:
             raise ValueError(f"expected a state {'with' if self._residuals else 'without'} residuals")
         return learned_step(self._network, self._scene, state, gradient, self._rates * part, time, part)

@@ -23,7 +23,7 @@ from genre_tasks.optimiser.features import FEATURES, Fixed, features
 from genre_tasks.optimiser.fused import FusedStep
 from genre_tasks.optimiser.fused_library import takes
 from genre_tasks.optimiser.network_constants import RESIDUALS
-from genre_tasks.optimiser.rules import Schedule, Step, rate_vector, schedule
+from genre_tasks.optimiser.rules import Step, rate_vector, schedule
 from genre_tasks.optimiser.sparse_unet import SparseUNet, VoxelPyramid
 from genre_tasks.optimiser.state import GROUPS, Frame, State
 from genre_tasks.optimiser.voxels import voxel_pyramid
@@ -42,7 +42,6 @@ class NetworkConfig(BaseModel):
     rates: tuple[float, ...] = Field(
         default=GNET_RATES, min_length=len(GROUPS), max_length=len(GROUPS), description="As TunedAdam's."
     )
-    schedule: Schedule = Field(default="cosine", description="Of the rates and of residuals over t/T.")
 
 
 class LearnedOptimiser(nn.Module):
@@ -86,10 +85,6 @@ class LearnedOptimiser(nn.Module):
         heads: Tensor = self.head(F.silu(self.mix(both)))
         return heads
 
-    def scheduled(self, iteration: int, total: int) -> float:
-        """The part of the rates at an iteration."""
-        return schedule(iteration, total, self.config.schedule)
-
     def pyramid(self, frame: Frame, centre: Tensor) -> VoxelPyramid:
         """The voxels of a scene at its start; they serve all iterations."""
         return voxel_pyramid(frame.scene, centre, self.config.voxel_m, len(self.config.channels))
@@ -97,7 +92,7 @@ class LearnedOptimiser(nn.Module):
     def delta(self, state: State, inputs: Tensor, pyramid: VoxelPyramid, total: int) -> Tensor:
         """The step [N, 14], differentiable in the network's weights; 0 where ``state.seen_now`` is."""
         seen = state.seen_now[:, 0].nonzero()[:, 0]
-        step = self._step(self(inputs[seen], pyramid, seen), state, seen, self.scheduled(state.iteration, total))
+        step = self._step(self(inputs[seen], pyramid, seen), state, seen, schedule(state.iteration, total))
         return step.new_zeros(state.offsets.shape).index_copy(0, seen, step)
 
     def _step(self, heads: Tensor, state: State, rows: Tensor, part: float) -> Tensor:
@@ -128,7 +123,7 @@ class LearnedOptimiser(nn.Module):
         voxel = pyramid.voxel_of[part]
         change = torch.zeros_like(everyone).index_add(0, voxel, own - own.detach()) / counts
         around = self.unet(everyone + change * (len(inputs) / len(rows)), pyramid)
-        step = self._step(self._heads(own, around, voxel), state, part, self.scheduled(state.iteration, total))
+        step = self._step(self._heads(own, around, voxel), state, part, schedule(state.iteration, total))
         return step.new_zeros((len(rows), 14)).index_copy(0, place, step)
 
     def start(self, frame: Frame, centre: Tensor) -> Step:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -13,7 +13,6 @@ from genre_tasks.errors import ConfigError
 from genre_tasks.optimiser.state import GROUPS, Frame, State
 
 SCHEDULE_END = 0.05
-Schedule = Literal["cosine", "constant"]
 
 
 class Step(Protocol):
@@ -39,10 +38,8 @@ class StepRule(Protocol):
         ...
 
 
-def schedule(iteration: int, total: int, kind: Schedule = "cosine") -> float:
-    """Cosine from 1 down to ``SCHEDULE_END`` over ``total`` iterations, and ``SCHEDULE_END`` after them; or 1."""
-    if kind == "constant":
-        return 1.0
+def schedule(iteration: int, total: int) -> float:
+    """Cosine from 1 down to ``SCHEDULE_END`` over ``total`` iterations, and ``SCHEDULE_END`` after them."""
     part = min(iteration / total, 1.0)
     return SCHEDULE_END + (1 - SCHEDULE_END) * 0.5 * (1 + math.cos(math.pi * part))
 

@@ -7,18 +7,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from genre_tasks.config import LossConfig
+from genre_tasks.optimiser.density import each
 from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.passes import Beside
 from genre_tasks.optimiser.state import Frame
 from genre_tasks.optimiser.targets import Target
 from genre_tasks.render.reference import rotation_matrices
-from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import DISTANT, SceneGraph
 
 SHRINK = 2.0
@@ -65,7 +65,7 @@ def unexplained(scene: SceneGraph, targets: Sequence[Target]) -> Tensor:
 
 def halved(scene: SceneGraph, rows: Tensor) -> SceneGraph:
     """The scene with the Gaussians ``rows`` [M] split in two along their longest side."""
-    parents = _rows(scene.gaussians, rows)
+    parents = each(lambda x: x[rows], scene.gaussians)
     longest = parents.log_scales.argmax(1)
     place = torch.arange(len(rows), device=longest.device)
     axis = rotation_matrices(parents.quats)[place, :, longest]
@@ -74,15 +74,7 @@ def halved(scene: SceneGraph, rows: Tensor) -> SceneGraph:
     log_scales[place, longest] -= math.log(SHRINK)
     first = replace(parents, means=parents.means + move, log_scales=log_scales)
     second = replace(parents, means=parents.means - move, log_scales=log_scales)
-    joined = {
-        f.name: torch.cat([getattr(scene.gaussians, f.name).index_copy(0, rows, a), b])
-        for f in fields(Gaussians)
-        for a, b in [(getattr(first, f.name), getattr(second, f.name))]
-    }
+    joined = each(lambda x, a, b: torch.cat([x.index_copy(0, rows, a), b]), scene.gaussians, first, second)
     harmonics = None if scene.harmonics is None else torch.cat([scene.harmonics, scene.harmonics[rows]])
     nodes = torch.cat([scene.nodes, scene.nodes[rows]])
-    return replace(scene, gaussians=Gaussians(**joined), nodes=nodes, harmonics=harmonics)
-
-
-def _rows(gaussians: Gaussians, rows: Tensor) -> Gaussians:
-    return Gaussians(*(getattr(gaussians, f.name)[rows] for f in fields(Gaussians)))
+    return replace(scene, gaussians=joined, nodes=nodes, harmonics=harmonics)
