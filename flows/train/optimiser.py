@@ -52,7 +52,7 @@ def network_from(
         network = LearnedOptimiser(config)
     if weights is not None:
         start = LearnedOptimiser.load(weights)
-        may = {"rates", "relaxation", "schedule"} | ({"residuals"} if config.residuals else set())
+        may = {"rates", "relaxation"} | ({"residuals"} if config.residuals else set())
         other = {name for name, value in config if name not in may and value != getattr(start.config, name)}
         if other:
             raise InputError(
