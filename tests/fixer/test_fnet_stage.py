@@ -194,7 +194,7 @@ def test_views_that_do_not_call_for_it_are_copied(scene, weights):
     gated = fnet(FnetConfig(weights=str(weights), gate=gate), chunk, novel)
     assert every.copied == () and every.seconds_saved == 0
     assert gated.copied == (0, 2, 3, 4) and gated.seconds_saved > 0
-    assert torch.equal(gated.color[1], every.color[1])
+    torch.testing.assert_close(gated.color[1], every.color[1], rtol=0, atol=1e-5)  # alone, and in a batch of four
     assert all(torch.equal(gated.color[i], novel.color[i]) for i in gated.copied)
 
 
