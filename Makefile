@@ -17,7 +17,7 @@ demo: $(READY)
 	$(GENRE) run 'synthetic:street?seed=1000' --preset demo
 
 test: $(READY)
-	$(VENV)/bin/python -m pytest
+	$(VENV)/bin/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 test-all: $(READY)
 	$(VENV)/bin/python -m pytest -m "" --timeout 3600
