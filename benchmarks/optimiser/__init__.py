@@ -29,7 +29,7 @@ from flows.configuration import load_configuration
 from flows.pipeline import BY_NAME, weights_digest, weights_file
 from genre_tasks.config import GnetConfig, OptimiserConfig, PipelineConfig
 from genre_tasks.errors import ConfigError
-from genre_tasks.optimiser.run import step_rule
+from genre_tasks.optimiser.run import StageName, step_rule
 
 RENDER_S, STEP_S, JUDGE_S = 0.012, 0.02, 0.2
 """Predicted for a view with its gradient at 40k Gaussians, a step of a network, and a look at a scene."""
@@ -37,6 +37,7 @@ QUICK_CAP = 10.0
 PARTS = ("race", "enhancement", "distillation", "converged", "stability", "trade")
 SLOWER_3DGS = 4.0
 """Per-scene 3DGS grows to several times as many Gaussians."""
+NETWORKS: tuple[StageName, ...] = ("gnet", "enet")
 CLAIMED = ("tuned_adam", "standard_3dgs")
 """The methods that claims are about; street_gs stands beside them in the tables."""
 
@@ -87,7 +88,7 @@ class Optimiser:
                 out += [made.distillation(*log, order) for log in logs if "distillation" in parts]
                 out += [made.converged(*log, order) for log in logs if "converged" in parts]
             if order == int(orders[0]) and "stability" in parts:
-                out += [made.stability(*log) for log in logs]
+                out += [made.stability(*log, network) for network in NETWORKS for log in logs]
         if options["minutes"]:
             out = [_before(time.monotonic() + 60 * float(options["minutes"]), cell) for cell in out]
         return out
@@ -156,9 +157,12 @@ class _Maker:
         parameters = self._gnet | {"cap": self._cap, "variants": values, "long": self._long.model_dump(mode="json")}
         return Cell(f"converged/{log} chunk {chunk} order {order}", seconds, measure, parameters)
 
-    def stability(self, log: str, chunk: int) -> Cell:
-        measure = partial(measure_stability, log, chunk, self._store)
-        return Cell(f"stability/{log} chunk {chunk}", 11 * self._gnet_s, measure, self._gnet)
+    def stability(self, log: str, chunk: int, network: StageName) -> Cell:
+        measure = partial(measure_stability, log, chunk, self._store, network)
+        if network == "gnet":
+            return Cell(f"stability/{log} chunk {chunk}", 11 * self._gnet_s, measure, self._gnet)
+        seconds = self._gnet_s + 11 * _learned_s(self._small.enet) + 20.0
+        return Cell(f"stability/enet {log} chunk {chunk}", seconds, measure, self._all)
 
 
 def _learned_s(config: OptimiserConfig) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from benchmarks.bench import Row
@@ -88,6 +89,11 @@ def _distillation(rows: Sequence[Row], family: str, name: str, words: str, targe
     note += f"1 %, synthetic PSNR within 0.1 dB of the best that it came to); in {len(missed)} of {len(rows)} cells "
     note += f"ENet does not reach it, and the cap counts as the ratio ({', '.join(missed) or 'none'})"
     ratios = [times_distillation(row, family) for row in rows]
+    if early := [row for row in rows if row[family].get("enet_first_s") is not None]:
+        first = [row[family]["enet_first_s"] / row[family]["reached_s"] for row in early]
+        lengths = ", ".join(early[0]["enet_shorter"])
+        note += f"; the first of its lengths ({lengths} and its own) that is as good: {statistics.median(first):.3f} "
+        note += f"({min(first):.3f}–{max(first):.3f}, {len(first)} cells)"
     return over_cells(name, ratios, "<=", target, "ratio", f"{note}; {where(rows)}")
 
 

@@ -1,4 +1,4 @@
-"""What is measured on one log: GNet beside a baseline, and GNet far past its length."""
+"""What is measured on one log: GNet beside a baseline, and GNet and ENet far past their lengths."""
 
 from __future__ import annotations
 
@@ -11,11 +11,15 @@ import torch
 from benchmarks.bench import Row
 from benchmarks.optimiser import race
 from benchmarks.optimiser.race import Point
-from benchmarks.optimiser.task import Task, task_of
+from benchmarks.optimiser.steps import steps_of
+from benchmarks.optimiser.task import HELDOUT_VIEWS, Task, task_of
 from flows.baselines import load_baselines
 from flows.configuration import load_configuration
-from genre_tasks.config import GnetConfig
+from flows.train.scenes import spread
+from genre_tasks.config import GnetConfig, OptimiserConfig
 from genre_tasks.optimiser.objective import Objective
+from genre_tasks.optimiser.run import StageName, plan_of, step_rule
+from genre_tasks.optimiser.targets import Target
 
 THREADS = 2
 METHODS = ("tuned_adam", "standard_3dgs", "street_gs")
@@ -71,22 +75,29 @@ def variants(method: str) -> dict[str, GnetConfig]:
     return dict(load_baselines("small")[method].variants)
 
 
-def measure_stability(log: str, chunk: int, store: str) -> Row:
-    """GNet to ten times its length, still told its length: the loss on all source views there and at T."""
-    task, config = task_of(log, chunk, store), load_configuration("small").gnet
+def measure_stability(log: str, chunk: int, store: str, network: StageName) -> Row:
+    """GNet or ENet to ten times its length, still told its length; ENet from GNet's scene with its fixed images."""
+    where = {"log": log, "chunk": chunk, "network": network}
     with threads():
-        return {"log": log, "chunk": chunk} | stability_row(task, config)
+        if network == "gnet":
+            return where | stability_row(task_of(log, chunk, store), "gnet", load_configuration("small").gnet)
+        steps = steps_of(log, chunk, store, 0, enet=False)
+        task = Task(steps.gnet, steps.source, spread(steps.heldout, HELDOUT_VIEWS))
+        return where | stability_row(task, "enet", steps.config.enet, steps.fixed)
 
 
-def stability_row(task: Task, config: GnetConfig) -> Row:
-    """Loss and held-out PSNR at T, 2T, 5T and 10T, each beside T's."""
-    objective, total = Objective(config.loss), config.iterations
-    steps = race.configured(task, config, 0)
+def stability_row(task: Task, network: StageName, config: OptimiserConfig, fixed: Sequence[Target] = ()) -> Row:
+    """Loss on all source and fixed views, and held-out PSNR, at T, 2T, 5T and 10T, each beside T's.
+
+    The perceptual term is left out, as the presets do that claims are about.
+    """
+    objective, total = Objective(config.loss.model_copy(update={"perceptual": 0.0})), config.iterations
+    moments = race.walk(lambda: (step_rule(network, config), objective), task, plan_of(network, config), fixed)
     losses, psnrs = {}, {}
-    for moment in itertools.islice(steps, PAST * total):
+    for moment in itertools.islice(moments, PAST * total):
         if moment.iteration in (total, 2 * total, 5 * total, PAST * total):
-            times = str(moment.iteration // total)
-            losses[times] = objective(moment.frame, moment.state.offsets, task.source, 0, torch.Generator()).loss
+            times, targets = str(moment.iteration // total), (*task.source, *fixed)
+            losses[times] = objective(moment.frame, moment.state.offsets, targets, 0, torch.Generator()).loss
             psnrs[times] = task.psnr(moment.scene)
     return {"iterations": total, "loss": losses, "heldout_psnr": psnrs, "ratio": losses[str(PAST)] / losses["1"]}
 

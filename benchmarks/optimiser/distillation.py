@@ -7,7 +7,7 @@ the PSNR against ray-cast truth.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from benchmarks.bench import Row
@@ -46,6 +46,8 @@ whole rates and 3 at half of them, both with the term, were behind in both.
 STANDARD_ITERATIONS = 1500
 """One view each: every source and every fixed view some thirty times. All schedules of the recipe scale with it."""
 STANDARD_LOOKS = 16
+SHORTER = (1 / 3, 2 / 3)
+"""ENet's lengths beside its own, of it: each a run told its length, as the distillations' variants each are a run."""
 
 
 @dataclass(frozen=True)
@@ -128,12 +130,14 @@ def adam_variants(enet: OptimiserConfig, split: float = 0.0) -> dict[str, Optimi
 def distillation_row(enet: OptimiserConfig, standard: PerSceneConfig, judge: Judge, fixed: Sequence[Target]) -> Row:
     """Each family of distillations: the best it came to, when it first was as good as that, whether ENet is.
 
+    ENet at ``SHORTER`` lengths stands beside: the first that is as good says when it can be, if no better is asked.
     Where ENet splits Gaussians, tuned Adam is measured on split ones too, beside what the claims are about.
     """
     task = judge.task
     start = judge.mark(task.scene, 0.0, 0)
-    *_, last = itertools.islice(walked(enet, task, fixed), enet.iterations)
-    own = judge.mark(last.scene, last.seconds, last.renders)
+    lengths = [max(1, round(part * enet.iterations)) for part in SHORTER]
+    shorter = {t: ended(enet.model_copy(update={"iterations": t}), judge, fixed) for t in lengths}
+    own = ended(enet, judge, fixed)
     budget_s = MOST_TIMES * own.seconds
     shares = {"adam": 0.0} | ({"adam_split": enet.split} if enet.split else {})
     adam = {
@@ -147,9 +151,16 @@ def distillation_row(enet: OptimiserConfig, standard: PerSceneConfig, judge: Jud
     return {
         "start": start.as_row(),
         "enet": own.as_row(),
-        **{name: family(runs, own) for name, runs in adam.items()},
-        "standard": family(recipe, own),
+        "enet_shorter": {str(t): mark.as_row() for t, mark in shorter.items()},
+        **{name: family(runs, own, shorter.values()) for name, runs in adam.items()},
+        "standard": family(recipe, own, shorter.values()),
     }
+
+
+def ended(enet: OptimiserConfig, judge: Judge, fixed: Sequence[Target]) -> Mark:
+    """ENet at its end."""
+    *_, last = itertools.islice(walked(enet, judge.task, fixed), enet.iterations)
+    return judge.mark(last.scene, last.seconds, last.renders)
 
 
 def walked(config: OptimiserConfig, task: Task, fixed: Sequence[Target]) -> Iterator[race.Moment]:
@@ -184,8 +195,11 @@ def by_recipe(config: PerSceneConfig, judge: Judge, fixed: Sequence[Target], see
         yield judge.mark(s.scene, s.seconds, s.iteration)
 
 
-def family(runs: Mapping[str, Marks], own: Mark) -> Row:
-    """What the runs came to after their start, all together, when, whether ``own`` is as good, when they were as it."""
+def family(runs: Mapping[str, Marks], own: Mark, shorter: Iterable[Mark] = ()) -> Row:
+    """What the runs came to after their start, all together, when, whether ``own`` is as good, when they were as it.
+
+    ``enet_first_s``: of ``own`` and the ``shorter`` runs of ENet the first that is as good.
+    """
     best = min((m for marks in runs.values() for m in marks[1:]), key=lambda m: m.kernel)
     times = [t for marks in runs.values() if (t := first_as_good(marks, best)) is not None]
     own_times = [t for marks in runs.values() if (t := first_as_good(marks, own)) is not None]
@@ -194,6 +208,7 @@ def family(runs: Mapping[str, Marks], own: Mark) -> Row:
         "reached_s": min(times),
         "enet_as_good": own.as_good_as(best),
         "enet_lacks": list(own.lacks(best)),
+        "enet_first_s": min((m.seconds for m in (own, *shorter) if m.as_good_as(best)), default=None),
         "as_good_as_enet_s": min(own_times, default=None),
         "curves": {name: [m.as_row() for m in marks] for name, marks in runs.items()},
     }

@@ -37,7 +37,8 @@ def markdown(rows: Mapping[str, Row]) -> Iterator[str]:
     for name, row in rows.items():
         if "ratio" in row:
             losses = ", ".join(f"{k} T: {v:.5f}" for k, v in row["loss"].items())
-            yield f"\n{place(row)}, past its length: loss at {losses}; 10 T over T {row['ratio']:.4f}"
+            name = {"gnet": "GNet", "enet": "ENet"}[row.get("network", "gnet")]
+            yield f"\n{place(row)}, {name} past its length: loss at {losses}; 10 T over T {row['ratio']:.4f}"
         if "not_measured" in row:
             yield f"\n{name}: not measured: {row['not_measured']}"
 
@@ -80,6 +81,8 @@ def _distillation(rows: Sequence[Row]) -> Iterator[str]:
     yield "|---|---|---|---|---|---|---|"
     for row in rows:
         yield f"| {place(row)} | as it is | " + " | ".join(_mark(row["start"])) + " | |"
+        for length, mark in row.get("enet_shorter", {}).items():
+            yield f"| | ENet, T = {length} | " + " | ".join(_mark(mark)) + " | |"
         yield "| | ENet | " + " | ".join(_mark(row["enet"])) + " | |"
         for family in ("adam", "adam_split", "standard"):
             if (found := row.get(family)) is None:

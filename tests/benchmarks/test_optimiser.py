@@ -27,6 +27,7 @@ from benchmarks.schema import Result
 from genre_tasks.config import (
     AdamConfig,
     GnetConfig,
+    OptimiserConfig,
     PerSceneConfig,
 )
 from genre_tasks.errors import ConfigError
@@ -107,9 +108,18 @@ def test_a_race_says_how_each_variant_ended(task: Task, tmp_path: Path) -> None:
 
 
 def test_far_past_its_length_the_loss_is_compared_with_that_at_t(task: Task) -> None:
-    row = cells.stability_row(task, learned(2))
+    row = cells.stability_row(task, "gnet", learned(2))
     assert list(row["loss"]) == ["1", "2", "5", "10"]
     assert row["ratio"] == pytest.approx(row["loss"]["10"] / row["loss"]["1"])
+
+
+def test_enet_past_its_length_is_judged_on_its_fixed_views_too(task: Task) -> None:
+    fixed = street.targets(street.scene(), novel=True)
+    config = OptimiserConfig(iterations=1, views_per_iteration=1, novel_views_per_iteration=1, split=0.1, loss=LOSS)
+    with_fixed = cells.stability_row(task, "enet", config, fixed)
+    alone = cells.stability_row(task, "enet", config.model_copy(update={"novel_views_per_iteration": 0}))
+    assert with_fixed["loss"]["1"] != pytest.approx(alone["loss"]["1"], rel=1e-3)
+    assert set(with_fixed["heldout_psnr"]) == {"1", "2", "5", "10"}
 
 
 def test_the_network_is_measured_at_every_count() -> None:
@@ -160,6 +170,11 @@ def test_the_worst_of_the_stable_cells_counts() -> None:
     rows = {f"stability/{k}": {"log": "a", "chunk": k, "ratio": 1.0 + 0.015 * k} for k in range(3)}
     claim = next(c for c in summary.claims(rows) if c.id == "optimiser.stable_10x")
     assert (claim.measured, claim.holds) == (1.03, False)
+    line = {"log": "a", "chunk": 0, "network": "enet", "loss": {"1": 1.0, "10": 1.1}, "ratio": 1.1}
+    rows["stability/enet a chunk 0"] = line
+    claim = next(c for c in summary.claims(rows) if c.id == "optimiser.stable_10x")
+    assert claim.measured == 1.1 and claim.data.endswith("gnet a chunk 2, enet a chunk 0")
+    assert "ENet past its length: loss at 1 T: 1.00000, 10 T: 1.10000" in "".join(BENCH.table({"a": line}))
 
 
 def test_what_is_not_measured_does_not_count() -> None:
@@ -187,7 +202,8 @@ def test_options_choose_cells_and_a_quick_run_ends_in_time() -> None:
     races = [f"{log} order 2 {m}" for m in cells.METHODS]
     parts = [f"{part}/{log} order 2" for part in ("enhancement", "distillation", "converged")]
     trades = [f"trade/street {seed}" for seed in trade.SEEDS]
-    assert [c.name for c in BENCH.cells(given, False)] == ["network", *trades, *races, *parts, f"stability/{log}"]
+    past = [f"stability/{log}", f"stability/enet {log}"]
+    assert [c.name for c in BENCH.cells(given, False)] == ["network", *trades, *races, *parts, *past]
     few = given | {"parts": "enhancement,converged", "long_orders": "0"}
     assert [c.name for c in BENCH.cells(few, False)] == ["network", parts[0]]
     with pytest.raises(ConfigError, match=r"no part.*races"):

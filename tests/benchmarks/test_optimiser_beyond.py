@@ -99,6 +99,14 @@ def test_a_distillation_is_timed_to_its_own_best_and_not_from_its_start() -> Non
     assert useless["reached_s"] == 3.0 and useless["best"][2] == 0.5 and useless["enet_as_good"]
 
 
+def test_the_first_of_enets_lengths_that_is_as_good_counts_beside_its_own() -> None:
+    runs = {"a": [_mark(0.0, 0.4, 21.0), _mark(3.0, 0.2, 22.0)]}
+    own, shorter = _mark(1.0, 0.19, 22.1), [_mark(0.4, 0.21, 22.0), _mark(0.7, 0.2, 22.0)]
+    assert distillation.family(runs, own, shorter)["enet_first_s"] == 0.7
+    assert distillation.family(runs, own)["enet_first_s"] == 1.0
+    assert distillation.family(runs, _mark(1.0, 0.3, 22.0))["enet_first_s"] is None
+
+
 def test_a_distillation_ends_when_it_has_settled_or_its_budget_is_spent(task: Task) -> None:
     class Fading:
         """Better by a tenth a second until ``since``."""
@@ -131,6 +139,7 @@ def test_enet_beside_distillations_of_the_same_images(task: Task) -> None:
     )
     row = distillation.distillation_row(enet, PerSceneConfig(iterations=6), judge, novel)
     assert row["enet"][1] == 8 and row["enet"][0] > 0
+    assert {t: mark[1] for t, mark in row["enet_shorter"].items()} == {"1": 4}  # a third of two, and two thirds
     variants = ["1+1 at 0.25", "2+2 at 0.5, no perceptual"]
     assert list(row["adam"]["curves"]) == variants and list(row["standard"]["curves"]) == ["6"]
     assert list(row["adam_split"]["curves"]) == ["2+2 at 0.5, no perceptual, split"]
@@ -260,6 +269,9 @@ def test_where_enet_is_not_as_good_the_cap_counts() -> None:
     assert (claims["distillation"].measured, claims["distillation"].holds) == (0.4, True)
     at_once = where | {"adam": good | {"reached_s": 0.001}, "standard": bad}
     assert beyond.times_distillation(at_once, "adam") == 50.0
+    short = {"enet_shorter": {"24": best}, "adam": good | {"enet_first_s": 2.0}, "standard": bad}
+    said = next(c for c in summary.claims({"distillation/a": where | short}) if c.id == "optimiser.distillation")
+    assert said.measured == 0.4 and "(24 and its own) that is as good: 0.200 (0.200–0.200, 1 cells)" in said.data
     standard = claims["distillation_standard"]
     assert (standard.measured, standard.holds) == (50.0, False)
     assert "in 1 of 1 cells ENet does not reach it" in standard.data
