@@ -20,7 +20,13 @@ from benchmarks.bench import Bench, Cell, NotMeasuredError, Row, logs_of
 from benchmarks.optimiser import summary, table
 from benchmarks.optimiser.cells import METHODS, measure_race, measure_stability, variants
 from benchmarks.optimiser.converged import LONG_RENDERS, PRESET, long_variants, measure_converged
-from benchmarks.optimiser.distillation import MOST_TIMES, STANDARD_ITERATIONS, adam_variants, measure_distillation
+from benchmarks.optimiser.distillation import (
+    MOST_TIMES,
+    SHORTER,
+    STANDARD_ITERATIONS,
+    adam_variants,
+    measure_distillation,
+)
 from benchmarks.optimiser.enhancement import as_enhancer, measure_enhancement
 from benchmarks.optimiser.network import COUNTS, measure_network
 from benchmarks.optimiser.trade import SEEDS, measure_trade, settings
@@ -38,6 +44,7 @@ PARTS = ("race", "enhancement", "distillation", "converged", "stability", "trade
 SLOWER_3DGS = 4.0
 """Per-scene 3DGS grows to several times as many Gaussians."""
 NETWORKS: tuple[StageName, ...] = ("gnet", "enet")
+"""Those that are run far past their lengths."""
 CLAIMED = ("tuned_adam", "standard_3dgs")
 """The methods that claims are about; street_gs stands beside them in the tables."""
 
@@ -141,7 +148,7 @@ class _Maker:
         enet_s, configs = _learned_s(self._small.enet), adam_variants(self._small.enet)
         if split := self._small.enet.split:
             configs |= adam_variants(self._small.enet, split)
-        seconds = enet_s * (1 + MOST_TIMES * len(configs)) + SLOWER_3DGS * RENDER_S * STANDARD_ITERATIONS
+        seconds = enet_s * (1 + sum(SHORTER) + MOST_TIMES * len(configs)) + SLOWER_3DGS * RENDER_S * STANDARD_ITERATIONS
         measure = partial(measure_distillation, log, chunk, self._store, order, self._cap)
         values = {name: config.model_dump(mode="json") for name, config in configs.items()}
         name = f"distillation/{log} chunk {chunk} order {order}"
