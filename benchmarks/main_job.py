@@ -18,7 +18,7 @@ from typing import Any
 from benchmarks.bench import Bench, Cell, NotMeasuredError, Row
 from benchmarks.schema import Claim, Op, claim
 from flows.configuration import load_configuration
-from flows.pipeline import PIPELINE, weights_digest, weights_file
+from flows.pipeline import PIPELINE, stage_weights
 from flows.produce import ArtifactRef, Job, produce
 from storage.local import open_store
 
@@ -161,7 +161,7 @@ class MainJob:
         seeds = [seed for seed in options["seeds"].split(",") if seed][: 1 if quick else None]
         logs = [(f"synthetic:street?seed={seed}", 0) for seed in seeds] + [(f"pandaset:{options['pandaset']}", 1)]
         config = load_configuration("small", settings=SETTINGS)
-        weights = [weights_digest(weights_file(spec, config)) for spec in PIPELINE]
+        weights = [stage_weights(spec, config) for spec in PIPELINE]
         parameters = {"configuration": config.model_dump(mode="json"), "weights": weights}
         return [
             Cell(f"{log} chunk {chunk}", SECONDS, partial(measure, log, chunk, options["store"]), parameters)

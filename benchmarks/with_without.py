@@ -25,7 +25,7 @@ from benchmarks.optimiser.steps import images_of
 from benchmarks.optimiser.task import Task, task_of
 from benchmarks.schema import Claim
 from flows.configuration import load_configuration
-from flows.pipeline import BY_NAME, weights_digest, weights_file
+from flows.pipeline import BY_NAME, stage_weights
 from genre_tasks.config import GnetConfig
 
 KINDS = {"without": "false", "with": "true"}
@@ -76,7 +76,7 @@ class WithWithout:
         small = load_configuration("small")
         parameters = {
             "configuration": small.model_dump(mode="json"),
-            "weights": weights_digest(weights_file(BY_NAME["gnet"], small)),
+            "weights": stage_weights(BY_NAME["gnet"], small),
         }
         run = partial(measure, self.setting)
         return [
@@ -114,7 +114,7 @@ def picture(setting: str, log: str, store: str, path: Path) -> None:
     for value in KINDS.values():
         task, gnet = _posed(setting, value, log, 0, store)
         views = task.beside[:: max(1, len(task.beside) // 3)][:3]
-        *_, end = itertools.islice(race.configured(task, gnet, gnet.seed), gnet.iterations)
+        *_, end = itertools.islice(race.configured(task, gnet, gnet.seed), gnet.total_iterations)
         columns.append(images_of(end.scene, views).flatten(0, 1))
     columns.append(torch.cat([view.image.image for view in views]))
     Image.fromarray((torch.cat(columns, 1) * 255).round().byte().numpy()).save(path)

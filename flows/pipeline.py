@@ -130,6 +130,16 @@ def weights_file(spec: StageSpec, config: PipelineConfig) -> Path | None:
     return resolve_weights(network_of(spec.weights, method), section.weights)
 
 
+def stage_weights(spec: StageSpec, config: PipelineConfig) -> str | None:
+    """Digest of all weights that the stage will load, or ``None`` if it loads none."""
+    first, finish = weights_digest(weights_file(spec, config)), getattr(section_of(spec, config), "finishing", None)
+    if finish is None:
+        return first
+    from genre_tasks.weights import resolve_weights
+
+    return digest_value([first, weights_digest(resolve_weights("gnet", finish.weights))])
+
+
 def weights_digest(path: Path | None) -> str | None:
     """sha256 over the weights (a file with its JSON beside it, or all files of a folder)."""
     if path is None:

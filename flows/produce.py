@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flows.logs import opened_log
-from flows.pipeline import BY_NAME, StageSpec, section_of, stage_key, weights_digest, weights_file
+from flows.pipeline import BY_NAME, StageSpec, section_of, stage_key, stage_weights
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ArtifactCorruptError, ResourceError
 from genre_tasks.progress import Progress, silent
@@ -60,7 +60,7 @@ def key_of(spec: StageSpec, job: Job, inputs: Mapping[str, ArtifactRef]) -> tupl
     if spec.needs_log:
         digests["log"] = opened_log(job.log).digest()
         digests["chunk"] = str(job.chunk)
-    weights = weights_digest(weights_file(spec, config))
+    weights = stage_weights(spec, config)
     return stage_key(spec, config, digests, weights, reader_of(spec, job)), weights
 
 
@@ -134,7 +134,7 @@ def produce(
         inputs={name: inputs[name].key for name in spec.inputs},
         configuration=section_of(spec, config).model_dump(mode="json"),
         code_digest=code_digest(spec.module, also=(*spec.lazy, *reader_of(spec, job))),
-        weights_digest=weights_digest(weights_file(spec, config)),
+        weights_digest=stage_weights(spec, config),
         seconds=usage.seconds,
         peak_mib=usage.peak_mib,
         environment=environment(),

@@ -120,6 +120,19 @@ class OptimiserConfig(Section):
     snapshots: int = Field(6, ge=0, description="Intermediate scenes kept for the curve of accuracy against seconds.")
     seed: int = Field(0, ge=0)
 
+    @property
+    def total_iterations(self) -> int:
+        """With those of what follows the first T, where something does."""
+        return self.iterations
+
+
+class FinishConfig(Section):
+    """A second unrolled optimisation, from the scene that the first left: split first, then with weights of its own."""
+
+    iterations: int = Field(72, ge=1, le=10_000, description="Its T, of as many source views as the first has.")
+    split: float = Field(0.3, ge=0, le=4, description="As the section's own, before its first iteration.")
+    weights: str = Field("builtin:enet", description="As the section's own; those of ENet have met split Gaussians.")
+
 
 class GnetConfig(OptimiserConfig):
     """GNet, or in its place a baseline that reconstructs from source views too (``configs/baselines.yaml``)."""
@@ -130,6 +143,16 @@ class GnetConfig(OptimiserConfig):
         "g3r: learned from recorded views alone, with weights of its own.",
     )
     per_scene: PerSceneConfig = PerSceneConfig()
+    finish: FinishConfig | None = Field(None, description="What follows with the method learned; null: nothing.")
+
+    @property
+    def finishing(self) -> FinishConfig | None:
+        """What follows: baselines have nothing of it."""
+        return self.finish if self.method == "learned" else None
+
+    @property
+    def total_iterations(self) -> int:
+        return self.iterations + (self.finishing.iterations if self.finishing else 0)
 
 
 class NovelViewsConfig(Section):

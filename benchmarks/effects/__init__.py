@@ -22,7 +22,7 @@ from benchmarks.effects.whole import SHAPED, auto_vs_on, plain_cost, trained
 from benchmarks.optimiser.beyond import over_cells
 from benchmarks.schema import Claim, Op
 from flows.configuration import load_configuration
-from flows.pipeline import BY_NAME, weights_digest, weights_file
+from flows.pipeline import BY_NAME, stage_weights
 
 CELL_S, WHOLE_S, COUNTED_S = 120.0, 200.0, 1500.0
 WHOLE: Mapping[str, tuple[Callable[[str, str], Row], float]] = {
@@ -56,7 +56,7 @@ class Effects:
         small = load_configuration("small")
         parameters = {
             "configuration": small.model_dump(mode="json"),
-            "weights": weights_digest(weights_file(BY_NAME["gnet"], small)),
+            "weights": stage_weights(BY_NAME["gnet"], small),
         }
         if quick:
             seeds = seeds[:1]

@@ -20,7 +20,7 @@ from benchmarks.evaluation.reliability import ranked
 from benchmarks.evaluation.reliability import table_of as reliability_table
 from benchmarks.schema import Claim
 from flows.configuration import load_configuration
-from flows.pipeline import BY_NAME, weights_digest, weights_file
+from flows.pipeline import BY_NAME, stage_weights
 
 RANKED_S, START_S = 150.0, 30.0
 
@@ -49,7 +49,7 @@ class Evaluation:
         small = load_configuration("small")
         parameters = {
             "configuration": small.model_dump(mode="json"),
-            "weights": [weights_digest(weights_file(BY_NAME[s], small)) for s in ("gnet", "fnet", "enet")],
+            "weights": [stage_weights(BY_NAME[s], small) for s in ("gnet", "fnet", "enet")],
             "table": options["table"],
         }
         out = []

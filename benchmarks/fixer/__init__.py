@@ -21,7 +21,7 @@ from benchmarks.optimiser.cells import place
 from benchmarks.schema import Claim, claim
 from benchmarks.timing import Measured
 from flows.configuration import load_configuration
-from flows.pipeline import BY_NAME, weights_digest, weights_file
+from flows.pipeline import BY_NAME, stage_weights, weights_digest
 from genre_tasks.metrics.collect import BOOTSTRAP_SEED
 
 FEWER = {"render": "src", "render+reference": "src_ref", "reference+lidar": "ref_lidar"}
@@ -50,7 +50,7 @@ class Fixer:
         """``quick``: one street. An empty ``pandaset`` leaves the real log out."""
         logs = logs_of(options)
         small = load_configuration("small")
-        digests = [weights_digest(weights_file(BY_NAME[name], small)) for name in ("gnet", "fnet")]
+        digests = [stage_weights(BY_NAME[name], small) for name in ("gnet", "fnet")]
         fewer = {inputs: weights_digest(path) for inputs, path in ablated(options["ablations"]).items()}
         parameters = {"configuration": small.model_dump(mode="json"), "weights": digests, "ablations": fewer}
         told = (options["store"], options["ablations"])

@@ -32,7 +32,7 @@ from benchmarks.optimiser.network import COUNTS, measure_network
 from benchmarks.optimiser.trade import SEEDS, measure_trade, settings
 from benchmarks.schema import Claim
 from flows.configuration import load_configuration
-from flows.pipeline import BY_NAME, weights_digest, weights_file
+from flows.pipeline import BY_NAME, stage_weights
 from genre_tasks.config import GnetConfig, OptimiserConfig, PipelineConfig
 from genre_tasks.errors import ConfigError
 from genre_tasks.optimiser.run import StageName, step_rule
@@ -115,7 +115,7 @@ class _Maker:
     def __init__(self, small: PipelineConfig, long: PipelineConfig, store: str, cap: float) -> None:
         self._small, self._long, self._store, self._cap = small, long, store, cap
         self._gnet_s = _learned_s(small.gnet)
-        digests = [weights_digest(weights_file(BY_NAME[name], small)) for name in ("gnet", "fnet", "enet")]
+        digests = [stage_weights(BY_NAME[name], small) for name in ("gnet", "fnet", "enet")]
         self._gnet = {"configuration": small.model_dump(mode="json"), "weights": digests[0]}
         self._all = {"configuration": small.model_dump(mode="json"), "weights": digests}
 

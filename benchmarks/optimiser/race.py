@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -20,7 +20,7 @@ from genre_tasks.optimiser.per_scene import PerSceneTraining
 from genre_tasks.optimiser.per_scene_run import snapshots
 from genre_tasks.optimiser.per_scene_start import world_static
 from genre_tasks.optimiser.rules import StepRule
-from genre_tasks.optimiser.run import step_rule
+from genre_tasks.optimiser.run import finishing_plan, finishing_rule, plan_of, step_rule
 from genre_tasks.optimiser.sampler import ViewSampler
 from genre_tasks.optimiser.splitting import split_where_images_have_more
 from genre_tasks.optimiser.state import Frame, State
@@ -89,17 +89,32 @@ def walk(
 
 
 def configured(task: Task, config: GnetConfig, seed: int) -> Iterator[Moment]:
-    """The stage's own rule, loss, views and T, without its perceptual term: the preset has none."""
-    plan = Plan(config.iterations, config.views_per_iteration, seed=seed, hold_ground=config.hold_ground)
-    return walk(lambda: (step_rule("gnet", config), Objective(config.loss)), task, plan)
+    """The stage's own rules, loss, views and T, without its perceptual term: the preset has none. Without end."""
+    config = config.model_copy(update={"seed": seed})
+    first = walk(lambda: (step_rule("gnet", config), Objective(config.loss)), task, plan_of("gnet", config))
+    finish = config.finishing
+    if finish is None:
+        yield from first
+        return
+    for moment in itertools.islice(first, config.iterations):
+        last = moment
+        yield moment
+    then = replace(task, scene=last.scene)
+    for moment in walk(lambda: (finishing_rule(finish), Objective(config.loss)), then, finishing_plan(config, finish)):
+        yield replace(
+            moment,
+            seconds=last.seconds + moment.seconds,
+            iteration=last.iteration + moment.iteration,
+            renders=last.renders + moment.renders,
+        )
 
 
 def learned(task: Task, config: GnetConfig, seed: int) -> list[Point]:
     """GNet to its end, judged at each quarter of its way."""
-    quarters = {round(config.iterations * k / 4) for k in (1, 2, 3, 4)}
+    quarters = {round(config.total_iterations * k / 4) for k in (1, 2, 3, 4)}
     steps = configured(task, config, seed)
     out = [start(task)]
-    for moment in itertools.islice(steps, config.iterations):
+    for moment in itertools.islice(steps, config.total_iterations):
         if moment.iteration in quarters:
             out.append(point(task, moment.seconds, moment.renders, moment.scene))
     return out

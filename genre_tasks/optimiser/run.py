@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
-from genre_tasks.config import GnetConfig, OptimiserConfig
+from genre_tasks.config import FinishConfig, GnetConfig, OptimiserConfig
 from genre_tasks.effects.types import EffectsPlan
 from genre_tasks.optimiser import targets
 from genre_tasks.optimiser.adam import ENET_RATES, GNET_RATES, TunedAdam
@@ -38,11 +39,54 @@ def optimise(
     """Source views of ``chunk`` and, where given, ``fixed`` novel views; see the stages for what is raised."""
     if isinstance(config, GnetConfig) and config.method in PER_SCENE:
         return per_scene(stage, config, chunk, scene, progress)
-    rule = step_rule(stage, config)
     source = targets.of_source(chunk, depth=config.loss.depth > 0)
     novel = () if fixed is None else targets.of_fixed(fixed)
-    return unroll(
-        rule, scene, source, novel, Objective(config.loss, distance(config)), plan_of(stage, config), progress
+    objective, total = Objective(config.loss, distance(config)), config.total_iterations
+
+    def overall(done: int, _: int, note: str) -> None:
+        progress(done, total, note)
+
+    def further(done: int, _: int, note: str) -> None:
+        progress(config.iterations + done, total, note)
+
+    first = unroll(step_rule(stage, config), scene, source, novel, objective, plan_of(stage, config), overall)
+    if not isinstance(config, GnetConfig) or config.finishing is None:
+        return first
+    plan = finishing_plan(config, config.finishing)
+    return _joined(
+        first, unroll(finishing_rule(config.finishing), first.scene, source, novel, objective, plan, further)
+    )
+
+
+def finishing_plan(config: GnetConfig, finish: FinishConfig) -> Plan:
+    """As the section's, with another order of views."""
+    return replace(
+        plan_of("gnet", config),
+        iterations=finish.iterations,
+        snapshots=config.snapshots - _of_first(config),
+        seed=config.seed + 1,
+        split=finish.split,
+    )
+
+
+def finishing_rule(finish: FinishConfig) -> StepRule:
+    """The learned optimiser with the weights that are configured for what follows. Raises as :func:`step_rule`."""
+    return LearnedOptimiser.load(resolve_weights("gnet", finish.weights))
+
+
+def _of_first(config: OptimiserConfig) -> int:
+    """Snapshots that the first T iterations keep."""
+    return round(config.snapshots * config.iterations / config.total_iterations)
+
+
+def _joined(first: Reconstruction, then: Reconstruction) -> Reconstruction:
+    """One after the other."""
+    before = len(first.losses)
+    return replace(
+        then,
+        losses=first.losses + then.losses,
+        snapshots=first.snapshots | {before + k: scene for k, scene in then.snapshots.items()},
+        seconds_per_iteration=first.seconds_per_iteration + then.seconds_per_iteration,
     )
 
 
@@ -52,7 +96,7 @@ def plan_of(stage: StageName, config: OptimiserConfig) -> Plan:
         config.iterations,
         config.views_per_iteration,
         config.novel_views_per_iteration,
-        config.snapshots,
+        _of_first(config),
         config.seed,
         stage,
         config.hold_ground,

@@ -1,0 +1,99 @@
+"""GNet with a second unrolled optimisation after its first: one scene, one key, the same way in benchmark and stage."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from benchmarks.optimiser import race
+from benchmarks.optimiser.task import Task
+from flows.configuration import load_configuration
+from flows.pipeline import BY_NAME, stage_weights, weights_digest
+from genre_tasks.config import FinishConfig, GnetConfig, IngestConfig, InitialConfig, LossConfig, PipelineConfig
+from genre_tasks.errors import InputError
+from genre_tasks.logs.registry import open_log
+from genre_tasks.optimiser.run import finishing_plan, optimise, plan_of
+from genre_tasks.optimiser.targets import of_source
+from genre_tasks.scene.chunk import Chunk
+from genre_tasks.scene.graph import SceneGraph
+from genre_tasks.stages.ingest import ingest
+from genre_tasks.stages.initial import initial
+from genre_tasks.weights import resolve_weights
+
+LOG = "synthetic:street?seed=903&width=96&height=54&samples=1&lidar_beams=32&lidar_azimuths=450&frames=9&cameras=2"
+FINISH = FinishConfig(iterations=4, split=0.3)
+CONFIG = GnetConfig(iterations=8, views_per_iteration=2, loss=LossConfig(perceptual=0.0), snapshots=3, finish=FINISH)
+
+
+@pytest.fixture(scope="module")
+def chunk() -> Chunk:
+    return ingest(IngestConfig(width_px=96, height_px=54), open_log(LOG), 0)
+
+
+@pytest.fixture(scope="module")
+def start(chunk: Chunk) -> SceneGraph:
+    return initial(InitialConfig(max_points=3000, distant_count=300), chunk).scene
+
+
+def _packed(scene: SceneGraph) -> torch.Tensor:
+    return scene.gaussians.packed()
+
+
+def test_what_follows_is_a_run_of_its_own_from_the_scene_that_the_first_left(chunk: Chunk, start: SceneGraph) -> None:
+    shown: list[tuple[int, int]] = []
+    found = optimise("gnet", CONFIG, chunk, start, None, lambda done, total, _: shown.append((done, total)))
+    first = optimise("gnet", CONFIG.model_copy(update={"finish": None}), chunk, start, None)
+    alone = CONFIG.model_copy(
+        update={"iterations": 4, "seed": 1, "split": 0.3, "weights": "builtin:enet", "finish": None}
+    )
+    then = optimise("gnet", alone, chunk, first.scene, None)
+    assert torch.equal(_packed(found.scene), _packed(then.scene))
+    assert len(found.scene) == len(start) + round(0.3 * len(start))
+    assert found.losses == first.losses + then.losses and len(found.seconds_per_iteration) == 12
+    assert shown == [(k + 1, 12) for k in range(12)]
+    counts = {k: len(scene) for k, scene in sorted(found.snapshots.items())}
+    assert counts == {3: len(start), 5: len(start), 10: len(found.scene)}
+
+
+def test_the_benchmark_goes_the_same_way(chunk: Chunk, start: SceneGraph) -> None:
+    task = Task(start, of_source(chunk, depth=True), ())
+    *_, end = itertools.islice(race.configured(task, CONFIG, CONFIG.seed), CONFIG.total_iterations)
+    assert torch.equal(_packed(end.scene), _packed(optimise("gnet", CONFIG, chunk, start, None).scene))
+    assert (end.iteration, end.renders) == (12, 24) and end.seconds > 0
+    quarters = race.learned(replace(task, heldout=task.source[:1]), CONFIG, 0)
+    assert [p.renders for p in quarters] == [0, 6, 12, 18, 24]
+
+
+def test_both_weights_are_part_of_the_key(tmp_path: Path) -> None:
+    spec = BY_NAME["gnet"]
+    plain, own = PipelineConfig(gnet=CONFIG.model_copy(update={"finish": None})), PipelineConfig(gnet=CONFIG)
+    gnet = weights_digest(resolve_weights("gnet", "builtin"))
+    assert stage_weights(spec, plain) == gnet
+    other = FINISH.model_copy(update={"weights": "builtin:gnet"})
+    digests = {
+        gnet,
+        *(stage_weights(spec, PipelineConfig(gnet=CONFIG.model_copy(update={"finish": f}))) for f in (FINISH, other)),
+    }
+    assert len(digests) == 3 and stage_weights(spec, own) in digests
+    missing = FINISH.model_copy(update={"weights": str(tmp_path / "none.safetensors")})
+    with pytest.raises(InputError, match=r"none\.safetensors"):
+        stage_weights(spec, PipelineConfig(gnet=CONFIG.model_copy(update={"finish": missing})))
+
+
+def test_a_baseline_in_its_place_has_nothing_of_it(chunk: Chunk, start: SceneGraph) -> None:
+    adam = CONFIG.model_copy(update={"method": "adam"})
+    found = optimise("gnet", adam, chunk, start, None)
+    assert adam.finishing is None and (adam.total_iterations, len(found.losses)) == (8, 8)
+    assert len(found.scene) == len(start) and stage_weights(BY_NAME["gnet"], PipelineConfig(gnet=adam)) is None
+
+
+def test_snapshots_are_shared_out_by_length() -> None:
+    long = load_configuration("long").gnet
+    assert long.finishing is not None
+    plans = plan_of("gnet", long), finishing_plan(long, long.finishing)
+    assert [p.iterations for p in plans] == [72, 72] and sum(p.snapshots for p in plans) == long.snapshots
+    assert [p.split for p in plans] == [0.0, 0.3] and plans[0].seed != plans[1].seed
