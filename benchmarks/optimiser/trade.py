@@ -9,16 +9,17 @@ from typing import Any
 from benchmarks.bench import Row
 from benchmarks.optimiser.cells import threads
 from benchmarks.optimiser.task import Task, task_of
-from genre_tasks.config import GnetConfig
-from genre_tasks.optimiser.objective import Objective
-from genre_tasks.optimiser.run import distance, step_rule
-from genre_tasks.optimiser.unroll import Plan, unroll
+from genre_tasks.config import FinishConfig, GnetConfig
+from genre_tasks.optimiser.run import unrolled
 
 SEEDS = (900, 901, 902)
 """Of validation: the preset is chosen by these rows."""
 
 SHAPES = ((24, 30), (24, 6), (48, 3), (72, 2), (144, 1), (72, 3), (36, 6), (96, 3), (48, 6))
 """Iterations × source views an iteration; 30 is all of them. Four of the shapes render 144 views."""
+
+FINISHES = ((24, 48, 0.3), (36, 36, 0.3), (72, 48, 0.3), (72, 72, 0.0), (72, 72, 0.3), (72, 72, 0.7))
+"""Iterations of three views, those of a second optimisation that follows, and what it splits before."""
 
 PERCEPTUAL = {"perceptual 0.1": (0.1, 1), "perceptual 0.1 every fourth": (0.1, 4)}
 """Weight of the term on a 128-pixel crop, and in which iterations it is taken."""
@@ -27,6 +28,10 @@ PERCEPTUAL = {"perceptual 0.1": (0.1, 1), "perceptual 0.1 every fourth": (0.1, 4
 def settings(gnet: GnetConfig) -> dict[str, GnetConfig]:
     """By name: the preset's section in every shape, and in its own with the perceptual term."""
     out = {f"{t}x{v}": gnet.model_copy(update={"iterations": t, "views_per_iteration": v}) for t, v in SHAPES}
+    for first, then, split in FINISHES:
+        shape = {"iterations": first, "views_per_iteration": 3, "snapshots": 0}
+        finish = {"finish": FinishConfig(iterations=then, split=split)}
+        out[f"{first}x3, {then}x3 with {split:.0%} more"] = gnet.model_copy(update=shape | finish)
     for name, (weight, every) in PERCEPTUAL.items():
         loss = gnet.loss.model_copy(update={"perceptual": weight, "perceptual_every": every})
         out[name] = gnet.model_copy(update={"loss": loss})
@@ -44,9 +49,7 @@ def measure_trade(log: str, store: str, configs: Mapping[str, GnetConfig]) -> Ro
 def trade(task: Task, config: GnetConfig) -> dict[str, Any]:
     """One run."""
     began = time.perf_counter()
-    rule, objective = step_rule("gnet", config), Objective(config.loss, distance(config))
-    plan = Plan(config.iterations, config.views_per_iteration, seed=config.seed)
-    scene = unroll(rule, task.scene, task.source, (), objective, plan).scene
+    scene = unrolled("gnet", config.model_copy(update={"snapshots": 0}), task.scene, task.source).scene
     seconds = time.perf_counter() - began
-    renders = config.iterations * min(config.views_per_iteration, len(task.source))
+    renders = config.total_iterations * min(config.views_per_iteration, len(task.source))
     return {"seconds": seconds, "renders": renders, "psnr": task.psnr(scene), "psnr_3m": task.psnr_beside(scene)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -16,6 +17,7 @@ from genre_tasks.optimiser.per_scene import PerSceneTraining
 from genre_tasks.optimiser.per_scene_run import reconstruct
 from genre_tasks.optimiser.per_scene_start import world_static
 from genre_tasks.optimiser.rules import StepRule
+from genre_tasks.optimiser.targets import Target
 from genre_tasks.optimiser.unroll import Plan, unroll
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.chunk import Chunk
@@ -40,7 +42,18 @@ def optimise(
     if isinstance(config, GnetConfig) and config.method in PER_SCENE:
         return per_scene(stage, config, chunk, scene, progress)
     source = targets.of_source(chunk, depth=config.loss.depth > 0)
-    novel = () if fixed is None else targets.of_fixed(fixed)
+    return unrolled(stage, config, scene, source, () if fixed is None else targets.of_fixed(fixed), progress)
+
+
+def unrolled(
+    stage: StageName,
+    config: OptimiserConfig,
+    scene: SceneGraph,
+    source: Sequence[Target],
+    novel: Sequence[Target] = (),
+    progress: Progress = silent,
+) -> Reconstruction:
+    """The learned optimiser or tuned Adam from ``scene``, and what follows where the configuration has it."""
     objective, total = Objective(config.loss, distance(config)), config.total_iterations
 
     def overall(done: int, _: int, note: str) -> None:
@@ -52,10 +65,8 @@ def optimise(
     first = unroll(step_rule(stage, config), scene, source, novel, objective, plan_of(stage, config), overall)
     if not isinstance(config, GnetConfig) or config.finishing is None:
         return first
-    plan = finishing_plan(config, config.finishing)
-    return _joined(
-        first, unroll(finishing_rule(config.finishing), first.scene, source, novel, objective, plan, further)
-    )
+    rule, plan = finishing_rule(config.finishing), finishing_plan(config, config.finishing)
+    return _joined(first, unroll(rule, first.scene, source, novel, objective, plan, further))
 
 
 def finishing_plan(config: GnetConfig, finish: FinishConfig) -> Plan:

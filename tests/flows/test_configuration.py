@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.mark.parametrize("preset", PRESETS)
 def test_presets_are_valid(preset: str) -> None:
     config = load_configuration(preset)
-    assert config.gnet.iterations == {"fine": 144, "paper": 24}.get(preset, 72)
+    assert config.gnet.iterations == {"fine": 144, "long": 48, "paper": 24}.get(preset, 72)
     assert (config.enet.iterations, config.enet.split) == {"paper": (12, 0.0), "fine": (72, 0.3)}.get(preset, (72, 0.7))
     assert differences(config, preset) == {}
 

@@ -95,5 +95,5 @@ def test_snapshots_are_shared_out_by_length() -> None:
     long = load_configuration("long").gnet
     assert long.finishing is not None
     plans = plan_of("gnet", long), finishing_plan(long, long.finishing)
-    assert [p.iterations for p in plans] == [72, 72] and sum(p.snapshots for p in plans) == long.snapshots
+    assert [p.iterations for p in plans] == [48, 72] and sum(p.snapshots for p in plans) == long.snapshots
     assert [p.split for p in plans] == [0.0, 0.3] and plans[0].seed != plans[1].seed
