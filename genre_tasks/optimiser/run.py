@@ -54,13 +54,13 @@ def unrolled(
     progress: Progress = silent,
 ) -> Reconstruction:
     """The learned optimiser or tuned Adam from ``scene``, and what follows where the configuration has it."""
-    objective, total = Objective(config.loss, distance(config)), config.total_iterations
+    objective, whole = Objective(config.loss, distance(config)), config.total_iterations
 
-    def overall(done: int, _: int, note: str) -> None:
-        progress(done, total, note)
+    def overall(done: int, total: int, note: str = "") -> None:
+        progress(done, whole, note)
 
-    def further(done: int, _: int, note: str) -> None:
-        progress(config.iterations + done, total, note)
+    def further(done: int, total: int, note: str = "") -> None:
+        progress(config.iterations + done, whole, note)
 
     first = unroll(step_rule(stage, config), scene, source, novel, objective, plan_of(stage, config), overall)
     if not isinstance(config, GnetConfig) or config.finishing is None:
