@@ -114,7 +114,7 @@ def picture(setting: str, log: str, store: str, path: Path) -> None:
     for value in KINDS.values():
         task, gnet = _posed(setting, value, log, 0, store)
         views = task.beside[:: max(1, len(task.beside) // 3)][:3]
-        *_, end = itertools.islice(race.configured(task, gnet, gnet.seed), gnet.total_iterations)
+        *_, end = itertools.islice(race.configured(task, gnet, gnet.seed), gnet.iterations)
         columns.append(images_of(end.scene, views).flatten(0, 1))
     columns.append(torch.cat([view.image.image for view in views]))
     Image.fromarray((torch.cat(columns, 1) * 255).round().byte().numpy()).save(path)

@@ -121,16 +121,16 @@ class OptimiserConfig(Section):
     seed: int = Field(0, ge=0)
 
     @property
-    def total_iterations(self) -> int:
-        """With those of what follows the first T, where something does."""
-        return self.iterations
+    def finishing_iterations(self) -> int:
+        """Of the T, those that are of a second optimisation."""
+        return 0
 
 
 class FinishConfig(Section):
-    """A second unrolled optimisation, from the scene that the first left: split first, then with weights of its own."""
+    """The last iterations as an optimisation of its own, from the scene that the first left: split, other weights."""
 
-    iterations: int = Field(72, ge=1, le=10_000, description="Its T, of as many source views as the first has.")
-    split: float = Field(0.3, ge=0, le=4, description="As the section's own, before its first iteration.")
+    share: float = Field(2 / 3, gt=0, lt=1, description="Of the section's iterations.")
+    split: float = Field(0.3, ge=0, le=4, description="As the section's own, before the first of these.")
     weights: str = Field("builtin:enet", description="As the section's own; those of ENet have met split Gaussians.")
 
 
@@ -143,16 +143,19 @@ class GnetConfig(OptimiserConfig):
         "g3r: learned from recorded views alone, with weights of its own.",
     )
     per_scene: PerSceneConfig = PerSceneConfig()
-    finish: FinishConfig | None = Field(None, description="What follows with the method learned; null: nothing.")
+    finish: FinishConfig | None = Field(None, description="How the method learned ends; null: as it began.")
 
     @property
     def finishing(self) -> FinishConfig | None:
-        """What follows: baselines have nothing of it."""
-        return self.finish if self.method == "learned" else None
+        """How it ends, where that is not as it began: baselines know no such end, nor does a single iteration."""
+        return self.finish if self.method == "learned" and self.iterations > 1 else None
 
     @property
-    def total_iterations(self) -> int:
-        return self.iterations + (self.finishing.iterations if self.finishing else 0)
+    def finishing_iterations(self) -> int:
+        """Its share of T, and at least one iteration on either side."""
+        if self.finishing is None:
+            return 0
+        return min(max(1, round(self.finishing.share * self.iterations)), self.iterations - 1)
 
 
 class NovelViewsConfig(Section):

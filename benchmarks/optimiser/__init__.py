@@ -175,7 +175,7 @@ class _Maker:
 def _learned_s(config: OptimiserConfig) -> float:
     """Of a learned optimiser to its end."""
     views = config.views_per_iteration + config.novel_views_per_iteration
-    return config.total_iterations * (RENDER_S * views + STEP_S)
+    return config.iterations * (RENDER_S * views + STEP_S)
 
 
 def _baseline_s(config: GnetConfig, gnet_s: float, cap: float) -> float:

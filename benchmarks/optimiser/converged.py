@@ -44,13 +44,13 @@ def long_variants(configs: Mapping[str, GnetConfig]) -> dict[str, GnetConfig]:
 def converged_row(task: Task, gnet: GnetConfig, configs: Mapping[str, GnetConfig], order: int) -> Row:
     """The plateau of all variants, and when GNet and when the first of them came within ``CLOSE_DB`` of it."""
     most = max(c.iterations * c.views_per_iteration for c in configs.values())
-    own = to_the_end(task, gnet, order, gnet.total_iterations * gnet.views_per_iteration)
+    own = to_the_end(task, gnet, order, gnet.iterations * gnet.views_per_iteration)
     curves = {name: to_the_end(task, config, order, most) for name, config in configs.items()}
     plateau = max(best(curve) for curve in curves.values())
     goal = plateau - CLOSE_DB
     times = [t for curve in curves.values() if (t := race.reached(curve, goal)) is not None]
     return {
-        "iterations": gnet.total_iterations,
+        "iterations": gnet.iterations,
         "plateau": plateau,
         "goal": goal,
         "gnet": _of(own) | {"reached_s": race.reached(own, goal)},
@@ -62,7 +62,7 @@ def converged_row(task: Task, gnet: GnetConfig, configs: Mapping[str, GnetConfig
 def to_the_end(task: Task, config: GnetConfig, seed: int, most_renders: int) -> list[Point]:
     """A learned optimiser or a cosine to its length, a constant schedule until it has settled; looks get rarer."""
     endless = config.method == "adam" and config.adam.schedule == "constant"
-    length = None if endless else config.total_iterations
+    length = None if endless else config.iterations
     due, out = FIRST_LOOK_S, [race.start(task)]
     for moment in itertools.islice(race.configured(task, config, seed), length):
         last = moment.iteration == length or (endless and moment.renders >= most_renders)

@@ -36,7 +36,7 @@ FIRST_LOOK = 0.25
 
 @dataclass(frozen=True)
 class Moment:
-    """After ``iteration`` steps, which took ``seconds`` and so many views rendered."""
+    """After ``iteration`` steps, which took ``seconds`` and so many views rendered, those of a split among them."""
 
     seconds: float
     iteration: int
@@ -74,7 +74,7 @@ def walk(
     scene = split_where_images_have_more(task.scene, [*task.source, *novel], plan.split)
     frame, state = Frame.of(scene, plan.hold_ground), State.start(len(scene), scene.gaussians.means)
     step = rule.start(frame, camera_centre(task.source))
-    seconds, renders = time.perf_counter() - began, 0
+    seconds, renders = time.perf_counter() - began, len(task.source) + len(novel) if plan.split else 0
     for i in itertools.count():
         began = time.perf_counter()
         batch = [target for sampler in samplers for target in sampler.draw()]
@@ -91,30 +91,30 @@ def walk(
 def configured(task: Task, config: GnetConfig, seed: int) -> Iterator[Moment]:
     """The stage's own rules, loss, views and T, without its perceptual term: the preset has none. Without end."""
     config = config.model_copy(update={"seed": seed})
-    first = walk(lambda: (step_rule("gnet", config), Objective(config.loss)), task, plan_of("gnet", config))
-    finish = config.finishing
+    objective, plan, finish = Objective(config.loss), plan_of("gnet", config), config.finishing
+    first = walk(lambda: (step_rule("gnet", config), objective), task, plan)
     if finish is None:
         yield from first
         return
-    for moment in itertools.islice(first, config.iterations):
-        last = moment
+    for moment in itertools.islice(first, plan.iterations):
+        before = moment
         yield moment
-    then = replace(task, scene=last.scene)
-    for moment in walk(lambda: (finishing_rule(finish), Objective(config.loss)), then, finishing_plan(config, finish)):
+    then = replace(task, scene=before.scene)
+    for moment in walk(lambda: (finishing_rule(finish), objective), then, finishing_plan(config, finish)):
         yield replace(
             moment,
-            seconds=last.seconds + moment.seconds,
-            iteration=last.iteration + moment.iteration,
-            renders=last.renders + moment.renders,
+            seconds=before.seconds + moment.seconds,
+            iteration=before.iteration + moment.iteration,
+            renders=before.renders + moment.renders,
         )
 
 
 def learned(task: Task, config: GnetConfig, seed: int) -> list[Point]:
     """GNet to its end, judged at each quarter of its way."""
-    quarters = {round(config.total_iterations * k / 4) for k in (1, 2, 3, 4)}
+    quarters = {round(config.iterations * k / 4) for k in (1, 2, 3, 4)}
     steps = configured(task, config, seed)
     out = [start(task)]
-    for moment in itertools.islice(steps, config.total_iterations):
+    for moment in itertools.islice(steps, config.iterations):
         if moment.iteration in quarters:
             out.append(point(task, moment.seconds, moment.renders, moment.scene))
     return out

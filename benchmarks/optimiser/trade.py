@@ -19,19 +19,20 @@ SHAPES = ((24, 30), (24, 6), (48, 3), (72, 2), (144, 1), (72, 3), (36, 6), (96, 
 """Iterations × source views an iteration; 30 is all of them. Four of the shapes render 144 views."""
 
 FINISHES = ((24, 48, 0.3), (36, 36, 0.3), (72, 48, 0.3), (72, 72, 0.0), (72, 72, 0.3), (72, 72, 0.7))
-"""Iterations of three views, those of a second optimisation that follows, and what it splits before."""
+"""Iterations of three views, those of an end of its own that follows, and what is split between."""
 
 PERCEPTUAL = {"perceptual 0.1": (0.1, 1), "perceptual 0.1 every fourth": (0.1, 4)}
 """Weight of the term on a 128-pixel crop, and in which iterations it is taken."""
 
 
 def settings(gnet: GnetConfig) -> dict[str, GnetConfig]:
-    """By name: the preset's section in every shape, and in its own with the perceptual term."""
-    out = {f"{t}x{v}": gnet.model_copy(update={"iterations": t, "views_per_iteration": v}) for t, v in SHAPES}
-    for first, then, split in FINISHES:
-        shape = {"iterations": first, "views_per_iteration": 3, "snapshots": 0}
-        finish = {"finish": FinishConfig(iterations=then, split=split)}
-        out[f"{first}x3, {then}x3 with {split:.0%} more"] = gnet.model_copy(update=shape | finish)
+    """By name: the preset's section in every shape and with some ends of its own, and with the perceptual term."""
+    plain = gnet.model_copy(update={"finish": None})
+    out = {f"{t}x{v}": plain.model_copy(update={"iterations": t, "views_per_iteration": v}) for t, v in SHAPES}
+    for first, last, split in FINISHES:
+        shape = {"iterations": first + last, "views_per_iteration": 3, "snapshots": 0}
+        finish = FinishConfig(share=last / (first + last), split=split)
+        out[f"{first}x3, {last}x3 with {split:.0%} more"] = gnet.model_copy(update=shape | {"finish": finish})
     for name, (weight, every) in PERCEPTUAL.items():
         loss = gnet.loss.model_copy(update={"perceptual": weight, "perceptual_every": every})
         out[name] = gnet.model_copy(update={"loss": loss})
@@ -51,5 +52,7 @@ def trade(task: Task, config: GnetConfig) -> dict[str, Any]:
     began = time.perf_counter()
     scene = unrolled("gnet", config.model_copy(update={"snapshots": 0}), task.scene, task.source).scene
     seconds = time.perf_counter() - began
-    renders = config.total_iterations * min(config.views_per_iteration, len(task.source))
+    renders = config.iterations * min(config.views_per_iteration, len(task.source))
+    if config.finishing is not None and config.finishing.split:
+        renders += len(task.source)
     return {"seconds": seconds, "renders": renders, "psnr": task.psnr(scene), "psnr_3m": task.psnr_beside(scene)}

@@ -55,5 +55,5 @@ def _times(section: str, config: PipelineConfig, base: PipelineConfig) -> float:
     if section in ("gnet", "enet"):
         here, there = (getattr(c, section) for c in (config, base))
         views = [x.views_per_iteration + x.novel_views_per_iteration for x in (here, there)]
-        work *= here.total_iterations * views[0] / (there.total_iterations * views[1])
+        work *= here.iterations * views[0] / (there.iterations * views[1])
     return work

@@ -83,6 +83,6 @@ def _seconds(stage: str, config: PipelineConfig, base: PipelineConfig, known: di
         return section.per_scene.iterations * PER_SCENE_S * pixels
     seconds = known[stage.partition("/")[0]]
     if spec.section in ("gnet", "enet"):
-        renders = [x.total_iterations * (x.views_per_iteration + x.novel_views_per_iteration) for x in (section, plain)]
+        renders = [x.iterations * (x.views_per_iteration + x.novel_views_per_iteration) for x in (section, plain)]
         seconds *= renders[0] / renders[1]
     return seconds

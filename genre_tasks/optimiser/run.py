@@ -53,61 +53,58 @@ def unrolled(
     novel: Sequence[Target] = (),
     progress: Progress = silent,
 ) -> Reconstruction:
-    """The learned optimiser or tuned Adam from ``scene``, and what follows where the configuration has it."""
-    objective, whole = Objective(config.loss, distance(config)), config.total_iterations
+    """The learned optimiser or tuned Adam from ``scene``, and its end where the configuration has one of its own."""
+    finish = config.finishing if isinstance(config, GnetConfig) else None
+    rule, objective = step_rule(stage, config), Objective(config.loss, distance(config))
+    last = None if finish is None else finishing_rule(finish)  # so early that weights unfit are said before any work
+    plan = plan_of(stage, config)
 
-    def overall(done: int, total: int, note: str = "") -> None:
-        progress(done, whole, note)
+    def after(before: int) -> Progress:
+        return lambda done, _, note="": progress(before + done, config.iterations, note)
 
-    def further(done: int, total: int, note: str = "") -> None:
-        progress(config.iterations + done, whole, note)
-
-    first = unroll(step_rule(stage, config), scene, source, novel, objective, plan_of(stage, config), overall)
-    if not isinstance(config, GnetConfig) or config.finishing is None:
+    first = unroll(rule, scene, source, novel, objective, plan, after(0))
+    if last is None or finish is None:
         return first
-    rule, plan = finishing_rule(config.finishing), finishing_plan(config, config.finishing)
-    return _joined(first, unroll(rule, first.scene, source, novel, objective, plan, further))
+    end = finishing_plan(config, finish)
+    return _joined(first, unroll(last, first.scene, source, novel, objective, end, after(plan.iterations)))
 
 
-def finishing_plan(config: GnetConfig, finish: FinishConfig) -> Plan:
-    """As the section's, with another order of views."""
+def finishing_plan(config: OptimiserConfig, finish: FinishConfig) -> Plan:
+    """As the first iterations', with another order of views."""
+    first = plan_of("gnet", config)
     return replace(
-        plan_of("gnet", config),
-        iterations=finish.iterations,
-        snapshots=config.snapshots - _of_first(config),
+        first,
+        iterations=config.finishing_iterations,
+        snapshots=config.snapshots - first.snapshots,
         seed=config.seed + 1,
         split=finish.split,
     )
 
 
 def finishing_rule(finish: FinishConfig) -> StepRule:
-    """The learned optimiser with the weights that are configured for what follows. Raises as :func:`step_rule`."""
+    """The learned optimiser with the weights that are configured for the end. Raises as :func:`step_rule`."""
     return LearnedOptimiser.load(resolve_weights("gnet", finish.weights))
 
 
-def _of_first(config: OptimiserConfig) -> int:
-    """Snapshots that the first T iterations keep."""
-    return round(config.snapshots * config.iterations / config.total_iterations)
-
-
-def _joined(first: Reconstruction, then: Reconstruction) -> Reconstruction:
+def _joined(first: Reconstruction, last: Reconstruction) -> Reconstruction:
     """One after the other."""
     before = len(first.losses)
     return replace(
-        then,
-        losses=first.losses + then.losses,
-        snapshots=first.snapshots | {before + k: scene for k, scene in then.snapshots.items()},
-        seconds_per_iteration=first.seconds_per_iteration + then.seconds_per_iteration,
+        last,
+        losses=first.losses + last.losses,
+        snapshots=first.snapshots | {before + k: scene for k, scene in last.snapshots.items()},
+        seconds_per_iteration=first.seconds_per_iteration + last.seconds_per_iteration,
     )
 
 
 def plan_of(stage: StageName, config: OptimiserConfig) -> Plan:
-    """How far and how often to look, as the configuration says."""
+    """How far and how often to look, as the configuration says; of an end of its own see :func:`finishing_plan`."""
+    iterations = config.iterations - config.finishing_iterations
     return Plan(
-        config.iterations,
+        iterations,
         config.views_per_iteration,
         config.novel_views_per_iteration,
-        _of_first(config),
+        round(config.snapshots * iterations / config.iterations),
         config.seed,
         stage,
         config.hold_ground,

@@ -69,7 +69,7 @@ def test_the_long_preset_is_small_with_a_longer_gnet() -> None:
     small, long = (load_configuration(name).model_dump() for name in ("small", "long"))
     assert {k for k in small["gnet"] if small["gnet"][k] != long["gnet"][k]} == {"iterations", "finish"}
     assert {k for k in small if small[k] != long[k]} == {"gnet"}
-    assert long["gnet"]["iterations"] + long["gnet"]["finish"]["iterations"] > small["gnet"]["iterations"]
+    assert long["gnet"]["iterations"] > small["gnet"]["iterations"]
 
 
 def _mark(seconds: float, kernel: float, beside: float | None = None) -> Mark:
@@ -137,7 +137,7 @@ def test_enet_beside_distillations_of_the_same_images(task: Task) -> None:
         iterations=2, views_per_iteration=2, novel_views_per_iteration=2, split=0.1, loss=LossConfig(perceptual=0.0)
     )
     row = distillation.distillation_row(enet, PerSceneConfig(iterations=6), judge, novel)
-    assert row["enet"][1] == 8 and row["enet"][0] > 0
+    assert row["enet"][1] == 8 + len(task.source) + len(novel) and row["enet"][0] > 0  # all once more for the split
     assert {t: mark[1] for t, mark in row["enet_shorter"].items()} == {"1": 4}  # a third of two, and two thirds
     variants = ["1+1 at 0.25", "2+2 at 0.5, no perceptual"]
     assert list(row["adam"]["curves"]) == variants and list(row["standard"]["curves"]) == ["6"]
