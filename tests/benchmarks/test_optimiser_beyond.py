@@ -137,8 +137,9 @@ def test_enet_beside_distillations_of_the_same_images(task: Task) -> None:
         iterations=2, views_per_iteration=2, novel_views_per_iteration=2, split=0.1, loss=LossConfig(perceptual=0.0)
     )
     row = distillation.distillation_row(enet, PerSceneConfig(iterations=6), judge, novel)
-    assert row["enet"][1] == 8 + len(task.source) + len(novel) and row["enet"][0] > 0  # all once more for the split
-    assert {t: mark[1] for t, mark in row["enet_shorter"].items()} == {"1": 4}  # a third of two, and two thirds
+    once = len(task.source) + len(novel)  # rendered for the split
+    assert row["enet"][1] == 8 + once and row["enet"][0] > 0
+    assert {t: mark[1] for t, mark in row["enet_shorter"].items()} == {"1": 4 + once}  # a third of two, and two thirds
     variants = ["1+1 at 0.25", "2+2 at 0.5, no perceptual"]
     assert list(row["adam"]["curves"]) == variants and list(row["standard"]["curves"]) == ["6"]
     assert list(row["adam_split"]["curves"]) == ["2+2 at 0.5, no perceptual, split"]
