@@ -10,6 +10,10 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
+Rate = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Rates = tuple[Rate, Rate, Rate, Rate, Rate]
+"""Of means (in units of the initial size), log-scales, quaternions, logit opacities and colours."""
+
 
 class Section(BaseModel):
     """Base of all sections: unknown keys are errors, values are frozen."""
@@ -60,7 +64,7 @@ class LossConfig(Section):
 class AdamConfig(Section):
     """Tuned Adam, to be tuned for the horizon that it is used at (``configs/baselines.yaml``)."""
 
-    rates: tuple[float, float, float, float, float] | None = Field(
+    rates: Rates | None = Field(
         None,
         description="Of means (in units of the initial size), log-scales, quaternions, logit opacities and colours; "
         "null: the stage's own, tuned for 24 iterations of 6 views.",
@@ -132,6 +136,11 @@ class FinishConfig(Section):
     share: float = Field(2 / 3, gt=0, lt=1, description="Of the section's iterations.")
     split: float = Field(0.3, ge=0, le=4, description="As the section's own, before the first of these.")
     weights: str = Field("builtin:enet", description="As the section's own; those of ENet have met split Gaussians.")
+    rates_before: Rates | None = Field(
+        None,
+        description="Of the learned optimiser's steps before the end, as adam.rates; null: those of its weights, which "
+        "were swept for steps to the very end.",
+    )
 
 
 class GnetConfig(OptimiserConfig):

@@ -18,11 +18,12 @@ from flows.configuration import load_configuration
 from flows.train.scenes import spread
 from genre_tasks.config import GnetConfig, OptimiserConfig
 from genre_tasks.optimiser.objective import Objective
-from genre_tasks.optimiser.run import StageName, plan_of, step_rule
+from genre_tasks.optimiser.run import StageName, distance, plan_of, step_rule
 from genre_tasks.optimiser.targets import Target
 
 THREADS = 2
-METHODS = ("tuned_adam", "standard_3dgs", "street_gs")
+ADAM = ("tuned_adam", "tuned_adam_split")
+METHODS = (*ADAM, "standard_3dgs", "street_gs")
 PAST = 10
 
 
@@ -38,7 +39,7 @@ def race_row(task: Task, gnet: GnetConfig, configs: dict[str, GnetConfig], order
     curve = race.learned(task, gnet, order)
     goal = curve[-1]
     cap_s = cap * goal.seconds
-    run = race.adam if method == "tuned_adam" else race.per_scene
+    run = race.adam if method in ADAM else race.per_scene
     out = {name: variant_row(run(task, config, order, goal, cap_s), goal, cap_s) for name, config in configs.items()}
     sizes = {"gaussians": len(task.scene), "source_views": len(task.source), "heldout_views": len(task.heldout)}
     goals = {"seconds": goal.seconds, "renders": goal.renders, "psnr": goal.psnr, "curve": as_rows(curve)}
@@ -89,13 +90,14 @@ def measure_stability(log: str, chunk: int, store: str, network: StageName) -> R
 def stability_row(task: Task, network: StageName, config: OptimiserConfig, fixed: Sequence[Target] = ()) -> Row:
     """Loss on all source and fixed views, and held-out PSNR, at T, 2T, 5T and 10T, each beside T's.
 
-    An end of GNet's own goes on past T. The perceptual term is left out, as the presets do that claims are about.
+    An end of GNet's own goes on past T. ENet is walked with its perceptual term, which the loss that counts leaves out.
     """
     objective, total = Objective(config.loss.model_copy(update={"perceptual": 0.0})), config.iterations
     if isinstance(config, GnetConfig):
         moments = race.configured(task, config, config.seed)
     else:
-        moments = race.walk(lambda: (step_rule(network, config), objective), task, plan_of(network, config), fixed)
+        own = Objective(config.loss, distance(config))
+        moments = race.walk(lambda: (step_rule(network, config), own), task, plan_of(network, config), fixed)
     losses, psnrs = {}, {}
     for moment in itertools.islice(moments, PAST * total):
         if moment.iteration in (total, 2 * total, 5 * total, PAST * total):

@@ -10,6 +10,7 @@ algebraic reconstruction technique (Andersen and Kak 1984) with a relaxation of 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -68,6 +69,12 @@ class LearnedOptimiser(nn.Module):
         from genre_tasks.optimiser.weights import load
 
         return load(weights)
+
+    def at_rates(self, rates: Sequence[float]) -> LearnedOptimiser:
+        """The same weights at other rates."""
+        other = LearnedOptimiser(self.config.model_copy(update={"rates": tuple(rates)}))
+        other.load_state_dict(self.state_dict())
+        return other.eval().requires_grad_(False)
 
     def forward(
         self,

@@ -142,7 +142,9 @@ def step_rule(stage: StageName, config: OptimiserConfig) -> StepRule:
     if config.method == "adam":
         rates = GNET_RATES if stage == "gnet" else ENET_RATES
         return TunedAdam(config.adam.rates or rates, config.adam.schedule)
-    return LearnedOptimiser.load(resolve_weights(network_of(stage, config.method), config.weights))
+    learned = LearnedOptimiser.load(resolve_weights(network_of(stage, config.method), config.weights))
+    finish = config.finishing if isinstance(config, GnetConfig) else None
+    return learned if finish is None or finish.rates_before is None else learned.at_rates(finish.rates_before)
 
 
 def distance(config: OptimiserConfig) -> Distance | None:

@@ -16,6 +16,7 @@ from flows.pipeline import BY_NAME, stage_weights, weights_digest
 from genre_tasks.config import FinishConfig, GnetConfig, IngestConfig, InitialConfig, LossConfig, PipelineConfig
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.logs.registry import open_log
+from genre_tasks.optimiser.learned import LearnedOptimiser
 from genre_tasks.optimiser.run import finishing_plan, optimise, plan_of
 from genre_tasks.optimiser.targets import of_source
 from genre_tasks.scene.chunk import Chunk
@@ -109,6 +110,27 @@ def test_the_end_is_a_share_of_any_length() -> None:
     assert [parts(n, 2 / 3) for n in (1, 2, 3, 8, 72, 144)] == [(1, 0), (1, 1), (1, 2), (3, 5), (24, 48), (48, 96)]
     assert parts(10, 0.99) == (1, 9) and parts(10, 0.01) == (9, 1)
     assert GnetConfig(iterations=8).finishing_iterations == 0
+
+
+def test_rates_of_the_first_iterations_are_the_ends_to_say(chunk: Chunk, start: SceneGraph) -> None:
+    def at(config: GnetConfig) -> torch.Tensor:
+        return _packed(optimise("gnet", config, chunk, start, None).scene)
+
+    def told(rates: tuple[float, ...], **more: object) -> GnetConfig:
+        finish = FinishConfig.model_validate({**FINISH.model_dump(), "rates_before": rates})
+        return CONFIG.model_copy(update={"finish": finish, **more})
+
+    own = LearnedOptimiser.load(resolve_weights("gnet", "builtin")).config.rates
+    plain = at(CONFIG)
+    assert torch.equal(at(told(own)), plain) and not torch.equal(at(told((4 * own[0], *own[1:]))), plain)
+    task = Task(start, of_source(chunk, depth=True), ())
+    bold = told((4 * own[0], *own[1:]))
+    *_, end = itertools.islice(race.configured(task, bold, bold.seed), bold.iterations)
+    assert torch.equal(_packed(end.scene), at(bold))
+    assert torch.equal(at(told((9.0, *own[1:]), iterations=1)), at(CONFIG.model_copy(update={"iterations": 1})))
+    for bad in ((-0.1, 1, 1, 1, 1), (float("nan"), 1, 1, 1, 1), (1, 1, 1)):
+        with pytest.raises(ValueError, match="rates_before"):
+            told(bad)
 
 
 def test_weights_unfit_for_the_end_are_said_before_the_first_iteration(

@@ -104,17 +104,19 @@ def test_a_constant_schedule_steps_as_far_at_the_end_as_a_cosine_at_the_start() 
 @pytest.mark.parametrize("preset", ["demo", "small", "paper"])
 def test_the_table_of_baselines_is_sound(preset: str) -> None:
     table = load_baselines(preset)
-    assert set(table) == {"standard_3dgs", "street_gs", "tuned_adam", "g3r"}
+    adam = {"tuned_adam", "tuned_adam_split"}
+    assert set(table) == {"standard_3dgs", "street_gs", "g3r"} | adam
     methods = {name: {c.method for c in b.variants.values()} for name, b in table.items()}
-    assert methods == {n: {"adam" if n == "tuned_adam" else n} for n in table}
+    assert methods == {n: {"adam" if n in adam else n} for n in table}
     gnet = load_configuration(preset).gnet
     for name, baseline in table.items():
         assert baseline.source and baseline.why
         for variant, config in baseline.variants.items():
             assert config.loss == gnet.loss  # the same objective, where it is the stage's own
-            if name == "tuned_adam":
-                assert f"{config.iterations}x{config.views_per_iteration}" == variant
-                assert config.adam.rates is not None
+            if name in adam:
+                share = f"+{config.split:.0%}" if config.split else ""
+                assert f"{config.iterations}x{config.views_per_iteration}{share}" == variant
+                assert config.adam.rates is not None and bool(share) == name.endswith("split")
             elif "3" in name or name == "street_gs":
                 assert variant in ("default", str(config.per_scene.iterations))
     with pytest.raises(ConfigError, match=r"no variant '1'.*Known: 30000"):
