@@ -114,6 +114,9 @@ class OptimiserConfig(Section):
     weights: str = Field(
         "builtin", description="builtin, builtin:NAME (another network's, e.g. gnet), or a path to a .safetensors file."
     )
+    rates: Rates | None = Field(
+        None, description="Of the learned optimiser's steps, as adam.rates; null: those that its weights were swept at."
+    )
     hold_ground: bool = Field(True, description="Flat discs that lie on the ground move and turn in their plane only.")
     split: float = Field(
         0.0,
@@ -138,8 +141,7 @@ class FinishConfig(Section):
     weights: str = Field("builtin:enet", description="As the section's own; those of ENet have met split Gaussians.")
     rates_before: Rates | None = Field(
         None,
-        description="Of the learned optimiser's steps before the end, as adam.rates; null: those of its weights, which "
-        "were swept for steps to the very end.",
+        description="The section's rates where this end follows; null: its own, which are for steps to the very end.",
     )
 
 

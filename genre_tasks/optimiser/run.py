@@ -144,7 +144,8 @@ def step_rule(stage: StageName, config: OptimiserConfig) -> StepRule:
         return TunedAdam(config.adam.rates or rates, config.adam.schedule)
     learned = LearnedOptimiser.load(resolve_weights(network_of(stage, config.method), config.weights))
     finish = config.finishing if isinstance(config, GnetConfig) else None
-    return learned if finish is None or finish.rates_before is None else learned.at_rates(finish.rates_before)
+    rates = config.rates if finish is None or finish.rates_before is None else finish.rates_before
+    return learned if rates is None else learned.at_rates(rates)
 
 
 def distance(config: OptimiserConfig) -> Distance | None:

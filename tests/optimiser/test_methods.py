@@ -23,6 +23,7 @@ from genre_tasks.config import (
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.optimiser import run
 from genre_tasks.optimiser.adam import ENET_RATES, GNET_RATES, TunedAdam
+from genre_tasks.optimiser.learned import LearnedOptimiser
 from genre_tasks.optimiser.state import Frame, State
 from genre_tasks.optimiser.targets import Target
 from genre_tasks.scene.results import Reconstruction
@@ -69,6 +70,18 @@ def test_only_gnet_can_be_replaced_by_what_knows_no_fixed_views(method: str) -> 
     assert load_configuration("small", settings=[f"gnet.method={method}"]).gnet.method == method
     with pytest.raises(ConfigError, match=r"enet.method is not allowed.*'learned' or 'adam'"):
         load_configuration("small", settings=[f"enet.method={method}"])
+
+
+@pytest.mark.parametrize("stage", ["gnet", "enet"])
+def test_the_learned_optimisers_rates_are_the_weights_own_or_those_that_are_given(stage: run.StageName) -> None:
+    config = GnetConfig() if stage == "gnet" else OptimiserConfig()
+    own = run.step_rule(stage, config)
+    assert isinstance(own, LearnedOptimiser)
+    given = run.step_rule(stage, config.model_copy(update={"rates": (0.5, 0.4, 0.3, 0.2, 0.0)}))
+    assert isinstance(given, LearnedOptimiser) and given.config.rates == (0.5, 0.4, 0.3, 0.2, 0.0) != own.config.rates
+    assert given.config.relaxation == own.config.relaxation
+    assert all(torch.equal(a, b) for a, b in zip(own.parameters(), given.parameters(), strict=True))
+    assert not any(p.requires_grad for p in given.parameters())
 
 
 def test_g3r_has_weights_of_its_own_or_those_that_are_named(views: tuple[Target, ...]) -> None:
