@@ -140,8 +140,8 @@ def step_rule(stage: StageName, config: OptimiserConfig) -> StepRule:
     Raises ``InputError`` for weights missing or unfit.
     """
     if config.method == "adam":
-        rates = GNET_RATES if stage == "gnet" else ENET_RATES
-        return TunedAdam(config.adam.rates or rates, config.adam.schedule)
+        own = GNET_RATES if stage == "gnet" else ENET_RATES
+        return TunedAdam(config.adam.rates or own, config.adam.schedule)
     learned = LearnedOptimiser.load(resolve_weights(network_of(stage, config.method), config.weights))
     finish = config.finishing if isinstance(config, GnetConfig) else None
     rates = config.rates if finish is None or finish.rates_before is None else finish.rates_before
