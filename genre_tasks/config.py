@@ -115,7 +115,9 @@ class OptimiserConfig(Section):
         "builtin", description="builtin, builtin:NAME (another network's, e.g. gnet), or a path to a .safetensors file."
     )
     rates: Rates | None = Field(
-        None, description="Of the learned optimiser's steps, as adam.rates; null: those that its weights were swept at."
+        None,
+        description="Of the learned optimiser's steps, as adam.rates; null: those of its weights. A preset's are for "
+        "the built-in weights: with others set null.",
     )
     hold_ground: bool = Field(True, description="Flat discs that lie on the ground move and turn in their plane only.")
     split: float = Field(

@@ -52,10 +52,12 @@ def measure_enhancement(log: str, chunk: int, store: str, order: int) -> Row:
 
 
 def as_enhancer(config: PipelineConfig) -> OptimiserConfig:
-    """ENet's section with GNet's weights, T and source views an iteration, and as many fixed views."""
+    """ENet's section with GNet's weights at their own rates, its T and source views, and as many fixed views."""
     views = config.gnet.views_per_iteration
     own = {"iterations": config.gnet.iterations, "views_per_iteration": views, "novel_views_per_iteration": views}
-    return config.enet.model_copy(update=own | {"weights": str(resolve_weights("gnet", config.gnet.weights))})
+    return config.enet.model_copy(
+        update=own | {"weights": str(resolve_weights("gnet", config.gnet.weights)), "rates": None}
+    )
 
 
 def enhanced_by_gnet(steps: Steps) -> SceneGraph:

@@ -150,11 +150,12 @@ BUILT_IN: Mapping[str, Method] = {
         "The shipped ENet, which was trained on scenes of GNet and of tuned Adam and never saw G3R's.",
     ),
     "g3r+genre-tuned": Method(
-        "G3R-style + GenRe (fine-tuned)", (*_LEARNED, "gnet.method=g3r"), "enet", slot="enet-g3r", needs_weights=True,
+        "G3R-style + GenRe (fine-tuned)", (*_LEARNED, "gnet.method=g3r", "enet.rates=null"), "enet", slot="enet-g3r",
+        needs_weights=True,
     ),
     "gnet-gnet": Method(
         "GNet → FNet → GNet",
-        (*_LEARNED, "enet.weights=builtin:gnet", "enet.iterations={gnet.iterations}",
+        (*_LEARNED, "enet.weights=builtin:gnet", "enet.rates=null", "enet.iterations={gnet.iterations}",
          "enet.views_per_iteration={gnet.views_per_iteration}",
          "enet.novel_views_per_iteration={gnet.views_per_iteration}"),
         "enet",

@@ -208,6 +208,8 @@ def test_gnets_network_enhances_with_its_own_length_and_weights() -> None:
     config = load_configuration("small")
     own = enhancement.as_enhancer(config)
     assert (own.iterations, own.loss) == (config.gnet.iterations, config.enet.loss)
+    # A preset's rates are for the weights they were swept for.
+    assert config.enet.rates is not None and own.rates is None
     assert Path(own.weights).name == "gnet.safetensors" and own.novel_views_per_iteration == own.views_per_iteration
 
 
