@@ -7,7 +7,6 @@ python -m benchmarks.with_without ground LOG STORE PICTURE.png    # GNet's scene
 
 from __future__ import annotations
 
-import itertools
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -114,7 +113,7 @@ def picture(setting: str, log: str, store: str, path: Path) -> None:
     for value in KINDS.values():
         task, gnet = _posed(setting, value, log, 0, store)
         views = task.beside[:: max(1, len(task.beside) // 3)][:3]
-        *_, end = itertools.islice(race.configured(task, gnet, gnet.seed), gnet.iterations)
+        end = race.at_end(race.configured(task, gnet, gnet.seed), gnet.iterations)
         columns.append(images_of(end.scene, views).flatten(0, 1))
     columns.append(torch.cat([view.image.image for view in views]))
     Image.fromarray((torch.cat(columns, 1) * 255).round().byte().numpy()).save(path)

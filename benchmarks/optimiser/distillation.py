@@ -159,7 +159,7 @@ def distillation_row(enet: OptimiserConfig, standard: PerSceneConfig, judge: Jud
 
 def ended(enet: OptimiserConfig, judge: Judge, fixed: Sequence[Target]) -> Mark:
     """ENet at its end."""
-    *_, last = itertools.islice(walked(enet, judge.task, fixed), enet.iterations)
+    last = race.at_end(walked(enet, judge.task, fixed), enet.iterations)
     return judge.mark(last.scene, last.seconds, last.renders)
 
 

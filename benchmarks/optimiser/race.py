@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -86,6 +87,12 @@ def walk(
         renders += len(batch)
         seconds += time.perf_counter() - began
         yield Moment(seconds, i + 1, renders, frame, state)
+
+
+def at_end(moments: Iterator[Moment], iterations: int) -> Moment:
+    """The last of so many moments, > 0. Those before are let go: fresh memory for each state takes milliseconds."""
+    (last,) = deque(itertools.islice(moments, iterations), maxlen=1)
+    return last
 
 
 def configured(task: Task, config: GnetConfig, seed: int) -> Iterator[Moment]:

@@ -50,6 +50,22 @@ def test_walking_is_unrolling(task: Task) -> None:
     assert all(a.seconds < b.seconds for a, b in itertools.pairwise(moments))
 
 
+def test_of_a_walk_to_its_end_one_moment_is_kept_at_a_time() -> None:
+    class Counted:
+        alive, most = 0, 0
+
+        def __init__(self, iteration: int) -> None:
+            self.iteration = iteration
+            Counted.alive += 1
+            Counted.most = max(Counted.most, Counted.alive)
+
+        def __del__(self) -> None:
+            Counted.alive -= 1
+
+    end: Any = race.at_end((Counted(i + 1) for i in itertools.count()), 7)  # type: ignore[misc]
+    assert end.iteration == 7 and Counted.most <= 2
+
+
 def test_loading_counts_and_judging_does_not(task: Task, monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
     monkeypatch.setattr(race.time, "perf_counter", lambda: now[0])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -63,7 +62,7 @@ def test_the_end_is_a_run_of_its_own_from_the_scene_that_the_first_left(chunk: C
 
 def test_the_benchmark_goes_the_same_way(chunk: Chunk, start: SceneGraph) -> None:
     task = Task(start, of_source(chunk, depth=True), ())
-    *_, end = itertools.islice(race.configured(task, CONFIG, CONFIG.seed), CONFIG.iterations)
+    end = race.at_end(race.configured(task, CONFIG, CONFIG.seed), CONFIG.iterations)
     assert torch.equal(_packed(end.scene), _packed(optimise("gnet", CONFIG, chunk, start, None).scene))
     views = len(task.source)  # all of them are rendered once more for the split
     assert (end.iteration, end.renders) == (12, 24 + views) and end.seconds > 0
@@ -125,7 +124,7 @@ def test_rates_of_the_first_iterations_are_the_ends_to_say(chunk: Chunk, start: 
     assert torch.equal(at(told(own)), plain) and not torch.equal(at(told((4 * own[0], *own[1:]))), plain)
     task = Task(start, of_source(chunk, depth=True), ())
     bold = told((4 * own[0], *own[1:]))
-    *_, end = itertools.islice(race.configured(task, bold, bold.seed), bold.iterations)
+    end = race.at_end(race.configured(task, bold, bold.seed), bold.iterations)
     assert torch.equal(_packed(end.scene), at(bold))
     assert torch.equal(at(told((9.0, *own[1:]), iterations=1)), at(CONFIG.model_copy(update={"iterations": 1})))
     for bad in ((-0.1, 1, 1, 1, 1), (float("nan"), 1, 1, 1, 1), (1, 1, 1)):
