@@ -59,6 +59,7 @@ class LossConfig(Section):
     depth: float = Field(0.01, ge=0, description="Source views only.")
     novel: float = Field(0.5, ge=0, description="Weight of the novel-view terms.")
     perceptual_every: int = Field(4, ge=1, description="The perceptual term is taken in every n-th iteration.")
+    perceptual_views: int = Field(1, ge=1, description="There on crops of so many source and so many novel views.")
 
 
 class AdamConfig(Section):

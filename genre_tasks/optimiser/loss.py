@@ -2,7 +2,8 @@
 
 Each view's loss is taken on its own, on one thread, so that the sums have one order at any thread count; views are
 spread over the threads. The perceptual distance costs far more than the other terms together: it is taken in every
-``perceptual_every``-th iteration, on one random crop of at most ``CROP_PX`` of one source view and one novel view.
+``perceptual_every``-th iteration, on one random crop of at most ``CROP_PX`` of ``perceptual_views`` source and as many
+novel views.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def plan_loss(
 ) -> LossPlan:
     """Weights and crops of a batch: the mean over source views plus λ_novel times the mean over novel views.
 
-    The crop's term counts for its one view as if it were the whole image's: with λ_lpips times that view's weight.
+    A crop's term counts for its one view as if it were the whole image's: with λ_lpips times that view's weight.
     """
     novel = sum(t.novel for t in targets)
     source = len(targets) - novel
@@ -53,8 +54,8 @@ def plan_loss(
     if perceptual and config.perceptual > 0 and iteration % config.perceptual_every == 0:
         for kind in (False, True):
             of_kind = [i for i, t in enumerate(targets) if t.novel == kind]
-            if of_kind:
-                i = of_kind[_below(len(of_kind), generator)]
+            for _ in range(min(config.perceptual_views, len(of_kind))):
+                i = of_kind.pop(_below(len(of_kind), generator))
                 crops[i] = _crop(targets[i].image.image.shape, generator)
     return LossPlan(weights, tuple(crops))
 

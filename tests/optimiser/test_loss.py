@@ -51,6 +51,21 @@ def test_the_perceptual_term_is_taken_every_nth_iteration_on_one_view_of_each_ki
     assert row + height <= 32 and column + width <= 48
 
 
+def test_the_perceptual_term_is_taken_of_as_many_views_as_are_asked_for_and_there() -> None:
+    targets = [_target(i, novel=i > 2) for i in range(5)]
+    one, two, many = (LossConfig(perceptual_every=1, perceptual_views=n) for n in (1, 2, 9))
+    of_two = set()
+    for seed in range(20):
+        first, some, every = (
+            plan_loss(c, targets, 0, torch.Generator().manual_seed(seed)).crops for c in (one, two, many)
+        )
+        of_two.add(tuple(k for k, c in enumerate(some) if c is not None))
+        assert None not in every
+        source = next(k for k, c in enumerate(first) if c is not None)
+        assert some[source] == every[source] == first[source]  # the first drawn is the same
+    assert of_two == {(0, 1, 3, 4), (0, 2, 3, 4), (1, 2, 3, 4)}
+
+
 @pytest.mark.parametrize("broken", [0.0, float("nan"), float("inf"), -1.0])
 def test_no_valid_lidar_is_no_depth_loss(broken: float) -> None:
     depth = torch.ones(4, 4, requires_grad=True)
