@@ -71,7 +71,7 @@ class Optimiser:
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
         """The network; then for each order every part on all logs.
 
-        ``quick``: one seed, one order, a lower cap, the methods of claims.
+        ``quick``: one seed, one order, a lower cap, the methods of claims, the shorter standard recipe.
         An empty ``pandaset`` leaves the real log out; with ``minutes`` cells that would not end by then are left out.
         Raises ``ConfigError`` for an unknown part.
         """
@@ -82,7 +82,7 @@ class Optimiser:
         if quick:
             logs, orders, methods = logs[:1], orders[:1], [m for m in methods if m in CLAIMED]
         cap = min(float(options["cap"]), QUICK_CAP) if quick else float(options["cap"])
-        made = _Maker(load_configuration("small"), load_configuration(PRESET), options["store"], cap)
+        made = _Maker(load_configuration("small"), load_configuration(PRESET), options["store"], cap, quick)
         out = [made.network(3 if quick else 9)]
         if "trade" in parts:
             out += [made.trade(seed) for seed in SEEDS[: 1 if quick else None]]
@@ -112,8 +112,8 @@ class Optimiser:
 class _Maker:
     """Makes the cells, each with a prediction of its seconds from its renders and steps."""
 
-    def __init__(self, small: PipelineConfig, long: PipelineConfig, store: str, cap: float) -> None:
-        self._small, self._long, self._store, self._cap = small, long, store, cap
+    def __init__(self, small: PipelineConfig, long: PipelineConfig, store: str, cap: float, quick: bool) -> None:
+        self._small, self._long, self._store, self._cap, self._quick = small, long, store, cap, quick
         self._gnet_s = _learned_s(small.gnet)
         digests = [stage_weights(BY_NAME[name], small) for name in ("gnet", "fnet", "enet")]
         self._gnet = {"configuration": small.model_dump(mode="json"), "weights": digests[0]}
@@ -148,11 +148,14 @@ class _Maker:
         enet_s, configs = _learned_s(self._small.enet), adam_variants(self._small.enet)
         if split := self._small.enet.split:
             configs |= adam_variants(self._small.enet, split)
-        seconds = enet_s * (1 + sum(SHORTER) + MOST_TIMES * len(configs)) + SLOWER_3DGS * RENDER_S * STANDARD_ITERATIONS
-        measure = partial(measure_distillation, log, chunk, self._store, order, self._cap)
+        seconds = enet_s * (1 + sum(SHORTER) + MOST_TIMES * len(configs))
+        standard = STANDARD_ITERATIONS[: 1 if self._quick else None]
+        seconds += SLOWER_3DGS * RENDER_S * sum(standard)
+        measure = partial(measure_distillation, log, chunk, self._store, order, self._cap, standard)
         values = {name: config.model_dump(mode="json") for name, config in configs.items()}
         name = f"distillation/{log} chunk {chunk} order {order}"
-        return Cell(name, seconds + 20.0, measure, self._all | {"cap": self._cap, "variants": values})
+        parameters = self._all | {"cap": self._cap, "variants": values, "standard": list(standard)}
+        return Cell(name, seconds + 20.0, measure, parameters)
 
     def converged(self, log: str, chunk: int, order: int) -> Cell:
         configs = long_variants(variants("tuned_adam"))

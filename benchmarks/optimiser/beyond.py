@@ -88,6 +88,9 @@ def _distillation(rows: Sequence[Row], family: str, name: str, words: str, targe
     note = f"ENet's wall time over that of distillation by {words} to the same quality at 3 m (kernel distance within "
     note += f"1 %, synthetic PSNR within 0.1 dB of the best that it came to); in {len(missed)} of {len(rows)} cells "
     note += f"ENet does not reach it, and the cap counts as the ratio ({', '.join(missed) or 'none'})"
+    if rows:
+        never = sum(row[family]["as_good_as_enet_s"] is None for row in rows)
+        note += f"; in {never} it never came to ENet's own"
     ratios = [times_distillation(row, family) for row in rows]
     if early := [row for row in rows if row[family].get("enet_first_s") is not None]:
         first = [row[family]["enet_first_s"] / row[family]["reached_s"] for row in early]

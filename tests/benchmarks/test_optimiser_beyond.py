@@ -136,12 +136,13 @@ def test_enet_beside_distillations_of_the_same_images(task: Task) -> None:
     enet = OptimiserConfig(
         iterations=2, views_per_iteration=2, novel_views_per_iteration=2, split=0.1, loss=LossConfig(perceptual=0.0)
     )
-    row = distillation.distillation_row(enet, PerSceneConfig(iterations=6), judge, novel)
+    recipes = [PerSceneConfig(iterations=count) for count in (6, 9)]
+    row = distillation.distillation_row(enet, recipes, judge, novel)
     once = len(task.source) + len(novel)  # rendered for the split
     assert row["enet"][1] == 8 + once and row["enet"][0] > 0
     assert {t: mark[1] for t, mark in row["enet_shorter"].items()} == {"1": 4 + once}  # a third of two, and two thirds
     variants = ["1+1 at 0.25", "2+2 at 0.5, no perceptual"]
-    assert list(row["adam"]["curves"]) == variants and list(row["standard"]["curves"]) == ["6"]
+    assert list(row["adam"]["curves"]) == variants and list(row["standard"]["curves"]) == ["6", "9"]
     assert list(row["adam_split"]["curves"]) == ["2+2 at 0.5, no perceptual, split"]
     given = distillation.adam_variants(enet)
     assert [(c.split, c.loss.perceptual) for c in given.values()] == [(0.0, 0.1), (0.0, 0.0)]
@@ -277,4 +278,5 @@ def test_where_enet_is_not_as_good_the_cap_counts() -> None:
     standard = claims["distillation_standard"]
     assert (standard.measured, standard.holds) == (50.0, False)
     assert "in 1 of 1 cells ENet does not reach it" in standard.data
+    assert "in 1 it never came to ENet's own" in standard.data and "in 0 it never" in claims["distillation"].data
     assert any("| no |" in line for line in BENCH.table(rows))
