@@ -22,6 +22,7 @@ from benchmarks.optimiser.cells import METHODS, measure_race, measure_stability,
 from benchmarks.optimiser.converged import LONG_RENDERS, PRESET, long_variants, measure_converged
 from benchmarks.optimiser.distillation import (
     MOST_TIMES,
+    QUICK_STANDARD_ITERATIONS,
     SHORTER,
     STANDARD_ITERATIONS,
     adam_variants,
@@ -71,7 +72,7 @@ class Optimiser:
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
         """The network; then for each order every part on all logs.
 
-        ``quick``: one seed, one order, a lower cap, the methods of claims, the shorter standard recipe.
+        ``quick``: one seed, one order, a lower cap, the methods of claims, a shorter standard recipe.
         An empty ``pandaset`` leaves the real log out; with ``minutes`` cells that would not end by then are left out.
         Raises ``ConfigError`` for an unknown part.
         """
@@ -149,12 +150,12 @@ class _Maker:
         if split := self._small.enet.split:
             configs |= adam_variants(self._small.enet, split)
         seconds = enet_s * (1 + sum(SHORTER) + MOST_TIMES * len(configs))
-        standard = STANDARD_ITERATIONS[: 1 if self._quick else None]
-        seconds += SLOWER_3DGS * RENDER_S * sum(standard)
+        standard = QUICK_STANDARD_ITERATIONS if self._quick else STANDARD_ITERATIONS
+        seconds += SLOWER_3DGS * RENDER_S * standard
         measure = partial(measure_distillation, log, chunk, self._store, order, self._cap, standard)
         values = {name: config.model_dump(mode="json") for name, config in configs.items()}
         name = f"distillation/{log} chunk {chunk} order {order}"
-        parameters = self._all | {"cap": self._cap, "variants": values, "standard": list(standard)}
+        parameters = self._all | {"cap": self._cap, "variants": values, "standard": standard}
         return Cell(name, seconds + 20.0, measure, parameters)
 
     def converged(self, log: str, chunk: int, order: int) -> Cell:

@@ -26,9 +26,10 @@ PERCEPTUAL = {"perceptual 0.1": (0.1, 1), "perceptual 0.1 every fourth": (0.1, 4
 
 
 def settings(gnet: GnetConfig) -> dict[str, GnetConfig]:
-    """By name: the preset's section in every shape and with some ends of its own, and with the perceptual term."""
+    """By name: the preset's section, in every shape and with some ends of its own, and with the perceptual term."""
     plain = gnet.model_copy(update={"finish": None})
-    out = {f"{t}x{v}": plain.model_copy(update={"iterations": t, "views_per_iteration": v}) for t, v in SHAPES}
+    out = {"preset": gnet}
+    out |= {f"{t}x{v}": plain.model_copy(update={"iterations": t, "views_per_iteration": v}) for t, v in SHAPES}
     for first, last, split in FINISHES:
         shape = {"iterations": first + last, "views_per_iteration": 3, "snapshots": 0}
         finish = FinishConfig(share=last / (first + last), split=split)

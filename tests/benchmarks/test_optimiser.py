@@ -201,6 +201,7 @@ def test_what_is_not_measured_does_not_count() -> None:
 
 def test_the_trade_counts_renders_and_judges_the_end(task: Task) -> None:
     named = trade.settings(learned(4))
+    assert named["preset"] == learned(4)
     assert [named[n].loss.perceptual_every for n in trade.PERCEPTUAL] == [1, 4]
     config = learned(4).model_copy(update={"views_per_iteration": 1000})
     found = trade.trade(replace(task, beside=task.heldout), config)
