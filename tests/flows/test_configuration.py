@@ -19,7 +19,7 @@ def test_presets_are_valid(preset: str) -> None:
     config = load_configuration(preset)
     assert config.gnet.iterations == {"fine": 144, "long": 120, "paper": 24}.get(preset, 72)
     enet = {"paper": (12, 0.0), "demo": (72, 0.7), "fine": (72, 0.3)}
-    assert (config.enet.iterations, config.enet.split) == enet.get(preset, (72, 1.0))
+    assert (config.enet.iterations, config.enet.split) == enet.get(preset, (96, 1.0))
     assert config.gnet.finishing_iterations == {"demo": 48, "small": 48, "long": 72}.get(preset, 0)
     assert differences(config, preset) == {}
 
