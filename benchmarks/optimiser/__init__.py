@@ -5,22 +5,24 @@ genre bench optimiser --json docs/benchmarks/optimiser.json [--set seeds=1001 --
 A log and an order of views (a seed) make a cell with each method; GNet runs in each of them anew, before the method.
 A baseline's run ends where it reaches GNet's held-out PSNR, or at ``cap`` times GNet's seconds. A log and an order make
 also a cell of enhancement, one of distillation and one of convergence. The two latter run baselines to their ends and
-are the dearest: ``long_orders`` chooses their orders. All cells of the first order come first. What GNet's length and
-views bring and cost is measured on validation streets.
+are the dearest: ``long_orders`` chooses their orders, ``families`` what is distilled beside ENet. All cells of the
+first order come first. What GNet's length and views bring and cost is measured on validation streets. All that is
+compared in a cell runs on as many ``threads``: with one, two logs can be measured at a time.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
 from benchmarks.bench import Bench, Cell, NotMeasuredError, Row, logs_of
 from benchmarks.optimiser import summary, table
-from benchmarks.optimiser.cells import METHODS, measure_race, measure_stability, variants
+from benchmarks.optimiser.cells import METHODS, measure_race, measure_stability, threads, variants
 from benchmarks.optimiser.converged import LONG_RENDERS, PRESET, long_variants, measure_converged
 from benchmarks.optimiser.distillation import (
+    FAMILIES,
     MOST_TIMES,
     QUICK_STANDARD_ITERATIONS,
     SHORTER,
@@ -56,8 +58,8 @@ class Optimiser:
     name = "optimiser"
     options: Mapping[str, str] = {
         "seeds": "1001,1002,1003,1004,1005", "orders": "0,1,2", "long_orders": "0,1,2", "methods": ",".join(METHODS),
-        "parts": ",".join(PARTS), "cap": "50", "minutes": "", "store": "genre-store",
-        "pandaset": "../shared/data/pandaset/002",
+        "parts": ",".join(PARTS), "families": ",".join(FAMILIES), "cap": "50", "threads": "2", "minutes": "",
+        "store": "genre-store", "pandaset": "../shared/data/pandaset/002",
     }  # fmt: skip
     code: tuple[str, ...] = (
         "benchmarks.optimiser.cells", "benchmarks.optimiser.network", "benchmarks.optimiser.race",
@@ -74,17 +76,17 @@ class Optimiser:
 
         ``quick``: one seed, one order, a lower cap, the methods of claims, a shorter standard recipe.
         An empty ``pandaset`` leaves the real log out; with ``minutes`` cells that would not end by then are left out.
-        Raises ``ConfigError`` for an unknown part.
+        The network alone has two threads in any case. Raises ``ConfigError`` for an unknown part or family.
         """
         logs = logs_of(options)
-        orders, parts, methods = (_parts(options[name]) for name in ("orders", "parts", "methods"))
-        if unknown := set(parts) - set(PARTS):
-            raise ConfigError(f"the benchmark has no part {sorted(unknown)}", remedy=f"Known: {', '.join(PARTS)}.")
+        orders, methods = (_parts(options[name]) for name in ("orders", "methods"))
+        parts, families = _known("part", options["parts"], PARTS), _known("family", options["families"], FAMILIES)
         if quick:
             logs, orders, methods = logs[:1], orders[:1], [m for m in methods if m in CLAIMED]
         cap = min(float(options["cap"]), QUICK_CAP) if quick else float(options["cap"])
         made = _Maker(load_configuration("small"), load_configuration(PRESET), options["store"], cap, quick)
-        out = [made.network(3 if quick else 9)]
+        network = made.network(3 if quick else 9)
+        out: list[Cell] = []
         if "trade" in parts:
             out += [made.trade(seed) for seed in SEEDS[: 1 if quick else None]]
         for order in map(int, orders):
@@ -93,10 +95,11 @@ class Optimiser:
             if "enhancement" in parts:
                 out += [made.enhancement(*log, order) for log in logs]
             if str(order) in _parts(options["long_orders"]):
-                out += [made.distillation(*log, order) for log in logs if "distillation" in parts]
+                out += [made.distillation(*log, order, families) for log in logs if "distillation" in parts]
                 out += [made.converged(*log, order) for log in logs if "converged" in parts]
             if order == int(orders[0]) and "stability" in parts:
                 out += [made.stability(*log, network) for network in NETWORKS for log in logs]
+        out = [network, *(_on(int(options["threads"]), cell) for cell in out)]
         if options["minutes"]:
             out = [_before(time.monotonic() + 60 * float(options["minutes"]), cell) for cell in out]
         return out
@@ -145,17 +148,20 @@ class _Maker:
         measure = partial(measure_enhancement, log, chunk, self._store, order)
         return Cell(f"enhancement/{log} chunk {chunk} order {order}", own + 25.0, measure, self._all)
 
-    def distillation(self, log: str, chunk: int, order: int) -> Cell:
-        enet_s, configs = _learned_s(self._small.enet), adam_variants(self._small.enet)
-        if split := self._small.enet.split:
+    def distillation(self, log: str, chunk: int, order: int, families: Sequence[str]) -> Cell:
+        enet_s, configs = _learned_s(self._small.enet), dict[str, OptimiserConfig]()
+        if "adam" in families:
+            configs |= adam_variants(self._small.enet)
+        if (split := self._small.enet.split) and "adam_split" in families:
             configs |= adam_variants(self._small.enet, split)
         seconds = enet_s * (1 + sum(SHORTER) + MOST_TIMES * len(configs))
         standard = QUICK_STANDARD_ITERATIONS if self._quick else STANDARD_ITERATIONS
-        seconds += SLOWER_3DGS * RENDER_S * standard
-        measure = partial(measure_distillation, log, chunk, self._store, order, self._cap, standard)
+        if "standard" in families:
+            seconds += SLOWER_3DGS * RENDER_S * standard
+        measure = partial(measure_distillation, log, chunk, self._store, order, self._cap, standard, families)
         values = {name: config.model_dump(mode="json") for name, config in configs.items()}
         name = f"distillation/{log} chunk {chunk} order {order}"
-        parameters = self._all | {"cap": self._cap, "variants": values, "standard": standard}
+        parameters = self._all | {"cap": self._cap, "variants": values, "standard": standard, "families": families}
         return Cell(name, seconds + 20.0, measure, parameters)
 
     def converged(self, log: str, chunk: int, order: int) -> Cell:
@@ -190,6 +196,16 @@ def _baseline_s(config: GnetConfig, gnet_s: float, cap: float) -> float:
     return cap * gnet_s + 20 * JUDGE_S
 
 
+def _on(count: int, cell: Cell) -> Cell:
+    """The cell measured on so many threads; its row says so."""
+
+    def measure() -> Row:
+        with threads(count):
+            return {"threads": count, **cell.measure()}
+
+    return replace(cell, measure=measure, parameters={**cell.parameters, "threads": count})
+
+
 def _before(deadline: float, cell: Cell) -> Cell:
     """The cell, which refuses to be measured where it would end after the deadline."""
 
@@ -199,6 +215,13 @@ def _before(deadline: float, cell: Cell) -> Cell:
         return cell.measure()
 
     return replace(cell, measure=measure)
+
+
+def _known(kind: str, text: str, known: Sequence[str]) -> list[str]:
+    parts = _parts(text)
+    if unknown := set(parts) - set(known):
+        raise ConfigError(f"the benchmark has no {kind} {sorted(unknown)}", remedy=f"Known: {', '.join(known)}.")
+    return parts
 
 
 def _parts(text: str) -> list[str]:

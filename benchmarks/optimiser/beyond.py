@@ -84,6 +84,7 @@ def _converged(rows: Sequence[Row]) -> Claim:
 
 
 def _distillation(rows: Sequence[Row], family: str, name: str, words: str, target: float) -> Claim:
+    rows = [row for row in rows if family in row]
     missed = [place(row) for row in rows if not row[family]["enet_as_good"]]
     note = f"ENet's wall time over that of distillation by {words} to the same quality at 3 m (kernel distance within "
     note += f"1 %, synthetic PSNR within 0.1 dB of the best that it came to); in {len(missed)} of {len(rows)} cells "

@@ -30,8 +30,7 @@ PAST = 10
 def measure_race(log: str, chunk: int, store: str, order: int, method: str, cap: float) -> Row:
     """GNet, then every variant of the method with the same scene, views and order seed, up to ``cap`` × GNet's time."""
     task, gnet = task_of(log, chunk, store), load_configuration("small").gnet
-    with threads():
-        return {"log": log, "chunk": chunk, "order": order} | race_row(task, gnet, variants(method), order, method, cap)
+    return {"log": log, "chunk": chunk, "order": order} | race_row(task, gnet, variants(method), order, method, cap)
 
 
 def race_row(task: Task, gnet: GnetConfig, configs: dict[str, GnetConfig], order: int, method: str, cap: float) -> Row:
@@ -43,7 +42,7 @@ def race_row(task: Task, gnet: GnetConfig, configs: dict[str, GnetConfig], order
     out = {name: variant_row(run(task, config, order, goal, cap_s), goal, cap_s) for name, config in configs.items()}
     sizes = {"gaussians": len(task.scene), "source_views": len(task.source), "heldout_views": len(task.heldout)}
     goals = {"seconds": goal.seconds, "renders": goal.renders, "psnr": goal.psnr, "curve": as_rows(curve)}
-    return sizes | {"method": method, "threads": torch.get_num_threads(), "cap": cap, "gnet": goals, "variants": out}
+    return sizes | {"method": method, "cap": cap, "gnet": goals, "variants": out}
 
 
 def variant_row(curve: Sequence[Point], goal: Point, cap_s: float) -> Row:
@@ -79,12 +78,11 @@ def variants(method: str) -> dict[str, GnetConfig]:
 def measure_stability(log: str, chunk: int, store: str, network: StageName) -> Row:
     """GNet or ENet to ten times its length, still told its length; ENet from GNet's scene with its fixed images."""
     where = {"log": log, "chunk": chunk, "network": network}
-    with threads():
-        if network == "gnet":
-            return where | stability_row(task_of(log, chunk, store), "gnet", load_configuration("small").gnet)
-        steps = steps_of(log, chunk, store, 0, enet=False)
-        task = Task(steps.gnet, steps.source, spread(steps.heldout, HELDOUT_VIEWS))
-        return where | stability_row(task, "enet", steps.config.enet, steps.fixed)
+    if network == "gnet":
+        return where | stability_row(task_of(log, chunk, store), "gnet", load_configuration("small").gnet)
+    steps = steps_of(log, chunk, store, 0, enet=False)
+    task = Task(steps.gnet, steps.source, spread(steps.heldout, HELDOUT_VIEWS))
+    return where | stability_row(task, "enet", steps.config.enet, steps.fixed)
 
 
 def stability_row(task: Task, network: StageName, config: OptimiserConfig, fixed: Sequence[Target] = ()) -> Row:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from benchmarks.bench import Row
 from benchmarks.optimiser import race
-from benchmarks.optimiser.cells import as_rows, threads, variants
+from benchmarks.optimiser.cells import as_rows, variants
 from benchmarks.optimiser.race import Point
 from benchmarks.optimiser.task import Task, task_of
 from flows.configuration import load_configuration
@@ -26,10 +26,9 @@ FIRST_LOOK_S = 0.5
 def measure_converged(log: str, chunk: int, store: str, order: int, cap: float) -> Row:
     """One cell: the preset ``long`` and tuned Adam's long variants from the same scene."""
     task = task_of(log, chunk, store)
-    with threads():
-        configs = long_variants(variants("tuned_adam"))
-        row = converged_row(task, load_configuration(PRESET).gnet, configs, order)
-        return {"log": log, "chunk": chunk, "order": order, "cap": cap} | row
+    configs = long_variants(variants("tuned_adam"))
+    row = converged_row(task, load_configuration(PRESET).gnet, configs, order)
+    return {"log": log, "chunk": chunk, "order": order, "cap": cap} | row
 
 
 def long_variants(configs: Mapping[str, GnetConfig]) -> dict[str, GnetConfig]:

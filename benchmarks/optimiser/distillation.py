@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from benchmarks.bench import Row
 from benchmarks.optimiser import race
 from benchmarks.optimiser.beside import true_targets, views_at
-from benchmarks.optimiser.cells import threads
 from benchmarks.optimiser.steps import images_of, steps_of
 from benchmarks.optimiser.task import HELDOUT_VIEWS, SIDE_M, Task
 from flows.train.scenes import spread
@@ -30,6 +29,8 @@ from genre_tasks.optimiser.targets import Target
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.views import NovelView
 
+FAMILIES = ("adam", "adam_split", "standard")
+"""What ENet stands beside: tuned Adam, the same on Gaussians that are split as ENet's are, the published recipe."""
 KERNEL_VIEWS = 48
 """Of the views at ±3 m, spread evenly over sides, frames and cameras: an unbiased distance at any number."""
 KERNEL_PART, PSNR_DB = 0.01, 0.1
@@ -100,16 +101,21 @@ Marks = Sequence[Mark]
 
 
 def measure_distillation(
-    log: str, chunk: int, store: str, order: int, cap: float, standard: int = STANDARD_ITERATIONS
+    log: str,
+    chunk: int,
+    store: str,
+    order: int,
+    cap: float,
+    standard: int = STANDARD_ITERATIONS,
+    families: Sequence[str] = FAMILIES,
 ) -> Row:
-    """One cell: ENet, then tuned Adam's variants, then the standard recipe of so many iterations."""
-    with threads():
-        steps = steps_of(log, chunk, store, order, enet=False)
-        heldout = spread(steps.heldout, HELDOUT_VIEWS)
-        task = Task(steps.gnet, steps.source, heldout, true_targets(log, store, steps.chunk, SIDE_M))
-        judge = Judge(views_at(steps.chunk, SIDE_M, KERNEL_VIEWS), real_images(steps.chunk), task)
-        row = distillation_row(steps.config.enet, PerSceneConfig(iterations=standard), judge, steps.fixed)
-        return {"log": log, "chunk": chunk, "order": order, "cap": cap} | row
+    """One cell: ENet, then those of the ``FAMILIES`` that are asked for."""
+    steps = steps_of(log, chunk, store, order, enet=False)
+    heldout = spread(steps.heldout, HELDOUT_VIEWS)
+    task = Task(steps.gnet, steps.source, heldout, true_targets(log, store, steps.chunk, SIDE_M))
+    judge = Judge(views_at(steps.chunk, SIDE_M, KERNEL_VIEWS), real_images(steps.chunk), task)
+    row = distillation_row(steps.config.enet, PerSceneConfig(iterations=standard), judge, steps.fixed, families)
+    return {"log": log, "chunk": chunk, "order": order, "cap": cap} | row
 
 
 def adam_variants(enet: OptimiserConfig, split: float = 0.0) -> dict[str, OptimiserConfig]:
@@ -132,7 +138,13 @@ def adam_variants(enet: OptimiserConfig, split: float = 0.0) -> dict[str, Optimi
     return out
 
 
-def distillation_row(enet: OptimiserConfig, standard: PerSceneConfig, judge: Judge, fixed: Sequence[Target]) -> Row:
+def distillation_row(
+    enet: OptimiserConfig,
+    standard: PerSceneConfig,
+    judge: Judge,
+    fixed: Sequence[Target],
+    families: Sequence[str] = FAMILIES,
+) -> Row:
     """Each family of distillations: the best it came to, when it first was as good as that, whether ENet is.
 
     ENet at ``SHORTER`` lengths stands beside: the first that is as good says when it can be, if no better is asked.
@@ -145,20 +157,21 @@ def distillation_row(enet: OptimiserConfig, standard: PerSceneConfig, judge: Jud
     own = ended(enet, judge, fixed)
     budget_s = MOST_TIMES * own.seconds
     shares = {"adam": 0.0} | ({"adam_split": enet.split} if enet.split else {})
-    adam = {
+    runs = {
         name: {
             variant: distilled(walked(config, task, fixed), judge, start, own.seconds, budget_s)
             for variant, config in adam_variants(enet, share).items()
         }
         for name, share in shares.items()
+        if name in families
     }
-    recipe = {str(standard.iterations): [start, *by_recipe(standard, judge, fixed, enet.seed)]}
+    if "standard" in families:
+        runs["standard"] = {str(standard.iterations): [start, *by_recipe(standard, judge, fixed, enet.seed)]}
     return {
         "start": start.as_row(),
         "enet": own.as_row(),
         "enet_shorter": {str(t): mark.as_row() for t, mark in shorter.items()},
-        **{name: family(runs, own, shorter.values()) for name, runs in adam.items()},
-        "standard": family(recipe, own, shorter.values()),
+        **{name: family(curves, own, shorter.values()) for name, curves in runs.items()},
     }
 
 

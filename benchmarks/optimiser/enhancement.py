@@ -13,7 +13,6 @@ from torch import Tensor
 
 from benchmarks.bench import Row
 from benchmarks.optimiser.beside import true_targets, views_at
-from benchmarks.optimiser.cells import threads
 from benchmarks.optimiser.steps import Steps, images_of, steps_of
 from genre_tasks.config import OptimiserConfig, PipelineConfig
 from genre_tasks.metrics.collect import BOOTSTRAP_SEED, FeatureSet, real_images
@@ -36,19 +35,18 @@ Scenes = Mapping[str, SceneGraph]
 
 def measure_enhancement(log: str, chunk: int, store: str, order: int) -> Row:
     """One cell: the three scenes on held-out frames and at every shift."""
-    with threads():
-        steps = steps_of(log, chunk, store, order, enet=True)
-        assert steps.enet is not None
-        scenes = {"gnet": steps.gnet, "enet": steps.enet, "gnet_again": enhanced_by_gnet(steps)}
-        shifts = {}
-        for shift in SHIFTS_M:
-            truth = true_targets(log, store, steps.chunk, shift)
-            views = views_at(steps.chunk, shift)
-            shifts[f"{shift:g}"] = (
-                against_truth(scenes, truth) if truth else as_sets(scenes, views, real_images(steps.chunk))
-            )
-        heldout = {name: mean_psnr(scene, steps.heldout) for name, scene in scenes.items()}
-        return {"log": log, "chunk": chunk, "order": order, "heldout_psnr": heldout, "shifts": shifts}
+    steps = steps_of(log, chunk, store, order, enet=True)
+    assert steps.enet is not None
+    scenes = {"gnet": steps.gnet, "enet": steps.enet, "gnet_again": enhanced_by_gnet(steps)}
+    shifts = {}
+    for shift in SHIFTS_M:
+        truth = true_targets(log, store, steps.chunk, shift)
+        views = views_at(steps.chunk, shift)
+        shifts[f"{shift:g}"] = (
+            against_truth(scenes, truth) if truth else as_sets(scenes, views, real_images(steps.chunk))
+        )
+    heldout = {name: mean_psnr(scene, steps.heldout) for name, scene in scenes.items()}
+    return {"log": log, "chunk": chunk, "order": order, "heldout_psnr": heldout, "shifts": shifts}
 
 
 def as_enhancer(config: PipelineConfig) -> OptimiserConfig:

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from benchmarks.bench import Row
-from benchmarks.optimiser.cells import threads
 from benchmarks.optimiser.task import Task, task_of
 from genre_tasks.config import FinishConfig, GnetConfig
 from genre_tasks.optimiser.run import unrolled
@@ -43,9 +42,8 @@ def settings(gnet: GnetConfig) -> dict[str, GnetConfig]:
 def measure_trade(log: str, store: str, configs: Mapping[str, GnetConfig]) -> Row:
     """Seconds from the scene in memory, loading included, view renders, and PSNR in dB held out and at 3 m."""
     task = task_of(log, 0, store)
-    with threads():
-        trade(task, next(iter(configs.values())))  # the first call of a process loads libraries
-        return {"log": log, "chunk": 0, "trade": {name: trade(task, config) for name, config in configs.items()}}
+    trade(task, next(iter(configs.values())))  # the first call of a process loads libraries
+    return {"log": log, "chunk": 0, "trade": {name: trade(task, config) for name, config in configs.items()}}
 
 
 def trade(task: Task, config: GnetConfig) -> dict[str, Any]:
