@@ -44,7 +44,7 @@ def test_a_mean_with_a_bound_is_a_bound_and_what_is_missing_is_a_dash() -> None:
 
 def test_the_page_of_a_written_result(tmp_path: Path, capsys: Any) -> None:
     mark = [3.0, 9, 0.2, 24.0, 28.0]
-    family = {"best": [9.0, 9, 0.21, 24.1, 28.0], "reached_s": 6.0, "enet_as_good": True}
+    family = {"best": [9.0, 9, 0.21, 24.1, 28.0], "reached_s": 6.0, "enet_as_good": True, "enet_first_s": 1.5}
     distilled = {"cell": "distillation/a", "log": "synthetic:s", "chunk": 0, "order": 0, "start": mark, "enet": mark}
     rows = [distilled | {"adam": family}, {"cell": "distillation/b", "not_measured": "no time"}]
     write_json(tmp_path / "a.json", Result(machine="m", commit="a" * 40, rows=rows, claims=[]).model_dump(mode="json"))
@@ -52,5 +52,5 @@ def test_the_page_of_a_written_result(tmp_path: Path, capsys: Any) -> None:
     lines = capsys.readouterr().out.splitlines()
     assert (
         lines[2].startswith("| s chunk 0 | 1 | 0.200 | 24.00 | 3.0 |")
-        and "| 0.210 | 24.10 | 1.00 | 0.50 | – |" in lines[2]
+        and "| 0.210 | 24.10 | 1.00 | 0.50 | 0.25 | – |" in lines[2]
     )
