@@ -7,35 +7,69 @@ python -m benchmarks.optimiser.picture docs/benchmarks/optimiser.json docs/bench
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from benchmarks.bench import Row
 from benchmarks.optimiser.cells import place
 
+ACROSS = 3
+"""Logs beside each other."""
+LABELS = {
+    "tuned_adam": "tuned Adam",
+    "tuned_adam_split": "tuned Adam on split Gaussians",
+    "standard_3dgs": "standard 3DGS",
+    "street_gs": "Street Gaussians' recipe",
+}
+COLOURS = {
+    "tuned_adam": "tab:blue",
+    "tuned_adam_split": "tab:green",
+    "standard_3dgs": "tab:red",
+    "street_gs": "tab:orange",
+}
 HELDOUT, BESIDE = 2, 4
 """Columns of a curve's points; the latter only where there is truth beside the path."""
 
 
 def draw(rows: Sequence[Row], picture: Path) -> None:
-    """A column for each log, its first order: held-out PSNR, and below it PSNR at 3 m where the log has truth.
+    """For each log, its first order: held-out PSNR, and below it PSNR at 3 m where the log has truth.
 
-    Seconds on a logarithmic axis. Raises ``ValueError`` without a measured race.
+    Each method's variants are thin lines, the best that any of them has had by then a bold one. Seconds, logarithmic,
+    are in GNet's of the same cell, so that cells of other machines or threads can share a panel; the first cell's stand
+    in its title. Raises ``ValueError`` without a measured race.
     """
     panels = _first_orders([row for row in rows if "variants" in row])
     if not panels:
         raise ValueError("expected at least one measured race; the result has none")
-    columns = [HELDOUT, BESIDE] if any(len(r[0]["gnet"]["curve"][0]) > BESIDE for r in panels.values()) else [HELDOUT]
+    wide = min(ACROSS, len(panels))
+    blocks = [list(panels.items())[k : k + wide] for k in range(0, len(panels), wide)]
+    lines = [(block, column) for block in blocks for column in (HELDOUT, BESIDE) if _has(block, column)]
     plt = _pyplot()
-    size = (4.2 * len(panels), 3.6 * len(columns))
-    figure, axes = plt.subplots(len(columns), len(panels), figsize=size, layout="constrained", squeeze=False)
-    for k, column in enumerate(columns):
-        for axis, (title, races) in zip(axes[k], panels.items(), strict=True):
-            _panel(axis, title, races, column)
-    figure.savefig(picture, dpi=110)
+    size = (4.6 * wide, 3.2 * len(lines) + 0.4)
+    figure, axes = plt.subplots(len(lines), wide, figsize=size, layout="constrained", squeeze=False)
+    for row_of_axes, (block, column) in zip(axes, lines, strict=True):
+        for axis, panel in itertools.zip_longest(row_of_axes, block):
+            if panel is None or not _has([panel], column):
+                axis.set_axis_off()
+            else:
+                _panel(axis, panel[0], panel[1], column)
+    known = {label: line for axis in axes.flat for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    figure.legend(known.values(), known.keys(), loc="outside lower center", ncols=len(known), fontsize=9)
+    figure.savefig(picture, dpi=90)
     plt.close(figure)
+
+
+def envelope(curves: Sequence[Sequence[Sequence[float]]], column: int) -> tuple[list[float], list[float]]:
+    """Seconds, and the best that any of the curves has had by then; without their starts."""
+    best, seconds, values = -float("inf"), [], []
+    for point in sorted((p for curve in curves for p in curve[1:]), key=lambda p: p[0]):
+        best = max(best, point[column])
+        seconds.append(point[0])
+        values.append(best)
+    return seconds, values
 
 
 def draw_network(row: Row, picture: Path) -> None:
@@ -83,28 +117,33 @@ def _first_orders(races: Sequence[Row]) -> dict[str, list[Row]]:
     return panels
 
 
+def _has(panels: Sequence[tuple[str, list[Row]]], column: int) -> bool:
+    return any(len(races[0]["gnet"]["curve"][0]) > column for _, races in panels)
+
+
 def _panel(axis: Any, title: str, races: Sequence[Row], column: int) -> None:
     from matplotlib.ticker import LogLocator, NullFormatter
 
-    if len(races[0]["gnet"]["curve"][0]) <= column:
-        axis.set_axis_off()
-        return
-    for i, row in enumerate(races):
-        _curve(axis, "GNet" if i == 0 else None, row["gnet"], column, color="black", marker="o", markersize=3)
-        for name, variant in row["variants"].items():
-            _curve(axis, f"{row['method']} {name}", variant, column, linewidth=1)
+    for row in races:
+        unit, colour = row["gnet"]["seconds"], COLOURS[row["method"]]
+        curves = [[[p[0] / unit, *p[1:]] for p in v["curve"]] for v in row["variants"].values()]
+        for curve in curves:
+            axis.plot(
+                [p[0] for p in curve[1:]], [p[column] for p in curve[1:]], color=colour, linewidth=0.6, alpha=0.45
+            )
+        axis.plot(*envelope(curves, column), color=colour, linewidth=1.8, label=LABELS[row["method"]])
+    gnet = races[0]["gnet"]
+    points = [(p[0] / gnet["seconds"], p[column]) for p in gnet["curve"][1:]]  # the start is at no second
+    axis.plot(*zip(*points, strict=True), color="black", marker="o", markersize=3, label="GNet")
     label = "held-out PSNR, dB" if column == HELDOUT else "PSNR at 3 m, dB"
-    axis.set(title=title, xscale="log", xlabel="seconds", ylabel=label)
+    threads = f", {n} threads" if (n := races[0].get("threads", 2)) > 1 else ", 1 thread"
+    title = f"{title.partition(' order')[0]} (GNet: {gnet['seconds']:.1f} s{threads})"
+    axis.set_title(title, fontsize=9)
+    axis.set(xscale="log", xlabel="seconds, in GNet's", ylabel=label)
     axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axis.xaxis.set_major_formatter("{x:g}")
     axis.xaxis.set_minor_formatter(NullFormatter())
     axis.grid(alpha=0.3)
-    axis.legend(fontsize=6)
-
-
-def _curve(axis: Any, label: str | None, row: Mapping[str, Any], column: int, **style: Any) -> None:
-    seconds, psnr = ([point[k] for point in row["curve"][1:]] for k in (0, column))  # the start is at no second
-    axis.plot(seconds, psnr, label=label, **style)
 
 
 def main() -> None:

@@ -20,7 +20,7 @@ from benchmarks.optimiser import (
     trade,
 )
 from benchmarks.optimiser.network import measure_network, scene_of
-from benchmarks.optimiser.picture import draw, draw_network
+from benchmarks.optimiser.picture import draw, draw_network, envelope
 from benchmarks.optimiser.race import Point
 from benchmarks.optimiser.task import Task
 from benchmarks.schema import Result
@@ -234,6 +234,11 @@ def test_what_would_not_end_in_the_minutes_given_is_left_out() -> None:
     given = {**BENCH.options, "seeds": "900", "pandaset": "", "minutes": "0.1"}
     with pytest.raises(NotMeasuredError, match="minutes given"):
         BENCH.cells(given, False)[1].measure()
+
+
+def test_an_envelope_is_the_best_so_far_of_all_curves_without_their_starts() -> None:
+    curves = [[[0, 0, 99], [1, 0, 20], [3, 0, 19]], [[0, 0, 99], [2, 0, 22], [4, 0, 21]]]
+    assert envelope(curves, 2) == ([1, 2, 3, 4], [20, 22, 22, 22])
 
 
 def test_committed_rows_make_the_committed_claims() -> None:
