@@ -161,6 +161,8 @@ class _Maker:
         measure = partial(measure_distillation, log, chunk, self._store, order, self._cap, standard, families)
         values = {name: config.model_dump(mode="json") for name, config in configs.items()}
         name = f"distillation/{log} chunk {chunk} order {order}"
+        if set(families) != set(FAMILIES):
+            name += f" {'+'.join(families)}"
         parameters = self._all | {"cap": self._cap, "variants": values, "standard": standard, "families": families}
         return Cell(name, seconds + 20.0, measure, parameters)
 

@@ -18,12 +18,18 @@ def of_kind(rows: Mapping[str, Row], kind: str) -> list[Row]:
     return [row for name, row in rows.items() if name.startswith(f"{kind}/") and "not_measured" not in row]
 
 
+def distilled(rows: Mapping[str, Row], family: str) -> list[Row]:
+    """The distillations that have the family; of a log's and order's several cells that have it the last."""
+    found = [row for row in of_kind(rows, "distillation") if family in row]
+    return list({(row["log"], row["chunk"], row["order"]): row for row in found}.values())
+
+
 def claims(rows: Mapping[str, Row]) -> Iterator[Claim]:
     """Every claim; those without a row say that they were not measured."""
     yield _converged(of_kind(rows, "converged"))
-    distilled = of_kind(rows, "distillation")
-    yield _distillation(distilled, "adam", "distillation", "tuned Adam", 0.5)
-    yield _distillation(distilled, "standard", "distillation_standard", "the standard recipe", 0.1)
+    yield _distillation(distilled(rows, "adam"), "adam", "distillation", "tuned Adam", 0.5)
+    recipe = distilled(rows, "standard")
+    yield _distillation(recipe, "standard", "distillation_standard", "the standard recipe", 0.1)
     enhanced = of_kind(rows, "enhancement")
     for shift in SHIFTS:
         bad = [place(row) for row in enhanced if not better(row, shift)]
@@ -84,7 +90,6 @@ def _converged(rows: Sequence[Row]) -> Claim:
 
 
 def _distillation(rows: Sequence[Row], family: str, name: str, words: str, target: float) -> Claim:
-    rows = [row for row in rows if family in row]
     missed = [place(row) for row in rows if not row[family]["enet_as_good"]]
     note = f"ENet's wall time over that of distillation by {words} to the same quality at 3 m (kernel distance within "
     note += f"1 %, synthetic PSNR within 0.1 dB of the best that it came to); in {len(missed)} of {len(rows)} cells "

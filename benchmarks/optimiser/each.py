@@ -16,6 +16,7 @@ from benchmarks.bench import Row
 from benchmarks.merge import read
 from benchmarks.optimiser import beyond, summary
 from benchmarks.optimiser.cells import place
+from benchmarks.optimiser.distillation import FAMILIES
 
 SECONDS, RENDERS, PSNR, GAUSSIANS, BESIDE = range(5)
 """Of a curve's point; the last only where there is truth beside the path."""
@@ -46,9 +47,10 @@ class Column:
 def pages(rows: Mapping[str, Row]) -> Iterator[str]:
     """The race, how far it goes, distillation and enhancement, each where it was measured."""
     kinds = {method: summary.races(rows, method) for method in ("tuned_adam", "tuned_adam_split", "standard_3dgs")}
-    kinds |= {kind: beyond.of_kind(rows, kind) for kind in ("converged", "distillation", "enhancement")}
+    kinds |= {kind: beyond.of_kind(rows, kind) for kind in ("converged", "enhancement")}
+    kinds |= {family: beyond.distilled(rows, family) for family in FAMILIES}
     logs = {kind: by_log(found) for kind, found in kinds.items()}
-    for columns in (_RACE, _CONVERGED, _DISTILLATION, _ENHANCEMENT):
+    for columns in (_RACE, _CONVERGED, _BY_ADAM, _BY_RECIPE, _ENHANCEMENT):
         if logs[columns[0].kind]:
             yield from table(columns, logs)
             yield ""
@@ -161,24 +163,33 @@ _CONVERGED = (
     Column("`long` after, s", "converged", lambda r: r["gnet"]["reached_s"], 1),
     Column("ratio", "converged", beyond.times_adam, 2, lambda r: r["gnet"]["reached_s"] is None),
 )
-_DISTILLATION = (
-    Column("GNet's scene: kernel at 3 m", "distillation", _mark("start", KERNEL), 3),
-    Column("PSNR", "distillation", _mark("start", MARK_BESIDE)),
-    Column("ENet: s", "distillation", _mark("enet", MARK_SECONDS), 1),
-    Column("kernel", "distillation", _mark("enet", KERNEL), 3),
-    Column("PSNR", "distillation", _mark("enet", MARK_BESIDE)),
-    Column("tuned Adam's best: kernel", "distillation", _mark("adam", KERNEL), 3),
-    Column("PSNR", "distillation", _mark("adam", MARK_BESIDE)),
-    Column("ENet as good, share of orders", "distillation", _good("adam")),
-    Column("in so much of its time", "distillation", _share("adam")),
-    Column("the first of its lengths as good", "distillation", _first_share("adam"), 2),
-    Column("on split Gaussians: kernel", "distillation", _mark("adam_split", KERNEL), 3),
-    Column("PSNR", "distillation", _mark("adam_split", MARK_BESIDE)),
-    Column("standard recipe's best: kernel", "distillation", _mark("standard", KERNEL), 3),
-    Column("PSNR", "distillation", _mark("standard", MARK_BESIDE)),
-    Column("ENet as good, share of orders", "distillation", _good("standard")),
-    Column("in so much of its time", "distillation", _share("standard"), 3),
-    Column("the first of its lengths as good", "distillation", _first_share("standard"), 3),
+_BY_ADAM = (
+    Column("threads", "adam", lambda r: r.get("threads", 2), 0),
+    Column("GNet's scene: kernel at 3 m", "adam", _mark("start", KERNEL), 3),
+    Column("PSNR", "adam", _mark("start", MARK_BESIDE)),
+    Column("ENet: s", "adam", _mark("enet", MARK_SECONDS), 1),
+    Column("kernel", "adam", _mark("enet", KERNEL), 3),
+    Column("PSNR", "adam", _mark("enet", MARK_BESIDE)),
+    Column("tuned Adam's best: kernel", "adam", _mark("adam", KERNEL), 3),
+    Column("PSNR", "adam", _mark("adam", MARK_BESIDE)),
+    Column("first as good as that after, s", "adam", lambda r: r["adam"]["reached_s"], 0),
+    Column("ENet as good, share of orders", "adam", _good("adam"), 1),
+    Column("ENet's time over its", "adam", _share("adam")),
+    Column("of its shortest as good", "adam", _first_share("adam")),
+    Column("tuned Adam on split Gaussians: kernel", "adam_split", _mark("adam_split", KERNEL), 3),
+    Column("PSNR", "adam_split", _mark("adam_split", MARK_BESIDE)),
+)
+_BY_RECIPE = (
+    Column("threads", "standard", lambda r: r.get("threads", 2), 0),
+    Column("ENet: s", "standard", _mark("enet", MARK_SECONDS), 1),
+    Column("kernel at 3 m", "standard", _mark("enet", KERNEL), 3),
+    Column("PSNR", "standard", _mark("enet", MARK_BESIDE)),
+    Column("standard recipe's best: kernel", "standard", _mark("standard", KERNEL), 3),
+    Column("PSNR", "standard", _mark("standard", MARK_BESIDE)),
+    Column("first as good as that after, s", "standard", lambda r: r["standard"]["reached_s"], 0),
+    Column("ENet as good, share of orders", "standard", _good("standard"), 1),
+    Column("ENet's time over its", "standard", _share("standard"), 3),
+    Column("of its shortest as good", "standard", _first_share("standard"), 3),
 )
 _ENHANCEMENT = (
     Column("held-out PSNR", "enhancement", _heldout("gnet"), then=_heldout("enet")),

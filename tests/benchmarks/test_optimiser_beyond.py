@@ -279,3 +279,19 @@ def test_where_enet_is_not_as_good_the_cap_counts() -> None:
     assert "in 1 of 1 cells ENet does not reach it" in standard.data
     assert "in 1 it never came to ENet's own" in standard.data and "in 0 it never" in claims["distillation"].data
     assert any("| no |" in line for line in BENCH.table(rows))
+
+
+def test_a_family_that_was_measured_again_by_itself_takes_the_place_of_its_earlier_row() -> None:
+    where = {"log": "synthetic:s", "chunk": 0}
+    rows = {
+        "distillation/s order 0": where | {"order": 0, "adam": 1, "standard": 1},
+        "distillation/s order 1": where | {"order": 1, "adam": 2, "standard": 2},
+        "distillation/s order 0 standard": where | {"order": 0, "standard": 3},
+        "distillation/t": {"not_measured": "no time"},
+    }
+    assert [row["standard"] for row in beyond.distilled(rows, "standard")] == [3, 2]
+    assert [row["adam"] for row in beyond.distilled(rows, "adam")] == [1, 2]
+    assert not beyond.distilled(rows, "adam_split")
+    given = {**BENCH.options, "seeds": "900", "pandaset": "", "orders": "0", "parts": "distillation"}
+    names = [BENCH.cells(given | {"families": f}, False)[1].name for f in ("standard,adam,adam_split", "standard")]
+    assert names == [f"distillation/synthetic:street?seed=900 chunk 0 order 0{end}" for end in ("", " standard")]
