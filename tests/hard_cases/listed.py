@@ -106,7 +106,7 @@ LISTED: dict[int, tuple[str, tuple[str, ...] | str]] = {
          f"{_SPARSE}::test_unet_on_degenerate_inputs"),
     ),
     32: (
-        "weights of another dtype or shape, with missing or extra keys (a file knows no device: it is read onto the CPU)",
+        "weights of another dtype or shape, with missing or extra keys (read onto the CPU, whatever the device)",
         (f"{_WEIGHTS}::test_tensors_that_do_not_fit_are_named",
          f"{_WEIGHTS}::test_weights_of_another_configuration_are_refused",
          f"{_FNET}::test_weights_that_do_not_fit_are_named"),
