@@ -1,6 +1,6 @@
 """What each log came to, from a written result, as Markdown: a line for a log, the mean over its orders of views.
 
-python -m benchmarks.optimiser.each docs/benchmarks/optimiser_split.json
+python -m benchmarks.optimiser.each docs/benchmarks/optimiser.json
 """
 
 from __future__ import annotations
@@ -17,11 +17,10 @@ from benchmarks.merge import read
 from benchmarks.optimiser import beyond, summary
 from benchmarks.optimiser.cells import place
 from benchmarks.optimiser.distillation import FAMILIES
+from benchmarks.optimiser.picture import BESIDE, HELDOUT
 
-SECONDS, RENDERS, PSNR, GAUSSIANS, BESIDE = range(5)
-"""Of a curve's point; the last only where there is truth beside the path."""
-MARK_SECONDS, MARK_RENDERS, KERNEL, MARK_BESIDE, HELDOUT = range(5)
-"""Of a distillation's mark."""
+MARK_SECONDS, KERNEL, MARK_BESIDE = 0, 2, 3
+"""Places in a distillation's mark."""
 AT = ("1", "3", "5")
 """Shifts in metres that the table of enhancement shows; the JSON has all."""
 
@@ -112,24 +111,12 @@ def _mark(name: str, k: int) -> _Read:
 
 
 def _share(family: str) -> _Read:
-    def value(row: Row) -> float | None:
-        return row["enet"][MARK_SECONDS] / row[family]["reached_s"] if family in row else None
-
-    return value
+    return lambda row: row["enet"][MARK_SECONDS] / row[family]["reached_s"]
 
 
 def _first_share(family: str) -> _Read:
     """Of the shortest of ENet's lengths that is as good."""
-
-    def value(row: Row) -> float | None:
-        first = row.get(family, {}).get("enet_first_s")
-        return None if first is None else first / row[family]["reached_s"]
-
-    return value
-
-
-def _good(family: str) -> _Read:
-    return lambda row: float(row[family]["enet_as_good"]) if family in row else None
+    return lambda row: None if (first := row[family]["enet_first_s"]) is None else first / row[family]["reached_s"]
 
 
 def _heldout(scene: str) -> _Read:
@@ -145,12 +132,12 @@ _RACE = (
     Column("held-out PSNR", "tuned_adam", lambda r: r["gnet"]["psnr"]),
     Column("at 3 m", "tuned_adam", lambda r: _last(r["gnet"]["curve"], BESIDE)),
     Column("over tuned Adam of as many renders, dB", "tuned_adam", summary.gain_db),
-    Column("tuned Adam's best", "tuned_adam", lambda r: _most(r, "variants", PSNR)),
+    Column("tuned Adam's best", "tuned_adam", lambda r: _most(r, "variants", HELDOUT)),
     Column("its best at 3 m", "tuned_adam", lambda r: _most(r, "variants", BESIDE)),
     Column("its time over GNet's", "tuned_adam", _times, 1, _never),
     Column("over Adam on split Gaussians, dB", "tuned_adam_split", summary.gain_db),
     Column("its time over GNet's", "tuned_adam_split", _times, 1, _never),
-    Column("standard 3DGS's best", "standard_3dgs", lambda r: _most(r, "variants", PSNR)),
+    Column("standard 3DGS's best", "standard_3dgs", lambda r: _most(r, "variants", HELDOUT)),
     Column("its time over GNet's", "standard_3dgs", _times, 0, _never),
 )
 _CONVERGED = (
@@ -163,34 +150,30 @@ _CONVERGED = (
     Column("`long` after, s", "converged", lambda r: r["gnet"]["reached_s"], 1),
     Column("ratio", "converged", beyond.times_adam, 2, lambda r: r["gnet"]["reached_s"] is None),
 )
+
+
+def _distillation(family: str, words: str) -> tuple[Column, ...]:
+    """ENet beside a family's best."""
+    return (
+        Column("threads", family, lambda r: r.get("threads", 2), 0),
+        Column("ENet: s", family, _mark("enet", MARK_SECONDS), 1),
+        Column("kernel at 3 m", family, _mark("start", KERNEL), 3, then=_mark("enet", KERNEL)),
+        Column("PSNR at 3 m", family, _mark("start", MARK_BESIDE), then=_mark("enet", MARK_BESIDE)),
+        Column(f"{words}'s best: kernel", family, _mark(family, KERNEL), 3),
+        Column("PSNR", family, _mark(family, MARK_BESIDE)),
+        Column("first as good as that after, s", family, lambda r: r[family]["reached_s"], 0),
+        Column("ENet as good, share of orders", family, lambda r: float(r[family]["enet_as_good"]), 1),
+        Column("ENet's time over its", family, _share(family), 3),
+        Column("of its shortest as good", family, _first_share(family), 3),
+    )
+
+
 _BY_ADAM = (
-    Column("threads", "adam", lambda r: r.get("threads", 2), 0),
-    Column("GNet's scene: kernel at 3 m", "adam", _mark("start", KERNEL), 3),
-    Column("PSNR", "adam", _mark("start", MARK_BESIDE)),
-    Column("ENet: s", "adam", _mark("enet", MARK_SECONDS), 1),
-    Column("kernel", "adam", _mark("enet", KERNEL), 3),
-    Column("PSNR", "adam", _mark("enet", MARK_BESIDE)),
-    Column("tuned Adam's best: kernel", "adam", _mark("adam", KERNEL), 3),
-    Column("PSNR", "adam", _mark("adam", MARK_BESIDE)),
-    Column("first as good as that after, s", "adam", lambda r: r["adam"]["reached_s"], 0),
-    Column("ENet as good, share of orders", "adam", _good("adam"), 1),
-    Column("ENet's time over its", "adam", _share("adam")),
-    Column("of its shortest as good", "adam", _first_share("adam")),
+    *_distillation("adam", "tuned Adam"),
     Column("tuned Adam on split Gaussians: kernel", "adam_split", _mark("adam_split", KERNEL), 3),
     Column("PSNR", "adam_split", _mark("adam_split", MARK_BESIDE)),
 )
-_BY_RECIPE = (
-    Column("threads", "standard", lambda r: r.get("threads", 2), 0),
-    Column("ENet: s", "standard", _mark("enet", MARK_SECONDS), 1),
-    Column("kernel at 3 m", "standard", _mark("enet", KERNEL), 3),
-    Column("PSNR", "standard", _mark("enet", MARK_BESIDE)),
-    Column("standard recipe's best: kernel", "standard", _mark("standard", KERNEL), 3),
-    Column("PSNR", "standard", _mark("standard", MARK_BESIDE)),
-    Column("first as good as that after, s", "standard", lambda r: r["standard"]["reached_s"], 0),
-    Column("ENet as good, share of orders", "standard", _good("standard"), 1),
-    Column("ENet's time over its", "standard", _share("standard"), 3),
-    Column("of its shortest as good", "standard", _first_share("standard"), 3),
-)
+_BY_RECIPE = _distillation("standard", "the standard recipe")
 _ENHANCEMENT = (
     Column("held-out PSNR", "enhancement", _heldout("gnet"), then=_heldout("enet")),
     *(

@@ -50,5 +50,5 @@ def test_the_page_of_a_written_result(tmp_path: Path, capsys: Any) -> None:
     write_json(tmp_path / "a.json", Result(machine="m", commit="a" * 40, rows=rows, claims=[]).model_dump(mode="json"))
     each.main([str(tmp_path / "a.json")])
     lines = capsys.readouterr().out.splitlines()
-    assert lines[2].startswith("| s chunk 0 | 1 | 2 | 0.200 | 24.00 | 3.0 |")
-    assert "| 0.210 | 24.10 | 6 | 1.0 | 0.50 | 0.25 | – |" in lines[2]
+    assert lines[2].startswith("| s chunk 0 | 1 | 2 | 3.0 | 0.200 → 0.200 | 24.00 → 24.00 |")
+    assert "| 0.210 | 24.10 | 6 | 1.0 | 0.500 | 0.250 | – |" in lines[2]
