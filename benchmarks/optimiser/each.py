@@ -44,11 +44,13 @@ class Column:
 
 
 def pages(rows: Mapping[str, Row]) -> Iterator[str]:
-    """The race, how far it goes, distillation and enhancement, each where it was measured."""
+    """The race, how far it goes, distillation and enhancement, each where it was measured; logs in the race's order."""
     kinds = {method: summary.races(rows, method) for method in ("tuned_adam", "tuned_adam_split", "standard_3dgs")}
     kinds |= {kind: beyond.of_kind(rows, kind) for kind in ("converged", "enhancement")}
     kinds |= {family: beyond.distilled(rows, family) for family in FAMILIES}
     logs = {kind: by_log(found) for kind, found in kinds.items()}
+    order = {log: None for found in logs.values() for log in found}
+    logs = {kind: {log: found[log] for log in order if log in found} for kind, found in logs.items()}
     for columns in (_RACE, _CONVERGED, _BY_ADAM, _BY_RECIPE, _ENHANCEMENT):
         if logs[columns[0].kind]:
             yield from table(columns, logs)

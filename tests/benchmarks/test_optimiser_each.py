@@ -21,6 +21,12 @@ def _race(order: int, reached: float | None, behind: float) -> dict[str, Any]:
     return {**where, "gnet": gnet, "variants": {"a": variant}}
 
 
+def _distillation(log: str) -> dict[str, Any]:
+    mark = [3.0, 9, 0.2, 24.0, 28.0]
+    family = {"best": [9.0, 9, 0.21, 24.1, 28.0], "reached_s": 6.0, "enet_as_good": True, "enet_first_s": 1.5}
+    return {"log": log, "chunk": 0, "order": 0, "start": mark, "enet": mark, "adam": family}
+
+
 def test_a_log_has_one_line_of_the_means_over_its_orders() -> None:
     head, _, line, *rest = pages({"a": _race(0, 6.0, 1.0), "b": _race(1, None, 2.0)})
     cells = dict(zip(head.split(" | "), line.split(" | "), strict=True))
@@ -28,6 +34,13 @@ def test_a_log_has_one_line_of_the_means_over_its_orders() -> None:
     assert cells["GNet: s"] == "3.0" and cells["at 3 m"] == "23.00" and cells["its best at 3 m"] == "22.00"
     assert cells["over tuned Adam of as many renders, dB"] == "1.50"
     assert rest == [""]
+
+
+def test_logs_stand_in_the_order_of_the_race_in_every_table() -> None:
+    races = {name: _race(0, None, 1.0) | {"log": f"synthetic:{name}"} for name in "ba"}
+    distilled = {f"distillation/{name}": _distillation(f"synthetic:{name}") for name in "ab"}
+    lines = [line for line in pages(races | distilled) if "chunk" in line]
+    assert [line.partition(" chunk")[0] for line in lines] == ["| b", "| a"] * 2
 
 
 def test_a_mean_with_a_bound_is_a_bound_and_what_is_missing_is_a_dash() -> None:
@@ -43,10 +56,8 @@ def test_a_mean_with_a_bound_is_a_bound_and_what_is_missing_is_a_dash() -> None:
 
 
 def test_the_page_of_a_written_result(tmp_path: Path, capsys: Any) -> None:
-    mark = [3.0, 9, 0.2, 24.0, 28.0]
-    family = {"best": [9.0, 9, 0.21, 24.1, 28.0], "reached_s": 6.0, "enet_as_good": True, "enet_first_s": 1.5}
-    distilled = {"cell": "distillation/a", "log": "synthetic:s", "chunk": 0, "order": 0, "start": mark, "enet": mark}
-    rows = [distilled | {"adam": family}, {"cell": "distillation/b", "not_measured": "no time"}]
+    rows = [_distillation("synthetic:s") | {"cell": "distillation/a"}]
+    rows.append({"cell": "distillation/b", "not_measured": "no time"})
     write_json(tmp_path / "a.json", Result(machine="m", commit="a" * 40, rows=rows, claims=[]).model_dump(mode="json"))
     each.main([str(tmp_path / "a.json")])
     lines = capsys.readouterr().out.splitlines()
