@@ -49,7 +49,7 @@ def pages(rows: Mapping[str, Row]) -> Iterator[str]:
     kinds |= {kind: beyond.of_kind(rows, kind) for kind in ("converged", "enhancement")}
     kinds |= {family: beyond.distilled(rows, family) for family in FAMILIES}
     logs = {kind: by_log(found) for kind, found in kinds.items()}
-    order = {log: None for found in logs.values() for log in found}
+    order = dict.fromkeys(log for found in logs.values() for log in found)
     logs = {kind: {log: found[log] for log in order if log in found} for kind, found in logs.items()}
     for columns in (_RACE, _CONVERGED, _BY_ADAM, _BY_RECIPE, _ENHANCEMENT):
         if logs[columns[0].kind]:
