@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,12 +39,19 @@ class TerminalReporter:
         self._started = self._said = time.monotonic()
         self._what = what
         self._total, self._first, self._counting = -1, 0, 0.0
+        self._handles = False
 
     def __enter__(self) -> TerminalReporter:
+        ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # else it is ignored, or a test's
+        if ours and "PREFECT_API_URL" not in os.environ and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, self._stop_at_once)
+            self._handles = True
         self._write(self._what, end=not self._live)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if self._handles:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         if self._live:
             self._write("")
         if kind is KeyboardInterrupt:
@@ -51,6 +60,18 @@ class TerminalReporter:
 
     def stopped(self) -> None:
         self._write("stopped; what is finished is kept: run the same command again to go on", end=True)
+
+    def _stop_at_once(self, number: int, frame: Any) -> None:
+        """On Ctrl-C: Prefect's own server gets it too and is gone, and Prefect would try to reach it for a minute.
+
+        Whatever is written is written whole, so that an end at any moment is sound.
+        """
+        import psutil
+
+        self.stopped()
+        for child in psutil.Process().children():
+            child.terminate()
+        os._exit(130)
 
     def stage_started(self, stage: str, chunk: int) -> None:
         self.began(f"chunk {chunk}  {stage}")

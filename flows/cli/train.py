@@ -5,17 +5,12 @@ Everything goes into one folder and is resumable: a command that was stopped goe
 
 from __future__ import annotations
 
-import os
-import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
-
-if TYPE_CHECKING:
-    from flows.cli.terminal import TerminalReporter
 
 app = typer.Typer(help="Train the networks (tens of minutes each on a CPU; resumable).", no_args_is_help=True)
 
@@ -106,32 +101,14 @@ def _train(network: str, folder: Path, *values: Any) -> None:
 
         result = train_network(network, str(folder), *values)
     typer.echo(f"weights in {result['weights']}; use them with --set {network}.weights={result['weights']}")
+    rates = {"gnet": "gnet.rates=null and, with small, --set gnet.finish.rates_before=null", "enet": "enet.rates=null"}
+    typer.echo(f"A preset's rates are for the built-in weights: add --set {rates[network]}")
 
 
 @contextmanager
 def _reported(what: str) -> Iterator[None]:
-    """The flow's progress on the terminal, a home for Prefect, and an end at once on Ctrl-C."""
+    """The flow's progress on the terminal, and a home for Prefect."""
     from flows.cli.terminal import reporting
 
-    reporter = reporting(what)
-    if "PREFECT_API_URL" not in os.environ:
-        _stop_at_once(reporter)
-    with reporter:
+    with reporting(what):
         yield
-
-
-def _stop_at_once(reporter: TerminalReporter) -> None:
-    """On Ctrl-C: Prefect's own server gets it too and is gone, and Prefect would try to reach it for a minute.
-
-    Whatever is written is written whole, so that an end at any moment is sound.
-    """
-
-    def stop(number: int, frame: Any) -> None:
-        import psutil
-
-        reporter.stopped()
-        for child in psutil.Process().children():
-            child.terminate()
-        os._exit(130)
-
-    signal.signal(signal.SIGINT, stop)

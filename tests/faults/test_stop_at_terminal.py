@@ -1,0 +1,57 @@
+"""Ctrl-C in a training or a run at a terminal: the signal reaches the whole process group, Prefect's own server too."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.faults import tiny
+
+pytestmark = pytest.mark.fault
+
+
+def started(folder: Path, *command: str) -> subprocess.Popen[str]:
+    """``genre COMMAND`` in a process group of its own, as a terminal starts it, with Prefect's own server."""
+    return subprocess.Popen(
+        [tiny.GENRE, *command], env=tiny.environment(folder), cwd=folder, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL), start_new_session=True,
+    )  # fmt: skip
+
+
+def assert_it_stops(process: subprocess.Popen[str]) -> None:
+    """Sends what Ctrl-C sends."""
+    os.killpg(process.pid, signal.SIGINT)
+    began = time.monotonic()
+    _, error = process.communicate(timeout=120)
+    assert process.returncode == 130 and time.monotonic() - began < 30
+    assert "Traceback" not in error and "run the same command again" in error
+
+
+def test_ctrl_c_ends_at_once_and_keeps_what_is_made(tmp_path: Path) -> None:
+    store = tmp_path / "training" / "store"
+    made: list[set[Path]] = []
+    for stage in ("ingest", "truth"):
+        process = started(tmp_path, "train", "scenes", "--folder", "training")
+        while not list(store.rglob(f"{stage}/*/manifest.json")):
+            assert process.poll() is None
+            time.sleep(0.05)
+        assert_it_stops(process)
+        made.append(set(store.rglob("manifest.json")))
+    assert made[0] < made[1]
+
+
+def test_ctrl_c_in_a_run_ends_at_once_too(tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    process = started(tmp_path, *tiny.arguments(store))
+    while not list(store.rglob("initial/*/manifest.json")):
+        assert process.poll() is None
+        time.sleep(0.05)
+    assert_it_stops(process)
+    again = tiny.run_to_the_end(tmp_path, store)
+    served = {s["stage"]: s["cached"] for s in again["chunks"][0]["stages"]}
+    assert served["ingest"] and served["initial"] and not all(served.values())
