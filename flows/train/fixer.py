@@ -114,8 +114,11 @@ def shares(pairs: Sequence[tuple[str, float]]) -> dict[str, float]:
     return {**out, "optimiser": 1 - out.get("perturbed", 0.0), "lateral": lateral}
 
 
-def train_fixer(job: FixerJob, progress: Progress = silent) -> Path:
-    """Trains FNet to the end of its preset; goes on from the checkpoint in ``job.place``. Returns the weights' path.
+def train_fixer(job: FixerJob, progress: Progress = silent) -> tuple[Path, bool]:
+    """Trains FNet to the end of its preset; goes on from the checkpoint in ``job.place``.
+
+    Returns the weights' path, and whether anything was left to train. Raises ``InputError`` where the checkpoint is of
+    other settings, pairs or weights to start from.
 
     Writes there at each checkpoint ``fnet.safetensors`` with its JSON, ``curve.parquet`` (a row for each step) and,
     with ``job.validate``, a sample picture and the scores.
@@ -128,12 +131,16 @@ def train_fixer(job: FixerJob, progress: Progress = silent) -> Path:
     validation = None
     if job.validate:
         validation = joined([pairs_of(job.store, scene, VALIDATION) for scene in validation_scenes()])
-    began, rows = time.perf_counter(), read_rows(folder / CURVE, FIXING)
+    began, rows, trained = time.perf_counter(), read_rows(folder / CURVE, FIXING), False
     base = job.start if job.preset == "paper" else None
 
-    def checkpoint(fnet: Fnet, step: int, losses: Sequence[float]) -> None:
-        nonlocal began
+    def save(fnet: Fnet) -> None:
         save_fnet(fnet, folder / WEIGHTS, base, None if base is None else RANK)
+
+    def checkpoint(fnet: Fnet, step: int, losses: Sequence[float]) -> None:
+        nonlocal began, trained
+        trained = True
+        save(fnet)
         known = [row for row in rows if row["step"] < step][: len(losses)]
         each = (time.perf_counter() - began) / max(1, len(losses) - len(known))
         new = [{"step": k, "loss": losses[k], "seconds": each} for k in range(len(known), len(losses))]
@@ -155,7 +162,7 @@ def train_fixer(job: FixerJob, progress: Progress = silent) -> Path:
         start = load_fnet(Path(before))
         if start.architecture.inputs != architecture.inputs:
             raise InputError("the weights to start from have other inputs", remedy="Give the same.", file=Path(before))
-    train(
+    fnet = train(
         pairs,
         settings,
         folder,
@@ -166,7 +173,9 @@ def train_fixer(job: FixerJob, progress: Progress = silent) -> Path:
         start,
         Path(job.folder) / "fnet",
     )
-    return folder / WEIGHTS
+    if not (folder / WEIGHTS).is_file():  # deleted since
+        save(fnet)
+    return folder / WEIGHTS, trained
 
 
 def score(fnet: Fnet, pairs: Pairs, seed: int = 0) -> Scores:

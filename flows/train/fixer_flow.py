@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from prefect import flow, task
@@ -11,7 +10,7 @@ from prefect.cache_policies import NO_CACHE
 from prefect.states import Completed
 
 from flows.reporting import current_reporter
-from flows.train.fixer import CURVE, WEIGHTS, FixerJob, shares, train_fixer
+from flows.train.fixer import CURVE, FixerJob, shares, train_fixer
 from flows.train.pairs import pair_scenes, pairs_of
 from flows.train.scenes import SceneRecipe
 from storage.curve import FIXING, read_rows
@@ -71,12 +70,11 @@ def pairs_task(uri: str, job: FixerJob, scene: SceneRecipe) -> list[tuple[str, f
 def fixer_task(name: str, job: FixerJob) -> Any:
     """Trains to the end; ends in a ``Cached`` state where that was done before."""
     reporter = current_reporter()
-    rows = read_rows(job.place / CURVE, FIXING)
-    if len(rows) >= job.settings.steps and (job.place / WEIGHTS).is_file():
-        return Completed(name="Cached", message="trained before", data=str(job.place / WEIGHTS))
     reporter.began(name)
-    weights = train_fixer(job, reporter.progress)
-    reporter.ended("trained")
+    weights, trained = train_fixer(job, reporter.progress)
+    reporter.ended("trained" if trained else "trained before")
+    if not trained:
+        return Completed(name="Cached", message="trained before", data=str(weights))
     rows = read_rows(job.place / CURVE, FIXING)
     last = rows[-100:]
     row = {
@@ -86,4 +84,4 @@ def fixer_task(name: str, job: FixerJob) -> Any:
         "loss, last updates": round(sum(r["loss"] for r in last) / len(last), 4),
     }
     create_table_artifact(table=[row], key="training-fnet", description=f"Training of {name}")
-    return str(Path(weights))
+    return str(weights)

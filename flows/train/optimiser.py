@@ -98,9 +98,9 @@ def train_optimiser(
         if training.done % save_every == 0 or training.done == config.steps:
             write_curve(folder, rows)
             save(training.network, folder / WEIGHTS)
-            checkpoint.save(training, path, origin)
-            if watch is not None:
+            if watch is not None:  # before the checkpoint: what a kill leaves out is made again
                 watch(training.done, training.network)
+            checkpoint.save(training, path, origin)
     if not path.is_file():  # no update at all: what it starts from, at the rates of its own configuration
         write_curve(folder, rows)
         save(training.network, folder / WEIGHTS)

@@ -15,6 +15,7 @@ from flows.pipeline import weights_digest
 from flows.train.recipes import DENSE, scene_recipes
 from flows.train.scenes import PreparedScene, SceneRecipe, check_training, kept, prepare, spread
 from genre_tasks.config import GnetConfig, LossConfig
+from genre_tasks.errors import ConfigError
 from genre_tasks.logs.registry import open_log
 from genre_tasks.scene.chunk import Chunk, View
 from genre_tasks.scene.lidar_map import lidar_scene
@@ -83,8 +84,13 @@ PAIRS = PairRecipe()
 
 
 def pair_scenes(count: int, real: str | None) -> list[SceneRecipe]:
-    """The scenes that pairs are made of: ``count`` streets as GNet's last stage has them, and the real log's."""
+    """The scenes that pairs are made of: ``count`` streets as GNet's last stage has them, and the real log's.
+
+    Raises ``ConfigError`` for none, and as :func:`flows.train.scenes.check_training`.
+    """
     scenes = scene_recipes(replace(DENSE, count=count, real=1), real)
+    if not scenes:
+        raise ConfigError("there is nothing to make pairs of", remedy="Give --streets or --real.")
     for scene in scenes:
         check_training(scene)
     return scenes

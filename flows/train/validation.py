@@ -53,7 +53,7 @@ class Validation:
     def at_checkpoint(self, done: int, network: LearnedOptimiser) -> None:
         """Adds a row a scene to ``validation.parquet`` where one is due."""
         path = self.folder / TABLE
-        rows = read_rows(path, VALIDATION)
+        rows = [row for row in read_rows(path, VALIDATION) if row["step"] < done]  # more: of a training since deleted
         last = max((row["step"] for row in rows), default=0)
         if done // self.every == last // self.every and done != self.steps:
             return

@@ -145,9 +145,9 @@ def train(
                 state.average[name].lerp_(parameter, 1 - decay)
         report(state)
         if state.step % settings.checkpoint_every == 0 or state.step == settings.steps:
-            _save(state, folder / "fixer.pt", settings, origin)
-            if on_checkpoint is not None:
+            if on_checkpoint is not None:  # before the checkpoint: what a kill leaves out is made again
                 on_checkpoint(averaged(state), state.step, state.losses)
+            _save(state, folder / "fixer.pt", settings, origin)
     return averaged(state)
 
 
@@ -300,6 +300,7 @@ def _restore(state: TrainingState, path: Path, settings: TrainingSettings, origi
 
 def _write(document: dict[str, Any], path: Path) -> None:
     """Renamed into place: a kill leaves the last whole checkpoint."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_suffix(".tmp")
     torch.save(document, part)
     part.replace(path)

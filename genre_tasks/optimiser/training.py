@@ -62,7 +62,7 @@ class StepRecord:
 class MetaTraining:
     """The training's whole state; ``step`` advances it by one weight update.
 
-    Everything random comes from ``generator``; see :mod:`genre_tasks.optimiser.checkpoint` for saving and resuming.
+    Everything random comes from ``generator``; see ``flows.train.checkpoint`` for saving and resuming.
     """
 
     def __init__(
@@ -109,6 +109,7 @@ class MetaTraining:
         gradients: list[Tensor] = []
         count = len(episode.frame.scene)
         rows = torch.randperm(count, generator=self.generator)[: max(1, round(self.config.sample * count))]
+        rows = rows.to(episode.state.offsets.device)
         move = episode.mover(self.network)
         for _ in range(self.config.segment):
             deltas.append(episode.step(self.network, move, rows))

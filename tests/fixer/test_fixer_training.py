@@ -29,12 +29,12 @@ class StoppedError(Exception):
 def test_a_stopped_training_resumes_to_the_same_bytes(tmp_path):
     whole = train(some_pairs(), SETTINGS, tmp_path / "whole", distance, architecture=TOY)
 
-    def stop(fnet, step, losses):
-        if step == 3:
+    def stop(done, total, note):
+        if done == 8:
             raise StoppedError
 
     with pytest.raises(StoppedError):
-        train(some_pairs(), SETTINGS, tmp_path / "stopped", distance, on_checkpoint=stop, architecture=TOY)
+        train(some_pairs(), SETTINGS, tmp_path / "stopped", distance, stop, architecture=TOY)
     steps = []
     resumed = train(
         some_pairs(), SETTINGS, tmp_path / "stopped", distance,

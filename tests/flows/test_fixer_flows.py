@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from flows.train.fixer_flow import train_fnet, train_pairs
 from flows.train.pairs import PAIRS, PairRecipe, PairSet
 from flows.train.scenes import SceneRecipe
 from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.fixer import training
 from genre_tasks.fixer.network import small_architecture
 from genre_tasks.fixer.training import TrainingSettings
 from genre_tasks.fixer.weights import load_fnet
@@ -135,7 +137,7 @@ def test_a_stopped_training_resumes_to_the_same_bytes(trained, tmp_path, monkeyp
     with pytest.raises(StoppedError):
         train_fixer(job, stop)
     assert len(read_rows(tmp_path / "fnet" / CURVE, FIXING)) == 2
-    train_fixer(job)
+    assert train_fixer(job) == (tmp_path / "fnet" / "fnet.safetensors", True)
     assert len(read_rows(tmp_path / "fnet" / CURVE, FIXING)) == 4
     assert digest_file(tmp_path / "fnet" / "fnet.safetensors") == digest_file(folder / "fnet" / "fnet.safetensors")
 
@@ -150,6 +152,47 @@ def test_fewer_inputs_have_a_folder_of_their_own_and_the_same_autoencoder(traine
     assert digest_file(folder / "fnet" / "autoencoder.pt") == before
     with pytest.raises(InputError, match="other inputs"):
         train_fixer(FixerJob(str(folder), streets=2, inputs="render+lidar", start=str(weights)))
+
+
+def test_what_is_trained_is_not_taken_for_another_training(trained, tmp_path) -> None:
+    folder, _ = trained
+    shutil.copytree(folder / "fnet", tmp_path / "fnet")
+    (tmp_path / "store").symlink_to(folder / "store")
+    weights = tmp_path / "fnet" / "fnet.safetensors"
+    before = digest_file(weights)
+    weights.unlink()
+    assert train_fixer(FixerJob(str(tmp_path), streets=2)) == (weights, False)
+    assert digest_file(weights) == before
+    with pytest.raises(InputError, match=r"other settings: steps \(file .*fixer\.pt"):
+        train_fnet(str(tmp_path), None, 2, steps=2)
+    with pytest.raises(InputError, match=r"other pairs \(file .*autoencoder\.pt"):
+        train_fnet(str(tmp_path), None, 1)
+
+
+def test_a_kill_at_the_last_checkpoint_loses_no_weights(trained, tmp_path, monkeypatch) -> None:
+    folder, _ = trained
+    (tmp_path / "store").symlink_to(folder / "store")
+    job, kept = FixerJob(str(tmp_path), streets=2), training._save
+
+    def killed(state, *where) -> None:
+        kept(state, *where)
+        if state.step == SETTINGS.steps:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(training, "_save", killed)
+    with pytest.raises(KeyboardInterrupt):
+        train_fixer(job)
+    monkeypatch.undo()
+    make_tiny(monkeypatch)
+    weights, trained_anew = train_fixer(job)
+    assert not trained_anew and digest_file(weights) == digest_file(folder / "fnet" / "fnet.safetensors")
+
+
+def test_fewer_inputs_may_be_trained_first(trained, tmp_path) -> None:
+    (tmp_path / "store").symlink_to(trained[0] / "store")
+    weights, _ = train_fixer(FixerJob(str(tmp_path), streets=2, inputs="reference+lidar"))
+    assert load_fnet(weights).architecture.inputs == ("reference", "lidar")
+    assert (tmp_path / "fnet" / "autoencoder.pt").is_file()
 
 
 def test_a_fixer_is_trained_further_in_a_folder_of_its_own(trained) -> None:
@@ -171,6 +214,8 @@ def test_faults_are_said(monkeypatch) -> None:
         FixerJob("x", preset="huge")
     with pytest.raises(ConfigError, match="starts from SD-Turbo"):
         FixerJob("x", preset="paper")
+    with pytest.raises(ConfigError, match="nothing to make pairs of"):
+        train_pairs("x", None, 0)
     monkeypatch.setattr(recipes, "dense_scenes", lambda *_: [replace(tiny_scene(1), uri="synthetic:street?seed=1001")])
     with pytest.raises(ConfigError, match="seed 1001"):
         train_pairs("x", None, 1)

@@ -144,18 +144,29 @@ def test_an_interrupted_training_goes_on_and_writes_its_curve(tmp_path: Path) ->
     config = CONFIG.model_copy(update={"steps": 4})
 
     def run(folder: Path, stop: int | None) -> list[torch.Tensor]:
-        def watch(done: int, network: object) -> None:
+        def progress(done: int, total: int, note: str = "") -> None:
             if done == stop:
                 raise KeyboardInterrupt
 
-        trained = train_optimiser(network_from(NETWORK, 0), scenes, config, folder, save_every=2, watch=watch)
+        network = network_from(NETWORK, 0)
+        trained = train_optimiser(network, scenes, config, folder, save_every=2, watch=watch, progress=progress)
         return [p.clone() for p in trained.parameters()]
 
+    watched: list[int] = []
+
+    def watch(done: int, network: object) -> None:
+        watched.append(done)
+        if watched == [2, 4, 2, 4]:  # a kill at the last checkpoint
+            raise KeyboardInterrupt
+
     whole = run(tmp_path / "whole", None)
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path / "parts", 2)
+    for stop in (3, None):
+        with pytest.raises(KeyboardInterrupt):
+            run(tmp_path / "parts", stop)
+    assert checkpoint.describe(tmp_path / "parts/checkpoint.safetensors")["done"] == 2
     resumed = run(tmp_path / "parts", None)
     assert all(torch.equal(a, b) for a, b in zip(whole, resumed, strict=True))
     curves = [read_rows(tmp_path / name / "curve.parquet", LEARNING) for name in ("whole", "parts")]
+    assert watched == [2, 4, 2, 4, 4]
     steps, again = ([{**row, "seconds": 0.0} for row in rows] for rows in curves)
     assert steps == again and [row["step"] for row in steps] == [0, 1, 2, 3]
