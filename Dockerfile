@@ -13,7 +13,9 @@ RUN python -m venv /opt/venv && /opt/venv/bin/pip install --no-cache-dir --const
 FROM python:3.11-slim
 COPY --from=build /opt/venv /opt/venv
 COPY prefect.yaml /app/prefect.yaml
+# Flows are started from here, and read the presets beside them.
 COPY flows /app/flows
+COPY configs /app/configs
 ENV PATH=/opt/venv/bin:$PATH DO_NOT_TRACK=1 PREFECT_SERVER_ANALYTICS_ENABLED=false
 WORKDIR /app
 ENTRYPOINT []

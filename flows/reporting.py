@@ -9,6 +9,8 @@ from typing import Protocol
 from flows.produce import ArtifactRef
 
 _log = logging.getLogger("genre")
+if _log.level == logging.NOTSET:  # else a worker's root logger, at WARNING, would drop what a run says
+    _log.setLevel(logging.INFO)
 
 
 class Reporter(Protocol):

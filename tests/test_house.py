@@ -51,6 +51,11 @@ def test_compose_file_follows_the_specification() -> None:
     assert {n for n in named if re.fullmatch(r"\w+", n)} == set(compose["volumes"])
 
 
+def test_the_image_has_what_flows_read_beside_them() -> None:
+    worker = (ROOT / "Dockerfile").read_text().rpartition("FROM ")[2]
+    assert {"COPY flows /app/flows", "COPY configs /app/configs", "WORKDIR /app"} <= set(worker.splitlines())
+
+
 def test_deployments_name_flows_that_exist() -> None:
     for deployment in yaml.safe_load((ROOT / "prefect.yaml").read_text())["deployments"]:
         path, _, function = deployment["entrypoint"].partition(":")
