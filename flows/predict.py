@@ -6,7 +6,7 @@ import statistics
 from typing import Any
 
 from flows.logs import chosen_chunks, opened_log
-from flows.pipeline import PIPELINE, StageSpec
+from flows.pipeline import PIPELINE, RECONSTRUCTING, StageSpec, reconstructing_until
 from flows.produce import ArtifactRef, Job, look_up
 from genre_tasks.config import PipelineConfig
 from storage.local import open_store
@@ -16,27 +16,31 @@ from storage.local import open_store
 _TYPICAL = {
     "ingest": (10.0, 2.5),
     "initial": (4.0, 2.0),
-    "gnet": (5.0, 2.5),
+    "gnet": (4.0, 2.5),
     "effects": (7.0, 2.0),
     "novel_views": (10.0, 2.5),
     "fnet": (24.0, 3.0),
-    "enet": (5.0, 2.5),
+    "enet": (16.0, 2.5),
     "evaluate": (40.0, 3.0),
 }
 _TYPICAL_PIXELS = 320 * 180
 
 
-def plan_run(log: str, store: str, chunks: list[int] | None, config: PipelineConfig) -> dict[str, Any]:
+def plan_run(
+    log: str, store: str, chunks: list[int] | None, config: PipelineConfig, end: str = RECONSTRUCTING[-1]
+) -> dict[str, Any]:
     """The plan of ``genre run --dry-run``: a row per chunk and stage with key, hit or miss, seconds and gigabytes.
 
+    ``end``: the last stage before evaluation, where a budget chose an earlier one than the pipeline's.
     A key depends on the payloads of the inputs: below a miss it is not known yet (``follows``).
     """
     known = _measured(store, opened_log(log).dataset)
     rows: list[dict[str, Any]] = []
+    made = reconstructing_until(end)
     for chunk in chosen_chunks(log, config, chunks):
         job = Job(log, chunk, store, config.model_dump(mode="json"))
         refs: dict[str, ArtifactRef] = {}
-        for spec in PIPELINE:
+        for spec in (s for s in PIPELINE if s.name.removeprefix("evaluate/") in made):
             rows.append(_row(spec, job, refs, known, config))
     misses = [row for row in rows if row["cache"] != "hit"]
     return {

@@ -71,13 +71,16 @@ class Chooser:
         self._finished: list[str] = []
         self._now: tuple[Point, PipelineConfig] | None = None
         self.used_s = 0.0  # of the budget at the latest border
+        self._until_s: float | None = None  # of the budget, the chunk may have used by its end
 
     def next(self, share: float = 1.0) -> tuple[str, PipelineConfig] | None:
         """The stage to compute next and its configuration, ``None`` where the chunk is done.
 
-        ``share`` of the time left is this chunk's.
+        ``share`` of the time left when it is first asked is this chunk's.
         """
-        left = self.clock.left_s * share
+        if self._until_s is None:
+            self._until_s = self.clock.used_s + share * self.clock.left_s
+        left = self._until_s - self.clock.used_s
         possible = [(p, c) for p, c in self._points if self._reachable(p, c)]
         ranked = sorted(possible, key=lambda pc: (-pc[0].accuracy, self.predicted_s(pc[0])))
         chosen = next((pc for pc in ranked if self.predicted_s(pc[0]) <= left), None)

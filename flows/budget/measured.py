@@ -61,8 +61,9 @@ def load(path: Path, preset: str, own: Iterable[str] = ()) -> Table:
     """The table of a sweep over ``preset``, for a run whose user has set the keys ``own``.
 
     Effects, threads and the images' size are left out: a log's plan decides the first, the machine has the second, and
-    the third is what the user asked for. Raises ``ConfigError`` for a table of another preset, one made by a sweep
-    that did not say how fast its machine was, or one that turns what the user has set.
+    the third is what the user asked for; so are settings that were not measured wherever the preset was. Raises
+    ``ConfigError`` for a table of another preset, one made by a sweep that did not say how fast its machine was, or one
+    that turns what the user has set.
     """
     remedy = f"Give the cost.parquet of `genre cost LOG --preset {preset}`."
     if not path.is_file():
@@ -77,7 +78,7 @@ def load(path: Path, preset: str, own: Iterable[str] = ()) -> Table:
     points = tuple(
         Point(x.setting, x.changes, x.end, sign * x.values[judged.name].middle, x.stage_seconds)
         for x in lines
-        if _is_a_choice(x) and math.isfinite(x.values[judged.name].middle)
+        if _is_a_choice(x) and x.n == lines[0].n and math.isfinite(x.values[judged.name].middle)
     )
     turned = {change.partition("=")[0] for p in points for change in p.changes}
     if both := sorted(turned & set(own)):

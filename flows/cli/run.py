@@ -45,6 +45,7 @@ def run(
     from flows.cli.numbers import numbers, seconds
     from flows.configuration import load_configuration
     from flows.logs import opened_log
+    from flows.pipeline import RECONSTRUCTING
     from genre_tasks.errors import ConfigError
 
     began = psutil.Process().create_time()
@@ -60,9 +61,10 @@ def run(
 
         table_for(given, preset, effective)  # what does not fit is said before a server is started
     if dry_run:
+        end = RECONSTRUCTING[-1]
         if budget_s is not None:
-            effective = _chosen(log, preset, wanted, effective, budget_s, began, given)
-        _dry_run(log, preset, store, wanted, effective, as_json)
+            effective, end = _chosen(log, preset, wanted, effective, budget_s, began, given)
+        _dry_run(log, preset, store, wanted, effective, end, as_json)
         return
     from flows.cli.terminal import print_run, reporting
 
@@ -83,8 +85,8 @@ def run(
 def _chosen(
     log: str, preset: str, chunks: list[int] | None, config: PipelineConfig, budget_s: float, began: float,
     table: str | None,
-) -> PipelineConfig:  # fmt: skip
-    """What a budget would begin the first chunk with; said on stderr."""
+) -> tuple[PipelineConfig, str]:  # fmt: skip
+    """What a budget would begin the first chunk with, and the stage where that ends; said on stderr."""
     from flows.budget.budget import Budget
     from flows.logs import chosen_chunks
 
@@ -94,17 +96,17 @@ def _chosen(
     chooser.calibrate()  # nothing else is starting
     step = chooser.next(1 / len(wanted))
     typer.echo(f"chunk {wanted[0]}: {chooser.choices[0]} (Prefect's start would be counted, too)", err=True)
-    return config if step is None else step[1]
+    return config if step is None else step[1], str(chooser.record()["end"])
 
 
 def _dry_run(
-    log: str, preset: str, store: str, chunks: list[int] | None, config: PipelineConfig, as_json: bool
+    log: str, preset: str, store: str, chunks: list[int] | None, config: PipelineConfig, end: str, as_json: bool
 ) -> None:
     from flows.cli.terminal import print_plan
     from flows.configuration import differences
     from flows.predict import plan_run
 
-    plan: dict[str, Any] = plan_run(log, store, chunks, config)
+    plan: dict[str, Any] = plan_run(log, store, chunks, config, end)
     plan |= {"preset": preset, "differs": {k: list(v) for k, v in differences(config, preset).items()}}
     if as_json:
         typer.echo(json.dumps(plan))

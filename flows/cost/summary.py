@@ -74,7 +74,7 @@ class Line:
 
     A gain is in the measure's unit, positive where the setting is better. ``images`` are those at 3 m that distances
     are of, ``source_images`` those of a chunk. ``on_front`` names the measures in which no setting is as good in less
-    time.
+    time; a setting with fewer cells than the preset is of other places, and left out.
     """
 
     knob: str
@@ -109,8 +109,12 @@ def lines_of(rows: Sequence[Row]) -> list[Line]:
         by.setdefault(row["setting"], []).append(row)
     own = {(*_place(r), r["seed"]): r for r in by.get(PRESET_ITSELF, ())}
     lines = [_line(name, part, own) for name, part in by.items()]
-    chosen = (PSNR, beside(rows))
-    fronts = {m.name: front([(x.seconds, x.values[m.name].middle) for x in lines], m.more_is_better) for m in chosen}
+    chosen, whole = (PSNR, beside(rows)), len(by.get(PRESET_ITSELF, ()))
+    fronts = {
+        m.name: front([(x.seconds, x.values[m.name].middle if x.n == whole else math.nan) for x in lines],
+                      m.more_is_better)
+        for m in chosen
+    }  # fmt: skip
     return [
         Line(**{**vars(x), "on_front": tuple(m for m, found in fronts.items() if k in found)})
         for k, x in enumerate(lines)

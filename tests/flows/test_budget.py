@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -114,6 +115,18 @@ def test_a_fixer_that_overran_leaves_the_scene_that_is_there() -> None:
     assert end == "alone" and clock.now < 65.0
 
 
+def test_a_chunks_share_is_of_what_was_left_when_it_began() -> None:
+    clock = Frozen(90.0)
+    by = Chooser(TABLE, SMALL, clock, 1.0, lambda: 1.0)
+    while (step := by.next(0.5)) is not None:  # the first of two chunks
+        own = next(p for p in POINTS if p.name == by.choices[-1].point)
+        took = own.seconds[step[0]] + TABLE.cold.get(step[0], 0.0) + BORDER_S
+        clock.now += took
+        by.done(step[0], took, cached=False)
+    assert by.choices[0].left_s == 45.0 and {c.point for c in by.choices} == {"short"}
+    assert clock.now < 45.0 and by._until_s == 45.0
+
+
 @given(st.floats(5.0, 120.0), st.floats(0.3, 3.0))
 def test_accuracy_does_not_fall_as_the_budget_grows(budget_s: float, pace: float) -> None:
     accuracy = {p.name: p.accuracy for p in POINTS}
@@ -223,6 +236,9 @@ def test_a_table_comes_back_as_written_and_effects_and_sizes_are_no_choice(tmp_p
     assert lines[1].changes == ("gnet.iterations=1", "enet.iterations=1") and facts["machine"] == "somewhere"
     table = load(path, "demo")
     assert [p.name for p in table.points] == ["preset", "together=short", "together=alone"]
+    part = tmp_path / "part.parquet"  # with a setting that was not measured wherever the preset was
+    write_lines(part, [lines[0], replace(lines[1], n=2), *lines[2:]], facts)
+    assert [p.name for p in load(part, "demo").points] == ["preset", "together=alone"]
     assert table.points[2].accuracy == 24.0 and set(table.points[2].seconds) == {*EARLY, "gnet"}
 
 
@@ -275,7 +291,11 @@ def test_the_command_says_what_it_would_choose(tmp_path: Path) -> None:
     table = str(written(tmp_path / "cost.parquet"))
     done = CliRunner().invoke(app, [*told, "--budget", "1h", "--table", table])
     assert done.exit_code == 0, done.output
-    assert "budget 3600 s" in done.output and "preset:" in done.output
+    assert "budget 3600 s" in done.output and "preset:" in done.output and "evaluate/enet" in done.output
+    done = CliRunner().invoke(app, [*told, "--budget", "0.01s", "--table", table, "--json"])
+    plan = json.loads(done.stdout.splitlines()[-1])
+    made = ["ingest", "effects", "initial", "gnet", "evaluate/initial", "evaluate/gnet"]
+    assert "together=alone" in done.output and [row["stage"] for row in plan["stages"]] == made
     with pytest.raises(ConfigError, match="--budget"):
         CliRunner().invoke(app, [*told, "--table", table], catch_exceptions=False)
     with pytest.raises(ConfigError, match=r"gnet\.iterations is what a budget decides"):

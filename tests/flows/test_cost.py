@@ -53,6 +53,12 @@ def test_lines_are_means_with_spreads_over_seeds_and_gains_in_the_same_place() -
     assert math.isnan(lines_of(ROWS[:1])[0].values["psnr"].sd)
 
 
+def test_what_was_not_measured_everywhere_is_not_on_the_front() -> None:
+    easier = [row("2", 0, 1.0, 26.0), row("2", 1, 1.0, 26.5)]  # on one of two logs
+    *whole, part = lines_of([*ROWS, *easier])
+    assert [x.on_front for x in whole] == [x.on_front for x in lines_of(ROWS)] and part.on_front == ()
+
+
 def test_the_front_is_what_no_other_setting_beats() -> None:
     points = [(1.0, 20.0), (2.0, 25.0), (3.0, 24.0), (2.0, 25.0), (2.0, 24.0), (5.0, math.nan)]
     assert front(points, more_is_better=True) == {0, 1, 3}
