@@ -54,11 +54,13 @@ class Pass(Protocol):
     gloss: GlossSight | None
     residuals: Tensor | None
 
-    def gradient(self, by_color: Tensor, by_depth: Tensor, residual: Tensor | None = None) -> Tensor:
+    def gradient(
+        self, by_color: Tensor, by_depth: Tensor, residual: Tensor | None = None, shares: Tensor | None = None
+    ) -> Tensor:
         """[N, 14] with respect to the offsets, from the gradients of the images; once, and they are used up.
 
         Where there are harmonics, ``gloss`` is what these views tell of them from then on. ``residual`` [V, H, W, 3]:
-        see ``residuals``.
+        see ``residuals``; ``shares`` [V]: how much each view counts in them, 1 if not given.
         """
 
 
@@ -91,10 +93,12 @@ class TorchPass:
         self.gloss: GlossSight | None = None
         self.residuals: Tensor | None = None
 
-    def gradient(self, by_color: Tensor, by_depth: Tensor, residual: Tensor | None = None) -> Tensor:
+    def gradient(
+        self, by_color: Tensor, by_depth: Tensor, residual: Tensor | None = None, shares: Tensor | None = None
+    ) -> Tensor:
         """As in :class:`Pass`."""
         if residual is not None:
-            self.residuals = self._shown_of(residual)
+            self.residuals = self._shown_of(residual, shares)
         if self._seen is not None:
             self._seen.retain_grad()
         torch.autograd.backward([self._color, self._depth], [by_color, by_depth], retain_graph=self._seen is not None)
@@ -109,10 +113,12 @@ class TorchPass:
             self.gloss = GlossSight(self._harmonics.grad, sums, views[:, 11:14])
         return self._leaf.grad
 
-    def _shown_of(self, residual: Tensor) -> Tensor:
+    def _shown_of(self, residual: Tensor, shares: Tensor | None) -> Tensor:
         """[N, 5], by the gradients of the colours: a pixel's colour is linear in them, with w as its slope."""
         square = residual.square().sum(-1)
         others = torch.stack([square, torch.ones_like(square), torch.zeros_like(square)], -1)
+        if shares is not None:
+            residual, others = (shares.to(square)[:, None, None, None] * image for image in (residual, others))
         of = self._leaf if self._seen is None else self._seen  # what views see of harmonics is held above 0
         grads = [torch.autograd.grad(self._color, of, image, retain_graph=True)[0] for image in (residual, others)]
         found = torch.cat([grads[0][..., -3:], grads[1][..., -3:-1]], -1)
@@ -158,32 +164,42 @@ class CompiledPass:
         self.gloss: GlossSight | None = None
         self.residuals: Tensor | None = None
 
-    def gradient(self, by_color: Tensor, by_depth: Tensor, residual: Tensor | None = None) -> Tensor:
+    def gradient(
+        self, by_color: Tensor, by_depth: Tensor, residual: Tensor | None = None, shares: Tensor | None = None
+    ) -> Tensor:
         """As in :class:`Pass`."""
         by_alpha, by_depth = posing.expected_depth_gradient(self._alpha, self.depth, by_depth.contiguous())
         by_splats = posing.arrays(len(self._posed.splats[0]))
         by_images = by_color, by_alpha, by_depth
         assert self._batch is not None
         if self._shown is None:
-            shown = self._backward(by_images, by_splats, residual)
+            shown = self._backward(by_images, by_splats, residual, shares)
             out = self._posing.gradient(self._posed, by_splats, self._threads)
         else:
-            out, shown = self._glossy_gradient(self._shown, by_images, by_splats, residual)
+            out, shown = self._glossy_gradient(self._shown, by_images, by_splats, residual, shares)
         if shown is not None:
             self.residuals = self._posing.residuals(self._posed, shown, self._threads)
         if self._shift is not None:
             self.by_deformation = self._shift.gradient(by_splats[0], out)
         return out
 
-    def _backward(self, by_images: cpu.Images, by_splats: cpu.Arrays, residual: Tensor | None) -> Tensor | None:
+    def _backward(
+        self, by_images: cpu.Images, by_splats: cpu.Arrays, residual: Tensor | None, shares: Tensor | None
+    ) -> Tensor | None:
         assert self._batch is not None
-        return cpu.backward(self._batch, self._splats, self._images, by_images, self._threads, by_splats, residual)
+        told = residual, shares
+        return cpu.backward(self._batch, self._splats, self._images, by_images, self._threads, by_splats, *told)
 
     def _glossy_gradient(
-        self, shown: Shine, by_images: cpu.Images, by_splats: cpu.Arrays, residual: Tensor | None
+        self,
+        shown: Shine,
+        by_images: cpu.Images,
+        by_splats: cpu.Arrays,
+        residual: Tensor | None,
+        shares: Tensor | None,
     ) -> tuple[Tensor, Tensor | None]:
         by_colors = torch.empty_like(self._splats[4])
-        residuals = self._backward(by_images, (*by_splats[:4], by_colors), residual)
+        residuals = self._backward(by_images, (*by_splats[:4], by_colors), residual, shares)
         by_splats[4].zero_()
         out = self._posing.gradient(self._posed, by_splats, self._threads)
         by_means, by_own, self.gloss = shown.gradient(by_colors)
@@ -233,7 +249,9 @@ class BlurredPass:
         self.color = torch.stack(map_single_threaded(lambda part: mean(sharp.color[part]), moments.parts))
         self.depth, self.culled = sharp.depth[moments.middle], sharp.culled
 
-    def gradient(self, by_color: Tensor, by_depth: Tensor, residual: Tensor | None = None) -> Tensor:
+    def gradient(
+        self, by_color: Tensor, by_depth: Tensor, residual: Tensor | None = None, shares: Tensor | None = None
+    ) -> Tensor:
         """As in :class:`Pass`; a view's residual is that of each of its moments, each an equal share of its pixels."""
         sharp, parts = self._sharp, self._moments.parts
         pairs = list(zip(parts, by_color, strict=True))
@@ -241,16 +259,11 @@ class BlurredPass:
         by_depths = torch.zeros_like(sharp.depth)
         by_depths[self._moments.middle] = by_depth
         if residual is not None:
-            residual = torch.cat(
-                [
-                    image.expand(part.stop - part.start, *image.shape)
-                    for image, part in zip(residual, parts, strict=True)
-                ]
-            )
-        out = sharp.gradient(by_moments, by_depths, residual)
-        self.by_deformation, self.gloss = sharp.by_deformation, sharp.gloss
-        if sharp.residuals is not None:
-            self.residuals = sharp.residuals * (len(parts) / len(sharp.color))
+            counts = torch.tensor([part.stop - part.start for part in parts])
+            own = torch.ones(len(parts)) if shares is None else shares
+            residual, shares = (x.repeat_interleave(counts.to(x.device), 0) for x in (residual, own / counts))
+        out = sharp.gradient(by_moments, by_depths, residual, shares)
+        self.by_deformation, self.gloss, self.residuals = sharp.by_deformation, sharp.gloss, sharp.residuals
         return out
 
 

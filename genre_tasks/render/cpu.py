@@ -81,18 +81,19 @@ def backward(
     threads: int,
     out: Arrays,
     residual: Tensor | None = None,
+    shares: Tensor | None = None,
 ) -> Tensor | None:
     """Writes the gradients of ``arrays`` to ``out``, from those of the images.
 
     With a ``residual`` r [V, H, W, 3] it returns what of it each Gaussian shows, [N, 5]: the sums over all pixels of
-    w r, w ‖r‖² and w, where w is the Gaussian's share of the pixel.
+    w r, w ‖r‖² and w, where w is the Gaussian's share of the pixel; a view's times its own of ``shares`` [V], float32.
     """
     v = [x.contiguous() for x in by_images]
     back = None if residual is None else torch.empty(len(arrays[0]), 5)
     residual = None if residual is None else residual.contiguous()
     status = load_kernel().genre_backward(
         batch.handle, len(arrays[0]), *(a.data_ptr() for a in arrays), arrays[4].dim() == 3, _pointer(batch.velocities),
-        *(a.data_ptr() for a in images), *(x.data_ptr() for x in v), _pointer(residual), threads,
+        *(a.data_ptr() for a in images), *(x.data_ptr() for x in v), _pointer(residual), _pointer(shares), threads,
         *(g.data_ptr() for g in out), _pointer(back),
     )  # fmt: skip
     check_status(status)

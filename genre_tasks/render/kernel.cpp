@@ -126,11 +126,12 @@ int genre_forward(int count, const float* means, const float* scales, const floa
 }
 
 // `color`, `alpha`, `depth` are what genre_forward wrote. With a `residual` [V, H, W, 3], `back` [N, 5] gets the sums over
-// pixels and views of w r, w |r|^2 and w, the weights being those of the forward pass; else both are null.
+// pixels and views of w r, w |r|^2 and w, the weights being those of the forward pass, times the view's of `shares` [V] (null:
+// 1); else both are null.
 int genre_backward(void* batch, int count, const float* means, const float* scales, const float* quats,
                    const float* opacities, const float* colors, int by_view, const float* velocities, const float* color,
                    const float* alpha, const float* depth, const float* v_color, const float* v_alpha, const float* v_depth,
-                   const float* residual, int threads, float* grad_means, float* grad_scales, float* grad_quats,
+                   const float* residual, const float* shares, int threads, float* grad_means, float* grad_scales, float* grad_quats,
                    float* grad_opacities, float* grad_colors, float* back) {
   return guarded([&] {
     auto& views = static_cast<Batch*>(batch)->views;
@@ -143,7 +144,7 @@ int genre_backward(void* batch, int count, const float* means, const float* scal
       const GaussianArrays in{count, means, scales, quats, opacities, colors + color_step * v, velocities};
       size_t at = (size_t)views[v]->camera.width * views[v]->camera.height * v;
       backward(*views[v], *scratch.of[w], in, inside, Images{color + 3 * at, alpha + at, depth + at},
-               Images{v_color + 3 * at, v_alpha + at, v_depth + at}, residual ? residual + 3 * at : nullptr);
+               Images{v_color + 3 * at, v_alpha + at, v_depth + at}, residual ? residual + 3 * at : nullptr, shares ? shares[v] : 1.f);
       sum.add(v, *scratch.of[w], inside);
     });
   });

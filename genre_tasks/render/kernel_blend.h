@@ -141,10 +141,10 @@ struct Images {
 
 // Also front to back: what lies behind a layer is the pixel's value minus what came so far, so no list per pixel is kept.
 // The sums of a pair go to its own slot and are added later: no atomics, the same bits at any thread count.
-// With BACK also what of `residual` [H, W, 3] each layer shows: the sums of w r, w |r|^2 and w.
+// With BACK also what of `residual` [H, W, 3] each layer shows: the sums of w r, w |r|^2 and w, times the view's `share`.
 template <bool BACK>
 static void blend_backward(const Footprint* footprints, const Pair* pair, const Pair* end, int X, int Y, int width, int height,
-                           const uint16_t* visited, Images out, Images grad, const float* residual, Lanes* slots) {
+                           const uint16_t* visited, Images out, Images grad, const float* residual, float share, Lanes* slots) {
   Lanes T[BLOCKS], behind[BLOCKS], vr[BLOCKS], vg[BLOCKS], vb[BLOCKS], vd[BLOCKS];
   Lanes rr[BACK ? BLOCKS : 1], rg[BACK ? BLOCKS : 1], rb[BACK ? BLOCKS : 1];
   for (int b = 0; b < BLOCKS; b++) {
@@ -215,8 +215,8 @@ static void blend_backward(const Footprint* footprints, const Pair* pair, const 
         }
       }
       if constexpr (BACK)
-        stream(&slots[slot[k]], sums({sum_v, sum_s, sum_ss, sum_sy, sum_y, sum_yy, red, green, blue, z, back_red, back_green,
-                                      back_blue, back_square, weight}));
+        stream(&slots[slot[k]], sums({sum_v, sum_s, sum_ss, sum_sy, sum_y, sum_yy, red, green, blue, z, share * back_red,
+                                      share * back_green, share * back_blue, share * back_square, share * weight}));
       else
         stream(&slots[slot[k]], sums({sum_v, sum_s, sum_ss, sum_sy, sum_y, sum_yy, red, green, blue, z}));
     }

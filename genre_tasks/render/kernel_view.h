@@ -273,16 +273,16 @@ static void project_all_backward(const View& v, Scratch& s, const GaussianArrays
   });
 }
 
-// Leaves a list of gradients for each thread in the scratch; where there is a `residual` [H, W, 3], with its sums.
+// Leaves a list of gradients for each thread in the scratch; where there is a `residual` [H, W, 3], with `share` of its sums.
 static void backward(View& v, Scratch& s, const GaussianArrays& in, int threads, Images out, Images grad,
-                     const float* residual) {
+                     const float* residual, float share) {
   s.slots.resize(v.pairs.n);
   while ((int)s.gradients.size() < threads) s.gradients.push_back(std::make_unique<GradientList>());
   for_each_tile(v, threads, [&](int t, int X, int Y) {
     const Pair* pairs = v.pairs.p + v.tile_begin[t];
     const auto blend = residual ? blend_backward<true> : blend_backward<false>;
     blend(v.input.p, pairs, pairs + v.taken[t], X, Y, v.camera.width, v.camera.height, v.visited.p + v.tile_begin[t], out, grad,
-          residual, s.slots.p);
+          residual, share, s.slots.p);
   });
   specialised(v.camera, [&](auto rolls, auto bends, auto smooths) {
     project_all_backward<rolls, bends, smooths>(v, s, in, residual != nullptr, threads);

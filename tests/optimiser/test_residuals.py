@@ -27,8 +27,8 @@ from genre_tasks.optimiser.state import Frame
 from genre_tasks.optimiser.training import MetaConfig, MetaTraining
 from genre_tasks.optimiser.unroll import Plan, unroll
 from genre_tasks.optimiser.weights import load, save
+from genre_tasks.render import RenderSettings, render_views
 from genre_tasks.render import kernel_library as renderer
-from genre_tasks.render import render_views
 from genre_tasks.weights import resolve_weights
 from tests.optimiser import street
 from tests.optimiser.test_fused import CENTRE, TOTAL, _fused_step, _random, _states, _threads, _torch_step
@@ -93,16 +93,19 @@ def test_the_sums_are_the_same_bits_at_any_number_of_threads() -> None:
     assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
 
 
-def test_of_blurred_views_each_moment_has_an_equal_share() -> None:
+@pytest.mark.parametrize("kind", ["compiled", "torch"])
+@pytest.mark.parametrize("count", [1, 2], ids=["one is sharp", "all are blurred"])
+def test_of_blurred_views_each_moment_has_an_equal_share(kind: str, count: int) -> None:
     scene, still = _scene(), street.targets(street.scene())
     resting = MotionBlur(1e-6, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.1)
     plain = [_Rolling(t, 1, None) for t in still]
     blurred = [_Rolling(t, 1, None) for t in still]
-    for view in blurred[:2]:
+    for view in blurred[:count]:
         view.blur = resting
+    settings = SETTINGS if kind == "compiled" else RenderSettings(backend="reference")
     sums = []
     for views in (plain[:2], blurred[:2]):
-        one = begin(Frame.of(scene), _offsets(scene), views, SETTINGS)
+        one = begin(Frame.of(scene), _offsets(scene), views, settings)
         assert isinstance(one, BlurredPass) == (views[0].blur is not None)
         residual = _residual(one.color)
         one.gradient(residual.clone(), torch.zeros_like(one.depth), residual)
