@@ -137,7 +137,7 @@ def stage_weights(spec: StageSpec, config: PipelineConfig) -> str | None:
         return first
     from genre_tasks.weights import resolve_weights
 
-    return digest_value([first, weights_digest(resolve_weights("gnet", finish.weights))])
+    return digest_value([first, weights_digest(resolve_weights("gnet", finish.weights, "gnet.finish.weights"))])
 
 
 def weights_digest(path: Path | None) -> str | None:

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from flows.files import anew
 from flows.report_curve import Curve, accuracy_curve
 from flows.summary import ChunkSummary, RunSummary, StageSummary
 
@@ -101,9 +102,8 @@ def write_report(path: Path, run: RunSummary) -> Path:
     template = environment.get_template("report.html.jinja")
     html = template.render(run=run, chunks=[chunk_page(c) for c in run.chunks], columns=[NAMES[s] for s in MEASURED])
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(html, encoding="utf-8")
-    partial.replace(path)
+    with anew(path) as part:
+        part.write_text(html, encoding="utf-8")
     return path
 
 

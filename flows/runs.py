@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flows.pipeline import PIPELINE, RECONSTRUCTING
+from flows.files import anew
+from flows.pipeline import PIPELINE
 from flows.produce import ArtifactRef, run_id
 from flows.summary import ChunkSummary, RunSummary, StageSummary
 from genre_tasks.errors import InputError
@@ -17,9 +18,12 @@ from storage.address import Address
 from storage.local import open_store
 
 if TYPE_CHECKING:
+    from genre_tasks.scene.graph import SceneGraph
     from storage.local import Artifact
 
 _FOLDER = "runs"
+SCENES = ("initial", "gnet", "enet")
+"""The stages that make a scene, in their order."""
 
 
 @dataclass(frozen=True)
@@ -82,10 +86,8 @@ def finish_run(run: Run, summary: RunSummary, more: Mapping[str, Any]) -> dict[s
         ],
         **more,
     }
-    path = run.folder / "run.json"
-    partial = path.with_suffix(".tmp")
-    partial.write_text(json.dumps(record, indent=1))
-    partial.replace(path)
+    with anew(run.folder / "run.json") as part:
+        part.write_text(json.dumps(record, indent=1))
     return record
 
 
@@ -191,18 +193,26 @@ def stage_value(store: str, run: str, chunk: int | None, stage: str) -> tuple[in
         raise InputError(f"the run has no chunk {number}", remedy=f"It has {sorted(chunks)}.", log=record["log"])
     keys = {s["stage"]: s["key"] for s in chunks[number]}
     if stage not in keys:
-        raise InputError(f"the run has no stage '{stage}'", remedy=f"It has {', '.join(RECONSTRUCTING)}.", stage=stage)
+        raise InputError(f"the run has no stage '{stage}'", remedy=f"It has {', '.join(keys)}.", stage=stage)
     opened = open_store(store)
     for artifact in opened.artifacts(key=keys[stage]):
         return number, opened.read(artifact)
     raise InputError("the artifact is gone", remedy="Run the log again.", log=record["log"], stage=stage)
 
 
+def stage_scene(store: str, run: str, chunk: int, stage: str) -> SceneGraph:
+    """The scene that a stage has made. Raises ``InputError`` for a stage that makes none."""
+    if stage not in SCENES:
+        raise InputError(f"the stage {stage} makes no scene", remedy=f"Those do: {', '.join(SCENES)}.", stage=stage)
+    scene: SceneGraph = stage_value(store, run, chunk, stage)[1].scene
+    return scene
+
+
 def last_stage(store: str, run: str, chunk: int) -> str:
     """The stage whose scene is the result of a run's chunk: enet, or gnet where nothing was distilled."""
     record = _record(store, run)
     stages = {s["stage"] for c in record["chunks"] if c["chunk"] == chunk for s in c["stages"]}
-    return next(name for name in ("enet", "gnet", "initial") if name in stages)
+    return next(name for name in reversed(SCENES) if name in stages)
 
 
 def next_scene(store: str, run: str, chunk: int, stage: str | None) -> tuple[Any, Any] | None:
@@ -211,5 +221,4 @@ def next_scene(store: str, run: str, chunk: int, stage: str | None) -> tuple[Any
     if chunk + 1 not in chunks:
         return None
     name = stage or last_stage(store, run, chunk + 1)
-    ingested, made = (stage_value(store, run, chunk + 1, each)[1] for each in ("ingest", name))
-    return ingested, made.scene
+    return stage_value(store, run, chunk + 1, "ingest")[1], stage_scene(store, run, chunk + 1, name)

@@ -76,10 +76,10 @@ class Optimiser:
 
         ``quick``: one seed, one order, a lower cap, the methods of claims, a shorter standard recipe.
         An empty ``pandaset`` leaves the real log out; with ``minutes`` cells that would not end by then are left out.
-        The network alone has two threads in any case. Raises ``ConfigError`` for an unknown part or family.
+        The network alone has two threads in any case. Raises ``ConfigError`` for an unknown part, family or method.
         """
         logs = logs_of(options)
-        orders, methods = (_parts(options[name]) for name in ("orders", "methods"))
+        orders, methods = _parts(options["orders"]), _known("method", options["methods"], METHODS)
         parts, families = _known("part", options["parts"], PARTS), _known("family", options["families"], FAMILIES)
         if quick:
             logs, orders, methods = logs[:1], orders[:1], [m for m in methods if m in CLAIMED]

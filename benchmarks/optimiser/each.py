@@ -118,7 +118,7 @@ def _share(family: str) -> _Read:
 
 def _first_share(family: str) -> _Read:
     """Of the shortest of ENet's lengths that is as good."""
-    return lambda row: None if (first := row[family]["enet_first_s"]) is None else first / row[family]["reached_s"]
+    return lambda row: None if (first := row[family].get("enet_first_s")) is None else first / row[family]["reached_s"]
 
 
 def _heldout(scene: str) -> _Read:

@@ -4,23 +4,32 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from genre_tasks.logs.check import LogCheck
 
 
 def check(
     log: Annotated[str, typer.Argument(help="pandaset:PATH/002 or synthetic:street?seed=1000")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object to stdout.")] = False,
 ) -> None:
-    """Say what a log has and lacks: cameras, images, sweeps, tracks, times, travel, chunks."""
+    """Say what a log has and lacks: cameras, images, sweeps, tracks, times, travel, chunks. Exit code 1: unusable."""
     from genre_tasks.logs.check import check_log
     from genre_tasks.logs.registry import open_log
 
     found = check_log(open_log(log))
     if as_json:
-        typer.echo(json.dumps(dataclasses.asdict(found), default=str))
-        return
+        typer.echo(json.dumps({"verdict": found.verdict} | dataclasses.asdict(found), default=str))
+    else:
+        _print(log, found)
+    if found.verdict == "unusable":
+        raise typer.Exit(1)
+
+
+def _print(log: str, found: LogCheck) -> None:
     from flows.cli.tables import print_fields
 
     fields = {name: value for name, value in dataclasses.asdict(found).items() if name not in ("uri", "cameras")}
@@ -31,5 +40,3 @@ def check(
     }
     findings = [f"{f.severity}: {f.message}{'. ' * bool(f.remedy)}{f.remedy}" for f in found.findings]
     print_fields(log, {"verdict": found.verdict, "cameras": cameras} | fields | {"findings": "\n".join(findings)})
-    if found.verdict == "unusable":
-        raise typer.Exit(1)

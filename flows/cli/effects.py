@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import typer
@@ -38,6 +39,12 @@ def effects(
     print_rows(f"{log} chunk {chunk}, {config.ingest.width_px}×{config.ingest.height_px}", rows)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        codec_of("effects").write(out, found)
-        write_png(out / "effects.png", drawn(found, f"{log} chunk {chunk}"))
+        with TemporaryDirectory(dir=out) as made:  # written once there, as in the store, then put in place
+            codec_of("effects").write(Path(made), found)
+            write_png(Path(made) / "effects.png", drawn(found, f"{log} chunk {chunk}"))
+            for path in sorted(Path(made).rglob("*")):
+                if path.is_file():
+                    place = out / path.relative_to(made)
+                    place.parent.mkdir(parents=True, exist_ok=True)
+                    path.replace(place)
         typer.echo(f"wrote {out / 'effects.parquet'} and effects.png")

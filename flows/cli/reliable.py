@@ -32,7 +32,7 @@ def reliable(
     from flows.cli.tables import print_rows
     from flows.cli.terminal import TerminalReporter
     from flows.reliable import write
-    from flows.runs import last_stage, next_scene, stage_value
+    from flows.runs import last_stage, next_scene, stage_scene, stage_value
     from genre_tasks.config import RangeConfig
     from genre_tasks.errors import ConfigError
     from genre_tasks.reliability.range import reliable_range
@@ -50,9 +50,9 @@ def reliable(
     number, ingested = stage_value(store, run, chunk, "ingest")
     name = stage or last_stage(store, run, number)
     _, plan = stage_value(store, run, number, "effects")
-    _, reconstruction = stage_value(store, run, number, name)
+    scene = stage_scene(store, run, number, name)
     with TerminalReporter(f"chunk {number}  guards") as reporter:
-        found = reliable_range(config, ingested, reconstruction.scene, plan, reporter.progress, network)
+        found = reliable_range(config, ingested, scene, plan, reporter.progress, network)
     beside = next_scene(store, run, number, stage)
     facts = {"log": ingested.log, "chunk": str(number), "stage": name, "run": run}
     files = write(out, found, facts)
@@ -68,6 +68,6 @@ def reliable(
     print_rows(f"{ingested.log}, chunk {number}, after {name}", rows)
     typer.echo(f"{found}; wrote {', '.join(files)}")
     if beside is not None:
-        jumps = medians(seam((ingested, reconstruction.scene), beside))
+        jumps = medians(seam((ingested, scene), beside))
         told = ", ".join(f"{db:.1f} dB at {distance:g} m" for distance, db in jumps.items())
         typer.echo(f"seam to chunk {number + 1}, the same view from both scenes without actors: {told}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -28,21 +29,21 @@ def render(
     store: Annotated[str, typer.Option(help="The run's store.")] = "genre-store",
 ) -> None:
     """Render a scene of a finished run at the recorded poses or shifted to the side."""
-    from flows.runs import last_stage, stage_value
+    from flows.runs import last_stage, stage_scene, stage_value
     from genre_tasks.errors import InputError
 
     if out.suffix not in (".mp4", ".png", ".exr"):
         raise InputError(f"cannot write '{out.suffix}'", remedy="Use .mp4, .png or .exr.", file=out)
     number, ingested = stage_value(store, run, chunk, "ingest")
     stage = stage or last_stage(store, run, number)
-    _, reconstruction = stage_value(store, run, number, stage)
+    scene = stage_scene(store, run, number, stage)
     frames = _frames(ingested, frame, every=out.suffix == ".mp4")
     name = camera or ingested.camera_names[0]
     if name not in ingested.camera_names:
         raise InputError(
             f"the chunk has no camera '{name}'", remedy=f"It has {', '.join(ingested.camera_names)}.", chunk=number
         )
-    images = _rendered(ingested, reconstruction.scene, name, frames, shift)
+    images = _rendered(ingested, scene, name, frames, shift)
     _write(out, images)
     count = f"{len(frames)} frame{'s' * (len(frames) > 1)}"
     typer.echo(f"wrote {out}: {count} of {name}, {shift:+g} m, chunk {number}, after {stage}")
@@ -79,7 +80,7 @@ def _rendered(chunk: Chunk, scene: SceneGraph, camera: str, frames: list[int], s
 
 def _write(out: Path, images: Any) -> None:
     out.parent.mkdir(parents=True, exist_ok=True)
-    partial = out.with_name(f".{out.stem}.partial{out.suffix}")
+    partial = out.with_name(f".{out.stem}.{os.getpid()}.partial{out.suffix}")
     if out.suffix == ".exr":
         from storage.codecs.exr import write_exr
 

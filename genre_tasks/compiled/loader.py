@@ -11,7 +11,7 @@ from genre_tasks.compiled import recipe
 from genre_tasks.compiled.recipe import Kernel
 from genre_tasks.errors import ConfigError, ResourceError
 
-REMEDY = "Run `pip install -e .` in the repository (it needs g++ or clang++, or the ziglang package)"
+REMEDY = "Run `pip install -e .` in the repository (it needs a C++ compiler: g++, clang++ or what CXX names)"
 _NEEDED_FLAGS = {
     "avx512": {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl", "avx2", "fma", "bmi2"},
     "avx2": {"avx", "avx2", "fma", "bmi1", "bmi2", "f16c", "movbe"},

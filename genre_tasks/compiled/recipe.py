@@ -32,7 +32,8 @@ X86_ISAS = {
 }
 """Best first. Other machines get the one library ``generic``."""
 NO_COMPILER = (
-    "no C++ compiler found: install g++ or clang++ (Debian: apt install g++), or `pip install ziglang`, or set CXX"
+    "no C++ compiler found: install g++ or clang++ (Debian: apt install g++), or set CXX to another one, "
+    "e.g. to 'python -m ziglang c++' after `pip install ziglang`"
 )
 
 

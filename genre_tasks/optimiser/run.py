@@ -83,7 +83,7 @@ def finishing_plan(config: OptimiserConfig, finish: FinishConfig) -> Plan:
 
 def finishing_rule(finish: FinishConfig) -> StepRule:
     """The learned optimiser with the weights that are configured for the end. Raises as :func:`step_rule`."""
-    return LearnedOptimiser.load(resolve_weights("gnet", finish.weights))
+    return LearnedOptimiser.load(resolve_weights("gnet", finish.weights, "gnet.finish.weights"))
 
 
 def _joined(first: Reconstruction, last: Reconstruction) -> Reconstruction:

@@ -12,24 +12,25 @@ def network_of(stage: str, method: str) -> str:
     return "g3r" if method == "g3r" else stage
 
 
-def resolve_weights(name: str, configured: str) -> Path:
+def resolve_weights(name: str, configured: str, setting: str = "") -> Path:
     """The file (or folder) that ``configured`` names.
 
     Args:
         name: the network, as ``fnet``, ``gnet``, ``g3r`` or ``enet``: the stem of its built-in file.
         configured: ``builtin``, ``builtin:gnet`` for those that ship for another network, or a path.
+        setting: the key that said so, for messages; ``NAME.weights`` if not given.
 
     Raises:
         InputError: it does not exist.
     """
-    first, colon, other = configured.partition(":")
+    setting, (first, colon, other) = setting or f"{name}.weights", configured.partition(":")
     if first == "builtin":
         path = Path(__file__).parent / f"{other if colon else name}.safetensors"
         known = ", ".join(sorted(p.stem for p in path.parent.glob("*.safetensors")))
-        remedy = f"Those of {known} ship; train weights with `genre train {name}`, or give a path by `{name}.weights`."
+        remedy = f"Those of {known} ship; train weights with `genre train {name}`, or give a path by `{setting}`."
     else:
         path = Path(configured).expanduser()
-        remedy = f"Check `{name}.weights`, or leave it at `builtin`."
+        remedy = f"Check `{setting}`, or leave it at `builtin`."
     if not path.exists():
         raise InputError(f"the weights of {name} do not exist", remedy=remedy, file=path, stage=name)
     return path

@@ -225,6 +225,8 @@ def test_options_choose_cells_and_a_quick_run_ends_in_time() -> None:
     assert [c.name for c in BENCH.cells(few, False)] == ["network", parts[0]]
     with pytest.raises(ConfigError, match=r"no part.*races"):
         BENCH.cells(given | {"parts": "races"}, False)
+    with pytest.raises(ConfigError, match=r"no method.*g3r"):
+        BENCH.cells(given | {"methods": "g3r"}, False)
     quick, full = (BENCH.cells(BENCH.options, q) for q in (True, False))
     assert sum(c.seconds for c in quick) <= run.QUICK_S < sum(c.seconds for c in full)
     assert len({c.name for c in full}) == len(full)

@@ -10,7 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from typer.testing import CliRunner
 
+from flows.cli.main import app
+from genre_tasks.logs import registry
 from genre_tasks.logs.check import LogCheck, check_log
 from genre_tasks.logs.pandaset import open_pandaset
 from genre_tasks.logs.pandaset_writer import write_pandaset
@@ -91,6 +94,15 @@ def test_no_lidar_is_fatal_and_says_what_to_give() -> None:
     check = check_log(log_of(no_lidar=True))
     assert check.verdict == "unusable" and check.points == (0, 0, 0)
     assert "ingest.points=FILE.ply" in messages(check, "fatal")
+
+
+@pytest.mark.parametrize("no_lidar", [False, True])
+def test_the_command_ends_with_1_where_a_log_is_unusable(monkeypatch: pytest.MonkeyPatch, no_lidar: bool) -> None:
+    monkeypatch.setattr(registry, "open_log", lambda uri: log_of(no_lidar=no_lidar))
+    told, as_json = (CliRunner().invoke(app, ["check", "fake", *more]) for more in ((), ("--json",)))
+    assert told.exit_code == as_json.exit_code == int(no_lidar)
+    verdict = json.loads(as_json.stdout)["verdict"]
+    assert verdict == ("unusable" if no_lidar else "good") and verdict in told.stdout
 
 
 def test_no_cuboids_and_one_camera_are_survived() -> None:

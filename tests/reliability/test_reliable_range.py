@@ -162,6 +162,11 @@ def test_the_command_answers_for_a_finished_run(finished: Run, tmp_path: Path) -
     assert last_stage(finished.store, finished.name, 0) == "gnet"
     with pytest.raises(ConfigError, match="range --help"):
         CliRunner().invoke(app, [*told, "--drop-db", "-1"], catch_exceptions=False)
+    for command in (told, ["render", finished.name, "--store", finished.store, "--out", str(tmp_path / "x.png")]):
+        with pytest.raises(InputError, match=r"ingest makes no scene.*initial, gnet, enet"):
+            CliRunner().invoke(app, [*command, "--stage", "ingest"], catch_exceptions=False)
+        with pytest.raises(InputError, match=r"no stage 'enet'.*ingest, effects, initial, gnet, evaluate"):
+            CliRunner().invoke(app, [*command, "--stage", "enet"], catch_exceptions=False)
     with pytest.raises(InputError, match="runs of this store begin with"):
         CliRunner().invoke(app, ["range", "zzz", "--store", finished.store], catch_exceptions=False)
 
@@ -169,6 +174,7 @@ def test_the_command_answers_for_a_finished_run(finished: Run, tmp_path: Path) -
 def test_a_record_says_what_a_budget_did(finished: Run) -> None:
     record = finish_run(finished, summary_of(finished), {"budget": {"budget_s": 1.0}})
     assert json.loads((finished.folder / "run.json").read_text())["budget"] == record["budget"] == {"budget_s": 1.0}
+    assert {p.name for p in finished.folder.iterdir()} == {"run.json", "report.html"}
 
 
 def test_a_seam_is_the_same_view_from_both_scenes(chunk: Chunk, scene: SceneGraph) -> None:
