@@ -118,7 +118,7 @@ class OptimiserConfig(Section):
     rates: Rates | None = Field(
         None,
         description="Of the learned optimiser's steps, as adam.rates; null: those of its weights. A preset's are for "
-        "the built-in weights: with others set null, and gnet.finish.rates_before, which counts in their place.",
+        "the built-in weights: with others set null. gnet.finish.rates_before, where given, counts in gnet's place.",
     )
     hold_ground: bool = Field(True, description="Flat discs that lie on the ground move and turn in their plane only.")
     split: float = Field(

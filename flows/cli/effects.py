@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
@@ -42,6 +43,7 @@ def effects(
         with TemporaryDirectory(dir=out) as made:  # written once there, as in the store, then put in place
             codec_of("effects").write(Path(made), found)
             write_png(Path(made) / "effects.png", drawn(found, f"{log} chunk {chunk}"))
+            shutil.rmtree(out / "own", ignore_errors=True)  # masks of a plan that was here before
             for path in sorted(Path(made).rglob("*")):
                 if path.is_file():
                     place = out / path.relative_to(made)

@@ -48,7 +48,7 @@ def figure(
         TABLE[chosen], (log,), preset, store, (chunk,), tuple(settings or ()), own, tuple(weights or ())
     )  # fmt: skip
     plan = request.planned()
-    reporter = TerminalReporter()
+    reporter = TerminalReporter(f"figure {chosen}")
 
     def produced(stage: str, job: Job, inputs: dict[str, ArtifactRef]) -> ArtifactRef:
         reporter.began(stage)

@@ -81,17 +81,24 @@ def _rendered(chunk: Chunk, scene: SceneGraph, camera: str, frames: list[int], s
 def _write(out: Path, images: Any) -> None:
     out.parent.mkdir(parents=True, exist_ok=True)
     partial = out.with_name(f".{out.stem}.{os.getpid()}.partial{out.suffix}")
-    if out.suffix == ".exr":
+    try:
+        _write_to(partial, images)
+        partial.replace(out)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _write_to(path: Path, images: Any) -> None:
+    if path.suffix == ".exr":
         from storage.codecs.exr import write_exr
 
-        write_exr(partial, images.color[0].numpy(), images.alpha[0].numpy(), images.expected_depth()[0].numpy())
-    else:
-        pixels: NDArray[np.uint8] = (images.color.clamp(0, 1) * 255).round().byte().numpy()
-        import imageio.v3 as imageio
+        write_exr(path, images.color[0].numpy(), images.alpha[0].numpy(), images.expected_depth()[0].numpy())
+        return
+    import imageio.v3 as imageio
 
-        if out.suffix == ".png":
-            imageio.imwrite(partial, pixels[0])
-        else:
-            even = pixels[:, : pixels.shape[1] // 2 * 2, : pixels.shape[2] // 2 * 2]
-            imageio.imwrite(partial, even, fps=10, codec="libx264", macro_block_size=2)
-    partial.replace(out)
+    pixels: NDArray[np.uint8] = (images.color.clamp(0, 1) * 255).round().byte().numpy()
+    if path.suffix == ".png":
+        imageio.imwrite(path, pixels[0])
+    else:
+        even = pixels[:, : pixels.shape[1] // 2 * 2, : pixels.shape[2] // 2 * 2]
+        imageio.imwrite(path, even, fps=10, codec="libx264", macro_block_size=2)

@@ -32,21 +32,23 @@ _HEADLINES = {
 
 
 class TerminalReporter:
-    """Progress on stderr: a line that rewrites itself on a terminal, a line every ten seconds elsewhere."""
+    """Progress on stderr: a line that rewrites itself on a terminal, a line every ten seconds elsewhere.
 
-    def __init__(self, what: str = "starting Prefect") -> None:
+    ``flows``: whether flows run in its context, which start a server of Prefect's where none is configured.
+    """
+
+    def __init__(self, what: str, flows: bool = False) -> None:
         self._live = sys.stderr.isatty()
         self._started = self._said = time.monotonic()
         self._what = what
         self._total, self._first, self._counting = -1, 0, 0.0
-        self._handles = False
+        self._flows, self._handles = flows, False
 
     def __enter__(self) -> TerminalReporter:
-        ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # else it is ignored, or a test's
-        if ours and "PREFECT_API_URL" not in os.environ and threading.current_thread() is threading.main_thread():
+        self._write(self._what, end=not self._live)
+        if self._flows and _ends_on_ctrl_c() and _starts_a_server():
             signal.signal(signal.SIGINT, self._stop_at_once)
             self._handles = True
-        self._write(self._what, end=not self._live)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
@@ -115,12 +117,25 @@ class TerminalReporter:
         sys.stderr.flush()
 
 
+def _ends_on_ctrl_c() -> bool:
+    """Whether this thread would: a shell may have it ignored."""
+    main = threading.current_thread() is threading.main_thread()
+    return main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def _starts_a_server() -> bool:
+    """Whether Prefect will, because neither the environment nor a profile names one."""
+    from prefect.settings import get_current_settings
+
+    return get_current_settings().api.url is None
+
+
 def reporting(what: str = "starting Prefect") -> TerminalReporter:
     """Makes Prefect's home and a reporter, and has the process's runs tell it; to be used as a context."""
     from flows.reporting import report_to
 
     Path(os.environ["PREFECT_HOME"]).mkdir(parents=True, exist_ok=True)
-    reporter = TerminalReporter(what)
+    reporter = TerminalReporter(what, flows=True)
     report_to(reporter)
     return reporter
 

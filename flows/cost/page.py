@@ -35,7 +35,7 @@ def page(lines: Sequence[Line], judged: Measure, facts: Sequence[str], picture: 
 def _table(lines: Sequence[Line], judged: Measure) -> Iterator[str]:
     shown = [m for m in MEASURES if any(math.isfinite(x.values[m.name].middle) for x in lines)]
     yield "Gains are over the preset in the same place with the same seed, positive where the setting is better. "
-    yield f"**Bold**: no setting is as good in less time (held-out PSNR, {judged.label})."
+    yield f"**Bold**: no setting with as many cells is as good in less time (held-out PSNR, {judged.label})."
     if KERNEL_3M in shown:
         yield f"Distances between sets are of N = {lines[0].images:.0f} images at 3 m; compare them at equal N only."
     yield ""

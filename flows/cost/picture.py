@@ -50,7 +50,9 @@ def _panel(axes, lines: Sequence[Line], knob: str, measure: Measure) -> None:  #
     star = preset.values[measure.name].middle
     best = sorted((x for x in lines if measure.name in x.on_front), key=lambda x: x.seconds)
     x, y, _ = _points(best, measure)
-    axes.step(x, y, where="post", color="0.6", linewidth=1, label="no setting of the sweep is better in less time")
+    axes.step(
+        x, y, where="post", color="0.6", linewidth=1, label="no setting with as many cells is better in less time"
+    )
     own = sorted((x for x in lines if x.knob == knob), key=lambda x: x.seconds)
     x, y, e = _points(own, measure)
     axes.errorbar(x, y, e, fmt="o", color="C0", markersize=4, linewidth=1, label="a setting, ± over seeds")

@@ -13,7 +13,7 @@ import numpy as np
 from flows.train.pairs import VALIDATION, pair_scenes, pairs_of, validation_scenes
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.fixer.network import INPUTS, sd_turbo, small_architecture
-from genre_tasks.fixer.training import FOLLOWS, PRESETS, TrainingSettings, train
+from genre_tasks.fixer.training import CHECKPOINT, FOLLOWS, PRESETS, TrainingSettings, train
 from genre_tasks.fixer.weights import load_fnet, save_fnet
 from genre_tasks.progress import Progress, silent
 from storage.curve import FIXING, FIXING_SCORES, read_rows, write_rows
@@ -131,7 +131,8 @@ def train_fixer(job: FixerJob, progress: Progress = silent) -> tuple[Path, bool]
     validation = None
     if job.validate:
         validation = joined([pairs_of(job.store, scene, VALIDATION) for scene in validation_scenes()])
-    began, rows, trained = time.perf_counter(), read_rows(folder / CURVE, FIXING), False
+    began, trained = time.perf_counter(), False
+    rows = read_rows(folder / CURVE, FIXING) if (folder / CHECKPOINT).is_file() else []  # else of one since deleted
     base = job.start if job.preset == "paper" else None
 
     def save(fnet: Fnet) -> None:

@@ -33,7 +33,7 @@ X86_ISAS = {
 """Best first. Other machines get the one library ``generic``."""
 NO_COMPILER = (
     "no C++ compiler found: install g++ or clang++ (Debian: apt install g++), or set CXX to another one, "
-    "e.g. to 'python -m ziglang c++' after `pip install ziglang`"
+    "or `pip install ziglang setuptools` and build with `pip install --no-build-isolation`"
 )
 
 

@@ -62,6 +62,8 @@ PRESETS = {
 those. ``paper`` (Sec. III-B):
 SD-Turbo's LoRA adapters and skips; the paper gives steps, batch and size, rate and weight are Difix3D's."""
 
+CHECKPOINT = "fixer.pt"
+
 FOLLOWS = {"further": "small", "last": "further"}
 """The preset whose weights a preset starts from."""
 
@@ -127,7 +129,7 @@ def train(
         if fnet.architecture.residual:
             fnet.requires_grad_(True)
     state, origin = _fixer_state(fnet, settings), {"pairs": pairs.digest(), "starting weights": _digest(fnet)}
-    _restore(state, folder / "fixer.pt", settings, origin)
+    _restore(state, folder / CHECKPOINT, settings, origin)
     report = _Reporter(progress, first, total, state.step)
     while state.step < settings.steps:
         views, truth = sample(pairs, state.generator, settings.batch, settings.crop, settings.clean_share)
@@ -147,7 +149,7 @@ def train(
         if state.step % settings.checkpoint_every == 0 or state.step == settings.steps:
             if on_checkpoint is not None:  # before the checkpoint: what a kill leaves out is made again
                 on_checkpoint(averaged(state), state.step, state.losses)
-            _save(state, folder / "fixer.pt", settings, origin)
+            _save(state, folder / CHECKPOINT, settings, origin)
     return averaged(state)
 
 

@@ -171,6 +171,17 @@ def test_the_command_answers_for_a_finished_run(finished: Run, tmp_path: Path) -
         CliRunner().invoke(app, ["range", "zzz", "--store", finished.store], catch_exceptions=False)
 
 
+@pytest.mark.parametrize("suffix", ["png", "exr", "mp4"])
+def test_a_finished_run_is_rendered_beside_the_path(finished: Run, tmp_path: Path, suffix: str) -> None:
+    out = tmp_path / f"lane.{suffix}"
+    for _ in range(2):
+        done = CliRunner().invoke(
+            app, ["render", finished.name, "--store", finished.store, "--shift", "1", "--out", str(out)]
+        )
+        assert done.exit_code == 0 and "+1 m, chunk 0, after gnet" in done.output, done.output
+    assert list(tmp_path.iterdir()) == [out] and out.stat().st_size > 1000
+
+
 def test_a_record_says_what_a_budget_did(finished: Run) -> None:
     record = finish_run(finished, summary_of(finished), {"budget": {"budget_s": 1.0}})
     assert json.loads((finished.folder / "run.json").read_text())["budget"] == record["budget"] == {"budget_s": 1.0}
