@@ -78,20 +78,21 @@ def claims_of(rows: Sequence[Row]) -> Iterator[Claim]:
 
 
 def fitted(rows: Sequence[Row]) -> tuple[dict[str, float], float]:
-    """Least squares of true PSNR on the guards of ``guards.ESTIMATE`` over the views beside the path.
+    """Least squares of true PSNR on the guards of ``guards.ESTIMATE`` over all views, the path's too.
 
-    Also the rank correlation of what each log's views are told by the fit of the others (NaN for fewer than two).
+    The path's, since a range ends where the estimate has fallen from there. Also the rank correlation of what each
+    log's views beside the path are told by the fit of the others (NaN for fewer than two).
     """
-    logs, views = zip(*((r["log"], v) for r in rows for v in r["views"] if v["shift_m"]), strict=True)
+    logs, views = zip(*((r["log"], v) for r in rows for v in r["views"]), strict=True)
     x = np.array([[1.0, v["agreement_db"], v["shown"], abs(v["shift_m"])] for v in views])
-    y, of = np.array([v["psnr"] for v in views]), np.array(logs)
+    y, of, beside = np.array([v["psnr"] for v in views]), np.array(logs), x[:, 3] > 0
     whole = np.linalg.lstsq(x, y, rcond=None)[0]
     if len(set(logs)) < 2:
         return dict(zip(ESTIMATE, map(float, whole), strict=True)), math.nan
     told = np.empty_like(y)
     for log in set(logs):
         told[of == log] = x[of == log] @ np.linalg.lstsq(x[of != log], y[of != log], rcond=None)[0]
-    return dict(zip(ESTIMATE, map(float, whole), strict=True)), float(spearmanr(told, y).statistic)
+    return dict(zip(ESTIMATE, map(float, whole), strict=True)), float(spearmanr(told[beside], y[beside]).statistic)
 
 
 def true_reach(views: Sequence[Row], side: int) -> float:
@@ -119,7 +120,7 @@ def table_of(rows: Sequence[Row]) -> Iterator[str]:
         true = " / ".join(f"{true_reach(r['views'], side):.1f} m" for side in (1, -1))
         street = r["log"].partition("?")[2]
         yield f"| {street} | {r['stage']} | {len(truths)} | {_rank(r['views']):.3f} | {error:.2f} | {reach} | {true} |"
-    for stage in sorted({r["stage"] for r in rows}):
-        found, apart = fitted([r for r in rows if r["stage"] == stage])
+    if rows:
+        found, apart = fitted(rows)
         numbers = ", ".join(f"{name} {value:.4g}" for name, value in found.items())
-        yield f"\nFitted on these views of {stage}: {numbers}; rank correlation with one street left out: {apart:.3f}"
+        yield f"\nFitted on these views: {numbers}; rank correlation with one street left out: {apart:.3f}"

@@ -95,13 +95,16 @@ def test_the_estimate_can_be_fitted_again() -> None:
             {"shift_m": s, "agreement_db": 20 + 8 * g.random(), "shown": g.random()} for s in (-2.0, 1.0, 0.0, 3.0)
         ]
         for v in views:
-            v["psnr"] = (
-                5 + 0.5 * v["agreement_db"] + 9 * v["shown"] - 0.7 * abs(v["shift_m"]) + 99 * (v["shift_m"] == 0)
-            )
+            v["psnr"] = 5 + 0.5 * v["agreement_db"] + 9 * v["shown"] - 0.7 * abs(v["shift_m"])
         rows.append({"log": log, "views": views})
     found, apart = fitted(rows)
     assert found == pytest.approx({"constant": 5, "agreement_db": 0.5, "shown": 9, "shift_m": -0.7})
     assert apart == pytest.approx(1.0) and math.isnan(fitted(rows[:1])[1])
+    path = [v for row in rows for v in row["views"] if v["shift_m"] == 0]
+    for v in path:
+        v["psnr"] += 3  # what the path alone shows is fitted, too: ranges are relative to it
+    again, apart = fitted(rows)
+    assert again["shift_m"] < -0.8 and apart > 0.9
 
 
 def test_rounds_bring_every_budget_to_every_seed() -> None:
