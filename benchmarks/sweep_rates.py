@@ -46,7 +46,7 @@ from genre_tasks.optimiser.learned import LearnedOptimiser
 from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.rules import StepRule
 from genre_tasks.optimiser.unroll import Plan, unroll
-from genre_tasks.optimiser.weights import write_atomically
+from genre_tasks.optimiser.weights import load, write_atomically
 from genre_tasks.scene.graph import SceneGraph
 from storage.files import digest_file
 from storage.local import LocalStore
@@ -109,7 +109,7 @@ def adam_of(setting: Setting) -> StepRule:
 
 def network_of(weights: Path) -> tuple[Setting, Callable[[Setting], StepRule]]:
     """The setting that a network has, and the network with another one."""
-    network = LearnedOptimiser.load(weights)
+    network = load(weights)
     config = network.config
 
     def tuned(setting: Setting) -> StepRule:

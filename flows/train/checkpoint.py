@@ -13,7 +13,7 @@ from torch import Tensor
 
 from genre_tasks.errors import InputError
 from genre_tasks.optimiser.episodes import Course, Episode
-from genre_tasks.optimiser.learned import NetworkConfig
+from genre_tasks.optimiser.learned_network import NetworkConfig
 from genre_tasks.optimiser.objective import Sight
 from genre_tasks.optimiser.training import MetaTraining
 from genre_tasks.optimiser.weights import write_atomically

@@ -14,14 +14,15 @@ from flows.train.curve import read_curve, write_curve
 from genre_tasks.config import LossConfig
 from genre_tasks.errors import InputError
 from genre_tasks.optimiser.episodes import TrainingScene
-from genre_tasks.optimiser.learned import LearnedOptimiser, NetworkConfig
+from genre_tasks.optimiser.learned import LearnedOptimiser
+from genre_tasks.optimiser.learned_network import NetworkConfig
 from genre_tasks.optimiser.loss import Distance
 from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.rules import StepRule
 from genre_tasks.optimiser.targets import Target
 from genre_tasks.optimiser.training import MetaConfig, MetaTraining
 from genre_tasks.optimiser.unroll import Plan, unroll
-from genre_tasks.optimiser.weights import save, with_residuals
+from genre_tasks.optimiser.weights import load, save, with_residuals
 from genre_tasks.progress import Progress, silent
 from genre_tasks.render.api import render_views
 from genre_tasks.scene.graph import SceneGraph
@@ -51,7 +52,7 @@ def network_from(
         torch.manual_seed(seed)
         network = LearnedOptimiser(config)
     if weights is not None:
-        start = LearnedOptimiser.load(weights)
+        start = load(weights)
         may = {"rates", "relaxation"} | ({"residuals"} if config.residuals else set())
         other = {name for name, value in config if name not in may and value != getattr(start.config, name)}
         if other:

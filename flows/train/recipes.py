@@ -16,7 +16,7 @@ from flows.train.scenes import SceneRecipe
 from genre_tasks.config import LossConfig
 from genre_tasks.errors import ConfigError
 from genre_tasks.optimiser.adam import ENET_RATES, GNET_RATES
-from genre_tasks.optimiser.learned import NetworkConfig
+from genre_tasks.optimiser.learned_network import NetworkConfig
 from genre_tasks.optimiser.training import MetaConfig
 
 SHIPPED = "builtin:"

@@ -1,11 +1,9 @@
 """The learned optimiser's step as one compiled call, for inference on the CPU.
 
-``LearnedOptimiser.delta`` with :func:`genre_tasks.optimiser.features.features` defines the step and is its oracle.
+``LearnedNetwork.delta`` with :func:`genre_tasks.optimiser.features.features` defines the step and is its oracle.
 """
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -14,13 +12,11 @@ from genre_tasks.optimiser.features import TIMES, Fixed, times
 from genre_tasks.optimiser.fused_calls import learned_step
 from genre_tasks.optimiser.fused_layers import LANES, ByOwner, Layers, Memory, Pairs, padded, round_up
 from genre_tasks.optimiser.fused_library import Network, Scene
+from genre_tasks.optimiser.learned_network import LearnedNetwork
 from genre_tasks.optimiser.network_constants import BLOCK
 from genre_tasks.optimiser.rules import rate_vector, schedule
 from genre_tasks.optimiser.sparse_unet import VoxelPyramid
 from genre_tasks.optimiser.state import Frame, State
-
-if TYPE_CHECKING:
-    from genre_tasks.optimiser.learned import LearnedOptimiser
 
 
 class FusedStep:
@@ -29,7 +25,7 @@ class FusedStep:
     Runs on ``torch.get_num_threads()`` threads; the bits do not depend on their number.
     """
 
-    def __init__(self, network: LearnedOptimiser, frame: Frame, fixed: Fixed, pyramid: VoxelPyramid) -> None:
+    def __init__(self, network: LearnedNetwork, frame: Frame, fixed: Fixed, pyramid: VoxelPyramid) -> None:
         self._memory = Memory()
         self._rates = -rate_vector(network.config.rates)
         self._count, self._residuals = len(pyramid.voxel_of), network.residuals
@@ -51,7 +47,7 @@ class FusedStep:
         return learned_step(self._network, self._scene, state, gradient, self._rates * part, time, part)
 
 
-def _dense_layers(network: LearnedOptimiser, hidden: int, memory: Memory) -> Network:
+def _dense_layers(network: LearnedNetwork, hidden: int, memory: Memory) -> Network:
     at, entry, head = memory.address, network.entry, network.head
     own = network.mix.weight[:, : network.config.hidden].T
     column = torch.cat([torch.arange(14), LANES + torch.arange(14)])  # gains and offsets have a row of lanes each
@@ -67,7 +63,7 @@ def _dense_layers(network: LearnedOptimiser, hidden: int, memory: Memory) -> Net
 
 
 def _scene(
-    network: LearnedOptimiser, hidden: int, frame: Frame, fixed: Fixed, pyramid: VoxelPyramid, memory: Memory
+    network: LearnedNetwork, hidden: int, frame: Frame, fixed: Fixed, pyramid: VoxelPyramid, memory: Memory
 ) -> Scene:
     """What the mixing layer takes from around is the same for all Gaussians of a voxel: it is a layer of voxels."""
     voxels, layers, at = pyramid.count, Layers(memory), memory.address

@@ -10,7 +10,6 @@ from genre_tasks.config import FinishConfig, GnetConfig, OptimiserConfig
 from genre_tasks.effects.types import EffectsPlan
 from genre_tasks.optimiser import targets
 from genre_tasks.optimiser.adam import ENET_RATES, GNET_RATES, TunedAdam
-from genre_tasks.optimiser.learned import LearnedOptimiser
 from genre_tasks.optimiser.loss import Distance
 from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.per_scene import PerSceneTraining
@@ -19,6 +18,7 @@ from genre_tasks.optimiser.per_scene_start import world_static
 from genre_tasks.optimiser.rules import StepRule
 from genre_tasks.optimiser.targets import Target
 from genre_tasks.optimiser.unroll import Plan, unroll
+from genre_tasks.optimiser.weights import load
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.graph import SceneGraph
@@ -83,7 +83,7 @@ def finishing_plan(config: OptimiserConfig, finish: FinishConfig) -> Plan:
 
 def finishing_rule(finish: FinishConfig) -> StepRule:
     """The learned optimiser with the weights that are configured for the end. Raises as :func:`step_rule`."""
-    return LearnedOptimiser.load(resolve_weights("gnet", finish.weights, "gnet.finish.weights"))
+    return load(resolve_weights("gnet", finish.weights, "gnet.finish.weights"))
 
 
 def _joined(first: Reconstruction, last: Reconstruction) -> Reconstruction:
@@ -142,7 +142,7 @@ def step_rule(stage: StageName, config: OptimiserConfig) -> StepRule:
     if config.method == "adam":
         own = GNET_RATES if stage == "gnet" else ENET_RATES
         return TunedAdam(config.adam.rates or own, config.adam.schedule)
-    learned = LearnedOptimiser.load(resolve_weights(network_of(stage, config.method), config.weights))
+    learned = load(resolve_weights(network_of(stage, config.method), config.weights))
     finish = config.finishing if isinstance(config, GnetConfig) else None
     rates = config.rates if finish is None or finish.rates_before is None else finish.rates_before
     return learned if rates is None else learned.at_rates(rates)

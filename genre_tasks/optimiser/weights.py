@@ -9,7 +9,8 @@ import torch
 from pydantic import ValidationError
 
 from genre_tasks.errors import ConfigError, InputError
-from genre_tasks.optimiser.learned import LearnedOptimiser, NetworkConfig
+from genre_tasks.optimiser.learned import LearnedOptimiser
+from genre_tasks.optimiser.learned_network import NetworkConfig
 from genre_tasks.optimiser.network_constants import RESIDUALS, VARYING
 
 REMEDY = "Give weights made by `genre train gnet` or `genre train enet`, or use `builtin`."

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from genre_tasks.logs.types import CuboidTrack, Float32, Float64
+from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.chunk import Mark
 from genre_tasks.scene.geometry import interpolate_pose, rigid, se3_inverse
-from genre_tasks.scene.graph import ActorNode
 
 MARGIN_M = 0.15
 """Boxes are enlarged by this to the sides and above before points are cut out: annotations are tight."""

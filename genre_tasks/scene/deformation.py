@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from genre_tasks.scene.graph import ActorNode
+from genre_tasks.scene.actor_node import ActorNode
 
 LATTICE = (2, 2, 4)
 """Nodes along the box's length, width and height."""

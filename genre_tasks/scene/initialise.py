@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from genre_tasks.config import InitialConfig
 from genre_tasks.errors import InputError
 from genre_tasks.logs.types import Float64
+from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.chunk import Chunk, Points
 from genre_tasks.scene.distant import distant_region
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.geometry import matrix_to_quat, path_distance
-from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR, STATIC, ActorNode, SceneGraph
+from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR, STATIC, SceneGraph
 from genre_tasks.scene.ground import CELL_M
 from genre_tasks.scene.voxels import Voxels, group, levels, voxel_size_for
 

@@ -35,6 +35,7 @@ from genre_tasks.optimiser.adam import TunedAdam
 from genre_tasks.optimiser.learned import LearnedOptimiser
 from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.unroll import Plan, unroll
+from genre_tasks.optimiser.weights import load
 from genre_tasks.scene.graph import DISTANT
 from genre_tasks.weights import resolve_weights
 from tests.benchmarks.tiny_races import ADAM, LOSS, NEVER, learned
@@ -205,7 +206,7 @@ def test_the_trade_counts_renders_and_judges_the_end(task: Task) -> None:
     assert [named[n].loss.perceptual_every for n in trade.PERCEPTUAL] == [1, 4]
     config = learned(4).model_copy(update={"views_per_iteration": 1000})
     found = trade.trade(replace(task, beside=task.heldout), config)
-    rule, plan = LearnedOptimiser.load(resolve_weights("gnet", "builtin")), Plan(4, 1000)
+    rule, plan = load(resolve_weights("gnet", "builtin")), Plan(4, 1000)
     expected = unroll(rule, task.scene, task.source, (), Objective(LOSS), plan).scene
     assert found["renders"] == 4 * len(task.source) and found["seconds"] > 0
     assert found["psnr"] == found["psnr_3m"] == task.psnr(expected)

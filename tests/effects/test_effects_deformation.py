@@ -22,9 +22,10 @@ from genre_tasks.optimiser.run import optimise
 from genre_tasks.optimiser.state import Frame
 from genre_tasks.optimiser.unroll import Plan, unroll
 from genre_tasks.render import RenderSettings, render_views
+from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.deformation import LATTICE, NODES, Deformation, weights
 from genre_tasks.scene.gaussians import Gaussians
-from genre_tasks.scene.graph import FIRST_ACTOR, ActorNode, SceneGraph
+from genre_tasks.scene.graph import FIRST_ACTOR, SceneGraph
 from genre_tasks.scene.results import Reconstruction
 from genre_tasks.stages.gnet import gnet
 from genre_tasks.stages.initial import initial

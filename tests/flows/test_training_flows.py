@@ -21,8 +21,9 @@ from flows.train.stages import TrainJob, places, train_stage
 from genre_tasks.config import LossConfig
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.optimiser.adam import GNET_RATES
-from genre_tasks.optimiser.learned import LearnedOptimiser, NetworkConfig
+from genre_tasks.optimiser.learned_network import NetworkConfig
 from genre_tasks.optimiser.training import MetaConfig
+from genre_tasks.optimiser.weights import load
 from storage.curve import LEARNING, VALIDATION, read_rows
 from storage.files import digest_file
 
@@ -209,7 +210,7 @@ def test_a_stage_may_tell_a_network_residuals_and_train_nothing(trained: Said, t
     told = replace(told, config=told.config.model_copy(update={"steps": 0}))
     done = [train_stage(job, told) for _ in range(2)]
     assert [d.cached for d in done] == [False, True]
-    before, after = (LearnedOptimiser.load(job.weights(f"gnet/{name}")) for name in ("only", "told"))
+    before, after = (load(job.weights(f"gnet/{name}")) for name in ("only", "told"))
     assert after.config == network and torch.equal(before.mix.weight, after.mix.weight)
 
 

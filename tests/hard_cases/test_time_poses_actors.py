@@ -11,10 +11,11 @@ import torch
 from genre_tasks.config import IngestConfig
 from genre_tasks.logs.types import CuboidTrack, Lens
 from genre_tasks.render import Cameras, RenderSettings, render
+from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.geometry import interpolate_pose, quat_to_matrix, rigid
-from genre_tasks.scene.graph import FIRST_ACTOR, ActorNode, SceneGraph
+from genre_tasks.scene.graph import FIRST_ACTOR, SceneGraph
 from genre_tasks.stages.ingest import NO_SWEEP, ingest
 from tests.fakes import FakeCar, FakeLog, camera_turn, yaw_pose
 

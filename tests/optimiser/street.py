@@ -9,8 +9,9 @@ from genre_tasks.logs.types import Lens
 from genre_tasks.optimiser.ssim import SsimTarget
 from genre_tasks.optimiser.targets import Target
 from genre_tasks.render import render_views
+from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.gaussians import Gaussians
-from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR, STATIC, ActorNode, SceneGraph
+from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR, STATIC, SceneGraph
 
 LENS = Lens(40.0, 40.0, 24.0, 16.0, 48, 32)
 

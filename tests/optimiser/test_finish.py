@@ -15,9 +15,9 @@ from flows.pipeline import BY_NAME, stage_weights, weights_digest
 from genre_tasks.config import FinishConfig, GnetConfig, IngestConfig, InitialConfig, LossConfig, PipelineConfig
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.logs.registry import open_log
-from genre_tasks.optimiser.learned import LearnedOptimiser
 from genre_tasks.optimiser.run import finishing_plan, optimise, plan_of
 from genre_tasks.optimiser.targets import of_source
+from genre_tasks.optimiser.weights import load
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.deformation import Deformation
 from genre_tasks.scene.graph import SceneGraph
@@ -119,7 +119,7 @@ def test_rates_of_the_first_iterations_are_the_ends_to_say(chunk: Chunk, start: 
         finish = FinishConfig.model_validate({**FINISH.model_dump(), "rates_before": rates})
         return CONFIG.model_copy(update={"finish": finish, **more})
 
-    own = LearnedOptimiser.load(resolve_weights("gnet", "builtin")).config.rates
+    own = load(resolve_weights("gnet", "builtin")).config.rates
     plain = at(CONFIG)
     assert torch.equal(at(told(own)), plain) and not torch.equal(at(told((4 * own[0], *own[1:]))), plain)
     task = Task(start, of_source(chunk, depth=True), ())

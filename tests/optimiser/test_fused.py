@@ -23,12 +23,14 @@ from genre_tasks.optimiser.build_network import KERNEL
 from genre_tasks.optimiser.features import FEATURES, Fixed, features, times
 from genre_tasks.optimiser.fused import FusedStep
 from genre_tasks.optimiser.fused_layers import Pairs
-from genre_tasks.optimiser.learned import LearnedOptimiser, NetworkConfig
+from genre_tasks.optimiser.learned import LearnedOptimiser
+from genre_tasks.optimiser.learned_network import NetworkConfig
 from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.rules import Step, StepRule, rate_vector
 from genre_tasks.optimiser.sparse import neighbour_map, pack
 from genre_tasks.optimiser.state import Frame, State
 from genre_tasks.optimiser.unroll import Plan, unroll
+from genre_tasks.optimiser.weights import load
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.weights import resolve_weights
@@ -117,7 +119,7 @@ def _threads(count: int) -> Iterator[None]:
 @pytest.mark.parametrize("stage", ["gnet", "enet"])
 @pytest.mark.parametrize("size", [1e-10, 1.0, 1e8])
 def test_the_shipped_networks_step_is_torchs(stage: str, size: float) -> None:
-    network = LearnedOptimiser.load(Path(resolve_weights(stage, "builtin")))
+    network = load(Path(resolve_weights(stage, "builtin")))
     assert _error(network, street.scene(400), size) < 1e-4
 
 

@@ -12,10 +12,10 @@ import torch
 from genre_tasks.config import IngestConfig, InitialConfig, LossConfig, OptimiserConfig
 from genre_tasks.errors import InputError
 from genre_tasks.logs.registry import open_log
-from genre_tasks.optimiser.learned import LearnedOptimiser
 from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.targets import Target, of_fixed, of_source, of_views
 from genre_tasks.optimiser.unroll import Plan, unroll
+from genre_tasks.optimiser.weights import load
 from genre_tasks.render import render_views
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.graph import SceneGraph
@@ -102,7 +102,7 @@ def test_a_chunk_without_source_views_is_refused(chunk: Chunk) -> None:
 def test_the_shipped_weights_stay_stable_at_ten_times_their_horizon(name: str) -> None:
     path = resolve_weights(name, "builtin")
     assert path.stat().st_size < 2_000_000
-    rule, truth = LearnedOptimiser.load(path), street.scene()
+    rule, truth = load(path), street.scene()
     start, views, objective = street.blurred(truth), street.targets(truth), Objective(LOSS)
     horizon = 24 if name == "gnet" else 12
     short = unroll(rule, start, views, (), objective, Plan(horizon, 4))

@@ -16,9 +16,10 @@ from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.state import Frame, State
 from genre_tasks.optimiser.unroll import Plan, unroll
 from genre_tasks.render.surface import normals
+from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.geometry import quat_multiply
-from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR, STATIC, ActorNode, SceneGraph
+from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR, STATIC, SceneGraph
 from tests.optimiser import street
 
 FLAT, BALL = (0.2, 0.1, 0.01), (0.2, 0.2, 0.15)

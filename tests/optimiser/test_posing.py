@@ -31,9 +31,10 @@ from genre_tasks.optimiser.unroll import Plan, unroll
 from genre_tasks.render import render_views
 from genre_tasks.render.types import Render, RenderSettings
 from genre_tasks.scene import constants
+from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.geometry import se3
-from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR, ActorNode, SceneGraph
+from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR, SceneGraph
 from tests.optimiser import street
 
 NAMES = ("means", "scales", "quats", "opacities", "colors")

@@ -17,7 +17,8 @@ from genre_tasks.logs.types import MotionBlur
 from genre_tasks.optimiser.adam import TunedAdam
 from genre_tasks.optimiser.episodes import TrainingScene
 from genre_tasks.optimiser.features import FEATURES
-from genre_tasks.optimiser.learned import LearnedOptimiser, NetworkConfig
+from genre_tasks.optimiser.learned import LearnedOptimiser
+from genre_tasks.optimiser.learned_network import NetworkConfig
 from genre_tasks.optimiser.loss import residual_image
 from genre_tasks.optimiser.network_constants import RESIDUALS, VARYING
 from genre_tasks.optimiser.objective import Objective

@@ -13,7 +13,8 @@ from benchmarks.sweep_rates import Scores, Setting, Subject, network_moves, netw
 from genre_tasks.errors import ConfigError
 from genre_tasks.optimiser.adam import GNET_RATES
 from genre_tasks.optimiser.episodes import TrainingScene
-from genre_tasks.optimiser.learned import LearnedOptimiser, NetworkConfig
+from genre_tasks.optimiser.learned import LearnedOptimiser
+from genre_tasks.optimiser.learned_network import NetworkConfig
 from genre_tasks.optimiser.weights import save
 from genre_tasks.scene.graph import SceneGraph
 from tests.optimiser import street

@@ -18,7 +18,8 @@ from genre_tasks.errors import InputError
 from genre_tasks.optimiser.adam import TunedAdam
 from genre_tasks.optimiser.episodes import Course, Episode, TrainingScene
 from genre_tasks.optimiser.features import features
-from genre_tasks.optimiser.learned import LearnedOptimiser, NetworkConfig
+from genre_tasks.optimiser.learned import LearnedOptimiser
+from genre_tasks.optimiser.learned_network import NetworkConfig
 from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.training import MetaConfig, MetaTraining
 from genre_tasks.optimiser.unroll import Plan, unroll

@@ -14,7 +14,8 @@ from genre_tasks.errors import InputError, NonFiniteError
 from genre_tasks.optimiser.adam import TunedAdam
 from genre_tasks.optimiser.episodes import TrainingScene
 from genre_tasks.optimiser.features import FEATURES, Fixed, features
-from genre_tasks.optimiser.learned import LearnedOptimiser, NetworkConfig
+from genre_tasks.optimiser.learned import LearnedOptimiser
+from genre_tasks.optimiser.learned_network import NetworkConfig
 from genre_tasks.optimiser.objective import Objective, check_finite
 from genre_tasks.optimiser.rules import StepRule
 from genre_tasks.optimiser.state import Frame, State

@@ -10,8 +10,9 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from genre_tasks.errors import ConfigError, InputError
-from genre_tasks.optimiser.learned import LearnedOptimiser, NetworkConfig
-from genre_tasks.optimiser.weights import save
+from genre_tasks.optimiser.learned import LearnedOptimiser
+from genre_tasks.optimiser.learned_network import NetworkConfig
+from genre_tasks.optimiser.weights import load, save
 
 CONFIG = NetworkConfig(hidden=16, channels=(8, 12))
 
@@ -25,7 +26,7 @@ def path(tmp_path: Path) -> Path:
 
 def test_round_trip(path: Path) -> None:
     torch.manual_seed(0)
-    made, loaded = LearnedOptimiser(CONFIG), LearnedOptimiser.load(path)
+    made, loaded = LearnedOptimiser(CONFIG), load(path)
     assert loaded.config == CONFIG and not loaded.training
     for (name, a), (other, b) in zip(made.named_parameters(), loaded.named_parameters(), strict=True):
         assert name == other and torch.equal(a, b) and not b.requires_grad
@@ -57,7 +58,7 @@ def _changed(path: Path, change: str) -> None:
 def test_tensors_that_do_not_fit_are_named(path: Path, change: str, said: str) -> None:
     _changed(path, change)
     with pytest.raises(InputError, match=said) as raised:
-        LearnedOptimiser.load(path)
+        load(path)
     assert raised.value.file == str(path)
 
 
@@ -65,21 +66,21 @@ def test_weights_of_another_configuration_are_refused(path: Path) -> None:
     described = path.with_suffix(".json")
     described.write_text(json.dumps({**json.loads(described.read_text()), "hidden": 32}))
     with pytest.raises(InputError, match="do not fit"):
-        LearnedOptimiser.load(path)
+        load(path)
 
 
 @pytest.mark.parametrize("text", ["", "{", '{"hiden": 3}', '{"hidden": -1}', '{"rates": [0.1]}'])
 def test_a_broken_configuration_is_a_config_error(path: Path, text: str) -> None:
     path.with_suffix(".json").write_text(text)
     with pytest.raises(ConfigError):
-        LearnedOptimiser.load(path)
+        load(path)
 
 
 def test_missing_and_truncated_files(path: Path) -> None:
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
     with pytest.raises(InputError, match="cannot be read"):
-        LearnedOptimiser.load(path)
+        load(path)
     path.unlink()
     with pytest.raises(InputError, match="missing"):
-        LearnedOptimiser.load(path)
+        load(path)

@@ -11,9 +11,10 @@ import torch
 from genre_tasks.logs.types import Lens, MotionBlur, RollingShutter
 from genre_tasks.render import RenderSettings, cpu, render_views
 from genre_tasks.render.blur import MOMENTS, Moments, _encoded, _linear, mean, mean_gradient
+from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.geometry import se3
-from genre_tasks.scene.graph import ActorNode, SceneGraph
+from genre_tasks.scene.graph import SceneGraph
 from tests.optimiser import street
 from tests.scenes import twist
 

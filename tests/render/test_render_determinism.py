@@ -12,8 +12,9 @@ import torch
 from genre_tasks.logs.types import Lens
 from genre_tasks.render import Cameras, RenderSettings, render, render_views
 from genre_tasks.render.work import count_work
+from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.gaussians import Gaussians, Splats
-from genre_tasks.scene.graph import FIRST_ACTOR, STATIC, ActorNode, SceneGraph
+from genre_tasks.scene.graph import FIRST_ACTOR, STATIC, SceneGraph
 from genre_tasks.scene.views import NovelView
 
 IMAGES = ("color", "alpha", "depth")

@@ -11,8 +11,9 @@ import torch
 from genre_tasks.logs.types import Lens
 from genre_tasks.render import render_views
 from genre_tasks.render.surface import normals, render_surfaces
+from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.gaussians import Gaussians
-from genre_tasks.scene.graph import FIRST_ACTOR, ActorNode, SceneGraph
+from genre_tasks.scene.graph import FIRST_ACTOR, SceneGraph
 
 LENS = Lens(80.0, 80.0, 48.0, 32.0, 96, 64)
 UP_PX = 40  # rows from here on see the road nearer than 20 m

@@ -13,8 +13,9 @@ from torch import Tensor
 from genre_tasks.logs.types import Lens
 from genre_tasks.render import RenderSettings, render_views
 from genre_tasks.render.gloss import seen_colors
+from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.gaussians import Gaussians
-from genre_tasks.scene.graph import COUNTS, DEGREE, FIRST_ACTOR, ActorNode, SceneGraph
+from genre_tasks.scene.graph import COUNTS, DEGREE, FIRST_ACTOR, SceneGraph
 from genre_tasks.scene.harmonics import basis, colors_by_view, shown_colors, starting
 from genre_tasks.scene.views import NovelView
 

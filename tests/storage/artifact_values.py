@@ -12,9 +12,10 @@ from genre_tasks.effects.types import Decision, EffectsPlan, Fitted
 from genre_tasks.fixer.conditioning import Degraded
 from genre_tasks.fixer.pairs import NAMES, Pairs
 from genre_tasks.logs.types import Lens, MotionBlur, RollingShutter
+from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.chunk import Actor, Chunk, Mark, Points, Role, View
 from genre_tasks.scene.gaussians import Gaussians
-from genre_tasks.scene.graph import ActorNode, SceneGraph
+from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.results import Evaluation, Metric, Reconstruction, ViewScore
 from genre_tasks.scene.views import FixedViews, NovelView, NovelViews
 
