@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -35,14 +34,18 @@ def test_a_deployment_runs_on_a_worker(tmp_path: Path) -> None:
         try:
             values = {"logs": [tiny.LOG], "preset": "demo", "store": str(store), "settings": list(tiny.SETTINGS)}
             params = [part for k, v in values.items() for part in ("--param", f"{k}={json.dumps(v)}")]
-            prefect("deployment", "run", "reconstruct-dataset/dataset", *params)
-            deadline = time.monotonic() + 400
-            while not list(store.glob("runs/*/run.json")):
-                assert time.monotonic() < deadline, (tmp_path / "worker.log").read_text()[-3000:]
-                time.sleep(1)
+            # Watched to its end: a worker that is told to stop as a run ends may wait for ever.
+            done = prefect(
+                "deployment", "run", "reconstruct-dataset/dataset", *params, "--watch", "--watch-timeout", "400"
+            )
+            assert "Completed" in done, done + (tmp_path / "worker.log").read_text()[-3000:]
         finally:
             worker.terminate()
-            worker.wait(60)
+            try:
+                worker.wait(60)
+            except subprocess.TimeoutExpired:
+                worker.kill()
+                raise
             log.close()
     (record,) = store.glob("runs/*/run.json")
     stages = json.loads(record.read_text())["chunks"][0]["stages"]
