@@ -7,7 +7,7 @@ READY   = $(VENV)/.ready
 .PHONY: setup demo test test-all lint clean
 setup: $(READY)
 
-$(READY): pyproject.toml constraints.txt setup.py $(wildcard genre_tasks/*/*.cpp genre_tasks/*/*.h genre_tasks/*/*constants.py genre_tasks/*/build_*.py) genre_tasks/compiled/recipe.py
+$(READY): pyproject.toml constraints.txt setup.py $(wildcard $(foreach d,genre_tasks/* genre_tasks/*/*,$(d)/*.cpp $(d)/*.h $(d)/constants.py $(d)/build*.py))
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "GenRe needs Python 3.11 or newer; run e.g. make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
@@ -26,4 +26,4 @@ lint: $(READY)
 	$(VENV)/bin/ruff check . && $(VENV)/bin/ruff format --check . && $(VENV)/bin/mypy && $(VENV)/bin/lint-imports
 
 clean:
-	rm -rf $(VENV) build *.egg-info genre_tasks/*/*.so
+	rm -rf $(VENV) build *.egg-info genre_tasks/*/*.so genre_tasks/*/*/*.so

@@ -12,16 +12,16 @@ from setuptools.command.build_ext import build_ext
 ROOT = Path(__file__).resolve().parent
 sys.path.insert(0, str(ROOT))  # a build backend leaves it out
 
-from genre_tasks.compiled import recipe  # noqa: E402 — imports no torch
+from genre_tasks.compiled import build as kernel_build  # noqa: E402 — imports no torch
 
 # By path: a room's __init__ may import torch, which an isolated build lacks.
 KERNELS = [
     runpy.run_path(str(ROOT / "genre_tasks" / file))["KERNEL"]
     for file in (
-        "render/build_kernel.py",
-        "optimiser/build_image_loss.py",
-        "optimiser/build_network.py",
-        "optimiser/build_posing.py",
+        "render/kernel/build.py",
+        "losses/build_image_loss.py",
+        "optimiser/kernels/build_network.py",
+        "optimiser/kernels/build_posing.py",
     )
 ]
 
@@ -33,7 +33,7 @@ class BuildKernels(build_ext):
         """Compiles; without a compiler one clear line instead of a trace."""
         target = ROOT if self.inplace or self.editable_mode else Path(self.build_lib).resolve()
         try:
-            recipe.build([(kernel, target / kernel.folder.relative_to(ROOT)) for kernel in KERNELS])
+            kernel_build.build([(kernel, target / kernel.folder.relative_to(ROOT)) for kernel in KERNELS])
         except RuntimeError as error:
             raise SystemExit(f"error: {error}") from None
 
@@ -42,7 +42,7 @@ class BuildKernels(build_ext):
         return [
             str(Path(self.build_lib) / kernel.folder.relative_to(ROOT) / kernel.library_name(isa))
             for kernel in KERNELS
-            for isa in recipe.isas_for(recipe.find_compiler())
+            for isa in kernel_build.isas_for(kernel_build.find_compiler())
         ]
 
     def get_output_mapping(self) -> dict[str, str]:
@@ -60,6 +60,6 @@ class BinaryDistribution(Distribution):
 
 setup(
     cmdclass={"build_ext": BuildKernels},
-    ext_modules=[Extension("genre_tasks.render.kernel", sources=[])],
+    ext_modules=[Extension("genre_tasks.compiled.kernels", sources=[])],
     distclass=BinaryDistribution,
 )

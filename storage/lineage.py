@@ -51,15 +51,6 @@ def describe(store: Store, artifact: Artifact) -> list[TableSummary]:
     return out + ([_describe_png(artifact.path, pictures)] if pictures else [])
 
 
-def picture(store: Store, artifact: Artifact) -> NDArray[np.uint8] | None:
-    """One sRGB image [H, W, 3] that shows the artifact, or ``None`` where there is nothing to show; verified first."""
-    from storage.pictures import PICTURES
-
-    store.verify(artifact)
-    draw = PICTURES.get(artifact.manifest.kind)
-    return None if draw is None else draw(artifact.path)
-
-
 def _describe_table(folder: Path, path: Path) -> TableSummary:
     import pyarrow.parquet as pq
 

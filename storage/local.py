@@ -16,10 +16,10 @@ from urllib.parse import unquote, urlparse
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
 from storage.address import Address
 from storage.codecs import codec_of
-from storage.failures import as_genre_error
 from storage.files import make_folders, payload_files, sync
+from storage.io_errors import as_genre_error
 from storage.manifest import MANIFEST, FileEntry, Manifest, NewerSchemaError, parse_manifest, payload_digest
-from storage.sealing import difference, seal
+from storage.manifest_writer import difference, seal
 from storage.store import Artifact
 
 __all__ = ["Artifact", "LocalStore", "open_store"]
@@ -113,9 +113,13 @@ class LocalStore:
         manifest = parse_manifest(data, path / MANIFEST)
         if manifest.address != address:
             raise ArtifactCorruptError(
-                f"The manifest belongs to {manifest.address}", remedy=_RECOMPUTE, file=path / MANIFEST,
-                log=address.log, chunk=address.chunk, stage=address.stage,
-            )  # fmt: skip
+                f"The manifest belongs to {manifest.address}",
+                remedy=_RECOMPUTE,
+                file=path / MANIFEST,
+                log=address.log,
+                chunk=address.chunk,
+                stage=address.stage,
+            )
         return Artifact(address, path, manifest)
 
     def verify(self, artifact: Artifact) -> None:

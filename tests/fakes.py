@@ -88,9 +88,13 @@ class FakeLog:
     @property
     def lens(self) -> Lens:
         return Lens(
-            self.width_px * 0.6, self.width_px * 0.6, self.width_px / 2, self.height_px / 2, self.width_px,
+            self.width_px * 0.6,
+            self.width_px * 0.6,
+            self.width_px / 2,
+            self.height_px / 2,
+            self.width_px,
             self.height_px,
-        )  # fmt: skip
+        )
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
@@ -176,11 +180,15 @@ class FakeLog:
         frames = np.arange(0, self.frame_count, self.track_every, dtype=np.int64)
         made = tuple(
             CuboidTrack(
-                c.track_id, "car", frames, np.stack([self._offset(c.pose(0.1 * f)) for f in frames]), c.size_m,
+                c.track_id,
+                "car",
+                frames,
+                np.stack([self._offset(c.pose(0.1 * f)) for f in frames]),
+                c.size_m,
                 abs(c.speed_mps) > 0,
             )
             for c in self.cars
-        )  # fmt: skip
+        )
         return made + self.extra_tracks
 
     def digest(self) -> str:
@@ -193,9 +201,12 @@ def cast(origin: Float64, directions: Float64, cars: tuple[FakeCar, ...], time_s
         best = np.full(len(directions), np.inf)
         shade = np.stack([0.45 + 0.0 * best.clip(0, 1), np.full(len(best), 0.65), np.full(len(best), 0.9)], -1)
         surfaces = [
-            (2, 0.0, (0.35, 0.35, 0.38)), (1, WALL_Y_M, (0.7, 0.45, 0.3)), (1, -WALL_Y_M, (0.4, 0.6, 0.4)),
-            (0, END_X_M, (0.6, 0.6, 0.3)), (0, -END_X_M, (0.5, 0.3, 0.5)),
-        ]  # fmt: skip
+            (2, 0.0, (0.35, 0.35, 0.38)),
+            (1, WALL_Y_M, (0.7, 0.45, 0.3)),
+            (1, -WALL_Y_M, (0.4, 0.6, 0.4)),
+            (0, END_X_M, (0.6, 0.6, 0.3)),
+            (0, -END_X_M, (0.5, 0.3, 0.5)),
+        ]
         for axis, at, color in surfaces:
             t = (at - origin[axis]) / directions[:, axis]
             hit = origin + t[:, None] * directions

@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from genre_tasks.render import Cameras, Render, RenderSettings, render
-from genre_tasks.render.oracles import reference_bands, relative_l2
 from genre_tasks.scene.gaussians import Splats
+from tests.render.oracles import reference_bands, relative_l2
 
 NAMES = ("means", "scales", "quats", "opacities", "colors")
 Scene = tuple[Splats, Cameras]

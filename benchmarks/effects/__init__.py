@@ -15,19 +15,20 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.bench import Cell, Row
+from benchmarks.common.bench import Cell, Row
+from benchmarks.common.claims import Claim, Op
+from benchmarks.common.over_cells import over_cells
 from benchmarks.effects.cases import CASES
 from benchmarks.effects.cells import on_real, on_street
-from benchmarks.effects.whole import SHAPED, auto_vs_on, plain_cost, trained
-from benchmarks.optimiser.beyond import over_cells
-from benchmarks.schema import Claim, Op
+from benchmarks.effects.whole_plans import SHAPED, auto_vs_on, plain_cost, trained
 from flows.configuration import load_configuration
-from flows.pipeline import BY_NAME, stage_weights
+from flows.pipeline.definition import BY_NAME, stage_weights
 
 CELL_S, WHOLE_S, COUNTED_S = 120.0, 200.0, 1500.0
 WHOLE: Mapping[str, tuple[Callable[[str, str], Row], float]] = {
-    "auto_vs_on": (auto_vs_on, WHOLE_S), "plain_cost": (plain_cost, COUNTED_S),
-}  # fmt: skip
+    "auto_vs_on": (auto_vs_on, WHOLE_S),
+    "plain_cost": (plain_cost, COUNTED_S),
+}
 """Whole plans, and their predicted seconds; the latter is counted on the first street alone."""
 TRAINED = "trained"
 """Among the effects that are asked for: whether the optimiser gains from training with them; needs ``training``."""
@@ -38,15 +39,26 @@ class Effects:
 
     name = "effects"
     options: Mapping[str, str] = {
-        "seeds": "1001,1002,1003", "effects": ",".join((*CASES, *WHOLE)), "factors": "0,4", "store": "genre-store",
-        "pandaset": "../shared/data/pandaset/002", "chunks": "0,1", "training": "",
-    }  # fmt: skip
+        "seeds": "1001,1002,1003",
+        "effects": ",".join((*CASES, *WHOLE)),
+        "factors": "0,4",
+        "store": "genre-store",
+        "pandaset": "../shared/data/pandaset/002",
+        "chunks": "0,1",
+        "training": "",
+    }
     code: tuple[str, ...] = (
-        "benchmarks.effects.cells", "benchmarks.effects.whole", "benchmarks.effects.counted",
-        "genre_tasks.optimiser.run", "genre_tasks.stages.ingest", "genre_tasks.stages.initial",
-        "genre_tasks.stages.effects", *BY_NAME["effects"].lazy, "genre_tasks.logs.pandaset",
+        "benchmarks.effects.cells",
+        "benchmarks.effects.whole_plans",
+        "benchmarks.effects.instruction_count",
+        "genre_tasks.stages.optimise",
+        "genre_tasks.stages.ingest",
+        "genre_tasks.stages.initial",
+        "genre_tasks.stages.effects",
+        *BY_NAME["effects"].lazy,
+        "genre_tasks.logs.pandaset.reader",
         "genre_tasks.logs.synthetic",
-    )  # fmt: skip
+    )
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
         """Factor 0 is the street that does not call for it. ``quick``: one street, no real log."""

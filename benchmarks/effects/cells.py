@@ -8,19 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.bench import NotMeasuredError, Row
+from benchmarks.common.bench import NotMeasuredError, Row
+from benchmarks.common.context import threads
+from benchmarks.common.run_stages import reconstruct, seconds_of
+from benchmarks.common.task import value_of
 from benchmarks.effects.cases import CASES
 from benchmarks.effects.measures import beside_psnr, heldout_psnr
-from benchmarks.main_job import reconstruct, seconds_of
-from benchmarks.optimiser.cells import threads
-from benchmarks.optimiser.task import value_of
 from flows.configuration import load_configuration
-from flows.logs import opened_log
-from flows.machine import commit
-from flows.produce import Job
-from genre_tasks.effects.applied import applied
-from genre_tasks.effects.motion import pixel_speeds
-from genre_tasks.effects.seen import Seen
+from flows.machine.facts import commit
+from flows.pipeline.log_cache import opened_log
+from flows.pipeline.stage_runner import Job
+from genre_tasks.effects.apply_plan import applied
+from genre_tasks.effects.measurements import Seen
+from genre_tasks.effects.pixel_motion import pixel_speeds
 from genre_tasks.effects.types import EffectsPlan, Fitted
 from genre_tasks.logs.types import Truth
 from genre_tasks.scene.chunk import Chunk

@@ -11,15 +11,15 @@ import torch
 from genre_tasks.effects.anti_aliasing import ratios
 from genre_tasks.effects.nonrigid_actors import covered
 from genre_tasks.logs.types import Float32, Truth
-from genre_tasks.metrics.collect import true_pixels, view_image
-from genre_tasks.metrics.image import psnr
+from genre_tasks.metrics.image_quality import psnr
+from genre_tasks.metrics.scoring import true_pixels, view_image
 from genre_tasks.render.api import render_views
 from genre_tasks.scene.chunk import Chunk, View
-from genre_tasks.scene.coloring import visible
-from genre_tasks.scene.depth import lidar_depth
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.novel import novel_view_poses
-from genre_tasks.scene.views import NovelView
+from genre_tasks.scene.lidar_depth import lidar_depth
+from genre_tasks.scene.novel_poses import novel_view_poses
+from genre_tasks.scene.novel_views import NovelView
+from genre_tasks.scene.visibility import visible
 from genre_tasks.stages.evaluate import as_recorded
 
 SIDE_M = 3.0

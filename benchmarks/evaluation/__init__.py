@@ -11,16 +11,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from functools import partial
 
-from benchmarks.bench import Cell, Row
+from benchmarks.common.bench import Cell, Row
+from benchmarks.common.claims import Claim
 from benchmarks.evaluation.budgets import claims_of as budget_claims
 from benchmarks.evaluation.budgets import run_within
 from benchmarks.evaluation.budgets import table_of as budget_table
 from benchmarks.evaluation.reliability import claims_of as reliability_claims
 from benchmarks.evaluation.reliability import ranked
 from benchmarks.evaluation.reliability import table_of as reliability_table
-from benchmarks.schema import Claim
 from flows.configuration import load_configuration
-from flows.pipeline import BY_NAME, stage_weights
+from flows.pipeline.definition import BY_NAME, stage_weights
 
 RANKED_S, START_S = 150.0, 30.0
 
@@ -34,14 +34,24 @@ class Evaluation:
 
     name = "evaluation"
     options: Mapping[str, str] = {
-        "seeds": "1001,1002,1003,1004,1005", "budgets": "52,56,60,65,70,75,80,90,100,120", "rounds": "5",
-        "stages": "gnet,enet", "store": "genre-store", "table": "",
-    }  # fmt: skip
+        "seeds": "1001,1002,1003,1004,1005",
+        "budgets": "52,56,60,65,70,75,80,90,100,120",
+        "rounds": "5",
+        "stages": "gnet,enet",
+        "store": "genre-store",
+        "table": "",
+    }
     code: tuple[str, ...] = (
-        "benchmarks.evaluation.budgets", "benchmarks.evaluation.reliability", "flows.budget.budget",
-        "genre_tasks.reliability.guards", "genre_tasks.stages.ingest", "genre_tasks.stages.initial",
-        "genre_tasks.optimiser.run", "genre_tasks.stages.fnet", "genre_tasks.logs.synthetic",
-    )  # fmt: skip
+        "benchmarks.evaluation.budgets",
+        "benchmarks.evaluation.reliability",
+        "flows.budget.budget",
+        "genre_tasks.reliability.guards",
+        "genre_tasks.stages.ingest",
+        "genre_tasks.stages.initial",
+        "genre_tasks.stages.optimise",
+        "genre_tasks.stages.fnet",
+        "genre_tasks.logs.synthetic",
+    )
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
         """``quick``: one round, one seed's guards."""

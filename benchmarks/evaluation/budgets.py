@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.bench import NotMeasuredError, Row
-from benchmarks.schema import Claim, claim
+from benchmarks.common.bench import NotMeasuredError, Row
+from benchmarks.common.claims import Claim, claim
 from flows.budget.chooser import BORDER_S
-from flows.budget.measured import Point, load, shipped_table
-from flows.machine import CHECKOUT, commit
-from flows.pipeline import reconstructing_until
+from flows.budget.cost_table import Point, load, shipped_table
+from flows.machine.facts import CHECKOUT, commit
+from flows.pipeline.definition import reconstructing_until
 
 JUDGED = ("evaluate.shifts_m=[3.0]", "evaluate.every=4", "evaluate.bootstrap=0", "evaluate.pictures=0")
 """Of the evaluation, which no budget counts, as much as the claims need; no snapshots for its curve."""
@@ -52,12 +52,19 @@ def run_within(seed: str, budget_s: float, table: str) -> Row:
     stages = {s["stage"]: s for s in chunk["stages"]}
     metrics = stages[chosen["end"]]["metrics"]
     return {
-        "log": log, "budget_s": budget_s, "used_s": record["budget"]["used_s"], "command_s": command_s,
-        "speed": record["budget"]["speed"], "end": chosen["end"], "settings": chosen["settings"],
-        "choices": chosen["choices"], "table": table,
+        "log": log,
+        "budget_s": budget_s,
+        "used_s": record["budget"]["used_s"],
+        "command_s": command_s,
+        "speed": record["budget"]["speed"],
+        "end": chosen["end"],
+        "settings": chosen["settings"],
+        "choices": chosen["choices"],
+        "table": table,
         "seconds": {n: s["seconds"] for n, s in stages.items() if "/" not in n},
-        "metrics": {n: metrics[n] for n in ("interpolation/psnr", "shift_3m/psnr", MEASURE)}, "commit": commit(),
-    }  # fmt: skip
+        "metrics": {n: metrics[n] for n in ("interpolation/psnr", "shift_3m/psnr", MEASURE)},
+        "commit": commit(),
+    }
 
 
 def _run(log: str, home: Path, *arguments: str) -> str:

@@ -10,23 +10,23 @@ from dataclasses import fields
 import numpy as np
 from scipy.stats import spearmanr
 
-from benchmarks.bench import Row
-from benchmarks.main_job import reconstruct
-from benchmarks.optimiser.cells import threads
-from benchmarks.optimiser.task import value_of
-from benchmarks.schema import Claim, claim
+from benchmarks.common.bench import Row
+from benchmarks.common.claims import Claim, claim
+from benchmarks.common.context import threads
+from benchmarks.common.run_stages import reconstruct
+from benchmarks.common.task import value_of
 from flows.configuration import load_configuration
-from flows.logs import opened_log
-from flows.machine import commit
-from flows.pipeline import reconstructing_until
-from flows.produce import Job
+from flows.machine.facts import commit
+from flows.pipeline.definition import reconstructing_until
+from flows.pipeline.log_cache import opened_log
+from flows.pipeline.stage_runner import Job
 from genre_tasks.config import RangeConfig
-from genre_tasks.effects.applied import applied
-from genre_tasks.metrics.collect import true_pixels
-from genre_tasks.metrics.image import psnr
+from genre_tasks.effects.apply_plan import applied
+from genre_tasks.metrics.image_quality import psnr
+from genre_tasks.metrics.scoring import true_pixels
 from genre_tasks.progress import silent
 from genre_tasks.reliability.guards import ESTIMATE, Guards
-from genre_tasks.reliability.range import judged, measured
+from genre_tasks.reliability.reliable_range import judged, measured
 
 CONFIG = RangeConfig(every=8)
 

@@ -15,14 +15,14 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.bench import Bench, Cell, Row, logs_of
+from benchmarks.common.bench import Bench, Cell, Row, logs_of
+from benchmarks.common.claims import Claim, claim
+from benchmarks.common.context import place
+from benchmarks.common.timing import Measured
 from benchmarks.fixer.cells import ABLATIONS, EVERYTHING, GATE_SHIFTS_M, KERNEL_SHIFTS_M, ablated, measure_fixer
-from benchmarks.optimiser.cells import place
-from benchmarks.schema import Claim, claim
-from benchmarks.timing import Measured
 from flows.configuration import load_configuration
-from flows.pipeline import BY_NAME, stage_weights, weights_digest
-from genre_tasks.metrics.collect import BOOTSTRAP_SEED
+from flows.pipeline.definition import BY_NAME, stage_weights, weights_digest
+from genre_tasks.metrics.scoring import BOOTSTRAP_SEED
 
 FEWER = {"render": "src", "render+reference": "src_ref", "reference+lidar": "ref_lidar"}
 """Inputs that all three are held against, and what the paper's Table 3 calls them."""
@@ -37,14 +37,21 @@ class Fixer:
 
     name = "fixer"
     options: Mapping[str, str] = {
-        "seeds": "1001,1002,1003,1004,1005", "store": "genre-store", "pandaset": "../shared/data/pandaset/002",
+        "seeds": "1001,1002,1003,1004,1005",
+        "store": "genre-store",
+        "pandaset": "../shared/data/pandaset/002",
         "ablations": "training",
-    }  # fmt: skip
+    }
     code: tuple[str, ...] = (
-        "benchmarks.fixer.cells", "genre_tasks.optimiser.run", "genre_tasks.stages.novel_views",
-        "genre_tasks.stages.fnet", "genre_tasks.stages.ingest", "genre_tasks.stages.initial",
-        "genre_tasks.logs.pandaset", "genre_tasks.logs.synthetic",
-    )  # fmt: skip
+        "benchmarks.fixer.cells",
+        "genre_tasks.stages.optimise",
+        "genre_tasks.stages.novel_views",
+        "genre_tasks.stages.fnet",
+        "genre_tasks.stages.ingest",
+        "genre_tasks.stages.initial",
+        "genre_tasks.logs.pandaset.reader",
+        "genre_tasks.logs.synthetic",
+    )
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
         """``quick``: one street. An empty ``pandaset`` leaves the real log out."""

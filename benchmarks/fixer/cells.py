@@ -14,24 +14,25 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.bench import Row
-from benchmarks.optimiser.beside import TRUE_VIEWS, true_targets, views_at
-from benchmarks.optimiser.cells import threads
-from benchmarks.optimiser.enhancement import BOOTSTRAP, psnr_of
-from benchmarks.optimiser.steps import Steps, steps_of
-from benchmarks.optimiser.task import SIDE_M
-from flows.logs import opened_log
-from flows.train.fixer import WEIGHTS, FixerJob
+from benchmarks.common.bench import Row
+from benchmarks.common.context import threads
+from benchmarks.common.novel_view_truth import TRUE_VIEWS, true_targets, views_at
+from benchmarks.common.pipeline_inputs import Steps, steps_of
+from benchmarks.common.scores import psnr_of
+from benchmarks.common.task import SIDE_M
+from benchmarks.optimiser.enhancement import BOOTSTRAP
+from flows.pipeline.log_cache import opened_log
+from flows.training.fixer_training import WEIGHTS, FixerJob
 from genre_tasks.config import FnetConfig
-from genre_tasks.fixer.conditioning import recorded
 from genre_tasks.fixer.network import Fnet
+from genre_tasks.fixer.source_images import recorded
 from genre_tasks.fixer.warping import MIN_ALPHA, SourceImage, surface_of, warp
 from genre_tasks.fixer.weights import load_fnet
-from genre_tasks.metrics.collect import BOOTSTRAP_SEED, FeatureSet, real_images
-from genre_tasks.metrics.distribution import kernel_difference, kernel_distance
+from genre_tasks.metrics.distribution_distances import kernel_difference, kernel_distance
 from genre_tasks.metrics.perceptual import perceptual_distance
+from genre_tasks.metrics.scoring import BOOTSTRAP_SEED, FeatureSet, real_images
 from genre_tasks.scene.chunk import Actor, Chunk
-from genre_tasks.scene.views import NovelView, NovelViews
+from genre_tasks.scene.novel_views import NovelView, NovelViews
 from genre_tasks.stages.fnet import fix_views, load_configured, need
 from genre_tasks.stages.novel_views import render_novel
 

@@ -17,10 +17,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
-from benchmarks.bench import Bench, Cell, NotMeasuredError, Row, logs_of
-from benchmarks.optimiser import summary, table
-from benchmarks.optimiser.cells import METHODS, measure_race, measure_stability, threads, variants
-from benchmarks.optimiser.converged import LONG_RENDERS, PRESET, long_variants, measure_converged
+from benchmarks.common.bench import Bench, Cell, NotMeasuredError, Row, logs_of
+from benchmarks.common.claims import Claim
+from benchmarks.common.context import threads
+from benchmarks.optimiser import claims, race_table
+from benchmarks.optimiser.cells import METHODS, measure_race, measure_stability, variants
+from benchmarks.optimiser.convergence import LONG_RENDERS, PRESET, long_variants, measure_converged
 from benchmarks.optimiser.distillation import (
     FAMILIES,
     MOST_TIMES,
@@ -31,14 +33,13 @@ from benchmarks.optimiser.distillation import (
     measure_distillation,
 )
 from benchmarks.optimiser.enhancement import as_enhancer, measure_enhancement
-from benchmarks.optimiser.network import COUNTS, measure_network
-from benchmarks.optimiser.trade import SEEDS, measure_trade, settings
-from benchmarks.schema import Claim
+from benchmarks.optimiser.iteration_tradeoff import SEEDS, measure_trade, settings
+from benchmarks.optimiser.network_speed import COUNTS, measure_network
 from flows.configuration import load_configuration
-from flows.pipeline import BY_NAME, stage_weights
+from flows.pipeline.definition import BY_NAME, stage_weights
 from genre_tasks.config import GnetConfig, OptimiserConfig, PipelineConfig
 from genre_tasks.errors import ConfigError
-from genre_tasks.optimiser.run import StageName, step_rule
+from genre_tasks.stages.optimise import StageName, step_rule
 
 RENDER_S, STEP_S, JUDGE_S = 0.012, 0.02, 0.2
 """Predicted for a view with its gradient at 40k Gaussians, a step of a network, and a look at a scene."""
@@ -57,19 +58,39 @@ class Optimiser:
 
     name = "optimiser"
     options: Mapping[str, str] = {
-        "seeds": "1001,1002,1003,1004,1005", "orders": "0,1,2", "long_orders": "0,1,2", "methods": ",".join(METHODS),
-        "parts": ",".join(PARTS), "families": ",".join(FAMILIES), "cap": "50", "threads": "2", "minutes": "",
-        "store": "genre-store", "pandaset": "../shared/data/pandaset/002",
-    }  # fmt: skip
+        "seeds": "1001,1002,1003,1004,1005",
+        "orders": "0,1,2",
+        "long_orders": "0,1,2",
+        "methods": ",".join(METHODS),
+        "parts": ",".join(PARTS),
+        "families": ",".join(FAMILIES),
+        "cap": "50",
+        "threads": "2",
+        "minutes": "",
+        "store": "genre-store",
+        "pandaset": "../shared/data/pandaset/002",
+    }
     code: tuple[str, ...] = (
-        "benchmarks.optimiser.cells", "benchmarks.optimiser.network", "benchmarks.optimiser.race",
-        "benchmarks.optimiser.task", "benchmarks.raster.scenes", "benchmarks.timing", "genre_tasks.optimiser.run",
-        "benchmarks.optimiser.beside", "benchmarks.optimiser.converged", "benchmarks.optimiser.distillation",
-        "benchmarks.optimiser.enhancement", "benchmarks.optimiser.steps", "benchmarks.optimiser.trade",
+        "benchmarks.optimiser.cells",
+        "benchmarks.optimiser.network_speed",
+        "benchmarks.optimiser.race",
+        "benchmarks.common.task",
+        "benchmarks.raster.scenes",
+        "benchmarks.common.timing",
+        "genre_tasks.stages.optimise",
+        "benchmarks.common.novel_view_truth",
+        "benchmarks.optimiser.convergence",
+        "benchmarks.optimiser.distillation",
+        "benchmarks.optimiser.enhancement",
+        "benchmarks.common.pipeline_inputs",
+        "benchmarks.optimiser.iteration_tradeoff",
         "genre_tasks.stages.novel_views",
-        "genre_tasks.stages.fnet", "genre_tasks.stages.ingest", "genre_tasks.stages.initial",
-        "genre_tasks.logs.pandaset", "genre_tasks.logs.synthetic",
-    )  # fmt: skip
+        "genre_tasks.stages.fnet",
+        "genre_tasks.stages.ingest",
+        "genre_tasks.stages.initial",
+        "genre_tasks.logs.pandaset.reader",
+        "genre_tasks.logs.synthetic",
+    )
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
         """The network; then for each order every part on all logs.
@@ -105,12 +126,12 @@ class Optimiser:
         return out
 
     def claims(self, rows: Mapping[str, Row]) -> Iterator[Claim]:
-        """See :mod:`benchmarks.optimiser.summary`."""
-        return summary.claims(rows)
+        """See :mod:`benchmarks.optimiser.claims`."""
+        return claims.claims(rows)
 
     def table(self, rows: Mapping[str, Row]) -> Iterator[str]:
         """The tables that the documents show."""
-        return table.markdown(rows)
+        return race_table.markdown(rows)
 
 
 class _Maker:

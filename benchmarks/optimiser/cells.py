@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 
 import torch
 
-from benchmarks.bench import Row
+from benchmarks.common.bench import Row
+from benchmarks.common.pipeline_inputs import steps_of
+from benchmarks.common.task import HELDOUT_VIEWS, Task, task_of
 from benchmarks.optimiser import race
 from benchmarks.optimiser.race import Point
-from benchmarks.optimiser.steps import steps_of
-from benchmarks.optimiser.task import HELDOUT_VIEWS, Task, task_of
-from flows.baselines import load_baselines
 from flows.configuration import load_configuration
-from flows.train.scenes import spread
+from flows.paper_tables.baselines import load_baselines
+from flows.training.training_scenes import spread
 from genre_tasks.config import GnetConfig, OptimiserConfig
+from genre_tasks.losses.targets import Target
 from genre_tasks.optimiser.objective import Objective
-from genre_tasks.optimiser.run import StageName, distance, plan_of, step_rule
-from genre_tasks.optimiser.targets import Target
+from genre_tasks.stages.optimise import StageName, distance, plan_of, step_rule
 
-THREADS = 2
 ADAM = ("tuned_adam", "tuned_adam_split")
 METHODS = (*ADAM, "standard_3dgs", "street_gs")
 PAST = 10
@@ -103,20 +101,3 @@ def stability_row(task: Task, network: StageName, config: OptimiserConfig, fixed
             losses[times] = objective(moment.frame, moment.state.offsets, targets, 0, torch.Generator()).loss
             psnrs[times] = task.psnr(moment.scene)
     return {"iterations": total, "loss": losses, "heldout_psnr": psnrs, "ratio": losses[str(PAST)] / losses["1"]}
-
-
-def place(row: Row) -> str:
-    """The log's short name with chunk and order."""
-    name = f"{row['log'].split('/')[-1].removeprefix('synthetic:')} chunk {row['chunk']}"
-    return f"{name} order {row['order']}" if "order" in row else name
-
-
-@contextmanager
-def threads(count: int = THREADS) -> Iterator[None]:
-    """Torch and the renderer on so many threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -10,24 +10,24 @@ import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from benchmarks.bench import Row
+from benchmarks.common.bench import Row
+from benchmarks.common.novel_view_truth import true_targets, views_at
+from benchmarks.common.pipeline_inputs import images_of, steps_of
+from benchmarks.common.task import HELDOUT_VIEWS, SIDE_M, Task
 from benchmarks.optimiser import race
-from benchmarks.optimiser.beside import true_targets, views_at
-from benchmarks.optimiser.steps import images_of, steps_of
-from benchmarks.optimiser.task import HELDOUT_VIEWS, SIDE_M, Task
-from flows.train.scenes import spread
+from flows.training.training_scenes import spread
 from genre_tasks.config import AdamConfig, OptimiserConfig, PerSceneConfig
-from genre_tasks.metrics.collect import FeatureSet, real_images
-from genre_tasks.metrics.distribution import kernel_distance
+from genre_tasks.losses.targets import Target
+from genre_tasks.metrics.distribution_distances import kernel_distance
 from genre_tasks.metrics.perceptual import perceptual_distance
-from genre_tasks.optimiser.adam import ENET_RATES
+from genre_tasks.metrics.scoring import FeatureSet, real_images
 from genre_tasks.optimiser.objective import Objective
-from genre_tasks.optimiser.per_scene import PerSceneTraining
-from genre_tasks.optimiser.per_scene_run import snapshots
-from genre_tasks.optimiser.run import distance, plan_of, step_rule
-from genre_tasks.optimiser.targets import Target
+from genre_tasks.optimiser.tuned_adam import ENET_RATES
+from genre_tasks.per_scene.run import snapshots
+from genre_tasks.per_scene.training import PerSceneTraining
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.views import NovelView
+from genre_tasks.scene.novel_views import NovelView
+from genre_tasks.stages.optimise import distance, plan_of, step_rule
 
 FAMILIES = ("adam", "adam_split", "standard")
 """What ENet stands beside: tuned Adam, the same on Gaussians that are split as ENet's are, the published recipe."""

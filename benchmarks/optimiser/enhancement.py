@@ -9,21 +9,21 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import torch
-from torch import Tensor
 
-from benchmarks.bench import Row
-from benchmarks.optimiser.beside import true_targets, views_at
-from benchmarks.optimiser.steps import Steps, images_of, steps_of
+from benchmarks.common.bench import Row
+from benchmarks.common.novel_view_truth import true_targets, views_at
+from benchmarks.common.pipeline_inputs import Steps, images_of, steps_of
+from benchmarks.common.scores import mean_psnr, psnr_of
 from genre_tasks.config import OptimiserConfig, PipelineConfig
-from genre_tasks.metrics.collect import BOOTSTRAP_SEED, FeatureSet, real_images
-from genre_tasks.metrics.distribution import kernel_difference, kernel_distance
+from genre_tasks.losses.targets import Target
+from genre_tasks.metrics.distribution_distances import kernel_difference, kernel_distance
 from genre_tasks.metrics.perceptual import perceptual_distance
+from genre_tasks.metrics.scoring import BOOTSTRAP_SEED, FeatureSet, real_images
 from genre_tasks.optimiser.objective import Objective
-from genre_tasks.optimiser.run import distance, plan_of, step_rule
-from genre_tasks.optimiser.targets import Target
 from genre_tasks.optimiser.unroll import unroll
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.views import NovelView
+from genre_tasks.scene.novel_views import NovelView
+from genre_tasks.stages.optimise import distance, plan_of, step_rule
 from genre_tasks.weights import resolve_weights
 
 SHIFTS_M = (1.0, 2.0, 3.0, 4.0, 5.0)
@@ -92,13 +92,3 @@ def as_sets(scenes: Scenes, views: Sequence[NovelView], real: FeatureSet) -> Row
             assert less is not None
             out[name] |= {"difference": less.value, "low": less.low, "high": less.high}
     return out
-
-
-def mean_psnr(scene: SceneGraph, views: Sequence[Target]) -> float:
-    """dB, over the views."""
-    return float(psnr_of(images_of(scene, views), torch.stack([t.image.image for t in views])).mean())
-
-
-def psnr_of(images: Tensor, truth: Tensor) -> Tensor:
-    """[V] dB of [V, H, W, 3] twice."""
-    return -10 * torch.log10((images - truth).square().mean((1, 2, 3)).clamp_min(1e-10))

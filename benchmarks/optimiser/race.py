@@ -14,20 +14,21 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from benchmarks.optimiser.task import Task
+from benchmarks.common.task import Task
+from genre_tasks.checks import check_finite
 from genre_tasks.config import GnetConfig
-from genre_tasks.optimiser.objective import Objective, check_finite
-from genre_tasks.optimiser.per_scene import PerSceneTraining
-from genre_tasks.optimiser.per_scene_run import snapshots
-from genre_tasks.optimiser.per_scene_start import world_static
-from genre_tasks.optimiser.rules import StepRule
-from genre_tasks.optimiser.run import finishing_plan, finishing_rule, plan_of, step_rule
-from genre_tasks.optimiser.sampler import ViewSampler
-from genre_tasks.optimiser.splitting import split_where_images_have_more
+from genre_tasks.losses.targets import Target
+from genre_tasks.optimiser.objective import Objective
+from genre_tasks.optimiser.residual_splitting import split_where_images_have_more
 from genre_tasks.optimiser.state import Frame, State
-from genre_tasks.optimiser.targets import Target
+from genre_tasks.optimiser.step_rules import StepRule
 from genre_tasks.optimiser.unroll import Plan, camera_centre, moved_scene
+from genre_tasks.optimiser.view_sampler import ViewSampler
+from genre_tasks.per_scene.run import snapshots
+from genre_tasks.per_scene.setup import world_static
+from genre_tasks.per_scene.training import PerSceneTraining
 from genre_tasks.scene.graph import SceneGraph
+from genre_tasks.stages.optimise import finishing_plan, finishing_rule, plan_of, step_rule
 
 LOOK_FACTOR = 1.25
 """Seconds between two looks grow by this: a time is known to a quarter, and interpolated in between."""

@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 
-from benchmarks.bench import Bench, Cell, Row
-from benchmarks.raster import cells, peers, table, without
+from benchmarks.common.bench import Bench, Cell, Row
+from benchmarks.common.claims import Claim, Op, claim
+from benchmarks.raster import ablation, cells, gsplat_comparison, table
 from benchmarks.raster.scenes import CASES
-from benchmarks.schema import Claim, Op, claim
 
 _CLAIMS: tuple[tuple[str, str, str, Op, float, str, str], ...] = (
     ("vs_gsplat_torch", "peer/300k", "ratio", ">=", 230.0, "ratio", "forward + backward, 300k, 2 threads"),
@@ -31,25 +31,32 @@ class Raster:
     name = "raster"
     options: Mapping[str, str] = {}
     code: tuple[str, ...] = (
-        "benchmarks.raster.cells", "benchmarks.raster.ceilings", "benchmarks.raster.gsplat_torch",
-        "benchmarks.raster.isa_child", "benchmarks.raster.isas", "benchmarks.raster.peers", "benchmarks.raster.scenes",
-        "benchmarks.raster.without", "benchmarks.timing", "genre_tasks.render.api",
-    )  # fmt: skip
+        "benchmarks.raster.cells",
+        "benchmarks.raster.machine_limits",
+        "benchmarks.raster.gsplat_torch",
+        "benchmarks.raster.instruction_set_worker",
+        "benchmarks.raster.instruction_sets",
+        "benchmarks.raster.gsplat_comparison",
+        "benchmarks.raster.scenes",
+        "benchmarks.raster.ablation",
+        "benchmarks.common.timing",
+        "genre_tasks.render.api",
+    )
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
-        """Scenes, peers, many views, instruction sets, build, GPU."""
+        """Scenes, gsplat's, many views, instruction sets, build, GPU."""
         largest = CASES[-1]
         out = []
         for case, seconds in zip(CASES, (2.0, 2.5, 3.5), strict=True):
             rounds = 5 if quick else 15
             out.append(_cell(f"scene/{case.name}", seconds, rounds, partial(cells.measure_scene, case)))
         for case, seconds, rounds in zip(CASES, (2.0, 8.0, 45.0), (2, 2, 2) if quick else (9, 5, 3), strict=True):
-            out.append(_cell(f"peer/{case.name}", seconds, rounds, partial(peers.measure_peer, case)))
+            out.append(_cell(f"peer/{case.name}", seconds, rounds, partial(gsplat_comparison.measure_peer, case)))
         out.append(_cell("views", 2.0, 5 if quick else 11, cells.measure_views))
         out.append(_cell("isas", 1.0, 5 if quick else 15, partial(cells.measure_isas, largest)))
-        out.append(_cell("without", 2.0, 5 if quick else 15, partial(without.measure_without, largest, cells.THREADS)))
+        out.append(_cell("without", 2.0, 5 if quick else 15, partial(ablation.measure_without, largest, cells.THREADS)))
         out.append(_cell("build", 10.0, 2 if quick else 5, cells.measure_build))
-        out += [_cell(f"cuda/{case.name}", 1.0, 15, partial(peers.measure_cuda, case)) for case in CASES]
+        out += [_cell(f"cuda/{case.name}", 1.0, 15, partial(gsplat_comparison.measure_cuda, case)) for case in CASES]
         return out
 
     def claims(self, rows: Mapping[str, Row]) -> Iterator[Claim]:

@@ -8,16 +8,16 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from benchmarks.bench import NotMeasuredError, Row
-from benchmarks.raster.ceilings import COPY_BYTES, GEMM_FLOP, copy, gemm
-from benchmarks.raster.isas import IsaProcess
+from benchmarks.common.bench import NotMeasuredError, Row
+from benchmarks.common.timing import Action, Measured, on_threads, ratio, take_turns
+from benchmarks.raster.instruction_sets import IsaProcess
+from benchmarks.raster.machine_limits import COPY_BYTES, GEMM_FLOP, copy, gemm
 from benchmarks.raster.scenes import MANY, Case, Scene, forward, forward_backward, leaves_of, scene
-from benchmarks.timing import Action, Measured, on_threads, ratio, take_turns
+from benchmarks.raster.work_count import FLOP_PER_LANE_BACKWARD, FLOP_PER_LANE_FORWARD, count_work
+from genre_tasks.compiled.build import build
 from genre_tasks.compiled.loader import supported_isas
-from genre_tasks.compiled.recipe import build
 from genre_tasks.render import Cameras
-from genre_tasks.render.build_kernel import KERNEL
-from genre_tasks.render.work import FLOP_PER_LANE_BACKWARD, FLOP_PER_LANE_FORWARD, count_work
+from genre_tasks.render.kernel.build import KERNEL
 
 THREADS = 2
 """What every claim is made on; one thread is measured beside it."""

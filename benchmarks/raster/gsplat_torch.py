@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.bench import NotMeasuredError
+from benchmarks.common.bench import NotMeasuredError
 from benchmarks.raster.scenes import ATTRIBUTES, Scene
 from genre_tasks.scene.gaussians import Splats
 
@@ -59,9 +59,16 @@ def render_peer(gsplat: Any, splats: Splats, s: Scene, pairs: Pairs) -> tuple[Te
     _, centers, depths, conics = _project(gsplat, splats, s)
     features = torch.cat([splats.colors[None], depths[..., None]], -1)
     out: tuple[Tensor, Tensor] = gsplat.accumulate(
-        centers, conics, splats.opacities[None], features, pairs.gaussians, pairs.pixels, pairs.images, c.width_px,
+        centers,
+        conics,
+        splats.opacities[None],
+        features,
+        pairs.gaussians,
+        pairs.pixels,
+        pairs.images,
+        c.width_px,
         c.height_px,
-    )  # fmt: skip
+    )
     return out
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from genre_tasks.logs.types import Float64
 from genre_tasks.render import Cameras, Render, RenderSettings, render
 from genre_tasks.scene.gaussians import Splats
-from genre_tasks.scene.initialise import neighbour_spacing
+from genre_tasks.scene.initial_gaussians import neighbour_spacing
 
 SEED = 7
 FIELD_OF_VIEW_DEG = 70.0

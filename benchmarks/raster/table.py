@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from benchmarks.bench import Row
+from benchmarks.common.bench import Row
 from benchmarks.raster.scenes import CASES
 
 

@@ -21,9 +21,9 @@ from pathlib import Path
 import torch
 
 from flows.configuration import load_configuration
-from flows.machine import machine
-from flows.pipeline import PIPELINE
-from flows.produce import ArtifactRef, Job, produce
+from flows.machine.facts import machine
+from flows.pipeline.definition import PIPELINE
+from flows.pipeline.stage_runner import ArtifactRef, Job, produce
 
 EVERY_EFFECT = (
     "rolling_shutter_s=0.03&exposure_jitter=0.2&white_balance_jitter=0.05&bonnet=0.08&distortion=0.02"
@@ -74,9 +74,7 @@ CASES = {
     "real_chunk_1": Case("pandaset:{pandaset}", 1, "small"),
     "adam": Case(DEMO_LOG, 0, "demo", ("gnet.method=adam", "gnet.iterations=12"), SCENE_STAGES),
     "g3r": Case(DEMO_LOG, 0, "demo", ("gnet.method=g3r", "gnet.iterations=12"), SCENE_STAGES),
-    "street_gs": Case(
-        DEMO_LOG, 0, "demo", ("gnet.method=street_gs", "gnet.per_scene.iterations=600"), SCENE_STAGES
-    ),
+    "street_gs": Case(DEMO_LOG, 0, "demo", ("gnet.method=street_gs", "gnet.per_scene.iterations=600"), SCENE_STAGES),
     "standard_3dgs": Case(
         DEMO_LOG, 0, "demo", ("gnet.method=standard_3dgs", "gnet.per_scene.iterations=600"), SCENE_STAGES
     ),

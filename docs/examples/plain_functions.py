@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from flows.configuration import load_configuration
 from genre_tasks.logs.registry import open_log
-from genre_tasks.scene.results import Evaluation
+from genre_tasks.metrics.results import Evaluation
 from genre_tasks.stages.enet import enet
 from genre_tasks.stages.evaluate import evaluate_scene
 from genre_tasks.stages.fnet import fnet

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from flows.budget.chooser import Chooser, images_of
-from flows.budget.clock import Clock
-from flows.budget.measured import Table, load, shipped_table
-from flows.calibration import calibration_s
+from flows.budget.cost_table import Table, load, shipped_table
+from flows.budget.deadline import Clock
 from flows.configuration import differences
+from flows.machine.calibration import calibration_s
 from genre_tasks.config import PipelineConfig
 
 

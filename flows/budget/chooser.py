@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from flows.budget.clock import Clock
-from flows.budget.measured import Point, Table
+from flows.budget.cost_table import Point, Table
+from flows.budget.deadline import Clock
 from flows.configuration import with_settings
-from flows.logs import opened_log
-from flows.pipeline import BY_NAME, reconstructing_until
+from flows.pipeline.definition import BY_NAME, reconstructing_until
+from flows.pipeline.log_cache import opened_log
 from genre_tasks.config import PipelineConfig
 
 BORDER_S = 0.6

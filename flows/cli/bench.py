@@ -25,10 +25,12 @@ class BenchEntry:
 _BENCHES: dict[str, BenchEntry] = {
     "effects": BenchEntry("benchmarks.effects:EFFECTS", "what each effect brings where a log calls for it"),
     "evaluation": BenchEntry("benchmarks.evaluation:EVALUATION", "whether budgets are kept, and what guards tell"),
-    "facades": BenchEntry("benchmarks.with_without:FACADES", "what completing façades above the LiDAR's view brings"),
+    "facades": BenchEntry(
+        "benchmarks.optimiser.ablation:FACADES", "what completing façades above the LiDAR's view brings"
+    ),
     "fixer": BenchEntry("benchmarks.fixer:BENCH", "what FNet brings beside the path, and what it costs"),
-    "ground": BenchEntry("benchmarks.with_without:GROUND", "what holding the ground in its plane brings"),
-    "main_job": BenchEntry("benchmarks.main_job:BENCH", "the pipeline on claim seeds and a real chunk"),
+    "ground": BenchEntry("benchmarks.optimiser.ablation:GROUND", "what holding the ground in its plane brings"),
+    "main_job": BenchEntry("benchmarks.pipeline:BENCH", "the pipeline on claim seeds and a real chunk"),
     "optimiser": BenchEntry(
         "benchmarks.optimiser:BENCH", "GNet's seconds and renders beside per-scene 3DGS and tuned Adam"
     ),
@@ -37,7 +39,7 @@ _BENCHES: dict[str, BenchEntry] = {
 
 
 def register(name: str, target: str, about: str = "") -> None:
-    """Adds a benchmark: ``target`` is ``"module:NAME"`` of a :class:`benchmarks.bench.Bench`."""
+    """Adds a benchmark: ``target`` is ``"module:NAME"`` of a :class:`benchmarks.common.bench.Bench`."""
     if name in _BENCHES and _BENCHES[name].target != target:
         raise ValueError(f"the benchmark {name!r} exists already, at {_BENCHES[name].target}")
     _BENCHES[name] = BenchEntry(target, about)
@@ -73,10 +75,10 @@ def bench(
     from genre_tasks.errors import ConfigError
 
     chosen = load(name)
-    runner = importlib.import_module("benchmarks.run")
+    runner = importlib.import_module("benchmarks.common.runner")
     options = runner.options_of(chosen, tuple(settings or ()))
     if dry_run:
-        from flows.cli.tables import print_rows
+        from flows.cli.printing import print_rows
 
         listed = runner.dry_run(runner.plan(chosen, options, quick, fresh))
         print_rows(f"genre bench {name} (dry run)", listed)

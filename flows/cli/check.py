@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from genre_tasks.logs.check import LogCheck
+    from genre_tasks.logs.validation import LogCheck
 
 
 def check(
@@ -17,8 +17,8 @@ def check(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object to stdout.")] = False,
 ) -> None:
     """Say what a log has and lacks: cameras, images, sweeps, tracks, times, travel, chunks. Exit code 1: unusable."""
-    from genre_tasks.logs.check import check_log
     from genre_tasks.logs.registry import open_log
+    from genre_tasks.logs.validation import check_log
 
     found = check_log(open_log(log))
     if as_json:
@@ -30,7 +30,7 @@ def check(
 
 
 def _print(log: str, found: LogCheck) -> None:
-    from flows.cli.tables import print_fields
+    from flows.cli.printing import print_fields
 
     fields = {name: value for name, value in dataclasses.asdict(found).items() if name not in ("uri", "cameras")}
     cameras = {

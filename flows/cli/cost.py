@@ -29,11 +29,11 @@ def cost(
 
     Finished stages come from the store, so a sweep that was stopped goes on where it was.
     """
-    from flows.cli.numbers import numbers
-    from flows.cli.tables import print_rows
-    from flows.cost.cell import Sweep
-    from flows.cost.flow import cost_of_accuracy, planned
-    from flows.cost.prediction import predicted
+    from flows.cli.parsing import numbers
+    from flows.cli.printing import print_rows
+    from flows.cost_sweep.cell import Sweep
+    from flows.cost_sweep.flow import cost_of_accuracy, planned
+    from flows.cost_sweep.prediction import predicted
 
     chosen, order = numbers(chunks, "--chunks"), numbers(seeds, "--seeds")
     names = knobs.split(",") if knobs else None

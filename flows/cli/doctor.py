@@ -39,7 +39,7 @@ def doctor(
     if as_json:
         typer.echo(json.dumps(found))
         return
-    from flows.cli.tables import print_fields
+    from flows.cli.printing import print_fields
 
     print_fields("genre doctor", found)
 
@@ -47,7 +47,7 @@ def doctor(
 def _machine() -> dict[str, Any]:
     import psutil
 
-    from flows.memory import memory_limit_gib
+    from flows.machine.memory import memory_limit_gib
 
     total = psutil.virtual_memory().total / 2**30
     out: dict[str, Any] = {
@@ -69,7 +69,7 @@ def _renderer() -> str:
 
     try:
         from genre_tasks.compiled.loader import candidate_isas
-        from genre_tasks.render.kernel_library import load_kernel
+        from genre_tasks.render.kernel.library import load_kernel
 
         load_kernel()
         return f"cpu kernel, {candidate_isas()[0]}"

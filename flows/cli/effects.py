@@ -23,13 +23,13 @@ def effects(
     out: Annotated[Path | None, typer.Option(help="A folder for effects.parquet and effects.png.")] = None,
 ) -> None:
     """Say for each effect what of the log decides, its threshold, the decision and what enabling would cost."""
-    from flows.cli.tables import print_rows
+    from flows.cli.printing import print_rows
     from flows.configuration import load_configuration
-    from flows.effects import effects_of
-    from flows.produce import Job
+    from flows.pipeline.effects_plan import effects_of
+    from flows.pipeline.stage_runner import Job
+    from flows.plots.effects_plot import drawn
     from storage.codecs import codec_of
     from storage.codecs.png import write_png
-    from storage.effects_picture import drawn
 
     config = load_configuration(preset, settings=settings or [])
     found = effects_of(Job(log, chunk, store, config.model_dump(mode="json")))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from flows.produce import ArtifactRef, Job
+    from flows.pipeline.stage_runner import ArtifactRef, Job
 
 
 def figure(
@@ -32,11 +32,11 @@ def figure(
 
     Stages that the store has not are computed.
     """
+    from flows.atomic_file import anew
     from flows.cli.terminal import TerminalReporter
-    from flows.files import anew
-    from flows.produce import produce
-    from flows.tables.figure import TABLE, drawn, kind_of, strips
-    from flows.tables.request import Request
+    from flows.paper_tables.figure import TABLE, drawn, kind_of, strips
+    from flows.paper_tables.request import Request
+    from flows.pipeline.stage_runner import produce
     from genre_tasks.errors import ConfigError
     from storage.codecs.png import write_png
 
@@ -44,9 +44,7 @@ def figure(
     if out.suffix != ".png":
         raise ConfigError(f"cannot write {out.name!r}", remedy="Give --out x.png.")
     own = tuple(str(f) for f in methods or ())
-    request = Request(
-        TABLE[chosen], (log,), preset, store, (chunk,), tuple(settings or ()), own, tuple(weights or ())
-    )  # fmt: skip
+    request = Request(TABLE[chosen], (log,), preset, store, (chunk,), tuple(settings or ()), own, tuple(weights or ()))
     plan = request.planned()
     reporter = TerminalReporter(f"figure {chosen}")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import typer
 
-from flows.cli import bench, check, cost, doctor, effects, figure, reliable, render, run, show, table, train, verify
+from flows.cli import bench, check, cost, doctor, effects, figure, paper_table, range, render, run, show, train, verify
 
 app = typer.Typer(
     name="genre",
@@ -22,12 +22,12 @@ app.command(name="run")(run.run)
 app.command(name="check")(check.check)
 app.command(name="effects")(effects.effects)
 app.command(name="render")(render.render)
-app.command(name="range")(reliable.reliable)
+app.command(name="range")(range.reliable)
 app.command(name="show")(show.show)
 app.command(name="verify")(verify.verify)
 app.command(name="doctor")(doctor.doctor)
 app.command(name="cost")(cost.cost)
-app.command(name="table")(table.table)
+app.command(name="table")(paper_table.table)
 app.command(name="figure")(figure.figure)
 app.command(name="bench")(bench.bench)
 app.add_typer(train.app, name="train")

@@ -29,7 +29,7 @@ def render(
     store: Annotated[str, typer.Option(help="The run's store.")] = "genre-store",
 ) -> None:
     """Render a scene of a finished run at the recorded poses or shifted to the side."""
-    from flows.runs import last_stage, stage_scene, stage_value
+    from flows.reconstruction.run_records import last_stage, stage_scene, stage_value
     from genre_tasks.errors import InputError
 
     if out.suffix not in (".mp4", ".png", ".exr"):
@@ -67,7 +67,7 @@ def _rendered(chunk: Chunk, scene: SceneGraph, camera: str, frames: list[int], s
 
     from genre_tasks.errors import InputError
     from genre_tasks.render import render_views
-    from genre_tasks.scene.novel import novel_view_poses
+    from genre_tasks.scene.novel_poses import novel_view_poses
 
     views = [v for v in novel_view_poses(chunk, (shift,), frames=frames) if v.camera == camera]
     if not views:

@@ -42,10 +42,10 @@ def run(
     """
     import psutil
 
-    from flows.cli.numbers import numbers, seconds
+    from flows.cli.parsing import numbers, seconds
     from flows.configuration import load_configuration
-    from flows.logs import opened_log
-    from flows.pipeline import RECONSTRUCTING
+    from flows.pipeline.definition import RECONSTRUCTING
+    from flows.pipeline.log_cache import opened_log
     from genre_tasks.errors import ConfigError
 
     began = psutil.Process().create_time()
@@ -69,12 +69,18 @@ def run(
     from flows.cli.terminal import print_run, reporting
 
     with reporting():
-        from flows.reconstruct import reconstruct_log
+        from flows.reconstruction.flow import reconstruct_log
 
         summary = reconstruct_log(
-            log, preset=preset, store=store, chunks=wanted, config=effective.model_dump(mode="json"),
-            budget_s=budget_s, began=began, table=given,
-        )  # fmt: skip
+            log,
+            preset=preset,
+            store=store,
+            chunks=wanted,
+            config=effective.model_dump(mode="json"),
+            budget_s=budget_s,
+            began=began,
+            table=given,
+        )
     if as_json:
         shown = ("log", "preset", "store", "run", "chunks", "budget")
         typer.echo(json.dumps({key: summary[key] for key in shown if key in summary}))
@@ -83,12 +89,17 @@ def run(
 
 
 def _chosen(
-    log: str, preset: str, chunks: list[int] | None, config: PipelineConfig, budget_s: float, began: float,
+    log: str,
+    preset: str,
+    chunks: list[int] | None,
+    config: PipelineConfig,
+    budget_s: float,
+    began: float,
     table: str | None,
-) -> tuple[PipelineConfig, str]:  # fmt: skip
+) -> tuple[PipelineConfig, str]:
     """What a budget would begin the first chunk with, and the stage where that ends; said on stderr."""
     from flows.budget.budget import Budget
-    from flows.logs import chosen_chunks
+    from flows.pipeline.log_cache import chosen_chunks
 
     budget, wanted = Budget(budget_s, began, table, preset, config), chosen_chunks(log, config, chunks)
     typer.echo(budget.told(), err=True)
@@ -104,7 +115,7 @@ def _dry_run(
 ) -> None:
     from flows.cli.terminal import print_plan
     from flows.configuration import differences
-    from flows.predict import plan_run
+    from flows.pipeline.prediction import plan_run
 
     plan: dict[str, Any] = plan_run(log, store, chunks, config, end)
     plan |= {"preset": preset, "differs": {k: list(v) for k, v in differences(config, preset).items()}}

@@ -20,14 +20,14 @@ def show(
     picture: Annotated[Path | None, typer.Option(help="Write the artifact's picture to this PNG.")] = None,
 ) -> None:
     """Show what a store holds: `genre show`, `genre show stages`, `genre show RUN`, `genre show KEY`."""
-    from flows.cli.tables import print_fields, print_rows
+    from flows.cli.printing import print_fields, print_rows
 
     if what == "config":
         from flows.configuration import load_configuration
 
         print_fields(f"preset {preset}", load_configuration(preset).model_dump())
     elif what == "runs":
-        from flows.runs import recorded_runs
+        from flows.reconstruction.run_records import recorded_runs
 
         print_rows("runs", [_run_row(run) for run in recorded_runs(store)])
     elif what == "stages":
@@ -67,8 +67,8 @@ def _row(artifact: Artifact) -> dict[str, Any]:
 
 
 def _show_one(what: str, store: str, picture: Path | None) -> None:
-    from flows.cli.tables import print_fields, print_rows
-    from flows.runs import recorded_runs
+    from flows.cli.printing import print_fields, print_rows
+    from flows.reconstruction.run_records import recorded_runs
     from genre_tasks.errors import InputError
     from storage.local import open_store
 
@@ -91,8 +91,8 @@ def _show_one(what: str, store: str, picture: Path | None) -> None:
             remedy="`genre show runs` and `genre show stages` list them; give more of the name.",
             file=store,
         )
+    from flows.plots.artifact_pictures import draw_artifact
     from storage.lineage import ancestors, describe
-    from storage.lineage import picture as picture_of
 
     (artifact,) = found
     print_fields("manifest", artifact.manifest.model_dump(exclude={"files"}))
@@ -101,7 +101,7 @@ def _show_one(what: str, store: str, picture: Path | None) -> None:
         print_rows(table.name, table.rows)
     print_rows("made from", [_row(a) for a in ancestors(opened, artifact)])
     if picture is not None:
-        image = picture_of(opened, artifact)
+        image = draw_artifact(opened, artifact)
         if image is None:
             raise InputError(
                 "this artifact has no picture", remedy="Leave out --picture.", stage=artifact.manifest.stage

@@ -18,7 +18,7 @@ from rich.table import Table
 if TYPE_CHECKING:
     from types import TracebackType
 
-    from flows.produce import ArtifactRef
+    from flows.pipeline.stage_runner import ArtifactRef
 
 _HEADLINES = {
     "interpolation/psnr": "PSNR",
@@ -132,7 +132,7 @@ def _starts_a_server() -> bool:
 
 def reporting(what: str = "starting Prefect") -> TerminalReporter:
     """Makes Prefect's home and a reporter, and has the process's runs tell it; to be used as a context."""
-    from flows.reporting import report_to
+    from flows.pipeline.progress import report_to
 
     Path(os.environ["PREFECT_HOME"]).mkdir(parents=True, exist_ok=True)
     reporter = TerminalReporter(what, flows=True)

@@ -39,7 +39,7 @@ OneStage = Annotated[str | None, typer.Option(help="This stage alone, e.g. gnet/
 def pairs(folder: Folder = Path("training"), real: Real = None, streets: Streets = 28) -> None:
     """Make FNet's training pairs: degraded render and truth, with reference images and LiDAR map."""
     with _reported("training pairs"):
-        from flows.train.fixer_flow import train_pairs
+        from flows.training.fixer_flow import train_pairs
 
         made = train_pairs(str(folder), real, streets)
     typer.echo(f"{made['pairs']} pairs of {made['scenes']} scenes in {folder / 'store'}")
@@ -49,16 +49,18 @@ def pairs(folder: Folder = Path("training"), real: Real = None, streets: Streets
 
 @app.command()
 def fnet(
-    folder: Folder = Path("training"), real: Real = None, streets: Streets = 28,
+    folder: Folder = Path("training"),
+    real: Real = None,
+    streets: Streets = 28,
     inputs: Annotated[str, typer.Option(help="What it is given, joined by +.")] = "render+reference+lidar",
     preset: Annotated[str, typer.Option(help="small; further and last, each from the one before; paper.")] = "small",
     start: Annotated[str | None, typer.Option(help="Weights to train further; SD-Turbo's for paper.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Weight updates; the preset's if not given.")] = None,
     validate: Annotated[bool, typer.Option(help="Scores and a picture of seeds 900–902 at each checkpoint.")] = False,
-) -> None:  # fmt: skip
+) -> None:
     """Train FNet on the pairs; those that are not there yet are made."""
     with _reported("training fnet"):
-        from flows.train.fixer_flow import train_fnet
+        from flows.training.fixer_flow import train_fnet
 
         weights = train_fnet(str(folder), real, streets, inputs, preset, start, steps, validate)["weights"]
     typer.echo(f"weights in {weights}; use them with --set fnet.weights={weights}")
@@ -70,7 +72,7 @@ def scenes(
 ) -> None:
     """Make the scenes that GNet and ENet train on: chunks, true views, per-scene 3DGS, FNet's images of it."""
     with _reported("training scenes"):
-        from flows.train.flow import train_scenes
+        from flows.training.optimiser_flow import train_scenes
 
         made = train_scenes(str(folder), recipe, real, fnet)
     typer.echo(f"{made['scenes']} scenes in {folder / 'store'}, {made['made']} artifacts of them made now")
@@ -78,26 +80,38 @@ def scenes(
 
 @app.command()
 def gnet(
-    folder: Folder = Path("training"), recipe: Recipe = "shipped", real: Real = None, novel: Novel = None,
-    fnet: Fixer = "builtin", device: Device = "auto", save_every: SaveEvery = 50, validate_every: ValidateEvery = 0,
+    folder: Folder = Path("training"),
+    recipe: Recipe = "shipped",
+    real: Real = None,
+    novel: Novel = None,
+    fnet: Fixer = "builtin",
+    device: Device = "auto",
+    save_every: SaveEvery = 50,
+    validate_every: ValidateEvery = 0,
     stage: OneStage = None,
-) -> None:  # fmt: skip
+) -> None:
     """Train GNet, in the stages of the recipe; scenes that are not there yet are made."""
     _train("gnet", folder, recipe, real, novel, fnet, device, save_every, validate_every, stage)
 
 
 @app.command()
 def enet(
-    folder: Folder = Path("training"), recipe: Recipe = "shipped", real: Real = None, fnet: Fixer = "builtin",
-    device: Device = "auto", save_every: SaveEvery = 50, validate_every: ValidateEvery = 0, stage: OneStage = None,
-) -> None:  # fmt: skip
+    folder: Folder = Path("training"),
+    recipe: Recipe = "shipped",
+    real: Real = None,
+    fnet: Fixer = "builtin",
+    device: Device = "auto",
+    save_every: SaveEvery = 50,
+    validate_every: ValidateEvery = 0,
+    stage: OneStage = None,
+) -> None:
     """Train ENet, in the stages of the recipe, after those of GNet that they need."""
     _train("enet", folder, recipe, real, None, fnet, device, save_every, validate_every, stage)
 
 
 def _train(network: str, folder: Path, *values: Any) -> None:
     with _reported(f"training {network}"):
-        from flows.train.flow import train_network
+        from flows.training.optimiser_flow import train_network
 
         result = train_network(network, str(folder), *values)
     typer.echo(f"weights in {result['weights']}; use them with --set {network}.weights={result['weights']}")

@@ -7,8 +7,8 @@ import os
 import platform
 from pathlib import Path
 
-from genre_tasks.compiled import recipe
-from genre_tasks.compiled.recipe import Kernel
+from genre_tasks.compiled import build
+from genre_tasks.compiled.build import Kernel
 from genre_tasks.errors import ConfigError, ResourceError
 
 REMEDY = "Run `pip install -e .` in the repository (it needs a C++ compiler: g++, clang++ or what CXX names)"
@@ -30,7 +30,7 @@ def _cpu_flags() -> set[str]:
 
 def supported_isas() -> list[str]:
     """The instruction sets of the kernels that this machine can run, best first (never one that it lacks)."""
-    if "generic" in recipe.isas():
+    if "generic" in build.isas():
         return ["generic"]
     flags = _cpu_flags()
     if not flags and platform.system() != "Linux":

@@ -15,12 +15,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from genre_tasks.effects.seen import Seen
+from genre_tasks.effects.measurements import Seen
 from genre_tasks.effects.types import Effect, Measured
 from genre_tasks.logs.types import Float32, Float64
 from genre_tasks.scene.chunk import Chunk, View
-from genre_tasks.scene.coloring import visible
-from genre_tasks.scene.geometry import shift_laterally
+from genre_tasks.scene.transforms import shift_laterally
+from genre_tasks.scene.visibility import visible
 
 THRESHOLD = 2.0
 """A tenth of a decibel at 3 m is gained from about 1.65 on (a validation street at standstill: ratio 1.55, 0.06 dB; two

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from genre_tasks.effects.seen import Seen
+from genre_tasks.effects.measurements import Seen
 from genre_tasks.effects.types import Effect, Measured
 from genre_tasks.logs.types import Float32
 from genre_tasks.scene.chunk import View

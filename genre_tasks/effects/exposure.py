@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from genre_tasks.effects.seen import Seen
+from genre_tasks.effects.measurements import Seen
 from genre_tasks.effects.types import Effect, Fitted, Measured
 from genre_tasks.scene.chunk import Gain, View
 

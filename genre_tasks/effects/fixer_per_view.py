@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from genre_tasks.effects.seen import Seen
+from genre_tasks.effects.measurements import Seen
 from genre_tasks.effects.types import Effect, Measured
 
 

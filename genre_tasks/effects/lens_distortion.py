@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from genre_tasks.effects.seen import Seen
+from genre_tasks.effects.measurements import Seen
 from genre_tasks.effects.types import Effect, Measured
-from genre_tasks.scene.distortion import distort
+from genre_tasks.scene.lens_distortion import distort
 
 _GRID = 33
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from genre_tasks.effects.seen import Seen
+from genre_tasks.effects.measurements import Seen
 from genre_tasks.effects.types import Effect, Measured
-from genre_tasks.scene.depth import lidar_depth
+from genre_tasks.scene.lidar_depth import lidar_depth
 
 
 def measure(seen: Seen) -> Measured:

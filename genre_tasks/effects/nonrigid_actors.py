@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from genre_tasks.effects.seen import Seen
+from genre_tasks.effects.measurements import Seen
 from genre_tasks.effects.types import Effect, Measured
-from genre_tasks.scene.boxes import outline
+from genre_tasks.scene.box_projection import outline
 from genre_tasks.scene.chunk import Chunk, View
 from genre_tasks.scene.graph import SceneGraph
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from genre_tasks.config import EffectsConfig
-from genre_tasks.effects.seen import Seen
+from genre_tasks.effects.measurements import Seen
 from genre_tasks.effects.types import Choice, Decision, Effect, EffectsPlan, Fitted, Measured
 from genre_tasks.errors import ConfigError
 from genre_tasks.logs.types import Camera
@@ -52,9 +52,16 @@ def _decided(name: str, setting: str, seen: Seen) -> Decision:
     choice, reason = _choice(effect, found, setting)
     value = math.nan if found.value is None else found.value
     return Decision(
-        name, effect.property, value, effect.unit, effect.threshold, "on" if setting == "on" else "auto", choice,
-        reason, effect.cost,
-    )  # fmt: skip
+        name,
+        effect.property,
+        value,
+        effect.unit,
+        effect.threshold,
+        "on" if setting == "on" else "auto",
+        choice,
+        reason,
+        effect.cost,
+    )
 
 
 def _choice(effect: Effect, found: Measured, setting: str) -> tuple[Choice, str]:

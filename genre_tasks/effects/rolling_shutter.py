@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from genre_tasks.effects.motion import displaced, motions
-from genre_tasks.effects.seen import Seen
+from genre_tasks.effects.measurements import Seen
+from genre_tasks.effects.pixel_motion import displaced, motions
 from genre_tasks.effects.types import Effect, Fitted, Measured
 from genre_tasks.logs.types import RollingShutter
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from genre_tasks.logs.types import MotionBlur, RollingShutter
 
 if TYPE_CHECKING:
-    from genre_tasks.effects.seen import Seen
+    from genre_tasks.effects.measurements import Seen
 
 BASIC = frozenset({"rigid_actors", "distant_region", "lidar_depth"})
 """What a scene has that was not planned for."""

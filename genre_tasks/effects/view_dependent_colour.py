@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from genre_tasks.effects.seen import Seen
+from genre_tasks.effects.measurements import Seen
 from genre_tasks.effects.types import Effect, Measured
 
 MIN_VIEWS = 3
@@ -29,6 +29,10 @@ def measure(seen: Seen) -> Measured:
 
 
 EFFECT = Effect(
-    "view_dependent_colour", "spread of a point's colour per its texture's", "ratio", 0.7,
-    "eight harmonics a colour: 24 more numbers a Gaussian beside 14", measure,
-)  # fmt: skip
+    "view_dependent_colour",
+    "spread of a point's colour per its texture's",
+    "ratio",
+    0.7,
+    "eight harmonics a colour: 24 more numbers a Gaussian beside 14",
+    measure,
+)

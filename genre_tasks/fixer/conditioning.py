@@ -13,22 +13,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from genre_tasks.errors import InputError
 from genre_tasks.fixer.network import Conditions
+from genre_tasks.fixer.source_images import references
 from genre_tasks.fixer.warping import MIN_ALPHA, SourceImage, Warp, choose, surface_of, warp
-from genre_tasks.render.surface import render_surfaces
-from genre_tasks.scene.chunk import Chunk, View
-from genre_tasks.scene.images import decode_image
-from genre_tasks.scene.lidar_map import lidar_scene
-from genre_tasks.scene.projection import NEAR_M
-from genre_tasks.scene.views import NovelView, NovelViews
+from genre_tasks.scene.chunk import Chunk
+from genre_tasks.scene.novel_views import NovelViews
 
 MAX_COLOUR_SHIFT = 0.03
 """Largest change of an image's mean per channel, where the render is more than half opaque. A fixer repairs structure;
 a larger drift of the whole image is an error of the network (about 8 of 255 levels, just visible side by side)."""
 
-OCCLUDING_POINTS = 60_000
-"""LiDAR points whose discs hide things from source images."""
 
 HOLE_ALPHA = 0.5
 """What is thinner than this is a hole, the more so the thinner."""
@@ -93,53 +87,6 @@ def _pull_push(color: Tensor, weight: Tensor) -> Tensor:
     return torch.where(weight > 1e-4, trust * local + (1 - trust) * coarse, coarse)
 
 
-def recorded(chunk: Chunk) -> tuple[SourceImage, ...]:
-    """The chunk's source images at the working resolution, with the depth from which LiDAR's points hide things.
-
-    Raises ``InputError`` for an unreadable image.
-    """
-    views = [v if v.blur is None else replace(v, blur=None) for v in chunk.of_role("source")]  # depth has none
-    with torch.no_grad():
-        map_ = render_surfaces(lidar_scene(chunk, OCCLUDING_POINTS), views)
-    depth = torch.where(map_.alpha >= MIN_ALPHA, map_.expected_depth(), torch.zeros_like(map_.alpha))
-    out = []
-    for view, hidden_at in zip(views, depth, strict=True):
-        image = _own_colours(view).permute(2, 0, 1)
-        if view.own is not None:  # what lies behind the vehicle is hidden by it
-            hidden_at = torch.where(torch.from_numpy(view.own), NEAR_M, hidden_at)
-        out.append(
-            SourceImage(view.camera, view.frame, view.chunk_SE3_camera, view.lens, image, hidden_at, view.shutter)
-        )
-    return tuple(out)
-
-
-def _own_colours(view: View) -> Tensor:
-    """[H, W, 3] the image, at the scene's own exposure where its gain is known."""
-    image = decode_image(view.image, view.lens.width_px, view.lens.height_px)
-    if view.log_gain is None:
-        return image
-    from genre_tasks.effects.exposure import neutral
-
-    return neutral(image, image.new_tensor(view.log_gain))
-
-
-def references(chunk: Chunk, views: Sequence[NovelView], sources: Sequence[SourceImage]) -> list[SourceImage]:
-    """The reference of each view. Raises ``InputError`` for one that is no source view of the chunk."""
-    known = {(s.camera, s.frame): s for s in sources}
-    for view in views:
-        if view.reference not in known:
-            raise InputError(
-                "the reference of a novel view is no view of the chunk",
-                remedy="Render the novel views of this chunk again.",
-                log=chunk.log,
-                chunk=chunk.index,
-                camera=view.reference[0],
-                frame=view.reference[1],
-                stage="fnet",
-            )
-    return [known[v.reference] for v in views]
-
-
 def degraded(chunk: Chunk, novel: NovelViews, indices: Sequence[int], sources: Sequence[SourceImage]) -> Degraded:
     """The views ``indices`` with what they are fixed from; ``sources`` are the chunk's (see :func:`recorded`)."""
     at = list(indices)
@@ -171,9 +118,10 @@ def _warps(chunk: Chunk, novel: NovelViews, index: int, sources: Sequence[Source
 
 def _stacked(warps: Sequence[Warp]) -> tuple[Tensor, Tensor, Tensor]:
     return (
-        torch.stack([w.color for w in warps]), torch.stack([w.mask for w in warps]),
+        torch.stack([w.color for w in warps]),
+        torch.stack([w.mask for w in warps]),
         torch.stack([w.spread for w in warps]),
-    )  # fmt: skip
+    )
 
 
 def depth_gap(depth: Tensor, alpha: Tensor, lidar_depth: Tensor, lidar_alpha: Tensor) -> Tensor:
@@ -188,12 +136,23 @@ def given(views: Degraded, inputs: Collection[str]) -> Degraded:
     from_ = {
         "render": ("color", "alpha", "warped", "warp_mask", "warp_spread", "depth_gap"),
         "reference": (
-            "reference", "warped", "warp_mask", "warp_spread", "lidar_warped", "lidar_warp_mask", "lidar_warp_spread",
+            "reference",
+            "warped",
+            "warp_mask",
+            "warp_spread",
+            "lidar_warped",
+            "lidar_warp_mask",
+            "lidar_warp_spread",
         ),
         "lidar": (
-            "lidar_color", "lidar_alpha", "lidar_warped", "lidar_warp_mask", "lidar_warp_spread", "depth_gap",
+            "lidar_color",
+            "lidar_alpha",
+            "lidar_warped",
+            "lidar_warp_mask",
+            "lidar_warp_spread",
+            "depth_gap",
         ),
-    }  # fmt: skip
+    }
     blank = {name for source, names in from_.items() if source not in inputs for name in names}
     return replace(views, **{name: torch.zeros_like(getattr(views, name)) for name in blank})
 

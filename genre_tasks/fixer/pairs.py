@@ -21,7 +21,7 @@ from genre_tasks.render.surface import render_surfaces
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.views import NovelView, NovelViews
+from genre_tasks.scene.novel_views import NovelView, NovelViews
 
 NAMES = tuple(f.name for f in fields(Degraded))
 """The tensors of ``Degraded``, in order."""
@@ -70,9 +70,14 @@ def render_pairs(
     with torch.no_grad():
         render, points = render_views(scene, views), render_surfaces(lidar, views)
     novel = NovelViews(
-        tuple(views), render.color, render.alpha, render.expected_depth(),
-        points.color, points.alpha, points.expected_depth(),
-    )  # fmt: skip
+        tuple(views),
+        render.color,
+        render.alpha,
+        render.expected_depth(),
+        points.color,
+        points.alpha,
+        points.expected_depth(),
+    )
     every = degraded(chunk, novel, range(len(views)), sources)
     images = torch.from_numpy(np.stack(truth)).permute(0, 3, 1, 2).contiguous()
     shifts = np.array([v.shift_m for v in views], np.float32)

@@ -20,7 +20,7 @@ from genre_tasks.logs.types import Float64, Lens, RollingShutter
 from genre_tasks.render.reference_camera import OneCamera
 from genre_tasks.render.types import Cameras
 from genre_tasks.scene.chunk import Actor
-from genre_tasks.scene.distortion import rays_at
+from genre_tasks.scene.lens_distortion import rays_at
 
 SOURCES = 5
 """Images looked at for a view, the reference among them: from six on, what is gained is under a tenth of a decibel."""

@@ -24,7 +24,9 @@ class ReaderEntry:
 
 _READERS: dict[str, ReaderEntry] = {
     "pandaset": ReaderEntry(
-        "genre_tasks.logs.pandaset:open_pandaset", "pandaset:PATH/002", "pip install genre (pillow is part of it)"
+        "genre_tasks.logs.pandaset.reader:open_pandaset",
+        "pandaset:PATH/002",
+        "pip install genre (pillow is part of it)",
     ),
     "synthetic": ReaderEntry(
         "genre_tasks.logs.synthetic:open_synthetic",

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from genre_tasks.errors import InputError
-from genre_tasks.metrics.threads import map_single_threaded
+from genre_tasks.threads import map_single_threaded
 
 TAPS = (0, 2, 4, 10, 14)
 """Blocks whose outputs are compared: strides 2, 4, 8, 16 and 32, the last block of each resolution but the head's."""
@@ -116,7 +116,7 @@ class PerceptualDistance(nn.Module):
 
 
 class _PerImage(torch.autograd.Function):
-    """The distance of each pair on one thread, forwards and backwards: see :mod:`genre_tasks.metrics.threads`."""
+    """The distance of each pair on one thread, forwards and backwards: see :mod:`genre_tasks.threads`."""
 
     @staticmethod
     def forward(ctx: Any, module: PerceptualDistance, a: Tensor, b: Tensor) -> Tensor:

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from genre_tasks.config import LossConfig
-from genre_tasks.errors import NonFiniteError
-from genre_tasks.optimiser.loss import Distance, image_gradients, plan_loss, residual_image
-from genre_tasks.optimiser.passes import RIGID_AND_DULL, Beside, begin
+from genre_tasks.losses.rendering_loss import Distance, image_gradients, plan_loss, residual_image
+from genre_tasks.losses.targets import Target
+from genre_tasks.optimiser.differentiable_render import RIGID_AND_DULL, Beside, begin
 from genre_tasks.optimiser.state import Frame
-from genre_tasks.optimiser.targets import Target
 from genre_tasks.render.types import RenderSettings
 
 if TYPE_CHECKING:
-    from genre_tasks.optimiser.gloss import GlossSight
+    from genre_tasks.optimiser.sh_optimiser import GlossSight
 
 
 @dataclass(frozen=True)
@@ -65,21 +62,3 @@ class Objective:
         loss, by_color, by_depth = image_gradients(self.config, image.color, image.depth, targets, plan, self.distance)
         gradient = image.gradient(by_color, by_depth, residual_image(image.color, targets) if residuals else None)
         return Sight(loss, gradient, image.culled, image.by_deformation, image.gloss, image.residuals)
-
-
-def check_finite(values: Tensor, name: str, stage: str, **where: object) -> None:
-    """Raises ``NonFiniteError`` naming the tensor and its first non-finite entry."""
-    if math.isfinite(_sum(values)):  # a tenth of the time; a sum that only overflows is looked at again below
-        return
-    bad = ~torch.isfinite(values)
-    if bool(bad.any()):
-        first = tuple(torch.nonzero(bad)[0].tolist())
-        raise NonFiniteError(stage, name, int(bad.sum()), first, **where)
-
-
-def _sum(values: Tensor) -> float:
-    """On the CPU by numpy: torch would wake its threads, which then spin for milliseconds beside the kernels'."""
-    if values.device.type == "cpu":
-        with np.errstate(over="ignore", invalid="ignore"):
-            return float(values.detach().numpy().sum())
-    return float(values.sum())

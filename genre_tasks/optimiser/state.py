@@ -9,10 +9,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from genre_tasks.optimiser import fused_state
-from genre_tasks.optimiser.ground import along_ground, ground_planes
-from genre_tasks.optimiser.network_constants import DEVIATION_FLOOR, SHARE_FLOOR_PX
-from genre_tasks.optimiser.posing import Posing
+from genre_tasks.optimiser.ground_constraint import along_ground, ground_planes
+from genre_tasks.optimiser.kernels import state_update
+from genre_tasks.optimiser.kernels.constants import DEVIATION_FLOOR, SHARE_FLOOR_PX
+from genre_tasks.optimiser.kernels.posing import Posing
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import DISTANT, SceneGraph
 
@@ -115,9 +115,9 @@ class State:
 
     def saw(self, gradient: Tensor, residuals: Tensor | None = None) -> State:
         """With this iteration's gradient [N, 14] with respect to ``offsets`` taken into the moments; its residuals."""
-        if fused_state.fits(gradient, self.first, self.second, self.seen):
+        if state_update.fits(gradient, self.first, self.second, self.seen):
             decays = (FIRST_DECAY, SECOND_DECAY)
-            first, second, seen, now = fused_state.saw(gradient, self.first, self.second, self.seen, decays)
+            first, second, seen, now = state_update.saw(gradient, self.first, self.second, self.seen, decays)
             return replace(self, first=first, second=second, seen=seen, seen_now=now, residuals=residuals)
         now = (gradient != 0).any(1, keepdim=True).to(gradient.dtype)
         first = self.first + now * (1 - FIRST_DECAY) * (gradient - self.first)
@@ -133,8 +133,8 @@ class State:
         A direction kept from earlier views would lead on and on what nothing corrects.
         """
         fixed = frame.start, frame.low, frame.high, frame.planes
-        if fused_state.fits(self.offsets, delta, self.seen_now, *fixed):
-            offsets = fused_state.moved(self.offsets, delta, self.seen_now, *fixed)
+        if state_update.fits(self.offsets, delta, self.seen_now, *fixed):
+            offsets = state_update.moved(self.offsets, delta, self.seen_now, *fixed)
             return replace(self, offsets=offsets, iteration=self.iteration + 1)
         delta = along_ground(delta, frame.planes)
         offsets = torch.where(self.seen_now > 0, frame.bounded(self.offsets + delta), self.offsets)

@@ -11,21 +11,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from genre_tasks.checks import check_finite
 from genre_tasks.errors import InputError
-from genre_tasks.optimiser.objective import Objective, check_finite
-from genre_tasks.optimiser.passes import Beside
-from genre_tasks.optimiser.rules import StepRule, schedule
-from genre_tasks.optimiser.sampler import ViewSampler
-from genre_tasks.optimiser.splitting import split_where_images_have_more
+from genre_tasks.losses.targets import Target
+from genre_tasks.optimiser.differentiable_render import Beside
+from genre_tasks.optimiser.objective import Objective
+from genre_tasks.optimiser.residual_splitting import split_where_images_have_more
 from genre_tasks.optimiser.state import Frame, State
-from genre_tasks.optimiser.targets import Target
+from genre_tasks.optimiser.step_rules import StepRule, schedule
+from genre_tasks.optimiser.view_sampler import ViewSampler
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.results import Reconstruction
+from genre_tasks.scene.reconstruction import Reconstruction
 
 if TYPE_CHECKING:
-    from genre_tasks.optimiser.deforming import DeformationFit
-    from genre_tasks.optimiser.gloss import GlossState
+    from genre_tasks.optimiser.deformation_optimiser import DeformationFit
+    from genre_tasks.optimiser.sh_optimiser import GlossState
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,7 @@ def _deforming(scene: SceneGraph) -> DeformationFit | None:
     """What fits the offsets of a scene whose actors deform."""
     if scene.deformation is None:
         return None
-    from genre_tasks.optimiser.deforming import DeformationFit
+    from genre_tasks.optimiser.deformation_optimiser import DeformationFit
 
     return DeformationFit(scene.deformation)
 
@@ -143,7 +144,7 @@ def _gloss_of(scene: SceneGraph) -> GlossState | None:
     """What harmonics need, where the scene has any."""
     if scene.harmonics is None:
         return None
-    from genre_tasks.optimiser.gloss import GlossState
+    from genre_tasks.optimiser.sh_optimiser import GlossState
 
     return GlossState.start(scene.harmonics)
 

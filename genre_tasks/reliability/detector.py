@@ -14,7 +14,7 @@ from torch.nn.functional import interpolate
 
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.logs.types import Float32, Float64
-from genre_tasks.scene.boxes import Seeing, outline
+from genre_tasks.scene.box_projection import Seeing, outline
 from genre_tasks.scene.chunk import Chunk
 
 ROAD_USERS = (0, 1, 2, 3, 5, 7)

@@ -13,7 +13,7 @@ from torch import Tensor
 from genre_tasks.fixer.conditioning import degraded
 from genre_tasks.fixer.warping import SourceImage
 from genre_tasks.scene.chunk import Chunk
-from genre_tasks.scene.views import NovelView, NovelViews
+from genre_tasks.scene.novel_views import NovelView, NovelViews
 
 if TYPE_CHECKING:
     from genre_tasks.reliability.detector import Detector
@@ -87,10 +87,16 @@ def _guards(
     image = found.color[0].clamp(0, 1).permute(1, 2, 0)
     actors, detected = (0, 0) if detector is None else detector.found(chunk, view, image)
     return Guards(
-        view.camera, view.frame, view.shift_m, _decibels(error[shown]),
-        _share(found.warp_mask > SEEN), _share(found.alpha < SEEN), float(near.sum()) / max(1, int(known.sum())),
-        actors, detected,
-    )  # fmt: skip
+        view.camera,
+        view.frame,
+        view.shift_m,
+        _decibels(error[shown]),
+        _share(found.warp_mask > SEEN),
+        _share(found.alpha < SEEN),
+        float(near.sum()) / max(1, int(known.sum())),
+        actors,
+        detected,
+    )
 
 
 def _floating(novel: NovelViews, index: int) -> tuple[Tensor, Tensor]:

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from genre_tasks.errors import NonFiniteError
 from genre_tasks.logs.types import RollingShutter
-from genre_tasks.render.blur import Moments, PosedView
+from genre_tasks.render.motion_blur import Moments, PosedView
 from genre_tasks.render.types import Cameras, Render, RenderSettings, Shown
 from genre_tasks.scene.gaussians import Splats
-from genre_tasks.scene.geometry import matrix_to_quat, quat_multiply
 from genre_tasks.scene.graph import SceneGraph
+from genre_tasks.scene.transforms import matrix_to_quat, quat_multiply
 
 DEFAULT = RenderSettings()
 
@@ -89,7 +89,7 @@ def render_views(
 
 def colors_of(scene: SceneGraph, views: Sequence[PosedView]) -> Tensor:
     """What each view sees of a scene with harmonics, [V, N, 3], laid out as by ``SceneGraph.posed``."""
-    from genre_tasks.render.gloss import seen_colors
+    from genre_tasks.render.spherical_harmonics import seen_colors
 
     return seen_colors(scene, [v.frame for v in views], np.stack([v.chunk_SE3_camera[:3, 3] for v in views]))
 
@@ -191,12 +191,17 @@ def _check_shapes(splats: Splats, cameras: Cameras) -> None:
     n, v = len(splats), len(cameras)
     colors = (v, n, 3) if splats.colors.dim() == 3 else (n, 3)
     expected: dict[str, tuple[Tensor | None, tuple[int, ...]]] = {
-        "means": (splats.means, (n, 3)), "scales": (splats.scales, (n, 3)), "quats": (splats.quats, (n, 4)),
-        "opacities": (splats.opacities, (n,)), "colors": (splats.colors, colors),
-        "camera_SE3_chunk": (cameras.camera_SE3_chunk, (v, 4, 4)), "focal_px": (cameras.focal_px, (v, 2)),
-        "center_px": (cameras.center_px, (v, 2)), "velocities": (splats.velocities, (n, 3)),
+        "means": (splats.means, (n, 3)),
+        "scales": (splats.scales, (n, 3)),
+        "quats": (splats.quats, (n, 4)),
+        "opacities": (splats.opacities, (n,)),
+        "colors": (splats.colors, colors),
+        "camera_SE3_chunk": (cameras.camera_SE3_chunk, (v, 4, 4)),
+        "focal_px": (cameras.focal_px, (v, 2)),
+        "center_px": (cameras.center_px, (v, 2)),
+        "velocities": (splats.velocities, (n, 3)),
         "distortion": (cameras.distortion, (v, 5)),
-    }  # fmt: skip
+    }
     if (shutter := cameras.shutter) is not None:
         expected["readout_s"] = shutter.readout_s, (v,)
         expected |= {"velocity_m_s": (shutter.velocity_m_s, (v, 3)), "turn_rad_s": (shutter.turn_rad_s, (v, 3))}

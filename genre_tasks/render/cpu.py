@@ -11,9 +11,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from genre_tasks.errors import ResourceError
-from genre_tasks.render.bent import Domain, domain_of
 from genre_tasks.render.constants import CULL_REASONS
-from genre_tasks.render.kernel_library import load_kernel
+from genre_tasks.render.kernel.library import load_kernel
+from genre_tasks.render.lens_domain import Domain, domain_of
 from genre_tasks.render.types import Cameras, Shown
 from genre_tasks.scene.gaussians import Splats
 
@@ -63,11 +63,24 @@ def forward(
     handle = ctypes.c_void_p()
     of_cameras = poses.data_ptr(), lenses.data_ptr(), _pointer(distortions), _pointer(shutters)
     status = kernel.genre_forward(
-        len(arrays[0]), *(a.data_ptr() for a in arrays), arrays[4].dim() == 3, _pointer(velocities), views,
-        *of_cameras, cameras.antialiased, width, height, threads, shown.shared, own,
-        color.data_ptr(), alpha.data_ptr(), depth.data_ptr(), culled,
+        len(arrays[0]),
+        *(a.data_ptr() for a in arrays),
+        arrays[4].dim() == 3,
+        _pointer(velocities),
+        views,
+        *of_cameras,
+        cameras.antialiased,
+        width,
+        height,
+        threads,
+        shown.shared,
+        own,
+        color.data_ptr(),
+        alpha.data_ptr(),
+        depth.data_ptr(),
+        culled,
         ctypes.byref(handle) if keep else None,
-    )  # fmt: skip
+    )
     check_status(status)
     counts = {reason: n for reason, n in zip(CULL_REASONS, culled, strict=True) if n}
     return (color, alpha, depth), counts, _Batch(handle, velocities) if keep else None
@@ -92,10 +105,19 @@ def backward(
     back = None if residual is None else torch.empty(len(arrays[0]), 5)
     residual = None if residual is None else residual.contiguous()
     status = load_kernel().genre_backward(
-        batch.handle, len(arrays[0]), *(a.data_ptr() for a in arrays), arrays[4].dim() == 3, _pointer(batch.velocities),
-        *(a.data_ptr() for a in images), *(x.data_ptr() for x in v), _pointer(residual), _pointer(shares), threads,
-        *(g.data_ptr() for g in out), _pointer(back),
-    )  # fmt: skip
+        batch.handle,
+        len(arrays[0]),
+        *(a.data_ptr() for a in arrays),
+        arrays[4].dim() == 3,
+        _pointer(batch.velocities),
+        *(a.data_ptr() for a in images),
+        *(x.data_ptr() for x in v),
+        _pointer(residual),
+        _pointer(shares),
+        threads,
+        *(g.data_ptr() for g in out),
+        _pointer(back),
+    )
     check_status(status)
     return back
 
@@ -126,9 +148,18 @@ def _shutters(cameras: Cameras) -> Tensor | None:
 class _Rasterise(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, cameras: Cameras, shown: Shown, threads: int, culled: dict[str, int], means: Tensor, scales: Tensor,
-        quats: Tensor, opacities: Tensor, colors: Tensor, velocities: Tensor | None,
-    ) -> Images:  # fmt: skip
+        ctx: Any,
+        cameras: Cameras,
+        shown: Shown,
+        threads: int,
+        culled: dict[str, int],
+        means: Tensor,
+        scales: Tensor,
+        quats: Tensor,
+        opacities: Tensor,
+        colors: Tensor,
+        velocities: Tensor | None,
+    ) -> Images:
         arrays = (means, scales, quats, opacities, colors)
         keep = any(ctx.needs_input_grad)
         images, counts, ctx.batch = forward(arrays, cameras, shown, threads, keep, velocities)

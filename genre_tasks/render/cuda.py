@@ -44,11 +44,21 @@ def render_cuda(splats: Splats, cameras: Cameras) -> tuple[tuple[Tensor, Tensor,
     intrinsics[:, 0, 0], intrinsics[:, 1, 1] = cameras.focal_px.to(like).unbind(1)
     intrinsics[:, :2, 2], intrinsics[:, 2, 2] = cameras.center_px.to(like), 1.0
     image, alpha, _ = rasterization(
-        safe.means, safe.quats, safe.scales, safe.opacities, safe.colors, Ks=intrinsics, width=cameras.width_px,
-        height=cameras.height_px, near_plane=const.NEAR_M, eps2d=const.BLUR_PX2, render_mode="RGB+D",
-        packed=False, rasterize_mode="antialiased" if cameras.antialiased else "classic",
+        safe.means,
+        safe.quats,
+        safe.scales,
+        safe.opacities,
+        safe.colors,
+        Ks=intrinsics,
+        width=cameras.width_px,
+        height=cameras.height_px,
+        near_plane=const.NEAR_M,
+        eps2d=const.BLUR_PX2,
+        render_mode="RGB+D",
+        packed=False,
+        rasterize_mode="antialiased" if cameras.antialiased else "classic",
         **({"viewmats": cameras.camera_SE3_chunk.to(like)} | effects),
-    )  # fmt: skip
+    )
     # "D" is the accumulated Σ w z; "ED" would be divided by alpha.
     return (image[..., :3], alpha[..., 0], image[..., 3]), culled
 

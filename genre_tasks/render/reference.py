@@ -17,6 +17,7 @@ from genre_tasks.render import constants as const
 from genre_tasks.render.reference_camera import OneCamera
 from genre_tasks.render.types import Cameras
 from genre_tasks.scene.gaussians import Splats
+from genre_tasks.scene.rotations import rotation_matrices
 
 BLOCK_PX = 16
 
@@ -42,19 +43,6 @@ def render_reference(splats: Splats, cameras: Cameras) -> tuple[tuple[Tensor, Te
     height, width = cameras.height_px, cameras.width_px
     image = torch.stack(views) if views else splats.means.new_zeros(0, height, width, 5)
     return (image[..., :3], image[..., 4], image[..., 3]), {k: n for k, n in culled.items() if n}
-
-
-def rotation_matrices(quats: Tensor) -> Tensor:
-    """[N, 4], need not be unit → [N, 3, 3]; autograd through the normalisation gives (v − (v·q̂)q̂) / ‖q‖."""
-    # Dividing by the largest entry first keeps the squares of long quaternions finite and changes no direction.
-    quats = quats / quats.detach().abs().amax(1, keepdim=True)
-    w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
-    rows = [
-        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-    ]
-    return torch.stack(rows, 1)
 
 
 def _view(splats: Splats, cameras: Cameras, v: int, culled: dict[str, int]) -> Tensor:

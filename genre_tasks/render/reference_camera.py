@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from genre_tasks.render import constants as const
-from genre_tasks.render.bent import domain_of
+from genre_tasks.render.lens_domain import domain_of
 from genre_tasks.render.types import Cameras
-from genre_tasks.scene.distortion import distort, slopes
 from genre_tasks.scene.gaussians import Splats
+from genre_tasks.scene.lens_distortion import distort, slopes
 
 
 class OneCamera:

@@ -16,12 +16,12 @@ from torch import Tensor
 
 from genre_tasks.logs.types import Lens
 from genre_tasks.render.api import DEFAULT, cameras_of, moving, on_device_of, render, render_views
-from genre_tasks.render.blur import PosedView
+from genre_tasks.render.motion_blur import PosedView
 from genre_tasks.render.reference_camera import OneCamera
 from genre_tasks.render.types import Render, RenderSettings
-from genre_tasks.scene.distortion import rays_at
 from genre_tasks.scene.gaussians import Splats
 from genre_tasks.scene.graph import SceneGraph
+from genre_tasks.scene.lens_distortion import rays_at
 
 MIN_COSINE = 0.01
 """Between a ray and a disc's normal: a disc seen more on edge counts as facing the camera."""

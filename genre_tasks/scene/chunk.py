@@ -14,9 +14,16 @@ Role = Literal["source", "heldout"]
 Gain = tuple[float, float, float]
 """Logarithm of an image's gain in linear light: red, green, blue."""
 MarkKind = Literal[
-    "missing_image", "unreadable_image", "missing_sweep", "unreadable_sweep", "cuboid_outside", "cuboid_invalid",
-    "actor_few_points", "timestamps", "standstill",
-]  # fmt: skip
+    "missing_image",
+    "unreadable_image",
+    "missing_sweep",
+    "unreadable_sweep",
+    "cuboid_outside",
+    "cuboid_invalid",
+    "actor_few_points",
+    "timestamps",
+    "standstill",
+]
 
 
 @dataclass(frozen=True)

@@ -78,3 +78,8 @@ class Splats:
     def _map(self, f: Callable[[Tensor], Tensor]) -> Splats:
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return Splats(**{name: f(x) for name, x in values.items() if x is not None})
+
+
+def map_attributes(function: Callable[..., Tensor], *gaussians: Gaussians) -> Gaussians:
+    """``function`` of the means, of the log-scales and so on; its results as Gaussians."""
+    return Gaussians(*(function(*(getattr(g, f.name) for g in gaussians)) for f in fields(Gaussians)))

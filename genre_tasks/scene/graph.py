@@ -16,7 +16,7 @@ from genre_tasks.logs.types import Float32, Float64
 from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.constants import ABSENT_LOGIT
 from genre_tasks.scene.gaussians import Gaussians
-from genre_tasks.scene.geometry import matrix_to_quat, quat_multiply
+from genre_tasks.scene.transforms import matrix_to_quat, quat_multiply
 
 if TYPE_CHECKING:
     from genre_tasks.scene.deformation import Deformation

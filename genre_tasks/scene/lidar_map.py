@@ -10,9 +10,9 @@ from genre_tasks.config import InitialConfig
 from genre_tasks.logs.types import Float64
 from genre_tasks.scene.chunk import Chunk, Points
 from genre_tasks.scene.gaussians import Gaussians
-from genre_tasks.scene.geometry import path_distance, quat_to_matrix
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.initialise import actor_cap, assembled, node_gaussians, select
+from genre_tasks.scene.initial_gaussians import actor_cap, assembled, node_gaussians, select
+from genre_tasks.scene.transforms import path_distance, quat_to_matrix
 
 LIDAR_OPACITY = 0.95
 

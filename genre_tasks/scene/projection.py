@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from genre_tasks.logs.types import Float32, Float64, Lens, RollingShutter
-from genre_tasks.scene.distortion import Reals, distort, fold_radius, slopes
+from genre_tasks.scene.lens_distortion import Reals, distort, fold_radius, slopes
 
 NEAR_M = 0.1
 """Points nearer to the camera plane than this are behind it."""

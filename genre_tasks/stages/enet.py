@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from genre_tasks.config import OptimiserConfig
-from genre_tasks.effects.applied import applied
+from genre_tasks.effects.apply_plan import applied
 from genre_tasks.effects.types import UNPLANNED, EffectsPlan
-from genre_tasks.optimiser.run import optimise, planned
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.chunk import Chunk
-from genre_tasks.scene.results import Reconstruction
-from genre_tasks.scene.views import FixedViews
+from genre_tasks.scene.novel_views import FixedViews
+from genre_tasks.scene.reconstruction import Reconstruction
+from genre_tasks.stages.optimise import optimise, planned
 
 
 def enet(

@@ -15,20 +15,21 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from genre_tasks.config import EvaluateConfig
-from genre_tasks.effects.applied import applied
+from genre_tasks.effects.apply_plan import applied
 from genre_tasks.effects.types import UNPLANNED, EffectsPlan
 from genre_tasks.logs.types import Truth
-from genre_tasks.metrics.collect import Collector, real_images, true_pixels, view_image
-from genre_tasks.metrics.image import psnr
-from genre_tasks.metrics.published import inception, lpips
+from genre_tasks.metrics.fid_lpips import inception, lpips
+from genre_tasks.metrics.image_quality import psnr
+from genre_tasks.metrics.results import Evaluation, Metric, ViewScore
+from genre_tasks.metrics.scoring import Collector, real_images, true_pixels, view_image
 from genre_tasks.progress import Progress, silent
 from genre_tasks.render import render_views
 from genre_tasks.render.types import RenderSettings
 from genre_tasks.scene.chunk import Chunk, View
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.novel import novel_view_poses
-from genre_tasks.scene.results import Evaluation, Metric, Reconstruction, ViewScore
-from genre_tasks.scene.views import FixedViews, NovelView, NovelViews
+from genre_tasks.scene.novel_poses import novel_view_poses
+from genre_tasks.scene.novel_views import FixedViews, NovelView, NovelViews
+from genre_tasks.scene.reconstruction import Reconstruction
 
 CURVE_VIEWS = 12
 """The curve of accuracy is taken on at most so many held-out views, spread evenly over the chunk's."""

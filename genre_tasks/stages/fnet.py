@@ -11,18 +11,19 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from genre_tasks.config import FnetConfig
-from genre_tasks.effects.applied import applied
+from genre_tasks.effects.apply_plan import applied
 from genre_tasks.effects.types import UNPLANNED, EffectsPlan
 from genre_tasks.errors import InputError
-from genre_tasks.fixer.conditioning import degraded, recorded, references
+from genre_tasks.fixer.conditioning import degraded
 from genre_tasks.fixer.inference import fix, noise_of, prefers_half, require_finite
 from genre_tasks.fixer.network import Encoded, Fnet
+from genre_tasks.fixer.source_images import recorded, references
 from genre_tasks.fixer.warping import SourceImage, surface_of, unseen_share
 from genre_tasks.fixer.weights import load_fnet
-from genre_tasks.metrics.threads import map_single_threaded
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.chunk import Chunk
-from genre_tasks.scene.views import FixedViews, NovelViews
+from genre_tasks.scene.novel_views import FixedViews, NovelViews
+from genre_tasks.threads import map_single_threaded
 from genre_tasks.weights import resolve_weights
 
 

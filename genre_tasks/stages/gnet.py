@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from genre_tasks.config import OptimiserConfig
-from genre_tasks.effects.applied import applied
+from genre_tasks.effects.apply_plan import applied
 from genre_tasks.effects.types import UNPLANNED, EffectsPlan
-from genre_tasks.optimiser.run import PER_SCENE, optimise, planned
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.results import Reconstruction
+from genre_tasks.scene.reconstruction import Reconstruction
+from genre_tasks.stages.optimise import PER_SCENE, optimise, planned
 
 
 def gnet(
@@ -32,6 +32,6 @@ def _start(config: OptimiserConfig, scene: SceneGraph, plan: EffectsPlan) -> Sce
     """With harmonics where the plan has them; per-scene 3DGS has one colour a Gaussian in any case."""
     if not plan.on("view_dependent_colour") or config.method in PER_SCENE:
         return scene
-    from genre_tasks.scene.harmonics import starting
+    from genre_tasks.scene.spherical_harmonics import starting
 
     return starting(scene)

@@ -12,14 +12,14 @@ from genre_tasks.config import IngestConfig
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.logs.types import Camera, DrivingLog, Float32, Float64
 from genre_tasks.progress import Progress, silent
-from genre_tasks.scene.actors import Movers, Path, inside_box, movers
 from genre_tasks.scene.chunk import Actor, Chunk, Mark, MarkKind, Points, View
-from genre_tasks.scene.coloring import Cloud, color_clouds
-from genre_tasks.scene.geometry import se3_inverse
-from genre_tasks.scene.ground import road_fill
-from genre_tasks.scene.images import decode_pixels, encoded_size
-from genre_tasks.scene.ply import read_ply
-from genre_tasks.scene.walls import wall_fill
+from genre_tasks.scene.facade_completion import wall_fill
+from genre_tasks.scene.image_decoding import decode_pixels, encoded_size
+from genre_tasks.scene.moving_actors import Movers, Path, inside_box, movers
+from genre_tasks.scene.ply_reader import read_ply
+from genre_tasks.scene.road_completion import road_fill
+from genre_tasks.scene.transforms import se3_inverse
+from genre_tasks.scene.visibility import Cloud, color_clouds
 
 STANDSTILL_M = 0.1
 """An ego vehicle that travels less than this in a chunk stands still: there is no parallax."""
@@ -92,10 +92,20 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
     points = [Points(c.positions, *colors, c.frames) for c, colors in zip(clouds, colored, strict=True)]
     reading.report(3 * len(frames), "ingest")
     return Chunk(
-        log.dataset, log.name, chunk_index, frames, tuple(c.name for c in cameras), config.width_px, config.height_px,
-        world_SE3_chunk, chunk_SE3_ego, tuple(views), points[0],
-        tuple(_actor(c.path, p) for c, p in zip(actors, points[1:], strict=True) if c.path), tuple(reading.marks),
-    )  # fmt: skip
+        log.dataset,
+        log.name,
+        chunk_index,
+        frames,
+        tuple(c.name for c in cameras),
+        config.width_px,
+        config.height_px,
+        world_SE3_chunk,
+        chunk_SE3_ego,
+        tuple(views),
+        points[0],
+        tuple(_actor(c.path, p) for c, p in zip(actors, points[1:], strict=True) if c.path),
+        tuple(reading.marks),
+    )
 
 
 def _frames(config: IngestConfig, log: DrivingLog, chunk_index: int) -> tuple[int, ...]:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 from genre_tasks.config import InitialConfig
-from genre_tasks.effects.applied import applied
+from genre_tasks.effects.apply_plan import applied
 from genre_tasks.effects.types import UNPLANNED, EffectsPlan
 from genre_tasks.errors import NonFiniteError
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.chunk import Chunk
-from genre_tasks.scene.initialise import initial_scene
-from genre_tasks.scene.results import Reconstruction
+from genre_tasks.scene.initial_gaussians import initial_scene
+from genre_tasks.scene.reconstruction import Reconstruction
 
 
 def initial(

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import torch
 
 from genre_tasks.config import NovelViewsConfig
-from genre_tasks.effects.applied import applied
+from genre_tasks.effects.apply_plan import applied
 from genre_tasks.effects.types import UNPLANNED, EffectsPlan
 from genre_tasks.errors import NonFiniteError
 from genre_tasks.progress import Progress, silent
@@ -17,9 +17,9 @@ from genre_tasks.render.surface import render_surfaces
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.lidar_map import lidar_scene
-from genre_tasks.scene.novel import novel_view_poses
-from genre_tasks.scene.results import Reconstruction
-from genre_tasks.scene.views import NovelView, NovelViews
+from genre_tasks.scene.novel_poses import novel_view_poses
+from genre_tasks.scene.novel_views import NovelView, NovelViews
+from genre_tasks.scene.reconstruction import Reconstruction
 
 DEFAULT_SETTINGS = RenderSettings()
 
@@ -55,9 +55,16 @@ def render_novel(
     lidar = _render(render_surfaces, points, views, settings, progress, len(views), "LiDAR maps")
     progress(2 * len(views), 2 * len(views), "novel views")
     images = NovelViews(
-        tuple(views), image.color, image.alpha, image.expected_depth(),
-        lidar.color, lidar.alpha, lidar.expected_depth(), image.culled, lidar.culled,
-    )  # fmt: skip
+        tuple(views),
+        image.color,
+        image.alpha,
+        image.expected_depth(),
+        lidar.color,
+        lidar.alpha,
+        lidar.expected_depth(),
+        image.culled,
+        lidar.culled,
+    )
     for name in ("color", "alpha", "depth", "lidar_color", "lidar_alpha", "lidar_depth"):
         bad = (~getattr(images, name).isfinite()).nonzero()
         if len(bad):

@@ -13,7 +13,7 @@ from typing import Any
 import pyarrow as pa
 
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
-from genre_tasks.scene.results import Evaluation, Metric, ViewScore
+from genre_tasks.metrics.results import Evaluation, Metric, ViewScore
 from storage.codecs.png import read_png, write_png
 from storage.codecs.tables import REMEDY, column, read_table, schema, write_table
 

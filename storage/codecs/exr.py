@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
 from storage.codecs.tables import REMEDY
-from storage.color import to_linear_half
 from storage.files import write_file
+from storage.srgb import to_linear_half
 
 EXR_THREADS = 2
 

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from genre_tasks.scene.views import FixedViews
+from genre_tasks.scene.novel_views import FixedViews
 from storage.codecs.exr import read_channels, write_exr
 from storage.codecs.novel_views import read_views, write_views
 from storage.codecs.tables import checked
-from storage.color import from_linear_half
+from storage.srgb import from_linear_half
 
 CHANNELS: dict[str, Any] = dict.fromkeys("RGB", np.float16)
 

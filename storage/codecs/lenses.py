@@ -41,7 +41,12 @@ def lens_columns(poses: Sequence[Float64], lenses: Sequence[Lens]) -> dict[str, 
 def pose_and_lens(row: dict[str, Any]) -> tuple[Float64, Lens]:
     """The inverse, for one row."""
     lens = Lens(
-        row["fx_px"], row["fy_px"], row["cx_px"], row["cy_px"],
-        row["lens_width_px"], row["lens_height_px"], tuple(row["distortion"]),
-    )  # fmt: skip
+        row["fx_px"],
+        row["fy_px"],
+        row["cx_px"],
+        row["cy_px"],
+        row["lens_width_px"],
+        row["lens_height_px"],
+        tuple(row["distortion"]),
+    )
     return poses_of(row["chunk_SE3_camera"])[0], lens

@@ -15,11 +15,11 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from genre_tasks.errors import ArtifactCorruptError
-from genre_tasks.scene.views import NovelView, NovelViews
+from genre_tasks.scene.novel_views import NovelView, NovelViews
 from storage.codecs.exr import read_channels, write_channels
 from storage.codecs.lenses import LENS_AND_POSE, lens_columns, pose_and_lens
 from storage.codecs.tables import REMEDY, checked, column, read_table, schema, write_table
-from storage.color import from_linear_half, to_linear_half
+from storage.srgb import from_linear_half, to_linear_half
 
 VIEWS = schema(
     "novel_views/1",

@@ -22,7 +22,7 @@ from genre_tasks.errors import ArtifactCorruptError, ConfigError
 from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import COUNTS, DEGREE, FIRST_ACTOR, SceneGraph
-from genre_tasks.scene.results import Reconstruction
+from genre_tasks.scene.reconstruction import Reconstruction
 from storage.codecs.chunk import ACTORS, actor_columns, actor_fields
 from storage.codecs.tables import REMEDY, array_of, checked, column, read_table, schema, write_table
 

@@ -4,27 +4,27 @@ import os
 
 import pytest
 
-from benchmarks import run
-from benchmarks.optimiser.task import Task
+from benchmarks.common import runner
+from benchmarks.common.task import Task
 from flows.cli import bench as command
-from tests.benchmarks import tiny
-from tests.optimiser import street
+from tests.benchmarks import small_cells
+from tests.optimiser import street_scenes
 
 
 @pytest.fixture
-def bench(monkeypatch: pytest.MonkeyPatch, tmp_path: os.PathLike[str]) -> tiny.Tiny:
+def bench(monkeypatch: pytest.MonkeyPatch, tmp_path: os.PathLike[str]) -> small_cells.Tiny:
     """A fresh tiny benchmark, known to ``genre bench``, in an empty folder."""
-    made = tiny.Tiny()
-    monkeypatch.setattr(tiny, "BENCH", made)
+    made = small_cells.Tiny()
+    monkeypatch.setattr(small_cells, "BENCH", made)
     monkeypatch.setattr(command, "_BENCHES", dict(command._BENCHES))
-    monkeypatch.setattr(run, "machine", lambda: "a machine")
-    command.register("tiny", "tests.benchmarks.tiny:BENCH")
+    monkeypatch.setattr(runner, "machine", lambda: "a machine")
+    command.register("tiny", "tests.benchmarks.small_cells:BENCH")
     monkeypatch.chdir(tmp_path)
     return made
 
 
 @pytest.fixture(scope="module")
 def task() -> Task:
-    truth = street.scene()
-    views = street.targets(truth)
-    return Task(street.blurred(truth), views, views[:2])
+    truth = street_scenes.scene()
+    views = street_scenes.targets(truth)
+    return Task(street_scenes.blurred(truth), views, views[:2])

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from benchmarks import run
-from benchmarks.bench import NotMeasuredError
+from benchmarks.common import runner
+from benchmarks.common.bench import NotMeasuredError
 from flows.cli import bench as command
 from flows.cli.main import app
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
-from tests.benchmarks.tiny import Tiny
+from tests.benchmarks.small_cells import Tiny
 
 
 def _bench(*arguments: str) -> Result:
@@ -62,9 +62,9 @@ def test_what_is_measured_again(bench: Tiny, monkeypatch: pytest.MonkeyPatch) ->
 
     assert [measured(), measured(), measured("--fresh"), measured()] == [2, 0, 2, 0]
     assert [measured("--set", "size=2"), measured("--quick"), measured()] == [2, 2, 0]
-    monkeypatch.setattr(run, "machine", lambda: "another machine")
+    monkeypatch.setattr(runner, "machine", lambda: "another machine")
     assert measured() == 2
-    monkeypatch.setattr(run, "code_digest", lambda module, also: "changed code")
+    monkeypatch.setattr(runner, "code_digest", lambda module, also: "changed code")
     assert measured() == 2
 
 
@@ -85,8 +85,8 @@ def test_what_cannot_be_measured_says_why_and_is_tried_again(bench: Tiny) -> Non
 
 
 def test_a_quick_run_leaves_out_what_would_not_end_in_time(bench: Tiny) -> None:
-    plans = run.plan(bench, bench.options, quick=True, fresh=False)
-    rows = run.measure(plans, lambda text: None, limit_s=59.0)
+    plans = runner.plan(bench, bench.options, quick=True, fresh=False)
+    rows = runner.measure(plans, lambda text: None, limit_s=59.0)
     assert bench.measured == []
     assert all("would not end" in row["not_measured"] for row in rows.values())
 
@@ -133,7 +133,7 @@ def test_a_benchmark_that_cannot_be_imported_says_how(bench: Tiny) -> None:
 def test_quick_runs_are_predicted_to_end_in_time(name: str) -> None:
     known = command.load(name)
     quick, full = (known.cells(known.options, quick=q) for q in (True, False))
-    assert 0 < sum(cell.seconds for cell in quick) <= run.QUICK_S
+    assert 0 < sum(cell.seconds for cell in quick) <= runner.QUICK_S
     assert sum(cell.seconds for cell in quick) < sum(cell.seconds for cell in full)
     assert len({cell.name for cell in full}) == len(full)
     for module in known.code:

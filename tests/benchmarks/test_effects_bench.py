@@ -13,8 +13,8 @@ from genre_tasks.config import IngestConfig, InitialConfig
 from genre_tasks.effects.anti_aliasing import ratios
 from genre_tasks.effects.plan import EFFECTS as NAMES
 from genre_tasks.logs.registry import open_log
-from genre_tasks.metrics.collect import view_image
-from genre_tasks.scene.coloring import visible
+from genre_tasks.metrics.scoring import view_image
+from genre_tasks.scene.visibility import visible
 from genre_tasks.stages.ingest import ingest
 from genre_tasks.stages.initial import initial
 
@@ -22,10 +22,18 @@ from genre_tasks.stages.initial import initial
 def row(name: str, factor: float, on: float, off: float, value: float = 3.0, unit: str = "dB") -> dict:
     each = {"heldout_db": 20.0, "beside_db": None, "gnet_s": 2.0, "plan_s": 3.0}
     return {
-        "effect": name, "log": f"synthetic:street?seed={factor}", "chunk": 0, "factor": factor, "unit": unit,
-        "value": value, "threshold": 1.0, "property_unit": "px", "choice": "on",
-        "on": each | {"measure": on}, "off": each | {"measure": off},
-    }  # fmt: skip
+        "effect": name,
+        "log": f"synthetic:street?seed={factor}",
+        "chunk": 0,
+        "factor": factor,
+        "unit": unit,
+        "value": value,
+        "threshold": 1.0,
+        "property_unit": "px",
+        "choice": "on",
+        "on": each | {"measure": on},
+        "off": each | {"measure": off},
+    }
 
 
 def test_it_is_registered_and_its_cases_are_effects() -> None:
@@ -58,10 +66,12 @@ def test_cells_are_streets_with_and_without_and_the_real_chunks() -> None:
 
 def test_claims_are_of_four_times_the_threshold_and_of_plain_streets() -> None:
     rows = {
-        "a": row("exposure", 4.0, 27.0, 26.2), "b": row("exposure", 0.0, 27.0, 26.8),
-        "c": row("lidar_depth", 4.0, -3.0, -4.0, unit="%"), "d": row("exposure", -1.0, 9.0, 1.0),
+        "a": row("exposure", 4.0, 27.0, 26.2),
+        "b": row("exposure", 0.0, 27.0, 26.8),
+        "c": row("lidar_depth", 4.0, -3.0, -4.0, unit="%"),
+        "d": row("exposure", -1.0, 9.0, 1.0),
         "e": {"not_measured": "no data"},
-    }  # fmt: skip
+    }
     claims = {c.id: c for c in EFFECTS.claims(rows)}
     assert claims["effects.gain_exposure"].measured == pytest.approx(0.8) and claims["effects.gain_exposure"].holds
     assert claims["effects.loss_exposure"].measured == pytest.approx(0.2) and not claims["effects.loss_exposure"].holds

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.bench import NotMeasuredError
+from benchmarks.common.bench import NotMeasuredError
+from benchmarks.common.claims import Claim
 from benchmarks.evaluation import EVALUATION
 from benchmarks.evaluation.budgets import claims_of, run_within, table_of
 from benchmarks.evaluation.reliability import claims_of as guard_claims
 from benchmarks.evaluation.reliability import fitted, true_reach
 from benchmarks.evaluation.reliability import table_of as guard_table
-from benchmarks.schema import Claim
-from flows.budget.measured import load, shipped_table
+from flows.budget.cost_table import load, shipped_table
 from genre_tasks.reliability.guards import ESTIMATE
 
 
@@ -24,11 +24,15 @@ def run(budget_s: float, used_s: float, distance: float, log: str = "a", point: 
     """A run at the shipped table's own pace."""
     own = next(p for p in load(shipped_table("small"), "small").points if p.name == point)
     return {
-        "log": log, "budget_s": budget_s, "used_s": used_s, "settings": [], "end": own.end,
+        "log": log,
+        "budget_s": budget_s,
+        "used_s": used_s,
+        "settings": [],
+        "end": own.end,
         "seconds": dict(own.seconds),
         "choices": [{"point": point, "why": "the best that fits"}],
         "metrics": {"interpolation/psnr": 27.0, "shift_3m/perceptual": distance},
-    }  # fmt: skip
+    }
 
 
 def by_name(claims: Any) -> dict[str, Claim]:
@@ -65,8 +69,9 @@ def guards(log: str, stage: str, agreement: list[float]) -> Any:
     views = [
         {"camera": "c", "frame": 4, "shift_m": float(side * k), "agreement_db": a, "shown": 0.5, "thin": 0.0}
         | {"floating": 0.0, "psnr": 30.0 - k}
-        for k, a in enumerate(agreement) for side in (1, -1)
-    ]  # fmt: skip
+        for k, a in enumerate(agreement)
+        for side in (1, -1)
+    ]
     return {"log": log, "stage": stage, "views": views}
 
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from benchmarks import merge
-from benchmarks.schema import Result, write_json
+from benchmarks.common import merge
+from benchmarks.common.claims import Result, write_json
 from flows.cli import bench as command
 from genre_tasks.errors import ArtifactCorruptError
-from tests.benchmarks.tiny import Tiny
+from tests.benchmarks.small_cells import Tiny
 
 A, B = "a" * 40, "b" * 40
 
@@ -56,7 +56,7 @@ def test_a_cell_that_was_not_measured_leaves_the_one_that_was() -> None:
 
 
 def test_files_are_read_and_written_in_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(command._BENCHES, "tiny", command.BenchEntry("tests.benchmarks.tiny:BENCH", "two cells"))
+    monkeypatch.setitem(command._BENCHES, "tiny", command.BenchEntry("tests.benchmarks.small_cells:BENCH", "two cells"))
     files = tmp_path / "all.json", tmp_path / "part.json"
     for path, result in zip(files, (_result("m", A, first=3.0), _result("m", A, second=5.0)), strict=True):
         write_json(path, result.model_dump(mode="json"))

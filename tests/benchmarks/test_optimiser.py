@@ -10,20 +10,14 @@ from typing import Any
 import pytest
 import torch
 
-from benchmarks import run
-from benchmarks.bench import NotMeasuredError
-from benchmarks.optimiser import (
-    BENCH,
-    cells,
-    race,
-    summary,
-    trade,
-)
-from benchmarks.optimiser.network import measure_network, scene_of
-from benchmarks.optimiser.picture import draw, draw_network, envelope
+from benchmarks.common import runner
+from benchmarks.common.bench import NotMeasuredError
+from benchmarks.common.claims import Result
+from benchmarks.common.task import Task
+from benchmarks.optimiser import BENCH, cells, claims, iteration_tradeoff, race
+from benchmarks.optimiser.network_speed import measure_network, scene_of
+from benchmarks.optimiser.plots import draw, draw_network, envelope
 from benchmarks.optimiser.race import Point
-from benchmarks.optimiser.task import Task
-from benchmarks.schema import Result
 from genre_tasks.config import (
     AdamConfig,
     GnetConfig,
@@ -31,19 +25,23 @@ from genre_tasks.config import (
     PerSceneConfig,
 )
 from genre_tasks.errors import ConfigError
-from genre_tasks.optimiser.adam import TunedAdam
-from genre_tasks.optimiser.learned import LearnedOptimiser
+from genre_tasks.learned.learned_optimiser import LearnedOptimiser
+from genre_tasks.learned.weights import load
 from genre_tasks.optimiser.objective import Objective
+from genre_tasks.optimiser.tuned_adam import TunedAdam
 from genre_tasks.optimiser.unroll import Plan, unroll
-from genre_tasks.optimiser.weights import load
 from genre_tasks.scene.graph import DISTANT
 from genre_tasks.weights import resolve_weights
-from tests.benchmarks.tiny_races import ADAM, LOSS, NEVER, learned
-from tests.optimiser import street
+from tests.benchmarks.small_races import ADAM, LOSS, NEVER, learned
+from tests.optimiser import street_scenes
 
 
 def test_walking_is_unrolling(task: Task) -> None:
-    plan, novel, objective = Plan(5, 2, 1, seed=3), street.targets(street.scene(), novel=True), Objective(LOSS)
+    plan, novel, objective = (
+        Plan(5, 2, 1, seed=3),
+        street_scenes.targets(street_scenes.scene(), novel=True),
+        Objective(LOSS),
+    )
     expected = unroll(TunedAdam(), task.scene, task.source, novel, objective, plan)
     moments = list(itertools.islice(race.walk(lambda: (TunedAdam(), objective), task, plan, novel), 5))
     assert torch.equal(moments[-1].scene.gaussians.packed(), expected.scene.gaussians.packed())
@@ -131,7 +129,7 @@ def test_far_past_its_length_the_loss_is_compared_with_that_at_t(task: Task) -> 
 
 
 def test_enet_past_its_length_is_judged_on_its_fixed_views_too(task: Task) -> None:
-    fixed = street.targets(street.scene(), novel=True)
+    fixed = street_scenes.targets(street_scenes.scene(), novel=True)
     config = OptimiserConfig(iterations=1, views_per_iteration=1, novel_views_per_iteration=1, split=0.1, loss=LOSS)
     with_fixed = cells.stability_row(task, "enet", config, fixed)
     alone = cells.stability_row(task, "enet", config.model_copy(update={"novel_views_per_iteration": 0}))
@@ -161,19 +159,19 @@ def test_claims_take_the_earliest_variant_and_the_cap_where_there_is_none() -> N
         "c": _race("tuned_adam", [6.0, None], [23.0, 24.0]),
         "d": _race("street_gs", [1.0], [None]),
     }
-    claims = {c.id: c for c in summary.claims(rows)}
-    standard = claims["optimiser.vs_standard_3dgs"]
+    by_id = {c.id: c for c in claims.claims(rows)}
+    standard = by_id["optimiser.vs_standard_3dgs"]
     assert (standard.measured, standard.n, standard.holds) == (31.0, 2, True)  # the median of 12 and the cap
     assert "in 1 of 2 cells not within the cap" in standard.data
-    assert claims["optimiser.vs_tuned_adam"].measured == 3.0
-    db = claims["optimiser.equal_renders_db"]
+    assert by_id["optimiser.vs_tuned_adam"].measured == 3.0
+    db = by_id["optimiser.equal_renders_db"]
     assert (db.measured, db.holds) == (1.0, False)
-    assert claims["optimiser.stable_10x"].measured is None
-    assert claims["optimiser.network_100k"].measured is None
+    assert by_id["optimiser.stable_10x"].measured is None
+    assert by_id["optimiser.network_100k"].measured is None
 
 
 def test_a_race_is_judged_beside_the_path_where_there_is_truth(task: Task, tmp_path: Path) -> None:
-    with_truth = replace(task, beside=street.targets(street.scene(), novel=True))
+    with_truth = replace(task, beside=street_scenes.targets(street_scenes.scene(), novel=True))
     row = cells.race_row(with_truth, learned(4), {"short": ADAM}, 0, "tuned_adam", 1000.0)
     assert all(len(point) == 5 for point in row["gnet"]["curve"] + row["variants"]["short"]["curve"])
     assert row["gnet"]["curve"][0][4] == pytest.approx(with_truth.psnr_beside(task.scene), abs=1e-3)
@@ -185,11 +183,11 @@ def test_a_race_is_judged_beside_the_path_where_there_is_truth(task: Task, tmp_p
 
 def test_the_worst_of_the_stable_cells_counts() -> None:
     rows = {f"stability/{k}": {"log": "a", "chunk": k, "ratio": 1.0 + 0.015 * k} for k in range(3)}
-    claim = next(c for c in summary.claims(rows) if c.id == "optimiser.stable_10x")
+    claim = next(c for c in claims.claims(rows) if c.id == "optimiser.stable_10x")
     assert (claim.measured, claim.holds) == (1.03, False)
     line = {"log": "a", "chunk": 0, "network": "enet", "loss": {"1": 1.0, "10": 1.1}, "ratio": 1.1}
     rows["stability/enet a chunk 0"] = line
-    claim = next(c for c in summary.claims(rows) if c.id == "optimiser.stable_10x")
+    claim = next(c for c in claims.claims(rows) if c.id == "optimiser.stable_10x")
     assert claim.measured == 1.1 and claim.data.endswith("gnet a chunk 2, enet a chunk 0")
     assert "ENet past its length: loss at 1 T: 1.00000, 10 T: 1.10000" in "".join(BENCH.table({"a": line}))
 
@@ -201,11 +199,11 @@ def test_what_is_not_measured_does_not_count() -> None:
 
 
 def test_the_trade_counts_renders_and_judges_the_end(task: Task) -> None:
-    named = trade.settings(learned(4))
+    named = iteration_tradeoff.settings(learned(4))
     assert named["preset"] == learned(4)
-    assert [named[n].loss.perceptual_every for n in trade.PERCEPTUAL] == [1, 4]
+    assert [named[n].loss.perceptual_every for n in iteration_tradeoff.PERCEPTUAL] == [1, 4]
     config = learned(4).model_copy(update={"views_per_iteration": 1000})
-    found = trade.trade(replace(task, beside=task.heldout), config)
+    found = iteration_tradeoff.trade(replace(task, beside=task.heldout), config)
     rule, plan = load(resolve_weights("gnet", "builtin")), Plan(4, 1000)
     expected = unroll(rule, task.scene, task.source, (), Objective(LOSS), plan).scene
     assert found["renders"] == 4 * len(task.source) and found["seconds"] > 0
@@ -219,7 +217,7 @@ def test_options_choose_cells_and_a_quick_run_ends_in_time() -> None:
     log = "synthetic:street?seed=900 chunk 0"
     races = [f"{log} order 2 {m}" for m in cells.METHODS]
     parts = [f"{part}/{log} order 2" for part in ("enhancement", "distillation", "converged")]
-    trades = [f"trade/street {seed}" for seed in trade.SEEDS]
+    trades = [f"trade/street {seed}" for seed in iteration_tradeoff.SEEDS]
     past = [f"stability/{log}", f"stability/enet {log}"]
     assert [c.name for c in BENCH.cells(given, False)] == ["network", *trades, *races, *parts, *past]
     few = given | {"parts": "enhancement,converged", "long_orders": "0"}
@@ -229,7 +227,7 @@ def test_options_choose_cells_and_a_quick_run_ends_in_time() -> None:
     with pytest.raises(ConfigError, match=r"no method.*g3r"):
         BENCH.cells(given | {"methods": "g3r"}, False)
     quick, full = (BENCH.cells(BENCH.options, q) for q in (True, False))
-    assert sum(c.seconds for c in quick) <= run.QUICK_S < sum(c.seconds for c in full)
+    assert sum(c.seconds for c in quick) <= runner.QUICK_S < sum(c.seconds for c in full)
     assert len({c.name for c in full}) == len(full)
 
 

@@ -7,13 +7,13 @@ from collections.abc import Mapping
 import pytest
 import torch
 
-from benchmarks.bench import NotMeasuredError
-from benchmarks.raster import BENCH, cells, peers
-from benchmarks.raster.ceilings import GEMM_FLOP
+from benchmarks.common.bench import NotMeasuredError
+from benchmarks.common.timing import Action, Measured, ratio, take_turns
+from benchmarks.raster import BENCH, cells, gsplat_comparison
 from benchmarks.raster.gsplat_torch import forward_backward_peer, pairs_of, reference, render_peer
+from benchmarks.raster.machine_limits import GEMM_FLOP
 from benchmarks.raster.scenes import ATTRIBUTES, CASES, Case, forward, forward_backward, leaves_of, scene, street
-from benchmarks.timing import Action, Measured, ratio, take_turns
-from genre_tasks.render.work import FLOP_PER_LANE_BACKWARD, FLOP_PER_LANE_FORWARD, Work, count_work
+from benchmarks.raster.work_count import FLOP_PER_LANE_BACKWARD, FLOP_PER_LANE_FORWARD, Work, count_work
 
 SMALL = Case("small", 300, 48, 64)
 
@@ -46,22 +46,23 @@ def test_the_peer_renders_what_the_renderer_renders() -> None:
     assert (own.color - image[..., :3]).abs().max() < 2e-3
     assert (own.alpha - alpha[..., 0]).abs().max() < 2e-3
     assert abs(len(pairs.gaussians) - count_work(s.splats, s.cameras).contributions) <= 1e-3 * len(pairs.gaussians)
-    ours, peers = leaves_of(s.splats), leaves_of(s.splats)
+    ours = leaves_of(s.splats)
+    theirs = leaves_of(s.splats)
     forward_backward(s, ours, 1)
-    forward_backward_peer(gsplat, peers, s, pairs)
+    forward_backward_peer(gsplat, theirs, s, pairs)
     for name in ATTRIBUTES:
-        a, b = getattr(ours, name).grad, getattr(peers, name).grad
+        a, b = getattr(ours, name).grad, getattr(theirs, name).grad
         assert (a - b).norm() < 5e-3 * b.norm(), name
 
 
 def test_a_missing_peer_is_not_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("benchmarks.raster.gsplat_torch.VERSION", "0.0.1")
     with pytest.raises(NotMeasuredError, match=r"needs gsplat 0\.0\.1"):
-        peers.measure_peer(SMALL, 1)
+        gsplat_comparison.measure_peer(SMALL, 1)
 
 
 def test_actions_take_turns(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("benchmarks.timing.seconds_of", lambda action: float(action() or 0))
+    monkeypatch.setattr("benchmarks.common.timing.seconds_of", lambda action: float(action() or 0))
     called: list[str] = []
     actions = {name: (lambda name=name: called.append(name)) for name in "ab"}
     assert take_turns(actions, 2) == {"a": [0.0, 0.0], "b": [0.0, 0.0]}
@@ -107,6 +108,12 @@ def _nothing_measured() -> dict[str, dict[str, object]]:
 def test_claims_that_were_not_measured_fail() -> None:
     claims = list(BENCH.claims(_nothing_measured()))
     assert {c.id.split(".")[1] for c in claims} == {
-        "vs_gsplat_torch", "ns_per_pair", "gemm_share", "many_views", "threads", "avx2", "build_s",
-    }  # fmt: skip
+        "vs_gsplat_torch",
+        "ns_per_pair",
+        "gemm_share",
+        "many_views",
+        "threads",
+        "avx2",
+        "build_s",
+    }
     assert not any(c.holds for c in claims)

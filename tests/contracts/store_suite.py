@@ -165,9 +165,14 @@ class StoreSuite:
 
     def test_names_of_no_folder_are_refused(self) -> None:
         for dataset, log, stage, key in (
-            ("..", "l", "s", "k"), ("d", "a/b", "s", "k"), ("d", "l", "s//t", "k"), ("d", "l", "../s", "k"),
-            ("d", "l", "s", ""), ("d", "l", "s", ".hidden"), ("d", "l\n", "s", "k"),
-        ):  # fmt: skip
+            ("..", "l", "s", "k"),
+            ("d", "a/b", "s", "k"),
+            ("d", "l", "s//t", "k"),
+            ("d", "l", "../s", "k"),
+            ("d", "l", "s", ""),
+            ("d", "l", "s", ".hidden"),
+            ("d", "l\n", "s", "k"),
+        ):
             with pytest.raises(ConfigError, match="cannot be a folder's name"):
                 Address(dataset, log, 0, stage, key)
         with pytest.raises(ConfigError, match="negative"):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from genre_tasks.logs.pandaset_writer import write_pandaset
+from genre_tasks.logs.pandaset.writer import write_pandaset
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.types import DrivingLog
 from tests.contracts.reader_suite import ReaderSuite

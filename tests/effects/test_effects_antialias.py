@@ -11,17 +11,17 @@ import torch
 from genre_tasks.config import EffectsConfig, GnetConfig, InitialConfig, LossConfig
 from genre_tasks.effects.plan import EFFECTS, effect_of, plan
 from genre_tasks.effects.types import UNPLANNED
-from genre_tasks.optimiser.passes import CompiledPass, TorchPass
+from genre_tasks.optimiser.differentiable_render import CompiledPass, TorchPass
 from genre_tasks.optimiser.state import Frame
 from genre_tasks.render import RenderSettings, render_views
 from genre_tasks.scene.chunk import Chunk
-from genre_tasks.scene.results import Reconstruction
+from genre_tasks.scene.reconstruction import Reconstruction
 from genre_tasks.stages.gnet import gnet
 from genre_tasks.stages.initial import initial
 from storage.codecs import reconstruction as codec
-from tests.effects.test_effects_applied import BASIC, chunk, with_
+from tests.effects.test_apply_plan import BASIC, chunk, with_
 from tests.effects.test_effects_plan import cameras
-from tests.optimiser import street
+from tests.optimiser import street_scenes
 
 SMALL = InitialConfig(max_points=2000, distant_count=200)
 
@@ -67,8 +67,8 @@ def test_the_scene_says_so_from_its_start_to_its_file(tmp_path) -> None:
 
 
 def test_every_way_to_render_a_scene_asks_it() -> None:
-    scene = street.scene()
-    smooth, views = replace(scene, antialiased=True), street.targets(scene)
+    scene = street_scenes.scene()
+    smooth, views = replace(scene, antialiased=True), street_scenes.targets(scene)
     plain, image = render_views(scene, views), render_views(smooth, views)
     assert (plain.color - image.color).abs().max() > 0.01
     reference = render_views(smooth, views, RenderSettings("reference"))

@@ -14,24 +14,24 @@ from torch import Tensor
 from genre_tasks.config import GnetConfig, InitialConfig, LossConfig, OptimiserConfig
 from genre_tasks.effects.nonrigid_actors import covered, deforms, rigid_at_first
 from genre_tasks.errors import ArtifactCorruptError, NonFiniteError
-from genre_tasks.optimiser.adam import TunedAdam
-from genre_tasks.optimiser.deforming import DeformationFit
+from genre_tasks.optimiser.deformation_optimiser import DeformationFit
+from genre_tasks.optimiser.differentiable_render import Beside, CompiledPass, TorchPass
 from genre_tasks.optimiser.objective import Objective
-from genre_tasks.optimiser.passes import Beside, CompiledPass, TorchPass
-from genre_tasks.optimiser.run import optimise
 from genre_tasks.optimiser.state import Frame
+from genre_tasks.optimiser.tuned_adam import TunedAdam
 from genre_tasks.optimiser.unroll import Plan, unroll
 from genre_tasks.render import RenderSettings, render_views
 from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.deformation import LATTICE, NODES, Deformation, weights
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import FIRST_ACTOR, SceneGraph
-from genre_tasks.scene.results import Reconstruction
+from genre_tasks.scene.reconstruction import Reconstruction
 from genre_tasks.stages.gnet import gnet
 from genre_tasks.stages.initial import initial
+from genre_tasks.stages.optimise import optimise
 from storage.codecs import reconstruction as codec
-from tests.effects.test_effects_applied import BASIC, chunk, with_
-from tests.optimiser import street
+from tests.effects.test_apply_plan import BASIC, chunk, with_
+from tests.optimiser import street_scenes
 
 SIZE_M = (1.0, 1.0, 1.0)
 SMALL_START = InitialConfig(max_points=2000, distant_count=200)
@@ -52,7 +52,7 @@ def some(of: Deformation, scale_m: float = 0.1, seed: int = 0) -> Deformation:
 
 def walking(scale_m: float = 0.1) -> SceneGraph:
     """The tiny scene, whose only actor deforms at both of its frames."""
-    scene = street.scene()
+    scene = street_scenes.scene()
     return replace(scene, deformation=some(Deformation.none(scene.actors, (0,), (0, 1)), scale_m))
 
 
@@ -79,8 +79,9 @@ def test_an_actors_other_frames_are_between_its_own_and_beyond_them_the_nearest(
     of = some(Deformation.none(paths((2, 4, 8), (2, 8), (4,), (11,)), (0, 1, 2, 3), (2, 4, 8)))
     assert of.known.tolist() == [[True] * 3, [True, False, True], [False, True, False], [False] * 3]
     o, at = of.offsets, of.at((0, 3, 4, 5, 30))
-    torch.testing.assert_close(at[:, 0], torch.stack([o[0, 0], (o[0, 0] + o[0, 1]) / 2, o[0, 1],
-                                                      0.75 * o[0, 1] + 0.25 * o[0, 2], o[0, 2]]))  # fmt: skip
+    torch.testing.assert_close(
+        at[:, 0], torch.stack([o[0, 0], (o[0, 0] + o[0, 1]) / 2, o[0, 1], 0.75 * o[0, 1] + 0.25 * o[0, 2], o[0, 2]])
+    )
     torch.testing.assert_close(at[2, 1], o[1, 0] * 2 / 3 + o[1, 2] / 3)
     torch.testing.assert_close(at[:, 2], o[2, 1].expand(5, -1, -1))
     torch.testing.assert_close(DeformationFit(of).deformation.at((2, 4)), of.at((2, 4)))
@@ -117,7 +118,7 @@ def test_a_scenes_loss_has_the_offsets_gradient_of_finite_differences() -> None:
     scene = walking(0.05)
     parts = [getattr(scene.gaussians, n).double() for n in Gaussians.__dataclass_fields__]
     scene = replace(scene, gaussians=Gaussians(*parts))
-    views, settings = street.targets(street.scene())[:2], RenderSettings(backend="reference")
+    views, settings = street_scenes.targets(street_scenes.scene())[:2], RenderSettings(backend="reference")
     way = torch.randn(scene.deformation.offsets.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     start = scene.deformation.offsets.double()
 
@@ -136,7 +137,7 @@ def test_a_scenes_loss_has_the_offsets_gradient_of_finite_differences() -> None:
 
 def test_the_compiled_pass_agrees_with_torch() -> None:
     scene = walking()
-    frame, views = Frame.of(scene), street.targets(scene)
+    frame, views = Frame.of(scene), street_scenes.targets(scene)
     offsets = 0.05 * torch.randn(len(scene), 14, generator=torch.Generator().manual_seed(6))
     found = []
     for kind in (TorchPass, CompiledPass):
@@ -151,7 +152,7 @@ def test_the_compiled_pass_agrees_with_torch() -> None:
 
 def test_offsets_are_recovered_with_the_scene_left_as_it_is() -> None:
     truth = walking(0.15)
-    source = street.targets(truth)
+    source = street_scenes.targets(truth)
     still = TunedAdam(rates=(0.0, 0.0, 0.0, 0.0, 0.0))
     start = replace(truth, deformation=Deformation.none(truth.actors, (0,), (0, 1)))
     objective = Objective(LossConfig(perceptual=0))
@@ -164,12 +165,12 @@ def test_offsets_are_recovered_with_the_scene_left_as_it_is() -> None:
 
 
 def test_an_actor_outside_of_the_views_keeps_its_shape() -> None:
-    scene = street.scene()
+    scene = street_scenes.scene()
     away = replace(scene.actors[0], track_id="b", frames=np.array([40, 41]))
     scene = replace(scene, actors=(*scene.actors, away))
     start = replace(scene, deformation=Deformation.none(scene.actors, (0, 1), (0, 1, 40)))
     rule = TunedAdam(rates=(0.0,) * 5)
-    out = unroll(rule, start, street.targets(walking()), (), Objective(LossConfig(perceptual=0)), Plan(3, 2))
+    out = unroll(rule, start, street_scenes.targets(walking()), (), Objective(LossConfig(perceptual=0)), Plan(3, 2))
     offsets = out.scene.deformation.offsets
     assert not offsets[1].any() and not offsets[0, 2].any() and offsets[0, :2].any()
 
@@ -185,7 +186,7 @@ def test_a_gradient_that_is_not_finite_is_named(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(CompiledPass, "gradient", broken)
     scene = walking()
     with pytest.raises(NonFiniteError, match="gradient of the deformation"):
-        unroll(TunedAdam(), scene, street.targets(scene), (), Objective(LossConfig(perceptual=0)), Plan(1, 1))
+        unroll(TunedAdam(), scene, street_scenes.targets(scene), (), Objective(LossConfig(perceptual=0)), Plan(1, 1))
 
 
 def test_only_people_deform_and_at_the_frames_that_have_images() -> None:
@@ -216,7 +217,7 @@ def test_gnet_fits_it_and_enet_keeps_it() -> None:
 def test_a_scene_without_it_never_loads_the_code() -> None:
     code = (
         "import sys\n"
-        "from tests.effects.test_effects_applied import *\n"
+        "from tests.effects.test_apply_plan import *\n"
         "first = initial(InitialConfig(max_points=2000, distant_count=200), chunk(), with_(*BASIC))\n"
         "config = GnetConfig(iterations=1, method='adam', loss=LossConfig(perceptual=0))\n"
         "scene = gnet(config, chunk(), first, with_(*BASIC))\n"

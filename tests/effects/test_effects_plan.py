@@ -11,8 +11,8 @@ import pytest
 
 from flows.configuration import load_configuration
 from genre_tasks.config import EffectsConfig, IngestConfig
+from genre_tasks.effects.measurements import Colours, Seen
 from genre_tasks.effects.plan import EFFECTS, effect_of, plan
-from genre_tasks.effects.seen import Colours, Seen
 from genre_tasks.effects.types import EffectsPlan
 from genre_tasks.errors import ConfigError
 from genre_tasks.logs.registry import open_log

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from genre_tasks.logs.pandaset_writer import write_pandaset
+from genre_tasks.logs.pandaset.writer import write_pandaset
 from genre_tasks.logs.registry import open_log
-from tests.faults import tiny
+from tests.faults import small_run
 
 STREET = "synthetic:street?seed=904&frames=8&cameras=1&width=64&height=36&lidar_beams=16&lidar_azimuths=200"
 
@@ -37,7 +37,7 @@ class Hostile:
 
 
 def refused(folder: Path, *args: str, words: tuple[str, ...]) -> None:
-    done = tiny.genre(folder, *args)
+    done = small_run.genre(folder, *args)
     assert done.returncode not in (0, -9), done.stdout
     assert done.stdout == ""
     error = done.stderr.strip().splitlines()[-1]
@@ -50,7 +50,7 @@ def refused(folder: Path, *args: str, words: tuple[str, ...]) -> None:
 
 def run_of(log: Path | str, store: Path, *more: str) -> list[str]:
     uri = log if isinstance(log, str) else f"pandaset:{log}"
-    return [uri if part == tiny.LOG else part for part in tiny.arguments(store, *more)]
+    return [uri if part == small_run.LOG else part for part in small_run.arguments(store, *more)]
 
 
 def test_no_such_log(tmp_path: Path) -> None:
@@ -101,8 +101,8 @@ def test_a_pickle_that_tries_to_run_code(log: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_full_disk(tmp_path: Path) -> None:
     """A limit on file sizes stands for the full disk: the kernel refuses the write in the same place."""
-    command = [tiny.GENRE, *tiny.arguments(tmp_path / "store")]
-    env = tiny.environment(tmp_path)
+    command = [small_run.GENRE, *small_run.arguments(tmp_path / "store")]
+    env = small_run.environment(tmp_path)
 
     def limit() -> None:
         import signal
@@ -110,7 +110,7 @@ def test_a_full_disk(tmp_path: Path) -> None:
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (2_000_000, 2_000_000))
 
-    with tiny.prefect_server(tmp_path) as url:
+    with small_run.prefect_server(tmp_path) as url:
         done = subprocess.run(
             [*command, "--set", "initial.max_points=60000", "--set", "initial.distant_count=60000"],
             env=env | {"PREFECT_API_URL": url},

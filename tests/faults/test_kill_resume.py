@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from flows.pipeline import PIPELINE
-from tests.faults import tiny
+from flows.pipeline.definition import PIPELINE
+from tests.faults import small_run
 
 pytestmark = pytest.mark.fault
 RANDOM_KILLS = 80
@@ -22,7 +22,7 @@ SYNCS = (1, 3)
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
-    with tiny.prefect_server(tmp_path_factory.mktemp("server")) as url:
+    with small_run.prefect_server(tmp_path_factory.mktemp("server")) as url:
         yield {"PREFECT_API_URL": url}
 
 
@@ -31,8 +31,8 @@ def quiet(tmp_path_factory: pytest.TempPathFactory, server: dict[str, str]) -> t
     """Payload digests and seconds of a run that nobody disturbs."""
     folder = tmp_path_factory.mktemp("quiet")
     start = time.monotonic()
-    tiny.run_to_the_end(folder, folder / "store", **server)
-    digests = tiny.payloads(folder / "store")
+    small_run.run_to_the_end(folder, folder / "store", **server)
+    digests = small_run.payloads(folder / "store")
     assert len(digests) == len(PIPELINE)
     return digests, time.monotonic() - start
 
@@ -51,8 +51,8 @@ def test_random_kills(tmp_path: Path, server: dict[str, str], quiet: tuple[dict[
         finished = False
         while not finished:
             before = _manifests(store)
-            command = [tiny.GENRE, *tiny.arguments(store)]
-            env = tiny.environment(tmp_path, **server)
+            command = [small_run.GENRE, *small_run.arguments(store)]
+            env = small_run.environment(tmp_path, **server)
             pipe = subprocess.DEVNULL
             process = subprocess.Popen(command, env=env, cwd=tmp_path, stdout=pipe, stderr=pipe)
             try:
@@ -63,7 +63,7 @@ def test_random_kills(tmp_path: Path, server: dict[str, str], quiet: tuple[dict[
                 kills += 1
             after = _manifests(store)
             assert {p: after.get(p) for p in before} == before  # what was finished is neither lost nor made again
-        assert tiny.payloads(store) == digests
+        assert small_run.payloads(store) == digests
     assert rounds >= 2
 
 
@@ -73,23 +73,23 @@ def test_kills_inside_a_commit(
 ) -> None:
     digests, _ = quiet
     store = tmp_path / "store"
-    script = str(Path(tiny.__file__).parent / "die_in_commit.py")
+    script = str(Path(small_run.__file__).parent / "die_in_commit.py")
     for syncs in SYNCS:
-        command = [sys.executable, script, stage, str(syncs), *tiny.arguments(store)]
+        command = [sys.executable, script, stage, str(syncs), *small_run.arguments(store)]
         died = subprocess.run(
             command,
-            env=tiny.environment(tmp_path, **server),
+            env=small_run.environment(tmp_path, **server),
             cwd=tmp_path,
             capture_output=True,
             timeout=600,
             check=False,
         )
         assert died.returncode == -9, died.stderr[-2000:]
-        here = tiny.payloads(store)
+        here = small_run.payloads(store)
         assert not any(name.endswith("/" + stage) for name in here)
         assert here.items() <= digests.items()
-    again = tiny.run_to_the_end(tmp_path, store, **server)
+    again = small_run.run_to_the_end(tmp_path, store, **server)
     served = {s["stage"]: s["cached"] for s in again["chunks"][0]["stages"]}
     earlier = [spec.name for spec in PIPELINE][: [spec.name for spec in PIPELINE].index(stage)]
     assert served == {spec.name: spec.name in earlier for spec in PIPELINE}
-    assert tiny.payloads(store) == digests
+    assert small_run.payloads(store) == digests

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults import tiny
+from tests.faults import small_run
 
 pytestmark = pytest.mark.fault
 
@@ -18,14 +18,19 @@ pytestmark = pytest.mark.fault
 def started(folder: Path, *command: str) -> subprocess.Popen[str]:
     """``genre COMMAND`` in a process group of its own, as a terminal starts it, with Prefect's own server."""
     return subprocess.Popen(
-        [tiny.GENRE, *command], env=tiny.environment(folder), cwd=folder, stderr=subprocess.PIPE, text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL), start_new_session=True,
-    )  # fmt: skip
+        [small_run.GENRE, *command],
+        env=small_run.environment(folder),
+        cwd=folder,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        start_new_session=True,
+    )
 
 
 def made_so_far(store: Path) -> set[str]:
     try:
-        return set(tiny.payloads(store))
+        return set(small_run.payloads(store))
     except FileNotFoundError:  # a temporary folder took its place meanwhile
         return set()
 
@@ -54,8 +59,8 @@ def test_ctrl_c_ends_at_once_and_keeps_what_is_made(tmp_path: Path) -> None:
 
 def test_ctrl_c_in_a_run_ends_at_once_too(tmp_path: Path) -> None:
     store = tmp_path / "store"
-    process = started(tmp_path, *tiny.arguments(store))
+    process = started(tmp_path, *small_run.arguments(store))
     assert_it_stops(process, store, "initial")
-    again = tiny.run_to_the_end(tmp_path, store)
+    again = small_run.run_to_the_end(tmp_path, store)
     served = {s["stage"]: s["cached"] for s in again["chunks"][0]["stages"]}
     assert served["ingest"] and served["initial"] and not all(served.values())

@@ -66,11 +66,17 @@ def test_a_full_disk_at_every_moment_of_a_commit(
 @pytest.mark.parametrize(
     ("code", "kind"),
     [
-        (errno.EDQUOT, ResourceError), (errno.EFBIG, ResourceError), (errno.EMFILE, ResourceError),
-        (errno.EIO, TransientIOError), (errno.EAGAIN, TransientIOError), (errno.ESTALE, TransientIOError),
-        (errno.EACCES, InputError), (errno.EROFS, InputError), (errno.ENAMETOOLONG, InputError),
+        (errno.EDQUOT, ResourceError),
+        (errno.EFBIG, ResourceError),
+        (errno.EMFILE, ResourceError),
+        (errno.EIO, TransientIOError),
+        (errno.EAGAIN, TransientIOError),
+        (errno.ESTALE, TransientIOError),
+        (errno.EACCES, InputError),
+        (errno.EROFS, InputError),
+        (errno.ENAMETOOLONG, InputError),
     ],
-)  # fmt: skip
+)
 def test_each_error_of_the_system_has_its_kind(
     code: int, kind: type[GenreError], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -53,9 +53,13 @@ for line in sys.stdin:
 def test_kills_inside_commits(tmp_path: Path) -> None:
     moments = random.Random(0)
     server = subprocess.Popen(
-        [sys.executable, "-c", SERVER, str(tmp_path), *KINDS], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        text=True, env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
+        [sys.executable, "-c", SERVER, str(tmp_path), *KINDS],
+        cwd=ROOT,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+    )
     assert server.stdin is not None and server.stdout is not None
     assert server.stdout.readline() == "ready\n"
     store, half_written = LocalStore(tmp_path), 0

@@ -13,7 +13,7 @@ from genre_tasks.fixer.conditioning import Degraded
 from genre_tasks.fixer.network import Fnet, build, small_architecture
 from genre_tasks.logs.types import Lens
 from genre_tasks.scene.chunk import Chunk, Points, View
-from genre_tasks.scene.views import NovelView, NovelViews
+from genre_tasks.scene.novel_views import NovelView, NovelViews
 
 
 def toy(seed: int = 0, trained: bool = True) -> Fnet:
@@ -54,9 +54,20 @@ def scene() -> tuple[Chunk, NovelViews]:
         views.append(View("front_camera", frame, "source", 0.1 * frame, pose, lens, buffer.getvalue()))
     points = Points(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, bool), np.zeros(0, np.int16))
     chunk = Chunk(
-        "synthetic", "toy", 0, (0, 4), ("front_camera",), width, height, np.eye(4), np.stack([np.eye(4)] * 2),
-        tuple(views), points, (), (),
-    )  # fmt: skip
+        "synthetic",
+        "toy",
+        0,
+        (0, 4),
+        ("front_camera",),
+        width,
+        height,
+        np.eye(4),
+        np.stack([np.eye(4)] * 2),
+        tuple(views),
+        points,
+        (),
+        (),
+    )
     novel = []
     for k in range(5):
         pose = np.eye(4)

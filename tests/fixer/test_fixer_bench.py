@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from benchmarks.bench import Row
+from benchmarks.common.bench import Row
 from benchmarks.fixer import BENCH, interval
 from benchmarks.fixer.cells import flicker, time_row, truth_row
 from genre_tasks.config import FnetConfig

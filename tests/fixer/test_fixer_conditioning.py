@@ -65,9 +65,7 @@ def test_without_opaque_pixels_nothing_is_corrected():
 def test_agreement_and_sharpness_are_told():
     sharp = torch.rand(1, 3, 16, 24)
     one, zero = torch.ones(1, 1, 16, 24), torch.zeros(1, 1, 16, 24)
-    views = Degraded(
-        sharp * 0 + 0.5, one, sharp * 0, zero, sharp, sharp, one, one / 8, sharp * 0, zero, zero, one / 2
-    )  # fmt: skip
+    views = Degraded(sharp * 0 + 0.5, one, sharp * 0, zero, sharp, sharp, one, one / 8, sharp * 0, zero, zero, one / 2)
     hints = conditions(views).hints
     assert hints.shape == (1, HINTS, 16, 24)
     lidar, warp, lidar_warp, render_sharp, warp_sharp, lidar_warp_sharp = hints[0, 10:16]

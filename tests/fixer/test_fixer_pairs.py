@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from genre_tasks.fixer.conditioning import Degraded, recorded
+from genre_tasks.fixer.conditioning import Degraded
 from genre_tasks.fixer.pairs import Pairs, joined, perturbed, render_pairs, sample
+from genre_tasks.fixer.source_images import recorded
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.lidar_map import lidar_scene

@@ -37,9 +37,13 @@ def test_a_stopped_training_resumes_to_the_same_bytes(tmp_path):
         train(some_pairs(), SETTINGS, tmp_path / "stopped", distance, stop, architecture=TOY)
     steps = []
     resumed = train(
-        some_pairs(), SETTINGS, tmp_path / "stopped", distance,
-        progress=lambda done, total, note: steps.append((done, total)), architecture=TOY,
-    )  # fmt: skip
+        some_pairs(),
+        SETTINGS,
+        tmp_path / "stopped",
+        distance,
+        progress=lambda done, total, note: steps.append((done, total)),
+        architecture=TOY,
+    )
     assert steps == [(8, 10), (9, 10), (10, 10)]
     pairs = zip(whole.state_dict().values(), resumed.state_dict().values(), strict=True)
     assert all(torch.equal(a, b) for a, b in pairs)
@@ -63,9 +67,13 @@ def test_it_learns_to_take_a_tint_away(tmp_path):
     views = replace(pairs.views, color=ramp - 60, alpha=torch.full_like(pairs.views.alpha, 255))
     notes = []
     train(
-        replace(pairs, views=views, truth=ramp), settings, tmp_path, distance,
-        lambda done, total, note: notes.append(note), architecture=TOY,
-    )  # fmt: skip
+        replace(pairs, views=views, truth=ramp),
+        settings,
+        tmp_path,
+        distance,
+        lambda done, total, note: notes.append(note),
+        architecture=TOY,
+    )
     losses = torch.load(tmp_path / "fixer.pt", weights_only=True)["losses"]
     assert sum(losses[-5:]) < 0.5 * sum(losses[:5])
     assert "min left" in notes[-1]
@@ -110,9 +118,13 @@ def test_a_fixer_is_trained_further(tmp_path):
     steps = []
     settings = replace(SETTINGS, steps=2, learning_rate=1e-6)
     further = train(
-        some_pairs(), settings, tmp_path / "further", distance,
-        lambda done, total, note: steps.append((done, total)), start=first,
-    )  # fmt: skip
+        some_pairs(),
+        settings,
+        tmp_path / "further",
+        distance,
+        lambda done, total, note: steps.append((done, total)),
+        start=first,
+    )
     assert steps == [(1, 2), (2, 2)] and not (tmp_path / "further" / "autoencoder.pt").exists()
     before, after = first.state_dict(), further.state_dict()
     assert any(not torch.equal(v, after[k]) for k, v in before.items())

@@ -12,8 +12,8 @@ from safetensors.torch import load_file, save_file
 
 from genre_tasks.config import FnetConfig
 from genre_tasks.errors import InputError
-from genre_tasks.fixer.conditioning import recorded
 from genre_tasks.fixer.network import Fnet, FnetArchitecture, add_lora, sd_turbo, small_architecture
+from genre_tasks.fixer.source_images import recorded
 from genre_tasks.fixer.weights import load_fnet, save_fnet
 from genre_tasks.stages.fnet import fnet, need
 from genre_tasks.weights import resolve_weights

@@ -15,15 +15,23 @@ from genre_tasks.fixer.weights import load_fnet, save_fnet, trainable_state
 from tests.fixer.test_fixer_pairs import some_pairs
 
 VAE = {
-    "down_block_types": ("DownEncoderBlock2D",) * 4, "up_block_types": ("UpDecoderBlock2D",) * 4,
-    "block_out_channels": (128, 256, 512, 512), "layers_per_block": 2, "latent_channels": 4, "sample_size": 768,
-}  # fmt: skip
+    "down_block_types": ("DownEncoderBlock2D",) * 4,
+    "up_block_types": ("UpDecoderBlock2D",) * 4,
+    "block_out_channels": (128, 256, 512, 512),
+    "layers_per_block": 2,
+    "latent_channels": 4,
+    "sample_size": 768,
+}
 UNET = {
-    "sample_size": 64, "block_out_channels": (320, 640, 1280, 1280), "layers_per_block": 2,
-    "attention_head_dim": (5, 10, 20, 20), "cross_attention_dim": 1024, "use_linear_projection": True,
+    "sample_size": 64,
+    "block_out_channels": (320, 640, 1280, 1280),
+    "layers_per_block": 2,
+    "attention_head_dim": (5, 10, 20, 20),
+    "cross_attention_dim": 1024,
+    "use_linear_projection": True,
     "down_block_types": (*(("CrossAttnDownBlock2D",) * 3), "DownBlock2D"),
     "up_block_types": ("UpBlock2D", *(("CrossAttnUpBlock2D",) * 3)),
-}  # fmt: skip
+}
 """The configurations in `stabilityai/sd-turbo`."""
 
 

@@ -14,19 +14,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from flows import reconstruct
 from flows.budget import budget as budgets
 from flows.budget.chooser import BORDER_S, Chooser, images_of
-from flows.budget.clock import Clock
-from flows.budget.measured import Point, Table, load, shipped_table
+from flows.budget.cost_table import Point, Table, load, shipped_table
+from flows.budget.deadline import Clock
 from flows.cli.main import app
-from flows.cli.numbers import seconds
+from flows.cli.parsing import seconds
 from flows.configuration import load_configuration, with_settings
-from flows.cost.summary import lines_of
-from flows.cost.tables import read_lines, write_lines
-from flows.pipeline import reconstructing_until
+from flows.cost_sweep.parquet import read_lines, write_lines
+from flows.cost_sweep.summary import lines_of
+from flows.pipeline.definition import reconstructing_until
+from flows.reconstruction import flow
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
-from tests.faults.tiny import LOG, SETTINGS
+from tests.faults.small_run import LOG, SETTINGS
 
 EARLY = {"ingest": 5.0, "effects": 1.0, "initial": 2.0}
 LATE = {"novel_views": 2.0, "fnet": 10.0}
@@ -41,9 +41,13 @@ def point(name: str, gnet: int, enet: int, accuracy: float) -> Point:
 
 
 POINTS = (
-    point("least", 2, 0, 20.0), point("alone", 10, 0, 24.0), point("worse", 20, 0, 23.0),
-    point("short", 10, 2, 25.0), point("long", 10, 8, 26.0), point("most", 30, 8, 27.0),
-)  # fmt: skip
+    point("least", 2, 0, 20.0),
+    point("alone", 10, 0, 24.0),
+    point("worse", 20, 0, 23.0),
+    point("short", 10, 2, 25.0),
+    point("long", 10, 8, 26.0),
+    point("most", 30, 8, 27.0),
+)
 TABLE = Table("small", "accuracy", POINTS, 120.0, 0.1, {"ingest": 3.0}, "somewhere")
 
 
@@ -171,7 +175,7 @@ def test_what_the_user_has_set_is_not_turned(tmp_path: Path) -> None:
 def test_the_command_says_what_does_not_fit_before_a_server_is_started(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reconstruct, "reconstruct_log", None)  # would end in a TypeError
+    monkeypatch.setattr(flow, "reconstruct_log", None)  # would end in a TypeError
     table = str(written(tmp_path / "cost.parquet"))
     told = ["run", LOG, "--preset", "demo", "--budget", "1h", "--table", table, "--set", "gnet.iterations=3"]
     with pytest.raises(ConfigError, match=r"gnet\.iterations is what a budget decides"):
@@ -221,11 +225,22 @@ def table_row(
 ) -> dict[str, Any]:
     stages = [*EARLY, "gnet", *([*LATE, "enet"] if end == "enet" else [])]
     return {
-        "knob": knob if value else "preset", "value": value, "setting": f"{knob}={value}" if value else "preset",
-        "changes": changes, "end": end, "threads": 0, "log": "a", "chunk": 0, "seed": 0, "images": 8, "peak_mib": 1.0,
-        "seconds": dict.fromkeys(stages, stage_s), "cpu_seconds": dict.fromkeys(stages, stage_s), "gaussians": 10,
+        "knob": knob if value else "preset",
+        "value": value,
+        "setting": f"{knob}={value}" if value else "preset",
+        "changes": changes,
+        "end": end,
+        "threads": 0,
+        "log": "a",
+        "chunk": 0,
+        "seed": 0,
+        "images": 8,
+        "peak_mib": 1.0,
+        "seconds": dict.fromkeys(stages, stage_s),
+        "cpu_seconds": dict.fromkeys(stages, stage_s),
+        "gaussians": 10,
         "metrics": {"interpolation/psnr": psnr},
-    }  # fmt: skip
+    }
 
 
 def test_a_table_comes_back_as_written_and_effects_and_sizes_are_no_choice(tmp_path: Path) -> None:
@@ -268,7 +283,7 @@ def test_a_run_ends_where_its_budget_says(tmp_path: Path, monkeypatch: pytest.Mo
 
     def run(budget_s: float) -> tuple[list[str], dict[str, Any]]:
         """The stages that were made, and the record; the report says, too, what the scene was made with."""
-        done = reconstruct.reconstruct_log(
+        done = flow.reconstruct_log(
             LOG, preset="demo", store=str(tmp_path / "store"), settings=own, budget_s=budget_s, table=table
         )
         assert done["chunks"][0]["warnings"][0].startswith("within a budget: gnet.iterations=1")

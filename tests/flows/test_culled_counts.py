@@ -9,10 +9,10 @@ from typer.testing import CliRunner
 
 from flows.cli.main import app
 from flows.configuration import load_configuration
-from flows.pipeline import BY_NAME
-from flows.produce import ArtifactRef, Job, produce
+from flows.pipeline.definition import BY_NAME
+from flows.pipeline.stage_runner import ArtifactRef, Job, produce
 from storage.local import open_store
-from tests.faults.tiny import LOG, SETTINGS
+from tests.faults.small_run import LOG, SETTINGS
 
 
 @pytest.fixture(scope="module")

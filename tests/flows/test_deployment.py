@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults import tiny
+from tests.faults import small_run
 
 pytestmark = pytest.mark.slow
 PREFECT = str(Path(sys.executable).parent / "prefect")
@@ -17,13 +17,15 @@ PREFECT = str(Path(sys.executable).parent / "prefect")
 
 def test_a_deployment_runs_on_a_worker(tmp_path: Path) -> None:
     store = tmp_path / "store"
-    with tiny.prefect_server(tmp_path) as url:
-        env = tiny.environment(tmp_path, PREFECT_API_URL=url, DO_NOT_TRACK="1")
+    with small_run.prefect_server(tmp_path) as url:
+        env = small_run.environment(tmp_path, PREFECT_API_URL=url, DO_NOT_TRACK="1")
 
         log = tmp_path / "worker.log"
 
         def prefect(*args: str) -> str:
-            done = subprocess.run([PREFECT, *args], env=env, cwd=tiny.ROOT, capture_output=True, text=True, check=False)
+            done = subprocess.run(
+                [PREFECT, *args], env=env, cwd=small_run.ROOT, capture_output=True, text=True, check=False
+            )
             told = log.read_text()[-3000:] if log.exists() else ""
             assert done.returncode == 0, done.stdout + done.stderr + told
             return done.stdout
@@ -32,10 +34,15 @@ def test_a_deployment_runs_on_a_worker(tmp_path: Path) -> None:
         prefect("--no-prompt", "deploy", "--all")
         with log.open("w") as out:
             worker = subprocess.Popen(
-                [PREFECT, "worker", "start", "--pool", "genre"], env=env, cwd=tiny.ROOT, stdout=out, stderr=out
+                [PREFECT, "worker", "start", "--pool", "genre"], env=env, cwd=small_run.ROOT, stdout=out, stderr=out
             )
         try:
-            values = {"logs": [tiny.LOG], "preset": "demo", "store": str(store), "settings": list(tiny.SETTINGS)}
+            values = {
+                "logs": [small_run.LOG],
+                "preset": "demo",
+                "store": str(store),
+                "settings": list(small_run.SETTINGS),
+            }
             params = [part for k, v in values.items() for part in ("--param", f"{k}={json.dumps(v)}")]
             # Watched to its end: a worker that is told to stop as a run ends may wait for ever.
             watch = ("--watch", "--watch-timeout", "400")

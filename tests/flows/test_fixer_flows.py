@@ -12,28 +12,30 @@ import numpy as np
 import pytest
 import torch
 
-from flows.train import fixer, pairs, recipes
-from flows.train.fixer import CURVE, SCORES, FixerJob, load_pairs, train_fixer
-from flows.train.fixer_flow import train_fnet, train_pairs
-from flows.train.pairs import PAIRS, PairRecipe, PairSet
-from flows.train.scenes import SceneRecipe
+from flows.training import fixer_pairs, fixer_training, recipes
+from flows.training.curve_table import FIXING, FIXING_SCORES, read_rows
+from flows.training.fixer_flow import train_fnet, train_pairs
+from flows.training.fixer_pairs import PAIRS, PairRecipe, PairSet
+from flows.training.fixer_training import CURVE, SCORES, FixerJob, load_pairs, train_fixer
+from flows.training.training_scenes import SceneRecipe
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.fixer import training
 from genre_tasks.fixer.network import small_architecture
 from genre_tasks.fixer.training import TrainingSettings
 from genre_tasks.fixer.weights import load_fnet
-from storage.curve import FIXING, FIXING_SCORES, read_rows
 from storage.files import digest_file
 
 SMALL = "&frames=12&cameras=2&width=64&height=36&lidar_beams=16&lidar_azimuths=150"
 SETS = PairRecipe(
     sets=(
-        PairSet("beside", 4, "beside"), PairSet("under-trained", 1, "beside", young=True),
-        PairSet("sparse", 2, "unseen", keep_every=2), PairSet("cross-camera", 1, "camera"),
+        PairSet("beside", 4, "beside"),
+        PairSet("under-trained", 1, "beside", young=True),
+        PairSet("sparse", 2, "unseen", keep_every=2),
+        PairSet("cross-camera", 1, "camera"),
         PairSet("perturbed", 2, "beside", perturbed=(0.3, 1.0)),
     ),
     iterations=6,
-)  # fmt: skip
+)
 SETTINGS = TrainingSettings(
     autoencoder_steps=2, autoencoder_batch=1, steps=4, batch=1, crop=(32, 48), warmup=2, checkpoint_every=2
 )
@@ -58,12 +60,14 @@ def prefect() -> Iterator[None]:
 
 def make_tiny(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(recipes, "dense_scenes", tiny_scenes)
-    patch.setattr(pairs, "PAIRS", SETS)
-    patch.setattr(fixer, "VALIDATION", PairRecipe(sets=(PairSet("side", 1, "side"),), iterations=6))
-    patch.setattr(fixer, "validation_scenes", lambda: [tiny_scene(900)])
+    patch.setattr(fixer_pairs, "PAIRS", SETS)
+    patch.setattr(fixer_training, "VALIDATION", PairRecipe(sets=(PairSet("side", 1, "side"),), iterations=6))
+    patch.setattr(fixer_training, "validation_scenes", lambda: [tiny_scene(900)])
     further = replace(SETTINGS, steps=2)
-    patch.setattr(fixer, "PRESETS", {"small": SETTINGS, "further": further, "last": further, "paper": SETTINGS})
-    patch.setattr(fixer, "small_architecture", lambda: small_architecture((8, 8, 16, 16), 4, (16, 16)))
+    patch.setattr(
+        fixer_training, "PRESETS", {"small": SETTINGS, "further": further, "last": further, "paper": SETTINGS}
+    )
+    patch.setattr(fixer_training, "small_architecture", lambda: small_architecture((8, 8, 16, 16), 4, (16, 16)))
 
 
 @pytest.fixture(autouse=True)
@@ -73,7 +77,7 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict[str, Any]]]:
-    """A folder with pairs and a fixer, and what the flows said, each called twice."""
+    """A folder with pairs and a training, and what the flows said, each called twice."""
     folder = tmp_path_factory.mktemp("training")
     with pytest.MonkeyPatch.context() as patch:
         make_tiny(patch)

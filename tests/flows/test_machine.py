@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from flows.machine import commit, machine
+from flows.machine.facts import commit, machine
 from genre_tasks.compiled.loader import supported_isas
 
 

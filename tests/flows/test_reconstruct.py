@@ -9,12 +9,13 @@ from typing import Any
 
 import pytest
 
-from flows import reconstruct, runs, stage_task
-from flows.logs import expanded, opened_log
-from flows.pipeline import PIPELINE
-from flows.produce import Job
+from flows.pipeline import stage_task
+from flows.pipeline.definition import PIPELINE
+from flows.pipeline.log_cache import expanded, opened_log
+from flows.pipeline.stage_runner import Job
+from flows.reconstruction import flow, run_records
 from genre_tasks.errors import ConfigError, InputError, ResourceError, TransientIOError
-from tests.faults.tiny import LOG, SETTINGS
+from tests.faults.small_run import LOG, SETTINGS
 
 OTHER_LOG = LOG.replace("seed=900", "seed=902")
 
@@ -31,12 +32,12 @@ def prefect() -> Iterator[None]:
 def early_stages(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first three stages are enough to see how the flow treats any stage."""
     short = tuple(spec for spec in PIPELINE if spec.name in ("ingest", "effects", "initial"))
-    monkeypatch.setattr(reconstruct, "PIPELINE", short)
-    monkeypatch.setattr(runs, "PIPELINE", short)
+    monkeypatch.setattr(flow, "PIPELINE", short)
+    monkeypatch.setattr(run_records, "PIPELINE", short)
 
 
 def run(store: Path, log: str = LOG, **more: Any) -> dict[str, Any]:
-    return reconstruct.reconstruct_log(log, preset="demo", store=str(store), settings=list(SETTINGS), **more)
+    return flow.reconstruct_log(log, preset="demo", store=str(store), settings=list(SETTINGS), **more)
 
 
 def served(summary: dict[str, Any]) -> list[bool]:
@@ -91,16 +92,16 @@ def test_a_chunk_that_cannot_be_made_leaves_the_others(tmp_path: Path) -> None:
     settings = [*SETTINGS, "ingest.chunk_frames=6", "ingest.source_every=2"]
     log = LOG.replace("frames=8", "frames=7")  # the second chunk has one frame, hence one source view
     with pytest.raises(InputError, match="source"):
-        reconstruct.reconstruct_log(log, preset="demo", store=str(tmp_path), settings=settings)
-    (record,) = runs.recorded_runs(str(tmp_path))
+        flow.reconstruct_log(log, preset="demo", store=str(tmp_path), settings=settings)
+    (record,) = run_records.recorded_runs(str(tmp_path))
     assert [c["chunk"] for c in record["chunks"]] == [0]
 
 
 def test_a_log_that_fails_does_not_stop_the_dataset(tmp_path: Path) -> None:
     logs = ["synthetic:nothing", LOG, OTHER_LOG]
     with pytest.raises((InputError, ConfigError), match="nothing"):
-        reconstruct.reconstruct_dataset(logs, preset="demo", store=str(tmp_path), settings=list(SETTINGS))
-    assert {r["log"] for r in runs.recorded_runs(str(tmp_path))} == {LOG, OTHER_LOG}
+        flow.reconstruct_dataset(logs, preset="demo", store=str(tmp_path), settings=list(SETTINGS))
+    assert {r["log"] for r in run_records.recorded_runs(str(tmp_path))} == {LOG, OTHER_LOG}
 
 
 def test_an_unknown_chunk_is_named(tmp_path: Path) -> None:
@@ -122,8 +123,8 @@ def test_a_folder_of_sequences_is_expanded(tmp_path: Path) -> None:
 
 def test_a_stages_value_can_be_had_back(tmp_path: Path) -> None:
     summary = run(tmp_path)
-    number, chunk = runs.stage_value(str(tmp_path), summary["run"][:6], None, "ingest")
+    number, chunk = run_records.stage_value(str(tmp_path), summary["run"][:6], None, "ingest")
     assert number == 0 and chunk.log == opened_log(LOG).name
     shutil.rmtree(next(tmp_path.glob("synthetic/*/0000/initial")))
     with pytest.raises(InputError, match="gone"):
-        runs.stage_value(str(tmp_path), summary["run"], 0, "initial")
+        run_records.stage_value(str(tmp_path), summary["run"], 0, "initial")

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from flows.report import MEASURED, headline, metric_rows, picture_rows, write_report
-from flows.report_curve import accuracy_curve
-from flows.summary import ChunkSummary, RunSummary, StageSummary
+from flows.reconstruction.report import MEASURED, headline, metric_rows, picture_rows, write_report
+from flows.reconstruction.report_curve import accuracy_curve
+from flows.reconstruction.run_summary import ChunkSummary, RunSummary, StageSummary
 
 PNG = bytes.fromhex(
     "89504e470d0a1a0a0000000d4948445200000001000000010802000000907753de0000000c4944415408d763f8cfc000000301010018dd8db0"
@@ -94,10 +94,22 @@ def test_writes_one_self_contained_page(tmp_path: Path) -> None:
     assert "script" not in page.tags
     text = " ".join(page.text)
     for expected in (
-        'x=<script>alert("1")</script>', "demo", "a/store", "0123456789ab", "Chunk 3", "gnet.iterations = 8",
-        "frame 28 <has> no sweep & none follows", "4 of 12", "from cache", "computed", "7.2", "+7.00 against initial",
-        "−0.0010 … 0.0030", "3 m to the left · front camera · frame 4", "the fixer works beside the path",
-    ):  # fmt: skip
+        'x=<script>alert("1")</script>',
+        "demo",
+        "a/store",
+        "0123456789ab",
+        "Chunk 3",
+        "gnet.iterations = 8",
+        "frame 28 <has> no sweep & none follows",
+        "4 of 12",
+        "from cache",
+        "computed",
+        "7.2",
+        "+7.00 against initial",
+        "−0.0010 … 0.0030",
+        "3 m to the left · front camera · frame 4",
+        "the fixer works beside the path",
+    ):
         assert expected in text, expected
     assert page.tags.count("img") == 2 * 5 and page.tags.count("svg") == 2
 
@@ -147,8 +159,10 @@ def test_curve_continues_where_gnet_ended() -> None:
     curve = accuracy_curve(chunk())
     gnet, enet = curve.lines
     assert [t for *_, t in gnet.points] == [
-        "GNet: 17.10 dB after 0.0 s", "GNet: 20.00 dB after 2.0 s", "GNet: 24.10 dB after 10.0 s"
-    ]  # fmt: skip
+        "GNet: 17.10 dB after 0.0 s",
+        "GNet: 20.00 dB after 2.0 s",
+        "GNet: 24.10 dB after 10.0 s",
+    ]
     assert [t.rpartition("after ")[2] for *_, t in enet.points] == ["10.0 s", "13.0 s", "16.0 s"]
     assert gnet.points[-1][:2] == enet.points[0][:2]
     assert all(48 <= x <= 628 and 16 <= y <= 256 for line in curve.lines for x, y, _ in line.points)
@@ -167,7 +181,8 @@ def test_a_run_with_nothing_to_show_still_has_a_report(tmp_path: Path, stages: t
 
 def test_needs_neither_torch_nor_prefect() -> None:
     code = (
-        "import sys, pathlib, tempfile; from flows.report import write_report; from flows.summary import *;"
+        "import sys, pathlib, tempfile; from flows.reconstruction.report import write_report; "
+        "from flows.reconstruction.run_summary import *;"
         "run = RunSummary('r', 'l', 'p', 's', (ChunkSummary(0, ()),));"
         "write_report(pathlib.Path(tempfile.mkdtemp()) / 'r.html', run);"
         "assert not {'torch', 'prefect', 'numpy', 'matplotlib'} & set(sys.modules)"

@@ -11,20 +11,20 @@ from typing import Any
 import pytest
 import torch
 
-from flows.train import recipes, scenes, stages, validation
-from flows.train.begins import Adam, ByGnet, Initial, PerScene
-from flows.train.flow import train_network, train_scenes
-from flows.train.images import Images
-from flows.train.recipes import SceneList, Stage
-from flows.train.scenes import SceneRecipe, prepare, training_scene
-from flows.train.stages import TrainJob, places, train_stage
+from flows.training import optimiser_stages, recipes, training_scenes, validation
+from flows.training.curve_table import LEARNING, VALIDATION, read_rows
+from flows.training.fixed_images import Images
+from flows.training.optimiser_flow import train_network, train_scenes
+from flows.training.optimiser_stages import TrainJob, places, train_stage
+from flows.training.recipes import SceneList, Stage
+from flows.training.scene_starts import Adam, ByGnet, Initial, PerScene
+from flows.training.training_scenes import SceneRecipe, prepare, training_scene
 from genre_tasks.config import LossConfig
 from genre_tasks.errors import ConfigError, InputError
-from genre_tasks.optimiser.adam import GNET_RATES
-from genre_tasks.optimiser.learned_network import NetworkConfig
-from genre_tasks.optimiser.training import MetaConfig
-from genre_tasks.optimiser.weights import load
-from storage.curve import LEARNING, VALIDATION, read_rows
+from genre_tasks.learned.meta_training import MetaConfig
+from genre_tasks.learned.network import NetworkConfig
+from genre_tasks.learned.weights import load
+from genre_tasks.optimiser.tuned_adam import GNET_RATES
 from storage.files import digest_file
 
 SMALL = "&frames=8&cameras=1&width=32&height=18&lidar_beams=16&lidar_azimuths=150"
@@ -39,10 +39,15 @@ TABLE = (
     Stage("enet/3dgs", None, NETWORK, replace(TWO, rounds=2), CONFIG, AGES, Images("fnet")),
     Stage("gnet/only", "enet/3dgs", NETWORK, TWO, CONFIG.model_copy(update={"seed": 1})),
     Stage(
-        "enet/gnet", "enet/3dgs", NETWORK, TWO, CONFIG,
-        (ByGnet("gnet/only", 2, 2), Adam(2)), Images("stand_in", Initial()),
+        "enet/gnet",
+        "enet/3dgs",
+        NETWORK,
+        TWO,
+        CONFIG,
+        (ByGnet("gnet/only", 2, 2), Adam(2)),
+        Images("stand_in", Initial()),
     ),
-)  # fmt: skip
+)
 """The paper's order."""
 
 
@@ -185,10 +190,10 @@ def test_rounds_move_the_begins_on() -> None:
 def test_a_planned_scene_has_its_effects_and_plain_ones_their_old_keys(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    forced = scenes.PLANNED.model_copy(
+    forced = training_scenes.PLANNED.model_copy(
         update={"rolling_shutter": "on", "exposure": "on"}
     )  # tiny images call for little
-    monkeypatch.setattr(scenes, "PLANNED", forced)
+    monkeypatch.setattr(training_scenes, "PLANNED", forced)
     uri = f"synthetic:street?seed=1{SMALL}&rolling_shutter_s=0.05&exposure_jitter=0.3"
     plain = SceneRecipe(uri, max_points=150, distant_count=20, width_px=32, height_px=18)
     planned = replace(plain, planned=True)
@@ -229,5 +234,5 @@ def test_an_unsound_scene_is_made_anew(trained: Said, tmp_path: Path) -> None:
     file = next((tmp_path / "store").glob("synthetic/*seed=0*/0000/initial/*/gaussians.parquet"))
     before = file.read_bytes()
     file.write_bytes(before[:-9] + b"x" + before[-8:])
-    stages.make_scene(job, recipe, stages.works(TABLE, None)[recipe])
+    optimiser_stages.make_scene(job, recipe, optimiser_stages.works(TABLE, None)[recipe])
     assert file.read_bytes() == before

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import pytest
 
-from flows.train import recipes
-from flows.train.begins import Adam, ByGnet, PerScene
-from flows.train.device import chosen_device
-from flows.train.recipes import GNET_STAGES, ordered, table_of
-from flows.train.stages import places
-from flows.train.validation import validation_recipes
+from flows.training import recipes
+from flows.training.device import chosen_device
+from flows.training.optimiser_stages import places
+from flows.training.recipes import GNET_STAGES, ordered, table_of
+from flows.training.scene_starts import Adam, ByGnet, PerScene
+from flows.training.validation import validation_recipes
 from genre_tasks.errors import ConfigError
-from genre_tasks.optimiser.weights import load
+from genre_tasks.learned.weights import load
 from genre_tasks.weights import resolve_weights
 
 REAL = "pandaset:002"

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from genre_tasks.render import Render, RenderSettings, render
-from genre_tasks.render.oracles import Survey, agreement, relative_l2, sparsity_faults, survey
 from genre_tasks.scene.gaussians import Splats
-from tests.hard_cases.measured import SCENES
+from tests.hard_cases.case_measurements import SCENES
 from tests.hard_cases.render_cases import Case
+from tests.render.oracles import Survey, agreement, relative_l2, sparsity_faults, survey
 from tests.scenes import NAMES, Scene, gradients
 
 REFERENCE = RenderSettings("reference")

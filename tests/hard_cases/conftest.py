@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.hard_cases.measured import ROWS
+from tests.hard_cases.case_measurements import ROWS
 from tests.hard_cases.stability import Row, document, key
 
 _largest: dict[tuple[int, str, str, str], float] = {}
@@ -20,7 +20,7 @@ class Stability:
 
     def record(self, row: Row, backend: str, measured: float) -> None:
         """Fails if the row is not in the tables, or ``measured`` exceeds its bound (a NaN does)."""
-        assert row in ROWS, f"{row} is not a row of tests/hard_cases/measured.py"
+        assert row in ROWS, f"{row} is not a row of tests/hard_cases/case_measurements.py"
         place = key(row, backend)
         self._largest[place] = max(measured, self._largest.get(place, measured))
         what = f"{row.number} {row.words}: {row.quantity} on {backend}"

@@ -147,9 +147,12 @@ def layers(n: int, opacity: float) -> Scene:
     means = torch.zeros(n, 3)
     means[:, 2] = 5 + 1e-3 * torch.arange(n)
     splats = Splats(
-        means, 2 + torch.rand(n, 3, generator=g), torch.randn(n, 4, generator=g), torch.full((n,), opacity),
+        means,
+        2 + torch.rand(n, 3, generator=g),
+        torch.randn(n, 4, generator=g),
+        torch.full((n,), opacity),
         torch.rand(n, 3, generator=g),
-    )  # fmt: skip
+    )
     return splats, Cameras(torch.eye(4)[None], torch.full((1, 2), 10.0), torch.full((1, 2), 4.5), 9, 9)
 
 

@@ -9,7 +9,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from tests.hard_cases.listed import LISTED, SECTIONS
+from tests.hard_cases.case_list import LISTED, SECTIONS
 
 BACKENDS = ("reference", "cpu")
 
@@ -22,7 +22,7 @@ are those of the suite. To add a case, add a line to a table in `tests/hard_case
 
 Errors are against the float64 reference of the same input, the largest found. *image*: colour, alpha, and depth as a
 share of the farthest, absolute, outside of the band of pixels where rounding may decide (alpha beside 1/255 or the
-clamp, transmittance beside the stop, depths too near to be told apart; `genre_tasks/render/oracles.py`). *gradient*:
+clamp, transmittance beside the stop, depths too near to be told apart; `tests/render/oracles.py`). *gradient*:
 relative L2 of the worst of the five attributes, with no weight on those pixels; *whole gradient*: with them.
 `reference` is the same code in float32. `cuda` (gsplat) has no column: its images are held to 0.02 where there is a
 GPU, and no numbers have been taken. Tests that are slow or inject faults are part of `make test-all`, the others of

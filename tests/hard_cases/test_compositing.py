@@ -10,11 +10,11 @@ from torch import Tensor
 
 from genre_tasks.render import Cameras, render
 from genre_tasks.render import constants as const
-from genre_tasks.render.oracles import agreement, alpha_excess, survey
 from genre_tasks.scene.gaussians import Splats
+from tests.hard_cases.case_measurements import ALPHA_BOUND, DIFFERENCES, HALF, NO_WEIGHT
 from tests.hard_cases.comparison import REFERENCE, SETTINGS, compare, on_all, on_both, worst
-from tests.hard_cases.measured import ALPHA_BOUND, DIFFERENCES, HALF, NO_WEIGHT
 from tests.hard_cases.render_cases import COMPOSITING, layers
+from tests.render.oracles import agreement, alpha_excess, survey
 from tests.scenes import NAMES, Scene, cloud, gradients, street
 
 

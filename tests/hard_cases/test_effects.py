@@ -9,12 +9,12 @@ import torch
 
 from genre_tasks.logs.types import RollingShutter
 from genre_tasks.render import Cameras, render
-from genre_tasks.render.oracles import agreement, survey
 from genre_tasks.render.types import Shutter
-from genre_tasks.scene.distortion import fold_radius
 from genre_tasks.scene.gaussians import Splats
+from genre_tasks.scene.lens_distortion import fold_radius
+from tests.hard_cases.case_measurements import CROSSING, FOLDING, NO_READOUT
 from tests.hard_cases.comparison import REFERENCE, SETTINGS, changed_bits, different, on_both, worst
-from tests.hard_cases.measured import CROSSING, FOLDING, NO_READOUT
+from tests.render.oracles import agreement, survey
 from tests.scenes import NAMES, Scene, cloud, gradients
 
 BARREL = (-0.3, 0.0, 0.001, -0.002, 0.0)

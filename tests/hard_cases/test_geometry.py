@@ -10,11 +10,11 @@ import torch
 
 from genre_tasks.config import IngestConfig
 from genre_tasks.render import Cameras, Render, render
-from genre_tasks.render.oracles import agreement, relative_l2, survey
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.gaussians import Splats
 from genre_tasks.stages.ingest import ingest
 from tests.fakes import FakeLog
+from tests.hard_cases.case_measurements import FAR_WORLD, HIDDEN, NEEDLES_ONLY, ORDER, POISON, STREET_DIRECT
 from tests.hard_cases.comparison import (
     REFERENCE,
     SETTINGS,
@@ -26,9 +26,9 @@ from tests.hard_cases.comparison import (
     on_all,
     on_both,
     worst,
-)  # fmt: skip
-from tests.hard_cases.measured import FAR_WORLD, HIDDEN, NEEDLES_ONLY, ORDER, POISON, STREET_DIRECT
+)
 from tests.hard_cases.render_cases import GEOMETRY, needles_only
+from tests.render.oracles import agreement, relative_l2, survey
 from tests.scenes import NAMES, Scene, cloud, gradients, street
 
 

@@ -14,15 +14,16 @@ import pytest
 from PIL import Image
 
 from flows.configuration import load_configuration
-from flows.pipeline import PIPELINE
-from flows.produce import ArtifactRef, Job, produce
+from flows.pipeline.definition import PIPELINE
+from flows.pipeline.stage_runner import ArtifactRef, Job, produce
 from genre_tasks.errors import InputError
-from genre_tasks.logs.pandaset_writer import write_pandaset
+from genre_tasks.logs.pandaset.writer import write_pandaset
 from genre_tasks.logs.registry import open_log
+from genre_tasks.metrics.results import Evaluation
 from genre_tasks.scene.chunk import Chunk
-from genre_tasks.scene.results import Evaluation, Reconstruction
+from genre_tasks.scene.reconstruction import Reconstruction
 from storage.local import open_store
-from tests.faults.tiny import SETTINGS
+from tests.faults.small_run import SETTINGS
 
 pytestmark = pytest.mark.slow
 T = TypeVar("T")

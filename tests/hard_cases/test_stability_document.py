@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.hard_cases.listed import LISTED, SECTIONS
-from tests.hard_cases.measured import ROWS
+from tests.hard_cases.case_list import LISTED, SECTIONS
+from tests.hard_cases.case_measurements import ROWS
 from tests.hard_cases.stability import Row, document, key, parsed
 
 ROOT = Path(__file__).parents[2]

@@ -14,8 +14,8 @@ from genre_tasks.render import Cameras, RenderSettings, render
 from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.gaussians import Gaussians
-from genre_tasks.scene.geometry import interpolate_pose, quat_to_matrix, rigid
 from genre_tasks.scene.graph import FIRST_ACTOR, SceneGraph
+from genre_tasks.scene.transforms import interpolate_pose, quat_to_matrix, rigid
 from genre_tasks.stages.ingest import NO_SWEEP, ingest
 from tests.fakes import FakeCar, FakeLog, camera_turn, yaw_pose
 
@@ -102,9 +102,12 @@ def test_interpolation_is_the_shortest_turn(yaw: float) -> None:
 
 def _one_actor_graph(yaw: float) -> SceneGraph:
     gaussians = Gaussians(
-        torch.tensor([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), torch.zeros(2, 3), torch.tensor([[1.0, 0, 0, 0]] * 2),
-        torch.zeros(2), torch.zeros(2, 3),
-    )  # fmt: skip
+        torch.tensor([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]),
+        torch.zeros(2, 3),
+        torch.tensor([[1.0, 0, 0, 0]] * 2),
+        torch.zeros(2),
+        torch.zeros(2, 3),
+    )
     actor = ActorNode("a", "car", (4.0, 2.0, 1.5), np.array([3]), yaw_pose(yaw, (10.0, 0.0, 0.0))[None])
     return SceneGraph(gaussians, torch.tensor([0, FIRST_ACTOR]), (actor,))
 

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from genre_tasks.errors import InputError
-from genre_tasks.logs.frame_unpickler import read_frame
-from genre_tasks.logs.pandaset import PandaSetLog, open_pandaset
-from genre_tasks.logs.pandaset_layout import pose_matrix, seconds, to_our_axes, to_panda_axes
-from genre_tasks.logs.pandaset_writer import write_pandaset
-from tests.logs.panda_folder import FRAMES, cuboids, edit_json, edit_table, small_log, write_table
+from genre_tasks.logs.pandaset.layout import pose_matrix, seconds, to_our_axes, to_panda_axes
+from genre_tasks.logs.pandaset.pickle_reader import read_frame
+from genre_tasks.logs.pandaset.reader import PandaSetLog, open_pandaset
+from genre_tasks.logs.pandaset.writer import write_pandaset
+from tests.logs.pandaset_folder import FRAMES, cuboids, edit_json, edit_table, small_log, write_table
 
 
 @pytest.fixture(scope="module")
@@ -74,8 +74,12 @@ class TestConversions:
         for name in ("back_camera", "front_camera", "left_camera"):
             shutil.copytree(folder / "camera/front", folder / "camera" / name)
         assert [c.name for c in opened(folder).cameras] == [
-            "front_camera", "left_camera", "back_camera", "front", "left",
-        ]  # fmt: skip
+            "front_camera",
+            "left_camera",
+            "back_camera",
+            "front",
+            "left",
+        ]
 
 
 class TestOpening:
@@ -309,9 +313,14 @@ class TestTracks:
 class TestDigest:
     @pytest.mark.parametrize(
         "name",
-        ["lidar/01.pkl.gz", "lidar/poses.json", "camera/left/02.png", "camera/left/intrinsics.json",
-         "annotations/cuboids/00.pkl.gz"],
-    )  # fmt: skip
+        [
+            "lidar/01.pkl.gz",
+            "lidar/poses.json",
+            "camera/left/02.png",
+            "camera/left/intrinsics.json",
+            "annotations/cuboids/00.pkl.gz",
+        ],
+    )
     def test_a_changed_byte_changes_it(self, folder: Path, name: str) -> None:
         before = opened(folder).digest()
         data = (folder / name).read_bytes()

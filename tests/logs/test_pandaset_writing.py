@@ -10,12 +10,12 @@ import pytest
 from PIL import Image
 
 from genre_tasks.errors import InputError, ResourceError
-from genre_tasks.logs.pandaset import open_pandaset
-from genre_tasks.logs.pandaset_writer import write_pandaset
+from genre_tasks.logs.pandaset.reader import open_pandaset
+from genre_tasks.logs.pandaset.writer import write_pandaset
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.types import CuboidTrack, DrivingLog
 from tests.fakes import FakeCar, FakeLog
-from tests.logs.panda_folder import small_log
+from tests.logs.pandaset_folder import small_log
 
 
 def assert_same_log(found: DrivingLog, expected: DrivingLog) -> None:
@@ -27,9 +27,17 @@ def assert_same_log(found: DrivingLog, expected: DrivingLog) -> None:
         assert one.readout_s == other.readout_s and one.lens.distortion == other.lens.distortion
         np.testing.assert_allclose(
             [one.lens.fx_px, one.lens.fy_px, one.lens.cx_px, one.lens.cy_px, one.lens.width_px, one.lens.height_px],
-            [other.lens.fx_px, other.lens.fy_px, other.lens.cx_px, other.lens.cy_px, other.lens.width_px,
-             other.lens.height_px], rtol=0, atol=1e-9,
-        )  # fmt: skip
+            [
+                other.lens.fx_px,
+                other.lens.fy_px,
+                other.lens.cx_px,
+                other.lens.cy_px,
+                other.lens.width_px,
+                other.lens.height_px,
+            ],
+            rtol=0,
+            atol=1e-9,
+        )
     for frame in range(expected.frame_count):
         assert found.frame_timestamp_s(frame) == expected.frame_timestamp_s(frame)
         np.testing.assert_allclose(found.world_SE3_lidar(frame), expected.world_SE3_lidar(frame), rtol=0, atol=1e-9)
@@ -62,10 +70,14 @@ class TestRoundTrip:
     def test_fake_log(self, tmp_path: Path) -> None:
         turned = (FakeCar("a", 6.0, 3.0, 5.0, yaw_rad=2.7), FakeCar("b", 14.0, -4.0, yaw_rad=-3.1))
         log = small_log().with_(
-            cars=turned, world_offset_m=(4e6, -5e5, 12.0), ego_yaw_rad=0.7, track_every=2,
-            missing_images=frozenset({("left", 1)}), missing_sweeps=frozenset({2}),
+            cars=turned,
+            world_offset_m=(4e6, -5e5, 12.0),
+            ego_yaw_rad=0.7,
+            track_every=2,
+            missing_images=frozenset({("left", 1)}),
+            missing_sweeps=frozenset({2}),
             timestamps_s=(1557539959.300518, 1557539959.400481, 1557539959.500444, 1557539959.600418),
-        )  # fmt: skip
+        )
         written = write_pandaset(log, tmp_path / "out" / "041")
         assert_same_log(open_pandaset(str(written)), log)
 
@@ -140,7 +152,7 @@ class TestAtomic:
         def full(*_: object) -> None:
             raise OSError(28, "No space left on device")
 
-        monkeypatch.setattr("genre_tasks.logs.pandaset_writer._write_lidar", full)
+        monkeypatch.setattr("genre_tasks.logs.pandaset.writer._write_lidar", full)
         with pytest.raises(ResourceError, match="No space left"):
             write_pandaset(small_log(), tmp_path / "002")
         assert list(tmp_path.iterdir()) == []

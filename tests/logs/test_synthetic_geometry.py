@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from genre_tasks.logs.synthetic import SyntheticStreet, open_synthetic
-from genre_tasks.logs.synthetic.picture import camera_rays
+from genre_tasks.logs.synthetic.camera_images import camera_rays
 from genre_tasks.logs.types import CuboidTrack, Lens
 
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from genre_tasks.logs.synthetic.camera_images import to_srgb
 from genre_tasks.logs.synthetic.materials import MIRROR, REFLECTIVITY, Material
 from genre_tasks.logs.synthetic.mesh import Mesh, boxes, ellipsoid, joined, linear, tube
 from genre_tasks.logs.synthetic.noise import cell, dot3, fractal, noise, rotated, seam, stripe
-from genre_tasks.logs.synthetic.picture import to_srgb
 from genre_tasks.logs.synthetic.textures import TEXTURES, albedo
 
 

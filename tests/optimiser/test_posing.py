@@ -17,25 +17,25 @@ from genre_tasks.compiled.loader import supported_isas
 from genre_tasks.config import LossConfig
 from genre_tasks.errors import NonFiniteError, ResourceError
 from genre_tasks.logs.types import MotionBlur, RollingShutter
+from genre_tasks.losses.ssim import SsimTarget
+from genre_tasks.losses.targets import Target
 from genre_tasks.optimiser import objective as objective_module
-from genre_tasks.optimiser import posing as module
-from genre_tasks.optimiser.adam import TunedAdam
-from genre_tasks.optimiser.build_posing import KERNEL
+from genre_tasks.optimiser.differentiable_render import BlurredPass, CompiledPass, TorchPass, begin
+from genre_tasks.optimiser.kernels import posing as module
+from genre_tasks.optimiser.kernels.build_posing import KERNEL
+from genre_tasks.optimiser.kernels.posing import arrays, load_posing
 from genre_tasks.optimiser.objective import Objective
-from genre_tasks.optimiser.passes import BlurredPass, CompiledPass, TorchPass, begin
-from genre_tasks.optimiser.posing import arrays, load_posing
-from genre_tasks.optimiser.ssim import SsimTarget
 from genre_tasks.optimiser.state import Frame
-from genre_tasks.optimiser.targets import Target
+from genre_tasks.optimiser.tuned_adam import TunedAdam
 from genre_tasks.optimiser.unroll import Plan, unroll
 from genre_tasks.render import render_views
 from genre_tasks.render.types import Render, RenderSettings
 from genre_tasks.scene import constants
 from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.gaussians import Gaussians
-from genre_tasks.scene.geometry import se3
 from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR, SceneGraph
-from tests.optimiser import street
+from genre_tasks.scene.transforms import se3
+from tests.optimiser import street_scenes
 
 NAMES = ("means", "scales", "quats", "opacities", "colors")
 FRAMES = (1, 7, 0, 2)
@@ -45,7 +45,7 @@ SETTINGS = RenderSettings()
 
 def _scene(count: int = 3000, actors: int = 2) -> SceneGraph:
     """Actors that turn, each absent at times, whose Gaussians lie among the others."""
-    plain = street.scene(count, actor=False)
+    plain = street_scenes.scene(count, actor=False)
     paths = []
     for k in range(actors):
         turns = Rotation.from_euler("zyx", [[0.3 + k, 0.1, -0.2], [2.9, -0.4, 0.5 * k]]).as_matrix()
@@ -193,7 +193,9 @@ ROLLING = RollingShutter(0.05, (1.0, 0.2, 4.0), (0.1, -0.3, 0.2), frame_s=0.1)
 def _passes(
     scene: SceneGraph, settings: RenderSettings = SETTINGS, shutter: RollingShutter | None = None
 ) -> list[CompiledPass | TorchPass]:
-    views = [_Rolling(t, f, shutter) for t, f in zip(street.targets(street.scene()), (1, 7, 1, 2), strict=True)]
+    views = [
+        _Rolling(t, f, shutter) for t, f in zip(street_scenes.targets(street_scenes.scene()), (1, 7, 1, 2), strict=True)
+    ]
     return [p(Frame.of(scene), _offsets(scene), views, settings) for p in (CompiledPass, TorchPass)]
 
 
@@ -229,7 +231,9 @@ def test_a_whole_pass_is_torchs(shutter: RollingShutter | None) -> None:
 def test_a_blurred_pass_is_torchs_and_that_of_its_moments(shutter: RollingShutter | None) -> None:
     """Compiled and by torch: what ``begin`` takes, and by autograd through ``render_views``; again at known moments."""
     scene, blur = _scene(), MotionBlur(0.05, ROLLING.velocity_m_s, ROLLING.turn_rad_s, 0.1)
-    views = [_Rolling(t, f, shutter) for t, f in zip(street.targets(street.scene()), (1, 7, 1, 2), strict=True)]
+    views = [
+        _Rolling(t, f, shutter) for t, f in zip(street_scenes.targets(street_scenes.scene()), (1, 7, 1, 2), strict=True)
+    ]
     for view in views[:3]:
         view.blur = blur
     frame, offsets = Frame.of(scene), _offsets(scene)
@@ -250,7 +254,7 @@ def test_a_blurred_street_is_recovered_sharp_where_blur_is_known() -> None:
     """By the PSNR of what an ideal camera would see, of images 48 px wide that are blurred by four."""
     truth = _scene(600)
     blur = MotionBlur(0.1, (7.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.1)  # 40 px / 7 m of depth · 0.7 m
-    plain = street.targets(truth)
+    plain = street_scenes.targets(truth)
     moving = [replace(t, blur=blur) for t in plain]
     with torch.no_grad():
         images = render_views(truth, moving).color
@@ -258,7 +262,7 @@ def test_a_blurred_street_is_recovered_sharp_where_blur_is_known() -> None:
     error = {}
     for name, views in (("known", blurred), ("ignored", [replace(t, blur=None) for t in blurred])):
         objective = Objective(LossConfig(perceptual=0, depth=0.0))
-        found = unroll(TunedAdam(), street.blurred(truth), views, (), objective, Plan(60, 4)).scene
+        found = unroll(TunedAdam(), street_scenes.blurred(truth), views, (), objective, Plan(60, 4)).scene
         with torch.no_grad():
             seen = render_views(found, plain).color
         true = torch.stack([t.image.image for t in plain])
@@ -269,7 +273,7 @@ def test_a_blurred_street_is_recovered_sharp_where_blur_is_known() -> None:
 @pytest.mark.parametrize("depth", [0.0, 0.1])
 def test_an_unrolled_optimisation_with_actors_is_torchs(depth: float, monkeypatch: pytest.MonkeyPatch) -> None:
     truth = _scene(600)
-    start, views, plan = street.blurred(truth), street.targets(truth), Plan(6, 3)
+    start, views, plan = street_scenes.blurred(truth), street_scenes.targets(truth), Plan(6, 3)
     objective = Objective(LossConfig(perceptual=0, depth=depth))
     ours = unroll(TunedAdam(), start, views, (), objective, plan)
     monkeypatch.setattr(objective_module, "begin", TorchPass)
@@ -281,7 +285,7 @@ def test_an_unrolled_optimisation_with_actors_is_torchs(depth: float, monkeypatc
 
 
 def test_it_is_for_float32_on_the_cpu_and_its_backend() -> None:
-    scene, views = _scene(50), street.targets(street.scene())[:1]
+    scene, views = _scene(50), street_scenes.targets(street_scenes.scene())[:1]
     frame, offsets = Frame.of(scene), torch.zeros(50, 14)
     for settings in (SETTINGS, RenderSettings("cpu", 1)):
         assert isinstance(begin(frame, offsets, views, settings), CompiledPass)
@@ -293,8 +297,8 @@ def test_what_does_not_fit_is_refused() -> None:
     frame = Frame.of(_scene(50))
     with pytest.raises(ValueError, match=r"expected offsets of shape \[50, 14\], got \[49, 14\]"):
         frame.posing.splats(torch.zeros(49, 14), FRAMES, 1)
-    pose = street.pose(torch.nan)
-    view = replace(street.targets(street.scene())[0], chunk_SE3_camera=pose)
+    pose = street_scenes.pose(torch.nan)
+    view = replace(street_scenes.targets(street_scenes.scene())[0], chunk_SE3_camera=pose)
     with pytest.raises(NonFiniteError):
         CompiledPass(frame, torch.zeros(50, 14), [view], SETTINGS)
 

@@ -8,31 +8,31 @@ from pathlib import Path
 import pytest
 import torch
 
-from flows.train import checkpoint
-from flows.train.optimiser import network_from
+from flows.training import checkpoint
+from flows.training.optimiser_training import network_from
 from genre_tasks.compiled.loader import supported_isas
 from genre_tasks.config import LossConfig
 from genre_tasks.errors import InputError
+from genre_tasks.learned.features import FEATURES
+from genre_tasks.learned.learned_optimiser import LearnedOptimiser
+from genre_tasks.learned.meta_episodes import TrainingScene
+from genre_tasks.learned.meta_training import MetaConfig, MetaTraining
+from genre_tasks.learned.network import NetworkConfig
+from genre_tasks.learned.weights import load, save
 from genre_tasks.logs.types import MotionBlur
-from genre_tasks.optimiser.adam import TunedAdam
-from genre_tasks.optimiser.episodes import TrainingScene
-from genre_tasks.optimiser.features import FEATURES
-from genre_tasks.optimiser.learned import LearnedOptimiser
-from genre_tasks.optimiser.learned_network import NetworkConfig
-from genre_tasks.optimiser.loss import residual_image
-from genre_tasks.optimiser.network_constants import RESIDUALS, VARYING
+from genre_tasks.losses.rendering_loss import residual_image
+from genre_tasks.losses.ssim import SsimTarget
+from genre_tasks.optimiser.differentiable_render import Beside, BlurredPass, CompiledPass, TorchPass, begin
+from genre_tasks.optimiser.kernels.constants import RESIDUALS, VARYING
 from genre_tasks.optimiser.objective import Objective
-from genre_tasks.optimiser.passes import Beside, BlurredPass, CompiledPass, TorchPass, begin
-from genre_tasks.optimiser.ssim import SsimTarget
 from genre_tasks.optimiser.state import Frame
-from genre_tasks.optimiser.training import MetaConfig, MetaTraining
+from genre_tasks.optimiser.tuned_adam import TunedAdam
 from genre_tasks.optimiser.unroll import Plan, unroll
-from genre_tasks.optimiser.weights import load, save
 from genre_tasks.render import RenderSettings, render_views
-from genre_tasks.render import kernel_library as renderer
+from genre_tasks.render.kernel import library as renderer
 from genre_tasks.weights import resolve_weights
-from tests.optimiser import street
-from tests.optimiser.test_fused import CENTRE, TOTAL, _fused_step, _random, _states, _threads, _torch_step
+from tests.learned.test_kernel_step import CENTRE, TOTAL, _fused_step, _random, _states, _threads, _torch_step
+from tests.optimiser import street_scenes
 from tests.optimiser.test_posing import ROLLING, SETTINGS, _offsets, _passes, _Rolling, _scene
 
 TOLD = NetworkConfig(hidden=16, channels=(8, 12), residuals=True)
@@ -51,7 +51,7 @@ def test_the_sums_are_torchs(kind: str) -> None:
         scene, beside = scene.with_harmonics(harmonics), Beside(harmonics=harmonics)
     views = [
         _Rolling(t, f, ROLLING if kind == "rolling" else None)
-        for t, f in zip(street.targets(street.scene()), (1, 7, 1, 2), strict=True)
+        for t, f in zip(street_scenes.targets(street_scenes.scene()), (1, 7, 1, 2), strict=True)
     ]
     fixed = Frame.of(scene), _offsets(scene), views, SETTINGS, beside
     ours, torchs = CompiledPass(*fixed), TorchPass(*fixed)
@@ -97,7 +97,7 @@ def test_the_sums_are_the_same_bits_at_any_number_of_threads() -> None:
 @pytest.mark.parametrize("kind", ["compiled", "torch"])
 @pytest.mark.parametrize("count", [1, 2], ids=["one is sharp", "all are blurred"])
 def test_of_blurred_views_each_moment_has_an_equal_share(kind: str, count: int) -> None:
-    scene, still = _scene(), street.targets(street.scene())
+    scene, still = _scene(), street_scenes.targets(street_scenes.scene())
     resting = MotionBlur(1e-6, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.1)
     plain = [_Rolling(t, 1, None) for t in still]
     blurred = [_Rolling(t, 1, None) for t in still]
@@ -115,7 +115,7 @@ def test_of_blurred_views_each_moment_has_an_equal_share(kind: str, count: int) 
 
 
 def test_the_residual_is_in_the_scenes_own_colours_and_not_of_the_vehicle() -> None:
-    targets = street.targets(street.scene())[:2]
+    targets = street_scenes.targets(street_scenes.scene())[:2]
     own = torch.zeros(32, 48, dtype=torch.bool)
     own[20:] = True
     gain = (0.3, 0.0, -0.2)
@@ -132,15 +132,15 @@ def test_the_residual_is_in_the_scenes_own_colours_and_not_of_the_vehicle() -> N
 
 def test_untrained_steps_bring_colours_home_where_adam_has_a_long_way() -> None:
     """Every colour is wrong by as much; the mean residual says by how much, a gradient in which direction."""
-    truth = street.scene(600)
+    truth = street_scenes.scene(600)
     g = truth.gaussians
     begun = truth.with_gaussians(replace(g, colors=g.colors + 0.3))
     objective, plan = Objective(LossConfig(perceptual=0, depth=0.0)), Plan(6, 4)
     still = (0.0, 0.0, 0.0, 0.0, 0.01)
     rules = TunedAdam(still), LearnedOptimiser(NetworkConfig(residuals=True, rates=still)).requires_grad_(False)
-    adam, ours = (unroll(r, begun, street.targets(truth), (), objective, plan).scene for r in rules)
+    adam, ours = (unroll(r, begun, street_scenes.targets(truth), (), objective, plan).scene for r in rules)
     with torch.no_grad():
-        views = street.targets(truth)
+        views = street_scenes.targets(truth)
         error = [
             float((render_views(s, views).color - render_views(truth, views).color).abs().mean())
             for s in (begun, adam, ours)
@@ -151,7 +151,7 @@ def test_untrained_steps_bring_colours_home_where_adam_has_a_long_way() -> None:
 @pytest.mark.parametrize(("hidden", "channels"), [(64, (16, 32, 48)), (33, (17, 3))])
 def test_the_kernels_step_is_torchs(hidden: int, channels: tuple[int, ...]) -> None:
     scene, network = (
-        street.scene(400),
+        street_scenes.scene(400),
         _random(NetworkConfig(hidden=hidden, channels=channels, residuals=True, relaxation=-0.4)),
     )
     frame = Frame.of(scene)
@@ -186,7 +186,7 @@ def test_weights_without_them_can_be_told_them(tmp_path: Path) -> None:
     save(told, tmp_path / "told.safetensors")
     told = load(tmp_path / "told.safetensors")
     assert told.residuals and not plain.residuals
-    scene = street.scene(400)
+    scene = street_scenes.scene(400)
     steps = [network.start(Frame.of(scene), CENTRE) for network in (plain, told)]
     for state, gradient in _states(scene, told=True):
         moved = [steps[0](replace(state, residuals=None), gradient, TOTAL), steps[1](state, gradient, TOTAL)]
@@ -200,9 +200,9 @@ def test_weights_without_them_can_be_told_them(tmp_path: Path) -> None:
 
 
 def test_training_with_them_resumes_to_the_same_bytes(tmp_path: Path) -> None:
-    truth = street.scene(120)
-    views, loss = street.targets(truth), LossConfig(perceptual=0)
-    scene = TrainingScene("s", street.blurred(truth), views[:3], views[3:])
+    truth = street_scenes.scene(120)
+    views, loss = street_scenes.targets(truth), LossConfig(perceptual=0)
+    scene = TrainingScene("s", street_scenes.blurred(truth), views[:3], views[3:])
     config = MetaConfig(steps=40, segment=3, pool=2, iterations=(6, 9), views=(2, 3), loss=loss, judge_loss=loss)
     whole = MetaTraining(network_from(TOLD, 0), [scene], config)
     for _ in range(5):

@@ -9,15 +9,23 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.sweep_rates import Scores, Setting, Subject, network_moves, network_of, search, validation_seeds
+from benchmarks.optimiser.rate_sweep import (
+    Scores,
+    Setting,
+    Subject,
+    network_moves,
+    network_of,
+    search,
+    validation_seeds,
+)
 from genre_tasks.errors import ConfigError
-from genre_tasks.optimiser.adam import GNET_RATES
-from genre_tasks.optimiser.episodes import TrainingScene
-from genre_tasks.optimiser.learned import LearnedOptimiser
-from genre_tasks.optimiser.learned_network import NetworkConfig
-from genre_tasks.optimiser.weights import save
+from genre_tasks.learned.learned_optimiser import LearnedOptimiser
+from genre_tasks.learned.meta_episodes import TrainingScene
+from genre_tasks.learned.network import NetworkConfig
+from genre_tasks.learned.weights import save
+from genre_tasks.optimiser.tuned_adam import GNET_RATES
 from genre_tasks.scene.graph import SceneGraph
-from tests.optimiser import street
+from tests.optimiser import street_scenes
 
 
 def test_it_finds_rates_that_are_all_far_off_and_a_schedule() -> None:
@@ -36,9 +44,9 @@ def test_it_finds_rates_that_are_all_far_off_and_a_schedule() -> None:
 
 def test_scores_are_kept_and_not_measured_again(tmp_path: Path) -> None:
     def scene() -> Subject:
-        truth = street.scene()
-        views, novel = street.targets(truth), street.targets(truth, novel=True)
-        return Subject(TrainingScene("tiny", street.blurred(truth), views, novel))
+        truth = street_scenes.scene()
+        views, novel = street_scenes.targets(truth), street_scenes.targets(truth, novel=True)
+        return Subject(TrainingScene("tiny", street_scenes.blurred(truth), views, novel))
 
     def never() -> Subject:
         raise AssertionError("measured again")
@@ -69,9 +77,9 @@ def test_a_networks_rates_are_searched_with_its_relaxation(tmp_path: Path) -> No
 
 
 def test_what_is_beside_the_path_counts_where_it_is_asked_for(tmp_path: Path) -> None:
-    truth = street.scene()
-    views, novel = street.targets(truth), street.targets(truth, novel=True)
-    scenes = {900: lambda: Subject(TrainingScene("s", street.blurred(truth), views, views, truth=novel))}
+    truth = street_scenes.scene()
+    views, novel = street_scenes.targets(truth), street_scenes.targets(truth, novel=True)
+    scenes = {900: lambda: Subject(TrainingScene("s", street_scenes.blurred(truth), views, views, truth=novel))}
     at, there = (
         Scores(tmp_path / f"{beside}.json", scenes, beside=beside).mean(Setting(), 2, 2) for beside in (0.0, 0.5)
     )
@@ -79,9 +87,9 @@ def test_what_is_beside_the_path_counts_where_it_is_asked_for(tmp_path: Path) ->
 
 
 def test_an_enhancer_is_scored_by_what_it_is_given_and_by_how_close_it_comes(tmp_path: Path) -> None:
-    truth = street.scene()
-    views, novel = street.targets(truth), street.targets(truth, novel=True)
-    scene = TrainingScene("s", street.blurred(truth), views, views, fixed=novel)
+    truth = street_scenes.scene()
+    views, novel = street_scenes.targets(truth), street_scenes.targets(truth, novel=True)
+    scene = TrainingScene("s", street_scenes.blurred(truth), views, views, fixed=novel)
     seen: list[int] = []
 
     def closeness(result: SceneGraph) -> float:

@@ -8,22 +8,23 @@ from dataclasses import replace
 import pytest
 import torch
 
-from flows.train.device import scene_on
+from flows.training.device import scene_on
+from genre_tasks.checks import check_finite
 from genre_tasks.config import LossConfig
 from genre_tasks.errors import InputError, NonFiniteError
-from genre_tasks.optimiser.adam import TunedAdam
-from genre_tasks.optimiser.episodes import TrainingScene
-from genre_tasks.optimiser.features import FEATURES, Fixed, features
-from genre_tasks.optimiser.learned import LearnedOptimiser
-from genre_tasks.optimiser.learned_network import NetworkConfig
-from genre_tasks.optimiser.objective import Objective, check_finite
-from genre_tasks.optimiser.rules import StepRule
+from genre_tasks.learned.features import FEATURES, Fixed, features
+from genre_tasks.learned.learned_optimiser import LearnedOptimiser
+from genre_tasks.learned.meta_episodes import TrainingScene
+from genre_tasks.learned.network import NetworkConfig
+from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.state import Frame, State
+from genre_tasks.optimiser.step_rules import StepRule
+from genre_tasks.optimiser.tuned_adam import TunedAdam
 from genre_tasks.optimiser.unroll import Plan, camera_centre, unroll
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.results import Reconstruction
-from tests.optimiser import street
+from genre_tasks.scene.reconstruction import Reconstruction
+from tests.optimiser import street_scenes
 
 OBJECTIVE = Objective(LossConfig(perceptual=0))
 SMALL = NetworkConfig(hidden=16, channels=(8, 12), rates=TunedAdam().rates)
@@ -39,16 +40,16 @@ def _network(seed: int = 0, trained: bool = True) -> LearnedOptimiser:
 
 
 def _run(rule: StepRule, scene: SceneGraph, truth: SceneGraph, plan: Plan) -> Reconstruction:
-    return unroll(rule, scene, street.targets(truth), street.targets(truth, novel=True), OBJECTIVE, plan)
+    return unroll(rule, scene, street_scenes.targets(truth), street_scenes.targets(truth, novel=True), OBJECTIVE, plan)
 
 
 @pytest.fixture(scope="module")
 def truth() -> SceneGraph:
-    return street.scene()
+    return street_scenes.scene()
 
 
 def test_an_untrained_network_is_tuned_adam_to_the_bit(truth: SceneGraph) -> None:
-    start, plan = street.blurred(truth), Plan(5, 2, 1)
+    start, plan = street_scenes.blurred(truth), Plan(5, 2, 1)
     a = _run(TunedAdam(SMALL.rates), start, truth, plan)
     b = _run(_network(trained=False), start, truth, plan)
     assert a.losses == b.losses
@@ -58,11 +59,11 @@ def test_an_untrained_network_is_tuned_adam_to_the_bit(truth: SceneGraph) -> Non
 @pytest.mark.parametrize("rule", [TunedAdam(), _network()], ids=["adam", "learned"])
 def test_the_loss_falls_and_the_result_says_how(rule: StepRule, truth: SceneGraph) -> None:
     seen = []
-    start = street.blurred(truth)
+    start = street_scenes.blurred(truth)
     result = unroll(
         rule,
         start,
-        street.targets(truth),
+        street_scenes.targets(truth),
         (),
         OBJECTIVE,
         Plan(20, 4, snapshots=3),
@@ -77,7 +78,7 @@ def test_the_loss_falls_and_the_result_says_how(rule: StepRule, truth: SceneGrap
 
 
 def test_same_seed_same_bytes_at_any_thread_count(truth: SceneGraph) -> None:
-    start, before, results = street.blurred(truth), torch.get_num_threads(), []
+    start, before, results = street_scenes.blurred(truth), torch.get_num_threads(), []
     try:
         for threads in (1, 2):
             torch.set_num_threads(threads)
@@ -99,7 +100,7 @@ def _hidden(scene: SceneGraph) -> SceneGraph:
 
 @pytest.mark.parametrize("rule", [TunedAdam(), _network()], ids=["adam", "learned"])
 def test_a_gaussian_that_no_view_has_seen_gets_exactly_no_update(rule: StepRule, truth: SceneGraph) -> None:
-    start = _hidden(street.blurred(truth))
+    start = _hidden(street_scenes.blurred(truth))
     result = _run(rule, start, truth, Plan(6, 4, 4))
     before, after = start.gaussians.packed(), result.scene.gaussians.packed()
     assert torch.equal(before[:5], after[:5])
@@ -139,7 +140,7 @@ def test_permuting_the_gaussians_permutes_the_step(truth: SceneGraph) -> None:
 
 
 def test_shifting_everything_by_whole_voxels_changes_nothing() -> None:
-    scene = street.scene(actor=False)
+    scene = street_scenes.scene(actor=False)
     gradient = torch.randn(len(scene), 14, generator=torch.Generator().manual_seed(0))
     coarsest = SMALL.voxel_m * 2**5 * 2 * 2 ** (len(SMALL.channels) - 1)
     g = scene.gaussians
@@ -171,8 +172,8 @@ def test_gradients_of_many_sizes_at_once_give_finite_bounded_features(truth: Sce
 
 
 def test_far_beyond_its_horizon_it_stays_bounded(truth: SceneGraph) -> None:
-    result = unroll(TunedAdam(), street.blurred(truth), street.targets(truth), (), OBJECTIVE, Plan(12, 4))
-    long = unroll(TunedAdam(), street.blurred(truth), street.targets(truth), (), OBJECTIVE, Plan(120, 4))
+    result = unroll(TunedAdam(), street_scenes.blurred(truth), street_scenes.targets(truth), (), OBJECTIVE, Plan(12, 4))
+    long = unroll(TunedAdam(), street_scenes.blurred(truth), street_scenes.targets(truth), (), OBJECTIVE, Plan(120, 4))
     assert long.losses[-1] <= result.losses[-1] * 1.05
     packed = long.scene.gaussians.packed()
     assert bool(torch.isfinite(packed).all())
@@ -180,37 +181,37 @@ def test_far_beyond_its_horizon_it_stays_bounded(truth: SceneGraph) -> None:
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_empty_and_single_scenes(count: int) -> None:
-    full = street.scene(actor=False)
+    full = street_scenes.scene(actor=False)
     scene = SceneGraph(
         Gaussians.unpacked(full.gaussians.packed()[50 : 50 + count].clone()), full.nodes[50 : 50 + count], ()
     )
-    result = unroll(_network(), scene, street.targets(full), (), OBJECTIVE, Plan(2, 2))
+    result = unroll(_network(), scene, street_scenes.targets(full), (), OBJECTIVE, Plan(2, 2))
     assert len(result.scene) == count
     assert bool(torch.isfinite(result.scene.gaussians.packed()).all())
 
 
 def test_all_gaussians_in_one_voxel() -> None:
-    full = street.scene(actor=False)
+    full = street_scenes.scene(actor=False)
     g = full.gaussians
     scene = full.with_gaussians(replace(g, means=torch.tensor([0.0, 0.0, 6.0]).expand(len(full), 3).clone()))
-    result = unroll(_network(), scene, street.targets(full), (), OBJECTIVE, Plan(2, 2))
+    result = unroll(_network(), scene, street_scenes.targets(full), (), OBJECTIVE, Plan(2, 2))
     assert bool(torch.isfinite(result.scene.gaussians.packed()).all())
 
 
 @pytest.mark.parametrize("rule", [_network(), TunedAdam()])
 def test_a_scene_out_of_every_view_is_an_error_that_says_so(rule: StepRule) -> None:
-    full = street.scene(actor=False)
+    full = street_scenes.scene(actor=False)
     behind = full.with_gaussians(replace(full.gaussians, means=full.gaussians.means - torch.tensor([0.0, 0.0, 1e3])))
     with pytest.raises(
         InputError, match=rf"None of the scene's {len(full)} Gaussians .* source views .*frames \d"
     ) as hit:
-        unroll(rule, behind, street.targets(full), (), OBJECTIVE, Plan(9, 2, stage="gnet"))
+        unroll(rule, behind, street_scenes.targets(full), (), OBJECTIVE, Plan(9, 2, stage="gnet"))
     assert "genre check" in str(hit.value.remedy)
 
 
 def test_cameras_and_rates_are_where_the_scene_is(truth: SceneGraph) -> None:
     elsewhere = torch.device("meta")  # any device but the CPU
-    targets = scene_on(TrainingScene("s", truth, street.targets(truth), ()), elsewhere).source
+    targets = scene_on(TrainingScene("s", truth, street_scenes.targets(truth), ()), elsewhere).source
     assert camera_centre(targets).device == elsewhere
     state = State.start(4, torch.empty(0, device=elsewhere))
     assert TunedAdam().start(Frame.of(truth), torch.zeros(3))(state, state.first, 4).device == elsewhere
@@ -229,7 +230,14 @@ def test_a_step_that_is_not_finite_is_named(truth: SceneGraph) -> None:
             return step
 
     with pytest.raises(NonFiniteError) as raised:
-        unroll(Broken(), street.blurred(truth), street.targets(truth), (), OBJECTIVE, Plan(2, 2, stage="gnet"))
+        unroll(
+            Broken(),
+            street_scenes.blurred(truth),
+            street_scenes.targets(truth),
+            (),
+            OBJECTIVE,
+            Plan(2, 2, stage="gnet"),
+        )
     assert raised.value.stage == "gnet" and raised.value.first_index == (len(truth) - 1, 4)
 
 
@@ -244,7 +252,7 @@ def test_a_sum_that_overflows_is_no_fault_and_infinities_do_not_cancel() -> None
 
 
 def test_bounds_hold_and_what_starts_outside_may_stay() -> None:
-    scene = street.scene(actor=False)
+    scene = street_scenes.scene(actor=False)
     frame = Frame.of(scene)
     state = State.start(len(scene), scene.gaussians.means).saw(torch.ones(len(scene), 14))
     far = state.moved(frame, torch.full((len(scene), 14), 100.0))
@@ -255,7 +263,7 @@ def test_bounds_hold_and_what_starts_outside_may_stay() -> None:
 
 
 def test_no_side_grows_beyond_eight_times_the_longest_one_at_the_start() -> None:
-    scene = street.scene(actor=False)
+    scene = street_scenes.scene(actor=False)
     start = scene.gaussians.log_scales
     frame, gradient = Frame.of(scene), torch.ones(len(scene), 14)
     far = State.start(len(scene), scene.gaussians.means).saw(gradient).moved(frame, 100 * gradient)

@@ -14,11 +14,11 @@ import torch
 from genre_tasks.config import IngestConfig, RangeConfig
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.logs.registry import open_log
-from genre_tasks.metrics.collect import view_image
+from genre_tasks.metrics.scoring import view_image
 from genre_tasks.reliability.detector import LEAST_PX, Detector
 from genre_tasks.reliability.guards import Guards
-from genre_tasks.reliability.range import judged
-from genre_tasks.scene.boxes import outline
+from genre_tasks.reliability.reliable_range import judged
+from genre_tasks.scene.box_projection import outline
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.stages.ingest import ingest
 

@@ -14,30 +14,36 @@ from typer.testing import CliRunner
 
 from flows.cli.main import app
 from flows.configuration import load_configuration
-from flows.logs import opened_log
-from flows.pipeline import BY_NAME
-from flows.produce import ArtifactRef, Job, produce
-from flows.reliable import write
-from flows.runs import Run, finish_run, last_stage, stage_value, summary_of
+from flows.pipeline.definition import BY_NAME
+from flows.pipeline.log_cache import opened_log
+from flows.pipeline.stage_runner import ArtifactRef, Job, produce
+from flows.reconstruction.reliable_range import write
+from flows.reconstruction.run_records import Run, finish_run, last_stage, stage_value, summary_of
 from genre_tasks.config import RangeConfig
 from genre_tasks.errors import ConfigError, InputError
-from genre_tasks.fixer.conditioning import recorded
-from genre_tasks.metrics.collect import true_pixels
-from genre_tasks.metrics.image import psnr
+from genre_tasks.fixer.source_images import recorded
+from genre_tasks.metrics.image_quality import psnr
+from genre_tasks.metrics.scoring import true_pixels
+from genre_tasks.reliability.chunk_seam import medians, seam
 from genre_tasks.reliability.guards import ESTIMATE, MOST_DB, Guards, guards_of
-from genre_tasks.reliability.range import judged, reliable_range
-from genre_tasks.reliability.seam import medians, seam
+from genre_tasks.reliability.reliable_range import judged, reliable_range
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.novel import novel_view_poses
-from genre_tasks.scene.views import NovelViews
+from genre_tasks.scene.novel_poses import novel_view_poses
+from genre_tasks.scene.novel_views import NovelViews
 from genre_tasks.stages.novel_views import render_novel
 
 LOG = "synthetic:street?seed=900&frames=8&cameras=1&width=128&height=72&moving=0&pedestrians=0"
 SETTINGS = [
-    "ingest.width_px=128", "ingest.height_px=72", "initial.max_points=6000", "initial.distant_count=500",
-    "gnet.iterations=4", "evaluate.shifts_m=[3]", "evaluate.bootstrap=0", "evaluate.every=4",
-]  # fmt: skip
+    "ingest.width_px=128",
+    "ingest.height_px=72",
+    "initial.max_points=6000",
+    "initial.distant_count=500",
+    "gnet.iterations=4",
+    "evaluate.shifts_m=[3]",
+    "evaluate.bootstrap=0",
+    "evaluate.every=4",
+]
 STAGES = ("ingest", "effects", "initial", "gnet", "evaluate/initial", "evaluate/gnet")
 
 
@@ -85,11 +91,15 @@ def test_estimates_are_in_the_order_of_the_truth(chunk: Chunk, scene: SceneGraph
     novel = rendered(chunk, scene, 0.0, 1.5, 5.0)
     guards = guards_of(chunk, novel, recorded(chunk))
     true = {
-        shift: np.mean([
-            psnr(novel.color[i].clamp(0, 1).numpy(), true_pixels(chunk, truth, v).astype(np.float32) / 255)
-            for i, v in enumerate(novel.views) if v.shift_m == shift
-        ]) for shift in (0.0, 1.5, 5.0)
-    }  # fmt: skip
+        shift: np.mean(
+            [
+                psnr(novel.color[i].clamp(0, 1).numpy(), true_pixels(chunk, truth, v).astype(np.float32) / 255)
+                for i, v in enumerate(novel.views)
+                if v.shift_m == shift
+            ]
+        )
+        for shift in (0.0, 1.5, 5.0)
+    }
     ours = {shift: np.mean([g.estimate_db for g in guards if g.shift_m == shift]) for shift in true}
     assert sorted(true, key=true.__getitem__) == sorted(ours, key=ours.__getitem__) == [5.0, 1.5, 0.0]
 
@@ -197,9 +207,13 @@ def test_a_seam_is_the_same_view_from_both_scenes(chunk: Chunk, scene: SceneGrap
         replace(v, chunk_SE3_camera=shift @ v.chunk_SE3_camera) for v in chunk.views if v.frame in chunk.frames[4:]
     ]
     second = replace(
-        chunk, index=1, frames=chunk.frames[4:], views=tuple(moved), chunk_SE3_ego=shift @ chunk.chunk_SE3_ego[4:],
+        chunk,
+        index=1,
+        frames=chunk.frames[4:],
+        views=tuple(moved),
+        chunk_SE3_ego=shift @ chunk.chunk_SE3_ego[4:],
         world_SE3_chunk=chunk.world_SE3_chunk @ np.linalg.inv(shift),
-    )  # fmt: skip
+    )
     first = replace(first, chunk_SE3_ego=chunk.chunk_SE3_ego[:4])
     offset = torch.tensor([7.0, -3.0, 0.5])
     same = replace(scene.gaussians, means=scene.gaussians.means + offset)

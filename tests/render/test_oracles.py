@@ -10,7 +10,8 @@ import torch
 
 from genre_tasks.render import Cameras, Render, RenderSettings, render
 from genre_tasks.render import constants as const
-from genre_tasks.render.oracles import (
+from genre_tasks.scene.gaussians import Splats
+from tests.render.oracles import (
     agreement,
     alpha_excess,
     cosine,
@@ -18,8 +19,7 @@ from genre_tasks.render.oracles import (
     relative_l2,
     sparsity_faults,
     survey,
-)  # fmt: skip
-from genre_tasks.scene.gaussians import Splats
+)
 
 REFERENCE = RenderSettings("reference")
 

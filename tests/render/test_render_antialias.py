@@ -12,9 +12,9 @@ from genre_tasks.errors import ConfigError
 from genre_tasks.logs.types import RollingShutter
 from genre_tasks.render import Cameras, RenderSettings, constants, render
 from genre_tasks.render.cuda import _effects
-from genre_tasks.render.oracles import agreement, relative_l2, survey
 from genre_tasks.render.types import Shutter
 from genre_tasks.scene.gaussians import Splats
+from tests.render.oracles import agreement, relative_l2, survey
 from tests.scenes import NAMES, cloud, smooth
 
 CPU, REFERENCE = RenderSettings("cpu", 1), RenderSettings("reference")

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.raster.work_count import count_work
 from genre_tasks.logs.types import Lens
 from genre_tasks.render import Cameras, RenderSettings, render, render_views
-from genre_tasks.render.work import count_work
 from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.gaussians import Gaussians, Splats
 from genre_tasks.scene.graph import FIRST_ACTOR, STATIC, SceneGraph
-from genre_tasks.scene.views import NovelView
+from genre_tasks.scene.novel_views import NovelView
 
 IMAGES = ("color", "alpha", "depth")
 ONE = RenderSettings("cpu", 1)

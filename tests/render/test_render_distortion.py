@@ -11,14 +11,14 @@ import torch
 
 from genre_tasks.logs.types import Lens
 from genre_tasks.render import Cameras, RenderSettings, render, render_views
-from genre_tasks.render.bent import domain_of
 from genre_tasks.render.constants import JACOBIAN_MARGIN
-from genre_tasks.render.oracles import agreement, relative_l2, survey
+from genre_tasks.render.lens_domain import domain_of
 from genre_tasks.render.surface import render_surfaces
-from genre_tasks.scene.distortion import distort, fold_radius, rays_at, slopes, undistort
 from genre_tasks.scene.gaussians import Gaussians, Splats
 from genre_tasks.scene.graph import SceneGraph
+from genre_tasks.scene.lens_distortion import distort, fold_radius, rays_at, slopes, undistort
 from genre_tasks.scene.projection import project
+from tests.render.oracles import agreement, relative_l2, survey
 from tests.scenes import NAMES, pose_gradient_error, smooth, street
 
 CPU, REFERENCE = RenderSettings("cpu", 1), RenderSettings("reference")

@@ -11,20 +11,21 @@ from pathlib import Path
 import pytest
 import torch
 
-from genre_tasks.compiled import loader, recipe
-from genre_tasks.compiled.recipe import Kernel
+from genre_tasks.compiled import build, loader
+from genre_tasks.compiled.build import Kernel
 from genre_tasks.errors import ConfigError, ResourceError
 from genre_tasks.logs.types import RollingShutter
-from genre_tasks.render import RenderSettings, constants, cpu, kernel_library, render
-from genre_tasks.render.build_kernel import KERNEL
+from genre_tasks.render import RenderSettings, constants, cpu, render
+from genre_tasks.render.kernel import library
+from genre_tasks.render.kernel.build import KERNEL
 from genre_tasks.render.types import Shutter
 
 
 @pytest.fixture
 def fresh_loader():
-    kernel_library.load_kernel.cache_clear()
-    yield kernel_library.load_kernel
-    kernel_library.load_kernel.cache_clear()
+    library.load_kernel.cache_clear()
+    yield library.load_kernel
+    library.load_kernel.cache_clear()
 
 
 def test_missing_library_says_what_to_run(tmp_path, fresh_loader):
@@ -55,7 +56,7 @@ def test_an_instruction_set_that_is_lacking_is_never_loaded(fresh_loader, monkey
         fresh_loader()
     monkeypatch.delenv("GENRE_RENDER_ISA")
     monkeypatch.setattr(loader, "_cpu_flags", lambda: {"sse4_2", "popcnt", "ssse3"})
-    if "generic" not in recipe.isas():
+    if "generic" not in build.isas():
         assert loader.candidate_isas() == ["sse42"]
 
 
@@ -81,21 +82,21 @@ def test_no_compiler_is_one_clear_line(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(RuntimeError, match=r"install g\+\+ or clang\+\+.*ziglang") as caught:
-        recipe.build([(KERNEL, tmp_path)])
+        build.build([(KERNEL, tmp_path)])
     assert "\n" not in str(caught.value)
 
 
 def test_a_failing_compiler_leaves_nothing(tmp_path, monkeypatch):
     monkeypatch.setenv("CXX", "false")
     with pytest.raises(RuntimeError, match="false failed on the renderer"):
-        recipe.build([(KERNEL, tmp_path)])
+        build.build([(KERNEL, tmp_path)])
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
 def test_a_fresh_build_loads(tmp_path, fresh_loader):
-    paths = recipe.build([(KERNEL, tmp_path)])
-    assert [p.name for p in paths] == [KERNEL.library_name(i) for i in recipe.isas_for(recipe.find_compiler())]
+    paths = build.build([(KERNEL, tmp_path)])
+    assert [p.name for p in paths] == [KERNEL.library_name(i) for i in build.isas_for(build.find_compiler())]
     assert fresh_loader(tmp_path).genre_digest().decode() == KERNEL.source_digest()
 
 

@@ -18,13 +18,13 @@ from genre_tasks.errors import ConfigError, NonFiniteError, ResourceError
 from genre_tasks.logs.types import Lens, RollingShutter
 from genre_tasks.render import Cameras, RenderSettings, constants, render, render_views
 from genre_tasks.render.cuda import _effects
-from genre_tasks.render.oracles import agreement, relative_l2, survey
 from genre_tasks.render.reference_camera import OneCamera
 from genre_tasks.render.types import Shutter
 from genre_tasks.scene import projection
 from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.gaussians import Gaussians, Splats
 from genre_tasks.scene.graph import FIRST_ACTOR, SceneGraph
+from tests.render.oracles import agreement, relative_l2, survey
 from tests.scenes import NAMES, cloud, pose_gradient_error, smooth, twist
 
 CPU, REFERENCE = RenderSettings("cpu", 1), RenderSettings("reference")

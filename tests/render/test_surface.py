@@ -76,9 +76,12 @@ def test_where_planes_do_not_meet_the_centres_count(angle):
     # one ball, and one disc seen exactly on edge, 5 m ahead
     quats = torch.tensor([[np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0]], dtype=torch.float32)
     g = Gaussians(
-        torch.tensor([[0.0, 0.0, 5.0]]), torch.log(torch.tensor([[0.5, 0.5, 0.01 if angle else 0.5]])), quats,
-        torch.tensor([4.0]), torch.full((1, 3), 0.5),
-    )  # fmt: skip
+        torch.tensor([[0.0, 0.0, 5.0]]),
+        torch.log(torch.tensor([[0.5, 0.5, 0.01 if angle else 0.5]])),
+        quats,
+        torch.tensor([4.0]),
+        torch.full((1, 3), 0.5),
+    )
     out = render_surfaces(graph(g), [Posed(0, np.eye(4))])
     seen = out.alpha[0] > 0.1
     assert seen.any()
@@ -88,9 +91,12 @@ def test_where_planes_do_not_meet_the_centres_count(angle):
 def test_normals_are_along_the_shortest_axis():
     half = float(np.sqrt(0.5))
     g = Gaussians(
-        torch.zeros(3, 3), torch.log(torch.tensor([[1.0, 1, 0.1], [0.1, 1, 1], [1, 1, 0.1]])),
-        torch.tensor([[2.0, 0, 0, 0], [1, 0, 0, 0], [half, half, 0, 0]]), torch.zeros(3), torch.zeros(3, 3),
-    )  # fmt: skip
+        torch.zeros(3, 3),
+        torch.log(torch.tensor([[1.0, 1, 0.1], [0.1, 1, 1], [1, 1, 0.1]])),
+        torch.tensor([[2.0, 0, 0, 0], [1, 0, 0, 0], [half, half, 0, 0]]),
+        torch.zeros(3),
+        torch.zeros(3, 3),
+    )
     expected = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, -1, 0]])  # a quarter turn about x takes z to −y
     torch.testing.assert_close(normals(g.activated()), expected, atol=1e-6, rtol=0)
 

@@ -14,7 +14,7 @@ from genre_tasks.render.surface import render_surfaces
 from genre_tasks.scene.chunk import Points
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.initialise import node_gaussians
+from genre_tasks.scene.initial_gaussians import node_gaussians
 from genre_tasks.scene.lidar_map import ACTOR_VOXEL_M, MAX_GAP_M, closed
 
 LENS = Lens(80.0, 80.0, 48.0, 32.0, 96, 64)
@@ -38,9 +38,11 @@ def _rings(gap_m: float, rings: int = 5) -> Points:
     noise = np.random.default_rng(0).normal(0, 0.005, positions.shape)
     count = len(positions)
     return Points(
-        (positions + noise).astype(np.float32), np.full((count, 3), 200, np.uint8), np.ones(count, bool),
+        (positions + noise).astype(np.float32),
+        np.full((count, 3), 200, np.uint8),
+        np.ones(count, bool),
         np.zeros(count, np.int16),
-    )  # fmt: skip
+    )
 
 
 def _discs(points: Points) -> Gaussians:
@@ -81,9 +83,12 @@ def test_the_outline_stays_and_what_is_farther_apart_is_left_open() -> None:
 def test_hardly_any_points_are_left_as_they_are_or_finite(count: int) -> None:
     few = Gaussians.unpacked(torch.zeros(count, 14))
     few = Gaussians(
-        torch.randn(count, 3), few.log_scales, torch.tensor([1.0, 0, 0, 0]).repeat(count, 1), *few.packed()[:, 10:11].T,
+        torch.randn(count, 3),
+        few.log_scales,
+        torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+        *few.packed()[:, 10:11].T,
         few.colors,
-    )  # fmt: skip
+    )
     assert len(closed(few)) == count and bool(closed(few).packed().isfinite().all())
 
 

@@ -10,8 +10,8 @@ import pytest
 from genre_tasks.config import IngestConfig, InitialConfig
 from genre_tasks.logs.registry import open_log
 from genre_tasks.render import render_views
-from genre_tasks.scene.depth import lidar_depth
-from genre_tasks.scene.images import decode_image
+from genre_tasks.scene.image_decoding import decode_image
+from genre_tasks.scene.lidar_depth import lidar_depth
 from genre_tasks.stages.ingest import ingest
 from genre_tasks.stages.initial import initial
 

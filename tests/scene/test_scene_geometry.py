@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from genre_tasks.scene.geometry import (
+from genre_tasks.scene.transforms import (
     matrix_to_quat,
     quat_multiply,
     quat_to_matrix,

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from genre_tasks.logs.types import Lens
-from genre_tasks.scene.actors import Path
 from genre_tasks.scene.chunk import View
-from genre_tasks.scene.coloring import GREY, Cloud, color_clouds
-from genre_tasks.scene.ground import road_fill
+from genre_tasks.scene.moving_actors import Path
 from genre_tasks.scene.projection import project, splat_depth
-from genre_tasks.scene.voxels import count_voxels, group, levels, voxel_size_for
+from genre_tasks.scene.road_completion import road_fill
+from genre_tasks.scene.visibility import GREY, Cloud, color_clouds
+from genre_tasks.scene.voxel_grid import count_voxels, group, levels, voxel_size_for
 from tests.fakes import camera_turn, yaw_pose
 
 LENS = Lens(100.0, 100.0, 50.0, 40.0, 100, 80)

@@ -13,20 +13,21 @@ import torch
 from genre_tasks.config import EvaluateConfig, IngestConfig
 from genre_tasks.errors import NonFiniteError
 from genre_tasks.logs.types import Float64, Lens
-from genre_tasks.metrics import collect
-from genre_tasks.metrics.collect import real_images
+from genre_tasks.metrics import scoring
+from genre_tasks.metrics.results import Evaluation
+from genre_tasks.metrics.scoring import real_images
 from genre_tasks.render.types import Render
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import STATIC, SceneGraph
-from genre_tasks.scene.novel import novel_view_poses
-from genre_tasks.scene.results import Evaluation, Reconstruction
-from genre_tasks.scene.views import FixedViews, NovelViews
+from genre_tasks.scene.novel_poses import novel_view_poses
+from genre_tasks.scene.novel_views import FixedViews, NovelViews
+from genre_tasks.scene.reconstruction import Reconstruction
 from genre_tasks.stages import evaluate
 from genre_tasks.stages.evaluate import evaluate_fixed, evaluate_scene
 from genre_tasks.stages.ingest import ingest
 from tests.fakes import FakeLog
-from tests.metrics.test_published import FakeInception, FakeVgg, saved
+from tests.metrics.test_fid_lpips import FakeInception, FakeVgg, saved
 
 CONFIG = EvaluateConfig(shifts_m=(1.0, 3.0), bootstrap=20)
 LOG = FakeLog(frame_count=8, width_px=48, height_px=32, world_offset_m=(64.0, -32.0, 2.0))
@@ -101,8 +102,9 @@ def test_a_perfect_renderer_scores_perfectly(chunk: Chunk, scene: SceneGraph, mo
     assert counts["interpolation/psnr"] == counts["shift_0m/kernel"] == 12  # 6 held-out frames × 2 cameras
     assert counts["shift_3m/psnr"] == counts["shift_3m/kernel"] == 32  # 8 frames × 2 cameras × 2 sides
     assert {(v.shift_m > 0, abs(v.shift_m)) for v in result.views} == {
-        (False, 0.0), *itertools.product((True, False), (1.0, 3.0))
-    }  # fmt: skip
+        (False, 0.0),
+        *itertools.product((True, False), (1.0, 3.0)),
+    }
     ((iteration, accuracy),) = result.curve
     assert iteration == 3 and accuracy > 60
 
@@ -205,7 +207,7 @@ def test_a_render_that_is_not_finite_is_named(chunk: Chunk) -> None:
 def test_real_features_are_taken_once(chunk: Chunk, monkeypatch) -> None:
     first = real_images(chunk)
     assert first.features.shape == (16, 1280) and first.frames == tuple(v.frame for v in chunk.views)
-    monkeypatch.setattr(collect, "decode_image", None)
+    monkeypatch.setattr(scoring, "decode_image", None)
     assert real_images(chunk) is first
     with pytest.raises(TypeError):
         real_images(replace(chunk, views=chunk.views[1:]))
@@ -227,9 +229,9 @@ def test_truth_is_cast_once_for_all_stages(chunk: Chunk, monkeypatch) -> None:
     assert len(asked) == len(fixed.views)
     evaluate_fixed(CONFIG, chunk, fixed, novel, Counting(LOG))  # another truth is asked anew
     assert len(asked) == 2 * len(fixed.views)
-    monkeypatch.setattr(collect, "_KEPT_TRUTH_BYTES", 1)
+    monkeypatch.setattr(scoring, "_KEPT_TRUTH_BYTES", 1)
     evaluate_fixed(CONFIG, chunk, fixed, novel, Counting(LOG))
-    assert len(collect._true) == 1
+    assert len(scoring._true) == 1
 
 
 def test_same_bytes_at_any_thread_count(chunk: Chunk, scene: SceneGraph) -> None:
@@ -238,7 +240,7 @@ def test_same_bytes_at_any_thread_count(chunk: Chunk, scene: SceneGraph) -> None
     try:
         for threads in (1, 3):
             torch.set_num_threads(threads)
-            collect._real.clear()
+            scoring._real.clear()
             results.append(evaluate_scene(config, chunk, "gnet", Reconstruction(scene), FakeTruth(LOG)))
     finally:
         torch.set_num_threads(before)
@@ -259,8 +261,13 @@ def test_fid_and_lpips_are_there_once_their_networks_are_given(
         found.append(by_name(evaluate_scene(config, chunk, "gnet", Reconstruction(scene), FakeTruth(LOG))))
     better, worse = found
     assert {n for n in better if n.endswith(("fid", "lpips"))} == {
-        "interpolation/lpips", "shift_0m/fid", "shift_1m/fid", "shift_1m/lpips", "shift_3m/fid", "shift_3m/lpips",
-    }  # fmt: skip
+        "interpolation/lpips",
+        "shift_0m/fid",
+        "shift_1m/fid",
+        "shift_1m/lpips",
+        "shift_3m/fid",
+        "shift_3m/lpips",
+    }
     assert 0 < better["interpolation/lpips"] < worse["interpolation/lpips"]
     assert better["shift_0m/fid"] < worse["shift_0m/fid"]
     fixed, novel = views_of(chunk)

@@ -11,7 +11,7 @@ import pytest
 from genre_tasks.config import IngestConfig
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.scene.chunk import Chunk, Mark
-from genre_tasks.scene.walls import STEP_M
+from genre_tasks.scene.facade_completion import STEP_M
 from genre_tasks.stages.ingest import NO_SWEEP, chunk_count, ingest
 from tests.fakes import SENSOR_HEIGHT_M, WALL_HEIGHT_M, FakeLog
 
@@ -96,9 +96,11 @@ def test_missing_and_unreadable_parts_are_marked(log: FakeLog) -> None:
     out = ingest(CONFIG, broken, 0)
     marks = {(m.kind, m.camera, m.frame) for m in out.marks}
     assert marks == {
-        ("missing_image", "front", 4), ("unreadable_image", "left", 5), ("missing_sweep", None, 3),
+        ("missing_image", "front", 4),
+        ("unreadable_image", "left", 5),
+        ("missing_sweep", None, 3),
         ("unreadable_sweep", None, 6),
-    }  # fmt: skip
+    }
     assert len(out.views) == 38 and not {3, 6} & set(out.static.frames.tolist())
 
 

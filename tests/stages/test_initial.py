@@ -12,15 +12,15 @@ from genre_tasks.config import IngestConfig, InitialConfig, NovelViewsConfig
 from genre_tasks.errors import InputError
 from genre_tasks.render import render_views
 from genre_tasks.scene.chunk import Chunk, Points
-from genre_tasks.scene.depth import lidar_depth
-from genre_tasks.scene.distant import fibonacci_directions
-from genre_tasks.scene.geometry import quat_to_matrix
+from genre_tasks.scene.distant_shell import fibonacci_directions
 from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR, STATIC
-from genre_tasks.scene.images import decode_image
-from genre_tasks.scene.initialise import MAX_SCALE_M, surface_frames
+from genre_tasks.scene.image_decoding import decode_image
+from genre_tasks.scene.initial_gaussians import MAX_SCALE_M, surface_frames
+from genre_tasks.scene.lidar_depth import lidar_depth
 from genre_tasks.scene.lidar_map import lidar_scene
-from genre_tasks.scene.novel import nearest_reference, novel_view_poses
-from genre_tasks.scene.results import Reconstruction
+from genre_tasks.scene.novel_poses import nearest_reference, novel_view_poses
+from genre_tasks.scene.reconstruction import Reconstruction
+from genre_tasks.scene.transforms import quat_to_matrix
 from genre_tasks.stages.ingest import ingest
 from genre_tasks.stages.initial import initial
 from genre_tasks.stages.novel_views import novel_views

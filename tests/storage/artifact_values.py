@@ -12,12 +12,13 @@ from genre_tasks.effects.types import Decision, EffectsPlan, Fitted
 from genre_tasks.fixer.conditioning import Degraded
 from genre_tasks.fixer.pairs import NAMES, Pairs
 from genre_tasks.logs.types import Lens, MotionBlur, RollingShutter
+from genre_tasks.metrics.results import Evaluation, Metric, ViewScore
 from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.chunk import Actor, Chunk, Mark, Points, Role, View
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.results import Evaluation, Metric, Reconstruction, ViewScore
-from genre_tasks.scene.views import FixedViews, NovelView, NovelViews
+from genre_tasks.scene.novel_views import FixedViews, NovelView, NovelViews
+from genre_tasks.scene.reconstruction import Reconstruction
 
 
 def pose(rng: np.random.Generator) -> np.ndarray:
@@ -59,12 +60,20 @@ def chunk(rng: np.random.Generator, frames: int = 3, actors: int = 2, count: int
         size = tuple(rng.uniform(0.1, 9, 3).tolist())
         made.append(Actor(f"t{k}", "Car", size, np.arange(n), poses, points(rng, k * count)))
     return Chunk(
-        dataset="synthetic", log="street-seed=1", index=2, frames=tuple(range(frames)), camera_names=names,
-        width_px=7, height_px=5, world_SE3_chunk=pose(rng),
-        chunk_SE3_ego=np.array([pose(rng) for _ in range(frames)]).reshape(-1, 4, 4), views=views,
-        static=points(rng, count), actors=tuple(made),
+        dataset="synthetic",
+        log="street-seed=1",
+        index=2,
+        frames=tuple(range(frames)),
+        camera_names=names,
+        width_px=7,
+        height_px=5,
+        world_SE3_chunk=pose(rng),
+        chunk_SE3_ego=np.array([pose(rng) for _ in range(frames)]).reshape(-1, 4, 4),
+        views=views,
+        static=points(rng, count),
+        actors=tuple(made),
         marks=marks,
-    )  # fmt: skip
+    )
 
 
 def scene(rng: np.random.Generator, count: int = 13, actors: tuple[ActorNode, ...] = ()) -> SceneGraph:

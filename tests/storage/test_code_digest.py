@@ -122,7 +122,7 @@ def test_cycles_end_and_unknown_modules_are_named(digest_with) -> None:
 
 
 def test_closure_of_the_real_package() -> None:
-    files, packages = closure("genre_tasks.scene.results", (), Path(module.__file__).parents[1])
+    files, packages = closure("genre_tasks.scene.reconstruction", (), Path(module.__file__).parents[1])
     assert {"genre_tasks", "genre_tasks.scene.graph", "genre_tasks.logs.types"} <= set(files)
     assert "genre_tasks.config" not in files and {"torch", "numpy", "kornia"} <= packages
 
@@ -133,7 +133,7 @@ def test_every_kernel_of_the_real_package_counts(monkeypatch: pytest.MonkeyPatch
     module._cached.__wrapped__("genre_tasks.stages.gnet", ("genre_tasks.render.cpu",), None)
     root = Path(module.__file__).parents[1]
     sources = {p.relative_to(root).as_posix() for p in (root / "genre_tasks").rglob("*") if p.suffix in (".cpp", ".h")}
-    assert "genre_tasks/optimiser/image_loss.cpp" in sources and sources <= covered
+    assert "genre_tasks/losses/image_loss.cpp" in sources and sources <= covered
 
 
 def test_cpp_comments() -> None:
@@ -143,7 +143,7 @@ def test_cpp_comments() -> None:
 def test_keys_do_not_pay_for_torch() -> None:
     code = (
         "import sys; import storage.local, storage.manifest, storage.address, storage.keys, storage.store\n"
-        "from storage.code_digest import code_digest; code_digest('genre_tasks.scene.results')\n"
+        "from storage.code_digest import code_digest; code_digest('genre_tasks.scene.reconstruction')\n"
         "slow = {'torch', 'numpy', 'pyarrow', 'OpenEXR', 'kornia', 'prefect', 'genre_tasks.scene'} & set(sys.modules)\n"
         "assert not slow, slow"
     )

@@ -106,13 +106,27 @@ def test_gaussians_columns_are_named_and_documented(tmp_path: Path) -> None:
     codec_of("reconstruction").write(tmp_path, values.make("reconstruction"))
     found = pq.read_schema(tmp_path / "gaussians.parquet")
     assert found.names == [
-        "x", "y", "z", "log_scale_x", "log_scale_y", "log_scale_z", "quat_w", "quat_x", "quat_y", "quat_z",
-        "logit_opacity", "red", "green", "blue", "node",
-    ]  # fmt: skip
+        "x",
+        "y",
+        "z",
+        "log_scale_x",
+        "log_scale_y",
+        "log_scale_z",
+        "quat_w",
+        "quat_x",
+        "quat_y",
+        "quat_z",
+        "logit_opacity",
+        "red",
+        "green",
+        "blue",
+        "node",
+    ]
     assert found.field("x").metadata[b"note"] == b"metres"
     assert sorted(p.name for p in (tmp_path / "snapshots").iterdir()) == [
-        "iteration_0008.parquet", "iteration_0016.parquet",
-    ]  # fmt: skip
+        "iteration_0008.parquet",
+        "iteration_0016.parquet",
+    ]
     scene = values.make("reconstruction").scene
     x = pq.read_table(tmp_path / "gaussians.parquet")["x"].to_numpy()
     assert np.array_equal(x, scene.gaussians.means[:, 0].numpy())

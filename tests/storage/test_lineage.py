@@ -11,10 +11,10 @@ import pytest
 import torch
 from PIL import Image
 
+from flows.plots.artifact_pictures import contact_sheet, draw_artifact, evenly, from_above
 from genre_tasks.errors import ArtifactCorruptError
-from storage.lineage import ancestors, describe, picture
+from storage.lineage import ancestors, describe
 from storage.local import LocalStore
-from storage.pictures import contact_sheet, evenly, from_above
 from tests.contracts.store_suite import address
 from tests.storage.artifact_values import MAKERS, make
 
@@ -77,7 +77,7 @@ def test_pictures_of_every_kind(store: LocalStore) -> None:
     chunk = make("chunk")
     chunk = replace(chunk, views=tuple(replace(v, image=png((200, 0, 0))) for v in chunk.views))
     for kind in MAKERS:
-        image = picture(store, store.commit(address(kind), kind, chunk if kind == "chunk" else make(kind)))
+        image = draw_artifact(store, store.commit(address(kind), kind, chunk if kind == "chunk" else make(kind)))
         assert image is not None and image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] == 3
         if kind == "chunk":  # two source frames of two cameras
             assert image.shape == (244, 484, 3) and (image[5, 5] == [200, 0, 0]).all()
@@ -85,16 +85,16 @@ def test_pictures_of_every_kind(store: LocalStore) -> None:
 
 def test_nothing_to_show_is_none(store: LocalStore) -> None:
     empty = replace(make("evaluation"), pictures={})
-    assert picture(store, store.commit(address(), "evaluation", empty)) is None
+    assert draw_artifact(store, store.commit(address(), "evaluation", empty)) is None
     assert contact_sheet([], 3) is None and from_above(np.zeros((0, 3)), np.zeros((0, 3))) is None
     scene = MAKERS["reconstruction"](np.random.default_rng(0), 0)
-    assert picture(store, store.commit(address("initial"), "reconstruction", scene)) is None
+    assert draw_artifact(store, store.commit(address("initial"), "reconstruction", scene)) is None
 
 
 def test_corrupt_is_not_described(store: LocalStore) -> None:
     artifact = store.commit(address(), "evaluation", make("evaluation"))
     (artifact.path / "curve.parquet").write_bytes(b"")
-    for look in (describe, picture):
+    for look in (describe, draw_artifact):
         with pytest.raises(ArtifactCorruptError, match=r"curve\.parquet"):
             look(store, artifact)
 

@@ -18,9 +18,17 @@ FILE = Path("somewhere/manifest.json")
 def example(**changed: object) -> Manifest:
     files = (FileEntry(path="b/x.exr", sha256="1" * 64, size=3), FileEntry(path="a.parquet", sha256="2" * 64, size=4))
     fields = {
-        "kind": "chunk", "dataset": "d", "log": "l", "chunk": 0, "stage": "ingest", "key": "k",
-        "files": files, "payload_digest": payload_digest(files), "seconds": 1.25, "measurements": {"n": [1, 2.5]},
-    }  # fmt: skip
+        "kind": "chunk",
+        "dataset": "d",
+        "log": "l",
+        "chunk": 0,
+        "stage": "ingest",
+        "key": "k",
+        "files": files,
+        "payload_digest": payload_digest(files),
+        "seconds": 1.25,
+        "measurements": {"n": [1, 2.5]},
+    }
     return Manifest.model_validate(fields | changed)
 
 
@@ -85,8 +93,13 @@ def test_stage_key_depends_on_everything_and_not_on_order() -> None:
     keys = {stage_key(**base)}
     assert keys == {stage_key(**base | {"configuration": {"b": 2, "a": 1}})} and len(next(iter(keys))) == 64
     for change in (
-        {"stage": "enet"}, {"code_digest": "d"}, {"configuration": {"a": 1, "b": 3}}, {"inputs": {"chunk": "y"}},
-        {"weights_digest": "w"}, {"plan_digest": "w"}, {"extra": ["w"]},
-    ):  # fmt: skip
+        {"stage": "enet"},
+        {"code_digest": "d"},
+        {"configuration": {"a": 1, "b": 3}},
+        {"inputs": {"chunk": "y"}},
+        {"weights_digest": "w"},
+        {"plan_digest": "w"},
+        {"extra": ["w"]},
+    ):
         keys.add(stage_key(**base | change))
     assert len(keys) == 8

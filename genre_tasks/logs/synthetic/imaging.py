@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from genre_tasks.logs.synthetic.ego import Ego, ego_SE3_camera
+from genre_tasks.logs.synthetic.camera_images import Light, radiance, to_srgb
+from genre_tasks.logs.synthetic.ego_vehicle import Ego, ego_SE3_camera
 from genre_tasks.logs.synthetic.parameters import StreetParameters
-from genre_tasks.logs.synthetic.picture import Light, radiance, to_srgb
 from genre_tasks.logs.synthetic.raycast import Scene
 from genre_tasks.logs.synthetic.road import generator
 from genre_tasks.logs.types import Float32, Float64, Lens

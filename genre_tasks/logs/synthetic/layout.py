@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from genre_tasks.logs.synthetic import furniture
 from genre_tasks.logs.synthetic.actors import Actor, Part, PoseAt, car, draw_shape, pedestrian
 from genre_tasks.logs.synthetic.buildings import building
-from genre_tasks.logs.synthetic.ego import FRAME_S, Ego
+from genre_tasks.logs.synthetic.ego_vehicle import FRAME_S, Ego
 from genre_tasks.logs.synthetic.materials import Material
 from genre_tasks.logs.synthetic.mesh import Mesh, joined, masonry
 from genre_tasks.logs.synthetic.parameters import StreetParameters

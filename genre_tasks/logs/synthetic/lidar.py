@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from genre_tasks.logs.synthetic.ego import FRAME_S, LIDAR_HEIGHT_M, Ego
+from genre_tasks.logs.synthetic.ego_vehicle import FRAME_S, LIDAR_HEIGHT_M, Ego
 from genre_tasks.logs.synthetic.materials import REFLECTIVITY
 from genre_tasks.logs.synthetic.parameters import StreetParameters
 from genre_tasks.logs.synthetic.raycast import Scene

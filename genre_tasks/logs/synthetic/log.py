@@ -16,16 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from genre_tasks.errors import ConfigError, InputError
-from genre_tasks.logs.synthetic.ego import FRAME_S, draw_ego, ego_SE3_camera, rig
+from genre_tasks.logs.synthetic.annotations import annotate
+from genre_tasks.logs.synthetic.camera_images import camera_rays, draw_light, picture
+from genre_tasks.logs.synthetic.ego_vehicle import FRAME_S, draw_ego, ego_SE3_camera, rig
 from genre_tasks.logs.synthetic.imaging import Imaging
 from genre_tasks.logs.synthetic.layout import Layout, lay_out
 from genre_tasks.logs.synthetic.lidar import sweep
 from genre_tasks.logs.synthetic.noise import rotated
 from genre_tasks.logs.synthetic.parameters import parse_parameters
-from genre_tasks.logs.synthetic.picture import camera_rays, draw_light, picture
 from genre_tasks.logs.synthetic.raycast import Scene
 from genre_tasks.logs.synthetic.road import Road, generator
-from genre_tasks.logs.synthetic.tracks import annotate
 from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Lens, Sweep
 
 _EPOCH_S = 1.7e9

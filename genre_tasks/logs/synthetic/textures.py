@@ -12,10 +12,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from genre_tasks.logs.synthetic.ground import grass, kerb, pavement, road
 from genre_tasks.logs.synthetic.materials import DARK, WHITE, Material, mix, resolved, wobble
 from genre_tasks.logs.synthetic.mesh import linear
 from genre_tasks.logs.synthetic.noise import Reals, cell, fractal, noise, seam, stripe
+from genre_tasks.logs.synthetic.terrain import grass, kerb, pavement, road
 
 Texture = Callable[[Reals, Reals, Reals, Reals], Reals]
 

@@ -1,0 +1,1 @@
+"""The stages as data, and how one stage of one chunk is looked up, computed and committed."""

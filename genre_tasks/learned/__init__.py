@@ -1,0 +1,1 @@
+"""The learned optimiser: its network, features and weights, and its meta-training."""

@@ -1,0 +1,1 @@
+"""What a render is compared with, and the losses that compare them."""

@@ -1,0 +1,1 @@
+"""C++ kernels of the optimiser: posing of Gaussians, and the learned step with its state."""

@@ -1,0 +1,16 @@
+"""What the way from offsets to splats is compiled from. Imports no torch: ``setup.py`` runs this file by its path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from genre_tasks.compiled.build import Kernel
+
+KERNEL = Kernel(
+    title="the posing of Gaussians on the CPU",
+    stem="posing",
+    folder=Path(__file__).resolve().parent,
+    sources=("posing.cpp", "../../scene/constants.py", "build_posing.py"),
+    constants_file="../../scene/constants.py",
+    constants=("ABSENT_LOGIT", "LOWEST_LOGIT"),
+)

@@ -1,0 +1,1 @@
+"""Per-scene 3D Gaussian Splatting, the baseline that the learned optimiser is compared with."""

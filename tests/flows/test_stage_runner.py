@@ -1,0 +1,170 @@
+"""Keys, hits and repairs of the stages, without Prefect."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flows.configuration import load_configuration
+from flows.pipeline import stage_runner as room
+from flows.pipeline.definition import BY_NAME, PIPELINE, stage_key
+from flows.pipeline.stage_runner import ArtifactRef, Job, key_of, measured, produce
+from genre_tasks.config import EffectsConfig, EvaluateConfig, PipelineConfig
+from genre_tasks.errors import InputError, ResourceError
+from storage.code_digest import closure
+from tests.faults.small_run import LOG, SETTINGS
+
+EARLY = ("ingest", "effects", "initial")
+
+
+def job(store: Path, *settings: str, log: str = LOG) -> Job:
+    config = load_configuration("demo", settings=[*SETTINGS, *settings])
+    return Job(log, 0, str(store), config.model_dump(mode="json"))
+
+
+def run(work: Job, *stages: str) -> dict[str, ArtifactRef]:
+    refs: dict[str, ArtifactRef] = {}
+    for stage in stages:
+        refs[stage] = produce(stage, work, {name: refs[name] for name in BY_NAME[stage].inputs})
+    return refs
+
+
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    store = tmp_path_factory.mktemp("filled") / "store"
+    run(job(store), *EARLY)
+    return store
+
+
+@pytest.fixture
+def store(filled: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(filled, tmp_path / "store"))  # moved, too: every hit below is one of a moved store
+
+
+def cached(refs: dict[str, ArtifactRef]) -> dict[str, bool]:
+    return {name: ref.cached for name, ref in refs.items()}
+
+
+def test_the_pipeline_is_in_order() -> None:
+    seen: set[str] = set()
+    for spec in PIPELINE:
+        assert set(spec.inputs) <= seen
+        seen.add(spec.name)
+
+
+def test_a_second_run_is_served_from_the_store(store: Path) -> None:
+    assert cached(run(job(store), *EARLY)) == {"ingest": True, "effects": True, "initial": True}
+
+
+def test_an_unrelated_setting_keeps_the_key_and_a_related_one_changes_it(store: Path) -> None:
+    other = run(job(store, "gnet.iterations=3", "evaluate.every=2"), *EARLY)
+    assert cached(other) == {"ingest": True, "effects": True, "initial": True}
+    changed = run(job(store, "initial.opacity=0.5"), *EARLY)
+    assert cached(changed) == {"ingest": True, "effects": True, "initial": False}
+
+
+def test_a_plan_of_effects_is_part_of_later_keys(store: Path) -> None:
+    other = run(job(store, "effects.lidar_depth=off"), *EARLY)
+    assert cached(other) == {"ingest": True, "effects": False, "initial": False}
+    spec, config = BY_NAME["gnet"], load_configuration("demo")
+    keys = {stage_key(spec, config, {"ingest": "a", "initial": "b", "effects": e}, "w") for e in "cd"}
+    assert len(keys) == 2
+
+
+def test_the_effects_code_is_part_of_the_plans_key() -> None:
+    spec, root = BY_NAME["effects"], Path(room.__file__).parents[2]
+    files, _ = closure(spec.module, spec.lazy, root)
+    assert {f"genre_tasks.effects.{name}" for name in EffectsConfig.model_fields} <= set(files)
+    assert "genre_tasks.effects.exposure" not in closure(spec.module, (), root)[0]  # why it has to be said
+
+
+def test_a_setting_that_only_bounds_memory_keeps_the_key(store: Path) -> None:
+    spec = BY_NAME["fnet"]
+    inputs = {"ingest": "a", "novel_views": "b"}
+    keys = {
+        stage_key(spec, load_configuration("demo", settings=[f"fnet.batch_views={n}"]), inputs, "w") for n in (1, 4)
+    }
+    assert len(keys) == 1
+
+
+def test_inputs_weights_and_reader_are_part_of_the_key() -> None:
+    spec, config = BY_NAME["gnet"], load_configuration("demo")
+    base = stage_key(spec, config, {"ingest": "a", "initial": "b"}, "w")
+    assert base != stage_key(spec, config, {"ingest": "a", "initial": "c"}, "w")
+    assert base != stage_key(spec, config, {"ingest": "a", "initial": "b"}, "v")
+    ingest = BY_NAME["ingest"]
+    readers = {stage_key(ingest, config, {"log": "x"}, None, (f"genre_tasks.logs.{m}",)) for m in ("pandaset.reader", "validation")}
+    assert len(readers) == 2
+
+
+def test_the_key_follows_the_logs_content_and_the_chunk(store: Path) -> None:
+    spec = BY_NAME["ingest"]
+    here, _ = key_of(spec, job(store), {})
+    other, _ = key_of(spec, job(store, log=LOG.replace("seed=900", "seed=901")), {})
+    assert here != other
+
+
+def test_deleting_an_artifact_computes_it_again_and_nothing_else(store: Path) -> None:
+    refs = run(job(store), *EARLY)
+    shutil.rmtree(refs["ingest"].path)
+    again = run(job(store), *EARLY)
+    assert cached(again) == {"ingest": False, "effects": True, "initial": True}
+    assert again["ingest"].payload_digest == refs["ingest"].payload_digest
+
+
+@pytest.mark.parametrize("damage", ["flip", "truncate", "remove", "add"])
+def test_a_damaged_file_is_found_named_and_computed_again(store: Path, damage: str) -> None:
+    refs = run(job(store), *EARLY)
+    file = sorted(Path(refs["initial"].path).glob("*.parquet"))[0]
+    data = bytearray(file.read_bytes())
+    if damage == "flip":
+        data[len(data) // 2] ^= 4
+        file.write_bytes(data)
+    elif damage == "truncate":
+        file.write_bytes(data[: len(data) // 2])
+    elif damage == "remove":
+        file.unlink()
+    else:
+        (file.parent / "stray.bin").write_bytes(b"x")
+    again = run(job(store), *EARLY)
+    assert cached(again) == {"ingest": True, "effects": True, "initial": False}
+    assert ("stray.bin" if damage == "add" else file.name) in again["initial"].note
+    assert again["initial"].payload_digest == refs["initial"].payload_digest
+
+
+def test_out_of_memory_becomes_a_resource_error() -> None:
+    with pytest.raises(ResourceError, match="memory ran out"), measured():
+        raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes")
+    with pytest.raises(RuntimeError, match="shapes"), measured():
+        raise RuntimeError("shapes do not fit")
+
+
+def test_a_retry_after_out_of_memory_is_smaller_and_the_key_stays(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[int] = []
+    section = load_configuration("demo").fnet
+    for attempt in range(4):
+        smaller: Any = room._smaller(BY_NAME["fnet"], section, attempt)
+        seen.append(smaller.batch_views)
+    assert seen == [4, 2, 1, 1]
+
+
+def test_an_impossible_chunk_leaves_nothing_behind(tmp_path: Path) -> None:
+    with pytest.raises(InputError):
+        run(job(tmp_path / "store", "ingest.source_every=20"), "ingest")
+    assert not [p for p in (tmp_path / "store").rglob("*") if p.is_file()]
+
+
+def test_the_bytes_of_a_network_are_part_of_an_evaluations_key_and_its_name_is_not(tmp_path: Path) -> None:
+    spec = BY_NAME["evaluate/gnet"]
+    inputs = dict.fromkeys((*spec.inputs, "log", "chunk"), "x")
+
+    def key(file: Path) -> str:
+        return stage_key(spec, PipelineConfig(evaluate=EvaluateConfig(inception=str(file))), inputs, None)
+
+    one, same, other = (tmp_path / name for name in ("one.pt", "same.pt", "other.pt"))
+    for file, data in ((one, b"a"), (same, b"a"), (other, b"b")):
+        file.write_bytes(data)
+    assert key(one) == key(same) != key(other)

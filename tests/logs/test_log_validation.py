@@ -1,0 +1,184 @@
+"""What the check says of sound and of damaged logs."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from flows.cli.main import app
+from genre_tasks.logs import registry
+from genre_tasks.logs.pandaset.reader import open_pandaset
+from genre_tasks.logs.pandaset.writer import write_pandaset
+from genre_tasks.logs.registry import open_log
+from genre_tasks.logs.validation import LogCheck, check_log
+from tests.fakes import FakeLog
+from tests.logs.pandaset_folder import edit_json, edit_table, small_log
+
+REAL = Path(__file__).resolve().parents[3] / "shared/data/pandaset/002"
+
+
+def log_of(**changes: object) -> FakeLog:
+    return small_log().with_(lidar_azimuths=360, **changes)
+
+
+def messages(check: LogCheck, severity: str) -> str:
+    return " | ".join(f"{f.message} [{f.remedy}]" for f in check.findings if f.severity == severity)
+
+
+def test_a_sound_log() -> None:
+    check = check_log(log_of(frame_count=5, speed_mps=20.0), chunk_frames=5)
+    assert check.verdict == "good" and check.findings == ()
+    assert check.travel_m == pytest.approx(4 * 2.0)
+    assert check.chunk_travel_m == pytest.approx((8.0,)) and check.chunk_count == 1
+    assert check.duration_s == pytest.approx(0.4)
+    assert (check.tracks_moving, check.tracks_static) == (1, 1)
+    assert [(c.name, c.width_px, c.height_px) for c in check.cameras] == [("front", 48, 32), ("left", 48, 32)]
+    least, median, most = check.points
+    assert 1000 < least <= median <= most
+
+
+def test_chunks_and_the_short_last_one() -> None:
+    check = check_log(log_of(frame_count=7, speed_mps=20.0), chunk_frames=3)
+    assert check.chunk_travel_m == pytest.approx((4.0, 4.0, 0.0))
+    assert "the last chunk has 1 frame" in messages(check, "warning")
+    short = check_log(log_of(frame_count=5, speed_mps=20.0), chunk_frames=3)
+    assert "the last chunk is short: 2 of 3 frames" in messages(short, "note")
+    assert short.verdict == "good"
+
+
+def test_missing_things_are_named_by_frame() -> None:
+    log = log_of(
+        frame_count=6,
+        speed_mps=20.0,
+        missing_images=frozenset({("left", 1), ("left", 2), ("left", 3), ("left", 5)}),
+        corrupt_images=frozenset({("front", 4)}),
+        missing_sweeps=frozenset({2}),
+        unreadable_sweeps=frozenset({3}),
+    )
+    check = check_log(log)
+    front, left = check.cameras
+    assert left.missing == (1, 2, 3, 5) and left.unreadable == ()
+    assert front.unreadable == (4,) and front.missing == ()
+    assert check.missing_sweeps == (2,) and check.unreadable_sweeps == (3,)
+    assert check.verdict == "usable"
+    warnings = messages(check, "warning")
+    assert "left: no image at frames 1–3, 5" in warnings
+    assert "front: unreadable images at frames 4" in warnings
+    assert "no LiDAR sweep at frames 2" in warnings
+    assert "cannot read the sweep (frame 3, file 3.bin) [Fetch the file again.]" in warnings
+
+
+def test_truncated_jpegs_and_odd_sizes() -> None:
+    def encode(width: int, kind: str) -> bytes:
+        stream = io.BytesIO()
+        noise = np.random.default_rng(0).integers(0, 255, (32, width, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(stream, kind)
+        return stream.getvalue()
+
+    log = log_of()
+    jpeg = encode(48, "JPEG")
+    log._images.update({("front", 0): jpeg, ("front", 1): jpeg[: len(jpeg) // 2], ("front", 2): encode(40, "PNG")})
+    log._images[("front", 3)] = b""
+    (front, _) = check_log(log).cameras
+    assert front.unreadable == (1, 3) and front.odd_size == (2,)
+
+
+def test_no_lidar_is_fatal_and_says_what_to_give() -> None:
+    check = check_log(log_of(no_lidar=True))
+    assert check.verdict == "unusable" and check.points == (0, 0, 0)
+    assert "ingest.points=FILE.ply" in messages(check, "fatal")
+
+
+@pytest.mark.parametrize("no_lidar", [False, True])
+def test_the_command_ends_with_1_where_a_log_is_unusable(monkeypatch: pytest.MonkeyPatch, no_lidar: bool) -> None:
+    monkeypatch.setattr(registry, "open_log", lambda uri: log_of(no_lidar=no_lidar))
+    told, as_json = (CliRunner().invoke(app, ["check", "fake", *more]) for more in ((), ("--json",)))
+    assert told.exit_code == as_json.exit_code == int(no_lidar)
+    verdict = json.loads(as_json.stdout)["verdict"]
+    assert verdict == ("unusable" if no_lidar else "good") and verdict in told.stdout
+
+
+def test_no_cuboids_and_one_camera_are_survived() -> None:
+    check = check_log(log_of(without_tracks=True, camera_names=("front",), speed_mps=20.0))
+    assert check.verdict == "good"
+    assert "no cuboids" in messages(check, "note") and "one camera only" in messages(check, "note")
+
+
+def test_standstill() -> None:
+    check = check_log(log_of(speed_mps=0.0))
+    assert check.standstill_chunks == (0,) and check.verdict == "usable"
+    assert "stands still (0.00 m)" in messages(check, "warning")
+
+
+@pytest.mark.parametrize(
+    ("times", "said"),
+    [
+        ((0.0, 0.1, 0.1, 0.2), "duplicated timestamps at frames 2"),
+        ((0.0, 0.2, 0.1, 0.3), "time runs backwards at frames 2"),
+        ((0.0, 100000.0, 200000.0, 300000.0), "the time between frames is 100000 s"),
+        ((0.0, float("nan"), 0.2, 0.3), "frames 1 have no finite timestamp"),
+    ],
+)
+def test_clocks(times: tuple[float, ...], said: str) -> None:
+    check = check_log(log_of(timestamps_s=times, speed_mps=20.0))
+    assert said in messages(check, "warning") and check.verdict == "usable"
+
+
+def test_progress_covers_images_and_sweeps() -> None:
+    calls: list[tuple[int, int]] = []
+    check_log(log_of(), progress=lambda done, total, note="": calls.append((done, total)))
+    assert [done for done, _ in calls] == list(range(1, 13)) and {total for _, total in calls} == {12}
+
+
+class TestPandaSet:
+    @pytest.fixture
+    def folder(self, tmp_path: Path) -> Path:
+        return write_pandaset(log_of(speed_mps=20.0), tmp_path / "002")
+
+    def test_left_out_boxes_are_counted(self, folder: Path) -> None:
+        edit_table(folder / "annotations/cuboids/01.pkl.gz", yaw=np.array([0.0, np.nan]))
+        check = check_log(open_pandaset(str(folder)))
+        assert check.invalid == (("invalid_box", 1),) and check.verdict == "usable"
+        assert "left out 1 × invalid box" in messages(check, "warning")
+
+    def test_a_bad_pose_is_a_finding(self, folder: Path) -> None:
+        edit_json(folder / "lidar/poses.json", lambda poses: poses[2]["position"].update(x=float("nan")))
+        check = check_log(open_pandaset(str(folder)))
+        assert "the pose is not finite" in messages(check, "warning") and "frame 2" in messages(check, "warning")
+        assert np.isfinite(check.travel_m)
+
+    def test_a_camera_that_cannot_be_opened_is_fatal(self, folder: Path) -> None:
+        edit_json(folder / "camera/left/poses.json", lambda poses: poses[:-1])
+        check = check_log(open_pandaset(str(folder)))
+        assert check.verdict == "unusable"
+        assert "camera/left/poses.json" in messages(check, "fatal")
+
+    def test_bad_intrinsics_are_fatal(self, folder: Path) -> None:
+        (folder / "camera/left/intrinsics.json").write_text(json.dumps({"fx": 1}))
+        check = check_log(open_pandaset(str(folder)))
+        assert check.verdict == "unusable" and "fx, fy, cx, cy" in messages(check, "fatal")
+
+    def test_cuboids_that_cannot_be_read_are_a_finding(self, folder: Path) -> None:
+        (folder / "annotations/cuboids/01.pkl.gz").write_bytes(b"text")
+        check = check_log(open_pandaset(str(folder)))
+        assert messages(check, "warning").count("no readable pickle") == 1
+        assert check.tracks_moving == check.tracks_static == 0
+
+
+@pytest.mark.real
+@pytest.mark.skipif(not REAL.is_dir(), reason=f"no PandaSet sequence beside the checkout ({REAL})")
+def test_the_real_sequence() -> None:
+    check = check_log(open_log(f"pandaset:{REAL}"))
+    assert check.frames == 32 and check.missing_sweeps == (28, 29, 30) and check.unreadable_sweeps == ()
+    assert [round(travel, 1) for travel in check.chunk_travel_m] == [5.0, 5.2]
+    assert all(camera == replace(camera, missing=(), unreadable=(), odd_size=()) for camera in check.cameras)
+    assert {(camera.width_px, camera.height_px) for camera in check.cameras} == {(1920, 1080)}
+    assert (check.tracks_moving, check.tracks_static) == (32, 63)
+    assert check.verdict == "usable"
