@@ -96,7 +96,10 @@ def test_inputs_weights_and_reader_are_part_of_the_key() -> None:
     assert base != stage_key(spec, config, {"ingest": "a", "initial": "c"}, "w")
     assert base != stage_key(spec, config, {"ingest": "a", "initial": "b"}, "v")
     ingest = BY_NAME["ingest"]
-    readers = {stage_key(ingest, config, {"log": "x"}, None, (f"genre_tasks.logs.{m}",)) for m in ("pandaset.reader", "validation")}
+    readers = {
+        stage_key(ingest, config, {"log": "x"}, None, (f"genre_tasks.logs.{m}",))
+        for m in ("pandaset.reader", "validation")
+    }
     assert len(readers) == 2
 
 
