@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -45,7 +45,6 @@ def preset_values(preset: str) -> dict[str, Any]:
             f"no preset is called '{preset}'", remedy=f"{_did_you_mean(preset, PRESETS)}Known: {', '.join(PRESETS)}."
         )
     values = _read_yaml(_FOLDER / f"{preset}.yaml")
-    values.pop("training", None)  # numbers of the training commands, which read them themselves
     return values
 
 
@@ -124,16 +123,56 @@ def _merged(base: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any
     return out
 
 
+RENAMED_KEYS = {
+    "ingest.walls": "ingest.complete_facades",
+    "gnet.finish": "gnet.refine",
+    "gnet.refine.share": "gnet.refine.fraction_of_iterations",
+    "gnet.refine.split": "gnet.refine.split_fraction",
+    "gnet.refine.rates_before": "gnet.refine.lr_before_refine",
+    "gnet.per_scene.means_rate": "gnet.per_scene.means_lr",
+    "gnet.per_scene.means_rate_end": "gnet.per_scene.means_lr_end_fraction",
+    "gnet.per_scene.log_scales_rate": "gnet.per_scene.log_scales_lr",
+    "gnet.per_scene.quats_rate": "gnet.per_scene.quats_lr",
+    "gnet.per_scene.logit_opacities_rate": "gnet.per_scene.logit_opacities_lr",
+    "gnet.per_scene.sh_rate": "gnet.per_scene.sh_lr",
+    **{
+        f"{section}.{old}": f"{section}.{new}"
+        for section in ("gnet", "enet")
+        for old, new in (
+            ("rates", "learning_rates"),
+            ("adam.rates", "adam.learning_rates"),
+            ("hold_ground", "constrain_ground"),
+            ("split", "split_fraction"),
+        )
+    },
+}
+"""Keys of version 0.1 and what they are called since; an old key is an error that names the new one."""
+REMOVED_KEYS = {
+    "effects.fixer_per_view": "It changed nothing; fnet.gate decides which views are fixed.",
+    "training": "Training commands read their own recipes; delete the section.",
+}
+
+
 def _check_keys(values: Mapping[str, Any], model: type[BaseModel], prefix: str, source: str) -> None:
     for key, value in values.items():
+        if f"{prefix}{key}" in RENAMED_KEYS:
+            raise ConfigError(
+                f"the configuration key '{prefix}{key}' was renamed",
+                remedy=f"Write '{RENAMED_KEYS[prefix + key]}'.",
+                file=source,
+            )
+        if f"{prefix}{key}" in REMOVED_KEYS:
+            raise ConfigError(
+                f"the configuration key '{prefix}{key}' was removed", remedy=REMOVED_KEYS[prefix + key], file=source
+            )
         if key not in model.model_fields:
             raise ConfigError(
                 f"there is no configuration key '{prefix}{key}'",
                 remedy=f"{_did_you_mean(key, model.model_fields, prefix)}Known here: {', '.join(model.model_fields)}.",
                 file=source,
             )
-        annotation = model.model_fields[key].annotation
-        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        annotation, optional = _section_type(model.model_fields[key].annotation)
+        if annotation is not None and not (optional and value is None):
             if not isinstance(value, Mapping):
                 raise ConfigError(
                     f"'{prefix}{key}' is a section, got {value!r}",
@@ -141,6 +180,15 @@ def _check_keys(values: Mapping[str, Any], model: type[BaseModel], prefix: str, 
                     file=source,
                 )
             _check_keys(value, annotation, f"{prefix}{key}.", source)
+
+
+def _section_type(annotation: Any) -> tuple[type[BaseModel] | None, bool]:
+    """The section's model if a field's annotation is one, and whether the field may be null instead."""
+    kinds = get_args(annotation) or (annotation,)
+    for kind in kinds:
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            return kind, type(None) in kinds
+    return None, False
 
 
 def _did_you_mean(word: str, known: Any, prefix: str = "") -> str:

@@ -6,19 +6,45 @@ change and why.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 Rate = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Rates = tuple[Rate, Rate, Rate, Rate, Rate]
-"""Of means (in units of the initial size), log-scales, quaternions, logit opacities and colours."""
+Rates = tuple[float, float, float, float, float]
+"""Learning rates of means, log-scales, quaternions, logit opacities and colours, in this order."""
 
 
 class Section(BaseModel):
     """Base of all sections: unknown keys are errors, values are frozen."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class LearningRates(Section):
+    """Learning rate of each attribute of a Gaussian.
+
+    A mean moves in units of its Gaussian's initial size; all else moves in raw space (log-scale, logit opacity).
+
+    >>> LearningRates(means=0.1, log_scales=0.2, quats=0.05, logit_opacities=0.3, colors=0.02).as_tuple()
+    (0.1, 0.2, 0.05, 0.3, 0.02)
+    """
+
+    means: Rate
+    log_scales: Rate
+    quats: Rate
+    logit_opacities: Rate
+    colors: Rate
+
+    def as_tuple(self) -> Rates:
+        """The rates in the order of the 14 packed attributes."""
+        return (self.means, self.log_scales, self.quats, self.logit_opacities, self.colors)
+
+    @classmethod
+    def of(cls, rates: Sequence[float]) -> LearningRates:
+        """From five rates in the order of :meth:`as_tuple`."""
+        return cls(**dict(zip(cls.model_fields, rates, strict=True)))
 
 
 class IngestConfig(Section):
@@ -30,7 +56,9 @@ class IngestConfig(Section):
     height_px: int = Field(720, ge=16, le=4096, description="Working height of all images.")
     cameras: tuple[str, ...] | None = Field(None, description="Cameras to use, by name; null: all.")
     points: str | None = Field(None, description="A PLY file with coloured points, for a log without LiDAR.")
-    walls: bool = Field(True, description="Complete façades above the LiDAR's view as far as the images bear it out.")
+    complete_facades: bool = Field(
+        True, description="Complete façades above the LiDAR's view as far as the images bear it out."
+    )
     strict: bool = Field(False, description="Fail on a missing or unreadable image or sweep instead of marking it.")
     min_actor_travel_m: float = Field(0.5, ge=0, description="A track that moves less is part of the background.")
     min_actor_points: int = Field(10, ge=1, description="An actor with fewer LiDAR points is left out and counted.")
@@ -65,10 +93,8 @@ class LossConfig(Section):
 class AdamConfig(Section):
     """Tuned Adam, to be tuned for the horizon that it is used at (``configs/baselines.yaml``)."""
 
-    rates: Rates | None = Field(
-        None,
-        description="Of means (in units of the initial size), log-scales, quaternions, logit opacities and colours; "
-        "null: the stage's own, tuned for 24 iterations of 6 views.",
+    learning_rates: LearningRates | None = Field(
+        None, description="null: the rates that were tuned for 24 iterations of 6 views, one set a stage."
     )
     schedule: Literal["cosine", "constant"] = Field("cosine", description="Of all rates, over the iterations.")
 
@@ -91,12 +117,14 @@ class PerSceneConfig(Section):
     """Per-scene 3DGS as published (Kerbl et al. 2023; gsplat's ``simple_trainer`` and ``DefaultStrategy``)."""
 
     iterations: int = Field(30_000, ge=1, le=200_000, description="One view each; all schedules scale with it.")
-    means_rate: float = Field(1.6e-4, ge=0, description="Metres per step and metre of the scene's extent.")
-    means_rate_end: float = Field(0.01, gt=0, le=1, description="The means' rate at the end, of that at the start.")
-    log_scales_rate: float = Field(5e-3, ge=0)
-    quats_rate: float = Field(1e-3, ge=0)
-    logit_opacities_rate: float = Field(5e-2, ge=0)
-    sh_rate: float = Field(2.5e-3, ge=0, description="Of the spherical harmonics' constant term: colours × 1/C0.")
+    means_lr: float = Field(1.6e-4, ge=0, description="Metres per step and metre of the scene's extent.")
+    means_lr_end_fraction: float = Field(
+        0.01, gt=0, le=1, description="Learning rate of the means at the end, as a fraction of that at the start."
+    )
+    log_scales_lr: float = Field(5e-3, ge=0)
+    quats_lr: float = Field(1e-3, ge=0)
+    logit_opacities_lr: float = Field(5e-2, ge=0)
+    sh_lr: float = Field(2.5e-3, ge=0, description="Of the spherical harmonics' constant term: colours × 1/C0.")
     rgb: float = Field(0.8, ge=0, description="Weight of L1.")
     ssim: float = Field(0.2, ge=0, description="Weight of 1 − SSIM.")
     depth: float = Field(0.0, ge=0, description="Weight of the LiDAR depth term, as in loss.depth; published: none.")
@@ -115,36 +143,38 @@ class OptimiserConfig(Section):
     weights: str = Field(
         "builtin", description="builtin, builtin:NAME (another network's, e.g. gnet), or a path to a .safetensors file."
     )
-    rates: Rates | None = Field(
+    learning_rates: LearningRates | None = Field(
         None,
-        description="Of the learned optimiser's steps, as adam.rates; null: those of its weights. A preset's are for "
-        "the built-in weights: with others set null. gnet.finish.rates_before, where given, counts in gnet's place.",
+        description="Step sizes of the learned optimiser; null: those that its weights were trained with. Presets are "
+        "tuned for the built-in weights, so set null with others. gnet.refine.lr_before_refine takes precedence.",
     )
-    hold_ground: bool = Field(True, description="Flat discs that lie on the ground move and turn in their plane only.")
-    split: float = Field(
-        0.0,
-        ge=0,
-        le=4,
-        description="So many more Gaussians, per those there are, where images have more to show: split.",
+    constrain_ground: bool = Field(
+        True, description="Gaussians that lie on the ground move and turn within the ground's plane only."
+    )
+    split_fraction: float = Field(
+        0.0, ge=0, le=4, description="Fraction of Gaussians to split before the start, largest image residual first."
     )
     snapshots: int = Field(6, ge=0, description="Intermediate scenes kept for the curve of accuracy against seconds.")
     seed: int = Field(0, ge=0)
 
     @property
-    def finishing_iterations(self) -> int:
-        """Of the T, those that are of a second optimisation."""
+    def refine_iterations(self) -> int:
+        """How many of the T iterations belong to the refinement part."""
         return 0
 
 
-class FinishConfig(Section):
-    """The last iterations as an optimisation of its own, from the scene that the first left: split, other weights."""
+class RefineConfig(Section):
+    """The refinement part of GNet: Gaussians are split, then optimised further with other weights."""
 
-    share: float = Field(2 / 3, gt=0, lt=1, description="Of the section's iterations.")
-    split: float = Field(0.3, ge=0, le=4, description="As the section's own, before the first of these.")
-    weights: str = Field("builtin:enet", description="As the section's own; those of ENet have met split Gaussians.")
-    rates_before: Rates | None = Field(
-        None,
-        description="The section's rates where this end follows; null: its own, which are for steps to the very end.",
+    fraction_of_iterations: float = Field(2 / 3, gt=0, lt=1, description="Part of gnet.iterations spent on refinement.")
+    split_fraction: float = Field(
+        0.3, ge=0, le=4, description="Fraction of Gaussians to split before refinement, largest image residual first."
+    )
+    weights: str = Field(
+        "builtin:enet", description="As gnet.weights. ENet's weights were trained on scenes with split Gaussians."
+    )
+    lr_before_refine: LearningRates | None = Field(
+        None, description="Learning rates of the first part when refinement follows; null: the same as gnet's."
     )
 
 
@@ -157,19 +187,22 @@ class GnetConfig(OptimiserConfig):
         "g3r: learned from recorded views alone, with weights of its own.",
     )
     per_scene: PerSceneConfig = PerSceneConfig()
-    finish: FinishConfig | None = Field(None, description="How the method learned ends; null: as it began.")
+    refine: RefineConfig | None = Field(
+        None, description="The last iterations of the method learned, on split Gaussians; null: no refinement part."
+    )
 
     @property
-    def finishing(self) -> FinishConfig | None:
-        """How it ends, where that is not as it began: baselines know no such end, nor does a single iteration."""
-        return self.finish if self.method == "learned" and self.iterations > 1 else None
+    def refinement(self) -> RefineConfig | None:
+        """The refinement part that runs, if any: baselines have none, nor has a single iteration."""
+        return self.refine if self.method == "learned" and self.iterations > 1 else None
 
     @property
-    def finishing_iterations(self) -> int:
-        """Its share of T, and at least one iteration on either side."""
-        if self.finishing is None:
+    def refine_iterations(self) -> int:
+        """Iterations of the refinement part; at least one iteration is left on either side."""
+        if self.refinement is None:
             return 0
-        return min(max(1, round(self.finishing.share * self.iterations)), self.iterations - 1)
+        wanted = max(1, round(self.refinement.fraction_of_iterations * self.iterations))
+        return min(wanted, self.iterations - 1)
 
 
 class NovelViewsConfig(Section):
@@ -215,11 +248,13 @@ class RangeConfig(Section):
         (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0), min_length=1, description="Each is rendered on both sides."
     )
     every: int = Field(4, ge=1, description="Every n-th frame of the chunk is rendered.")
-    drop_db: float = Field(3.0, gt=0, description="The median view's estimated PSNR falls by no more.")
-    hidden: float = Field(0.1, gt=0, le=1, description="No more pixels than this that no recorded image bears out.")
-    thin: float = Field(0.02, gt=0, le=1, description="No more pixels than this that are covered by less than half.")
-    floating: float = Field(0.02, gt=0, le=1, description="No more pixels than this far before the LiDAR's depth.")
-    undetected: float = Field(
+    max_drop_db: float = Field(3.0, gt=0, description="The median view's estimated PSNR falls by no more.")
+    max_hidden: float = Field(0.1, gt=0, le=1, description="No more pixels than this that no recorded image bears out.")
+    max_thin: float = Field(
+        0.02, gt=0, le=1, description="No more pixels than this that are covered by less than half."
+    )
+    max_floating: float = Field(0.02, gt=0, le=1, description="No more pixels than this far before the LiDAR's depth.")
+    max_undetected: float = Field(
         0.3, gt=0, le=1, description="No more of what a detector finds on the path is lost to it."
     )
     lidar_max_points: int = Field(20_000, ge=100, description="Points drawn in the LiDAR map.")
@@ -252,7 +287,6 @@ class EffectsConfig(Section):
     lidar_depth: EffectSetting = "auto"
     anti_aliasing: EffectSetting = "auto"
     ego_mask: EffectSetting = "auto"
-    fixer_per_view: EffectSetting = "auto"
     darkness: ToldSetting = Field("auto", description="Measured and told; not modelled.")
 
 

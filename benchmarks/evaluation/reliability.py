@@ -96,15 +96,15 @@ def fitted(rows: Sequence[Row]) -> tuple[dict[str, float], float]:
 
 
 def true_reach(views: Sequence[Row], side: int) -> float:
-    """How far the median view's true PSNR is within ``CONFIG.drop_db`` of the path's; left: 1, right: -1. Metres."""
+    """Metres up to which the median view's true PSNR is within ``CONFIG.max_drop_db`` of the path's; left: side 1."""
     by: dict[float, list[float]] = {}
     for v in views:
         if side * v["shift_m"] >= 0:
             by.setdefault(abs(v["shift_m"]), []).append(v["psnr"])
     lost = [(shift, np.median(by[0.0]) - np.median(by[shift])) for shift in sorted(by)]
     for (near, before), (far, after) in itertools.pairwise(lost):
-        if after > CONFIG.drop_db:
-            return near + (far - near) * float((CONFIG.drop_db - before) / (after - before))
+        if after > CONFIG.max_drop_db:
+            return near + (far - near) * float((CONFIG.max_drop_db - before) / (after - before))
     return lost[-1][0]
 
 

@@ -214,7 +214,7 @@ def _against(streets: Sequence[Row], other: str, name: str) -> Iterator[Claim]:
 
 
 def _loose(streets: Sequence[Row], note: str) -> Iterator[Claim]:
-    """The first two claims where the optimiser does not hold the ground (``gnet.hold_ground=false``)."""
+    """The first two claims where the optimiser does not hold the ground (``gnet.constrain_ground=false``)."""
     gains, part = differences(streets, "psnr", "loose"), reduced(streets, "loose")
     said = f"of scenes whose ground is not held, {note}; {len(gains)} views at 3 m; {_of(streets)}"
     data = f"PSNR of the fixed less that of the render, {said}"

@@ -59,7 +59,7 @@ def measure_fixer(log: str, chunk: int, store: str, ablations: str) -> Row:
             novel = _rendered(steps, views_at(steps.chunk, SIDE_M, TRUE_VIEWS))
             images = torch.stack([t.image.image for t in truth])
             out["truth"] = truth_row(network, config, steps.chunk, novel, images)
-            loose = steps_of(log, chunk, store, 0, False, "gnet.hold_ground=false")
+            loose = steps_of(log, chunk, store, 0, False, "gnet.constrain_ground=false")
             novel_loose = _rendered(loose, novel.views)
             out["loose"] = truth_row(network, config, steps.chunk, novel_loose, images)
             out["inputs"] = {

@@ -173,7 +173,7 @@ class _Maker:
         enet_s, configs = _learned_s(self._small.enet), dict[str, OptimiserConfig]()
         if "adam" in families:
             configs |= adam_variants(self._small.enet)
-        if (split := self._small.enet.split) and "adam_split" in families:
+        if (split := self._small.enet.split_fraction) and "adam_split" in families:
             configs |= adam_variants(self._small.enet, split)
         seconds = enet_s * (1 + sum(SHORTER) + MOST_TIMES * len(configs))
         standard = QUICK_STANDARD_ITERATIONS if self._quick else STANDARD_ITERATIONS

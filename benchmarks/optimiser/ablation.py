@@ -125,8 +125,8 @@ def picture(setting: str, log: str, store: str, path: Path) -> None:
     Image.fromarray((torch.cat(columns, 1) * 255).round().byte().numpy()).save(path)
 
 
-FACADES = WithWithout("facades", "ingest.walls", "façades completed")
-GROUND = WithWithout("ground", "gnet.hold_ground", "ground held")
+FACADES = WithWithout("facades", "ingest.complete_facades", "façades completed")
+GROUND = WithWithout("ground", "gnet.constrain_ground", "ground held")
 
 if __name__ == "__main__":
     setting = {bench.name: bench.setting for bench in (FACADES, GROUND)}[sys.argv[1]]

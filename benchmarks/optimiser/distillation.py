@@ -16,7 +16,7 @@ from benchmarks.common.pipeline_inputs import images_of, steps_of
 from benchmarks.common.task import HELDOUT_VIEWS, SIDE_M, Task
 from benchmarks.optimiser import race
 from flows.training.training_scenes import spread
-from genre_tasks.config import AdamConfig, OptimiserConfig, PerSceneConfig
+from genre_tasks.config import AdamConfig, LearningRates, OptimiserConfig, PerSceneConfig
 from genre_tasks.losses.targets import Target
 from genre_tasks.metrics.distribution_distances import kernel_distance
 from genre_tasks.metrics.perceptual import perceptual_distance
@@ -126,11 +126,11 @@ def adam_variants(enet: OptimiserConfig, split: float = 0.0) -> dict[str, Optimi
             continue  # on split Gaussians the term brought nothing that its time would not have
         views, novel = min(count, enet.views_per_iteration), min(count, enet.novel_views_per_iteration)
         changes = {
-            "split": split,
+            "split_fraction": split,
             "views_per_iteration": views,
             "novel_views_per_iteration": novel,
             "method": "adam",
-            "adam": AdamConfig(rates=tuple(part * r for r in ENET_RATES), schedule="constant"),  # type: ignore[arg-type]
+            "adam": AdamConfig(learning_rates=LearningRates.of([part * r for r in ENET_RATES]), schedule="constant"),
             "loss": enet.loss.model_copy(update={"perceptual": perceptual, "perceptual_every": 1}),
         }
         name = f"{views}+{novel} at {part:g}{'' if perceptual else ', no perceptual'}{', split' if split else ''}"
@@ -156,7 +156,7 @@ def distillation_row(
     shorter = {t: ended(enet.model_copy(update={"iterations": t}), judge, fixed) for t in lengths}
     own = ended(enet, judge, fixed)
     budget_s = MOST_TIMES * own.seconds
-    shares = {"adam": 0.0} | ({"adam_split": enet.split} if enet.split else {})
+    shares = {"adam": 0.0} | ({"adam_split": enet.split_fraction} if enet.split_fraction else {})
     runs = {
         name: {
             variant: distilled(walked(config, task, fixed), judge, start, own.seconds, budget_s)

@@ -54,7 +54,7 @@ def as_enhancer(config: PipelineConfig) -> OptimiserConfig:
     views = config.gnet.views_per_iteration
     own = {"iterations": config.gnet.iterations, "views_per_iteration": views, "novel_views_per_iteration": views}
     return config.enet.model_copy(
-        update=own | {"weights": str(resolve_weights("gnet", config.gnet.weights)), "rates": None}
+        update=own | {"weights": str(resolve_weights("gnet", config.gnet.weights)), "learning_rates": None}
     )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from benchmarks.common.bench import Row
 from benchmarks.common.task import Task, task_of
-from genre_tasks.config import FinishConfig, GnetConfig
+from genre_tasks.config import GnetConfig, RefineConfig
 from genre_tasks.stages.optimise import unrolled
 
 SEEDS = (900, 901, 902)
@@ -26,13 +26,13 @@ PERCEPTUAL = {"perceptual 0.1": (0.1, 1), "perceptual 0.1 every fourth": (0.1, 4
 
 def settings(gnet: GnetConfig) -> dict[str, GnetConfig]:
     """By name: the preset's section, in every shape and with some ends of its own, and with the perceptual term."""
-    plain = gnet.model_copy(update={"finish": None})
+    plain = gnet.model_copy(update={"refine": None})
     out = {"preset": gnet}
     out |= {f"{t}x{v}": plain.model_copy(update={"iterations": t, "views_per_iteration": v}) for t, v in SHAPES}
     for first, last, split in FINISHES:
         shape = {"iterations": first + last, "views_per_iteration": 3, "snapshots": 0}
-        finish = FinishConfig(share=last / (first + last), split=split)
-        out[f"{first}x3, {last}x3 with {split:.0%} more"] = gnet.model_copy(update=shape | {"finish": finish})
+        finish = RefineConfig(fraction_of_iterations=last / (first + last), split_fraction=split)
+        out[f"{first}x3, {last}x3 with {split:.0%} more"] = gnet.model_copy(update=shape | {"refine": finish})
     for name, (weight, every) in PERCEPTUAL.items():
         loss = gnet.loss.model_copy(update={"perceptual": weight, "perceptual_every": every})
         out[name] = gnet.model_copy(update={"loss": loss})
@@ -52,6 +52,6 @@ def trade(task: Task, config: GnetConfig) -> dict[str, Any]:
     scene = unrolled("gnet", config.model_copy(update={"snapshots": 0}), task.scene, task.source).scene
     seconds = time.perf_counter() - began
     renders = config.iterations * min(config.views_per_iteration, len(task.source))
-    if config.finishing is not None and config.finishing.split:
+    if config.refinement is not None and config.refinement.split_fraction:
         renders += len(task.source)
     return {"seconds": seconds, "renders": renders, "psnr": task.psnr(scene), "psnr_3m": task.psnr_beside(scene)}

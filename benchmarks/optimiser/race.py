@@ -28,7 +28,7 @@ from genre_tasks.per_scene.run import snapshots
 from genre_tasks.per_scene.setup import world_static
 from genre_tasks.per_scene.training import PerSceneTraining
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.stages.optimise import finishing_plan, finishing_rule, plan_of, step_rule
+from genre_tasks.stages.optimise import plan_of, refine_plan, refine_rule, step_rule
 
 LOOK_FACTOR = 1.25
 """Seconds between two looks grow by this: a time is known to a quarter, and interpolated in between."""
@@ -74,7 +74,7 @@ def walk(
     generator = torch.Generator().manual_seed(plan.seed)
     samplers = ViewSampler(task.source, plan.views, generator), ViewSampler(novel, plan.novel_views, generator)
     scene = split_where_images_have_more(task.scene, [*task.source, *novel], plan.split)
-    frame, state = Frame.of(scene, plan.hold_ground), State.start(len(scene), scene.gaussians.means)
+    frame, state = Frame.of(scene, plan.constrain_ground), State.start(len(scene), scene.gaussians.means)
     step = rule.start(frame, camera_centre(task.source))
     seconds, renders = time.perf_counter() - began, len(task.source) + len(novel) if plan.split else 0
     for i in itertools.count():
@@ -99,7 +99,7 @@ def at_end(moments: Iterator[Moment], iterations: int) -> Moment:
 def configured(task: Task, config: GnetConfig, seed: int) -> Iterator[Moment]:
     """The stage's own rules, loss, views and T, without its perceptual term: the preset has none. Without end."""
     config = config.model_copy(update={"seed": seed})
-    objective, plan, finish = Objective(config.loss), plan_of("gnet", config), config.finishing
+    objective, plan, finish = Objective(config.loss), plan_of("gnet", config), config.refinement
     first = walk(lambda: (step_rule("gnet", config), objective), task, plan)
     if finish is None:
         yield from first
@@ -108,7 +108,7 @@ def configured(task: Task, config: GnetConfig, seed: int) -> Iterator[Moment]:
         before = moment
         yield moment
     then = replace(task, scene=before.scene)
-    for moment in walk(lambda: (finishing_rule(finish), objective), then, finishing_plan(config, finish)):
+    for moment in walk(lambda: (refine_rule(finish), objective), then, refine_plan(config, finish)):
         yield replace(
             moment,
             seconds=before.seconds + moment.seconds,

@@ -194,7 +194,8 @@ def search(
 def setting_of(variant: str) -> Setting:
     """What ``configs/baselines.yaml`` has for tuned Adam. Raises ``ConfigError`` for an unknown variant."""
     adam = load_baselines("small")["tuned_adam"].at(variant).adam
-    return Setting(adam.rates or GNET_RATES, adam.schedule)
+    rates = GNET_RATES if adam.learning_rates is None else adam.learning_rates.as_tuple()
+    return Setting(rates, adam.schedule)
 
 
 def validation_seeds(text: str) -> list[int]:
@@ -223,7 +224,7 @@ def initial(store: LocalStore, points: int, uri: str) -> Subject:
 
 def enhanced(store: str, split: float | None, uri: str) -> Subject:
     """ENet's task: GNet's scene and FNet's images in the preset ``small``."""
-    split = load_configuration("small").enet.split if split is None else split
+    split = load_configuration("small").enet.split_fraction if split is None else split
     steps = steps_of(uri, 0, store, 0, enet=False)
     heldout, truth = spread(steps.heldout, HELDOUT_VIEWS), true_targets(uri, store, steps.chunk, SIDE_M)
     scene = TrainingScene(uri, steps.gnet, steps.source, heldout, steps.fixed, truth)

@@ -13,7 +13,7 @@ def reliable(
     run: Annotated[str, typer.Argument(help="A run's name (or its start), as `genre show runs` lists it.")],
     stage: Annotated[str | None, typer.Option(help="initial, gnet or enet; the run's last without it.")] = None,
     chunk: Annotated[int | None, typer.Option(help="A chunk of the run; the first one without it.")] = None,
-    drop_db: Annotated[float, typer.Option(help="How much the median view's estimated PSNR may fall, dB.")] = 3.0,
+    max_drop_db: Annotated[float, typer.Option(help="How much the median view's estimated PSNR may fall, dB.")] = 3.0,
     every: Annotated[int, typer.Option(help="Every n-th frame is rendered.")] = 4,
     store: Annotated[str, typer.Option(help="The run's store.")] = "genre-store",
     detector: Annotated[
@@ -39,7 +39,7 @@ def reliable(
     from genre_tasks.reliability.reliable_range import reliable_range
 
     try:
-        config = RangeConfig(drop_db=drop_db, every=every)
+        config = RangeConfig(max_drop_db=max_drop_db, every=every)
     except ValidationError as error:
         raise ConfigError(f"{error.errors()[0]['msg']}", remedy="See `genre range --help`.") from error
     network = None

@@ -115,7 +115,10 @@ def _train(network: str, folder: Path, *values: Any) -> None:
 
         result = train_network(network, str(folder), *values)
     typer.echo(f"weights in {result['weights']}; use them with --set {network}.weights={result['weights']}")
-    rates = {"gnet": "gnet.rates=null and, with small, --set gnet.finish.rates_before=null", "enet": "enet.rates=null"}
+    rates = {
+        "gnet": "gnet.learning_rates=null and, with small, --set gnet.refine.lr_before_refine=null",
+        "enet": "enet.learning_rates=null",
+    }
     typer.echo(f"A preset's rates are for the built-in weights: add --set {rates[network]}")
 
 

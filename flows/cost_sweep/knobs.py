@@ -26,7 +26,7 @@ SIZES = ((160, 90), (240, 136), (320, 180), (480, 270))
 GAUSSIANS = (0.25, 0.5, 1.0, 2.0, 4.0)
 VIEWS = (1, 3, 6, 12)
 PERCEPTUAL = (0.0, 0.1, 0.2)
-NOT_SWEPT = frozenset({"ego_mask", "fixer_per_view"})
+NOT_SWEPT = frozenset({"ego_mask"})
 """Effects that change what is judged, or are knobs of their own (``fixer``)."""
 
 

@@ -100,10 +100,10 @@ _DISTILLED = (
     "enet.iterations=480",
     "enet.views_per_iteration=3",
     "enet.novel_views_per_iteration=3",
-    "enet.adam.rates=[0.05,0.05,0.0125,0.075,0.005]",
+    "enet.adam.learning_rates={means: 0.05, log_scales: 0.05, quats: 0.0125, logit_opacities: 0.075, colors: 0.005}",
     "enet.adam.schedule=constant",
     "enet.loss.perceptual=0",
-    "enet.split=0",
+    "enet.split_fraction=0",
 )
 """Per-scene distillation: the variant of tuned Adam that ``genre bench optimiser`` found to distil best (3 + 3 views an
 iteration at half of the rates, no perceptual term), long enough to settle."""
@@ -171,7 +171,7 @@ BUILT_IN: Mapping[str, Method] = {
     ),
     "g3r+genre-tuned": Method(
         "G3R-style + GenRe (fine-tuned)",
-        (*_LEARNED, "gnet.method=g3r", "enet.rates=null"),
+        (*_LEARNED, "gnet.method=g3r", "enet.learning_rates=null"),
         "enet",
         slot="enet-g3r",
         needs_weights=True,
@@ -181,7 +181,7 @@ BUILT_IN: Mapping[str, Method] = {
         (
             *_LEARNED,
             "enet.weights=builtin:gnet",
-            "enet.rates=null",
+            "enet.learning_rates=null",
             "enet.iterations={gnet.iterations}",
             "enet.views_per_iteration={gnet.views_per_iteration}",
             "enet.novel_views_per_iteration={gnet.views_per_iteration}",

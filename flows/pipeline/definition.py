@@ -132,12 +132,12 @@ def weights_file(spec: StageSpec, config: PipelineConfig) -> Path | None:
 
 def stage_weights(spec: StageSpec, config: PipelineConfig) -> str | None:
     """Digest of all weights that the stage will load, or ``None`` if it loads none."""
-    first, finish = weights_digest(weights_file(spec, config)), getattr(section_of(spec, config), "finishing", None)
+    first, finish = weights_digest(weights_file(spec, config)), getattr(section_of(spec, config), "refinement", None)
     if finish is None:
         return first
     from genre_tasks.weights import resolve_weights
 
-    return digest_value([first, weights_digest(resolve_weights("gnet", finish.weights, "gnet.finish.weights"))])
+    return digest_value([first, weights_digest(resolve_weights("gnet", finish.weights, "gnet.refine.weights"))])
 
 
 def weights_digest(path: Path | None) -> str | None:

@@ -61,10 +61,10 @@ def drawn(found: ReliableRange, title: str) -> NDArray[np.uint8]:
     above.axvspan(-found.right_m, found.left_m, color="C2", alpha=0.15, label="holds")
     above.plot([g.shift_m for g in found.guards], [g.estimate_db for g in found.guards], ".", color="C0", alpha=0.25)
     above.plot(shifts, [p.estimate_db for p in found.points], "o-", color="C0", label="median view")
-    above.axhline(path.estimate_db - found.limits.drop_db, color="C3", linestyle=":", label="limit")
+    above.axhline(path.estimate_db - found.limits.max_drop_db, color="C3", linestyle=":", label="limit")
     above.set(ylabel="estimated PSNR, dB")
     above.legend(fontsize=8)
-    for name, limit in (("shown", -found.limits.hidden), ("thin", found.limits.thin), ("floating", 0.0)):
+    for name, limit in (("shown", -found.limits.max_hidden), ("thin", found.limits.max_thin), ("floating", 0.0)):
         (line,) = below.plot(shifts, [getattr(p, name) - getattr(path, name) for p in found.points], "o-", label=name)
         if limit:
             below.axhline(limit, color=line.get_color(), linestyle=":")

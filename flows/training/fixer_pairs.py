@@ -156,7 +156,7 @@ class _Scenes:
         if key not in self._made:
             config = GnetConfig(
                 iterations=self._recipe.iterations, views_per_iteration=self._recipe.views,
-                loss=LossConfig(perceptual=0.0), snapshots=6, hold_ground=not wanted.loose,
+                loss=LossConfig(perceptual=0.0), snapshots=6, constrain_ground=not wanted.loose,
             )
             self._made[key] = gnet(config, seen, self._start)
         made = self._made[key]

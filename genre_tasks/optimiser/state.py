@@ -46,8 +46,8 @@ class Frame:
     planes: Tensor
 
     @staticmethod
-    def of(scene: SceneGraph, hold_ground: bool = True) -> Frame:
-        """From the scene at the start; ``hold_ground``: steps keep what lies on the ground in its plane."""
+    def of(scene: SceneGraph, constrain_ground: bool = True) -> Frame:
+        """From the scene at the start; ``constrain_ground``: steps keep what lies on the ground in its plane."""
         start = scene.gaussians.packed()
         unit = scene.gaussians.log_scales.median(1).values.exp().clamp(MIN_UNIT_M, MAX_UNIT_M)[:, None]
         low, high = torch.full_like(start, -torch.inf), torch.full_like(start, torch.inf)
@@ -58,7 +58,7 @@ class Frame:
         high[:, 3:6] = torch.minimum(high[:, 3:6], longest + math.log(GROWTH))
         low[:, 10], high[:, 10] = -LOGIT_BOUND, LOGIT_BOUND
         low[:, 11:14], high[:, 11:14] = COLOR_BOUNDS
-        planes = ground_planes(scene) if hold_ground else start.new_zeros((len(start), 11))
+        planes = ground_planes(scene) if constrain_ground else start.new_zeros((len(start), 11))
         return Frame(scene, unit, torch.minimum(low, start), torch.maximum(high, start), planes)
 
     @cached_property

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 class Plan:
     """How far and how often to look: ``iterations`` T, views drawn in each, snapshots kept on the way, the seed.
 
-    ``stage`` names the run in errors; ``hold_ground``: see ``Frame.of``; ``deform``: how actors deform is fitted,
+    ``stage`` names the run in errors; ``constrain_ground``: see ``Frame.of``; ``deform``: how actors deform is fitted,
     else it stays as the scene has it; ``split``: so many more Gaussians, per those there are, before the first
     iteration, see ``splitting``.
     """
@@ -44,7 +44,7 @@ class Plan:
     snapshots: int = 0
     seed: int = 0
     stage: str = "optimiser"
-    hold_ground: bool = True
+    constrain_ground: bool = True
     deform: bool = True
     split: float = 0.0
 
@@ -73,7 +73,7 @@ def unroll(
     generator = torch.Generator().manual_seed(plan.seed)
     samplers = [ViewSampler(source, plan.views, generator), ViewSampler(novel, plan.novel_views, generator)]
     scene = split_where_images_have_more(scene, [*source, *novel], plan.split)
-    frame = Frame.of(scene, plan.hold_ground)
+    frame = Frame.of(scene, plan.constrain_ground)
     state = State.start(len(scene), scene.gaussians.means)
     gloss = _gloss_of(scene)
     step = rule.start(frame, camera_centre(source))

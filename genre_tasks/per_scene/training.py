@@ -150,8 +150,8 @@ class PerSceneTraining:
     def _move(self, gradient: Gaussians) -> None:
         """Adam in place. Products and sums stand apart: fused ones round differently at the ends of threads' pieces."""
         p, config, t = self._population, self.config, self.iteration
-        means = config.means_rate * config.means_rate_end ** (t / config.iterations)
-        rates = (config.log_scales_rate, config.quats_rate, config.logit_opacities_rate, SH_C0 * config.sh_rate)
+        means = config.means_lr * config.means_lr_end_fraction ** (t / config.iterations)
+        rates = (config.log_scales_lr, config.quats_lr, config.logit_opacities_lr, SH_C0 * config.sh_lr)
         root = math.sqrt(1 - SECOND_DECAY ** (t + 1))
         bias = root / (1 - FIRST_DECAY ** (t + 1))
         for f, rate in zip(fields(Gaussians), (means, *rates), strict=True):

@@ -122,11 +122,11 @@ def _point(shift: float, views: Sequence[Guards], path: dict[str, float], limits
 def _excess(here: dict[str, float], path: dict[str, float], limits: RangeConfig) -> tuple[float, ...]:
     """By how much each limit is passed; negative where it holds."""
     return (
-        path["estimate_db"] - here["estimate_db"] - limits.drop_db,
-        path["shown"] - here["shown"] - limits.hidden,
-        here["thin"] - path["thin"] - limits.thin,
-        here["floating"] - path["floating"] - limits.floating,
-        _lost(path["detected"], here["detected"]) - limits.undetected,
+        path["estimate_db"] - here["estimate_db"] - limits.max_drop_db,
+        path["shown"] - here["shown"] - limits.max_hidden,
+        here["thin"] - path["thin"] - limits.max_thin,
+        here["floating"] - path["floating"] - limits.max_floating,
+        _lost(path["detected"], here["detected"]) - limits.max_undetected,
     )
 
 

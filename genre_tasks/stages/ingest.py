@@ -220,7 +220,7 @@ def _from_sweeps(reading: _Reading, sources: Sequence[View]) -> tuple[Cloud, lis
         raise reading.error("the chunk has no LiDAR sweep", remedy)
     swept = np.concatenate([p for _, p in static])
     static.append((NO_SWEEP, road_fill(swept, reading.chunk_SE3_ego)))
-    if reading.config.walls:
+    if reading.config.complete_facades:
         static.append((NO_SWEEP, wall_fill(swept, reading.chunk_SE3_ego, sources)))
     actors = []
     for parts, path in zip(own, moving.kept, strict=True):

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
-from genre_tasks.config import FinishConfig, GnetConfig, OptimiserConfig
+from genre_tasks.config import GnetConfig, OptimiserConfig, RefineConfig
 from genre_tasks.effects.types import EffectsPlan
 from genre_tasks.learned.weights import load
 from genre_tasks.losses import targets
@@ -54,9 +54,9 @@ def unrolled(
     progress: Progress = silent,
 ) -> Reconstruction:
     """The learned optimiser or tuned Adam from ``scene``, and its end where the configuration has one of its own."""
-    finish = config.finishing if isinstance(config, GnetConfig) else None
+    finish = config.refinement if isinstance(config, GnetConfig) else None
     rule, objective = step_rule(stage, config), Objective(config.loss, distance(config))
-    last = None if finish is None else finishing_rule(finish)  # so early that weights unfit are said before any work
+    last = None if finish is None else refine_rule(finish)  # so early that weights unfit are said before any work
     plan = plan_of(stage, config)
 
     def after(before: int) -> Progress:
@@ -65,25 +65,25 @@ def unrolled(
     first = unroll(rule, scene, source, novel, objective, plan, after(0))
     if last is None or finish is None:
         return first
-    end = finishing_plan(config, finish)
+    end = refine_plan(config, finish)
     return _joined(first, unroll(last, first.scene, source, novel, objective, end, after(plan.iterations)))
 
 
-def finishing_plan(config: OptimiserConfig, finish: FinishConfig) -> Plan:
+def refine_plan(config: OptimiserConfig, finish: RefineConfig) -> Plan:
     """As the first iterations', with another order of views."""
     first = plan_of("gnet", config)
     return replace(
         first,
-        iterations=config.finishing_iterations,
+        iterations=config.refine_iterations,
         snapshots=config.snapshots - first.snapshots,
         seed=config.seed + 1,
-        split=finish.split,
+        split=finish.split_fraction,
     )
 
 
-def finishing_rule(finish: FinishConfig) -> StepRule:
+def refine_rule(finish: RefineConfig) -> StepRule:
     """The learned optimiser with the weights that are configured for the end. Raises as :func:`step_rule`."""
-    return load(resolve_weights("gnet", finish.weights, "gnet.finish.weights"))
+    return load(resolve_weights("gnet", finish.weights, "gnet.refine.weights"))
 
 
 def _joined(first: Reconstruction, last: Reconstruction) -> Reconstruction:
@@ -98,8 +98,8 @@ def _joined(first: Reconstruction, last: Reconstruction) -> Reconstruction:
 
 
 def plan_of(stage: StageName, config: OptimiserConfig) -> Plan:
-    """How far and how often to look, as the configuration says; of an end of its own see :func:`finishing_plan`."""
-    iterations = config.iterations - config.finishing_iterations
+    """How far and how often to look, as the configuration says; of an end of its own see :func:`refine_plan`."""
+    iterations = config.iterations - config.refine_iterations
     return Plan(
         iterations,
         config.views_per_iteration,
@@ -107,9 +107,9 @@ def plan_of(stage: StageName, config: OptimiserConfig) -> Plan:
         round(config.snapshots * iterations / config.iterations),
         config.seed,
         stage,
-        config.hold_ground,
+        config.constrain_ground,
         deform=stage == "gnet",  # the fixer's images of people are no measure of their shape
-        split=config.split,
+        split=config.split_fraction,
     )
 
 
@@ -141,11 +141,13 @@ def step_rule(stage: StageName, config: OptimiserConfig) -> StepRule:
     """
     if config.method == "adam":
         own = GNET_RATES if stage == "gnet" else ENET_RATES
-        return TunedAdam(config.adam.rates or own, config.adam.schedule)
+        return TunedAdam(
+            config.adam.learning_rates.as_tuple() if config.adam.learning_rates else own, config.adam.schedule
+        )
     learned = load(resolve_weights(network_of(stage, config.method), config.weights))
-    finish = config.finishing if isinstance(config, GnetConfig) else None
-    rates = config.rates if finish is None or finish.rates_before is None else finish.rates_before
-    return learned if rates is None else learned.at_rates(rates)
+    finish = config.refinement if isinstance(config, GnetConfig) else None
+    rates = config.learning_rates if finish is None or finish.lr_before_refine is None else finish.lr_before_refine
+    return learned if rates is None else learned.at_rates(rates.as_tuple())
 
 
 def distance(config: OptimiserConfig) -> Distance | None:

@@ -59,7 +59,7 @@ def test_long_variants_are_constant_or_of_many_renders() -> None:
 
 def test_the_long_preset_is_small_with_a_longer_gnet() -> None:
     small, long = (load_configuration(name).model_dump() for name in ("small", "long"))
-    assert {k for k in small["gnet"] if small["gnet"][k] != long["gnet"][k]} == {"iterations", "finish"}
+    assert {k for k in small["gnet"] if small["gnet"][k] != long["gnet"][k]} == {"iterations", "refine"}
     assert {k for k in small if small[k] != long[k]} == {"gnet"}
     assert long["gnet"]["iterations"] > small["gnet"]["iterations"]
 
@@ -126,7 +126,11 @@ def test_enet_beside_distillations_of_the_same_images(task: Task) -> None:
     features = perceptual_distance().pooled_features(images_of(street_scenes.scene(), task.source))
     judge = Judge(views, FeatureSet(features, (0, 0, 1, 1)), replace(task, beside=novel))
     enet = OptimiserConfig(
-        iterations=2, views_per_iteration=2, novel_views_per_iteration=2, split=0.1, loss=LossConfig(perceptual=0.0)
+        iterations=2,
+        views_per_iteration=2,
+        novel_views_per_iteration=2,
+        split_fraction=0.1,
+        loss=LossConfig(perceptual=0.0),
     )
     row = distillation.distillation_row(enet, PerSceneConfig(iterations=6), judge, novel)
     once = len(task.source) + len(novel)  # rendered for the split
@@ -136,7 +140,7 @@ def test_enet_beside_distillations_of_the_same_images(task: Task) -> None:
     assert list(row["adam"]["curves"]) == variants and list(row["standard"]["curves"]) == ["6"]
     assert list(row["adam_split"]["curves"]) == ["2+2 at 0.5, no perceptual, split"]
     given = distillation.adam_variants(enet)
-    assert [(c.split, c.loss.perceptual) for c in given.values()] == [(0.0, 0.1), (0.0, 0.0)]
+    assert [(c.split_fraction, c.loss.perceptual) for c in given.values()] == [(0.0, 0.1), (0.0, 0.0)]
     for family in ("adam", "adam_split", "standard"):
         assert all(curve[0] == row["start"] for curve in row[family]["curves"].values())
         assert row[family]["reached_s"] > 0
@@ -201,7 +205,7 @@ def test_gnets_network_enhances_with_its_own_length_and_weights() -> None:
     own = enhancement.as_enhancer(config)
     assert (own.iterations, own.loss) == (config.gnet.iterations, config.enet.loss)
     # A preset's rates are for the weights they were swept for.
-    assert config.enet.rates is not None and own.rates is None
+    assert config.enet.learning_rates is not None and own.learning_rates is None
     assert Path(own.weights).name == "gnet.safetensors" and own.novel_views_per_iteration == own.views_per_iteration
 
 

@@ -130,7 +130,9 @@ def test_far_past_its_length_the_loss_is_compared_with_that_at_t(task: Task) -> 
 
 def test_enet_past_its_length_is_judged_on_its_fixed_views_too(task: Task) -> None:
     fixed = street_scenes.targets(street_scenes.scene(), novel=True)
-    config = OptimiserConfig(iterations=1, views_per_iteration=1, novel_views_per_iteration=1, split=0.1, loss=LOSS)
+    config = OptimiserConfig(
+        iterations=1, views_per_iteration=1, novel_views_per_iteration=1, split_fraction=0.1, loss=LOSS
+    )
     with_fixed = cells.stability_row(task, "enet", config, fixed)
     alone = cells.stability_row(task, "enet", config.model_copy(update={"novel_views_per_iteration": 0}))
     assert with_fixed["loss"]["1"] != pytest.approx(alone["loss"]["1"], rel=1e-3)

@@ -208,7 +208,7 @@ def test_gnet_fits_it_and_enet_keeps_it() -> None:
     scene = gnet(SMALL_FIT, chunk(), first, on)
     assert scene.scene.deformation is not None and scene.scene.deformation.offsets.any()
     assert np.isfinite(scene.scene.deformation.offsets.numpy()).all()
-    own = OptimiserConfig(**SMALL_FIT.model_dump(exclude={"per_scene", "finish"}))
+    own = OptimiserConfig(**SMALL_FIT.model_dump(exclude={"per_scene", "refine"}))
     kept = optimise("enet", own, chunk(), scene.scene, None)
     assert torch.equal(kept.scene.deformation.offsets, scene.scene.deformation.offsets)
     assert not torch.equal(kept.scene.gaussians.packed(), scene.scene.gaussians.packed())

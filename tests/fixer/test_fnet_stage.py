@@ -139,8 +139,8 @@ def test_absent_weights_have_a_remedy(tmp_path):
         resolve_weights("nosuch", "builtin")
     with pytest.raises(InputError, match="the weights of fnet do not exist"):
         resolve_weights("fnet", str(tmp_path / "none.safetensors"))
-    with pytest.raises(InputError, match=r"Check `gnet.finish.weights`"):
-        resolve_weights("gnet", str(tmp_path / "none.safetensors"), "gnet.finish.weights")
+    with pytest.raises(InputError, match=r"Check `gnet.refine.weights`"):
+        resolve_weights("gnet", str(tmp_path / "none.safetensors"), "gnet.refine.weights")
     assert resolve_weights("fnet", str(tmp_path)) == tmp_path
 
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import itertools
+import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
-from flows.configuration import PRESETS, differences, load_configuration
+from flows.configuration import PRESETS, RENAMED_KEYS, _section_type, differences, load_configuration
+from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -19,8 +22,8 @@ def test_presets_are_valid(preset: str) -> None:
     config = load_configuration(preset)
     assert config.gnet.iterations == {"fine": 144, "long": 120, "paper": 24}.get(preset, 72)
     enet = {"paper": (12, 0.0), "demo": (72, 0.7), "fine": (72, 0.3)}
-    assert (config.enet.iterations, config.enet.split) == enet.get(preset, (96, 1.0))
-    assert config.gnet.finishing_iterations == {"demo": 48, "small": 48, "long": 72}.get(preset, 0)
+    assert (config.enet.iterations, config.enet.split_fraction) == enet.get(preset, (96, 1.0))
+    assert config.gnet.refine_iterations == {"demo": 48, "small": 48, "long": 72}.get(preset, 0)
     assert differences(config, preset) == {}
 
 
@@ -30,8 +33,6 @@ def test_paper_preset_has_the_papers_numbers() -> None:
     loss = config.enet.loss
     assert (loss.rgb, loss.perceptual, loss.ssim, loss.depth, loss.novel) == (0.8, 0.2, 0.2, 0.01, 0.5)
     assert config.fnet.timestep == 200 and config.novel_views.shifts_m == (3.0, -3.0)
-    training = yaml.safe_load((ROOT / "configs/paper.yaml").read_text())["training"]
-    assert training["logs"] == {"train": 93, "test": 10} and training["fnet_steps"] == 20000
 
 
 def test_settings_win_over_file_over_preset(tmp_path: Path) -> None:
@@ -75,3 +76,32 @@ def test_seeds_do_not_overlap() -> None:
     seeds = yaml.safe_load((ROOT / "configs/seeds.yaml").read_text())
     ranges = [seeds["training"], seeds["validation"], [seeds["demo"]] * 2, seeds["claims"]]
     assert all(a[1] < b[0] for a, b in itertools.pairwise(ranges))
+
+
+@pytest.mark.parametrize(
+    ("setting", "new"),
+    [
+        ("gnet.finish=null", "gnet.refine"),
+        ("gnet.refine.share=0.5", "gnet.refine.fraction_of_iterations"),
+        ("enet.rates=[1, 2, 3, 4, 5]", "enet.learning_rates"),
+        ("gnet.adam.rates=null", "gnet.adam.learning_rates"),
+        ("gnet.per_scene.means_rate=0.1", "gnet.per_scene.means_lr"),
+        ("ingest.walls=false", "ingest.complete_facades"),
+    ],
+)
+def test_a_renamed_key_is_an_error_that_names_the_new_key(setting: str, new: str) -> None:
+    with pytest.raises(ConfigError, match=rf"was renamed.*Write '{re.escape(new)}'"):
+        load_configuration("small", settings=[setting])
+
+
+def test_every_renamed_key_leads_to_a_key_that_exists() -> None:
+    for new in RENAMED_KEYS.values():
+        model: Any = PipelineConfig
+        for part in new.split("."):
+            field = model.model_fields[part]
+            model, _ = _section_type(field.annotation)
+
+
+def test_a_removed_key_says_what_to_do_instead() -> None:
+    with pytest.raises(ConfigError, match=r"was removed.*fnet\.gate"):
+        load_configuration("small", settings=["effects.fixer_per_view=off"])

@@ -98,7 +98,7 @@ def test_the_compiled_step_along_the_ground_is_torchs() -> None:
 def test_only_flat_static_gaussians_that_lie_are_ground_and_only_where_asked_for() -> None:
     planes = ground_planes(_scene())
     assert (planes != 0).any(1).tolist() == [True] * len(LYING) + [False] * len(FREE)
-    assert not Frame.of(_scene(), hold_ground=False).planes.any()
+    assert not Frame.of(_scene(), constrain_ground=False).planes.any()
 
 
 def test_a_turn_in_the_plane_and_a_longer_quaternion_are_left_as_they_are() -> None:
@@ -117,14 +117,14 @@ def test_what_leads_along_the_ground_has_gradients() -> None:
 
 
 def test_a_run_may_leave_the_ground_free() -> None:
-    assert GnetConfig().hold_ground and PipelineConfig().enet.hold_ground
+    assert GnetConfig().constrain_ground and PipelineConfig().enet.constrain_ground
     scene = street_scenes.scene(actor=False)
     log_scales, quats = torch.tensor(FLAT).log().repeat(300, 1), torch.tensor([1.0, 0, 0, 0]).repeat(300, 1)
     start = scene.with_gaussians(replace(scene.gaussians, log_scales=log_scales, quats=quats))
     objective = Objective(LossConfig(perceptual=0, depth=0))
 
     def height(hold: bool) -> Tensor:
-        plan = Plan(4, 4, hold_ground=hold)
+        plan = Plan(4, 4, constrain_ground=hold)
         return unroll(TunedAdam(), start, street_scenes.targets(scene), (), objective, plan).scene.gaussians.means[:, 2]
 
     static = start.nodes == STATIC

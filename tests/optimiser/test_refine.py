@@ -12,7 +12,15 @@ from benchmarks.common.task import Task
 from benchmarks.optimiser import race
 from flows.configuration import load_configuration
 from flows.pipeline.definition import BY_NAME, stage_weights, weights_digest
-from genre_tasks.config import FinishConfig, GnetConfig, IngestConfig, InitialConfig, LossConfig, PipelineConfig
+from genre_tasks.config import (
+    GnetConfig,
+    IngestConfig,
+    InitialConfig,
+    LearningRates,
+    LossConfig,
+    PipelineConfig,
+    RefineConfig,
+)
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.learned.weights import load
 from genre_tasks.logs.registry import open_log
@@ -22,12 +30,12 @@ from genre_tasks.scene.deformation import Deformation
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.stages.ingest import ingest
 from genre_tasks.stages.initial import initial
-from genre_tasks.stages.optimise import finishing_plan, optimise, plan_of
+from genre_tasks.stages.optimise import optimise, plan_of, refine_plan
 from genre_tasks.weights import resolve_weights
 
 LOG = "synthetic:street?seed=903&width=96&height=54&samples=1&lidar_beams=32&lidar_azimuths=450&frames=9&cameras=2"
-FINISH = FinishConfig(share=1 / 3, split=0.3)
-CONFIG = GnetConfig(iterations=12, views_per_iteration=2, loss=LossConfig(perceptual=0.0), snapshots=3, finish=FINISH)
+FINISH = RefineConfig(fraction_of_iterations=1 / 3, split_fraction=0.3)
+CONFIG = GnetConfig(iterations=12, views_per_iteration=2, loss=LossConfig(perceptual=0.0), snapshots=3, refine=FINISH)
 
 
 @pytest.fixture(scope="module")
@@ -47,9 +55,9 @@ def _packed(scene: SceneGraph) -> torch.Tensor:
 def test_the_end_is_a_run_of_its_own_from_the_scene_that_the_first_left(chunk: Chunk, start: SceneGraph) -> None:
     shown: list[tuple[int, int]] = []
     found = optimise("gnet", CONFIG, chunk, start, None, lambda done, total, _: shown.append((done, total)))
-    first = optimise("gnet", CONFIG.model_copy(update={"iterations": 8, "finish": None}), chunk, start, None)
+    first = optimise("gnet", CONFIG.model_copy(update={"iterations": 8, "refine": None}), chunk, start, None)
     alone = CONFIG.model_copy(
-        update={"iterations": 4, "seed": 1, "split": 0.3, "weights": "builtin:enet", "finish": None}
+        update={"iterations": 4, "seed": 1, "split_fraction": 0.3, "weights": "builtin:enet", "refine": None}
     )
     then = optimise("gnet", alone, chunk, first.scene, None)
     assert torch.equal(_packed(found.scene), _packed(then.scene))
@@ -72,43 +80,43 @@ def test_the_benchmark_goes_the_same_way(chunk: Chunk, start: SceneGraph) -> Non
 
 def test_both_weights_are_part_of_the_key(tmp_path: Path) -> None:
     spec = BY_NAME["gnet"]
-    plain, own = PipelineConfig(gnet=CONFIG.model_copy(update={"finish": None})), PipelineConfig(gnet=CONFIG)
+    plain, own = PipelineConfig(gnet=CONFIG.model_copy(update={"refine": None})), PipelineConfig(gnet=CONFIG)
     gnet = weights_digest(resolve_weights("gnet", "builtin"))
     assert stage_weights(spec, plain) == gnet
     other = FINISH.model_copy(update={"weights": "builtin:gnet"})
     digests = {
         gnet,
-        *(stage_weights(spec, PipelineConfig(gnet=CONFIG.model_copy(update={"finish": f}))) for f in (FINISH, other)),
+        *(stage_weights(spec, PipelineConfig(gnet=CONFIG.model_copy(update={"refine": f}))) for f in (FINISH, other)),
     }
     assert len(digests) == 3 and stage_weights(spec, own) in digests
     missing = FINISH.model_copy(update={"weights": str(tmp_path / "none.safetensors")})
     with pytest.raises(InputError, match=r"none\.safetensors"):
-        stage_weights(spec, PipelineConfig(gnet=CONFIG.model_copy(update={"finish": missing})))
+        stage_weights(spec, PipelineConfig(gnet=CONFIG.model_copy(update={"refine": missing})))
 
 
 def test_a_baseline_in_its_place_has_nothing_of_it(chunk: Chunk, start: SceneGraph) -> None:
     adam = CONFIG.model_copy(update={"method": "adam"})
     found = optimise("gnet", adam, chunk, start, None)
-    assert adam.finishing is None and (adam.finishing_iterations, len(found.losses)) == (0, 12)
+    assert adam.refinement is None and (adam.refine_iterations, len(found.losses)) == (0, 12)
     assert len(found.scene) == len(start) and stage_weights(BY_NAME["gnet"], PipelineConfig(gnet=adam)) is None
 
 
 def test_snapshots_are_shared_out_by_length() -> None:
     long = load_configuration("long").gnet
-    assert long.finishing is not None
-    plans = plan_of("gnet", long), finishing_plan(long, long.finishing)
+    assert long.refinement is not None
+    plans = plan_of("gnet", long), refine_plan(long, long.refinement)
     assert [p.iterations for p in plans] == [48, 72] and sum(p.snapshots for p in plans) == long.snapshots
     assert [p.split for p in plans] == [0.0, 0.3] and plans[0].seed != plans[1].seed
 
 
 def test_the_end_is_a_share_of_any_length() -> None:
     def parts(iterations: int, share: float) -> tuple[int, int]:
-        config = GnetConfig(iterations=iterations, finish=FinishConfig(share=share))
-        return plan_of("gnet", config).iterations, config.finishing_iterations
+        config = GnetConfig(iterations=iterations, refine=RefineConfig(fraction_of_iterations=share))
+        return plan_of("gnet", config).iterations, config.refine_iterations
 
     assert [parts(n, 2 / 3) for n in (1, 2, 3, 8, 72, 144)] == [(1, 0), (1, 1), (1, 2), (3, 5), (24, 48), (48, 96)]
     assert parts(10, 0.99) == (1, 9) and parts(10, 0.01) == (9, 1)
-    assert GnetConfig(iterations=8).finishing_iterations == 0
+    assert GnetConfig(iterations=8).refine_iterations == 0
 
 
 def test_rates_of_the_first_iterations_are_the_ends_to_say(chunk: Chunk, start: SceneGraph) -> None:
@@ -116,8 +124,9 @@ def test_rates_of_the_first_iterations_are_the_ends_to_say(chunk: Chunk, start: 
         return _packed(optimise("gnet", config, chunk, start, None).scene)
 
     def told(rates: tuple[float, ...], **more: object) -> GnetConfig:
-        finish = FinishConfig.model_validate({**FINISH.model_dump(), "rates_before": rates})
-        return CONFIG.model_copy(update={"finish": finish, **more})
+        before = LearningRates.of(rates)
+        finish = RefineConfig.model_validate({**FINISH.model_dump(), "lr_before_refine": before})
+        return CONFIG.model_copy(update={"refine": finish, **more})
 
     own = load(resolve_weights("gnet", "builtin")).config.rates
     plain = at(CONFIG)
@@ -128,7 +137,7 @@ def test_rates_of_the_first_iterations_are_the_ends_to_say(chunk: Chunk, start: 
     assert torch.equal(_packed(end.scene), at(bold))
     assert torch.equal(at(told((9.0, *own[1:]), iterations=1)), at(CONFIG.model_copy(update={"iterations": 1})))
     for bad in ((-0.1, 1, 1, 1, 1), (float("nan"), 1, 1, 1, 1), (1, 1, 1)):
-        with pytest.raises(ValueError, match="rates_before"):
+        with pytest.raises(ValueError, match=r"means|shorter"):
             told(bad)
 
 
@@ -136,7 +145,7 @@ def test_weights_unfit_for_the_end_are_said_before_the_first_iteration(
     chunk: Chunk, start: SceneGraph, tmp_path: Path
 ) -> None:
     (bad := tmp_path / "bad.safetensors").write_bytes(b"no weights")
-    config, shown = CONFIG.model_copy(update={"finish": FINISH.model_copy(update={"weights": str(bad)})}), []
+    config, shown = CONFIG.model_copy(update={"refine": FINISH.model_copy(update={"weights": str(bad)})}), []
     with pytest.raises(InputError, match=r"bad\.json"):
         optimise("gnet", config, chunk, start, None, lambda done, total, _: shown.append(done))
     assert not shown
@@ -144,12 +153,12 @@ def test_weights_unfit_for_the_end_are_said_before_the_first_iteration(
 
 def test_one_setting_gives_a_preset_an_end() -> None:
     plain = load_configuration("fine")
-    assert plain.gnet.finish is None
-    ending = load_configuration("fine", settings=["gnet.finish.split=0.5"]).gnet
-    assert ending.finishing == FinishConfig(split=0.5)
-    assert load_configuration("long", settings=["gnet.finish=null"]).gnet.finishing_iterations == 0
-    with pytest.raises(ConfigError, match="share"):
-        load_configuration("long", settings=["gnet.finish.share=1.5"])
+    assert plain.gnet.refine is None
+    ending = load_configuration("fine", settings=["gnet.refine.split_fraction=0.5"]).gnet
+    assert ending.refinement == RefineConfig(split_fraction=0.5)
+    assert load_configuration("long", settings=["gnet.refine=null"]).gnet.refine_iterations == 0
+    with pytest.raises(ConfigError, match="fraction_of_iterations"):
+        load_configuration("long", settings=["gnet.refine.fraction_of_iterations=1.5"])
 
 
 def test_actors_that_deform_and_gloss_go_through_the_split(chunk: Chunk, start: SceneGraph) -> None:

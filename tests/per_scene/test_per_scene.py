@@ -62,7 +62,7 @@ def test_it_grows_where_the_picture_disagrees_alone() -> None:
     means = g.means.clone()
     means[seen] += torch.tensor([0.3, 0.0, 0.0])
     quick = DensityConfig(start=0, every=10, stop=15_000)
-    config = PerSceneConfig(iterations=30_000, means_rate=0.0, density=quick)
+    config = PerSceneConfig(iterations=30_000, means_lr=0.0, density=quick)
     training = PerSceneTraining(config, truth.with_gaussians(replace(g, means=means)), views)
     for _ in range(9):
         training.step()

@@ -83,7 +83,7 @@ def guard(shift: float, actors: int, detected: int) -> Guards:
 
 
 def test_the_range_ends_where_too_much_is_no_longer_detected() -> None:
-    limits = RangeConfig(shifts_m=(1.0, 2.0), drop_db=60.0, undetected=0.3)
+    limits = RangeConfig(shifts_m=(1.0, 2.0), max_drop_db=60.0, max_undetected=0.3)
     left = [guard(1.0, 10, 8), guard(2.0, 10, 2)]  # nothing lost, then three quarters
     right = [guard(-1.0, 0, 0), guard(-2.0, 5, 4)]  # nothing in view, then nothing lost
     found = judged([guard(0.0, 10, 8), *left, *right], limits)

@@ -127,7 +127,7 @@ def view(shift: float, agreement: float, shown: float = 0.7, thin: float = 0.0, 
 
 
 def test_the_range_ends_where_the_first_limit_is_crossed() -> None:
-    limits = RangeConfig(shifts_m=(1.0, 2.0), drop_db=1.0, hidden=0.1)
+    limits = RangeConfig(shifts_m=(1.0, 2.0), max_drop_db=1.0, max_hidden=0.1)
     drop, a_metre = 1.0 / ESTIMATE["agreement_db"], -ESTIMATE["shift_m"]  # of agreement, for one of the estimate
     flat = [view(0.0, 30.0), view(1.0, 30.0 - (0.2 - a_metre) * drop), view(2.0, 30.0 - (1.8 - 2 * a_metre) * drop)]
     right = [view(-1.0, 30.0, shown=0.55), view(-2.0, 30.0, shown=0.2)]
@@ -140,7 +140,7 @@ def test_the_range_ends_where_the_first_limit_is_crossed() -> None:
 
 
 def test_what_holds_everywhere_is_usable_to_the_last_shift_or_more() -> None:
-    limits = RangeConfig(shifts_m=(1.0, 2.0), drop_db=3.0)
+    limits = RangeConfig(shifts_m=(1.0, 2.0), max_drop_db=3.0)
     found = judged([view(s, 30.0) for s in (0.0, 1.0, 2.0, -1.0, -2.0)], limits)
     assert (found.left_m, found.right_m) == (2.0, 2.0) and "2.0 m or more left" in str(found)
     later = judged([view(s, 30.0, thin=0.5 * (s == 1.0)) for s in (0.0, 1.0, 2.0)], limits)
@@ -171,7 +171,7 @@ def test_the_command_answers_for_a_finished_run(finished: Run, tmp_path: Path) -
     assert "usable to" in done.output and "after gnet" in done.output and (tmp_path / "range.png").is_file()
     assert last_stage(finished.store, finished.name, 0) == "gnet"
     with pytest.raises(ConfigError, match="range --help"):
-        CliRunner().invoke(app, [*told, "--drop-db", "-1"], catch_exceptions=False)
+        CliRunner().invoke(app, [*told, "--max-drop-db", "-1"], catch_exceptions=False)
     for command in (told, ["render", finished.name, "--store", finished.store, "--out", str(tmp_path / "x.png")]):
         with pytest.raises(InputError, match=r"ingest makes no scene.*initial, gnet, enet"):
             CliRunner().invoke(app, [*command, "--stage", "ingest"], catch_exceptions=False)

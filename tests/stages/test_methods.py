@@ -15,6 +15,7 @@ from genre_tasks.config import (
     AdamConfig,
     DensityConfig,
     GnetConfig,
+    LearningRates,
     LossConfig,
     OptimiserConfig,
     PerSceneConfig,
@@ -57,8 +58,8 @@ def test_per_scene_methods_with_and_without_actors(method: str, actors: int, vie
 
 def test_the_published_recipe_is_the_default() -> None:
     c = PerSceneConfig()
-    assert (c.iterations, c.means_rate, c.means_rate * c.means_rate_end) == (30_000, 1.6e-4, pytest.approx(1.6e-6))
-    assert (c.log_scales_rate, c.quats_rate, c.logit_opacities_rate, c.sh_rate) == (5e-3, 1e-3, 5e-2, 2.5e-3)
+    assert (c.iterations, c.means_lr, c.means_lr * c.means_lr_end_fraction) == (30_000, 1.6e-4, pytest.approx(1.6e-6))
+    assert (c.log_scales_lr, c.quats_lr, c.logit_opacities_lr, c.sh_lr) == (5e-3, 1e-3, 5e-2, 2.5e-3)
     assert (c.rgb, c.ssim) == (0.8, 0.2)
     d = c.density
     assert (d.start, d.stop, d.every, d.reset_every) == (500, 15_000, 100, 3000)
@@ -77,7 +78,9 @@ def test_the_learned_optimisers_rates_are_the_weights_own_or_those_that_are_give
     config = GnetConfig() if stage == "gnet" else OptimiserConfig()
     own = optimise.step_rule(stage, config)
     assert isinstance(own, LearnedOptimiser)
-    given = optimise.step_rule(stage, config.model_copy(update={"rates": (0.5, 0.4, 0.3, 0.2, 0.0)}))
+    given = optimise.step_rule(
+        stage, config.model_copy(update={"learning_rates": LearningRates.of((0.5, 0.4, 0.3, 0.2, 0.0))})
+    )
     assert isinstance(given, LearnedOptimiser) and given.config.rates == (0.5, 0.4, 0.3, 0.2, 0.0) != own.config.rates
     assert given.config.relaxation == own.config.relaxation
     assert all(torch.equal(a, b) for a, b in zip(own.parameters(), given.parameters(), strict=True))
@@ -100,7 +103,7 @@ def test_g3r_has_weights_of_its_own_or_those_that_are_named(views: tuple[Target,
 def test_adam_takes_the_stages_rates_unless_others_are_set() -> None:
     rules = [optimise.step_rule(stage, OptimiserConfig(method="adam")) for stage in ("gnet", "enet")]
     assert rules == [TunedAdam(GNET_RATES), TunedAdam(ENET_RATES)]
-    adam = AdamConfig(rates=(1, 2, 3, 4, 5), schedule="constant")
+    adam = AdamConfig(learning_rates=LearningRates.of((1, 2, 3, 4, 5)), schedule="constant")
     assert optimise.step_rule("enet", OptimiserConfig(method="adam", adam=adam)) == TunedAdam(
         (1, 2, 3, 4, 5), "constant"
     )
@@ -129,9 +132,9 @@ def test_the_table_of_baselines_is_sound(preset: str) -> None:
         for variant, config in baseline.variants.items():
             assert config.loss == gnet.loss  # the same objective, where it is the stage's own
             if name in adam:
-                share = f"+{config.split:.0%}" if config.split else ""
+                share = f"+{config.split_fraction:.0%}" if config.split_fraction else ""
                 assert f"{config.iterations}x{config.views_per_iteration}{share}" == variant
-                assert config.adam.rates is not None and bool(share) == name.endswith("split")
+                assert config.adam.learning_rates is not None and bool(share) == name.endswith("split")
             elif "3" in name or name == "street_gs":
                 assert variant in ("default", str(config.per_scene.iterations))
     with pytest.raises(ConfigError, match=r"no variant '1'.*Known: 30000"):
