@@ -6,14 +6,37 @@ on it. Here each item is computed on exactly one thread, and the threads are use
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import TypeVar
 
 import torch
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+
+@contextmanager
+def torch_threads(count: int | None) -> Iterator[None]:
+    """Runs a block with ``count`` threads of torch, and restores their number afterwards.
+
+    Args:
+        count: number of threads; ``None`` keeps the present number.
+
+    >>> before = torch.get_num_threads()
+    >>> with torch_threads(1):
+    ...     torch.get_num_threads()
+    1
+    >>> torch.get_num_threads() == before
+    True
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(count or before)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def map_single_threaded(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:

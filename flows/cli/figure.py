@@ -32,11 +32,11 @@ def figure(
 
     Stages that the store has not are computed.
     """
-    from flows.atomic_file import anew
     from flows.cli.terminal import TerminalReporter
     from flows.paper_tables.figure import TABLE, drawn, kind_of, strips
     from flows.paper_tables.request import Request
     from flows.pipeline.stage_runner import produce
+    from genre_tasks.atomic_path import atomic_path
     from genre_tasks.errors import ConfigError
     from storage.codecs.png import write_png
 
@@ -58,7 +58,7 @@ def figure(
         found = strips(chosen, plan, produced, camera, frame)
     said = " ".join([f"{log} chunk {chunk}, preset {preset}", *request.settings])
     out.parent.mkdir(parents=True, exist_ok=True)
-    with anew(out) as part:
+    with atomic_path(out) as part:
         write_png(part, drawn(chosen, found, said))
     left = f"; not drawn: {', '.join(plan.missing)}" if plan.missing else ""
     typer.echo(f"wrote {out}: {', '.join(s.label for s in found)}{left}")

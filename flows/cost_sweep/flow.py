@@ -12,7 +12,6 @@ from typing import Any
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from flows.atomic_file import anew
 from flows.cost_sweep.cell import Cell, Sweep, cells_of, run_cell
 from flows.cost_sweep.knobs import PRESET_ITSELF, settings_of
 from flows.cost_sweep.page import page
@@ -25,6 +24,7 @@ from flows.machine.facts import commit, machine
 from flows.pipeline.log_cache import chosen_chunks, expanded
 from flows.pipeline.progress import current_reporter
 from flows.pipeline.stage_runner import ArtifactRef, Job, produce
+from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import GenreError
 from storage.codecs.png import write_png
 from storage.files import write_file
@@ -148,15 +148,15 @@ def write(
     }
     basis = {"base": sweep.preset, "settings": json.dumps(sweep.settings), "judged": judged.name, **speed}
     files = [out / name for name in ("cost.parquet", "cost_cells.parquet", "cost.png", "cost.md")]
-    with anew(files[0]) as part:
+    with atomic_path(files[0]) as part:
         write_lines(part, lines, facts | basis)
-    with anew(files[1]) as part:
+    with atomic_path(files[1]) as part:
         write_cells(part, rows, facts | basis)
-    with anew(files[2]) as part:
+    with atomic_path(files[2]) as part:
         write_png(part, drawn(lines, judged, f"{facts['preset']}: {facts['logs']}"))
     said = [f"* {name}: {f'`{value}`' if name == 'command' else value}" for name, value in facts.items()] + [
         f"* left out: {text}" for text in failed
     ]
-    with anew(files[3]) as part:
+    with atomic_path(files[3]) as part:
         write_file(part, page(lines, judged, said, "cost.png").encode())
     return [str(file) for file in files]

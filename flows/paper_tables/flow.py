@@ -12,7 +12,6 @@ from typing import Any
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from flows.atomic_file import anew
 from flows.machine.facts import commit, machine
 from flows.paper_tables.layouts import Cell
 from flows.paper_tables.measure import Place, measure
@@ -23,6 +22,7 @@ from flows.paper_tables.request import Planned, Request
 from flows.paper_tables.warm_up import warm_up
 from flows.pipeline.progress import current_reporter
 from flows.pipeline.stage_runner import ArtifactRef, Job, produce
+from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import GenreError
 from storage.files import write_file
 from storage.local import open_store
@@ -120,10 +120,10 @@ def write(request: Request, plan: Planned, cells: Sequence[Cell], missing: dict[
     said = [f"* {name}: {value}" for name, value in facts.items()]
     text = page(plan.layout, cells, missing, said, apart, plan.dataset)
     written = [out / f"table{request.number}_{plan.dataset}.{kind}" for kind in ("parquet", "md")]
-    with anew(written[0]) as part:
+    with atomic_path(written[0]) as part:
         basis = {"basis": json.dumps(plan.config.model_dump(mode="json"))}
         write_cells(part, plan.layout, cells, missing, facts | basis)
-    with anew(written[1]) as part:
+    with atomic_path(written[1]) as part:
         write_file(part, text.encode())
     if request.into is not None:
         written.append(Path(request.into))

@@ -8,10 +8,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from flows.atomic_file import anew
 from flows.paper_tables.layouts import Cell, Column, Layout, Row
 from flows.paper_tables.methods import PER_SCENE
 from flows.paper_tables.published_numbers import PAPER
+from genre_tasks.atomic_path import atomic_path
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import InputError
 from storage.files import write_file
@@ -128,7 +128,7 @@ def put_into(file: Path, number: int, dataset: str, text: str) -> None:
         at = next((m.start() for m in found if (int(m[1]), m[2]) > (number, dataset)), len(old))
         new = old[:at].rstrip("\n") + f"\n\n{section}\n\n" + old[at:]
     file.parent.mkdir(parents=True, exist_ok=True)
-    with anew(file) as part:
+    with atomic_path(file) as part:
         write_file(part, (new.rstrip("\n") + "\n").encode())
 
 

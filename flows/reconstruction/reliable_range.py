@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from flows.atomic_file import anew
+from genre_tasks.atomic_path import atomic_path
 from storage.codecs.png import write_png
 from storage.codecs.tables import column, schema, write_table
 
@@ -41,9 +41,9 @@ def write(out: Path, found: ReliableRange, facts: Mapping[str, str]) -> list[str
     rows = found.guards
     facts = dict(facts) | {"left_m": f"{found.left_m:.3f}", "right_m": f"{found.right_m:.3f}"}
     files = [out / "range.parquet", out / "range.png"]
-    with anew(files[0]) as part:
+    with atomic_path(files[0]) as part:
         write_table(part, VIEWS, {f.name: [getattr(g, f.name) for g in rows] for f in VIEWS}, facts)
-    with anew(files[1]) as part:
+    with atomic_path(files[1]) as part:
         write_png(part, drawn(found, f"{facts.get('log', '')} chunk {facts.get('chunk', '')}: {found}"))
     return [str(file) for file in files]
 

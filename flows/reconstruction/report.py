@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from flows.atomic_file import anew
 from flows.reconstruction.report_curve import Curve, accuracy_curve
 from flows.reconstruction.run_summary import ChunkSummary, RunSummary, StageSummary
+from genre_tasks.atomic_path import atomic_path
 
 NAMES = {
     "ingest": "Ingest",
@@ -102,7 +102,7 @@ def write_report(path: Path, run: RunSummary) -> Path:
     template = environment.get_template("report.html.jinja")
     html = template.render(run=run, chunks=[chunk_page(c) for c in run.chunks], columns=[NAMES[s] for s in MEASURED])
     path.parent.mkdir(parents=True, exist_ok=True)
-    with anew(path) as part:
+    with atomic_path(path) as part:
         part.write_text(html, encoding="utf-8")
     return path
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flows.atomic_file import anew
 from flows.pipeline.definition import PIPELINE
 from flows.pipeline.stage_runner import ArtifactRef, run_id
 from flows.reconstruction.run_summary import ChunkSummary, RunSummary, StageSummary
+from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import InputError
 from storage.address import Address
 from storage.local import open_store
@@ -86,7 +86,7 @@ def finish_run(run: Run, summary: RunSummary, more: Mapping[str, Any]) -> dict[s
         ],
         **more,
     }
-    with anew(run.folder / "run.json") as part:
+    with atomic_path(run.folder / "run.json") as part:
         part.write_text(json.dumps(record, indent=1))
     return record
 

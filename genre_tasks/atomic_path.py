@@ -1,0 +1,34 @@
+"""Files that appear whole or not at all, for everything that is written outside the store."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """Gives a temporary path beside ``path``; when the block ends, the file written there replaces ``path``.
+
+    After an error the old file is still there and the temporary one is gone. Two processes may write the same path.
+
+    Args:
+        path: the file to replace; its folder exists.
+
+    Yields:
+        The path to write to.
+
+    Example::
+
+        with atomic_path(Path("report.html")) as part:
+            part.write_text(html)
+    """
+    # The process's number keeps two writers apart; the suffix stays, since libraries choose the format by it.
+    part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    try:
+        yield part
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
