@@ -1,10 +1,10 @@
-# make demo: the main job on a synthetic log.  make test: the tests.  Both set up .venv first.
+# make demo: the pipeline on a synthetic log.  make test: the tests.  make docs: the documents.  All set up .venv first.
 PYTHON ?= python3
 VENV   ?= .venv
 GENRE   = $(VENV)/bin/genre
 READY   = $(VENV)/.ready
 
-.PHONY: setup demo test test-all lint clean
+.PHONY: setup demo test test-all lint docs clean
 setup: $(READY)
 
 $(READY): pyproject.toml constraints.txt setup.py $(wildcard $(foreach d,genre_tasks/* genre_tasks/*/*,$(d)/*.cpp $(d)/*.h $(d)/constants.py $(d)/build*.py))
@@ -24,6 +24,9 @@ test-all: $(READY)
 
 lint: $(READY)
 	$(VENV)/bin/ruff check . && $(VENV)/bin/ruff format --check . && $(VENV)/bin/mypy && $(VENV)/bin/lint-imports
+
+docs: $(READY)
+	$(VENV)/bin/python docs/generate.py && NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build
 
 clean:
 	rm -rf $(VENV) build *.egg-info genre_tasks/*/*.so genre_tasks/*/*/*.so

@@ -42,7 +42,7 @@ class BuildKernels(build_ext):
         return [
             str(Path(self.build_lib) / kernel.folder.relative_to(ROOT) / kernel.library_name(isa))
             for kernel in KERNELS
-            for isa in kernel_build.isas_for(kernel_build.find_compiler())
+            for isa in kernel_build.instruction_sets_for(kernel_build.find_compiler())
         ]
 
     def get_output_mapping(self) -> dict[str, str]:

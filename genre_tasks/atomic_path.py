@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, for everything that is written outside the store."""
+"""Files that appear whole or not at all, for everything that is written outside of the store."""
 
 from __future__ import annotations
 
@@ -32,3 +32,18 @@ def atomic_path(path: Path) -> Iterator[Path]:
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Writes a file that must survive a loss of power, such as a checkpoint that a training resumes from.
+
+    Args:
+        path: the file to write or replace; its folder is made where it is missing.
+        data: all of its bytes.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as part, part.open("wb") as file:
+        file.write(data)
+        file.flush()
+        # A rename can reach the disk before the data does: without this, a crash could leave an empty file.
+        os.fsync(file.fileno())

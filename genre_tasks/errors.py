@@ -1,6 +1,6 @@
 """The one family of errors: each knows log, chunk, camera and frame, and says the remedy.
 
-``TransientIOError`` (with backoff) and ``ResourceError`` (retried smaller) are the only ones a flow retries.
+A flow retries only two of them: ``TransientIOError`` after a pause, and ``ResourceError`` with less work at once.
 """
 
 from __future__ import annotations
@@ -9,12 +9,22 @@ from pathlib import Path
 
 
 class GenreError(Exception):
-    """Base of every error a user may meet.
+    """Base of every error that a user may meet.
 
     Args:
         problem: what is wrong, one sentence without a full stop.
         remedy: what the user can do about it.
-        file, log, chunk, camera, frame, stage: where it happened; ``None`` where it does not apply.
+        file: the file that it happened with; ``None``, like the others, where it does not apply.
+        log: the log that was processed.
+        chunk: the chunk of it.
+        camera: the camera.
+        frame: the log's frame.
+        stage: the stage that ran.
+
+    Attributes are the arguments; ``file`` is a string.
+
+    >>> print(InputError("no such file", remedy="Check the path.", log="001", frame=3))
+    no such file (log 001, frame 3). Check the path.
     """
 
     def __init__(
@@ -32,6 +42,7 @@ class GenreError(Exception):
         super().__init__(problem)
         self.problem = problem
         self.remedy = remedy
+        # A string, so that an error can be stored and compared.
         self.file = None if file is None else str(file)
         self.log = log
         self.chunk = chunk
@@ -41,17 +52,19 @@ class GenreError(Exception):
 
     @property
     def where(self) -> str:
-        """The known coordinates, as ``log X, chunk 0, camera C, frame 3, file F``."""
+        """What is known of the place, as ``log X, chunk 0, camera C, frame 3, file F``."""
+        # From the whole to the part, as a user looks for it.
         names = ("log", "chunk", "stage", "camera", "frame", "file")
-        return ", ".join(f"{n} {getattr(self, n)}" for n in names if getattr(self, n) is not None)
+        return ", ".join(f"{name} {getattr(self, name)}" for name in names if getattr(self, name) is not None)
 
     def __str__(self) -> str:
+        # Problem, place, remedy: what a user asks in this order.
         where = f" ({self.where})" if self.where else ""
         return f"{self.problem}{where}. {self.remedy}"
 
 
 class InputError(GenreError):
-    """The log, or a file the user named, is missing, unreadable or unfit."""
+    """The log, or a file that the user named, is missing, unreadable or unfit."""
 
 
 class ConfigError(GenreError):
@@ -61,7 +74,12 @@ class ConfigError(GenreError):
 class NonFiniteError(GenreError):
     """A tensor that must be finite is not.
 
-    Attributes: ``tensor`` (its name), ``count`` (non-finite entries), ``first_index`` (of the first one).
+    Args:
+        stage: the stage that computed it.
+        tensor: its name.
+        count: number of entries that are NaN or infinite.
+        first_index: index of the first of them.
+        where: log, chunk, camera or frame, as :class:`GenreError` takes them.
     """
 
     def __init__(self, stage: str, tensor: str, count: int, first_index: tuple[int, ...], **where: object) -> None:
@@ -77,12 +95,12 @@ class NonFiniteError(GenreError):
 
 
 class ArtifactCorruptError(GenreError):
-    """A stored file does not match its manifest (digest, size, schema)."""
+    """A stored file does not match its manifest: its digest, its size or its schema."""
 
 
 class ResourceError(GenreError):
-    """Memory, disk or a device does not suffice; retried smaller where a stage can split its work."""
+    """Memory, disk or a device does not suffice; retried with less at once where a stage can split its work."""
 
 
 class TransientIOError(GenreError):
-    """A read or write failed in a way that may pass (network store, busy file system); retried with backoff."""
+    """A read or write failed in a way that may pass, such as a busy network store; retried after a pause."""

@@ -6,10 +6,27 @@ from typing import Protocol
 
 
 class Progress(Protocol):
-    """Called as ``progress(done, total, note)`` with ``0 <= done <= total``; must be cheap and must not raise."""
+    """What stages call to report how far they are; it must be cheap and must not raise."""
 
-    def __call__(self, done: int, total: int, note: str = "") -> None: ...
+    def __call__(self, done: int, total: int, note: str = "") -> None:
+        """Reports progress.
+
+        Args:
+            done: units of work that are done, ``0 <= done <= total``.
+            total: all units of work.
+            note: what is being done, in a few words.
+        """
+        # Implementations draw bars, write logs, or do nothing.
+        ...
 
 
 def silent(done: int, total: int, note: str = "") -> None:
-    """The default: says nothing."""
+    """Ignores progress, the default of every stage.
+
+    Args:
+        done: units of work that are done.
+        total: all units of work.
+        note: what is being done.
+
+    >>> silent(3, 10)
+    """

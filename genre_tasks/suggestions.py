@@ -22,5 +22,7 @@ def did_you_mean(word: str, known: Iterable[str], prefix: str = "") -> str:
     >>> did_you_mean("xyz", ["gnet", "enet"])
     ''
     """
+    # Lower than difflib's own 0.6: most words here are short, where one wrong letter counts much.
     near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.5)
+    # With a space at the end, so that a remedy can go on after it.
     return f"Did you mean '{prefix}{near[0]}'? " if near else ""

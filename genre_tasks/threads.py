@@ -1,4 +1,4 @@
-"""The same bytes at any thread count: convolutions on one thread each, images side by side.
+"""The same bytes at any number of threads: each item on one thread, several items at once.
 
 PyTorch's CPU convolutions and matrix products split their sums by the number of threads, so that their last bits depend
 on it. Here each item is computed on exactly one thread, and the threads are used for several items at once.
@@ -40,17 +40,32 @@ def torch_threads(count: int | None) -> Iterator[None]:
 
 
 def map_single_threaded(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """``[function(item) for item in items]`` in order, each call on one thread, ``torch.get_num_threads()`` at a time.
+    """Applies a function to items, each call on one thread and ``torch.get_num_threads()`` calls at a time.
 
-    The gradient mode is a property of a thread: ``function`` sets its own. Exceptions come through.
+    Args:
+        function: may run in a thread of its own. The gradient mode belongs to a thread, so it sets the mode that it
+            needs.
+        items: its arguments.
+
+    Returns:
+        ``[function(item) for item in items]``, in order.
+
+    Raises:
+        Exception: whatever ``function`` raises.
+
+    >>> map_single_threaded(lambda x: x * x, [1, 2, 3])
+    [1, 4, 9]
     """
     threads = torch.get_num_threads()
     try:
         if threads == 1 or len(items) < 2:
+            # A pool of one worker would cost its start and give the same bits.
             torch.set_num_threads(1)
             return [function(item) for item in items]
+        # As many workers as threads before, each with a single one: the CPU is as busy as it would be.
         workers = min(threads, len(items))
         with ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            # In the order of the items; an exception is that of the first item that failed.
             return list(pool.map(function, items))
     finally:
         torch.set_num_threads(threads)

@@ -8,15 +8,25 @@ from pathlib import PurePosixPath
 
 from genre_tasks.errors import ConfigError
 
-_PART = re.compile(r"[^\x00-\x1f\x7f/\\]{1,200}")
+_FOLDER_NAME = re.compile(r"[^\x00-\x1f\x7f/\\]{1,200}")
 
 
 @dataclass(frozen=True, order=True)
 class Address:
-    """Coordinates of an artifact. ``stage`` may hold "/" (``evaluate/gnet``), which makes folders of it.
+    """Coordinates of one artifact in a store.
 
-    Raises ``ConfigError`` where a part cannot be a folder's name (empty, hidden, ``..``, with a slash or a control
-    character), so that no address leads out of the store.
+    Attributes:
+        dataset: name of the dataset, such as ``pandaset``.
+        log: name of the driving log.
+        chunk: index of the chunk in the log, from 0.
+        stage: name of the stage. It may hold "/" (``evaluate/gnet``), which makes folders of it.
+        key: digest over everything that the stage's result depends on.
+
+    Raises:
+        ConfigError: a part cannot be a folder's name, or the chunk is negative.
+
+    >>> print(Address("pandaset", "002", 0, "evaluate/gnet", "5f41af0e"))
+    pandaset/002/0000/evaluate/gnet/5f41af0e
     """
 
     dataset: str
@@ -26,6 +36,7 @@ class Address:
     key: str
 
     def __post_init__(self) -> None:
+        # An empty or hidden name, "..", a slash or a control character could lead out of the store.
         for name, part in (("dataset", self.dataset), ("log", self.log), ("key", self.key)):
             self._check(name, part)
         for part in self.stage.split("/"):
@@ -34,16 +45,17 @@ class Address:
             raise ConfigError(f"Chunk {self.chunk} is negative", remedy="Chunks count from 0.", log=self.log)
 
     def _check(self, name: str, part: str) -> None:
-        if not _PART.fullmatch(part) or part.startswith("."):
+        if not _FOLDER_NAME.fullmatch(part) or part.startswith("."):
             raise ConfigError(
                 f"The {name} {part!r} cannot be a folder's name",
                 remedy="Use letters, digits, and any of - _ = + . inside; not empty and with no dot in front.",
             )
 
     @property
-    def relative(self) -> PurePosixPath:
-        """The artifact's folder inside the store."""
+    def relative_path(self) -> PurePosixPath:
+        """The artifact's folder, relative to the store's root."""
+        # Four digits, so that folders sort as numbers do.
         return PurePosixPath(self.dataset, self.log, f"{self.chunk:04d}", *self.stage.split("/"), self.key)
 
     def __str__(self) -> str:
-        return str(self.relative)
+        return str(self.relative_path)

@@ -1,6 +1,6 @@
 """The code a stage depends on, as one digest: found by reading sources, nothing is imported.
 
-A fully cached run computes keys only: it should not pay for torch.
+A run that is served from the cache computes keys only: it should not pay for importing torch.
 """
 
 from __future__ import annotations
@@ -39,57 +39,76 @@ NUMERIC_PACKAGES = {
 """Import name → distribution whose version can change a number."""
 
 
-def code_digest(module: str, also: Sequence[str] = (), root: Path | None = None) -> str:
-    """sha256 (hex) over the code that ``module`` can run.
+def code_digest(module: str, lazy_modules: Sequence[str] = (), root: Path | None = None) -> str:
+    """Computes a digest over the code that a module can run, so that a change of code changes the keys.
 
-    Covered: every module of the package in the import closure (imports at any level, also inside functions), without
-    comments and docstrings; the C++ sources in every room that the closure enters, comments removed; the versions of
-    the numeric packages that the closure imports.
+    It covers every module of the package in the import closure, without comments and docstrings. Imports count at any
+    level, also inside functions. It also covers the C++ sources in every room that the closure enters, and the
+    versions of the numeric packages that the closure imports.
 
     Args:
-        module: ``genre_tasks.stages.gnet``.
-        also: modules named lazily (in a registry, as strings), which reading cannot find.
+        module: the module's full name, such as ``genre_tasks.stages.gnet``.
+        lazy_modules: modules that are named in a registry as strings, which reading imports cannot find.
         root: the folder that holds the package; by default the one this code runs from.
 
-    Raises ``ConfigError`` for a module that does not exist.
+    Returns:
+        64 hex digits of sha256.
+
+    Raises:
+        ConfigError: one of the modules does not exist.
     """
-    return _cached(module, tuple(sorted(also)), root)
+    return _digest_closure(module, tuple(sorted(lazy_modules)), root)
 
 
 @lru_cache(maxsize=256)
-def _cached(module: str, also: tuple[str, ...], root: Path | None) -> str:
+def _digest_closure(module: str, lazy_modules: tuple[str, ...], root: Path | None) -> str:
     base = (root or Path(__file__).resolve().parents[1]).absolute()
-    files, packages = closure(module, also, base)
+    files, packages = import_closure(module, lazy_modules, base)
     digest = hashlib.sha256()
     for name in sorted(files):
-        _add(digest, name, _source(name, files[name]).text)
+        _update(digest, name, _read_source(name, files[name]).text)
+    # A kernel's sources are loaded by path, not imported, so all of a room's count with any of its modules.
     rooms = {base / PACKAGE / name.split(".")[1] for name in files if "." in name}
     for path in sorted(p for room in rooms if room.is_dir() for p in room.rglob("*") if p.suffix in KERNEL_SUFFIXES):
-        _add(digest, path.relative_to(base).as_posix(), strip_cpp_comments(path.read_text(encoding="utf-8")))
+        _update(digest, path.relative_to(base).as_posix(), strip_cpp_comments(path.read_text(encoding="utf-8")))
     for name in sorted(packages & set(NUMERIC_PACKAGES)):
-        _add(digest, f"version of {NUMERIC_PACKAGES[name]}", _version(NUMERIC_PACKAGES[name]))
+        _update(digest, f"version of {NUMERIC_PACKAGES[name]}", _installed_version(NUMERIC_PACKAGES[name]))
     return digest.hexdigest()
 
 
-def closure(module: str, also: Sequence[str], root: Path) -> tuple[dict[str, Path], set[str]]:
-    """Modules of the package that ``module`` and ``also`` import, with their files; and other top-level packages."""
-    todo, files, packages = [module, *also], dict[str, Path](), set[str]()
+def import_closure(module: str, lazy_modules: Sequence[str], root: Path) -> tuple[dict[str, Path], set[str]]:
+    """Finds everything that modules import, directly and through others.
+
+    Args:
+        module: the module to start from.
+        lazy_modules: further modules to start from.
+        root: the folder that holds the package.
+
+    Returns:
+        (module of the package → its file, names of other top-level packages).
+
+    Raises:
+        ConfigError: one of the modules does not exist.
+    """
+    todo = [module, *lazy_modules]
+    files: dict[str, Path] = {}
+    packages: set[str] = set()
     for name in todo:
-        if _file(name, root) is None:
+        if _find_file(name, root) is None:
             raise ConfigError(
                 f"There is no module {name!r}", remedy="Name a module inside the package, as genre_tasks.stages.gnet."
             )
     while todo:
         name = todo.pop()
-        path = _file(name, root)
+        path = _find_file(name, root)
         if name in files or path is None:
             continue
         files[name] = path
-        for imported in _source(name, path).imports:
-            if imported.split(".")[0] != PACKAGE:
-                packages.add(imported.split(".")[0])
-                continue
+        for imported in _read_source(name, path).imports:
             parts = imported.split(".")
+            if parts[0] != PACKAGE:
+                packages.add(parts[0])
+                continue
             # Importing a.b.c runs a and a.b too; the last part of "from a.b import c" may be a name and no module.
             todo += [".".join(parts[: i + 1]) for i in range(len(parts))]
     return files, packages
@@ -101,13 +120,23 @@ _CPP_SPACES = re.compile(r"[ \t]+|" + _CPP_STRING)
 
 
 def strip_cpp_comments(source: str) -> str:
-    """C++ without comments, empty lines and repeated spaces; strings are left alone."""
+    r"""Removes what does not change a C++ program: comments, empty lines and repeated spaces.
+
+    Args:
+        source: the text of a C++ file.
+
+    Returns:
+        The text that is left. Strings and character literals are unchanged.
+
+    >>> strip_cpp_comments('int  a;  // why\n\nputs("// no comment");')
+    'int a;\nputs("// no comment");'
+    """
     bare = _CPP_COMMENT.sub(lambda m: m[1] or " ", source)
     lines = _CPP_SPACES.sub(lambda m: m[1] or " ", bare).splitlines()
     return "\n".join(line.strip() for line in lines if line.strip())
 
 
-def _file(name: str, root: Path) -> Path | None:
+def _find_file(name: str, root: Path) -> Path | None:
     base = root.joinpath(*name.split("."))
     if (base / "__init__.py").is_file():
         return base / "__init__.py"
@@ -116,19 +145,22 @@ def _file(name: str, root: Path) -> Path | None:
 
 @dataclass(frozen=True)
 class _Source:
+    """A module without comments and docstrings, and the full names that it imports."""
+
     text: str
     imports: tuple[str, ...]
 
 
+# Most stages share most files: each is parsed once.
 @lru_cache(maxsize=4096)
-def _source(name: str, path: Path) -> _Source:
-    """A module's normalised text and what it imports; parsed once, since most stages share most files."""
+def _read_source(name: str, path: Path) -> _Source:
     tree = ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
-    imports = tuple(_imports(name, path, tree))
-    return _Source(ast.unparse(ast.fix_missing_locations(_Bare().visit(tree))), imports)
+    imports = tuple(_imported_names(name, path, tree))
+    # Unparsing gives one layout to all sources, so that a formatter changes no key.
+    return _Source(ast.unparse(ast.fix_missing_locations(_DocstringRemover().visit(tree))), imports)
 
 
-def _imports(name: str, path: Path, tree: ast.Module) -> Iterator[str]:
+def _imported_names(name: str, path: Path, tree: ast.Module) -> Iterator[str]:
     package = (name if path.name == "__init__.py" else name.rpartition(".")[0]).split(".")
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -140,7 +172,7 @@ def _imports(name: str, path: Path, tree: ast.Module) -> Iterator[str]:
             yield from (f"{source}.{alias.name}" for alias in node.names)
 
 
-class _Bare(ast.NodeTransformer):
+class _DocstringRemover(ast.NodeTransformer):
     """Removes docstrings and any other statement that is only a string."""
 
     def generic_visit(self, node: ast.AST) -> ast.AST:
@@ -148,8 +180,9 @@ class _Bare(ast.NodeTransformer):
         for name in ("body", "orelse", "finalbody"):
             body = getattr(node, name, None)
             if isinstance(body, list):
-                kept = [n for n in body if not _is_string(n)]
-                setattr(node, name, kept or ([ast.Pass()] if body and not isinstance(node, ast.Module) else []))
+                code = [n for n in body if not _is_string(n)]
+                # A block must not be empty: "pass" stands in where a docstring was all there was.
+                setattr(node, name, code or ([ast.Pass()] if body and not isinstance(node, ast.Module) else []))
         return node
 
 
@@ -157,14 +190,15 @@ def _is_string(node: ast.AST) -> bool:
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 
-def _version(distribution: str) -> str:
+def _installed_version(distribution: str) -> str:
     try:
         return metadata.version(distribution)
     except metadata.PackageNotFoundError:
         return "absent"
 
 
-def _add(digest: hashlib._Hash, name: str, text: str) -> None:
+def _update(digest: hashlib._Hash, name: str, text: str) -> None:
+    # Lengths are part of the digest, so that no text can pass for a name and another text.
     for part in (name, text):
         data = part.encode()
         digest.update(len(data).to_bytes(8, "little") + data)

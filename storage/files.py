@@ -7,17 +7,27 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-_BLOCK = 1 << 20
+_BLOCK_BYTES = 1 << 20
 
 
 def write_file(path: Path, data: bytes | memoryview) -> None:
-    """Write a new file whole, or raise ``OSError`` with ``filename`` set; refuses to overwrite."""
+    """Writes a new file completely; never overwrites one.
+
+    Args:
+        path: the new file; its folder exists.
+        data: the file's bytes.
+
+    Raises:
+        OSError: the file exists or cannot be written; ``filename`` is set.
+    """
     try:
+        # O_EXCL: a payload file is written once; overwriting one could only hide a mistake.
         handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
         try:
-            rest = memoryview(data).cast("B")
-            while len(rest):
-                rest = rest[os.write(handle, rest) :]
+            # One call may write less than it was asked to, for instance where a quota ends.
+            unwritten = memoryview(data).cast("B")
+            while len(unwritten):
+                unwritten = unwritten[os.write(handle, unwritten) :]
         finally:
             os.close(handle)
     except OSError as error:
@@ -26,7 +36,14 @@ def write_file(path: Path, data: bytes | memoryview) -> None:
 
 
 def sync(path: Path) -> None:
-    """Push a file, or the entries of a folder, to the disk."""
+    """Pushes a file's bytes, or a folder's entries, from the system's cache to the disk.
+
+    Args:
+        path: an existing file or folder.
+
+    Raises:
+        OSError: the disk refuses; ``filename`` is set.
+    """
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -38,23 +55,49 @@ def sync(path: Path) -> None:
 
 
 def make_folders(path: Path) -> None:
-    """``mkdir -p`` whose new entries survive a power cut."""
-    new = [p for p in (path, *path.parents) if not p.exists()]
+    """Makes a folder and its parents so that their entries survive a power cut.
+
+    Args:
+        path: the folder; it may exist.
+
+    Raises:
+        OSError: a part of the path is a file, or the folder cannot be made.
+    """
+    new_folders = [p for p in (path, *path.parents) if not p.exists()]
     path.mkdir(parents=True, exist_ok=True)
-    for folder in new:
+    # A new folder is an entry of its parent: that is what has to reach the disk.
+    for folder in new_folders:
         sync(folder.parent)
 
 
 def digest_file(path: Path) -> str:
-    """sha256 (hex) of a file's bytes."""
+    """Computes a file's sha256 without reading all of it into memory.
+
+    Args:
+        path: the file.
+
+    Returns:
+        64 hex digits.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
     digest = hashlib.sha256()
     with path.open("rb") as file:
-        while block := file.read(_BLOCK):
+        while block := file.read(_BLOCK_BYTES):
             digest.update(block)
     return digest.hexdigest()
 
 
 def payload_files(folder: Path) -> Iterator[tuple[str, Path]]:
-    """(relative POSIX path, path) of each file below a folder, sorted; follows no links."""
+    """Lists all files below a folder, links included, without following them.
+
+    Args:
+        folder: where to look; subfolders are searched too.
+
+    Yields:
+        (path relative to the folder with "/" between parts, path), sorted.
+    """
+    # Links are listed although they are never written: a manifest that does not name them shows that one was added.
     found = [(p.relative_to(folder).as_posix(), p) for p in folder.rglob("*") if p.is_symlink() or not p.is_dir()]
     yield from sorted(found)

@@ -1,46 +1,85 @@
-"""What the operating system says, as the project's errors with a remedy."""
+"""Errors of the operating system, translated into the project's errors with a remedy."""
 
 from __future__ import annotations
 
 import errno
+from dataclasses import dataclass
 from pathlib import Path
 
 from genre_tasks.errors import GenreError, InputError, ResourceError, TransientIOError
 from storage.address import Address
 
-_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-_PASSING = {errno.EIO, errno.EAGAIN, errno.ESTALE, errno.EINTR, errno.ETIMEDOUT, errno.EBUSY, errno.ENETUNREACH}
-_EXHAUSTED = {errno.ENOMEM, errno.EMFILE, errno.ENFILE}
-_DENIED = {errno.EACCES, errno.EPERM, errno.EROFS}
+
+@dataclass(frozen=True)
+class _Translation:
+    """How the error numbers of one kind are reported."""
+
+    codes: frozenset[int]
+    kind: type[GenreError]
+    problem: str
+    remedy: str
+
+
+# The class decides what a flow does: it repeats a TransientIOError after a pause, and a ResourceError with less memory
+# at a time. Everything else stops the run.
+_TRANSLATIONS = (
+    _Translation(
+        # No retry helps here, so the remedy says what is most feared: nothing is lost.
+        frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG}),
+        ResourceError,
+        "The disk is full, or a quota or file-size limit is reached ({name})",
+        "Free space there or choose another place with --store; finished stages are kept, nothing is half-written.",
+    ),
+    _Translation(
+        frozenset({errno.ENOMEM, errno.EMFILE, errno.ENFILE}),
+        ResourceError,
+        "The machine has no memory or file handles left ({name})",
+        "Run fewer chunks at once, or raise the limit (ulimit -n).",
+    ),
+    _Translation(
+        frozenset(
+            # ESTALE, ETIMEDOUT and ENETUNREACH are how network mounts fail, EIO how some of them report it.
+            {errno.EIO, errno.EAGAIN, errno.ESTALE, errno.EINTR, errno.ETIMEDOUT, errno.EBUSY, errno.ENETUNREACH}
+        ),
+        TransientIOError,
+        "The file system did not answer properly ({name})",
+        "It is tried again; if it stays, check the disk or the network mount.",
+    ),
+    _Translation(
+        frozenset({errno.EACCES, errno.EPERM, errno.EROFS}),
+        InputError,
+        "Not permitted ({name})",
+        "Give this user read and write permission there, or choose another place with --store.",
+    ),
+)
+_OTHER = _Translation(
+    frozenset(),
+    InputError,
+    "The file system refuses ({name}: {text})",
+    "Check that the path of the store is a folder that this user can write to.",
+)
 
 
 def as_genre_error(error: OSError, path: Path, address: Address | None = None) -> GenreError:
-    """The project's error for an ``OSError`` at ``path``.
+    """Translates an ``OSError`` so that a flow knows whether to retry, and a person what to do.
 
-    A full disk, quota or file-size limit and exhausted memory or descriptors are ``ResourceError``; what may pass by
-    itself is ``TransientIOError``; all else (permissions, a file where a folder should be) is ``InputError``.
+    Args:
+        error: what the operating system reported.
+        path: the file or folder, for an error that names none.
+        address: the artifact that was read or written, if any.
+
+    Returns:
+        ``ResourceError`` for a full disk, quota or file-size limit and for exhausted memory or descriptors;
+        ``TransientIOError`` for what may pass by itself; ``InputError`` for everything else, such as permissions.
+
+    >>> print(as_genre_error(PermissionError(13, "denied"), Path("store")))
+    Not permitted (EACCES) (file store). Give this user read and write permission there, ...
     """
     name = errno.errorcode.get(error.errno or 0, type(error).__name__)
-    file = error.filename or path
-    known: dict[str, object] = {"file": file}
+    where: dict[str, object] = {"file": error.filename or path}
     if address is not None:
-        known |= {"log": address.log, "chunk": address.chunk, "stage": address.stage}
-    kind: type[GenreError]
-    if error.errno in _FULL:
-        kind, problem = ResourceError, f"The disk is full, or a quota or file-size limit is reached ({name})"
-        remedy = (
-            "Free space there or choose another place with --store; finished stages are kept, nothing is half-written."
-        )
-    elif error.errno in _EXHAUSTED:
-        kind, problem = ResourceError, f"The machine has no memory or file handles left ({name})"
-        remedy = "Run fewer chunks at once, or raise the limit (ulimit -n)."
-    elif error.errno in _PASSING:
-        kind, problem = TransientIOError, f"The file system did not answer properly ({name})"
-        remedy = "It is tried again; if it stays, check the disk or the network mount."
-    elif error.errno in _DENIED:
-        kind, problem = InputError, f"Not permitted ({name})"
-        remedy = "Give this user read and write permission there, or choose another place with --store."
-    else:
-        kind, problem = InputError, f"The file system refuses ({name}: {error.strerror or error})"
-        remedy = "Check that the path of the store is a folder that this user can write to."
-    return kind(problem, remedy=remedy, **known)  # type: ignore[arg-type]
+        where |= {"log": address.log, "chunk": address.chunk, "stage": address.stage}
+    # An OSError without a number, as some libraries raise it, falls through to the general case.
+    translation = next((t for t in _TRANSLATIONS if error.errno in t.codes), _OTHER)
+    problem = translation.problem.format(name=name, text=error.strerror or error)
+    return translation.kind(problem, remedy=translation.remedy, **where)  # type: ignore[arg-type]

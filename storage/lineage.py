@@ -1,4 +1,4 @@
-"""What an artifact came from and what is in it, for people: ancestors, tables of statistics, a picture."""
+"""Where an artifact came from and what is in it, for people: its ancestors, and tables of statistics of its files."""
 
 from __future__ import annotations
 
@@ -18,40 +18,66 @@ from storage.store import Artifact, Store
 
 @dataclass(frozen=True)
 class TableSummary:
-    """A table for people: ``rows`` are dictionaries with the same keys, in order."""
+    """A table for people to read.
+
+    Attributes:
+        name: the table's heading.
+        rows: dictionaries with the same keys in the same order.
+    """
 
     name: str
     rows: list[dict[str, Any]]
 
 
-def ancestors(store: Store, artifact: Artifact) -> list[Artifact]:
-    """All artifacts that ``artifact`` was made from, nearest first, each once; those discarded since are left out."""
-    at = artifact.address
+def find_ancestors(store: Store, artifact: Artifact) -> list[Artifact]:
+    """Finds all artifacts that an artifact was made from, directly or through others.
+
+    Args:
+        store: the store that the artifact is in.
+        artifact: the artifact; its manifest names its inputs.
+
+    Returns:
+        The ancestors that the store still has, nearest first, each once.
+    """
+    address = artifact.address
     by_key: dict[str, Artifact] = {}
-    for other in store.artifacts(dataset=at.dataset, log=at.log, chunk=at.chunk):
+    for other in store.artifacts(dataset=address.dataset, log=address.log, chunk=address.chunk):
         by_key.setdefault(other.address.key, other)
     found: dict[str, Artifact] = {}
     todo = [artifact]
     while todo:
+        # Breadth first, so that near ancestors come before far ones.
         for key in todo.pop(0).manifest.inputs.values():
-            if key in by_key and key not in found and key != at.key:
+            if key in by_key and key not in found and key != address.key:
                 found[key] = by_key[key]
                 todo.append(by_key[key])
     return list(found.values())
 
 
-def describe(store: Store, artifact: Artifact) -> list[TableSummary]:
-    """Schema, rows and statistics of every file, after verification; images are pooled per folder and channel."""
+def summarise_files(store: Store, artifact: Artifact) -> list[TableSummary]:
+    """Summarises every file of an artifact: schema, rows and statistics.
+
+    Args:
+        store: the store that the artifact is in.
+        artifact: the artifact, which is verified first.
+
+    Returns:
+        A summary for each Parquet table, for each folder of EXR images (a row a channel) and for all PNG pictures.
+
+    Raises:
+        ArtifactCorruptError: a file is missing, unexpected or altered.
+    """
     store.verify(artifact)
     files = [artifact.path / entry.path for entry in artifact.manifest.files]
-    out = [_describe_table(artifact.path, p) for p in files if p.suffix == ".parquet"]
-    images = sorted({p.parent for p in files if p.suffix == ".exr"})
-    out += [_describe_exr(artifact.path, [p for p in files if p.parent == f and p.suffix == ".exr"]) for f in images]
+    summaries = [_summarise_table(artifact.path, p) for p in files if p.suffix == ".parquet"]
+    for folder in sorted({p.parent for p in files if p.suffix == ".exr"}):
+        images = [p for p in files if p.parent == folder and p.suffix == ".exr"]
+        summaries.append(_summarise_exr(artifact.path, images))
     pictures = [p for p in files if p.suffix == ".png"]
-    return out + ([_describe_png(artifact.path, pictures)] if pictures else [])
+    return summaries + ([_summarise_png(artifact.path, pictures)] if pictures else [])
 
 
-def _describe_table(folder: Path, path: Path) -> TableSummary:
+def _summarise_table(folder: Path, path: Path) -> TableSummary:
     import pyarrow.parquet as pq
 
     with pq.ParquetFile(path, page_checksum_verification=True) as file:
@@ -72,8 +98,8 @@ def _column_statistics(kind: Any, values: Any) -> dict[str, Any]:
     if not len(values):
         return {}
     if pa.types.is_string(kind):
-        kinds = values.unique().to_pylist()
-        return {"min": min(kinds), "mean": f"{len(kinds)} distinct", "max": max(kinds)}
+        words = values.unique().to_pylist()
+        return {"min": min(words), "mean": f"{len(words)} distinct", "max": max(words)}
     if pa.types.is_large_binary(kind):
         return _statistics(np.array([len(v.as_py()) for v in values])) | {"type": "bytes"}
     if pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind):
@@ -82,19 +108,21 @@ def _column_statistics(kind: Any, values: Any) -> dict[str, Any]:
 
 
 def _statistics(values: NDArray[Any]) -> dict[str, Any]:
+    # In double precision, since the mean of a million float32 values would lose digits.
     wide = values.astype(np.float64)
     out = {"min": float(wide.min()), "mean": float(wide.mean()), "max": float(wide.max())}
     return {k: int(v) if values.dtype.kind in "iu" and k != "mean" and math.isfinite(v) else v for k, v in out.items()}
 
 
-def _describe_exr(folder: Path, paths: list[Path]) -> TableSummary:
-    pooled: dict[str, dict[str, Any]] = {}
+def _summarise_exr(folder: Path, paths: list[Path]) -> TableSummary:
+    by_channel: dict[str, dict[str, Any]] = {}
     for path in paths:
-        for name, pixels in _channels(path):
-            row = pooled.setdefault(
+        for name, pixels in _read_channels(path):
+            row = by_channel.setdefault(
                 name,
-                {"column": name, "type": f"{pixels.dtype} {pixels.shape[0]}x{pixels.shape[1]}"}
-                | {
+                {
+                    "column": name,
+                    "type": f"{pixels.dtype} {pixels.shape[0]}x{pixels.shape[1]}",
                     "min": math.inf,
                     "mean": 0.0,
                     "max": -math.inf,
@@ -102,14 +130,14 @@ def _describe_exr(folder: Path, paths: list[Path]) -> TableSummary:
                 },
             )
             wide = pixels.astype(np.float64)
-            row["min"], row["max"] = min(row["min"], float(wide.min())), max(row["max"], float(wide.max()))
+            row["min"] = min(row["min"], float(wide.min()))
+            row["max"] = max(row["max"], float(wide.max()))
             row["mean"] += float(wide.mean()) / len(paths)
-    return TableSummary(
-        f"{paths[0].parent.relative_to(folder).as_posix()}/*.exr: {len(paths)} images", [*pooled.values()]
-    )
+    heading = f"{paths[0].parent.relative_to(folder).as_posix()}/*.exr: {len(paths)} images"
+    return TableSummary(heading, [*by_channel.values()])
 
 
-def _channels(path: Path) -> Iterator[tuple[str, NDArray[Any]]]:
+def _read_channels(path: Path) -> Iterator[tuple[str, NDArray[Any]]]:
     import OpenEXR
 
     with OpenEXR.File(str(path), separate_channels=True) as file:
@@ -119,7 +147,7 @@ def _channels(path: Path) -> Iterator[tuple[str, NDArray[Any]]]:
             yield name, np.array(channel.pixels)
 
 
-def _describe_png(folder: Path, paths: list[Path]) -> TableSummary:
+def _summarise_png(folder: Path, paths: list[Path]) -> TableSummary:
     from storage.codecs.png import read_png
 
     rows = []

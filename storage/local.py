@@ -6,8 +6,9 @@ import os
 import shutil
 import time
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import asdict, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -15,102 +16,93 @@ from urllib.parse import unquote, urlparse
 
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
 from storage.address import Address
-from storage.codecs import codec_of
+from storage.artifact_folders import (
+    TEMPORARY_PREFIX,
+    TRASH_PREFIX,
+    find_artifact_folders,
+    find_sound_manifest,
+    last_modified,
+    load_manifest,
+    move_to_trash,
+)
+from storage.codecs import get_codec
 from storage.files import make_folders, payload_files, sync
 from storage.io_errors import as_genre_error
-from storage.manifest import MANIFEST, FileEntry, Manifest, NewerSchemaError, parse_manifest, payload_digest
-from storage.manifest_writer import difference, seal
-from storage.store import Artifact
+from storage.manifest import MANIFEST, FileEntry, Manifest, parse_manifest, payload_digest
+from storage.manifest_writer import find_damage, write_manifest
+from storage.store import Artifact, Provenance
 
-__all__ = ["Artifact", "LocalStore", "open_store"]
+__all__ = ["Artifact", "LocalStore", "Provenance", "open_store"]
 
-_TEMPORARY, _TRASH = ".tmp-", ".trash-"
 _RECOMPUTE = "Run again: it is computed anew (or delete the folder by hand)."
+
+# Every further attempt needs another writer that leaves a damaged artifact at the same moment.
+_PUBLISH_ATTEMPTS = 20
 
 
 class LocalStore:
-    """Artifacts below ``root``; see :class:`storage.store.Store`. All paths in it are relative: it can be moved."""
+    """Artifacts in folders below ``root``; the methods of :class:`storage.store.Store` are documented there.
+
+    All paths inside the store are relative, so that its folder can be moved or copied.
+
+    Attributes:
+        root: the store's folder; it is made by the first commit.
+    """
 
     def __init__(self, root: Path) -> None:
         self.root = Path(root).expanduser().absolute()
 
-    def commit(
-        self,
-        address: Address,
-        kind: str,
-        value: Any,
-        *,
-        inputs: Mapping[str, str] | None = None,
-        configuration: Mapping[str, Any] | None = None,
-        code_digest: str = "",
-        weights_digest: str | None = None,
-        seconds: float = 0.0,
-        peak_mib: float = 0.0,
-        environment: Mapping[str, str] | None = None,
-        measurements: Mapping[str, Any] | None = None,
-        warnings: Sequence[str] = (),
-        created_at: str | None = None,
-    ) -> Artifact:
-        """Write ``value`` whole or not at all.
+    def commit(self, address: Address, kind: str, value: Any, provenance: Provenance | None = None) -> Artifact:
+        """Writes a value to a temporary folder and renames it into place: see :meth:`storage.store.Store.commit`.
 
-        What the codec names as measurements of the value (seconds per iteration, culled counts) is added to
-        ``measurements``. If a sound artifact is at ``address`` already it is kept and returned; a corrupt one is
-        replaced. Raises ``ResourceError`` (disk full), ``TransientIOError``, ``InputError`` (permission),
-        ``NonFiniteError`` and ``ConfigError`` (unknown kind, unfit value); nothing is left behind then.
+        Returns:
+            The artifact that is now at ``address``.
         """
-        codec = codec_of(kind)
-        target = self.root / address.relative
-        temporary = target.parent / f"{_TEMPORARY}{address.key[:12]}-{os.getpid()}-{uuid.uuid4().hex}"
+        codec = get_codec(kind)
+        provenance = provenance or Provenance()
+        target = self.root / address.relative_path
+        # Beside the target, because a rename is atomic only within one file system. The process's number tells people
+        # whose folder it is, the random part keeps two writers of one process apart.
+        temporary = target.parent / f"{TEMPORARY_PREFIX}{address.key[:12]}-{os.getpid()}-{uuid.uuid4().hex}"
 
-        def manifest(files: tuple[FileEntry, ...]) -> Manifest:
-            return Manifest(
-                kind=kind,
-                dataset=address.dataset,
-                log=address.log,
-                chunk=address.chunk,
-                stage=address.stage,
-                key=address.key,
-                inputs=dict(inputs or {}),
-                configuration=dict(configuration or {}),
-                code_digest=code_digest,
-                weights_digest=weights_digest,
-                files=files,
-                payload_digest=payload_digest(files),
-                seconds=seconds,
-                peak_mib=peak_mib,
-                created_at=created_at or datetime.now(UTC).isoformat(timespec="seconds"),
-                environment=dict(environment or {}),
-                measurements={**codec.measurements(value), **(measurements or {})},
-                warnings=tuple(warnings),
-            )
+        def make_manifest(files: tuple[FileEntry, ...]) -> Manifest:
+            # Called by the writer once all files are known, so that the manifest can list them.
+            known = {f.name: getattr(provenance, f.name) for f in fields(provenance)}
+            known["created_at"] = provenance.created_at or datetime.now(UTC).isoformat(timespec="seconds")
+            known["measurements"] = {**codec.measurements(value), **provenance.measurements}
+            digest = payload_digest(files)
+            return Manifest(kind=kind, files=files, payload_digest=digest, **asdict(address), **known)
 
-        with _translated(target, address):
+        with _os_errors_translated(target, address):
             try:
                 make_folders(target.parent)
                 temporary.mkdir()
                 codec.write(temporary, value)
-                seal(temporary, manifest)
+                write_manifest(temporary, make_manifest)
                 self._publish(temporary, target, address)
             finally:
+                # After the rename nothing is left here; after an error nothing may stay.
                 shutil.rmtree(temporary, ignore_errors=True)
             artifact = self.find(address)
         if artifact is None:
-            raise _corrupt(Artifact(address, target, manifest(())), "", "The artifact vanished while it was committed")
+            vanished = Artifact(address, target, make_manifest(()))
+            raise _corruption_error(vanished, "", "The artifact vanished while it was committed")
         return artifact
 
     def find(self, address: Address) -> Artifact | None:
-        """The artifact at ``address``, or ``None`` where there is no manifest.
+        """Looks an artifact up by its manifest: see :meth:`storage.store.Store.find`.
 
-        Raises ``ArtifactCorruptError`` where the manifest cannot be trusted or belongs elsewhere, and
-        ``NewerSchemaError`` where a newer version wrote it.
+        Returns:
+            The artifact, or ``None``.
         """
-        path = self.root / address.relative
-        with _translated(path, address):
+        path = self.root / address.relative_path
+        with _os_errors_translated(path, address):
             try:
                 data = (path / MANIFEST).read_bytes()
             except (FileNotFoundError, NotADirectoryError):
                 return None
         manifest = parse_manifest(data, path / MANIFEST)
+        # A folder that someone moved or copied by hand would otherwise pass for another artifact.
         if manifest.address != address:
             raise ArtifactCorruptError(
                 f"The manifest belongs to {manifest.address}",
@@ -123,38 +115,50 @@ class LocalStore:
         return Artifact(address, path, manifest)
 
     def verify(self, artifact: Artifact) -> None:
-        """Compare every file with the manifest: there, size, sha256, and none that is not listed."""
-        with _translated(artifact.path, artifact.address):
+        """Checks that every file is there with its size and sha256, and none that is not listed.
+
+        Raises:
+            ArtifactCorruptError: as :meth:`storage.store.Store.verify` says.
+        """
+        with _os_errors_translated(artifact.path, artifact.address):
+            # In the order of the manifest, so that the same damage is always named by the same file.
             listed = {entry.path: entry for entry in artifact.manifest.files}
             present = dict(payload_files(artifact.path))
             present.pop(MANIFEST, None)
             for name, entry in listed.items():
-                problem = difference(present.get(name), entry)
+                problem = find_damage(present.get(name), entry)
                 if problem:
-                    raise _corrupt(artifact, name, problem)
+                    raise _corruption_error(artifact, name, problem)
             for name in present:
                 if name not in listed:
-                    raise _corrupt(artifact, name, "A file is not in the manifest")
+                    raise _corruption_error(artifact, name, "A file is not in the manifest")
 
     def read(self, artifact: Artifact) -> Any:
-        """The value: digests first, then the codec with its strict checks of schema, shapes and channels."""
+        """Reads an artifact's value: digests first, then the codec with its strict checks.
+
+        Returns:
+            The value: see :meth:`storage.store.Store.read`.
+        """
         self.verify(artifact)
-        codec = codec_of(artifact.manifest.kind)
-        with _translated(artifact.path, artifact.address):
+        # After the digests, so that decoders never see bytes that the codec did not write.
+        codec = get_codec(artifact.manifest.kind)
+        with _os_errors_translated(artifact.path, artifact.address):
             return codec.read(artifact.path, artifact.manifest.measurements)
 
-    def discard(self, where: Artifact | Address) -> None:
-        """Remove an artifact (sound or corrupt): renamed away first, so that nobody sees half of it.
+    def discard(self, target: Artifact | Address) -> None:
+        """Removes an artifact, renamed away first so that nobody sees half of it.
 
-        Raises ``NewerSchemaError`` where a newer version of the project wrote it: that is not ours to remove.
+        Raises:
+            NewerSchemaError: as :meth:`storage.store.Store.discard` says.
         """
-        address = where.address if isinstance(where, Artifact) else where
-        target = self.root / address.relative
-        with _translated(target, address):
-            _manifest_in(target)
-            trash = _move_aside(target)
+        address = target.address if isinstance(target, Artifact) else target
+        folder = self.root / address.relative_path
+        with _os_errors_translated(folder, address):
+            # Only for the error: a newer version's artifact is not ours to remove.
+            find_sound_manifest(folder)
+            trash = move_to_trash(folder)
             if trash is not None:
-                sync(target.parent)
+                sync(folder.parent)
                 shutil.rmtree(trash, ignore_errors=True)
 
     def artifacts(
@@ -166,52 +170,70 @@ class LocalStore:
         key: str | None = None,
         kind: str | None = None,
     ) -> Iterator[Artifact]:
-        """All artifacts that fit, in the order of their paths; what has no sound manifest is passed over."""
+        """Lists the artifacts that fit, in the order of their paths.
+
+        Yields:
+            Artifacts with a sound manifest: see :meth:`storage.store.Store.artifacts`.
+        """
         base = self.root
+        # The known start of the path narrows the search; the rest is compared below.
         for part in (dataset, log, None if chunk is None else f"{chunk:04d}", stage):
             if part is None:
                 break
             base = base / part
-        for folder in _folders_with_manifest(base):
+        wanted = {"dataset": dataset, "log": log, "chunk": chunk, "stage": stage, "key": key, "kind": kind}
+        for folder in find_artifact_folders(base):
+            # A damaged artifact must not hide the sound ones after it; `verify_all` reports it.
             with suppress(ArtifactCorruptError, ConfigError):
-                manifest = parse_manifest((folder / MANIFEST).read_bytes(), folder / MANIFEST)
-                at = manifest.address
-                wanted = (dataset, log, chunk, stage, key, kind)
-                have = (at.dataset, at.log, at.chunk, at.stage, at.key, manifest.kind)
-                if folder == self.root / at.relative and all(
-                    w is None or w == h for w, h in zip(wanted, have, strict=True)
-                ):
-                    yield Artifact(at, folder, manifest)
+                manifest = load_manifest(folder)
+                address = manifest.address
+                fits = all(v is None or v == getattr(manifest, name) for name, v in wanted.items())
+                if fits and folder == self.root / address.relative_path:
+                    yield Artifact(address, folder, manifest)
 
-    def check(self) -> Iterator[tuple[Path, ArtifactCorruptError | None]]:
-        """Each folder with a manifest, in order, and what is wrong with it; also where the manifest is unreadable."""
-        for folder in _folders_with_manifest(self.root):
+    def verify_all(self) -> Iterator[tuple[Path, ArtifactCorruptError | None]]:
+        """Checks every artifact of the store, also those whose manifest cannot be read.
+
+        Yields:
+            (folder, what is wrong with it or ``None``), in the order of their paths.
+        """
+        for folder in find_artifact_folders(self.root):
             try:
-                manifest = parse_manifest((folder / MANIFEST).read_bytes(), folder / MANIFEST)
+                manifest = load_manifest(folder)
                 artifact = Artifact(manifest.address, folder, manifest)
-                if folder != self.root / artifact.address.relative:
-                    raise _corrupt(artifact, MANIFEST, f"The manifest belongs to {artifact.address}")
+                if folder != self.root / artifact.address.relative_path:
+                    raise _corruption_error(artifact, MANIFEST, f"The manifest belongs to {artifact.address}")
                 self.verify(artifact)
                 yield folder, None
             except ArtifactCorruptError as error:
                 yield folder, error
 
     def clean_temporaries(self, older_than_s: float = 3600.0) -> int:
-        """Remove what killed processes left, if nothing in it was touched for ``older_than_s``; returns how many."""
+        """Removes what killed processes left behind.
+
+        Args:
+            older_than_s: only folders in which nothing was touched for so many seconds: others may be in use.
+
+        Returns:
+            How many folders were removed.
+        """
         removed = 0
         for folder, names, _ in os.walk(self.root):
-            for name in [n for n in names if n.startswith((_TEMPORARY, _TRASH))]:
+            for name in [n for n in names if n.startswith((TEMPORARY_PREFIX, TRASH_PREFIX))]:
+                # Removed from the walk too, which would otherwise enter a folder that is going away.
                 names.remove(name)
                 path = Path(folder) / name
-                if time.time() - _last_touched(path) >= older_than_s:
+                if time.time() - last_modified(path) >= older_than_s:
                     shutil.rmtree(path, ignore_errors=True)
                     removed += 1
         return removed
 
     def _publish(self, temporary: Path, target: Path, address: Address) -> None:
-        """Rename into place. A folder that is not empty is never overwritten by a rename, so the first one wins."""
-        for _ in range(20):
+        """Renames into place, where the first sound artifact stays."""
+        # A loop, because another writer may come or go between any two of these calls.
+        for _ in range(_PUBLISH_ATTEMPTS):
             try:
+                # A rename never overwrites a folder that is not empty, so the first writer wins.
                 temporary.rename(target)
             except OSError:
                 if not os.path.lexists(target):
@@ -219,19 +241,19 @@ class LocalStore:
             else:
                 sync(target.parent)
                 return
-            if self._sound(target, address):
+            if self._is_sound(target, address):
                 return
-            trash = _move_aside(target)
+            trash = move_to_trash(target)
             if trash is None:
                 continue
             # Between the check and the move another writer may have put a sound one here: then it goes back.
-            if self._sound(trash, address):
+            if self._is_sound(trash, address):
                 with suppress(OSError):
                     trash.rename(target)
             shutil.rmtree(trash, ignore_errors=True)
 
-    def _sound(self, path: Path, address: Address) -> bool:
-        manifest = _manifest_in(path)
+    def _is_sound(self, path: Path, address: Address) -> bool:
+        manifest = find_sound_manifest(path)
         if manifest is None or manifest.address != address:
             return False
         try:
@@ -242,7 +264,20 @@ class LocalStore:
 
 
 def open_store(uri: str) -> LocalStore:
-    """The store at a plain path or ``file:///…``. Raises ``ConfigError`` for any other scheme."""
+    """Opens the store at a path or URI.
+
+    Args:
+        uri: a path, or ``file:///…``.
+
+    Returns:
+        The store; its folder need not exist yet.
+
+    Raises:
+        ConfigError: the URI has another scheme.
+
+    >>> print(open_store("file:///data/a%20store").root)
+    /data/a store
+    """
     parsed = urlparse(uri)
     if parsed.scheme == "" and uri:
         return LocalStore(Path(uri))
@@ -251,50 +286,20 @@ def open_store(uri: str) -> LocalStore:
     raise ConfigError(f"The store {uri!r} is of no known kind", remedy="Give a folder: a path, or file:///path.")
 
 
-def _manifest_in(folder: Path) -> Manifest | None:
-    """The manifest, or ``None`` where there is none that can be trusted; a newer one raises."""
-    try:
-        return parse_manifest((folder / MANIFEST).read_bytes(), folder / MANIFEST)
-    except NewerSchemaError:
-        raise
-    except (ArtifactCorruptError, FileNotFoundError, NotADirectoryError):
-        return None
-
-
-def _move_aside(target: Path) -> Path | None:
-    trash = target.parent / f"{_TRASH}{uuid.uuid4().hex}"
-    try:
-        target.rename(trash)
-    except FileNotFoundError:
-        return None
-    return trash
-
-
-def _corrupt(artifact: Artifact, name: str, problem: str) -> ArtifactCorruptError:
-    at = artifact.address
-    file = artifact.path / name
-    return ArtifactCorruptError(problem, remedy=_RECOMPUTE, file=file, log=at.log, chunk=at.chunk, stage=at.stage)
-
-
-def _folders_with_manifest(base: Path) -> Iterator[Path]:
-    for folder, names, files in os.walk(base):
-        names[:] = sorted(n for n in names if not n.startswith("."))
-        if MANIFEST in files:
-            names.clear()
-            yield Path(folder)
-
-
-def _last_touched(path: Path) -> float:
-    times = []
-    for p in (path, *path.rglob("*")):
-        with suppress(FileNotFoundError):
-            times.append(p.lstat().st_mtime)
-    return max(times, default=time.time())
+def _corruption_error(artifact: Artifact, name: str, problem: str) -> ArtifactCorruptError:
+    return ArtifactCorruptError(
+        problem,
+        remedy=_RECOMPUTE,
+        file=artifact.path / name,
+        log=artifact.address.log,
+        chunk=artifact.address.chunk,
+        stage=artifact.address.stage,
+    )
 
 
 @contextmanager
-def _translated(path: Path, address: Address) -> Iterator[None]:
-    """What the operating system refuses leaves as one of the project's errors."""
+def _os_errors_translated(path: Path, address: Address) -> Iterator[None]:
+    """Turns an ``OSError`` inside the block into one of the project's errors."""
     try:
         yield
     except OSError as error:

@@ -16,6 +16,7 @@ from storage.keys import digest_bytes, digest_value
 
 MANIFEST = "manifest.json"
 SCHEMA_VERSION = 1
+# The seal finds accidents, such as a flipped bit or an edit by hand. It is no signature.
 _SEAL = "manifest_sha256"
 _RECOMPUTE = "Delete the folder; the next run computes it again."
 
@@ -25,17 +26,35 @@ class NewerSchemaError(ArtifactCorruptError):
 
 
 class FileEntry(BaseModel):
-    """One payload file: POSIX path relative to the artifact's folder, sha256 (hex), size in bytes."""
+    """One payload file of an artifact.
+
+    Attributes:
+        path: path relative to the artifact's folder, with "/" between its parts.
+        sha256: digest of the file's bytes, 64 hex digits.
+        size: the file's size in bytes.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    # Unknown fields are refused: a version that does not know one would drop it silently.
     path: str
     sha256: str
     size: int = Field(ge=0)
 
 
 def payload_digest(files: Iterable[FileEntry]) -> str:
-    """sha256 (hex) over the sorted (path, sha256): equal for equal payloads, whatever their manifests say."""
+    """Computes the digest of an artifact's payload: equal for equal files, whatever their manifests say.
+
+    Args:
+        files: the payload's files, in any order.
+
+    Returns:
+        64 hex digits of sha256.
+
+    >>> payload_digest([])[:8]
+    'e3b0c442'
+    """
+    # A path holds neither NUL nor newline, so no two lists of files give the same text.
     pairs = sorted((f.path, f.sha256) for f in files)
     return digest_bytes("".join(f"{path}\0{sha}\n" for path, sha in pairs).encode())
 
@@ -43,8 +62,24 @@ def payload_digest(files: Iterable[FileEntry]) -> str:
 class Manifest(BaseModel):
     """Key, recipe, files and measurements of one artifact.
 
-    ``inputs`` maps a name to the key of the input artifact (or a log's digest). ``seconds``, ``peak_mib``,
-    ``created_at``, ``environment``, ``measurements`` and ``warnings`` are no payload: they differ between runs.
+    The fields from ``seconds`` on are no payload: they differ between runs that make the same files.
+
+    Attributes:
+        schema_version: version of this format.
+        kind: kind of artifact, which chooses the codec.
+        dataset: part of the address, as are ``log``, ``chunk``, ``stage`` and ``key``.
+        inputs: name → key of each input artifact (or digest of the log).
+        configuration: the stage's section of the configuration.
+        code_digest: digest of the stage's code.
+        weights_digest: digest of the network's weights, if the stage has a network.
+        files: all payload files.
+        payload_digest: digest over ``files``.
+        seconds: wall time of the stage.
+        peak_mib: largest memory of the process during the stage, in MiB.
+        created_at: time of the commit, ISO 8601.
+        environment: versions, machine and commit.
+        measurements: numbers and facts about the result that are no payload.
+        warnings: sentences for the user.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -75,21 +110,38 @@ class Manifest(BaseModel):
         return Address(self.dataset, self.log, self.chunk, self.stage, self.key)
 
     def to_json(self) -> bytes:
-        """Readable JSON, sealed with a sha256 over itself. Non-finite measurements become ``null``."""
-        body = plain(self.model_dump(mode="python"))
+        """Writes the manifest as readable JSON that carries a sha256 over itself.
+
+        Returns:
+            UTF-8 text. Non-finite measurements become ``null``.
+        """
+        body = to_json_value(self.model_dump(mode="python"))
+        # Indented, because people open manifests; the seal is over the compact form and does not mind.
         return (json.dumps(body | {_SEAL: digest_value(body)}, indent=2, ensure_ascii=False) + "\n").encode()
 
 
-def plain(value: Any) -> Any:
-    """A JSON-able copy: NumPy and torch scalars as numbers, tuples as lists, NaN and infinity as ``None``."""
+def to_json_value(value: Any) -> Any:
+    """Copies a value into types that JSON can hold.
+
+    Args:
+        value: mappings, sequences, pydantic models, numbers, strings, NumPy arrays and torch tensors, nested.
+
+    Returns:
+        Dictionaries, lists, numbers, strings and ``None``, which stands for NaN and infinity. Anything else
+        becomes its text.
+
+    >>> to_json_value({"psnr": float("inf"), "size": (320, 180), "file": Path("a")})
+    {'psnr': None, 'size': [320, 180], 'file': 'a'}
+    """
     if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
+        return {str(k): to_json_value(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
+        return [to_json_value(v) for v in value]
     if isinstance(value, BaseModel):
-        return plain(value.model_dump(mode="python"))
+        return to_json_value(value.model_dump(mode="python"))
+    # Duck typing, because importing torch for this check would make every look-up slow.
     if hasattr(value, "tolist"):
-        return plain(value.tolist())
+        return to_json_value(value.tolist())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if value is None or isinstance(value, str | int):
@@ -98,19 +150,29 @@ def plain(value: Any) -> Any:
 
 
 def parse_manifest(data: bytes, file: Path) -> Manifest:
-    """The manifest in ``data``, every promise of it checked.
+    """Reads a manifest and checks every promise of it.
 
-    Raises ``ArtifactCorruptError`` naming ``file``: not JSON, a broken seal, a field missing or of the wrong type, a
-    payload digest that is not of the files listed, a path that leads out of the folder; ``NewerSchemaError`` for a
-    schema version this code does not know.
+    Args:
+        data: bytes of a ``manifest.json``.
+        file: where they were read, for errors.
+
+    Returns:
+        The manifest.
+
+    Raises:
+        NewerSchemaError: its schema version is newer than this code.
+        ArtifactCorruptError: it is not JSON, does not match its own digest, or lacks a field; or its payload digest
+            is not that of its files, or a file's path leads out of the folder.
     """
     try:
         body = json.loads(data)
-        version, seal = int(body["schema_version"]), body.pop(_SEAL, None)
-        own = digest_value(body)
+        version = int(body["schema_version"])
+        seal = body.pop(_SEAL, None)
+        computed_seal = digest_value(body)
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise ArtifactCorruptError("The manifest is not readable", remedy=_RECOMPUTE, file=file) from error
-    if seal != own and not (seal is None and version > SCHEMA_VERSION):
+    # A newer version may seal its manifests in another way: a missing seal is then no damage.
+    if seal != computed_seal and not (seal is None and version > SCHEMA_VERSION):
         raise ArtifactCorruptError("The manifest does not match its own digest", remedy=_RECOMPUTE, file=file)
     if version > SCHEMA_VERSION:
         raise NewerSchemaError(
@@ -124,6 +186,7 @@ def parse_manifest(data: bytes, file: Path) -> Manifest:
         raise ArtifactCorruptError("The manifest does not fit its schema", remedy=_RECOMPUTE, file=file) from error
     if manifest.payload_digest != payload_digest(manifest.files):
         raise ArtifactCorruptError("The payload digest is not of the files listed", remedy=_RECOMPUTE, file=file)
+    # Stores are exchanged: a path from somebody else's manifest must not lead out of the folder.
     for entry in manifest.files:
         path = PurePosixPath(entry.path)
         if path.is_absolute() or ".." in path.parts or not path.parts or entry.path == MANIFEST:

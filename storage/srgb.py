@@ -1,55 +1,52 @@
 """The one border between display-referred sRGB (the pipeline) and scene-linear light (EXR).
 
-Rounding: a linear value kept as half has a relative error of at most 2⁻¹¹, which the sRGB curve flattens to 0.44 times
-that; for values in [0, 1] the way there and back is within :data:`ROUNDING_BOUND` in display space (measured:
-2.3e-4), premultiplied or not. Values outside [0, 1] follow the curve extended and mirrored at 0, with the same relative
-bound above 1.
+A linear value kept as half has a relative error of at most 2⁻¹¹, which the sRGB curve flattens to 0.44 times that.
+The way there and back is within :data:`ROUNDING_BOUND` in display space for colours in [0, 1] (measured: 2.3e-4),
+premultiplied or not. The same relative bound holds above 1, where the curve is extended.
 """
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from genre_tasks.errors import NonFiniteError
+from genre_tasks.srgb import linear_to_srgb, srgb_to_linear
+
+__all__ = ["HALF_MAX", "ROUNDING_BOUND", "from_linear_half", "linear_to_srgb", "srgb_to_linear", "to_linear_half"]
 
 ROUNDING_BOUND = 1e-3
 """Largest difference in display space, for colours in [0, 1], after the way to EXR and back."""
 
 HALF_MAX = 65504.0
-
-
-def srgb_to_linear(display: NDArray[Any]) -> NDArray[np.float64]:
-    """IEC 61966-2-1, mirrored for negative values; any shape, float64."""
-    x = np.asarray(display, np.float64)
-    size = np.abs(x)
-    return np.copysign(np.where(size <= 0.04045, size / 12.92, ((size + 0.055) / 1.055) ** 2.4), x)
-
-
-def linear_to_srgb(linear: NDArray[Any]) -> NDArray[np.float64]:
-    """The inverse of :func:`srgb_to_linear`."""
-    x = np.asarray(linear, np.float64)
-    size = np.abs(x)
-    return np.copysign(np.where(size <= 0.0031308, size * 12.92, 1.055 * size ** (1 / 2.4) - 0.055), x)
+"""The largest number in half precision."""
 
 
 def to_linear_half(
     color: NDArray[np.float32],  # [H, W, 3] display-referred, premultiplied
-    alpha: NDArray[np.float32] | None,  # [H, W] in [0, 1], or None: opaque
+    alpha: NDArray[np.float32] | None,  # [H, W]
     name: str,
 ) -> NDArray[np.float16]:  # [H, W, 3] scene-linear, premultiplied
-    """To EXR: un-premultiply, linearise, premultiply. Colour where alpha = 0 is 0.
+    """Converts an image for EXR: un-premultiplies, linearises, premultiplies.
 
-    Raises ``NonFiniteError`` naming ``name`` for non-finite input and for light above 65504, the largest half: it is
-    not clamped, since that would change the image silently.
+    Args:
+        color: [H, W, 3] display-referred, premultiplied.
+        alpha: [H, W] in [0, 1]; ``None`` for an opaque image.
+        name: what an error calls the image.
+
+    Returns:
+        [H, W, 3] scene-linear, premultiplied; 0 where alpha is 0.
+
+    Raises:
+        NonFiniteError: a colour is NaN or infinite, or brighter than :data:`HALF_MAX`.
     """
     if alpha is None:
         light = srgb_to_linear(color)
     else:
+        # The curve is not linear: applied to premultiplied colour it would darken edges.
         cover = alpha.astype(np.float64)[..., None]
         light = srgb_to_linear(np.divide(color, cover, out=np.zeros(color.shape), where=cover > 0)) * cover
+    # Light that half cannot hold is an error and not clamped: that would change the image silently.
     bad = ~(np.abs(light) <= HALF_MAX)
     if bad.any():
         first = tuple(int(i) for i in np.argwhere(bad)[0])
@@ -58,7 +55,18 @@ def to_linear_half(
 
 
 def from_linear_half(light: NDArray[np.float16], alpha: NDArray[np.float32] | None) -> NDArray[np.float32]:
-    """From EXR: the inverse of :func:`to_linear_half`; [H, W, 3] float32, 0 where alpha = 0."""
+    """Converts an image from EXR: the inverse of :func:`to_linear_half`.
+
+    Args:
+        light: [H, W, 3] scene-linear, premultiplied.
+        alpha: [H, W] in [0, 1]; ``None`` for an opaque image.
+
+    Returns:
+        [H, W, 3] display-referred, premultiplied, float32; 0 where alpha is 0.
+
+    >>> from_linear_half(np.full((1, 1, 3), 1.0, np.float16), None)
+    array([[[1., 1., 1.]]], dtype=float32)
+    """
     if alpha is None:
         return linear_to_srgb(light).astype(np.float32)
     cover = alpha.astype(np.float64)[..., None]

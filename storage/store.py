@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -13,50 +13,119 @@ from storage.manifest import Manifest
 
 @dataclass(frozen=True)
 class Artifact:
-    """A committed artifact: where it belongs, its folder, what its manifest says."""
+    """A committed artifact.
+
+    Attributes:
+        address: where it belongs.
+        path: its folder.
+        manifest: what it says of itself.
+    """
 
     address: Address
     path: Path
     manifest: Manifest
 
 
-class Store(Protocol):
-    """Commits are atomic, the first writer wins, reads are verified."""
+@dataclass(frozen=True)
+class Provenance:
+    """How a value was made: what its manifest says beside the payload.
 
-    def commit(
-        self,
-        address: Address,
-        kind: str,
-        value: Any,
-        *,
-        inputs: Mapping[str, str] | None = None,
-        configuration: Mapping[str, Any] | None = None,
-        code_digest: str = "",
-        weights_digest: str | None = None,
-        seconds: float = 0.0,
-        peak_mib: float = 0.0,
-        environment: Mapping[str, str] | None = None,
-        measurements: Mapping[str, Any] | None = None,
-        warnings: Sequence[str] = (),
-        created_at: str | None = None,
-    ) -> Artifact:
-        """Write ``value`` whole or not at all; if a sound artifact is there already, that one is returned."""
+    Attributes:
+        inputs: name → key of each input artifact (or digest of the log).
+        configuration: the stage's section of the configuration, as JSON values.
+        code_digest: digest of the stage's code.
+        weights_digest: digest of the network's weights, if the stage has a network.
+        seconds: wall time of the stage.
+        peak_mib: largest memory of the process during the stage, in MiB.
+        environment: versions, machine and commit.
+        measurements: numbers and facts about the result that are no payload.
+        warnings: sentences for the user.
+        created_at: time of the commit, ISO 8601; by default now.
+    """
+
+    inputs: Mapping[str, str] = field(default_factory=dict)
+    configuration: Mapping[str, Any] = field(default_factory=dict)
+    code_digest: str = ""
+    weights_digest: str | None = None
+    seconds: float = 0.0
+    peak_mib: float = 0.0
+    environment: Mapping[str, str] = field(default_factory=dict)
+    measurements: Mapping[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    created_at: str | None = None
+
+
+class Store(Protocol):
+    """A place for artifacts: commits are atomic, the first writer wins, reads are verified."""
+
+    def commit(self, address: Address, kind: str, value: Any, provenance: Provenance | None = None) -> Artifact:
+        """Writes a value completely or not at all.
+
+        Args:
+            address: where it belongs. A sound artifact that is there already stays; a corrupt one is replaced.
+            kind: kind of artifact, which chooses the codec (:data:`storage.codecs.KINDS`).
+            value: what the codec writes. What the codec calls measurements is added to those of ``provenance``.
+            provenance: how the value was made; by default nothing is known of it.
+
+        Returns:
+            The artifact that is now at ``address``.
+
+        Raises:
+            ConfigError: the kind is unknown, or the value breaks the codec's contract.
+            NonFiniteError: the value holds NaN or infinity where it must not.
+            ResourceError: the disk is full. ``TransientIOError`` and ``InputError`` are raised for other faults.
+        """
         ...
 
     def find(self, address: Address) -> Artifact | None:
-        """The artifact, or ``None``. Raises ``ArtifactCorruptError`` where its manifest cannot be trusted."""
+        """Looks an artifact up without reading its payload.
+
+        Args:
+            address: where it belongs.
+
+        Returns:
+            The artifact, or ``None`` where there is no manifest.
+
+        Raises:
+            NewerSchemaError: a newer version of the project wrote the manifest.
+            ArtifactCorruptError: the manifest cannot be trusted, or belongs to another address.
+        """
         ...
 
     def verify(self, artifact: Artifact) -> None:
-        """Raises ``ArtifactCorruptError`` naming the first file that is missing, unexpected or altered."""
+        """Compares every file of an artifact with its manifest.
+
+        Args:
+            artifact: the artifact to check.
+
+        Raises:
+            ArtifactCorruptError: a file is missing, unexpected or altered; it is named.
+        """
         ...
 
     def read(self, artifact: Artifact) -> Any:
-        """The value, after :meth:`verify`."""
+        """Reads an artifact's value, after :meth:`verify`.
+
+        Args:
+            artifact: the artifact to read.
+
+        Returns:
+            The value that was committed.
+
+        Raises:
+            ArtifactCorruptError: a file is damaged, or the codec finds another schema, shape or channel.
+        """
         ...
 
-    def discard(self, where: Artifact | Address) -> None:
-        """Remove an artifact, sound or not; nothing happens where there is none."""
+    def discard(self, target: Artifact | Address) -> None:
+        """Removes an artifact, sound or not; nothing happens where there is none.
+
+        Args:
+            target: the artifact or its address.
+
+        Raises:
+            NewerSchemaError: a newer version of the project wrote it; it is not removed.
+        """
         ...
 
     def artifacts(
@@ -68,5 +137,17 @@ class Store(Protocol):
         key: str | None = None,
         kind: str | None = None,
     ) -> Iterator[Artifact]:
-        """All artifacts that fit, in the order of their paths; what has no readable manifest is passed over."""
+        """Lists artifacts in the order of their paths; what has no readable manifest is left out.
+
+        Args:
+            dataset: only artifacts of this dataset; ``None``, here and below, for any.
+            log: only of this log.
+            chunk: only of this chunk.
+            stage: only of this stage.
+            key: only with this key.
+            kind: only of this kind.
+
+        Yields:
+            The artifacts that fit.
+        """
         ...

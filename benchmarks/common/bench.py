@@ -9,6 +9,17 @@ from typing import Any, Protocol
 from benchmarks.common.claims import Claim
 
 Row = dict[str, Any]
+"""What a cell measured, as JSON values; ``not_measured`` alone where it says why nothing was."""
+
+TINY_STREET = "900&width=64&height=36&samples=1&frames=8&cameras=1&lidar_beams=32&lidar_azimuths=300"
+"""A seed with further parameters of the street's URI: eight small frames of one camera, read within a second."""
+
+TINY_SETTINGS = (
+    "ingest.width_px=64 ingest.height_px=36 initial.max_points=600 initial.distant_count=100 gnet.iterations=3 "
+    "gnet.snapshots=0 enet.iterations=2 enet.snapshots=0 novel_views.lidar_max_points=600 novel_views.shifts_m=[3.0] "
+    "evaluate.every=8 evaluate.bootstrap=5"
+)
+"""Value of an option ``settings`` under which a tiny street goes through every stage within seconds."""
 
 
 class NotMeasuredError(Exception):
@@ -17,10 +28,13 @@ class NotMeasuredError(Exception):
 
 @dataclass(frozen=True)
 class Cell:
-    """The smallest thing that is measured, kept and resumed.
+    """The smallest thing that is measured, cached and resumed.
 
-    ``parameters`` (JSON values) say what is measured, as far as the name and the code do not; ``seconds`` is a
-    prediction.
+    Attributes:
+        name: unique within the benchmark.
+        seconds: predicted.
+        measure: measures the cell; may raise ``NotMeasuredError``.
+        parameters: JSON values that say what is measured, as far as the name and the code do not.
     """
 
     name: str
@@ -29,30 +43,122 @@ class Cell:
     parameters: Mapping[str, Any] = field(default_factory=dict)
 
 
-def logs_of(options: Mapping[str, str]) -> list[tuple[str, int]]:
-    """URI and chunk of each log that the options name: chunk 0 of streets of the ``seeds``, chunk 1 of ``pandaset``.
+@dataclass(frozen=True)
+class SmallestForm:
+    """The shortest run of a benchmark that still measures a real cell: it shows that the benchmark works end to end.
 
-    An empty ``pandaset`` leaves the real log out.
+    Attributes:
+        options: values of ``--set`` that make cells small.
+        only: part of the name of the cell that is measured, for ``--only``.
     """
-    logs = [(f"synthetic:street?seed={seed}", 0) for seed in options["seeds"].split(",") if seed]
-    return logs + ([(f"pandaset:{options['pandaset']}", 1)] if options["pandaset"] else [])
+
+    options: Mapping[str, str]
+    only: str
+
+    def arguments(self) -> list[str]:
+        """Gives the arguments of ``genre bench NAME`` that run this form.
+
+        >>> SmallestForm({"seeds": "900"}, "seed=900").arguments()
+        ['--quick', '--only', 'seed=900', '--set', 'seeds=900']
+        """
+        arguments = ["--quick", "--only", self.only]
+        for name, value in self.options.items():
+            arguments += ["--set", f"{name}={value}"]
+        return arguments
 
 
 class Bench(Protocol):
-    """One set of claims."""
+    """One set of claims.
+
+    Attributes:
+        name: as in ``genre bench NAME``.
+        options: what ``--set`` may change, with defaults.
+        code: names of modules; a cell's cached row is valid as long as they and their imports stay the same.
+        smallest: options of the shortest run.
+    """
 
     name: str
-    options: Mapping[str, str]  # what --set may change, with defaults
-    code: tuple[str, ...]  # modules whose closure a cell's key covers
+    options: Mapping[str, str]
+    code: tuple[str, ...]
+    smallest: SmallestForm
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
-        """What is measured, in order; ``quick`` takes fewer runs."""
+        """Lists what is measured, in order; ``quick`` takes fewer runs."""
         ...
 
     def claims(self, rows: Mapping[str, Row]) -> Iterator[Claim]:
-        """The claims, of the rows by cell; a row with ``not_measured`` has nothing else to read."""
+        """Makes the claims of the rows by cell; a row with ``not_measured`` has nothing else to read."""
         ...
 
     def table(self, rows: Mapping[str, Row]) -> Iterator[str]:
-        """Lines of Markdown."""
+        """Gives lines of Markdown."""
         ...
+
+
+def split_option(text: str) -> list[str]:
+    """Splits the value of an option at its commas; empty parts are left out.
+
+    >>> split_option("1001,1002")
+    ['1001', '1002']
+    >>> split_option("")
+    []
+    """
+    return [part for part in text.split(",") if part]
+
+
+def settings_from_options(options: Mapping[str, str]) -> tuple[str, ...]:
+    """Gives the configuration that the option ``settings`` puts over the preset.
+
+    Args:
+        options: ``settings``, with spaces between ``section.key=value``.
+
+    Returns:
+        The settings.
+
+    >>> settings_from_options({"settings": "gnet.iterations=3 enet.iterations=2"})
+    ('gnet.iterations=3', 'enet.iterations=2')
+    """
+    # Spaces and not commas, because values such as lists hold commas.
+    return tuple(options["settings"].split())
+
+
+def logs_from_options(options: Mapping[str, str]) -> list[tuple[str, int]]:
+    """Lists the logs that the options name.
+
+    Args:
+        options: ``seeds`` of synthetic streets, each with further URI parameters if need be; ``pandaset``, the folder
+            of a real sequence, or empty to leave it out.
+
+    Returns:
+        URI and chunk of each: chunk 0 of the streets, chunk 1 of the real sequence.
+
+    >>> logs_from_options({"seeds": "1001", "pandaset": "data/002"})
+    [('synthetic:street?seed=1001', 0), ('pandaset:data/002', 1)]
+    """
+    logs = [(f"synthetic:street?seed={seed}", 0) for seed in split_option(options["seeds"])]
+    # Real data is not shipped, so a benchmark has to run without it.
+    if options["pandaset"]:
+        logs.append((f"pandaset:{options['pandaset']}", 1))
+    return logs
+
+
+def measured_rows(rows: Mapping[str, Row]) -> list[Row]:
+    """Gives the rows of cells that were measured."""
+    return [row for row in rows.values() if "not_measured" not in row]
+
+
+def list_not_measured(rows: Mapping[str, Row]) -> Iterator[str]:
+    """Gives a Markdown paragraph for each cell that was not measured.
+
+    Args:
+        rows: by cell.
+
+    Returns:
+        Lines that end a benchmark's table.
+
+    >>> list(list_not_measured({"cuda": {"not_measured": "there is no GPU"}}))
+    ['\\ncuda: not measured: there is no GPU']
+    """
+    for name, row in rows.items():
+        if "not_measured" in row:
+            yield f"\n{name}: not measured: {row['not_measured']}"

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import operator
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
+
+from genre_tasks.atomic_path import atomic_path
 
 Op = Literal[">=", ">", "<=", "<"]
 _COMPARE: dict[str, Callable[[float, float], bool]] = {
@@ -27,18 +28,19 @@ class _Strict(BaseModel):
 class Claim(_Strict):
     """One requirement: ``holds`` says whether ``measured op target``; a claim that was not measured does not hold."""
 
-    id: str = Field(pattern=r"^[a-z0-9_]+(\.[a-z0-9_]+)+$")
+    id: str = Field(pattern=r"^[a-z0-9_]+(\.[a-z0-9_]+)+$", description="Benchmark and name, joined by a dot.")
     measured: float | None = Field(description="A median where n > 1; null: not measured, its row says why.")
-    op: Op
-    target: float
-    unit: str = Field(min_length=1)
+    op: Op = Field(description="How the number has to compare with the target.")
+    target: float = Field(description="In the unit of the number.")
+    unit: str = Field(min_length=1, description="Such as dB, s or ratio.")
     n: int = Field(ge=0, description="Measurements behind the number.")
     spread: tuple[float, float] | None = Field(description="First and third quartile of the n measurements.")
     data: str = Field(min_length=1, description="What it was measured on.")
-    holds: bool
+    holds: bool = Field(description="Whether the number meets the target.")
 
     @model_validator(mode="after")
     def _is_what_the_number_says(self) -> Claim:
+        # Checked on reading too, so that no edited file can claim what its own number denies.
         if self.holds != _holds(self.measured, self.op, self.target):
             raise ValueError(f"{self.id}: holds is {self.holds}, but {self.measured} {self.op} {self.target} is not so")
         if self.measured is None and (self.n or self.spread):
@@ -50,9 +52,9 @@ class Result(_Strict):
     """A benchmark's file."""
 
     machine: str = Field(min_length=1, description="CPU model, cores, instruction set, torch version.")
-    commit: str = Field(pattern=r"^([0-9a-f]{40}(\+changes)?|unknown)$")
-    rows: list[dict[str, JsonValue]]
-    claims: list[Claim]
+    commit: str = Field(pattern=r"^([0-9a-f]{40}(\+changes)?|unknown)$", description="Of the checkout.")
+    rows: list[dict[str, JsonValue]] = Field(description="What each cell measured, with its name as `cell`.")
+    claims: list[Claim] = Field(description="Made of the rows.")
 
 
 def claim(
@@ -65,23 +67,58 @@ def claim(
     n: int = 1,
     spread: Sequence[float] | None = None,
 ) -> Claim:
-    """A claim with ``holds`` worked out; ``measured`` ``None`` where nothing was measured."""
+    """Makes a claim with ``holds`` worked out.
+
+    Args:
+        name: its id, such as ``raster.build_s``.
+        measured: the number; ``None`` where nothing was measured.
+        op: how the number has to compare with the target.
+        target: in the unit of the number.
+        unit: such as ``dB``, ``s`` or ``ratio``.
+        data: what it was measured on.
+        n: number of measurements behind the number.
+        spread: first and third quartile of the measurements.
+
+    Returns:
+        The claim; without a number its ``n`` is 0 and it has no spread.
+
+    >>> claim("raster.build_s", 7.5, "<=", 10.0, "s", "an empty folder").holds
+    True
+    """
+    # The caller's count is of what it wanted to measure.
     if measured is None:
-        n, spread = 0, None
-    quartiles = None if spread is None else (spread[0], spread[1])
-    holds = _holds(measured, op, target)
+        n = 0
+        spread = None
     return Claim(
-        id=name, measured=measured, op=op, target=target, unit=unit, n=n, spread=quartiles, data=data, holds=holds
+        id=name,
+        measured=measured,
+        op=op,
+        target=target,
+        unit=unit,
+        n=n,
+        spread=None if spread is None else (spread[0], spread[1]),
+        data=data,
+        holds=_holds(measured, op, target),
     )
 
 
 def _holds(measured: float | None, op: str, target: float) -> bool:
+    # What was not measured fails, so that leaving out a cell never makes a claim hold.
     return measured is not None and bool(_COMPARE[op](measured, target))
 
 
 def write_json(path: Path, value: Any) -> None:
-    """JSON that appears whole or not at all, also when two processes write it. Raises ``ValueError`` for NaN."""
+    """Writes JSON that appears whole or not at all, also when two processes write it.
+
+    Args:
+        path: the file to write or replace; its folder is made if need be.
+        value: JSON values.
+
+    Raises:
+        ValueError: a number is NaN or infinite, which JSON does not have.
+    """
+    # NaN is no JSON, and other readers would fail on the file much later.
+    text = json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False)
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-    part.write_text(json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
-    part.replace(path)
+    with atomic_path(path) as part:
+        part.write_text(text + "\n", encoding="utf-8")

@@ -1,29 +1,24 @@
-"""Under which circumstances a cell is measured: threads, and the log and chunk."""
+"""Under which circumstances a cell is measured: the number of threads, and the log and chunk."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator
-from contextlib import contextmanager
-
-import torch
 
 from benchmarks.common.bench import Row
 
 THREADS = 2
+"""Threads of torch and the renderer where a benchmark does not say otherwise."""
 
 
-def place(row: Row) -> str:
-    """The log's short name with chunk and order."""
+def cell_label(row: Row) -> str:
+    """Names what a row was measured on, shortly.
+
+    Args:
+        row: with ``log`` and ``chunk``, and ``order`` if it depends on the order of views.
+
+    Returns:
+        The log's last part with chunk and order.
+
+    >>> cell_label({"log": "synthetic:street?seed=1001", "chunk": 0, "order": 2})
+    'street?seed=1001 chunk 0 order 2'
+    """
     name = f"{row['log'].split('/')[-1].removeprefix('synthetic:')} chunk {row['chunk']}"
     return f"{name} order {row['order']}" if "order" in row else name
-
-
-@contextmanager
-def threads(count: int = THREADS) -> Iterator[None]:
-    """Torch and the renderer on so many threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -1,6 +1,6 @@
-"""One result of several files of a benchmark, measured part by part; claims are made anew from all their rows.
+"""Merges files of a benchmark that was measured part by part; claims are made again from all their rows.
 
-python -m benchmarks.common.merge optimiser docs/benchmarks/optimiser_split.json race.json enhancement.json
+python -m benchmarks.common.merge optimiser docs/results/data/optimiser.json race.json enhancement.json
 """
 
 from __future__ import annotations
@@ -11,35 +11,51 @@ from pathlib import Path
 
 from benchmarks.common.bench import Bench, Row
 from benchmarks.common.claims import Result, write_json
-from flows.cli.bench import load
+from flows.cli.bench import load_bench
 from genre_tasks.errors import ArtifactCorruptError
 
 
-def merged(bench: Bench, results: Sequence[Result]) -> Result:
-    """All rows, in the order in which their cells first appear; of a cell in several results the last one's row.
+def merge_results(bench: Bench, results: Sequence[Result]) -> Result:
+    """Merges results of one benchmark.
 
-    Machine and commit are the last result's; a row from elsewhere says its own. A cell that was not measured does not
-    replace one that was. Raises ``ValueError`` without a result.
+    Args:
+        bench: makes the claims.
+        results: at least one; of a cell in several of them the last one's row counts, unless it was not measured there.
+
+    Returns:
+        All rows, in the order in which their cells first appear. Machine and commit are the last result's; a row from
+        elsewhere carries its own.
+
+    Raises:
+        ValueError: there is no result.
     """
     if not results:
         raise ValueError("expected at least one result to merge; there is none")
-    last, rows = results[-1], dict[str, Row]()
+    last = results[-1]
+    rows: dict[str, Row] = {}
     for result in results:
         for row in result.rows:
             name = str(row["cell"])
+            # A later partial run leaves most cells out, and must not erase what an earlier one measured.
             if "not_measured" not in row or name not in rows:
                 rows[name] = _with_origin(row, result, last)
+    # Claims are made again, because they may span cells of several files.
     named = {name: {k: v for k, v in row.items() if k != "cell"} for name, row in rows.items()}
     return last.model_copy(update={"rows": list(rows.values()), "claims": list(bench.claims(named))})
 
 
 def _with_origin(row: Row, result: Result, last: Result) -> Row:
-    own = {"machine": result.machine, "commit": result.commit} | row
-    return {k: v for k, v in own.items() if k not in ("machine", "commit") or v != getattr(last, k)}
+    # A row that an earlier merge took from elsewhere keeps its own machine and commit.
+    complete = {"machine": result.machine, "commit": result.commit} | row
+    return {k: v for k, v in complete.items() if k not in ("machine", "commit") or v != getattr(last, k)}
 
 
-def read(path: Path) -> Result:
-    """A result that ``genre bench`` wrote. Raises ``ArtifactCorruptError`` for anything else."""
+def read_result(path: Path) -> Result:
+    """Reads a result that ``genre bench`` wrote.
+
+    Raises:
+        ArtifactCorruptError: the file is not there or is no such result.
+    """
     try:
         return Result.model_validate_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -49,13 +65,22 @@ def read(path: Path) -> Result:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
+    """Runs the command line, see the top of this module.
+
+    Args:
+        arguments: of the command; those of the process if ``None``.
+
+    Raises:
+        ArtifactCorruptError: a file is no result.
+        ConfigError: there is no such benchmark.
+    """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("bench", help="the benchmark's name")
     parser.add_argument("out", type=Path, help="file to write; may be one of those read")
     parser.add_argument("results", type=Path, nargs="+", help="files to read; of a cell in several the last counts")
-    given = parser.parse_args(arguments)
-    result = merged(load(given.bench), [read(path) for path in given.results])
-    write_json(given.out, result.model_dump(mode="json"))
+    options = parser.parse_args(arguments)
+    result = merge_results(load_bench(options.bench), [read_result(path) for path in options.results])
+    write_json(options.out, result.model_dump(mode="json"))
 
 
 if __name__ == "__main__":

@@ -1,47 +1,55 @@
-"""Runs pipeline stages without Prefect, and reads their metrics and seconds from the store."""
+"""Runs pipeline stages without Prefect, and reads their metrics from the store."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 
+from flows.experiments.stages import interval_bounds, metric_values, run_stages
 from flows.pipeline.definition import PIPELINE
-from flows.pipeline.stage_runner import ArtifactRef, Job, produce
-from storage.local import open_store
+from flows.pipeline.stage_runner import ArtifactRef, Job, read_artifact, run_stage
 
 SETTINGS = ("evaluate.shifts_m=[3]",)
 """Claims are made at 3 m; the other shifts would only cost time."""
 
-
 ALL_STAGES = tuple(spec.name for spec in PIPELINE)
 
 
-def reconstruct(job: Job, stages: tuple[str, ...] = ALL_STAGES) -> dict[str, ArtifactRef]:
-    """The named stages of one chunk, in order."""
-    refs: dict[str, ArtifactRef] = {}
-    for spec in PIPELINE:
-        if spec.name in stages:
-            refs[spec.name] = produce(spec.name, job, {name: refs[name] for name in spec.inputs})
-            say(f"{job.log} chunk {job.chunk} {spec.name}: {'cached' if refs[spec.name].cached else 'done'}")
-    return refs
+def reconstruct(job: Job, stages: Sequence[str] = ALL_STAGES) -> dict[str, ArtifactRef]:
+    """Runs stages of one chunk, and says on stderr which one has ended.
+
+    Args:
+        job: chunk, configuration and store.
+        stages: names of stages; they run in the pipeline's order.
+
+    Returns:
+        The artifacts, by stage.
+    """
+    # The pipeline's order whatever the caller's: inputs have to come first.
+    return run_stages([name for name in ALL_STAGES if name in stages], job, _run_and_say)
 
 
-def metrics_of(job: Job, ref: ArtifactRef) -> dict[str, float]:
-    """Metric values of an ``evaluate/…`` artifact, intervals as ``…/low`` and ``…/high``."""
-    store = open_store(job.store)
-    (artifact,) = store.artifacts(key=ref.key, chunk=job.chunk)
-    out: dict[str, float] = {}
-    for metric in store.read(artifact).metrics:
-        out[metric.name] = metric.value
-        if metric.low is not None and metric.high is not None:
-            out |= {f"{metric.name}/low": metric.low, f"{metric.name}/high": metric.high}
-    return out
+def _run_and_say(stage: str, job: Job, inputs: dict[str, ArtifactRef]) -> ArtifactRef:
+    ref = run_stage(stage, job, inputs)
+    print_progress(f"{job.log} chunk {job.chunk} {stage}: {'cached' if ref.cached else 'done'}")
+    return ref
 
 
-def seconds_of(job: Job, ref: ArtifactRef) -> tuple[float, float]:
-    """Seconds and peak MiB of a stage, from its manifest."""
-    (artifact,) = open_store(job.store).artifacts(key=ref.key, chunk=job.chunk)
-    return artifact.manifest.seconds, artifact.manifest.peak_mib
+def read_metrics(job: Job, ref: ArtifactRef) -> dict[str, float]:
+    """Reads the metrics of an evaluation.
+
+    Args:
+        job: the job that the artifact belongs to.
+        ref: artifact of a stage ``evaluate/…``.
+
+    Returns:
+        Values by name, and bounds of 95 % intervals as ``…/low`` and ``…/high``.
+    """
+    metrics = read_artifact(job, ref).metrics
+    return metric_values(metrics) | interval_bounds(metrics)
 
 
-def say(text: str) -> None:
+def print_progress(text: str) -> None:
+    """Prints a line to stderr: stdout is for tables."""
     sys.stderr.write(text + "\n")
+    sys.stderr.flush()

@@ -1,4 +1,4 @@
-"""Runs a benchmark: cell by cell, each kept as soon as it is measured, so that a broken-off run goes on."""
+"""Runs a benchmark: cell by cell, each cached as soon as it is measured, so that a broken-off run goes on."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ import json
 import re
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from benchmarks.common.bench import Bench, Cell, NotMeasuredError, Row
 from benchmarks.common.claims import Result, write_json
-from flows.machine.facts import commit, machine
+from benchmarks.common.run_stages import print_progress
+from flows.machine.facts import describe_machine, git_commit
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
 from storage.code_digest import code_digest
 
@@ -24,18 +25,36 @@ QUICK_S = 20 * 60.0
 
 
 @dataclass(frozen=True)
-class Plan:
-    """A cell and where its row is kept; ``row`` is ``None`` until it was measured."""
+class CachedCell:
+    """A cell and where its row is cached.
+
+    Attributes:
+        cell: what to measure.
+        path: the file of its row.
+        row: what was measured; ``None`` until it was.
+    """
 
     cell: Cell
     path: Path
     row: Row | None
 
 
-def options_of(bench: Bench, settings: tuple[str, ...]) -> dict[str, str]:
-    """The benchmark's options with ``NAME=VALUE`` settings applied. Raises ``ConfigError`` for an unknown name."""
+def parse_options(bench: Bench, settings: Sequence[str]) -> dict[str, str]:
+    """Applies the user's settings to a benchmark's options.
+
+    Args:
+        bench: has the defaults.
+        settings: ``NAME=VALUE``.
+
+    Returns:
+        All options.
+
+    Raises:
+        ConfigError: there is no such option.
+    """
     options = dict(bench.options)
     for setting in settings:
+        # Split at the first sign alone: values such as settings hold further ones.
         name, equals, value = setting.partition("=")
         if not equals or name not in options:
             known = ", ".join(f"{k}={v}" for k, v in options.items()) or "none"
@@ -44,20 +63,40 @@ def options_of(bench: Bench, settings: tuple[str, ...]) -> dict[str, str]:
     return options
 
 
-def plan(bench: Bench, options: Mapping[str, str], quick: bool, fresh: bool, cache: Path = CACHE) -> list[Plan]:
-    """The cells, each with the row it has in the cache (none with ``fresh``)."""
-    code, where = code_digest(bench.code[0], bench.code[1:]), machine()
-    plans = []
+def find_cached_rows(
+    bench: Bench, options: Mapping[str, str], quick: bool, fresh: bool, cache: Path = CACHE
+) -> list[CachedCell]:
+    """Lists a benchmark's cells with the rows that the cache has of them.
+
+    Args:
+        bench: the benchmark.
+        options: all of its options.
+        quick: whether it takes fewer runs.
+        fresh: whether cached rows are ignored.
+        cache: folder of the rows.
+
+    Returns:
+        The cells in order. A row counts for one name, parameters, code and machine.
+
+    Raises:
+        ArtifactCorruptError: a cached row cannot be read.
+    """
+    code = code_digest(bench.code[0], bench.code[1:])
+    # Seconds of another machine are no measurement of this one.
+    machine = describe_machine()
+    found = []
     for cell in bench.cells(options, quick):
-        text = json.dumps([bench.name, cell.name, dict(cell.parameters), code, where], sort_keys=True)
+        text = json.dumps([bench.name, cell.name, dict(cell.parameters), code, machine], sort_keys=True)
+        # Sixteen digits are enough for a cache, and keep file names readable.
         key = hashlib.sha256(text.encode()).hexdigest()[:16]
+        # The name is for people; the key alone tells cells apart.
         readable = re.sub(r"[^\w.-]+", "_", cell.name)
         path = cache / bench.name / f"{readable}-{key}.json"
-        plans.append(Plan(cell, path, None if fresh else _kept(path)))
-    return plans
+        found.append(CachedCell(cell, path, None if fresh else _read_row(path)))
+    return found
 
 
-def _kept(path: Path) -> Row | None:
+def _read_row(path: Path) -> Row | None:
     if not path.exists():
         return None
     try:
@@ -69,64 +108,121 @@ def _kept(path: Path) -> Row | None:
     return dict(row)
 
 
-def measure(plans: list[Plan], say: Callable[[str], None], limit_s: float | None = None) -> dict[str, Row]:
-    """Rows by cell: kept ones as they are, the others measured now and kept.
+def measure_cells(
+    cells: Sequence[CachedCell], report: Callable[[str], None], limit_s: float | None = None, only: str = ""
+) -> dict[str, Row]:
+    """Measures what is not cached, and caches it.
 
-    A cell that cannot be measured here, or would not end within ``limit_s``, has the row ``{"not_measured": why}``,
-    which is not kept.
+    Args:
+        cells: in order.
+        report: gets a line for each cell.
+        limit_s: cells that would not end within so many seconds are left out.
+        only: cells without this text in their names are left out.
+
+    Returns:
+        Rows by cell. A cell that is left out, or that cannot be measured here, has the row ``{"not_measured": why}``,
+        which is not cached.
     """
     rows: dict[str, Row] = {}
     began = time.monotonic()
-    for p in plans:
+    for cached in cells:
+        name = cached.cell.name
+        # Monotonic, because the wall clock may be set while a benchmark runs for hours.
         start = time.monotonic()
-        if p.row is not None:
-            rows[p.cell.name] = p.row
-            say(f"{p.cell.name}: from the cache")
-            continue
         try:
-            if limit_s is not None and start - began + p.cell.seconds > limit_s:
+            if only not in name:
+                raise NotMeasuredError(f"left out: measured were cells with {only!r} in their names")
+            if cached.row is not None:
+                rows[name] = cached.row
+                report(f"{name}: from the cache")
+                continue
+            # Asked before the cell starts: a broken-off measurement would be lost time.
+            if limit_s is not None and start - began + cached.cell.seconds > limit_s:
                 raise NotMeasuredError(f"left out: would not end within {limit_s / 60:.0f} minutes")
-            rows[p.cell.name] = row = p.cell.measure()
+            rows[name] = cached.cell.measure()
         except NotMeasuredError as reason:
-            rows[p.cell.name] = {"not_measured": str(reason)}
-            say(f"{p.cell.name}: not measured: {reason}")
+            # Never cached: the folder or the GPU may be there the next time.
+            rows[name] = {"not_measured": str(reason)}
+            report(f"{name}: not measured: {reason}")
             continue
         seconds = time.monotonic() - start
-        write_json(p.path, {"cell": p.cell.name, "parameters": dict(p.cell.parameters), "seconds": seconds, "row": row})
-        say(f"{p.cell.name}: measured in {seconds:.1f} s")
+        # Written after each cell, so that a run that is killed loses one cell at most.
+        _write_row(cached, rows[name], seconds)
+        report(f"{name}: measured in {seconds:.1f} s")
     return rows
 
 
-def result_of(bench: Bench, rows: Mapping[str, Row]) -> Result:
-    """Rows and claims with machine and commit, checked against the schema."""
+def _write_row(cached: CachedCell, row: Row, seconds: float) -> None:
+    parameters = dict(cached.cell.parameters)
+    write_json(cached.path, {"cell": cached.cell.name, "parameters": parameters, "seconds": seconds, "row": row})
+
+
+def make_result(bench: Bench, rows: Mapping[str, Row]) -> Result:
+    """Makes the benchmark's file of its rows.
+
+    Args:
+        bench: makes the claims.
+        rows: by cell.
+
+    Returns:
+        Rows and claims with machine and commit, checked against the schema.
+    """
     named = [{"cell": name, **row} for name, row in rows.items()]
-    return Result(machine=machine(), commit=commit(), rows=named, claims=list(bench.claims(rows)))
+    return Result(machine=describe_machine(), commit=git_commit(), rows=named, claims=list(bench.claims(rows)))
 
 
 def run_bench(
-    bench: Bench, json_file: Path, options: Mapping[str, str], quick: bool, fresh: bool, cache: Path = CACHE
+    bench: Bench,
+    json_file: Path,
+    options: Mapping[str, str],
+    quick: bool,
+    fresh: bool,
+    cache: Path = CACHE,
+    only: str = "",
 ) -> Result:
-    """Measures what is not in the cache, writes the file, prints the table to stdout and the claims to stderr."""
-    rows = measure(plan(bench, options, quick, fresh, cache), _say, QUICK_S if quick else None)
-    result = result_of(bench, rows)
+    """Measures a benchmark, writes its file, prints the table to stdout and the claims to stderr.
+
+    Args:
+        bench: the benchmark.
+        json_file: the file to write.
+        options: all of its options.
+        quick: whether it takes fewer runs and leaves out what would not end within ``QUICK_S``.
+        fresh: whether cached rows are measured again.
+        cache: folder of the rows.
+        only: cells without this text in their names are left out.
+
+    Returns:
+        What was written.
+
+    Raises:
+        ArtifactCorruptError: a cached row cannot be read.
+    """
+    cells = find_cached_rows(bench, options, quick, fresh, cache)
+    rows = measure_cells(cells, print_progress, QUICK_S if quick else None, only)
+    result = make_result(bench, rows)
     write_json(json_file, result.model_dump(mode="json"))
     for line in bench.table(rows):
         sys.stdout.write(line + "\n")
     for c in result.claims:
+        # Capitals, because one failure has to be found among a screen of lines.
         word = "holds" if c.holds else "FAILS"
         measured = "not measured" if c.measured is None else f"{c.measured:12.4f}"
-        _say(f"{word}  {c.id:<28} {measured} {c.op} {c.target} {c.unit}  {c.data}")
+        print_progress(f"{word}  {c.id:<28} {measured} {c.op} {c.target} {c.unit}  {c.data}")
     return result
 
 
-def dry_run(plans: list[Plan]) -> list[dict[str, Any]]:
-    """A line per cell: predicted seconds, or that it is in the cache."""
+def list_cells(cells: Sequence[CachedCell], only: str = "") -> list[dict[str, Any]]:
+    """Lists cells for a dry run.
+
+    Args:
+        cells: in order.
+        only: cells without this text in their names are left out.
+
+    Returns:
+        A line for each: its name, whether it is cached, and the seconds to measure it.
+    """
     return [
-        {"cell": p.cell.name, "cached": p.row is not None, "seconds": 0.0 if p.row is not None else p.cell.seconds}
-        for p in plans
+        {"cell": c.cell.name, "cached": c.row is not None, "seconds": 0.0 if c.row is not None else c.cell.seconds}
+        for c in cells
+        if only in c.cell.name
     ]
-
-
-def _say(text: str) -> None:
-    sys.stderr.write(text + "\n")
-    sys.stderr.flush()

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
-from benchmarks.common.pipeline_inputs import images_of
-from genre_tasks.losses.targets import Target
-from genre_tasks.scene.graph import SceneGraph
 
+def psnr_per_view(images: Tensor, truth: Tensor) -> Tensor:
+    """Computes the PSNR of each of many images at once, in float32.
 
-def mean_psnr(scene: SceneGraph, views: Sequence[Target]) -> float:
-    """dB, over the views."""
-    return float(psnr_of(images_of(scene, views), torch.stack([t.image.image for t in views])).mean())
+    Args:
+        images: [V, H, W, 3] sRGB in [0, 1].
+        truth: [V, H, W, 3].
 
+    Returns:
+        [V] dB, at most 100.
 
-def psnr_of(images: Tensor, truth: Tensor) -> Tensor:
-    """[V] dB of [V, H, W, 3] twice."""
+    >>> psnr_per_view(torch.full((1, 2, 2, 3), 0.6), torch.full((1, 2, 2, 3), 0.5)).round().tolist()
+    [20.0]
+    """
+    # The floor keeps identical images at 100 dB, as an infinite one would spoil every mean.
     return -10 * torch.log10((images - truth).square().mean((1, 2, 3)).clamp_min(1e-10))

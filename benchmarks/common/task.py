@@ -1,4 +1,4 @@
-"""What every method is given: one chunk's initial scene, its source views, and views to judge by that none sees."""
+"""What every optimiser starts from: one chunk's initial scene, its source views, and views to evaluate it by."""
 
 from __future__ import annotations
 
@@ -7,72 +7,109 @@ from functools import lru_cache
 from pathlib import Path
 
 from benchmarks.common.bench import NotMeasuredError
-from benchmarks.common.novel_view_truth import true_targets
+from benchmarks.common.novel_view_truth import load_true_targets
 from benchmarks.common.run_stages import reconstruct
 from flows.configuration import load_configuration
-from flows.pipeline.stage_runner import Job, value_of
-from flows.training.optimiser_training import psnr
-from flows.training.training_scenes import spread
-from genre_tasks.effects.types import BASIC
-from genre_tasks.losses.targets import Target, of_source, of_views
+from flows.pipeline.stage_runner import Job, read_artifact
+from flows.training.optimiser_training import mean_psnr
+from flows.training.training_scenes import evenly_spaced
+from genre_tasks.effects.types import DEFAULT_EFFECTS
+from genre_tasks.losses.targets import Target, source_targets, view_targets
 from genre_tasks.scene.graph import SceneGraph
 
 HELDOUT_VIEWS = 12
-"""So many held-out views judge, spread evenly: a curve has some twenty points."""
-WITHOUT_EFFECTS = ("effects=none", *(f"effects.{name}=on" for name in sorted(BASIC)))
+"""Number of held-out views that a scene is evaluated by, spread evenly: a curve has some twenty points."""
+WITHOUT_EFFECTS = ("effects=none", *(f"effects.{name}=on" for name in sorted(DEFAULT_EFFECTS)))
 """Optimisers are compared on what all of them model; ``genre bench effects`` measures the rest."""
 SIDE_M = 3.0
-"""Where curves are judged beside the path: where the fixer works."""
+"""Metres beside the path at which curves are evaluated: where the fixer works."""
 
 
 @dataclass(frozen=True)
-class Task:
+class OptimisationTask:
     """A scene in memory, with its targets decoded: the clock starts here.
 
-    ``source``: with LiDAR depth, which per-scene 3DGS does not look at. ``beside``: ray-cast at ±3 m; none on a real
-    log.
+    Attributes:
+        scene: the initial scene.
+        source: targets of the source views, with LiDAR depth, which per-scene 3DGS does not use.
+        heldout: targets of held-out views, which no method sees.
+        novel_targets: ray-cast at ±3 m; none on a real log.
     """
 
     scene: SceneGraph
     source: tuple[Target, ...]
     heldout: tuple[Target, ...]
-    beside: tuple[Target, ...] = ()
+    novel_targets: tuple[Target, ...] = ()
 
     def psnr(self, scene: SceneGraph) -> float:
-        """Mean over the held-out views, dB."""
-        return psnr(scene, self.heldout)
+        """Averages a scene's PSNR over the held-out views, dB."""
+        return mean_psnr(scene, self.heldout)
 
-    def psnr_beside(self, scene: SceneGraph) -> float | None:
-        """Mean over the views at ±3 m, dB; ``None`` where there is no truth."""
-        return psnr(scene, self.beside) if self.beside else None
+    def psnr_novel(self, scene: SceneGraph) -> float | None:
+        """Averages a scene's PSNR over the views at ±3 m, dB; ``None`` where there is no truth."""
+        return mean_psnr(scene, self.novel_targets) if self.novel_targets else None
 
 
+# One task only: the decoded targets of a chunk take most of the memory.
 @lru_cache(maxsize=1)
-def task_of(log: str, chunk: int, store: str, *settings: str) -> Task:
-    """The preset ``small`` up to the initial scene, from and into a store; ``settings`` as for ``genre run --set``.
+def load_task(log: str, chunk: int, store: str, *settings: str) -> OptimisationTask:
+    """Runs the preset ``small`` up to the initial scene; the last task stays in memory.
 
-    Raises ``NotMeasuredError`` without data.
+    Args:
+        log: URI of the log.
+        chunk: index of the chunk.
+        store: folder of the store that stages come from and go to.
+        settings: ``section.key=value`` over the preset.
+
+    Raises:
+        NotMeasuredError: the log's folder is missing.
     """
-    job = job_of(log, chunk, store, None, *settings)
+    job = make_job(log, chunk, store, None, *settings)
     refs = reconstruct(job, ("ingest", "effects", "initial"))
-    read, initial = value_of(job, refs["ingest"]), value_of(job, refs["initial"])
-    heldout = of_views(read, spread(read.of_role("heldout"), HELDOUT_VIEWS))
-    beside = true_targets(log, store, read, SIDE_M)
-    return Task(initial.scene, of_source(read, depth=True), heldout, beside)
+    ingested = read_artifact(job, refs["ingest"])
+    return OptimisationTask(
+        scene=read_artifact(job, refs["initial"]).scene,
+        source=source_targets(ingested, depth=True),
+        heldout=view_targets(ingested, evenly_spaced(ingested.views_with_role("heldout"), HELDOUT_VIEWS)),
+        novel_targets=load_true_targets(log, store, ingested, SIDE_M),
+    )
 
 
-def job_of(log: str, chunk: int, store: str, order: int | None = None, *settings: str) -> Job:
-    """The preset ``small``, with ``order`` as the seed of GNet's and ENet's views and then without snapshots.
+def make_job(log: str, chunk: int, store: str, order: int | None = None, *settings: str) -> Job:
+    """Builds a job of the preset ``small``, with the effects alone that all optimisers model.
 
-    Raises ``NotMeasuredError`` where the log's folder is missing.
+    Args:
+        log: URI of the log.
+        chunk: index of the chunk.
+        store: folder of the store.
+        order: seed of GNet's and ENet's order of views; with it they keep no snapshots, which would cost time.
+        settings: ``section.key=value`` over the preset.
+
+    Raises:
+        NotMeasuredError: the log's folder is missing.
+    """
+    require_log_folder(log)
+    # Snapshots cost time and are not read here, so an order leaves them out.
+    seeds = [] if order is None else [f"{s}.{k}" for s in ("gnet", "enet") for k in (f"seed={order}", "snapshots=0")]
+    config = load_configuration("small", settings=[*WITHOUT_EFFECTS, *seeds, *settings])
+    return Job(log, chunk, store, config.model_dump(mode="json"))
+
+
+def require_log_folder(log: str) -> None:
+    """Checks that the folder of a real log is there.
+
+    Args:
+        log: URI of a log; a synthetic one needs no folder.
+
+    Raises:
+        NotMeasuredError: it is not.
+
+    >>> require_log_folder("synthetic:street?seed=1001")
+    >>> require_log_folder("pandaset:nowhere/002")
+    Traceback (most recent call last):
+    benchmarks.common.bench.NotMeasuredError: there is no folder nowhere/002; give it with --set pandaset=PATH
     """
     reader, _, path = log.partition(":")
+    # A missing download is no failure of the code, so the cell says why it was not measured.
     if reader == "pandaset" and not Path(path).is_dir():
         raise NotMeasuredError(f"there is no folder {path}; give it with --set pandaset=PATH")
-    seeds = [] if order is None else [f"{s}.{k}" for s in ("gnet", "enet") for k in (f"seed={order}", "snapshots=0")]
-    return Job(
-        log,
-        chunk,
-        store,
-        load_configuration("small", settings=[*WITHOUT_EFFECTS, *seeds, *settings]).model_dump(mode="json"),
-    )

@@ -1,6 +1,6 @@
 """What each effect brings where a log calls for it, and loses where it is left out of one that does not.
 
-genre bench effects --json docs/benchmarks/effects.json [--set seeds=1001] [--set effects=exposure] [--set pandaset=]
+genre bench effects --json docs/results/data/effects.json [--set seeds=1001] [--set effects=exposure] [--set pandaset=]
 genre bench effects --set seeds=900,901 --set factors=0.5,1,2,4    # where a threshold sits: see `Case`
 genre bench effects --set effects=trained --set training=FOLDER    # of `genre train gnet --recipe effects`
 
@@ -9,43 +9,54 @@ Each row says the commit that it was measured at.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 
-import numpy as np
-
-from benchmarks.common.bench import Cell, Row
-from benchmarks.common.claims import Claim, Op
-from benchmarks.common.over_cells import over_cells
+from benchmarks.common.bench import (
+    TINY_SETTINGS,
+    TINY_STREET,
+    Bench,
+    Cell,
+    Row,
+    SmallestForm,
+    settings_from_options,
+    split_option,
+)
+from benchmarks.common.claims import Claim
 from benchmarks.effects.cases import CASES
-from benchmarks.effects.cells import on_real, on_street
-from benchmarks.effects.whole_plans import SHAPED, auto_vs_on, plain_cost, trained
+from benchmarks.effects.cells import ChunkLocation, measure_on_pandaset, measure_on_street
+from benchmarks.effects.report import BENCH_NAME, make_claims, make_table
+from benchmarks.effects.whole_plans import TRAINED_EFFECTS, compare_auto_with_on, compare_trained, count_plain_cost
 from flows.configuration import load_configuration
-from flows.pipeline.definition import BY_NAME, stage_weights
+from flows.pipeline.definition import STAGE_BY_NAME, digest_stage_weights
+from genre_tasks.errors import ConfigError
+from genre_tasks.suggestions import did_you_mean
 
-CELL_S, WHOLE_S, COUNTED_S = 120.0, 200.0, 1500.0
-WHOLE: Mapping[str, tuple[Callable[[str, str], Row], float]] = {
-    "auto_vs_on": (auto_vs_on, WHOLE_S),
-    "plain_cost": (plain_cost, COUNTED_S),
+CELL_S = 120.0
+WHOLE_PLAN_S = 200.0
+COUNTED_S = 1500.0
+WHOLE_PLANS: Mapping[str, tuple[Callable[[ChunkLocation], Row], float]] = {
+    "auto_vs_on": (compare_auto_with_on, WHOLE_PLAN_S),
+    "plain_cost": (count_plain_cost, COUNTED_S),
 }
-"""Whole plans, and their predicted seconds; the latter is counted on the first street alone."""
+"""Whole plans, and their predicted seconds; the cost is counted on the first street alone."""
 TRAINED = "trained"
 """Among the effects that are asked for: whether the optimiser gains from training with them; needs ``training``."""
 
 
-class Effects:
+class EffectsBench:
     """A cell for each effect and log: streets that call for it, streets that do not, and the real chunks."""
 
-    name = "effects"
+    name = BENCH_NAME
     options: Mapping[str, str] = {
         "seeds": "1001,1002,1003",
-        "effects": ",".join((*CASES, *WHOLE)),
+        "effects": ",".join((*CASES, *WHOLE_PLANS)),
         "factors": "0,4",
         "store": "genre-store",
         "pandaset": "../shared/data/pandaset/002",
         "chunks": "0,1",
         "training": "",
+        "settings": "",
     }
     code: tuple[str, ...] = (
         "benchmarks.effects.cells",
@@ -55,125 +66,107 @@ class Effects:
         "genre_tasks.stages.ingest",
         "genre_tasks.stages.initial",
         "genre_tasks.stages.effects",
-        *BY_NAME["effects"].lazy,
+        *STAGE_BY_NAME["effects"].lazy_modules,
         "genre_tasks.logs.pandaset.reader",
         "genre_tasks.logs.synthetic",
     )
+    smallest = SmallestForm(
+        {"seeds": TINY_STREET, "effects": "exposure", "factors": "4", "settings": TINY_SETTINGS}, "exposure street"
+    )
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
-        """Factor 0 is the street that does not call for it. ``quick``: one street, no real log."""
-        seeds = [s for s in options["seeds"].split(",") if s]
-        names, chunks = ([n for n in options[k].split(",") if n] for k in ("effects", "chunks"))
-        factors = [float(f) for f in options["factors"].split(",") if f]
-        small = load_configuration("small")
-        parameters = {
-            "configuration": small.model_dump(mode="json"),
-            "weights": stage_weights(BY_NAME["gnet"], small),
-        }
-        if quick:
-            seeds = seeds[:1]
-        store, out = options["store"], []
-        for name in (n for n in names if n in WHOLE):
-            run, seconds = WHOLE[name]
-            for seed in seeds[:1] if name == "plain_cost" else seeds:
-                out.append(Cell(f"{name} street {seed}", seconds, partial(run, seed, store), parameters))
+        """Lists whole plans, training, then each effect; ``quick``: one street, no real log.
+
+        Args:
+            options: factor 0 is the street that does not call for the effect.
+            quick: fewer runs.
+
+        Raises:
+            ConfigError: there is no such effect.
+        """
+        seeds = split_option(options["seeds"])
+        seeds = seeds[:1] if quick else seeds
+        # A quick run has to work on machines without the real log.
+        chunks = [int(c) for c in split_option(options["chunks"])] if options["pandaset"] and not quick else []
+        settings = settings_from_options(options)
+        maker = _CellMaker(options["store"], options["pandaset"], settings)
+        names = split_option(options["effects"])
+        known = (*CASES, *WHOLE_PLANS, TRAINED)
+        for name in names:
+            # A typo would measure nothing, and its claims would fail without a reason.
+            if name not in known:
+                remedy = f"{did_you_mean(name, known)}Known: {', '.join(known)}."
+                raise ConfigError(f"nothing is measured of {name!r}", remedy=remedy)
+        cells = []
+        for name in names:
+            if name in WHOLE_PLANS:
+                # Counting instructions takes far longer than the rest, so it is done on the first street alone.
+                cells += [maker.full_plan(name, s) for s in (seeds[:1] if name == "plain_cost" else seeds)]
         if TRAINED in names:
-            places = [(f"synthetic:street?seed={s}{more}", 0) for s in seeds for more in ("", SHAPED)]
-            if options["pandaset"] and not quick:
-                places += [(f"pandaset:{options['pandaset']}", int(c)) for c in chunks]
-            for log, index in places:
-                both = partial(trained, log, index, store, options["training"])
-                out.append(Cell(f"{TRAINED} {log} chunk {index}", WHOLE_S, both, parameters))
-        for name in (n for n in names if n not in WHOLE and n != TRAINED):
-            for seed, factor in itertools.product(seeds, factors):
-                one = partial(on_street, name, seed, store, factor)
-                out.append(Cell(f"{name} street {seed} x {factor:g}", CELL_S, one, parameters))
-            for chunk in chunks if options["pandaset"] and not quick else ():
-                real = partial(on_real, name, options["pandaset"], int(chunk), store)
-                out.append(Cell(f"{name} {options['pandaset']} chunk {chunk}", CELL_S, real, parameters))
-        return out
+            cells += maker.trained(seeds, chunks, options["training"])
+        for name in names:
+            if name in CASES:
+                cells += [maker.street(name, s, float(f)) for s in seeds for f in split_option(options["factors"])]
+                cells += [maker.real(name, chunk) for chunk in chunks]
+        return cells
 
     def claims(self, rows: Mapping[str, Row]) -> Iterator[Claim]:
-        """For each effect: what enabling gains at four times its threshold, and loses left out of a plain street."""
-        found = [r for r in rows.values() if "effect" in r]
-        for name, case in CASES.items():
-            kinds: tuple[tuple[float, str, Op], ...] = ((4.0, "gain", ">="), (0.0, "loss", "<"))
-            for factor, claim, op in kinds:
-                own = [r for r in found if r["effect"] == name and r["factor"] == factor]
-                gains = [_gain(r) for r in own]
-                target = (0.5 if factor else 0.1) if case.unit == "dB" else (20.0 if factor else 2.0)
-                data = f"on less off; {', '.join(r['log'] for r in own) or 'not measured'}"
-                yield over_cells(f"{claim}_{name}", gains, op, target, case.unit, data, bench=self.name)
-        costs, lost = _of(rows, "plain_cost"), _of(rows, "auto_vs_on")
-        more, less = [r["cost_percent"]["planned"] for r in costs], [_lost(r) for r in lost]
-        data = "instructions of a street without actors, given its plan, over one that was not planned"
-        yield over_cells("plain_cost", more, "<=", 2.0, "%", data, bench=self.name)
-        data = "held out, all effects set on less as planned, of streets that have every effect"
-        yield over_cells("auto_vs_on", less, "<=", 0.2, "dB", data, bench=self.name)
+        """Makes the claims, see :func:`benchmarks.effects.report.make_claims`."""
+        return make_claims(rows)
 
     def table(self, rows: Mapping[str, Row]) -> Iterator[str]:
-        """A line for each cell."""
-        views, took = "held out: with | without | at 3 m: with | without", "GNet, s: with | without"
-        yield f"| effect | log | measured | plan | with | without | gain | {views} | {took} |"
-        yield "|---|---|---|---|---|---|---|---|---|---|---|---|---|"
-        for r in (r for r in rows.values() if "effect" in r):
-            value = "" if r["value"] is None else f"{r['value']:.3g} {r['property_unit']} (> {r['threshold']:g})"
-            views = " | ".join(_db(r[word][k]) for k in ("heldout_db", "beside_db") for word in ("on", "off"))
-            log = f"{r['log'].rpartition('/')[2].removeprefix('synthetic:')} chunk {r['chunk']}"
-            measured = f"{abs(r['on']['measure']):.2f} | {abs(r['off']['measure']):.2f} | {_gain(r):+.2f} {r['unit']}"
-            took = f"{r['on']['gnet_s']:.2f} | {r['off']['gnet_s']:.2f}"
-            yield f"| {r['effect']} | {log} | {value} | {r['choice']} | {measured} | {views} | {took} |"
-        for r in _of(rows, "auto_vs_on"):
-            auto, on = (_db(r[word]["heldout_db"]) for word in ("auto", "on"))
-            yield f"\n{r['log']}: held out {auto} as planned, {on} all on"
-        for r in _of(rows, "plain_cost"):
-            planned, planning = (r["cost_percent"][k] for k in ("planned", "planning"))
-            yield f"\n{r['log']}: {planned:+.2f} % instructions with the plan given, {planning:+.2f} % with making it"
-        for r in _of(rows, TRAINED):
-            told = ", ".join(
-                f"{word} {_db(r[word]['measure'])} and {_db(r[word]['beside_db']) or 'unknown'}"
-                for word in ("shipped", "plain", "effects")
+        """Gives a line for each cell."""
+        return make_table(rows)
+
+
+class _CellMaker:
+    """Makes cells of one store and configuration."""
+
+    def __init__(self, store: str, pandaset: str, settings: tuple[str, ...]) -> None:
+        self._store = store
+        self._pandaset = pandaset
+        self._settings = settings
+        config = load_configuration("small", settings=settings)
+        weights = digest_stage_weights(STAGE_BY_NAME["gnet"], config)
+        self._parameters = {"configuration": config.model_dump(mode="json"), "weights": weights}
+
+    def full_plan(self, name: str, seed: str) -> Cell:
+        """Makes a cell of ``WHOLE_PLANS``."""
+        measure, seconds = WHOLE_PLANS[name]
+        location = self._location(f"synthetic:street?seed={seed}", 0)
+        return Cell(f"{name} street {seed}", seconds, partial(measure, location), self._parameters)
+
+    def trained(self, seeds: list[str], chunks: list[int], folder: str) -> list[Cell]:
+        """Makes cells that compare weights: two for each street, one for each real chunk."""
+        # Each street is taken without effects too: training with them must not cost quality where there are none.
+        locations = [
+            self._location(f"synthetic:street?seed={seed}{query}", 0)
+            for seed in seeds
+            for query in ("", TRAINED_EFFECTS)
+        ]
+        locations += [self._location(f"pandaset:{self._pandaset}", chunk) for chunk in chunks]
+        return [
+            Cell(
+                f"{TRAINED} {x.log} chunk {x.chunk}",
+                WHOLE_PLAN_S,
+                partial(compare_trained, x, folder),
+                self._parameters,
             )
-            yield f"\n{r['log']} chunk {r['chunk']}: held out and at 3 m: {told}"
-        for name, case in CASES.items():
-            own = [r for r in rows.values() if r.get("effect") == name and r["factor"] > 0 and r["value"] is not None]
-            least = 0.1 if case.unit == "dB" else 2.0
-            if len({r["factor"] for r in own}) > 1 and (at := calibrated(own, least)) is not None:
-                yield f"\n{name}: enabling gains {least:g} {case.unit} at {at:.3g} {own[0]['property_unit']}"
-        for name in (n for n, r in rows.items() if "not_measured" in r):
-            yield f"\n{name}: not measured: {rows[name]['not_measured']}"
+            for x in locations
+        ]
+
+    def street(self, name: str, seed: str, factor: float) -> Cell:
+        """Makes a cell of one effect on a street."""
+        measure = partial(measure_on_street, name, seed, self._store, self._settings, factor)
+        return Cell(f"{name} street {seed} x {factor:g}", CELL_S, measure, self._parameters)
+
+    def real(self, name: str, chunk: int) -> Cell:
+        """Makes a cell of one effect on a chunk of the real sequence."""
+        measure = partial(measure_on_pandaset, name, self._location(f"pandaset:{self._pandaset}", chunk))
+        return Cell(f"{name} {self._pandaset} chunk {chunk}", CELL_S, measure, self._parameters)
+
+    def _location(self, log: str, chunk: int) -> ChunkLocation:
+        return ChunkLocation(log, chunk, self._store, self._settings)
 
 
-def _gain(row: Row) -> float:
-    """What enabling brings: in dB, or in per cent of what is left without."""
-    on, off = float(row["on"]["measure"]), float(row["off"]["measure"])
-    return on - off if row["unit"] == "dB" else 100 * (on - off) / abs(off)
-
-
-def _of(rows: Mapping[str, Row], whole: str) -> list[Row]:
-    return [r for r in rows.values() if r.get("whole") == whole]
-
-
-def _lost(row: Row) -> float:
-    return float(row["on"]["heldout_db"]) - float(row["auto"]["heldout_db"])
-
-
-def _db(value: float | None) -> str:
-    return "" if value is None else f"{value:.2f}"
-
-
-def calibrated(rows: Sequence[Row], least: float) -> float | None:
-    """The property's value at which the median gain is ``least``, between those measured; ``None`` outside of them."""
-    by: dict[float, list[Row]] = {}
-    for row in rows:
-        by.setdefault(row["factor"], []).append(row)
-    points = sorted(
-        (float(np.median([r["value"] for r in own])), float(np.median([_gain(r) for r in own]))) for own in by.values()
-    )
-    for (x0, y0), (x1, y1) in itertools.pairwise(points):
-        if y0 < least <= y1:
-            return x0 + (x1 - x0) * (least - y0) / (y1 - y0)
-    return None
-
-
-EFFECTS = Effects()
+EFFECTS: Bench = EffectsBench()

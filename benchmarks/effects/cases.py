@@ -5,87 +5,125 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from benchmarks.effects.measures import apart_psnr, beside_psnr, heldout_depth, heldout_people, heldout_psnr, sharp_psnr
-from genre_tasks.effects.plan import effect_of
-from genre_tasks.logs.types import Truth
-from genre_tasks.scene.chunk import Chunk
-from genre_tasks.scene.graph import SceneGraph
+from benchmarks.effects.measures import (
+    SceneMeasure,
+    footprint_change_psnr,
+    heldout_depth_score,
+    heldout_people_psnr,
+    heldout_psnr,
+    novel_view_psnr,
+    sharp_psnr,
+)
+from genre_tasks.effects.plan import load_effect
+
+MILD_FACTOR = 0.25
+LONGEST_S = 0.1
+"""The street's cameras take no more for a readout or an exposure."""
+PX_PER_K1 = 265.0
+"""About how many pixels a point is shifted for a k1 of 1."""
+GLOSS_PER_FACTOR = 0.25
+"""Gloss of a street for each factor: its ratio is 0.4 to 0.5 without any and grows with it, but not in proportion."""
+PEOPLE_PER_PERCENT = 3.5
+"""About how many walk beside the lane where they cover a per cent of the images; a street has twenty at most."""
+MOST_PEOPLE = 20
 
 
 @dataclass(frozen=True)
 class Case:
-    """How a street calls for an effect, how it does not (both as queries), and what is judged, in ``unit``.
+    """How a street calls for an effect, how it does not, and what is measured.
 
-    ``calls`` is given how far beyond the threshold (a factor) the property shall be, and the pixels a second that the
-    street's fastest camera moves over the scene. ``timed``: whether it asks for the latter; ``plain`` is then at the
-    factor ``LITTLE``, for what cannot be set on where the log states nothing of it.
+    Attributes:
+        query_at: makes the query of a street that calls for the effect. Its arguments are by which factor the
+            property exceeds the threshold, and pixels per second at which the street's fastest camera moves over the
+            scene.
+        measure: what scenes are evaluated by.
+        unit: of the measure.
+        plain: query of a street that does not call for the effect.
+        needs_speed: whether ``query_at`` uses the speed. The street that does not call for the effect is then at
+            ``MILD_FACTOR``, as a log that states no times cannot have the effect set on.
     """
 
-    calls: Callable[[float, float], str]
-    measure: Callable[[Chunk, SceneGraph, Truth | None], float]
+    query_at: Callable[[float, float], str]
+    measure: SceneMeasure
     unit: str = "dB"
     plain: str = ""
-    timed: bool = False
+    needs_speed: bool = False
 
     def query(self, factor: float, px_per_s: float) -> str:
-        """Of a street; factor 0 is the one that does not call for it."""
-        if factor == 0 and self.timed:
-            return self.calls(LITTLE, px_per_s)
-        return self.calls(factor, px_per_s) if factor else self.plain
+        """Makes the query of a street.
+
+        Args:
+            factor: of the threshold; 0 for the street that does not call for the effect.
+            px_per_s: speed of the fastest camera over the scene.
+
+        Returns:
+            Parameters to append to the street's URI.
+
+        >>> CASES["rigid_actors"].query(0, 0.0)
+        '&moving=0&pedestrians=0'
+        """
+        if factor == 0:
+            # A street without times could not have the effect set on, and the loss could not be measured.
+            return self.query_at(MILD_FACTOR, px_per_s) if self.needs_speed else self.plain
+        return self.query_at(factor, px_per_s)
 
 
-LITTLE = 0.25
-LONGEST_S = 0.1
-"""The street's cameras take no more for a readout or an exposure."""
-
-PX_PER_K1 = 265.0
-"""About what a pixel is shifted for a k1 of 1."""
-
-GLOSS = 0.25
-"""Of a street, for each factor: its ratio is 0.4 to 0.5 without any and grows with it, but not in proportion."""
+def _threshold(name: str) -> float:
+    return load_effect(name).threshold
 
 
-def _limit(name: str) -> float:
-    return effect_of(name).threshold
+def _in_percent(parameter: str, effect: str) -> Callable[[float, float], str]:
+    """Makes a query whose parameter is a fraction where the threshold is in per cent."""
+    return lambda factor, _: f"&{parameter}={factor * _threshold(effect) / 100:.4g}"
 
 
-def _seconds(parameter: str, name: str) -> Callable[[float, float], str]:
+def _in_seconds(parameter: str, effect: str) -> Callable[[float, float], str]:
+    """Makes a query whose parameter is a duration where the threshold is in pixels."""
+
     def query(factor: float, px_per_s: float) -> str:
-        return f"&{parameter}={min(LONGEST_S, factor * _limit(name) / px_per_s):.4g}"
+        # The street's cameras take no longer durations, however slowly they move.
+        return f"&{parameter}={min(LONGEST_S, factor * _threshold(effect) / px_per_s):.4g}"
 
     return query
 
 
-def _bent(factor: float, _: float) -> str:
-    return f"&distortion={factor * _limit('lens_distortion') / PX_PER_K1:.4g}"
+def _same_at_every_factor(query: str) -> Callable[[float, float], str]:
+    return lambda factor, px_per_s: query
 
 
-PEOPLE_PER_AREA = 3.5
-"""About how many walk beside the lane where they cover a per cent of the images; a street has twenty at most."""
+def _distorted(factor: float, _px_per_s: float) -> str:
+    return f"&distortion={factor * _threshold('lens_distortion') / PX_PER_K1:.4g}"
 
 
-def _crowd(factor: float, _: float) -> str:
-    count = min(20, max(1, round(factor * _limit("nonrigid_actors") * PEOPLE_PER_AREA)))
-    return f"&stride=1&pedestrians={count}&pedestrians_aside_m=5.3"
+def _glossy(factor: float, _px_per_s: float) -> str:
+    return f"&gloss={factor * GLOSS_PER_FACTOR:.4g}"
 
 
+def _crowded(factor: float, _px_per_s: float) -> str:
+    # A street places whole people, so the share of pixels is reached only roughly.
+    people = round(factor * _threshold("nonrigid_actors") * PEOPLE_PER_PERCENT)
+    return f"&stride=1&pedestrians={min(MOST_PEOPLE, max(1, people))}&pedestrians_aside_m=5.3"
+
+
+# Every street has a sky: there is none that does not call for the distant region, so that has no case.
 CASES: dict[str, Case] = {
-    "rigid_actors": Case(lambda *_: "", heldout_psnr, plain="&moving=0&pedestrians=0"),
-    "nonrigid_actors": Case(_crowd, heldout_people, plain="&pedestrians=0"),
-    "rolling_shutter": Case(_seconds("rolling_shutter_s", "rolling_shutter"), beside_psnr, timed=True),
-    "lens_distortion": Case(_bent, heldout_psnr, plain=_bent(LITTLE, 0.0)),
-    "exposure": Case(lambda x, _: f"&exposure_jitter={x * _limit('exposure') / 100:.4g}", heldout_psnr),
-    "motion_blur": Case(_seconds("exposure_s", "motion_blur"), sharp_psnr, timed=True),
-    "view_dependent_colour": Case(lambda x, _: f"&gloss={x * GLOSS:.4g}", heldout_psnr),
-    "lidar_depth": Case(lambda *_: "", heldout_depth, "%", plain="&lidar_beams=1&lidar_azimuths=90"),
-    "anti_aliasing": Case(lambda *_: "", apart_psnr, plain="&standstill=1"),
-    "ego_mask": Case(lambda x, _: f"&bonnet={x * _limit('ego_mask') / 100:.4g}", heldout_psnr),
+    "rigid_actors": Case(_same_at_every_factor(""), heldout_psnr, plain="&moving=0&pedestrians=0"),
+    "nonrigid_actors": Case(_crowded, heldout_people_psnr, plain="&pedestrians=0"),
+    # Held-out frames are sheared as source frames are, and a scene that is sheared too fits them. Only views away
+    # from the path tell the two apart.
+    "rolling_shutter": Case(_in_seconds("rolling_shutter_s", "rolling_shutter"), novel_view_psnr, needs_speed=True),
+    "lens_distortion": Case(_distorted, heldout_psnr, plain=_distorted(MILD_FACTOR, 0.0)),
+    "exposure": Case(_in_percent("exposure_jitter", "exposure"), heldout_psnr),
+    # Held-out frames are blurred too, so an ideal camera in their place is the truth. Three metres beside the path
+    # errors of place would hide most of what is sharp.
+    "motion_blur": Case(_in_seconds("exposure_s", "motion_blur"), sharp_psnr, needs_speed=True),
+    "view_dependent_colour": Case(_glossy, heldout_psnr),
+    "lidar_depth": Case(
+        _same_at_every_factor(""), heldout_depth_score, unit="%", plain="&lidar_beams=1&lidar_azimuths=90"
+    ),
+    # A vehicle that drives sees each thing from many distances: only a standing one does not call for anti-aliasing.
+    # Away from the path footprints differ from those in any image that the scene was made from.
+    "anti_aliasing": Case(_same_at_every_factor(""), footprint_change_psnr, plain="&standstill=1"),
+    "ego_mask": Case(_in_percent("bonnet", "ego_mask"), heldout_psnr),
 }
-"""Those that are modelled and that a street can be made to call for or not. Every street has a sky: there is none that
-does not call for the distant region; and whoever drives sees one thing from many distances: a street that does not call
-for anti-aliasing is one where the vehicle stands, and no factor is asked for. Rolling shutter is judged beside the
-path: held-out frames are sheared as source frames are, and a scene that is sheared too fits them. So is anti-aliasing:
-there footprints are other than in any image that the scene was made from, and over what is seen from far and from near
-alone. Motion blur is judged by what an ideal camera
-would have seen in place of held-out frames, which are blurred, too: three metres beside, errors of place hide most of
-what is sharp."""
+"""The effects that are modelled and that a street can be made to call for or not."""

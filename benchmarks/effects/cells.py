@@ -2,104 +2,157 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from benchmarks.common.bench import NotMeasuredError, Row
-from benchmarks.common.context import threads
-from benchmarks.common.run_stages import reconstruct, seconds_of
-from benchmarks.common.task import value_of
+from benchmarks.common.context import THREADS
+from benchmarks.common.run_stages import reconstruct
+from benchmarks.common.task import require_log_folder
 from benchmarks.effects.cases import CASES
-from benchmarks.effects.measures import beside_psnr, heldout_psnr
+from benchmarks.effects.measures import SceneMeasure, heldout_psnr, novel_view_psnr
 from flows.configuration import load_configuration
-from flows.machine.facts import commit
-from flows.pipeline.log_cache import opened_log
-from flows.pipeline.stage_runner import Job
-from genre_tasks.effects.apply_plan import applied
-from genre_tasks.effects.measurements import Seen
-from genre_tasks.effects.pixel_motion import pixel_speeds
-from genre_tasks.effects.types import EffectsPlan, Fitted
-from genre_tasks.logs.types import Truth
-from genre_tasks.scene.chunk import Chunk
-from genre_tasks.scene.graph import SceneGraph
+from flows.machine.facts import git_commit
+from flows.pipeline.log_cache import cached_log
+from flows.pipeline.stage_runner import Job, open_artifact, read_artifact
+from genre_tasks.effects.apply_plan import apply_plan
+from genre_tasks.effects.measurements import ChunkMeasurements
+from genre_tasks.effects.pixel_motion import measure_pixel_speeds
+from genre_tasks.effects.types import EffectParameters, EffectsPlan
+from genre_tasks.threads import torch_threads
 
 STAGES = ("ingest", "effects", "initial", "gnet")
 
 
 @dataclass(frozen=True)
-class Place:
-    """A chunk of a log, and the store that its stages are kept in."""
+class ChunkLocation:
+    """A chunk of a log, the store that its stages are kept in, and what all of its runs share.
+
+    Attributes:
+        log: URI of the log.
+        chunk: index of the chunk.
+        store: folder of the store.
+        settings: ``section.key=value`` over the preset ``small``.
+    """
 
     log: str
     chunk: int
     store: str
+    settings: tuple[str, ...] = ()
 
     def job(self, *settings: str) -> Job:
-        """Preset ``small`` with settings."""
-        configuration = load_configuration("small", settings=settings).model_dump(mode="json")
-        return Job(self.log, self.chunk, self.store, configuration)
+        """Builds a job with further settings over the preset."""
+        config = load_configuration("small", settings=(*self.settings, *settings))
+        return Job(self.log, self.chunk, self.store, config.model_dump(mode="json"))
 
     def plan(self, *settings: str) -> EffectsPlan:
-        """Of the chunk, under settings."""
+        """Gives the chunk's plan of effects under further settings."""
         job = self.job(*settings)
-        found: EffectsPlan = value_of(job, reconstruct(job, STAGES[:2])["effects"])
-        return found
+        plan: EffectsPlan = read_artifact(job, reconstruct(job, STAGES[:2])["effects"])
+        return plan
 
 
-def on_street(name: str, seed: str, store: str, factor: float) -> Row:
-    """The effect on the street that calls for it so much; factor 0: on one that does not."""
+def measure_on_street(name: str, seed: str, store: str, settings: tuple[str, ...], factor: float) -> Row:
+    """Measures an effect on a street.
+
+    Args:
+        name: of the effect.
+        seed: of the street, with further parameters of its URI if need be.
+        store: folder of the store.
+        settings: ``section.key=value`` over the preset.
+        factor: by which factor the property exceeds the effect's threshold; 0 for a street that does not call for it.
+
+    Raises:
+        NotMeasuredError: no camera of the street moves, and the effect's query needs its speed.
+    """
     case = CASES[name]
-    log = f"synthetic:street?seed={seed}{case.query(factor, _px_per_s(seed, store) if case.timed else 0.0)}"
-    return measure(name, Place(log, 0, store), factor)
+    plain = ChunkLocation(f"synthetic:street?seed={seed}", 0, store, settings)
+    # Measured on the same street: a duration means as many pixels only at that street's speed.
+    px_per_s = _fastest_camera_px_per_s(plain) if case.needs_speed else 0.0
+    return measure_effect(name, replace(plain, log=plain.log + case.query(factor, px_per_s)), factor)
 
 
-def on_real(name: str, path: str, chunk: int, store: str) -> Row:
-    """The effect on a chunk of a PandaSet sequence."""
-    if not Path(path).is_dir():
-        raise NotMeasuredError(f"there is no folder {path}; give it with --set pandaset=PATH")
-    return measure(name, Place(f"pandaset:{path}", chunk, store), -1.0)
+def measure_on_pandaset(name: str, location: ChunkLocation) -> Row:
+    """Measures an effect on a chunk of a real sequence.
+
+    Raises:
+        NotMeasuredError: the sequence's folder is missing.
+    """
+    require_log_folder(location.log)
+    return measure_effect(name, location, factor=-1.0)
 
 
-def measure(name: str, at: Place, factor: float) -> Row:
-    """The effect on and off: its measure, PSNR at 3 m, seconds of plan and GNet."""
-    with threads():
-        auto = at.plan()[name]
-        out: Row = {"effect": name, "log": at.log, "chunk": at.chunk, "factor": factor, "unit": CASES[name].unit}
-        out |= {"value": None if np.isnan(auto.value) else auto.value, "threshold": auto.threshold}
-        out |= {"property_unit": auto.unit, "choice": auto.choice, "commit": commit()}
-        own = at.plan(f"effects.{name}=on").fitted
-        for word in ("on", "off"):
-            out[word] = judged(at, own, CASES[name].measure, f"effects.{name}={word}")
-    return out
+def measure_effect(name: str, location: ChunkLocation, factor: float) -> Row:
+    """Measures an effect on and off.
+
+    Args:
+        name: of the effect.
+        location: the chunk.
+        factor: see :func:`measure_on_street`; negative on a real log.
+
+    Returns:
+        A row: what decides about the effect, and ``on`` and ``off``, see :func:`evaluate_settings`.
+    """
+    with torch_threads(THREADS):
+        # The plan is made of the log alone, before the effect is forced on or off.
+        planned = location.plan()[name]
+        row: Row = {
+            "effect": name,
+            "log": location.log,
+            "chunk": location.chunk,
+            "factor": factor,
+            "unit": CASES[name].unit,
+            # JSON has no NaN.
+            "value": None if np.isnan(planned.value) else planned.value,
+            "threshold": planned.threshold,
+            "property_unit": planned.unit,
+            "choice": planned.choice,
+            "commit": git_commit(),
+        }
+        # Masks come from one plan for both states, else the two would be compared on different pixels.
+        parameters = location.plan(f"effects.{name}=on").parameters
+        for state in ("on", "off"):
+            row[state] = evaluate_settings(location, parameters, CASES[name].measure, f"effects.{name}={state}")
+    return row
 
 
-def judged(
-    at: Place, own: Fitted, by: Callable[[Chunk, SceneGraph, Truth | None], float], *settings: str
+def evaluate_settings(
+    location: ChunkLocation, parameters: EffectParameters, measure: SceneMeasure, *settings: str
 ) -> dict[str, float | None]:
-    """GNet's scene under settings; the vehicle itself, as ``own`` has it, is left out of the judgement."""
-    job = at.job(*settings)
+    """Evaluates GNet's scene under settings.
+
+    Args:
+        location: the chunk.
+        parameters: their masks of the recording vehicle leave it out of the evaluation, whatever the settings are.
+        measure: what the scene is evaluated by.
+        settings: ``section.key=value`` over the preset.
+
+    Returns:
+        ``measure``; PSNR held out and at ±3 m (``None`` without truth) in dB; seconds of GNet and of the plan.
+    """
+    job = location.job(*settings)
     refs = reconstruct(job, STAGES)
-    read, plan, scene = (value_of(job, refs[k]) for k in ("ingest", "effects", "gnet"))
-    shown = applied(read, replace(plan, fitted=replace(plan.fitted, own=own.own)))
-    truth = opened_log(at.log).truth
+    plan = read_artifact(job, refs["effects"])
+    scene = read_artifact(job, refs["gnet"]).scene
+    # Otherwise switching the ego mask would change which pixels are compared, not only what was fitted to them.
+    evaluated = replace(plan, parameters=replace(plan.parameters, ego_masks=parameters.ego_masks))
+    chunk = apply_plan(read_artifact(job, refs["ingest"]), evaluated)
+    truth = cached_log(location.log).truth
     return {
-        "measure": by(shown, scene.scene, truth),
-        "heldout_db": heldout_psnr(shown, scene.scene),
-        "beside_db": None if truth is None else beside_psnr(shown, scene.scene, truth),
-        "gnet_s": seconds_of(job, refs["gnet"])[0],
-        "plan_s": seconds_of(job, refs["effects"])[0],
+        "measure": measure(chunk, scene, truth),
+        "heldout_db": heldout_psnr(chunk, scene),
+        "beside_db": None if truth is None else novel_view_psnr(chunk, scene, truth),
+        "gnet_s": open_artifact(job, refs["gnet"]).manifest.seconds,
+        "plan_s": open_artifact(job, refs["effects"]).manifest.seconds,
     }
 
 
-def _px_per_s(seed: str, store: str) -> float:
-    """How fast the fastest camera of the plain street moves over the scene."""
-    at = Place(f"synthetic:street?seed={seed}", 0, store)
-    job = at.job()
-    chunk: Chunk = value_of(job, reconstruct(job, STAGES[:1])["ingest"])
-    speeds: Sequence[float] = list(pixel_speeds(Seen(chunk, opened_log(at.log).cameras)).values())
+def _fastest_camera_px_per_s(location: ChunkLocation) -> float:
+    job = location.job()
+    chunk = read_artifact(job, reconstruct(job, STAGES[:1])["ingest"])
+    speeds = measure_pixel_speeds(ChunkMeasurements(chunk, cached_log(location.log).cameras)).values()
+    # A standing camera shears and blurs nothing, so no duration reaches the threshold.
     if not speeds:
-        raise NotMeasuredError(f"{at.log}: no camera moves over returns")
+        raise NotMeasuredError(f"{location.log}: no camera moves over returns")
     return max(speeds)

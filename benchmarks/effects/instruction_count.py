@@ -1,6 +1,6 @@
-"""The process whose instructions are counted, see :func:`benchmarks.effects.whole_plans.plain_cost`.
+"""The process whose instructions are counted, see :func:`benchmarks.effects.whole_plans.count_plain_cost`.
 
-python -m benchmarks.effects.instruction_count WORD LOG CHUNK STORE
+python -m benchmarks.effects.instruction_count KIND LOG CHUNK STORE [SETTING …]
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ import sys
 import torch
 
 from benchmarks.common.run_stages import reconstruct
-from benchmarks.common.task import value_of
-from benchmarks.effects.cells import STAGES, Place
-from benchmarks.effects.whole_plans import SHORT
-from flows.pipeline.log_cache import opened_log
+from benchmarks.effects.cells import STAGES, ChunkLocation
+from benchmarks.effects.whole_plans import COUNTED_SETTINGS
+from flows.pipeline.log_cache import cached_log
+from flows.pipeline.stage_runner import read_artifact
 from genre_tasks.config import PipelineConfig
 from genre_tasks.effects.types import EffectsPlan
 from genre_tasks.scene.chunk import Chunk
@@ -22,22 +22,32 @@ from genre_tasks.stages.gnet import gnet
 from genre_tasks.stages.initial import initial
 
 
-def main(word: str, at: Place) -> None:
-    """``start`` ends before the plan; ``none`` has what the street needs set on, and all else off."""
+def main(kind: str, location: ChunkLocation) -> None:
+    """Runs what is counted.
+
+    Args:
+        kind: ``start`` ends before the plan; ``none`` runs with what the street needs set on, and all else off;
+            ``planned`` reads the plan from the store; ``planning`` makes it.
+        location: the chunk, whose stages up to the plan are in the store.
+    """
+    # Waiting threads spin, and their instructions would differ from run to run.
     torch.set_num_threads(1)
-    job = at.job(*SHORT)
+    job = location.job(*COUNTED_SETTINGS)
     config = PipelineConfig.model_validate(job.config)
     refs = reconstruct(job, STAGES[:2])
-    chunk: Chunk = value_of(job, refs["ingest"])
-    plan: EffectsPlan = value_of(job, refs["effects"])
-    if word == "start":
+    chunk: Chunk = read_artifact(job, refs["ingest"])
+    plan: EffectsPlan = read_artifact(job, refs["effects"])
+    # Imports and reading are the same in every kind; this process measures them, to be subtracted.
+    if kind == "start":
         return
-    if word == "planning":
-        plan = effects(config.effects, chunk, opened_log(at.log))
-    if word == "none":
+    # The store would hand over the finished plan, so it is made here once more.
+    if kind == "planning":
+        plan = effects(config.effects, chunk, cached_log(location.log))
+    if kind == "none":
         plan = EffectsPlan()
     gnet(config.gnet, chunk, initial(config.initial, chunk, plan), plan)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], Place(sys.argv[2], int(sys.argv[3]), sys.argv[4]))
+    _, kind, log, chunk, store, *settings = sys.argv
+    main(kind, ChunkLocation(log, int(chunk), store, tuple(settings)))

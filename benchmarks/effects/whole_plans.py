@@ -1,5 +1,5 @@
-"""Whole plans: what ``auto`` leaves of ``on`` where a street has everything, what it costs where it has nothing, and
-whether the optimiser gains from training on logs that have effects."""
+"""Whole plans: what ``auto`` loses against ``on`` where a street has everything, what it costs where it has nothing,
+and whether the optimiser gains from training on logs that have effects."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ import sys
 from pathlib import Path
 
 from benchmarks.common.bench import NotMeasuredError, Row
-from benchmarks.common.context import threads
+from benchmarks.common.context import THREADS
 from benchmarks.common.run_stages import reconstruct
-from benchmarks.effects.cells import STAGES, Place, judged
+from benchmarks.effects.cells import STAGES, ChunkLocation, evaluate_settings
 from benchmarks.effects.measures import every_heldout_psnr, heldout_psnr
-from flows.machine.facts import CHECKOUT, commit
-from flows.training.optimiser_stages import TrainJob
+from flows.machine.facts import CHECKOUT, git_commit
+from flows.training.train_job import TrainJob
+from genre_tasks.threads import torch_threads
 
 EVERYTHING = (
     "&rolling_shutter_s=0.03&exposure_jitter=0.2&white_balance_jitter=0.05&bonnet=0.08&distortion=0.02"
@@ -24,68 +25,125 @@ EVERYTHING = (
 )
 """All but motion blur: drawing its moments row by row takes a quarter of an hour."""
 
-ALL = ("effects=on", "effects.motion_blur=auto")
+ALL_ON = ("effects=on", "effects.motion_blur=auto")
 
-SHAPED = "&rolling_shutter_s=0.03&exposure_jitter=0.2&white_balance_jitter=0.05&distortion=0.02"
-"""What training with effects shows the optimiser, but for the bonnet."""
+TRAINED_EFFECTS = "&rolling_shutter_s=0.03&exposure_jitter=0.2&white_balance_jitter=0.05&distortion=0.02"
+"""The effects that training with effects shows the optimiser, but for the bonnet."""
 
-PLAIN = "&moving=0&pedestrians=0"
-SHORT = ("gnet.iterations=4",)
+NO_ACTORS = "&moving=0&pedestrians=0"
+COUNTED_SETTINGS = ("gnet.iterations=4",)
 """Counting takes some fifty times as long as running."""
 
 COUNTER = ("valgrind", "--tool=cachegrind", "--cache-sim=no", "--cachegrind-out-file=/dev/null")
-COUNTED = re.compile(r"I\s+refs:\s+([\d,]+)")
+COUNT = re.compile(r"I\s+refs:\s+([\d,]+)")
 
 
-def auto_vs_on(seed: str, store: str) -> Row:
-    """Held-out PSNR of a street that has every effect, as planned and with all that can be set on."""
-    at = Place(f"synthetic:street?seed={seed}{EVERYTHING}", 0, store)
-    with threads():
-        own = at.plan(*ALL).fitted
-        out: Row = {"whole": "auto_vs_on", "log": at.log, "commit": commit()}
-        settings = {"auto": ("effects=auto",), "on": ALL}
-        return out | {word: judged(at, own, heldout_psnr, *each) for word, each in settings.items()}
+def compare_auto_with_on(location: ChunkLocation) -> Row:
+    """Measures what a street that has every effect loses by its plan.
 
+    Args:
+        location: the street; ``EVERYTHING`` is added to its URI.
 
-def plain_cost(seed: str, store: str) -> Row:
-    """Instructions of initial scene and GNet on a street without actors, as planned and with nothing but what it needs.
-
-    Counted in a process each by Valgrind (one thread, AVX2), less those of a process that ends before the plan.
-    ``planned`` is given its plan's artifact, ``planning`` makes it.
+    Returns:
+        A row: ``auto``, as planned, and ``on``, with all that can be set on; see
+        :func:`benchmarks.effects.cells.evaluate_settings`.
     """
+    street = _with_query(location, EVERYTHING)
+    with torch_threads(THREADS):
+        parameters = street.plan(*ALL_ON).parameters
+        row: Row = {"whole": "auto_vs_on", "log": street.log, "commit": git_commit()}
+        row["auto"] = evaluate_settings(street, parameters, heldout_psnr, "effects=auto")
+        row["on"] = evaluate_settings(street, parameters, heldout_psnr, *ALL_ON)
+    return row
+
+
+def count_plain_cost(location: ChunkLocation) -> Row:
+    """Counts what a plan costs on a street without actors.
+
+    Instructions of initial scene and GNet are counted in a process each by Valgrind (one thread, AVX2), less those of
+    a process that ends before the plan.
+
+    Args:
+        location: the street; ``NO_ACTORS`` is added to its URI.
+
+    Returns:
+        A row: instructions by kind of process, and the cost in per cent of a run with nothing but what the street
+        needs: ``planned`` reads its plan from the store, ``planning`` makes it.
+
+    Raises:
+        NotMeasuredError: Valgrind is not installed, or fails.
+    """
+    # Asked first: the stages before the count take minutes.
     if shutil.which("valgrind") is None:
         raise NotMeasuredError("valgrind is not installed")
-    at = Place(f"synthetic:street?seed={seed}{PLAIN}", 0, store)
-    with threads():
-        reconstruct(at.job(), STAGES[:2])
-    counted = {word: _instructions(at, word) for word in ("start", "none", "planned", "planning")}
+    street = _with_query(location, NO_ACTORS)
+    with torch_threads(THREADS):
+        reconstruct(street.job(), STAGES[:2])
+    # Instructions and not seconds: two per cent would be lost in the noise of timing.
+    counted = {kind: _count_instructions(street, kind) for kind in ("start", "none", "planned", "planning")}
+    # Imports and reading would dilute the cost, so they are taken off the base too.
     base = counted["none"] - counted["start"]
-    cost = {word: 100 * (counted[word] - counted["none"]) / base for word in ("planned", "planning")}
-    return {"whole": "plain_cost", "log": at.log, "commit": commit(), "instructions": counted, "cost_percent": cost}
+    cost = {kind: 100 * (counted[kind] - counted["none"]) / base for kind in ("planned", "planning")}
+    return {
+        "whole": "plain_cost",
+        "log": street.log,
+        "commit": git_commit(),
+        "instructions": counted,
+        "cost_percent": cost,
+    }
 
 
-def trained(log: str, chunk: int, store: str, folder: str) -> Row:
-    """GNet's scene as planned, by the weights that ship, and by those of ``genre train gnet --recipe effects``."""
+def compare_trained(location: ChunkLocation, folder: str) -> Row:
+    """Evaluates GNet's scene as planned, by the weights that ship and by weights trained with and without effects.
+
+    Args:
+        location: the chunk.
+        folder: of ``genre train gnet --recipe effects``.
+
+    Returns:
+        A row: ``shipped``, ``plain`` and ``effects``, see :func:`benchmarks.effects.cells.evaluate_settings`.
+
+    Raises:
+        NotMeasuredError: there is no folder.
+    """
     if not folder:
+        # Training takes hours, so this benchmark never starts one by itself.
         raise NotMeasuredError("no training; run `genre train gnet --recipe effects`, give its folder: training=PATH")
-    job, at = TrainJob(folder, "effects"), Place(log, chunk, store)
-    with threads():
-        own = at.plan().fitted
-        out: Row = {"whole": "trained", "log": log, "chunk": chunk, "commit": commit()}
-        out["shipped"] = judged(at, own, every_heldout_psnr)
-        for stage in job.table():
-            weights = f"gnet.weights={job.weights(stage.name)}"
-            out[stage.name.partition("/")[2]] = judged(at, own, every_heldout_psnr, weights)
-    return out
+    job = TrainJob(folder, "effects")
+    with torch_threads(THREADS):
+        parameters = location.plan().parameters
+        row: Row = {"whole": "trained", "log": location.log, "chunk": location.chunk, "commit": git_commit()}
+        row["shipped"] = evaluate_settings(location, parameters, every_heldout_psnr)
+        for stage in job.stages():
+            weights = f"gnet.weights={job.stage_weights(stage.name)}"
+            variant = stage.name.partition("/")[2]
+            row[variant] = evaluate_settings(location, parameters, every_heldout_psnr, weights)
+    return row
 
 
-def _instructions(at: Place, word: str) -> int:
+def _with_query(location: ChunkLocation, query: str) -> ChunkLocation:
+    return ChunkLocation(location.log + query, location.chunk, location.store, location.settings)
+
+
+def _count_instructions(location: ChunkLocation, kind: str) -> int:
     module = (sys.executable, "-P", "-m", "benchmarks.effects.instruction_count")
-    command = [*COUNTER, *module, word, at.log, str(at.chunk), at.store]
-    environment = os.environ | {"PYTHONPATH": str(CHECKOUT), "PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "1"}
-    environment["GENRE_RENDER_ISA"] = "avx2"  # Valgrind knows no AVX-512
-    done = subprocess.run(command, cwd=Path.cwd(), env=environment, capture_output=True, text=True, check=False)
-    found = COUNTED.search(done.stderr)
+    place = (location.log, str(location.chunk), location.store, *location.settings)
+    # Valgrind knows no AVX-512. A fixed hash seed and one thread make the count the same from run to run.
+    environment = os.environ | {
+        "PYTHONPATH": str(CHECKOUT),
+        "PYTHONHASHSEED": "0",
+        "OMP_NUM_THREADS": "1",
+        "GENRE_RENDER_ISA": "avx2",
+    }
+    done = subprocess.run(
+        [*COUNTER, *module, kind, *place],
+        cwd=Path.cwd(),
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    found = COUNT.search(done.stderr)
     if done.returncode or found is None:
         raise NotMeasuredError(f"valgrind ended with {done.returncode}: {done.stderr[-500:]}")
     return int(found[1].replace(",", ""))

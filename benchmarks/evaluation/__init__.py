@@ -1,6 +1,6 @@
 """Whether budgets are kept and used, and whether the reliable range tells good views from bad ones.
 
-genre bench evaluation --json docs/benchmarks/evaluation.json [--set rounds=1] [--set seeds=1001] [--set budgets=30,60]
+genre bench evaluation --json FILE [--set rounds=1] [--set seeds=1001] [--set budgets=30,60]
 
 A round runs each budget once, on the seeds in turn; the next one shifts the seeds by one, until five rounds have every
 budget on every seed.
@@ -11,21 +11,29 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from functools import partial
 
-from benchmarks.common.bench import Cell, Row
+from benchmarks.common.bench import (
+    TINY_SETTINGS,
+    TINY_STREET,
+    Bench,
+    Cell,
+    Row,
+    SmallestForm,
+    list_not_measured,
+    settings_from_options,
+    split_option,
+)
 from benchmarks.common.claims import Claim
-from benchmarks.evaluation.budgets import claims_of as budget_claims
-from benchmarks.evaluation.budgets import run_within
-from benchmarks.evaluation.budgets import table_of as budget_table
-from benchmarks.evaluation.reliability import claims_of as reliability_claims
-from benchmarks.evaluation.reliability import ranked
-from benchmarks.evaluation.reliability import table_of as reliability_table
+from benchmarks.evaluation.budgets import budget_claims, budget_table, run_with_budget
+from benchmarks.evaluation.reliability import measure_street, reliability_claims, reliability_table
 from flows.configuration import load_configuration
-from flows.pipeline.definition import BY_NAME, stage_weights
+from flows.pipeline.definition import STAGE_BY_NAME, digest_stage_weights
 
-RANKED_S, START_S = 150.0, 30.0
+GUARDS_S = 150.0
+START_S = 30.0
+"""What a command takes beyond its budget: start of Python and Prefect, evaluation, report."""
 
 
-class Evaluation:
+class EvaluationBench:
     """A cell for each budget and seed, and one for each seed's guards.
 
     Budgets start where the shortest setting ends on two cores: start-up, drawing a street and GNet's first iterations
@@ -40,6 +48,7 @@ class Evaluation:
         "stages": "gnet,enet",
         "store": "genre-store",
         "table": "",
+        "settings": "",
     }
     code: tuple[str, ...] = (
         "benchmarks.evaluation.budgets",
@@ -52,40 +61,54 @@ class Evaluation:
         "genre_tasks.stages.fnet",
         "genre_tasks.logs.synthetic",
     )
+    smallest = SmallestForm(
+        {"seeds": TINY_STREET, "stages": "gnet", "budgets": "", "settings": TINY_SETTINGS}, "guards street"
+    )
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
-        """``quick``: one round, one seed's guards."""
-        seeds, budgets, stages = ([x for x in options[k].split(",") if x] for k in ("seeds", "budgets", "stages"))
-        small = load_configuration("small")
+        """Lists the guards of each seed, then the budgets; ``quick``: one round, one seed's guards."""
+        seeds = split_option(options["seeds"])
+        budgets = split_option(options["budgets"])
+        settings = settings_from_options(options)
+        config = load_configuration("small", settings=settings)
         parameters = {
-            "configuration": small.model_dump(mode="json"),
-            "weights": [stage_weights(BY_NAME[s], small) for s in ("gnet", "fnet", "enet")],
+            "configuration": config.model_dump(mode="json"),
+            "weights": [digest_stage_weights(STAGE_BY_NAME[s], config) for s in ("gnet", "fnet", "enet")],
             "table": options["table"],
         }
-        out = []
+        cells = []
         for seed in seeds[:1] if quick else seeds:
-            for stage in stages:
-                measure = partial(ranked, seed, stage, options["store"])
-                out.append(Cell(f"guards street {seed} {stage}", RANKED_S, measure, parameters))
+            for stage in split_option(options["stages"]):
+                guards = partial(measure_street, seed, stage, options["store"], settings)
+                cells.append(Cell(f"guards street {seed} {stage}", GUARDS_S, guards, parameters))
+        # More rounds than seeds would only repeat cells.
         for k in range(1 if quick else min(len(seeds), int(options["rounds"]))):
             for i, budget in enumerate(budgets):
+                # Shifted by one each round, so that after some rounds every budget has met every seed.
                 seed = seeds[(i + k) % len(seeds)]
-                measure = partial(run_within, seed, float(budget), options["table"])
-                out.append(Cell(f"budget {budget} s street {seed}", float(budget) + START_S, measure, parameters))
-        return out
+                run = partial(run_with_budget, seed, float(budget), options["table"], settings)
+                cells.append(Cell(f"budget {budget} s street {seed}", float(budget) + START_S, run, parameters))
+        return cells
 
     def claims(self, rows: Mapping[str, Row]) -> Iterator[Claim]:
-        """Budgets kept, used, and worth it; guards in the order of the truth."""
-        yield from budget_claims([r for r in rows.values() if "budget_s" in r])
-        yield from reliability_claims([r for r in rows.values() if "views" in r])
+        """Claims that budgets are kept, used and worth it, and that guards rank views as the truth does."""
+        yield from budget_claims(_budget_rows(rows))
+        yield from reliability_claims(_guard_rows(rows))
 
     def table(self, rows: Mapping[str, Row]) -> Iterator[str]:
-        """Both tables, and what was not measured."""
-        yield from budget_table([r for r in rows.values() if "budget_s" in r])
+        """Gives both tables, and what was not measured."""
+        yield from budget_table(_budget_rows(rows))
         yield ""
-        yield from reliability_table([r for r in rows.values() if "views" in r])
-        for name in (n for n, r in rows.items() if "not_measured" in r):
-            yield f"\n{name}: not measured: {rows[name]['not_measured']}"
+        yield from reliability_table(_guard_rows(rows))
+        yield from list_not_measured(rows)
 
 
-EVALUATION = Evaluation()
+def _budget_rows(rows: Mapping[str, Row]) -> list[Row]:
+    return [r for r in rows.values() if "budget_s" in r]
+
+
+def _guard_rows(rows: Mapping[str, Row]) -> list[Row]:
+    return [r for r in rows.values() if "views" in r]
+
+
+EVALUATION: Bench = EvaluationBench()

@@ -10,42 +10,71 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.common.bench import NotMeasuredError, Row
 from benchmarks.common.claims import Claim, claim
-from flows.budget.chooser import BORDER_S
-from flows.budget.cost_table import Point, load, shipped_table
-from flows.machine.facts import CHECKOUT, commit
-from flows.pipeline.definition import reconstructing_until
+from flows.budget.chooser import STAGE_OVERHEAD_S
+from flows.budget.cost_table import CostPoint, CostTable, find_shipped_table, load_cost_table
+from flows.experiments.warm_up import TINY_LOG
+from flows.machine.facts import CHECKOUT, git_commit
+from flows.pipeline.definition import stages_until
 
-JUDGED = ("evaluate.shifts_m=[3.0]", "evaluate.every=4", "evaluate.bootstrap=0", "evaluate.pictures=0")
-"""Of the evaluation, which no budget counts, as much as the claims need; no snapshots for its curve."""
+EVALUATION_SETTINGS = (
+    "evaluate.shifts_m=[3.0]",
+    "evaluate.every=4",
+    "evaluate.bootstrap=0",
+    "evaluate.pictures=0",
+    "gnet.snapshots=0",
+    "enet.snapshots=0",
+)
+"""No more evaluation than the claims need, which no budget counts; no snapshots for its curve."""
 
-UNTOLD = ("gnet.snapshots=0", "enet.snapshots=0")
 COMMAND = (sys.executable, "-P", "-c", "from flows.cli.main import main; main()")
-MEASURE = "shift_3m/perceptual"
-OVER, LEAST_USED = 1.15, 0.7
+DISTANCE = "shift_3m/perceptual"
+KEPT_SHARE = 0.9
+MOST_OVERRUN = 1.15
+LEAST_USED = 0.7
+DISTANCE_NOISE = 0.01
+"""Three standard deviations of the distance over seeds and runs of one setting (a sweep says 0.001 to 0.003)."""
 
 
-def run_within(seed: str, budget_s: float, table: str) -> Row:
-    """One run of a street of preset ``small``: seconds used, what was chosen at each border, and its accuracy.
+def run_with_budget(seed: str, budget_s: float, table: str, settings: Sequence[str] = ()) -> Row:
+    """Runs a street of the preset ``small`` within a budget.
 
-    ``command_s`` is the whole command's, evaluation and report included.
+    Args:
+        seed: of the street, with further parameters of its URI if need be.
+        budget_s: seconds.
+        table: path of a sweep's table; the shipped one if empty.
+        settings: ``section.key=value`` over the preset.
+
+    Returns:
+        A row: seconds used, what was chosen at each border, and the accuracy. ``command_s`` is the whole command's,
+        evaluation and report included.
+
+    Raises:
+        NotMeasuredError: the command fails.
     """
     log = f"synthetic:street?seed={seed}"
-    home = Path.cwd() / ".genre" / "prefect-budgets"
-    if not home.is_dir():  # a user's first run ever makes Prefect's database: some twelve seconds
-        _run("synthetic:street?seed=900&frames=8&cameras=1", home, "--preset", "demo")
+    prefect_home = Path.cwd() / ".genre" / "prefect-budgets"
+    # A user's first run ever makes Prefect's database, which takes some twelve seconds that are no run's.
+    if not prefect_home.is_dir():
+        with tempfile.TemporaryDirectory() as store:
+            _run_genre(TINY_LOG, prefect_home, "--preset", "demo", "--store", store)
+    options = ["--preset", "small"]
+    for setting in (*EVALUATION_SETTINGS, *settings):
+        options += ["--set", setting]
+    if table:
+        options += ["--table", table]
     with tempfile.TemporaryDirectory() as store:
-        sets = [part for setting in (*JUDGED, *UNTOLD) for part in ("--set", setting)]
-        more = ["--table", table] if table else []
+        # The whole command is timed from outside, because a run cannot time its own start of Python.
         began = time.perf_counter()
-        out = _run(log, home, "--budget", f"{budget_s:g}s", *sets, *more, "--store", store, "--json")
+        out = _run_genre(log, prefect_home, "--budget", f"{budget_s:g}s", *options, "--store", store, "--json")
         command_s = time.perf_counter() - began
+    # The record is the last line; warnings of libraries may come before it.
     record = json.loads(out.strip().splitlines()[-1])
     (chunk,) = record["chunks"]
     (chosen,) = record["budget"]["chunks"]
@@ -62,85 +91,122 @@ def run_within(seed: str, budget_s: float, table: str) -> Row:
         "choices": chosen["choices"],
         "table": table,
         "seconds": {n: s["seconds"] for n, s in stages.items() if "/" not in n},
-        "metrics": {n: metrics[n] for n in ("interpolation/psnr", "shift_3m/psnr", MEASURE)},
-        "commit": commit(),
+        "metrics": {n: metrics[n] for n in ("interpolation/psnr", "shift_3m/psnr", DISTANCE)},
+        "commit": git_commit(),
     }
 
 
-def _run(log: str, home: Path, *arguments: str) -> str:
-    """``genre run`` to its end: what it prints."""
-    with tempfile.TemporaryDirectory() as store:
-        own = () if "--store" in arguments else ("--store", store)
-        environment = os.environ | {"PYTHONPATH": str(CHECKOUT), "PREFECT_HOME": str(home)}
-        command = [*COMMAND, "run", log, *arguments, *own]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+def _run_genre(log: str, prefect_home: Path, *arguments: str) -> str:
+    """Runs ``genre run`` to its end, and gives what it prints."""
+    # A home of its own, so that a user's Prefect server and its settings play no part.
+    environment = os.environ | {"PYTHONPATH": str(CHECKOUT), "PREFECT_HOME": str(prefect_home)}
+    command = [*COMMAND, "run", log, *arguments]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         raise NotMeasuredError(f"genre run ended with {done.returncode}: {done.stderr[-500:]}")
     return done.stdout
 
 
-def claims_of(rows: Sequence[Row]) -> Iterator[Claim]:
-    """Kept by nine of ten and never passed by more than 15 %; used where something costlier fits; worth it."""
-    logs = sorted({r["log"] for r in rows})
-    data = f"{len(rows)} runs, budgets {', '.join(f'{b:g}' for b in sorted({r['budget_s'] for r in rows}))} s; {logs}"
-    parts = [r["used_s"] / r["budget_s"] for r in rows]
-    kept = None if not rows else sum(p <= 1 for p in parts) / len(rows)
-    yield claim("evaluation.budget_kept", kept, ">=", 0.9, "share of runs", data, len(rows))
-    worst = max(parts, default=None)
-    note = f"seconds used over the budget, the worst run; {data}"
-    yield claim("evaluation.budget_overrun", worst, "<=", OVER, "ratio", note, len(rows))
-    costlier = [r["used_s"] / r["budget_s"] for r in rows if left_out_s(r) <= r["budget_s"] - r["used_s"]]
-    note = f"seconds used over the budget, the least of the runs that had time for a better setting; {data}"
-    least = min(costlier, default=None)
-    yield claim("evaluation.budget_used", least, ">=", LEAST_USED, "ratio", note, len(costlier))
-    note = f"{MEASURE}: how much it rises from a budget to the next on one street, the worst; {data}"
-    falls = [after - before for own in _by_log(rows) for before, after in itertools.pairwise(own)]
-    yield claim("evaluation.budget_worth", max(falls, default=None), "<=", SPREAD, "distance", note, len(falls))
+def budget_claims(rows: Sequence[Row]) -> Iterator[Claim]:
+    """Claims that budgets are kept, not passed by much, used where something costlier fits, and worth it.
 
-
-SPREAD = 0.01
-"""Three standard deviations of the distance over seeds and runs of one setting (a sweep says 0.001 to 0.003)."""
-
-
-def left_out_s(row: Row) -> float:
-    """What the nearest better setting would have taken beyond what was used, at this run's own pace.
-
-    Infinite where there is none. In hindsight: by the table's seconds of the stages after ingest, times what the run's
-    took over the table's.
+    Args:
+        rows: see :func:`run_with_budget`.
     """
-    table = load(Path(row["table"]) if row.get("table") else shipped_table("small"), "small")
-    own = next(p for p in table.points if p.name == row["choices"][-1]["point"])
+    logs = sorted({r["log"] for r in rows})
+    budgets = ", ".join(f"{b:g}" for b in sorted({r["budget_s"] for r in rows}))
+    data = f"{len(rows)} runs, budgets {budgets} s; {logs}"
+    used = [_used_part(r) for r in rows]
+    kept = None if not rows else sum(part <= 1 for part in used) / len(rows)
+    yield claim("evaluation.budget_kept", kept, ">=", KEPT_SHARE, "share of runs", data, len(rows))
+    note = f"seconds used over the budget, the worst run; {data}"
+    yield claim("evaluation.budget_overrun", max(used, default=None), "<=", MOST_OVERRUN, "ratio", note, len(rows))
+    # A run that ends early is only to blame where a better setting would have fitted.
+    with_time_left = [_used_part(r) for r in rows if seconds_to_better_setting(r) <= r["budget_s"] - r["used_s"]]
+    least = min(with_time_left, default=None)
+    note = f"seconds used over the budget, the least of the runs that had time for a better setting; {data}"
+    yield claim("evaluation.budget_used", least, ">=", LEAST_USED, "ratio", note, len(with_time_left))
+    rises = [after - before for values in _distances_by_log(rows) for before, after in itertools.pairwise(values)]
+    note = f"{DISTANCE}: how much it rises from a budget to the next on one street, the worst; {data}"
+    worst = max(rises, default=None)
+    yield claim("evaluation.budget_worth", worst, "<=", DISTANCE_NOISE, "distance", note, len(rises))
+
+
+def seconds_to_better_setting(row: Row) -> float:
+    """Estimates in hindsight what the nearest better setting would have taken beyond what was used.
+
+    Args:
+        row: see :func:`run_with_budget`.
+
+    Returns:
+        The table's seconds of the stages after ingest, times what the run's took over the table's; infinite where no
+        setting is better.
+    """
+    table = load_cost_table(Path(row["table"]) if row.get("table") else find_shipped_table("small"), "small")
+    chosen = next(p for p in table.points if p.name == row["choices"][-1]["point"])
+    foreseen = _foreseen_seconds(chosen, table)
     done = [s for s in row["seconds"] if s != "ingest"]
-    foreseen = {s: table.cold.get(s, 0.0) + BORDER_S for s in reconstructing_until("enet")}
-    pace = sum(row["seconds"][s] + BORDER_S for s in done) / sum(own.seconds.get(s, 0.0) + foreseen[s] for s in done)
-
-    def more(point: Point) -> float:
-        stages = set(point.seconds) | set(own.seconds)
-        both = {s: [p.seconds[s] + foreseen[s] if s in p.seconds else 0.0 for p in (point, own)] for s in stages}
-        return pace * sum(theirs - ours for s, (theirs, ours) in both.items() if s != "ingest")
-
-    better = [more(p) for p in table.points if p.accuracy > own.accuracy]
-    return min((s for s in better if s > 0), default=math.inf)
-
-
-def _by_log(rows: Sequence[Row]) -> list[list[float]]:
-    logs = {r["log"] for r in rows}
-    own = [sorted((r for r in rows if r["log"] == log), key=lambda r: float(r["budget_s"])) for log in sorted(logs)]
-    return [[float(r["metrics"][MEASURE]) for r in part] for part in own]
+    # A stage that the table's setting does not have still has its border and first calls.
+    extra = _extra_seconds(table)
+    measured_s = sum(row["seconds"][s] + STAGE_OVERHEAD_S for s in done)
+    # One factor for the run, because the machine's speed differs from that of the table's.
+    pace = measured_s / sum(foreseen.get(s, extra[s]) for s in done)
+    costlier = []
+    for point in table.points:
+        if point.accuracy > chosen.accuracy:
+            better = _foreseen_seconds(point, table)
+            stages = (better.keys() | foreseen.keys()) - {"ingest"}
+            costlier.append(pace * sum(better.get(s, 0.0) - foreseen.get(s, 0.0) for s in stages))
+    # A better setting that is also quicker is no reason: the planner never passes it over for lack of time.
+    return min((s for s in costlier if s > 0), default=math.inf)
 
 
-def table_of(rows: Sequence[Row]) -> Iterator[str]:
-    """A line a run."""
+def _foreseen_seconds(point: CostPoint, table: CostTable) -> dict[str, float]:
+    """Gives what the stages of a setting take on the table's machine, by stage."""
+    extra = _extra_seconds(table)
+    return {stage: seconds + extra[stage] for stage, seconds in point.seconds.items()}
+
+
+def _extra_seconds(table: CostTable) -> Mapping[str, float]:
+    """Gives what each stage takes beyond its warm seconds: first calls, and what lies between stages."""
+    return {s: table.first_call_s.get(s, 0.0) + STAGE_OVERHEAD_S for s in stages_until("enet")}
+
+
+def _used_part(row: Row) -> float:
+    return float(row["used_s"] / row["budget_s"])
+
+
+def _distances_by_log(rows: Sequence[Row]) -> list[list[float]]:
+    """Gives the distance of each log's runs, by ascending budget."""
+    out = []
+    for log in sorted({r["log"] for r in rows}):
+        # Only budgets of one street are compared: streets differ more than budgets do.
+        runs = sorted((r for r in rows if r["log"] == log), key=lambda r: float(r["budget_s"]))
+        out.append([float(r["metrics"][DISTANCE]) for r in runs])
+    return out
+
+
+def budget_table(rows: Sequence[Row]) -> Iterator[str]:
+    """Gives a line for each run, and the median part of the budgets that was used.
+
+    Args:
+        rows: see :func:`run_with_budget`.
+    """
     yield "| budget, s | log | used, s | part | settings | ends at | choices | held-out PSNR | perceptual at 3 m |"
     yield "|---|---|---|---|---|---|---|---|---|"
     for r in sorted(rows, key=lambda r: (r["budget_s"], r["log"])):
-        part, metrics = r["used_s"] / r["budget_s"], r["metrics"]
-        names = " → ".join(c["point"] for c in r["choices"])
-        values = f"{metrics['interpolation/psnr']:.2f} | {metrics[MEASURE]:.3f}"
-        settings = ", ".join(r["settings"]) or "the preset"
-        yield (
-            f"| {r['budget_s']:g} | {r['log'].partition('?')[2]} | {r['used_s']:.1f} | {part:.2f} | {settings} | "
-            f"{r['end']} | {names} | {values} |"
+        metrics = r["metrics"]
+        columns = (
+            f"{r['budget_s']:g}",
+            r["log"].partition("?")[2],
+            f"{r['used_s']:.1f}",
+            f"{_used_part(r):.2f}",
+            ", ".join(r["settings"]) or "the preset",
+            r["end"],
+            " → ".join(c["point"] for c in r["choices"]),
+            f"{metrics['interpolation/psnr']:.2f}",
+            f"{metrics[DISTANCE]:.3f}",
         )
+        yield f"| {' | '.join(columns)} |"
     if rows:
-        yield f"\nMedian part used: {np.median([r['used_s'] / r['budget_s'] for r in rows]):.2f}"
+        yield f"\nMedian part used: {np.median([_used_part(r) for r in rows]):.2f}"

@@ -1,91 +1,162 @@
 """What is measured of the fixer on one log: GNet's renders beside the path before and after it.
 
-On a synthetic log the ray-cast truth judges each view; on a real one the kernel distance to the chunk's real images.
+On a synthetic log the ray-cast truth is what views are compared with; on a real one the kernel distance to the chunk's
+real images.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from benchmarks.common.bench import Row
-from benchmarks.common.context import threads
-from benchmarks.common.novel_view_truth import TRUE_VIEWS, true_targets, views_at
-from benchmarks.common.pipeline_inputs import Steps, steps_of
-from benchmarks.common.scores import psnr_of
+from benchmarks.common.context import THREADS
+from benchmarks.common.novel_view_truth import TRUE_VIEWS, load_true_targets, views_at_shift
+from benchmarks.common.pipeline_inputs import PipelineInputs, load_pipeline_inputs
+from benchmarks.common.scores import psnr_per_view
 from benchmarks.common.task import SIDE_M
+from benchmarks.fixer.flicker import measure_flicker
 from benchmarks.optimiser.enhancement import BOOTSTRAP
-from flows.pipeline.log_cache import opened_log
-from flows.training.fixer_training import WEIGHTS, FixerJob
+from flows.training.fixer_job import WEIGHTS_FILE, FixerJob
 from genre_tasks.config import FnetConfig
 from genre_tasks.fixer.network import Fnet
-from genre_tasks.fixer.source_images import recorded
-from genre_tasks.fixer.warping import MIN_ALPHA, SourceImage, surface_of, warp
+from genre_tasks.fixer.source_images import load_source_images
 from genre_tasks.fixer.weights import load_fnet
 from genre_tasks.metrics.distribution_distances import kernel_difference, kernel_distance
 from genre_tasks.metrics.perceptual import perceptual_distance
-from genre_tasks.metrics.scoring import BOOTSTRAP_SEED, FeatureSet, real_images
-from genre_tasks.scene.chunk import Actor, Chunk
+from genre_tasks.metrics.scoring import BOOTSTRAP_SEED, FeatureSet, real_image_features
+from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.novel_views import NovelView, NovelViews
-from genre_tasks.stages.fnet import fix_views, load_configured, need
+from genre_tasks.stages.fnet import estimate_need, fix_views, load_configured_fnet
 from genre_tasks.stages.novel_views import render_novel
+from genre_tasks.threads import torch_threads
 
 KERNEL_SHIFTS_M = (1.0, 2.0, 3.0)
-TIMED_RUNS = 3
+GATE_VIEWS = 6
+"""Number of views at each shift of which it is measured whether they need fixing."""
 
-GATE_SHIFTS_M, GATE_VIEWS = (0.25, 0.5, 1.0, 2.0, SIDE_M), 6
-"""Where it is looked at whether views call for fixing, and how many views there."""
-
-EVERYTHING = "render+reference+lidar"
-ABLATIONS = ("render", "render+reference", "reference+lidar", EVERYTHING)
+ALL_INPUTS = "render+reference+lidar"
+ABLATIONS = ("render", "render+reference", "reference+lidar", ALL_INPUTS)
 """Which inputs a fixer is trained with: paper Table 3's rows src, src + ref, ref + LiDAR, and all."""
 
 
-def measure_fixer(log: str, chunk: int, store: str, ablations: str) -> Row:
-    """One cell: quality beside the path, flicker, what becomes of clean images, seconds a view, fewer inputs."""
-    with threads():
-        steps = steps_of(log, chunk, store, 0, enet=False)
-        config = steps.config.fnet
-        network = load_configured(config)
-        out: Row = {"log": log, "chunk": chunk, "flicker": flicker_row(network, config, steps, log)}
-        truth = true_targets(log, store, steps.chunk, SIDE_M)
-        if truth:
-            novel = _rendered(steps, views_at(steps.chunk, SIDE_M, TRUE_VIEWS))
-            images = torch.stack([t.image.image for t in truth])
-            out["truth"] = truth_row(network, config, steps.chunk, novel, images)
-            loose = steps_of(log, chunk, store, 0, False, "gnet.constrain_ground=false")
-            novel_loose = _rendered(loose, novel.views)
-            out["loose"] = truth_row(network, config, steps.chunk, novel_loose, images)
-            out["inputs"] = {
-                inputs: inputs_row(load_fnet(path), config, steps.chunk, novel, images)
-                for inputs, path in ablated(ablations).items()
-            }
-            out["gate"] = [gate_row(network, config, steps, log, store, shift) for shift in GATE_SHIFTS_M]
+@dataclass(frozen=True)
+class FixerCase:
+    """What one cell measures.
+
+    Attributes:
+        log: URI of the log.
+        chunk: index of the chunk.
+        store: folder of the store.
+        ablations: folder of fixers that were trained with fewer inputs.
+        gate_shifts_m: shifts at which it is measured whether views need fixing, metres.
+        timed_runs: how often the stage is timed.
+        settings: ``section.key=value`` over the preset ``small``.
+    """
+
+    log: str
+    chunk: int
+    store: str
+    ablations: str
+    gate_shifts_m: tuple[float, ...]
+    timed_runs: int
+    settings: tuple[str, ...] = ()
+
+    def inputs(self, *settings: str) -> PipelineInputs:
+        """Runs the pipeline up to FNet, with further settings over the preset."""
+        return load_pipeline_inputs(self.log, self.chunk, self.store, 0, False, *self.settings, *settings)
+
+    def true_images(self, chunk: Chunk, shift_m: float, count: int) -> Tensor | None:
+        """Gives ray-cast images [V, H, W, 3] at a shift; ``None`` where the log has no truth."""
+        targets = load_true_targets(self.log, self.store, chunk, shift_m, count)
+        return torch.stack([t.image.pixels for t in targets]) if targets else None
+
+
+def measure_fixer(case: FixerCase) -> Row:
+    """Measures one cell.
+
+    Args:
+        case: what to measure.
+
+    Returns:
+        A row: ``flicker`` and ``time``; with a truth ``truth``, ``loose`` (the same of a scene whose ground is not
+        constrained), ``inputs`` and ``gate``; without it ``kernel``.
+
+    Raises:
+        NotMeasuredError: the log's folder is missing.
+    """
+    with torch_threads(THREADS):
+        # The pipeline runs inside the block, so that its stages have as many threads as the timing below.
+        inputs = case.inputs()
+        config = inputs.config.fnet
+        network = load_configured_fnet(config)
+        row: Row = {"log": case.log, "chunk": case.chunk}
+        row["flicker"] = measure_flicker(network, config, inputs, case.log)
+        truth = case.true_images(inputs.chunk, SIDE_M, TRUE_VIEWS)
+        if truth is not None:
+            row |= _measure_against_truth(network, case, inputs, truth)
         else:
-            real = real_images(steps.chunk)
-            out["kernel"] = {
-                f"{shift:g}": kernel_row(network, config, steps, views_at(steps.chunk, shift), real)
+            real = real_image_features(inputs.chunk)
+            row["kernel"] = {
+                f"{shift:g}": measure_kernel(network, config, inputs, views_at_shift(inputs.chunk, shift), real)
                 for shift in KERNEL_SHIFTS_M
             }
-        novel = _rendered(steps, views_at(steps.chunk, SIDE_M))
-        return out | {"time": time_row(network, config, steps.chunk, novel)}
+        # All views at this shift and not a sample: batches have to be full, as in use.
+        novel = render_views_for_fixer(inputs, views_at_shift(inputs.chunk, SIDE_M))
+        return row | {"time": measure_seconds(network, config, inputs.chunk, novel, case.timed_runs)}
 
 
-def _rendered(steps: Steps, views: Sequence[NovelView]) -> NovelViews:
-    return render_novel(steps.chunk, steps.gnet, views, steps.config.novel_views.lidar_max_points)
+def _measure_against_truth(network: Fnet, case: FixerCase, inputs: PipelineInputs, truth: Tensor) -> Row:
+    config = inputs.config.fnet
+    novel = render_views_for_fixer(inputs, views_at_shift(inputs.chunk, SIDE_M, TRUE_VIEWS))
+    # A scene with a worse road shows whether the fixer repairs what the optimiser would otherwise prevent.
+    unconstrained = case.inputs("gnet.constrain_ground=false")
+    novel_unconstrained = render_views_for_fixer(unconstrained, novel.views)
+    return {
+        "truth": compare_with_truth(network, config, inputs.chunk, novel, truth),
+        "loose": compare_with_truth(network, config, inputs.chunk, novel_unconstrained, truth),
+        "inputs": {
+            name: score_ablation(load_fnet(path), config, inputs.chunk, novel, truth)
+            for name, path in find_ablation_weights(case.ablations).items()
+        },
+        "gate": [measure_gate(network, case, inputs, shift) for shift in case.gate_shifts_m],
+    }
+
+
+def render_views_for_fixer(inputs: PipelineInputs, views: Sequence[NovelView]) -> NovelViews:
+    """Renders GNet's scene with all that the fixer reads beside the colours.
+
+    Args:
+        inputs: the scene and its chunk.
+        views: V of one size.
+
+    Returns:
+        Colours, depths and LiDAR maps of the views.
+    """
+    return render_novel(inputs.chunk, inputs.gnet, views, inputs.config.novel_views.lidar_max_points)
 
 
 @torch.no_grad()
-def truth_row(network: Fnet, config: FnetConfig, chunk: Chunk, novel: NovelViews, truth: Tensor) -> Row:
-    """PSNR (dB) and perceptual distance of each view to ``truth`` [V, H, W, 3]: the render, the fixed, the truth itself
-    given as the render.
+def compare_with_truth(network: Fnet, config: FnetConfig, chunk: Chunk, novel: NovelViews, truth: Tensor) -> Row:
+    """Compares renders, fixed images, and what the fixer makes of true images with the truth.
+
+    Args:
+        network: the fixer.
+        config: of its stage.
+        chunk: the source images.
+        novel: V renders.
+        truth: [V, H, W, 3] sRGB in [0, 1].
+
+    Returns:
+        PSNR (dB) and perceptual distance of each view, for ``render``, ``fixed`` and ``clean``: the truth itself given
+        as the render, which a fixer should leave alone.
     """
+    # Depth stays the render's, because the warped references need one and the truth has none.
     clean = replace(novel, color=truth, alpha=torch.ones_like(novel.alpha))
     images = {
         "render": novel.color.clamp(0, 1),
@@ -94,98 +165,133 @@ def truth_row(network: Fnet, config: FnetConfig, chunk: Chunk, novel: NovelViews
     }
     distance = perceptual_distance()
     return {
-        name: {"psnr": psnr_of(image, truth).tolist(), "perceptual": distance(image, truth).tolist()}
+        name: {"psnr": psnr_per_view(image, truth).tolist(), "perceptual": distance(image, truth).tolist()}
         for name, image in images.items()
     }
 
 
 @torch.no_grad()
-def gate_row(network: Fnet, config: FnetConfig, steps: Steps, log: str, store: str, shift_m: float) -> Row:
-    """How much views near the path call for fixing, and their perceptual distance without and with it."""
-    truth = true_targets(log, store, steps.chunk, shift_m, GATE_VIEWS)
-    images = torch.stack([t.image.image for t in truth])
-    novel = _rendered(steps, views_at(steps.chunk, shift_m, GATE_VIEWS))
-    sources, distance = recorded(steps.chunk), perceptual_distance()
-    fixed = fix_views(network, config.model_copy(update={"gate": 0.0}), steps.chunk, novel).color
+def measure_gate(network: Fnet, case: FixerCase, inputs: PipelineInputs, shift_m: float) -> Row:
+    """Measures how much views near the path need fixing, and what fixing all of them does.
+
+    Args:
+        network: the fixer.
+        case: names the log and the store.
+        inputs: the scene and its chunk.
+        shift_m: metres to both sides of the path.
+
+    Returns:
+        Of each view the estimated need and the perceptual distance without and with fixing.
+    """
+    # Few views at each shift, because each is ray-cast.
+    truth = case.true_images(inputs.chunk, shift_m, GATE_VIEWS)
+    assert truth is not None  # the cell has a truth at other shifts
+    novel = render_views_for_fixer(inputs, views_at_shift(inputs.chunk, shift_m, GATE_VIEWS))
+    # Loaded once: decoding all sources for each view would take longer than the estimate.
+    sources = load_source_images(inputs.chunk)
+    distance = perceptual_distance()
+    # With a gate of 0 every view is fixed: what the gate would have left out is seen, too.
+    ungated = inputs.config.fnet.model_copy(update={"gate": 0.0})
+    fixed = fix_views(network, ungated, inputs.chunk, novel).color
     return {
         "shift": shift_m,
-        "need": [need(steps.chunk, novel, i, sources) for i in range(len(novel.views))],
-        "render": distance(novel.color.clamp(0, 1), images).tolist(),
-        "fixed": distance(fixed, images).tolist(),
+        "need": [estimate_need(inputs.chunk, novel, i, sources) for i in range(len(novel.views))],
+        "render": distance(novel.color.clamp(0, 1), truth).tolist(),
+        "fixed": distance(fixed, truth).tolist(),
     }
 
 
-def ablated(folder: str) -> dict[str, Path]:
-    """Weights trained as long as each other with some of the inputs, where ``genre train fnet --inputs …`` puts them.
+def find_ablation_weights(folder: str) -> dict[str, Path]:
+    """Finds weights that were trained equally long with some of the inputs.
 
-    From inputs, joined by "+", to the file; those that are not there are left out.
+    Args:
+        folder: where ``genre train fnet --inputs …`` puts them.
+
+    Returns:
+        Inputs, joined by "+" → the file; those that are not there are left out.
+
+    >>> find_ablation_weights("nowhere")
+    {}
     """
-    places = {inputs: FixerJob(folder, inputs=inputs).place / WEIGHTS for inputs in ABLATIONS}
-    return {inputs: path for inputs, path in places.items() if path.is_file()}
+    # The training decides where its weights go, so its job is asked.
+    files = {inputs: FixerJob(folder, inputs=inputs).run_folder / WEIGHTS_FILE for inputs in ABLATIONS}
+    return {inputs: path for inputs, path in files.items() if path.is_file()}
 
 
 @torch.no_grad()
-def inputs_row(network: Fnet, config: FnetConfig, chunk: Chunk, novel: NovelViews, truth: Tensor) -> Row:
-    """PSNR (dB) and perceptual distance of each fixed view, and seconds a view of the stage."""
+def score_ablation(network: Fnet, config: FnetConfig, chunk: Chunk, novel: NovelViews, truth: Tensor) -> Row:
+    """Scores a fixer that was trained with some of the inputs.
+
+    Args:
+        network: the fixer.
+        config: of its stage.
+        chunk: the source images.
+        novel: V renders.
+        truth: [V, H, W, 3] sRGB in [0, 1].
+
+    Returns:
+        PSNR (dB) and perceptual distance of each fixed view, and seconds a view of the stage.
+    """
     began = time.perf_counter()
     fixed = fix_views(network, config, chunk, novel).color
+    # The distance below is not the fixer's work, so the clock is read before it.
     seconds = (time.perf_counter() - began) / len(novel.views)
     perceptual = perceptual_distance()(fixed, truth).tolist()
-    return {"psnr": psnr_of(fixed, truth).tolist(), "perceptual": perceptual, "seconds": seconds}
+    return {"psnr": psnr_per_view(fixed, truth).tolist(), "perceptual": perceptual, "seconds": seconds}
 
 
 @torch.no_grad()
-def kernel_row(network: Fnet, config: FnetConfig, steps: Steps, views: Sequence[NovelView], real: FeatureSet) -> Row:
-    """Kernel distance of renders and fixed images to the real ones, and the difference with its paired interval."""
-    novel, frames = _rendered(steps, views), [v.frame for v in views]
-    fixed = fix_views(network, config, steps.chunk, novel).color
-    before, after = (perceptual_distance().pooled_features(i) for i in (novel.color.clamp(0, 1), fixed))
+def measure_kernel(
+    network: Fnet, config: FnetConfig, inputs: PipelineInputs, views: Sequence[NovelView], real: FeatureSet
+) -> Row:
+    """Measures the kernel distance of renders and of fixed images to the real ones.
+
+    Args:
+        network: the fixer.
+        config: of its stage.
+        inputs: the scene and its chunk.
+        views: to render.
+        real: features of the chunk's real images.
+
+    Returns:
+        The render's distance, the fixed images' difference to it, and the difference's paired interval over frames.
+    """
+    novel = render_views_for_fixer(inputs, views)
+    fixed = fix_views(network, config, inputs.chunk, novel).color
+    frames = [v.frame for v in views]
+    extract = perceptual_distance().pooled_features
+    before = extract(novel.color.clamp(0, 1))
+    after = extract(fixed)
+    # Only the difference needs an interval, and resampling is slow.
     render = kernel_distance(before, real.features, frames, real.frames, bootstrap=0)
-    less = kernel_difference(after, before, real.features, frames, frames, real.frames, BOOTSTRAP, BOOTSTRAP_SEED)
-    assert render is not None and less is not None
-    return {"n": len(views), "render": render.value, "difference": less.value, "low": less.low, "high": less.high}
+    # Paired over frames: the two distances share their views, and single intervals would be far too wide.
+    difference = kernel_difference(after, before, real.features, frames, frames, real.frames, BOOTSTRAP, BOOTSTRAP_SEED)
+    assert render is not None and difference is not None  # a chunk has more than one frame
+    return {
+        "n": len(views),
+        "render": render.value,
+        "difference": difference.value,
+        "low": difference.low,
+        "high": difference.high,
+    }
 
 
-@torch.no_grad()
-def flicker_row(network: Fnet, config: FnetConfig, steps: Steps, log: str) -> Row:
-    """Flicker of the first camera's renders and fixed images, and of the true ones, over the chunk's frames at a side.
+def measure_seconds(network: Fnet, config: FnetConfig, chunk: Chunk, novel: NovelViews, runs: int = 3) -> Row:
+    """Times the stage, except for loading the weights.
 
-    A sharp image differs more from its resampled neighbour than a blurred one: the truth's tells what that is worth.
+    Args:
+        network: the fixer.
+        config: of its stage.
+        chunk: the source images.
+        novel: renders to fix.
+        runs: how often.
+
+    Returns:
+        Number and size of the views, the batch, and the seconds of each run, ascending.
     """
-    chunk, truth = steps.chunk, opened_log(log).truth
-    camera, actors = chunk.views[0].camera, chunk.actors
-    views = sorted((v for v in views_at(chunk, SIDE_M) if v.camera == camera and v.shift_m > 0), key=lambda v: v.frame)
-    novel = _rendered(steps, views)
-    images = {"render": novel.color.clamp(0, 1), "fixed": fix_views(network, config, chunk, novel).color}
-    if truth is not None:
-        cast = [truth.image(v.frame, chunk.world_SE3_chunk @ v.chunk_SE3_camera, v.lens) for v in views]
-        images["truth"] = torch.from_numpy(np.stack(cast).astype(np.float32) / np.float32(255))
-    return {"frames": len(views)} | {name: flicker(image, novel, actors) for name, image in images.items()}
-
-
-def flicker(images: Tensor, novel: NovelViews, actors: Sequence[Actor] = ()) -> float:
-    """Mean absolute difference between each image [V, H, W, 3] and the next one, warped to it by rendered depth.
-
-    ``novel``: the views, in the order of frames, with their depth. Points on actors move along. Where a point is out
-    of the next image or hidden there it does not count.
-    """
-    total, count = 0.0, 0.0
-    for k in range(len(images) - 1):
-        view, after = novel.views[k], novel.views[k + 1]
-        hides = torch.where(novel.alpha[k + 1] >= MIN_ALPHA, novel.depth[k + 1], torch.zeros_like(novel.depth[k + 1]))
-        image = images[k + 1].permute(2, 0, 1)
-        source = SourceImage(after.camera, after.frame, after.chunk_SE3_camera, after.lens, image, hides)
-        surface = surface_of(novel.depth[k], novel.alpha[k], view.chunk_SE3_camera, view.lens, actors, view.frame)
-        found = warp(surface, [source], actors, view.frame)
-        total += float(((found.color - images[k].permute(2, 0, 1)).abs() * found.mask).sum())
-        count += float(3 * found.mask.sum())
-    return total / max(count, 1.0)
-
-
-def time_row(network: Fnet, config: FnetConfig, chunk: Chunk, novel: NovelViews) -> Row:
-    """Seconds of the whole stage but for loading the weights, of each run, ascending."""
     seconds = []
-    for _ in range(TIMED_RUNS):
+    # Several runs, because the first one also allocates and fills caches.
+    for _ in range(runs):
         began = time.perf_counter()
         fix_views(network, config, chunk, novel)
         seconds.append(time.perf_counter() - began)

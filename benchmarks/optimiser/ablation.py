@@ -1,14 +1,14 @@
 """What one setting brings: the initial scene and GNet's with it and without.
 
-genre bench facades --json docs/benchmarks/facades.json [--set seeds=1001] [--set pandaset=]
-genre bench ground --json docs/benchmarks/ground.json
+genre bench facades --json docs/results/data/facades.json [--set seeds=1001] [--set pandaset=]
+genre bench ground --json docs/results/data/ground.json
 python -m benchmarks.optimiser.ablation ground LOG STORE PICTURE.png    # scenes at ±3 m: without, with, truth
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -16,45 +16,77 @@ from pathlib import Path
 import torch
 from PIL import Image
 
-from benchmarks.common.bench import Cell, Row, logs_of
+from benchmarks.common.bench import (
+    TINY_SETTINGS,
+    TINY_STREET,
+    Cell,
+    Row,
+    SmallestForm,
+    logs_from_options,
+    settings_from_options,
+)
 from benchmarks.common.claims import Claim
-from benchmarks.common.context import place, threads
-from benchmarks.common.over_cells import over_cells
-from benchmarks.common.pipeline_inputs import images_of
-from benchmarks.common.task import Task, task_of
+from benchmarks.common.context import THREADS, cell_label
+from benchmarks.common.over_cells import claim_over_cells
+from benchmarks.common.pipeline_inputs import render_images
+from benchmarks.common.task import OptimisationTask, load_task
 from benchmarks.optimiser import race
 from flows.configuration import load_configuration
-from flows.pipeline.definition import BY_NAME, stage_weights
+from flows.pipeline.definition import STAGE_BY_NAME, digest_stage_weights
 from genre_tasks.config import GnetConfig
+from genre_tasks.threads import torch_threads
 
 KINDS = {"without": "false", "with": "true"}
 CELL_S = 90.0
 """Predicted; most of it ray-casts a street's images."""
 
 
-def measure(setting: str, log: str, chunk: int, store: str) -> Row:
-    """PSNR in dB on held-out frames and at 3 m, of the initial scene and of GNet's, and GNet's seconds."""
+def measure(setting: str, log: str, chunk: int, store: str, over_preset: Sequence[str] = ()) -> Row:
+    """Measures the initial scene and GNet's without and with a setting.
+
+    Args:
+        setting: a switch of the configuration.
+        log: URI.
+        chunk: index in the log.
+        store: folder of the artifacts.
+        over_preset: settings over the preset ``small``.
+
+    Returns:
+        PSNR in dB on held-out frames and at 3 m, and GNet's seconds, for each of ``KINDS``.
+    """
     out: Row = {"log": log, "chunk": chunk}
-    with threads():
+    # Both kinds run on the same threads and one after the other, so their seconds compare.
+    with torch_threads(THREADS):
         for kind, value in KINDS.items():
-            task, gnet = _posed(setting, value, log, chunk, store)
-            end = race.learned(task, gnet, gnet.seed)[-1]
+            task, gnet = _load_task_and_config(setting, value, log, chunk, store, over_preset)
+            end = race.run_learned(task, gnet, gnet.seed)[-1]
             out[kind] = {"initial": _psnr(task), "gnet": [end.psnr, end.beside], "gnet_s": end.seconds}
     return out
 
 
-def _posed(setting: str, value: str, log: str, chunk: int, store: str) -> tuple[Task, GnetConfig]:
-    told = f"{setting}={value}"
-    return task_of(log, chunk, store, told), load_configuration("small", settings=[told]).gnet
+def _load_task_and_config(
+    setting: str, value: str, log: str, chunk: int, store: str, over_preset: Sequence[str] = ()
+) -> tuple[OptimisationTask, GnetConfig]:
+    settings = (*over_preset, f"{setting}={value}")
+    return load_task(log, chunk, store, *settings), load_configuration("small", settings=settings).gnet
 
 
-def _psnr(task: Task) -> list[float | None]:
-    return [task.psnr(task.scene), task.psnr_beside(task.scene)]
+def _psnr(task: OptimisationTask) -> list[float | None]:
+    return [task.psnr(task.scene), task.psnr_novel(task.scene)]
 
 
 @dataclass
-class WithWithout:
-    """A cell for each log. ``setting``: a switch of the configuration; ``subject``: what it is called in tables."""
+class SwitchAblation:
+    """Benchmark of one switch of the configuration, with a cell for each log.
+
+    Attributes:
+        name: of the benchmark.
+        setting: the switch.
+        subject: what it is called in tables.
+        options: of the command line, with their defaults.
+        code: modules that the rows depend on.
+        smallest: options of the shortest run.
+    """
 
     name: str
     setting: str
@@ -64,6 +96,7 @@ class WithWithout:
             "seeds": "1001,1002,1003",
             "store": "genre-store",
             "pandaset": "../shared/data/pandaset/002",
+            "settings": "",
         }
     )
     code: tuple[str, ...] = (
@@ -74,18 +107,25 @@ class WithWithout:
         "genre_tasks.logs.pandaset.reader",
         "genre_tasks.logs.synthetic",
     )
+    smallest: SmallestForm = field(
+        default_factory=lambda: SmallestForm(
+            {"seeds": TINY_STREET, "pandaset": "", "settings": TINY_SETTINGS}, only="street"
+        )
+    )
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
         """``quick``: one street. An empty ``pandaset`` leaves the real log out."""
-        logs = logs_of(options)
-        small = load_configuration("small")
+        logs = logs_from_options(options)
+        settings = settings_from_options(options)
+        small = load_configuration("small", settings=settings)
+        # The weights are in the key, so that a new training measures again.
         parameters = {
             "configuration": small.model_dump(mode="json"),
-            "weights": stage_weights(BY_NAME["gnet"], small),
+            "weights": digest_stage_weights(STAGE_BY_NAME["gnet"], small),
         }
         run = partial(measure, self.setting)
         return [
-            Cell(f"{log} chunk {chunk}", CELL_S, partial(run, log, chunk, options["store"]), parameters)
+            Cell(f"{log} chunk {chunk}", CELL_S, partial(run, log, chunk, options["store"], settings), parameters)
             for log, chunk in (logs[:1] if quick else logs)
         ]
 
@@ -95,10 +135,11 @@ class WithWithout:
         streets = [row for row in found if row["log"].startswith("synthetic:")]
         reals = [row for row in found if row not in streets]
         sets = (("street_heldout_db", streets, 0), ("street_3m_db", streets, 1), ("real_heldout_db", reals, 0))
-        for name, of, k in sets:
-            gains = [row["with"]["gnet"][k] - row["without"]["gnet"][k] for row in of]
-            data = f"GNet's PSNR, {self.subject} less without; {', '.join(map(place, of)) or 'not measured'}"
-            yield over_cells(name, gains, ">", 0.0, "dB", data, bench=self.name)
+        # Only streets have truth at 3 m; the real log has a claim of its own on held-out frames.
+        for name, cells, k in sets:
+            gains = [row["with"]["gnet"][k] - row["without"]["gnet"][k] for row in cells]
+            data = f"GNet's PSNR, {self.subject} less without; {', '.join(map(cell_label, cells)) or 'not measured'}"
+            yield claim_over_cells(name, gains, ">", 0.0, "dB", data, bench=self.name)
 
     def table(self, rows: Mapping[str, Row]) -> Iterator[str]:
         """A line for each log and kind."""
@@ -108,26 +149,34 @@ class WithWithout:
             for kind in KINDS:
                 found = row[kind]
                 cells = ["" if x is None else f"{x:.2f}" for x in (*found["initial"], *found["gnet"])]
-                yield f"| {place(row)} | {kind} | {' | '.join(cells)} | {found['gnet_s']:.2f} |"
+                yield f"| {cell_label(row)} | {kind} | {' | '.join(cells)} | {found['gnet_s']:.2f} |"
         for name in (n for n, r in rows.items() if "not_measured" in r):
             yield f"\n{name}: not measured: {rows[name]['not_measured']}"
 
 
-def picture(setting: str, log: str, store: str, path: Path) -> None:
-    """A row for each of three views beside the path of a synthetic log's chunk 0: without, with, and the truth."""
+def save_comparison(setting: str, log: str, store: str, path: Path) -> None:
+    """Saves renders at three novel views of a synthetic log's chunk 0: without the setting, with it, and the truth.
+
+    Args:
+        setting: a switch of the configuration.
+        log: URI.
+        store: folder of the artifacts.
+        path: file to write.
+    """
     columns = []
     for value in KINDS.values():
-        task, gnet = _posed(setting, value, log, 0, store)
-        views = task.beside[:: max(1, len(task.beside) // 3)][:3]
-        end = race.at_end(race.configured(task, gnet, gnet.seed), gnet.iterations)
-        columns.append(images_of(end.scene, views).flatten(0, 1))
-    columns.append(torch.cat([view.image.image for view in views]))
+        task, gnet = _load_task_and_config(setting, value, log, 0, store)
+        views = task.novel_targets[:: max(1, len(task.novel_targets) // 3)][:3]
+        end = race.take_last(race.gnet_steps(task, gnet, gnet.seed), gnet.iterations)
+        columns.append(render_images(end.scene, views).flatten(0, 1))
+    # The truth comes last, beside the setting that should look like it.
+    columns.append(torch.cat([view.image.pixels for view in views]))
     Image.fromarray((torch.cat(columns, 1) * 255).round().byte().numpy()).save(path)
 
 
-FACADES = WithWithout("facades", "ingest.complete_facades", "façades completed")
-GROUND = WithWithout("ground", "gnet.constrain_ground", "ground held")
+FACADES = SwitchAblation("facades", "ingest.complete_facades", "façades completed")
+GROUND = SwitchAblation("ground", "gnet.constrain_ground", "ground held")
 
 if __name__ == "__main__":
     setting = {bench.name: bench.setting for bench in (FACADES, GROUND)}[sys.argv[1]]
-    picture(setting, sys.argv[2], sys.argv[3], Path(sys.argv[4]))
+    save_comparison(setting, sys.argv[2], sys.argv[3], Path(sys.argv[4]))

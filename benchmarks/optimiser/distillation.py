@@ -1,48 +1,48 @@
-"""ENet beside per-scene distillation of the same fixed images, from the same scene: GNet's.
+"""ENet against per-scene distillation of the same fixed images, from the same scene: GNet's.
 
-Judged at 3 m, at views that neither is given: the kernel distance to the chunk's real images and, on synthetic logs,
-the PSNR against ray-cast truth.
+Scored at 3 m, at views that neither optimises on: the kernel distance to the chunk's real images and, on
+synthetic logs, the PSNR against ray-cast truth.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 from benchmarks.common.bench import Row
-from benchmarks.common.novel_view_truth import true_targets, views_at
-from benchmarks.common.pipeline_inputs import images_of, steps_of
-from benchmarks.common.task import HELDOUT_VIEWS, SIDE_M, Task
+from benchmarks.common.novel_view_truth import load_true_targets, views_at_shift
+from benchmarks.common.pipeline_inputs import load_pipeline_inputs
+from benchmarks.common.task import HELDOUT_VIEWS, SIDE_M, OptimisationTask
 from benchmarks.optimiser import race
-from flows.training.training_scenes import spread
+from benchmarks.optimiser.distillation_scores import (
+    KERNEL_PART,
+    NovelViewScore,
+    NovelViewScorer,
+    ScoreCurve,
+    time_to_match,
+)
+from flows.training.training_scenes import evenly_spaced
 from genre_tasks.config import AdamConfig, LearningRates, OptimiserConfig, PerSceneConfig
 from genre_tasks.losses.targets import Target
-from genre_tasks.metrics.distribution_distances import kernel_distance
 from genre_tasks.metrics.perceptual import perceptual_distance
-from genre_tasks.metrics.scoring import FeatureSet, real_images
-from genre_tasks.optimiser.objective import Objective
-from genre_tasks.optimiser.tuned_adam import ENET_RATES
-from genre_tasks.per_scene.run import snapshots
+from genre_tasks.metrics.scoring import real_image_features
+from genre_tasks.optimiser.tuned_adam import ENET_LEARNING_RATES
+from genre_tasks.per_scene.run import train_with_snapshots
 from genre_tasks.per_scene.training import PerSceneTraining
-from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.novel_views import NovelView
-from genre_tasks.stages.optimise import distance, plan_of, step_rule
+from genre_tasks.stages.optimise import load_distance
 
 FAMILIES = ("adam", "adam_split", "standard")
-"""What ENet stands beside: tuned Adam, the same on Gaussians that are split as ENet's are, the published recipe."""
+"""What ENet is compared with: tuned Adam, the same on Gaussians that are split as ENet's are, the published recipe."""
 KERNEL_VIEWS = 48
 """Of the views at ±3 m, spread evenly over sides, frames and cameras: an unbiased distance at any number."""
-KERNEL_PART, PSNR_DB = 0.01, 0.1
-"""As good as: the kernel distance at most this part above, the PSNR at most so much below."""
-MOST_TIMES = 8.0
+MAX_TIME_RATIO = 8.0
 """Tuned Adam distils for at most so many times ENet's seconds."""
 SETTLED_FACTOR = 2.0
 """Tuned Adam has settled where its time grew by this factor, over ENet's and since it was better by ``KERNEL_PART``."""
 ADAM_VARIANTS = ((1, 0.25, 0.1), (3, 0.5, 0.0))
-"""Views of each kind in an iteration, the part of the baseline's rates, and the weight of the perceptual term. On seed
-950 the first came to the lowest kernel distance and the second to the highest PSNR, at almost any time; 15 views at the
-whole rates and 3 at half of them, both with the term, were behind in both.
+"""Views of each kind in an iteration, the factor of the baseline's learning rates, the weight of the perceptual term.
+
+On seed 950 the first came to the lowest kernel distance and the second to the highest PSNR, at almost any time. Two
+more were behind in both: 15 views at the full rates and 3 at half of them, both with the term.
 """
 STANDARD_ITERATIONS = 7000
 """One view each; all schedules of the recipe scale with them. The shorter of the published lengths that the race has
@@ -51,53 +51,7 @@ STANDARD_ITERATIONS = 7000
 QUICK_STANDARD_ITERATIONS = 1500
 STANDARD_LOOKS = 16
 SHORTER = (1 / 3, 2 / 3)
-"""ENet's lengths beside its own, of it: each a run told its length, as the distillations' variants each are a run."""
-
-
-@dataclass(frozen=True)
-class Judge:
-    """Looks at a scene from 3 m beside the path."""
-
-    views: tuple[NovelView, ...]
-    real: FeatureSet
-    task: Task  # its truth beside the path, its held-out views
-
-    def mark(self, scene: SceneGraph, seconds: float, renders: int) -> Mark:
-        """The scene's quality after so many seconds."""
-        features = perceptual_distance().pooled_features(images_of(scene, self.views))
-        frames = [v.frame for v in self.views]
-        found = kernel_distance(features, self.real.features, frames, self.real.frames, bootstrap=0)
-        assert found is not None
-        return Mark(seconds, renders, found.value, self.task.psnr_beside(scene), self.task.psnr(scene))
-
-
-@dataclass(frozen=True)
-class Mark:
-    """Quality after so many seconds and view renders; ``beside``: PSNR at 3 m, ``None`` on a real log."""
-
-    seconds: float
-    renders: int
-    kernel: float
-    beside: float | None
-    heldout: float
-
-    def lacks(self, other: Mark) -> tuple[float, float]:
-        """How far it is from being as good as the other, in kernel distance and in dB; ≤ 0: it is."""
-        kernel = self.kernel - other.kernel - KERNEL_PART * abs(other.kernel)
-        if self.beside is None or other.beside is None:
-            return kernel, 0.0
-        return kernel, other.beside - PSNR_DB - self.beside
-
-    def as_good_as(self, other: Mark) -> bool:
-        return max(self.lacks(other)) <= 0
-
-    def as_row(self) -> list[float | None]:
-        """Seconds, renders, kernel distance, PSNR at 3 m, held-out PSNR."""
-        beside = None if self.beside is None else round(self.beside, 3)
-        return [round(self.seconds, 3), self.renders, round(self.kernel, 5), beside, round(self.heldout, 3)]
-
-
-Marks = Sequence[Mark]
+"""Shorter lengths of ENet as fractions of its own; each is a run of that length, not a longer run stopped early."""
 
 
 def measure_distillation(
@@ -108,32 +62,63 @@ def measure_distillation(
     cap: float,
     standard: int = STANDARD_ITERATIONS,
     families: Sequence[str] = FAMILIES,
+    settings: Sequence[str] = (),
 ) -> Row:
-    """One cell: ENet, then those of the ``FAMILIES`` that are asked for."""
-    steps = steps_of(log, chunk, store, order, enet=False)
-    heldout = spread(steps.heldout, HELDOUT_VIEWS)
-    task = Task(steps.gnet, steps.source, heldout, true_targets(log, store, steps.chunk, SIDE_M))
-    judge = Judge(views_at(steps.chunk, SIDE_M, KERNEL_VIEWS), real_images(steps.chunk), task)
-    row = distillation_row(steps.config.enet, PerSceneConfig(iterations=standard), judge, steps.fixed, families)
+    """Measures ENet, then families of distillations, on one chunk.
+
+    Args:
+        log: URI.
+        chunk: index in the log.
+        store: folder of the artifacts.
+        order: seed of the order of views.
+        cap: ratio that counts where ENet is not as good.
+        standard: iterations of the published recipe.
+        families: those of ``FAMILIES`` to measure.
+        settings: over the preset ``small``.
+
+    Returns:
+        The row of the cell.
+    """
+    steps = load_pipeline_inputs(log, chunk, store, order, False, *settings)
+    # A curve is scored often, so only some of the held-out views are rendered.
+    heldout = evenly_spaced(steps.heldout, HELDOUT_VIEWS)
+    task = OptimisationTask(steps.gnet, steps.source, heldout, load_true_targets(log, store, steps.chunk, SIDE_M))
+    scorer = NovelViewScorer(views_at_shift(steps.chunk, SIDE_M, KERNEL_VIEWS), real_image_features(steps.chunk), task)
+    row = distillation_row(steps.config.enet, PerSceneConfig(iterations=standard), scorer, steps.fixed, families)
     return {"log": log, "chunk": chunk, "order": order, "cap": cap} | row
 
 
 def adam_variants(enet: OptimiserConfig, split: float = 0.0) -> dict[str, OptimiserConfig]:
-    """ENet's objective with tuned Adam at constant rates, on the Gaussians that it is given, or split as ENet's are."""
+    """Lists the variants of tuned Adam with ENet's objective and constant learning rates.
+
+    Args:
+        enet: ENet's section.
+        split: fraction of Gaussians to split first.
+
+    Returns:
+        Sections by name.
+    """
     out = {}
     for count, part, perceptual in ADAM_VARIANTS:
+        # On split Gaussians the term brought nothing that more iterations in its time did not bring too.
         if split and perceptual:
-            continue  # on split Gaussians the term brought nothing that its time would not have
-        views, novel = min(count, enet.views_per_iteration), min(count, enet.novel_views_per_iteration)
+            continue
+        # A tiny configuration may render fewer views than the variant asks for.
+        views = min(count, enet.views_per_iteration)
+        novel = min(count, enet.novel_views_per_iteration)
         changes = {
             "split_fraction": split,
             "views_per_iteration": views,
             "novel_views_per_iteration": novel,
             "method": "adam",
-            "adam": AdamConfig(learning_rates=LearningRates.of([part * r for r in ENET_RATES]), schedule="constant"),
+            "adam": AdamConfig(
+                learning_rates=LearningRates.from_sequence([part * r for r in ENET_LEARNING_RATES.as_tuple()]),
+                schedule="constant",
+            ),
             "loss": enet.loss.model_copy(update={"perceptual": perceptual, "perceptual_every": 1}),
         }
         name = f"{views}+{novel} at {part:g}{'' if perceptual else ', no perceptual'}{', split' if split else ''}"
+        # All else is ENet's, so that the comparison is of step rules alone.
         out[name] = enet.model_copy(update=changes)
     return out
 
@@ -141,103 +126,163 @@ def adam_variants(enet: OptimiserConfig, split: float = 0.0) -> dict[str, Optimi
 def distillation_row(
     enet: OptimiserConfig,
     standard: PerSceneConfig,
-    judge: Judge,
+    scorer: NovelViewScorer,
     fixed: Sequence[Target],
     families: Sequence[str] = FAMILIES,
 ) -> Row:
-    """Each family of distillations: the best it came to, when it first was as good as that, whether ENet is.
+    """Measures ENet at its length and at ``SHORTER`` ones, and every family of distillations.
 
-    ENet at ``SHORTER`` lengths stands beside: the first that is as good says when it can be, if no better is asked.
-    Where ENet splits Gaussians, tuned Adam is measured on split ones too, beside what the claims are about.
+    Where ENet splits Gaussians, tuned Adam is measured on split ones too; the claims are about unsplit ones.
+
+    Args:
+        enet: ENet's section.
+        standard: section of the published recipe.
+        scorer: with the task.
+        fixed: images of FNet that are distilled.
+        families: those of ``FAMILIES`` to measure.
+
+    Returns:
+        Scores of the start and of ENet, and a summary of each family.
     """
-    task = judge.task
-    start = judge.mark(task.scene, 0.0, 0)
+    task = scorer.task
+    start = scorer.score(task.scene, 0.0, 0)
+    # Very short configurations of the tests would round to no iteration at all.
     lengths = [max(1, round(part * enet.iterations)) for part in SHORTER]
-    shorter = {t: ended(enet.model_copy(update={"iterations": t}), judge, fixed) for t in lengths}
-    own = ended(enet, judge, fixed)
-    budget_s = MOST_TIMES * own.seconds
-    shares = {"adam": 0.0} | ({"adam_split": enet.split_fraction} if enet.split_fraction else {})
+    shorter = {t: score_enet_end(enet.model_copy(update={"iterations": t}), scorer, fixed) for t in lengths}
+    enet_score = score_enet_end(enet, scorer, fixed)
+    budget_s = MAX_TIME_RATIO * enet_score.seconds
+    splits = {"adam": 0.0} | ({"adam_split": enet.split_fraction} if enet.split_fraction else {})
     runs = {
         name: {
-            variant: distilled(walked(config, task, fixed), judge, start, own.seconds, budget_s)
-            for variant, config in adam_variants(enet, share).items()
+            variant: score_until_settled(enet_steps(config, task, fixed), scorer, start, enet_score.seconds, budget_s)
+            for variant, config in adam_variants(enet, split).items()
         }
-        for name, share in shares.items()
+        for name, split in splits.items()
         if name in families
     }
+    # The recipe is by far the slowest, so it comes last and may be left out.
     if "standard" in families:
-        runs["standard"] = {str(standard.iterations): [start, *by_recipe(standard, judge, fixed, enet.seed)]}
+        runs["standard"] = {
+            str(standard.iterations): [start, *score_standard_recipe(standard, scorer, fixed, enet.seed)]
+        }
     return {
         "start": start.as_row(),
-        "enet": own.as_row(),
-        "enet_shorter": {str(t): mark.as_row() for t, mark in shorter.items()},
-        **{name: family(curves, own, shorter.values()) for name, curves in runs.items()},
+        "enet": enet_score.as_row(),
+        "enet_shorter": {str(t): score.as_row() for t, score in shorter.items()},
+        **{name: summarise_family(curves, enet_score, shorter.values()) for name, curves in runs.items()},
     }
 
 
-def ended(enet: OptimiserConfig, judge: Judge, fixed: Sequence[Target]) -> Mark:
-    """ENet at its end."""
-    last = race.at_end(walked(enet, judge.task, fixed), enet.iterations)
-    return judge.mark(last.scene, last.seconds, last.renders)
+def score_enet_end(enet: OptimiserConfig, scorer: NovelViewScorer, fixed: Sequence[Target]) -> NovelViewScore:
+    """Runs ENet to its end and scores it.
+
+    Args:
+        enet: ENet's section.
+        scorer: with the task.
+        fixed: images of FNet.
+
+    Returns:
+        NovelViewScore: with ENet's seconds and renders.
+    """
+    last = race.take_last(enet_steps(enet, scorer.task, fixed), enet.iterations)
+    return scorer.score(last.scene, last.seconds, last.renders)
 
 
-def walked(config: OptimiserConfig, task: Task, fixed: Sequence[Target]) -> Iterator[race.Moment]:
-    """The stage enet from the task's scene, without end; loading of networks counts, that for the loss too."""
-    if distance(config) is not None:  # modules are imported here, before the clock starts; weights are loaded again
+def enet_steps(config: OptimiserConfig, task: OptimisationTask, fixed: Sequence[Target]) -> Iterator[race.Moment]:
+    """Runs the stage enet from the task's scene on the clock, without end.
+
+    Args:
+        config: ENet's section, or tuned Adam's in its place.
+        task: the scene and its views.
+        fixed: images of FNet.
+
+    Returns:
+        Iterator[race.Moment]: after each iteration; loading of networks counts, that of the loss too.
+    """
+    # Modules are imported here, before the clock starts; clearing the cache makes the run load the weights again.
+    if load_distance(config) is not None:
         perceptual_distance.cache_clear()
-    plan = plan_of("enet", config)
-    return race.walk(lambda: (step_rule("enet", config), Objective(config.loss, distance(config))), task, plan, fixed)
+    return race.stage_steps("enet", task, config, config.seed, fixed)
 
 
-def distilled(moments: Iterator[race.Moment], judge: Judge, start: Mark, unit_s: float, budget_s: float) -> list[Mark]:
-    """Marks from the start at growing intervals until it has settled, or the budget is spent."""
-    out, best, due = [start], start, unit_s * race.FIRST_LOOK
+def score_until_settled(
+    moments: Iterator[race.Moment], scorer: NovelViewScorer, start: NovelViewScore, unit_s: float, budget_s: float
+) -> list[NovelViewScore]:
+    """Scores a run at growing intervals until it has settled, or its budget is spent.
+
+    Args:
+        moments: of the run.
+        scorer: scores a scene.
+        start: score of the scene that the run began with.
+        unit_s: ENet's seconds.
+        budget_s: seconds at which the run is ended.
+
+    Returns:
+        The scores, the start's first.
+    """
+    out = [start]
+    best = start
+    due = unit_s * race.FIRST_SCORE
     for moment in moments:
         over = moment.seconds >= budget_s
         if moment.seconds < due and not over:
             continue
-        out.append(judge.mark(moment.scene, moment.seconds, moment.renders))
-        due = moment.seconds * race.LOOK_FACTOR
+        out.append(scorer.score(moment.scene, moment.seconds, moment.renders))
+        due = moment.seconds * race.SCORE_INTERVAL_GROWTH
         if out[-1].kernel < best.kernel - KERNEL_PART * abs(best.kernel):
+            # Only a clear gain counts as one, else noise would keep a settled run alive.
             best = out[-1]
+        # Without the unit a run that has not improved yet would end at its first score.
         if over or moment.seconds >= SETTLED_FACTOR * max(best.seconds, unit_s):
             break
     return out
 
 
-def by_recipe(config: PerSceneConfig, judge: Judge, fixed: Sequence[Target], seed: int) -> Iterator[Mark]:
-    """Marks of the published recipe on source and fixed views to its end; actors stay in their boxes."""
-    training = PerSceneTraining(config, judge.task.scene, [*judge.task.source, *fixed], seed, "enet")
-    looks = [max(1, round(config.iterations / race.LOOK_FACTOR**k)) for k in range(STANDARD_LOOKS)]
-    for s in snapshots(training, iterations=looks):
-        yield judge.mark(s.scene, s.seconds, s.iteration)
+def score_standard_recipe(
+    config: PerSceneConfig, scorer: NovelViewScorer, fixed: Sequence[Target], seed: int
+) -> Iterator[NovelViewScore]:
+    """Runs the published recipe on source and fixed views to its end; actors stay in their boxes.
 
+    Args:
+        config: of the recipe.
+        scorer: with the task.
+        fixed: images of FNet.
+        seed: of the order of views.
 
-def family(runs: Mapping[str, Marks], own: Mark, shorter: Iterable[Mark] = ()) -> Row:
-    """What the runs came to after their start, all together, when, whether ``own`` is as good, when they were as it.
-
-    ``enet_first_s``: of ``own`` and the ``shorter`` runs of ENet the first that is as good.
+    Yields:
+        NovelViewScore: at growing intervals, and at the end.
     """
-    best = min((m for marks in runs.values() for m in marks[1:]), key=lambda m: m.kernel)
-    times = [t for marks in runs.values() if (t := first_as_good(marks, best)) is not None]
-    own_times = [t for marks in runs.values() if (t := first_as_good(marks, own)) is not None]
+    # The recipe's schedules need its length, so it cannot be stopped where it has settled.
+    training = PerSceneTraining(config, scorer.task.scene, [*scorer.task.source, *fixed], seed, "enet")
+    looks = [max(1, round(config.iterations / race.SCORE_INTERVAL_GROWTH**k)) for k in range(STANDARD_LOOKS)]
+    for s in train_with_snapshots(training, iterations=looks):
+        yield scorer.score(s.scene, s.seconds, s.iteration)
+
+
+def summarise_family(
+    runs: Mapping[str, ScoreCurve], enet: NovelViewScore, shorter: Iterable[NovelViewScore] = ()
+) -> Row:
+    """Compares the runs of a family with ENet.
+
+    Args:
+        runs: scores of each variant, the start's first.
+        enet: ENet's score.
+        shorter: scores of shorter runs of ENet.
+
+    Returns:
+        The best score of all variants; the seconds to it; whether ENet is as good, and what it lacks; the seconds of
+        the first of ENet's runs that is as good, and of the first variant that is as good as ENet.
+    """
+    # Quality is ranked by the kernel distance alone, which real logs have too.
+    best = min((score for curve in runs.values() for score in curve[1:]), key=lambda score: score.kernel)
+    times = [t for curve in runs.values() if (t := time_to_match(curve, best)) is not None]
+    enet_times = [t for curve in runs.values() if (t := time_to_match(curve, enet)) is not None]
     return {
         "best": best.as_row(),
         "reached_s": min(times),
-        "enet_as_good": own.as_good_as(best),
-        "enet_lacks": list(own.lacks(best)),
-        "enet_first_s": min((m.seconds for m in (own, *shorter) if m.as_good_as(best)), default=None),
-        "as_good_as_enet_s": min(own_times, default=None),
-        "curves": {name: [m.as_row() for m in marks] for name, marks in runs.items()},
+        "enet_as_good": enet.is_as_good_as(best),
+        "enet_lacks": list(enet.shortfall(best)),
+        "enet_first_s": min((m.seconds for m in (enet, *shorter) if m.is_as_good_as(best)), default=None),
+        "as_good_as_enet_s": min(enet_times, default=None),
+        "curves": {name: [score.as_row() for score in curve] for name, curve in runs.items()},
     }
-
-
-def first_as_good(marks: Marks, best: Mark) -> float | None:
-    """Seconds at which the curve, linear between its marks, first is as good as ``best``; the start does not count."""
-    for before, after in itertools.pairwise(marks):
-        if after.as_good_as(best):
-            if before.as_good_as(best):  # the start was so good already: distillation brought nothing
-                return after.seconds
-            parts = [a / (a - b) if a > 0 else 0.0 for a, b in zip(before.lacks(best), after.lacks(best), strict=True)]
-            return before.seconds + max(parts) * (after.seconds - before.seconds)
-    return None

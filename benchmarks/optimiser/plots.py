@@ -1,7 +1,7 @@
 """Pictures from a written result: curves of PSNR over seconds, and the network's time over the number of Gaussians.
 
-python -m benchmarks.optimiser.plots docs/benchmarks/optimiser.json docs/benchmarks/optimiser.png \
-    --network docs/benchmarks/optimiser_network.png
+python -m benchmarks.optimiser.plots docs/results/data/optimiser.json docs/images/optimiser.png \
+    --network docs/images/optimiser_network.png
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common.bench import Row
-from benchmarks.common.context import place
+from benchmarks.common.context import cell_label
 
 ACROSS = 3
-"""Logs beside each other."""
+"""Panels in a row."""
 LABELS = {
     "tuned_adam": "tuned Adam",
     "tuned_adam_split": "tuned Adam on split Gaussians",
@@ -30,23 +30,32 @@ COLOURS = {
     "standard_3dgs": "tab:red",
     "street_gs": "tab:orange",
 }
-HELDOUT, BESIDE = 2, 4
-"""Columns of a curve's points; the latter only where there is truth beside the path."""
+HELDOUT = 2
+NOVEL = 4
+"""Columns of a curve's points; the latter only where there is truth at novel views."""
 
 
 def draw(rows: Sequence[Row], picture: Path) -> None:
-    """For each log, its first order: held-out PSNR, and below it PSNR at 3 m where the log has truth.
+    """Draws the first order of each log: held-out PSNR, and below it PSNR at 3 m where the log has truth.
 
     Each method's variants are thin lines, the best that any of them has had by then a bold one. Seconds, logarithmic,
     are in GNet's of the same cell, so that cells of other machines or threads can share a panel; the first cell's stand
-    in its title. Raises ``ValueError`` without a measured race.
+    in its title.
+
+    Args:
+        rows: of the optimiser's benchmark.
+        picture: file to write.
+
+    Raises:
+        ValueError: no race was measured.
     """
     panels = _first_orders([row for row in rows if "variants" in row])
     if not panels:
         raise ValueError("expected at least one measured race; the result has none")
     wide = min(ACROSS, len(panels))
+    # Logs fill rows of panels; each block of logs has a row for each kind of PSNR.
     blocks = [list(panels.items())[k : k + wide] for k in range(0, len(panels), wide)]
-    lines = [(block, column) for block in blocks for column in (HELDOUT, BESIDE) if _has(block, column)]
+    lines = [(block, column) for block in blocks for column in (HELDOUT, NOVEL) if _has(block, column)]
     plt = _pyplot()
     size = (4.6 * wide, 3.2 * len(lines) + 0.4)
     figure, axes = plt.subplots(len(lines), wide, figsize=size, layout="constrained", squeeze=False)
@@ -56,6 +65,7 @@ def draw(rows: Sequence[Row], picture: Path) -> None:
                 axis.set_axis_off()
             else:
                 _panel(axis, panel[0], panel[1], column)
+    # Panels share methods: one legend for the figure has each of them once.
     known = {label: line for axis in axes.flat for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
     figure.legend(known.values(), known.keys(), loc="outside lower center", ncols=len(known), fontsize=9)
     figure.savefig(picture, dpi=90)
@@ -63,9 +73,23 @@ def draw(rows: Sequence[Row], picture: Path) -> None:
 
 
 def envelope(curves: Sequence[Sequence[Sequence[float]]], column: int) -> tuple[list[float], list[float]]:
-    """Seconds, and the best that any of the curves has had by then; without their starts."""
-    best, seconds, values = -float("inf"), [], []
+    """Finds the best that any of several curves has had by each time.
+
+    Args:
+        curves: points of seconds and other columns; the first point, the start, does not count.
+        column: that is compared.
+
+    Returns:
+        Seconds, and the best value by then.
+
+    >>> envelope([[[0, 9], [1, 5], [3, 4]], [[0, 9], [2, 6]]], 1)
+    ([1, 2, 3], [5, 6, 6])
+    """
+    best = -float("inf")
+    seconds = []
+    values = []
     for point in sorted((p for curve in curves for p in curve[1:]), key=lambda p: p[0]):
+        # A user would stop at the best scene so far, so a curve that falls again is not held against a method.
         best = max(best, point[column])
         seconds.append(point[0])
         values.append(best)
@@ -73,7 +97,12 @@ def envelope(curves: Sequence[Sequence[Sequence[float]]], column: int) -> tuple[
 
 
 def draw_network(row: Row, picture: Path) -> None:
-    """Seconds of an evaluation over the number of Gaussians with the fitted line, and the memory that it adds."""
+    """Draws seconds of an evaluation over the number of Gaussians with the fitted line, and the memory that it adds.
+
+    Args:
+        row: of the cell of the network.
+        picture: file to write.
+    """
     plt = _pyplot()
     counts = [int(name) for name in row["seconds"]]
     medians, low, high = ([m[k] for m in row["seconds"].values()] for k in ("median", "low", "high"))
@@ -84,6 +113,7 @@ def draw_network(row: Row, picture: Path) -> None:
     line = [fit["seconds"] + fit["us_per_gaussian"] * 1e-6 * n for n in counts]
     axis.plot(counts, line, linewidth=1, label=f"{fit['us_per_gaussian']:.2f} µs a Gaussian, R² {fit['r2']:.4f}")
     axis.set(xlabel="Gaussians", ylabel="seconds of an evaluation", ylim=(0, None))
+    # Memory has an axis of its own: its numbers are thousands of times those of seconds.
     memory = axis.twinx()
     memory.plot(counts, list(row["peak_mib"].values()), "s--", color="grey", markersize=4, label="memory added, MiB")
     memory.set(ylabel="MiB", ylim=(0, None))
@@ -96,6 +126,7 @@ def draw_network(row: Row, picture: Path) -> None:
 
 
 def _pyplot() -> Any:
+    # The backend must be chosen before pyplot is imported; a machine without a display has no other.
     import matplotlib
 
     matplotlib.use("Agg")
@@ -109,11 +140,12 @@ def _first_orders(races: Sequence[Row]) -> dict[str, list[Row]]:
     first: dict[tuple[str, int], int] = {}
     for row in races:
         where = (row["log"], row["chunk"])
+        # One order a panel: curves of several would cover each other.
         first[where] = min(row["order"], first.get(where, row["order"]))
     panels: dict[str, list[Row]] = {}
     for row in races:
         if row["order"] == first[row["log"], row["chunk"]]:
-            panels.setdefault(place(row), []).append(row)
+            panels.setdefault(cell_label(row), []).append(row)
     return panels
 
 
@@ -125,7 +157,8 @@ def _panel(axis: Any, title: str, races: Sequence[Row], column: int) -> None:
     from matplotlib.ticker import LogLocator, NullFormatter
 
     for row in races:
-        unit, colour = row["gnet"]["seconds"], COLOURS[row["method"]]
+        unit = row["gnet"]["seconds"]
+        colour = COLOURS[row["method"]]
         curves = [[[p[0] / unit, *p[1:]] for p in v["curve"]] for v in row["variants"].values()]
         for curve in curves:
             axis.plot(
@@ -133,7 +166,8 @@ def _panel(axis: Any, title: str, races: Sequence[Row], column: int) -> None:
             )
         axis.plot(*envelope(curves, column), color=colour, linewidth=1.8, label=LABELS[row["method"]])
     gnet = races[0]["gnet"]
-    points = [(p[0] / gnet["seconds"], p[column]) for p in gnet["curve"][1:]]  # the start is at no second
+    # The start is at second 0, which a logarithmic axis cannot show.
+    points = [(p[0] / gnet["seconds"], p[column]) for p in gnet["curve"][1:]]
     axis.plot(*zip(*points, strict=True), color="black", marker="o", markersize=3, label="GNet")
     label = "held-out PSNR, dB" if column == HELDOUT else "PSNR at 3 m, dB"
     threads = f", {n} threads" if (n := races[0].get("threads", 2)) > 1 else ", 1 thread"
@@ -147,6 +181,7 @@ def _panel(axis: Any, title: str, races: Sequence[Row], column: int) -> None:
 
 
 def main() -> None:
+    """Draws the pictures that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("result", type=Path)
     parser.add_argument("picture", type=Path)

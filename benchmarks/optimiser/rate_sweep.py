@@ -5,7 +5,7 @@ python -m benchmarks.optimiser.rate_sweep --folder F --weights FILE --lengths 72
 python -m benchmarks.optimiser.rate_sweep --folder F --weights FILE --lengths 72x3 --enet [--real LOG] --beside 2
 
 A pattern search by factors of two from the rates in use, or from those of a variant (``--start``): all together, the
-schedule, then each by itself, each as long as it helps, again until a round brings less than ``ENOUGH_DB``. A network's
+schedule, then each by itself, each as long as it helps (:mod:`benchmarks.optimiser.rate_search`). A network's
 rates (and c₀ of its residuals) are tuned as they are in its configuration: meta-training looks a few iterations ahead
 and is blind to what pays later. Scores and scenes are kept in the folder: a sweep that was stopped goes on from there.
 Prints the variants as YAML with their mean score: the held-out PSNR, plus ``--beside`` times that at 3 m on streets.
@@ -21,95 +21,60 @@ import json
 import math
 import statistics
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import yaml
 
-from benchmarks.common.novel_view_truth import true_targets, views_at
-from benchmarks.common.pipeline_inputs import steps_of
-from benchmarks.common.task import HELDOUT_VIEWS, SIDE_M, Task
-from benchmarks.optimiser.distillation import KERNEL_VIEWS, Judge
+from benchmarks.common.novel_view_truth import load_true_targets, views_at_shift
+from benchmarks.common.pipeline_inputs import load_pipeline_inputs
+from benchmarks.common.task import HELDOUT_VIEWS, SIDE_M, OptimisationTask
+from benchmarks.optimiser.distillation import KERNEL_VIEWS
+from benchmarks.optimiser.distillation_scores import NovelViewScorer
+from benchmarks.optimiser.rate_search import Setting, moves, network_moves, search
 from flows.configuration import load_configuration
 from flows.paper_tables.baselines import load_baselines
-from flows.training.optimiser_training import psnr
-from flows.training.training_scenes import SceneRecipe, prepare, spread, training_scene
-from genre_tasks.config import LossConfig
+from flows.training.optimiser_training import mean_psnr
+from flows.training.training_scenes import SceneRecipe, build_training_scene, evenly_spaced, prepare_scene
+from genre_tasks.atomic_path import write_atomically
+from genre_tasks.config import LearningRates, LossConfig
 from genre_tasks.errors import ConfigError
 from genre_tasks.learned.learned_optimiser import LearnedOptimiser
 from genre_tasks.learned.meta_episodes import TrainingScene
-from genre_tasks.learned.weights import load, write_atomically
-from genre_tasks.metrics.scoring import real_images
+from genre_tasks.learned.weights import load_optimiser
+from genre_tasks.metrics.scoring import real_image_features
 from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.step_rules import StepRule
-from genre_tasks.optimiser.tuned_adam import GNET_RATES, TunedAdam
-from genre_tasks.optimiser.unroll import Plan, unroll
+from genre_tasks.optimiser.tuned_adam import GNET_LEARNING_RATES, TunedAdam
+from genre_tasks.optimiser.unroll import UnrollSettings, unroll
 from genre_tasks.scene.graph import SceneGraph
 from storage.files import digest_file
 from storage.local import LocalStore
 
 LENGTHS = "24x6,48x3,72x2,144x1,240x1,24x30,960x1,2880x1"
-ENOUGH_DB = 0.02
 LOSS = LossConfig(perceptual=0.0)
 """What GNet sees in the presets demo and small."""
 SEEDS_FILE = Path(__file__).resolve().parents[2] / "configs" / "seeds.yaml"
 
 
-@dataclass(frozen=True)
-class Setting:
-    """One point of the search."""
-
-    rates: tuple[float, ...] = GNET_RATES
-    schedule: Literal["cosine", "constant"] = "cosine"
-    relaxation: float = 0.0
-
-    def scaled(self, factor: float, which: int | None = None) -> Setting:
-        """With one rate, or all, times ``factor``."""
-        rates = (r * factor if which in (None, k) else r for k, r in enumerate(self.rates))
-        return replace(self, rates=tuple(float(f"{r:.4g}") for r in rates))
-
-    def relaxed(self, more: float) -> Setting:
-        """With another c₀."""
-        return replace(self, relaxation=round(self.relaxation + more, 4))
-
-    def turned(self) -> Setting:
-        """With the other schedule."""
-        return replace(self, schedule="constant" if self.schedule == "cosine" else "cosine")
+def make_adam(setting: Setting) -> StepRule:
+    """Makes tuned Adam with a setting's learning rates and schedule."""
+    return TunedAdam(LearningRates.from_sequence(setting.rates), setting.schedule)
 
 
-def moves(factor: float = 2.0) -> Iterator[Callable[[Setting], Setting]]:
-    """All rates divided and multiplied, the other schedule, then each rate multiplied and divided."""
-    yield lambda s: s.scaled(1 / factor)
-    yield lambda s: s.scaled(factor)
-    yield Setting.turned
-    yield from each_rate(factor)
+def load_network(weights: Path) -> tuple[Setting, Callable[[Setting], StepRule]]:
+    """Loads a network for tuning.
 
+    Args:
+        weights: file of the network.
 
-def each_rate(factor: float) -> Iterator[Callable[[Setting], Setting]]:
-    """Each multiplied and divided."""
-    for which in range(len(GNET_RATES)):
-        for by in (factor, 1 / factor):
-            yield partial(Setting.scaled, factor=by, which=which)
-
-
-def network_moves(factor: float) -> Iterator[Callable[[Setting], Setting]]:
-    """A network has its own schedule, and where it is told residuals a relaxation beside the rates."""
-    yield from each_rate(factor)
-    for more in (math.log(factor), -math.log(factor)):
-        yield partial(Setting.relaxed, more=more)
-
-
-def adam_of(setting: Setting) -> StepRule:
-    """Tuned Adam."""
-    return TunedAdam(setting.rates, setting.schedule)
-
-
-def network_of(weights: Path) -> tuple[Setting, Callable[[Setting], StepRule]]:
-    """The setting that a network has, and the network with another one."""
-    network = load(weights)
+    Returns:
+        The setting that the network has, and a function that makes the network with another one.
+    """
+    # The file is read once; every setting gets a copy of the weights under another configuration.
+    network = load_optimiser(weights)
     config = network.config
 
     def tuned(setting: Setting) -> StepRule:
@@ -122,8 +87,14 @@ def network_of(weights: Path) -> tuple[Setting, Callable[[Setting], StepRule]]:
 
 
 @dataclass(frozen=True)
-class Subject:
-    """A scene to optimise, ``split`` as ENet's; ``closeness`` in dB of its result: what counts beside PSNR, if any."""
+class TuningScene:
+    """A scene that a setting is scored on.
+
+    Attributes:
+        scene: to optimise, with its views.
+        split: fraction of Gaussians that are split first.
+        closeness: dB of a result that are added to its PSNR; ``None``: nothing is added.
+    """
 
     scene: TrainingScene
     split: float = 0.0
@@ -133,116 +104,176 @@ class Subject:
 class Scores:
     """Scores in dB of settings, each measured once and then read from the file.
 
-    ``rule_of`` makes the rule of a setting; ``beside``: how much the PSNR at the novel views counts, where there is
-    one. A scene's name is the seed of its views' order, or 0. Where a scene has fixed views, as many of them as of the
+    A scene's name is the seed of its views' order, or 0. Where a scene has fixed views, as many of them as of the
     source views are rendered.
     """
 
     def __init__(
         self,
         file: Path,
-        scenes: Mapping[int | str, Callable[[], Subject]],
-        rule_of: Callable[[Setting], StepRule] = adam_of,
-        beside: float = 0.0,
+        scenes: Mapping[int | str, Callable[[], TuningScene]],
+        rule_of: Callable[[Setting], StepRule] = make_adam,
+        novel_weight: float = 0.0,
     ) -> None:
-        self.file, self._scenes, self._rule_of, self._beside = file, scenes, rule_of, beside
-        self._made: dict[int | str, Subject] = {}
+        """Reads the scores that an earlier sweep measured.
+
+        Args:
+            file: JSON of the scores; written after every measurement.
+            scenes: makers of the scenes, by name; a scene is made when its first score is missing.
+            rule_of: makes the step rule of a setting.
+            novel_weight: factor of the PSNR at novel views, where a scene has their truth.
+        """
+        self.file = file
+        self._scenes = scenes
+        self._rule_of = rule_of
+        self._novel_weight = novel_weight
+        self._made: dict[int | str, TuningScene] = {}
         self._known: dict[str, float] = json.loads(file.read_text()) if file.is_file() else {}
 
     def mean(self, setting: Setting, iterations: int, views: int) -> float:
-        """Over the scenes."""
+        """Averages a setting's score over the scenes.
+
+        Args:
+            setting: to score.
+            iterations: length of a run.
+            views: source views of an iteration.
+
+        Returns:
+            dB.
+        """
         return statistics.fmean(self._one(name, setting, iterations, views) for name in self._scenes)
 
     def _one(self, name: int | str, setting: Setting, iterations: int, views: int) -> float:
         key = json.dumps({"scene": name, "iterations": iterations, "views": views, **asdict(setting)})
         if key not in self._known:
+            # Scenes are made only when a score is missing: a finished sweep is read in a second.
             if name not in self._made:
                 self._made[name] = self._scenes[name]()
-            self._known[key] = self._measured(name, setting, iterations, views)
+            self._known[key] = self._measure(name, setting, iterations, views)
+            # A sweep takes hours: every score is on disk before the next one is measured.
             write_atomically(self.file, json.dumps(self._known, indent=0).encode())
         return self._known[key]
 
-    def _measured(self, name: int | str, setting: Setting, iterations: int, views: int) -> float:
+    def _measure(self, name: int | str, setting: Setting, iterations: int, views: int) -> float:
         subject = self._made[name]
         scene = subject.scene
-        seed, novel = name if isinstance(name, int) else 0, views if scene.fixed else 0
-        plan = Plan(iterations, views, novel, seed=seed, split=subject.split)
-        end = unroll(self._rule_of(setting), scene.scene, scene.source, scene.fixed, Objective(LOSS), plan).scene
-        beside = self._beside * psnr(end, scene.truth) if self._beside and scene.truth else 0.0
-        return psnr(end, scene.heldout) + beside + (subject.closeness(end) if subject.closeness else 0.0)
+        # Another order of views for each street, so that rates are not tuned to one order.
+        seed = name if isinstance(name, int) else 0
+        # GNet's scenes have no fixed views.
+        novel = views if scene.fixed else 0
+        settings = UnrollSettings(iterations, views, novel, seed=seed, split_fraction=subject.split)
+        end = unroll(self._rule_of(setting), scene.scene, scene.source, scene.fixed, Objective(LOSS), settings).scene
+        novel_db = self._novel_weight * mean_psnr(end, scene.truth) if self._novel_weight and scene.truth else 0.0
+        closeness_db = subject.closeness(end) if subject.closeness else 0.0
+        return mean_psnr(end, scene.heldout) + novel_db + closeness_db
 
 
-def search(
-    measure: Callable[[Setting], float],
-    start: Setting,
-    rounds: int,
-    ways: Callable[[], Iterable[Callable[[Setting], Setting]]] = moves,
-) -> tuple[Setting, float]:
-    """The best setting found from ``start`` by ``ways``, and its score."""
-    best, found = start, measure(start)
-    for _ in range(rounds):
-        before = found
-        for move in ways():
-            while (value := measure(move(best))) > found:
-                best, found = move(best), value
-                say(f"{found:7.3f} dB  {best}")
-        if found - before < ENOUGH_DB:
-            break
-    return best, found
+def load_setting(variant: str) -> Setting:
+    """Reads a variant of tuned Adam from ``configs/baselines.yaml``.
 
+    Args:
+        variant: its name there.
 
-def setting_of(variant: str) -> Setting:
-    """What ``configs/baselines.yaml`` has for tuned Adam. Raises ``ConfigError`` for an unknown variant."""
-    adam = load_baselines("small")["tuned_adam"].at(variant).adam
-    rates = GNET_RATES if adam.learning_rates is None else adam.learning_rates.as_tuple()
+    Returns:
+        Setting: its learning rates and schedule.
+
+    Raises:
+        ConfigError: the variant is unknown.
+    """
+    adam = load_baselines("small")["tuned_adam"].variant(variant).adam
+    rates = GNET_LEARNING_RATES.as_tuple() if adam.learning_rates is None else adam.learning_rates.as_tuple()
     return Setting(rates, adam.schedule)
 
 
 def validation_seeds(text: str) -> list[int]:
-    """Raises ``ConfigError`` for a seed that is not of validation: claims are never tuned on."""
+    """Reads seeds of validation streets; nothing is tuned on the streets of claims.
+
+    Args:
+        text: seeds with commas.
+
+    Returns:
+        The seeds.
+
+    Raises:
+        ConfigError: a seed is not of validation.
+    """
     low, high = yaml.safe_load(SEEDS_FILE.read_text())["validation"]
     seeds = [int(part) for part in text.split(",")]
+    # Tuning on the streets of claims would make the claims worthless.
     if bad := [s for s in seeds if not low <= s <= high]:
         raise ConfigError(f"seeds {bad} are not of validation", remedy=f"Give seeds of {low}–{high}.", file=SEEDS_FILE)
     return seeds
 
 
-def scenes_of(
-    seeds: Sequence[int], real: str | None, make: Callable[[str], Subject]
-) -> dict[int | str, Callable[[], Subject]]:
-    """Makers of the seeds' scenes and of a real chunk 0, by their URI."""
+def scene_makers(
+    seeds: Sequence[int], real: str | None, make: Callable[[str], TuningScene]
+) -> dict[int | str, Callable[[], TuningScene]]:
+    """Lists the scenes of a sweep.
+
+    Args:
+        seeds: of synthetic streets.
+        real: URI of a log whose chunk 0 counts as one more scene; ``None``: none does.
+        make: makes a scene from a URI.
+
+    Returns:
+        Makers by seed; the real scene's name is ``real``.
+    """
     uris: dict[int | str, str] = {seed: f"synthetic:street?seed={seed}" for seed in seeds}
     uris |= {} if real is None else {"real": real}
     return {name: partial(make, uri) for name, uri in uris.items()}
 
 
-def initial(store: LocalStore, points: int, uri: str) -> Subject:
-    """GNet's task: an initial scene at 320×180, with all source views and twelve held-out ones."""
+def load_gnet_scene(store: LocalStore, points: int, uri: str) -> TuningScene:
+    """Loads GNet's task: an initial scene at 320×180, with all source views and twelve held-out ones.
+
+    Args:
+        store: artifacts of the sweep.
+        points: LiDAR points at most; a tenth as many Gaussians are distant.
+        uri: of the log.
+
+    Returns:
+        TuningScene: without a split.
+    """
     recipe = SceneRecipe(uri, max_points=points, distant_count=points // 10)
-    return Subject(training_scene(prepare(store, recipe)))
+    return TuningScene(build_training_scene(prepare_scene(store, recipe)))
 
 
-def enhanced(store: str, split: float | None, uri: str) -> Subject:
-    """ENet's task: GNet's scene and FNet's images in the preset ``small``."""
+def load_enet_scene(store: str, split: float | None, uri: str) -> TuningScene:
+    """Loads ENet's task: GNet's scene and FNet's images in the preset ``small``.
+
+    Args:
+        store: folder of the sweep's artifacts.
+        split: fraction of Gaussians to split; ``None``: the preset's.
+        uri: of the log.
+
+    Returns:
+        TuningScene: its closeness is the kernel distance at 3 m, in dB.
+    """
     split = load_configuration("small").enet.split_fraction if split is None else split
-    steps = steps_of(uri, 0, store, 0, enet=False)
-    heldout, truth = spread(steps.heldout, HELDOUT_VIEWS), true_targets(uri, store, steps.chunk, SIDE_M)
+    steps = load_pipeline_inputs(uri, 0, store, 0, enet=False)
+    heldout = evenly_spaced(steps.heldout, HELDOUT_VIEWS)
+    truth = load_true_targets(uri, store, steps.chunk, SIDE_M)
     scene = TrainingScene(uri, steps.gnet, steps.source, heldout, steps.fixed, truth)
-    task = Task(steps.gnet, steps.source, heldout, truth)
-    judge = Judge(views_at(steps.chunk, SIDE_M, KERNEL_VIEWS), real_images(steps.chunk), task)
-    return Subject(scene, split, partial(kernel_db, judge))
+    task = OptimisationTask(steps.gnet, steps.source, heldout, truth)
+    scorer = NovelViewScorer(views_at_shift(steps.chunk, SIDE_M, KERNEL_VIEWS), real_image_features(steps.chunk), task)
+    return TuningScene(scene, split, partial(kernel_db, scorer))
 
 
-def kernel_db(judge: Judge, scene: SceneGraph) -> float:
-    """The kernel distance at 3 m to the real images, in dB: a tenth less is half a decibel."""
-    return -10 * math.log10(max(judge.mark(scene, 0.0, 0).kernel, 1e-3))
+def kernel_db(scorer: NovelViewScorer, scene: SceneGraph) -> float:
+    """Expresses the kernel distance at 3 m to the real images in dB, so that it can be added to a PSNR.
+
+    Args:
+        scorer: with the views and the real images.
+        scene: to score.
+
+    Returns:
+        dB, higher is better: a tenth less distance is half a decibel.
+    """
+    # The unbiased estimate may fall to zero or below, where there is no logarithm.
+    return -10 * math.log10(max(scorer.score(scene, 0.0, 0).kernel, 1e-3))
 
 
-def say(text: str) -> None:
-    sys.stderr.write(text + "\n")
-
-
-def main() -> None:
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--seeds", default="900,901,902")
@@ -257,23 +288,32 @@ def main() -> None:
     parser.add_argument("--split", type=float, help="as enet.split; without it the preset's")
     parser.add_argument("--rates", help="five with commas, which the search for Adam's starts from, schedule constant")
     parser.add_argument("--beside", type=float, default=0.0, help="how much the PSNR at 3 m counts")
+    return parser
+
+
+def main() -> None:
+    """Tunes every length in turn and prints its variant."""
+    parser = _parser()
     options = parser.parse_args()
     if options.weights is not None and (options.start is not None or options.rates is not None):
         parser.error("--start and --rates are Adam's; a network's search starts from its own rates")
     options.folder.mkdir(parents=True, exist_ok=True)
-    seeds, store = validation_seeds(options.seeds), options.folder / "store"
-    make: Callable[[str], Subject] = partial(initial, LocalStore(store), options.points)
+    seeds = validation_seeds(options.seeds)
+    store = options.folder / "store"
+    make: Callable[[str], TuningScene] = partial(load_gnet_scene, LocalStore(store), options.points)
     if options.enet:
-        make = partial(enhanced, str(store), options.split)
-    makers = scenes_of(seeds, options.real, make)
-    best = Setting() if options.start is None else setting_of(options.start)
+        make = partial(load_enet_scene, str(store), options.split)
+    # Functions and not scenes: making one takes minutes, and all scores may be known already.
+    makers = scene_makers(seeds, options.real, make)
+    best = Setting() if options.start is None else load_setting(options.start)
     if options.rates is not None:
         best = Setting(tuple(float(rate) for rate in options.rates.split(",")), "constant")
-    rule_of: Callable[[Setting], StepRule] = adam_of
+    rule_of: Callable[[Setting], StepRule] = make_adam
     ways = partial(moves, options.factor)
     if options.weights is not None:
-        best, rule_of = network_of(options.weights)
+        best, rule_of = load_network(options.weights)
         ways = partial(network_moves, options.factor)
+    # Scores of other weights, tasks or mixtures are not comparable: each has a file of its own.
     digest = "" if options.weights is None else f"-{digest_file(options.weights)[:8]}"
     task = f"-enet{'' if options.split is None else f'-{options.split}'}" if options.enet else ""
     file = options.folder / f"scores{task}{digest}{f'-{options.beside}' if options.beside else ''}.json"

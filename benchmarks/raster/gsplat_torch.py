@@ -21,7 +21,9 @@ from benchmarks.raster.scenes import ATTRIBUTES, Scene
 from genre_tasks.scene.gaussians import Splats
 
 VERSION = "1.5.3"
-ALPHA_MIN, ALPHA_MAX, STOP = 1 / 255, 0.999, 1e-4
+ALPHA_MIN = 1 / 255
+ALPHA_MAX = 0.999
+STOP = 1e-4
 """gsplat's constants (``cuda/include/Common.h``, ``RasterizeToIndices3DGS.cu``)."""
 BLOCK_PX = 16
 
@@ -35,8 +37,15 @@ class Pairs:
     images: Tensor  # [M] all zero: one view
 
 
-def reference() -> Any:
-    """gsplat's module. Raises ``NotMeasuredError`` where gsplat, or this version of it, is not installed."""
+def load_reference() -> Any:
+    """Imports gsplat's torch reference.
+
+    Returns:
+        The module.
+
+    Raises:
+        NotMeasuredError: gsplat, or this version of it, is not installed.
+    """
     from importlib.metadata import PackageNotFoundError, version
 
     try:
@@ -45,6 +54,7 @@ def reference() -> Any:
         found = "no"
     if found != VERSION:
         raise NotMeasuredError(f"needs gsplat {VERSION}, found {found} version: pip install 'genre[bench]'")
+    # gsplat imports nerfacc by name when the reference is called, so a stand-in must be there first.
     stand_in = ModuleType("nerfacc")
     vars(stand_in).update(render_weight_from_alpha=_weights, accumulate_along_rays=_accumulate)
     sys.modules["nerfacc"] = stand_in
@@ -53,8 +63,18 @@ def reference() -> Any:
     return _torch_impl
 
 
-def render_peer(gsplat: Any, splats: Splats, s: Scene, pairs: Pairs) -> tuple[Tensor, Tensor]:
-    """The scene's first view: colour and depth [1, H, W, 4], alpha [1, H, W, 1]."""
+def render_reference(gsplat: Any, splats: Splats, s: Scene, pairs: Pairs) -> tuple[Tensor, Tensor]:
+    """Renders the scene's first view with the reference.
+
+    Args:
+        gsplat: the reference.
+        splats: to render.
+        s: with the cameras.
+        pairs: that are blended.
+
+    Returns:
+        Colour and depth [1, H, W, 4], alpha [1, H, W, 1].
+    """
     c = s.cameras
     _, centers, depths, conics = _project(gsplat, splats, s)
     features = torch.cat([splats.colors[None], depths[..., None]], -1)
@@ -72,11 +92,19 @@ def render_peer(gsplat: Any, splats: Splats, s: Scene, pairs: Pairs) -> tuple[Te
     return out
 
 
-def forward_backward_peer(gsplat: Any, leaves: Splats, s: Scene, pairs: Pairs) -> None:
-    """Renders, and leaves fresh gradients of all 14 attributes in ``leaves``."""
+def forward_backward_reference(gsplat: Any, leaves: Splats, s: Scene, pairs: Pairs) -> None:
+    """Renders, and leaves fresh gradients of all 14 attributes in ``leaves``.
+
+    Args:
+        gsplat: the reference.
+        leaves: to render; their gradients are replaced.
+        s: with the cameras and the weights of the images.
+        pairs: that are blended.
+    """
     for name in ATTRIBUTES:
+        # Gradients would otherwise add up over calls, which costs time and changes values.
         getattr(leaves, name).grad = None
-    image, alpha = render_peer(gsplat, leaves, s, pairs)
+    image, alpha = render_reference(gsplat, leaves, s, pairs)
     weights = torch.cat([s.v_color, s.v_depth[..., None]], -1)
     torch.autograd.backward((image, alpha), (weights, s.v_alpha[..., None]))
 
@@ -84,7 +112,8 @@ def forward_backward_peer(gsplat: Any, leaves: Splats, s: Scene, pairs: Pairs) -
 def _project(gsplat: Any, splats: Splats, s: Scene) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Radii [1, N, 2], centres [1, N, 2], depths [1, N] and conics [1, N, 3] in the first view."""
     c = s.cameras
-    (fx, fy), (cx, cy) = c.focal_px[0].tolist(), c.center_px[0].tolist()
+    fx, fy = c.focal_px[0].tolist()
+    cx, cy = c.center_px[0].tolist()
     intrinsics = torch.tensor([[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]])
     covariances, _ = gsplat._quat_scale_to_covar_preci(splats.quats, splats.scales, compute_preci=False)
     pose = c.camera_SE3_chunk[:1]
@@ -95,27 +124,43 @@ def _project(gsplat: Any, splats: Splats, s: Scene) -> tuple[Tensor, Tensor, Ten
 
 
 @torch.no_grad()
-def pairs_of(gsplat: Any, s: Scene) -> Pairs:
-    """What ``rasterize_to_indices_in_range`` lists, block of pixels by block of pixels."""
-    width, height = s.cameras.width_px, s.cameras.height_px
+def list_pairs(gsplat: Any, s: Scene) -> Pairs:
+    """Lists what ``rasterize_to_indices_in_range`` lists, block of pixels by block of pixels.
+
+    Args:
+        gsplat: the reference.
+        s: with one view.
+
+    Returns:
+        Pairs: row after row of the image, each pixel's front to back.
+    """
+    width = s.cameras.width_px
+    height = s.cameras.height_px
     radii, centers, depths, conics = (x[0] for x in _project(gsplat, s.splats, s))
     shown = torch.nonzero((radii > 0).all(1))[:, 0]
+    # Stable, so that Gaussians at equal depth blend in one order every time.
     shown = shown[torch.argsort(depths[shown], stable=True)]
     center, conic, opacity, radius = (x[shown] for x in (centers, conics, s.splats.opacities, radii))
-    low, high = center - radius, center + radius
-    gaussians, pixels = [], []
+    low = center - radius
+    high = center + radius
+    gaussians = []
+    pixels = []
     for y in range(0, height, BLOCK_PX):
+        # Culling by bands first keeps the search in each block short.
         in_band = torch.nonzero((high[:, 1] >= y) & (low[:, 1] <= y + BLOCK_PX))[:, 0]
         for x in range(0, width, BLOCK_PX):
+            # Without culling, each block would test all Gaussians at each of its pixels.
             near = in_band[(high[in_band, 0] >= x) & (low[in_band, 0] <= x + BLOCK_PX)]
-            ys, xs = torch.arange(y, min(y + BLOCK_PX, height)), torch.arange(x, min(x + BLOCK_PX, width))
-            at = torch.cartesian_prod(ys, xs)
-            blended = _blended(at.flip(1) + 0.5, center[near], conic[near], opacity[near])
+            ys = torch.arange(y, min(y + BLOCK_PX, height))
+            xs = torch.arange(x, min(x + BLOCK_PX, width))
+            pixel_yx = torch.cartesian_prod(ys, xs)
+            blended = _blended(pixel_yx.flip(1) + 0.5, center[near], conic[near], opacity[near])
             pixel, k = torch.nonzero(blended, as_tuple=True)
             gaussians.append(shown[near[k]])
-            pixels.append((at[:, 0] * width + at[:, 1])[pixel])
+            pixels.append((pixel_yx[:, 0] * width + pixel_yx[:, 1])[pixel])
     pixels_of_all = torch.cat(pixels)
-    order = torch.argsort(pixels_of_all, stable=True)  # row after row of the image, as gsplat lists them
+    # Row after row of the image, as gsplat lists them; a stable sort keeps each pixel's order of depth.
+    order = torch.argsort(pixels_of_all, stable=True)
     return Pairs(torch.cat(gaussians)[order], pixels_of_all[order], torch.zeros_like(order))
 
 
@@ -125,17 +170,21 @@ def _blended(at: Tensor, center: Tensor, conic: Tensor, opacity: Tensor) -> Tens
     sigma = 0.5 * (conic[:, 0] * dx * dx + conic[:, 2] * dy * dy) + conic[:, 1] * dx * dy
     alpha = (opacity * torch.exp(-sigma)).clamp_max(ALPHA_MAX)
     drawn = (sigma >= 0) & (alpha >= ALPHA_MIN)
+    # A pair is blended while enough light is left behind it, as in gsplat's CUDA code.
     after = torch.cumprod(torch.where(drawn, 1 - alpha, 1.0), -1)
     return drawn & (after > STOP)
 
 
 def _weights(alphas: Tensor, *, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, Tensor]:
     """nerfacc's ``render_weight_from_alpha``: weights [M] and transmittances [M] before each pair, per ray."""
-    logs = torch.log1p(-alphas.double())  # in float32 the running sum over all rays would lose the last digits
+    # In float32 the running sum over all rays would lose the last digits.
+    logs = torch.log1p(-alphas.double())
     before = torch.cumsum(logs, 0) - logs
     first = torch.ones_like(ray_indices, dtype=torch.bool)
     first[1:] = ray_indices[1:] != ray_indices[:-1]
-    starts, segment = torch.nonzero(first)[:, 0], torch.cumsum(first, 0) - 1
+    starts = torch.nonzero(first)[:, 0]
+    segment = torch.cumsum(first, 0) - 1
+    # One scan over all rays, less its value at the ray's start, avoids a loop over rays.
     transmittance = torch.exp(before - before[starts][segment]).float()
     return alphas * transmittance, transmittance
 

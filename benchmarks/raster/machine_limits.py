@@ -13,7 +13,15 @@ COPY_BYTES = 256 << 20
 
 
 def gemm(threads: int) -> Action:
-    """A product of two float32 matrices, ``GEMM_FLOP`` operations."""
+    """Makes an action that multiplies two float32 matrices.
+
+    Args:
+        threads: of torch.
+
+    Returns:
+        Action: ``GEMM_FLOP`` operations.
+    """
+    # The product goes into memory that is there already: allocation is not what is measured.
     g = torch.Generator().manual_seed(0)
     a, b = (torch.randn(GEMM_SIZE, GEMM_SIZE, generator=g) for _ in range(2))
     out = torch.empty_like(a)
@@ -21,7 +29,14 @@ def gemm(threads: int) -> Action:
 
 
 def copy(threads: int) -> Action:
-    """A copy of ``COPY_BYTES`` from memory to memory."""
+    """Makes an action that copies ``COPY_BYTES`` from memory to memory.
+
+    Args:
+        threads: of torch.
+
+    Returns:
+        Action: one copy.
+    """
     source = torch.zeros(COPY_BYTES // 4)
     target = torch.zeros_like(source)
     return on_threads(threads, lambda: target.copy_(source))

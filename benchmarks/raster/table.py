@@ -10,7 +10,14 @@ from benchmarks.raster.scenes import CASES
 
 
 def markdown(rows: Mapping[str, Row]) -> Iterator[str]:
-    """Times beside the peers', the machine's ceilings, and the other cells a line each."""
+    """Makes the tables of times, of the work and the machine's limits, and of the other cells.
+
+    Args:
+        rows: by cell.
+
+    Yields:
+        Lines of Markdown.
+    """
     yield from _times(rows)
     yield ""
     yield from _work(rows)
@@ -31,8 +38,10 @@ def _times(rows: Mapping[str, Row]) -> Iterator[str]:
         ("gsplat CUDA", "cuda", "forward", "forward+backward"),
     )
     for title, kind, forward, both in lines:
+        # A row that says only why nothing was measured has no times.
         found = [rows[f"{kind}/{c.name}"].get("milliseconds") for c in CASES]
         yield _line(title, ("" if m is None else f"{_ms(m[forward])} / {_ms(m[both])}" for m in found))
+    # Cells that were not measured stay empty: the table has the same shape on every machine.
     ratios = [rows[f"peer/{c.name}"] for c in CASES]
     yield _line("gsplat torch ÷ this", (f"{_of(r, 'forward_ratio', '.0f')} / {_of(r, 'ratio', '.0f')}" for r in ratios))
     yield _line("largest difference of colour", (_difference(r) for r in ratios))
@@ -63,7 +72,9 @@ def _work(rows: Mapping[str, Row]) -> Iterator[str]:
 def _rest(rows: Mapping[str, Row]) -> Iterator[str]:
     yield "| what | measured |"
     yield "|---|---|"
-    views, isas, build = rows["views"], rows["isas"], rows["build"]
+    views = rows["views"]
+    isas = rows["isas"]
+    build = rows["build"]
     if "ratio" in views:
         m = views["milliseconds_per_view"]
         times = f"{_ms(m['forward+backward, one call'])} to {_ms(m['forward+backward, single calls'])} ms a view"
@@ -89,6 +100,7 @@ def _line(title: str, values: Iterator[str]) -> str:
 
 
 def _ms(m: Mapping[str, Any]) -> str:
+    # Three digits of a number above a thousand would be printed with an exponent.
     return f"{m['median']:.3g}" if m["median"] < 1000 else f"{m['median']:,.0f}"
 
 

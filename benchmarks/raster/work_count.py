@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 from dataclasses import dataclass
 
-from genre_tasks.render.cpu import check_status, forward_state
+from genre_tasks.render.cpu import check_status, run_forward
 from genre_tasks.render.kernel.library import load_kernel
 from genre_tasks.render.types import Cameras
 from genre_tasks.scene.gaussians import Splats
@@ -33,8 +33,20 @@ class Work:
 
 
 def count_work(splats: Splats, cameras: Cameras) -> Work:
-    """Renders N Gaussians at V cameras once and counts. Raises as :func:`genre_tasks.render.render`."""
-    state = forward_state(splats, cameras)
+    """Renders once and counts what the CPU kernel did.
+
+    Args:
+        splats: N Gaussians.
+        cameras: V views.
+
+    Returns:
+        Work: summed over the views.
+
+    Raises:
+        ValueError: as :func:`genre_tasks.render.render`.
+    """
+    state = run_forward(splats, cameras)
     counts = (ctypes.c_longlong * 4)()
+    # The kernel's own bookkeeping is read, because a second count in Python could differ from what it does.
     check_status(load_kernel().genre_work(state.handle, counts))
     return Work(*counts)

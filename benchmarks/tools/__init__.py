@@ -1,0 +1,1 @@
+"""Tools that compare results before and after a change of the code."""

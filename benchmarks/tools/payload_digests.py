@@ -20,10 +20,11 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.common.run_stages import ALL_STAGES, print_progress
 from flows.configuration import load_configuration
-from flows.machine.facts import machine
-from flows.pipeline.definition import PIPELINE
-from flows.pipeline.stage_runner import ArtifactRef, Job, produce
+from flows.experiments.stages import run_stages
+from flows.machine.facts import describe_machine
+from flows.pipeline.stage_runner import ArtifactRef, Job, run_stage
 
 EVERY_EFFECT = (
     "rolling_shutter_s=0.03&exposure_jitter=0.2&white_balance_jitter=0.05&bonnet=0.08&distortion=0.02"
@@ -42,11 +43,11 @@ class Case:
     """One reconstruction whose payloads are compared.
 
     Attributes:
-        log: a log's URI; ``{pandaset}`` is replaced by the folder of the real sequence.
+        log: the log's URI; ``{pandaset}`` is replaced by the folder of the real sequence.
         chunk: index of the chunk.
         preset: name of a preset in ``configs/``.
         settings: ``section.key=value`` on top of the preset.
-        stages: stages to run; empty for all.
+        stages: stages to run, in the pipeline's order; empty for all.
     """
 
     log: str
@@ -94,16 +95,25 @@ def digests_of(case: Case, pandaset: str, store: str) -> dict[str, str]:
     """
     config = load_configuration(case.preset, settings=case.settings)
     job = Job(case.log.format(pandaset=pandaset), case.chunk, store, config.model_dump(mode="json"))
-    refs: dict[str, ArtifactRef] = {}
-    for spec in PIPELINE:
-        if not case.stages or spec.name in case.stages:
-            refs[spec.name] = produce(spec.name, job, {name: refs[name] for name in spec.inputs})
-            sys.stderr.write(f"  {spec.name}: {refs[spec.name].payload_digest[:12]}\n")
+    refs = run_stages(case.stages or ALL_STAGES, job, _run_and_print_digest)
     return {name: ref.payload_digest for name, ref in refs.items()}
 
 
+def _run_and_print_digest(stage: str, job: Job, inputs: dict[str, ArtifactRef]) -> ArtifactRef:
+    ref = run_stage(stage, job, inputs)
+    print_progress(f"  {stage}: {ref.payload_digest[:12]}")
+    return ref
+
+
 def differences(before: dict[str, dict[str, str]], after: dict[str, dict[str, str]]) -> list[str]:
-    """One line for each stage whose payload changed; stages of cases that did not run are skipped.
+    """Lists the stages whose payload changed.
+
+    Args:
+        before: case → stage → digest, of the old code.
+        after: the same of the new code; cases that did not run are not compared.
+
+    Returns:
+        A line for each changed stage.
 
     >>> differences({"demo": {"gnet": "aa", "enet": "bb"}}, {"demo": {"gnet": "aa", "enet": "cc"}})
     ['demo enet: bb is now cc']
@@ -118,7 +128,11 @@ def differences(before: dict[str, dict[str, str]], after: dict[str, dict[str, st
 
 
 def main() -> int:
-    """Runs the cases and writes or compares their digests; exit status 1 where a payload changed."""
+    """Runs the cases and writes or compares their digests.
+
+    Returns:
+        The exit status: 1 where a payload changed.
+    """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, help="write the digests to this JSON file")
     parser.add_argument("--compare", type=Path, help="compare with the digests in this JSON file")
@@ -128,11 +142,11 @@ def main() -> int:
     torch.set_num_threads(2)
     found: dict[str, dict[str, str]] = {}
     for name in options.cases.split(","):
-        sys.stderr.write(f"{name}\n")
+        print_progress(name)
         with tempfile.TemporaryDirectory() as store:
             found[name] = digests_of(CASES[name], options.pandaset, store)
     if options.out:
-        options.out.write_text(json.dumps({"machine": machine(), "digests": found}, indent=1) + "\n")
+        options.out.write_text(json.dumps({"machine": describe_machine(), "digests": found}, indent=1) + "\n")
     changed: list[str] = []
     if options.compare:
         changed = differences(json.loads(options.compare.read_text())["digests"], found)

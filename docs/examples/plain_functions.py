@@ -32,4 +32,4 @@ def reconstruct(uri: str, settings: list[str]) -> dict[str, Evaluation]:
 if __name__ == "__main__":
     for stage, evaluation in reconstruct("synthetic:street?seed=1000", []).items():
         for metric in evaluation.metrics:
-            print(f"{stage:<8} {metric.name:<26} {metric.value:10.4f}  n = {metric.n}")  # noqa: T201
+            print(f"{stage:<8} {metric.name:<26} {metric.value:10.4f}  n = {metric.n}")

@@ -1,1 +1,1 @@
-"""A run within a given time: which settings of a measured table fit, and stepping down where time runs short."""
+"""A run within a given time: the measured settings, the deadline, and the choice of what fits."""

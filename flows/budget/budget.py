@@ -1,62 +1,115 @@
-"""The budget of a whole run: one clock and one table, a chooser for each chunk."""
+"""The budget of a whole run: one deadline and one table, and a chooser for each chunk."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-from flows.budget.chooser import Chooser, images_of
-from flows.budget.cost_table import Table, load, shipped_table
-from flows.budget.deadline import Clock
-from flows.configuration import differences
-from flows.machine.calibration import calibration_s
+from flows.budget.chooser import Chooser, count_images
+from flows.budget.cost_table import CostTable, find_shipped_table, load_cost_table
+from flows.budget.deadline import Deadline
+from flows.configuration import diff_from_preset
+from flows.machine.calibration import measure_calibration_s
 from genre_tasks.config import PipelineConfig
 
 
-def table_for(table: str | None, preset: str, config: PipelineConfig) -> Table:
-    """What a run with ``config`` over ``preset`` chooses from: the file ``table``, or the preset's own.
+def resolve_table(table: str | None, preset: str, config: PipelineConfig) -> CostTable:
+    """Loads the table that a run within a budget chooses from, and checks it against the user's settings.
 
-    Raises ``ConfigError`` as ``measured.load`` does.
+    Args:
+        table: the cost.parquet of a sweep; ``None`` for the table that ships with the preset.
+        preset: the preset of the run.
+        config: the run's configuration; a key that differs from the preset counts as set by the user.
+
+    Returns:
+        The table.
+
+    Raises:
+        ConfigError: as :func:`flows.budget.cost_table.load_cost_table` and ``find_shipped_table`` raise it.
     """
-    return load(Path(table) if table else shipped_table(preset), preset, differences(config, preset))
+    path = Path(table) if table else find_shipped_table(preset)
+    return load_cost_table(path, preset, diff_from_preset(config, preset))
 
 
 class Budget:
-    """``budget_s`` seconds from ``began`` (since the epoch; now without it) for a run with ``config`` over ``preset``.
+    """Shares the time of a run among its chunks and chooses the settings that fit. Evaluation does not count.
 
-    ``table`` is the cost.parquet of a sweep; the preset's own without it. Evaluation is not counted.
+    Args:
+        budget_s: seconds that the run may take.
+        start_time: when the run began, in seconds since the epoch; ``None`` for now.
+        table: the cost.parquet of a sweep; ``None`` for the table that ships with the preset.
+        preset: the preset of the run.
+        config: the run's configuration, over which settings of the table are applied.
+
+    Attributes:
+        deadline: counts the time of the run.
+        speed: this machine's calibration over the table's; ``None`` until it is measured.
+        choosers: the chooser of each chunk that was begun, by chunk.
+
+    Raises:
+        ConfigError: as :func:`resolve_table` raises it.
     """
 
     def __init__(
-        self, budget_s: float, began: float | None, table: str | None, preset: str, config: PipelineConfig
+        self, budget_s: float, start_time: float | None, table: str | None, preset: str, config: PipelineConfig
     ) -> None:
-        self.clock = Clock(budget_s, began)
-        self._table, self._config = table_for(table, preset, config), config
+        self.deadline = Deadline(budget_s, start_time)
+        self._table = resolve_table(table, preset, config)
+        self._config = config
         self.speed: float | None = None
         self.choosers: dict[int, Chooser] = {}
 
-    def chooser(self, log: str, chunk: int) -> Chooser:
-        """Of a chunk; the first one's stages are also the first of the process."""
-        work = images_of(log, chunk, self._config) / self._table.images
-        made = Chooser(self._table, self._config, self.clock, work, self.calibrated, not self.choosers)
-        self.choosers[chunk] = made
-        return made
+    def make_chooser(self, log: str, chunk: int) -> Chooser:
+        """Makes the chooser of a chunk and keeps it for the record.
 
-    def calibrated(self) -> float:
-        """This machine's calibration over the table's, measured once: more than 1 where it is slower."""
+        Args:
+            log: the log's URI.
+            chunk: number of the chunk.
+
+        Returns:
+            The chooser, which asks for this machine's speed when it needs it.
+        """
+        chooser = Chooser(
+            self._table,
+            self._config,
+            self.deadline,
+            image_factor=count_images(log, chunk, self._config) / self._table.images,
+            measure_speed=self.measure_speed,
+            # The stages of the first chunk are also the first ones of the process: they load code and weights.
+            first_calls=not self.choosers,
+        )
+        self.choosers[chunk] = chooser
+        return chooser
+
+    def measure_speed(self) -> float:
+        """Measures this machine's speed once; later calls give the same number.
+
+        Returns:
+            Seconds of the calibration here over those of the table's machine: more than 1 where this one is slower.
+        """
+        # Measured once for the whole run: it takes a second, and other work beside it would disturb it.
         if self.speed is None:
-            self.speed = calibration_s() / self._table.calibration_s
+            self.speed = measure_calibration_s() / self._table.calibration_s
         return self.speed
 
-    def told(self) -> str:
-        """What the clock says before the first choice."""
+    def describe(self) -> str:
+        """Says in one line how much time there is and where the table was measured.
+
+        Returns:
+            A line for the user, before the first choice.
+        """
         return (
-            f"budget {self.clock.budget_s:g} s, {self.clock.used_s:.1f} s used so far; "
+            f"budget {self.deadline.budget_s:g} s, {self.deadline.used_s:.1f} s used so far; "
             f"its settings were measured on {self._table.machine}"
         )
 
-    def record(self) -> dict[str, Any]:
-        """For the run's record, once the last scene is there. ``speed`` is null where nothing was computed."""
-        chunks = [{"chunk": c, **by.record()} for c, by in self.choosers.items()]
-        used_s = max((by.used_s for by in self.choosers.values()), default=self.clock.used_s)
-        return {"budget_s": self.clock.budget_s, "used_s": used_s, "speed": self.speed, "chunks": chunks}
+    def as_record(self) -> dict[str, Any]:
+        """Gathers what the run's record keeps of the budget, once the last scene is there.
+
+        Returns:
+            ``budget_s``, ``used_s``, ``speed`` (``None`` where nothing was computed), and the choices of each chunk.
+        """
+        chunks = [{"chunk": chunk, **chooser.as_record()} for chunk, chooser in self.choosers.items()]
+        # Time after the last chunk's last stage is evaluation and the report, which do not count.
+        used_s = max((chooser.used_s for chooser in self.choosers.values()), default=self.deadline.used_s)
+        return {"budget_s": self.deadline.budget_s, "used_s": used_s, "speed": self.speed, "chunks": chunks}

@@ -1,34 +1,40 @@
-"""Chooses the most accurate setting that fits, and chooses again at every border between stages."""
+"""Chooses the most accurate setting that fits into the time, and chooses again before every stage."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
-from flows.budget.cost_table import Point, Table
-from flows.budget.deadline import Clock
-from flows.configuration import with_settings
-from flows.pipeline.definition import BY_NAME, reconstructing_until
-from flows.pipeline.log_cache import opened_log
+from flows.budget.cost_table import CostPoint, CostTable
+from flows.budget.deadline import Deadline
+from flows.configuration import apply_settings
+from flows.pipeline.definition import STAGE_BY_NAME, stages_until
+from flows.pipeline.log_cache import cached_log
 from genre_tasks.config import PipelineConfig
 
-BORDER_S = 0.6
-"""Of a stage beyond its own seconds on the table's machine: artifacts read, hashed and written, Prefect's states."""
+STAGE_OVERHEAD_S = 0.6
+"""Seconds that a stage takes on the table's machine beyond its own: artifacts are read, hashed and written, and Prefect
+keeps its states."""
 
-SPARE = 0.06
-"""Of the predicted time, kept for what no table knows."""
+SAFETY_MARGIN = 0.06
+"""Safety margin, as a fraction of the predicted time."""
 
-TOLD_BY_CALIBRATION_S = 5.0
-"""So many seconds of stages weigh as much as the calibration does. Ingest is not among them: its time tells of the
-log's reader."""
+CALIBRATION_WEIGHT_S = 5.0
+"""Seconds of stages that count as much as the calibration when the pace is estimated."""
 
 
 @dataclass(frozen=True)
-class Choice:
-    """What a border decided: ``before`` which stage, the point's name, seconds predicted and left, and why.
+class BudgetChoice:
+    """What was decided before a stage.
 
-    ``pace``: seconds here over the table's, as far as was known by then.
+    Attributes:
+        before: the stage that follows, or ``the end``.
+        point: name of the setting that was chosen.
+        predicted_s: seconds that the chunk's remaining stages would take with it.
+        left_s: seconds that the chunk had left.
+        pace: seconds here over the table's seconds, as far as it was known by then.
+        why: the reason, one clause.
     """
 
     before: str
@@ -39,119 +45,203 @@ class Choice:
     why: str
 
     def __str__(self) -> str:
-        at = f"{self.pace:.2f} × the table's seconds"
-        return f"{self.point}: {self.predicted_s:.0f} s predicted ({at}) of {self.left_s:.0f} s left; {self.why}"
+        pace = f"{self.pace:.2f} × the table's seconds"
+        return f"{self.point}: {self.predicted_s:.0f} s predicted ({pace}) of {self.left_s:.0f} s left; {self.why}"
+
+
+class _Candidate(NamedTuple):
+    """A setting of the table, and the user's configuration with it."""
+
+    point: CostPoint
+    config: PipelineConfig
 
 
 class Chooser:
-    """For one chunk.
+    """Chooses the setting of one chunk, stage by stage.
 
-    ``base`` is the user's configuration, over which a setting of the table is applied. ``work`` is the chunk's images
-    over the table's, ``speed`` says this machine's calibration over the table's, ``cold`` whether no stage has run in
-    this process.
+    The machine's speed is measured only when the first stage was computed. Until then Prefect's server is starting,
+    which makes a machine look up to 1.6 times as slow as it is. Nothing is lost by waiting: the first stage is ingest,
+    which is the same in all settings.
 
-    Speed is asked for once the first stage was computed: until then Prefect's server is starting beside it, which
-    makes a machine look up to 1.6 times as slow as it is. Nothing is lost: that is ingest, the same in all points.
+    Args:
+        table: the settings to choose from.
+        base: the user's configuration, over which a setting is applied.
+        deadline: the time of the run.
+        image_factor: images of the chunk over images of a chunk of the table.
+        measure_speed: gives this machine's calibration over the table's.
+        first_calls: whether no stage has run in this process yet.
+
+    Attributes:
+        deadline: the time of the run.
+        choices: every choice that changed the setting, in order.
+        used_s: seconds of the budget that were used when the latest choice was made.
     """
 
     def __init__(
         self,
-        table: Table,
+        table: CostTable,
         base: PipelineConfig,
-        clock: Clock,
-        work: float,
-        speed: Callable[[], float],
-        cold: bool = True,
+        deadline: Deadline,
+        image_factor: float,
+        measure_speed: Callable[[], float],
+        first_calls: bool = True,
     ) -> None:
-        self.clock, self.choices = clock, list[Choice]()
-        self._table, self._work, self._speed, self._pace = table, work, speed, 1.0
-        self._taken = self._foreseen = 0.0
-        self._cold = table.cold if cold else {}
-        self._points = [(p, with_settings(base, p.changes)) for p in table.points]
+        self.deadline = deadline
+        self.choices: list[BudgetChoice] = []
+        self.used_s = 0.0
+        self._table = table
+        self._image_factor = image_factor
+        self._measure_speed = measure_speed
+        self._first_call_s = table.first_call_s if first_calls else {}
+        self._candidates = [_Candidate(point, apply_settings(base, point.changes)) for point in table.points]
         self._finished: list[str] = []
-        self._now: tuple[Point, PipelineConfig] | None = None
-        self.used_s = 0.0  # of the budget at the latest border
-        self._until_s: float | None = None  # of the budget, the chunk may have used by its end
+        self._current: _Candidate | None = None
+        # Until the calibration this machine counts as fast as the table's.
+        self._pace = 1.0
+        # Seconds that stages took here, and that the table says for them; their ratio is the pace.
+        self._measured_s = 0.0
+        self._table_s = 0.0
+        # How much of the budget may be used when the chunk ends; the first choice sets it.
+        self._until_s: float | None = None
 
-    def next(self, share: float = 1.0) -> tuple[str, PipelineConfig] | None:
-        """The stage to compute next and its configuration, ``None`` where the chunk is done.
+    def next_stage(self, fraction: float = 1.0) -> tuple[str, PipelineConfig] | None:
+        """Chooses the setting that fits best now, and says which stage follows.
 
-        ``share`` of the time left when it is first asked is this chunk's.
+        Args:
+            fraction: the part of the time left at the first call that this chunk may use.
+
+        Returns:
+            The stage to compute and its configuration; ``None`` when the chunk is done.
         """
         if self._until_s is None:
-            self._until_s = self.clock.used_s + share * self.clock.left_s
-        left = self._until_s - self.clock.used_s
-        possible = [(p, c) for p, c in self._points if self._reachable(p, c)]
-        ranked = sorted(possible, key=lambda pc: (-pc[0].accuracy, self.predicted_s(pc[0])))
-        chosen = next((pc for pc in ranked if self.predicted_s(pc[0]) <= left), None)
-        why = self._why(ranked, chosen)
+            self._until_s = self.deadline.used_s + fraction * self.deadline.left_s
+        left_s = self._until_s - self.deadline.used_s
+        reachable = [candidate for candidate in self._candidates if self._is_reachable(candidate)]
+        # Most accurate first; of equally accurate settings the faster one.
+        ranked = sorted(reachable, key=lambda c: (-c.point.accuracy, self.predict_s(c.point)))
+        chosen = next((c for c in ranked if self.predict_s(c.point) <= left_s), None)
+        why = self._explain(ranked, chosen)
         if chosen is None:
-            chosen = min(ranked, key=lambda pc: self.predicted_s(pc[0]))
-        todo = self._todo(chosen[0])
-        if self._now is None or chosen[0] is not self._now[0]:
-            before = todo[0] if todo else "the end"
-            self.choices.append(Choice(before, chosen[0].name, self.predicted_s(chosen[0]), left, self._pace, why))
-        self._now, self.used_s = chosen, self.clock.used_s
-        return (todo[0], chosen[1]) if todo else None
+            # The time is too short for any setting: the one that exceeds it least is the best answer there is.
+            chosen = min(ranked, key=lambda c: self.predict_s(c.point))
+        remaining = self._remaining(chosen.point)
+        # A choice that confirms the last one is not worth a line in the record.
+        if self._current is None or chosen.point is not self._current.point:
+            before = remaining[0] if remaining else "the end"
+            predicted_s = self.predict_s(chosen.point)
+            self.choices.append(BudgetChoice(before, chosen.point.name, predicted_s, left_s, self._pace, why))
+        self._current = chosen
+        self.used_s = self.deadline.used_s
+        return (remaining[0], chosen.config) if remaining else None
 
     def calibrate(self) -> None:
-        """Begins to predict at this machine's speed."""
-        self._pace = self._speed()
-        self._taken, self._foreseen = self._pace * TOLD_BY_CALIBRATION_S, TOLD_BY_CALIBRATION_S
+        """Measures this machine's speed, by which seconds are predicted from now on."""
+        self._pace = self._measure_speed()
+        self._measured_s = self._pace * CALIBRATION_WEIGHT_S
+        # The calibration counts as that many seconds of stages, so that one odd stage does not turn the prediction
+        # over.
+        self._table_s = CALIBRATION_WEIGHT_S
 
-    def done(self, stage: str, seconds: float, cached: bool) -> None:
-        """Takes note of what a stage took from border to border: where it was computed, others will go at its pace."""
-        assert self._now is not None
+    def record_stage(self, stage: str, seconds: float, cached: bool) -> None:
+        """Notes that a stage has ended; if it was computed, later stages are predicted at its pace.
+
+        Args:
+            stage: the stage that :meth:`next_stage` named.
+            seconds: wall time with everything around the stage, artifacts and Prefect's states included.
+            cached: whether the stage came from the store.
+        """
+        assert self._current is not None
         if not cached:
-            if not self._foreseen:
+            if not self._table_s:
                 self.calibrate()
+            # How long ingest takes depends on the log's reader more than on the machine, so its pace says little.
             if stage != "ingest":
-                self._taken += seconds
-                self._foreseen += self._of(self._now[0], stage)
-            self._pace = self._taken / self._foreseen
+                self._measured_s += seconds
+                self._table_s += self._stage_s(self._current.point, stage)
+            self._pace = self._measured_s / self._table_s
         self._finished.append(stage)
 
-    def record(self) -> dict[str, Any]:
-        """The settings over the user's that the chunk was made with, the stage it ends at, and all choices."""
-        settings, end = ([], "") if self._now is None else (list(self._now[0].changes), self._now[0].end)
-        return {"settings": settings, "end": end, "choices": [asdict(c) for c in self.choices]}
+    def as_record(self) -> dict[str, Any]:
+        """Gathers what the run's record keeps of this chunk.
 
-    def told(self) -> str:
-        """What the chunk was made with, a line."""
-        made = self.record()
-        return f"within a budget: {', '.join(made['settings']) or 'as configured'}; ends at {made['end']}"
+        Returns:
+            ``settings`` over the user's that the chunk was made with, ``end``, its last stage, and all ``choices``.
+        """
+        point = None if self._current is None else self._current.point
+        return {
+            "settings": [] if point is None else list(point.changes),
+            "end": "" if point is None else point.end,
+            "choices": [asdict(choice) for choice in self.choices],
+        }
 
-    def predicted_s(self, point: Point) -> float:
-        """Of the stages that are not finished, with what is kept for surprises."""
-        return (1 + SPARE) * self._pace * sum(self._of(point, stage) for stage in self._todo(point))
+    def describe(self) -> str:
+        """Says in one line what the chunk was made with.
 
-    def _of(self, point: Point, stage: str) -> float:
-        """Seconds on the table's machine. GNet's and ENet's go with their iterations, all others' with the images."""
-        work = 1.0 if stage in ("gnet", "enet") else self._work
-        return point.seconds[stage] * work + self._cold.get(stage, 0.0) + BORDER_S
+        Returns:
+            A line for the report.
+        """
+        record = self.as_record()
+        return f"within a budget: {', '.join(record['settings']) or 'as configured'}; ends at {record['end']}"
 
-    def _todo(self, point: Point) -> list[str]:
-        return [s for s in reconstructing_until(point.end) if s not in self._finished]
+    def predict_s(self, point: CostPoint) -> float:
+        """Predicts the seconds of the stages that remain with a setting, with the safety margin.
 
-    def _reachable(self, point: Point, config: PipelineConfig) -> bool:
-        """Whether what is finished is what the point would have made; to stop at GNet's scene is always possible."""
-        if self._now is None:
+        Args:
+            point: the setting.
+
+        Returns:
+            Seconds on this machine; 0 when all stages are finished.
+        """
+        table_s = sum(self._stage_s(point, stage) for stage in self._remaining(point))
+        return (1 + SAFETY_MARGIN) * self._pace * table_s
+
+    def _stage_s(self, point: CostPoint, stage: str) -> float:
+        """Seconds of a stage of this chunk on the table's machine."""
+        # GNet's and ENet's time goes with their iterations, which the setting fixes; all other stages' with the images.
+        factor = 1.0 if stage in ("gnet", "enet") else self._image_factor
+        return point.seconds[stage] * factor + self._first_call_s.get(stage, 0.0) + STAGE_OVERHEAD_S
+
+    def _remaining(self, point: CostPoint) -> list[str]:
+        return [stage for stage in stages_until(point.end) if stage not in self._finished]
+
+    def _is_reachable(self, candidate: _Candidate) -> bool:
+        """Whether the finished stages are those that the setting would have made.
+
+        To stop at GNet's scene is always possible: stages that the setting does not go through do not count.
+        """
+        if self._current is None:
             return True
-        sections = {BY_NAME[s].section for s in self._finished if s in reconstructing_until(point.end)}
-        return all(getattr(config, name) == getattr(self._now[1], name) for name in sections)
+        stages = stages_until(candidate.point.end)
+        sections = {STAGE_BY_NAME[stage].section for stage in self._finished if stage in stages}
+        return all(getattr(candidate.config, name) == getattr(self._current.config, name) for name in sections)
 
-    def _why(self, ranked: Sequence[tuple[Point, PipelineConfig]], chosen: tuple[Point, PipelineConfig] | None) -> str:
+    def _explain(self, ranked: Sequence[_Candidate], chosen: _Candidate | None) -> str:
         if chosen is None:
             return "nothing fits; this is the shortest"
-        what, better = f"the best {self._table.judged} that fits", ranked[: ranked.index(chosen)]
+        reason = f"the best {self._table.accuracy_label} that fits"
+        better = ranked[: ranked.index(chosen)]
         if not better:
-            return f"{what}, and of all {len(ranked)}"
-        nearest = min(better, key=lambda pc: self.predicted_s(pc[0]))[0]
-        return f"{what}; {nearest.name} would take {self.predicted_s(nearest):.0f} s"
+            return f"{reason}, and of all {len(ranked)}"
+        # Of the better settings the one that came nearest to fitting: it tells how much time would have been needed.
+        nearest = min(better, key=lambda c: self.predict_s(c.point)).point
+        return f"{reason}; {nearest.name} would take {self.predict_s(nearest):.0f} s"
 
 
-def images_of(log: str, chunk: int, config: PipelineConfig) -> int:
-    """How many images a chunk of a log has at most: frames times cameras."""
-    opened, frames = opened_log(log), config.ingest.chunk_frames
-    cameras = config.ingest.cameras or tuple(c.name for c in opened.cameras)
+def count_images(log: str, chunk: int, config: PipelineConfig) -> int:
+    """Counts the images that a chunk of a log has at most: frames times cameras.
+
+    Args:
+        log: the log's URI.
+        chunk: number of the chunk.
+        config: its section ``ingest`` says which cameras and how many frames a chunk has.
+
+    Returns:
+        The number of images if none is missing.
+
+    >>> count_images("synthetic:street?seed=900&frames=25&cameras=2", 1, PipelineConfig())
+    10
+    """
+    opened = cached_log(log)
+    frames = config.ingest.chunk_frames
+    cameras = config.ingest.cameras or tuple(camera.name for camera in opened.cameras)
     return len(cameras) * min(frames, opened.frame_count - chunk * frames)

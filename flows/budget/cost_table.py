@@ -1,4 +1,4 @@
-"""A sweep's table as what a budget chooses from."""
+"""The table of a cost sweep as the list of settings that a budget chooses from."""
 
 from __future__ import annotations
 
@@ -9,16 +9,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flows.cost_sweep.knobs import EFFECTS
-from flows.cost_sweep.parquet import read_lines
-from flows.cost_sweep.summary import MEASURES, PSNR, Line
+from flows.cost_sweep.parquet import read_settings
+from flows.cost_sweep.summary import MEASURES, PSNR, SettingSummary
 from genre_tasks.errors import ConfigError
 
-SHIPPED = Path(__file__).resolve().parents[2] / "configs"
+_CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 
 @dataclass(frozen=True)
-class Point:
-    """A setting: ``changes`` over the preset up to the stage ``end``; its accuracy (more is better), warm seconds."""
+class CostPoint:
+    """A setting that was measured: how accurate it is and how long its stages take.
+
+    Attributes:
+        name: the setting's name in the sweep, such as ``gnet_iterations=24``.
+        changes: ``section.key=value`` over the preset.
+        end: the stage whose scene is the result.
+        accuracy: more is better; the unit is that of :attr:`CostTable.accuracy_label`.
+        seconds: wall time by stage in a process that is warmed up.
+    """
 
     name: str
     changes: tuple[str, ...]
@@ -28,27 +36,46 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Table:
-    """Points of one preset, and how fast the machine was that they were measured on.
+class CostTable:
+    """The measured settings of one preset, and how fast the machine was that they were measured on.
 
-    ``judged`` says what accuracy is; ``images`` of a chunk were reconstructed; ``calibration_s`` and ``cold`` seconds
-    of first calls by stage, see ``flows.machine.calibration`` and ``flows.cost_sweep.warm_up``.
+    Attributes:
+        preset: the preset that the settings change.
+        accuracy_label: what the accuracy is, for readers.
+        points: the settings.
+        images: images in a chunk of the sweep, source views and held-out ones.
+        calibration_s: seconds of :func:`flows.machine.calibration.measure_calibration_s` on the sweep's machine.
+        first_call_s: by stage, how many seconds more the first call in a process takes than a later one.
+        machine: the sweep's machine, one line.
     """
 
     preset: str
-    judged: str
-    points: tuple[Point, ...]
+    accuracy_label: str
+    points: tuple[CostPoint, ...]
     images: float
     calibration_s: float
-    cold: Mapping[str, float]
+    first_call_s: Mapping[str, float]
     machine: str
 
 
-def shipped_table(preset: str) -> Path:
-    """The table that comes with the preset. Raises ``ConfigError`` for a preset that has none."""
-    path = SHIPPED / f"cost_{preset}.parquet"
+def find_shipped_table(preset: str) -> Path:
+    """Finds the table that ships with a preset.
+
+    Args:
+        preset: the preset's name.
+
+    Returns:
+        A Parquet file in ``configs/``.
+
+    Raises:
+        ConfigError: no table ships with the preset.
+
+    >>> find_shipped_table("small").name
+    'cost_small.parquet'
+    """
+    path = _CONFIGS / f"cost_{preset}.parquet"
     if not path.is_file():
-        known = ", ".join(p.stem.removeprefix("cost_") for p in sorted(SHIPPED.glob("cost_*.parquet"))) or "none"
+        known = ", ".join(p.stem.removeprefix("cost_") for p in sorted(_CONFIGS.glob("cost_*.parquet"))) or "none"
         raise ConfigError(
             f"no times were measured for the preset {preset}",
             remedy=f"Measure them with `genre cost LOG --preset {preset}` and give its cost.parquet with --table. "
@@ -57,48 +84,65 @@ def shipped_table(preset: str) -> Path:
     return path
 
 
-def load(path: Path, preset: str, own: Iterable[str] = ()) -> Table:
-    """The table of a sweep over ``preset``, for a run whose user has set the keys ``own``.
+def load_cost_table(path: Path, preset: str, user_keys: Iterable[str] = ()) -> CostTable:
+    """Loads the settings of a sweep over a preset that a budget may choose from.
 
-    Effects, threads and the images' size are left out: a log's plan decides the first, the machine has the second, and
-    the third is what the user asked for; so are settings that were not measured wherever the preset was. Raises
-    ``ConfigError`` for a table of another preset, one made by a sweep that did not say how fast its machine was, or one
-    that turns what the user has set.
+    Left out are settings of effects (the log's plan decides them), of threads (the machine has them) and of the images'
+    size (the user asked for it), and settings that were not measured on every chunk on which the preset was.
+
+    Args:
+        path: the cost.parquet of a sweep.
+        preset: the preset of the run.
+        user_keys: configuration keys that the user has set, as ``section.key``.
+
+    Returns:
+        The table.
+
+    Raises:
+        ConfigError: there is no table, it is of another preset, it does not say how fast its machine was, or it changes
+            a key that the user has set.
+        ArtifactCorruptError: the file is not a sweep's table.
+
+    >>> table = load_cost_table(find_shipped_table("small"), "small")
+    >>> table.preset, "gnet" in table.points[0].seconds
+    ('small', True)
     """
     remedy = f"Give the cost.parquet of `genre cost LOG --preset {preset}`."
     if not path.is_file():
         raise ConfigError("there is no table", remedy=remedy, file=path)
-    lines, facts = read_lines(path)
+    summaries, facts = read_settings(path)
     if facts.get("base") != preset:
         raise ConfigError(f"this table is of the preset {facts.get('base')}", remedy=remedy, file=path)
+    # Without the speed of its machine, a table's seconds say nothing about this one.
     if "calibration_s" not in facts:
         raise ConfigError("this table does not say how fast its machine was", remedy=remedy, file=path)
-    judged = next((m for m in MEASURES if m.name == facts["judged"]), PSNR)
-    sign = 1.0 if judged.more_is_better else -1.0
+    measure = next((m for m in MEASURES if m.name == facts["judged"]), PSNR)
+    # Accuracy is better when larger; of distances it is the opposite.
+    sign = 1.0 if measure.more_is_better else -1.0
     points = tuple(
-        Point(x.setting, x.changes, x.end, sign * x.values[judged.name].middle, x.stage_seconds)
-        for x in lines
-        if _is_a_choice(x) and x.n == lines[0].n and math.isfinite(x.values[judged.name].middle)
+        CostPoint(x.setting, x.changes, x.end, sign * x.values[measure.name].average, x.stage_seconds)
+        for x in summaries
+        # The first line is the preset itself: fewer cells than it has means other chunks, which do not compare.
+        if _budget_may_choose(x) and x.n == summaries[0].n and math.isfinite(x.values[measure.name].average)
     )
-    turned = {change.partition("=")[0] for p in points for change in p.changes}
-    if both := sorted(turned & set(own)):
+    changed_keys = {change.partition("=")[0] for point in points for change in point.changes}
+    # A key that both the user and the table set has no right value: one would silently lose.
+    if both := sorted(changed_keys & set(user_keys)):
         raise ConfigError(
             f"{', '.join(both)} is what a budget decides", remedy="Leave out either --budget or that setting."
         )
-    return Table(
-        preset,
-        judged.label,
-        points,
-        _images(lines),
-        float(facts["calibration_s"]),
-        json.loads(facts["cold_seconds"]),
-        facts["machine"],
+    return CostTable(
+        preset=preset,
+        accuracy_label=measure.label,
+        points=points,
+        images=summaries[0].source_images,
+        calibration_s=float(facts["calibration_s"]),
+        first_call_s=json.loads(facts["cold_seconds"]),
+        machine=facts["machine"],
     )
 
 
-def _is_a_choice(line: Line) -> bool:
-    return line.knob != EFFECTS and not line.threads and not any(c.startswith("ingest.") for c in line.changes)
-
-
-def _images(lines: list[Line]) -> float:
-    return lines[0].source_images
+def _budget_may_choose(summary: SettingSummary) -> bool:
+    # The log's plan decides about effects, the machine has its threads, and the user asked for this size of images.
+    resizes_images = any(change.startswith("ingest.") for change in summary.changes)
+    return summary.knob != EFFECTS and not summary.threads and not resizes_images

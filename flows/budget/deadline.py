@@ -1,4 +1,4 @@
-"""The time that a run may take, and what of it is left."""
+"""The time that a run may take, and how much of it is left."""
 
 from __future__ import annotations
 
@@ -7,28 +7,40 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 
-class Clock:
-    """Counts wall time from ``began`` (seconds since the epoch), without what is spent in :meth:`paused`."""
+class Deadline:
+    """Counts the wall time that a run has used of its budget; time in :meth:`paused` does not count.
 
-    def __init__(self, budget_s: float, began: float | None = None) -> None:
+    Args:
+        budget_s: seconds that the run may take.
+        start_time: when the run began, in seconds since the epoch; now by default.
+
+    >>> deadline = Deadline(60.0)
+    >>> 59.0 < deadline.left_s <= 60.0
+    True
+    """
+
+    def __init__(self, budget_s: float, start_time: float | None = None) -> None:
         self.budget_s = budget_s
-        self._began = time.time() if began is None else began
-        self._paused = 0.0
+        # Wall time and not time.monotonic: the start may come from another clock, when the process was created.
+        self._start_time = time.time() if start_time is None else start_time
+        self._paused_s = 0.0
 
     @property
     def used_s(self) -> float:
-        return time.time() - self._began - self._paused
+        """Seconds that the run has used so far."""
+        return time.time() - self._start_time - self._paused_s
 
     @property
     def left_s(self) -> float:
-        """Negative where the budget is spent."""
+        """Seconds that are left; negative once the budget is spent."""
         return self.budget_s - self.used_s
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """What is not the run's own work: evaluation."""
-        before = time.time()
+        """Stops the count for a block that is not the run's own work, such as evaluation."""
+        pause_start = time.time()
         try:
             yield
         finally:
-            self._paused += time.time() - before
+            # Also after an error, so that the time left stays right for whoever handles it.
+            self._paused_s += time.time() - pause_start

@@ -1,0 +1,1 @@
+"""The ``genre`` command: one module for each subcommand, and what they print."""

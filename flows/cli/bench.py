@@ -5,55 +5,89 @@ Benchmarks are named, not imported: nothing in the product depends on them.
 
 from __future__ import annotations
 
-import difflib
 import importlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 
 @dataclass(frozen=True)
 class BenchEntry:
-    """Where a benchmark lives (``module:NAME``), and what it measures."""
+    """A known benchmark.
+
+    Attributes:
+        target: where it lives, as ``module:NAME``.
+        about: what it measures, a few words.
+    """
 
     target: str
     about: str
 
 
 _BENCHES: dict[str, BenchEntry] = {
-    "effects": BenchEntry("benchmarks.effects:EFFECTS", "what each effect brings where a log calls for it"),
-    "evaluation": BenchEntry("benchmarks.evaluation:EVALUATION", "whether budgets are kept, and what guards tell"),
+    "effects": BenchEntry("benchmarks.effects:EFFECTS", "what each effect gains where a log calls for it"),
+    "evaluation": BenchEntry(
+        "benchmarks.evaluation:EVALUATION", "whether runs keep their budget, and how well guards predict quality"
+    ),
     "facades": BenchEntry(
-        "benchmarks.optimiser.ablation:FACADES", "what completing façades above the LiDAR's view brings"
+        "benchmarks.optimiser.ablation:FACADES", "what completing façades above the LiDAR's view gains"
     ),
-    "fixer": BenchEntry("benchmarks.fixer:BENCH", "what FNet brings beside the path, and what it costs"),
-    "ground": BenchEntry("benchmarks.optimiser.ablation:GROUND", "what holding the ground in its plane brings"),
-    "main_job": BenchEntry("benchmarks.pipeline:BENCH", "the pipeline on claim seeds and a real chunk"),
+    "fixer": BenchEntry("benchmarks.fixer:BENCH", "what FNet gains beside the path, and what it costs"),
+    "ground": BenchEntry("benchmarks.optimiser.ablation:GROUND", "what constraining the ground to its plane gains"),
     "optimiser": BenchEntry(
-        "benchmarks.optimiser:BENCH", "GNet's seconds and renders beside per-scene 3DGS and tuned Adam"
+        "benchmarks.optimiser:BENCH", "GNet's seconds and renders against per-scene 3DGS and tuned Adam"
     ),
-    "raster": BenchEntry("benchmarks.raster:BENCH", "the renderer beside gsplat's torch reference and the machine"),
+    "pipeline": BenchEntry("benchmarks.pipeline:BENCH", "the pipeline on synthetic streets and a real chunk"),
+    "raster": BenchEntry(
+        "benchmarks.raster:BENCH", "the renderer's speed against gsplat's torch reference and the machine's limits"
+    ),
 }
 
 
-def register(name: str, target: str, about: str = "") -> None:
-    """Adds a benchmark: ``target`` is ``"module:NAME"`` of a :class:`benchmarks.common.bench.Bench`."""
+def register_bench(name: str, target: str, about: str = "") -> None:
+    """Makes a benchmark known to ``genre bench``.
+
+    Args:
+        name: the benchmark's name on the command line.
+        target: ``module:NAME`` of a :class:`benchmarks.common.bench.Bench`.
+        about: what it measures, a few words.
+
+    Raises:
+        ValueError: another benchmark has this name.
+    """
     if name in _BENCHES and _BENCHES[name].target != target:
         raise ValueError(f"the benchmark {name!r} exists already, at {_BENCHES[name].target}")
     _BENCHES[name] = BenchEntry(target, about)
 
 
-def load(name: str) -> Any:
-    """The benchmark of that name. Raises ``ConfigError`` where there is none, or it cannot be imported."""
+def load_bench(name: str) -> Any:
+    """Imports a benchmark.
+
+    Args:
+        name: the benchmark's name on the command line.
+
+    Returns:
+        A :class:`benchmarks.common.bench.Bench`.
+
+    Raises:
+        ConfigError: there is no such benchmark, or it cannot be imported.
+
+    >>> load_bench("rasta")
+    Traceback (most recent call last):
+    genre_tasks.errors.ConfigError: unknown benchmark 'rasta'. Did you mean 'raster'? …
+    """
     from genre_tasks.errors import ConfigError
+    from genre_tasks.suggestions import did_you_mean
 
     if name not in _BENCHES:
-        close = difflib.get_close_matches(name, _BENCHES, n=1)
-        question = f"Did you mean {close[0]!r}? " if close else ""
-        known = "; ".join(f"{n}: {entry.about}" for n, entry in sorted(_BENCHES.items()))
-        raise ConfigError(f"unknown benchmark {name!r}", remedy=f"{question}Known: {known}.")
+        known = "; ".join(f"{bench_name}: {entry.about}" for bench_name, entry in sorted(_BENCHES.items()))
+        raise ConfigError(f"unknown benchmark {name!r}", remedy=f"{did_you_mean(name, _BENCHES)}Known: {known}.")
+    # Imported by name: an installation without the benchmarks has all other commands.
     module, _, attribute = _BENCHES[name].target.partition(":")
     try:
         return getattr(importlib.import_module(module), attribute)
@@ -64,30 +98,60 @@ def load(name: str) -> Any:
 
 
 def bench(
-    name: Annotated[str, typer.Argument(help=f"One of {', '.join(_BENCHES)}.")],
-    json_file: Annotated[Path | None, typer.Option("--json", help="File to write rows and claims to.")] = None,
-    quick: Annotated[bool, typer.Option(help="Fewer runs; ends within 20 minutes.")] = False,
-    dry_run: Annotated[bool, typer.Option(help="List the cells with predicted seconds, measure nothing.")] = False,
-    fresh: Annotated[bool, typer.Option(help="Measure again what is in the cache.")] = False,
-    settings: Annotated[list[str] | None, typer.Option("--set", help="An option of the benchmark, NAME=VALUE.")] = None,
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="The benchmark: " + ", ".join(f"{name} ({entry.about})" for name, entry in _BENCHES.items()) + "."
+        ),
+    ],
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="The JSON file to write; required, except for a dry run.")
+    ] = None,
+    quick: Annotated[bool, typer.Option(help="Measure less, so that it ends within 20 minutes.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option(help="List what would be measured and how long it would take, then stop.")
+    ] = False,
+    fresh: Annotated[bool, typer.Option(help="Measure again what an earlier run has measured.")] = False,
+    only: Annotated[str, typer.Option(help="Measure only cells whose names contain this text.")] = "",
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Change one option of the benchmark, as NAME=VALUE. May be given several times."),
+    ] = None,
 ) -> None:
-    """Measure a set of claims, write them as JSON, and print a table; exits 0 when written, also if claims fail."""
+    """Run a benchmark and write its claims as JSON.
+
+    A benchmark measures cells, such as one log with one seed, and checks claims on them. The claims go into the JSON
+    file with all measurements, and a table is printed. The exit status is 0 even if a claim fails.
+
+    Measured cells are kept in .genre/bench, so a benchmark that was stopped goes on where it was.
+
+    Example:
+
+    \b
+        genre bench pipeline --json pipeline.json --set seeds=1001
+    """
     from genre_tasks.errors import ConfigError
 
-    chosen = load(name)
+    benchmark = load_bench(name)
     runner = importlib.import_module("benchmarks.common.runner")
-    options = runner.options_of(chosen, tuple(settings or ()))
+    # The options are read before anything is measured, so that a mistyped one costs nothing.
+    options = runner.parse_options(benchmark, settings or ())
     if dry_run:
-        from flows.cli.printing import print_rows
-
-        listed = runner.dry_run(runner.plan(chosen, options, quick, fresh))
-        print_rows(f"genre bench {name} (dry run)", listed)
-        typer.echo(f"about {sum(line['seconds'] for line in listed):.0f} s to measure")
+        _print_cells(name, runner.list_cells(runner.find_cached_rows(benchmark, options, quick, fresh), only))
         return
     if json_file is None:
         raise ConfigError("there is no file to write to", remedy="Add --json FILE, or --dry-run.")
     try:
-        runner.run_bench(chosen, json_file, options, quick, fresh)
+        runner.run_bench(benchmark, json_file, options, quick, fresh, only=only)
     except KeyboardInterrupt:
         typer.echo("stopped; measured cells are kept: run the same command again to go on", err=True)
         raise typer.Exit(130) from None
+    # On stderr, as stdout is the table alone and may go into a document.
+    typer.echo(f"wrote {json_file}", err=True)
+
+
+def _print_cells(name: str, cells: list[Mapping[str, Any]]) -> None:
+    from flows.cli.printing import print_rows
+
+    print_rows(f"genre bench {name} (dry run)", cells)
+    typer.echo(f"about {sum(cell['seconds'] for cell in cells):.0f} s to measure")

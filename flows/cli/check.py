@@ -4,39 +4,62 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
+from flows.cli.options import JsonOption, LogArgument
+
 if TYPE_CHECKING:
-    from genre_tasks.logs.validation import LogCheck
+    from genre_tasks.logs.findings import CameraCheck, Finding, LogCheck
 
 
-def check(
-    log: Annotated[str, typer.Argument(help="pandaset:PATH/002 or synthetic:street?seed=1000")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object to stdout.")] = False,
-) -> None:
-    """Say what a log has and lacks: cameras, images, sweeps, tracks, times, travel, chunks. Exit code 1: unusable."""
+def check(log: LogArgument, as_json: JsonOption = False) -> None:
+    """Check what a log has and lacks before it is reconstructed.
+
+    Every image and every sweep is read. The command prints cameras, missing and unreadable images and sweeps, tracks,
+    times, the distance travelled and the chunks, then what to do about each finding. It writes no files.
+
+    The verdict is good, usable (with warnings) or unusable. The exit status is 1 for an unusable log.
+
+    Example:
+
+    \b
+        genre check pandaset:data/002
+    """
     from genre_tasks.logs.registry import open_log
     from genre_tasks.logs.validation import check_log
 
-    found = check_log(open_log(log))
+    report = check_log(open_log(log))
     if as_json:
-        typer.echo(json.dumps({"verdict": found.verdict} | dataclasses.asdict(found), default=str))
+        typer.echo(json.dumps({"verdict": report.verdict} | dataclasses.asdict(report), default=str))
     else:
-        _print(log, found)
-    if found.verdict == "unusable":
+        _print_report(log, report)
+    # With the exit status a script can check a whole dataset before it spends hours on it.
+    if report.verdict == "unusable":
         raise typer.Exit(1)
 
 
-def _print(log: str, found: LogCheck) -> None:
+def _print_report(log: str, report: LogCheck) -> None:
     from flows.cli.printing import print_fields
 
-    fields = {name: value for name, value in dataclasses.asdict(found).items() if name not in ("uri", "cameras")}
-    cameras = {
-        c.name: f"{c.width_px}×{c.height_px}"
-        + "".join(f", {len(getattr(c, k))} {k}" for k in ("missing", "unreadable", "odd_size") if getattr(c, k))
-        for c in found.cameras
+    fields = {name: value for name, value in dataclasses.asdict(report).items() if name not in ("uri", "cameras")}
+    cameras = {camera.name: _describe_camera(camera) for camera in report.cameras}
+    findings = "\n".join(_describe_finding(finding) for finding in report.findings)
+    print_fields(log, {"verdict": report.verdict, "cameras": cameras} | fields | {"findings": findings})
+
+
+def _describe_camera(camera: CameraCheck) -> str:
+    # Counts alone: the findings below the table name the frames.
+    problems = {
+        "missing": camera.missing,
+        "unreadable": camera.unreadable,
+        "odd_size": camera.odd_size,
     }
-    findings = [f"{f.severity}: {f.message}{'. ' * bool(f.remedy)}{f.remedy}" for f in found.findings]
-    print_fields(log, {"verdict": found.verdict, "cameras": cameras} | fields | {"findings": "\n".join(findings)})
+    counts = [f", {len(frames)} {problem}" for problem, frames in problems.items() if frames]
+    return f"{camera.width_px}×{camera.height_px}" + "".join(counts)
+
+
+def _describe_finding(finding: Finding) -> str:
+    text = f"{finding.severity}: {finding.message}"
+    return f"{text}. {finding.remedy}" if finding.remedy else text

@@ -7,46 +7,72 @@ from typing import Annotated
 
 import typer
 
+from flows.cli.options import (
+    DEFAULT_STORE,
+    ChunksOption,
+    DryRunOption,
+    LogsArgument,
+    PresetOption,
+    SettingsOption,
+    StoreOption,
+)
+
 
 def cost(
-    logs: Annotated[
-        list[str], typer.Argument(help="Logs: pandaset:PATH/002, pandaset:PATH/*, synthetic:street?seed=…")
-    ],
-    preset: Annotated[str, typer.Option(help="demo, small, fine, long or paper: where all knobs start.")] = "small",
-    knobs: Annotated[str | None, typer.Option(help="Which, e.g. gnet_iterations,fixer; all without it.")] = None,
-    seeds: Annotated[str, typer.Option(help="Of the order of views and the fixer's noise.")] = "0,1,2",
-    chunks: Annotated[str | None, typer.Option(help="Which chunks of each log, e.g. 0; all without it.")] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", help="section.key=value over the preset, for every cell.")
+    logs: LogsArgument,
+    preset: PresetOption = "small",
+    knobs: Annotated[
+        str | None,
+        typer.Option(help="The knobs to turn, separated by commas, such as gnet_iterations,fixer. All if not given."),
     ] = None,
-    store: Annotated[str, typer.Option(help="Where stages are kept and found again.")] = "genre-store",
-    out: Annotated[Path, typer.Option(help="A folder for cost.parquet, cost.png and cost.md.")] = Path("cost"),
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say which cells would run, and what they would take.")
-    ] = False,
+    seeds: Annotated[
+        str, typer.Option(help="Seeds of the order of views and of the fixer's noise, separated by commas.")
+    ] = "0,1,2",
+    chunks: ChunksOption = None,
+    settings: SettingsOption = None,
+    store: StoreOption = DEFAULT_STORE,
+    out: Annotated[Path, typer.Option(help="The folder for cost.parquet, cost.png and cost.md.")] = Path("cost"),
+    dry_run: DryRunOption = False,
 ) -> None:
-    """Sweep the knobs of a run, one at a time and a few together: a table, a picture and a page of accuracy and time.
+    """Measure what each setting gains and what it costs in time.
+
+    The knobs of a run, such as iterations or the images' size, are turned one at a time and in a few combinations. The
+    result is a table, a picture and a page of accuracy against seconds. `genre run --budget` chooses from the table.
 
     Finished stages come from the store, so a sweep that was stopped goes on where it was.
+
+    Example:
+
+    \b
+        genre cost 'synthetic:street?seed=1000' --knobs gnet_iterations --seeds 0 --out cost
     """
-    from flows.cli.parsing import numbers
+    from flows.cli.parsing import parse_numbers
     from flows.cli.printing import print_rows
-    from flows.cost_sweep.cell import Sweep
-    from flows.cost_sweep.flow import cost_of_accuracy, planned
-    from flows.cost_sweep.prediction import predicted
+    from flows.cost_sweep.cell import Sweep, predict_cells
+    from flows.cost_sweep.flow import SweepRequest, cost_of_accuracy
 
-    chosen, order = numbers(chunks, "--chunks"), numbers(seeds, "--seeds")
-    names = knobs.split(",") if knobs else None
+    chunk_numbers = parse_numbers(chunks, "--chunks")
+    seed_numbers = parse_numbers(seeds, "--seeds")
+    knob_names = knobs.split(",") if knobs else None
     sweep = Sweep(preset, tuple(settings or ()), store)
-    cells = planned(sweep, logs, chosen, order, names)  # what is wrong is said before a server is started
+    # Mistakes in the request show here, before Prefect's server takes seconds to start.
+    cells = SweepRequest(sweep, logs, chunk_numbers, seed_numbers, knob_names).cells()
     if dry_run:
-        rows = predicted(sweep, cells)
-        print_rows(f"{len(rows)} cells, {sum(r['seconds'] for r in rows) / 60:.0f} minutes", rows)
+        rows = predict_cells(sweep, cells)
+        print_rows(f"{len(rows)} cells, {sum(row['seconds'] for row in rows) / 60:.0f} minutes", rows)
         return
-    from flows.cli.terminal import reporting
+    from flows.cli.terminal import report_on_terminal
 
-    with reporting():
+    # The sweep is a flow: Prefect shows its cells, and a cell that fails is left out and named.
+    with report_on_terminal():
         done = cost_of_accuracy(
-            logs, preset=preset, store=store, chunks=chosen, seeds=order, knobs=names, settings=settings, out=str(out)
+            logs,
+            preset=preset,
+            store=store,
+            chunks=chunk_numbers,
+            seeds=seed_numbers,
+            knobs=knob_names,
+            settings=settings,
+            out=str(out),
         )
     typer.echo(f"{done['cells']} cells, {len(done['failed'])} left out; wrote {', '.join(done['files'])}")

@@ -7,16 +7,29 @@ import importlib.util
 import json
 import os
 import platform
-from typing import Annotated, Any
+from dataclasses import dataclass
+from typing import Any
 
 import typer
 
+from flows.cli.options import JsonOption
+
+
+@dataclass(frozen=True)
+class _OptionalPackage:
+    """A package that GenRe runs without: what it would enable, and how to install it."""
+
+    enables: str
+    install: str
+
+
 _OPTIONAL = {
-    "gsplat": ("GPU rendering (needs CUDA)", "pip install 'genre[cuda]'"),
-    "peft": ("LoRA fine-tuning and SD-Turbo's adapters", "pip install 'genre[sd-turbo]'"),
-    "transformers": ("loading SD-Turbo", "pip install 'genre[sd-turbo]'"),
-    "pandas": ("writing logs in the PandaSet layout", "pip install pandas"),
+    "gsplat": _OptionalPackage("GPU rendering (needs CUDA)", "pip install 'genre[cuda]'"),
+    "peft": _OptionalPackage("LoRA fine-tuning and SD-Turbo's adapters", "pip install 'genre[sd-turbo]'"),
+    "transformers": _OptionalPackage("loading SD-Turbo", "pip install 'genre[sd-turbo]'"),
+    "pandas": _OptionalPackage("writing logs in the PandaSet layout", "pip install pandas"),
 }
+# Packages that a stage would miss late. Without typer and rich this command itself would not start.
 _REQUIRED = (
     "torch",
     "kornia",
@@ -31,48 +44,56 @@ _REQUIRED = (
 )
 
 
-def doctor(
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object to stdout.")] = False,
-) -> None:
-    """Say what this machine has (cores, memory, GPU, weights, packages) and what missing pieces would enable."""
-    found = {**_machine(), "renderer": _renderer(), "weights": _weights(), "packages": _packages()}
+def doctor(as_json: JsonOption = False) -> None:
+    """Show what this machine has and what is missing.
+
+    The command prints cores, memory, GPU, the renderer's instruction set, the shipped weights and the versions of
+    packages. For each missing piece it says what the piece would enable and how to install it. It writes no files.
+
+    Example:
+
+    \b
+        genre doctor
+    """
+    report = {**_describe_hardware(), "renderer": _renderer(), "weights": _weights(), "packages": _packages()}
     if as_json:
-        typer.echo(json.dumps(found))
+        typer.echo(json.dumps(report))
         return
     from flows.cli.printing import print_fields
 
-    print_fields("genre doctor", found)
+    print_fields("genre doctor", report)
 
 
-def _machine() -> dict[str, Any]:
+def _describe_hardware() -> dict[str, Any]:
     import psutil
+    import torch
 
     from flows.machine.memory import memory_limit_gib
 
-    total = psutil.virtual_memory().total / 2**30
-    out: dict[str, Any] = {
-        "python": platform.python_version(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "memory": f"{total:.1f} GiB, of which this process may use {memory_limit_gib():.1f}",
-    }
-    import torch
-
+    total_gib = psutil.virtual_memory().total / 2**30
     if torch.cuda.is_available():
-        out["gpu"] = f"{torch.cuda.get_device_name()}: used for rendering and training"
+        gpu = f"{torch.cuda.get_device_name()}: used for rendering and training"
     else:
-        out["gpu"] = "none: everything runs on the CPU; with one, `genre` renders with gsplat and trains faster"
-    return out
+        gpu = "none: everything runs on the CPU; with one, `genre` renders with gsplat and trains faster"
+    return {
+        "python": platform.python_version(),
+        # A container or a batch system may give the process fewer cores than the machine has.
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "memory": f"{total_gib:.1f} GiB, of which this process may use {memory_limit_gib():.1f}",
+        "gpu": gpu,
+    }
 
 
 def _renderer() -> str:
     from genre_tasks.errors import GenreError
 
+    # A kernel that cannot be loaded is a finding of this command and not an error.
     try:
-        from genre_tasks.compiled.loader import candidate_isas
+        from genre_tasks.compiled.loader import candidate_instruction_sets
         from genre_tasks.render.kernel.library import load_kernel
 
         load_kernel()
-        return f"cpu kernel, {candidate_isas()[0]}"
+        return f"cpu kernel, {candidate_instruction_sets()[0]}"
     except GenreError as error:
         return f"cpu kernel cannot be loaded: {error}"
 
@@ -81,24 +102,27 @@ def _weights() -> dict[str, str]:
     from genre_tasks.errors import GenreError
     from genre_tasks.weights import resolve_weights
 
-    out = {}
+    weights = {}
     for name in ("gnet", "fnet", "enet"):
         try:
             path = resolve_weights(name, "builtin")
-            out[name] = f"{path.name}, {path.stat().st_size / 2**20:.1f} MiB"
+            weights[name] = f"{path.name}, {path.stat().st_size / 2**20:.1f} MiB"
         except GenreError as error:
-            out[name] = str(error)
-    return out
+            weights[name] = str(error)
+    return weights
 
 
 def _packages() -> dict[str, str]:
-    out = {}
+    packages = {}
     for name in _REQUIRED:
         try:
-            out[name] = importlib.metadata.version(name)
+            packages[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
-            out[name] = "missing: run `make setup`"
-    for name, (enables, how) in _OPTIONAL.items():
-        present = importlib.util.find_spec(name) is not None
-        out[name] = importlib.metadata.version(name) if present else f"missing; would enable {enables}: {how}"
-    return out
+            packages[name] = "missing: run `make setup`"
+    for name, package in _OPTIONAL.items():
+        # Looking for a package is enough: importing transformers alone would take seconds.
+        if importlib.util.find_spec(name) is not None:
+            packages[name] = importlib.metadata.version(name)
+        else:
+            packages[name] = f"missing; would enable {package.enables}: {package.install}"
+    return packages

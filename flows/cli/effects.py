@@ -5,48 +5,80 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from flows.cli.options import (
+    DEFAULT_STORE,
+    ChunkOption,
+    LogArgument,
+    PresetOption,
+    SettingsOption,
+    StoreOption,
+)
+
+if TYPE_CHECKING:
+    from genre_tasks.effects.types import EffectsPlan
+
 
 def effects(
-    log: Annotated[str, typer.Argument(help="pandaset:PATH/002 or synthetic:street?seed=1000")],
-    chunk: Annotated[int, typer.Option(help="A chunk of the log.")] = 0,
-    preset: Annotated[
-        str, typer.Option(help="demo, small, fine, long or paper: thresholds hold at its resolution.")
-    ] = "small",
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", help="effects.NAME=on|off|auto, or any other setting.")
+    log: LogArgument,
+    chunk: ChunkOption = 0,
+    preset: PresetOption = "small",
+    settings: SettingsOption = None,
+    store: StoreOption = DEFAULT_STORE,
+    out: Annotated[
+        Path | None, typer.Option(help="A folder for effects.parquet, effects.png and the plan's other files.")
     ] = None,
-    store: Annotated[str, typer.Option(help="Where the ingested chunk is kept.")] = "genre-store",
-    out: Annotated[Path | None, typer.Option(help="A folder for effects.parquet and effects.png.")] = None,
 ) -> None:
-    """Say for each effect what of the log decides, its threshold, the decision and what enabling would cost."""
+    """Show which effects a log calls for, and why.
+
+    For each effect, such as exposure or rolling shutter, the command measures the log and compares the result
+    with a threshold. It prints the decision, the reason and what the effect would cost. Thresholds hold at the
+    preset's resolution. `--set effects.NAME=on` or off decides by hand.
+
+    Example:
+
+    \b
+        genre effects pandaset:data/002 --chunk 1 --out effects
+    """
     from flows.cli.printing import print_rows
     from flows.configuration import load_configuration
-    from flows.pipeline.effects_plan import effects_of
+    from flows.pipeline.effects_plan import plan_effects
     from flows.pipeline.stage_runner import Job
-    from flows.plots.effects_plot import drawn
-    from storage.codecs import codec_of
-    from storage.codecs.png import write_png
 
     config = load_configuration(preset, settings=settings or [])
-    found = effects_of(Job(log, chunk, store, config.model_dump(mode="json")))
+    # Both stages go through the store: a run with the same settings finds this plan there and takes it.
+    plan = plan_effects(Job(log, chunk, store, config.model_dump(mode="json")))
     rows = [
         {"effect": d.name, "choice": d.choice, "set": d.setting, "because": d.reason, "cost": d.cost}
-        for d in found.decisions
+        for d in plan.decisions
     ]
     print_rows(f"{log} chunk {chunk}, {config.ingest.width_px}×{config.ingest.height_px}", rows)
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=out) as made:  # written once there, as in the store, then put in place
-            codec_of("effects").write(Path(made), found)
-            write_png(Path(made) / "effects.png", drawn(found, f"{log} chunk {chunk}"))
-            shutil.rmtree(out / "own", ignore_errors=True)  # masks of a plan that was here before
-            for path in sorted(Path(made).rglob("*")):
-                if path.is_file():
-                    place = out / path.relative_to(made)
-                    place.parent.mkdir(parents=True, exist_ok=True)
-                    path.replace(place)
-        typer.echo(f"wrote {out / 'effects.parquet'} and effects.png")
+        files = _write_plan(plan, out, f"{log} chunk {chunk}")
+        typer.echo(f"wrote {', '.join(files)}")
+
+
+def _write_plan(plan: EffectsPlan, folder: Path, title: str) -> list[str]:
+    """Writes the plan's files and its picture into the folder, over those of an earlier plan; their paths."""
+    from flows.plots.effects_plot import plot_effects_plan
+    from storage.codecs import get_codec
+    from storage.codecs.png import write_png
+
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    # Everything is written beside the old files first, so that an error leaves the old ones as they were.
+    with TemporaryDirectory(dir=folder) as temporary:
+        get_codec("effects").write(Path(temporary), plan)
+        write_png(Path(temporary) / "effects.png", plot_effects_plan(plan, title))
+        # An earlier plan may have had masks of the ego vehicle that this one does not have.
+        shutil.rmtree(folder / "own", ignore_errors=True)
+        for source in sorted(Path(temporary).rglob("*")):
+            if source.is_file():
+                target = folder / source.relative_to(temporary)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                source.replace(target)
+                written.append(str(target))
+    return written

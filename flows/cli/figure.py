@@ -7,58 +7,90 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from flows.cli.options import (
+    DEFAULT_STORE,
+    ChunkOption,
+    LogArgument,
+    MethodsOption,
+    PresetOption,
+    SettingsOption,
+    StoreOption,
+    WeightsOption,
+)
+
 if TYPE_CHECKING:
     from flows.pipeline.stage_runner import ArtifactRef, Job
 
 
-def figure(
-    kind: Annotated[str, typer.Argument(help="recon: table 1's methods; fixers: table 3's.")],
-    log: Annotated[str, typer.Argument(help="A log: pandaset:PATH/002, synthetic:street?seed=…")],
-    out: Annotated[Path, typer.Option(help="x.png")],
-    preset: Annotated[str, typer.Option(help="demo, small, fine, long or paper.")] = "small",
-    chunk: Annotated[int, typer.Option(help="Of the log.")] = 0,
-    camera: Annotated[str | None, typer.Option(help="A camera; the first front one without it.")] = None,
-    frame: Annotated[int | None, typer.Option(help="A source frame; the middle one without it.")] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", help="section.key=value over the preset, for every method.")
-    ] = None,
-    methods: Annotated[
-        list[Path] | None, typer.Option("--method", help="A YAML file of a method of your own, see `genre table`.")
-    ] = None,
-    weights: Annotated[list[str] | None, typer.Option(help="NAME=PATH of weights, see `genre table`.")] = None,
-    store: Annotated[str, typer.Option(help="Where stages are kept and found again.")] = "genre-store",
-) -> None:
-    """Draw a row for each method and a column for each shift to the left, with the truth where the log can tell it.
+CameraOption = Annotated[str | None, typer.Option(help="The camera to show. The first front camera if not given.")]
+FrameOption = Annotated[
+    int | None, typer.Option(help="The frame of the log to show, a source frame. The middle one if not given.")
+]
 
-    Stages that the store has not are computed.
+
+def figure(
+    kind: Annotated[
+        str,
+        typer.Argument(help="The methods to compare: recon for those of table 1, fixers for those of table 3."),
+    ],
+    log: LogArgument,
+    out: Annotated[Path, typer.Option(help="The PNG file to write, such as figure.png.")],
+    preset: PresetOption = "small",
+    chunk: ChunkOption = 0,
+    camera: CameraOption = None,
+    frame: FrameOption = None,
+    settings: SettingsOption = None,
+    methods: MethodsOption = None,
+    weights: WeightsOption = None,
+    store: StoreOption = DEFAULT_STORE,
+) -> None:
+    """Draw a figure that compares methods beside the path.
+
+    The figure has a row for each method and a column for each distance to the left of the path. The last row is the
+    truth, where the log can tell it. Stages that are not in the store are computed.
+
+    Example:
+
+    \b
+        genre figure recon 'synthetic:street?seed=1000' --out figure.png
     """
     from flows.cli.terminal import TerminalReporter
-    from flows.paper_tables.figure import TABLE, drawn, kind_of, strips
-    from flows.paper_tables.request import Request
-    from flows.pipeline.stage_runner import produce
+    from flows.paper_tables.figure import TABLE, comparison_strips, draw_strips, parse_kind
+    from flows.paper_tables.request import TableRequest
+    from flows.pipeline.stage_runner import run_stage
     from genre_tasks.atomic_path import atomic_path
     from genre_tasks.errors import ConfigError
     from storage.codecs.png import write_png
 
-    chosen = kind_of(kind)
+    parsed_kind = parse_kind(kind)
+    # Checked before any stage is computed, which may take minutes.
     if out.suffix != ".png":
         raise ConfigError(f"cannot write {out.name!r}", remedy="Give --out x.png.")
-    own = tuple(str(f) for f in methods or ())
-    request = Request(TABLE[chosen], (log,), preset, store, (chunk,), tuple(settings or ()), own, tuple(weights or ()))
-    plan = request.planned()
-    reporter = TerminalReporter(f"figure {chosen}")
+    request = TableRequest(
+        number=TABLE[parsed_kind],
+        logs=(log,),
+        preset=preset,
+        store=store,
+        chunks=(chunk,),
+        settings=tuple(settings or ()),
+        methods=tuple(str(file) for file in methods or ()),
+        weights=tuple(weights or ()),
+    )
+    checked = request.check()
+    # Without Prefect: one chunk needs neither its retries nor its server, which takes seconds to start.
+    reporter = TerminalReporter(f"figure {parsed_kind}")
 
-    def produced(stage: str, job: Job, inputs: dict[str, ArtifactRef]) -> ArtifactRef:
-        reporter.began(stage)
-        ref = produce(stage, job, inputs, progress=reporter.progress)
-        reporter.ended("cached" if ref.cached else "computed")
+    def run_reported(stage: str, job: Job, inputs: dict[str, ArtifactRef]) -> ArtifactRef:
+        reporter.part_started(stage)
+        ref = run_stage(stage, job, inputs, progress=reporter.progress)
+        reporter.part_ended("cached" if ref.cached else "computed")
         return ref
 
     with reporter:
-        found = strips(chosen, plan, produced, camera, frame)
-    said = " ".join([f"{log} chunk {chunk}, preset {preset}", *request.settings])
+        strips = comparison_strips(parsed_kind, checked, run_reported, camera, frame)
+    title = " ".join([f"{log} chunk {chunk}, preset {preset}", *request.settings])
     out.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(out) as part:
-        write_png(part, drawn(chosen, found, said))
-    left = f"; not drawn: {', '.join(plan.missing)}" if plan.missing else ""
-    typer.echo(f"wrote {out}: {', '.join(s.label for s in found)}{left}")
+        write_png(part, draw_strips(parsed_kind, strips, title))
+    not_drawn = f"; not drawn: {', '.join(checked.missing)}" if checked.missing else ""
+    typer.echo(f"wrote {out}: {', '.join(strip.label for strip in strips)}{not_drawn}")

@@ -5,49 +5,102 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
+from typing import Annotated
 
 import typer
 
-from flows.cli import bench, check, cost, doctor, effects, figure, paper_table, range, render, run, show, train, verify
+from flows.cli.bench import bench
+from flows.cli.check import check
+from flows.cli.cost import cost
+from flows.cli.doctor import doctor
+from flows.cli.effects import effects
+from flows.cli.figure import figure
+from flows.cli.paper_table import table
+from flows.cli.range import range_command
+from flows.cli.render import render
+from flows.cli.run import run
+from flows.cli.show import show
+from flows.cli.train import app as train_app
+from flows.cli.verify import verify
 
 app = typer.Typer(
     name="genre",
-    help="Make driving logs re-simulatable: reconstruct, fix and enhance 3D Gaussian scenes.",
     no_args_is_help=True,
+    # Installing completion would write into the user's shell files.
     add_completion=False,
+    # An unexpected error shows Python's own traceback, which a report of a bug can quote.
     pretty_exceptions_enable=False,
+    # Plain help starts faster, and the reference of commands is generated from the same text.
     rich_markup_mode=None,
 )
-app.command(name="run")(run.run)
-app.command(name="check")(check.check)
-app.command(name="effects")(effects.effects)
-app.command(name="render")(render.render)
-app.command(name="range")(range.reliable)
-app.command(name="show")(show.show)
-app.command(name="verify")(verify.verify)
-app.command(name="doctor")(doctor.doctor)
-app.command(name="cost")(cost.cost)
-app.command(name="table")(paper_table.table)
-app.command(name="figure")(figure.figure)
-app.command(name="bench")(bench.bench)
-app.add_typer(train.app, name="train")
+# The order here is the order in `genre --help`: from a first run to looking at it, then measuring and training.
+app.command(name="run")(run)
+app.command(name="check")(check)
+app.command(name="effects")(effects)
+app.command(name="render")(render)
+app.command(name="range")(range_command)
+app.command(name="show")(show)
+app.command(name="verify")(verify)
+app.command(name="doctor")(doctor)
+app.command(name="cost")(cost)
+app.command(name="table")(table)
+app.command(name="figure")(figure)
+app.command(name="bench")(bench)
+app.add_typer(train_app, name="train")
+
+
+def _print_version(requested: bool) -> None:
+    if requested:
+        # The installed package's metadata is the one place that is right in a checkout and in an installation.
+        from importlib.metadata import version
+
+        typer.echo(f"genre {version('genre')}")
+        raise typer.Exit
+
+
+@app.callback()
+def describe_program(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Make driving logs re-simulatable: reconstruct them as 3D Gaussian scenes and enhance the scenes.
+
+    Add --debug to any command to see a traceback after an error. The exit status is 0 after success, 2 after a mistake
+    in the input or the configuration, 1 after another error, and 130 after Ctrl-C.
+
+    Example:
+
+    \b
+        genre run 'synthetic:street?seed=1000' --preset demo
+    """
 
 
 def prepare_environment(debug: bool) -> None:
-    """Settings that Prefect and the numeric libraries read at import: a home per project, no telemetry, no chatter."""
+    """Sets what Prefect and the numeric libraries read when they are imported; what the user has set stays.
+
+    Args:
+        debug: whether Prefect's own messages are shown.
+    """
+    # Each project has its own Prefect database, and nothing is sent to Prefect's makers.
     os.environ.setdefault("PREFECT_HOME", str(Path.cwd() / ".genre" / "prefect"))
     os.environ.setdefault("DO_NOT_TRACK", "1")
     os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
-    # Twenty seconds, its default, are not enough for its server on a busy machine.
+    # Twenty seconds, Prefect's default, are not enough for its server on a busy machine.
     os.environ.setdefault("PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS", "180")
     os.environ.setdefault("PREFECT_LOGGING_LEVEL", "INFO" if debug else "CRITICAL")
     os.environ.setdefault("PREFECT_LOGGING_TO_API_ENABLED", "false")
-    # Idle OpenMP threads would spin and take the cores from the renderer's and the pools' own: ten times as slow here.
+    # Idle OpenMP threads would spin and take the cores from the renderer's threads: ten times as slow on two cores.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 def main() -> None:
-    """Runs the command; an expected error is one line on stderr and an exit code, a traceback only with ``--debug``."""
+    """Runs the command. An expected error becomes one line on stderr and an exit status.
+
+    Raises:
+        SystemExit: always, with the exit status, unless ``--debug`` shows the error's traceback.
+    """
+    # Any command takes --debug, in any place, so it is taken out before the arguments are parsed.
     debug = "--debug" in sys.argv
     if debug:
         sys.argv.remove("--debug")
@@ -59,6 +112,7 @@ def main() -> None:
     except GenreError as error:
         if debug:
             raise
+        # Not on stdout: what a command prints there may go into another program.
         typer.echo(f"error: {error}", err=True)
         raise SystemExit(2 if isinstance(error, ConfigError | InputError) else 1) from None
 

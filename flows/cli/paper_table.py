@@ -3,93 +3,122 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from flows.cli.options import (
+    DEFAULT_STORE,
+    ChunksOption,
+    DryRunOption,
+    LogsArgument,
+    MethodsOption,
+    PresetOption,
+    SettingsOption,
+    StoreOption,
+    WeightsOption,
+)
+
+if TYPE_CHECKING:
+    from flows.paper_tables.request import TableRequest
+
+TableNumberArgument = Annotated[
+    int,
+    typer.Argument(
+        help="The table's number: 1 comparison of methods, 2 GenRe after other methods, 3 fixers by their inputs, 4 "
+        "ablation, 5 runtime by phase."
+    ),
+]
+TableFolderOption = Annotated[
+    Path, typer.Option(help="The folder for the table as Markdown and as Parquet, tableN_DATASET.md and .parquet.")
+]
+PageOption = Annotated[
+    Path | None,
+    typer.Option(help="A Markdown page that collects several tables; the section of this table is replaced."),
+]
+RemarksOption = Annotated[
+    list[str] | None,
+    typer.Option("--remark", help="A sentence for the reader, written below the table. May be given several times."),
+]
+StoredOption = Annotated[
+    bool,
+    typer.Option("--stored", help="Compute nothing, and leave out methods whose stages are not all in the store."),
+]
+
 
 def table(
-    number: Annotated[
-        int,
-        typer.Argument(help="1 comparison, 2 plug-in, 3 fixers by input, 4 ablation, 5 runtime by phase."),
-    ],
-    logs: Annotated[
-        list[str], typer.Argument(help="Logs of one dataset: pandaset:PATH/002, pandaset:PATH/*, synthetic:…")
-    ],
-    preset: Annotated[str, typer.Option(help="demo, small, fine, long or paper.")] = "small",
-    chunks: Annotated[str | None, typer.Option(help="Which chunks of each log, e.g. 0; all without it.")] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", help="section.key=value over the preset, for every method.")
-    ] = None,
-    methods: Annotated[
-        list[Path] | None,
-        typer.Option("--method", help="A YAML file of a method of your own: name, settings, end, note."),
-    ] = None,
-    weights: Annotated[
-        list[str] | None,
-        typer.Option(help="NAME=PATH of weights that do not ship: difix, streetcrafter (fixers), enet-g3r."),
-    ] = None,
-    store: Annotated[str, typer.Option(help="Where stages are kept and found again.")] = "genre-store",
-    out: Annotated[Path, typer.Option(help="A folder for tableN_DATASET.md and .parquet.")] = Path("tables"),
-    into: Annotated[
-        Path | None, typer.Option(help="A Markdown page of several tables; this one's section is written anew.")
-    ] = None,
-    remarks: Annotated[
-        list[str] | None, typer.Option("--remark", help="What else the reader should know, into the page.")
-    ] = None,
-    stored: Annotated[
-        bool, typer.Option("--stored", help="Compute nothing: leave out the methods that the store has not whole.")
-    ] = False,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say which cells would run, and what they would take.")
-    ] = False,
+    number: TableNumberArgument,
+    logs: LogsArgument,
+    preset: PresetOption = "small",
+    chunks: ChunksOption = None,
+    settings: SettingsOption = None,
+    methods: MethodsOption = None,
+    weights: WeightsOption = None,
+    store: StoreOption = DEFAULT_STORE,
+    out: TableFolderOption = Path("tables"),
+    into: PageOption = None,
+    remarks: RemarksOption = None,
+    stored: StoredOption = False,
+    dry_run: DryRunOption = False,
 ) -> None:
-    """Measure a table of the paper: every method on every chunk by the paper's protocol, its numbers beside.
+    """Measure a table of the paper, with the paper's numbers beside.
+
+    Every method runs on every chunk by the paper's protocol. All logs must be of one dataset.
 
     Finished stages come from the store, so a table that was stopped goes on where it was, and tables share stages.
+
+    Example:
+
+    \b
+        genre table 4 'synthetic:street?seed=1000' --chunks 0 --out tables
     """
-    from flows.cli.parsing import numbers
+    from flows.cli.parsing import parse_numbers
     from flows.cli.printing import print_rows
-    from flows.paper_tables.flow import paper_table
-    from flows.paper_tables.prediction import predicted
-    from flows.paper_tables.request import Request
+    from flows.paper_tables.request import TableRequest, predict_table
 
-    chosen = numbers(chunks, "--chunks")
-    files = [str(f) for f in methods or ()]
-    request = Request(
-        number,
-        tuple(logs),
-        preset,
-        store,
-        None if chosen is None else tuple(chosen),
-        tuple(settings or ()),
-        tuple(files),
-        tuple(weights or ()),
-        str(out),
-        None if into is None else str(into),
-        tuple(remarks or ()),
-        stored,
+    chunk_numbers = parse_numbers(chunks, "--chunks")
+    request = TableRequest(
+        number=number,
+        logs=tuple(logs),
+        preset=preset,
+        store=store,
+        chunks=None if chunk_numbers is None else tuple(chunk_numbers),
+        settings=tuple(settings or ()),
+        methods=tuple(str(file) for file in methods or ()),
+        weights=tuple(weights or ()),
+        out=str(out),
+        into=None if into is None else str(into),
+        remarks=tuple(remarks or ()),
+        stored=stored,
     )
-    plan = request.planned()  # what is wrong is said before a server is started
+    # Mistakes in the request show here, before Prefect's server takes seconds to start.
+    checked = request.check()
     if dry_run:
-        rows = predicted(plan)
-        print_rows(f"{len(rows)} cells, {sum(r['seconds'] for r in rows) / 60:.0f} minutes", rows)
+        rows = predict_table(checked)
+        print_rows(f"{len(rows)} cells, {sum(row['seconds'] for row in rows) / 60:.0f} minutes", rows)
         return
-    from flows.cli.terminal import reporting
-
-    with reporting():
-        done = paper_table(
-            number,
-            logs,
-            preset=preset,
-            store=store,
-            chunks=chosen,
-            settings=settings,
-            methods=files,
-            weights=weights,
-            out=str(out),
-            into=request.into,
-            remarks=remarks,
-            stored=stored,
-        )
+    done = _measure_table(request)
     typer.echo(f"{done['cells']} cells, {len(done['failed'])} left out; wrote {', '.join(done['files'])}")
+
+
+def _measure_table(request: TableRequest) -> dict[str, Any]:
+    from flows.cli.terminal import report_on_terminal
+    from flows.paper_tables.flow import paper_table
+
+    # Plain values and not the request: Prefect keeps a flow's parameters, and a worker may be given them.
+    with report_on_terminal():
+        done: dict[str, Any] = paper_table(
+            request.number,
+            list(request.logs),
+            preset=request.preset,
+            store=request.store,
+            chunks=None if request.chunks is None else list(request.chunks),
+            settings=list(request.settings),
+            methods=list(request.methods),
+            weights=list(request.weights),
+            out=request.out,
+            into=request.into,
+            remarks=list(request.remarks),
+            stored=request.stored,
+        )
+    return done

@@ -4,75 +4,102 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from flows.cli.options import DEFAULT_STORE, RunArgument, RunChunkOption, SceneStageOption, StoreOption
 
-def reliable(
-    run: Annotated[str, typer.Argument(help="A run's name (or its start), as `genre show runs` lists it.")],
-    stage: Annotated[str | None, typer.Option(help="initial, gnet or enet; the run's last without it.")] = None,
-    chunk: Annotated[int | None, typer.Option(help="A chunk of the run; the first one without it.")] = None,
-    max_drop_db: Annotated[float, typer.Option(help="How much the median view's estimated PSNR may fall, dB.")] = 3.0,
-    every: Annotated[int, typer.Option(help="Every n-th frame is rendered.")] = 4,
-    store: Annotated[str, typer.Option(help="The run's store.")] = "genre-store",
+if TYPE_CHECKING:
+    from genre_tasks.config import RangeConfig
+    from genre_tasks.reliability.reliable_range import CurvePoint
+
+
+def range_command(
+    run: RunArgument,
+    stage: SceneStageOption = None,
+    chunk: RunChunkOption = None,
+    max_drop_db: Annotated[
+        float, typer.Option(help="By how many dB the median view's estimated PSNR may be below that on the path.")
+    ] = 3.0,
+    every: Annotated[int, typer.Option(help="Render every n-th frame.")] = 4,
+    store: StoreOption = DEFAULT_STORE,
     detector: Annotated[
         Path | None,
-        typer.Option(help="A detector as ONNX (FastestDet's form): how many actors it finds is a guard too."),
+        typer.Option(
+            help="An ONNX model that detects road users, in the form of FastestDet. The fraction of actors that it "
+            "finds is then one more guard."
+        ),
     ] = None,
-    out: Annotated[Path, typer.Option(help="A folder for range.parquet and range.png.")] = Path("range"),
+    out: Annotated[Path, typer.Option(help="The folder for range.parquet and range.png.")] = Path("range"),
 ) -> None:
-    """Say how far to the left and right of the path the scene's renders agree with what was recorded.
+    """Estimate how far beside the path a scene can be trusted.
 
-    Guards need no truth: the agreement with recorded images, what none of them shows, holes, what floats, and what a
-    detector does not find any more. Where the run has the next chunk too, the same view is rendered from both.
+    Views beside the path have no true image to compare with, so guards stand in its place: agreement with the recorded
+    images, surfaces that no image shows, holes, floating Gaussians, and actors that a detector no longer finds.
+
+    Where the run has the next chunk too, the same views are rendered from both scenes and compared.
+
+    Example:
+
+    \b
+        genre range 4b1c --max-drop-db 2 --out range
     """
-    from pydantic import ValidationError
-
     from flows.cli.printing import print_rows
     from flows.cli.terminal import TerminalReporter
-    from flows.reconstruction.reliable_range import write
-    from flows.reconstruction.run_records import last_stage, next_scene, stage_scene, stage_value
-    from genre_tasks.config import RangeConfig
-    from genre_tasks.errors import ConfigError
-    from genre_tasks.reliability.chunk_seam import medians, seam
-    from genre_tasks.reliability.reliable_range import reliable_range
+    from flows.reconstruction.reliable_range import write_range
+    from flows.reconstruction.run_records import find_last_stage, read_next_scene, read_stage_scene, read_stage_value
+    from genre_tasks.reliability.chunk_seam import measure_seam, median_psnr_by_distance
+    from genre_tasks.reliability.reliable_range import estimate_reliable_range
 
-    try:
-        config = RangeConfig(max_drop_db=max_drop_db, every=every)
-    except ValidationError as error:
-        raise ConfigError(f"{error.errors()[0]['msg']}", remedy="See `genre range --help`.") from error
+    config = _range_config(max_drop_db, every)
+    # Without a detector the other guards decide alone.
     network = None
     if detector is not None:
         from genre_tasks.reliability.detector import Detector
 
         network = Detector.load(detector)
-    number, ingested = stage_value(store, run, chunk, "ingest")
-    name = stage or last_stage(store, run, number)
-    _, plan = stage_value(store, run, number, "effects")
-    scene = stage_scene(store, run, number, name)
+    number, ingested = read_stage_value(store, run, chunk, "ingest")
+    scene_stage = stage or find_last_stage(store, run, number)
+    _, plan = read_stage_value(store, run, number, "effects")
+    scene = read_stage_scene(store, run, number, scene_stage)
     with TerminalReporter(f"chunk {number}  guards") as reporter:
-        found = reliable_range(config, ingested, scene, plan, reporter.progress, network)
-    beside = next_scene(store, run, number, stage)
-    facts = {"log": ingested.log, "chunk": str(number), "stage": name, "run": run}
-    files = write(out, found, facts)
-    rows = [
-        {
-            "shift": f"{p.shift_m:+g} m",
-            "views": p.views,
-            "estimate": f"{p.estimate_db:.1f} dB",
-            "agreement": f"{p.agreement_db:.1f} dB",
-            "shown": f"{p.shown:.1%}",
-            "thin": f"{p.thin:.1%}",
-            "floating": f"{p.floating:.1%}",
-            "detected": "" if math.isnan(p.detected) else f"{p.detected:.0%}",
-            "": "holds" if p.holds else "",
-        }
-        for p in found.points
-    ]
-    print_rows(f"{ingested.log}, chunk {number}, after {name}", rows)
-    typer.echo(f"{found}; wrote {', '.join(files)}")
-    if beside is not None:
-        jumps = medians(seam((ingested, scene), beside))
-        told = ", ".join(f"{db:.1f} dB at {distance:g} m" for distance, db in jumps.items())
-        typer.echo(f"seam to chunk {number + 1}, the same view from both scenes without actors: {told}")
+        reliable_range = estimate_reliable_range(config, ingested, scene, plan, reporter.progress, network)
+    # With --stage the next chunk is compared after the same stage, without it each after its own last one.
+    following = read_next_scene(store, run, number, stage)
+    facts = {"log": ingested.log, "chunk": str(number), "stage": scene_stage, "run": run}
+    files = write_range(out, reliable_range, facts)
+    rows = [_point_row(point) for point in reliable_range.points]
+    print_rows(f"{ingested.log}, chunk {number}, after {scene_stage}", rows)
+    typer.echo(f"{reliable_range}; wrote {', '.join(files)}")
+    if following is not None:
+        psnr_by_distance = median_psnr_by_distance(measure_seam((ingested, scene), following))
+        values = ", ".join(f"{db:.1f} dB at {distance:g} m" for distance, db in psnr_by_distance.items())
+        typer.echo(f"seam to chunk {number + 1}, the same view from both scenes without actors: {values}")
+
+
+def _range_config(max_drop_db: float, every: int) -> RangeConfig:
+    from pydantic import ValidationError
+
+    from genre_tasks.config import RangeConfig
+    from genre_tasks.errors import ConfigError
+
+    try:
+        return RangeConfig(max_drop_db=max_drop_db, every=every)
+    except ValidationError as error:
+        raise ConfigError(f"{error.errors()[0]['msg']}", remedy="See `genre range --help`.") from error
+
+
+def _point_row(point: CurvePoint) -> dict[str, Any]:
+    # One row for each shift, from right to left, as the curve in range.png.
+    return {
+        "shift": f"{point.shift_m:+g} m",
+        "views": point.views,
+        "estimate": f"{point.estimate_db:.1f} dB",
+        "agreement": f"{point.agreement_db:.1f} dB",
+        "shown": f"{point.shown:.1%}",
+        "thin": f"{point.thin:.1%}",
+        "floating": f"{point.floating:.1%}",
+        "detected": "" if math.isnan(point.detected) else f"{point.detected:.0%}",
+        "": "holds" if point.holds else "",
+    }

@@ -3,123 +3,189 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from flows.cli.options import (
+    DEFAULT_STORE,
+    ChunksOption,
+    DryRunOption,
+    JsonOption,
+    LogArgument,
+    PresetOption,
+    SettingsOption,
+    StoreOption,
+)
+
 if TYPE_CHECKING:
     from genre_tasks.config import PipelineConfig
 
-DEFAULT_STORE = "genre-store"
+DEFAULT_PRESET = "fine"
+"""Chosen on validation logs: the better one for real logs (docs/guides/presets.md)."""
+
+
+ConfigFileOption = Annotated[
+    Path | None, typer.Option(help="A YAML file with settings over the preset; --set goes over both.")
+]
+StrictOption = Annotated[
+    bool, typer.Option("--strict", help="Stop at a missing or unreadable image or sweep, instead of leaving it out.")
+]
+BudgetOption = Annotated[
+    str | None,
+    typer.Option(
+        help="How long the run may take from the command's start, such as 90s, 5m or 1h; evaluation does not count. "
+        "The most accurate settings that fit are chosen."
+    ),
+]
+TableOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="The settings that --budget chooses from: a cost.parquet of `genre cost`. The preset's own table if not "
+        "given."
+    ),
+]
+
+
+@dataclass(frozen=True)
+class _RunRequest:
+    """What the user asks for, read and checked."""
+
+    log: str
+    preset: str
+    store: str
+    chunks: list[int] | None
+    config: PipelineConfig
+    budget_s: float | None
+    start_time: float
+    table: str | None
 
 
 def run(
-    log: Annotated[str, typer.Argument(help="pandaset:PATH/002 or synthetic:street?seed=1000")],
-    preset: Annotated[str, typer.Option(help="demo, small, fine, long or paper.")] = "small",
-    config: Annotated[Path | None, typer.Option(help="A YAML file over the preset.")] = None,
-    store: Annotated[str, typer.Option(help="A folder (or URI) that keeps every artifact.")] = DEFAULT_STORE,
-    chunks: Annotated[str | None, typer.Option(help="Which chunks, e.g. 0,1; all without it.")] = None,
-    set_: Annotated[list[str] | None, typer.Option("--set", help="section.key=value, e.g. gnet.iterations=8.")] = None,
-    strict: Annotated[
-        bool, typer.Option("--strict", help="A missing or unreadable image or sweep is an error.")
-    ] = False,
-    budget: Annotated[
-        str | None,
-        typer.Option(help="Wall time from the command's start, e.g. 90s or 5m: the best that fits is chosen."),
-    ] = None,
-    table: Annotated[
-        Path | None, typer.Option(help="What --budget chooses from: a cost.parquet of `genre cost` here.")
-    ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say what would be computed, and what it would take.")
-    ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object to stdout.")] = False,
+    log: LogArgument,
+    preset: PresetOption = DEFAULT_PRESET,
+    config: ConfigFileOption = None,
+    store: StoreOption = DEFAULT_STORE,
+    chunks: ChunksOption = None,
+    settings: SettingsOption = None,
+    strict: StrictOption = False,
+    budget: BudgetOption = None,
+    table: TableOption = None,
+    dry_run: DryRunOption = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Reconstruct a log: GNet, novel views, FNet, ENet, evaluation and a report. Finished stages come from the store.
+    """Reconstruct a driving log and write a report.
 
-    Add --debug to any command for tracebacks.
+    The log goes through ingest, effects, the initial scene, GNet, novel views, FNet, ENet and evaluation, chunk by
+    chunk. The store keeps the result of every stage. A stage whose inputs and settings have not changed is taken from
+    there, so a run that was stopped goes on where it was.
+
+    The report and the run's record are written to STORE/runs/RUN/report.html and run.json.
+
+    Example:
+
+    \b
+        genre run 'synthetic:street?seed=1000' --preset demo
+        genre run pandaset:data/002 --chunks 0,1 --set gnet.iterations=96
+        genre run pandaset:data/002 --budget 5m
     """
     import psutil
 
-    from flows.cli.parsing import numbers, seconds
+    from flows.cli.parsing import parse_duration, parse_numbers
     from flows.configuration import load_configuration
-    from flows.pipeline.definition import RECONSTRUCTING
-    from flows.pipeline.log_cache import opened_log
+
+    # Over the settings, as --strict is the more explicit wish.
+    strict_settings = ["ingest.strict=true"] if strict else []
+    request = _RunRequest(
+        log=log,
+        preset=preset,
+        store=store,
+        chunks=parse_numbers(chunks, "--chunks"),
+        config=load_configuration(preset, config, [*(settings or []), *strict_settings]),
+        budget_s=parse_duration(budget, "--budget"),
+        # A budget counts from when the user pressed return, imports included.
+        start_time=psutil.Process().create_time(),
+        table=None if table is None else str(table),
+    )
+    _check_request(request)
+    if dry_run:
+        _print_dry_run(request, as_json)
+    else:
+        _reconstruct(request, as_json)
+
+
+def _check_request(request: _RunRequest) -> None:
+    """Opens the log and reads the table: a mistake shows here, before Prefect's server takes seconds to start."""
+    from flows.pipeline.log_cache import cached_log
     from genre_tasks.errors import ConfigError
 
-    began = psutil.Process().create_time()
-    settings = [*(set_ or []), *(["ingest.strict=true"] if strict else [])]
-    effective = load_configuration(preset, config, settings)
-    wanted, budget_s = numbers(chunks, "--chunks"), seconds(budget, "--budget")
-    opened_log(log)  # a log that cannot be opened is said before a server is started
-    if table is not None and budget_s is None:
+    cached_log(request.log)
+    if request.budget_s is not None:
+        from flows.budget.budget import resolve_table
+
+        resolve_table(request.table, request.preset, request.config)
+    elif request.table is not None:
         raise ConfigError("--table is what --budget chooses from", remedy="Give a --budget, too, or leave it out.")
-    given = None if table is None else str(table)
-    if budget_s is not None:
-        from flows.budget.budget import table_for
 
-        table_for(given, preset, effective)  # what does not fit is said before a server is started
-    if dry_run:
-        end = RECONSTRUCTING[-1]
-        if budget_s is not None:
-            effective, end = _chosen(log, preset, wanted, effective, budget_s, began, given)
-        _dry_run(log, preset, store, wanted, effective, end, as_json)
-        return
-    from flows.cli.terminal import print_run, reporting
 
-    with reporting():
+def _reconstruct(request: _RunRequest, as_json: bool) -> None:
+    from flows.cli.run_tables import print_run
+    from flows.cli.terminal import report_on_terminal
+
+    with report_on_terminal():
         from flows.reconstruction.flow import reconstruct_log
 
-        summary = reconstruct_log(
-            log,
-            preset=preset,
-            store=store,
-            chunks=wanted,
-            config=effective.model_dump(mode="json"),
-            budget_s=budget_s,
-            began=began,
-            table=given,
+        record = reconstruct_log(
+            request.log,
+            preset=request.preset,
+            store=request.store,
+            chunks=request.chunks,
+            config=request.config.model_dump(mode="json"),
+            budget_s=request.budget_s,
+            start_time=request.start_time,
+            table=request.table,
         )
     if as_json:
-        shown = ("log", "preset", "store", "run", "chunks", "budget")
-        typer.echo(json.dumps({key: summary[key] for key in shown if key in summary}))
+        # Without the configuration, which `genre show RUN` prints: a program that reads this wants results.
+        shown = ("log", "preset", "store", "run", "report", "chunks", "budget")
+        typer.echo(json.dumps({key: record[key] for key in shown if key in record}))
     else:
-        print_run(summary)
+        print_run(record)
 
 
-def _chosen(
-    log: str,
-    preset: str,
-    chunks: list[int] | None,
-    config: PipelineConfig,
-    budget_s: float,
-    began: float,
-    table: str | None,
-) -> tuple[PipelineConfig, str]:
-    """What a budget would begin the first chunk with, and the stage where that ends; said on stderr."""
-    from flows.budget.budget import Budget
-    from flows.pipeline.log_cache import chosen_chunks
+def _print_dry_run(request: _RunRequest, as_json: bool) -> None:
+    from flows.cli.run_tables import print_prediction
+    from flows.configuration import diff_from_preset
+    from flows.pipeline.definition import RECONSTRUCTION_STAGES
+    from flows.pipeline.prediction import predict_run
 
-    budget, wanted = Budget(budget_s, began, table, preset, config), chosen_chunks(log, config, chunks)
-    typer.echo(budget.told(), err=True)
-    chooser = budget.chooser(log, wanted[0])
-    chooser.calibrate()  # nothing else is starting
-    step = chooser.next(1 / len(wanted))
-    typer.echo(f"chunk {wanted[0]}: {chooser.choices[0]} (Prefect's start would be counted, too)", err=True)
-    return config if step is None else step[1], str(chooser.record()["end"])
-
-
-def _dry_run(
-    log: str, preset: str, store: str, chunks: list[int] | None, config: PipelineConfig, end: str, as_json: bool
-) -> None:
-    from flows.cli.terminal import print_plan
-    from flows.configuration import differences
-    from flows.pipeline.prediction import plan_run
-
-    plan: dict[str, Any] = plan_run(log, store, chunks, config, end)
-    plan |= {"preset": preset, "differs": {k: list(v) for k, v in differences(config, preset).items()}}
+    config = request.config
+    # A budget may end the first chunk earlier; without one every chunk goes to the last stage.
+    end = RECONSTRUCTION_STAGES[-1]
+    if request.budget_s is not None:
+        config, end = _first_choice(request, request.budget_s)
+    prediction: dict[str, Any] = predict_run(request.log, request.store, request.chunks, config, end)
+    differs = {key: list(values) for key, values in diff_from_preset(config, request.preset).items()}
+    prediction |= {"preset": request.preset, "differs": differs}
     if as_json:
-        typer.echo(json.dumps(plan))
+        typer.echo(json.dumps(prediction))
     else:
-        print_plan(plan)
+        print_prediction(prediction)
+
+
+def _first_choice(request: _RunRequest, budget_s: float) -> tuple[PipelineConfig, str]:
+    """What the first chunk would begin with and the stage where that ends; printed to stderr, too."""
+    from flows.budget.budget import Budget
+    from flows.pipeline.log_cache import select_chunks
+
+    budget = Budget(budget_s, request.start_time, request.table, request.preset, request.config)
+    chunks = select_chunks(request.log, request.config, request.chunks)
+    typer.echo(budget.describe(), err=True)
+    chooser = budget.make_chooser(request.log, chunks[0])
+    # A run waits with this until ingest is done, as Prefect's server starts meanwhile; nothing starts here.
+    chooser.calibrate()
+    step = chooser.next_stage(1 / len(chunks))
+    typer.echo(f"chunk {chunks[0]}: {chooser.choices[0]} (Prefect's start would be counted, too)", err=True)
+    return request.config if step is None else step[1], str(chooser.as_record()["end"])

@@ -1,4 +1,4 @@
-"""``genre show``: tables of runs, chunks and stages; one artifact's manifest, schema, statistics and a picture."""
+"""``genre show``: tables of runs and stages; one run's metrics; one artifact's manifest, statistics and picture."""
 
 from __future__ import annotations
 
@@ -7,19 +7,41 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from flows.cli.options import DEFAULT_STORE, PresetOption, StoreOption
+
 if TYPE_CHECKING:
-    from storage.local import Artifact
+    from storage.local import LocalStore
+    from storage.store import Artifact
 
 
 def show(
     what: Annotated[
-        str, typer.Argument(help="runs, stages, config, a run, or (the start of) an artifact's key.")
+        str,
+        typer.Argument(
+            help="runs for all finished runs, stages for all artifacts, config for a preset's configuration, the name "
+            "of a run, or the key of an artifact. The first characters of a name or a key are enough."
+        ),
     ] = "runs",
-    store: Annotated[str, typer.Option(help="The store to look into.")] = "genre-store",
-    preset: Annotated[str, typer.Option(help="With `config`: whose values to show.")] = "small",
-    picture: Annotated[Path | None, typer.Option(help="Write the artifact's picture to this PNG.")] = None,
+    store: StoreOption = DEFAULT_STORE,
+    preset: PresetOption = "small",
+    picture: Annotated[
+        Path | None, typer.Option(help="Write the artifact's picture to this PNG file, if `what` is a key.")
+    ] = None,
 ) -> None:
-    """Show what a store holds: `genre show`, `genre show stages`, `genre show RUN`, `genre show KEY`."""
+    """Show what a store holds: runs, stages, one run or one artifact.
+
+    Without an argument the command lists the finished runs. For an artifact it prints the manifest, the files with
+    statistics of their columns, and the artifacts that it was made from. `--preset` counts for `genre show config`.
+
+    Example:
+
+    \b
+        genre show
+        genre show stages
+        genre show config --preset fine
+        genre show 4b1c
+        genre show 9f02ab --picture artifact.png
+    """
     from flows.cli.printing import print_fields, print_rows
 
     if what == "config":
@@ -27,86 +49,103 @@ def show(
 
         print_fields(f"preset {preset}", load_configuration(preset).model_dump())
     elif what == "runs":
-        from flows.reconstruction.run_records import recorded_runs
+        from flows.reconstruction.run_records import list_runs
 
-        print_rows("runs", [_run_row(run) for run in recorded_runs(store)])
+        print_rows("runs", [_run_row(record) for record in list_runs(store)])
     elif what == "stages":
         from storage.local import open_store
 
-        print_rows("artifacts", [_row(artifact) for artifact in open_store(store).artifacts()])
+        print_rows("artifacts", [_artifact_row(artifact) for artifact in open_store(store).artifacts()])
     else:
-        _show_one(what, store, picture)
+        _show_run_or_artifact(what, store, picture)
 
 
-def _run_row(run: dict[str, Any]) -> dict[str, Any]:
-    stages = [s for c in run["chunks"] for s in c["stages"]]
-    return {
-        "run": run["run"],
-        "log": run["log"],
-        "preset": run["preset"],
-        "chunks": len(run["chunks"]),
-        "computed": sum(not s["cached"] for s in stages),
-        "seconds": sum(s["seconds"] for s in stages),
-        "report": run["report"],
-    }
-
-
-def _row(artifact: Artifact) -> dict[str, Any]:
-    m = artifact.manifest
-    size = sum(f.size for f in m.files) / 2**20
-    return {
-        "log": m.log,
-        "chunk": m.chunk,
-        "stage": m.stage,
-        "key": m.key[:12],
-        "seconds": m.seconds,
-        "peak MiB": m.peak_mib,
-        "MiB": size,
-        "made": m.created_at[:19],
-    }
-
-
-def _show_one(what: str, store: str, picture: Path | None) -> None:
-    from flows.cli.printing import print_fields, print_rows
-    from flows.reconstruction.run_records import recorded_runs
+def _show_run_or_artifact(name: str, store: str, picture: Path | None) -> None:
+    from flows.reconstruction.run_records import list_runs
     from genre_tasks.errors import InputError
     from storage.local import open_store
 
-    for run in recorded_runs(store):
-        if run["run"].startswith(what):
-            print_fields(f"run {run['run']}", {k: run[k] for k in ("log", "preset", "report", "differs", "config")})
-            for chunk in run["chunks"]:
-                rows = [
-                    {"stage": s["stage"], "key": s["key"][:12], "seconds": s["seconds"], **s["metrics"]}
-                    for s in chunk["stages"]
-                ]
-                for row in rows:
-                    print_fields(f"chunk {chunk['chunk']}  {row.pop('stage')}", row)
+    # Names of runs and keys of artifacts are both hex digits. Runs are fewer and asked for more often.
+    for record in list_runs(store):
+        if record["run"].startswith(name):
+            _print_record(record)
             return
     opened = open_store(store)
-    found = [a for a in opened.artifacts() if a.manifest.key.startswith(what)]
-    if len(found) != 1:
+    artifacts = [artifact for artifact in opened.artifacts() if artifact.manifest.key.startswith(name)]
+    # Several stages may share the first digits; to guess which one is meant would show the wrong one.
+    if len(artifacts) != 1:
         raise InputError(
-            f"{len(found)} runs or artifacts begin with '{what}'",
+            f"{len(artifacts)} runs or artifacts begin with '{name}'",
             remedy="`genre show runs` and `genre show stages` list them; give more of the name.",
             file=store,
         )
-    from flows.plots.artifact_pictures import draw_artifact
-    from storage.lineage import ancestors, describe
-
-    (artifact,) = found
-    print_fields("manifest", artifact.manifest.model_dump(exclude={"files"}))
-    print_rows("files", [f.model_dump() for f in artifact.manifest.files])
-    for table in describe(opened, artifact):
-        print_rows(table.name, table.rows)
-    print_rows("made from", [_row(a) for a in ancestors(opened, artifact)])
+    _print_artifact(opened, artifacts[0])
     if picture is not None:
-        image = draw_artifact(opened, artifact)
-        if image is None:
-            raise InputError(
-                "this artifact has no picture", remedy="Leave out --picture.", stage=artifact.manifest.stage
-            )
-        from PIL import Image
-
-        Image.fromarray(image).save(picture)
+        _write_picture(opened, artifacts[0], picture)
         typer.echo(f"wrote {picture}")
+
+
+def _print_record(record: dict[str, Any]) -> None:
+    from flows.cli.printing import print_fields
+
+    fields = ("log", "preset", "report", "differs", "config")
+    print_fields(f"run {record['run']}", {field: record[field] for field in fields})
+    for chunk in record["chunks"]:
+        for stage in chunk["stages"]:
+            row = {"key": stage["key"][:12], "seconds": stage["seconds"], **stage["metrics"]}
+            print_fields(f"chunk {chunk['chunk']}  {stage['stage']}", row)
+
+
+def _print_artifact(store: LocalStore, artifact: Artifact) -> None:
+    from flows.cli.printing import print_fields, print_rows
+    from storage.lineage import find_ancestors, summarise_files
+
+    print_fields("manifest", artifact.manifest.model_dump(exclude={"files"}))
+    print_rows("files", [file.model_dump() for file in artifact.manifest.files])
+    for table in summarise_files(store, artifact):
+        print_rows(table.name, table.rows)
+    print_rows("made from", [_artifact_row(ancestor) for ancestor in find_ancestors(store, artifact)])
+
+
+def _write_picture(store: LocalStore, artifact: Artifact, path: Path) -> None:
+    from flows.plots.artifact_pictures import draw_artifact
+    from genre_tasks.atomic_path import atomic_path
+    from genre_tasks.errors import InputError
+    from storage.codecs.png import write_png
+
+    # The picture is a PNG under any name, and a PNG called x.jpg would not open everywhere.
+    if path.suffix != ".png":
+        raise InputError(f"cannot write {path.name!r}", remedy="Give --picture x.png.", file=path)
+    image = draw_artifact(store, artifact)
+    if image is None:
+        raise InputError("this artifact has no picture", remedy="Leave out --picture.", stage=artifact.manifest.stage)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as part:
+        write_png(part, image)
+
+
+def _run_row(record: dict[str, Any]) -> dict[str, Any]:
+    stages = [stage for chunk in record["chunks"] for stage in chunk["stages"]]
+    return {
+        "run": record["run"],
+        "log": record["log"],
+        "preset": record["preset"],
+        "chunks": len(record["chunks"]),
+        "computed": sum(not stage["cached"] for stage in stages),
+        "seconds": sum(stage["seconds"] for stage in stages),
+        "report": record["report"],
+    }
+
+
+def _artifact_row(artifact: Artifact) -> dict[str, Any]:
+    manifest = artifact.manifest
+    return {
+        "log": manifest.log,
+        "chunk": manifest.chunk,
+        "stage": manifest.stage,
+        "key": manifest.key[:12],
+        "seconds": manifest.seconds,
+        "peak MiB": manifest.peak_mib,
+        "MiB": sum(file.size for file in manifest.files) / 2**20,
+        "made": manifest.created_at[:19],
+    }

@@ -2,28 +2,39 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import typer
 
+from flows.cli.options import DEFAULT_STORE, StoreOption
 
-def verify(
-    store: Annotated[str, typer.Option(help="The store to read through.")] = "genre-store",
-) -> None:
-    """Read every artifact of a store and compare it with its manifest; exit code 1 if any is damaged."""
+
+def verify(store: StoreOption = DEFAULT_STORE) -> None:
+    """Check every artifact of a store against its manifest.
+
+    Every file is read and compared with the size and the sha256 that its manifest lists. Damaged artifacts are named;
+    nothing is changed. The exit status is 1 if any artifact is damaged.
+
+    Example:
+
+    \b
+        genre verify --store genre-store
+    """
     from genre_tasks.errors import InputError
     from storage.local import open_store
 
-    opened, whole, damaged = open_store(store), 0, 0
+    opened = open_store(store)
+    # A mistyped path must not look like an empty store in which nothing is damaged.
     if not opened.root.is_dir():
         raise InputError("there is no store", remedy="Give the folder of one by --store.", file=opened.root)
-    for _, error in opened.check():
+    sound = 0
+    damaged = 0
+    for _, error in opened.verify_all():
         if error is None:
-            whole += 1
+            sound += 1
         else:
             damaged += 1
+            # All of them are listed, not the first alone: a failing disk seldom damages one file.
             typer.echo(f"damaged: {error}")
-    typer.echo(f"{whole} artifacts are whole, {damaged} damaged")
+    typer.echo(f"{sound} artifacts are sound, {damaged} damaged")
     if damaged:
-        typer.echo("Run the log again: damaged artifacts are computed anew, nothing else is.")
+        typer.echo("Run the log again: damaged artifacts are computed again, nothing else is.")
         raise typer.Exit(1)

@@ -2,112 +2,226 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+import math
+import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from flows.configuration import load_configuration
 from flows.cost_sweep.knobs import PRESET_ITSELF, Setting
-from flows.pipeline.definition import BY_NAME, PIPELINE, reconstructing_until
-from flows.pipeline.stage_runner import ArtifactRef, Job, artifact_of, value_of
-
-Produce = Callable[[str, Job, dict[str, ArtifactRef]], ArtifactRef]
+from flows.experiments.log_chunks import LogChunk
+from flows.experiments.stage_prediction import StagePredictor
+from flows.experiments.stages import StageRunner, image_counts, metric_values, read_stage_costs, run_stages
+from flows.experiments.warm_up import run_on_tiny_log
+from flows.pipeline.definition import STAGE_BY_NAME, stages_until
+from flows.pipeline.stage_runner import ArtifactRef, Job, read_artifact, run_stage
+from genre_tasks.config import PipelineConfig
+from genre_tasks.threads import torch_threads
 
 
 @dataclass(frozen=True)
 class Cell:
-    """Where, with which seed, and how."""
+    """What one cell measures: where, with which seed, and how.
 
-    log: str
-    chunk: int
+    Attributes:
+        where: the chunk.
+        seed: orders the views of GNet and ENet, and draws the fixer's noise.
+        setting: the preset with a knob turned.
+    """
+
+    where: LogChunk
     seed: int
     setting: Setting
 
     @property
     def name(self) -> str:
-        return f"{self.setting.name} · {self.log} chunk {self.chunk} · seed {self.seed}"
+        """Names the cell for the user.
+
+        >>> Cell(LogChunk("synthetic:street?seed=1001", 0), 2, Setting("views", "6")).name
+        'views=6 · synthetic:street?seed=1001 chunk 0 · seed 2'
+        """
+        return f"{self.setting.name} · {self.where} · seed {self.seed}"
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """What all cells share: the preset, the user's settings over it, what is judged, and the store."""
+    """What all cells share.
+
+    Attributes:
+        preset: name of the preset.
+        settings: the user's ``section.key=value`` over it.
+        store: folder of the store.
+    """
 
     preset: str
     settings: tuple[str, ...]
     store: str
 
     def job(self, cell: Cell) -> Job:
-        """Other numbers of threads have a store of their own: their payloads, and so their keys, are the same."""
-        values = cell.setting.configuration(self.preset, self.settings, cell.seed).model_dump(mode="json")
+        """Builds the job of a cell.
+
+        A number of threads has a store of its own: payloads and keys do not depend on it, so a shared store would
+        give the seconds of whichever number ran first.
+        """
+        config = cell.setting.configuration(self.preset, self.settings, cell.seed)
         threads = cell.setting.threads
-        return Job(cell.log, cell.chunk, f"{self.store}-threads-{threads}" if threads else self.store, values)
+        # A shared store would hand a cell the seconds of another number of threads.
+        store = f"{self.store}-threads-{threads}" if threads else self.store
+        return Job(cell.where.log, cell.where.chunk, store, config.model_dump(mode="json"))
 
-    def judge(self, cell: Cell) -> Job:
-        """The job of the preset itself, whose images are those that every setting is judged by."""
-        return self.job(Cell(cell.log, cell.chunk, cell.seed, Setting(PRESET_ITSELF, "", threads=cell.setting.threads)))
+    def reference_job(self, cell: Cell) -> Job:
+        """Builds the job of the preset itself, whose images every setting is compared with.
+
+        Args:
+            cell: its chunk, seed and number of threads are kept.
+        """
+        return self.job(Cell(cell.where, cell.seed, Setting(PRESET_ITSELF, "", threads=cell.setting.threads)))
 
 
-def stages_of(setting: Setting) -> tuple[str, ...]:
-    """The reconstructing stages up to the setting's end."""
-    return reconstructing_until(setting.end)
+def list_cells(places: Sequence[LogChunk], seeds: Sequence[int], settings: Sequence[Setting]) -> list[Cell]:
+    """Lists every setting on every chunk with every seed.
 
+    Args:
+        places: the chunks.
+        seeds: see :class:`Cell`.
+        settings: the preset itself first, then the others.
 
-def run_cell(sweep: Sweep, cell: Cell, produce: Produce) -> dict[str, Any] | None:
-    """A row: seconds, CPU seconds and memory of each stage, Gaussians, and the metrics of the end's scene.
-
-    A scene is judged by the images at the preset's resolution, whatever it was reconstructed from. ``None`` for an
-    effect that the plan has as the cell would set it, or that the log makes impossible.
+    Returns:
+        One seed of one chunk after the other, so that a sweep that is stopped early is a sweep of fewer seeds.
     """
-    job = sweep.job(cell)
-    if cell.setting.effect is not None and not _differs(sweep, cell, produce):
+    # Seeds are the outermost loop: a sweep that is stopped early is then a complete sweep of fewer seeds.
+    return [Cell(where, seed, setting) for seed in seeds for where in places for setting in settings]
+
+
+def run_cell(sweep: Sweep, cell: Cell, runner: StageRunner) -> dict[str, Any] | None:
+    """Measures a cell.
+
+    A scene is compared with the images at the preset's resolution, whatever it was reconstructed from.
+
+    Args:
+        sweep: what all cells share.
+        cell: what to measure.
+        runner: runs one stage.
+
+    Returns:
+        A row: seconds, CPU seconds and memory of the stages, number of Gaussians, and the metrics of the end's scene.
+        ``None`` for an effect that the plan sets as the cell would, or that the log makes impossible.
+
+    Raises:
+        GenreError: as the stages raise it.
+    """
+    # A cell that equals the preset would show the noise of timing as a gain.
+    if cell.setting.effect is not None and not _changes_the_plan(sweep, cell, runner):
         return None
-    refs: dict[str, ArtifactRef] = {}
-    with threads(cell.setting.threads):
-        for spec in PIPELINE:
-            if spec.name in stages_of(cell.setting):
-                refs[spec.name] = produce(spec.name, job, {name: refs[name] for name in spec.inputs})
-        judging = BY_NAME[f"evaluate/{cell.setting.end}"]
-        judged = {name: refs[name] for name in judging.inputs}
-        judge = sweep.judge(cell)
-        shown = produce("ingest", judge, {})
-        if shown.key != refs["ingest"].key:  # images of another size: what was fitted to pixels is the judge's too
-            judged |= {"ingest": shown, "effects": produce("effects", judge, {"ingest": shown})}
-        evaluation = produce(judging.name, job, judged)
-    row: dict[str, Any] = {"knob": cell.setting.knob, "value": cell.setting.value, "setting": cell.setting.name}
-    row |= {"changes": list(cell.setting.changes), "end": cell.setting.end, "threads": cell.setting.threads}
-    row |= {"log": cell.log, "chunk": cell.chunk, "seed": cell.seed, "images": len(value_of(job, refs["ingest"]).views)}
-    stages = {name: artifact_of(job, ref).manifest for name, ref in refs.items()}
-    row["seconds"] = {name: m.seconds for name, m in stages.items()}
-    row["cpu_seconds"] = {name: m.measurements.get("cpu_seconds") for name, m in stages.items()}
-    row["peak_mib"] = max(m.peak_mib for m in stages.values())
-    row["gaussians"] = len(value_of(job, refs[cell.setting.end]).scene)
-    metrics = value_of(job, evaluation).metrics
-    row["metrics"] = {m.name: m.value for m in metrics} | {m.name.rpartition("/")[0] + "/n": m.n for m in metrics}
-    return row
+    job = sweep.job(cell)
+    # The end belongs to the setting, because some knobs leave out ENet altogether.
+    end = cell.setting.end
+    # 0 threads stand for those that there are.
+    with torch_threads(cell.setting.threads or None):
+        refs = run_stages(stages_until(end), job, runner)
+        evaluation = runner(f"evaluate/{end}", job, _evaluation_inputs(sweep, cell, refs, runner))
+    # The evaluation is not among these stages: it is no cost of a reconstruction.
+    costs = read_stage_costs(job, refs)
+    metrics = read_artifact(job, evaluation).metrics
+    return {
+        "knob": cell.setting.knob,
+        "value": cell.setting.value,
+        "setting": cell.setting.name,
+        "changes": list(cell.setting.changes),
+        "end": end,
+        "threads": cell.setting.threads,
+        "log": cell.where.log,
+        "chunk": cell.where.chunk,
+        "seed": cell.seed,
+        "images": len(read_artifact(job, refs["ingest"]).views),
+        "seconds": costs.seconds,
+        "cpu_seconds": costs.cpu_seconds,
+        "peak_mib": costs.peak_mib,
+        "gaussians": len(read_artifact(job, refs[end]).scene),
+        "metrics": metric_values(metrics) | image_counts(metrics),
+    }
 
 
-def cells_of(places: Sequence[tuple[str, int]], seeds: Sequence[int], settings: Sequence[Setting]) -> list[Cell]:
-    """Every setting everywhere with every seed: one seed of one place after the other, so that a part is a sweep."""
-    return [Cell(log, chunk, seed, s) for seed in seeds for log, chunk in places for s in settings]
+def _evaluation_inputs(
+    sweep: Sweep, cell: Cell, refs: dict[str, ArtifactRef], runner: StageRunner
+) -> dict[str, ArtifactRef]:
+    # Every setting is judged at the preset's resolution, else fewer pixels would look like better quality.
+    inputs = {name: refs[name] for name in STAGE_BY_NAME[f"evaluate/{cell.setting.end}"].inputs}
+    reference = sweep.reference_job(cell)
+    ingest = runner("ingest", reference, {})
+    # Images of another size: the plan holds a mask of their pixels, so it has to be the reference's too.
+    if ingest.key != refs["ingest"].key:
+        inputs["ingest"] = ingest
+        inputs["effects"] = runner("effects", reference, {"ingest": ingest})
+    return inputs
 
 
-@contextmanager
-def threads(count: int) -> Iterator[None]:
-    """``count`` threads of the CPU, or as they are for 0."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(count or before)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+def _changes_the_plan(sweep: Sweep, cell: Cell, runner: StageRunner) -> bool:
+    """Tells whether the chunk's plan sets the cell's effect otherwise, and whether it can be set at all."""
+    reference = sweep.reference_job(cell)
+    refs = run_stages(("ingest", "effects"), reference, runner)
+    decision = read_artifact(reference, refs["effects"])[cell.setting.effect]
+    # Off without a measured value means that the log lacks what the effect needs.
+    impossible = decision.choice == "off" and math.isnan(decision.value)
+    return decision.choice != cell.setting.effect_state and not impossible
 
 
-def _differs(sweep: Sweep, cell: Cell, produce: Produce) -> bool:
-    """Whether the cell's effect is one that its chunk's plan has otherwise, and that can be set at all."""
-    judge = sweep.judge(cell)
-    planned = produce("effects", judge, {"ingest": produce("ingest", judge, {})})
-    decision = value_of(judge, planned)[cell.setting.effect]
-    impossible = decision.choice == "off" and decision.value != decision.value
-    return decision.choice != cell.setting.word and not impossible
+def predict_cells(sweep: Sweep, cells: Sequence[Cell]) -> list[dict[str, Any]]:
+    """Predicts what cells would take, without running any.
+
+    Args:
+        sweep: what all cells share.
+        cells: in the order in which they would run.
+
+    Returns:
+        A row for each cell, see :meth:`flows.experiments.stage_prediction.StagePredictor.predict`.
+    """
+    predictor = StagePredictor(sweep.store)
+    rows = []
+    for cell in cells:
+        # Usual seconds are those of the preset, from which the prediction scales to the cell.
+        base = PipelineConfig.model_validate(sweep.reference_job(cell).config)
+        names = (*stages_until(cell.setting.end), f"evaluate/{cell.setting.end}")
+        rows.append(predictor.predict(cell.name, sweep.job(cell), base, names))
+    return rows
+
+
+def read_logs_once(sweep: Sweep, cells: Sequence[Cell]) -> None:
+    """Ingests each chunk once into a store that is deleted, so that no cell pays for a log's first reading.
+
+    A synthetic street draws its images when they are first asked for, which takes longer than the rest of ingest.
+
+    Args:
+        sweep: what all cells share.
+        cells: name the chunks.
+
+    Raises:
+        InputError: a log cannot be read.
+    """
+    config = load_configuration(sweep.preset, settings=sweep.settings).model_dump(mode="json")
+    # Many cells share a chunk, and only the first reading of a log is slow.
+    for where in dict.fromkeys(c.where for c in cells):
+        with tempfile.TemporaryDirectory() as store:
+            run_stage("ingest", Job(where.log, where.chunk, store, config), {})
+
+
+def measure_cold_start(sweep: Sweep) -> dict[str, float]:
+    """Measures what the first stage of each kind in a process takes beyond later ones: imports, weights, first calls.
+
+    Args:
+        sweep: its preset and settings are run on a tiny log, twice.
+
+    Returns:
+        By stage: the seconds of the first run less those of the second, at least 0. Afterwards the process is warm, so
+        that a sweep's seconds hold none of it.
+    """
+    preset = Setting(PRESET_ITSELF, "")
+    config = preset.configuration(sweep.preset, sweep.settings, seed=0)
+    stages = stages_until(preset.end)
+    names = (*stages, f"evaluate/{preset.end}")
+    # The difference of two runs cancels the work itself, which a single first run would count as start-up.
+    first = run_on_tiny_log(config, names)
+    second = run_on_tiny_log(config, names)
+    # Noise can make the second run the slower one, but a negative start-up would make no sense.
+    return {stage: max(0.0, first[stage] - second[stage]) for stage in stages}

@@ -4,31 +4,77 @@ from __future__ import annotations
 
 import json
 import shlex
-import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from flows.cost_sweep.cell import Cell, Sweep, cells_of, run_cell
-from flows.cost_sweep.knobs import PRESET_ITSELF, settings_of
-from flows.cost_sweep.page import page
-from flows.cost_sweep.parquet import write_cells, write_lines
-from flows.cost_sweep.plot import drawn
-from flows.cost_sweep.summary import beside, lines_of
-from flows.cost_sweep.warm_up import cold_seconds, read_before
-from flows.machine.calibration import calibration_s
-from flows.machine.facts import commit, machine
-from flows.pipeline.log_cache import chosen_chunks, expanded
-from flows.pipeline.progress import current_reporter
-from flows.pipeline.stage_runner import ArtifactRef, Job, produce
+from flows.cost_sweep.cell import Cell, Sweep, list_cells, measure_cold_start, read_logs_once, run_cell
+from flows.cost_sweep.knobs import PRESET_ITSELF, list_settings
+from flows.cost_sweep.page import render_page
+from flows.cost_sweep.parquet import write_cells, write_settings
+from flows.cost_sweep.plot import draw_sweep
+from flows.cost_sweep.summary import novel_view_measure, summarise_settings
+from flows.experiments.log_chunks import select_log_chunks
+from flows.experiments.result_files import machine_facts, write_text
+from flows.experiments.stages import run_reported_stage
+from flows.machine.calibration import measure_calibration_s
+from flows.pipeline.progress import get_reporter
 from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import GenreError
 from storage.codecs.png import write_png
-from storage.files import write_file
 from storage.local import open_store
+
+DEFAULT_SEEDS = (0, 1, 2)
+
+
+@dataclass(frozen=True)
+class SweepRequest:
+    """What a user asks to sweep.
+
+    Attributes:
+        sweep: preset, settings and store.
+        logs: URIs; ``pandaset:PATH/*`` stands for every sequence in a folder.
+        chunks: of each log; all if ``None``.
+        seeds: see :class:`flows.cost_sweep.cell.Cell`; three if ``None``.
+        knobs: names of knobs; all if ``None``.
+    """
+
+    sweep: Sweep
+    logs: Sequence[str]
+    chunks: list[int] | None = None
+    seeds: Sequence[int] | None = None
+    knobs: Sequence[str] | None = None
+
+    def cells(self) -> list[Cell]:
+        """Lists the cells in the order in which they run.
+
+        Raises:
+            ConfigError: there is no such knob, or a setting is not allowed.
+            InputError: a log does not have one of the chunks.
+        """
+        settings = list_settings(self.sweep.preset, self.sweep.settings, self.knobs or ())
+        base = settings[0].configuration(self.sweep.preset, self.sweep.settings, 0)
+        places = select_log_chunks(self.logs, self.chunks, base)
+        return list_cells(places, DEFAULT_SEEDS if self.seeds is None else self.seeds, settings)
+
+    @property
+    def command(self) -> str:
+        """The command that sweeps the same cells again.
+
+        >>> SweepRequest(Sweep("demo", (), "store"), ["synthetic:street"], chunks=[2]).command
+        'genre cost synthetic:street --preset demo --chunks 2'
+        """
+        parts = ["genre", "cost", *self.logs, "--preset", self.sweep.preset]
+        for option, values in (("--chunks", self.chunks), ("--seeds", self.seeds), ("--knobs", self.knobs)):
+            if values:
+                parts += [option, ",".join(map(str, values))]
+        for setting in self.sweep.settings:
+            parts += ["--set", setting]
+        return shlex.join(parts)
 
 
 @flow(name="cost-of-accuracy", persist_result=False, validate_parameters=False)
@@ -42,121 +88,116 @@ def cost_of_accuracy(
     settings: list[str] | None = None,
     out: str = "cost",
 ) -> dict[str, Any]:
-    """Turns each knob on each log with each seed, and writes a table, a picture and a page into ``out``.
+    """Turns each knob on each log with each seed, and writes a table, a picture and a page.
+
+    Finished stages come from the store: killed at any point, it goes on where it was.
 
     Args:
-        logs: URIs; ``pandaset:PATH/*`` stands for every sequence in a folder. chunks: of each; all if None.
-        seeds: of the order of views and the fixer's noise; three if None. knobs: which; all if None.
+        logs: URIs; ``pandaset:PATH/*`` stands for every sequence in a folder.
+        preset: name of the preset.
+        store: folder of the store.
+        chunks: of each log; all if ``None``.
+        seeds: of the order of views and the fixer's noise; three if ``None``.
+        knobs: which knobs to turn; all if ``None``.
         settings: ``section.key=value`` over the preset, for every cell.
+        out: folder to write into.
 
-    Finished stages come from the store: killed at any point, it goes on where it was. A cell that fails (memory) is
-    left out and said; the preset's own is raised, as nothing could be compared with it.
+    Returns:
+        ``cells``, their number; ``failed``, names of cells that are left out; ``files`` that were written.
+
+    Raises:
+        GenreError: a cell of the preset itself failed, so that nothing could be compared with it.
     """
-    sweep = Sweep(preset, tuple(settings or ()), store)
-    cells = planned(sweep, logs, chunks, seeds, knobs)
+    request = SweepRequest(Sweep(preset, tuple(settings or ()), store), logs, chunks, seeds, knobs)
+    cells = request.cells()
     open_store(store).clean_temporaries()
+    reporter = get_reporter()
+    reporter.part_started("warming up")
+    cold = measure_cold_start(request.sweep)
+    fastest = measure_calibration_s()
+    reporter.part_ended(f"{sum(cold.values()):.1f} s more than warm")
+    reporter.part_started("reading the logs")
+    read_logs_once(request.sweep, cells)
+    reporter.part_ended("each once, before anything is timed")
+    rows, failed = _run_cells(request.sweep, cells)
+    # Calibrated before and after: what else runs on the machine seldom disturbs both.
+    fastest = min(fastest, measure_calibration_s())
+    speed = {"calibration_s": f"{fastest:.4f}", "cold_seconds": json.dumps(cold)}
+    left_out = [f"{name}: {error}" for name, error in failed.items()]
+    files = write_results(Path(out), request.sweep, rows, left_out, request.command, speed)
+    return {"cells": len(rows), "failed": sorted(failed), "files": files}
+
+
+def _run_cells(sweep: Sweep, cells: Sequence[Cell]) -> tuple[list[dict[str, Any]], dict[str, GenreError]]:
+    """Gives the rows, and the errors of cells that failed, such as for lack of memory."""
     rows: list[dict[str, Any]] = []
     failed: dict[str, GenreError] = {}
-    reporter = current_reporter()
-    reporter.began("warming up")
-    cold = cold_seconds(sweep)
-    fastest = calibration_s()
-    reporter.ended(f"{sum(cold.values()):.1f} s more than warm")
-    reporter.began("reading the logs")
-    read_before(sweep, cells)
-    reporter.ended("each once, before anything is timed")
+    reporter = get_reporter()
     for k, cell in enumerate(cells):
-        reporter.began(f"{k + 1}/{len(cells)} {cell.name}")
+        reporter.part_started(f"{k + 1}/{len(cells)} {cell.name}")
         try:
             row = cell_task(sweep, cell)
-            rows += [] if row is None else [row]
-            reporter.ended("as the plan has it" if row is None else f"{sum(row['seconds'].values()):.1f} s of stages")
         except GenreError as error:
             if cell.setting.knob == PRESET_ITSELF:
                 raise
             failed[cell.name] = error
-            reporter.ended(f"left out: {error}")
-    fastest = min(fastest, calibration_s())  # what ran beside the one is seldom there for both
-    speed = {"calibration_s": f"{fastest:.4f}", "cold_seconds": json.dumps(cold)}
-    told = command_of(sweep, logs, chunks, seeds, knobs)
-    files = write(Path(out), sweep, rows, [f"{name}: {error}" for name, error in failed.items()], told, speed)
-    return {"cells": len(rows), "failed": sorted(failed), "files": files}
-
-
-def planned(
-    sweep: Sweep,
-    logs: Sequence[str],
-    chunks: list[int] | None,
-    seeds: Sequence[int] | None,
-    knobs: Sequence[str] | None,
-) -> list[Cell]:
-    """The cells, in the order in which they run."""
-    settings = settings_of(sweep.preset, sweep.settings, knobs or ())
-    base = settings[0].configuration(sweep.preset, sweep.settings, 0)
-    places = [(log, chunk) for log in expanded(list(logs)) for chunk in chosen_chunks(log, base, chunks)]
-    return cells_of(places, (0, 1, 2) if seeds is None else seeds, settings)
-
-
-def command_of(
-    sweep: Sweep,
-    logs: Sequence[str],
-    chunks: Sequence[int] | None,
-    seeds: Sequence[int] | None,
-    knobs: Sequence[str] | None,
-) -> str:
-    """The command that sweeps the same cells again."""
-    lists = {"--chunks": chunks, "--seeds": seeds, "--knobs": knobs}
-    chosen = [part for name, values in lists.items() if values for part in (name, ",".join(map(str, values)))]
-    sets = [part for setting in sweep.settings for part in ("--set", setting)]
-    return shlex.join(["genre", "cost", *logs, "--preset", sweep.preset, *chosen, *sets])
+            reporter.part_ended(f"left out: {error}")
+            continue
+        if row is None:
+            reporter.part_ended("as the plan has it")
+        else:
+            rows.append(row)
+            reporter.part_ended(f"{sum(row['seconds'].values()):.1f} s of stages")
+    return rows, failed
 
 
 @task(name="cell", task_run_name="{cell.name}", persist_result=False, cache_policy=NO_CACHE)
 def cell_task(sweep: Sweep, cell: Cell) -> dict[str, Any] | None:
-    """A row of the sweep, see :func:`flows.cost_sweep.cell.run_cell`."""
-
-    def produced(stage: str, job: Job, inputs: dict[str, ArtifactRef]) -> ArtifactRef:
-        return produce(stage, job, inputs, progress=current_reporter().progress)
-
-    return run_cell(sweep, cell, produced)
+    """Measures one cell as a Prefect task, see :func:`flows.cost_sweep.cell.run_cell`."""
+    return run_cell(sweep, cell, run_reported_stage)
 
 
-def write(
+def write_results(
     out: Path,
     sweep: Sweep,
     rows: Sequence[dict[str, Any]],
-    failed: Sequence[str],
+    left_out: Sequence[str],
     command: str,
     speed: Mapping[str, str],
 ) -> list[str]:
-    """``cost.parquet``, ``cost_cells.parquet``, ``cost.png`` and ``cost.md``, each whole or not at all.
+    """Writes ``cost.parquet``, ``cost_cells.parquet``, ``cost.png`` and ``cost.md``, each whole or not at all.
 
-    ``command`` makes them again. ``speed`` of the machine goes into the tables, for whoever predicts from them.
+    Args:
+        out: folder to write into.
+        sweep: preset, settings and store.
+        rows: of the measured cells.
+        left_out: a line for each cell that failed.
+        command: makes the files again.
+        speed: how fast the machine is; into the tables, for predictions on another machine.
+
+    Returns:
+        The paths of the files.
     """
     out.mkdir(parents=True, exist_ok=True)
-    lines, judged = lines_of(rows), beside(rows)
-    where = sorted({f"{r['log']} chunk {r['chunk']}" for r in rows})
-    seeds = sorted({r["seed"] for r in rows})
+    summaries = summarise_settings(rows)
+    novel_measure = novel_view_measure(rows)
     facts = {
         "command": command,
         "preset": " ".join([sweep.preset, *sweep.settings]),
-        "logs": ", ".join(where),
-        "seeds": ", ".join(map(str, seeds)),
-        "machine": machine(),
-        "commit": commit(),
-        "date": time.strftime("%Y-%m-%d", time.gmtime()),
+        "logs": ", ".join(sorted({f"{r['log']} chunk {r['chunk']}" for r in rows})),
+        "seeds": ", ".join(map(str, sorted({r["seed"] for r in rows}))),
+        **machine_facts(),
     }
-    basis = {"base": sweep.preset, "settings": json.dumps(sweep.settings), "judged": judged.name, **speed}
+    # For programs that read the table, not for the page: budgets look up their preset and the machine's speed here.
+    basis = {"base": sweep.preset, "settings": json.dumps(sweep.settings), "judged": novel_measure.name, **speed}
     files = [out / name for name in ("cost.parquet", "cost_cells.parquet", "cost.png", "cost.md")]
     with atomic_path(files[0]) as part:
-        write_lines(part, lines, facts | basis)
+        write_settings(part, summaries, facts | basis)
     with atomic_path(files[1]) as part:
         write_cells(part, rows, facts | basis)
     with atomic_path(files[2]) as part:
-        write_png(part, drawn(lines, judged, f"{facts['preset']}: {facts['logs']}"))
-    said = [f"* {name}: {f'`{value}`' if name == 'command' else value}" for name, value in facts.items()] + [
-        f"* left out: {text}" for text in failed
-    ]
-    with atomic_path(files[3]) as part:
-        write_file(part, page(lines, judged, said, "cost.png").encode())
+        write_png(part, draw_sweep(summaries, novel_measure, f"{facts['preset']}: {facts['logs']}"))
+    bullets = [f"* {name}: {f'`{value}`' if name == 'command' else value}" for name, value in facts.items()]
+    bullets += [f"* left out: {text}" for text in left_out]
+    write_text(files[3], render_page(summaries, novel_measure, bullets, "cost.png"))
     return [str(file) for file in files]

@@ -6,7 +6,6 @@ product, which would take years.
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,26 +14,36 @@ from typing import Literal
 from flows.configuration import load_configuration
 from genre_tasks.config import EffectsConfig, PipelineConfig
 from genre_tasks.errors import ConfigError
+from genre_tasks.suggestions import did_you_mean
 
 End = Literal["gnet", "enet"]
 PRESET_ITSELF = "preset"
-TOGETHER, EFFECTS = "together", "effects"
-LENGTHS = (1, 4, 8, 16, 24, 48, 72, 144)
-ENHANCING = (1 / 6, 1 / 3, 2 / 3, 2.0)
-"""ENet's lengths, of the preset's."""
-SIZES = ((160, 90), (240, 136), (320, 180), (480, 270))
-GAUSSIANS = (0.25, 0.5, 1.0, 2.0, 4.0)
-VIEWS = (1, 3, 6, 12)
-PERCEPTUAL = (0.0, 0.1, 0.2)
+TOGETHER = "together"
+EFFECTS = "effects"
+GNET_ITERATIONS = (1, 4, 8, 16, 24, 48, 72, 144)
+ENET_FRACTIONS = (1 / 6, 1 / 3, 2 / 3, 2.0)
+"""ENet's iterations, as fractions of the preset's."""
+IMAGE_SIZES = ((160, 90), (240, 136), (320, 180), (480, 270))
+GAUSSIAN_FRACTIONS = (0.25, 0.5, 1.0, 2.0, 4.0)
+VIEWS_PER_ITERATION = (1, 3, 6, 12)
+PERCEPTUAL_WEIGHTS = (0.0, 0.1, 0.2)
+FIXER_GATES = (0.05, 0.2)
+NOVEL_VIEW_SHIFTS_M = ((3.0,), (1.5, -1.5), (3.0, 1.5, -1.5, -3.0))
+COMBINED_GNET_ITERATIONS = (4, 8, 16, 24, 48, 144)
 NOT_SWEPT = frozenset({"ego_mask"})
-"""Effects that change what is judged, or are knobs of their own (``fixer``)."""
+"""Effects that change which pixels are compared, or that are knobs of their own (``fixer``)."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One point of a sweep: ``changes`` are ``section.key=value`` over the preset.
+    """One point of a sweep.
 
-    ``end`` is the stage whose scene is the result: gnet where nothing is fixed. ``threads`` of the CPU, 0: as they are.
+    Attributes:
+        knob: what is turned; ``preset`` for the preset itself.
+        value: to what it is turned.
+        changes: ``section.key=value`` over the preset.
+        end: the stage whose scene is the result; ``gnet`` where nothing is fixed.
+        threads: threads of the CPU; 0 leaves them as they are.
     """
 
     knob: str
@@ -45,7 +54,11 @@ class Setting:
 
     @property
     def name(self) -> str:
-        """``knob=value``."""
+        """Names the setting, as ``knob=value``.
+
+        >>> Setting("views", "6").name
+        'views=6'
+        """
         return self.knob if self.knob == PRESET_ITSELF else f"{self.knob}={self.value}"
 
     @property
@@ -54,92 +67,132 @@ class Setting:
         return self.value.split()[0] if self.knob == EFFECTS else None
 
     @property
-    def word(self) -> str:
-        """``on`` or ``off``, of :attr:`effect`."""
+    def effect_state(self) -> str:
+        """Tells whether :attr:`effect` is set ``on`` or ``off``.
+
+        >>> Setting("effects", "exposure off").effect_state
+        'off'
+        """
         return self.value.split()[-1]
 
     def configuration(self, preset: str, settings: Sequence[str], seed: int) -> PipelineConfig:
-        """The preset, the user's settings, the knob, and the seed that orders views and draws noise."""
+        """Builds the configuration of this setting.
+
+        Args:
+            preset: name of the preset.
+            settings: the user's ``section.key=value`` over the preset; the knob comes after them.
+            seed: orders the views of GNet and ENet, and draws the fixer's noise.
+
+        Raises:
+            ConfigError: a setting is unknown or out of range.
+        """
+        # Seeds come last, so that no setting of the user can make two cells equal.
         seeds = [f"{section}.seed={seed}" for section in ("gnet", "fnet", "enet")]
         return load_configuration(preset, settings=(*settings, *self.changes, *seeds))
 
 
-def settings_of(preset: str, settings: Sequence[str] = (), knobs: Sequence[str] = ()) -> list[Setting]:
-    """The preset itself first, then every value of the ``knobs`` (default: all) that differs from the preset's.
+def list_settings(preset: str, settings: Sequence[str] = (), knobs: Sequence[str] = ()) -> list[Setting]:
+    """Lists what a sweep measures.
 
-    Raises ``ConfigError`` for a knob that does not exist.
+    Args:
+        preset: name of the preset.
+        settings: the user's ``section.key=value`` over the preset.
+        knobs: names of knobs; all of them if empty.
+
+    Returns:
+        The preset itself first, then every value of the knobs that differs from the preset's.
+
+    Raises:
+        ConfigError: there is no such knob.
+
+    >>> [s.name for s in list_settings("small", knobs=["views"])]
+    ['preset', 'views=1', 'views=6', 'views=12']
     """
     base = load_configuration(preset, settings=settings)
     known = _knobs(base)
     for name in knobs:
         if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f"Did you mean {near[0]}? " if near else ""
-            raise ConfigError(f"there is no knob {name!r}", remedy=f"{hint}Known: {', '.join(known)}.")
+            remedy = f"{did_you_mean(name, known)}Known: {', '.join(known)}."
+            raise ConfigError(f"there is no knob {name!r}", remedy=remedy)
+    # The preset comes first: without its cells nothing can be compared when a sweep is stopped.
     out = [Setting(PRESET_ITSELF, "")]
     for name in knobs or known:
-        for one in known[name]:
-            if (
-                one.end != "enet"
-                or one.threads
-                or load_configuration(preset, settings=(*settings, *one.changes)) != base
-            ):
-                out.append(one)
+        out += [setting for setting in known[name] if _differs_from_preset(setting, preset, settings, base)]
     return out
+
+
+def _differs_from_preset(setting: Setting, preset: str, settings: Sequence[str], base: PipelineConfig) -> bool:
+    # An earlier end and a number of threads are not in the configuration, so comparing it would miss them.
+    if setting.end != "enet" or setting.threads:
+        return True
+    return load_configuration(preset, settings=(*settings, *setting.changes)) != base
 
 
 def _knobs(base: PipelineConfig) -> Mapping[str, list[Setting]]:
     points = base.initial.max_points
-    enhancing = [max(1, round(base.enet.iterations * x)) for x in ENHANCING]
+    enet_iterations = [max(1, round(base.enet.iterations * x)) for x in ENET_FRACTIONS]
     return {
-        "gnet_iterations": [Setting("gnet_iterations", f"{t}", (f"gnet.iterations={t}",)) for t in LENGTHS],
-        "enet_iterations": [Setting("enet_iterations", f"{t}", (f"enet.iterations={t}",)) for t in enhancing],
+        "gnet_iterations": [_turn("gnet_iterations", f"{n}", f"gnet.iterations={n}") for n in GNET_ITERATIONS],
+        "enet_iterations": [_turn("enet_iterations", f"{n}", f"enet.iterations={n}") for n in enet_iterations],
         "resolution": [
-            Setting("resolution", f"{w}x{h}", (f"ingest.width_px={w}", f"ingest.height_px={h}")) for w, h in SIZES
+            _turn("resolution", f"{w}x{h}", f"ingest.width_px={w}", f"ingest.height_px={h}") for w, h in IMAGE_SIZES
         ],
         "gaussians": [
-            Setting("gaussians", f"{n}", (f"initial.max_points={n}",)) for n in (round(points * x) for x in GAUSSIANS)
+            _turn("gaussians", f"{n}", f"initial.max_points={n}")
+            for n in (round(points * x) for x in GAUSSIAN_FRACTIONS)
         ],
-        "views": [Setting("views", f"{n}", (f"gnet.views_per_iteration={n}",)) for n in VIEWS],
-        "perceptual": [Setting("perceptual", f"{x:g}", (f"gnet.loss.perceptual={x}",)) for x in PERCEPTUAL],
+        "views": [_turn("views", f"{n}", f"gnet.views_per_iteration={n}") for n in VIEWS_PER_ITERATION],
+        "perceptual": [_turn("perceptual", f"{x:g}", f"gnet.loss.perceptual={x}") for x in PERCEPTUAL_WEIGHTS],
         "fixer": [
             Setting("fixer", "off", end="gnet"),
-            *(Setting("fixer", f"gate {x:g}", (f"fnet.gate={x}",)) for x in (0.05, 0.2)),
-            *(Setting("fixer", "bfloat16" if x else "float32", (f"fnet.half={x}".lower(),)) for x in (True, False)),
+            *(_turn("fixer", f"gate {x:g}", f"fnet.gate={x}") for x in FIXER_GATES),
+            _turn("fixer", "bfloat16", "fnet.half=true"),
+            _turn("fixer", "float32", "fnet.half=false"),
         ],
         "shifts": [
-            Setting("shifts", " ".join(f"{x:g}" for x in shifts), (f"novel_views.shifts_m={list(shifts)}",))
-            for shifts in ((3.0,), (1.5, -1.5), (3.0, 1.5, -1.5, -3.0))
+            _turn("shifts", " ".join(f"{x:g}" for x in shifts), f"novel_views.shifts_m={list(shifts)}")
+            for shifts in NOVEL_VIEW_SHIFTS_M
         ],
         EFFECTS: [
-            Setting(EFFECTS, f"{name} {word}", (f"effects.{name}={word}",))
-            for name, field in EffectsConfig.model_fields.items()
-            for word in ("on", "off")
-            if name not in NOT_SWEPT and field.annotation != Literal["auto", "off"]
+            _turn(EFFECTS, f"{name} {state}", f"effects.{name}={state}")
+            for name in _switchable_effects()
+            for state in ("on", "off")
         ],
-        "threads": [Setting("threads", f"{n}", threads=n) for n in _halved(os.cpu_count() or 1)],
-        TOGETHER: _together(points, (enhancing[0], enhancing[-1])),
+        "threads": [Setting("threads", f"{n}", threads=n) for n in _fewer_threads(os.cpu_count() or 1)],
+        TOGETHER: _combinations(points, (enet_iterations[0], enet_iterations[-1])),
     }
 
 
-def _together(points: int, enhancing: tuple[int, int]) -> list[Setting]:
-    """Several knobs at once: lengths of GNet and ENet, as they share stages; and the cheapest and the costliest."""
-    fewer = f"initial.max_points={points // 2}"
-    small = ("ingest.width_px=240", "ingest.height_px=136")
-    designed: list[tuple[str, tuple[str, ...], End]] = [("least", (*small, fewer, "gnet.iterations=8"), "gnet")]
-    for gnet in (4, 8, 16, 24, 48, 144):
-        designed.append((f"GNet {gnet} alone", (f"gnet.iterations={gnet}",), "gnet"))
-        for enet in enhancing:
+def _turn(knob: str, value: str, *changes: str) -> Setting:
+    return Setting(knob, value, changes)
+
+
+def _switchable_effects() -> list[str]:
+    fields = EffectsConfig.model_fields.items()
+    # An effect that can only be off or automatic has nothing to turn on.
+    return [n for n, field in fields if n not in NOT_SWEPT and field.annotation != Literal["auto", "off"]]
+
+
+def _combinations(points: int, enet_iterations: tuple[int, int]) -> list[Setting]:
+    """Turns several knobs at once: GNet's and ENet's iterations, as they share stages, and the two extremes."""
+    # Designed combinations instead of the full product, which would take years.
+    half_the_points = f"initial.max_points={points // 2}"
+    small_images = ("ingest.width_px=240", "ingest.height_px=136")
+    out = [Setting(TOGETHER, "least", (*small_images, half_the_points, "gnet.iterations=8"), "gnet")]
+    for gnet in COMBINED_GNET_ITERATIONS:
+        out.append(Setting(TOGETHER, f"GNet {gnet} alone", (f"gnet.iterations={gnet}",), "gnet"))
+        for enet in enet_iterations:
             changes = (f"gnet.iterations={gnet}", f"enet.iterations={enet}")
-            designed.append((f"GNet {gnet}, ENet {enet}", changes, "enet"))
+            out.append(Setting(TOGETHER, f"GNet {gnet}, ENet {enet}", changes))
     most = (f"initial.max_points={2 * points}", "gnet.iterations=144", "gnet.views_per_iteration=6")
-    designed.append(("most", (*most, f"enet.iterations={enhancing[1]}"), "enet"))
-    return [Setting(TOGETHER, name, changes, end) for name, changes, end in designed]
+    out.append(Setting(TOGETHER, "most", (*most, f"enet.iterations={enet_iterations[1]}")))
+    return out
 
 
-def _halved(cores: int) -> list[int]:
-    """1, 2, 4 … below the number of cores."""
+def _fewer_threads(cores: int) -> list[int]:
+    """Lists 1, 2, 4 … below the number of cores."""
     out = [1]
+    # All cores are the preset itself, so the list stays below their number.
     while 2 * out[-1] < cores:
         out.append(2 * out[-1])
     return [n for n in out if n < cores]

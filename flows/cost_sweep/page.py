@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
-from flows.cost_sweep.summary import COSTS, KERNEL_3M, MEASURES, PSNR, Line, Measure, Spread
+from flows.cost_sweep.summary import COSTS, KERNEL_3M, MEASURES, PSNR, Measure, SettingSummary, Spread
 
 INCLUDED = (
     "Seconds are the wall time of the stages up to the scene (ingest, plan of effects, initial scene, GNet, and unless "
@@ -17,8 +17,18 @@ INCLUDED = (
 )
 
 
-def page(lines: Sequence[Line], judged: Measure, facts: Sequence[str], picture: str) -> str:
-    """Title, facts (what, on which machine, at which commit), picture, a table, and seconds by stage."""
+def render_page(summaries: Sequence[SettingSummary], novel_measure: Measure, facts: Sequence[str], picture: str) -> str:
+    """Writes the page of a sweep.
+
+    Args:
+        summaries: the settings.
+        novel_measure: what settings are compared by away from the path.
+        facts: Markdown lines that say what was measured, on which machine and at which commit.
+        picture: path of the picture, relative to the page.
+
+    Returns:
+        Markdown: title, facts, picture, a table of accuracy and costs, and a table of seconds by stage.
+    """
     head = [
         "# What accuracy costs in time",
         "",
@@ -29,38 +39,45 @@ def page(lines: Sequence[Line], judged: Measure, facts: Sequence[str], picture: 
         f"![Accuracy against seconds]({picture})",
         "",
     ]
-    return "\n".join([*head, *_table(lines, judged), "", *_stages(lines), ""])
+    return "\n".join([*head, *_accuracy_table(summaries, novel_measure), "", *_stage_table(summaries), ""])
 
 
-def _table(lines: Sequence[Line], judged: Measure) -> Iterator[str]:
-    shown = [m for m in MEASURES if any(math.isfinite(x.values[m.name].middle) for x in lines)]
+def _accuracy_table(summaries: Sequence[SettingSummary], novel_measure: Measure) -> Iterator[str]:
+    # Real logs lack some measures, whose columns would be empty.
+    measured = [m for m in MEASURES if any(math.isfinite(x.values[m.name].average) for x in summaries)]
     yield "Gains are over the preset in the same place with the same seed, positive where the setting is better. "
-    yield f"**Bold**: no setting with as many cells is as good in less time (held-out PSNR, {judged.label})."
-    if KERNEL_3M in shown:
-        yield f"Distances between sets are of N = {lines[0].images:.0f} images at 3 m; compare them at equal N only."
+    yield f"**Bold**: no setting with as many cells is as good in less time (held-out PSNR, {novel_measure.label})."
+    if KERNEL_3M in measured:
+        # The kernel distance is unbiased, but its variance and the Fréchet distance's bias depend on the set's size.
+        count = f"{summaries[0].images_at_3m:.0f}"
+        yield f"Distances between sets are of N = {count} images at 3 m; compare them at equal N only."
     yield ""
-    yield "| knob | value | n | " + " | ".join(m.label for m in (*COSTS, *shown)) + " | gain held out | gain beside |"
-    yield "|---" * (5 + len(COSTS) + len(shown)) + "|"
-    for x in lines:
-        values = [_value(x.values[m.name], m.name in x.on_front) for m in (*COSTS, *shown)]
-        gains = [_value(x.gains[m.name], sign="+") for m in (PSNR, judged)]
+    labels = " | ".join(m.label for m in (*COSTS, *measured))
+    yield f"| knob | value | n | {labels} | gain held out | gain beside |"
+    yield "|---" * (5 + len(COSTS) + len(measured)) + "|"
+    for x in summaries:
+        values = [_format(x.values[m.name], bold=m.name in x.on_front) for m in (*COSTS, *measured)]
+        gains = [_format(x.gains[m.name], sign="+") for m in (PSNR, novel_measure)]
         yield f"| {x.knob} | {x.value} | {x.n} | " + " | ".join([*values, *gains]) + " |"
 
 
-def _stages(lines: Sequence[Line]) -> Iterator[str]:
-    names = list(dict.fromkeys(s for x in lines for s in x.stage_seconds))
+def _stage_table(summaries: Sequence[SettingSummary]) -> Iterator[str]:
+    names = list(dict.fromkeys(s for x in summaries for s in x.stage_seconds))
     yield "Median seconds by stage:"
     yield ""
     yield "| knob | value | " + " | ".join(names) + " |"
     yield "|---" * (2 + len(names)) + "|"
-    for x in lines:
-        cells = [f"{x.stage_seconds[s]:.2f}" if s in x.stage_seconds else "" for s in names]
-        yield f"| {x.knob} | {x.value} | " + " | ".join(cells) + " |"
+    for x in summaries:
+        seconds = [f"{x.stage_seconds[s]:.2f}" if s in x.stage_seconds else "" for s in names]
+        yield f"| {x.knob} | {x.value} | " + " | ".join(seconds) + " |"
 
 
-def _value(spread: Spread, bold: bool = False, sign: str = "") -> str:
-    if math.isnan(spread.middle):
+def _format(spread: Spread, bold: bool = False, sign: str = "") -> str:
+    if math.isnan(spread.average):
         return ""
-    digits = 0 if abs(spread.middle) >= 100 else 2 if abs(spread.middle) >= 1 else 3
-    text = f"{spread.middle:{sign}.{digits}f}" + ("" if math.isnan(spread.sd) else f" ± {spread.sd:.{digits}f}")
+    # Counts of Gaussians need no decimals; distances, which are below 1, differ in the third.
+    digits = 0 if abs(spread.average) >= 100 else 2 if abs(spread.average) >= 1 else 3
+    text = f"{spread.average:{sign}.{digits}f}"
+    if not math.isnan(spread.sd):
+        text += f" ± {spread.sd:.{digits}f}"
     return f"**{text}**" if bold else text

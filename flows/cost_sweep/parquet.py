@@ -1,4 +1,4 @@
-"""A sweep's Parquet: every cell, and a line for each setting."""
+"""A sweep's Parquet files: every cell, and a line for each setting."""
 
 from __future__ import annotations
 
@@ -10,10 +10,36 @@ from typing import Any
 
 import pyarrow as pa
 
-from flows.cost_sweep.summary import COSTS, MEASURES, Line, Spread
+from flows.cost_sweep.summary import COSTS, MEASURES, Measure, SettingSummary, Spread
 from storage.codecs.tables import column, read_table, schema, write_table
 
+# The order is that of the columns: changing it needs a new version of the schema.
 _MEASURES = (*COSTS, *MEASURES)
+
+
+def _value_columns(measure: Measure) -> tuple[str, str]:
+    """Names the columns of a measure's average and its standard deviation."""
+    return f"{measure.name}_{measure.average}", f"{measure.name}_sd"
+
+
+def _gain_columns(measure: Measure) -> tuple[str, str]:
+    return f"{measure.name}_gain", f"{measure.name}_gain_sd"
+
+
+def _measure_columns(measure: Measure) -> list[Any]:
+    better = "more" if measure.more_is_better else "less"
+    value, value_sd = _value_columns(measure)
+    gain, gain_sd = _gain_columns(measure)
+    gain_note = "over the preset in the same place with the same seed; positive is better"
+    notes = {
+        value: f"{measure.label}, {measure.average} over seeds: {better} is better",
+        value_sd: "over seeds, pooled over places",
+        gain: gain_note,
+        gain_sd: "over seeds, pooled over places",
+    }
+    return [column(name, pa.float64(), note, nullable=True) for name, note in notes.items()]
+
+
 LINES = schema(
     "cost/3",
     [
@@ -26,16 +52,7 @@ LINES = schema(
         column("images", pa.float64(), "in a chunk, source views and held-out ones"),
         column("stage_seconds", pa.string(), "JSON: median wall seconds by stage"),
         column("on_front", pa.string(), "the measures in which no setting is as good in less time, with commas"),
-        *(
-            column(f"{m.name}_{part}", pa.float64(), note, nullable=True)
-            for m in _MEASURES
-            for part, note in (
-                (m.middle, f"{m.label}, {m.middle} over seeds: {'more' if m.more_is_better else 'less'} is better"),
-                ("sd", "over seeds, pooled over places"),
-                ("gain", "over the preset in the same place with the same seed; positive is better"),
-                ("gain_sd", "over seeds, pooled over places"),
-            )
-        ),
+        *(c for measure in _MEASURES for c in _measure_columns(measure)),
     ],
 )
 CELLS = schema(
@@ -54,73 +71,96 @@ CELLS = schema(
         column("metrics", pa.string(), "JSON: by name, as in an evaluation"),
     ],
 )
+_PLAIN_CELL_COLUMNS = ("setting", "log", "chunk", "seed", "peak_mib", "gaussians", "images")
+_JSON_CELL_COLUMNS = ("changes", "seconds", "cpu_seconds", "metrics")
 
 
-def write_lines(path: Path, lines: Sequence[Line], extra: Mapping[str, str]) -> None:
-    """``extra``: machine, commit and the like, into the file's metadata."""
-    columns: dict[str, Any] = {"knob": [x.knob for x in lines], "value": [x.value for x in lines]}
-    columns |= {"n": [x.n for x in lines], "changes": [json.dumps(x.changes) for x in lines]}
-    columns |= {"end": [x.end for x in lines], "threads": [x.threads for x in lines]}
-    columns |= {"images": [x.source_images for x in lines]}
-    columns |= {"stage_seconds": [json.dumps(x.stage_seconds) for x in lines]}
-    columns |= {"on_front": [",".join(x.on_front) for x in lines]}
-    for m in _MEASURES:
-        for part, spreads in (("", [x.values[m.name] for x in lines]), ("gain", [x.gains[m.name] for x in lines])):
-            columns[f"{m.name}_{part or m.middle}"] = [_number(s.middle) for s in spreads]
-            columns[f"{m.name}_{part}{'_' * bool(part)}sd"] = [_number(s.sd) for s in spreads]
-    write_table(path, LINES, columns, extra)
+def write_settings(path: Path, summaries: Sequence[SettingSummary], facts: Mapping[str, str]) -> None:
+    """Writes a line for each setting.
 
-
-def read_lines(path: Path) -> tuple[list[Line], dict[str, str]]:
-    """What :func:`write_lines` wrote, and the strings of its metadata. Distances' numbers of images are not in it.
-
-    Raises ``ArtifactCorruptError`` for a file that is no such table.
+    Args:
+        path: the Parquet file to write.
+        summaries: the settings.
+        facts: machine, commit and the like, for the file's metadata.
     """
-    table, extra = read_table(path, LINES)
-    return [_line(row) for row in table.to_pylist()], extra
+    columns: dict[str, Any] = {
+        "knob": [x.knob for x in summaries],
+        "value": [x.value for x in summaries],
+        "n": [x.n for x in summaries],
+        # JSON and not nested columns: each setting has other keys.
+        "changes": [json.dumps(x.changes) for x in summaries],
+        "end": [x.end for x in summaries],
+        "threads": [x.threads for x in summaries],
+        "images": [x.source_images for x in summaries],
+        "stage_seconds": [json.dumps(x.stage_seconds) for x in summaries],
+        "on_front": [",".join(x.on_front) for x in summaries],
+    }
+    for m in _MEASURES:
+        columns |= _spread_columns(_value_columns(m), [x.values[m.name] for x in summaries])
+        columns |= _spread_columns(_gain_columns(m), [x.gains[m.name] for x in summaries])
+    write_table(path, LINES, columns, facts)
 
 
-def _line(row: Mapping[str, Any]) -> Line:
-    def spreads(part: str) -> dict[str, Spread]:
-        return {
-            m.name: Spread(
-                _float(row[f"{m.name}_{part or m.middle}"]), _float(row[f"{m.name}_{part}{'_' * bool(part)}sd"])
-            )
-            for m in _MEASURES
-        }
+def _spread_columns(names: tuple[str, str], spreads: Sequence[Spread]) -> dict[str, list[float | None]]:
+    average, sd = names
+    return {average: [_null_if_nan(s.average) for s in spreads], sd: [_null_if_nan(s.sd) for s in spreads]}
 
-    name = row["knob"] if not row["value"] else f"{row['knob']}={row['value']}"
-    return Line(
-        row["knob"],
-        row["value"],
-        name,
-        row["n"],
-        spreads(""),
-        spreads("gain"),
-        json.loads(row["stage_seconds"]),
-        math.nan,
-        tuple(json.loads(row["changes"])),
-        row["end"],
-        row["threads"],
-        row["images"],
-        tuple(m for m in row["on_front"].split(",") if m),
+
+def read_settings(path: Path) -> tuple[list[SettingSummary], dict[str, str]]:
+    """Reads what :func:`write_settings` wrote.
+
+    Returns:
+        The settings, whose ``images_at_3m`` are NaN as the file does not hold them, and the strings of its metadata.
+
+    Raises:
+        ArtifactCorruptError: the file is no such table.
+    """
+    table, facts = read_table(path, LINES)
+    return [_summary(row) for row in table.to_pylist()], facts
+
+
+def _summary(row: Mapping[str, Any]) -> SettingSummary:
+    return SettingSummary(
+        knob=row["knob"],
+        value=row["value"],
+        setting=f"{row['knob']}={row['value']}" if row["value"] else row["knob"],
+        n=row["n"],
+        values={m.name: _read_spread(row, _value_columns(m)) for m in _MEASURES},
+        gains={m.name: _read_spread(row, _gain_columns(m)) for m in _MEASURES},
+        stage_seconds=json.loads(row["stage_seconds"]),
+        # The file has no such column, and zero would be a claim.
+        images_at_3m=math.nan,
+        changes=tuple(json.loads(row["changes"])),
+        end=row["end"],
+        threads=row["threads"],
+        source_images=row["images"],
+        # Splitting an empty string gives one empty name.
+        on_front=tuple(m for m in row["on_front"].split(",") if m),
     )
 
 
-def write_cells(path: Path, rows: Sequence[Mapping[str, Any]], extra: Mapping[str, str]) -> None:
-    """As :func:`write_lines`, of the rows of :func:`flows.cost_sweep.cell.run_cell`."""
-    plain = ("setting", "log", "chunk", "seed", "peak_mib", "gaussians", "images")
-    columns = {name: [row[name] for row in rows] for name in plain}
-    columns |= {
-        k: [json.dumps(row[k], sort_keys=True) for row in rows]
-        for k in ("changes", "seconds", "cpu_seconds", "metrics")
-    }
-    write_table(path, CELLS, {f.name: columns[f.name] for f in CELLS}, extra)
+def _read_spread(row: Mapping[str, Any], names: tuple[str, str]) -> Spread:
+    average, sd = names
+    return Spread(_nan_if_null(row[average]), _nan_if_null(row[sd]))
 
 
-def _float(value: float | None) -> float:
+def write_cells(path: Path, rows: Sequence[Mapping[str, Any]], facts: Mapping[str, str]) -> None:
+    """Writes every cell.
+
+    Args:
+        path: the Parquet file to write.
+        rows: see :func:`flows.cost_sweep.cell.run_cell`.
+        facts: machine, commit and the like, for the file's metadata.
+    """
+    columns = {name: [row[name] for row in rows] for name in _PLAIN_CELL_COLUMNS}
+    columns |= {name: [json.dumps(row[name], sort_keys=True) for row in rows] for name in _JSON_CELL_COLUMNS}
+    write_table(path, CELLS, {f.name: columns[f.name] for f in CELLS}, facts)
+
+
+def _nan_if_null(value: float | None) -> float:
     return math.nan if value is None else value
 
 
-def _number(value: float) -> float | None:
-    return None if value != value else value
+def _null_if_nan(value: float) -> float | None:
+    # Null and not NaN: readers of Parquet leave nulls out of averages, and let a NaN spoil them.
+    return None if math.isnan(value) else value

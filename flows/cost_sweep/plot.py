@@ -5,39 +5,59 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flows.cost_sweep.knobs import EFFECTS, PRESET_ITSELF, TOGETHER
-from flows.cost_sweep.summary import PSNR, Line, Measure
+from flows.cost_sweep.summary import PSNR, Measure, SettingSummary
 
-LABELLED = 0.005
-"""Effects that change a measure by less of the preset's get no label: a dozen lie on one point."""
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+LABELLED_CHANGE = 0.005
+"""Effects that change a measure by less than this fraction of the preset's get no label: a dozen lie on one point."""
+LEAST_WIDTH_S = 4.0
+LEAST_HEIGHT = 0.02
+"""Height of a panel's range at least, as a fraction of the preset's value."""
 COLUMNS = 5
 
 
-def drawn(lines: Sequence[Line], judged: Measure, title: str) -> NDArray[np.uint8]:
-    """[H, W, 3]: for each knob two panels, held-out PSNR over what is ``judged`` beside the path; up is better."""
+def draw_sweep(summaries: Sequence[SettingSummary], novel_measure: Measure, title: str) -> NDArray[np.uint8]:
+    """Draws a sweep.
+
+    Args:
+        summaries: the settings, the preset among them.
+        novel_measure: what settings are compared by away from the path.
+        title: wrapped to the picture's width.
+
+    Returns:
+        [H, W, 3] sRGB: for each knob two panels, held-out PSNR over ``novel_measure``; up is better in both.
+    """
+    # Imported here, because the command line should start without matplotlib.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    knobs = list(dict.fromkeys(x.knob for x in lines if x.knob != PRESET_ITSELF))
+    knobs = list(dict.fromkeys(x.knob for x in summaries if x.knob != PRESET_ITSELF))
     columns = min(COLUMNS, max(1, len(knobs)))
-    rows = -(-max(1, len(knobs)) // columns)
+    rows = math.ceil(max(1, len(knobs)) / columns)
     figure = Figure(figsize=(3.6 * columns, 5.0 * rows), dpi=100, layout="constrained")
+    # A canvas of its own and not pyplot, whose global state would leak between threads and need a display.
     canvas = FigureCanvasAgg(figure)
     panels = figure.subplots(2 * rows, columns, squeeze=False)
+    # The last row of the grid may have panels without a knob.
     for axes in panels.ravel():
         axes.set_visible(False)
     for k, knob in enumerate(knobs):
-        for below, measure in enumerate((PSNR, judged)):
-            axes = panels[2 * (k // columns) + below, k % columns]
+        row, column = divmod(k, columns)
+        for lower, measure in enumerate((PSNR, novel_measure)):
+            axes = panels[2 * row + lower, column]
             axes.set_visible(True)
-            _panel(axes, lines, knob, measure)
-            axes.set_ylabel(measure.label if k % columns == 0 else "", fontsize=8)
-            axes.set_title("" if below else knob.replace("_", " "), fontsize=9)
-            axes.set_xlabel("seconds, without evaluation" if below else "", fontsize=8)
+            _draw_panel(axes, summaries, knob, measure)
+            axes.set_ylabel(measure.label if column == 0 else "", fontsize=8)
+            axes.set_title("" if lower else knob.replace("_", " "), fontsize=9)
+            axes.set_xlabel("seconds, without evaluation" if lower else "", fontsize=8)
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8)
     figure.suptitle(textwrap.fill(title, 50 * columns), fontsize=9)
@@ -45,41 +65,56 @@ def drawn(lines: Sequence[Line], judged: Measure, title: str) -> NDArray[np.uint
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def _panel(axes, lines: Sequence[Line], knob: str, measure: Measure) -> None:  # type: ignore[no-untyped-def]  # matplotlib's axes
-    preset = next(x for x in lines if x.knob == PRESET_ITSELF)
-    star = preset.values[measure.name].middle
-    best = sorted((x for x in lines if measure.name in x.on_front), key=lambda x: x.seconds)
-    x, y, _ = _points(best, measure)
-    axes.step(
-        x, y, where="post", color="0.6", linewidth=1, label="no setting with as many cells is better in less time"
+def _draw_panel(axes: Axes, summaries: Sequence[SettingSummary], knob: str, measure: Measure) -> None:
+    preset = next(x for x in summaries if x.knob == PRESET_ITSELF)
+    preset_value = preset.values[measure.name].average
+    # The front is that of the whole sweep, so that a panel shows what other knobs reach in the same time.
+    front = sorted((x for x in summaries if measure.name in x.on_front), key=lambda x: x.seconds)
+    seconds, values, _ = _points(front, measure)
+    label = "no setting with as many cells is better in less time"
+    # Steps and not lines: nothing was measured between two settings.
+    axes.step(seconds, values, where="post", color="0.6", linewidth=1, label=label)
+    turned = sorted((x for x in summaries if x.knob == knob), key=lambda x: x.seconds)
+    seconds, values, errors = _points(turned, measure)
+    axes.errorbar(
+        seconds, values, errors, fmt="o", color="C0", markersize=4, linewidth=1, label="a setting, ± over seeds"
     )
-    own = sorted((x for x in lines if x.knob == knob), key=lambda x: x.seconds)
-    x, y, e = _points(own, measure)
-    axes.errorbar(x, y, e, fmt="o", color="C0", markersize=4, linewidth=1, label="a setting, ± over seeds")
-    for at_x, at_y, line in zip(x, y, own, strict=True):
-        if knob == EFFECTS and abs(line.gains[measure.name].middle) < LABELLED * abs(star):
-            continue
-        if knob == TOGETHER and measure.name not in line.on_front:
-            continue
-        axes.annotate(line.value, (at_x, at_y), fontsize=7, xytext=(4, 3), textcoords="offset points")
-    axes.plot([preset.seconds], [star], "*", color="black", markersize=11, label="preset")
-    axes.set_xlim(*_around([*x, preset.seconds], 4.0))
-    axes.set_ylim(*_around([*y, star], 0.02 * abs(star)))
+    for x, y, summary in zip(seconds, values, turned, strict=True):
+        if _is_labelled(summary, measure, preset_value):
+            axes.annotate(summary.value, (x, y), fontsize=7, xytext=(4, 3), textcoords="offset points")
+    axes.plot([preset.seconds], [preset_value], "*", color="black", markersize=11, label="preset")
+    axes.set_xlim(*_limits([*seconds, preset.seconds], LEAST_WIDTH_S))
+    axes.set_ylim(*_limits([*values, preset_value], LEAST_HEIGHT * abs(preset_value)))
+    # Up has to mean better in every panel, also for distances.
     if not measure.more_is_better:
         axes.invert_yaxis()
     axes.tick_params(labelsize=7)
     axes.grid(alpha=0.3)
 
 
-def _around(values: Sequence[float], least: float) -> tuple[float, float]:
-    """Limits of an axis that has these values and is at least so wide; some space is left for labels."""
+def _is_labelled(summary: SettingSummary, measure: Measure, preset_value: float) -> bool:
+    if summary.knob == EFFECTS:
+        # Written with "not", so that an unknown gain, which is NaN, gets its label.
+        return not abs(summary.gains[measure.name].average) < LABELLED_CHANGE * abs(preset_value)
+    # Two dozen combinations would hide each other's labels: only the best ones are named.
+    return summary.knob != TOGETHER or measure.name in summary.on_front
+
+
+def _limits(values: Sequence[float], least: float) -> tuple[float, float]:
+    """Gives limits of an axis that hold these values, are at least ``least`` apart, and leave space for labels."""
+    # A NaN among the values would make both limits NaN, and the panel empty.
     known = [v for v in values if math.isfinite(v)]
-    low, high = min(known), max(known)
+    low = min(known)
+    high = max(known)
+    # Without a least range, noise of a hundredth of a second would fill the panel.
     wider = max(0.0, least - (high - low)) / 2
     margin = 0.15 * (high - low + 2 * wider)
+    # Labels stand to the upper right of their points, so that margin is the larger one.
     return low - wider - margin, high + wider + 1.5 * margin
 
 
-def _points(lines: Sequence[Line], measure: Measure) -> tuple[list[float], list[float], list[float]]:
-    spreads = [x.values[measure.name] for x in lines]
-    return [x.seconds for x in lines], [s.middle for s in spreads], [0 if math.isnan(s.sd) else s.sd for s in spreads]
+def _points(summaries: Sequence[SettingSummary], measure: Measure) -> tuple[list[float], list[float], list[float]]:
+    """Gives seconds, averages and error bars; a single seed has no error bar."""
+    seconds = [x.seconds for x in summaries]
+    spreads = [x.values[measure.name] for x in summaries]
+    return seconds, [s.average for s in spreads], [0 if math.isnan(s.sd) else s.sd for s in spreads]

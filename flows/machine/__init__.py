@@ -1,1 +1,1 @@
-"""What this machine is, how much memory a process may take, and how fast the machine is beside a reference."""
+"""The machine: what it is, how much memory a process may use, how fast it is, and what a piece of work takes."""

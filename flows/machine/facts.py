@@ -1,26 +1,75 @@
-"""What a number was measured on."""
+"""What a number was measured on: the machine, the commit of the code, the versions of the packages."""
 
 from __future__ import annotations
 
+import functools
 import os
 import platform
 import subprocess
+from importlib.metadata import version
 from pathlib import Path
 
 CHECKOUT = Path(__file__).resolve().parents[2]
+"""The folder that holds the packages: the checkout, where they run from one."""
 
 
-def machine() -> str:
-    """CPU model, cores that this process may use, instruction set of the kernel, torch version, GPU if there is one."""
+def describe_machine() -> str:
+    """Names the machine in one line, for the results that are measured on it.
+
+    Returns:
+        CPU model, cores that this process may use, instruction set of the kernels, version of torch, and the GPU if
+        there is one, separated by commas.
+    """
     import torch
 
-    from genre_tasks.compiled.loader import supported_isas
+    from genre_tasks.compiled.loader import supported_instruction_sets
 
+    # A container may have fewer cores than the machine: the affinity says how many this process may use.
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    parts = [_cpu_model(), f"{cores} cores", supported_isas()[0], f"torch {torch.__version__}"]
+    parts = [_cpu_model(), f"{cores} cores", supported_instruction_sets()[0], f"torch {torch.__version__}"]
     if torch.cuda.is_available():
         parts.append(torch.cuda.get_device_name())
     return ", ".join(parts)
+
+
+@functools.lru_cache(maxsize=1)
+def describe_environment() -> dict[str, str]:
+    """Lists what can change a measured number, for the manifest of an artifact.
+
+    Returns:
+        Versions of Python, torch, numpy and GenRe, the platform, the processor, and the number of torch's threads.
+    """
+    import torch
+
+    return {
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "processor": platform.machine(),
+        "threads": str(torch.get_num_threads()),
+        **{name: version(name) for name in ("torch", "numpy", "genre")},
+    }
+
+
+def git_commit(folder: Path = CHECKOUT) -> str:
+    """Finds the commit that the code of a folder is at.
+
+    Args:
+        folder: the root of a checkout, as a resolved path.
+
+    Returns:
+        40 hex digits, followed by ``+changes`` where tracked files differ from the commit; ``unknown`` outside of a
+        checkout.
+    """
+    try:
+        # Installed below another project's repository, git would answer with that project's commit.
+        if Path(_git(folder, "rev-parse", "--show-toplevel")).resolve() != folder:
+            return "unknown"
+        head = _git(folder, "rev-parse", "HEAD")
+        # Stores, results and notes lie untracked in many checkouts; they change no measurement.
+        changed = _git(folder, "status", "--porcelain", "--untracked-files=no")
+        return f"{head}+changes" if changed else head
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
 
 
 def _cpu_model() -> str:
@@ -29,24 +78,13 @@ def _cpu_model() -> str:
     except OSError:
         return platform.processor() or platform.machine()
     fields = dict(line.split(":", 1) for line in lines if ":" in line)
-    names = {k.strip(): v.strip() for k, v in fields.items()}
-    if "model name" not in names:
+    values = {name.strip(): value.strip() for name, value in fields.items()}
+    if "model name" not in values:
         return platform.processor() or platform.machine()
-    # Virtual machines hide the name; family and model still tell the generation.
-    return f"{names['model name']} (family {names.get('cpu family', '?')} model {names.get('model', '?')})"
+    # Virtual machines hide the model's name; family and model still tell the generation.
+    return f"{values['model name']} (family {values.get('cpu family', '?')} model {values.get('model', '?')})"
 
 
-def commit(folder: Path = CHECKOUT) -> str:
-    """The checkout's commit, ``+changes`` added where tracked files differ from it; ``unknown`` outside of one."""
-    try:
-        if Path(_git(folder, "rev-parse", "--show-toplevel")).resolve() != folder:
-            return "unknown"  # installed below somebody else's repository
-        head = _git(folder, "rev-parse", "HEAD")
-        return head + ("+changes" if _git(folder, "status", "--porcelain", "--untracked-files=no") else "")
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-
-
-def _git(where: Path, *arguments: str) -> str:
-    done = subprocess.run(["git", *arguments], cwd=where, capture_output=True, text=True, check=True)
+def _git(folder: Path, *arguments: str) -> str:
+    done = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=True)
     return done.stdout.strip()

@@ -8,13 +8,23 @@ _CGROUP_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory
 
 
 def memory_limit_gib() -> float:
-    """GiB. On Linux the kernel kills a process that goes over, so work is planned against this beforehand."""
+    """Finds how much memory this process may use, in GiB.
+
+    On Linux the kernel kills a process that uses more, so work is planned against this limit beforehand.
+
+    Returns:
+        The smaller of the machine's memory and the limit of the process's cgroup (a container's limit).
+
+    >>> memory_limit_gib() > 0
+    True
+    """
     import psutil
 
     limits = [float(psutil.virtual_memory().total)]
     for path in _CGROUP_LIMITS:
         try:
             limits.append(float(path.read_text()))
-        except (OSError, ValueError):  # no cgroup, or the word "max"
+        except (OSError, ValueError):
+            # There is no cgroup here, or its file says "max": no limit.
             continue
     return min(limits) / 2**30

@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from flows.configuration import preset_values, validated
+from flows.configuration import read_preset, validate_config
 from genre_tasks.config import GnetConfig
 from genre_tasks.errors import ConfigError
 
@@ -18,41 +18,67 @@ FILE = Path(__file__).resolve().parents[2] / "configs" / "baselines.yaml"
 
 @dataclass(frozen=True)
 class Baseline:
-    """A method to compare with: where it comes from, why it is done so, and its configuration at each length."""
+    """A method to compare with.
+
+    Attributes:
+        name: its key in the file.
+        source: where it comes from.
+        why: why it is configured so.
+        variants: its configuration at each length, by name.
+    """
 
     name: str
     source: str
     why: str
     variants: Mapping[str, GnetConfig]
 
-    def at(self, variant: str) -> GnetConfig:
-        """The configuration of one length. Raises ``ConfigError`` for one that there is not."""
-        if variant not in self.variants:
+    def variant(self, name: str) -> GnetConfig:
+        """Gives the configuration of one length.
+
+        Raises:
+            ConfigError: there is no such variant.
+        """
+        if name not in self.variants:
             raise ConfigError(
-                f"the baseline {self.name} has no variant '{variant}'",
+                f"the baseline {self.name} has no variant '{name}'",
                 remedy=f"Known: {', '.join(self.variants)}.",
                 file=FILE,
             )
-        return self.variants[variant]
+        return self.variants[name]
 
 
 def load_baselines(preset: str, file: Path = FILE) -> dict[str, Baseline]:
-    """All baselines on top of a preset; one without variants has the one called ``default``.
+    """Reads all baselines on top of a preset.
 
-    Raises ``ConfigError`` for an unknown key or a value out of range.
+    Args:
+        preset: name of the preset whose section ``gnet`` the baselines change.
+        file: the YAML file.
+
+    Returns:
+        The baselines by name; one without variants has a single one called ``default``.
+
+    Raises:
+        ConfigError: a key is unknown or missing, or a value is out of range.
+
+    >>> sorted(name for name in load_baselines("small") if name.startswith("tuned"))
+    ['tuned_adam', 'tuned_adam_split']
     """
-    gnet = preset_values(preset).get("gnet", {})
-    out = {}
+    # Baselines share the preset's views and losses, so that only the method differs.
+    gnet = read_preset(preset).get("gnet", {})
+    baselines = {}
     for name, section in yaml.safe_load(file.read_text(encoding="utf-8")).items():
+        # A baseline without its source or reason could not be defended against its authors.
         if missing := {"source", "why", "gnet"} - section.keys():
             raise ConfigError(
                 f"the baseline {name} does not say its {', '.join(sorted(missing))}", remedy="Add it.", file=file
             )
+        # Some methods have one published length only.
         variants = section.get("variants", {"default": {}})
+        # Every variant is checked now, because a long table should not fail at its last row.
         configs = {k: _config({**gnet, **section["gnet"], **v}, f"{file}, {name}, {k}") for k, v in variants.items()}
-        out[name] = Baseline(name, section["source"], section["why"], configs)
-    return out
+        baselines[name] = Baseline(name, section["source"], section["why"], configs)
+    return baselines
 
 
 def _config(gnet: Mapping[str, Any], source: str) -> GnetConfig:
-    return validated({"gnet": gnet}, source).gnet
+    return validate_config({"gnet": gnet}, source).gnet

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.paper_tables.measure import Produce, run_stages
-from flows.paper_tables.request import Planned
-from flows.pipeline.definition import reconstructing_until
-from flows.pipeline.log_cache import opened_log
-from flows.pipeline.stage_runner import value_of
+from flows.experiments.stages import StageRunner, run_stages
+from flows.paper_tables.request import CheckedRequest
+from flows.pipeline.definition import stages_until
+from flows.pipeline.log_cache import cached_log
+from flows.pipeline.stage_runner import read_artifact
 from genre_tasks.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
@@ -24,78 +24,114 @@ if TYPE_CHECKING:
 
 Kind = Literal["recon", "fixers"]
 TABLE: Mapping[str, int] = {"recon": 1, "fixers": 3}
-"""The table whose methods a kind shows."""
+"""The table whose methods a kind of figure shows."""
 SHIFTS_M: Mapping[str, tuple[float, ...]] = {"recon": (0.0, 1.0, 3.0, 5.0), "fixers": (1.0, 2.0, 3.0)}
-"""To the left of the path."""
+"""Metres to the left of the path, a column each."""
 
 Pixels = NDArray[np.uint8]  # [H, W, 3] sRGB
 
 
 @dataclass(frozen=True)
-class Strip:
-    """A row of the picture: its label and an image for each shift."""
+class ComparisonStrip:
+    """A row of the picture.
+
+    Attributes:
+        label: the method's name, or what else the row shows.
+        images: one for each shift, [H, W, 3] sRGB.
+    """
 
     label: str
     images: tuple[Pixels, ...]
 
 
-def kind_of(name: str) -> Kind:
-    """Raises ``ConfigError`` for a figure that there is not."""
+def parse_kind(name: str) -> Kind:
+    """Checks the name of a kind of figure.
+
+    Raises:
+        ConfigError: there is no such figure.
+
+    >>> parse_kind("recon")
+    'recon'
+    """
     for kind in get_args(Kind):
         if name == kind:
             return kind  # type: ignore[no-any-return]  # one of the literals
     raise ConfigError(f"there is no figure {name!r}", remedy=f"Choose from {', '.join(TABLE)}.")
 
 
-def strips(
-    kind: Kind, plan: Planned, produce: Produce, camera: str | None = None, frame: int | None = None
-) -> list[Strip]:
-    """Of the request's first chunk: methods in the order of their table, what fixers were given, the truth.
+def comparison_strips(
+    kind: Kind, checked: CheckedRequest, runner: StageRunner, camera: str | None = None, frame: int | None = None
+) -> list[ComparisonStrip]:
+    """Renders or fixes the same views with every method, on the request's first chunk.
 
-    ``camera``: the first front one without it; ``frame`` of the log, a source frame: the middle one without it.
-    Methods without weights are not among them. Raises ``InputError`` for a camera or frame that the chunk has not.
+    Args:
+        kind: which figure.
+        checked: the table's rows and chunks; rows that cannot be measured are left out.
+        runner: runs one stage.
+        camera: name of a camera; the first front one if ``None``.
+        frame: a source frame of the log; the middle one if ``None``.
+
+    Returns:
+        The methods in the order of their table; before them what fixers get as input, after them the truth where the
+        log can tell it.
+
+    Raises:
+        InputError: the chunk has no source image of this camera and frame.
     """
-    from genre_tasks.metrics.scoring import true_pixels
-
-    place = plan.places[0]
-    out: list[Strip] = []
+    strips: list[ComparisonStrip] = []
+    # Every method has the same ingest, so the last row's chunk and views serve the truth too.
     views: list[NovelView] = []
-    for row in plan.layout.rows:
-        if row.label in plan.missing:
-            continue
-        job = plan.basis.job(plan.layout, row.method, place)
-        refs = run_stages(reconstructing_until(row.method.end), job, produce)
-        chunk = value_of(job, refs["ingest"])
-        views = _views(chunk, SHIFTS_M[kind], camera, frame)
+    # One chunk only: a picture of several would need a row for each method and chunk.
+    where = checked.places[0]
+    for row in checked.measurable_rows:
+        job = checked.basis.job(checked.layout, row.method, where)
+        refs = run_stages(stages_until(row.method.end), job, runner)
+        chunk = read_artifact(job, refs["ingest"])
+        views = _select_views(chunk, SHIFTS_M[kind], camera, frame)
         if kind == "recon":
-            out.append(Strip(row.label, _rendered(value_of(job, refs[row.method.end]).scene, views)))
+            scene = read_artifact(job, refs[row.method.end]).scene
+            strips.append(ComparisonStrip(row.label, _render(scene, views)))
             continue
-        novel, fixed = (value_of(job, refs[name]) for name in ("novel_views", "fnet"))
-        at = {(v.camera, v.frame, v.shift_m): i for i, v in enumerate(novel.views)}
-        chosen = [at[v.camera, v.frame, v.shift_m] for v in views]
-        if not out:
-            out.append(Strip("what they are given", _pixels(novel.color[chosen])))
-        out.append(Strip(row.label, _pixels(fixed.color[chosen])))
-    truth = opened_log(place.log).truth
-    if truth is not None and views:
-        out.append(Strip("the truth", tuple(true_pixels(chunk, truth, v) for v in views)))
-    return out
+        novel = read_artifact(job, refs["novel_views"])
+        fixed = read_artifact(job, refs["fnet"])
+        # Looked up by name, because the fixer's stage may hold more views than the figure shows.
+        index = {(v.camera, v.frame, v.shift_m): i for i, v in enumerate(novel.views)}
+        chosen = [index[v.camera, v.frame, v.shift_m] for v in views]
+        # All fixers get the same renders, so one strip of inputs stands for all.
+        if not strips:
+            strips.append(ComparisonStrip("what they are given", _to_pixels(novel.color[chosen])))
+        strips.append(ComparisonStrip(row.label, _to_pixels(fixed.color[chosen])))
+    truth = _true_strip(where.log, chunk, views) if views else None
+    return strips if truth is None else [*strips, truth]
 
 
-def drawn(kind: Kind, found: Sequence[Strip], title: str) -> Pixels:
-    """[H, W, 3]: a row for each strip."""
+def draw_strips(kind: Kind, strips: Sequence[ComparisonStrip], title: str) -> Pixels:
+    """Draws the picture.
+
+    Args:
+        kind: which figure.
+        strips: its rows, at least one.
+        title: above the rows.
+
+    Returns:
+        [H, W, 3] sRGB.
+    """
+    # Imported here, because the command line should start without matplotlib.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    height, width = found[0].images[0].shape[:2]
-    columns, dpi = len(SHIFTS_M[kind]), 100
-    size = ((columns * width + 40) / dpi, (len(found) * (height + 24) + 40) / dpi)
+    height, width = strips[0].images[0].shape[:2]
+    columns = len(SHIFTS_M[kind])
+    dpi = 100
+    # One image pixel is about one pixel of the picture; labels take 24 pixels a row, the title 40.
+    size = ((columns * width + 40) / dpi, (len(strips) * (height + 24) + 40) / dpi)
     figure = Figure(figsize=size, dpi=dpi, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=9)
-    panels = figure.subplots(len(found), columns, squeeze=False)
-    for line, strip in zip(panels, found, strict=True):
+    panels = figure.subplots(len(strips), columns, squeeze=False)
+    for line, strip in zip(panels, strips, strict=True):
         for axes, image, shift in zip(line, strip.images, SHIFTS_M[kind], strict=True):
+            # Smoothing would hide the very artefacts that the figure compares.
             axes.imshow(image, interpolation="nearest")
             axes.set_axis_off()
             axes.set_title(f"{strip.label}, {shift:g} m", fontsize=8, pad=2)
@@ -103,10 +139,21 @@ def drawn(kind: Kind, found: Sequence[Strip], title: str) -> Pixels:
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def _views(chunk: Chunk, shifts_m: Sequence[float], camera: str | None, frame: int | None) -> list[NovelView]:
-    from genre_tasks.scene.novel_poses import novel_view_poses
+def _true_strip(log: str, chunk: Chunk, views: Sequence[NovelView]) -> ComparisonStrip | None:
+    from genre_tasks.metrics.scoring import truth_image
 
-    frames = sorted({v.frame for v in chunk.of_role("source")})
+    truth = cached_log(log).truth
+    if truth is None:
+        return None
+    return ComparisonStrip("the truth", tuple(truth_image(chunk, truth, v) for v in views))
+
+
+def _select_views(chunk: Chunk, shifts_m: Sequence[float], camera: str | None, frame: int | None) -> list[NovelView]:
+    from genre_tasks.scene.novel_poses import place_novel_views
+
+    # Only source frames: the stage places novel views at these, so others have no fixed image.
+    frames = sorted({v.frame for v in chunk.views_with_role("source")})
+    # Of several front cameras the shortest name is the one that looks straight ahead.
     name = camera or min(chunk.camera_names, key=lambda c: ("front" not in c, len(c)))
     chosen = frames[len(frames) // 2] if frame is None else frame
     if name not in chunk.camera_names or chosen not in frames:
@@ -116,7 +163,7 @@ def _views(chunk: Chunk, shifts_m: Sequence[float], camera: str | None, frame: i
             log=chunk.log,
             chunk=chunk.index,
         )
-    views = [v for v in novel_view_poses(chunk, shifts_m, [chosen]) if v.camera == name]
+    views = [v for v in place_novel_views(chunk, shifts_m, [chosen]) if v.camera == name]
     if not views:
         raise InputError(
             "this image is missing in the log", remedy="Choose another --frame.", camera=name, frame=chosen
@@ -124,14 +171,16 @@ def _views(chunk: Chunk, shifts_m: Sequence[float], camera: str | None, frame: i
     return views
 
 
-def _rendered(scene: object, views: Sequence[NovelView]) -> tuple[Pixels, ...]:
+def _render(scene: object, views: Sequence[NovelView]) -> tuple[Pixels, ...]:
     import torch
 
     from genre_tasks.render import render_views
 
+    # The scene's tensors may ask for gradients, whose buffers a picture does not need.
     with torch.no_grad():
-        return _pixels(render_views(scene, views).color)  # type: ignore[arg-type]  # read back from the store
+        return _to_pixels(render_views(scene, views).color)  # type: ignore[arg-type]  # read back from the store
 
 
-def _pixels(color: Tensor) -> tuple[Pixels, ...]:
+def _to_pixels(color: Tensor) -> tuple[Pixels, ...]:
+    # Rounded, because a plain cast truncates and darkens every image by half a level.
     return tuple((color.clamp(0, 1) * 255).round().byte().cpu().numpy())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,19 +11,18 @@ from typing import Any
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from flows.machine.facts import commit, machine
-from flows.paper_tables.layouts import Cell
-from flows.paper_tables.measure import Place, measure
-from flows.paper_tables.page import differences_from_the_paper, page, put_into
+from flows.experiments.log_chunks import LogChunk
+from flows.experiments.result_files import machine_facts, write_text
+from flows.experiments.stages import run_reported_stage
+from flows.paper_tables.columns import MeasuredCell
+from flows.paper_tables.measure import measure_cell, warm_up
+from flows.paper_tables.page import list_differences, render_page
+from flows.paper_tables.page_sections import replace_section
 from flows.paper_tables.parquet import write_cells
-from flows.paper_tables.prediction import not_stored, predicted
-from flows.paper_tables.request import Planned, Request
-from flows.paper_tables.warm_up import warm_up
-from flows.pipeline.progress import current_reporter
-from flows.pipeline.stage_runner import ArtifactRef, Job, produce
+from flows.paper_tables.request import CheckedRequest, TableRequest, find_unstored_methods, predict_table
+from flows.pipeline.progress import get_reporter
 from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import GenreError
-from storage.files import write_file
 from storage.local import open_store
 
 
@@ -43,113 +41,156 @@ def paper_table(
     remarks: list[str] | None = None,
     stored: bool = False,
 ) -> dict[str, Any]:
-    """Measures a table of the paper on ``logs``, and writes it into ``out`` with the paper's numbers beside.
-
-    Args:
-        number: 1 to 5. logs: URIs, all of one dataset; ``pandaset:PATH/*`` stands for every sequence in a folder.
-        chunks: of each; all if None. settings: ``section.key=value`` over the preset and the paper's protocol.
-        methods: YAML files of further methods, see ``flows/paper_tables/methods.py``.
-        weights: ``NAME=PATH`` of weights that do not ship. into: a Markdown page whose section of this table is
-            written anew.
+    """Measures a table of the paper, and writes it with the paper's numbers beside the measured ones.
 
     Finished stages come from the store: killed at any point, it goes on where it was. A method that fails on a chunk
-    is left out and said, and raised if none is left.
+    is left out, and the table says so.
+
+    Args:
+        number: of the table, 1 to 5.
+        logs: URIs, all of one dataset; ``pandaset:PATH/*`` stands for every sequence in a folder.
+        preset: name of the preset.
+        store: folder of the store.
+        chunks: of each log; all if ``None``.
+        settings: ``section.key=value`` over the preset and the paper's protocol.
+        methods: YAML files of further methods, see ``flows/paper_tables/user_methods.py``.
+        weights: ``NAME=PATH`` of weights that do not ship.
+        out: folder to write into.
+        into: a Markdown page whose section of this table is replaced.
+        remarks: what else the reader should know.
+        stored: compute nothing, and leave out the methods that the store has not completely.
+
+    Returns:
+        ``cells``, their number; ``failed``, labels of methods that failed; ``files`` that were written.
+
+    Raises:
+        GenreError: the request is wrong, or no method is left.
     """
-    request = Request(
-        number,
-        tuple(logs),
-        preset,
-        store,
-        None if chunks is None else tuple(chunks),
-        tuple(settings or ()),
-        tuple(methods or ()),
-        tuple(weights or ()),
-        out,
-        into,
-        tuple(remarks or ()),
-        stored,
+    request = TableRequest(
+        number=number,
+        logs=tuple(logs),
+        preset=preset,
+        store=store,
+        chunks=None if chunks is None else tuple(chunks),
+        settings=tuple(settings or ()),
+        methods=tuple(methods or ()),
+        weights=tuple(weights or ()),
+        out=out,
+        into=into,
+        remarks=tuple(remarks or ()),
+        stored=stored,
     )
-    plan = request.planned()
+    checked = request.check()
     if stored:
-        plan = replace(plan, missing=not_stored(plan) | plan.missing)
+        checked = replace(checked, missing=find_unstored_methods(checked) | checked.missing)
     open_store(store).clean_temporaries()
-    reporter = current_reporter()
-    if any(row["seconds"] > 0 for row in predicted(plan)):  # else nothing is timed
-        reporter.began("warming up")
-        warm_up(plan.basis, plan.layout)
-        reporter.ended("imports, weights and first calls are in no stage's seconds")
-    cells: list[Cell] = []
-    failed: dict[str, GenreError] = {}
-    rows = [row for row in plan.layout.rows if row.label not in plan.missing]
-    for k, (place, row) in enumerate((p, r) for p in plan.places for r in rows):
-        if row.label in failed:
-            continue
-        reporter.began(f"{k + 1}/{len(plan.places) * len(rows)} {row.label} · {place}")
-        try:
-            cell = cell_task(plan, row.label, place)
-            cells.append(cell)
-            reporter.ended(f"{sum(cell.seconds.values()):.1f} s of stages")
-        except GenreError as error:
-            failed[row.label] = error
-            reporter.ended(f"left out: {error}")
-    left = [c for c in cells if c.method not in failed]
-    if not left and failed:
+    _warm_up_if_timed(checked)
+    cells, failed = _run_cells(checked)
+    complete = [c for c in cells if c.method not in failed]
+    if not complete and failed:
         raise next(iter(failed.values()))
-    told = plan.missing | {name: f"it failed: {error}" for name, error in failed.items()}
-    files = write(request, plan, left, told)
-    return {"cells": len(left), "failed": sorted(failed), "files": files}
+    missing = checked.missing | {name: f"it failed: {error}" for name, error in failed.items()}
+    files = write_results(request, checked, complete, missing)
+    return {"cells": len(complete), "failed": sorted(failed), "files": files}
 
 
-@task(name="table-cell", task_run_name="{label} {place}", persist_result=False, cache_policy=NO_CACHE)
-def cell_task(plan: Planned, label: str, place: Place) -> Cell:
-    """See :func:`flows.paper_tables.measure.measure`."""
-
-    def produced(stage: str, job: Job, inputs: dict[str, ArtifactRef]) -> ArtifactRef:
-        return produce(stage, job, inputs, progress=current_reporter().progress)
-
-    method = next(row.method for row in plan.layout.rows if row.label == label)
-    return measure(plan.basis, plan.layout, replace(method, name=label), place, produced)
+def _warm_up_if_timed(checked: CheckedRequest) -> None:
+    # What comes from the store keeps the seconds of its first computation: nothing is timed then.
+    if any(row["seconds"] > 0 for row in predict_table(checked)):
+        get_reporter().part_started("warming up")
+        warm_up(checked.basis, checked.layout)
+        get_reporter().part_ended("imports, weights and first calls are in no stage's seconds")
 
 
-def write(request: Request, plan: Planned, cells: Sequence[Cell], missing: dict[str, str]) -> list[str]:
-    """``tableN_DATASET.parquet`` and ``.md`` in ``out``, and the section of ``into``; each whole or not at all."""
+def _run_cells(checked: CheckedRequest) -> tuple[list[MeasuredCell], dict[str, GenreError]]:
+    """Gives the measured cells, and the error of each method that failed, which is not tried on further chunks."""
+    cells: list[MeasuredCell] = []
+    failed: dict[str, GenreError] = {}
+    reporter = get_reporter()
+    planned = [(where, row.label) for where in checked.places for row in checked.measurable_rows]
+    for k, (where, label) in enumerate(planned):
+        # Its row is left out anyway, so its further chunks would be hours for nothing.
+        if label in failed:
+            continue
+        reporter.part_started(f"{k + 1}/{len(planned)} {label} · {where}")
+        try:
+            cell = cell_task(checked, label, where)
+        except GenreError as error:
+            failed[label] = error
+            reporter.part_ended(f"left out: {error}")
+            continue
+        cells.append(cell)
+        reporter.part_ended(f"{sum(cell.seconds.values()):.1f} s of stages")
+    return cells, failed
+
+
+@task(name="table-cell", task_run_name="{label} {where}", persist_result=False, cache_policy=NO_CACHE)
+def cell_task(checked: CheckedRequest, label: str, where: LogChunk) -> MeasuredCell:
+    """Measures one cell as a Prefect task, see :func:`flows.paper_tables.measure.measure_cell`."""
+    method = next(row.method for row in checked.layout.rows if row.label == label)
+    return measure_cell(checked.basis, checked.layout, replace(method, name=label), where, run_reported_stage)
+
+
+def write_results(
+    request: TableRequest, checked: CheckedRequest, cells: Sequence[MeasuredCell], missing: dict[str, str]
+) -> list[str]:
+    """Writes ``tableN_DATASET.parquet`` and ``.md``, and the section of the user's page; each whole or not at all.
+
+    Args:
+        request: what the user asked for.
+        checked: the same, checked.
+        cells: what was measured.
+        missing: label of a row → why it was not measured.
+
+    Returns:
+        The paths of the files.
+
+    Raises:
+        InputError: the page's section cannot be found.
+    """
     out = Path(request.out)
     out.mkdir(parents=True, exist_ok=True)
-    facts = facts_of(request, plan, cells)
-    apart = differences_from_the_paper(plan.layout, plan.config, plan.dataset, len(plan.places))
-    said = [f"* {name}: {value}" for name, value in facts.items()]
-    text = page(plan.layout, cells, missing, said, apart, plan.dataset)
-    written = [out / f"table{request.number}_{plan.dataset}.{kind}" for kind in ("parquet", "md")]
-    with atomic_path(written[0]) as part:
-        basis = {"basis": json.dumps(plan.config.model_dump(mode="json"))}
-        write_cells(part, plan.layout, cells, missing, facts | basis)
-    with atomic_path(written[1]) as part:
-        write_file(part, text.encode())
+    facts = collect_facts(request, checked, cells)
+    differences = list_differences(checked.layout, checked.config, checked.dataset, len(checked.places))
+    bullets = [f"* {name}: {value}" for name, value in facts.items()]
+    text = render_page(checked.layout, cells, missing, bullets, differences, checked.dataset)
+    files = [out / f"table{request.number}_{checked.dataset}.{kind}" for kind in ("parquet", "md")]
+    with atomic_path(files[0]) as part:
+        # The whole configuration is only in the file: on the page nobody would read it.
+        basis = {"basis": json.dumps(checked.config.model_dump(mode="json"))}
+        write_cells(part, checked.layout, cells, missing, facts | basis)
+    write_text(files[1], text)
     if request.into is not None:
-        written.append(Path(request.into))
-        put_into(written[-1], request.number, plan.dataset, text)
-    return [str(path) for path in written]
+        page = Path(request.into)
+        replace_section(page, request.number, checked.dataset, text)
+        files.append(page)
+    return [str(path) for path in files]
 
 
-def facts_of(request: Request, plan: Planned, cells: Sequence[Cell]) -> dict[str, str]:
-    """What the numbers are of, by name."""
-    config = plan.config
+def collect_facts(request: TableRequest, checked: CheckedRequest, cells: Sequence[MeasuredCell]) -> dict[str, str]:
+    """Collects what the numbers are of.
+
+    Args:
+        request: what the user asked for.
+        checked: the same, checked.
+        cells: what was measured.
+
+    Returns:
+        Facts by name, in the order in which the page shows them.
+    """
+    ingest = checked.config.ingest
     facts = {
         "command": f"`{request.command}`",
         "preset": " ".join([request.preset, *request.settings]),
-        "logs": ", ".join(map(str, plan.places)),
-        "images": f"{config.ingest.width_px}×{config.ingest.height_px}",
-        "machine": machine(),
-        "commit": commit(),
-        "date": time.strftime("%Y-%m-%d", time.gmtime()),
-    }
-    counts = {
-        group: sorted({int(c.metrics[f"{group}/n"]) for c in cells if f"{group}/n" in c.metrics})
-        for group in ("interpolation", "shift_3m")
+        "logs": ", ".join(map(str, checked.places)),
+        "images": f"{ingest.width_px}×{ingest.height_px}",
+        **machine_facts(),
     }
     for group, name in (("interpolation", "held-out images a chunk"), ("shift_3m", "images at a shift, a chunk")):
-        if counts[group]:
-            facts[name] = ", ".join(map(str, counts[group]))
+        # Several counts are shown, because a mean over sets of different sizes has to be visible.
+        counts = sorted({int(c.metrics[f"{group}/n"]) for c in cells if f"{group}/n" in c.metrics})
+        if counts:
+            facts[name] = ", ".join(map(str, counts))
     if request.remarks:
         facts["remark"] = " ".join(request.remarks)
     return facts

@@ -3,84 +3,122 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from flows.paper_tables.layouts import Cell, Layout
+from flows.experiments.log_chunks import LogChunk
+from flows.experiments.stages import (
+    StageRunner,
+    image_counts,
+    interval_bounds,
+    metric_values,
+    read_stage_costs,
+    run_stages,
+)
+from flows.experiments.warm_up import run_on_tiny_log
+from flows.paper_tables.columns import MeasuredCell
+from flows.paper_tables.layouts import Layout
 from flows.paper_tables.methods import Method
-from flows.pipeline.definition import BY_NAME, PIPELINE, reconstructing_until
-from flows.pipeline.log_cache import chosen_chunks, expanded
-from flows.pipeline.stage_runner import ArtifactRef, Job, artifact_of, value_of
-from genre_tasks.config import PipelineConfig
+from flows.pipeline.definition import PIPELINE, stages_until
+from flows.pipeline.stage_runner import ArtifactRef, Job, read_artifact
 
-Produce = Callable[[str, Job, dict[str, ArtifactRef]], ArtifactRef]
-
-
-@dataclass(frozen=True)
-class Place:
-    """A chunk of a log."""
-
-    log: str
-    chunk: int
-
-    def __str__(self) -> str:
-        return f"{self.log} chunk {self.chunk}"
+PRESET_METHOD = Method("the preset", ())
 
 
 @dataclass(frozen=True)
 class Basis:
-    """What all methods of a table share: the preset, the user's settings over it and over the protocol, the store."""
+    """What all methods of a table share.
+
+    Attributes:
+        preset: name of the preset.
+        settings: the user's ``section.key=value`` over the preset and over the protocol.
+        store: folder of the store.
+    """
 
     preset: str
     settings: tuple[str, ...]
     store: str
 
-    def job(self, layout: Layout, method: Method, place: Place) -> Job:
-        """The method's settings come last: they are what makes it that method."""
+    def job(self, layout: Layout, method: Method, where: LogChunk) -> Job:
+        """Builds the job of a cell.
+
+        Args:
+            layout: the table, whose protocol comes after the preset.
+            method: its settings come last, as they are what makes it that method.
+            where: the chunk.
+
+        Raises:
+            ConfigError: a setting is unknown or out of range.
+        """
+        # The user's settings come after the protocol, which they may change, and before the method, which they may not.
         config = method.configuration(self.preset, (*layout.protocol, *self.settings))
-        return Job(place.log, place.chunk, self.store, config.model_dump(mode="json"))
+        return Job(where.log, where.chunk, self.store, config.model_dump(mode="json"))
 
 
-def stages_of(layout: Layout, method: Method) -> tuple[str, ...]:
-    """The stages of a cell, in their order: up to the method's end, and its evaluation where the table has one."""
-    stages = set(reconstructing_until(method.end))
+def list_stages(layout: Layout, method: Method) -> tuple[str, ...]:
+    """Lists the stages of a cell in the pipeline's order.
+
+    Args:
+        layout: the table.
+        method: the row's method.
+
+    Returns:
+        The stages up to the method's end, and its evaluation where the table has one.
+    """
+    stages = set(stages_until(method.end))
     if layout.evaluated:
         stages.add(f"evaluate/{method.end}")
+    # The pipeline's order puts an evaluation after all of its inputs.
     return tuple(spec.name for spec in PIPELINE if spec.name in stages)
 
 
-def run_stages(names: Sequence[str], job: Job, produce: Produce) -> dict[str, ArtifactRef]:
-    """The artifacts of stages that are named in their order, by stage."""
-    refs: dict[str, ArtifactRef] = {}
-    for name in names:
-        refs[name] = produce(name, job, {i: refs[i] for i in BY_NAME[name].inputs})
-    return refs
+def measure_cell(basis: Basis, layout: Layout, method: Method, where: LogChunk, runner: StageRunner) -> MeasuredCell:
+    """Measures a method on a chunk.
 
+    Args:
+        basis: what all methods share.
+        layout: the table.
+        method: the row's method.
+        where: the chunk.
+        runner: runs one stage.
 
-def measure(basis: Basis, layout: Layout, method: Method, place: Place, produce: Produce) -> Cell:
-    """The cell; raises as the stages do."""
-    job = basis.job(layout, method, place)
-    refs = run_stages(stages_of(layout, method), job, produce)
-    manifests = {name: artifact_of(job, ref).manifest for name, ref in refs.items() if not name.startswith("evaluate/")}
-    cpu = {name: m.measurements.get("cpu_seconds") for name, m in manifests.items()}
-    metrics: dict[str, float] = {}
-    if layout.evaluated:
-        for m in value_of(job, refs[f"evaluate/{method.end}"]).metrics:
-            metrics |= {m.name: m.value, m.name.rpartition("/")[0] + "/n": float(m.n)}
-            if m.low is not None and m.high is not None:
-                metrics |= {f"{m.name}/low": m.low, f"{m.name}/high": m.high}
-    return Cell(
-        method.name,
-        place.log,
-        place.chunk,
-        {name: m.seconds for name, m in manifests.items()},
-        {name: math.nan if value is None else float(value) for name, value in cpu.items()},
-        metrics,
-        len(value_of(job, refs["gnet" if method.end == "fnet" else method.end]).scene),
-        len(value_of(job, refs["fnet"]).views) if "fnet" in refs else 0,
+    Returns:
+        The cell.
+
+    Raises:
+        GenreError: as the stages raise it.
+    """
+    job = basis.job(layout, method, where)
+    refs = run_stages(list_stages(layout, method), job, runner)
+    costs = read_stage_costs(job, {name: ref for name, ref in refs.items() if not name.startswith("evaluate/")})
+    # A fixer's result is images; the scene that they were rendered from is GNet's.
+    scene_stage = "gnet" if method.end == "fnet" else method.end
+    return MeasuredCell(
+        method=method.name,
+        log=where.log,
+        chunk=where.chunk,
+        seconds=costs.seconds,
+        # NaN and not zero: an artifact from before CPU seconds were counted did cost some.
+        cpu_seconds={name: math.nan if s is None else float(s) for name, s in costs.cpu_seconds.items()},
+        metrics=_read_metrics(job, refs[f"evaluate/{method.end}"]) if layout.evaluated else {},
+        gaussians=len(read_artifact(job, refs[scene_stage]).scene),
+        fixed_views=len(read_artifact(job, refs["fnet"]).views) if "fnet" in refs else 0,
     )
 
 
-def places_of(logs: Sequence[str], chunks: list[int] | None, config: PipelineConfig) -> list[Place]:
-    """Every chosen chunk of every log. Raises ``InputError`` for a chunk that a log does not have."""
-    return [Place(log, chunk) for log in expanded(list(logs)) for chunk in chosen_chunks(log, config, chunks)]
+def _read_metrics(job: Job, ref: ArtifactRef) -> dict[str, float]:
+    metrics = read_artifact(job, ref).metrics
+    counts = {name: float(n) for name, n in image_counts(metrics).items()}
+    return metric_values(metrics) | counts | interval_bounds(metrics)
+
+
+def warm_up(basis: Basis, layout: Layout) -> None:
+    """Runs the preset to its end on a tiny log, so that imports, weights and first calls are in no cell's seconds.
+
+    Args:
+        basis: its settings of ``ingest`` are left out, as cameras and points are of the user's log.
+        layout: the table, whose stages are run.
+    """
+    # Cameras and points are those of the user's log, which the tiny log does not have.
+    settings = tuple(s for s in basis.settings if not s.startswith("ingest"))
+    config = PRESET_METHOD.configuration(basis.preset, (*layout.protocol, *settings))
+    run_on_tiny_log(config, list_stages(layout, PRESET_METHOD))

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 
-from flows.paper_tables.layouts import Cell, Column, Layout, Row
-from flows.paper_tables.methods import PER_SCENE
+from flows.experiments.stage_prediction import PER_SCENE_METHODS
+from flows.paper_tables.columns import Column, MeasuredCell, mean_over_cells
+from flows.paper_tables.layouts import Layout, Row
 from flows.paper_tables.published_numbers import PAPER
-from genre_tasks.atomic_path import atomic_path
 from genre_tasks.config import PipelineConfig
-from genre_tasks.errors import InputError
-from storage.files import write_file
 
 PUBLISHED_ITERATIONS = 30_000
+PUBLISHED_SIZE_PX = (1920, 1080)
 KERNEL = (
     "the paper's distances are FID, on features of InceptionV3; measured are kernel distances (unbiased at any number "
     "of images) on features of EfficientNet-Lite0: they may be compared in their order alone, not in their size. FID "
@@ -26,74 +23,102 @@ KERNEL = (
 FID = "FID is biased by the number of images, which the paper does not state and which is a chunk's here"
 
 
-def page(
+def render_page(
     layout: Layout,
-    cells: Sequence[Cell],
+    cells: Sequence[MeasuredCell],
     missing: Mapping[str, str],
     facts: Sequence[str],
-    apart: Sequence[str],
+    differences: Sequence[str],
     dataset: str,
 ) -> str:
-    """Title, the table, what else was measured, notes on methods, facts, and ``apart``: what is not comparable.
+    """Writes the section of one table.
 
-    ``missing``: a method's name → why it was not measured.
+    Args:
+        layout: the table.
+        cells: what was measured.
+        missing: label of a row → why it was not measured.
+        facts: Markdown lines that say what was measured, on which machine and at which commit.
+        differences: what keeps the numbers from being compared with the paper's, a sentence each.
+        dataset: of the logs.
+
+    Returns:
+        Markdown: title, the table, what else was measured, notes on methods, differences and facts.
     """
-    paper = PAPER[layout.number]
-    layout = with_the_papers_own(layout, cells)
-    head = [
-        f"## Table {layout.number} on {dataset}: {paper.caption}",
+    layout = prefer_papers_quantities(layout, cells)
+    lines = [
+        f"## Table {layout.number} on {dataset}: {PAPER[layout.number].caption}",
         "",
-        "measured / the paper's. " + _ordered(layout),
+        "measured / the paper's. " + _legend(layout),
+        "",
+        *_papers_table(layout, cells, missing),
+        "",
+        *layout.notes,
+    ]
+    if layout.notes:
+        lines.append("")
+    lines += [
+        *_extra_table(layout, cells),
+        *_method_notes(layout, missing),
+        "Not comparable with the paper's numbers:",
+        "",
+        *(f"* {text}" for text in differences),
+        "",
+        "Measured on:",
+        "",
+        *facts,
         "",
     ]
-    return "\n".join(
-        [
-            *head,
-            *_table(layout, layout.columns, cells, missing),
-            "",
-            *layout.said,
-            *([""] if layout.said else []),
-            *_beside(layout, cells),
-            *_notes(layout, missing),
-            "Not comparable with the paper's numbers:",
-            "",
-            *(f"* {text}" for text in apart),
-            "",
-            "Measured on:",
-            "",
-            *facts,
-            "",
-        ]
-    )
+    return "\n".join(lines)
 
 
-def with_the_papers_own(layout: Layout, cells: Sequence[Cell]) -> Layout:
-    """The layout with FID in the place of the kernel distance where it was measured, and that beside it."""
-    own: list[Column] = []
-    beside: list[Column] = []
+def prefer_papers_quantities(layout: Layout, cells: Sequence[MeasuredCell]) -> Layout:
+    """Puts FID in the place of the kernel distance where FID was measured.
+
+    Args:
+        layout: the table.
+        cells: what was measured.
+
+    Returns:
+        The table; a kernel distance that FID replaced is among its extra columns.
+    """
+    columns: list[Column] = []
+    replaced: list[Column] = []
     for column in layout.columns:
-        if column.proper is None or not any(math.isfinite(column.proper(c)) for c in cells):
-            own.append(column)
+        read = column.read_papers_quantity
+        # One row with FID is enough: the others then show a gap, as two quantities must not share a column.
+        if read is None or not any(math.isfinite(read(c)) for c in cells):
+            columns.append(column)
             continue
-        own.append(Column(column.paper, column.paper_label, column.proper, 2, column.paper))
-        beside.append(replace(column, paper="", paper_label="", proper=None))
-    return replace(layout, columns=tuple(own), beside=(*beside, *layout.beside))
+        columns.append(Column(column.paper, column.paper_label, read, 2, paper=column.paper))
+        replaced.append(replace(column, paper="", paper_label="", read_papers_quantity=None))
+    return replace(layout, columns=tuple(columns), extra_columns=(*replaced, *layout.extra_columns))
 
 
-def differences_from_the_paper(layout: Layout, config: PipelineConfig, dataset: str, chunks: int) -> list[str]:
-    """What keeps the measured numbers from being compared with the paper's, a sentence each."""
+def list_differences(layout: Layout, config: PipelineConfig, dataset: str, chunks: int) -> list[str]:
+    """Lists what keeps the measured numbers from being compared with the paper's.
+
+    Args:
+        layout: the table.
+        config: the preset with protocol and settings, without any method's.
+        dataset: of the logs.
+        chunks: number of chunks that were measured.
+
+    Returns:
+        A sentence each, without full stop.
+    """
     size = f"{config.ingest.width_px}×{config.ingest.height_px}"
-    over = f"{chunks} chunk{'s' * (chunks > 1)} of {'PandaSet' if dataset == 'pandaset' else dataset}"
+    plural = "s" if chunks > 1 else ""
+    over = f"{chunks} chunk{plural} of {'PandaSet' if dataset == 'pandaset' else dataset}"
     out = [f"the paper's are means over ten test sequences of PandaSet, these are of {over}"]
-    if (config.ingest.width_px, config.ingest.height_px) != (1920, 1080):
+    if (config.ingest.width_px, config.ingest.height_px) != PUBLISHED_SIZE_PX:
         out.append(f"the paper's images are 1920×1080 (its fixer is trained at 1280×720), these {size}")
-    if any(c.proper is not None for c in layout.columns):
+    if any(c.read_papers_quantity is not None for c in layout.columns):
         out.append(KERNEL if config.evaluate.inception is None else FID)
-    per_scene = config.gnet.per_scene.iterations
-    if per_scene != PUBLISHED_ITERATIONS and any(
-        s == f"gnet.method={m}" for r in layout.rows for s in r.method.settings for m in PER_SCENE
-    ):
-        short = f"per-scene methods had {per_scene} iterations, of {PUBLISHED_ITERATIONS} as published"
+    # The preset shortens per-scene training, which a reader must know before comparing.
+    iterations = config.gnet.per_scene.iterations
+    if iterations != PUBLISHED_ITERATIONS and _has_per_scene_method(layout):
+        # Shorter training favours the feed-forward methods, so the table has to say so.
+        short = f"per-scene methods had {iterations} iterations, of {PUBLISHED_ITERATIONS} as published"
         out.append(f"{short} (all of their schedules scaled): how far longer ones come was not measured")
     if config.fnet.model == "small" and any(r.method.end in ("enet", "fnet") for r in layout.rows):
         out.append("the paper's fixer is SD-Turbo with adapters, this one a small network of the same classes")
@@ -102,121 +127,95 @@ def differences_from_the_paper(layout: Layout, config: PipelineConfig, dataset: 
     return out
 
 
-def put_into(file: Path, number: int, dataset: str, text: str) -> None:
-    """Writes ``text`` as the section of table ``number`` on ``dataset``, of a page that holds several; others stay.
-
-    Sections are in the order of the tables, those of one table in that of the datasets' names.
-
-    Raises ``InputError`` for a page whose marks do not fit.
-    """
-    begin, end = f"<!-- genre table {number} on {dataset} -->", f"<!-- end of table {number} on {dataset} -->"
-    try:
-        old = file.read_text(encoding="utf-8") if file.exists() else PREFACE
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"the page cannot be read: {error}", remedy="Check --into.", file=file) from error
-    section = f"{begin}\n\n{text.strip()}\n\n{end}"
-    if begin in old or end in old:
-        if not (old.count(begin) == old.count(end) == 1 and old.index(begin) < old.index(end)):
-            raise InputError(
-                f"the page does not hold one section between '{begin}' and '{end}'",
-                remedy="Mend its marks, or remove the page.",
-                file=file,
-            )
-        new = old[: old.index(begin)] + section + old[old.index(end) + len(end) :]
-    else:
-        found = re.finditer(r"<!-- genre table (\d) on (\S+) -->", old)
-        at = next((m.start() for m in found if (int(m[1]), m[2]) > (number, dataset)), len(old))
-        new = old[:at].rstrip("\n") + f"\n\n{section}\n\n" + old[at:]
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(file) as part:
-        write_file(part, (new.rstrip("\n") + "\n").encode())
+def _has_per_scene_method(layout: Layout) -> bool:
+    per_scene = {f"gnet.method={m}" for m in PER_SCENE_METHODS}
+    return any(per_scene.intersection(r.method.settings) for r in layout.rows)
 
 
-PREFACE = (
-    "# The paper's tables, measured here\n\n"
-    "Each section is written by the command that it states, `genre table N … --into FILE`.\n"
-)
-
-
-def mean_of(column: Column, cells: Sequence[Cell]) -> float:
-    """Over the places of a method; NaN where one of them has none."""
-    values = [column.read(c) for c in cells]
-    return math.fsum(values) / len(values) if values else math.nan
-
-
-def _table(
-    layout: Layout, columns: Sequence[Column], cells: Sequence[Cell], missing: Mapping[str, str]
-) -> Iterator[str]:
-    means = {(r.label, c.key): mean_of(c, _of(r, cells)) for r in layout.rows for c in columns}
+def _papers_table(layout: Layout, cells: Sequence[MeasuredCell], missing: Mapping[str, str]) -> Iterator[str]:
+    means = {(r.label, c.key): mean_over_cells(c, _cells_of(r, cells)) for r in layout.rows for c in layout.columns}
+    best = {c.key: _best([means[r.label, c.key] for r in layout.rows], c) for c in layout.columns}
     printed = PAPER[layout.number].rows
-    yield "| method | " + " | ".join(_header(c) for c in columns) + " |"
-    yield "|---" * (1 + len(columns)) + "|"
+    yield "| method | " + " | ".join(_heading(c) for c in layout.columns) + " |"
+    yield "|---" * (1 + len(layout.columns)) + "|"
     for row in layout.rows:
         values = []
-        for c in columns:
-            best = _best([means[r.label, c.key] for r in layout.rows], c)
-            own = means[row.label, c.key]
-            text = "not measured" if row.label in missing else _number(own, c.digits) or "–"
-            text = f"**{text}**" if own == best else text
-            theirs = printed.get(row.paper, {}).get(c.paper, math.nan) if c.paper else math.nan
-            values.append(text + (f" / {_plain(theirs)}" if math.isfinite(theirs) else ""))
+        for c in layout.columns:
+            mean = means[row.label, c.key]
+            text = "not measured" if row.label in missing else _format(mean, c.digits) or "–"
+            # A best of NaN equals nothing, so that a single measured row is not printed in bold.
+            if mean == best[c.key]:
+                text = f"**{text}**"
+            published = printed.get(row.paper, {}).get(c.paper, math.nan) if c.paper else math.nan
+            values.append(text + (f" / {_format_published(published)}" if math.isfinite(published) else ""))
         yield f"| {row.label} | " + " | ".join(values) + " |"
 
 
-def _beside(layout: Layout, cells: Sequence[Cell]) -> Iterator[str]:
-    """What the paper's table does not have, where it could be measured."""
-    columns = [c for c in layout.beside if any(math.isfinite(mean_of(c, _of(r, cells))) for r in layout.rows)]
+def _extra_table(layout: Layout, cells: Sequence[MeasuredCell]) -> Iterator[str]:
+    """Shows what the paper's table does not have, where it could be measured."""
+    columns = [
+        c
+        for c in layout.extra_columns
+        if any(math.isfinite(mean_over_cells(c, _cells_of(r, cells))) for r in layout.rows)
+    ]
     if not columns:
         return
-    yield "Measured beside it" + (
-        " (PSNR and perceptual distance at a shift: against the truth there, on logs that have one):"
-        if any(c.key.startswith("perceptual_") for c in columns)
-        else ":"
-    )
+    has_truth = any(c.key.startswith("perceptual_") for c in columns)
+    note = " (PSNR and perceptual distance at a shift: against the truth there, on logs that have one)"
+    yield f"Measured beside it{note if has_truth else ''}:"
     yield ""
     yield "| method | " + " | ".join(c.label for c in columns) + " |"
     yield "|---" * (1 + len(columns)) + "|"
     for row in layout.rows:
-        own = _of(row, cells)
-        if own:
-            yield f"| {row.label} | " + " | ".join(_number(mean_of(c, own), c.digits) for c in columns) + " |"
+        measured = _cells_of(row, cells)
+        # Rows without a measurement are explained in the notes already.
+        if measured:
+            values = [_format(mean_over_cells(c, measured), c.digits) for c in columns]
+            yield f"| {row.label} | " + " | ".join(values) + " |"
     yield ""
 
 
-def _notes(layout: Layout, missing: Mapping[str, str]) -> Iterator[str]:
+def _method_notes(layout: Layout, missing: Mapping[str, str]) -> Iterator[str]:
     lines = []
     for row in layout.rows:
         why = f"Not measured: {missing[row.label]}" if row.label in missing else ""
         text = " ".join(part for part in (row.method.note, why) if part)
-        lines += [f"* {row.label}: {text}"] if text else []
+        if text:
+            lines.append(f"* {row.label}: {text}")
     if lines:
         yield from lines
         yield ""
 
 
-def _of(row: Row, cells: Sequence[Cell]) -> list[Cell]:
+def _cells_of(row: Row, cells: Sequence[MeasuredCell]) -> list[MeasuredCell]:
     return [c for c in cells if c.method == row.label]
 
 
-def _header(column: Column) -> str:
+def _heading(column: Column) -> str:
     return column.label if not column.paper_label else f"{column.label} / {column.paper_label}"
 
 
-def _ordered(layout: Layout) -> str:
-    """What is better, and what bold means."""
+def _legend(layout: Layout) -> str:
+    """Says what is better, and what bold means."""
     more = [c.label.partition(",")[0] for c in layout.columns if c.more_is_better]
-    said = f"More is better in {' and '.join(more)}, less in the others. " if more else "Less is better. "
-    return said + "**Bold**: the best measured."
+    direction = f"More is better in {' and '.join(more)}, less in the others. " if more else "Less is better. "
+    return direction + "**Bold**: the best measured."
 
 
 def _best(values: Sequence[float], column: Column) -> float:
+    """Gives the best of the measured values; NaN where there is nothing to compare it with."""
     finite = [v for v in values if math.isfinite(v)]
-    return (max if column.more_is_better else min)(finite) if len(finite) > 1 else math.nan
+    # The best of one is no statement.
+    if len(finite) < 2:
+        return math.nan
+    return max(finite) if column.more_is_better else min(finite)
 
 
-def _number(value: float, digits: int) -> str:
+def _format(value: float, digits: int) -> str:
+    # An empty cell and not "nan", which a reader could take for a failure of the method.
     return f"{value:,.{digits}f}" if math.isfinite(value) else ""
 
 
-def _plain(value: float) -> str:
+def _format_published(value: float) -> str:
+    # The paper prints two decimals, and three of what is below one.
     return f"{value:.2f}" if value >= 1 else f"{value:.3f}"

@@ -1,4 +1,4 @@
-"""A table's Parquet: every cell, with the paper's numbers of its row."""
+"""A table's Parquet file: every cell, with the paper's numbers of its row."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from flows.paper_tables.layouts import Cell, Layout
+from flows.paper_tables.columns import MeasuredCell
+from flows.paper_tables.layouts import Layout, Row
 from flows.paper_tables.published_numbers import PAPER
 from storage.codecs.tables import column, schema, write_table
 
@@ -35,34 +36,47 @@ CELLS = schema(
 
 
 def write_cells(
-    path: Path, layout: Layout, cells: Sequence[Cell], missing: Mapping[str, str], extra: Mapping[str, str]
+    path: Path,
+    layout: Layout,
+    cells: Sequence[MeasuredCell],
+    missing: Mapping[str, str],
+    facts: Mapping[str, str],
 ) -> None:
-    """A row for each cell, and one for each method without any (``missing``: its name → why)."""
-    rows = []
+    """Writes a line for each cell, and one for each method without any.
+
+    Args:
+        path: the Parquet file to write.
+        layout: the table.
+        cells: what was measured.
+        missing: label of a row → why it was not measured.
+        facts: machine, commit and the like, for the file's metadata.
+    """
+    # A method without a cell has a line too, so that the reason for its absence is kept.
+    lines: list[tuple[Row, MeasuredCell | None]] = []
     for row in layout.rows:
-        own: list[Cell | None] = [c for c in cells if c.method == row.label]
-        for cell in own or [None]:
-            rows.append((row, cell))
+        measured: list[MeasuredCell | None] = [c for c in cells if c.method == row.label]
+        lines += [(row, cell) for cell in measured or [None]]
     columns = {
-        "table": [layout.number for _ in rows],
-        "method": [r.label for r, _ in rows],
-        "end": [r.method.end for r, _ in rows],
-        "settings": [json.dumps(r.method.settings, ensure_ascii=False) for r, _ in rows],
-        "note": [r.method.note for r, _ in rows],
-        "log": ["" if c is None else c.log for _, c in rows],
-        "chunk": [None if c is None else c.chunk for _, c in rows],
-        "seconds": [_json({} if c is None else c.seconds) for _, c in rows],
-        "cpu_seconds": [_json({} if c is None else c.cpu_seconds) for _, c in rows],
-        "gaussians": [None if c is None else c.gaussians for _, c in rows],
-        "fixed": [None if c is None else c.fixed for _, c in rows],
-        "metrics": [_json({} if c is None else c.metrics) for _, c in rows],
-        "not_measured": [missing.get(r.label, "") if c is None else "" for r, c in rows],
-        "paper_row": [r.paper for r, _ in rows],
-        "paper": [_json(PAPER[layout.number].rows.get(r.paper, {})) for r, _ in rows],
+        "table": [layout.number for _ in lines],
+        "method": [r.label for r, _ in lines],
+        "end": [r.method.end for r, _ in lines],
+        "settings": [json.dumps(r.method.settings, ensure_ascii=False) for r, _ in lines],
+        "note": [r.method.note for r, _ in lines],
+        "log": ["" if c is None else c.log for _, c in lines],
+        # Null and not -1, which a mean over the column would take in.
+        "chunk": [None if c is None else c.chunk for _, c in lines],
+        "seconds": [_to_json({} if c is None else c.seconds) for _, c in lines],
+        "cpu_seconds": [_to_json({} if c is None else c.cpu_seconds) for _, c in lines],
+        "gaussians": [None if c is None else c.gaussians for _, c in lines],
+        "fixed": [None if c is None else c.fixed_views for _, c in lines],
+        "metrics": [_to_json({} if c is None else c.metrics) for _, c in lines],
+        "not_measured": [missing.get(r.label, "") if c is None else "" for r, c in lines],
+        "paper_row": [r.paper for r, _ in lines],
+        "paper": [_to_json(PAPER[layout.number].rows.get(r.paper, {})) for r, _ in lines],
     }
-    write_table(path, CELLS, columns, extra)
+    write_table(path, CELLS, columns, facts)
 
 
-def _json(values: Mapping[str, float]) -> str:
-    """Numbers that are not finite become null."""
+def _to_json(values: Mapping[str, float]) -> str:
+    # JSON has no NaN: what was not counted becomes null.
     return json.dumps({k: v if v == v else None for k, v in values.items()}, sort_keys=True)

@@ -11,10 +11,14 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class PaperTable:
-    """A table as printed: ``rows`` by the method's name there, values by column.
+    """A table as printed.
 
-    Columns: ``psnr`` (dB), ``ssim``, ``fid_Nm``, ``minutes`` (of reconstruction), ``s_per_frame``, and of table 5
-    ``reconstruction``, ``fixer``, ``distillation``, ``total`` (minutes).
+    Attributes:
+        number: in the paper.
+        caption: as printed.
+        rows: values by column, by the method's name in the paper. Columns are ``psnr`` (dB), ``ssim``, ``fid_Nm``,
+            ``minutes`` (of reconstruction), ``s_per_frame``, and of table 5 ``reconstruction``, ``fixer``,
+            ``distillation`` and ``total`` (minutes).
     """
 
     number: int
@@ -23,18 +27,19 @@ class PaperTable:
 
 
 def _rows(columns: str, text: str) -> dict[str, dict[str, float]]:
-    """Lines of ``name: number number …``."""
+    """Parses lines of ``name: number number …``."""
     names = columns.split()
-    out = {}
+    rows = {}
     for line in text.strip().splitlines():
         name, _, values = line.partition(":")
-        out[name.strip()] = dict(zip(names, map(float, values.split()), strict=True))
-    return out
+        # Strict, so that a number left out in typing is an error and not a shift of columns.
+        rows[name.strip()] = dict(zip(names, map(float, values.split()), strict=True))
+    return rows
 
 
 PAPER: Mapping[int, PaperTable] = {
-    t.number: t
-    for t in (
+    table.number: table
+    for table in (
         PaperTable(
             1,
             "Comparison to state-of-the-art reconstruction methods on interpolated and extrapolated views",
@@ -103,3 +108,4 @@ PAPER: Mapping[int, PaperTable] = {
         ),
     )
 }
+"""The tables by their numbers in the paper."""

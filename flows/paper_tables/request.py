@@ -1,23 +1,42 @@
-"""What a user asks for, checked before anything is computed."""
+"""What a user asks for, checked before anything is computed; and what it would take."""
 
 from __future__ import annotations
 
 import shlex
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from flows.configuration import load_configuration
-from flows.paper_tables.layouts import Layout, layout_of
-from flows.paper_tables.measure import Basis, Place, places_of
-from flows.paper_tables.methods import SLOTS, read_method, read_weights
-from flows.pipeline.log_cache import opened_log
+from flows.experiments.log_chunks import LogChunk, select_log_chunks
+from flows.experiments.stage_prediction import StagePredictor, find_stored_stages
+from flows.paper_tables.layouts import Layout, Row, get_layout
+from flows.paper_tables.measure import PRESET_METHOD, Basis, list_stages
+from flows.paper_tables.user_methods import read_method
+from flows.paper_tables.weights_slots import SLOTS, read_weights
+from flows.pipeline.log_cache import cached_log
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ConfigError
 
 
 @dataclass(frozen=True)
-class Request:
-    """What a user asks for: a table's ``number``, logs, and what is set; files are checked by :meth:`planned`."""
+class TableRequest:
+    """What a user asks for; its files are read by :meth:`check`.
+
+    Attributes:
+        number: of the table, 1 to 5.
+        logs: URIs; ``pandaset:PATH/*`` stands for every sequence in a folder.
+        preset: name of the preset.
+        store: folder of the store.
+        chunks: of each log; all if ``None``.
+        settings: ``section.key=value`` over the preset and the paper's protocol.
+        methods: YAML files of further methods.
+        weights: ``NAME=PATH`` of weights that do not ship.
+        out: folder to write into.
+        into: a Markdown page whose section of this table is replaced.
+        remarks: what else the reader should know.
+        stored: whether methods that the store has not completely are left out.
+    """
 
     number: int
     logs: tuple[str, ...]
@@ -32,17 +51,24 @@ class Request:
     remarks: tuple[str, ...] = ()
     stored: bool = False
 
-    def planned(self) -> Planned:
-        """Layout, places, and why a method cannot be measured.
+    def check(self) -> CheckedRequest:
+        """Reads the files, and finds the table's rows and chunks.
 
-        Raises ``ConfigError`` or ``InputError`` for what is wrong in the request, before anything is computed.
+        Raises:
+            ConfigError: a table, method, setting or name of weights does not exist, or the logs are of several
+                datasets.
+            InputError: a log, chunk or file of weights does not exist.
         """
         basis = Basis(self.preset, self.settings, self.store)
-        own = [read_method(Path(f), self.preset, self.settings) for f in self.methods]
-        layout, given = layout_of(self.number, own), read_weights(self.weights)
+        # Files are read once, as they could change while the table is measured.
+        user_methods = [read_method(Path(f), self.preset, self.settings) for f in self.methods]
+        layout = get_layout(self.number, user_methods)
+        weights = read_weights(self.weights)
         config = load_configuration(self.preset, settings=(*layout.protocol, *self.settings))
-        places = places_of(self.logs, None if self.chunks is None else list(self.chunks), config)
-        datasets = sorted({opened_log(p.log).dataset for p in places})
+        chunks = None if self.chunks is None else list(self.chunks)
+        places = select_log_chunks(self.logs, chunks, config)
+        datasets = sorted({cached_log(where.log).dataset for where in places})
+        # Image sizes and difficulty differ so much that a mean would depend on the mix alone.
         if len(datasets) > 1:
             raise ConfigError(
                 f"the logs are of several datasets ({', '.join(datasets)}), over which no mean says anything",
@@ -51,32 +77,103 @@ class Request:
         missing = {
             row.label: f"no weights; give {SLOTS[row.method.slot].about} by --weights {row.method.slot}=PATH."
             for row in layout.rows
-            if row.method.needs_weights and row.method.slot not in given
+            if row.method.needs_weights and row.method.slot not in weights
         }
-        rows = tuple(replace(row, method=row.method.given(given)) for row in layout.rows)
-        return Planned(basis, replace(layout, rows=rows), tuple(places), missing, "".join(datasets))
+        # Weights change the notes too, so the layout itself is rebuilt.
+        rows = tuple(replace(row, method=row.method.with_weights(weights)) for row in layout.rows)
+        return CheckedRequest(basis, replace(layout, rows=rows), tuple(places), missing, "".join(datasets))
 
     @property
     def command(self) -> str:
-        """That makes this table again, wholly also where this one is of what the store has."""
+        """The command that makes this table again, completely also where this one is of what the store has.
+
+        >>> TableRequest(4, ("synthetic:street",), chunks=(0,)).command
+        'genre table 4 synthetic:street --preset small --chunks 0'
+        """
+        # Neither --out nor --stored: they do not change what the numbers mean.
         parts = ["genre", "table", str(self.number), *self.logs, "--preset", self.preset]
-        parts += ["--chunks", ",".join(map(str, self.chunks))] if self.chunks is not None else []
-        repeated = {"--set": self.settings, "--method": self.methods, "--weights": self.weights}
-        parts += [p for option, values in repeated.items() for value in values for p in (option, value)]
-        return shlex.join([*parts, *(["--into", self.into] if self.into else [])])
+        if self.chunks is not None:
+            parts += ["--chunks", ",".join(map(str, self.chunks))]
+        for option, values in (("--set", self.settings), ("--method", self.methods), ("--weights", self.weights)):
+            for value in values:
+                parts += [option, value]
+        if self.into:
+            parts += ["--into", self.into]
+        return shlex.join(parts)
 
 
 @dataclass(frozen=True)
-class Planned:
-    """A checked request. ``missing``: a method's name → why it cannot be measured."""
+class CheckedRequest:
+    """A request whose files were read.
+
+    Attributes:
+        basis: preset, settings and store.
+        layout: the table with the user's rows and weights.
+        places: the chunks to measure.
+        missing: label of a row → why it cannot be measured.
+        dataset: of all logs.
+    """
 
     basis: Basis
     layout: Layout
-    places: tuple[Place, ...]
+    places: tuple[LogChunk, ...]
     missing: dict[str, str]
     dataset: str
 
     @property
     def config(self) -> PipelineConfig:
-        """The preset with protocol and user's settings, without any method's."""
+        """The preset with the protocol and the user's settings, without any method's."""
         return load_configuration(self.basis.preset, settings=(*self.layout.protocol, *self.basis.settings))
+
+    @property
+    def measurable_rows(self) -> tuple[Row, ...]:
+        """The rows that can be measured."""
+        return tuple(row for row in self.layout.rows if row.label not in self.missing)
+
+
+def predict_table(checked: CheckedRequest) -> list[dict[str, Any]]:
+    """Predicts what a table would take, without computing anything.
+
+    Args:
+        checked: what to measure.
+
+    Returns:
+        A row for each cell, see :meth:`flows.experiments.stage_prediction.StagePredictor.predict`; for a method that
+        cannot be measured ``cached`` says why.
+    """
+    predictor = StagePredictor(checked.basis.store)
+    rows: list[dict[str, Any]] = []
+    for where in checked.places:
+        base = PipelineConfig.model_validate(checked.basis.job(checked.layout, PRESET_METHOD, where).config)
+        for row in checked.layout.rows:
+            # It is listed all the same, so that a dry run shows what the table will lack.
+            if row.label in checked.missing:
+                reason = f"not measured: {checked.missing[row.label]}"
+                rows.append({"cell": row.label, "seconds": 0.0, "cached": reason})
+                continue
+            # The predictor remembers earlier cells, so that shared stages are counted once.
+            job = checked.basis.job(checked.layout, row.method, where)
+            names = list_stages(checked.layout, row.method)
+            rows.append(predictor.predict(f"{row.label} · {where}", job, base, names))
+    return rows
+
+
+def find_unstored_methods(checked: CheckedRequest) -> dict[str, str]:
+    """Finds methods of which the store lacks a stage on any chunk.
+
+    Args:
+        checked: what to measure.
+
+    Returns:
+        Label of the row → the first stage that is missing, as a sentence.
+    """
+    unstored: dict[str, str] = {}
+    for where in checked.places:
+        for row in checked.layout.rows:
+            names = list_stages(checked.layout, row.method)
+            stored = find_stored_stages(checked.basis.job(checked.layout, row.method, where), names)
+            absent = [name for name in names if name not in stored]
+            if absent:
+                # The first chunk's reason is kept; one is enough to leave the method out.
+                unstored.setdefault(row.label, f"the store has no {absent[0]} of {where} yet.")
+    return unstored

@@ -16,18 +16,27 @@ from storage import keys
 from storage.code_digest import code_digest
 from storage.keys import digest_file, digest_value
 
-RECONSTRUCTING = ("ingest", "effects", "initial", "gnet", "novel_views", "fnet", "enet")
+RECONSTRUCTION_STAGES = ("ingest", "effects", "initial", "gnet", "novel_views", "fnet", "enet")
+"""The stages that make a scene, in their order; evaluation stages are not among them."""
+
+SPECIAL_ARGUMENTS = ("log", "chunk_index", "stage_name", "truth")
+"""Arguments of a stage function that are not the result of an earlier stage."""
 
 
 @dataclass(frozen=True)
 class StageSpec:
-    """One stage.
+    """Describes one stage.
 
-    ``function`` is ``module:name``; it is called as ``function(config section, *arguments, progress=…)``, where each
-    argument is the name of an earlier stage (its value) or one of ``log``, ``chunk_index``, ``stage_name``, ``truth``.
-    ``weights`` names the weights it loads. ``splits`` names a setting that bounds memory and does not change a
-    payload's bytes: it is halved when memory runs out, and is not part of the key. ``lazy`` modules are its code too,
-    though no import of the stage names them.
+    Attributes:
+        name: the stage's name, such as ``gnet`` or ``evaluate/gnet``.
+        kind: the kind of artifact that the stage makes; it chooses the codec.
+        section: the section of the configuration that the stage gets.
+        function: ``module:name``; it is called as ``function(section, *arguments, progress=…)``.
+        arguments: for each argument the name of an earlier stage (its value is passed) or a special argument.
+        weights: the network whose weights the stage loads; ``None`` for a stage without a network.
+        batch_setting: a setting of the section that bounds memory and does not change the payload. It is halved when
+            memory runs out, and it is not part of the key.
+        lazy_modules: modules that belong to the stage's code although no import names them.
     """
 
     name: str
@@ -36,25 +45,29 @@ class StageSpec:
     function: str
     arguments: tuple[str, ...]
     weights: str | None = None
-    splits: str | None = None
-    lazy: tuple[str, ...] = ()
+    batch_setting: str | None = None
+    lazy_modules: tuple[str, ...] = ()
 
     @property
     def module(self) -> str:
+        """The full name of the module that holds the stage function."""
         return self.function.partition(":")[0]
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The earlier stages it reads."""
-        return tuple(a for a in self.arguments if a not in SPECIAL_ARGUMENTS)
+        """The earlier stages whose results the stage reads.
+
+        >>> STAGE_BY_NAME["gnet"].inputs
+        ('ingest', 'initial', 'effects')
+        """
+        return tuple(argument for argument in self.arguments if argument not in SPECIAL_ARGUMENTS)
 
     @property
     def needs_log(self) -> bool:
-        """Whether it reads the driving log itself (its frames, or the truth a synthetic log has)."""
+        """Whether the stage reads the driving log itself: its frames, or the truth of a synthetic log."""
         return "log" in self.arguments or "truth" in self.arguments
 
 
-SPECIAL_ARGUMENTS = ("log", "chunk_index", "stage_name", "truth")
 _STAGES = "genre_tasks.stages"
 
 PIPELINE: tuple[StageSpec, ...] = (
@@ -65,7 +78,8 @@ PIPELINE: tuple[StageSpec, ...] = (
         "effects",
         f"{_STAGES}.effects:effects",
         ("ingest", "log"),
-        lazy=tuple(f"genre_tasks.effects.{name}" for name in EffectsConfig.model_fields),
+        # The stage looks its effects up in a registry of names: reading its imports would not find their code.
+        lazy_modules=tuple(f"genre_tasks.effects.{name}" for name in EffectsConfig.model_fields),
     ),
     StageSpec("initial", "reconstruction", "initial", f"{_STAGES}.initial:initial", ("ingest", "effects")),
     StageSpec(
@@ -81,7 +95,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         f"{_STAGES}.fnet:fnet",
         ("ingest", "novel_views", "effects"),
         weights="fnet",
-        splits="batch_views",
+        batch_setting="batch_views",
     ),
     StageSpec(
         "enet", "reconstruction", "enet", f"{_STAGES}.enet:enet", ("ingest", "gnet", "fnet", "effects"), weights="enet"
@@ -104,47 +118,112 @@ PIPELINE: tuple[StageSpec, ...] = (
         ("ingest", "fnet", "novel_views", "truth"),
     ),
 )
-_FILES = {"ingest": ("points",), "evaluate": ("inception", "lpips")}
+"""All stages, each after the stages that it reads."""
+
+STAGE_BY_NAME: Mapping[str, StageSpec] = {spec.name: spec for spec in PIPELINE}
+
+_FILE_SETTINGS = {"ingest": ("points",), "evaluate": ("inception", "lpips")}
 """Settings that name files, by section."""
-BY_NAME: Mapping[str, StageSpec] = {spec.name: spec for spec in PIPELINE}
 
 
-def reconstructing_until(end: str) -> tuple[str, ...]:
-    """The reconstructing stages up to ``end``, whose scene is the result."""
-    return RECONSTRUCTING[: RECONSTRUCTING.index(end) + 1]
+def stages_until(end: str) -> tuple[str, ...]:
+    """Lists the stages that a run goes through when the scene of stage ``end`` is its result.
+
+    Args:
+        end: a name in :data:`RECONSTRUCTION_STAGES`.
+
+    Returns:
+        The names from ``ingest`` to ``end``, in order.
+
+    Raises:
+        ValueError: ``end`` is not a reconstruction stage.
+
+    >>> stages_until("gnet")
+    ('ingest', 'effects', 'initial', 'gnet')
+    """
+    return RECONSTRUCTION_STAGES[: RECONSTRUCTION_STAGES.index(end) + 1]
 
 
-def section_of(spec: StageSpec, config: PipelineConfig) -> Any:
-    """The configuration subtree that the stage gets."""
+def config_section(spec: StageSpec, config: PipelineConfig) -> Any:
+    """Picks the part of the configuration that a stage gets.
+
+    Args:
+        spec: the stage.
+        config: the configuration of the whole pipeline.
+
+    Returns:
+        The pydantic model of the stage's section, such as ``GnetConfig``.
+
+    >>> config_section(STAGE_BY_NAME["evaluate/gnet"], PipelineConfig()) == PipelineConfig().evaluate
+    True
+    """
     return getattr(config, spec.section)
 
 
-def weights_file(spec: StageSpec, config: PipelineConfig) -> Path | None:
-    """The weights that the stage will load, or ``None`` if it loads none."""
-    section = section_of(spec, config)
+def find_weights_file(spec: StageSpec, config: PipelineConfig) -> Path | None:
+    """Finds the network's weights that a stage will load.
+
+    Args:
+        spec: the stage.
+        config: the configuration of the whole pipeline.
+
+    Returns:
+        The file or folder, or ``None`` if the stage runs without a network.
+
+    Raises:
+        InputError: the configuration names weights that do not exist.
+    """
+    section = config_section(spec, config)
     method = getattr(section, "method", "learned")
+    # Methods without a network, such as tuned Adam and per-scene 3DGS, load nothing whatever `weights` says.
     if spec.weights is None or method not in ("learned", "g3r"):
         return None
-    from genre_tasks.weights import network_of, resolve_weights
+    from genre_tasks.weights import resolve_weights, select_network
 
-    return resolve_weights(network_of(spec.weights, method), section.weights)
+    return resolve_weights(select_network(spec.weights, method), section.weights)
 
 
-def stage_weights(spec: StageSpec, config: PipelineConfig) -> str | None:
-    """Digest of all weights that the stage will load, or ``None`` if it loads none."""
-    first, finish = weights_digest(weights_file(spec, config)), getattr(section_of(spec, config), "refinement", None)
-    if finish is None:
-        return first
+def digest_stage_weights(spec: StageSpec, config: PipelineConfig) -> str | None:
+    """Digests all weights that a stage will load, those of a refinement part included.
+
+    Args:
+        spec: the stage.
+        config: the configuration of the whole pipeline.
+
+    Returns:
+        64 hex digits, or ``None`` if the stage loads no weights.
+
+    Raises:
+        InputError: the configuration names weights that do not exist.
+    """
+    stage_digest = digest_weights(find_weights_file(spec, config))
+    refinement = getattr(config_section(spec, config), "refinement", None)
+    # The bare digest where nothing is refined, so that stages without this option keep a key of their own form.
+    if refinement is None:
+        return stage_digest
     from genre_tasks.weights import resolve_weights
 
-    return digest_value([first, weights_digest(resolve_weights("gnet", finish.weights, "gnet.refine.weights"))])
+    return digest_value(
+        [stage_digest, digest_weights(resolve_weights("gnet", refinement.weights, "gnet.refine.weights"))]
+    )
 
 
-def weights_digest(path: Path | None) -> str | None:
-    """sha256 over the weights (a file with its JSON beside it, or all files of a folder)."""
+def digest_weights(path: Path | None) -> str | None:
+    """Digests weights by their content: a file with the JSON beside it, or all files of a folder.
+
+    Args:
+        path: the file or folder; ``None`` for a stage without weights.
+
+    Returns:
+        64 hex digits, or ``None`` for ``None``.
+    """
     if path is None:
         return None
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path, path.with_suffix(".json")]
+    if path.is_dir():
+        # Sorted, because the order in which a file system lists files is no part of the weights.
+        files = sorted(file for file in path.rglob("*") if file.is_file())
+    else:
+        files = [path, path.with_suffix(".json")]
     return digest_value([[file.name, digest_file(file)] for file in files if file.exists()])
 
 
@@ -155,14 +234,24 @@ def stage_key(
     weights: str | None,
     reader: tuple[str, ...] = (),
 ) -> str:
-    """The artifact's key: sha256 of stage, code digest, configuration subtree, inputs' payload digests, weights.
+    """Computes the key of a stage's artifact: equal keys mean that a stored artifact can be used again.
 
-    ``inputs`` maps each input's name to the digest of its payload (for ``log``: the log's digest and the chunk);
-    ``reader`` is the module that reads the log, which no import of the stage names but which is part of its code.
+    Args:
+        spec: the stage.
+        config: the configuration of the whole pipeline; only the stage's section counts.
+        inputs: name → payload digest of each input, and for ``log`` the log's digest and the chunk.
+        weights: digest of the stage's weights, from :func:`digest_stage_weights`.
+        reader: the module that reads the log. No import of the stage names it, but it is part of the stage's code.
+
+    Returns:
+        64 hex digits of sha256.
     """
-    configuration = section_of(spec, config).model_dump(mode="json", exclude={spec.splits} if spec.splits else set())
-    for key in _FILES.get(spec.section, ()):
-        if configuration[key] and Path(configuration[key]).is_file():  # an input: its bytes count, not its name alone
+    # A retry with a smaller batch makes the same payload, so it must have the same key.
+    excluded = {spec.batch_setting} if spec.batch_setting else set()
+    configuration = config_section(spec, config).model_dump(mode="json", exclude=excluded)
+    for key in _FILE_SETTINGS.get(spec.section, ()):
+        # A file that a setting names is an input: its bytes count, not its name alone.
+        if configuration[key] and Path(configuration[key]).is_file():
             configuration[key] = digest_file(Path(configuration[key]))
-    code = code_digest(spec.module, also=(*spec.lazy, *reader))
+    code = code_digest(spec.module, lazy_modules=(*spec.lazy_modules, *reader))
     return keys.stage_key(spec.name, code, configuration, inputs, weights)

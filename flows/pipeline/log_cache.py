@@ -1,4 +1,4 @@
-"""Which logs and chunks a run is about."""
+"""The logs and chunks that a run is about: opened once, selected, expanded."""
 
 from __future__ import annotations
 
@@ -13,36 +13,84 @@ if TYPE_CHECKING:
     from genre_tasks.logs.types import DrivingLog
 
 
+# Four: a run has one log, and a sweep goes through its chunks log by log. More would only hold memory.
 @functools.lru_cache(maxsize=4)
-def opened_log(uri: str) -> DrivingLog:
-    """The log behind a URI, opened once per process."""
+def cached_log(uri: str) -> DrivingLog:
+    """Opens a log once for each process; later calls give the same object.
+
+    Args:
+        uri: the log's reader and address, such as ``pandaset:PATH/002`` or ``synthetic:street?seed=1000``.
+
+    Returns:
+        The opened log.
+
+    Raises:
+        InputError: the log cannot be opened.
+        ConfigError: no reader is called that.
+
+    >>> log = cached_log("synthetic:street?seed=1000&frames=8")
+    >>> log.frame_count
+    8
+    >>> log is cached_log("synthetic:street?seed=1000&frames=8")
+    True
+    """
     from genre_tasks.logs.registry import open_log
 
     return open_log(uri)
 
 
-def chosen_chunks(log: str, config: PipelineConfig, chunks: list[int] | None) -> list[int]:
-    """The chunks to run, all without a choice. Raises ``InputError`` for one that the log does not have."""
+def select_chunks(log: str, config: PipelineConfig, chunks: list[int] | None) -> list[int]:
+    """Checks the chunks that the user asked for.
+
+    Args:
+        log: the log's URI.
+        config: its section ``ingest`` says how long a chunk is.
+        chunks: numbers of chunks, from 0; ``None`` for all chunks of the log.
+
+    Returns:
+        The numbers of the chunks to run.
+
+    Raises:
+        InputError: the log does not have one of the chunks.
+
+    >>> select_chunks("synthetic:street?seed=1000&frames=30", PipelineConfig(), None)
+    [0, 1]
+    """
     from genre_tasks.stages.ingest import chunk_count
 
-    count = chunk_count(config.ingest, opened_log(log))
-    wanted = list(range(count)) if chunks is None else chunks
-    for chunk in wanted:
+    count = chunk_count(config.ingest, cached_log(log))
+    selected = list(range(count)) if chunks is None else chunks
+    for chunk in selected:
+        # All are checked before the first one is computed, as that takes minutes.
         if not 0 <= chunk < count:
             raise InputError(f"there is no chunk {chunk}", remedy=f"Chunks are 0 to {count - 1}.", log=log)
-    return wanted
+    return selected
 
 
-def expanded(logs: list[str]) -> list[str]:
-    """``reader:PATH/*`` becomes one URI per folder, sorted. Raises ``InputError`` where nothing matches."""
-    out: list[str] = []
+def expand_logs(logs: list[str]) -> list[str]:
+    """Replaces every ``reader:PATH/*`` by one URI for each folder in ``PATH``, sorted by name.
+
+    Args:
+        logs: URIs of logs, with or without a star at the end.
+
+    Returns:
+        URIs without stars, in the order of ``logs``.
+
+    Raises:
+        InputError: a star matches no folder.
+
+    >>> expand_logs(["synthetic:street?seed=1", "pandaset:logs/002"])
+    ['synthetic:street?seed=1', 'pandaset:logs/002']
+    """
+    expanded: list[str] = []
     for uri in logs:
         reader, _, path = uri.partition(":")
         if not path.endswith("/*"):
-            out.append(uri)
+            expanded.append(uri)
             continue
-        folders = sorted(p for p in Path(path[:-2]).glob("*") if p.is_dir())
+        # Sorted by name, so that a dataset runs in the same order on every file system.
+        folders = sorted(folder for folder in Path(path[:-2]).glob("*") if folder.is_dir())
         if not folders:
             raise InputError(f"no log matches {uri}", remedy="Name a folder that holds sequences.", file=path[:-2])
-        out += [f"{reader}:{p}" for p in folders]
-    return out
+        expanded += [f"{reader}:{folder}" for folder in folders]
+    return expanded

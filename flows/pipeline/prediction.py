@@ -1,19 +1,20 @@
-"""What a run would take before it runs: hits, seconds and gigabytes per stage."""
+"""What a run would take before it runs: cache hits, seconds and gigabytes of each stage."""
 
 from __future__ import annotations
 
 import statistics
+from collections.abc import Mapping
 from typing import Any
 
-from flows.pipeline.definition import PIPELINE, RECONSTRUCTING, StageSpec, reconstructing_until
-from flows.pipeline.log_cache import chosen_chunks, opened_log
-from flows.pipeline.stage_runner import ArtifactRef, Job, look_up
+from flows.pipeline.definition import PIPELINE, RECONSTRUCTION_STAGES, StageSpec, stages_until
+from flows.pipeline.log_cache import cached_log, select_chunks
+from flows.pipeline.stage_runner import ArtifactRef, Job, find_artifact
 from genre_tasks.config import PipelineConfig
 from storage.local import open_store
 
-# Measured on two cores at 320×180 with six cameras and 44k Gaussians (preset small), per chunk: seconds, GB.
-# Used where the store holds no finished stage to learn from; scaled with the pixels.
-_TYPICAL = {
+# Measured on two cores at 320×180 with six cameras and 44k Gaussians (preset small), for one chunk.
+# Used where the store holds no finished stage to learn from; scaled with the number of pixels.
+_TYPICAL_SECONDS_AND_GB = {
     "ingest": (10.0, 2.5),
     "initial": (4.0, 2.0),
     "gnet": (4.0, 2.5),
@@ -26,47 +27,85 @@ _TYPICAL = {
 _TYPICAL_PIXELS = 320 * 180
 
 
-def plan_run(
-    log: str, store: str, chunks: list[int] | None, config: PipelineConfig, end: str = RECONSTRUCTING[-1]
+def predict_run(
+    log: str, store: str, chunks: list[int] | None, config: PipelineConfig, end: str = RECONSTRUCTION_STAGES[-1]
 ) -> dict[str, Any]:
-    """The plan of ``genre run --dry-run``: a row per chunk and stage with key, hit or miss, seconds and gigabytes.
+    """Predicts what a run would compute and what that would take, for ``genre run --dry-run``.
 
-    ``end``: the last stage before evaluation, where a budget chose an earlier one than the pipeline's.
-    A key depends on the payloads of the inputs: below a miss it is not known yet (``follows``).
+    Args:
+        log: the log's URI.
+        store: folder (or URI) of the store.
+        chunks: numbers of chunks; ``None`` for all.
+        config: the effective configuration.
+        end: the last stage before evaluation, where a budget ends the pipeline early.
+
+    Returns:
+        Plain values: ``stages``, a row for each chunk and stage with ``key``, ``cache`` (hit, miss, corrupt or
+        follows), ``seconds`` and ``gigabytes``; and ``seconds``, ``gigabytes`` and ``basis`` of the whole run. A key
+        depends on the payloads of the inputs: below a miss it is not known yet, and ``cache`` is ``follows``.
+
+    Raises:
+        InputError: the log cannot be opened, or does not have one of the chunks.
     """
-    known = _measured(store, opened_log(log).dataset)
+    measured = _measured_stages(store, cached_log(log).dataset)
+    included = stages_until(end)
     rows: list[dict[str, Any]] = []
-    made = reconstructing_until(end)
-    for chunk in chosen_chunks(log, config, chunks):
+    for chunk in select_chunks(log, config, chunks):
         job = Job(log, chunk, store, config.model_dump(mode="json"))
         refs: dict[str, ArtifactRef] = {}
-        for spec in (s for s in PIPELINE if s.name.removeprefix("evaluate/") in made):
-            rows.append(_row(spec, job, refs, known, config))
+        for spec in PIPELINE:
+            if spec.name.removeprefix("evaluate/") in included:
+                rows.append(_predict_stage(spec, job, refs, measured, config))
+    # A damaged artifact is computed again, so it costs as much as one that is not there.
     misses = [row for row in rows if row["cache"] != "hit"]
     return {
         "log": log,
         "store": store,
         "stages": rows,
         "seconds": sum(row["seconds"] for row in misses),
+        # Stages run one after the other, so their memory does not add up.
         "gigabytes": max((row["gigabytes"] for row in misses), default=0.0),
-        "basis": "stages in this store" if known else "a table of typical values",
+        "basis": "stages in this store" if measured else "a table of typical values",
     }
 
 
-def _row(
+def median_stage_seconds(store: str) -> dict[str, float]:
+    """Looks up how long stages usually take: the median of those in a store, or a typical value.
+
+    Args:
+        store: folder (or URI) of the store.
+
+    Returns:
+        Seconds by stage; all evaluation stages share the name ``evaluate``.
+    """
+    typical = {stage: seconds for stage, (seconds, _) in _TYPICAL_SECONDS_AND_GB.items()}
+    stored: dict[str, list[float]] = {}
+    for artifact in open_store(store).artifacts():
+        stage = artifact.manifest.stage.partition("/")[0]
+        stored.setdefault(stage, []).append(artifact.manifest.seconds)
+    return typical | {stage: statistics.median(values) for stage, values in stored.items()}
+
+
+def _predict_stage(
     spec: StageSpec,
     job: Job,
     refs: dict[str, ArtifactRef],
-    known: dict[str, tuple[float, float]],
+    measured: Mapping[str, tuple[float, float]],
     config: PipelineConfig,
 ) -> dict[str, Any]:
-    key, cache = None, "follows"
+    """One row of the prediction; a hit is added to ``refs``, so that later stages can be looked up."""
+    key = None
+    cache = "follows"
     if all(name in refs for name in spec.inputs):
-        address, ref, note = look_up(spec, job, refs, repair=False)
-        key, cache = address.key, "hit" if ref else ("corrupt" if note else "miss")
-        if ref:
+        # A prediction deletes nothing: a damaged artifact stays for the run to repair.
+        address, ref, note = find_artifact(spec, job, refs, repair=False)
+        key = address.key
+        if ref is not None:
             refs[spec.name] = ref
-    seconds, gigabytes = known.get(spec.name) or _typical(spec, config)
+            cache = "hit"
+        else:
+            cache = "corrupt" if note else "miss"
+    seconds, gigabytes = measured.get(spec.name) or _typical_stage(spec, config)
     return {
         "chunk": job.chunk,
         "stage": spec.name,
@@ -77,27 +116,22 @@ def _row(
     }
 
 
-def _measured(store: str, dataset: str) -> dict[str, tuple[float, float]]:
+def _measured_stages(store: str, dataset: str) -> dict[str, tuple[float, float]]:
+    """Median seconds and largest memory (GiB) of the stages in a store, by stage."""
     seconds: dict[str, list[float]] = {}
     memory: dict[str, list[float]] = {}
     for artifact in open_store(store).artifacts():
         manifest = artifact.manifest
+        # Cameras and images differ between datasets, and with them the time of every stage.
         if manifest.dataset == dataset:
             seconds.setdefault(manifest.stage, []).append(manifest.seconds)
             memory.setdefault(manifest.stage, []).append(manifest.peak_mib / 1024)
+    # The median of the time, but the largest memory: too little of it ends a run, too much time only delays it.
     return {stage: (statistics.median(seconds[stage]), max(memory[stage])) for stage in seconds}
 
 
-def stage_seconds(store: str) -> dict[str, float]:
-    """By stage (``evaluate`` for all of them): the median of those in the store, or a typical value."""
-    seconds = {stage: s for stage, (s, _) in _TYPICAL.items()}
-    found: dict[str, list[float]] = {}
-    for artifact in open_store(store).artifacts():
-        found.setdefault(artifact.manifest.stage.partition("/")[0], []).append(artifact.manifest.seconds)
-    return seconds | {stage: statistics.median(values) for stage, values in found.items()}
-
-
-def _typical(spec: StageSpec, config: PipelineConfig) -> tuple[float, float]:
+def _typical_stage(spec: StageSpec, config: PipelineConfig) -> tuple[float, float]:
     scale = config.ingest.width_px * config.ingest.height_px / _TYPICAL_PIXELS
-    seconds, gigabytes = _TYPICAL[spec.name.partition("/")[0]]
+    seconds, gigabytes = _TYPICAL_SECONDS_AND_GB[spec.name.partition("/")[0]]
+    # Most of the memory at low resolution is torch and the Gaussians, which do not grow with the pixels.
     return seconds * scale, gigabytes * max(1.0, scale / 4)

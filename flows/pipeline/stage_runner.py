@@ -2,38 +2,37 @@
 
 from __future__ import annotations
 
-import functools
-import gc
-import hashlib
 import importlib
-import platform
-import time
-from collections.abc import Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import version
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from flows.pipeline.definition import BY_NAME, StageSpec, section_of, stage_key, stage_weights
-from flows.pipeline.log_cache import opened_log
+from flows.machine.facts import describe_environment
+from flows.machine.resource_usage import measure_usage
+from flows.pipeline.definition import STAGE_BY_NAME, StageSpec, config_section, digest_stage_weights, stage_key
+from flows.pipeline.log_cache import cached_log
 from genre_tasks.config import PipelineConfig
-from genre_tasks.errors import ArtifactCorruptError, ResourceError
+from genre_tasks.errors import ArtifactCorruptError
 from genre_tasks.progress import Progress, silent
 from storage.address import Address
 from storage.code_digest import code_digest
-from storage.local import Artifact, open_store
+from storage.local import open_store
+from storage.store import Artifact, Provenance, Store
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
-    from genre_tasks.scene.chunk import Mark
-    from storage.store import Store
+    from genre_tasks.scene.chunk import LogIssue
 
 
 @dataclass(frozen=True)
 class Job:
-    """What to reconstruct: a log, a chunk of it, with which configuration, into which store. Plain values only."""
+    """What to reconstruct, as plain values that a process can be given.
+
+    Attributes:
+        log: the log's URI, such as ``pandaset:PATH/002``.
+        chunk: number of the chunk in the log, from 0.
+        store: folder (or URI) of the store.
+        config: the whole effective configuration, as JSON values.
+    """
 
     log: str
     chunk: int
@@ -43,7 +42,16 @@ class Job:
 
 @dataclass(frozen=True)
 class ArtifactRef:
-    """A reference that tasks exchange in place of values: where the artifact lies and what its payload's digest is."""
+    """A reference that tasks exchange in place of an artifact's value.
+
+    Attributes:
+        stage: the stage that made the artifact.
+        key: the artifact's key.
+        payload_digest: digest of its files; later keys depend on it.
+        path: its folder in the store.
+        cached: whether it was in the store already.
+        note: a warning for the user, such as that a damaged artifact was computed again; empty without one.
+    """
 
     stage: str
     key: str
@@ -53,211 +61,244 @@ class ArtifactRef:
     note: str = ""
 
 
-def key_of(spec: StageSpec, job: Job, inputs: Mapping[str, ArtifactRef]) -> tuple[str, str | None]:
-    """The stage's key and the digest of its weights."""
+class FoundArtifact(NamedTuple):
+    """What the store holds for a stage.
+
+    Attributes:
+        address: where the artifact is, or will be.
+        ref: the verified artifact; ``None`` if there is none.
+        note: why an artifact that is there cannot be used; empty if there is nothing to say.
+    """
+
+    address: Address
+    ref: ArtifactRef | None
+    note: str
+
+
+def compute_key(spec: StageSpec, job: Job, inputs: Mapping[str, ArtifactRef]) -> tuple[str, str | None]:
+    """Computes the key of a stage's artifact from everything that its payload depends on.
+
+    Args:
+        spec: the stage.
+        job: log, chunk, store and configuration.
+        inputs: references of at least the stage's inputs, by stage name.
+
+    Returns:
+        The key, and the digest of the weights that the stage loads (``None`` without weights).
+
+    Raises:
+        InputError: the log or the weights do not exist.
+        KeyError: an input is missing.
+    """
     config = PipelineConfig.model_validate(job.config)
+    # Payload digests and not keys: an input that was computed again by other code, but came out the same, changes no
+    # later key.
     digests = {name: inputs[name].payload_digest for name in spec.inputs}
     if spec.needs_log:
-        digests["log"] = opened_log(job.log).digest()
+        # The digest is of the log's content, so a log that was moved keeps its keys.
+        digests["log"] = cached_log(job.log).digest()
         digests["chunk"] = str(job.chunk)
-    weights = stage_weights(spec, config)
-    return stage_key(spec, config, digests, weights, reader_of(spec, job)), weights
+    weights = digest_stage_weights(spec, config)
+    return stage_key(spec, config, digests, weights, reader_modules(spec, job)), weights
 
 
-def reader_of(spec: StageSpec, job: Job) -> tuple[str, ...]:
-    """The module that reads the log, for a stage that does."""
-    return (type(opened_log(job.log)).__module__,) if spec.needs_log else ()
+def reader_modules(spec: StageSpec, job: Job) -> tuple[str, ...]:
+    """Names the module that reads the log, whose code is part of the stage's code.
+
+    Args:
+        spec: the stage.
+        job: says which log is read.
+
+    Returns:
+        One module name, or nothing for a stage that does not read the log.
+    """
+    return (type(cached_log(job.log)).__module__,) if spec.needs_log else ()
 
 
-def address_of(stage: str, job: Job, key: str) -> Address:
-    """Where the artifact lies in the store."""
-    log = opened_log(job.log)
+def artifact_address(stage: str, job: Job, key: str) -> Address:
+    """Builds the address in the store of one stage's artifact.
+
+    Args:
+        stage: the stage's name.
+        job: says which log and chunk.
+        key: the artifact's key.
+
+    Returns:
+        The address, whether there is an artifact or not.
+    """
+    log = cached_log(job.log)
     return Address(dataset=log.dataset, log=log.name, chunk=job.chunk, stage=stage, key=key)
 
 
-def look_up(
-    spec: StageSpec, job: Job, inputs: Mapping[str, ArtifactRef], repair: bool = True
-) -> tuple[Address, ArtifactRef | None, str]:
-    """The stage's address, its verified artifact if there is one, and a note if the one there is corrupt.
+def find_artifact(spec: StageSpec, job: Job, inputs: Mapping[str, ArtifactRef], repair: bool = True) -> FoundArtifact:
+    """Looks in the store for a stage's artifact and verifies it.
 
-    With ``repair`` a corrupt artifact is removed, so that it can be computed anew.
+    Args:
+        spec: the stage.
+        job: log, chunk, store and configuration.
+        inputs: references of at least the stage's inputs, by stage name.
+        repair: whether a damaged artifact is removed, so that it can be computed again.
+
+    Returns:
+        The artifact's address, its reference if a sound one is there, and a note if a damaged one is there.
+
+    Raises:
+        InputError: the log or the weights do not exist.
     """
     store = open_store(job.store)
-    key, _ = key_of(spec, job, inputs)
-    address = address_of(spec.name, job, key)
-    artifact = None
-    note = ""
+    key, _ = compute_key(spec, job, inputs)
+    address = artifact_address(spec.name, job, key)
     try:
         artifact = store.find(address)
         if artifact is not None:
             store.verify(artifact)
     except ArtifactCorruptError as error:
-        note = f"{error.problem} ({error.file}): computed again"
-        artifact = None
+        # Damage is no error of the run: the artifact is computed again, and the note says so.
         if repair:
             store.discard(address)
-    return address, None if artifact is None else _ref(artifact, cached=True), note
+        return FoundArtifact(address, None, f"{error.problem} ({error.file}): computed again")
+    return FoundArtifact(address, None if artifact is None else _reference(artifact, cached=True), "")
 
 
-def produce(
+def run_stage(
     stage: str,
     job: Job,
     inputs: Mapping[str, ArtifactRef],
     attempt: int = 0,
     progress: Progress = silent,
 ) -> ArtifactRef:
-    """The stage's artifact: from the store if a verified one is there, else computed and committed.
+    """Makes a stage's artifact: takes it from the store if a sound one is there, else computes and commits it.
 
-    ``attempt`` counts the tries before this one that ran out of memory: the stage's ``splits`` setting is halved that
-    often, which does not change the payload. Inputs are read back from the store and verified there.
+    Inputs are read back from the store and verified there, so a stage never works on what only memory holds.
+
+    Args:
+        stage: the stage's name in :data:`flows.pipeline.definition.PIPELINE`.
+        job: log, chunk, store and configuration.
+        inputs: references of at least the stage's inputs, by stage name.
+        attempt: how many tries before this one ran out of memory. The stage's ``batch_setting`` is halved that often,
+            which does not change the payload.
+        progress: called with how far the computation is.
+
+    Returns:
+        The reference of the artifact.
 
     Raises:
-        ResourceError: memory or disk does not suffice. Other ``GenreError``: as the stage raises them.
+        ResourceError: memory or disk does not suffice.
+        GenreError: any other kind, as the stage raises it.
+
+    Example::
+
+        job = Job("synthetic:street?seed=1000", 0, "genre-store", load_configuration("demo").model_dump(mode="json"))
+        ingested = run_stage("ingest", job, {})
+        planned = run_stage("effects", job, {"ingest": ingested})
     """
-    spec = BY_NAME[stage]
-    address, hit, note = look_up(spec, job, inputs)
-    if hit is not None:
-        return hit
+    spec = STAGE_BY_NAME[stage]
+    address, ref, note = find_artifact(spec, job, inputs)
+    if ref is not None:
+        return ref
     store = open_store(job.store)
-    values = {name: store.read(_artifact(store, inputs[name], job)) for name in spec.inputs}
-    values |= _specials(spec, job)
-    section = _smaller(spec, section_of(spec, PipelineConfig.model_validate(job.config)), attempt)
+    # Read here and not before the look-up: a hit reads the manifests alone.
+    values = {name: store.read(_find_input(store, inputs[name], job)) for name in spec.inputs}
+    values |= _special_arguments(spec, job)
+    configured = config_section(spec, PipelineConfig.model_validate(job.config))
+    section = _shrink_batch(spec, configured, attempt)
     module, _, name = spec.function.partition(":")
-    with measured() as usage:
+    # The import counts: a first run's seconds include loading torch, as a user's clock does.
+    with measure_usage() as usage:
         function = getattr(importlib.import_module(module), name)
-        value = function(section, *(values[a] for a in spec.arguments), progress=progress)
-    config = PipelineConfig.model_validate(job.config)
-    artifact = store.commit(
-        address,
-        spec.kind,
-        value,
+        value = function(section, *(values[argument] for argument in spec.arguments), progress=progress)
+    provenance = Provenance(
         inputs={name: inputs[name].key for name in spec.inputs},
-        configuration=section_of(spec, config).model_dump(mode="json"),
-        code_digest=code_digest(spec.module, also=(*spec.lazy, *reader_of(spec, job))),
-        weights_digest=stage_weights(spec, config),
+        # As configured, not with the smaller batch of a retry, which is no part of the result.
+        configuration=configured.model_dump(mode="json"),
+        code_digest=code_digest(spec.module, lazy_modules=(*spec.lazy_modules, *reader_modules(spec, job))),
+        weights_digest=digest_stage_weights(spec, PipelineConfig.model_validate(job.config)),
         seconds=usage.seconds,
         peak_mib=usage.peak_mib,
-        environment=environment(),
-        measurements={"cpu_seconds": usage.cpu_seconds, "marks": _grouped_marks(getattr(value, "marks", ()))},
+        environment=describe_environment(),
+        measurements={"cpu_seconds": usage.cpu_seconds, "marks": _group_issues(getattr(value, "log_issues", ()))},
         warnings=(note,) if note else (),
     )
-    return _ref(artifact, cached=False, note=note)
+    # The first writer wins: if another process has committed this key meanwhile, its artifact is the result.
+    artifact = store.commit(address, spec.kind, value, provenance)
+    return _reference(artifact, cached=False, note=note)
 
 
-@dataclass
-class Usage:
-    """Seconds of wall time and of all threads on the CPU, and the process's peak of resident memory meanwhile, MiB."""
+def open_artifact(job: Job, ref: ArtifactRef) -> Artifact:
+    """Opens the artifact behind a reference: its folder and its manifest.
 
-    seconds: float = 0.0
-    cpu_seconds: float = 0.0
-    peak_mib: float = 0.0
+    Args:
+        job: the job that the reference comes from.
+        ref: the reference.
 
+    Returns:
+        The artifact; its files are not verified.
 
-@contextmanager
-def measured() -> Iterator[Usage]:
-    """Times a block and takes its memory peak; out-of-memory of any kind becomes a ``ResourceError``."""
-    usage = Usage()
-    gc.collect()
-    _reset_peak()
-    start, begun = time.perf_counter(), time.process_time()
-    try:
-        yield usage
-    except (MemoryError, RuntimeError) as error:
-        text = str(error)
-        if isinstance(error, MemoryError) or "alloc" in text or "out of memory" in text.lower():
-            raise ResourceError(
-                f"memory ran out: {text[:200]}", remedy="Choose a smaller ingest.width_px or fewer cameras."
-            ) from error
-        raise
-    finally:
-        usage.seconds, usage.cpu_seconds = time.perf_counter() - start, time.process_time() - begun
-        usage.peak_mib = _peak_mib()
+    Raises:
+        ArtifactCorruptError: the artifact is gone, or its manifest cannot be trusted.
+    """
+    return _find_input(open_store(job.store), ref, job)
 
 
-def _reset_peak() -> None:
-    try:  # Linux: 5 resets the high-water mark of resident memory
-        Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        return
+def read_artifact(job: Job, ref: ArtifactRef) -> Any:
+    """Reads the value behind a reference.
+
+    Args:
+        job: the job that the reference comes from.
+        ref: the reference.
+
+    Returns:
+        The stage's result, such as a ``Chunk`` or a ``Reconstruction``.
+
+    Raises:
+        ArtifactCorruptError: the artifact is gone or damaged; files are verified before they are read.
+    """
+    return open_store(job.store).read(open_artifact(job, ref))
 
 
-def _peak_mib() -> float:
-    status = Path("/proc/self/status")
-    if status.exists():
-        for line in status.read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) / 1024
-    import psutil
-
-    return psutil.Process().memory_info().rss / 2**20
-
-
-@functools.lru_cache(maxsize=1)
-def environment() -> dict[str, str]:
-    """What the numbers were measured on."""
-    import torch
-
-    return {
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "processor": platform.machine(),
-        "threads": str(torch.get_num_threads()),
-        **{name: version(name) for name in ("torch", "numpy", "genre")},
-    }
-
-
-def _specials(spec: StageSpec, job: Job) -> dict[str, Any]:
+def _special_arguments(spec: StageSpec, job: Job) -> dict[str, Any]:
     values: dict[str, Any] = {"chunk_index": job.chunk, "stage_name": spec.name.removeprefix("evaluate/")}
     if spec.needs_log:
-        log = opened_log(job.log)
+        log = cached_log(job.log)
         values |= {"log": log, "truth": log.truth}
     return values
 
 
-def _grouped_marks(marks: Iterable[Mark]) -> list[str]:
-    """What the chunk's log lacks, a line a kind: the first detail, and how many more there are."""
-    kinds: dict[str, list[str]] = {}
-    for mark in marks:
-        kinds.setdefault(mark.kind.replace("_", " "), []).append(mark.detail)
-    return [
-        f"{kind}: {details[0]}" + f" (and {len(details) - 1} more)" * (len(details) > 1)
-        for kind, details in kinds.items()
-    ]
+def _group_issues(issues: Iterable[LogIssue]) -> list[str]:
+    """Says what the chunk's log lacks, one line for each kind: the first detail, and how many more there are."""
+    details_by_kind: dict[str, list[str]] = {}
+    for issue in issues:
+        details_by_kind.setdefault(issue.kind.replace("_", " "), []).append(issue.detail)
+    lines = []
+    for kind, details in details_by_kind.items():
+        line = f"{kind}: {details[0]}"
+        if len(details) > 1:
+            line += f" (and {len(details) - 1} more)"
+        lines.append(line)
+    return lines
 
 
-def _smaller(spec: StageSpec, section: Any, attempt: int) -> Any:
-    if spec.splits is None or attempt == 0:
+def _shrink_batch(spec: StageSpec, section: Any, attempt: int) -> Any:
+    """The stage's section with its ``batch_setting`` halved once for each attempt that ran out of memory."""
+    # Other stages have no such setting: their retry runs the same again, when other processes may have ended.
+    if spec.batch_setting is None or attempt == 0:
         return section
-    return section.model_copy(update={spec.splits: max(1, getattr(section, spec.splits) >> attempt)})
+    smaller = max(1, getattr(section, spec.batch_setting) >> attempt)
+    return section.model_copy(update={spec.batch_setting: smaller})
 
 
-def artifact_of(job: Job, ref: ArtifactRef) -> Artifact:
-    """The artifact behind a reference of this job. Raises ``ArtifactCorruptError`` where it is gone."""
-    return _artifact(open_store(job.store), ref, job)
-
-
-def value_of(job: Job, ref: ArtifactRef) -> Any:
-    """Its value, verified while it is read."""
-    return open_store(job.store).read(artifact_of(job, ref))
-
-
-def _artifact(store: Store, ref: ArtifactRef, job: Job) -> Artifact:
-    artifact = store.find(address_of(ref.stage, job, ref.key))
+def _find_input(store: Store, ref: ArtifactRef, job: Job) -> Artifact:
+    artifact = store.find(artifact_address(ref.stage, job, ref.key))
+    # Another process may have discarded the artifact since its key was computed.
     if artifact is None:
         raise ArtifactCorruptError(
             f"the artifact of {ref.stage} vanished while the run was going on",
-            remedy="Run again: it is computed anew.",
+            remedy="Run again: it is computed again.",
             file=ref.path,
         )
     return artifact
 
 
-def _ref(artifact: Artifact, cached: bool, note: str = "") -> ArtifactRef:
+def _reference(artifact: Artifact, cached: bool, note: str = "") -> ArtifactRef:
     manifest = artifact.manifest
     return ArtifactRef(manifest.stage, manifest.key, manifest.payload_digest, str(artifact.path), cached, note)
-
-
-def run_id(uri: str, preset: str, keys: Mapping[str, str]) -> str:
-    """A name for a run that is the same when everything it made is the same."""
-    text = "\n".join([uri, preset, *(f"{k}={v}" for k, v in sorted(keys.items()))])
-    return hashlib.sha256(text.encode()).hexdigest()[:12]

@@ -1,7 +1,7 @@
 """The one task: a stage of a chunk under Prefect, with cache state, retries and progress.
 
-The store's manifests are the one truth about what is cached: Prefect's own result cache is off, and a hit ends in a
-state named ``Cached``.
+The store's manifests alone decide what is cached. Prefect's own result cache is off, and a hit ends in a state named
+``Cached``.
 """
 
 from __future__ import annotations
@@ -15,20 +15,22 @@ from prefect.context import TaskRunContext
 from prefect.states import Completed
 from prefect.tasks import Task, exponential_backoff
 
-from flows.pipeline.progress import current_reporter
-from flows.pipeline.stage_runner import ArtifactRef, Job, produce
+from flows.pipeline.progress import get_reporter
+from flows.pipeline.stage_runner import ArtifactRef, Job, run_stage
 from genre_tasks.errors import ResourceError, TransientIOError
 
+# Each retry halves the batch of a stage that has one, so three retries divide it by eight.
 RETRIES = 3
 
 
-async def _may_pass(task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
-    """Only what a retry can cure is retried: smaller after ``ResourceError``, later after ``TransientIOError``."""
+async def _can_retry(task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
+    """Whether a retry can cure the failure: with less memory after ``ResourceError``, later after an I/O error."""
     try:
         await state.aresult()
     except (ResourceError, TransientIOError):
         return True
-    except BaseException:  # the result call raises whatever the task raised; any other kind is final
+    except BaseException:
+        # The result call raises whatever the task raised; any other kind is final.
         return False
     return False
 
@@ -38,23 +40,34 @@ async def _may_pass(task: Task[..., Any], run: TaskRun, state: State[Any]) -> bo
     task_run_name="{stage} · chunk {chunk}",
     retries=RETRIES,
     retry_delay_seconds=exponential_backoff(backoff_factor=1),
-    retry_condition_fn=_may_pass,
+    retry_condition_fn=_can_retry,
+    # Results are in the store. Prefect would pickle them once more, and answer from its copy without verification.
     persist_result=False,
     cache_policy=NO_CACHE,
 )
 def stage_task(stage: str, chunk: int, job: Job, inputs: dict[str, ArtifactRef]) -> Any:
-    """Produces a stage's artifact and returns its reference, in a ``Cached`` state if it was there already.
+    """Makes a stage's artifact, or finds it in the store.
 
     Args:
-        stage: the stage's name in ``flows.pipeline.definition``. chunk: repeated for the task run's name.
-        job: log, chunk, store, configuration. inputs: references of all earlier artifacts of the chunk.
+        stage: the stage's name in ``flows.pipeline.definition``.
+        chunk: the job's chunk, repeated for the name of the task run.
+        job: log, chunk, store and configuration.
+        inputs: references of at least the stage's inputs, by stage name.
+
+    Returns:
+        The artifact's reference, in a state named ``Cached`` if the artifact was in the store already.
+
+    Raises:
+        GenreError: as the stage raises it, after the retries.
     """
     context = TaskRunContext.get()
+    # Prefect counts runs from 1; every earlier run of this task ended in an error that a retry can cure.
     attempt = context.task_run.run_count - 1 if context else 0
-    reporter = current_reporter()
+    reporter = get_reporter()
     reporter.stage_started(stage, chunk)
-    ref = produce(stage, job, inputs, attempt=max(attempt, 0), progress=reporter.progress)
+    ref = run_stage(stage, job, inputs, attempt=max(attempt, 0), progress=reporter.progress)
     reporter.stage_ended(stage, chunk, ref)
+    # The name of the state is what Prefect's UI shows.
     if ref.cached:
         return Completed(name="Cached", message="served from the store", data=ref)
     return ref

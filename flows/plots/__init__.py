@@ -1,1 +1,1 @@
-"""Pictures of artifacts, drawn with matplotlib."""
+"""Pictures of artifacts, drawn with matplotlib and Pillow."""

@@ -2,32 +2,52 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from genre_tasks.effects.types import EffectsPlan
 
+_LEAST = 0.01
+"""Where the logarithmic axis begins, in thresholds."""
 
-def drawn(effects: EffectsPlan, title: str = "") -> NDArray[np.uint8]:
-    """[H, W, 3], a bar an effect: its value in thresholds, on a logarithmic axis; red where it is called for."""
+
+def plot_effects_plan(plan: EffectsPlan, title: str = "") -> NDArray[np.uint8]:
+    """Draws a bar for each effect: its measured value in thresholds, red where the effect is modelled.
+
+    Args:
+        plan: the plan, with a decision for every effect.
+        title: written above the plot.
+
+    Returns:
+        An sRGB image [H, W, 3].
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    rows = effects.decisions[::-1]
-    figure = Figure(figsize=(8, 0.36 * len(rows) + 1.2), dpi=120, layout="constrained")
+    # Horizontal bars count from the bottom; the first effect belongs on top.
+    decisions = plan.decisions[::-1]
+    figure = Figure(figsize=(8, 0.36 * len(decisions) + 1.2), dpi=120, layout="constrained")
+    # The canvas is made by hand: pyplot would keep figures in a global list and may look for a display.
     canvas = FigureCanvasAgg(figure)
     axes = figure.add_subplot()
-    least = 0.01
-    told = [d.value == d.value and d.threshold > 0 for d in rows]
-    parts = [max(d.value / d.threshold, least) if known else least for d, known in zip(rows, told, strict=True)]
-    wide = [part - least for part in parts]
-    axes.barh(range(len(rows)), wide, left=least, color=["tab:grey" if d.choice == "off" else "tab:red" for d in rows])
+    measured = [not math.isnan(d.value) and d.threshold > 0 for d in decisions]
+    in_thresholds = [
+        max(d.value / d.threshold, _LEAST) if is_measured else _LEAST
+        for d, is_measured in zip(decisions, measured, strict=True)
+    ]
+    widths = [value - _LEAST for value in in_thresholds]
+    colors = ["tab:grey" if d.choice == "off" else "tab:red" for d in decisions]
+    axes.barh(range(len(decisions)), widths, left=_LEAST, color=colors)
     axes.axvline(1, color="black", linewidth=1)
-    axes.set(xscale="log", xlim=(least, max(*parts, 10.0) * 30), title=title)
+    # The axis ends well to the right of the longest bar, so that the text beside it fits.
+    axes.set(xscale="log", xlim=(_LEAST, max(*in_thresholds, 10.0) * 30), title=title)
     axes.set_xlabel("value / threshold: right of the line it is called for")
-    axes.set_yticks(range(len(rows)), [d.name.replace("_", " ") for d in rows])
-    for k, (d, known) in enumerate(zip(rows, told, strict=True)):
-        said = f"{d.value:.3g} {d.unit}" if known else d.reason
-        axes.text(parts[k] * 1.2, k, f"{d.choice}: {said}", va="center", fontsize=7, backgroundcolor="white")
+    axes.set_yticks(range(len(decisions)), [d.name.replace("_", " ") for d in decisions])
+    for row, d in enumerate(decisions):
+        explanation = f"{d.value:.3g} {d.unit}" if measured[row] else d.reason
+        label = f"{d.choice}: {explanation}"
+        axes.text(in_thresholds[row] * 1.2, row, label, va="center", fontsize=7, backgroundcolor="white")
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()

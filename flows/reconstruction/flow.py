@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import logging
 import time
 from dataclasses import replace
@@ -12,20 +13,22 @@ from prefect.artifacts import create_image_artifact, create_table_artifact
 
 from flows.budget.budget import Budget
 from flows.budget.chooser import Chooser
-from flows.configuration import differences, load_configuration, validated
-from flows.pipeline.definition import BY_NAME, PIPELINE, RECONSTRUCTING, StageSpec
-from flows.pipeline.log_cache import chosen_chunks, expanded
-from flows.pipeline.progress import current_reporter
+from flows.configuration import diff_from_preset, load_configuration, validate_config
+from flows.pipeline.definition import PIPELINE, RECONSTRUCTION_STAGES, STAGE_BY_NAME, StageSpec
+from flows.pipeline.log_cache import expand_logs, select_chunks
+from flows.pipeline.progress import get_reporter
 from flows.pipeline.stage_runner import ArtifactRef, Job
 from flows.pipeline.stage_task import stage_task
-from flows.reconstruction.run_records import Run, finish_run, summary_of
+from flows.reconstruction.run_records import FinishedRun, summarise_run, write_run_record
 from flows.reconstruction.run_summary import RunSummary
+from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import GenreError, InputError
 from storage.local import open_store
 
 _log = logging.getLogger("genre")
 
 
+# Parameters are not validated by Prefect: the configuration's own models do it, and their errors say what to do.
 @flow(name="reconstruct-log", flow_run_name="{log}", persist_result=False, validate_parameters=False)
 def reconstruct_log(
     log: str,
@@ -35,114 +38,64 @@ def reconstruct_log(
     config: dict[str, Any] | None = None,
     settings: list[str] | None = None,
     budget_s: float | None = None,
-    began: float | None = None,
+    start_time: float | None = None,
     table: str | None = None,
 ) -> dict[str, Any]:
-    """Reconstructs and enhances one driving log, chunk by chunk; returns the run's summary as plain values.
+    """Reconstructs and enhances one driving log, chunk by chunk, and writes a report into the store.
+
+    With a budget, the most accurate setting that fits into the time is chosen, and again before each stage. A chunk
+    that cannot be reconstructed is left out; the others go on, and the error is raised at the end.
 
     Args:
-        log: ``pandaset:PATH/002`` or ``synthetic:street?seed=1000``.
-        preset: demo, small, long or paper. store: a folder or URI.
-        chunks: which chunks; all if None. config: a whole effective configuration (it overrides the preset's).
-        settings: ``section.key=value`` strings, applied last.
-        budget_s: seconds that the run may take from ``began`` on (since the epoch; the flow's start without it),
-            evaluation not counted: the most accurate setting of ``table`` (a sweep's cost.parquet; the preset's own
-            without it) that fits is chosen, and again before each stage.
+        log: the log's URI, such as ``pandaset:PATH/002`` or ``synthetic:street?seed=1000``.
+        preset: demo, small, fine, long or paper.
+        store: folder (or URI) of the store.
+        chunks: numbers of the chunks; ``None`` for all.
+        config: a whole effective configuration as JSON values, in place of the preset's.
+        settings: ``section.key=value`` strings over the preset; not used together with ``config``.
+        budget_s: seconds that the run may take from ``start_time`` on, evaluation not counted; ``None`` for no limit.
+        start_time: when the run began, in seconds since the epoch; ``None`` for now.
+        table: the cost.parquet that a budget chooses from; ``None`` for the table that ships with the preset.
 
-    A chunk that its input makes impossible is left out and the others go on; the error is raised at the end.
+    Returns:
+        The run's record as plain values, as ``run.json`` holds it.
+
+    Raises:
+        ConfigError: a setting is wrong, or no table fits to the budget.
+        InputError: the log or one of its chunks cannot be reconstructed.
+        GenreError: any other kind, as a stage raises it.
+
+    Example::
+
+        print(reconstruct_log("synthetic:street?seed=1000", preset="demo", store="genre-store")["report"])
     """
-    if config is None:
-        effective = load_configuration(preset, settings=settings or ())
-    else:
-        effective = validated(config, "parameters of the flow")
+    effective = _effective_config(preset, config, settings)
+    # A killed run may have left half-written folders behind; no artifact is among them.
+    open_store(store).clean_temporaries()
+    selected = select_chunks(log, effective, chunks)
+    budget = None if budget_s is None else Budget(budget_s, start_time, table, preset, effective)
     values = effective.model_dump(mode="json")
-    failed: list[GenreError] = []
-    done: dict[int, dict[str, ArtifactRef]] = {}
-    open_store(store).clean_temporaries()  # what killed runs left half-written
-    chosen = chosen_chunks(log, effective, chunks)
-    budget = None if budget_s is None else Budget(budget_s, began, table, preset, effective)
-    if budget is not None:
-        current_reporter().said(budget.told())
-    for k, chunk in enumerate(chosen):
-        job = Job(log, chunk, store, values)
-        try:
-            if budget is None:
-                done[chunk] = _reconstruct_chunk(job)
-            else:
-                done[chunk] = _reconstruct_within(job, budget.chooser(log, chunk), 1 / (len(chosen) - k))
-        except InputError as error:
-            if len(chosen) > 1:  # a single one raises below
-                _log.error("chunk %d is left out: %s", chunk, error)
-            failed.append(error)
-    if not done and failed:
-        raise failed[0]
-    notes = {} if budget is None else {chunk: budget.choosers[chunk].told() for chunk in done}
-    run = Run(log, preset, store, values, differences(effective, preset), done, notes)
-    summary = summary_of(run)
-    record = finish_run(run, summary, {} if budget is None else {"budget": budget.record()})
-    _publish(summary)
-    if failed:
-        raise failed[0]
+    done, failures = _reconstruct_chunks(log, store, values, selected, budget)
+    # Without any chunk there is nothing to report on.
+    if not done and failures:
+        raise failures[0]
+    notes = {} if budget is None else {chunk: budget.choosers[chunk].describe() for chunk in done}
+    run = FinishedRun(
+        log=log,
+        preset=preset,
+        store=store,
+        config=values,
+        differs=diff_from_preset(effective, preset),
+        chunks=done,
+        notes=notes,
+    )
+    summary = summarise_run(run)
+    record = write_run_record(run, summary, {} if budget is None else {"budget": budget.as_record()})
+    # After the record is written: if Prefect's server fails now, the run is complete nevertheless.
+    _publish_to_prefect(summary)
+    if failures:
+        raise failures[0]
     return record
-
-
-def _reconstruct_chunk(job: Job) -> dict[str, ArtifactRef]:
-    refs: dict[str, ArtifactRef] = {}
-    for spec in PIPELINE:
-        refs[spec.name] = _staged(spec, job, refs)
-    return refs
-
-
-def _reconstruct_within(job: Job, chooser: Chooser, share: float) -> dict[str, ArtifactRef]:
-    """As the chooser chooses: the scene may be GNet's. What is there is evaluated while the clock stands still."""
-    refs: dict[str, ArtifactRef] = {}
-    while True:
-        told, step = len(chooser.choices), chooser.next(share)
-        for choice in chooser.choices[told:]:
-            current_reporter().said(f"chunk {job.chunk}  before {choice.before}: {choice}")
-        if step is None:
-            break
-        stage, config = step
-        job, begun = replace(job, config=config.model_dump(mode="json")), time.monotonic()
-        refs[stage] = _staged(BY_NAME[stage], job, refs)
-        chooser.done(stage, time.monotonic() - begun, refs[stage].cached)
-    with chooser.clock.paused():
-        for spec in PIPELINE:
-            if spec.name not in RECONSTRUCTING and all(name in refs for name in spec.inputs):
-                refs[spec.name] = _staged(spec, job, refs)
-    return refs
-
-
-def _staged(spec: StageSpec, job: Job, refs: dict[str, ArtifactRef]) -> ArtifactRef:
-    inputs = {name: refs[name] for name in spec.inputs}
-    done: ArtifactRef = stage_task(spec.name, job.chunk, job, inputs, return_state=True).result()
-    return done
-
-
-def _publish(summary: RunSummary) -> None:
-    """Tables and pictures in Prefect's UI; the store has the same and more."""
-    for chunk in summary.chunks:
-        rows = [
-            {"stage": s.stage, "served": "cache" if s.cached else "computed", "seconds": round(s.seconds, 2)}
-            | {k: round(v, 4) for k, v in s.metrics.items()}
-            for s in chunk.stages
-        ]
-        create_table_artifact(table=rows, key=f"chunk-{chunk.chunk}", description=f"{summary.log}, chunk {chunk.chunk}")
-        for stage in chunk.stages:
-            for name, png in sorted(stage.pictures.items())[:1]:
-                create_image_artifact(
-                    image_url=_data_url(png), key=f"chunk-{chunk.chunk}-{_slug(stage.stage)}", description=name
-                )
-
-
-def _data_url(png: bytes) -> str:
-    import base64
-
-    return "data:image/png;base64," + base64.b64encode(png).decode()
-
-
-def _slug(text: str) -> str:
-    return "".join(c if c.isalnum() else "-" for c in text.lower())
 
 
 @flow(name="reconstruct-dataset", persist_result=False, validate_parameters=False)
@@ -152,18 +105,124 @@ def reconstruct_dataset(
     store: str = "genre-store",
     settings: list[str] | None = None,
 ) -> list[dict[str, Any]]:
-    """Reconstructs many logs, a child flow run each; a log that fails does not stop the others.
+    """Reconstructs many logs, each in a child flow run; a log that fails does not stop the others.
 
-    ``logs`` are URIs; ``pandaset:PATH/*`` stands for every sequence in a folder. Raises the first error at the end.
+    Args:
+        logs: URIs of logs; ``pandaset:PATH/*`` stands for every sequence in a folder.
+        preset: demo, small, fine, long or paper.
+        store: folder (or URI) of the store.
+        settings: ``section.key=value`` strings over the preset.
+
+    Returns:
+        The record of each log, in order.
+
+    Raises:
+        GenreError: the first error, once all logs were tried.
     """
-    summaries: list[dict[str, Any]] = []
-    failed: list[Exception] = []
-    for log in expanded(logs):
+    records: list[dict[str, Any]] = []
+    failures: list[Exception] = []
+    for log in expand_logs(logs):
         try:
-            summaries.append(reconstruct_log(log, preset=preset, store=store, settings=settings))
+            records.append(reconstruct_log(log, preset=preset, store=store, settings=settings))
         except GenreError as error:
             _log.error("%s failed: %s", log, error)
-            failed.append(error)
-    if failed:
-        raise failed[0]
-    return summaries
+            failures.append(error)
+    if failures:
+        raise failures[0]
+    return records
+
+
+def _effective_config(preset: str, config: dict[str, Any] | None, settings: list[str] | None) -> PipelineConfig:
+    if config is None:
+        return load_configuration(preset, settings=settings or ())
+    # The values may come from a worker's parameters, which anyone can write by hand.
+    return validate_config(config, "parameters of the flow")
+
+
+def _reconstruct_chunks(
+    log: str, store: str, config: dict[str, Any], chunks: list[int], budget: Budget | None
+) -> tuple[dict[int, dict[str, ArtifactRef]], list[GenreError]]:
+    """The references of every chunk that could be reconstructed, and the errors of those that could not."""
+    done: dict[int, dict[str, ArtifactRef]] = {}
+    failures: list[GenreError] = []
+    if budget is not None:
+        get_reporter().message(budget.describe())
+    for position, chunk in enumerate(chunks):
+        job = Job(log, chunk, store, config)
+        try:
+            if budget is None:
+                done[chunk] = _reconstruct_chunk(job)
+            else:
+                # Chunks that are not begun yet share the time that is left equally.
+                fraction = 1 / (len(chunks) - position)
+                done[chunk] = _reconstruct_within(job, budget.make_chooser(log, chunk), fraction)
+        except InputError as error:
+            # With a single chunk the error itself is the message: the caller raises it.
+            if len(chunks) > 1:
+                _log.error("chunk %d is left out: %s", chunk, error)
+            failures.append(error)
+    return done, failures
+
+
+def _reconstruct_chunk(job: Job) -> dict[str, ArtifactRef]:
+    refs: dict[str, ArtifactRef] = {}
+    for spec in PIPELINE:
+        refs[spec.name] = _run_stage_task(spec, job, refs)
+    return refs
+
+
+def _reconstruct_within(job: Job, chooser: Chooser, fraction: float) -> dict[str, ArtifactRef]:
+    """Runs the stages that the chooser names; the last scene may be GNet's. Evaluation stops the deadline's count."""
+    refs: dict[str, ArtifactRef] = {}
+    while True:
+        reported = len(chooser.choices)
+        step = chooser.next_stage(fraction)
+        for choice in chooser.choices[reported:]:
+            get_reporter().message(f"chunk {job.chunk}  before {choice.before}: {choice}")
+        if step is None:
+            break
+        stage, config = step
+        # From here on the stages are made with the setting that fits now; finished ones are the same in both.
+        job = replace(job, config=config.model_dump(mode="json"))
+        start = time.monotonic()
+        refs[stage] = _run_stage_task(STAGE_BY_NAME[stage], job, refs)
+        chooser.record_stage(stage, time.monotonic() - start, refs[stage].cached)
+    # Evaluation is no part of what a budget buys, so its time does not count.
+    with chooser.deadline.paused():
+        for spec in PIPELINE:
+            if spec.name not in RECONSTRUCTION_STAGES and all(name in refs for name in spec.inputs):
+                refs[spec.name] = _run_stage_task(spec, job, refs)
+    return refs
+
+
+def _run_stage_task(spec: StageSpec, job: Job, refs: dict[str, ArtifactRef]) -> ArtifactRef:
+    inputs = {name: refs[name] for name in spec.inputs}
+    # By way of the state, as the task may end in a state of its own, which is named Cached.
+    ref: ArtifactRef = stage_task(spec.name, job.chunk, job, inputs, return_state=True).result()
+    return ref
+
+
+def _publish_to_prefect(summary: RunSummary) -> None:
+    """Shows tables and a few pictures in Prefect's UI; the report has all of them."""
+    for chunk in summary.chunks:
+        rows = [
+            {"stage": s.stage, "served": "cache" if s.cached else "computed", "seconds": round(s.seconds, 2)}
+            | {name: round(value, 4) for name, value in s.metrics.items()}
+            for s in chunk.stages
+        ]
+        create_table_artifact(table=rows, key=f"chunk-{chunk.chunk}", description=f"{summary.log}, chunk {chunk.chunk}")
+        for stage in chunk.stages:
+            # One picture of a stage is enough: Prefect keeps it as text in its database.
+            for name, png in sorted(stage.pictures.items())[:1]:
+                create_image_artifact(
+                    image_url=_data_url(png), key=f"chunk-{chunk.chunk}-{_slug(stage.stage)}", description=name
+                )
+
+
+def _data_url(png: bytes) -> str:
+    return "data:image/png;base64," + base64.b64encode(png).decode()
+
+
+def _slug(text: str) -> str:
+    # Keys of Prefect's artifacts allow lower-case letters, digits and dashes alone.
+    return "".join(character if character.isalnum() else "-" for character in text.lower())

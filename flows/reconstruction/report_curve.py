@@ -9,10 +9,22 @@ from flows.reconstruction.run_summary import ChunkSummary
 
 LABELS = {"gnet": "GNet", "enet": "ENet"}
 
+# The area of the axes in the SVG of 640 × 300; what is left and below holds the labels of the ticks.
+_LEFT = 48.0
+_RIGHT = 628.0
+_TOP = 16.0
+_BOTTOM = 256.0
+
 
 @dataclass(frozen=True)
 class Line:
-    """One stage's points: x and y in the SVG, and what to say of each."""
+    """The line of one stage.
+
+    Attributes:
+        name: the stage's name.
+        label: the stage's name for readers.
+        points: (x, y, tooltip) in the coordinates of the SVG.
+    """
 
     name: str
     label: str
@@ -20,13 +32,23 @@ class Line:
 
     @property
     def path(self) -> str:
-        """The points as SVG writes them."""
+        """The points as an SVG polyline lists them.
+
+        >>> Line("gnet", "GNet", ((48.0, 256.0, "start"), (60.5, 200.0, "end"))).path
+        '48,256 60.5,200'
+        """
         return " ".join(f"{x:g},{y:g}" for x, y, _ in self.points)
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Lines, and ticks as (coordinate, label) on both axes, in an SVG of 640 × 300."""
+    """The plot, in the coordinates of an SVG of 640 × 300.
+
+    Attributes:
+        lines: one line for each stage.
+        x: (coordinate, label) of the ticks on the horizontal axis, seconds.
+        y: (coordinate, label) of the ticks on the vertical axis, dB.
+    """
 
     lines: tuple[Line, ...]
     x: tuple[tuple[float, str], ...]
@@ -34,53 +56,66 @@ class Curve:
 
 
 def accuracy_curve(chunk: ChunkSummary) -> Curve | None:
-    """The plot of held-out PSNR against seconds of iterations: GNet, then ENet where GNet ended.
+    """Plots held-out PSNR against the seconds of iterations: GNet's line, and ENet's from where GNet's ended.
 
-    ``None`` with fewer than two points. Coordinates are in an SVG of 640 × 300.
+    Args:
+        chunk: a chunk whose stages may have a ``curve``.
+
+    Returns:
+        The plot, or ``None`` with fewer than two points.
     """
-    lines = _curve_lines(chunk)
-    points = [p for _, line in lines for p in line]
+    lines = _cumulative_lines(chunk)
+    points = [point for _, line in lines for point in line]
+    # A single point makes no line.
     if len(points) < 2:
         return None
-    ticks_x = _ticks(0.0, max(x for x, _ in points))
-    ticks_y = _ticks(min(y for _, y in points), max(y for _, y in points))
-    left, right, top, bottom = 48.0, 628.0, 16.0, 256.0
+    ticks_x = _round_ticks(0.0, max(seconds for seconds, _ in points))
+    ticks_y = _round_ticks(min(psnr for _, psnr in points), max(psnr for _, psnr in points))
 
-    def place(x: float, y: float) -> tuple[float, float]:
-        across = (x - ticks_x[0]) / (ticks_x[-1] - ticks_x[0])
-        up = (y - ticks_y[0]) / (ticks_y[-1] - ticks_y[0])
-        return round(left + across * (right - left), 1), round(bottom - up * (bottom - top), 1)
+    def to_svg(seconds: float, psnr: float) -> tuple[float, float]:
+        across = (seconds - ticks_x[0]) / (ticks_x[-1] - ticks_x[0])
+        up = (psnr - ticks_y[0]) / (ticks_y[-1] - ticks_y[0])
+        # A tenth of a pixel is enough; more digits would only make the page longer.
+        return round(_LEFT + across * (_RIGHT - _LEFT), 1), round(_BOTTOM - up * (_BOTTOM - _TOP), 1)
 
-    placed = []
+    svg_lines = []
     for name, line in lines:
-        marks = tuple((*place(x, y), f"{LABELS[name]}: {y:.2f} dB after {x:.1f} s") for x, y in line)
-        placed.append(Line(name, LABELS[name], marks))
-    across = tuple((place(x, ticks_y[0])[0], f"{x:g}") for x in ticks_x)
-    up = tuple((place(ticks_x[0], y)[1], f"{y:g}") for y in ticks_y)
-    return Curve(tuple(placed), across, up)
+        label = LABELS[name]
+        svg_points = tuple((*to_svg(s, psnr), f"{label}: {psnr:.2f} dB after {s:.1f} s") for s, psnr in line)
+        svg_lines.append(Line(name, label, svg_points))
+    labels_x = tuple((to_svg(seconds, ticks_y[0])[0], f"{seconds:g}") for seconds in ticks_x)
+    labels_y = tuple((to_svg(ticks_x[0], psnr)[1], f"{psnr:g}") for psnr in ticks_y)
+    return Curve(tuple(svg_lines), labels_x, labels_y)
 
 
-def _curve_lines(chunk: ChunkSummary) -> list[tuple[str, list[tuple[float, float]]]]:
-    """Lines in cumulative seconds; each begins where the one before ended, the first one at the initial scene."""
+def _cumulative_lines(chunk: ChunkSummary) -> list[tuple[str, list[tuple[float, float]]]]:
+    """(seconds, PSNR) by stage; a line begins where the one before ended, the first one at the initial scene."""
     initial = chunk.stage("initial")
-    start = [(0.0, y) for _, y in initial.curve[-1:]] if initial else []
+    start = [(0.0, psnr) for _, psnr in initial.curve[-1:]] if initial else []
     lines = []
     for name in ("gnet", "enet"):
         stage = chunk.stage(name)
-        points = [(x, y) for x, y in stage.curve if math.isfinite(x) and math.isfinite(y)] if stage else []
+        curve = stage.curve if stage else ()
+        points = [(seconds, psnr) for seconds, psnr in curve if math.isfinite(seconds) and math.isfinite(psnr)]
         if points:
-            offset = start[-1][0] if start else 0.0
-            line = [p for p in start if points[0][0] > 0] + [(x + offset, y) for x, y in points]
+            offset_s = start[-1][0] if start else 0.0
+            # A stage that measured its own scene before the first iteration needs no point of the stage before.
+            line = [point for point in start if points[0][0] > 0]
+            line += [(seconds + offset_s, psnr) for seconds, psnr in points]
             lines.append((name, line))
+            # The next stage begins with the scene that this one ended with.
             start = line[-1:]
     return lines
 
 
-def _ticks(low: float, high: float) -> list[float]:
+def _round_ticks(low: float, high: float) -> list[float]:
     """About five round numbers that enclose [low, high]."""
+    # A flat curve would otherwise have ticks at a distance of 0.
     span = max(high - low, 1e-3)
-    raw = span / 4
-    unit = 10 ** math.floor(math.log10(raw))
-    step = next(m * unit for m in (1, 2, 2.5, 5, 10) if m * unit >= raw * 0.999)
-    first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
+    wanted_step = span / 4
+    unit = 10 ** math.floor(math.log10(wanted_step))
+    # The tolerances keep a step that fits exactly from being skipped for the error of its last bit.
+    step = next(m * unit for m in (1, 2, 2.5, 5, 10) if m * unit >= wanted_step * 0.999)
+    first = math.floor(low / step + 1e-9)
+    last = math.ceil(high / step - 1e-9)
     return [round(k * step, 10) for k in range(first, max(last, first + 1) + 1)]

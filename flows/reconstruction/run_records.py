@@ -1,16 +1,18 @@
-"""Finished runs: their summary, their record beside the artifacts, and how to get a stage's value back."""
+"""Finished runs: their summary, their record in the store, and how to read a stage's value again."""
 
 from __future__ import annotations
 
+import hashlib
+import io
 import itertools
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flows.pipeline.definition import PIPELINE
-from flows.pipeline.stage_runner import ArtifactRef, run_id
+from flows.pipeline.stage_runner import ArtifactRef
 from flows.reconstruction.run_summary import ChunkSummary, RunSummary, StageSummary
 from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import InputError
@@ -18,19 +20,31 @@ from storage.address import Address
 from storage.local import open_store
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from genre_tasks.metrics.results import Evaluation, Metric
+    from genre_tasks.scene.chunk import Chunk
     from genre_tasks.scene.graph import SceneGraph
     from storage.local import Artifact
 
 _FOLDER = "runs"
-SCENES = ("initial", "gnet", "enet")
+SCENE_STAGES = ("initial", "gnet", "enet")
 """The stages that make a scene, in their order."""
 
 
 @dataclass(frozen=True)
-class Run:
+class FinishedRun:
     """A finished run: what was asked for, and the references of every stage of every chunk.
 
-    ``notes``, by chunk, are shown with it: what it was made with, where that is not what was asked for.
+    Attributes:
+        log: the log's URI.
+        preset: the preset that the run started from.
+        store: folder (or URI) of the store.
+        config: the whole effective configuration, as JSON values.
+        differs: (the preset's value, the value used) of each ``section.key`` that was set otherwise.
+        chunks: references by chunk and stage.
+        notes: by chunk, what it was made with if that is not what was asked for.
     """
 
     log: str
@@ -43,17 +57,32 @@ class Run:
 
     @property
     def name(self) -> str:
-        """The same for runs that made (or found) the same artifacts."""
-        keys = {f"{c}/{s}": ref.key for c, refs in self.chunks.items() for s, ref in refs.items()}
-        return run_id(self.log, self.preset, keys)
+        """Twelve hex digits, the same for runs that made (or found) the same artifacts."""
+        # Keys and no time: a run that finds everything in the cache has the same name and replaces its own record.
+        keys = {f"{chunk}/{stage}": ref.key for chunk, refs in self.chunks.items() for stage, ref in refs.items()}
+        text = "\n".join([self.log, self.preset, *(f"{name}={key}" for name, key in sorted(keys.items()))])
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
 
     @property
     def folder(self) -> Path:
+        """The folder of the run's record and report."""
         return open_store(self.store).root / _FOLDER / self.name
 
 
-def finish_run(run: Run, summary: RunSummary, more: Mapping[str, Any]) -> dict[str, Any]:
-    """Writes the run's record, ``more`` in it, and its report into the store; returns the record."""
+def write_run_record(run: FinishedRun, summary: RunSummary, extra: Mapping[str, Any]) -> dict[str, Any]:
+    """Writes a run's record (``run.json``) and its report (``report.html``) into the store.
+
+    Args:
+        run: the finished run.
+        summary: what the report shows.
+        extra: more entries of the record, such as ``budget``.
+
+    Returns:
+        The record, as plain values.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
     from flows.reconstruction.report import write_report
 
     run.folder.mkdir(parents=True, exist_ok=True)
@@ -70,97 +99,224 @@ def finish_run(run: Run, summary: RunSummary, more: Mapping[str, Any]) -> dict[s
             {
                 "chunk": chunk.chunk,
                 "warnings": list(chunk.warnings),
-                "stages": [
-                    {
-                        "stage": s.stage,
-                        "key": s.key,
-                        "cached": s.cached,
-                        "seconds": s.seconds,
-                        "peak_mib": s.peak_mib,
-                        "metrics": s.metrics,
-                    }
-                    for s in chunk.stages
-                ],
+                "stages": [_stage_record(stage) for stage in chunk.stages],
             }
             for chunk in summary.chunks
         ],
-        **more,
+        **extra,
     }
+    # Written last: a folder without run.json belongs to a run that did not end.
     with atomic_path(run.folder / "run.json") as part:
         part.write_text(json.dumps(record, indent=1))
     return record
 
 
-def summary_of(run: Run) -> RunSummary:
-    """What the report and the tables show, read from the store's manifests and evaluation artifacts."""
-    chunks = tuple(_chunk_summary(run, chunk, refs) for chunk, refs in sorted(run.chunks.items()))
+def summarise_run(run: FinishedRun) -> RunSummary:
+    """Gathers what the report and the tables show from the store's manifests and evaluation artifacts.
+
+    Args:
+        run: the finished run.
+
+    Returns:
+        The summary, chunk by chunk.
+
+    Raises:
+        InputError: an artifact of the run is gone.
+        ArtifactCorruptError: an evaluation artifact is damaged.
+    """
+    chunks = tuple(_summarise_chunk(run, chunk, refs) for chunk, refs in sorted(run.chunks.items()))
     return RunSummary(run=run.name, log=run.log, preset=run.preset, store=run.store, chunks=chunks, differs=run.differs)
 
 
-def _chunk_summary(run: Run, chunk: int, refs: dict[str, ArtifactRef]) -> ChunkSummary:
-    store = open_store(run.store)
-    found = {name: _found(run.store, ref) for name, ref in refs.items()}
-    stages = []
-    for spec in (s for s in PIPELINE if s.name in found):
-        manifest = found[spec.name].manifest
-        metrics: dict[str, float] = {}
-        pictures: dict[str, bytes] = {}
-        intervals: dict[str, tuple[float, float]] = {}
-        curve: tuple[tuple[float, float], ...] = ()
-        if f"evaluate/{spec.name}" in found:
-            evaluation = store.read(found[f"evaluate/{spec.name}"])
-            metrics = _with_counts(evaluation.metrics)
-            intervals = {
-                m.name: (m.low, m.high) for m in evaluation.metrics if m.low is not None and m.high is not None
-            }
-            pictures = {name: _png(image) for name, image in evaluation.pictures.items()}
-            curve = _against_seconds(evaluation.curve, manifest.measurements.get("seconds_per_iteration", ()))
-        stages.append(
-            StageSummary(
-                stage=spec.name,
-                key=manifest.key,
-                cached=refs[spec.name].cached,
-                seconds=manifest.seconds,
-                peak_mib=manifest.peak_mib,
-                metrics=metrics,
-                pictures=pictures,
-                curve=curve,
-                warnings=manifest.warnings,
-                intervals=intervals,
-            )
+def list_runs(store: str) -> list[dict[str, Any]]:
+    """Reads the records of all finished runs of a store.
+
+    Args:
+        store: folder (or URI) of the store.
+
+    Returns:
+        The records, oldest first.
+    """
+    # The time of the file is when the run ended; the record itself holds no time.
+    paths = sorted((open_store(store).root / _FOLDER).glob("*/run.json"), key=lambda path: path.stat().st_mtime)
+    return [json.loads(path.read_text()) for path in paths]
+
+
+def read_stage_value(store: str, run: str, chunk: int | None, stage: str) -> tuple[int, Any]:
+    """Reads the value of a stage of a finished run.
+
+    Args:
+        store: folder (or URI) of the store.
+        run: the run's name, or the start of it.
+        chunk: number of the chunk; ``None`` for the run's first one.
+        stage: the stage's name.
+
+    Returns:
+        The number of the chunk, and the stage's value.
+
+    Raises:
+        InputError: there is no such run, chunk or stage, or the artifact is gone.
+        ArtifactCorruptError: the artifact is damaged.
+    """
+    record = _find_record(store, run)
+    stages_by_chunk = {c["chunk"]: c["stages"] for c in record["chunks"]}
+    number = min(stages_by_chunk) if chunk is None else chunk
+    if number not in stages_by_chunk:
+        raise InputError(
+            f"the run has no chunk {number}", remedy=f"It has {sorted(stages_by_chunk)}.", log=record["log"]
         )
+    keys = {s["stage"]: s["key"] for s in stages_by_chunk[number]}
+    if stage not in keys:
+        raise InputError(f"the run has no stage '{stage}'", remedy=f"It has {', '.join(keys)}.", stage=stage)
+    opened = open_store(store)
+    # A key is unique, so the first artifact is the one.
+    for artifact in opened.artifacts(key=keys[stage]):
+        return number, opened.read(artifact)
+    raise InputError("the artifact is gone", remedy="Run the log again.", log=record["log"], stage=stage)
+
+
+def read_stage_scene(store: str, run: str, chunk: int, stage: str) -> SceneGraph:
+    """Reads the scene that a stage of a finished run has made.
+
+    Args:
+        store: folder (or URI) of the store.
+        run: the run's name, or the start of it.
+        chunk: number of the chunk.
+        stage: initial, gnet or enet.
+
+    Returns:
+        The scene.
+
+    Raises:
+        InputError: the stage makes no scene, or as :func:`read_stage_value` raises it.
+        ArtifactCorruptError: the artifact is damaged.
+    """
+    if stage not in SCENE_STAGES:
+        raise InputError(
+            f"the stage {stage} makes no scene", remedy=f"Those do: {', '.join(SCENE_STAGES)}.", stage=stage
+        )
+    scene: SceneGraph = read_stage_value(store, run, chunk, stage)[1].scene
+    return scene
+
+
+def find_last_stage(store: str, run: str, chunk: int) -> str:
+    """Finds the stage whose scene is the result of a run's chunk.
+
+    Args:
+        store: folder (or URI) of the store.
+        run: the run's name, or the start of it.
+        chunk: number of the chunk.
+
+    Returns:
+        ``enet``, or an earlier stage where a budget ended the run before it.
+
+    Raises:
+        InputError: there is no such run.
+    """
+    record = _find_record(store, run)
+    stages = {s["stage"] for c in record["chunks"] if c["chunk"] == chunk for s in c["stages"]}
+    # A budget may have ended the run with an earlier scene.
+    return next(name for name in reversed(SCENE_STAGES) if name in stages)
+
+
+def read_next_scene(store: str, run: str, chunk: int, stage: str | None) -> tuple[Chunk, SceneGraph] | None:
+    """Reads the chunk that follows another one, and its scene.
+
+    Args:
+        store: folder (or URI) of the store.
+        run: the run's name, or the start of it.
+        chunk: number of the chunk before.
+        stage: the stage whose scene is read; ``None`` for the last one of that chunk.
+
+    Returns:
+        The next chunk and its scene, or ``None`` if the run does not have that chunk.
+
+    Raises:
+        InputError: as :func:`read_stage_value` raises it.
+        ArtifactCorruptError: an artifact is damaged.
+    """
+    following = chunk + 1
+    if following not in {c["chunk"] for c in _find_record(store, run)["chunks"]}:
+        return None
+    name = stage or find_last_stage(store, run, following)
+    _, ingested = read_stage_value(store, run, following, "ingest")
+    return ingested, read_stage_scene(store, run, following, name)
+
+
+def _stage_record(stage: StageSummary) -> dict[str, Any]:
+    return {
+        "stage": stage.stage,
+        "key": stage.key,
+        "cached": stage.cached,
+        "seconds": stage.seconds,
+        "peak_mib": stage.peak_mib,
+        "metrics": stage.metrics,
+    }
+
+
+def _summarise_chunk(run: FinishedRun, chunk: int, refs: dict[str, ArtifactRef]) -> ChunkSummary:
+    store = open_store(run.store)
+    artifacts = {name: _find_by_path(run.store, ref) for name, ref in refs.items()}
+    stages = []
+    for spec in PIPELINE:
+        if spec.name not in artifacts:
+            continue
+        evaluated = artifacts.get(f"evaluate/{spec.name}")
+        evaluation = None if evaluated is None else store.read(evaluated)
+        stages.append(_summarise_stage(artifacts[spec.name], refs[spec.name].cached, evaluation))
     notes = (run.notes[chunk],) if chunk in run.notes else ()
-    return ChunkSummary(chunk=chunk, stages=tuple(stages), warnings=(*notes, *_marks(found["ingest"])))
+    # What the log lacks was found once, when the chunk was ingested.
+    issues = artifacts["ingest"].manifest.measurements.get("marks", ())
+    return ChunkSummary(chunk=chunk, stages=tuple(stages), warnings=(*notes, *(str(issue) for issue in issues)))
 
 
-def _with_counts(metrics: Any) -> dict[str, float]:
+def _summarise_stage(artifact: Artifact, cached: bool, evaluation: Evaluation | None) -> StageSummary:
+    manifest = artifact.manifest
+    summary = StageSummary(
+        stage=manifest.stage,
+        key=manifest.key,
+        cached=cached,
+        seconds=manifest.seconds,
+        peak_mib=manifest.peak_mib,
+        warnings=manifest.warnings,
+    )
+    # Stages that make no image, such as ingest, are not evaluated.
+    if evaluation is None:
+        return summary
+    return replace(
+        summary,
+        metrics=_metrics_with_counts(evaluation.metrics),
+        pictures={name: _encode_png(image) for name, image in evaluation.pictures.items()},
+        curve=_curve_over_seconds(evaluation.curve, manifest.measurements.get("seconds_per_iteration", ())),
+        intervals={m.name: (m.low, m.high) for m in evaluation.metrics if m.low is not None and m.high is not None},
+    )
+
+
+def _metrics_with_counts(metrics: Sequence[Metric]) -> dict[str, float]:
     """Metric values by name, and for each group of them the number of images as ``…/n``."""
-    out = {m.name: m.value for m in metrics}
-    return out | {m.name.rpartition("/")[0] + "/n": float(m.n) for m in metrics}
+    values = {metric.name: metric.value for metric in metrics}
+    return values | {metric.name.rpartition("/")[0] + "/n": float(metric.n) for metric in metrics}
 
 
-def _marks(ingested: Artifact) -> tuple[str, ...]:
-    marks = ingested.manifest.measurements.get("marks", ())
-    return tuple(str(m) for m in marks)
+def _curve_over_seconds(
+    curve: Iterable[tuple[int, float]], seconds_per_iteration: Iterable[float]
+) -> tuple[tuple[float, float], ...]:
+    spent_s = [0.0, *itertools.accumulate(seconds_per_iteration)]
+    # An artifact of an earlier version may have kept the curve without the seconds.
+    return tuple((spent_s[iteration], psnr) for iteration, psnr in curve if iteration < len(spent_s))
 
 
-def _against_seconds(curve: Any, seconds: Any) -> tuple[tuple[float, float], ...]:
-    spent = [0.0, *itertools.accumulate(seconds)]
-    return tuple((spent[iteration], psnr) for iteration, psnr in curve if iteration < len(spent))
-
-
-def _png(image: Any) -> bytes:
-    import io
-
+def _encode_png(image: NDArray[np.uint8]) -> bytes:
     from PIL import Image
 
-    out = io.BytesIO()
-    Image.fromarray(image).save(out, format="PNG")
-    return out.getvalue()
+    encoded = io.BytesIO()
+    Image.fromarray(image).save(encoded, format="PNG")
+    return encoded.getvalue()
 
 
-def _found(store: str, ref: ArtifactRef) -> Artifact:
+def _find_by_path(store: str, ref: ArtifactRef) -> Artifact:
     opened = open_store(store)
+    # dataset / log / chunk / stage (which may hold a slash) / key, as storage.address lays folders out.
     parts = Path(ref.path).relative_to(opened.root).parts
     address = Address(parts[0], parts[1], int(parts[2]), "/".join(parts[3:-1]), parts[-1])
     artifact = opened.find(address)
@@ -169,56 +325,10 @@ def _found(store: str, ref: ArtifactRef) -> Artifact:
     return artifact
 
 
-def recorded_runs(store: str) -> list[dict[str, Any]]:
-    """The records of all finished runs of a store, oldest first."""
-    paths = sorted((open_store(store).root / _FOLDER).glob("*/run.json"), key=lambda p: p.stat().st_mtime)
-    return [json.loads(path.read_text()) for path in paths]
-
-
-def _record(store: str, run: str) -> dict[str, Any]:
-    found = [r for r in recorded_runs(store) if r["run"].startswith(run)]
+def _find_record(store: str, run: str) -> dict[str, Any]:
+    found = [record for record in list_runs(store) if record["run"].startswith(run)]
     if len(found) != 1:
         raise InputError(
             f"{len(found)} runs of this store begin with '{run}'", remedy="`genre show runs` lists them.", file=store
         )
     return found[0]
-
-
-def stage_value(store: str, run: str, chunk: int | None, stage: str) -> tuple[int, Any]:
-    """The chunk's number and the value of one of its stages, for a run named by (the start of) its name."""
-    record = _record(store, run)
-    chunks = {c["chunk"]: c["stages"] for c in record["chunks"]}
-    number = min(chunks) if chunk is None else chunk
-    if number not in chunks:
-        raise InputError(f"the run has no chunk {number}", remedy=f"It has {sorted(chunks)}.", log=record["log"])
-    keys = {s["stage"]: s["key"] for s in chunks[number]}
-    if stage not in keys:
-        raise InputError(f"the run has no stage '{stage}'", remedy=f"It has {', '.join(keys)}.", stage=stage)
-    opened = open_store(store)
-    for artifact in opened.artifacts(key=keys[stage]):
-        return number, opened.read(artifact)
-    raise InputError("the artifact is gone", remedy="Run the log again.", log=record["log"], stage=stage)
-
-
-def stage_scene(store: str, run: str, chunk: int, stage: str) -> SceneGraph:
-    """The scene that a stage has made. Raises ``InputError`` for a stage that makes none."""
-    if stage not in SCENES:
-        raise InputError(f"the stage {stage} makes no scene", remedy=f"Those do: {', '.join(SCENES)}.", stage=stage)
-    scene: SceneGraph = stage_value(store, run, chunk, stage)[1].scene
-    return scene
-
-
-def last_stage(store: str, run: str, chunk: int) -> str:
-    """The stage whose scene is the result of a run's chunk: enet, or gnet where nothing was distilled."""
-    record = _record(store, run)
-    stages = {s["stage"] for c in record["chunks"] if c["chunk"] == chunk for s in c["stages"]}
-    return next(name for name in reversed(SCENES) if name in stages)
-
-
-def next_scene(store: str, run: str, chunk: int, stage: str | None) -> tuple[Any, Any] | None:
-    """The chunk after ``chunk`` and its scene after ``stage`` (its last one without it), where the run has both."""
-    chunks = {c["chunk"] for c in _record(store, run)["chunks"]}
-    if chunk + 1 not in chunks:
-        return None
-    name = stage or last_stage(store, run, chunk + 1)
-    return stage_value(store, run, chunk + 1, "ingest")[1], stage_scene(store, run, chunk + 1, name)

@@ -1,4 +1,8 @@
-"""Checkpoints of meta-training that resume to the same bytes: weights, optimiser, pool, generator, samplers."""
+"""Checkpoints of meta-training, from which it goes on to the same bytes as without an interruption.
+
+One file in safetensors holds the weights, Adam's state, the pool of episodes and the generator; its metadata describe
+them in JSON. Names in the file are those of older versions where these differ, so that old checkpoints still resume.
+"""
 
 from __future__ import annotations
 
@@ -11,135 +15,196 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from genre_tasks.atomic_path import write_atomically
 from genre_tasks.errors import InputError
-from genre_tasks.learned.meta_episodes import Course, Episode
-from genre_tasks.learned.network import NetworkConfig
-from genre_tasks.optimiser.objective import Sight
+from genre_tasks.learned.meta_episodes import Episode, EpisodeConfig
 from genre_tasks.learned.meta_training import MetaTraining
-from genre_tasks.learned.weights import write_atomically
+from genre_tasks.learned.network import NetworkConfig
+from genre_tasks.optimiser.gradients import Gradients
+from genre_tasks.optimiser.objective import LossAndGradients
 
-STATE = ("offsets", "first", "second", "seen", "seen_now")
+STATE_NAMES = {
+    "offsets": "offsets",
+    "first": "first_moment",
+    "second": "second_moment",
+    "seen": "visit_count",
+    "seen_now": "visible",
+}
+"""Name of a tensor in the file → attribute of ``State``."""
 
+HELD_OUT_VIEWS = "judges"
+"""What the file calls ``EpisodeConfig.held_out_views``."""
 
+ADAM_NAMES = ("step", "exp_avg", "exp_avg_sq")
 REMEDY = "Train with the same settings, or into an empty folder."
 
 
 def save(training: MetaTraining, path: Path, origin: Mapping[str, str] | None = None) -> None:
-    """One file, complete or not at all. ``origin``: what else the training depends on, name → digest."""
+    """Writes a checkpoint as one file, complete or not at all.
+
+    Args:
+        training: between two weight updates.
+        path: of the file.
+        origin: what else the training depends on, name → digest; :func:`resume` compares it.
+    """
     from safetensors.torch import save as serialise
 
-    tensors = {f"weights.{k}": v for k, v in training.network.state_dict().items()}
-    for name, value in _moments(training):
+    tensors = {f"weights.{name}": value for name, value in training.network.state_dict().items()}
+    for name, value in _adam_tensors(training):
         tensors[f"optimiser.{name}"] = value
     tensors["generator"] = training.generator.get_state()
     for i, episode in enumerate(training.pool):
-        tensors |= {f"pool.{i}.{name}": getattr(episode.state, name) for name in STATE}
-        if episode.sight is not None:
-            tensors[f"pool.{i}.gradient"] = episode.sight.gradient
-            if episode.sight.residuals is not None:
-                tensors[f"pool.{i}.residuals"] = episode.sight.residuals
-    described = {
+        tensors |= {f"pool.{i}.{name}": value for name, value in _episode_tensors(episode).items()}
+    description = {
         "done": training.done,
-        "scenes": [s.name for s in training.scenes],
-        "config": training.config.model_dump(mode="json"),
-        "network": training.network.config.model_dump(mode="json"),
+        **_describe_settings(training),
         "origin": dict(origin or {}),
-        "pool": [_described(e) for e in training.pool],
+        "pool": [_describe_episode(episode) for episode in training.pool],
     }
-    own = {k: v.detach().clone().contiguous() for k, v in tensors.items()}
-    write_atomically(path, serialise(own, {"training": json.dumps(described)}))
+    # Clones, because safetensors refuses tensors that share memory, as the moments of a new state do.
+    copies = {name: value.detach().clone().contiguous() for name, value in tensors.items()}
+    write_atomically(path, serialise(copies, {"training": json.dumps(description)}))
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """What the checkpoint says of itself: ``done`` updates, ``config``, ``network``, ``scenes``, ``origin``, ``pool``.
+    """Reads what a checkpoint says of itself.
 
-    Raises ``InputError`` where it is no checkpoint.
+    Args:
+        path: of the file.
+
+    Returns:
+        ``done`` updates, ``config``, ``network``, ``scenes``, ``origin`` and ``pool``.
+
+    Raises:
+        InputError: the file is no checkpoint.
     """
     from safetensors import SafetensorError, safe_open
 
     try:
         with safe_open(path, "pt") as file:
-            described: dict[str, Any] = json.loads((file.metadata() or {})["training"])
-        described["network"] = NetworkConfig(**described["network"]).model_dump(mode="json")  # older ones say less
+            description: dict[str, Any] = json.loads((file.metadata() or {})["training"])
+        # Older checkpoints lack settings that have since been added; they mean the defaults.
+        description["network"] = NetworkConfig(**description["network"]).model_dump(mode="json")
     except (SafetensorError, OSError, KeyError, ValueError) as error:
         raise InputError(
             f"The checkpoint cannot be read: {error}", remedy="Delete it to train the stage anew.", file=path
         ) from error
-    return described
+    return description
 
 
 def resume(training: MetaTraining, path: Path, origin: Mapping[str, str] | None = None) -> None:
-    """Takes ``training``, made anew with the same network, scenes and configuration, to where ``path`` was saved.
+    """Takes a new training to where a checkpoint was saved.
 
-    Raises ``InputError`` where it was saved with others, or is no checkpoint.
+    Args:
+        training: made with the same network, scenes and configuration; changed in place.
+        path: of the checkpoint.
+        origin: as for :func:`save`.
+
+    Raises:
+        InputError: the checkpoint was saved with others, or is none.
     """
-    from safetensors import safe_open
-
-    described = describe(path)
-    now = {
-        "scenes": [s.name for s in training.scenes],
-        "config": training.config.model_dump(mode="json"),
-        "network": training.network.config.model_dump(mode="json"),
-    }
-    changed = [name for name, value in now.items() if described[name] != value]
-    changed += [name for name, value in (origin or {}).items() if described["origin"].get(name) != value]
-    if changed:
-        raise InputError(
-            f"The checkpoint was made with other {' and '.join(dict.fromkeys(changed))}", remedy=REMEDY, file=path
-        )
-    device = next(training.network.parameters()).device
-    with safe_open(path, "pt") as file:
-        tensors = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118 - not a dictionary
-    # Adam counts its steps, and generators keep their state, on the CPU.
-    tensors = {
-        k: v if k == "generator" or k.startswith("optimiser.step.") else v.to(device) for k, v in tensors.items()
-    }
-    training.network.load_state_dict({k.removeprefix("weights."): v for k, v in _under(tensors, "weights.")})
-    _restore_moments(training, dict(_under(tensors, "optimiser.")))
-    training.done = described["done"]
+    description = describe(path)
+    # Before anything is changed: a refused checkpoint leaves the new training as it was.
+    _check_settings(training, description, path, origin or {})
+    tensors = _read_tensors(path, next(training.network.parameters()).device)
+    training.network.load_state_dict(_with_prefix(tensors, "weights."))
+    _restore_adam(training, _with_prefix(tensors, "optimiser."))
+    training.done = description["done"]
     training.pool = []
-    for i, entry in enumerate(described["pool"]):
-        training.pool.append(_episode(training, entry, dict(_under(tensors, f"pool.{i}."))))
+    for i, entry in enumerate(description["pool"]):
+        training.pool.append(_restore_episode(training, entry, _with_prefix(tensors, f"pool.{i}.")))
+    # Last, so that nothing above can have drawn from it.
     training.generator.set_state(tensors["generator"])
 
 
-def _moments(training: MetaTraining) -> list[tuple[str, Tensor]]:
+def _describe_settings(training: MetaTraining) -> dict[str, Any]:
+    return {
+        "scenes": [scene.name for scene in training.scenes],
+        "config": training.config.model_dump(mode="json"),
+        "network": training.network.config.model_dump(mode="json"),
+    }
+
+
+def _check_settings(
+    training: MetaTraining, description: Mapping[str, Any], path: Path, origin: Mapping[str, str]
+) -> None:
+    settings = _describe_settings(training)
+    changed = [name for name, value in settings.items() if description[name] != value]
+    changed += [name for name, value in origin.items() if description["origin"].get(name) != value]
+    # Going on under other settings would give weights that no configuration describes.
+    if changed:
+        names = " and ".join(dict.fromkeys(changed))
+        raise InputError(f"The checkpoint was made with other {names}", remedy=REMEDY, file=path)
+
+
+def _read_tensors(path: Path, device: torch.device) -> dict[str, Tensor]:
+    from safetensors import safe_open
+
+    with safe_open(path, "pt") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dictionary
+
+    # Adam counts its steps, and generators keep their state, on the CPU.
+    def stays(name: str) -> bool:
+        return name == "generator" or name.startswith("optimiser.step.")
+
+    return {name: value if stays(name) else value.to(device) for name, value in tensors.items()}
+
+
+def _adam_tensors(training: MetaTraining) -> list[tuple[str, Tensor]]:
     """Adam's state by parameter name."""
     out = []
     for name, parameter in training.network.named_parameters():
+        # By name and not by index, so that a checkpoint does not depend on the order of parameters.
         for key, value in training.optimiser.state.get(parameter, {}).items():
             out.append((f"{key}.{name}", torch.as_tensor(value)))
     return out
 
 
-def _restore_moments(training: MetaTraining, tensors: dict[str, Tensor]) -> None:
+def _restore_adam(training: MetaTraining, tensors: Mapping[str, Tensor]) -> None:
     for name, parameter in training.network.named_parameters():
-        state = {
-            key: tensors[f"{key}.{name}"] for key in ("step", "exp_avg", "exp_avg_sq") if f"{key}.{name}" in tensors
-        }
+        state = {key: tensors[f"{key}.{name}"] for key in ADAM_NAMES if f"{key}.{name}" in tensors}
         if state:
             training.optimiser.state[parameter] = state
 
 
-def _described(episode: Episode) -> dict[str, Any]:
+def _describe_episode(episode: Episode) -> dict[str, Any]:
+    config = asdict(episode.config)
+    # Old checkpoints have the old name, and new ones must stay readable by the same code.
+    config[HELD_OUT_VIEWS] = config.pop("held_out_views")
     return {
-        "course": asdict(episode.course),
+        "course": config,
         "iteration": episode.state.iteration,
-        "loss": None if episode.sight is None else episode.sight.loss,
-        "samplers": [s.queues() for s in episode.samplers],
+        "loss": None if episode.evaluation is None else episode.evaluation.loss,
+        "samplers": [sampler.queues() for sampler in episode.samplers],
     }
 
 
-def _episode(training: MetaTraining, entry: dict[str, Any], tensors: dict[str, Tensor]) -> Episode:
-    course = Course(**entry["course"])
-    episode = Episode.start(course, training.scenes[course.scene], training.network, training.generator)
-    episode.state = replace(episode.state, **{name: tensors[name] for name in STATE}, iteration=entry["iteration"])
+def _episode_tensors(episode: Episode) -> dict[str, Tensor]:
+    tensors: dict[str, Tensor] = {name: getattr(episode.state, attribute) for name, attribute in STATE_NAMES.items()}
+    if episode.evaluation is not None:
+        gradients = episode.evaluation.gradients
+        tensors["gradient"] = gradients.gaussians
+        if gradients.image_residuals is not None:
+            tensors["residuals"] = gradients.image_residuals
+    return tensors
+
+
+def _restore_episode(training: MetaTraining, entry: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Episode:
+    settings = dict(entry["course"])
+    settings["held_out_views"] = settings.pop(HELD_OUT_VIEWS)
+    episode = training.start_episode(EpisodeConfig(**settings))
+    gaussians = episode.loop.gaussians
+    values = {attribute: tensors[name] for name, attribute in STATE_NAMES.items()}
+    gaussians.state = replace(gaussians.state, **values, iteration=entry["iteration"])
     if entry["loss"] is not None:
-        episode.sight = Sight(entry["loss"], tensors["gradient"], {}, residuals=tensors.get("residuals"))
+        gradients = Gradients(tensors["gradient"], image_residuals=tensors.get("residuals"))
+        # Counts of culled Gaussians are for reports of stages; training does not read them.
+        episode.evaluation = LossAndGradients(entry["loss"], gradients, {})
     for sampler, queues in zip(episode.samplers, entry["samplers"], strict=True):
         sampler.set_queues(queues)
     return episode
 
 
-def _under(tensors: dict[str, Tensor], prefix: str) -> list[tuple[str, Tensor]]:
-    return [(k.removeprefix(prefix), v) for k, v in tensors.items() if k.startswith(prefix)]
+def _with_prefix(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """The tensors whose names begin so, without it."""
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

@@ -8,10 +8,11 @@ from typing import Any
 
 import pyarrow as pa
 
-from storage.codecs.tables import column, read_table, schema, write_table
+from storage.codecs.tables import column, read_rows, schema, write_table
 from storage.files import make_folders, sync
 
-LEARNING = schema(
+# Tables of trainings that were stopped are read on: names and notes of columns stay those of the first version.
+LEARNING_CURVE = schema(
     "learning_curve/1",
     [
         column("step", pa.int64(), "weight updates before this one"),
@@ -23,7 +24,7 @@ LEARNING = schema(
         column("seconds", pa.float64(), "wall time of this update"),
     ],
 )
-VALIDATION = schema(
+VALIDATION_SCORES = schema(
     "validation/1",
     [
         column("step", pa.int64(), "weight updates so far"),
@@ -34,7 +35,7 @@ VALIDATION = schema(
         column("seconds", pa.float64(), "wall time of the network's run"),
     ],
 )
-FIXING = schema(
+FIXER_CURVE = schema(
     "fixing_curve/1",
     [
         column("step", pa.int64(), "weight updates before this one"),
@@ -42,7 +43,7 @@ FIXING = schema(
         column("seconds", pa.float64(), "wall time, a mean over the updates between two checkpoints"),
     ],
 )
-FIXING_SCORES = schema(
+FIXER_SCORES = schema(
     "fixing_scores/1",
     [
         column("step", pa.int64(), "weight updates so far"),
@@ -56,18 +57,36 @@ FIXING_SCORES = schema(
 )
 
 
-def write_rows(path: Path, declared: pa.Schema, rows: Sequence[Mapping[str, Any]]) -> None:
-    """The whole table anew, complete or not at all."""
+def save_rows(path: Path, declared: pa.Schema, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Writes a table in place of the old one; at any moment the file is complete.
+
+    Args:
+        path: the file; its folder is made where it is missing.
+        declared: the table's schema.
+        rows: a value for each column, by name.
+    """
     make_folders(path.parent)
     temporary = path.with_name(f".{path.name}.tmp")
+    # Tables are written to new files only, and a killed training may have left this one.
     temporary.unlink(missing_ok=True)
+    # All rows are written again: Parquet cannot be appended to, and a training has a few thousand.
     write_table(temporary, declared, {name: [row[name] for row in rows] for name in declared.names})
+    # Without this a power cut after the rename could leave an empty file under the good name.
     sync(temporary)
     temporary.replace(path)
 
 
-def read_rows(path: Path, declared: pa.Schema) -> list[dict[str, Any]]:
-    """The rows, none where there is no file. Raises ``ArtifactCorruptError``."""
-    if not path.is_file():
-        return []
-    return read_table(path, declared)[0].to_pylist()
+def load_rows(path: Path, declared: pa.Schema) -> list[dict[str, Any]]:
+    """Reads a table that may not be there yet.
+
+    Args:
+        path: the file.
+        declared: the table's schema.
+
+    Returns:
+        A dictionary for each row; none where there is no file.
+
+    Raises:
+        ArtifactCorruptError: the table is damaged.
+    """
+    return read_rows(path, declared) if path.is_file() else []

@@ -13,33 +13,53 @@ from genre_tasks.errors import ConfigError
 from genre_tasks.learned.meta_episodes import TrainingScene
 
 
-def chosen_device(name: str) -> torch.device:
-    """``auto``: a GPU where there is one and gsplat to render on it, else the CPU.
+def choose_device(name: str) -> torch.device:
+    """Chooses the device to train on.
 
-    Raises ``ConfigError`` for an unknown name, and for ``cuda`` without either.
+    Args:
+        name: ``cpu``, ``cuda``, or ``auto`` for a GPU where there is one and gsplat to render on it, else the CPU.
+
+    Returns:
+        The device.
+
+    Raises:
+        ConfigError: the name is unknown, or ``cuda`` lacks a GPU or gsplat.
+
+    >>> choose_device("cpu")
+    device(type='cpu')
     """
     if name not in ("auto", "cpu", "cuda"):
         raise ConfigError(f"no device is called {name!r}", remedy="Give auto, cpu or cuda.")
-    lacks = [what for what, there in _PRESENT.items() if not there()]
-    if name == "cuda" and lacks:
-        raise ConfigError(f"cuda needs {' and '.join(lacks)}", remedy="Give --device cpu; `genre doctor` says more.")
-    return torch.device("cpu" if lacks or name == "cpu" else "cuda")
+    # Both are needed: the CPU's kernel cannot render tensors that are on a GPU.
+    lacking = [what for what, is_present in _REQUIREMENTS.items() if not is_present()]
+    if name == "cuda" and lacking:
+        raise ConfigError(f"cuda needs {' and '.join(lacking)}", remedy="Give --device cpu; `genre doctor` says more.")
+    return torch.device("cpu" if lacking or name == "cpu" else "cuda")
 
 
-_PRESENT = {"a GPU": torch.cuda.is_available, "gsplat": lambda: find_spec("gsplat") is not None}
+_REQUIREMENTS = {"a GPU": torch.cuda.is_available, "gsplat": lambda: find_spec("gsplat") is not None}
 
 
-def scene_on(scene: TrainingScene, device: torch.device) -> TrainingScene:
-    """The scene with all its tensors on ``device``; the same one where they are there."""
-    moved: TrainingScene = _on(scene, device)
+def move_scene(scene: TrainingScene, device: torch.device) -> TrainingScene:
+    """Moves all tensors of a scene to a device.
+
+    Args:
+        scene: the scene with its targets.
+        device: where they are needed.
+
+    Returns:
+        The scene there; tensors that are there already are not copied.
+    """
+    moved: TrainingScene = _move(scene, device)
     return moved
 
 
-def _on(value: Any, device: torch.device) -> Any:
+def _move(value: Any, device: torch.device) -> Any:
+    # By structure and not by field, so that a new tensor of any target is never left behind.
     if isinstance(value, Tensor):
         return value.to(device)
     if isinstance(value, tuple):
-        return tuple(_on(item, device) for item in value)
+        return tuple(_move(item, device) for item in value)
     if is_dataclass(value) and not isinstance(value, type):
-        return replace(value, **{f.name: _on(getattr(value, f.name), device) for f in fields(value)})
+        return replace(value, **{f.name: _move(getattr(value, f.name), device) for f in fields(value)})
     return value

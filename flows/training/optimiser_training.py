@@ -1,70 +1,89 @@
-"""Meta-training of GNet and ENet as a function: checkpoints, weights, a learning curve; and what it is scored by."""
+"""Meta-training of GNet and ENet as a function: checkpoints, weights and a learning curve; and what it is scored by."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
 from flows.training import checkpoint
-from flows.training.curve_plot import read_curve, write_curve
+from flows.training.curve_plot import read_curve, save_curve
 from genre_tasks.config import LossConfig
 from genre_tasks.errors import InputError
-from genre_tasks.learned.meta_episodes import TrainingScene
 from genre_tasks.learned.learned_optimiser import LearnedOptimiser
+from genre_tasks.learned.meta_episodes import TrainingScene
+from genre_tasks.learned.meta_training import MetaConfig, MetaTraining
 from genre_tasks.learned.network import NetworkConfig
-from genre_tasks.losses.rendering_loss import Distance
+from genre_tasks.learned.weights import add_residual_inputs, load_optimiser, save_optimiser
+from genre_tasks.losses.rendering_loss import ImageDistance
+from genre_tasks.losses.targets import Target
 from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.step_rules import StepRule
-from genre_tasks.losses.targets import Target
-from genre_tasks.learned.meta_training import MetaConfig, MetaTraining
-from genre_tasks.optimiser.unroll import Plan, unroll
-from genre_tasks.learned.weights import load, save, with_residuals
+from genre_tasks.optimiser.unroll import UnrollSettings, unroll
 from genre_tasks.progress import Progress, silent
 from genre_tasks.render.api import render_views
 from genre_tasks.scene.graph import SceneGraph
 
-CHECKPOINT, WEIGHTS = "checkpoint.safetensors", "weights.safetensors"
+CHECKPOINT_FILE = "checkpoint.safetensors"
+WEIGHTS_FILE = "weights.safetensors"
 
 
 @dataclass(frozen=True)
-class Score:
-    """Mean PSNR in dB of a scene on views of one kind, and how many they are."""
+class OptimisationScore:
+    """How well a scene shows views that its optimiser was not shown.
+
+    Attributes:
+        heldout: mean PSNR over held-out views in dB.
+        novel: mean PSNR over true novel views in dB; NaN where there are none.
+        views: how many held-out views there are.
+    """
 
     heldout: float
     novel: float
     views: int
 
 
-def network_from(
+def initialise_network(
     config: NetworkConfig, seed: int, weights: Path | None = None, new_head: bool = False
 ) -> LearnedOptimiser:
-    """A new network, or one that starts from ``weights`` with the rates and, if any, residuals of ``config``.
+    """Makes a new network, or one that starts from trained weights.
 
-    ``new_head``: its last layer is a new one, so that its first step is tuned Adam's.
+    Args:
+        config: the network's shape, learning rates and, if any, residuals.
+        seed: of the new weights.
+        weights: a file of weights to start from.
+        new_head: the last layer is new all the same, so that the network's first step is tuned Adam's.
 
-    Raises ``InputError`` for weights that are missing, unreadable, or of a network of another shape.
+    Returns:
+        The network on the CPU.
+
+    Raises:
+        InputError: the weights are missing, unreadable, or of a network of another shape.
     """
+    # Apart from the global generator, whose state must not depend on whether a network was made.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = LearnedOptimiser(config)
-    if weights is not None:
-        start = load(weights)
-        may = {"rates", "relaxation"} | ({"residuals"} if config.residuals else set())
-        other = {name for name, value in config if name not in may and value != getattr(start.config, name)}
-        if other:
-            raise InputError(
-                f"The weights to start from are of a network with other {' and '.join(sorted(other))}",
-                remedy="Start from weights of the same network, or from none.",
-                file=weights,
-            )
-        values = with_residuals(start) if config.residuals else start.state_dict()
-        if new_head:
-            values |= {name: value for name, value in network.state_dict().items() if name.startswith("head.")}
-        network.load_state_dict(values)
+    if weights is None:
+        return network
+    start = load_optimiser(weights)
+    # These are not weights: a stage may set them anew.
+    may_differ = {"rates", "relaxation"} | ({"residuals"} if config.residuals else set())
+    different = {name for name, value in config if name not in may_differ and value != getattr(start.config, name)}
+    if different:
+        raise InputError(
+            f"The weights to start from are of a network with other {' and '.join(sorted(different))}",
+            remedy="Start from weights of the same network, or from none.",
+            file=weights,
+        )
+    values = add_residual_inputs(start) if config.residuals else start.state_dict()
+    if new_head:
+        # A new last layer gives no correction, so training begins at tuned Adam and not at an old network's habits.
+        values |= {name: value for name, value in network.state_dict().items() if name.startswith("head.")}
+    network.load_state_dict(values)
     return network
 
 
@@ -73,53 +92,97 @@ def train_optimiser(
     scenes: Sequence[TrainingScene],
     config: MetaConfig,
     folder: Path,
-    distance: Distance | None = None,
+    distance: ImageDistance | None = None,
     save_every: int = 50,
-    watch: Callable[[int, LearnedOptimiser], None] | None = None,
+    on_checkpoint: Callable[[int, LearnedOptimiser], None] | None = None,
     progress: Progress = silent,
     origin: Mapping[str, str] | None = None,
 ) -> LearnedOptimiser:
-    """Meta-trains for ``config.steps`` weight updates; goes on from ``folder`` where it was interrupted.
+    """Meta-trains a network to the end of its configuration; goes on from ``folder`` where it was interrupted.
 
-    Writes there ``curve.parquet`` (a row for each update) with its picture, ``weights.safetensors`` with its JSON, and
-    last ``checkpoint.safetensors``. ``watch`` is called at each checkpoint, for validation; ``origin`` as for
-    :func:`flows.training.checkpoint.save`. Raises ``InputError`` where the folder holds another training.
+    At each checkpoint it writes ``curve.parquet`` (a row for each update) with its plot, ``weights.safetensors`` with
+    its JSON, and last ``checkpoint.safetensors``.
+
+    Args:
+        network: the network to train, on the device to train on.
+        scenes: what it is trained on, on the same device.
+        config: length and settings of meta-training.
+        folder: where everything is written.
+        distance: perceptual distance, for losses with such a term.
+        save_every: weight updates between checkpoints.
+        on_checkpoint: called with the updates done and the network at each checkpoint, for validation.
+        progress: called after each update.
+        origin: what else the training depends on: name → digest.
+
+    Returns:
+        The trained network, without gradients.
+
+    Raises:
+        InputError: the folder holds another training.
     """
     training = MetaTraining(network, scenes, config, distance)
-    path = folder / CHECKPOINT
+    path = folder / CHECKPOINT_FILE
     folder.mkdir(parents=True, exist_ok=True)
     if path.is_file():
         checkpoint.resume(training, path, origin)
+    # Later rows are of updates after the checkpoint, which are made again.
     rows = read_curve(folder, training.done)
     while training.done < config.steps:
         began = time.perf_counter()
         record = training.step()
-        rows.append({**asdict(record), "seconds": time.perf_counter() - began})
-        progress(training.done, config.steps, f"unseen loss {record.judged_loss:.3f}")
+        rows.append({**record.as_row(), "seconds": time.perf_counter() - began})
+        progress(training.done, config.steps, f"unseen loss {record.held_out_loss:.3f}")
         if training.done % save_every == 0 or training.done == config.steps:
-            write_curve(folder, rows)
-            save(training.network, folder / WEIGHTS)
-            if watch is not None:  # before the checkpoint: what a kill leaves out is made again
-                watch(training.done, training.network)
+            save_curve(folder, rows)
+            save_optimiser(training.network, folder / WEIGHTS_FILE)
+            # Validation comes before the checkpoint: what a kill leaves out is then made again on resuming.
+            if on_checkpoint is not None:
+                on_checkpoint(training.done, training.network)
             checkpoint.save(training, path, origin)
-    if not path.is_file():  # no update at all: what it starts from, at the rates of its own configuration
-        write_curve(folder, rows)
-        save(training.network, folder / WEIGHTS)
+    # Without any update the weights are those it starts from, at the learning rates of its own configuration.
+    if not path.is_file():
+        save_curve(folder, rows)
+        save_optimiser(training.network, folder / WEIGHTS_FILE)
         checkpoint.save(training, path, origin)
     return training.network.eval().requires_grad_(False)
 
 
-def score(rule: StepRule, scene: TrainingScene, loss: LossConfig, plan: Plan, distance: Distance | None) -> Score:
-    """Unrolls ``rule`` on a scene and measures it on what it did not see."""
+def score_rule(
+    rule: StepRule, scene: TrainingScene, loss: LossConfig, plan: UnrollSettings, distance: ImageDistance | None
+) -> OptimisationScore:
+    """Optimises a scene by a step rule and scores it on views that the optimiser was not shown.
+
+    Args:
+        rule: the optimiser.
+        scene: where it begins and what it is optimised towards.
+        loss: the loss that the rule descends.
+        plan: iterations and views.
+        distance: perceptual distance, for a loss with such a term.
+
+    Returns:
+        The scores of the optimised scene.
+    """
     result = unroll(rule, scene.scene, scene.source, scene.fixed, Objective(loss, distance), plan)
-    return Score(psnr(result.scene, scene.heldout), psnr(result.scene, scene.truth), len(scene.heldout))
+    return OptimisationScore(
+        mean_psnr(result.scene, scene.heldout), mean_psnr(result.scene, scene.truth), len(scene.heldout)
+    )
 
 
 @torch.no_grad()
-def psnr(scene: SceneGraph, targets: Sequence[Target]) -> float:
-    """Mean PSNR in dB over views; NaN for none."""
+def mean_psnr(scene: SceneGraph, targets: Sequence[Target]) -> float:
+    """Computes the mean PSNR of a scene's renders.
+
+    Args:
+        scene: the scene.
+        targets: the true images of V views.
+
+    Returns:
+        Mean over views in dB, at most 100 for each; NaN for no view.
+    """
+    # A stack of nothing would raise, and NaN is what a table shows as a gap.
     if not targets:
         return float("nan")
-    truth = torch.stack([t.image.image for t in targets])
+    truth = torch.stack([t.image.pixels for t in targets])
+    # The floor of 100 dB keeps equal images from an infinite PSNR, which would hide the others in the mean.
     error = (render_views(scene, targets).color.clamp(0, 1) - truth).square().mean((1, 2, 3)).clamp_min(1e-10)
     return float((-10 * torch.log10(error)).mean())

@@ -10,19 +10,19 @@ from urllib.parse import parse_qs
 import numpy as np
 import torch
 
-from flows.training.subsampled_log import ThinnedLog
+from flows.training.subsampled_log import SubsampledLog
 from genre_tasks.config import EffectsConfig, IngestConfig, InitialConfig
-from genre_tasks.effects.apply_plan import applied
-from genre_tasks.effects.types import UNPLANNED
+from genre_tasks.effects.apply_plan import apply_plan
+from genre_tasks.effects.types import DEFAULT_PLAN
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
+from genre_tasks.learned.meta_episodes import TrainingScene
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.types import DrivingLog
-from genre_tasks.learned.meta_episodes import TrainingScene
-from genre_tasks.losses.targets import of_fixed, of_source, of_views
+from genre_tasks.losses.targets import novel_targets, source_targets, view_targets
 from genre_tasks.scene.chunk import Chunk
-from genre_tasks.scene.novel_poses import novel_view_poses
-from genre_tasks.scene.reconstruction import Reconstruction
+from genre_tasks.scene.novel_poses import place_novel_views
 from genre_tasks.scene.novel_views import FixedViews
+from genre_tasks.scene.reconstruction import Reconstruction
 from genre_tasks.stages.effects import effects
 from genre_tasks.stages.ingest import ingest
 from genre_tasks.stages.initial import initial
@@ -33,18 +33,29 @@ from storage.local import LocalStore
 TRAINING_SEEDS = range(0, 900)
 """Seeds of the synthetic street (configs/seeds.yaml): no other may be used to train."""
 
-PLANNED = EffectsConfig(view_dependent_colour="off", nonrigid_actors="off", motion_blur="off")
-"""What a planned training scene may have: what changes how Gaussians become an image, and not what they hold. Blurred
-images take a quarter of an hour to draw."""
+# What changes how Gaussians become an image, and not what they hold. Blurred images are left out because they take a
+# quarter of an hour to draw.
+TRAINING_EFFECTS = EffectsConfig(view_dependent_colour="off", nonrigid_actors="off", motion_blur="off")
+"""The effects that a planned training scene may have."""
 
 
 @dataclass(frozen=True)
 class SceneRecipe:
     """How a training scene is made.
 
-    ``every``: only every n-th frame's images are kept (a ray-cast image costs half a second); a divisor of four keeps
-    the source views. ``novel_every``: every n-th of the views at ±3 m is ray-cast as truth. ``planned``: rolling
-    shutter, lens distortion and the like are modelled where the log calls for them (:data:`PLANNED`).
+    Attributes:
+        uri: the log.
+        chunk: index of the chunk in the log.
+        max_points: so many LiDAR points become Gaussians at most.
+        distant_count: Gaussians of the distant shell.
+        width_px: width of images.
+        height_px: height of images.
+        every: only every n-th frame's images are kept, since a ray-cast image costs half a second. A divisor of four
+            keeps the source views.
+        novel_every: every n-th of the novel views is ray-cast as truth.
+        shifts_m: lateral shifts of the novel views in metres, left is positive.
+        planned: rolling shutter, lens distortion and the like are modelled where the log calls for them
+            (:data:`TRAINING_EFFECTS`).
     """
 
     uri: str
@@ -58,117 +69,207 @@ class SceneRecipe:
     shifts_m: tuple[float, ...] = (3.0, -3.0)
     planned: bool = False
 
-    def said(self) -> dict[str, Any]:
-        """What makes it this scene, for digests: plain scenes keep those that they had before plans."""
-        own = asdict(self)
+    def key_fields(self) -> dict[str, Any]:
+        """Lists what makes it this scene, for digests.
+
+        Returns:
+            JSON values by field name.
+        """
+        values = asdict(self)
+        # Plain scenes keep the digests that they had before there were plans.
         if not self.planned:
-            del own["planned"]
-        return own
+            del values["planned"]
+        return values
 
-    def images(self) -> dict[str, Any]:
-        """What its images depend on, and not how many Gaussians begin: scenes of several sizes share them."""
-        own = self.said()
-        return {name: own[name] for name in ("uri", "chunk", "width_px", "height_px", "every")}
+    def image_key_fields(self) -> dict[str, Any]:
+        """Lists what the scene's images depend on, for digests.
 
-    def truths(self) -> dict[str, Any]:
-        """What its true views beside the path depend on."""
-        return self.images() | {"novel_every": self.novel_every, "shifts_m": self.shifts_m}
+        The number of Gaussians is not part of it, so scenes of several sizes share their images.
+
+        Returns:
+            JSON values by field name.
+        """
+        values = self.key_fields()
+        return {name: values[name] for name in ("uri", "chunk", "width_px", "height_px", "every")}
+
+    def truth_key_fields(self) -> dict[str, Any]:
+        """Lists what the scene's true novel views depend on, for digests.
+
+        Returns:
+            JSON values by field name.
+        """
+        # Neither points nor Gaussians are in this key: ray casting is the costliest part and depends on neither.
+        return self.image_key_fields() | {"novel_every": self.novel_every, "shifts_m": self.shifts_m}
 
 
 @dataclass(frozen=True)
 class PreparedScene:
-    """The parts of a training scene as the stages leave them, the chunk with its plan applied where it has one.
+    """The parts of a training scene as the stages leave them.
 
-    ``truth`` is ``None`` for a real log.
+    Attributes:
+        recipe: how it was made.
+        chunk: the chunk, with its plan of effects applied where it has one.
+        initial: the initial scene.
+        truth: true images at novel views; ``None`` for a real log.
     """
 
     recipe: SceneRecipe
     chunk: Chunk
-    start: Reconstruction
+    initial: Reconstruction
     truth: FixedViews | None
 
 
-def check_training(recipe: SceneRecipe) -> None:
-    """Raises ``ConfigError`` for a synthetic seed outside 0–899 and for any chunk but 0: those are for claims."""
+def check_for_training(recipe: SceneRecipe) -> None:
+    """Refuses chunks that results are claimed on.
+
+    Args:
+        recipe: the scene to train on.
+
+    Raises:
+        ConfigError: a synthetic seed is outside 0 to 899, or the chunk of any log is not chunk 0.
+
+    >>> check_for_training(SceneRecipe("synthetic:street?seed=899"))
+    >>> check_for_training(SceneRecipe("synthetic:street?seed=900"))
+    Traceback (most recent call last):
+    ...
+    genre_tasks.errors.ConfigError: ...
+    """
     reader, _, query = recipe.uri.partition("?")
+    # A street without a seed has seed 0, which is for training.
     seed = int(parse_qs(query).get("seed", ["0"])[0])
     if reader.startswith("synthetic:") and seed not in TRAINING_SEEDS:
         raise ConfigError(
             f"seed {seed} of {recipe.uri} is not for training",
             remedy=f"Use seeds {TRAINING_SEEDS[0]} to {TRAINING_SEEDS[-1]}.",
         )
+    # Results on real logs are claimed on their other chunks.
     if recipe.chunk != 0:
         raise ConfigError(f"chunk {recipe.chunk} of {recipe.uri} is not for training", remedy="Use chunk 0.")
 
 
-def prepare(store: LocalStore, recipe: SceneRecipe) -> PreparedScene:
-    """Reads the scene from the store, or makes and stores it.
+def prepare_scene(store: LocalStore, recipe: SceneRecipe) -> PreparedScene:
+    """Reads the parts of a training scene from the store; what it lacks is made and stored.
 
     Keys are the recipe's alone, not the code's: after a change of how scenes are made, take an empty store.
+
+    Args:
+        store: the training's store.
+        recipe: the scene.
+
+    Returns:
+        The scene's parts.
     """
     log = open_log(recipe.uri)
 
-    def part(stage: str, kind: str, said: dict[str, Any], make: Callable[[], Any]) -> Any:
-        return kept(store, Address(log.dataset, log.name, recipe.chunk, stage, digest_value(said)), kind, make)
+    # The code is not part of the keys, so that a change of code which leaves scenes alike keeps hours of work.
+    def get_part(stage: str, kind: str, key_fields: dict[str, Any], make: Callable[[], Any]) -> Any:
+        address = Address(log.dataset, log.name, recipe.chunk, stage, digest_value(key_fields))
+        return get_or_make(store, address, kind, make)
 
-    sizes = {"width_px": recipe.width_px, "height_px": recipe.height_px}
-    thinned: Any = ThinnedLog(log, recipe.every)
-    chunk = part("ingest", "chunk", recipe.images(), lambda: ingest(IngestConfig(**sizes), thinned, recipe.chunk))
-    points = InitialConfig(max_points=recipe.max_points, distant_count=recipe.distant_count)
-    plan = UNPLANNED
+    ingest_config = IngestConfig(width_px=recipe.width_px, height_px=recipe.height_px)
+    subsampled: Any = SubsampledLog(log, recipe.every)
+    chunk = get_part(
+        "ingest", "chunk", recipe.image_key_fields(), lambda: ingest(ingest_config, subsampled, recipe.chunk)
+    )
+    plan = DEFAULT_PLAN
     if recipe.planned:
-        plan = part("effects", "effects", recipe.said(), lambda: effects(PLANNED, chunk, thinned))
-    start = part("initial", "reconstruction", recipe.said(), lambda: initial(points, chunk, plan))
+        plan = get_part("effects", "effects", recipe.key_fields(), lambda: effects(TRAINING_EFFECTS, chunk, subsampled))
+    initial_config = InitialConfig(max_points=recipe.max_points, distant_count=recipe.distant_count)
+    start = get_part("initial", "reconstruction", recipe.key_fields(), lambda: initial(initial_config, chunk, plan))
     truth = None
+    # Only synthetic logs can be ray-cast away from the recorded path.
     if log.truth is not None:
-        truth = part("truth", "fixed_views", recipe.truths(), lambda: true_views(log, chunk, recipe))
-    return PreparedScene(recipe, applied(chunk, plan), start, truth)
+        truth = get_part(
+            "truth", "fixed_views", recipe.truth_key_fields(), lambda: ray_cast_true_views(log, chunk, recipe)
+        )
+    return PreparedScene(recipe, apply_plan(chunk, plan), start, truth)
 
 
-def kept(store: LocalStore, address: Address, kind: str, make: Callable[[], Any]) -> Any:
-    """What the store has at ``address``, read back; made and stored where it has nothing, or nothing sound."""
+def get_or_make(store: LocalStore, address: Address, kind: str, make: Callable[[], Any]) -> Any:
+    """Reads a value from the store; made and stored where the store has nothing, or nothing sound.
+
+    Args:
+        store: the store.
+        address: where the value belongs.
+        kind: kind of artifact.
+        make: makes the value.
+
+    Returns:
+        The value as it is read back, so that a value has passed through its codec on every path.
+    """
     try:
         if (artifact := store.find(address)) is not None:
             return store.read(artifact)
     except ArtifactCorruptError:
+        # Only damage: an artifact of a newer version raises here, since it is not ours to remove.
         store.discard(address)
     return store.read(store.commit(address, kind, make()))
 
 
-def true_views(log: DrivingLog, chunk: Chunk, recipe: SceneRecipe) -> FixedViews:
-    """The ray-cast images at every ``novel_every``-th view beside the path."""
+def ray_cast_true_views(log: DrivingLog, chunk: Chunk, recipe: SceneRecipe) -> FixedViews:
+    """Ray-casts the true images at every ``novel_every``-th novel view of a synthetic log.
+
+    Args:
+        log: a log that knows its truth.
+        chunk: the chunk.
+        recipe: which views.
+
+    Returns:
+        The images [V, H, W, 3] in [0, 1].
+    """
     assert log.truth is not None
-    views = novel_view_poses(chunk, recipe.shifts_m)[:: recipe.novel_every]
+    views = place_novel_views(chunk, recipe.shifts_m)[:: recipe.novel_every]
     images = [log.truth.image(v.frame, chunk.world_SE3_chunk @ v.chunk_SE3_camera, v.lens) for v in views]
+    # The very floats that decoding an image gives, so that a stored truth equals a fresh one.
     return FixedViews(views, torch.from_numpy(np.stack(images).astype(np.float32) / np.float32(255)))
 
 
-def training_scene(
+def build_training_scene(
     prepared: PreparedScene,
     start: Reconstruction | None = None,
     fixed: FixedViews | None = None,
     depth: bool = True,
-    heldout: int = 12,
+    held_out_count: int = 12,
 ) -> TrainingScene:
-    """Targets decoded; ``start`` replaces the initial scene, ``fixed`` is what the optimiser sees beside the path.
+    """Decodes the images of a scene into what meta-training needs.
 
-    True images judge at the novel views where they exist, else the fixed ones.
+    Args:
+        prepared: the scene's parts.
+        start: where the optimisation begins; by default at the initial scene.
+        fixed: images at novel views that the optimiser is shown. They also stand in for the truth where there is none.
+        depth: source targets have LiDAR depth.
+        held_out_count: so many held-out views at most, evenly spaced.
+
+    Returns:
+        The scene with its targets.
     """
     chunk = prepared.chunk
-    judge = prepared.truth or fixed
-    views = spread(chunk.of_role("heldout"), heldout)
+    # A real log has no true novel views.
+    truth = prepared.truth or fixed
+    held_out = evenly_spaced(chunk.views_with_role("heldout"), held_out_count)
     return TrainingScene(
-        f"{chunk.log}/{chunk.index}",
-        (start or prepared.start).scene,
-        of_source(chunk, depth),
-        of_views(chunk, views),
-        () if fixed is None else of_fixed(fixed),
-        () if judge is None else of_fixed(judge),
+        name=f"{chunk.log}/{chunk.index}",
+        scene=(start or prepared.initial).scene,
+        source=source_targets(chunk, depth),
+        heldout=view_targets(chunk, held_out),
+        fixed=() if fixed is None else novel_targets(fixed),
+        truth=() if truth is None else novel_targets(truth),
     )
 
 
-def spread(items: Sequence[Any], count: int) -> tuple[Any, ...]:
-    """At most ``count`` of the items, evenly spread; the middle one where it is one."""
+def evenly_spaced(items: Sequence[Any], count: int) -> tuple[Any, ...]:
+    """Selects items that are evenly spread over a sequence.
+
+    Args:
+        items: the sequence.
+        count: how many to select at most.
+
+    Returns:
+        The items in order: the first and the last are among them, or the middle one where ``count`` is 1.
+
+    >>> evenly_spaced("abcdefg", 3)
+    ('a', 'd', 'g')
+    """
     if len(items) <= count:
         return tuple(items)
     if count == 1:

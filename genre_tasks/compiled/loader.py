@@ -28,9 +28,9 @@ def _cpu_flags() -> set[str]:
     return next((set(line.split(":", 1)[1].split()) for line in text.splitlines() if line.startswith("flags")), set())
 
 
-def supported_isas() -> list[str]:
-    """The instruction sets of the kernels that this machine can run, best first (never one that it lacks)."""
-    if "generic" in build.isas():
+def supported_instruction_sets() -> list[str]:
+    """Lists the kernels' instruction sets that this machine can run, best first; never one that it lacks."""
+    if "generic" in build.instruction_sets():
         return ["generic"]
     flags = _cpu_flags()
     if not flags and platform.system() != "Linux":
@@ -42,38 +42,49 @@ def supported_isas() -> list[str]:
     return [isa for isa, needed in _NEEDED_FLAGS.items() if needed <= flags]
 
 
-def candidate_isas() -> list[str]:
-    """What to look for, best first: ``GENRE_RENDER_ISA`` alone if it is set, else all that run here.
+def candidate_instruction_sets() -> list[str]:
+    """Lists the instruction sets to look for, best first: ``GENRE_RENDER_ISA`` alone if it is set, else all.
 
     Raises:
         ConfigError: ``GENRE_RENDER_ISA`` names what this machine cannot run.
         ResourceError: the machine runs none.
     """
-    supported = supported_isas()
-    asked = os.environ.get("GENRE_RENDER_ISA")
-    if asked and asked not in supported:
+    supported = supported_instruction_sets()
+    wanted = os.environ.get("GENRE_RENDER_ISA")
+    # Loading it would end the process with an illegal instruction.
+    if wanted and wanted not in supported:
         raise ConfigError(
-            f"GENRE_RENDER_ISA={asked} cannot run on this machine", remedy=f"Unset it, or choose from {supported}"
+            f"GENRE_RENDER_ISA={wanted} cannot run on this machine", remedy=f"Unset it, or choose from {supported}"
         )
     if not supported:
         raise ResourceError(
             "the CPU is older than the kernel's oldest instruction set (SSE4.2)", remedy="Use backend reference"
         )
-    return [asked] if asked else supported
+    return [wanted] if wanted else supported
 
 
 def load(kernel: Kernel, folder: Path) -> ctypes.CDLL:
-    """The best library of ``kernel`` in ``folder`` that this machine can run.
+    """Loads the best library of a kernel that this machine can run.
+
+    Args:
+        kernel: what it is made of; its sources must be those that the library was compiled from.
+        folder: where its libraries are.
+
+    Returns:
+        The library, without argument types: the caller declares them.
 
     Raises:
-        ResourceError: it was never compiled, is older than its sources, or does not load.
+        ConfigError: ``GENRE_RENDER_ISA`` names what this machine cannot run.
+        ResourceError: the library was never compiled, is older than its sources, or does not load.
     """
-    paths = [folder / kernel.library_name(isa) for isa in candidate_isas()]
+    # The best that exists: a compiler may not have been able to make the best that runs.
+    paths = [folder / kernel.library_name(isa) for isa in candidate_instruction_sets()]
     path = next((p for p in paths if p.exists()), None)
     if path is None:
         raise ResourceError(f"{kernel.title} is not compiled", remedy=REMEDY, file=paths[0])
     try:
         library = ctypes.CDLL(str(path))
+        # The digest comes first: argument types declared on a stale library would crash, not raise.
         library.genre_digest.restype = ctypes.c_char_p
         digest = library.genre_digest().decode()
     except (OSError, AttributeError) as error:

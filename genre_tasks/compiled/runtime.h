@@ -1,4 +1,4 @@
-// What every kernel behind a plain C interface needs: threads for one call, exceptions as a status, and its digest.
+// What every kernel behind a plain C interface needs: threads for one call, exceptions as a status code, and its digest.
 #pragma once
 #include <exception>
 #include <mutex>
@@ -7,7 +7,8 @@
 #include <thread>
 #include <vector>
 
-// Threads live for one call: no pool to survive a fork, no OpenMP runtime beside the one that torch brings.
+// Runs f(worker) on `threads` threads, the calling one among them. They live for one call: no pool to survive a fork, no OpenMP
+// runtime beside the one that torch brings.
 template <class F>
 static void parallel(int threads, F f) {
   std::mutex guard;
@@ -20,20 +21,21 @@ static void parallel(int threads, F f) {
       error = std::current_exception();
     }
   };
-  std::vector<std::thread> crew;
-  crew.reserve(threads);
+  std::vector<std::thread> thread_team;
+  thread_team.reserve(threads);
   for (int w = 1; w < threads; w++) {
     try {
-      crew.emplace_back(run, w);
+      thread_team.emplace_back(run, w);
     } catch (const std::system_error&) {
-      run(w);  // no more threads to be had: do it here
+      run(w);  // the system has no more threads: run it here
     }
   }
   run(0);
-  for (auto& t : crew) t.join();
+  for (auto& t : thread_team) t.join();
   if (error) std::rethrow_exception(error);
 }
 
+// A function of the interface returns one of these: exceptions must not cross it.
 enum Status { OK = 0, OUT_OF_MEMORY = 1, FAILED = 2 };
 
 template <class F>
@@ -48,5 +50,5 @@ static int guarded(F f) {
   }
 }
 
-// Of what this library was built, so that a stale one is noticed.
+// Digest of the sources that this library was compiled from, so that a stale one is noticed.
 extern "C" const char* genre_digest() { return SOURCE_DIGEST; }

@@ -1,6 +1,6 @@
-"""A chunk as its plan has it: what the effects that are on say of each image, and no actors where they are off.
+"""Gives a chunk what its effects' plan decided, for the stages after it.
 
-Imports no effect: a plan's artifact holds all that is needed.
+This module imports no effect: a plan's artifact holds all that is needed.
 """
 
 from __future__ import annotations
@@ -12,39 +12,63 @@ import numpy as np
 from genre_tasks.effects.types import EffectsPlan
 from genre_tasks.scene.chunk import Actor, Chunk, Points, View
 
-
-def applied(chunk: Chunk, plan: EffectsPlan) -> Chunk:
-    """The chunk itself where no effect has anything to say of it."""
-    if chunk.actors and not plan.on("rigid_actors"):
-        chunk = replace(chunk, static=_standing(chunk), actors=())
-    straight = bool(plan.decisions) and not plan.on("lens_distortion")
-    views = tuple(_as_planned(v, plan, straight) for v in chunk.views)
-    return chunk if all(a is b for a, b in zip(views, chunk.views, strict=True)) else replace(chunk, views=views)
+_POINT_ATTRIBUTES = ("positions", "colors", "colored", "frames")
 
 
-def _as_planned(view: View, plan: EffectsPlan, straight: bool) -> View:
-    """The view itself where nothing is said of it; ``straight``: with its lens taken to be free of distortion."""
-    fitted, key = plan.fitted, (view.camera, view.frame)
-    gain, own = fitted.gains.get(key), fitted.own.get(view.camera)
-    shutter, blur = fitted.shutters.get(key), fitted.blurs.get(key)
-    straight = straight and any(view.lens.distortion)
-    if all(said is None for said in (gain, own, shutter, blur)) and not straight:
+def apply_plan(chunk: Chunk, plan: EffectsPlan) -> Chunk:
+    """Gives each view its gain, ego mask, shutter and blur, and makes actors static where they are not modelled.
+
+    Args:
+        chunk: as ``ingest`` made it.
+        plan: of this chunk.
+
+    Returns:
+        The chunk that later stages work on; ``chunk`` itself where the plan changes nothing.
+    """
+    if chunk.actors and not plan.is_on("rigid_actors"):
+        # Without nodes of their own, actors are smeared along their way, as in any static reconstruction.
+        chunk = replace(chunk, static=_merge_actors_into_background(chunk), actors=())
+    # The default plan decides nothing, so that lenses stay as they are.
+    undistort = bool(plan.decisions) and not plan.is_on("lens_distortion")
+    views = tuple(_apply_to_view(view, plan, undistort) for view in chunk.views)
+    # The same object where nothing changes: no array is copied, and callers may compare by identity.
+    if all(new is old for new, old in zip(views, chunk.views, strict=True)):
+        return chunk
+    return replace(chunk, views=views)
+
+
+def _apply_to_view(view: View, plan: EffectsPlan, undistort: bool) -> View:
+    """Returns the view itself where nothing changes; with ``undistort`` its lens is taken to be free of distortion."""
+    parameters = plan.parameters
+    key = (view.camera, view.frame)
+    gain = parameters.gains.get(key)
+    ego_mask = parameters.ego_masks.get(view.camera)
+    shutter = parameters.shutters.get(key)
+    blur = parameters.blurs.get(key)
+    undistort = undistort and any(view.lens.distortion)
+    unchanged = all(parameter is None for parameter in (gain, ego_mask, shutter, blur))
+    if unchanged and not undistort:
         return view
-    lens = replace(view.lens, distortion=()) if straight else view.lens
-    return replace(view, lens=lens, log_gain=gain, own=own, shutter=shutter, blur=blur)
+    lens = replace(view.lens, distortion=()) if undistort else view.lens
+    return replace(view, lens=lens, log_gain=gain, ego_mask=ego_mask, shutter=shutter, blur=blur)
 
 
-def _standing(chunk: Chunk) -> Points:
-    """The background with every actor's points where its own sweep saw them."""
-    parts = [chunk.static, *(_in_chunk(actor) for actor in chunk.actors)]
-    names = ("positions", "colors", "colored", "frames")
-    return Points(*(np.concatenate([getattr(p, n) for p in parts]) for n in names))
+def _merge_actors_into_background(chunk: Chunk) -> Points:
+    """Adds every actor's points to the background, where the point's own sweep saw them."""
+    parts = [chunk.static, *(_points_in_chunk(actor) for actor in chunk.actors)]
+    return Points(*(np.concatenate([getattr(part, name) for part in parts]) for name in _POINT_ATTRIBUTES))
 
 
-def _in_chunk(actor: Actor) -> Points:
-    at = {int(frame): pose.astype(np.float32) for frame, pose in zip(actor.frames, actor.chunk_SE3_box, strict=True)}
+def _points_in_chunk(actor: Actor) -> Points:
+    """Moves an actor's points from its box into the chunk, each by the box's pose at the point's frame."""
+    frames = zip(actor.frames, actor.chunk_SE3_box, strict=True)
+    pose_at_frame = {int(frame): pose.astype(np.float32) for frame, pose in frames}
+    # A point of a frame without an annotation has no pose that could move it.
     known = np.isin(actor.points.frames, actor.frames)
-    points = Points(*(getattr(actor.points, n)[known] for n in ("positions", "colors", "colored", "frames")))
-    poses = np.stack([at[int(f)] for f in points.frames]) if len(points) else np.zeros((0, 4, 4), np.float32)
-    moved = np.einsum("pij,pj->pi", poses[:, :3, :3], points.positions) + poses[:, :3, 3]
-    return replace(points, positions=moved.astype(np.float32))
+    points = Points(*(getattr(actor.points, name)[known] for name in _POINT_ATTRIBUTES))
+    if len(points):
+        poses = np.stack([pose_at_frame[int(frame)] for frame in points.frames])
+    else:
+        poses = np.zeros((0, 4, 4), np.float32)
+    positions = np.einsum("pij,pj->pi", poses[:, :3, :3], points.positions) + poses[:, :3, 3]
+    return replace(points, positions=positions.astype(np.float32))

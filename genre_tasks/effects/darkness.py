@@ -1,25 +1,43 @@
-"""Night: marked, not modelled."""
+"""Darkness: images of the night are reported, and not modelled."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from genre_tasks.effects.measurements import Seen
-from genre_tasks.effects.types import Effect, Measured
+from genre_tasks.effects.measurements import ChunkMeasurements
+from genre_tasks.effects.types import Effect, Measurement
 
-DARK = 0.15
-"""Mean of the luma, of 1, below which an image is dark."""
+DARK_LUMA = 0.15
+"""An image is dark where the mean of its luma, from 0 to 1, is below."""
 
-_LUMA = np.array([0.299, 0.587, 0.114])
+# Luma weights of ITU-R BT.601.
+_LUMA_WEIGHTS = np.array([0.299, 0.587, 0.114])
 
 
-def measure(seen: Seen) -> Measured:
-    """The share of source images that are dark."""
-    lumas = [float((image.reshape(-1, 3).mean(0) @ _LUMA) / 255) for image in seen.pixels.values()]
+def measure(measurements: ChunkMeasurements) -> Measurement:
+    """Measures which part of the source images is dark.
+
+    Args:
+        measurements: the chunk's images.
+
+    Returns:
+        Percentage of the source images; no value where there is no image.
+    """
+    lumas = [
+        float((image.reshape(-1, 3).mean(0) @ _LUMA_WEIGHTS) / 255) for image in measurements.source_images.values()
+    ]
     if not lumas:
-        return Measured(None, "there is no image")
-    dark = 100 * float(np.mean([luma < DARK for luma in lumas]))
-    return Measured(dark, f"luma {min(lumas):.2f} to {max(lumas):.2f} of 1")
+        return Measurement(None, "there is no image")
+    percent = 100 * float(np.mean([luma < DARK_LUMA for luma in lumas]))
+    return Measurement(percent, f"luma {min(lumas):.2f} to {max(lumas):.2f} of 1")
 
 
-EFFECT = Effect("darkness", "images darker than 0.15 of 1", "%", 50.0, "nothing: it is marked", measure, marks=True)
+EFFECT = Effect(
+    name="darkness",
+    property="images darker than 0.15 of 1",
+    unit="%",
+    threshold=50.0,
+    cost="nothing: it is marked",
+    measure=measure,
+    report_only=True,
+)

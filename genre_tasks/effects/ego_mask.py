@@ -5,105 +5,149 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from genre_tasks.effects.measurements import Seen
-from genre_tasks.effects.types import Effect, Fitted, Measured
+from genre_tasks.effects.measurements import ChunkMeasurements
+from genre_tasks.effects.types import Effect, EffectParameters, Measurement
 from genre_tasks.logs.types import Float32
 
 STILL_LEVELS = 6.0
 """Standard deviation over the frames, of 255, up to which a pixel does not change."""
 
+# A smooth road stands still too, but blurs into what passes by.
 EDGE_LEVELS = 8.0
-"""A part is the vehicle's own if its outline is an edge of so many levels a pixel in the mean of all frames: a smooth
-road stands still too, but blurs into what passes by."""
+"""A part is of the vehicle if its outline is an edge of so many levels a pixel in the mean of all frames."""
 
 MOTIONLESS_LEVELS = 1.5
 """Standard deviation over the frames of what does not even mirror the world."""
 
-STEP = 4.0
-"""A motionless part is the vehicle's own if what passes by just outside of it changes so many times as much: paint of
-the road's colour has no edge, and a black road at night fades into what moves."""
+# Paint of the road's colour has no edge around it, and a black road at night fades into what moves.
+CHANGE_RATIO = 4.0
+"""A motionless part is of the vehicle if what passes by just outside of it changes so many times as much."""
 
-STEP_PX = 3
+RIM_PX = 3
+"""Width of the rims inside and outside of a part whose changes are compared."""
+
+# The edge of the vehicle is blurred into the road.
 MARGIN_PX = 3
+"""Masks are enlarged by so many pixels."""
+
 ARC_PX = 4
 """How far an upper outline may be from its arc, a parabola over the image's columns."""
 
-MIN_ARC_COLUMNS, GAP_COLUMNS = 12, 25
+MIN_ARC_COLUMNS = 12
+GAP_COLUMNS = 25
+# Where the arc is known, a fainter edge along it is evidence enough.
 FAINT_LEVELS = EDGE_LEVELS / 2
-"""Where the arc is known a fainter edge along it will do."""
 
+# A tenth of a decibel is gained outside of the mask (validation streets 900–902, medians: 0.06 dB at 1 %, 0.27 at 2 and
+# 4, 0.54 at 8; a bonnet of the road's colour costs next to nothing up to 8 %).
 THRESHOLD_PERCENT = 1.2
-"""A tenth of a decibel is gained outside of it (validation streets 900–902, medians: 0.06 dB at 1 %, 0.27 at 2 and 4,
-0.54 at 8; a bonnet of the road's colour costs next to nothing up to 8 %)."""
 
-LEAST_PERCENT = 0.3
-"""Smaller parts are as often road as vehicle."""
+# Smaller parts are as often road as vehicle.
+MIN_MASK_PERCENT = 0.3
 
 MIN_TRAVEL_M = 2.0
 MIN_FRAMES = 4
 
 
-def measure(seen: Seen) -> Measured:
-    """The area of the largest part at the lower edge of a camera's images that never changes."""
-    travel = _travel(seen)
+def measure(measurements: ChunkMeasurements) -> Measurement:
+    """Measures the largest part at the lower edge of a camera's images that never changes.
+
+    Args:
+        measurements: the chunk's images over time.
+
+    Returns:
+        Percentage of the image's area. No value where the vehicle stands, since then all of the image never changes.
+    """
+    travel = _travel_m(measurements)
     if travel < MIN_TRAVEL_M:
-        return Measured(None, f"the vehicle travels {travel:.1f} m: all of the image stands still")
-    parts = _parts(seen)
-    if not parts:
-        return Measured(None, f"no camera has {MIN_FRAMES} images")
-    shares = {camera: float(part.mean()) for camera, part in parts.items()}
-    name = max(shares, key=lambda n: shares[n])
-    return Measured(100 * shares[name], f"of {name}" if shares[name] else "no part of an image stands still")
+        return Measurement(None, f"the vehicle travels {travel:.1f} m: all of the image stands still")
+    masks = _find_vehicle_masks(measurements)
+    if not masks:
+        return Measurement(None, f"no camera has {MIN_FRAMES} images")
+    fractions = {camera: float(mask.mean()) for camera, mask in masks.items()}
+    camera = max(fractions, key=lambda name: fractions[name])
+    explanation = f"of {camera}" if fractions[camera] else "no part of an image stands still"
+    return Measurement(100 * fractions[camera], explanation)
 
 
-def fit(seen: Seen) -> Fitted:
-    """The parts above ``LEAST_PERCENT``, grown by ``MARGIN_PX``: an edge is blurred into the road."""
-    if _travel(seen) < MIN_TRAVEL_M:
-        return Fitted()
+def fit(measurements: ChunkMeasurements) -> EffectParameters:
+    """Finds the ego masks that are larger than ``MIN_MASK_PERCENT``, and enlarges them by ``MARGIN_PX``.
+
+    Args:
+        measurements: the chunk's images over time.
+
+    Returns:
+        A mask for each camera that sees the vehicle; none where the vehicle stands.
+    """
+    if _travel_m(measurements) < MIN_TRAVEL_M:
+        return EffectParameters()
     from scipy import ndimage
 
-    called = {c: p for c, p in _parts(seen).items() if 100 * p.mean() > LEAST_PERCENT}
-    own = {c: ndimage.binary_dilation(p, iterations=MARGIN_PX) for c, p in called.items()}
-    return Fitted(own=own)
+    masks = {
+        camera: ndimage.binary_dilation(mask, iterations=MARGIN_PX)
+        for camera, mask in _find_vehicle_masks(measurements).items()
+        if 100 * mask.mean() > MIN_MASK_PERCENT
+    }
+    return EffectParameters(ego_masks=masks)
 
 
-def _travel(seen: Seen) -> float:
-    centres = seen.chunk.chunk_SE3_ego[:, :3, 3]
-    return float(np.linalg.norm(centres - centres[:1], axis=1).max())
+def _travel_m(measurements: ChunkMeasurements) -> float:
+    centers = measurements.chunk.chunk_SE3_ego[:, :3, 3]
+    return float(np.linalg.norm(centers - centers[:1], axis=1).max())
 
 
-def _parts(seen: Seen) -> dict[str, NDArray[np.bool_]]:
-    """By camera, [H, W]."""
-    found = {}
-    for camera in seen.chunk.camera_names:
-        if len(seen.over_time[camera]) >= MIN_FRAMES:
-            found[camera] = _own_part(seen.over_time[camera].astype(np.float32))
-    return found
+def _find_vehicle_masks(measurements: ChunkMeasurements) -> dict[str, NDArray[np.bool_]]:
+    """By camera, [H, W]; cameras with fewer than ``MIN_FRAMES`` images are left out."""
+    masks = {}
+    for camera in measurements.chunk.camera_names:
+        images = measurements.images_over_time[camera]
+        if len(images) >= MIN_FRAMES:
+            masks[camera] = find_vehicle(images.astype(np.float32))
+    return masks
 
 
-def _own_part(images: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Of [F, H, W, 3] in 0 to 255: [H, W], the largest still part at the lower edge with a still outline."""
+def find_vehicle(images: Float32) -> NDArray[np.bool_]:
+    """Finds the recording vehicle itself in the images of one camera.
+
+    A part is of the vehicle if it reaches the lower edge and does not change, and if either its outline is a still edge
+    or what is just outside of it changes far more than what is just inside.
+
+    Args:
+        images: [F, H, W, 3] sRGB in 0 to 255, at different times.
+
+    Returns:
+        [H, W] true at the vehicle; the largest such part.
+
+    >>> street = np.random.default_rng(0).uniform(90, 200, (8, 40, 60, 3)).astype(np.float32)
+    >>> street[:, 30:] = 20.0
+    >>> find_vehicle(street)[:, 30].nonzero()[0].tolist() == list(range(30, 40))
+    True
+    """
     from scipy import ndimage
 
+    # The channel that changes most counts: a change of hue may leave the brightness as it is.
     change = images.std(0).max(-1)
     mean = images.mean(0).mean(-1)
+    # Sobel's kernel weighs three rows by 1, 2 and 1: a quarter of it is the height of a step in levels.
     edge = np.hypot(ndimage.sobel(mean, 0), ndimage.sobel(mean, 1)) / 4
-    smooth = _at_lower_edge((change <= STILL_LEVELS) & (edge < EDGE_LEVELS))
-    found = [p for p in smooth if _outlined(p, edge)]
-    found += [p for p in _at_lower_edge(change <= MOTIONLESS_LEVELS) if _stands_out(p, change)]
-    best = max(found, key=lambda p: int(p.sum()), default=np.zeros(change.shape, bool))
-    return _below_outline(best, edge) if best.any() else best
+    smooth = _parts_at_lower_edge((change <= STILL_LEVELS) & (edge < EDGE_LEVELS))
+    candidates = [part for part in smooth if _has_edge_around(part, edge)]
+    # Paint of the road's colour has no edge, and is found by what moves around it.
+    motionless = _parts_at_lower_edge(change <= MOTIONLESS_LEVELS)
+    candidates += [part for part in motionless if _changes_far_less_than_surroundings(part, change)]
+    largest = max(candidates, key=lambda part: int(part.sum()), default=np.zeros(change.shape, bool))
+    return _fill_below_outline(largest, edge) if largest.any() else largest
 
 
-def _at_lower_edge(where: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+def _parts_at_lower_edge(mask: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
     """Connected parts that reach the last row."""
     from scipy import ndimage
 
-    parts, _ = ndimage.label(where)
-    return [parts == part for part in np.unique(parts[-1][parts[-1] > 0])]
+    labels, _ = ndimage.label(mask)
+    return [labels == label for label in np.unique(labels[-1][labels[-1] > 0])]
 
 
-def _outlined(part: NDArray[np.bool_], edge: Float32) -> bool:
+def _has_edge_around(part: NDArray[np.bool_], edge: Float32) -> bool:
     """Whether the mean of all frames has an edge around the part."""
     from scipy import ndimage
 
@@ -111,54 +155,66 @@ def _outlined(part: NDArray[np.bool_], edge: Float32) -> bool:
     return bool(around.any()) and float(np.median(edge[around])) >= EDGE_LEVELS
 
 
-def _stands_out(part: NDArray[np.bool_], change: Float32) -> bool:
-    """Whether what is just outside of the part changes far more than what is just inside."""
+def _changes_far_less_than_surroundings(part: NDArray[np.bool_], change: Float32) -> bool:
     from scipy import ndimage
 
-    wide, narrow = (ndimage.binary_dilation(part, iterations=k) for k in (STEP_PX + 1, 1))
-    outside, inside = wide & ~narrow, part & ~ndimage.binary_erosion(part, iterations=STEP_PX, border_value=1)
+    # The pixel next to the part is left out on the outside: it mixes both.
+    outside = ndimage.binary_dilation(part, iterations=RIM_PX + 1) & ~ndimage.binary_dilation(part, iterations=1)
+    inside = part & ~ndimage.binary_erosion(part, iterations=RIM_PX, border_value=1)
     if not outside.any() or not inside.any():
         return False
-    return float(np.median(change[outside])) >= STEP * max(float(np.median(change[inside])), MOTIONLESS_LEVELS / 4)
+    change_inside = max(float(np.median(change[inside])), MOTIONLESS_LEVELS / 4)
+    return float(np.median(change[outside])) >= CHANGE_RATIO * change_inside
 
 
-def _below_outline(part: NDArray[np.bool_], edge: Float32) -> NDArray[np.bool_]:
-    """What lies below the part's upper outline, and below that outline's arc as far as a still edge goes on along it.
+def _fill_below_outline(part: NDArray[np.bool_], edge: Float32) -> NDArray[np.bool_]:
+    """Adds what lies below the upper outline of a part, and below its arc as far as a still edge goes on along it.
 
     Paint mirrors what passes by, and an antenna cuts it in two: the part itself is but a piece of the vehicle.
     """
     from scipy import ndimage
 
-    rows, columns = np.arange(len(part))[:, None], np.arange(part.shape[1])
-    found = np.flatnonzero(part.any(0))
-    tops = part.argmax(0)[found]
-    near = ndimage.maximum_filter1d(edge, 2 * ARC_PX + 1, axis=0)
-    on_edge = near[tops, found] >= EDGE_LEVELS
+    rows = np.arange(len(part))[:, None]
+    columns = np.arange(part.shape[1])
+    below_part = part.cumsum(0) > 0
+    part_columns = np.flatnonzero(part.any(0))
+    tops = part.argmax(0)[part_columns]
+    # The part ends a pixel or two beside the edge, whose position the mean of all frames blurs.
+    strongest_edge = ndimage.maximum_filter1d(edge, 2 * ARC_PX + 1, axis=0)
+    on_edge = strongest_edge[tops, part_columns] >= EDGE_LEVELS
     if on_edge.sum() < MIN_ARC_COLUMNS:
-        return part | (part.cumsum(0) > 0)
-    arc, kept = np.zeros(3), on_edge
+        return part | below_part
+    arc = np.zeros(3)
+    on_arc = on_edge
+    # Three rounds of fitting and leaving out what is far from the arc: an antenna's top is an outlier.
     for _ in range(3):
-        arc = np.polyfit(found[kept], tops[kept], 2)
-        kept = on_edge & (np.abs(np.polyval(arc, found) - tops) <= ARC_PX)
-        if kept.sum() < MIN_ARC_COLUMNS:
-            return part | (part.cumsum(0) > 0)
-    top = np.polyval(arc, columns)
-    along = np.where(np.abs(rows - top) <= ARC_PX, edge, 0).max(0) >= FAINT_LEVELS
-    reach = found[kept]
-    goes_on = _run(along, int(reach[len(reach) // 2]))
-    return (part.cumsum(0) > 0) | (goes_on & (rows >= top))
+        arc = np.polyfit(part_columns[on_arc], tops[on_arc], 2)
+        on_arc = on_edge & (np.abs(np.polyval(arc, part_columns) - tops) <= ARC_PX)
+        if on_arc.sum() < MIN_ARC_COLUMNS:
+            return part | below_part
+    arc_rows = np.polyval(arc, columns)
+    edge_on_arc = np.where(np.abs(rows - arc_rows) <= ARC_PX, edge, 0).max(0) >= FAINT_LEVELS
+    arc_columns = part_columns[on_arc]
+    vehicle_columns = _connected_columns(edge_on_arc, int(arc_columns[len(arc_columns) // 2]))
+    return below_part | (vehicle_columns & (rows >= arc_rows))
 
 
-def _run(along: NDArray[np.bool_], start: int) -> NDArray[np.bool_]:
+def _connected_columns(edge_on_arc: NDArray[np.bool_], start: int) -> NDArray[np.bool_]:
     """The columns to both sides of ``start`` up to the first gap of more than ``GAP_COLUMNS``."""
     from scipy import ndimage
 
-    padded = np.pad(along, GAP_COLUMNS, mode="edge")
+    padded = np.pad(edge_on_arc, GAP_COLUMNS, mode="edge")
     bridged = ndimage.binary_closing(padded, np.ones(GAP_COLUMNS))[GAP_COLUMNS:-GAP_COLUMNS]
-    labels, _ = ndimage.label(bridged | along)
-    return labels == labels[start] if labels[start] else along & False
+    labels, _ = ndimage.label(bridged | edge_on_arc)
+    return labels == labels[start] if labels[start] else np.zeros_like(edge_on_arc)
 
 
 EFFECT = Effect(
-    "ego_mask", "part of an image that never changes", "%", THRESHOLD_PERCENT, "a mask a camera", measure, fit=fit
+    name="ego_mask",
+    property="part of an image that never changes",
+    unit="%",
+    threshold=THRESHOLD_PERCENT,
+    cost="a mask a camera",
+    measure=measure,
+    fit=fit,
 )

@@ -1,18 +1,33 @@
-"""The LiDAR depth term of the loss: it can only pull where there are returns."""
+"""LiDAR depth: the depth term of the loss, which has an effect only where an image has LiDAR returns."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from genre_tasks.effects.measurements import Seen
-from genre_tasks.effects.types import Effect, Measured
-from genre_tasks.scene.lidar_depth import lidar_depth
+from genre_tasks.effects.measurements import ChunkMeasurements
+from genre_tasks.effects.types import Effect, Measurement
+from genre_tasks.scene.lidar_depth import compute_lidar_depth
 
 
-def measure(seen: Seen) -> Measured:
-    """The share of the source images' pixels that have a depth in the loss."""
-    shares = [float((lidar_depth(seen.chunk, view) > 0).float().mean()) for view in seen.sources]
-    return Measured(100 * float(np.mean(shares)), "returns that the image sees, of its own frame")
+def measure(measurements: ChunkMeasurements) -> Measurement:
+    """Measures how many pixels of the source images have a depth in the loss.
+
+    Args:
+        measurements: the chunk's LiDAR sweeps and source views.
+
+    Returns:
+        Percentage of the pixels, mean over the source images.
+    """
+    chunk = measurements.chunk
+    fractions = [float((compute_lidar_depth(chunk, view) > 0).float().mean()) for view in measurements.source_views]
+    return Measurement(100 * float(np.mean(fractions)), "returns that the image sees, of its own frame")
 
 
-EFFECT = Effect("lidar_depth", "pixels with a LiDAR return", "%", 0.1, "a depth term in the loss", measure)
+EFFECT = Effect(
+    name="lidar_depth",
+    property="pixels with a LiDAR return",
+    unit="%",
+    threshold=0.1,
+    cost="a depth term in the loss",
+    measure=measure,
+)

@@ -18,6 +18,7 @@ class ViewMixingProcessor:
     """
 
     def __init__(self) -> None:
+        """Wraps diffusers' processor."""
         from diffusers.models.attention_processor import AttnProcessor2_0
 
         self.attend = AttnProcessor2_0()
@@ -31,7 +32,23 @@ class ViewMixingProcessor:
         temb: Tensor | None = None,
         views: int = 1,
     ) -> Tensor:
-        """Mixed tokens, same shape. Raises ``ValueError`` for a batch that is no multiple of ``views``."""
+        """Mixes the tokens of each sample's views, as diffusers calls its attention processors.
+
+        Args:
+            attn: the attention layer with its weights.
+            hidden_states: tokens of B samples, whose views follow one another.
+            encoder_hidden_states: tokens of a condition, if any.
+            attention_mask: passed on to diffusers' processor.
+            temb: passed on to diffusers' processor.
+            views: number of views per sample.
+
+        Returns:
+            The mixed tokens, of the same shape.
+
+        Raises:
+            ValueError: the batch is no multiple of ``views``.
+        """
+        # Attention has no weights per token, so that joining the views along the token axis is all that mixing takes.
         batch, tokens, channels = hidden_states.shape
         if batch % views:
             raise ValueError(f"expected a batch that is a multiple of {views} views, got {batch}")
@@ -40,9 +57,14 @@ class ViewMixingProcessor:
 
 
 def remove_text_attention(unet: Any) -> None:
-    """Takes the CLIP cross-attention layers out, in place: the fixer has no text (paper Sec. III-B)."""
+    """Takes the CLIP cross-attention layers out of a UNet: the fixer has no text (paper Sec. III-B).
+
+    Args:
+        unet: a ``UNet2DConditionModel``, changed in place.
+    """
     from diffusers.models.attention import BasicTransformerBlock
 
+    # diffusers' blocks skip a layer that is None, so that neither their code nor the other weights change.
     for module in unet.modules():
         if isinstance(module, BasicTransformerBlock):
             module.attn2 = None  # type: ignore[assignment]
@@ -50,6 +72,10 @@ def remove_text_attention(unet: Any) -> None:
 
 
 def mix_views(unet: Any) -> None:
-    """Replaces every self-attention processor, in place; views are passed by ``cross_attention_kwargs``."""
-    # a dictionary of its own: diffusers empties the one it is given
+    """Replaces every self-attention processor of a UNet by a :class:`ViewMixingProcessor`.
+
+    Args:
+        unet: a ``UNet2DConditionModel``, changed in place; ``cross_attention_kwargs`` then take the number of views.
+    """
+    # A new dictionary for each call: diffusers empties the one that it receives.
     unet.set_attn_processor({name: ViewMixingProcessor() for name in unet.attn_processors})

@@ -8,12 +8,14 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from genre_tasks.effects.color_gain import remove_gain
 from genre_tasks.errors import InputError
-from genre_tasks.fixer.warping import MIN_ALPHA, SourceImage
+from genre_tasks.fixer.view_surface import MIN_ALPHA
+from genre_tasks.fixer.warping import SourceImage
 from genre_tasks.render.surface import render_surfaces
 from genre_tasks.scene.chunk import Chunk, View
 from genre_tasks.scene.image_decoding import decode_image
-from genre_tasks.scene.lidar_map import lidar_scene
+from genre_tasks.scene.lidar_map import build_lidar_scene
 from genre_tasks.scene.novel_views import NovelView
 from genre_tasks.scene.projection import NEAR_M
 
@@ -21,38 +23,63 @@ OCCLUDING_POINTS = 60_000
 """LiDAR points whose discs hide things from source images."""
 
 
-def recorded(chunk: Chunk) -> tuple[SourceImage, ...]:
-    """The chunk's source images at the working resolution, with the depth from which LiDAR's points hide things.
+def load_source_images(chunk: Chunk) -> tuple[SourceImage, ...]:
+    """Loads the chunk's source images at the working resolution, with the depth of what hides points from them.
 
-    Raises ``InputError`` for an unreadable image.
+    Args:
+        chunk: with its plan's effects applied.
+
+    Returns:
+        One image for each source view, at the scene's own exposure.
+
+    Raises:
+        InputError: an image cannot be decoded.
     """
-    views = [v if v.blur is None else replace(v, blur=None) for v in chunk.of_role("source")]  # depth has none
+    # Depth has no motion blur, and without it each view is rendered once.
+    views = [v if v.blur is None else replace(v, blur=None) for v in chunk.views_with_role("source")]
     with torch.no_grad():
-        map_ = render_surfaces(lidar_scene(chunk, OCCLUDING_POINTS), views)
-    depth = torch.where(map_.alpha >= MIN_ALPHA, map_.expected_depth(), torch.zeros_like(map_.alpha))
-    out = []
-    for view, hidden_at in zip(views, depth, strict=True):
-        image = _own_colours(view).permute(2, 0, 1)
-        if view.own is not None:  # what lies behind the vehicle is hidden by it
-            hidden_at = torch.where(torch.from_numpy(view.own), NEAR_M, hidden_at)
-        out.append(
-            SourceImage(view.camera, view.frame, view.chunk_SE3_camera, view.lens, image, hidden_at, view.shutter)
+        lidar_map = render_surfaces(build_lidar_scene(chunk, OCCLUDING_POINTS), views)
+    depths = torch.where(lidar_map.alpha >= MIN_ALPHA, lidar_map.expected_depth(), torch.zeros_like(lidar_map.alpha))
+    sources = []
+    for view, depth in zip(views, depths, strict=True):
+        if view.ego_mask is not None:
+            # The vehicle itself hides whatever lies behind it.
+            depth = torch.where(torch.from_numpy(view.ego_mask), NEAR_M, depth)
+        source = SourceImage(
+            camera=view.camera,
+            frame=view.frame,
+            chunk_SE3_camera=view.chunk_SE3_camera,
+            lens=view.lens,
+            image=_decode_without_gain(view).permute(2, 0, 1),
+            depth=depth,
+            shutter=view.shutter,
         )
-    return tuple(out)
+        sources.append(source)
+    return tuple(sources)
 
 
-def _own_colours(view: View) -> Tensor:
+def _decode_without_gain(view: View) -> Tensor:
     """[H, W, 3] the image, at the scene's own exposure where its gain is known."""
     image = decode_image(view.image, view.lens.width_px, view.lens.height_px)
-    if view.log_gain is None:
-        return image
-    from genre_tasks.effects.exposure import neutral
-
-    return neutral(image, image.new_tensor(view.log_gain))
+    # Without this, neighbouring pixels that are taken from images of different gain would show seams.
+    return image if view.log_gain is None else remove_gain(image, image.new_tensor(view.log_gain))
 
 
-def references(chunk: Chunk, views: Sequence[NovelView], sources: Sequence[SourceImage]) -> list[SourceImage]:
-    """The reference of each view. Raises ``InputError`` for one that is no source view of the chunk."""
+def find_references(chunk: Chunk, views: Sequence[NovelView], sources: Sequence[SourceImage]) -> list[SourceImage]:
+    """Finds the reference image of each novel view.
+
+    Args:
+        chunk: that all are of, for messages.
+        views: novel views, which name their references.
+        sources: the chunk's source images.
+
+    Returns:
+        One source image for each view.
+
+    Raises:
+        InputError: a reference is no source view of the chunk.
+    """
+    # By name and not by index: sources may be a part of the chunk's.
     known = {(s.camera, s.frame): s for s in sources}
     for view in views:
         if view.reference not in known:

@@ -1,4 +1,4 @@
-"""Fixers to files and back: safetensors with a JSON of the configuration beside them.
+"""Reads and writes fixers: safetensors with a JSON of the configuration next to them.
 
 ``small`` stores the whole network in half precision; ``sd-turbo`` stores adapters and skips, and names its base.
 """
@@ -6,23 +6,32 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import InputError
-from genre_tasks.fixer.network import Fnet, FnetArchitecture, build, sd_turbo
+from genre_tasks.fixer.architectures import build_fnet, load_sd_turbo
+from genre_tasks.fixer.network import Fnet, FnetArchitecture
+from genre_tasks.weight_checks import require_weights_fit
 
 REMEDY = "Give weights that `genre train fnet` wrote for this version, or leave `fnet.weights` at builtin."
+# Files are in half precision; weights of other tools are in any of these, and all are used in float32.
+_FILE_DTYPES = (torch.float16, torch.bfloat16, torch.float32)
 
 
 def save_fnet(fnet: Fnet, path: Path, base: str | None = None, rank: int | None = None) -> None:
-    """Writes ``path`` (…/fnet.safetensors) and the JSON beside it; each is renamed into place.
+    """Writes a fixer and the JSON next to it; each file is complete or not there.
 
-    With ``base`` (a folder relative to ``path``'s, or a hub id) only what LoRA training changes is written.
+    Args:
+        fnet: the network.
+        path: of the weights, …/fnet.safetensors; its folder is made where it is missing.
+        base: SD-Turbo's folder relative to that of ``path``, or a hub id. With it only what LoRA training changes is
+            written.
+        rank: of the adapters, with ``base``.
     """
     from safetensors.torch import save_file
 
@@ -33,15 +42,22 @@ def save_fnet(fnet: Fnet, path: Path, base: str | None = None, rank: int | None 
         document = {"model": "sd-turbo", "base": base, "rank": rank, "timestep": fnet.architecture.timestep}
         tensors = trainable_state(fnet)
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".tmp")
-    save_file({k: v.detach().half().contiguous().cpu() for k, v in sorted(tensors.items())}, part)
-    part.replace(path)
-    part.write_text(json.dumps(document, indent=2, sort_keys=True) + "\n")
-    part.replace(path.with_suffix(".json"))
+    with atomic_path(path) as part:
+        # Half precision halves the file; loading widens the weights again.
+        save_file({name: value.detach().half().contiguous().cpu() for name, value in sorted(tensors.items())}, part)
+    with atomic_path(path.with_suffix(".json")) as part:
+        part.write_text(json.dumps(document, indent=2, sort_keys=True) + "\n")
 
 
 def load_fnet(path: Path, model: str = "small") -> Fnet:
-    """The fixer of a file, or of a folder that holds ``fnet.safetensors`` and ``fnet.json``; ready for inference.
+    """Loads a fixer for inference.
+
+    Args:
+        path: of the weights, or a folder that holds ``fnet.safetensors`` and ``fnet.json``.
+        model: ``small`` or ``sd-turbo``, which the weights must be of.
+
+    Returns:
+        The network, frozen.
 
     Raises:
         InputError: a file is missing or unreadable, is of the other model, or keys, shapes or dtypes do not fit.
@@ -51,6 +67,7 @@ def load_fnet(path: Path, model: str = "small") -> Fnet:
 
     path = path / "fnet.safetensors" if path.is_dir() else path
     document = _read_document(path.with_suffix(".json"))
+    # Checked before the tensors are read, which takes long for the larger model.
     if document.get("model") != model:
         raise InputError(
             f"the weights are of the model {document.get('model')!r}, the configuration says {model!r}",
@@ -62,24 +79,35 @@ def load_fnet(path: Path, model: str = "small") -> Fnet:
         tensors = load_file(path)
     except (OSError, SafetensorError) as error:
         raise InputError(f"the weights cannot be read: {error}", remedy=REMEDY, file=path, stage="fnet") from error
-    fnet = _network(document, path)
-    _check(tensors, fnet.state_dict() if model == "small" else trainable_state(fnet), path)
-    fnet.load_state_dict({k: v.float() for k, v in tensors.items()}, strict=False)
+    fnet = _build_described(document, path)
+    # Checked before loading, because torch's own error names neither the file nor a remedy.
+    expected = fnet.state_dict() if model == "small" else trainable_state(fnet)
+    require_weights_fit(tensors, expected, path, REMEDY, stage="fnet", dtypes=_FILE_DTYPES)
+    fnet.load_state_dict({name: value.float() for name, value in tensors.items()}, strict=False)
     return fnet.eval().requires_grad_(False)
 
 
 def trainable_state(fnet: Fnet) -> dict[str, Tensor]:
-    """The parameters that training changes, by name."""
-    return {name: p for name, p in fnet.named_parameters() if p.requires_grad}
+    """Collects the parameters that training changes.
+
+    Args:
+        fnet: the network.
+
+    Returns:
+        Parameters by name.
+    """
+    return {name: parameter for name, parameter in fnet.named_parameters() if parameter.requires_grad}
 
 
-def _network(document: dict[str, Any], path: Path) -> Fnet:
+def _build_described(document: dict[str, Any], path: Path) -> Fnet:
+    """Builds the network that the JSON describes, without the weights."""
     try:
         if document["model"] == "small":
-            return build(FnetArchitecture(**document["architecture"]))
+            return build_fnet(FnetArchitecture(**document["architecture"]))
+        # A base next to the weights moves with them; anything else is a hub id.
         local = path.parent / document["base"]
         source = str(local) if local.exists() else document["base"]
-        return sd_turbo(source, document["timestep"], document["rank"])
+        return load_sd_turbo(source, document["timestep"], document["rank"])
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"the configuration of the weights does not describe a fixer: {error}",
@@ -96,28 +124,7 @@ def _read_document(path: Path) -> dict[str, Any]:
         raise InputError(
             f"the configuration of the weights cannot be read: {error}", remedy=REMEDY, file=path, stage="fnet"
         ) from error
+    # A list or a number is valid JSON, and would fail later with an error that names no file.
     if not isinstance(document, dict):
         raise InputError("the configuration of the weights is no object", remedy=REMEDY, file=path, stage="fnet")
     return document
-
-
-def _check(found: Mapping[str, Tensor], expected: Mapping[str, Tensor], path: Path) -> None:
-    """Raises one ``InputError`` that names missing and extra keys, other shapes, other dtypes and non-finite values."""
-    problems = [f"missing key {k}" for k in sorted(expected.keys() - found.keys())]
-    problems += [f"extra key {k}" for k in sorted(found.keys() - expected.keys())]
-    for key in sorted(found.keys() & expected.keys()):
-        tensor, want = found[key], expected[key]
-        if tensor.shape != want.shape:
-            problems.append(f"{key} has shape {list(tensor.shape)}, expected {list(want.shape)}")
-        elif tensor.dtype not in (torch.float16, torch.bfloat16, torch.float32):
-            problems.append(f"{key} has dtype {tensor.dtype}, expected float16, bfloat16 or float32")
-        elif not bool(torch.isfinite(tensor).all()):
-            problems.append(f"{key} holds non-finite values")
-    if problems:
-        more = f" and {len(problems) - 5} more" if len(problems) > 5 else ""
-        raise InputError(
-            f"the weights do not fit the network: {'; '.join(problems[:5])}{more}",
-            remedy=REMEDY,
-            file=path,
-            stage="fnet",
-        )

@@ -5,27 +5,33 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
-from genre_tasks.learned.features import Fixed, features
+from genre_tasks.learned.features import StaticFeatures, compute_features
 from genre_tasks.learned.learned_optimiser import LearnedOptimiser
 from genre_tasks.learned.sparse_unet import VoxelPyramid
 from genre_tasks.losses.targets import Target
-from genre_tasks.optimiser.ground_constraint import along_ground
-from genre_tasks.optimiser.objective import Objective, Sight
-from genre_tasks.optimiser.state import Frame, State
-from genre_tasks.optimiser.step_rules import Step
-from genre_tasks.optimiser.unroll import camera_centre
+from genre_tasks.optimiser.ground_constraint import project_onto_ground
+from genre_tasks.optimiser.objective import LossAndGradients, Objective
+from genre_tasks.optimiser.parameter_groups import GaussianGroup
+from genre_tasks.optimiser.state import Parameterization, State
+from genre_tasks.optimiser.step_rules import StepFunction
+from genre_tasks.optimiser.unroll import UnrolledLoop, mean_camera_center
 from genre_tasks.optimiser.view_sampler import ViewSampler
-from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import SceneGraph
 
 
 @dataclass(frozen=True)
 class TrainingScene:
-    """A start and what it is optimised towards.
+    """A start, and the images that it is optimised towards and measured with.
 
-    ``source`` and ``fixed`` are what the optimiser sees; ``heldout`` and ``truth`` (true or fixed images at the novel
-    views) judge it in training alone. ``fixed`` and ``truth`` may be empty.
+    Attributes:
+        name: for records.
+        scene: where the optimisation starts.
+        source: source views, which the optimiser sees.
+        heldout: views of the log that only the held-out loss sees.
+        fixed: fixed novel views, which the optimiser sees; may be empty.
+        truth: true or fixed images at novel views that only the held-out loss sees; may be empty.
     """
 
     name: str
@@ -37,10 +43,17 @@ class TrainingScene:
 
 
 @dataclass(frozen=True)
-class Course:
-    """How an episode goes: which scene, T, views in each iteration, and the start's change of size and opacity.
+class EpisodeConfig:
+    """How an episode goes.
 
-    ``judges``: held-out views, and as many true novel views, in each judgement.
+    Attributes:
+        scene: index of the training scene.
+        iterations: T, the length of the schedule.
+        views: source views in each iteration.
+        novel_views: fixed novel views in each iteration.
+        log_scale_shift: added to all log-scales at the start.
+        logit_shift: added to all logit opacities at the start.
+        held_out_views: held-out views, and as many true novel views, in each held-out loss.
     """
 
     scene: int
@@ -49,84 +62,186 @@ class Course:
     novel_views: int
     log_scale_shift: float
     logit_shift: float
-    judges: int = 3
+    held_out_views: int = 3
 
 
 @dataclass
 class Episode:
-    """A scene at iteration ``state.iteration`` of its course, with the gradient there already taken."""
+    """A scene between two iterations of its optimisation.
 
-    course: Course
-    frame: Frame
+    Attributes:
+        config: how the episode goes.
+        loop: the optimisation.
+        static_features: of its Gaussians.
+        pyramid: voxels of its Gaussians.
+        held_out_samplers: they draw the views of the held-out loss.
+        evaluation: loss and gradients at the present state, for the next step; ``None`` until they are taken.
+    """
+
+    config: EpisodeConfig
+    loop: UnrolledLoop
+    static_features: StaticFeatures
     pyramid: VoxelPyramid
-    columns: Fixed
-    samplers: tuple[ViewSampler, ...]
-    state: State
-    sight: Sight | None = None
+    held_out_samplers: tuple[ViewSampler, ...]
+    evaluation: LossAndGradients | None = None
 
     @staticmethod
-    def start(course: Course, scene: TrainingScene, network: LearnedOptimiser, generator: torch.Generator) -> Episode:
-        """At iteration 0."""
-        frame = Frame.of(shifted(scene.scene, course))
-        centre = camera_centre(scene.source)
-        samplers = (
-            ViewSampler(scene.source, course.views, generator),
-            ViewSampler(scene.fixed, course.novel_views, generator),
-            ViewSampler(scene.heldout, course.judges, generator),
-            ViewSampler(scene.truth, course.judges, generator),
-        )
-        state = State.start(len(scene.scene), scene.scene.gaussians.means)
-        return Episode(course, frame, network.pyramid(frame, centre), Fixed.of(frame, centre), samplers, state)
+    def start(
+        config: EpisodeConfig,
+        scene: TrainingScene,
+        network: LearnedOptimiser,
+        objective: Objective,
+        generator: torch.Generator,
+    ) -> Episode:
+        """Sets an episode up before its first iteration.
 
-    def look(self, objective: Objective, generator: torch.Generator, residuals: bool = False) -> Sight:
-        """Loss and gradient at the present offsets, on the next views that the optimiser may see; with residuals."""
-        batch = [*self.samplers[0].draw(), *self.samplers[1].draw()]
-        at = self.frame, self.state.offsets, batch, self.state.iteration
-        return objective(*at, generator, residuals=residuals)
+        Args:
+            config: how it goes.
+            scene: the start and its images.
+            network: in training; its present weights make the steps until :meth:`use_network` or
+                :meth:`record_steps` is called.
+            objective: the loss that the optimiser sees.
+            generator: it draws views and crops, for as long as the episode lasts.
 
-    def judge(self, objective: Objective, generator: torch.Generator) -> Sight:
-        """Loss and gradient at the present offsets, on views that the optimiser does not see."""
-        batch = [*self.samplers[2].draw(), *self.samplers[3].draw()]
-        return objective(self.frame, self.state.offsets, batch, 0, generator)
-
-    def step(self, network: LearnedOptimiser, move: Step, rows: torch.Tensor) -> torch.Tensor:
-        """Moves the state by ``move`` (see :meth:`mover`); returns the rows [M, 14] of the step with their gradient.
-
-        Without what leads out of the ground's planes, as the state is moved.
+        Returns:
+            Episode: at iteration 0.
         """
-        inputs, total = self._see(), self.course.iterations
-        delta = network.sampled_delta(self.state, inputs, self.pyramid, total, rows)
-        self._move(move)
-        return along_ground(delta, self.frame.planes[rows])
+        # Units and bounds are those of the perturbed start, as they would be of a scene that looks so.
+        parameterization = Parameterization.from_scene(perturb_start(scene.scene, config))
+        center = mean_camera_center(scene.source)
+        pyramid = network.pyramid(parameterization, center)
+        static_features = StaticFeatures.compute(parameterization, center)
+        step_function = _inference_step(network, parameterization, static_features, pyramid)
+        samplers = (
+            ViewSampler(scene.source, config.views, generator),
+            ViewSampler(scene.fixed, config.novel_views, generator),
+        )
+        held_out_samplers = (
+            ViewSampler(scene.heldout, config.held_out_views, generator),
+            ViewSampler(scene.truth, config.held_out_views, generator),
+        )
+        loop = UnrolledLoop(
+            # Gaussians alone are trained on; what else a scene has is neither rendered nor moved.
+            GaussianGroup(parameterization, step_function),
+            (),
+            samplers,
+            objective=objective,
+            generator=generator,
+            total=config.iterations,
+            image_residuals=network.uses_image_residuals,
+        )
+        return Episode(config, loop, static_features, pyramid, held_out_samplers)
 
-    def step_only(self, move: Step) -> None:
-        """As :meth:`step`, without a gradient."""
-        assert self.sight is not None
-        self.state = self.state.saw(self.sight.gradient, self.sight.residuals)
-        self._move(move)
+    @property
+    def parameterization(self) -> Parameterization:
+        """The scene at its start, and the units of the offsets."""
+        return self.loop.gaussians.parameterization
 
-    def mover(self, network: LearnedOptimiser) -> Step:
-        """The network's step without gradient, with its weights as they are now."""
-        with torch.no_grad():
-            return network.step_of(self.frame, self.columns, self.pyramid)
+    @property
+    def state(self) -> State:
+        """Offsets and moments after the steps so far."""
+        return self.loop.gaussians.state
 
-    def _see(self) -> torch.Tensor:
-        assert self.sight is not None
-        self.state = self.state.saw(self.sight.gradient, self.sight.residuals)
-        return features(self.frame, self.columns, self.state, self.sight.gradient, self.course.iterations)
+    @property
+    def samplers(self) -> tuple[ViewSampler, ...]:
+        """All samplers: of the source, fixed, held-out and true views."""
+        # In this order checkpoints store the queues.
+        return (*self.loop.samplers, *self.held_out_samplers)
 
-    def _move(self, move: Step) -> None:
-        assert self.sight is not None
-        self.state = self.state.moved(self.frame, move(self.state, self.sight.gradient, self.course.iterations))
+    def evaluate_heldout(self, objective: Objective, generator: torch.Generator) -> LossAndGradients:
+        """Takes the loss and its gradients on views that the optimiser does not see.
+
+        Args:
+            objective: the held-out loss.
+            generator: it draws the perceptual term's crops.
+
+        Returns:
+            LossAndGradients: at the present offsets.
+        """
+        views = [target for sampler in self.held_out_samplers for target in sampler.draw()]
+        # As iteration 0, in which the perceptual term is always taken.
+        return self.loop.evaluate_views(views, objective, 0, generator)
+
+    def use_network(self, network: LearnedOptimiser) -> None:
+        """Makes the next steps with the network's weights as they are now, without gradients."""
+        self.loop.gaussians.step_function = _inference_step(
+            network, self.parameterization, self.static_features, self.pyramid
+        )
+
+    def record_steps(self, network: LearnedOptimiser, rows: Tensor) -> RecordedSteps:
+        """Makes the next steps with the network's weights as they are now, and records them differentiably.
+
+        Args:
+            network: in training.
+            rows: [M] Gaussians whose steps are recorded.
+
+        Returns:
+            RecordedSteps: it fills up while the loop advances.
+        """
+        self.use_network(network)
+        recorded = RecordedSteps(self, network, rows)
+        self.loop.gaussians.step_function = recorded
+        return recorded
 
 
-def shifted(scene: SceneGraph, course: Course) -> SceneGraph:
-    """The scene with all sizes and opacities changed alike, so that training meets starts of many kinds."""
-    g: Gaussians = scene.gaussians
+class RecordedSteps:
+    """A step function that moves as inference does, and keeps each step with its gradient in the network's weights.
+
+    Args:
+        episode: with the step function that makes the moves.
+        network: in training.
+        rows: [M] Gaussians whose steps are kept.
+
+    Attributes:
+        deltas: [M, 14] of each step so far, without what leads out of the ground's planes, as the state is moved.
+    """
+
+    def __init__(self, episode: Episode, network: LearnedOptimiser, rows: Tensor) -> None:
+        self.deltas: list[Tensor] = []
+        self._episode = episode
+        self._network = network
+        self._rows = rows
+        self._inference_step = episode.loop.gaussians.step_function
+
+    def __call__(self, state: State, gradient: Tensor, total: int) -> Tensor:
+        """Computes a step without gradient [N, 14], and keeps its differentiable rows; see :class:`StepFunction`."""
+        episode = self._episode
+        parameterization = episode.parameterization
+        # Detached features (paper Sec. III-C): the graph holds the network alone, for the sampled rows alone.
+        inputs = compute_features(parameterization, episode.static_features, state, gradient, total)
+        delta = self._network.sampled_delta(state, inputs, episode.pyramid, total, self._rows)
+        # The constraint is part of the step: a gradient out of the plane would train what the state never does.
+        self.deltas.append(project_onto_ground(delta, parameterization.ground_constraint[self._rows]))
+        # The move is made as at inference, by the kernel where there is one, so that training meets the same states.
+        return self._inference_step(state, gradient, total)
+
+
+def perturb_start(scene: SceneGraph, config: EpisodeConfig) -> SceneGraph:
+    """Changes all sizes and all opacities alike, so that training meets starts of many kinds.
+
+    Args:
+        scene: a training scene.
+        config: the shifts of log-scales and logit opacities.
+
+    Returns:
+        SceneGraph: the start of the episode.
+    """
+    gaussians = scene.gaussians
     return scene.with_gaussians(
         replace(
-            g,
-            log_scales=g.log_scales + course.log_scale_shift,
-            logit_opacities=g.logit_opacities + course.logit_shift,
+            gaussians,
+            log_scales=gaussians.log_scales + config.log_scale_shift,
+            logit_opacities=gaussians.logit_opacities + config.logit_shift,
         )
     )
+
+
+def _inference_step(
+    network: LearnedOptimiser,
+    parameterization: Parameterization,
+    static_features: StaticFeatures,
+    pyramid: VoxelPyramid,
+) -> StepFunction:
+    # The weights are copied into the kernel's layout; the graph must not follow them there.
+    with torch.no_grad():
+        return network.create_step_function(parameterization, static_features, pyramid)

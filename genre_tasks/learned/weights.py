@@ -1,96 +1,96 @@
-"""Weights as safetensors with a JSON configuration beside them."""
+"""The learned optimiser's weights on disk: safetensors with a JSON configuration beside them."""
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import torch
 from pydantic import ValidationError
 
+from genre_tasks.atomic_path import write_atomically
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.learned.learned_optimiser import LearnedOptimiser
 from genre_tasks.learned.network import NetworkConfig
-from genre_tasks.optimiser.kernels.constants import RESIDUALS, VARYING
+from genre_tasks.optimiser.kernels.constants import IMAGE_RESIDUALS, VARYING_FEATURES
+from genre_tasks.weight_checks import require_weights_fit
 
 REMEDY = "Give weights made by `genre train gnet` or `genre train enet`, or use `builtin`."
 
 
-def load(weights: Path) -> LearnedOptimiser:
-    """The network of ``weights`` (``X.safetensors`` with ``X.json`` beside it), float32, on the CPU.
+def load_optimiser(weights: Path) -> LearnedOptimiser:
+    """Reads a learned optimiser from its weights and the configuration beside them.
 
-    Raises ``InputError`` for a missing or unreadable file and for tensors that are missing, too many, or of another
-    shape or dtype, naming them; ``ConfigError`` for a configuration that does not describe a network.
+    Args:
+        weights: a file ``X.safetensors``, with ``X.json`` in the same folder.
+
+    Returns:
+        The network in float32 on the CPU, without gradients.
+
+    Raises:
+        InputError: a file is missing or unreadable; or tensors are missing, unknown, or of another shape or dtype,
+            and the error names them.
+        ConfigError: the configuration does not describe a network.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
-    described = weights.with_suffix(".json")
-    for path in (weights, described):
+    config_file = weights.with_suffix(".json")
+    for path in (weights, config_file):
         if not path.is_file():
             raise InputError("The optimiser's weights are missing", remedy=REMEDY, file=path)
     try:
-        config = NetworkConfig.model_validate_json(described.read_text())
+        config = NetworkConfig.model_validate_json(config_file.read_text())
     except (ValidationError, ValueError) as error:
+        # pydantic's message goes on with links; its first lines name the keys.
         detail = "; ".join(str(error).splitlines()[:4])
         raise ConfigError(
-            f"The network's configuration is not valid: {detail}", remedy=REMEDY, file=described
+            f"The network's configuration is not valid: {detail}", remedy=REMEDY, file=config_file
         ) from None
     try:
+        # Pickled weights could run code; safetensors cannot.
         tensors = load_file(weights, device="cpu")
     except (SafetensorError, OSError) as error:
         raise InputError(f"The weights cannot be read: {error}", remedy=REMEDY, file=weights) from error
+    # Compared by hand, since torch's strict loading casts other dtypes without a word.
     network = LearnedOptimiser(config)
-    problems = _differences(network.state_dict(), tensors)
-    if problems:
-        raise InputError(f"The weights do not fit the network: {problems}", remedy=REMEDY, file=weights)
+    require_weights_fit(tensors, network.state_dict(), weights, REMEDY)
     network.load_state_dict(tensors)
     return network.eval().requires_grad_(False)
 
 
-def save(network: LearnedOptimiser, weights: Path) -> None:
-    """Writes ``X.safetensors`` and ``X.json``, each complete or not at all."""
-    from safetensors.torch import save as serialise
+def save_optimiser(network: LearnedOptimiser, weights: Path) -> None:
+    """Writes a learned optimiser; each file is complete or absent at any moment.
+
+    Args:
+        network: the network to write.
+        weights: the file ``X.safetensors``; the configuration goes to ``X.json``.
+    """
+    from safetensors.torch import save
 
     tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
+    # The configuration first: weights without one are not readable.
     write_atomically(weights.with_suffix(".json"), (network.config.model_dump_json(indent=2) + "\n").encode())
-    write_atomically(weights, serialise(tensors))
+    write_atomically(weights, save(tensors))
 
 
-def with_residuals(network: LearnedOptimiser) -> dict[str, torch.Tensor]:
-    """The weights of a network that is told residuals: those of ``network``, and zeros for what these bring."""
+def add_residual_inputs(network: LearnedOptimiser) -> dict[str, torch.Tensor]:
+    """Extends weights for a network that uses image residuals, which then makes the same steps at first.
+
+    Args:
+        network: weights of a network with or without residuals.
+
+    Returns:
+        The state of a network with residuals; what the residuals feed is zero where ``network`` lacks it.
+    """
     weights = dict(network.state_dict())
-    if network.residuals:
+    if network.uses_image_residuals:
         return weights
-    entry, weight, bias = weights["entry.weight"], weights["head.weight"], weights["head.bias"]
-    told = entry.new_zeros((len(entry), RESIDUALS))
-    weights["entry.weight"] = torch.cat([entry[:, :VARYING], told, entry[:, VARYING:]], 1)
-    weights["head.weight"] = torch.cat([weight, weight.new_zeros((1, weight.shape[1]))])
+    entry = weights["entry.weight"]
+    head = weights["head.weight"]
+    bias = weights["head.bias"]
+    residual_columns = entry.new_zeros((len(entry), IMAGE_RESIDUALS))
+    # Residuals stand between the features that vary and those of the schedule, see ``features.compute_features``.
+    weights["entry.weight"] = torch.cat([entry[:, :VARYING_FEATURES], residual_columns, entry[:, VARYING_FEATURES:]], 1)
+    weights["head.weight"] = torch.cat([head, head.new_zeros((1, head.shape[1]))])
     weights["head.bias"] = torch.cat([bias, bias.new_zeros(1)])
     return weights
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Under a temporary name in the same folder, synced, then renamed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    with temporary.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
-
-
-def _differences(wanted: dict[str, torch.Tensor], found: dict[str, torch.Tensor]) -> str:
-    """What does not fit, in words; empty where everything does."""
-    parts = []
-    if missing := sorted(wanted.keys() - found.keys()):
-        parts.append(f"missing {', '.join(missing)}")
-    if extra := sorted(found.keys() - wanted.keys()):
-        parts.append(f"unknown {', '.join(extra)}")
-    for name in sorted(wanted.keys() & found.keys()):
-        a, b = wanted[name], found[name]
-        if a.shape != b.shape or a.dtype != b.dtype:
-            kinds = [f"{str(x.dtype).removeprefix('torch.')} {list(x.shape)}" for x in (a, b)]
-            parts.append(f"{name} is {kinds[1]} where {kinds[0]} is expected")
-    return "; ".join(parts)

@@ -5,23 +5,31 @@ A reader is a function ``open(rest: str) -> DrivingLog``, given as ``"module:fun
 
 from __future__ import annotations
 
-import difflib
 import importlib
 from dataclasses import dataclass
 
 from genre_tasks.errors import InputError
 from genre_tasks.logs.types import DrivingLog
+from genre_tasks.suggestions import did_you_mean
 
 
 @dataclass(frozen=True)
 class ReaderEntry:
-    """Where a reader lives, an example of its URI, and what to install if the import fails."""
+    """Where to find a reader.
+
+    Attributes:
+        target: ``"module:function"``.
+        example: a URI that the reader opens, for error messages.
+        install_hint: what to install if importing the module fails.
+    """
 
     target: str
     example: str
-    hint: str
+    install_hint: str
 
 
+# Targets are text, not functions: importing every reader would need the packages of all, and would slow down each
+# command.
 _READERS: dict[str, ReaderEntry] = {
     "pandaset": ReaderEntry(
         "genre_tasks.logs.pandaset.reader:open_pandaset",
@@ -36,47 +44,70 @@ _READERS: dict[str, ReaderEntry] = {
 }
 
 
-def register(name: str, target: str, hint: str, example: str = "") -> None:
-    """Adds a reader: ``target`` is ``"module:function"``, ``hint`` what to install if importing it fails."""
+def register(name: str, target: str, install_hint: str, example: str = "") -> None:
+    """Adds a reader, so that ``open_log`` opens URIs that begin with its name.
+
+    Args:
+        name: what stands before the colon of a URI.
+        target: ``"module:function"``; the function takes what stands behind the colon and returns a ``DrivingLog``.
+        install_hint: what to install if importing the module fails.
+        example: a URI for error messages; by default ``name:…``.
+
+    Raises:
+        ValueError: another reader has that name.
+
+    Example::
+
+        register("waymo", "my_package.waymo:open_waymo", "pip install my_package", "waymo:PATH/segment.tfrecord")
+        log = open_log("waymo:/data/segment.tfrecord")
+    """
+    # The same target again is no error: a module that registers its reader may be imported twice.
     if name in _READERS and _READERS[name].target != target:
         raise ValueError(f"the reader {name!r} exists already, at {_READERS[name].target}")
-    _READERS[name] = ReaderEntry(target, example or f"{name}:…", hint)
+    _READERS[name] = ReaderEntry(target, example or f"{name}:…", install_hint)
 
 
 def known_readers() -> tuple[str, ...]:
-    """The names that ``open_log`` understands, sorted."""
+    """Lists the names that ``open_log`` understands.
+
+    Returns:
+        The names, sorted.
+
+    >>> known_readers()
+    ('pandaset', 'synthetic')
+    """
     return tuple(sorted(_READERS))
 
 
 def open_log(uri: str) -> DrivingLog:
-    """Opens ``reader:rest``; cheap, nothing but small files is read.
+    """Opens a driving log by its URI; cheap, since nothing but small files is read.
+
+    Args:
+        uri: ``reader:rest``, such as ``pandaset:PATH/002`` or ``synthetic:street?seed=1000``.
+
+    Returns:
+        The log.
 
     Raises:
-        InputError: no or an unknown reader, a reader whose packages are not installed, or what the reader itself says
-            about ``rest`` (no such path, …).
+        InputError: no reader of that name, a reader whose packages are not installed, or no such log.
+        ConfigError: a parameter of a synthetic log is unknown or out of range.
+
+    >>> open_log("synthetic:street?seed=1000").frame_count
+    20
     """
     name, colon, rest = uri.partition(":")
     entry = _READERS.get(name)
-    if not colon or entry is None:
-        raise InputError(_unknown(uri, name, bool(colon)), remedy=_remedy(name), log=uri)
+    examples = f"Known: {', '.join(_READERS[reader].example for reader in known_readers())}."
+    if not colon:
+        raise InputError(f"a log is given as reader:where, {uri!r} names no reader", remedy=examples, log=uri)
+    if entry is None:
+        raise InputError(f"unknown reader {name!r}", remedy=did_you_mean(name, _READERS) + examples, log=uri)
     module_name, _, function = entry.target.partition(":")
+    # Imported here, since a reader may need packages that users of other readers do not have.
     try:
         reader = getattr(importlib.import_module(module_name), function)
     except ImportError as error:
-        raise InputError(
-            f"the reader {name!r} cannot be loaded ({error})", remedy=f"Install what it needs: {entry.hint}.", log=uri
-        ) from error
+        remedy = f"Install what it needs: {entry.install_hint}."
+        raise InputError(f"the reader {name!r} cannot be loaded ({error})", remedy=remedy, log=uri) from error
     log: DrivingLog = reader(rest)
     return log
-
-
-def _unknown(uri: str, name: str, has_colon: bool) -> str:
-    if not has_colon:
-        return f"a log is given as reader:where, {uri!r} names no reader"
-    return f"unknown reader {name!r}"
-
-
-def _remedy(name: str) -> str:
-    close = difflib.get_close_matches(name, _READERS, n=1)
-    question = f"Did you mean {close[0]!r}? " if close else ""
-    return question + "Known: " + ", ".join(_READERS[n].example for n in known_readers()) + "."

@@ -1,8 +1,16 @@
-"""Values of a driving log: cameras, images, sweeps, cuboid tracks.
+"""Values of a driving log: cameras, images, LiDAR sweeps and cuboid tracks, and the protocol that every reader keeps.
 
-Conventions: ``world_SE3_camera`` takes camera coordinates to world coordinates; camera axes x right, y down,
-z forward; metres, seconds, float64; quaternions w, x, y, z. Continuous image coordinates: the top-left corner of the
-image is (0, 0) and the centre of the first pixel is (0.5, 0.5).
+Conventions of this project, from the log to the render:
+
+* **Transforms.** ``a_SE3_b`` [4, 4] takes coordinates in frame b to coordinates in frame a. Names chain, so that a
+  wrong product looks wrong: ``world_SE3_camera = world_SE3_lidar @ lidar_SE3_camera``.
+* **Axes.** Cameras: x right, y down, z forward. Ego vehicle, LiDAR and cuboids: x forward, y left, z up. World: z up,
+  with the origin that the log has, which may be millions of metres away.
+* **Units.** Metres, seconds since 1970, radians and pixels. Poses, points and times are float64: a float32 would round
+  a world coordinate of 4 000 km to 0.25 m and a time of today to two minutes.
+* **Quaternions** are w, x, y, z.
+* **Image coordinates** are continuous: (0, 0) is the top-left corner of the image, (0.5, 0.5) the centre of its first
+  pixel.
 """
 
 from __future__ import annotations
@@ -21,8 +29,17 @@ Float32 = NDArray[np.float32]
 class Lens:
     """A pinhole lens with optional Brown–Conrady distortion.
 
-    ``fx_px … cy_px`` are in pixels of an image of ``width_px × height_px``; ``distortion`` is (k1, k2, p1, p2, k3) or
-    empty for an undistorted image.
+    A point (x, y, z) in camera axes appears at ``u = fx_px * x / z + cx_px`` and ``v = fy_px * y / z + cy_px`` where
+    nothing is distorted.
+
+    Attributes:
+        fx_px: horizontal focal length, pixels.
+        fy_px: vertical focal length, pixels.
+        cx_px: horizontal principal point, pixels from the image's left edge.
+        cy_px: vertical principal point, pixels from the image's upper edge.
+        width_px: width of the image that the four numbers belong to.
+        height_px: height of that image.
+        distortion: k1, k2, p1, p2, k3; empty for an undistorted image.
     """
 
     fx_px: float
@@ -35,61 +52,107 @@ class Lens:
 
     @property
     def coefficients(self) -> tuple[float, ...]:
-        """``distortion`` as five numbers, 0 where none is stated."""
+        """``distortion`` as five numbers, 0 where none is stated.
+
+        Returns:
+            k1, k2, p1, p2, k3.
+        """
+        # Padded, so that formulas need no case of their own for a lens without distortion.
         return (*self.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
 
     def resized(self, width_px: int, height_px: int) -> Lens:
-        """The same lens for an image resampled to ``width_px × height_px`` (whole field of view kept)."""
-        sx, sy = width_px / self.width_px, height_px / self.height_px
+        """Scales the lens to an image that was resampled, with the same field of view.
+
+        Args:
+            width_px: new width, at least 1.
+            height_px: new height, at least 1.
+
+        Returns:
+            The lens of the resampled image. Distortion stays: its coefficients act on normalised coordinates.
+
+        >>> Lens(100.0, 100.0, 32.0, 16.0, 64, 32).resized(32, 8)
+        Lens(fx_px=50.0, fy_px=25.0, cx_px=16.0, cy_px=4.0, width_px=32, height_px=8, distortion=())
+        """
+        # Two factors, since a rounded height changes the proportions of the image.
+        scale_x = width_px / self.width_px
+        scale_y = height_px / self.height_px
         return replace(
             self,
-            fx_px=self.fx_px * sx,
-            fy_px=self.fy_px * sy,
-            cx_px=self.cx_px * sx,
-            cy_px=self.cy_px * sy,
+            fx_px=self.fx_px * scale_x,
+            fy_px=self.fy_px * scale_y,
+            cx_px=self.cx_px * scale_x,
+            cy_px=self.cy_px * scale_y,
             width_px=width_px,
             height_px=height_px,
         )
 
-    def of_width(self, width_px: int) -> Lens:
-        """The same lens for an image resampled to ``width_px``, its sides in proportion."""
+    def resized_to_width(self, width_px: int) -> Lens:
+        """Scales the lens to an image of another width, its sides in proportion.
+
+        Args:
+            width_px: new width, at least 1.
+
+        Returns:
+            The lens of the resampled image; the height is rounded and at least 1.
+
+        >>> Lens(1970.0, 1970.0, 970.0, 532.0, 1920, 1080).resized_to_width(320).height_px
+        180
+        """
         return self.resized(width_px, max(1, round(width_px * self.height_px / self.width_px)))
 
 
+# Keyword-only, so that each kind of motion can begin with the duration that makes it one.
+@dataclass(frozen=True, kw_only=True)
+class CameraMotion:
+    """How a camera moves around the time of its pose, and how long a log frame lasts.
+
+    Attributes:
+        velocity_m_s: velocity of the camera along its axes, m/s.
+        turn_rad_s: angular velocity of the camera as a rotation vector in its axes, rad/s.
+        frame_s: seconds from one log frame to the next, which turn the poses of actors into velocities; 0: not stated,
+            and actors rest while an image is taken.
+    """
+
+    velocity_m_s: tuple[float, float, float]
+    turn_rad_s: tuple[float, float, float]
+    frame_s: float = 0.0
+
+
 @dataclass(frozen=True)
-class RollingShutter:
+class RollingShutter(CameraMotion):
     """How a camera moves while an image is read out, row after row from the top; the pose holds for the middle row.
 
     Row r (continuous, 0 to the height) is exposed (r / height − ½) · ``readout_s`` after the pose's time.
-    ``velocity_m_s`` and ``turn_rad_s`` are the camera's own, in camera axes. ``frame_s`` is the time from one log frame
-    to the next, which makes velocities of the poses of actors; 0: not stated, actors rest while an image is read out.
+
+    Attributes:
+        readout_s: seconds from the first row to the last; 0: all rows at once.
     """
 
     readout_s: float
-    velocity_m_s: tuple[float, float, float]
-    turn_rad_s: tuple[float, float, float]
-    frame_s: float = 0.0
 
 
 @dataclass(frozen=True)
-class MotionBlur:
+class MotionBlur(CameraMotion):
     """How a camera moves while its shutter is open; the pose holds for the middle of the exposure.
 
-    ``velocity_m_s``, ``turn_rad_s`` and ``frame_s`` as of a ``RollingShutter``; with one, each row is exposed for so
-    long. ``exposure_s`` 0 is no blur.
+    With a rolling shutter, the exposure of every row is centred on the time of that row.
+
+    Attributes:
+        exposure_s: seconds for which the shutter is open; 0: no blur.
     """
 
     exposure_s: float
-    velocity_m_s: tuple[float, float, float]
-    turn_rad_s: tuple[float, float, float]
-    frame_s: float = 0.0
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera of the rig: its name and its lens at native resolution.
+    """A camera of the rig.
 
-    ``readout_s``: the rolling shutter's readout (0: global); ``exposure_s``: of an image (0: not stated).
+    Attributes:
+        name: unique in the log, such as ``front_camera``.
+        lens: at the resolution of the recorded images.
+        readout_s: rolling shutter, seconds from the first row to the last; 0: a global shutter.
+        exposure_s: seconds for which the shutter is open; 0: not stated.
     """
 
     name: str
@@ -102,7 +165,10 @@ class Camera:
 class Sweep:
     """One LiDAR sweep in world coordinates.
 
-    ``points_world`` [N, 3] float64 metres; ``intensity`` [N] float32 in [0, 1]; ``timestamps_s`` [N] float64 per point.
+    Attributes:
+        points_world: [N, 3] float64, metres.
+        intensity: [N] float32 in [0, 1].
+        timestamps_s: [N] float64, seconds, when each point was measured.
     """
 
     points_world: Float64
@@ -114,9 +180,14 @@ class Sweep:
 class CuboidTrack:
     """One annotated object through time.
 
-    ``frames`` [F] int (increasing log frames in which it is annotated); ``world_SE3_box`` [F, 4, 4] float64, box axes
-    x forward (length), y left (width), z up (height); ``size_m`` (length, width, height), the median over frames.
-    ``moving``: the annotation says that it moves in at least one frame.
+    Attributes:
+        track_id: unique in the log.
+        label: class of the object, in the log's words.
+        frames: [F] log frames in which it is annotated, increasing.
+        world_SE3_box: [F, 4, 4] float64; box axes x forward (length), y left (width), z up (height); origin at the
+            centre.
+        size_m: length, width, height; the median over frames.
+        moving: the annotation says that the object moves in at least one frame.
     """
 
     track_id: str
@@ -129,7 +200,7 @@ class CuboidTrack:
 
 @runtime_checkable
 class Truth(Protocol):
-    """The true image at any viewpoint (only a ray-cast log has it)."""
+    """The true image at any viewpoint, which only a ray-cast log has."""
 
     def image(
         self,
@@ -137,15 +208,29 @@ class Truth(Protocol):
         world_SE3_camera: Float64,  # [4, 4]
         lens: Lens,
     ) -> NDArray[np.uint8]:  # [H, W, 3] sRGB, H × W of the lens
-        """What a camera at that pose would have seen at that frame's time."""
+        """Renders what a camera at that pose would have seen at the time of a frame.
+
+        Args:
+            frame: log frame.
+            world_SE3_camera: [4, 4] pose of the camera.
+            lens: lens of the camera; its size is the image's.
+
+        Returns:
+            [H, W, 3] sRGB.
+
+        Raises:
+            InputError: no such frame, or a pose that is not finite.
+        """
         ...
 
 
+# A protocol rather than a base class: a reader in another package does not depend on this one.
 class DrivingLog(Protocol):
-    """A driving log, read lazily: opening is cheap, images and sweeps are read when asked for.
+    """A driving log, read lazily: opening is cheap, images and sweeps are read when they are asked for.
 
-    Frames count from 0 to ``frame_count - 1``. A *missing* image or sweep is ``None``; an *unreadable* sweep raises
-    ``InputError`` naming file and frame (image bytes are not decoded here).
+    Frames count from 0 to ``frame_count - 1``; any other frame, and an unknown camera, raises ``InputError``. A
+    *missing* image or sweep is ``None``. An *unreadable* sweep raises ``InputError``, which names file and frame; image
+    bytes are not decoded here.
     """
 
     @property
@@ -164,51 +249,89 @@ class DrivingLog(Protocol):
         ...
 
     @property
-    def frame_count(self) -> int: ...
+    def frame_count(self) -> int:
+        """How many frames the log has: one per LiDAR sweep, or the sweep's time where a sweep is missing."""
+        ...
 
     @property
-    def cameras(self) -> tuple[Camera, ...]: ...
+    def cameras(self) -> tuple[Camera, ...]:
+        """The cameras of the rig, in a fixed order."""
+        ...
 
     def frame_timestamp_s(self, frame: int) -> float:
-        """The LiDAR sweep's time, seconds (float64)."""
+        """The time of a frame's LiDAR sweep.
+
+        Returns:
+            Seconds, float64.
+        """
         ...
 
     def world_SE3_lidar(self, frame: int) -> Float64:
-        """[4, 4]; the LiDAR (ego) pose: x forward, y left, z up. Raises ``InputError`` if it is not finite."""
+        """The pose of the LiDAR, which stands for the ego vehicle: x forward, y left, z up.
+
+        Returns:
+            [4, 4].
+
+        Raises:
+            InputError: the recorded pose is not finite.
+        """
         ...
 
     def world_SE3_camera(self, camera: str, frame: int) -> Float64:
-        """[4, 4]. Raises ``InputError`` if it is not finite."""
+        """The pose of a camera at the time of its image: x right, y down, z forward.
+
+        Returns:
+            [4, 4].
+
+        Raises:
+            InputError: the recorded pose is not finite.
+        """
         ...
 
-    def camera_timestamp_s(self, camera: str, frame: int) -> float: ...
+    def camera_timestamp_s(self, camera: str, frame: int) -> float:
+        """The time at which a camera took its image of a frame.
+
+        Returns:
+            Seconds, float64.
+        """
+        ...
 
     def image_bytes(self, camera: str, frame: int) -> bytes | None:
-        """The encoded image (JPEG or PNG) as it came, or ``None`` where the log has none."""
+        """The encoded image (JPEG or PNG) as it was recorded.
+
+        Returns:
+            The file's bytes, or ``None`` where the log has no image.
+        """
         ...
 
-    def sweep(self, frame: int) -> Sweep | None: ...
+    def sweep(self, frame: int) -> Sweep | None:
+        """The LiDAR sweep of a frame.
 
-    def tracks(self) -> tuple[CuboidTrack, ...]: ...
+        Returns:
+            The sweep, or ``None`` where the log has none.
+
+        Raises:
+            InputError: the sweep is there and cannot be read.
+        """
+        ...
+
+    def tracks(self) -> tuple[CuboidTrack, ...]:
+        """The annotated objects; empty where the log has no annotations.
+
+        Raises:
+            InputError: the annotations are there and cannot be read.
+        """
+        ...
 
     def digest(self) -> str:
-        """sha256 (hex) over everything that a reconstruction may read from this log."""
+        """Identifies everything that a reconstruction may read from this log.
+
+        Returns:
+            sha256, hexadecimal.
+        """
         ...
 
     @property
-    def truth(self) -> Truth | None: ...
-
-
-@dataclass(frozen=True)
-class LogProblem:
-    """Something that a reader left out or repaired without failing: a word to count by, and one sentence."""
-
-    kind: str
-    message: str
-
-
-@runtime_checkable
-class ReportsProblems(Protocol):
-    """A log whose reader leaves things out (a box without a position, a camera without images) says so here."""
-
-    def problems(self) -> tuple[LogProblem, ...]: ...
+    def truth(self) -> Truth | None:
+        """The true image at any viewpoint; ``None`` for recorded logs."""
+        ...

@@ -1,4 +1,4 @@
-"""What the renders are compared with: one target per supervised view."""
+"""What renders are compared with: one target for each supervised view."""
 
 from __future__ import annotations
 
@@ -13,56 +13,98 @@ from genre_tasks.logs.types import Float64, Lens, MotionBlur, RollingShutter
 from genre_tasks.losses.ssim import SsimTarget
 from genre_tasks.scene.chunk import Chunk, Gain, View
 from genre_tasks.scene.image_decoding import decode_image
+from genre_tasks.scene.lidar_depth import compute_lidar_depth
 from genre_tasks.scene.novel_views import FixedViews
 
 
 @dataclass(frozen=True)
 class Target:
-    """A view that supervises.
+    """One supervised view: where its camera is, and what a render from there should show.
 
-    ``image`` [H, W, 3] sRGB float32 with its SSIM terms; ``depth`` [H, W] metres along the optical axis, 0 where the
-    LiDAR returned nothing, or ``None`` where depth does not supervise (novel views, paper Eq. 11). ``log_gain``,
-    ``own`` [H, W], ``shutter`` and ``blur``: as a ``View`` has them.
+    Attributes:
+        camera: name of the camera.
+        frame: the log's frame.
+        chunk_SE3_camera: [4, 4] pose of the camera in chunk coordinates.
+        lens: the camera's lens at the working resolution.
+        image: the image [H, W, 3], sRGB in [0, 1], with the statistics that SSIM needs of it.
+        depth: [H, W] metres along the optical axis, 0 where the LiDAR returned nothing. ``None``: depth does not
+            supervise this view (as in novel views, paper Eq. 11).
+        novel: the view was rendered and fixed, not recorded.
+        log_gain: the image's log gain per channel in linear light, which a render gets before it is compared.
+        ego_mask: [H, W] true where the ego vehicle itself is in the image; these pixels have no loss.
+        shutter: motion of the camera while the image is read out; ``None``: a global shutter.
+        blur: motion of the camera while the image is exposed; ``None``: a sharp image.
     """
 
     camera: str
     frame: int
-    chunk_SE3_camera: Float64  # [4, 4]
+    chunk_SE3_camera: Float64
     lens: Lens
     image: SsimTarget
+    # Everything below has a default: a fixed novel view knows nothing of it.
     depth: Tensor | None = None
     novel: bool = False
     log_gain: Gain | None = None
-    own: Tensor | None = None
+    ego_mask: Tensor | None = None
     shutter: RollingShutter | None = None
     blur: MotionBlur | None = None
 
 
-def of_views(chunk: Chunk, views: Sequence[View], depth: bool = False) -> tuple[Target, ...]:
-    """Targets of a chunk's own views, in order; images are decoded at the working resolution.
+def view_targets(chunk: Chunk, views: Sequence[View], depth: bool = False) -> tuple[Target, ...]:
+    """Decodes recorded views of a chunk into targets at the working resolution.
 
-    ``depth``: LiDAR depth supervises too. Raises ``InputError`` for an unreadable image.
+    Args:
+        chunk: the chunk that the views belong to.
+        views: V views of it.
+        depth: whether LiDAR depth supervises too.
+
+    Returns:
+        V targets in the order of ``views``.
+
+    Raises:
+        InputError: an image cannot be decoded; the error names its camera and frame.
     """
-    from genre_tasks.scene.lidar_depth import lidar_depth
-
-    out = []
+    targets = []
     for view in views:
         try:
             image = decode_image(view.image, view.lens.width_px, view.lens.height_px)
         except InputError as error:
+            # The decoder knows bytes only; the user needs to know which image it is.
             where = {"log": chunk.log, "chunk": chunk.index, "camera": view.camera, "frame": view.frame}
             raise InputError(error.problem, remedy=error.remedy, **where) from error  # type: ignore[arg-type]
-        sparse = torch.as_tensor(lidar_depth(chunk, view)).float() if depth else None
-        own = None if view.own is None else torch.from_numpy(view.own)
-        pose, seen = view.chunk_SE3_camera, SsimTarget.of(image)
-        said = view.log_gain, own, view.shutter, view.blur
-        out.append(Target(view.camera, view.frame, pose, view.lens, seen, sparse, False, *said))
-    return tuple(out)
+        targets.append(
+            Target(
+                camera=view.camera,
+                frame=view.frame,
+                chunk_SE3_camera=view.chunk_SE3_camera,
+                lens=view.lens,
+                image=SsimTarget.from_image(image),
+                depth=torch.as_tensor(compute_lidar_depth(chunk, view)).float() if depth else None,
+                # How the image was taken goes along, so that the render can be made in the same way.
+                log_gain=view.log_gain,
+                ego_mask=None if view.ego_mask is None else torch.from_numpy(view.ego_mask),
+                shutter=view.shutter,
+                blur=view.blur,
+            )
+        )
+    return tuple(targets)
 
 
-def of_source(chunk: Chunk, depth: bool) -> tuple[Target, ...]:
-    """Targets of the chunk's source views. Raises ``InputError`` where there are none."""
-    views = chunk.of_role("source")
+def source_targets(chunk: Chunk, depth: bool) -> tuple[Target, ...]:
+    """Decodes the views that a scene is reconstructed from into targets.
+
+    Args:
+        chunk: the chunk whose source views are taken.
+        depth: whether LiDAR depth supervises too.
+
+    Returns:
+        One target for each source view, in the chunk's order.
+
+    Raises:
+        InputError: the chunk has no source view, or an image cannot be decoded.
+    """
+    # Without a source view a loss would be a mean over nothing, that is NaN.
+    views = chunk.views_with_role("source")
     if not views:
         raise InputError(
             "The chunk has no source view to optimise against",
@@ -70,12 +112,27 @@ def of_source(chunk: Chunk, depth: bool) -> tuple[Target, ...]:
             log=chunk.log,
             chunk=chunk.index,
         )
-    return of_views(chunk, views, depth)
+    return view_targets(chunk, views, depth)
 
 
-def of_fixed(fixed: FixedViews) -> tuple[Target, ...]:
-    """Targets of fixed novel views (no depth)."""
+def novel_targets(fixed: FixedViews) -> tuple[Target, ...]:
+    """Turns novel views that the fixer has repaired into targets.
+
+    Args:
+        fixed: V views with their fixed colours.
+
+    Returns:
+        V targets without depth, in the order of ``fixed.views``.
+    """
     return tuple(
-        Target(v.camera, v.frame, v.chunk_SE3_camera, v.lens, SsimTarget.of(color.float().contiguous()), None, True)
-        for v, color in zip(fixed.views, fixed.color, strict=True)
+        Target(
+            camera=view.camera,
+            frame=view.frame,
+            chunk_SE3_camera=view.chunk_SE3_camera,
+            lens=view.lens,
+            # The store has half floats, the losses compute in float32. No depth: LiDAR never measured a fixed view.
+            image=SsimTarget.from_image(color.float().contiguous()),
+            novel=True,
+        )
+        for view, color in zip(fixed.views, fixed.color, strict=True)
     )

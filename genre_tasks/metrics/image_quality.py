@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from genre_tasks.errors import NonFiniteError
+from genre_tasks.checks import check_finite
 from genre_tasks.logs.types import Float32
 
 PSNR_CAP_DB = 100.0
 """PSNR of identical images, and the most that any pair gets: without it a mean over images would be infinite."""
 
-_GAUSSIAN_WINDOW = 11
+_GAUSSIAN_WINDOW_PX = 11
 
 
 def psnr(
@@ -19,20 +21,35 @@ def psnr(
     truth: Float32,  # [H, W, 3]
     mask: NDArray[np.bool_] | None = None,  # [H, W]
 ) -> float:
-    """Peak signal-to-noise ratio, dB: ``−10 log10 MSE`` over all channels (of the masked pixels), at most 100.
+    """Computes the peak signal-to-noise ratio ``−10 log10 MSE`` over all pixels and channels.
+
+    Args:
+        image: the image to judge.
+        truth: what it should show.
+        mask: pixels that count; ``None``: all.
+
+    Returns:
+        dB, at most 100.
 
     Raises:
         ValueError: shapes differ, or the mask is empty.
         NonFiniteError: a value is NaN or infinite.
+
+    >>> truth = np.full((8, 8, 3), 0.5, np.float32)
+    >>> round(psnr(truth + np.float32(0.1), truth), 3)
+    20.0
     """
+    # Imported here: scikit-image is slow to load, and most commands compute no metric.
     from skimage.metrics import peak_signal_noise_ratio
 
-    left, right = _checked(image, truth, mask)
+    image64, truth64 = _check_and_widen(image, truth, mask)
     if mask is not None:
-        left, right = left[mask], right[mask]
-    if np.array_equal(left, right):
+        image64 = image64[mask]
+        truth64 = truth64[mask]
+    # The noise of equal images is 0, and its logarithm infinite.
+    if np.array_equal(image64, truth64):
         return PSNR_CAP_DB
-    return min(PSNR_CAP_DB, float(peak_signal_noise_ratio(right, left, data_range=1.0)))
+    return min(PSNR_CAP_DB, float(peak_signal_noise_ratio(truth64, image64, data_range=1.0)))
 
 
 def ssim(
@@ -40,36 +57,55 @@ def ssim(
     truth: Float32,  # [H, W, 3]
     mask: NDArray[np.bool_] | None = None,  # [H, W]
 ) -> float:
-    """Structural similarity (Wang et al. 2004: Gaussian window of σ = 1.5, 11 px), mean over pixels and channels.
+    """Computes the mean structural similarity over pixels and channels (Wang et al. 2004).
 
-    Computed in float64; two equal constant images score 1. Images narrower than the window get the largest uniform
-    window that fits. With a mask, the mean is over the masked pixels of the map (their windows may reach outside).
+    The window is a Gaussian of σ = 1.5 over 11 pixels. Images narrower than that get the largest uniform window that
+    fits. Computed in float64; two equal constant images score 1.
+
+    Args:
+        image: the image to judge.
+        truth: what it should show.
+        mask: pixels that count; ``None``: all. Their windows may reach outside of it.
+
+    Returns:
+        A number in [−1, 1].
 
     Raises:
-        ValueError: shapes differ, or the mask is empty. NonFiniteError: a value is NaN or infinite.
+        ValueError: shapes differ, or the mask is empty.
+        NonFiniteError: a value is NaN or infinite.
+
+    >>> image = np.full((16, 16, 3), 0.5, np.float32)
+    >>> round(ssim(image, image), 6)
+    1.0
     """
     from skimage.metrics import structural_similarity
 
-    left, right = _checked(image, truth, mask)
-    small = min(left.shape[:2])
-    window = {"gaussian_weights": True, "sigma": 1.5} if small >= _GAUSSIAN_WINDOW else {"win_size": small - 1 | 1}
-    common = {"data_range": 1.0, "channel_axis": 2, "use_sample_covariance": False, **window}
+    image64, truth64 = _check_and_widen(image, truth, mask)
+    # As published: covariances without Bessel's correction.
+    options: dict[str, Any] = {"data_range": 1.0, "channel_axis": 2, "use_sample_covariance": False}
+    smallest_side = min(image64.shape[:2])
+    if smallest_side >= _GAUSSIAN_WINDOW_PX:
+        options |= {"gaussian_weights": True, "sigma": 1.5}
+    else:
+        # The window's width must be odd.
+        options["win_size"] = smallest_side - 1 | 1
     if mask is None:
-        return float(structural_similarity(left, right, **common))
-    return float(structural_similarity(left, right, full=True, **common)[1][mask].mean())
+        return float(structural_similarity(image64, truth64, **options))
+    _, similarity = structural_similarity(image64, truth64, full=True, **options)
+    return float(similarity[mask].mean())
 
 
-def _checked(
+def _check_and_widen(
     image: Float32, truth: Float32, mask: NDArray[np.bool_] | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Both images in float64. Raises for what cannot be compared."""
     if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise ValueError(f"expected two images of shape [H, W, 3], got {image.shape} and {truth.shape}")
     if mask is not None and mask.shape != image.shape[:2]:
         raise ValueError(f"expected a mask of shape {image.shape[:2]}, got {mask.shape}")
     if mask is not None and not mask.any():
         raise ValueError("the mask is empty: there is nothing to compare")
-    for name, array in (("image", image), ("truth", truth)):
-        bad = np.argwhere(~np.isfinite(array))
-        if len(bad):
-            raise NonFiniteError("evaluate", name, len(bad), tuple(int(i) for i in bad[0]))
+    check_finite(image, "image", "evaluate")
+    check_finite(truth, "truth", "evaluate")
+    # Sums over a million pixels lose in float32 what near images differ in.
     return image.astype(np.float64), truth.astype(np.float64)

@@ -10,9 +10,14 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Metric:
-    """One number of an evaluation: ``name`` as ``interpolation/psnr`` or ``shift_3m/kernel``; ``n`` images.
+    """One number of an evaluation.
 
-    ``low`` and ``high`` bound a 95 % interval where one was made.
+    Attributes:
+        name: group and metric, as ``interpolation/psnr`` or ``shift_3m/kernel``.
+        value: the number, in the metric's unit.
+        n: number of images that it is of.
+        low: lower end of a 95 % interval; ``None`` where none was made.
+        high: upper end of it.
     """
 
     name: str
@@ -24,7 +29,16 @@ class Metric:
 
 @dataclass(frozen=True)
 class ViewScore:
-    """Scores of one image, where truth exists. ``shift_m`` is 0 for held-out frames."""
+    """How near one image is to its truth.
+
+    Attributes:
+        camera: name of the camera.
+        frame: the log's frame.
+        shift_m: distance to the left of the path, metres; 0 for held-out frames.
+        psnr: dB.
+        ssim: in [−1, 1].
+        perceptual: the project's own perceptual distance, in [0, 4].
+    """
 
     camera: str
     frame: int
@@ -38,10 +52,13 @@ class ViewScore:
 class Evaluation:
     """What ``evaluate/<stage>`` returns.
 
-    ``curve`` lists (iteration, held-out PSNR) along the unrolled iterations, where the stage kept snapshots.
-    ``pictures`` maps a name like ``3m_left_front_camera_04`` (``0m_…``, ``3m_left_…``, ``3m_right_…``; the same names
-    for every stage of a chunk, and ``…`` with the suffix ``.truth`` where truth exists) to an sRGB image [H, W, 3]
-    uint8.
+    Attributes:
+        stage: the stage that was evaluated.
+        metrics: all numbers.
+        views: scores of single images, where there is a truth.
+        curve: (iteration, held-out PSNR) along the unrolled iterations, where the stage kept snapshots.
+        pictures: sRGB images [H, W, 3] uint8 by name, as ``0m_front_camera_04``, ``3m_left_front_camera_04`` or
+            ``3m_right_…``. Every stage of a chunk has the same names; a truth has the suffix ``.truth``.
     """
 
     stage: str

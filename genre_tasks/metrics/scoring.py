@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,12 +12,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from genre_tasks.errors import NonFiniteError
+from genre_tasks.checks import check_finite
 from genre_tasks.logs.types import Truth
 from genre_tasks.metrics.distribution_distances import frechet_distance, kernel_distance
 from genre_tasks.metrics.fid_lpips import Inception, Lpips, fid
 from genre_tasks.metrics.image_quality import psnr, ssim
-from genre_tasks.metrics.perceptual import perceptual_distance
+from genre_tasks.metrics.perceptual import POOLED_DIMENSIONS, perceptual_distance
 from genre_tasks.metrics.results import Metric, ViewScore
 from genre_tasks.scene.chunk import Chunk, View
 from genre_tasks.scene.image_decoding import decode_image
@@ -25,95 +25,126 @@ from genre_tasks.scene.novel_views import NovelView
 from genre_tasks.threads import map_single_threaded
 
 BOOTSTRAP_SEED = 0
-"""The resamples over frames are the same for every stage and method, so that their intervals are comparable."""
+"""The resamples over frames are the same for every stage and method, so that their intervals can be compared."""
 
-_REAL_BATCH = 16
-_KEPT_CHUNKS = 4
-_KEPT_TRUTH_BYTES = 2**28
+_BATCH = 16
+"""Real images decoded at once: they are large, their features are small."""
+_CACHED_CHUNKS = 4
+_CACHED_TRUTH_BYTES = 2**28
 
 
 @dataclass(frozen=True)
 class FeatureSet:
-    """Pooled features of N images with the frame of each."""
+    """Pooled features of N images with the frame of each.
 
-    features: Tensor  # [N, 1280]
+    Attributes:
+        features: [N, 1280].
+        frames: the N log frames.
+    """
+
+    features: Tensor
     frames: tuple[int, ...]
 
 
-_real: OrderedDict[str, FeatureSet] = OrderedDict()
+_real_features: OrderedDict[str, FeatureSet] = OrderedDict()
+_real_inception_features: dict[tuple[str, Inception], Tensor] = {}
+_truth_images: OrderedDict[tuple[object, ...], tuple[Truth, NDArray[np.uint8]]] = OrderedDict()
 
 
-def real_images(chunk: Chunk) -> FeatureSet:
-    """Features of all real images of a chunk at the working resolution: the reference of the distribution distances.
+def real_image_features(chunk: Chunk) -> FeatureSet:
+    """Computes the features of all real images of a chunk, the reference of the distribution distances.
 
-    Computed once per process and chunk (by content). Raises ``InputError`` for an image that cannot be decoded.
+    They are computed once per process and chunk, by content, and kept for the last chunks.
+
+    Args:
+        chunk: its recorded images are taken at the working resolution.
+
+    Raises:
+        InputError: an image cannot be decoded.
     """
-    key = _contents(chunk)
-    if key not in _real:
-        parts = [torch.zeros((0, 1280))]
-        for start in range(0, len(chunk.views), _REAL_BATCH):
-            images = map_single_threaded(view_image, chunk.views[start : start + _REAL_BATCH])
-            parts.append(perceptual_distance().pooled_features(torch.stack(images)))
-        _real[key] = FeatureSet(torch.cat(parts), tuple(v.frame for v in chunk.views))
-        if len(_real) > _KEPT_CHUNKS:
-            _real.popitem(last=False)
-    _real.move_to_end(key)
-    return _real[key]
+    key = _digest_images(chunk)
+    if key not in _real_features:
+        parts = [torch.zeros((0, POOLED_DIMENSIONS))]
+        parts += [perceptual_distance().pooled_features(images) for images in _decode_batches(chunk)]
+        _real_features[key] = FeatureSet(torch.cat(parts), tuple(view.frame for view in chunk.views))
+        if len(_real_features) > _CACHED_CHUNKS:
+            _real_features.popitem(last=False)
+    _real_features.move_to_end(key)
+    return _real_features[key]
 
 
-def _contents(chunk: Chunk) -> str:
-    """Of its images at the working resolution."""
-    digest = hashlib.sha256(f"{chunk.width_px}×{chunk.height_px}".encode())
-    for view in chunk.views:
-        digest.update(f"{view.camera}/{view.frame}".encode() + hashlib.sha256(view.image).digest())
-    return digest.hexdigest()
+def real_inception_features(chunk: Chunk, network: Inception) -> Tensor:
+    """Computes FID's features of all real images of a chunk; kept for the last chunk.
+
+    Args:
+        chunk: its recorded images are taken at the working resolution.
+        network: FID's network.
+
+    Returns:
+        [N, 2048] float64.
+
+    Raises:
+        InputError: an image cannot be decoded.
+    """
+    key = _digest_images(chunk), network
+    if key not in _real_inception_features:
+        parts = [network.features(images) for images in _decode_batches(chunk)]
+        # Only the last chunk: FID of one chunk is asked for stage after stage.
+        _real_inception_features.clear()
+        _real_inception_features[key] = torch.cat(parts)
+    return _real_inception_features[key]
 
 
-_real_inception: dict[tuple[str, Inception], Tensor] = {}
+def decode_view_image(view: View) -> Tensor:
+    """Decodes a recorded image at the working resolution.
 
+    Args:
+        view: a view of a chunk.
 
-def real_inception(chunk: Chunk, network: Inception) -> Tensor:
-    """As :func:`real_images`, on the network that FID is of [N, 2048]; kept for the last chunk."""
-    key = _contents(chunk), network
-    if key not in _real_inception:
-        parts = []
-        for start in range(0, len(chunk.views), _REAL_BATCH):
-            images = map_single_threaded(view_image, chunk.views[start : start + _REAL_BATCH])
-            parts.append(network.features(torch.stack(images)))
-        _real_inception.clear()
-        _real_inception[key] = torch.cat(parts)
-    return _real_inception[key]
+    Returns:
+        [H, W, 3] sRGB in [0, 1].
 
-
-def view_image(view: View) -> Tensor:
-    """[H, W, 3] sRGB in [0, 1] at the working resolution."""
+    Raises:
+        InputError: the image cannot be decoded.
+    """
     return decode_image(view.image, view.lens.width_px, view.lens.height_px)
 
 
-_true: OrderedDict[tuple[object, ...], tuple[Truth, NDArray[np.uint8]]] = OrderedDict()
+def truth_image(chunk: Chunk, truth: Truth, view: NovelView) -> NDArray[np.uint8]:
+    """Asks a log's truth what the camera would have seen; the last images are kept, as every stage asks for the same.
 
+    Args:
+        chunk: the chunk whose coordinates the view's pose is in.
+        truth: of the chunk's log.
+        view: a view beside the path.
 
-def true_pixels(chunk: Chunk, truth: Truth, view: NovelView) -> NDArray[np.uint8]:
-    """[H, W, 3] sRGB: what the camera would have seen. Every stage asks for the same views: the last are kept.
-
-    Only an image's own truth object answers for it: the entry keeps the object, so that its id stays its own.
+    Returns:
+        [H, W, 3] sRGB.
     """
+    # The truth knows the world, not the chunk.
     pose = chunk.world_SE3_chunk @ view.chunk_SE3_camera
+    # The entry keeps the truth alive, so that no other object can get its id while the entry is there.
     key = (id(truth), view.frame, pose.tobytes(), view.lens)
-    if key not in _true:
-        _true[key] = truth, truth.image(view.frame, pose, view.lens)
-        while len(_true) > 1 and sum(image.nbytes for _, image in _true.values()) > _KEPT_TRUTH_BYTES:
-            _true.popitem(last=False)
-    _true.move_to_end(key)
-    return _true[key][1]
+    if key not in _truth_images:
+        _truth_images[key] = truth, truth.image(view.frame, pose, view.lens)
+        while len(_truth_images) > 1 and sum(x.nbytes for _, x in _truth_images.values()) > _CACHED_TRUTH_BYTES:
+            _truth_images.popitem(last=False)
+    # Last used goes last, so that the oldest image is dropped first.
+    _truth_images.move_to_end(key)
+    return _truth_images[key][1]
 
 
 @dataclass
-class Collector:
-    """Takes images batch by batch and keeps their scores and features, not the images.
+class ScoreCollector:
+    """Takes images batch by batch, and keeps their scores and features instead of the images.
 
-    ``prefix`` goes before a metric's last word: ``render_`` makes ``shift_3m/render_psnr``. ``inception`` and ``lpips``
-    are networks for FID and LPIPS proper, where the user gave them.
+    Attributes:
+        stage: the stage that errors name.
+        distributions: whether features for the distribution distances are computed.
+        prefix: goes before a metric's last word: ``render_`` makes ``shift_3m/render_psnr``.
+        inception: the network for FID proper, where the user gave it.
+        lpips: the network for LPIPS proper, where the user gave it.
+        scores: of the images with a truth, in the order in which they came.
     """
 
     stage: str
@@ -124,7 +155,7 @@ class Collector:
     scores: list[ViewScore] = field(default_factory=list)
     _features: list[Tensor] = field(default_factory=list)
     _frames: list[int] = field(default_factory=list)
-    _pooled: list[Tensor] = field(default_factory=list)
+    _inception_features: list[Tensor] = field(default_factory=list)
     _lpips: list[float] = field(default_factory=list)
 
     def add(
@@ -133,82 +164,169 @@ class Collector:
         images: Tensor,  # [V, H, W, 3] sRGB in [0, 1]
         truths: Tensor | None,  # [V, H, W, 3]
     ) -> None:
-        """Raises ``NonFiniteError`` naming camera and frame of an image that is not finite."""
+        """Scores a batch of images.
+
+        Args:
+            views: where the images are from.
+            images: the images to judge.
+            truths: what they should show; ``None``: only their distribution counts.
+
+        Raises:
+            NonFiniteError: an image is not finite; the error names its camera and frame.
+        """
         for view, image in zip(views, images, strict=True):
-            bad = torch.nonzero(~torch.isfinite(image))
-            if len(bad):
-                index = tuple(int(i) for i in bad[0])
-                where = {"camera": view.camera, "frame": view.frame}
-                raise NonFiniteError(f"evaluate/{self.stage}", "image", len(bad), index, **where)
+            # One by one, so that the error can name camera and frame.
+            check_finite(image, "image", f"evaluate/{self.stage}", camera=view.camera, frame=view.frame)
         if self.distributions:
+            # Features instead of images: those of all views would not fit into memory.
             self._features.append(perceptual_distance().pooled_features(images))
-            self._frames += [v.frame for v in views]
+            # Frames go with the features: the bootstrap resamples them.
+            self._frames += [view.frame for view in views]
         if self.inception is not None:
-            self._pooled.append(self.inception.features(images))
+            self._inception_features.append(self.inception.features(images))
         if truths is not None:
-            self.scores += scored(views, images, truths)
+            self.scores += score_views(views, images, truths)
             if self.lpips is not None:
-                self._lpips += self.lpips.distances(shown(views, images, truths), truths)
+                self._lpips += self.lpips.distances(show_truth_on_ego(views, images, truths), truths)
 
-    def quality(self, group: str) -> list[Metric]:
-        """``group/psnr``, ``ssim``, ``perceptual``: means over the images with truth; nothing if there are none."""
+    def quality_metrics(self, group: str) -> list[Metric]:
+        """Averages the scores over the images with truth.
+
+        Args:
+            group: first part of the metrics' names.
+
+        Returns:
+            ``group/psnr``, ``group/ssim``, ``group/perceptual``, and ``group/lpips`` where its network is given;
+            nothing without images that have a truth.
+        """
         n = len(self.scores)
-        names = ("psnr", "ssim", "perceptual") if n else ()
-        found = [Metric(f"{group}/{self.prefix}{k}", sum(getattr(s, k) for s in self.scores) / n, n) for k in names]
+        metrics = []
+        for name in ("psnr", "ssim", "perceptual") if n else ():
+            # Every image counts alike, whatever its camera.
+            metrics.append(Metric(self._name(group, name), sum(getattr(s, name) for s in self.scores) / n, n))
         if self._lpips:
-            found.append(Metric(f"{group}/{self.prefix}lpips", sum(self._lpips) / n, n))
-        return found
+            metrics.append(Metric(self._name(group, "lpips"), sum(self._lpips) / n, n))
+        return metrics
 
-    def inception_distance(self, group: str, chunk: Chunk) -> list[Metric]:
-        """``group/fid`` against all real images of the chunk, where there is a network for it and two images."""
-        if self.inception is None or not self._pooled:
+    def fid_metrics(self, group: str, chunk: Chunk) -> list[Metric]:
+        """Compares all images with the real images of a chunk by FID.
+
+        Args:
+            group: first part of the metric's name.
+            chunk: its recorded images are the reference.
+
+        Returns:
+            ``group/fid``; nothing without FID's network or with fewer than two images.
+        """
+        if self.inception is None or not self._inception_features:
             return []
-        features = torch.cat(self._pooled)
-        value = fid(features, real_inception(chunk, self.inception))
-        return [] if value is None else [Metric(f"{group}/{self.prefix}fid", value, len(features))]
+        features = torch.cat(self._inception_features)
+        # Against the real images of the chunk, as the other distances are.
+        value = fid(features, real_inception_features(chunk, self.inception))
+        return [] if value is None else [Metric(self._name(group, "fid"), value, len(features))]
 
-    def distances(self, group: str, real: FeatureSet, bootstrap: int) -> list[Metric]:
-        """``group/frechet`` and ``kernel`` with its interval; nothing where undefined (fewer than 2 images)."""
+    def distribution_metrics(self, group: str, real: FeatureSet, bootstrap: int) -> list[Metric]:
+        """Compares all images with real ones by the Fréchet and the kernel distance.
+
+        Args:
+            group: first part of the metrics' names.
+            real: features of the real images.
+            bootstrap: resamples for the interval of the kernel distance.
+
+        Returns:
+            ``group/frechet`` and ``group/kernel``; nothing where they are undefined (fewer than two images).
+        """
         if not self._features:
             return []
         features = torch.cat(self._features)
-        found = {
+        distances = {
             "frechet": frechet_distance(features, real.features),
             "kernel": kernel_distance(
                 features, real.features, self._frames, real.frames, bootstrap, seed=BOOTSTRAP_SEED
             ),
         }
         return [
-            Metric(f"{group}/{self.prefix}{name}", d.value, d.n, d.low, d.high)
-            for name, d in found.items()
+            Metric(self._name(group, name), d.value, d.n, d.low, d.high)
+            for name, d in distances.items()
             if d is not None
         ]
 
-
-def _where(shown: NDArray[np.bool_] | None, image: Tensor, truth: Tensor) -> Tensor:
-    return image if shown is None else torch.where(torch.from_numpy(shown)[..., None], image, truth)
-
-
-def _seen(views: Sequence[View | NovelView]) -> list[NDArray[np.bool_] | None]:
-    return [~v.own if isinstance(v, View) and v.own is not None else None for v in views]
+    def _name(self, group: str, metric: str) -> str:
+        return f"{group}/{self.prefix}{metric}"
 
 
-def shown(views: Sequence[View | NovelView], images: Tensor, truths: Tensor) -> Tensor:
-    """``images`` with the truth where the vehicle itself is: that is no error, nor no merit."""
-    seen = _seen(views)
-    if all(s is None for s in seen):
+def show_truth_on_ego(views: Sequence[View | NovelView], images: Tensor, truths: Tensor) -> Tensor:
+    """Puts the truth where an image shows the ego vehicle, which is neither an error of the scene nor its merit.
+
+    Args:
+        views: V views; only recorded ones can have a mask.
+        images: [V, H, W, 3].
+        truths: [V, H, W, 3].
+
+    Returns:
+        [V, H, W, 3]; ``images`` itself where no view has a mask.
+    """
+    # A mask alone would not do: perceptual features and SSIM's windows reach over its edge.
+    masks = _outside_ego(views)
+    if all(mask is None for mask in masks):
         return images
-    return torch.stack([_where(s, a, b) for s, a, b in zip(seen, images, truths, strict=True)])
+    return torch.stack(
+        [
+            image if mask is None else torch.where(torch.from_numpy(mask)[..., None], image, truth)
+            for mask, image, truth in zip(masks, images, truths, strict=True)
+        ]
+    )
 
 
-def scored(views: Sequence[View | NovelView], images: Tensor, truths: Tensor) -> list[ViewScore]:
-    """PSNR, SSIM and perceptual distance of each image [V, H, W, 3] against its truth, outside of ``View.own``."""
-    images, seen = shown(views, images, truths), _seen(views)
+def score_views(views: Sequence[View | NovelView], images: Tensor, truths: Tensor) -> list[ViewScore]:
+    """Computes PSNR, SSIM and perceptual distance of each image, without the pixels that show the ego vehicle.
+
+    Args:
+        views: V views.
+        images: [V, H, W, 3] sRGB in [0, 1], the images to judge.
+        truths: [V, H, W, 3] what they should show.
+
+    Returns:
+        V scores.
+    """
+    images = show_truth_on_ego(views, images, truths)
     with torch.no_grad():
+        # It has threads of its own, so it runs before the others share them.
         perceptual = perceptual_distance()(images, truths).tolist()
-    pairs = [(a.numpy(), b.numpy(), s) for a, b, s in zip(images, truths, seen, strict=True)]
-    both = map_single_threaded(lambda pair: (psnr(*pair), ssim(*pair)), pairs)
-    return [
-        ViewScore(v.camera, v.frame, v.shift_m if isinstance(v, NovelView) else 0.0, p, s, d)
-        for v, (p, s), d in zip(views, both, perceptual, strict=True)
+    # scikit-image works on one thread: images go side by side.
+    arguments = [
+        (image.numpy(), truth.numpy(), mask)
+        for image, truth, mask in zip(images, truths, _outside_ego(views), strict=True)
     ]
+    psnr_and_ssim = map_single_threaded(lambda pair: (psnr(*pair), ssim(*pair)), arguments)
+    return [
+        ViewScore(
+            camera=view.camera,
+            frame=view.frame,
+            shift_m=view.shift_m if isinstance(view, NovelView) else 0.0,
+            psnr=view_psnr,
+            ssim=view_ssim,
+            perceptual=view_perceptual,
+        )
+        for view, (view_psnr, view_ssim), view_perceptual in zip(views, psnr_and_ssim, perceptual, strict=True)
+    ]
+
+
+def _outside_ego(views: Sequence[View | NovelView]) -> list[NDArray[np.bool_] | None]:
+    """For each view a mask [H, W] of the pixels that count, ``None`` where all do."""
+    return [~v.ego_mask if isinstance(v, View) and v.ego_mask is not None else None for v in views]
+
+
+def _decode_batches(chunk: Chunk) -> Iterator[Tensor]:
+    """The recorded images of a chunk, some at a time, [V, H, W, 3] each."""
+    for start in range(0, len(chunk.views), _BATCH):
+        yield torch.stack(map_single_threaded(decode_view_image, chunk.views[start : start + _BATCH]))
+
+
+def _digest_images(chunk: Chunk) -> str:
+    """Sha256 of a chunk's images at the working resolution."""
+    # By content: every stage reads the chunk from the store again, as another object.
+    digest = hashlib.sha256(f"{chunk.width_px}×{chunk.height_px}".encode())
+    for view in chunk.views:
+        digest.update(f"{view.camera}/{view.frame}".encode() + hashlib.sha256(view.image).digest())
+    return digest.hexdigest()

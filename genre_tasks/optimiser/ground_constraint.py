@@ -1,8 +1,8 @@
-"""What LiDAR measured as ground stays on it: a step moves its discs along their plane and turns them within it.
+"""Keeps what LiDAR measured as ground on the ground: steps move its discs along their plane and turn them within it.
 
-Seen at a grazing angle from one height, a road's depth is what images say least about, and LiDAR most: left free, the
-optimiser paints markings with discs that stand above the road, tilted towards the recorded cameras. On the path that
-looks right, three metres beside it they smear.
+Cameras see a road at a grazing angle from one height, so its depth is what images constrain least and LiDAR most. An
+unconstrained optimiser paints lane markings with discs that stand above the road, tilted towards the recorded cameras.
+That looks right on the path and smears three metres beside it.
 """
 
 from __future__ import annotations
@@ -10,38 +10,67 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from genre_tasks.render.surface import normals
+from genre_tasks.render.surface import compute_normals
 from genre_tasks.scene.graph import STATIC, SceneGraph
-from genre_tasks.scene.transforms import quat_multiply
+from genre_tasks.scene.rotations import multiply_quats
 
 MIN_UPRIGHT = 0.9
-"""Cosine between a disc's normal and up, from which on it lies: slopes up to 26 degrees."""
+"""Least cosine between a disc's normal and the vertical for it to count as lying: slopes up to 26 degrees."""
 
-FLAT = 0.5
-"""A disc's shortest side, per its middle one, below which it is flat."""
+MAX_FLATNESS = 0.5
+"""A disc is flat if its shortest side is less than this fraction of its middle one."""
 
 
-def ground_planes(scene: SceneGraph) -> Tensor:
-    """[N, 11]: the normal, the unit quaternion, and the same turned by half a turn in the plane; 0 off the ground.
+def compute_ground_constraint(scene: SceneGraph) -> Tensor:
+    """Finds the Gaussians that lie on the ground, and the plane in which each may move.
 
-    A quaternion plus any mix of the latter two has the disc in its plane still. Flat static Gaussians that lie are
-    ground, a parked car's roof too: LiDAR measured that as well.
+    These are static discs that are flat and lie, the roof of a parked car too, since LiDAR measured it as well.
+
+    Args:
+        scene: at the start of an optimisation.
+
+    Returns:
+        [N, 11] per Gaussian: its normal [3], its unit quaternion q [4], and q after half a turn within the plane [4].
+        A quaternion plus any mix of the last two keeps the disc in its plane. 0 for Gaussians off the ground.
     """
-    splats = scene.gaussians.activated()
-    across = normals(splats)
+    splats = scene.gaussians.activate()
+    normals = compute_normals(splats)
     sides = splats.scales
-    lies = (scene.nodes == STATIC) & (across[:, 2].abs() >= MIN_UPRIGHT)
-    lies &= sides.min(1).values < FLAT * sides.median(1).values
-    own = torch.nn.functional.normalize(splats.quats, dim=1)
-    turned = quat_multiply(torch.cat([torch.zeros_like(across[:, :1]), across], 1), own)
-    return torch.where(lies[:, None], torch.cat([across, own, turned], 1), torch.zeros_like(across[:, :1]))
+    # z is up in chunk coordinates. A disc has two faces, and it is chance which of them its normal belongs to.
+    is_ground = (scene.nodes == STATIC) & (normals[:, 2].abs() >= MIN_UPRIGHT)
+    is_ground &= sides.min(1).values < MAX_FLATNESS * sides.median(1).values
+    quats = torch.nn.functional.normalize(splats.quats, dim=1)
+    # (0, n) q is the direction in which q changes while the disc turns about its normal n.
+    half_turns = torch.cat([torch.zeros_like(normals[:, :1]), normals], 1)
+    turned_quats = multiply_quats(half_turns, quats)
+    constraint = torch.cat([normals, quats, turned_quats], 1)
+    return torch.where(is_ground[:, None], constraint, torch.zeros_like(normals[:, :1]))
 
 
-def along_ground(delta: Tensor, planes: Tensor) -> Tensor:
-    """``delta`` [N, 14] of the packed attributes without what leads out of the planes [N, 11]."""
-    means, quats = delta[:, :3], delta[:, 6:10]
-    normal, own, turned = planes[:, :3], planes[:, 3:7], planes[:, 7:]
-    means = means - normal * (normal * means).sum(1, keepdim=True)
-    within = own * (own * quats).sum(1, keepdim=True) + turned * (turned * quats).sum(1, keepdim=True)
-    quats = torch.where((planes != 0).any(1, keepdim=True), within, quats)
+def project_onto_ground(delta: Tensor, constraint: Tensor) -> Tensor:
+    """Removes from a step what would lead out of the ground's planes.
+
+    Args:
+        delta: [N, 14] step in the packed attributes.
+        constraint: [N, 11] of :func:`compute_ground_constraint`.
+
+    Returns:
+        [N, 14]; rows off the ground as they were. Differentiable in ``delta``.
+
+    >>> up = torch.tensor([[0.0, 0, 1, 1, 0, 0, 0, 0, 0, 0, 1]])
+    >>> project_onto_ground(torch.ones(1, 14), up)[0, :10].tolist()
+    [1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 1.0]
+    """
+    means = delta[:, :3]
+    quats = delta[:, 6:10]
+    normals = constraint[:, :3]
+    unit_quats = constraint[:, 3:7]
+    turned_quats = constraint[:, 7:]
+    means = means - normals * (normals * means).sum(1, keepdim=True)
+    # Along q itself only the quaternion's length changes, which the renderer divides out again.
+    # Any direction but these two would tilt the disc out of its plane.
+    lengthening = unit_quats * (unit_quats * quats).sum(1, keepdim=True)
+    turning = turned_quats * (turned_quats * quats).sum(1, keepdim=True)
+    # Off the ground the projection would be 0, not the step; the means need no choice, since the normal is 0.
+    quats = torch.where((constraint != 0).any(1, keepdim=True), lengthening + turning, quats)
     return torch.cat([means, delta[:, 3:6], quats, delta[:, 10:]], 1)

@@ -1,4 +1,4 @@
-"""Steps by the compiled kernel: the learned optimiser's and tuned Adam's, which share Adam's direction."""
+"""Steps by the compiled kernel: those of the learned optimiser and of tuned Adam, which share Adam's direction."""
 
 from __future__ import annotations
 
@@ -7,9 +7,13 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+# As a module, so that a test can put another loader in its place.
 from genre_tasks.optimiser.kernels import library as library
-from genre_tasks.optimiser.kernels.constants import RESIDUALS
-from genre_tasks.optimiser.state import FIRST_DECAY, SECOND_DECAY, State
+from genre_tasks.optimiser.kernels.constants import IMAGE_RESIDUALS
+from genre_tasks.optimiser.state import FIRST_MOMENT_DECAY, SECOND_MOMENT_DECAY, State
+
+KernelCall = Callable[[library.StepInputs, int], int]
+"""A kernel function with all arguments set but the state and the number of threads; returns its status."""
 
 
 def learned_step(
@@ -17,57 +21,108 @@ def learned_step(
     scene: library.Scene,
     state: State,
     gradient: Tensor,
-    rates: Tensor,
-    time: Tensor,
-    part: float,
+    signed_rates: Tensor,
+    schedule_features: Tensor,
+    lr_scale: float,
 ) -> Tensor:
-    """The learned optimiser's step [N, 14] with the signed ``rates`` [14]; ``time`` [4]: the last features.
+    """Runs the learned optimiser's network for one iteration.
 
-    ``part``: the schedule's, which ``rates`` have in them. 0 where ``state.seen_now`` is.
+    Args:
+        network: weights of the dense layers.
+        scene: voxels of the scene, and memory to work in.
+        state: of N Gaussians, with ``gradient`` accumulated; with image residuals if the network takes them.
+        gradient: [N, 14] of this iteration.
+        signed_rates: [14] negative learning rates, with ``lr_scale`` in them.
+        schedule_features: [4] the features that all Gaussians share.
+        lr_scale: of the schedule, for the step towards the mean residual.
+
+    Returns:
+        [N, 14] step in the offsets, 0 for Gaussians that are not visible.
+
+    Raises:
+        ValueError: tensors do not fit together, or are not float32 on the CPU.
+        ResourceError: the kernel is not compiled, or memory does not suffice.
     """
     kernel = library.load_network()
 
-    def call(now: library.Now, threads: int) -> int:
-        return int(kernel.genre_network_step(network, scene, now, threads))
+    def call(inputs: library.StepInputs, threads: int) -> int:
+        return int(kernel.genre_network_step(network, scene, inputs, threads))
 
-    return _step(call, state, gradient, rates, time, state.residuals, part)
+    return _step(call, state, gradient, signed_rates, schedule_features, state.image_residuals, lr_scale)
 
 
-def adam_step(state: State, rates: Tensor) -> Tensor:
-    """Tuned Adam's step [N, 14] with the signed ``rates`` [14], 0 where nothing was seen now; float32 on the CPU."""
-    return _step(library.load_network().genre_adam_step, state, state.first, rates, rates)
+def adam_step(state: State, signed_rates: Tensor) -> Tensor:
+    """Computes tuned Adam's step.
+
+    Args:
+        state: of N Gaussians, float32 on the CPU.
+        signed_rates: [14] negative learning rates, with the scale of the schedule in them.
+
+    Returns:
+        [N, 14] step in the offsets, 0 for Gaussians that are not visible.
+
+    Raises:
+        ValueError: tensors do not fit together, or are not float32 on the CPU.
+        ResourceError: the kernel is not compiled.
+    """
+    # The kernel reads neither the gradient nor the schedule's features here: any tensor of the right size will do.
+    return _step(library.load_network().genre_adam_step, state, state.first_moment, signed_rates, signed_rates)
 
 
 def _step(
-    call: Callable[[library.Now, int], int],
+    call: KernelCall,
     state: State,
     gradient: Tensor,
-    rates: Tensor,
-    time: Tensor,
-    residuals: Tensor | None = None,
-    part: float = 0.0,
+    signed_rates: Tensor,
+    schedule_features: Tensor,
+    image_residuals: Tensor | None = None,
+    lr_scale: float = 0.0,
 ) -> Tensor:
-    of_attributes = [state.offsets, state.first, state.second, gradient]
-    rows = len(state.offsets)
-    if any(t.shape != (rows, 14) for t in of_attributes) or any(len(t) != rows for t in (state.seen, state.seen_now)):
-        raise ValueError(f"expected a state and a gradient [{rows}, 14], got {[list(t.shape) for t in of_attributes]}")
-    if residuals is not None and residuals.shape != (rows, RESIDUALS):
-        raise ValueError(f"expected residuals [{rows}, {RESIDUALS}], got {list(residuals.shape)}")
-    arrays = [*of_attributes[:3], state.seen, state.seen_now, gradient, *([] if residuals is None else [residuals])]
-    if not library.takes(*arrays):
+    _check_shapes(state, gradient, image_residuals)
+    arrays = [state.offsets, state.first_moment, state.second_moment, state.visit_count, state.visible, gradient]
+    if image_residuals is not None:
+        arrays.append(image_residuals)
+    if not library.is_supported(*arrays):
         raise ValueError("expected float32 tensors on the CPU")
-    arrays = [t.detach().contiguous() for t in arrays]
-    by_seen, delta, scheduled = _by_seen(arrays[3]), torch.empty_like(arrays[0]), torch.tensor([part])
-    pointers = [t.data_ptr() for t in (*arrays[:6], by_seen)]
-    last = None if residuals is None else arrays[6].data_ptr(), scheduled.data_ptr()
-    now = library.Now(rows, *pointers, len(by_seen), time.data_ptr(), rates.data_ptr(), delta.data_ptr(), *last)
-    library.check(call(now, torch.get_num_threads()))
+    arrays = [array.detach().contiguous() for array in arrays]
+    by_count = _factors_by_count(arrays[3])
+    delta = torch.empty_like(arrays[0])
+    # In a variable: the kernel reads it by its address, and a temporary would be freed before the call.
+    scale = torch.tensor([lr_scale])
+    inputs = library.StepInputs(
+        len(delta),
+        *(array.data_ptr() for array in arrays[:6]),
+        by_count.data_ptr(),
+        len(by_count),
+        schedule_features.data_ptr(),
+        signed_rates.data_ptr(),
+        delta.data_ptr(),
+        None if image_residuals is None else arrays[6].data_ptr(),
+        scale.data_ptr(),
+    )
+    library.check_status(call(inputs, torch.get_num_threads()))
     return delta
 
 
-def _by_seen(seen: Tensor) -> Tensor:
-    """What depends on how often a Gaussian was seen, for 0 … the most: [counts, 3], as state.py and features.py say."""
-    most = int(seen.numpy().max(initial=0))  # torch would wake its threads, which then spin beside the kernel's
-    counts = torch.arange(most + 1, dtype=torch.float32)
+def _check_shapes(state: State, gradient: Tensor, image_residuals: Tensor | None) -> None:
+    rows = len(state.offsets)
+    by_attribute = [state.offsets, state.first_moment, state.second_moment, gradient]
+    columns = (state.visit_count, state.visible)
+    if any(tensor.shape != (rows, 14) for tensor in by_attribute) or any(len(column) != rows for column in columns):
+        shapes = [list(tensor.shape) for tensor in by_attribute]
+        raise ValueError(f"expected a state and a gradient [{rows}, 14], got {shapes}")
+    if image_residuals is not None and image_residuals.shape != (rows, IMAGE_RESIDUALS):
+        raise ValueError(f"expected residuals [{rows}, {IMAGE_RESIDUALS}], got {list(image_residuals.shape)}")
+
+
+def _factors_by_count(visit_count: Tensor) -> Tensor:
+    """What depends only on how often a Gaussian was seen, for 0 … the largest count.
+
+    [counts, 3]: Adam's two bias corrections, and a feature of the network.
+    """
+    # Numpy, because torch would wake its threads, which then spin beside the kernel's threads.
+    largest = int(visit_count.numpy().max(initial=0))
+    counts = torch.arange(largest + 1, dtype=torch.float32)
+    # A table, because a power of the decays for each attribute would cost more than the rest of Adam's step.
     n = counts.clamp_min(1)
-    return torch.stack([1 - FIRST_DECAY**n, 1 - SECOND_DECAY**n, torch.log1p(counts) / 3], 1)
+    return torch.stack([1 - FIRST_MOMENT_DECAY**n, 1 - SECOND_MOMENT_DECAY**n, torch.log1p(counts) / 3], 1)

@@ -1,6 +1,6 @@
-"""Gaussians split where images have more than the render shows, before an optimisation.
+"""Splits Gaussians where images show more than the render does, before an optimisation.
 
-What a scene lacks after its reconstruction is finer than its Gaussians are; where that is, the residuals say.
+What a scene lacks after its reconstruction is finer than its Gaussians are. The residuals tell where that is.
 """
 
 from __future__ import annotations
@@ -14,67 +14,122 @@ from torch import Tensor
 
 from genre_tasks.config import LossConfig
 from genre_tasks.losses.targets import Target
-from genre_tasks.optimiser.differentiable_render import Beside
+from genre_tasks.optimiser.auxiliary import AuxiliaryParameters
+from genre_tasks.optimiser.gradients import WEIGHTED_SQUARED_RESIDUAL
 from genre_tasks.optimiser.objective import Objective
-from genre_tasks.optimiser.state import Frame
+from genre_tasks.optimiser.state import Parameterization
 from genre_tasks.scene.gaussians import map_attributes
 from genre_tasks.scene.graph import DISTANT, SceneGraph
-from genre_tasks.scene.rotations import rotation_matrices
+from genre_tasks.scene.rotations import quats_to_matrices
 
 SHRINK = 2.0
-"""Both halves are as long as this part of their parent's longest side; its other sides stay."""
-APART = 0.65
-"""The halves lie so many of the parent's longest standard deviations to both sides of its mean."""
-LEFT = 0.3
-"""A half is taken to leave this part of what its parent leaves unexplained; it is not looked at again."""
+"""Each half's longest side is its parent's divided by this; the other sides stay."""
+
+SEPARATION = 0.65
+"""The halves lie this many of the parent's longest standard deviations to either side of its mean."""
+
+REMAINING_ENERGY = 0.3
+"""A half is assumed to keep this fraction of its parent's residual energy; it is not measured again."""
+
 ROUNDS_PER_DOUBLING = 8
 _BATCH_VIEWS = 6
 
 
-def split_where_images_have_more(scene: SceneGraph, targets: Sequence[Target], share: float) -> SceneGraph:
-    """The scene with ``share`` of its number of Gaussians more: those with the largest :func:`unexplained` are halved.
+def split_by_residual(scene: SceneGraph, targets: Sequence[Target], fraction: float) -> SceneGraph:
+    """Splits the Gaussians with the largest residual energy.
 
-    In rounds, so that one that leaves much unexplained becomes four, eight and so on. The distant region keeps its
-    number, as in per-scene density control. One half takes its parent's row, the others of a round follow at the end in
-    the order of their parents' rows; both are of its node. Fewer come where too few are seen; 0: the scene itself.
+    It goes in rounds, so that a Gaussian that explains little becomes four, eight and so on. The distant region keeps
+    its number, as in the density control of per-scene 3DGS.
+
+    Args:
+        scene: of N Gaussians.
+        targets: images to compare the scene with.
+        fraction: how many Gaussians to add, as a fraction of N; 0 returns the scene itself.
+
+    Returns:
+        SceneGraph: up to N + ``fraction`` · N Gaussians, fewer where fewer are visible. One half takes its parent's
+        row; the others of a round follow at the end, in the order of their parents' rows.
     """
-    more = round(share * len(scene))
-    if not more or not targets:
+    remaining = round(fraction * len(scene))
+    if not remaining or not targets:
         return scene
-    of, at_once = unexplained(scene, targets), max(1, len(scene) // ROUNDS_PER_DOUBLING)
-    of = torch.where(scene.nodes == DISTANT, 0.0, of)
-    while (count := min(more, at_once, int((of > 0).sum()))) > 0:
-        rows = torch.argsort(of, descending=True, stable=True)[:count].sort().values
-        scene, more = halved(scene, rows), more - count
-        of = of.index_copy(0, rows, LEFT * of[rows])
-        of = torch.cat([of, of[rows]])
-    return scene
+    energy = residual_energy(scene, targets)
+    # An energy of 0 is never split.
+    energy = torch.where(scene.nodes == DISTANT, 0.0, energy)
+    round_limit = max(1, len(scene) // ROUNDS_PER_DOUBLING)
+    while True:
+        count = min(remaining, round_limit, int((energy > 0).sum()))
+        if count <= 0:
+            return scene
+        # Ranked by energy, then put in order of rows, in which the new halves are appended.
+        rows = torch.argsort(energy, descending=True, stable=True)[:count].sort().values
+        scene = split_along_longest_axis(scene, rows)
+        remaining -= count
+        # An estimate instead of another render: only the order of the next rounds depends on it.
+        energy = energy.index_copy(0, rows, REMAINING_ENERGY * energy[rows])
+        energy = torch.cat([energy, energy[rows]])
 
 
-def unexplained(scene: SceneGraph, targets: Sequence[Target]) -> Tensor:
-    """[N]: over all pixels of the views, the squared difference of image and render by each Gaussian's share of it."""
-    frame, objective = Frame.of(scene), Objective(LossConfig(perceptual=0.0, ssim=0.0, depth=0.0))
-    offsets, generator = torch.zeros_like(frame.start), torch.Generator()
-    beside, out = Beside(scene.deformation, scene.harmonics), offsets.new_zeros(len(scene))
-    for k in range(0, len(targets), _BATCH_VIEWS):
-        sight = objective(frame, offsets, targets[k : k + _BATCH_VIEWS], 0, generator, beside, residuals=True)
-        assert sight.residuals is not None
-        out += sight.residuals[:, 3]
-    return out
+def residual_energy(scene: SceneGraph, targets: Sequence[Target]) -> Tensor:
+    """Measures how much of the images each Gaussian fails to explain.
+
+    Args:
+        scene: of N Gaussians.
+        targets: images to compare the scene with.
+
+    Returns:
+        [N] squared difference of image and render, weighted by the Gaussian's blending weight and summed over all
+        pixels of all views.
+    """
+    parameterization = Parameterization.from_scene(scene)
+    # Residuals do not depend on the loss; the colour term alone is the cheapest one to differentiate.
+    objective = Objective(LossConfig(perceptual=0.0, ssim=0.0, depth=0.0))
+    offsets = torch.zeros_like(parameterization.initial)
+    auxiliary = AuxiliaryParameters.from_scene(scene)
+    generator = torch.Generator()
+    energy = offsets.new_zeros(len(scene))
+    # A few views at a time, since the renders of all of them would not fit the memory of a small machine.
+    for begin in range(0, len(targets), _BATCH_VIEWS):
+        batch = targets[begin : begin + _BATCH_VIEWS]
+        evaluation = objective.evaluate(
+            parameterization, offsets, batch, 0, generator, auxiliary=auxiliary, image_residuals=True
+        )
+        assert evaluation.gradients.image_residuals is not None
+        energy += evaluation.gradients.image_residuals[:, WEIGHTED_SQUARED_RESIDUAL][:, 0]
+    return energy
 
 
-def halved(scene: SceneGraph, rows: Tensor) -> SceneGraph:
-    """The scene with the Gaussians ``rows`` [M] split in two along their longest side."""
+def split_along_longest_axis(scene: SceneGraph, rows: Tensor) -> SceneGraph:
+    """Splits some Gaussians in two along their longest side.
+
+    Args:
+        scene: of N Gaussians.
+        rows: [M] which to split.
+
+    Returns:
+        SceneGraph: of N + M Gaussians. One half takes its parent's row, the other is appended; both keep its node,
+        colour, opacity and spherical harmonics.
+    """
     parents = map_attributes(lambda x: x[rows], scene.gaussians)
     longest = parents.log_scales.argmax(1)
-    place = torch.arange(len(rows), device=longest.device)
-    axis = rotation_matrices(parents.quats)[place, :, longest]
-    move = axis * (APART * parents.log_scales[place, longest].exp())[:, None]
+    index = torch.arange(len(rows), device=longest.device)
+    axis = quats_to_matrices(parents.quats)[index, :, longest]
+    shift = axis * (SEPARATION * parents.log_scales[index, longest].exp())[:, None]
     log_scales = parents.log_scales.clone()
-    log_scales[place, longest] -= math.log(SHRINK)
-    first = replace(parents, means=parents.means + move, log_scales=log_scales)
-    second = replace(parents, means=parents.means - move, log_scales=log_scales)
-    joined = map_attributes(lambda x, a, b: torch.cat([x.index_copy(0, rows, a), b]), scene.gaussians, first, second)
-    harmonics = None if scene.harmonics is None else torch.cat([scene.harmonics, scene.harmonics[rows]])
-    nodes = torch.cat([scene.nodes, scene.nodes[rows]])
-    return replace(scene, gaussians=joined, nodes=nodes, harmonics=harmonics)
+    # Opacity stays: the halves overlap in the middle, and each covers half of what the parent did.
+    log_scales[index, longest] -= math.log(SHRINK)
+    first = replace(parents, means=parents.means + shift, log_scales=log_scales)
+    second = replace(parents, means=parents.means - shift, log_scales=log_scales)
+
+    def join(values: Tensor, first_half: Tensor, second_half: Tensor) -> Tensor:
+        return torch.cat([values.index_copy(0, rows, first_half), second_half])
+
+    coefficients = scene.spherical_harmonics
+    if coefficients is not None:
+        coefficients = torch.cat([coefficients, coefficients[rows]])
+    return replace(
+        scene,
+        gaussians=map_attributes(join, scene.gaussians, first, second),
+        nodes=torch.cat([scene.nodes, scene.nodes[rows]]),
+        spherical_harmonics=coefficients,
+    )

@@ -13,46 +13,79 @@ from genre_tasks.scene.reconstruction import Reconstruction
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The scene after ``iteration`` iterations, which took ``seconds`` of training and of nothing else."""
+    """The scene at one moment of a training.
+
+    Attributes:
+        seconds: time spent on training so far, and on nothing else.
+        iteration: iterations so far.
+        scene: a copy of the scene.
+    """
 
     seconds: float
     iteration: int
     scene: SceneGraph
 
 
-def snapshots(
+def train_with_snapshots(
     training: PerSceneTraining,
     iterations: Sequence[int] = (),
     seconds: Sequence[float] = (),
     budget_s: float = float("inf"),
 ) -> Iterator[Snapshot]:
-    """Trains to the end, or until ``budget_s`` are spent, and yields the scene on the way and at the end.
+    """Trains to the end, or until a budget is spent, and yields the scene on the way and at the end.
 
-    After each of ``iterations``, and as soon as each of ``seconds`` has passed; the clock stands while the caller works
-    with a scene. The training itself does not depend on when it is looked at, and can be taken up again.
+    The clock stands while the caller works with a scene. Snapshots do not change the training, which can be continued
+    after it was left.
+
+    Args:
+        training: the training to continue.
+        iterations: yields the scene after each of these iterations.
+        seconds: yields the scene as soon as each of these times has passed.
+        budget_s: seconds of training after which it stops.
+
+    Yields:
+        The scenes in the order of time; the last one is at the end.
     """
-    due = sorted(s for s in seconds if s > training.seconds)
+    remaining = sorted(s for s in seconds if s > training.seconds)
     total = training.config.iterations
     while training.iteration < total and training.seconds < budget_s:
         training.step()
-        passed = [s for s in due if s <= training.seconds]
-        due = due[len(passed) :]
-        last = training.iteration == total or training.seconds >= budget_s
-        if passed or last or training.iteration in iterations:
+        passed = [s for s in remaining if s <= training.seconds]
+        # Several times can pass within one iteration; they share one snapshot.
+        remaining = remaining[len(passed) :]
+        # The end is always yielded, so that a curve goes as far as the training did.
+        is_last = training.iteration == total or training.seconds >= budget_s
+        if passed or is_last or training.iteration in iterations:
             yield Snapshot(training.seconds, training.iteration, training.scene)
 
 
-def reconstruct(
+def reconstruct_per_scene(
     training: PerSceneTraining, keep: frozenset[int] = frozenset(), progress: Progress = silent
 ) -> Reconstruction:
-    """The training run to its end, with the scenes after the iterations ``keep``. Raises ``NonFiniteError``."""
-    losses, seconds, kept = [], [], {}
+    """Runs a training to its end.
+
+    Args:
+        training: the training to continue.
+        keep: iterations after which the scene is kept for the curve.
+        progress: called after every iteration with the loss and the number of Gaussians.
+
+    Returns:
+        The final scene with the loss and the seconds of every iteration, and the kept scenes.
+
+    Raises:
+        NonFiniteError: the loss or a Gaussian is no longer finite.
+    """
+    losses = []
+    seconds = []
+    kept = {}
     total = training.config.iterations
     while training.iteration < total:
         before = training.seconds
         losses.append(training.step())
+        # By the training's own clock, which stands while scenes are copied and progress is shown.
         seconds.append(training.seconds - before)
         if training.iteration in keep:
+            # A copy: the training goes on in place.
             kept[training.iteration] = training.scene
         progress(training.iteration, total, f"loss {losses[-1]:.3f}, {len(training)} Gaussians")
     return Reconstruction(training.scene, tuple(losses), kept, tuple(seconds), training.culled)

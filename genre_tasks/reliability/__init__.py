@@ -1,1 +1,1 @@
-"""How far beside the path a scene can be trusted, told without knowing the truth."""
+"""How far beside the path a scene can be trusted, estimated without knowing the truth."""

@@ -1,4 +1,4 @@
-"""What a render beside the path tells of its own quality: agreement with recorded images, and what none has seen."""
+"""Signs of a render's quality that need no truth: agreement with recorded images, and what none of them shows."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from genre_tasks.fixer.conditioning import degraded
+from genre_tasks.fixer.inputs import build_inputs
 from genre_tasks.fixer.warping import SourceImage
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.novel_views import NovelView, NovelViews
@@ -18,29 +18,38 @@ from genre_tasks.scene.novel_views import NovelView, NovelViews
 if TYPE_CHECKING:
     from genre_tasks.reliability.detector import Detector
 
-SEEN = 0.5
-"""A pixel counts where at least so much of it is shown by recorded images (or, of alpha, is covered)."""
+MIN_COVERAGE = 0.5
+"""A pixel counts as shown where recorded images cover at least so much of it, and as covered from this alpha on."""
 
-FLOATING = 0.5
-"""What is nearer than this part of the LiDAR map's depth floats."""
+FLOATING_DEPTH = 0.5
+"""A pixel floats where its rendered depth is below this fraction of the LiDAR map's."""
 
-MOST_DB = 60.0
+MAX_AGREEMENT_DB = 60.0
 """Agreement of an image that is exactly what recorded ones show."""
 
-ESTIMATE = {"constant": 18.14, "agreement_db": 0.2834, "shown": 5.947, "shift_m": -1.127}
-"""PSNR in dB as a linear function of guards: least squares over 1224 views of the streets 900–905, up to 5 m beside the
-path and on it, scenes of GNet and ENet of preset ``small`` (``genre bench evaluation --set rounds=0 --set seeds=900,…``
-prints it). Fitted with one of the streets left out in turn, its rank correlation with the true PSNR is 0.873."""
+PSNR_COEFFICIENTS = {"constant": 18.14, "agreement_db": 0.2834, "shown": 5.947, "shift_m": -1.127}
+"""PSNR in dB as a linear function of guards.
+
+Least squares over 1224 views of the streets 900–905, on the path and up to 5 m beside it, in scenes of GNet and ENet of
+preset ``small``. ``genre bench evaluation --set rounds=0 --set seeds=900,…`` prints the coefficients. Fitted with one
+of the streets left out in turn, the rank correlation with the true PSNR is 0.873."""
 
 
 @dataclass(frozen=True)
 class Guards:
-    """Of one view, all without the truth.
+    """How well one render is supported, measured without the truth.
 
-    ``agreement_db``: PSNR between the render and recorded images looked up by LiDAR's depth, where these show anything.
-    ``shown``: share of pixels whose rendered depth some recorded image bears out. ``thin``: share of pixels that are
-    covered by less than half. ``floating``: share whose rendered depth is less than half of LiDAR's, where both are.
-    ``actors``: how many of the log's are wholly in the image, ``detected`` by a detector; 0 without one.
+    Attributes:
+        camera: name of the camera.
+        frame: the log's frame.
+        shift_m: distance to the left of the path, metres.
+        agreement_db: PSNR between the render and recorded images that are looked up by the LiDAR's depth; 0 where
+            these show nothing.
+        shown: fraction of pixels whose rendered depth agrees with some recorded image.
+        thin: fraction of pixels that are covered by less than half.
+        floating: fraction of pixels whose rendered depth is less than half of the LiDAR's, where both are known.
+        actors: actors of the log that are completely in the image; 0 without a detector.
+        detected: how many of them the detector finds.
     """
 
     camera: str
@@ -55,23 +64,33 @@ class Guards:
 
     @property
     def estimate_db(self) -> float:
-        """The PSNR that the view is likely to have, dB; see ``ESTIMATE``."""
+        """The PSNR that the view is likely to have, dB; see ``PSNR_COEFFICIENTS``."""
         return (
-            ESTIMATE["constant"]
-            + ESTIMATE["agreement_db"] * self.agreement_db
-            + ESTIMATE["shown"] * self.shown
-            + ESTIMATE["shift_m"] * abs(self.shift_m)
+            PSNR_COEFFICIENTS["constant"]
+            + PSNR_COEFFICIENTS["agreement_db"] * self.agreement_db
+            + PSNR_COEFFICIENTS["shown"] * self.shown
+            + PSNR_COEFFICIENTS["shift_m"] * abs(self.shift_m)
         )
 
 
-def guards_of(
+def compute_guards(
     chunk: Chunk, novel: NovelViews, sources: Sequence[SourceImage], detector: Detector | None = None
 ) -> list[Guards]:
-    """Of each view; ``sources`` are the chunk's, see ``fixer.conditioning.recorded``."""
-    return [_guards(chunk, novel, index, view, sources, detector) for index, view in enumerate(novel.views)]
+    """Measures how well rendered views are supported.
+
+    Args:
+        chunk: the chunk, with its plan's effects applied.
+        novel: V rendered views with their LiDAR maps.
+        sources: the chunk's recorded images, see :func:`genre_tasks.fixer.source_images.load_source_images`.
+        detector: counts the actors that are still found; ``None``: they are not counted.
+
+    Returns:
+        V guards, in the order of ``novel.views``.
+    """
+    return [_guard_view(chunk, novel, index, view, sources, detector) for index, view in enumerate(novel.views)]
 
 
-def _guards(
+def _guard_view(
     chunk: Chunk,
     novel: NovelViews,
     index: int,
@@ -79,39 +98,49 @@ def _guards(
     sources: Sequence[SourceImage],
     detector: Detector | None,
 ) -> Guards:
-    found = degraded(chunk, novel, [index], sources)
-    shown = found.lidar_warp_mask > SEEN
-    own = found.lidar_warped / found.lidar_warp_mask.clamp_min(SEEN)
-    error = ((found.color.clamp(0, 1) - own) ** 2).mean(1, keepdim=True)
-    near, known = _floating(novel, index)
-    image = found.color[0].clamp(0, 1).permute(1, 2, 0)
-    actors, detected = (0, 0) if detector is None else detector.found(chunk, view, image)
+    inputs = build_inputs(chunk, novel, [index], sources)
+    # By the LiDAR's depth: looked up by its own depth, a floater would agree with the images that made it.
+    covered = inputs.lidar_warp_mask > MIN_COVERAGE
+    # The warped images are premultiplied by how much of a pixel they cover.
+    recorded = inputs.lidar_warped / inputs.lidar_warp_mask.clamp_min(MIN_COVERAGE)
+    # Clamped, as the image is shown.
+    error = ((inputs.color.clamp(0, 1) - recorded) ** 2).mean(1, keepdim=True)
+    floating, known = _find_floating_pixels(novel, index)
+    actors = 0
+    detected = 0
+    if detector is not None:
+        image = inputs.color[0].clamp(0, 1).permute(1, 2, 0)
+        actors, detected = detector.count_detected_actors(chunk, view, image)
     return Guards(
-        view.camera,
-        view.frame,
-        view.shift_m,
-        _decibels(error[shown]),
-        _share(found.warp_mask > SEEN),
-        _share(found.alpha < SEEN),
-        float(near.sum()) / max(1, int(known.sum())),
-        actors,
-        detected,
+        camera=view.camera,
+        frame=view.frame,
+        shift_m=view.shift_m,
+        agreement_db=_mean_psnr(error[covered]),
+        # By the render's own depth this time: does any image agree with the surface as it was rendered?
+        shown=_fraction(inputs.warp_mask > MIN_COVERAGE),
+        thin=_fraction(inputs.alpha < MIN_COVERAGE),
+        # Only pixels with both depths can be judged; without any nothing floats.
+        floating=float(floating.sum()) / max(1, int(known.sum())),
+        actors=actors,
+        detected=detected,
     )
 
 
-def _floating(novel: NovelViews, index: int) -> tuple[Tensor, Tensor]:
-    """Where a pixel floats, and where that can be told."""
-    depth, lidar = novel.depth[index], novel.lidar_depth[index]
-    known = (novel.alpha[index] > SEEN) & (novel.lidar_alpha[index] > SEEN) & (lidar > 0)
-    return known & (depth < FLOATING * lidar), known
+def _find_floating_pixels(novel: NovelViews, index: int) -> tuple[Tensor, Tensor]:
+    """Masks [H, W]: where a pixel floats, and where that is known because both depths are."""
+    depth = novel.depth[index]
+    lidar_depth = novel.lidar_depth[index]
+    known = (novel.alpha[index] > MIN_COVERAGE) & (novel.lidar_alpha[index] > MIN_COVERAGE) & (lidar_depth > 0)
+    return known & (depth < FLOATING_DEPTH * lidar_depth), known
 
 
-def _decibels(error: Tensor) -> float:
-    """0 where nothing can be compared: nothing speaks for the view."""
-    if not error.numel():
+def _mean_psnr(squared_error: Tensor) -> float:
+    """PSNR in dB of squared errors; 0 without any: nothing speaks for the view."""
+    if not squared_error.numel():
         return 0.0
-    return min(MOST_DB, -10 * math.log10(max(float(error.double().mean()), 1e-12)))
+    # The floor only keeps the logarithm finite: the cap is reached long before it.
+    return min(MAX_AGREEMENT_DB, -10 * math.log10(max(float(squared_error.double().mean()), 1e-12)))
 
 
-def _share(mask: Tensor) -> float:
+def _fraction(mask: Tensor) -> float:
     return float(mask.to(torch.float64).mean())

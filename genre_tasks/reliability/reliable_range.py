@@ -10,26 +10,37 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from genre_tasks.config import RangeConfig
-from genre_tasks.effects.apply_plan import applied
-from genre_tasks.effects.types import UNPLANNED, EffectsPlan
-from genre_tasks.fixer.source_images import recorded
+from genre_tasks.effects.apply_plan import apply_plan
+from genre_tasks.effects.types import DEFAULT_PLAN, EffectsPlan
+from genre_tasks.fixer.source_images import load_source_images
 from genre_tasks.progress import Progress, silent
-from genre_tasks.reliability.guards import Guards, guards_of
+from genre_tasks.reliability.guards import Guards, compute_guards
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.novel_poses import novel_view_poses
+from genre_tasks.scene.novel_poses import place_novel_views
 from genre_tasks.scene.novel_views import NovelViews
 from genre_tasks.stages.novel_views import render_novel
 
 if TYPE_CHECKING:
     from genre_tasks.reliability.detector import Detector
 
+_MEDIAN_OF = ("estimate_db", "agreement_db", "shown", "thin", "floating")
+
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """At one shift (metres, left is positive): medians over the views, and whether they are within the limits.
+    """The guards at one shift, as medians over its views.
 
-    ``detected``: the share of all views' actors that a detector finds; NaN without one, or without actors.
+    Attributes:
+        shift_m: distance to the left of the path, metres.
+        views: number of views.
+        estimate_db: the PSNR that views are likely to have, dB.
+        agreement_db: PSNR against recorded images, dB.
+        shown: fraction of pixels whose depth agrees with some recorded image.
+        thin: fraction of pixels that are covered by less than half.
+        floating: fraction of pixels far before the LiDAR's depth.
+        holds: whether all guards are within the limits.
+        detected: fraction of all views' actors that a detector finds; NaN without a detector, or without actors.
     """
 
     shift_m: float
@@ -45,9 +56,14 @@ class CurvePoint:
 
 @dataclass(frozen=True)
 class ReliableRange:
-    """``left_m`` and ``right_m``: how far all points hold, between two shifts where the first limit is crossed.
+    """How far to each side of the path a scene can be trusted.
 
-    ``points`` by shift, from the right to the left, 0 among them. ``guards`` of all views.
+    Attributes:
+        points: the curve, from the right to the left, with shift 0 among its points.
+        guards: of all views.
+        left_m: how far all limits hold to the left, metres; between two shifts where the first limit is crossed.
+        right_m: the same to the right.
+        limits: what was asked for.
     """
 
     points: tuple[CurvePoint, ...]
@@ -57,90 +73,146 @@ class ReliableRange:
     limits: RangeConfig
 
     def __str__(self) -> str:
-        most = max(self.limits.shifts_m)
-        left, right = (f"{m:.1f} m{' or more' if m >= most else ''}" for m in (self.left_m, self.right_m))
-        return f"usable to {left} left, {right} right"
+        return f"usable to {self._describe(self.left_m)} left, {self._describe(self.right_m)} right"
+
+    def _describe(self, range_m: float) -> str:
+        return f"{range_m:.1f} m{' or more' if range_m >= max(self.limits.shifts_m) else ''}"
 
 
-def reliable_range(
+def estimate_reliable_range(
     config: RangeConfig,
     chunk: Chunk,
     scene: SceneGraph,
-    plan: EffectsPlan = UNPLANNED,
+    plan: EffectsPlan = DEFAULT_PLAN,
     progress: Progress = silent,
     detector: Detector | None = None,
 ) -> ReliableRange:
-    """The scene rendered at every ``config.every``-th frame of the path and beside it, and its guards.
+    """Renders a scene on the path and beside it, and finds how far the guards hold.
 
-    Limits are relative to the path itself: what no image shows there (sky above, what the rig hides) is no fault of the
-    shift. ``detector``: of road users; how many it finds is a guard, too. Raises ``InputError`` for an image of the
-    chunk that cannot be decoded.
+    Limits are relative to the path itself. What no image shows there (sky above, what the rig hides) is not the
+    shift's fault.
+
+    Args:
+        config: shifts, frames and limits.
+        chunk: the chunk that the scene is of.
+        scene: the scene to judge.
+        plan: the effects that the chunk was reconstructed with.
+        progress: called for every shift.
+        detector: of road users; how many of them it finds is a guard, too.
+
+    Returns:
+        The range with the curve and the guards that it comes from.
+
+    Raises:
+        InputError: an image of the chunk cannot be decoded.
     """
-    found = [g for _, guards in measured(config, applied(chunk, plan), scene, progress, detector) for g in guards]
-    return judged(found, config)
+    measured = measure_guards(config, apply_plan(chunk, plan), scene, progress, detector)
+    guards = [guard for _, shift_guards in measured for guard in shift_guards]
+    return find_reliable_range(guards, config)
 
 
-def measured(
+def measure_guards(
     config: RangeConfig, chunk: Chunk, scene: SceneGraph, progress: Progress, detector: Detector | None = None
 ) -> Iterator[tuple[NovelViews, list[Guards]]]:
-    """For each shift, 0 first, the renders and their guards; ``chunk`` has its plan's effects applied."""
+    """Renders a scene at every shift and measures its guards.
+
+    Args:
+        config: shifts and frames.
+        chunk: the chunk, with its plan's effects applied.
+        scene: the scene to judge.
+        progress: called for every shift.
+        detector: counts the actors that are still found; ``None``: they are not counted.
+
+    Yields:
+        The renders and their guards, shift 0 first.
+
+    Raises:
+        InputError: an image of the chunk cannot be decoded.
+    """
+    # From the middle of an interval on, so that few frames stand for the whole chunk.
     frames = chunk.frames[config.every // 2 :: config.every] or chunk.frames[:1]
-    shifts = [0.0, *(sign * s for s in sorted(config.shifts_m) for sign in (1, -1))]
-    sources = recorded(chunk)
+    # The path first: everything is compared with it.
+    shifts = [0.0]
+    for shift in sorted(config.shifts_m):
+        shifts += [shift, -shift]
+    # Decoded once for all shifts.
+    sources = load_source_images(chunk)
     for k, shift in enumerate(shifts):
         progress(k, len(shifts), f"guards at {shift:+g} m")
-        novel = render_novel(chunk, scene, novel_view_poses(chunk, (shift,), frames), config.lidar_max_points)
-        yield novel, guards_of(chunk, novel, sources, detector)
+        novel = render_novel(chunk, scene, place_novel_views(chunk, (shift,), frames), config.lidar_max_points)
+        yield novel, compute_guards(chunk, novel, sources, detector)
     progress(len(shifts), len(shifts), "guards")
 
 
-def judged(guards: Sequence[Guards], limits: RangeConfig) -> ReliableRange:
-    """The curve of medians, and how far it holds. Raises ``ValueError`` without views on the path."""
-    by: dict[float, list[Guards]] = {}
-    for one in guards:
-        by.setdefault(one.shift_m, []).append(one)
-    if 0.0 not in by:
+def find_reliable_range(guards: Sequence[Guards], limits: RangeConfig) -> ReliableRange:
+    """Finds how far guards stay within limits.
+
+    Args:
+        guards: of views on the path and beside it.
+        limits: how much worse than on the path each guard may be.
+
+    Raises:
+        ValueError: there is no view on the path.
+    """
+    by_shift: dict[float, list[Guards]] = {}
+    for guard in guards:
+        by_shift.setdefault(guard.shift_m, []).append(guard)
+    # Every limit is relative to the path.
+    if 0.0 not in by_shift:
         raise ValueError("expected guards at shift 0, which the others are compared with; got none")
-    path = _median(by[0.0])
-    points = tuple(_point(s, by[s], path, limits) for s in sorted(by))
-    left, right = (_reach(points, path, limits, side) for side in (1, -1))
-    return ReliableRange(points, tuple(guards), left, right, limits)
+    path = _summarise(by_shift[0.0])
+    points = tuple(_curve_point(shift, by_shift[shift], path, limits) for shift in sorted(by_shift))
+    return ReliableRange(
+        points=points,
+        guards=tuple(guards),
+        left_m=_find_reach(points, path, limits, side=1),
+        right_m=_find_reach(points, path, limits, side=-1),
+        limits=limits,
+    )
 
 
-def _median(views: Sequence[Guards]) -> dict[str, float]:
-    names = ("estimate_db", "agreement_db", "shown", "thin", "floating")
-    actors = sum(v.actors for v in views)
-    detected = sum(v.detected for v in views) / actors if actors else math.nan
-    return {name: statistics.median(getattr(v, name) for v in views) for name in names} | {"detected": detected}
+def _summarise(views: Sequence[Guards]) -> dict[str, float]:
+    """Medians of the guards, and the fraction of actors that is detected."""
+    summary = {name: statistics.median(getattr(view, name) for view in views) for name in _MEDIAN_OF}
+    # Over all views together: many show no actor or one, so that a median of fractions would be 0 or 1.
+    actors = sum(view.actors for view in views)
+    summary["detected"] = sum(view.detected for view in views) / actors if actors else math.nan
+    return summary
 
 
-def _point(shift: float, views: Sequence[Guards], path: dict[str, float], limits: RangeConfig) -> CurvePoint:
-    here = _median(views)
-    return CurvePoint(shift, len(views), **here, holds=all(x <= 0 for x in _excess(here, path, limits)))
+def _curve_point(shift: float, views: Sequence[Guards], path: dict[str, float], limits: RangeConfig) -> CurvePoint:
+    summary = _summarise(views)
+    holds = all(excess <= 0 for excess in _limit_excess(summary, path, limits))
+    return CurvePoint(shift, len(views), **summary, holds=holds)
 
 
-def _excess(here: dict[str, float], path: dict[str, float], limits: RangeConfig) -> tuple[float, ...]:
+def _limit_excess(here: dict[str, float], path: dict[str, float], limits: RangeConfig) -> tuple[float, ...]:
     """By how much each limit is passed; negative where it holds."""
     return (
+        # Path minus here where more is better, here minus path where less is.
         path["estimate_db"] - here["estimate_db"] - limits.max_drop_db,
         path["shown"] - here["shown"] - limits.max_hidden,
         here["thin"] - path["thin"] - limits.max_thin,
         here["floating"] - path["floating"] - limits.max_floating,
-        _lost(path["detected"], here["detected"]) - limits.max_undetected,
+        _lost_fraction(path["detected"], here["detected"]) - limits.max_undetected,
     )
 
 
-def _lost(before: float, now: float) -> float:
-    """Of the share that is detected on the path; 0 where either is not known, or nothing was detected there."""
-    return 1 - now / before if math.isfinite(now) and before > 0 else 0.0
+def _lost_fraction(on_path: float, here: float) -> float:
+    """Fraction of the detections on the path that is lost; 0 where either is unknown or nothing was detected there."""
+    return 1 - here / on_path if math.isfinite(here) and on_path > 0 else 0.0
 
 
-def _reach(points: Sequence[CurvePoint], path: dict[str, float], limits: RangeConfig, side: int) -> float:
-    """Linear between the last shift that holds and the first that does not."""
-    own = sorted((p for p in points if side * p.shift_m >= 0), key=lambda p: abs(p.shift_m))
-    for before, after in itertools.pairwise(own):
-        if not after.holds:
-            pairs = zip(*(_excess(vars(p), path, limits) for p in (before, after)), strict=True)
-            part = min(a / (a - b) for a, b in pairs if b > 0)
-            return abs(before.shift_m) + part * (abs(after.shift_m) - abs(before.shift_m))
-    return abs(own[-1].shift_m)
+def _find_reach(points: Sequence[CurvePoint], path: dict[str, float], limits: RangeConfig, side: int) -> float:
+    """Metres up to where the first limit is crossed, linear between the shifts on both sides of it."""
+    # Shift 0 belongs to both sides.
+    outward = sorted((p for p in points if side * p.shift_m >= 0), key=lambda p: abs(p.shift_m))
+    for inner, outer in itertools.pairwise(outward):
+        # A shift that holds beyond one that does not is of no use: a vehicle could not get there.
+        if not outer.holds:
+            inner_excess = _limit_excess(vars(inner), path, limits)
+            outer_excess = _limit_excess(vars(outer), path, limits)
+            # The excess is taken as linear in between; the first limit to be crossed ends the range.
+            crossings = [a / (a - b) for a, b in zip(inner_excess, outer_excess, strict=True) if b > 0]
+            return abs(inner.shift_m) + min(crossings) * (abs(outer.shift_m) - abs(inner.shift_m))
+    return abs(outward[-1].shift_m)

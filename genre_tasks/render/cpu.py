@@ -13,16 +13,26 @@ from torch.autograd.function import once_differentiable
 from genre_tasks.errors import ResourceError
 from genre_tasks.render.constants import CULL_REASONS
 from genre_tasks.render.kernel.library import load_kernel
-from genre_tasks.render.lens_domain import Domain, domain_of
-from genre_tasks.render.types import Cameras, Shown
+from genre_tasks.render.lens_domain import ValidDomain, find_valid_domain
+from genre_tasks.render.types import Cameras, VisibleRanges
 from genre_tasks.scene.gaussians import Splats
 
-Arrays = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
-Images = tuple[Tensor, Tensor, Tensor]
+SplatTensors = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+"""Means [N, 3], scales [N, 3], quaternions [N, 4], opacities [N], colours [N, 3] or [V, N, 3]."""
+
+ImageTensors = tuple[Tensor, Tensor, Tensor]
+"""Colour [V, H, W, 3], alpha [V, H, W], depth [V, H, W]."""
 
 
 def check_status(status: int) -> None:
-    """Raises ``ResourceError`` for what a kernel function returned, unless it is 0."""
+    """Turns what a function of the kernel returned into an error.
+
+    Args:
+        status: 0 is success.
+
+    Raises:
+        ResourceError: memory does not suffice, or the kernel failed.
+    """
     if status == 1:
         raise ResourceError("not enough memory to render", remedy="Render fewer views a call, or smaller images")
     if status:
@@ -31,11 +41,18 @@ def check_status(status: int) -> None:
         )
 
 
-class _Batch:
-    """The kernel's state after a forward pass, freed with this object, and the velocities that it was given."""
+class ForwardState:
+    """What the kernel's backward pass needs of the forward pass; freed with this object.
+
+    Attributes:
+        handle: of the kernel's state.
+        velocities: [N, 3] those of the forward pass, or ``None``; the kernel reads them again.
+    """
 
     def __init__(self, handle: ctypes.c_void_p, velocities: Tensor | None) -> None:
-        self.handle, self.velocities = handle, velocities
+        self.handle = handle
+        self.velocities = velocities
+        # A reference of its own: when the interpreter ends, modules may be gone before this object is.
         self._free = load_kernel().genre_free
 
     def __del__(self) -> None:
@@ -43,38 +60,62 @@ class _Batch:
 
 
 def forward(
-    arrays: Arrays, cameras: Cameras, shown: Shown, threads: int, keep: bool, velocities: Tensor | None = None
-) -> tuple[Images, dict[str, int], _Batch | None]:
-    """The images of contiguous ``arrays``, the culled counts, and with ``keep`` the state for :func:`backward`.
+    splats: SplatTensors,
+    cameras: Cameras,
+    visible: VisibleRanges,
+    threads: int,
+    keep: bool,
+    velocities: Tensor | None = None,
+) -> tuple[ImageTensors, dict[str, int], ForwardState | None]:
+    """Renders by the kernel, without autograd.
 
-    Colours are [N, 3], or [V, N, 3] where they differ from view to view.
+    Args:
+        splats: contiguous float32 tensors on the CPU.
+        cameras: V of them.
+        visible: which Gaussians each view shows.
+        threads: the result has the same bits at any number.
+        keep: whether :func:`backward` will follow.
+        velocities: [N, 3] float32, contiguous, as in ``Splats``.
 
-    ``velocities`` [N, 3] float32, contiguous, as in ``Splats``.
+    Returns:
+        The images, the culled counts by reason, and with ``keep`` the state for :func:`backward`.
+
+    Raises:
+        ResourceError: the kernel is not compiled, or memory does not suffice.
     """
     kernel = load_kernel()
-    views, height, width = len(cameras), cameras.height_px, cameras.width_px
+    views = len(cameras)
+    height = cameras.height_px
+    width = cameras.width_px
+    # A few hundred bytes each: these copies cost nothing. The splats are read in place.
     poses = cameras.camera_SE3_chunk.detach().to("cpu", torch.float32).contiguous()
     lenses = torch.cat([cameras.focal_px, cameras.center_px], 1).detach().to("cpu", torch.float32).contiguous()
-    distortions, shutters = _distortions(cameras), _shutters(cameras)
-    color, alpha = torch.empty(views, height, width, 3), torch.empty(views, height, width)
+    distortions = _distortions(cameras)
+    shutters = _shutters(cameras)
+    # Not zeroed: the kernel writes every pixel.
+    color = torch.empty(views, height, width, 3)
+    alpha = torch.empty(views, height, width)
     depth = torch.empty_like(alpha)
     culled = (ctypes.c_longlong * len(CULL_REASONS))()
-    own = (ctypes.c_int * (2 * views))(*itertools.chain(*shown.own))
+    # The ctypes arrays must outlive the call, so they have names.
+    ranges = (ctypes.c_int * (2 * views))(*itertools.chain(*visible.per_view))
     handle = ctypes.c_void_p()
-    of_cameras = poses.data_ptr(), lenses.data_ptr(), _pointer(distortions), _pointer(shutters)
     status = kernel.genre_forward(
-        len(arrays[0]),
-        *(a.data_ptr() for a in arrays),
-        arrays[4].dim() == 3,
+        len(splats[0]),
+        *(s.data_ptr() for s in splats),
+        splats[4].dim() == 3,
         _pointer(velocities),
         views,
-        *of_cameras,
+        poses.data_ptr(),
+        lenses.data_ptr(),
+        _pointer(distortions),
+        _pointer(shutters),
         cameras.antialiased,
         width,
         height,
         threads,
-        shown.shared,
-        own,
+        visible.shared,
+        ranges,
         color.data_ptr(),
         alpha.data_ptr(),
         depth.data_ptr(),
@@ -83,43 +124,58 @@ def forward(
     )
     check_status(status)
     counts = {reason: n for reason, n in zip(CULL_REASONS, culled, strict=True) if n}
-    return (color, alpha, depth), counts, _Batch(handle, velocities) if keep else None
+    return (color, alpha, depth), counts, ForwardState(handle, velocities) if keep else None
 
 
 def backward(
-    batch: _Batch,
-    arrays: Arrays,
-    images: Images,
-    by_images: Images,
+    state: ForwardState,
+    splats: SplatTensors,
+    images: ImageTensors,
+    image_gradients: ImageTensors,
     threads: int,
-    out: Arrays,
+    out: SplatTensors,
     residual: Tensor | None = None,
-    shares: Tensor | None = None,
+    view_weights: Tensor | None = None,
 ) -> Tensor | None:
-    """Writes the gradients of ``arrays`` to ``out``, from those of the images.
+    """Computes the gradients of splats from those of the images, without autograd.
 
-    With a ``residual`` r [V, H, W, 3] it returns what of it each Gaussian shows, [N, 5]: the sums over all pixels of
-    w r, w ‖r‖² and w, where w is the Gaussian's share of the pixel; a view's times its own of ``shares`` [V], float32.
+    Args:
+        state: of the forward pass.
+        splats: as given to :func:`forward`.
+        images: as returned by it.
+        image_gradients: with respect to colour, alpha and depth.
+        threads: the result has the same bits at any number.
+        out: contiguous float32 tensors; the gradients are written there.
+        residual: [V, H, W, 3] an image r whose distribution over the Gaussians is asked for, too.
+        view_weights: [V] float32, how much each view counts in it; ``None``: 1.
+
+    Returns:
+        With a ``residual``, how much of it each Gaussian covers [N, 5]: the sums over all pixels and views of w r,
+        w ‖r‖² and w, where w is the Gaussian's weight in the pixel, times that of the view.
+
+    Raises:
+        ResourceError: memory does not suffice.
     """
-    v = [x.contiguous() for x in by_images]
-    back = None if residual is None else torch.empty(len(arrays[0]), 5)
+    # Autograd may hand over expanded or transposed tensors, while the kernel counts in plain rows.
+    image_gradients_ = [x.contiguous() for x in image_gradients]
+    sums = None if residual is None else torch.empty(len(splats[0]), 5)
     residual = None if residual is None else residual.contiguous()
     status = load_kernel().genre_backward(
-        batch.handle,
-        len(arrays[0]),
-        *(a.data_ptr() for a in arrays),
-        arrays[4].dim() == 3,
-        _pointer(batch.velocities),
-        *(a.data_ptr() for a in images),
-        *(x.data_ptr() for x in v),
+        state.handle,
+        len(splats[0]),
+        *(s.data_ptr() for s in splats),
+        splats[4].dim() == 3,
+        _pointer(state.velocities),
+        *(x.data_ptr() for x in images),
+        *(x.data_ptr() for x in image_gradients_),
         _pointer(residual),
-        _pointer(shares),
+        _pointer(view_weights),
         threads,
         *(g.data_ptr() for g in out),
-        _pointer(back),
+        _pointer(sums),
     )
     check_status(status)
-    return back
+    return sums
 
 
 def _pointer(tensor: Tensor | None) -> int | None:
@@ -127,21 +183,24 @@ def _pointer(tensor: Tensor | None) -> int | None:
 
 
 def _distortions(cameras: Cameras) -> Tensor | None:
-    """[V, 10] as the kernel takes them: coefficients, square of the fold radius, limits of the linearisation."""
-    domains = [domain_of(cameras, v) for v in range(len(cameras))]
+    # [V, 10] as the kernel takes them: coefficients, square of the fold radius, limits of the linearisation.
+    domains = [find_valid_domain(cameras, v) for v in range(len(cameras))]
     if cameras.distortion is None or not any(domains):
         return None
-    straight = Domain(torch.inf, 0.0, 0.0, 0.0, 0.0)
-    each = [d or straight for d in domains]
-    limits = torch.tensor([[d.fold_radius**2, d.left, d.right, d.top, d.bottom] for d in each])
+    # The kernel takes one table for all views. A view that does not distort has coefficients of 0 in it, by which the
+    # kernel knows, and never reads its limits.
+    undistorted = ValidDomain(torch.inf, 0.0, 0.0, 0.0, 0.0)
+    per_view = [d or undistorted for d in domains]
+    limits = torch.tensor([[d.fold_radius**2, d.left, d.right, d.top, d.bottom] for d in per_view])
     return torch.cat([cameras.distortion.detach().to("cpu", torch.float32), limits], 1).contiguous()
 
 
 def _shutters(cameras: Cameras) -> Tensor | None:
-    """[V, 7] as the kernel takes them: readout, velocity, turn."""
-    if (shutter := cameras.shutter) is None:
+    # [V, 7] as the kernel takes them: readout, velocity, turn.
+    shutter = cameras.shutter
+    if shutter is None:
         return None
-    parts = shutter.readout_s[:, None], shutter.velocity_m_s, shutter.turn_rad_s
+    parts = (shutter.readout_s[:, None], shutter.velocity_m_s, shutter.turn_rad_s)
     return torch.cat(parts, 1).detach().to("cpu", torch.float32).contiguous()
 
 
@@ -150,7 +209,7 @@ class _Rasterise(torch.autograd.Function):
     def forward(
         ctx: Any,
         cameras: Cameras,
-        shown: Shown,
+        visible: VisibleRanges,
         threads: int,
         culled: dict[str, int],
         means: Tensor,
@@ -159,59 +218,87 @@ class _Rasterise(torch.autograd.Function):
         opacities: Tensor,
         colors: Tensor,
         velocities: Tensor | None,
-    ) -> Images:
-        arrays = (means, scales, quats, opacities, colors)
+    ) -> ImageTensors:
+        # Without a backward pass the kernel hands its memory back to the pool at once.
+        splats = (means, scales, quats, opacities, colors)
         keep = any(ctx.needs_input_grad)
-        images, counts, ctx.batch = forward(arrays, cameras, shown, threads, keep, velocities)
+        images, counts, ctx.state = forward(splats, cameras, visible, threads, keep, velocities)
         culled.update(counts)
-        ctx.cameras, ctx.shown, ctx.threads, ctx.velocities = cameras, shown, threads, velocities
-        ctx.save_for_backward(*arrays, *images)
+        ctx.cameras = cameras
+        ctx.visible = visible
+        ctx.threads = threads
+        ctx.velocities = velocities
+        ctx.save_for_backward(*splats, *images)
         return images
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_color: Tensor, v_alpha: Tensor, v_depth: Tensor) -> tuple[Tensor | None, ...]:
         saved = ctx.saved_tensors
-        arrays, images = saved[:5], saved[5:]
-        batch, ctx.batch = ctx.batch, None
-        if batch is None:  # a second backward through a retained graph: the state was given back after the first
-            batch = forward(arrays, ctx.cameras, ctx.shown, ctx.threads, True, ctx.velocities)[2]
-        means, scales, quats, opacities, colors = (torch.empty_like(a) for a in arrays)
+        splats = saved[:5]
+        images = saved[5:]
+        # Taken out of the context, so that its memory goes back to the pool as soon as this pass ends.
+        state = ctx.state
+        ctx.state = None
+        if state is None:  # a second backward through a retained graph: the state was given back after the first
+            state = forward(splats, ctx.cameras, ctx.visible, ctx.threads, True, ctx.velocities)[2]
+        means, scales, quats, opacities, colors = (torch.empty_like(s) for s in splats)
         grads = (means, scales, quats, opacities, colors)
-        backward(batch, arrays, images, (v_color, v_alpha, v_depth), ctx.threads, grads)
+        backward(state, splats, images, (v_color, v_alpha, v_depth), ctx.threads, grads)
         return (None, None, None, None, *grads, None)
 
 
-def _arrays(splats: Splats) -> Arrays:
-    arrays = (splats.means, splats.scales, splats.quats, splats.opacities, splats.colors)
-    if any(a.device.type != "cpu" for a in arrays):
+def _tensors_of(splats: Splats) -> SplatTensors:
+    tensors = (splats.means, splats.scales, splats.quats, splats.opacities, splats.colors)
+    # Other devices would be copied without a word, over and over in an optimisation: better to fail.
+    if any(t.device.type != "cpu" for t in tensors):
         raise ValueError(f"expected tensors on the cpu for backend cpu, got {splats.means.device}")
-    means, scales, quats, opacities, colors = (a.to(torch.float32).contiguous() for a in arrays)
+    means, scales, quats, opacities, colors = (t.to(torch.float32).contiguous() for t in tensors)
     return means, scales, quats, opacities, colors
 
 
-def _velocities(splats: Splats) -> Tensor | None:
+def _velocities_of(splats: Splats) -> Tensor | None:
     return None if splats.velocities is None else splats.velocities.detach().to("cpu", torch.float32).contiguous()
 
 
-def forward_state(splats: Splats, cameras: Cameras) -> _Batch:
-    """The kernel's state after a forward pass on one thread."""
+def run_forward(splats: Splats, cameras: Cameras) -> ForwardState:
+    """Renders on one thread and gives the kernel's state, from which a benchmark counts the work done.
+
+    Args:
+        splats: on the CPU.
+        cameras: V of them.
+    """
     with torch.no_grad():
-        shown = Shown.all_of(len(splats), len(cameras))
-        state = forward(_arrays(splats), cameras, shown, 1, True, _velocities(splats))[2]
+        visible = VisibleRanges.everything(len(splats), len(cameras))
+        state = forward(_tensors_of(splats), cameras, visible, 1, True, _velocities_of(splats))[2]
     assert state is not None
     return state
 
 
-def render_cpu(splats: Splats, cameras: Cameras, shown: Shown, threads: int | None) -> tuple[Images, dict[str, int]]:
-    """Colour [V, H, W, 3], alpha and depth [V, H, W], float32, and the culled counts; differentiable in the splats.
+def render_cpu(
+    splats: Splats, cameras: Cameras, visible: VisibleRanges, threads: int | None
+) -> tuple[ImageTensors, dict[str, int]]:
+    """Renders by the kernel; differentiable in the splats.
 
-    ``threads`` ``None`` takes torch's number. The bits of images and gradients do not depend on it. Memory, with N
-    Gaussians and P pairs of a footprint and a tile of 16×16 pixels in a view: 72 N + 11 P bytes a view from forward to
-    backward (4 N more with a rolling shutter), and 76 N + 68 P a thread while it works on one, each up to a quarter
-    more; up to 512 MB of either is kept for the next call.
+    Memory, with N Gaussians and P pairs of a footprint and a tile of 16×16 pixels in a view: 72 N + 11 P bytes a view
+    from forward to backward (4 N more with a rolling shutter), and 76 N + 68 P a thread while it works on one, each up
+    to a quarter more. Up to 512 MB of either stay for the next call.
+
+    Args:
+        splats: on the CPU.
+        cameras: V of them.
+        visible: which Gaussians each view shows.
+        threads: ``None``: torch's number. The bits of images and gradients do not depend on it.
+
+    Returns:
+        Colour [V, H, W, 3], alpha and depth [V, H, W], float32; and the culled counts by reason.
+
+    Raises:
+        ValueError: a tensor is not on the CPU.
+        ResourceError: the kernel is not compiled, or memory does not suffice.
     """
+    # An autograd function returns tensors only: the counts come back through this dictionary.
     culled: dict[str, int] = {}
     threads = threads or torch.get_num_threads()
-    images = _Rasterise.apply(cameras, shown, threads, culled, *_arrays(splats), _velocities(splats))
+    images = _Rasterise.apply(cameras, visible, threads, culled, *_tensors_of(splats), _velocities_of(splats))
     return images, culled

@@ -1,4 +1,4 @@
-"""Where boxes of actors are in images."""
+"""Where the boxes of actors are in images."""
 
 from __future__ import annotations
 
@@ -9,23 +9,31 @@ from genre_tasks.scene.chunk import Actor, View
 from genre_tasks.scene.novel_views import NovelView
 from genre_tasks.scene.projection import NEAR_M
 
-Seeing = View | NovelView
+AnyView = View | NovelView
 
 
-def outline(actor: Actor, view: Seeing) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First pixel (x, y) of the box in the image, and that after its last: the same where it is not in the image.
+def project_box(actor: Actor, view: AnyView) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Finds the rectangle of pixels that an actor's box covers in a view.
 
-    What is behind the camera plane is cut off there; lenses are taken to be free of distortion.
+    What is behind the camera plane is cut off there; the lens is taken to be free of distortion.
+
+    Args:
+        actor: with its poses in the chunk.
+        view: recorded or novel.
+
+    Returns:
+        The first pixel (x, y) of the rectangle, and the one after its last: equal where the box is not in the image.
     """
-    at = np.flatnonzero(actor.frames == view.frame)
+    index = np.flatnonzero(actor.frames == view.frame)
     nothing = np.zeros(2, np.int64)
-    if not len(at):
+    if not len(index):
         return nothing, nothing
-    corner = np.stack(np.meshgrid(*[(-s / 2, s / 2) for s in actor.size_m], indexing="ij"), -1).reshape(-1, 3)
-    pose = np.linalg.inv(view.chunk_SE3_camera) @ actor.chunk_SE3_box[at[0]]
-    points = corner @ pose[:3, :3].T + pose[:3, 3]
+    corners = np.stack(np.meshgrid(*[(-s / 2, s / 2) for s in actor.size_m], indexing="ij"), -1).reshape(-1, 3)
+    camera_SE3_box = np.linalg.inv(view.chunk_SE3_camera) @ actor.chunk_SE3_box[index[0]]
+    points = corners @ camera_SE3_box[:3, :3].T + camera_SE3_box[:3, 3]
     if (points[:, 2] < NEAR_M).all():
         return nothing, nothing
+    # Corners behind the camera plane are moved onto it: the rectangle then reaches the image's edge, as the box does.
     z = np.maximum(points[:, 2], NEAR_M)
     lens = view.lens
     u = (points[:, 0] / z * lens.fx_px + lens.cx_px).clip(0, lens.width_px)

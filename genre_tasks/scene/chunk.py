@@ -1,4 +1,4 @@
-"""A chunk: up to 20 consecutive frames of a log, rebased to a local origin, as `ingest` leaves it."""
+"""A chunk: up to 20 consecutive frames of a log, rebased to a local origin, as ``ingest`` leaves it."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from genre_tasks.logs.types import Float32, Float64, Lens, MotionBlur, RollingShutter
 
+# Words of the artifacts' tables: see storage/codecs/chunk.py.
 Role = Literal["source", "heldout"]
 Gain = tuple[float, float, float]
 """Logarithm of an image's gain in linear light: red, green, blue."""
-MarkKind = Literal[
+LogIssueKind = Literal[
     "missing_image",
     "unreadable_image",
     "missing_sweep",
@@ -28,14 +29,22 @@ MarkKind = Literal[
 
 @dataclass(frozen=True)
 class View:
-    """One camera at one frame of a chunk.
+    """One recorded image: a camera at a frame of a chunk.
 
-    ``frame`` counts in the log; ``chunk_SE3_camera`` [4, 4] float64; ``lens`` at the *working* resolution; ``image``
-    the encoded bytes as they came (native resolution), never ``None``: a view without an image is not in the chunk.
+    ``ingest`` leaves the last four attributes ``None``; the effects' plan fills in those whose effects are on.
 
-    What effects say of the image, ``None`` where they are off (``ingest`` knows nothing of it): ``log_gain`` of its
-    exposure, ``own`` [H, W] where the vehicle itself is in it, ``shutter`` how the camera moves while it is read out,
-    ``blur`` how it moves while it is exposed.
+    Attributes:
+        camera: name of the camera in the rig.
+        frame: counts in the log, not in the chunk.
+        role: whether scenes are fitted to it or compared with it.
+        timestamp_s: when the image was taken.
+        chunk_SE3_camera: [4, 4] float64.
+        lens: at the *working* resolution.
+        image: the encoded bytes as they came, at the native resolution; a view without an image is not in the chunk.
+        log_gain: of the image's exposure.
+        ego_mask: [H, W], true where the recording vehicle itself is in the image.
+        shutter: how the camera moves while the image is read out.
+        blur: how the camera moves while the image is exposed.
     """
 
     camera: str
@@ -46,18 +55,21 @@ class View:
     lens: Lens
     image: bytes
     log_gain: Gain | None = None
-    own: NDArray[np.bool_] | None = None
+    ego_mask: NDArray[np.bool_] | None = None
     shutter: RollingShutter | None = None
     blur: MotionBlur | None = None
 
 
 @dataclass(frozen=True)
 class Points:
-    """Coloured LiDAR points of one node (the static background in chunk coordinates, or an actor in its box frame).
+    """Coloured LiDAR points of one node: the static background in chunk coordinates, or an actor in its box frame.
 
-    ``positions`` [P, 3] float32 metres; ``colors`` [P, 3] uint8 sRGB; ``colored`` [P] bool: some image saw the point
-    unoccluded (elsewhere the colour is grey 128); ``frames`` [P] int16, the log frame of the sweep each point is
-    from, −1 of none (a point file, or road filled in where LiDAR is blind).
+    Attributes:
+        positions: [P, 3] float32 metres.
+        colors: [P, 3] uint8 sRGB; grey 128 where no image saw the point.
+        colored: [P] bool: some image saw the point unoccluded.
+        frames: [P] int16, the log frame of the sweep each point is from; −1 for points of no sweep (of a point file,
+            or filled in where LiDAR is blind).
     """
 
     positions: Float32
@@ -73,8 +85,13 @@ class Points:
 class Actor:
     """A moving object of the chunk.
 
-    ``frames`` [F] int64 log frames in which it exists; ``chunk_SE3_box`` [F, 4, 4] float64; ``size_m`` length, width,
-    height; ``points`` in box coordinates (x forward, y left, z up, origin at the centre).
+    Attributes:
+        track_id: the log's name for the object.
+        label: its class, in the log's words.
+        size_m: length, width, height of its box.
+        frames: [F] int64 log frames at which it exists.
+        chunk_SE3_box: [F, 4, 4] float64.
+        points: in box coordinates: x forward, y left, z up, origin at the centre.
     """
 
     track_id: str
@@ -86,10 +103,17 @@ class Actor:
 
 
 @dataclass(frozen=True)
-class Mark:
-    """Something the log lacks or that was set aside, kept so that a report can say it."""
+class LogIssue:
+    """Something that the log lacks or that was set aside, for reports to name.
 
-    kind: MarkKind
+    Attributes:
+        kind: what it is.
+        detail: one clause for a reader.
+        frame: log frame, where it is about one.
+        camera: where it is about one.
+    """
+
+    kind: LogIssueKind
     detail: str
     frame: int | None = None
     camera: str | None = None
@@ -97,11 +121,23 @@ class Mark:
 
 @dataclass(frozen=True)
 class Chunk:
-    """What every later stage reads of the log.
+    """All that later stages read of a log.
 
-    ``frames`` are the log frames of the chunk in order; ``world_SE3_chunk`` [4, 4] float64 (a pure translation to the
-    chunk's middle ego position, so that local coordinates are small); ``chunk_SE3_ego`` [F, 4, 4] float64 LiDAR poses,
-    x forward, y left, z up, one per frame; ``views`` ordered by (frame, camera order of the rig).
+    Attributes:
+        dataset: kind of log.
+        log: its name.
+        index: of the chunk in the log.
+        frames: log frames of the chunk, in order.
+        camera_names: in the order of the rig.
+        width_px: working width of images.
+        height_px: working height of images.
+        world_SE3_chunk: [4, 4] float64, a translation to the chunk's middle ego position: local coordinates are small
+            enough for float32.
+        chunk_SE3_ego: [F, 4, 4] float64 LiDAR poses, x forward, y left, z up, one per frame.
+        views: ordered by (frame, camera order of the rig).
+        static: points of the background.
+        actors: moving objects.
+        log_issues: what was missing, unreadable or left out.
     """
 
     dataset: str
@@ -116,8 +152,12 @@ class Chunk:
     views: tuple[View, ...]
     static: Points
     actors: tuple[Actor, ...]
-    marks: tuple[Mark, ...]
+    log_issues: tuple[LogIssue, ...]
 
-    def of_role(self, role: Role) -> tuple[View, ...]:
-        """The views of one role, in order."""
+    def views_with_role(self, role: Role) -> tuple[View, ...]:
+        """The views that scenes are fitted to, or those they are compared with, in order.
+
+        Args:
+            role: ``source`` or ``heldout``.
+        """
         return tuple(v for v in self.views if v.role == role)

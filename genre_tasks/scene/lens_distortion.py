@@ -1,6 +1,7 @@
-"""Brown–Conrady lens distortion on normalised image coordinates: there, its slopes, back, and where it ends.
+"""Brown–Conrady lens distortion of normalised image coordinates: forward, its slopes, inverse, and where it ends.
 
-Coefficients are k1, k2, p1, p2, k3: ``Lens.coefficients``.
+Coefficients are k1, k2, p1, p2, k3 throughout, as in ``Lens.coefficients``. Normalised coordinates are x/z and y/z of a
+ray in camera axes.
 """
 
 from __future__ import annotations
@@ -18,11 +19,25 @@ if TYPE_CHECKING:
 
 Reals = NDArray[np.floating]
 Numbers = TypeVar("Numbers", "NDArray[np.floating]", "Tensor")
-_NEWTON_STEPS, _CONVERGED = 25, 1e-14
+_NEWTON_STEPS = 25
+_CONVERGED = 1e-14
 
 
 def distort(x: Numbers, y: Numbers, coefficients: Sequence[Any]) -> tuple[Numbers, Numbers]:
-    """Normalised image coordinates as the lens bends them, in their precision; tensors with their gradients."""
+    """Bends rays as the lens does; differentiable for tensors.
+
+    Args:
+        x: normalised image coordinates of any shape.
+        y: of the same shape.
+        coefficients: k1, k2, p1, p2, k3: numbers or tensors.
+
+    Returns:
+        x' and y' in the precision of the input.
+
+    >>> x, y = distort(np.array([0.5]), np.array([0.0]), (-0.2, 0.0, 0.0, 0.0, 0.0))
+    >>> float(x[0]), float(y[0])
+    (0.475, 0.0)
+    """
     k1, k2, p1, p2, k3 = coefficients
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -32,11 +47,23 @@ def distort(x: Numbers, y: Numbers, coefficients: Sequence[Any]) -> tuple[Number
     )
 
 
-def slopes(x: Numbers, y: Numbers, coefficients: Sequence[Any]) -> tuple[Numbers, Numbers, Numbers]:
-    """∂x'/∂x, ∂x'/∂y and ∂y'/∂y of :func:`distort`; ∂y'/∂x is ∂x'/∂y: the distortion is a potential's gradient."""
+def distortion_jacobian(x: Numbers, y: Numbers, coefficients: Sequence[Any]) -> tuple[Numbers, Numbers, Numbers]:
+    """Computes the slopes of :func:`distort`.
+
+    The Jacobian is symmetric, since the distortion is the gradient of a potential: ∂y'/∂x is ∂x'/∂y.
+
+    Args:
+        x: normalised image coordinates of any shape.
+        y: of the same shape.
+        coefficients: k1, k2, p1, p2, k3.
+
+    Returns:
+        ∂x'/∂x, ∂x'/∂y and ∂y'/∂y.
+    """
     k1, k2, p1, p2, k3 = coefficients
     r2 = x * x + y * y
-    radial, slope = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), k1 + r2 * (2 * k2 + r2 * 3 * k3)
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = k1 + r2 * (2 * k2 + r2 * 3 * k3)
     return (
         radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x,
         2 * x * y * slope + 2 * p1 * x + 2 * p2 * y,
@@ -45,41 +72,81 @@ def slopes(x: Numbers, y: Numbers, coefficients: Sequence[Any]) -> tuple[Numbers
 
 
 def fold_radius(coefficients: Sequence[float]) -> float:
-    """The radius at which d(r · radial)/dr first is 0: rays beyond come back into the image. ``inf`` where it never is.
+    """Finds where a lens folds back: the radius at which d(r · radial)/dr first is 0.
 
-    The tangential terms, which are small in any lens, are not looked at.
+    Rays beyond it would come back into the image. The tangential terms, small in any lens, are left out.
+
+    Args:
+        coefficients: k1, k2, p1, p2, k3.
+
+    Returns:
+        The radius in normalised coordinates, ``inf`` for a lens that never folds.
+
+    >>> fold_radius((0.1, 0.0, 0.0, 0.0, 0.0))
+    inf
+    >>> round(fold_radius((-1 / 3, 0.0, 0.0, 0.0, 0.0)), 6)
+    1.0
     """
     k1, k2, _, _, k3 = coefficients
+    # d(r · radial)/dr is a cubic in r².
     roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
+    # The roots are numerical: a real double root comes with a tiny imaginary part.
     squares = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]
     return float(np.sqrt(squares.min())) if len(squares) else np.inf
 
 
 def undistort(x: Float64, y: Float64, coefficients: Sequence[float]) -> tuple[Float64, Float64]:
-    """The inverse of :func:`distort` within the fold radius, by Newton's method in float64.
+    """Inverts :func:`distort` within the fold radius, by Newton's method in float64.
 
-    Where no ray of the lens arrives, the result is on the fold radius.
+    Args:
+        x: distorted normalised image coordinates of any shape.
+        y: of the same shape.
+        coefficients: k1, k2, p1, p2, k3.
+
+    Returns:
+        Undistorted coordinates; on the fold radius where no ray of the lens arrives.
+
+    >>> x, y = undistort(np.array([0.475]), np.array([0.0]), (-0.2, 0.0, 0.0, 0.0, 0.0))
+    >>> round(float(x[0]), 12)
+    0.5
     """
-    most = fold_radius(coefficients)
+    radius = fold_radius(coefficients)
 
-    def limited(u: Float64, v: Float64) -> tuple[Float64, Float64]:
-        shrink = np.minimum(1.0, most / np.maximum(np.hypot(u, v), 1e-30))
+    def limit(u: Float64, v: Float64) -> tuple[Float64, Float64]:
+        # Beyond the fold Newton's method would run to a solution that no ray of the lens has.
+        shrink = np.minimum(1.0, radius / np.maximum(np.hypot(u, v), 1e-30))
         return u * shrink, v * shrink
 
-    x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
-    u, v = limited(x, y)
+    x = np.asarray(x, np.float64)
+    y = np.asarray(y, np.float64)
+    # The distorted point is near enough as a start for any real lens.
+    u, v = limit(x, y)
     for _ in range(_NEWTON_STEPS):
         found_x, found_y = distort(u, v, coefficients)
-        off_x, off_y = found_x - x, found_y - y
-        if max(np.abs(off_x).max(initial=0.0), np.abs(off_y).max(initial=0.0)) < _CONVERGED:
+        error_x = found_x - x
+        error_y = found_y - y
+        # An initial value, because the largest of no points would raise.
+        if max(np.abs(error_x).max(initial=0.0), np.abs(error_y).max(initial=0.0)) < _CONVERGED:
             break
-        xx, xy, yy = slopes(u, v, coefficients)
-        det = np.maximum(xx * yy - xy * xy, 1e-6)  # 0 on the fold
-        u, v = limited(u - (yy * off_x - xy * off_y) / det, v - (xx * off_y - xy * off_x) / det)
+        xx, xy, yy = distortion_jacobian(u, v, coefficients)
+        # The determinant is 0 on the fold, where a step would have no end.
+        det = np.maximum(xx * yy - xy * xy, 1e-6)
+        u, v = limit(u - (yy * error_x - xy * error_y) / det, v - (xx * error_y - xy * error_x) / det)
     return u, v
 
 
-def rays_at(u: Float64, v: Float64, lens: Lens) -> tuple[Float64, Float64]:
-    """x/z and y/z of the rays that arrive at pixels (u, v)."""
-    x, y = (u - lens.cx_px) / lens.fx_px, (v - lens.cy_px) / lens.fy_px
+def pixels_to_rays(u: Float64, v: Float64, lens: Lens) -> tuple[Float64, Float64]:
+    """Finds the rays that arrive at pixels, distortion included.
+
+    Args:
+        u: columns in pixels, of any shape; the first pixel's centre is at 0.5.
+        v: rows, of the same shape.
+        lens: of the camera.
+
+    Returns:
+        x/z and y/z of the rays in camera axes.
+    """
+    x = (u - lens.cx_px) / lens.fx_px
+    y = (v - lens.cy_px) / lens.fy_px
+    # Images of many logs are rectified already, and need no Newton steps.
     return undistort(x, y, lens.coefficients) if any(lens.distortion) else (x, y)

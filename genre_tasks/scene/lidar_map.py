@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -11,8 +13,9 @@ from genre_tasks.logs.types import Float64
 from genre_tasks.scene.chunk import Chunk, Points
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.initial_gaussians import actor_cap, assembled, node_gaussians, select
-from genre_tasks.scene.transforms import path_distance, quat_to_matrix
+from genre_tasks.scene.initial_gaussians import assemble_scene, fit_discs, max_points_per_actor, select_points
+from genre_tasks.scene.rotations import quats_to_matrices_numpy
+from genre_tasks.scene.transforms import distance_to_path
 
 LIDAR_OPACITY = 0.95
 
@@ -26,59 +29,89 @@ MAX_GAP_M = 0.8
 """What is farther is another part. From half a metre on ever less of a gap is closed: the next ring is then not among
 the neighbours looked at."""
 
-_AROUND, _ONE_SURFACE = 32, 0.7
-"""Neighbours looked at, and how far from a disc's plane they may be, per distance along it, to lie on its surface."""
+# Neighbours looked at for the next disc.
+_NEIGHBOURS = 32
+
+# Neighbours lie on a disc's surface up to this distance from its plane, per distance along it.
+_MAX_SLOPE = 0.7
 
 
-def lidar_scene(chunk: Chunk, max_points: int) -> SceneGraph:
-    """The coloured LiDAR points as discs on the surfaces they lie on, nearly opaque: actors move, nothing is distant.
+def build_lidar_scene(chunk: Chunk, max_points: int) -> SceneGraph:
+    """Turns a chunk's coloured LiDAR points into discs on the surfaces they lie on, nearly opaque.
 
     Discs, because the fixer looks images up by the map's depth: a ball as wide as its neighbours are far would stand
-    out of a road that is seen at a grazing angle. Points without colour are left out.
+    out of a road that is seen at a grazing angle.
+
+    Args:
+        chunk: points without colour are left out.
+        max_points: bounds the number of discs.
+
+    Returns:
+        A scene whose actors move and that has no distant region.
     """
-    cap = actor_cap(max_points, chunk)
-    actors = [_discs(a.points, np.zeros(len(a.points)), cap, ACTOR_VOXEL_M) for a in chunk.actors]
-    distance = path_distance(chunk.static.positions, chunk.chunk_SE3_ego)
-    static = _discs(chunk.static, distance, max_points - sum(len(a) for a in actors))
-    return assembled(chunk, static, Gaussians.unpacked(torch.zeros(0, 14)), [closed(a) for a in actors])
+    cap = max_points_per_actor(max_points, chunk)
+    actors = [_fit_opaque_discs(a.points, np.zeros(len(a.points)), cap, ACTOR_VOXEL_M) for a in chunk.actors]
+    distance = distance_to_path(chunk.static.positions, chunk.chunk_SE3_ego)
+    # The background needs no closing: as the vehicle drives on, its rings sweep over all of it.
+    static = _fit_opaque_discs(chunk.static, distance, max_points - sum(len(a) for a in actors))
+    nothing_distant = Gaussians.unpack(torch.zeros(0, 14))
+    return assemble_scene(chunk, static, nothing_distant, [close_gaps(a) for a in actors])
 
 
-def _discs(points: Points, distance: NDArray[np.floating], count: int, min_voxel_m: float = 0.0) -> Gaussians:
+def _fit_opaque_discs(
+    points: Points, distance: NDArray[np.floating], count: int, min_voxel_m: float = 0.0
+) -> Gaussians:
     colored = points.colored
     if not colored.any():
-        return Gaussians.unpacked(torch.zeros(0, 14))
+        return Gaussians.unpack(torch.zeros(0, 14))
     config = InitialConfig(opacity=LIDAR_OPACITY)
-    return node_gaussians(select(points, colored), distance[colored], count, config, min_voxel_m)
+    return fit_discs(select_points(points, colored), distance[colored], count, config, min_voxel_m)
 
 
-def closed(discs: Gaussians) -> Gaussians:
-    """The discs, widened along each of their two axes until they meet their neighbours on both sides.
+def close_gaps(discs: Gaussians) -> Gaussians:
+    """Widens discs along each of their two axes until they meet their neighbours on both sides.
 
-    A car that drives along with the recording vehicle is met by the same few rings in every frame. Its points lie
-    close within a ring and far from the next one: between discs as wide as the nearest points are far, the road behind
-    would show.
+    A car that drives along with the recording vehicle is met by the same few rings in every frame. Its points lie close
+    within a ring and far from the next one: between discs as wide as the nearest points are far, the road behind would
+    show.
+
+    Args:
+        discs: of one actor.
+
+    Returns:
+        The same discs with larger in-plane scales; discs at the outline do not grow beyond it.
     """
     if len(discs) < 2:
         return discs
-    reach = CLOSING * _sideways(discs.means.double().numpy(), quat_to_matrix(discs.quats.double().numpy()))
+    axes = quats_to_matrices_numpy(discs.quats.double().numpy())
+    reach = CLOSING * _distance_to_next_disc(discs.means.double().numpy(), axes)
     in_plane = torch.from_numpy(reach).to(discs.log_scales).clamp_min(1e-9).log()
+    # Never narrower than before, and the thickness stays: a thicker disc would stand out of its surface.
     log_scales = torch.cat([torch.maximum(discs.log_scales[:, :2], in_plane), discs.log_scales[:, 2:]], 1)
-    return Gaussians(discs.means, log_scales, discs.quats, discs.logit_opacities, discs.colors)
+    return replace(discs, log_scales=log_scales)
 
 
-def _sideways(means: Float64, axes: Float64) -> Float64:
-    """How far [N, 2] the nearest other of the same surface is along a disc's first axis, and along its second.
+def _distance_to_next_disc(means: Float64, axes: Float64) -> Float64:
+    """Measures along a disc's first axis, and along its second, how far the next disc of the same surface is.
 
-    The farther of both directions; 0 where there is none within ``MAX_GAP_M``, as at the outline.
+    Args:
+        means: [N, 3] metres.
+        axes: [N, 3, 3] columns: the two in-plane axes and the normal.
+
+    Returns:
+        Metres [N, 2], the farther of an axis's two directions; 0 where there is none within ``MAX_GAP_M``, as at the
+        outline.
     """
     from scipy.spatial import cKDTree
 
-    count = min(_AROUND + 1, len(means))
+    count = min(_NEIGHBOURS + 1, len(means))
     near = cKDTree(means).query(means, k=count)[1][:, 1:]
-    along, across, off = np.moveaxis(np.einsum("nkc,nca->nka", means[near] - means[:, None], axes), -1, 0)
+    along, across, off_plane = np.moveaxis(np.einsum("nkc,nca->nka", means[near] - means[:, None], axes), -1, 0)
     distance = np.hypot(along, across)
-    same = (np.abs(off) < _ONE_SURFACE * distance) & (distance <= MAX_GAP_M)
+    same_surface = (np.abs(off_plane) < _MAX_SLOPE * distance) & (distance <= MAX_GAP_M)
+    # Four directions: along each axis forwards and backwards.
     quarter = np.floor((np.arctan2(across, along) / np.pi + 1.25) * 2).astype(np.int64) % 4
-    nearest = np.stack([np.where(same & (quarter == q), distance, np.inf).min(1) for q in range(4)], 1)
+    in_quarters = [np.where(same_surface & (quarter == q), distance, np.inf).min(1) for q in range(4)]
+    nearest = np.stack(in_quarters, 1)
     nearest[~np.isfinite(nearest)] = 0
     return np.stack([np.maximum(nearest[:, k], nearest[:, k + 2]) for k in (0, 1)], 1)

@@ -1,4 +1,4 @@
-"""Moving objects of a chunk: their paths from cuboid tracks, and their LiDAR points in box coordinates."""
+"""Moving objects of a chunk: which cuboid tracks become actors, and which LiDAR points are theirs."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from genre_tasks.logs.types import CuboidTrack, Float32, Float64
-from genre_tasks.scene.actor_node import ActorNode
-from genre_tasks.scene.chunk import Mark
-from genre_tasks.scene.transforms import interpolate_pose, rigid, se3_inverse
+from genre_tasks.scene.actor_track import ActorTrack, cut_track_to_chunk
+from genre_tasks.scene.chunk import LogIssue
 
 MARGIN_M = 0.15
 """Boxes are enlarged by this to the sides and above before points are cut out: annotations are tight."""
@@ -21,95 +20,86 @@ GROUND_M = 0.08
 
 
 @dataclass(frozen=True)
-class Path(ActorNode):
-    """A track inside a chunk, before it is known whether it becomes an actor."""
+class MovingActors:
+    """Tracks that move in a chunk.
 
-    @property
-    def travel_m(self) -> float:
-        """The largest distance between the box's centre and where it was first."""
-        centres = self.chunk_SE3_box[:, :3, 3]
-        return float(np.linalg.norm(centres - centres[0], axis=1).max())
-
-
-def path_in_chunk(track: CuboidTrack, frames: Sequence[int], world_SE3_chunk: Float64) -> tuple[Path | None, int]:
-    """A track's path over the chunk's frames, and how many of its annotations were invalid and left out.
-
-    Frames between two annotated ones are interpolated; before the first and past the last the object is absent: poses
-    are never extrapolated. ``None`` if it is in no frame of the chunk, or its size is not finite and positive.
-    """
-    size = np.asarray(track.size_m, dtype=np.float64)
-    if not (np.isfinite(size).all() and (size > 0).all()):
-        return None, len(track.frames)
-    valid = np.array([rigid(pose) for pose in track.world_SE3_box], dtype=bool)
-    annotated, first = np.unique(track.frames[valid], return_index=True)
-    poses = track.world_SE3_box[valid][first]
-    invalid = int((~valid).sum())
-    inside = [f for f in frames if len(annotated) and annotated[0] <= f <= annotated[-1]]
-    if not inside:
-        return None, invalid
-    chunk_SE3_world = se3_inverse(world_SE3_chunk)
-    out = np.stack([chunk_SE3_world @ _pose_at(annotated, poses, f) for f in inside])
-    length, width, height = (float(s) for s in size)
-    return Path(track.track_id, track.label, (length, width, height), np.asarray(inside, np.int64), out), invalid
-
-
-def _pose_at(annotated: NDArray[np.int64], poses: Float64, frame: int) -> Float64:
-    """Interpolated over frame numbers, which are in order also where timestamps are not."""
-    after = int(np.searchsorted(annotated, frame))
-    if annotated[after] == frame:
-        return poses[after]
-    low, high = annotated[after - 1], annotated[after]
-    return interpolate_pose(poses[after - 1], poses[after], float(frame - low) / float(high - low))
-
-
-@dataclass(frozen=True)
-class Movers:
-    """Tracks that move in a chunk: ``kept`` become actors if they gather enough points, ``brief`` are left out.
-
-    ``marks`` says what was ignored.
+    Attributes:
+        tracks: become actors if they gather enough LiDAR points.
+        brief_tracks: move, but are in too few frames: their points belong neither to an actor nor to the background.
+        log_issues: what was ignored, and why.
     """
 
-    kept: tuple[Path, ...]
-    brief: tuple[Path, ...]
-    marks: tuple[Mark, ...]
+    tracks: tuple[ActorTrack, ...]
+    brief_tracks: tuple[ActorTrack, ...]
+    log_issues: tuple[LogIssue, ...]
 
 
-def movers(
+def select_moving_actors(
     tracks: Sequence[CuboidTrack],
     frames: Sequence[int],
     world_SE3_chunk: Float64,
     min_travel_m: float,
     min_frames: int,
-) -> Movers:
-    """Sorts tracks: outside the chunk (counted), invalid (marked), standing (background: nothing), brief, kept."""
-    kept, brief, marks, outside = [], [], [], 0
-    for track in tracks:
-        path, invalid = path_in_chunk(track, frames, world_SE3_chunk)
+) -> MovingActors:
+    """Finds the tracks of a log that move in a chunk; those that stand still belong to the background.
+
+    Args:
+        tracks: of the log, in world coordinates.
+        frames: log frames of the chunk, in order.
+        world_SE3_chunk: [4, 4].
+        min_travel_m: a track that travels less stands still.
+        min_frames: a track that is in fewer frames, and that the log says is moving, is brief.
+
+    Returns:
+        The moving tracks, and an issue for each track that has invalid cuboids, is brief, or lies outside the chunk.
+    """
+    moving = []
+    brief = []
+    issues = []
+    outside = 0
+    for log_track in tracks:
+        track, invalid = cut_track_to_chunk(log_track, frames, world_SE3_chunk)
         if invalid:
-            detail = f"track {track.track_id}: {invalid} of {len(track.frames)} cuboids are invalid and ignored"
-            marks.append(Mark("cuboid_invalid", detail))
-        if path is None:
+            detail = f"track {log_track.track_id}: {invalid} of {len(log_track.frames)} cuboids are invalid and ignored"
+            issues.append(LogIssue("cuboid_invalid", detail))
+        if track is None:
+            # A track whose cuboids were invalid has an issue already.
             outside += 0 if invalid else 1
-        elif len(path.frames) < min_frames and track.moving:
-            brief.append(path)
-            marks.append(Mark("actor_few_points", f"track {track.track_id}: seen in {len(path.frames)} frames"))
-        elif path.travel_m >= min_travel_m:
-            kept.append(path)
+        # What moves but is seen too briefly to be modelled would leave a ghost in the background.
+        elif len(track.frames) < min_frames and log_track.moving:
+            brief.append(track)
+            issues.append(
+                LogIssue("actor_few_points", f"track {log_track.track_id}: seen in {len(track.frames)} frames")
+            )
+        elif track.travel_m >= min_travel_m:
+            moving.append(track)
     if outside:
-        marks.append(Mark("cuboid_outside", f"{outside} tracks have no cuboid in this chunk"))
-    return Movers(tuple(kept), tuple(brief), tuple(marks))
+        issues.append(LogIssue("cuboid_outside", f"{outside} tracks have no cuboid in this chunk"))
+    return MovingActors(tuple(moving), tuple(brief), tuple(issues))
 
 
-def inside_box(points: Float32, path: Path, frame: int) -> tuple[NDArray[np.int64], Float32]:
-    """Which chunk points [P, 3] lie in a path's box (slightly enlarged) at a frame, and those in box coordinates."""
-    pose = path.pose(frame)
+def find_points_in_box(points: Float32, track: ActorTrack, frame: int) -> tuple[NDArray[np.int64], Float32]:
+    """Finds the points in a track's box at a frame; the box is enlarged by ``MARGIN_M`` and cut at ``GROUND_M``.
+
+    Args:
+        points: [P, 3] metres, chunk coordinates.
+        track: whose box.
+        frame: log frame.
+
+    Returns:
+        Indices [M] into ``points``, and those points [M, 3] in box coordinates; both empty where the track is absent.
+    """
+    pose = track.pose(frame)
+    # Poses are not extrapolated: where a track ends is where its annotation ended.
     if pose is None:
         return np.empty(0, np.int64), np.empty((0, 3), np.float32)
-    length, width, height = path.size_m
+    length, width, height = track.size_m
+    # A cube about the centre first: it costs no rotation and leaves out all but a few of a sweep's points.
     reach = 0.5 * float(np.hypot(np.hypot(length, width), height)) + 2 * MARGIN_M
     centre = pose[:3, 3].astype(np.float32)
     index = np.flatnonzero((np.abs(points - centre) < np.float32(reach)).all(1))
     box = (points[index] - centre) @ pose[:3, :3].astype(np.float32)
-    ok = (np.abs(box[:, 0]) < length / 2 + MARGIN_M) & (np.abs(box[:, 1]) < width / 2 + MARGIN_M)
-    ok &= (box[:, 2] < height / 2 + MARGIN_M) & (box[:, 2] > -height / 2 + GROUND_M)
-    return index[ok], box[ok]
+    inside = (np.abs(box[:, 0]) < length / 2 + MARGIN_M) & (np.abs(box[:, 1]) < width / 2 + MARGIN_M)
+    # Below, the box is cut and not enlarged: a slice of road would otherwise drive along with the car.
+    inside &= (box[:, 2] < height / 2 + MARGIN_M) & (box[:, 2] > -height / 2 + GROUND_M)
+    return index[inside], box[inside]

@@ -11,47 +11,66 @@ from genre_tasks.logs.types import Float64, Lens
 
 @dataclass(frozen=True)
 class NovelView:
-    """A viewpoint beside the path: camera × frame, moved ``shift_m`` to the left, with its nearest source image.
+    """A viewpoint beside the path.
 
-    ``reference`` is (camera, frame) of a source view of the chunk: same camera first, then distance, then angle.
+    Attributes:
+        camera: of the rig, moved sideways.
+        frame: log frame.
+        shift_m: metres to the left.
+        chunk_SE3_camera: [4, 4] float64.
+        lens: that of the camera.
+        reference: (camera, frame) of the nearest source view: same camera first, then distance, then angle.
     """
 
     camera: str
     frame: int
     shift_m: float
-    chunk_SE3_camera: Float64  # [4, 4]
+    chunk_SE3_camera: Float64
     lens: Lens
     reference: tuple[str, int]
 
 
 @dataclass(frozen=True)
 class NovelViews:
-    """Renders of a scene at V novel views, float32, colour sRGB in [0, 1] premultiplied by alpha.
+    """Renders of a scene, and of its LiDAR map, at V novel views; float32, colours sRGB premultiplied by alpha.
 
-    ``culled`` and ``lidar_culled`` count left-out Gaussians of the scene and of the LiDAR map by reason, summed over
-    the views: measurements, which go into the manifest.
+    Attributes:
+        views: V viewpoints.
+        color: [V, H, W, 3] in [0, 1].
+        alpha: [V, H, W].
+        depth: [V, H, W] Σ w z / Σ w in metres, 0 where Σ w = 0.
+        lidar_color: [V, H, W, 3] of the LiDAR map: coloured points as discs on their surfaces.
+        lidar_alpha: [V, H, W].
+        lidar_depth: [V, H, W] metres, where rays meet the planes of the discs.
+        culled: Gaussians of the scene that were left out, by reason, summed over the views; a measurement, which goes
+            into the manifest.
+        lidar_culled: the same for the LiDAR map.
     """
 
     views: tuple[NovelView, ...]
-    color: Tensor  # [V, H, W, 3]
-    alpha: Tensor  # [V, H, W]
-    depth: Tensor  # [V, H, W] Σ w z / Σ w in metres, 0 where Σ w = 0
-    lidar_color: Tensor  # [V, H, W, 3] the LiDAR map: coloured points rendered as discs on their surfaces
-    lidar_alpha: Tensor  # [V, H, W]
-    lidar_depth: Tensor  # [V, H, W] where rays meet the planes of the discs
+    color: Tensor
+    alpha: Tensor
+    depth: Tensor
+    lidar_color: Tensor
+    lidar_alpha: Tensor
+    lidar_depth: Tensor
     culled: dict[str, int] = field(default_factory=dict)
     lidar_culled: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class FixedViews:
-    """The fixer's images of the same views.
+    """The fixer's images of V novel views.
 
-    ``copied`` are the indices of views that did not call for fixing and are their renders, ``seconds_saved`` about what
-    that saved: measurements, which go into the manifest.
+    Attributes:
+        views: V viewpoints, those of the renders.
+        color: [V, H, W, 3] sRGB in [0, 1].
+        copied: indices of views that did not call for fixing and are their renders; a measurement, which goes into the
+            manifest.
+        seconds_saved: about what leaving these out saved; a measurement, too.
     """
 
     views: tuple[NovelView, ...]
-    color: Tensor  # [V, H, W, 3] sRGB in [0, 1]
+    color: Tensor
     copied: tuple[int, ...] = ()
     seconds_saved: float = 0.0

@@ -1,8 +1,13 @@
-"""A small reader of PLY point clouds: ASCII and binary little-endian; x, y, z and, if present, red, green, blue."""
+"""A small reader of PLY point clouds: ASCII and binary little-endian; x, y, z and, if present, red, green, blue.
+
+trimesh reads PLY too, but its errors name neither the line nor what is wrong with it, and a user's point file is the
+place where that matters.
+"""
 
 from __future__ import annotations
 
 import io
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,51 +34,76 @@ _TYPES = {
     "float32": "<f4",
     "float64": "<f8",
 }
+_COLORS = ("red", "green", "blue")
 _REMEDY = "Give ingest.points a PLY file (ascii or binary_little_endian) with x, y, z and red, green, blue per vertex."
 
 
 def read_ply(path: str | Path) -> tuple[Float64, NDArray[np.uint8] | None]:
-    """Positions [P, 3] float64 and colours [P, 3] uint8 (``None`` without them) of a PLY file's vertices.
+    """Reads the vertices of a PLY file.
 
-    Colours stored as floats are taken to be in [0, 1]. Raises ``InputError`` naming the file and what is wrong with it.
+    Args:
+        path: of the file.
+
+    Returns:
+        Positions [P, 3] float64, and colours [P, 3] uint8, ``None`` without them. Colours that are stored as floats are
+        taken to be in [0, 1].
+
+    Raises:
+        InputError: the file cannot be read, is no such PLY file, has no vertices, or a vertex is not finite; with the
+            file and, where there is one, the line.
     """
     file = Path(path)
     try:
         data = file.read_bytes()
     except OSError as error:
         raise InputError(f"cannot read the point file: {error.strerror}", remedy=_REMEDY, file=file) from error
-    form, count, columns, body = _header(data, file)
-    table = _ascii(body, count, columns, file, data) if form == "ascii" else _binary(body, count, columns, file)
-    missing = [c for c in "xyz" if c not in columns]
+    header = _read_header(data, file)
+    table = _read_ascii(data, header, file) if header.format == "ascii" else _read_binary(header, file)
+    missing = [c for c in "xyz" if c not in header.columns]
     if missing:
         raise InputError(f"the vertices have no {', '.join(missing)}", remedy=_REMEDY, file=file)
+    # In float64, whatever the file has: world coordinates do not fit into float32.
     positions = np.stack([table[c].astype(np.float64) for c in "xyz"], 1)
     bad = np.flatnonzero(~np.isfinite(positions).all(1))
     if len(bad):
         raise InputError(f"{len(bad)} vertices are not finite, the first is {bad[0]}", remedy=_REMEDY, file=file)
     if not len(positions):
         raise InputError("the file has no vertices", remedy=_REMEDY, file=file)
-    if not {"red", "green", "blue"} <= set(columns):
+    # Missing colours are no error: the images can colour the points.
+    if not set(_COLORS) <= set(header.columns):
         return positions, None
-    colors = np.stack([table[c] for c in ("red", "green", "blue")], 1)
-    if columns["red"] in ("<f4", "<f8"):
+    colors = np.stack([table[c] for c in _COLORS], 1)
+    # Files from 3DGS tools have colours as floats.
+    if header.columns["red"] in ("<f4", "<f8"):
+        # Rounded, because the cast below truncates.
         colors = np.round(colors.clip(0, 1) * 255)
     return positions, colors.clip(0, 255).astype(np.uint8)
 
 
-def _header(data: bytes, file: Path) -> tuple[str, int, dict[str, str], bytes]:
-    """(format, vertex count, {column: numpy type}, the bytes after the header)."""
+@dataclass(frozen=True)
+class _Header:
+    format: str  # ascii or binary_little_endian
+    count: int  # vertices
+    columns: dict[str, str]  # name → numpy type
+    body: bytes  # what follows the header
+
+
+def _read_header(data: bytes, file: Path) -> _Header:
     end = data.find(b"end_header")
     if not data.startswith(b"ply") or end < 0:
         raise InputError("this is no PLY file", remedy=_REMEDY, file=file)
     body = data[data.index(b"\n", end) + 1 :] if b"\n" in data[end:] else b""
-    form, count, element, columns = "", -1, "", {}
+    form = ""
+    count = -1
+    element = ""
+    columns: dict[str, str] = {}
     for number, line in enumerate(data[:end].decode("ascii", "replace").splitlines(), 1):
         match line.split():
             case ["format", ("ascii" | "binary_little_endian") as form, *_]:
                 pass
             case ["format", other, *_]:
                 raise InputError(f"line {number}: format {other} is not supported", remedy=_REMEDY, file=file)
+            # Elements that follow the vertices, such as faces, are never read, so they may be of any kind.
             case ["element", element, n]:
                 if element != "vertex" and count < 0:
                     raise InputError(f"line {number}: vertices must be the first element", remedy=_REMEDY, file=file)
@@ -87,29 +117,31 @@ def _header(data: bytes, file: Path) -> tuple[str, int, dict[str, str], bytes]:
                 raise InputError(f"line {number}: cannot read {line.strip()!r}", remedy=_REMEDY, file=file)
     if not form or count < 0:
         raise InputError("the header lacks its format or its vertices", remedy=_REMEDY, file=file)
-    return form, count, columns, body
+    return _Header(form, count, columns, body)
 
 
-def _binary(body: bytes, count: int, columns: dict[str, str], file: Path) -> NDArray:
-    kind = np.dtype(list(columns.items()))
-    if len(body) < count * kind.itemsize:
-        whole = len(body) // max(kind.itemsize, 1)
-        raise InputError(f"the file ends after {whole} of {count} vertices", remedy=_REMEDY, file=file)
-    return np.frombuffer(body, kind, count)
+def _read_binary(header: _Header, file: Path) -> NDArray:
+    row = np.dtype(list(header.columns.items()))
+    # NumPy's own error names neither the file nor how much of it is there.
+    if len(header.body) < header.count * row.itemsize:
+        complete = len(header.body) // max(row.itemsize, 1)
+        raise InputError(f"the file ends after {complete} of {header.count} vertices", remedy=_REMEDY, file=file)
+    return np.frombuffer(header.body, row, header.count)
 
 
-def _ascii(body: bytes, count: int, columns: dict[str, str], file: Path, data: bytes) -> NDArray:
-    lines = body.decode("ascii", "replace").splitlines()[:count]
-    first = data[: len(data) - len(body)].count(b"\n") + 1
-    if len(lines) < count:
-        raise InputError(f"the file ends after {len(lines)} of {count} vertices", remedy=_REMEDY, file=file)
+def _read_ascii(data: bytes, header: _Header, file: Path) -> NDArray:
+    lines = header.body.decode("ascii", "replace").splitlines()[: header.count]
+    first = data[: len(data) - len(header.body)].count(b"\n") + 1
+    if len(lines) < header.count:
+        raise InputError(f"the file ends after {len(lines)} of {header.count} vertices", remedy=_REMEDY, file=file)
     try:
-        return np.loadtxt(io.StringIO("\n".join(lines)), np.dtype(list(columns.items())), ndmin=1)
+        return np.loadtxt(io.StringIO("\n".join(lines)), np.dtype(list(header.columns.items())), ndmin=1)
     except ValueError as error:
+        # numpy names no line of the file: look for the first one that it cannot have read.
         for number, line in enumerate(lines, first):
             words = line.split()
-            if len(words) != len(columns) or not all(_is_number(w) for w in words):
-                problem = f"line {number}: {line.strip()!r} is no vertex of {len(columns)} numbers"
+            if len(words) != len(header.columns) or not all(_is_number(w) for w in words):
+                problem = f"line {number}: {line.strip()!r} is no vertex of {len(header.columns)} numbers"
                 raise InputError(problem, remedy=_REMEDY, file=file) from error
         raise InputError(f"cannot read the vertices: {error}", remedy=_REMEDY, file=file) from error
 

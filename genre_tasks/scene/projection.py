@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from genre_tasks.logs.types import Float32, Float64, Lens, RollingShutter
-from genre_tasks.scene.lens_distortion import Reals, distort, fold_radius, slopes
+from genre_tasks.scene.lens_distortion import Reals, distort, distortion_jacobian, fold_radius
 
 NEAR_M = 0.1
 """Points nearer to the camera plane than this are behind it."""
@@ -19,7 +19,13 @@ SHUTTER_MIN_RATE = 0.1
 
 @dataclass(frozen=True)
 class Projected:
-    """Points inside an image: ``index`` [M] into the points, ``uv`` [M, 2] float32 pixels, ``depth`` [M] float32 m."""
+    """Points inside an image.
+
+    Attributes:
+        index: [M] into the points that were projected, rising.
+        uv: [M, 2] float32 pixels, column and row.
+        depth: [M] float32 metres along the camera's axis.
+    """
 
     index: NDArray[np.int64]
     uv: Float32
@@ -27,62 +33,91 @@ class Projected:
 
 
 def project(points: Float32, chunk_SE3_camera: Float64, lens: Lens, shutter: RollingShutter | None = None) -> Projected:
-    """Which points [P, 3] (chunk coordinates) fall into an image, and where; occlusion is not considered.
+    """Finds which points fall into an image, and where; occlusion is not considered.
 
-    With a ``shutter``, from where the camera is when a point's row is exposed; the points themselves rest. A point is
-    seen if it is ahead of the camera, and within the lens's fold radius, both then and at the pose's time.
+    Args:
+        points: [P, 3] metres, chunk coordinates; they rest.
+        chunk_SE3_camera: [4, 4] at the time of the image.
+        lens: of the camera.
+        shutter: if any, points are seen from where the camera is when their row is exposed.
+
+    Returns:
+        The points ahead of the camera and within the lens's fold radius, both then and at the pose's time, that lie
+        inside the image.
+
+    >>> lens = Lens(fx_px=100.0, fy_px=100.0, cx_px=50.0, cy_px=50.0, width_px=100, height_px=100)
+    >>> seen = project(np.array([[0, 0, 2], [0, 0, -2]], np.float32), np.eye(4), lens)
+    >>> seen.index.tolist(), seen.uv.tolist(), seen.depth.tolist()
+    ([0], [[50.0, 50.0]], [2.0])
     """
-    inverse = np.linalg.inv(chunk_SE3_camera).astype(np.float32)
-    depth = points @ inverse[2, :3] + inverse[2, 3]
+    camera_SE3_chunk = np.linalg.inv(chunk_SE3_camera).astype(np.float32)
+    # Depth first: half of all points are behind a camera and need no more arithmetic.
+    depth = points @ camera_SE3_chunk[2, :3] + camera_SE3_chunk[2, 3]
     index = np.flatnonzero(depth > NEAR_M)
     depth = depth[index]
-    near = points[index]
-    x = (near @ inverse[0, :3] + inverse[0, 3]) / depth
-    y = (near @ inverse[1, :3] + inverse[1, 3]) / depth
+    ahead = points[index]
+    x = (ahead @ camera_SE3_chunk[0, :3] + camera_SE3_chunk[0, 3]) / depth
+    y = (ahead @ camera_SE3_chunk[1, :3] + camera_SE3_chunk[1, 3]) / depth
     inside = np.ones(len(index), dtype=bool)
     if any(lens.distortion):
         inside &= x * x + y * y < fold_radius(lens.coefficients) ** 2
+    # After the first check: a point that is outside of the fold at the pose's time has no row.
     if shutter is not None and shutter.readout_s:
-        x, y, depth = _exposed(x, y, depth, lens, shutter)
+        x, y, depth = _move_to_exposure(x, y, depth, lens, shutter)
         inside &= depth > NEAR_M
     if any(lens.distortion):
         inside &= x * x + y * y < fold_radius(lens.coefficients) ** 2
         x, y = distort(x, y, lens.coefficients)
-    u, v = x * np.float32(lens.fx_px) + np.float32(lens.cx_px), y * np.float32(lens.fy_px) + np.float32(lens.cy_px)
+    u = x * np.float32(lens.fx_px) + np.float32(lens.cx_px)
+    v = y * np.float32(lens.fy_px) + np.float32(lens.cy_px)
     inside &= (u >= 0) & (u < lens.width_px) & (v >= 0) & (v < lens.height_px)
     return Projected(index[inside], np.stack([u[inside], v[inside]], 1), depth[inside])
 
 
-def _exposed(x: Reals, y: Reals, z: Reals, lens: Lens, shutter: RollingShutter) -> tuple[Reals, Reals, Reals]:
-    """x/z, y/z and z when the points' rows are exposed: the formula of the renderer's ``Shutter``."""
-    moving, turning = np.array(shutter.velocity_m_s, np.float32), np.array(shutter.turn_rad_s, np.float32)
+def _move_to_exposure(x: Reals, y: Reals, z: Reals, lens: Lens, shutter: RollingShutter) -> tuple[Reals, Reals, Reals]:
+    # x/z, y/z and z when the points' rows are exposed: the formula of the renderer's Shutter.
+    velocity = np.array(shutter.velocity_m_s, np.float32)
+    turn = np.array(shutter.turn_rad_s, np.float32)
     posed = np.stack([x * z, y * z, z], 1)
-    motion = -moving - np.cross(turning, posed)
-    x_rate, y_rate = (motion[:, 0] - x * motion[:, 2]) / z, (motion[:, 1] - y * motion[:, 2]) / z
-    row, row_rate = distort(x, y, lens.coefficients)[1] * lens.fy_px + lens.cy_px, lens.fy_px * y_rate
+    motion = -velocity - np.cross(turn, posed)
+    x_rate = (motion[:, 0] - x * motion[:, 2]) / z
+    y_rate = (motion[:, 1] - y * motion[:, 2]) / z
+    row = distort(x, y, lens.coefficients)[1] * lens.fy_px + lens.cy_px
+    row_rate = lens.fy_px * y_rate
     if any(lens.distortion):
-        _, xy, yy = slopes(x, y, lens.coefficients)
+        _, xy, yy = distortion_jacobian(x, y, lens.coefficients)
         row_rate = lens.fy_px * (xy * x_rate + yy * y_rate)
     rate = np.maximum(1 - shutter.readout_s * row_rate / lens.height_px, SHUTTER_MIN_RATE)
     half = shutter.readout_s / 2
     time = np.clip(shutter.readout_s * (row / lens.height_px - 0.5) / rate, -half, half)
-    at = posed + time[:, None] * motion
-    depth = at[:, 2]
+    exposed = posed + time[:, None] * motion
+    depth = exposed[:, 2]
+    # What is beside the camera by then is left out by its depth; its quotient does not matter.
     with np.errstate(divide="ignore", invalid="ignore"):
-        return at[:, 0] / depth, at[:, 1] / depth, depth
+        return exposed[:, 0] / depth, exposed[:, 1] / depth, depth
 
 
 def splat_depth(projected: Projected, lens: Lens, footprint_m: float, max_radius_px: int = 10) -> Float32:
-    """Nearest depth per pixel [H, W] float32, ∞ where no point: points are squares of ± ``footprint_m`` metres.
+    """Draws points as squares into a depth map, which tells what they hide.
 
-    Squares are at least ± 1 pixel. Points of one pixel radius are splatted together and spread by a minimum filter.
+    Args:
+        projected: points in the image of ``lens``.
+        lens: of the depth map.
+        footprint_m: half the side of a point's square; at least one pixel.
+        max_radius_px: half the side of the largest square.
+
+    Returns:
+        Nearest depth of each pixel [H, W] float32 metres, ∞ where there is no point.
     """
     from scipy.ndimage import minimum_filter
 
-    height, width = lens.height_px, lens.width_px
+    height = lens.height_px
+    width = lens.width_px
     out = np.full((height, width), np.inf, np.float32)
+    # In pixels: near points hide more of the image.
     radius = np.rint(lens.fx_px * footprint_m / projected.depth).astype(np.int64).clip(1, max_radius_px)
     pixel = projected.uv[:, 1].astype(np.int64) * width + projected.uv[:, 0].astype(np.int64)
+    # Points of one radius are drawn together and spread by a minimum filter: a square each would cost far more.
     for size in np.unique(radius):
         chosen = radius == size
         layer = np.full(height * width, np.inf, np.float32)

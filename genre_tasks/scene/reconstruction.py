@@ -1,4 +1,4 @@
-"""What the reconstructing and the evaluating stages return."""
+"""What the stages return that reconstruct a scene."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ from genre_tasks.scene.graph import SceneGraph
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """A scene and how it came about (output of ``initial``, ``gnet`` and ``enet``).
+    """A scene and how it came about: the output of ``initial``, ``gnet`` and ``enet``.
 
-    ``losses`` [T] training loss per iteration; ``snapshots`` maps an iteration count to the scene after so many
-    iterations (0 and T need not be in it); ``seconds_per_iteration`` is a measurement and no payload: it goes into the
-    manifest. ``culled`` counts left-out Gaussians by reason in the last render.
+    Attributes:
+        scene: the result.
+        losses: [T] training loss of each iteration.
+        snapshots: iteration count → the scene after so many iterations; 0 and T need not be in it.
+        seconds_per_iteration: [T], a measurement and no payload: it goes into the manifest.
+        culled: Gaussians that the last render left out, by reason.
     """
 
     scene: SceneGraph

@@ -1,66 +1,61 @@
-"""Rotations and rigid transforms, each in one place. Quaternions are w, x, y, z."""
+"""Rigid transforms as [4, 4] matrices in float64: made, inverted, checked, interpolated, shifted sideways."""
 
 from __future__ import annotations
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from genre_tasks.logs.types import Float32, Float64
 
 
-def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton product a ∘ b, [..., 4] × [..., 4] → [..., 4]; norms multiply."""
-    aw, ax, ay, az = a.unbind(-1)
-    bw, bx, by, bz = b.unbind(-1)
-    return torch.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        -1,
-    )
+def compose_se3(rotation: Float64, translation: Float64) -> Float64:
+    """Puts rotations and translations together as homogeneous matrices.
 
+    Args:
+        rotation: [..., 3, 3].
+        translation: [..., 3].
 
-def matrix_to_quat(rotation: Tensor) -> Tensor:
-    """Unit quaternions of rotation matrices, [..., 3, 3] → [..., 4]; exact also for turns of 180°."""
-    from kornia.geometry.conversions import rotation_matrix_to_quaternion
+    Returns:
+        [..., 4, 4] float64.
 
-    return rotation_matrix_to_quaternion(rotation.contiguous())
-
-
-def quat_to_matrix(quat: Float64) -> Float64:
-    """Rotation matrices of quaternions that need not be unit, [..., 4] → [..., 3, 3], float64."""
-    w, x, y, z = np.moveaxis(quat / np.linalg.norm(quat, axis=-1, keepdims=True), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(r, -1) for r in rows], -2)
-
-
-def se3(rotation: Float64, translation: Float64) -> Float64:
-    """[..., 3, 3] and [..., 3] → [..., 4, 4] float64."""
+    >>> compose_se3(np.eye(3), np.array([1.0, 2.0, 3.0]))[:3, 3].tolist()
+    [1.0, 2.0, 3.0]
+    """
     out = np.zeros((*rotation.shape[:-2], 4, 4))
-    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = rotation, translation, 1.0
+    out[..., :3, :3] = rotation
+    out[..., :3, 3] = translation
+    out[..., 3, 3] = 1.0
     return out
 
 
-def se3_inverse(pose: Float64) -> Float64:
-    """Inverse of rigid transforms [..., 4, 4], by transposition (exact for orthonormal rotations)."""
-    turn = np.swapaxes(pose[..., :3, :3], -1, -2)
-    return se3(turn, -(turn @ pose[..., :3, 3:])[..., 0])
+def invert_se3(pose: Float64) -> Float64:
+    """Inverts rigid transforms [..., 4, 4] by transposing their rotations: exact where these are orthonormal.
+
+    >>> invert_se3(compose_se3(np.eye(3), np.array([1.0, 2.0, 3.0])))[:3, 3].tolist()
+    [-1.0, -2.0, -3.0]
+    """
+    # Transposed, as a general inverse would let rounding errors grow from pose to pose.
+    rotation = np.swapaxes(pose[..., :3, :3], -1, -2)
+    return compose_se3(rotation, -(rotation @ pose[..., :3, 3:])[..., 0])
 
 
 def shift_laterally(chunk_SE3_camera: Float64, chunk_SE3_ego: Float64, shift_m: float) -> Float64:
-    """A camera pose moved with the whole rig along the ego's lateral axis (left is +), rotation unchanged.
+    """Moves a camera pose with the whole rig along the ego vehicle's lateral axis.
 
-    The axis comes from the LiDAR pose's heading projected to the horizontal, which is defined at standstill too.
+    The axis follows from the LiDAR pose's heading in the horizontal plane, which is defined at standstill too.
+
+    Args:
+        chunk_SE3_camera: [4, 4].
+        chunk_SE3_ego: [4, 4] LiDAR pose, x forward, of the same frame.
+        shift_m: positive is left.
+
+    Returns:
+        The moved camera pose [4, 4], with its rotation as it was.
+
+    >>> shift_laterally(np.eye(4), np.eye(4), 3.0)[:3, 3].tolist()
+    [0.0, 3.0, 0.0]
     """
     forward = chunk_SE3_ego[:3, 0].copy()
+    # Horizontal, so that a shifted camera keeps its height over the road when the vehicle rolls.
     forward[2] = 0.0
     forward /= np.linalg.norm(forward)
     out = chunk_SE3_camera.copy()
@@ -69,28 +64,58 @@ def shift_laterally(chunk_SE3_camera: Float64, chunk_SE3_ego: Float64, shift_m: 
 
 
 def interpolate_pose(start: Float64, end: Float64, t: float) -> Float64:
-    """The rigid transform [4, 4] at ``t`` in [0, 1]: straight in position, the shortest turn in rotation.
+    """Interpolates between two rigid transforms: straight in position, by the shortest turn in rotation.
 
-    The relative turn is taken as a rotation vector, so it is exact for equal rotations, does not see the sign of
-    quaternions, and picks one axis, always the same, for a half turn.
+    The relative turn is a rotation vector. So the result is exact for equal rotations, does not depend on the sign of
+    quaternions, and takes always the same axis for half a turn.
+
+    Args:
+        start: [4, 4], the result at ``t`` 0.
+        end: [4, 4], the result at ``t`` 1.
+        t: in [0, 1].
+
+    Returns:
+        The transform [4, 4] at ``t``.
     """
     from scipy.spatial.transform import Rotation
 
+    # Relative to the start: the shortest turn between the two, not between either and the identity.
     turn = Rotation.from_matrix(start[:3, :3].T @ end[:3, :3]).as_rotvec()
     rotation = start[:3, :3] @ Rotation.from_rotvec(t * turn).as_matrix()
-    return se3(rotation, (1 - t) * start[:3, 3] + t * end[:3, 3])
+    return compose_se3(rotation, (1 - t) * start[:3, 3] + t * end[:3, 3])
 
 
-def rigid(pose: Float64, tolerance: float = 1e-3) -> bool:
-    """Whether a [4, 4] matrix is finite and its rotation part is one."""
+def is_rigid_transform(pose: Float64, tolerance: float = 1e-3) -> bool:
+    """Tells whether a [4, 4] matrix is finite and its rotation part orthonormal and right-handed.
+
+    Args:
+        pose: [4, 4].
+        tolerance: largest error of an entry of RᵀR.
+
+    >>> is_rigid_transform(np.eye(4)), is_rigid_transform(2 * np.eye(4))
+    (True, False)
+    """
     if not np.isfinite(pose).all():
         return False
-    turn = pose[:3, :3]
-    return bool(np.abs(turn.T @ turn - np.eye(3)).max() < tolerance and np.linalg.det(turn) > 0)
+    rotation = pose[:3, :3]
+    # The determinant tells a mirror image apart, which is orthonormal too.
+    return bool(np.abs(rotation.T @ rotation - np.eye(3)).max() < tolerance and np.linalg.det(rotation) > 0)
 
 
-def path_distance(positions: Float32, chunk_SE3_ego: Float64) -> Float32:
-    """Distance [P] of points [P, 3] to the nearest ego position."""
+def distance_to_path(positions: Float32, chunk_SE3_ego: Float64) -> Float32:
+    """Measures how far points are from the ego vehicle's path.
+
+    Args:
+        positions: [P, 3] metres, chunk coordinates.
+        chunk_SE3_ego: [F, 4, 4].
+
+    Returns:
+        Metres [P] to the nearest ego position.
+
+    >>> distance_to_path(np.array([[3.0, 4.0, 0.0]], np.float32), np.eye(4)[None]).tolist()
+    [5.0]
+    """
+    # One frame at a time: a [P, F] table of all distances would take gigabytes for a chunk's points.
     best = np.full(len(positions), np.inf, np.float32)
     for ego in chunk_SE3_ego[:, :3, 3].astype(np.float32):
         offset = positions - ego

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from genre_tasks.config import OptimiserConfig
-from genre_tasks.effects.apply_plan import applied
-from genre_tasks.effects.types import UNPLANNED, EffectsPlan
+from genre_tasks.effects.apply_plan import apply_plan
+from genre_tasks.effects.types import DEFAULT_PLAN, EffectsPlan
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.novel_views import FixedViews
 from genre_tasks.scene.reconstruction import Reconstruction
-from genre_tasks.stages.optimise import optimise, planned
+from genre_tasks.stages.optimise import drop_unplanned_losses, optimise
 
 
 def enet(
@@ -17,11 +17,25 @@ def enet(
     chunk: Chunk,
     reconstruction: Reconstruction,
     fixed: FixedViews,
-    plan: EffectsPlan = UNPLANNED,
+    plan: EffectsPlan = DEFAULT_PLAN,
     progress: Progress = silent,
 ) -> Reconstruction:
-    """The enhanced scene, optimised against source views and fixed novel views.
+    """Enhances a reconstructed scene with fixed novel views, against the source views as well.
 
-    Raises ``InputError`` (no source view, an unreadable image, weights that do not fit), ``NonFiniteError``.
+    Args:
+        config: the stage's section.
+        chunk: of the log.
+        reconstruction: result of the stage ``gnet``.
+        fixed: result of the stage ``fnet``.
+        plan: of the chunk's effects.
+        progress: called after each iteration.
+
+    Returns:
+        Reconstruction: the enhanced scene, and the snapshots on the way.
+
+    Raises:
+        InputError: the chunk has no source view, an image is unreadable, or weights are missing or do not fit.
+        NonFiniteError: the optimisation has diverged.
     """
-    return optimise("enet", planned(config, plan), applied(chunk, plan), reconstruction.scene, fixed, progress)
+    config = drop_unplanned_losses(config, plan)
+    return optimise("enet", config, apply_plan(chunk, plan), reconstruction.scene, fixed, progress)

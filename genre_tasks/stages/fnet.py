@@ -1,4 +1,4 @@
-"""The stage `fnet`: novel views are repaired by the one-step diffusion fixer (paper Sec. III-B)."""
+"""The stage ``fnet``: novel views are repaired by the one-step diffusion fixer (paper Sec. III-B)."""
 
 from __future__ import annotations
 
@@ -10,15 +10,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from genre_tasks.checks import check_finite
 from genre_tasks.config import FnetConfig
-from genre_tasks.effects.apply_plan import applied
-from genre_tasks.effects.types import UNPLANNED, EffectsPlan
+from genre_tasks.effects.apply_plan import apply_plan
+from genre_tasks.effects.types import DEFAULT_PLAN, EffectsPlan
 from genre_tasks.errors import InputError
-from genre_tasks.fixer.conditioning import degraded
-from genre_tasks.fixer.inference import fix, noise_of, prefers_half, require_finite
+from genre_tasks.fixer.inference import draw_noise, fix, prefers_bfloat16
+from genre_tasks.fixer.inputs import build_inputs
 from genre_tasks.fixer.network import Encoded, Fnet
-from genre_tasks.fixer.source_images import recorded, references
-from genre_tasks.fixer.warping import SourceImage, surface_of, unseen_share
+from genre_tasks.fixer.source_images import find_references, load_source_images
+from genre_tasks.fixer.view_surface import unproject_surface
+from genre_tasks.fixer.warping import SourceImage, unseen_fraction
 from genre_tasks.fixer.weights import load_fnet
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.chunk import Chunk
@@ -31,23 +33,44 @@ def fnet(
     config: FnetConfig,
     chunk: Chunk,
     novel: NovelViews,
-    plan: EffectsPlan = UNPLANNED,
+    plan: EffectsPlan = DEFAULT_PLAN,
     progress: Progress = silent,
 ) -> FixedViews:
-    """Each novel view repaired from its render, its LiDAR map and its reference image.
+    """Repairs each novel view from its render, its LiDAR map and source images.
 
-    The result depends on ``config.seed`` and a view's place in ``novel``, not on the batch size (to float
-    tolerance) nor on the number of threads (exactly). A view that does not call for it (``config.gate``) is its render.
+    The result depends on ``config.seed`` and a view's index in ``novel``. It does not depend on the number of threads;
+    another batch size changes it within float tolerance. A view that needs no repair (``config.gate``) is its render.
+
+    Args:
+        config: which network, and how it runs.
+        chunk: as ``ingest`` made it.
+        novel: renders and LiDAR maps of this chunk.
+        plan: of the chunk's effects.
+        progress: called with the views done and their total.
+
+    Returns:
+        Images in [0, 1], in the order of ``novel``.
 
     Raises:
         InputError: the weights are missing or do not fit, or a reference is no view of the chunk.
         NonFiniteError: a render is not finite.
     """
-    return fix_views(load_configured(config), config, applied(chunk, plan), novel, progress)
+    return fix_views(load_configured_fnet(config), config, apply_plan(chunk, plan), novel, progress)
 
 
-def load_configured(config: FnetConfig) -> Fnet:
-    """The network that the configuration names."""
+def load_configured_fnet(config: FnetConfig) -> Fnet:
+    """Loads the network that the configuration names.
+
+    Args:
+        config: with model, weights and timestep.
+
+    Returns:
+        The network, ready for inference.
+
+    Raises:
+        InputError: the weights are missing, do not fit, or were trained at another timestep.
+    """
+    # SD-Turbo's weights are large and have a licence of their own.
     if config.model == "sd-turbo" and config.weights == "builtin":
         raise InputError(
             "no weights of sd-turbo ship with the package",
@@ -55,6 +78,7 @@ def load_configured(config: FnetConfig) -> Fnet:
             stage="fnet",
         )
     network = load_fnet(resolve_weights("fnet", config.weights), config.model)
+    # The network has learned the noise of one timestep; at another one its output is wrong without any error.
     if network.architecture.timestep != config.timestep:
         raise InputError(
             f"the weights were trained at timestep {network.architecture.timestep}, configured is {config.timestep}",
@@ -67,56 +91,94 @@ def load_configured(config: FnetConfig) -> Fnet:
 def fix_views(
     network: Fnet, config: FnetConfig, chunk: Chunk, novel: NovelViews, progress: Progress = silent
 ) -> FixedViews:
-    """As :func:`fnet`, with a network at hand."""
+    """Repairs novel views with a network at hand.
+
+    Args:
+        network: the fixer.
+        config: seed, gate, precision and batch size.
+        chunk: with its plan's effects applied.
+        novel: renders and LiDAR maps of this chunk.
+        progress: called with the views done and their total.
+
+    Returns:
+        As :func:`fnet`.
+
+    Raises:
+        InputError: a reference is no view of the chunk.
+        NonFiniteError: a render is not finite.
+    """
     total = len(novel.views)
     if not total:
         return FixedViews(novel.views, novel.color.clone())
-    require_finite("render", novel.color)
-    sources = recorded(chunk)
-    near = references(chunk, novel.views, sources)
-    called = [i for i in range(total) if config.gate == 0 or need(chunk, novel, i, sources) > config.gate]
+    # Checked for all views, those that are only copied too.
+    check_finite(novel.color.float(), "render", "fnet")
+    sources = load_source_images(chunk)
+    references = find_references(chunk, novel.views, sources)
+    # A gate of 0 fixes every view, without the time that estimating the need takes.
+    selected = [i for i in range(total) if config.gate == 0 or estimate_need(chunk, novel, i, sources) > config.gate]
+    # Views that are not selected are their renders, clamped as the fixer's output is.
     color = novel.color.clamp(0, 1)
-    if not called:
+    if not selected:
         return FixedViews(novel.views, color, tuple(range(total)))
-    encoded = _encode(network, [near[i] for i in called])
-    done, lock = 0, Lock()
-    half = prefers_half(novel.color.device) if config.half is None else config.half
+    # Both sides of a frame and all shifts share their reference.
+    encoded = _encode_references(network, [references[i] for i in selected])
+    half = prefers_bfloat16(novel.color.device) if config.half is None else config.half
+    done = 0
+    lock = Lock()
 
-    def run(indices: Sequence[int]) -> Tensor:
+    def fix_batch(indices: Sequence[int]) -> Tensor:
         nonlocal done
-        views = degraded(chunk, novel, indices, sources)
-        noise = noise_of(network, config.seed, indices, *novel.alpha.shape[1:])
+        views = build_inputs(chunk, novel, indices, sources)
+        # Noise depends on a view's index, so that batches and threads do not matter.
+        noise = draw_noise(network, config.seed, indices, *novel.alpha.shape[1:])
         latent = torch.cat([encoded[novel.views[i].reference].latent for i in indices])
         fixed = fix(network, views, noise, Encoded(latent, ()), half)
+        # Batches end in any order, on several threads.
         with lock:
             done += len(indices)
-            progress(done, len(called), "fixing views")
+            progress(done, len(selected), "fixing views")
         return fixed
 
     size = config.batch_views
-    began = time.perf_counter()
-    fixed = map_single_threaded(run, [called[start : start + size] for start in range(0, len(called), size)])
-    color[called] = torch.cat(fixed).permute(0, 2, 3, 1)
-    copied = tuple(sorted(set(range(total)) - set(called)))
-    return FixedViews(novel.views, color, copied, len(copied) * (time.perf_counter() - began) / len(called))
+    start_s = time.perf_counter()
+    batches = [selected[first : first + size] for first in range(0, len(selected), size)]
+    fixed = map_single_threaded(fix_batch, batches)
+    color[selected] = torch.cat(fixed).permute(0, 2, 3, 1)
+    # Reported with the time that copying saved, so that a gate can be judged.
+    copied = tuple(sorted(set(range(total)) - set(selected)))
+    seconds_per_view = (time.perf_counter() - start_s) / len(selected)
+    return FixedViews(novel.views, color, copied, len(copied) * seconds_per_view)
 
 
-def need(chunk: Chunk, novel: NovelViews, index: int, sources: Sequence[SourceImage]) -> float:
-    """How much a view calls for fixing, in [0, 1]: what of it is thin, or shows points that no source image shows."""
-    view, alpha = novel.views[index], novel.alpha[index]
-    surface = surface_of(novel.depth[index], alpha, view.chunk_SE3_camera, view.lens, chunk.actors, view.frame)
-    return unseen_share(surface, alpha, sources, chunk.actors, view.frame)
+def estimate_need(chunk: Chunk, novel: NovelViews, index: int, sources: Sequence[SourceImage]) -> float:
+    """Estimates how much of a view calls for repair: what is thin, or shows points that no source image shows.
+
+    Args:
+        chunk: that the view is of.
+        novel: renders and LiDAR maps.
+        index: of the view.
+        sources: the chunk's source images.
+
+    Returns:
+        Fraction of the view's light, in [0, 1].
+    """
+    view = novel.views[index]
+    alpha = novel.alpha[index]
+    surface = unproject_surface(novel.depth[index], alpha, view.chunk_SE3_camera, view.lens, chunk.actors, view.frame)
+    return unseen_fraction(surface, alpha, sources, chunk.actors, view.frame)
 
 
 @torch.no_grad()
-def _encode(network: Fnet, images: Sequence[SourceImage]) -> dict[tuple[str, int], Encoded]:
-    """Latents of source images, each encoded once."""
+def _encode_references(network: Fnet, images: Sequence[SourceImage]) -> dict[tuple[str, int], Encoded]:
+    """Latents of source images by camera and frame, each encoded once."""
 
     def encode(image: Tensor) -> Encoded:
         height, width = image.shape[-2:]
         pad = (0, -width % network.stride, 0, -height % network.stride)
+        # The gradient mode is a property of a thread: that of the caller does not reach the pool's.
         with torch.no_grad():
             return Encoded(network.encode(F.pad(image[None], pad, mode="replicate")).latent, ())
 
-    each = {(s.camera, s.frame): s.image for s in images}
-    return dict(zip(each, map_single_threaded(encode, list(each.values())), strict=True))
+    image_of_source = {(s.camera, s.frame): s.image for s in images}
+    encoded = map_single_threaded(encode, list(image_of_source.values()))
+    return dict(zip(image_of_source, encoded, strict=True))

@@ -3,35 +3,49 @@
 from __future__ import annotations
 
 from genre_tasks.config import OptimiserConfig
-from genre_tasks.effects.apply_plan import applied
-from genre_tasks.effects.types import UNPLANNED, EffectsPlan
+from genre_tasks.effects.apply_plan import apply_plan
+from genre_tasks.effects.types import DEFAULT_PLAN, EffectsPlan
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.reconstruction import Reconstruction
-from genre_tasks.stages.optimise import PER_SCENE, optimise, planned
+from genre_tasks.stages.optimise import PER_SCENE_METHODS, drop_unplanned_losses, optimise
 
 
 def gnet(
     config: OptimiserConfig,
     chunk: Chunk,
     initial: Reconstruction,
-    plan: EffectsPlan = UNPLANNED,
+    plan: EffectsPlan = DEFAULT_PLAN,
     progress: Progress = silent,
 ) -> Reconstruction:
-    """The reconstructed scene. Source views only: fixed novel views enter GNet's training alone.
+    """Reconstructs the scene of a chunk from its source views.
 
-    Raises ``InputError`` (no source view, an unreadable image, weights that do not fit), ``NonFiniteError``.
+    Fixed novel views enter GNet's training only.
+
+    Args:
+        config: the stage's section; ``GnetConfig`` where a refinement or a baseline is configured.
+        chunk: of the log.
+        initial: result of the stage ``initial``.
+        plan: of the chunk's effects.
+        progress: called after each iteration.
+
+    Returns:
+        Reconstruction: the reconstructed scene, and the snapshots on the way.
+
+    Raises:
+        InputError: the chunk has no source view, an image is unreadable, or weights are missing or do not fit.
+        NonFiniteError: the optimisation has diverged.
     """
-    return optimise(
-        "gnet", planned(config, plan), applied(chunk, plan), _start(config, initial.scene, plan), None, progress
-    )
+    start = _prepare_start(config, initial.scene, plan)
+    return optimise("gnet", drop_unplanned_losses(config, plan), apply_plan(chunk, plan), start, None, progress)
 
 
-def _start(config: OptimiserConfig, scene: SceneGraph, plan: EffectsPlan) -> SceneGraph:
-    """With harmonics where the plan has them; per-scene 3DGS has one colour a Gaussian in any case."""
-    if not plan.on("view_dependent_colour") or config.method in PER_SCENE:
+def _prepare_start(config: OptimiserConfig, scene: SceneGraph, plan: EffectsPlan) -> SceneGraph:
+    """Adds spherical harmonics where the plan has them; per-scene 3DGS has one colour per Gaussian in any case."""
+    if not plan.is_on("view_dependent_colour") or config.method in PER_SCENE_METHODS:
         return scene
-    from genre_tasks.scene.spherical_harmonics import starting
+    # A scene without view-dependent colours imports none of their code.
+    from genre_tasks.scene.spherical_harmonics import with_zero_spherical_harmonics
 
-    return starting(scene)
+    return with_zero_spherical_harmonics(scene)

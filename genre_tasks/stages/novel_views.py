@@ -1,4 +1,4 @@
-"""Novel views beside the path: renders of a scene, and the LiDAR map that conditions the fixer (paper Sec. III-B)."""
+"""The stage ``novel_views``: renders to the side of the path, and the LiDAR map for the fixer (paper Sec. III-B)."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from collections.abc import Callable, Sequence
 
 import torch
 
+from genre_tasks.checks import check_finite
 from genre_tasks.config import NovelViewsConfig
-from genre_tasks.effects.apply_plan import applied
-from genre_tasks.effects.types import UNPLANNED, EffectsPlan
-from genre_tasks.errors import NonFiniteError
+from genre_tasks.effects.apply_plan import apply_plan
+from genre_tasks.effects.types import DEFAULT_PLAN, EffectsPlan
 from genre_tasks.progress import Progress, silent
 from genre_tasks.render import Render, RenderSettings, render_views
 from genre_tasks.render.surface import render_surfaces
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.lidar_map import lidar_scene
-from genre_tasks.scene.novel_poses import novel_view_poses
+from genre_tasks.scene.lidar_map import build_lidar_scene
+from genre_tasks.scene.novel_poses import place_novel_views
 from genre_tasks.scene.novel_views import NovelView, NovelViews
 from genre_tasks.scene.reconstruction import Reconstruction
 
@@ -28,16 +28,29 @@ def novel_views(
     config: NovelViewsConfig,
     chunk: Chunk,
     reconstruction: Reconstruction,
-    plan: EffectsPlan = UNPLANNED,
+    plan: EffectsPlan = DEFAULT_PLAN,
     progress: Progress = silent,
     settings: RenderSettings = DEFAULT_SETTINGS,
 ) -> NovelViews:
     """Renders the scene and the coloured LiDAR points at the source frames' poses, moved by each shift.
 
-    All cameras, in the order of ``novel_view_poses``. Raises ``NonFiniteError`` if an image is not finite.
+    Args:
+        config: the shifts, and how many LiDAR points are drawn.
+        chunk: as ``ingest`` made it.
+        reconstruction: whose scene is rendered.
+        plan: of the chunk's effects.
+        progress: called with the renders done and their total.
+        settings: of the renderer.
+
+    Returns:
+        Views of all cameras, in the order of :func:`~genre_tasks.scene.novel_poses.place_novel_views`.
+
+    Raises:
+        NonFiniteError: an image is not finite.
     """
-    chunk = applied(chunk, plan)
-    views = novel_view_poses(chunk, config.shifts_m)
+    # The plan gives the lenses that novel views are rendered with.
+    chunk = apply_plan(chunk, plan)
+    views = place_novel_views(chunk, config.shifts_m)
     return render_novel(chunk, reconstruction.scene, views, config.lidar_max_points, progress, settings)
 
 
@@ -49,32 +62,46 @@ def render_novel(
     progress: Progress = silent,
     settings: RenderSettings = DEFAULT_SETTINGS,
 ) -> NovelViews:
-    """As :func:`novel_views`, at any ``views``."""
+    """Renders the scene and the coloured LiDAR points at any views.
+
+    Args:
+        chunk: with its plan's effects applied.
+        scene: to render.
+        views: all of one image size.
+        lidar_max_points: points drawn in the LiDAR map.
+        progress: called with the renders done and their total.
+        settings: of the renderer.
+
+    Returns:
+        Images in the order of ``views``.
+
+    Raises:
+        NonFiniteError: an image is not finite.
+    """
+    # Render and map are drawn from the same poses, so that they are aligned pixel by pixel.
     image = _render(render_views, scene, views, settings, progress, 0, "novel views")
-    points = lidar_scene(chunk, lidar_max_points)
-    lidar = _render(render_surfaces, points, views, settings, progress, len(views), "LiDAR maps")
+    lidar_scene = build_lidar_scene(chunk, lidar_max_points)
+    lidar = _render(render_surfaces, lidar_scene, views, settings, progress, len(views), "LiDAR maps")
     progress(2 * len(views), 2 * len(views), "novel views")
     images = NovelViews(
-        tuple(views),
-        image.color,
-        image.alpha,
-        image.expected_depth(),
-        lidar.color,
-        lidar.alpha,
-        lidar.expected_depth(),
-        image.culled,
-        lidar.culled,
+        views=tuple(views),
+        color=image.color,
+        alpha=image.alpha,
+        depth=image.expected_depth(),
+        lidar_color=lidar.color,
+        lidar_alpha=lidar.alpha,
+        lidar_depth=lidar.expected_depth(),
+        culled=image.culled,
+        lidar_culled=lidar.culled,
     )
+    # A single NaN pixel would spread over the image in the fixer's convolutions.
     for name in ("color", "alpha", "depth", "lidar_color", "lidar_alpha", "lidar_depth"):
-        bad = (~getattr(images, name).isfinite()).nonzero()
-        if len(bad):
-            index = tuple(int(i) for i in bad[0])
-            raise NonFiniteError("novel_views", name, len(bad), index, log=chunk.log, chunk=chunk.index)
+        check_finite(getattr(images, name), name, "novel_views", log=chunk.log, chunk=chunk.index)
     return images
 
 
 def _render(
-    draw: Callable[[SceneGraph, Sequence[NovelView], RenderSettings], Render],
+    render: Callable[[SceneGraph, Sequence[NovelView], RenderSettings], Render],
     scene: SceneGraph,
     views: Sequence[NovelView],
     settings: RenderSettings,
@@ -82,7 +109,7 @@ def _render(
     done: int,
     note: str,
 ) -> Render:
-    """A call for each run of views of one frame, so that progress moves."""
+    """Renders the views of each frame in one call, so that progress moves between frames."""
     parts = []
     start = 0
     with torch.no_grad():
@@ -91,10 +118,15 @@ def _render(
             while end < len(views) and views[end].frame == views[start].frame:
                 end += 1
             progress(done + start, 2 * len(views), note)
-            parts.append(draw(scene, views[start:end], settings))
+            parts.append(render(scene, views[start:end], settings))
             start = end
-    color, alpha, depth = (torch.cat([getattr(p, name) for p in parts]) for name in ("color", "alpha", "depth"))
+    # Counts of Gaussians that were left out are added up, for the report.
     culled: Counter[str] = Counter()
     for part in parts:
         culled.update(part.culled)
-    return Render(color, alpha, depth, dict(culled))
+    return Render(
+        color=torch.cat([part.color for part in parts]),
+        alpha=torch.cat([part.alpha for part in parts]),
+        depth=torch.cat([part.depth for part in parts]),
+        culled=dict(culled),
+    )

@@ -7,30 +7,51 @@ from pathlib import Path
 from genre_tasks.errors import InputError
 
 
-def network_of(stage: str, method: str) -> str:
-    """Whose weights a stage runs with: its own network's, or those of the method that stands in its place."""
+def select_network(stage: str, method: str) -> str:
+    """Names the network whose weights a stage runs with.
+
+    Args:
+        stage: the stage's own network, as ``gnet`` or ``enet``.
+        method: the method that runs in the stage.
+
+    Returns:
+        The stem of the network's built-in file.
+
+    >>> select_network("gnet", "learned"), select_network("gnet", "g3r")
+    ('gnet', 'g3r')
+    """
+    # g3r runs in gnet's place, with weights that were trained without novel views.
     return "g3r" if method == "g3r" else stage
 
 
 def resolve_weights(name: str, configured: str, setting: str = "") -> Path:
-    """The file (or folder) that ``configured`` names.
+    """Finds the file or folder that a configured name means.
 
     Args:
         name: the network, as ``fnet``, ``gnet``, ``g3r`` or ``enet``: the stem of its built-in file.
         configured: ``builtin``, ``builtin:gnet`` for those that ship for another network, or a path.
-        setting: the key that said so, for messages; ``NAME.weights`` if not given.
+        setting: the configuration key that holds the name, for messages; ``NAME.weights`` if not given.
+
+    Returns:
+        A path that exists.
 
     Raises:
-        InputError: it does not exist.
+        InputError: it does not exist; the error lists the networks that ship.
+
+    >>> resolve_weights("gnet", "builtin").name, resolve_weights("gnet", "builtin:enet").name
+    ('gnet.safetensors', 'enet.safetensors')
     """
-    setting, (first, colon, other) = setting or f"{name}.weights", configured.partition(":")
-    if first == "builtin":
+    key = setting or f"{name}.weights"
+    # ``builtin:`` with another network's name lets a stage run with weights that were trained for a different one.
+    kind, colon, other = configured.partition(":")
+    if kind == "builtin":
+        # An unknown name is a file that does not exist: the error below lists those that do.
         path = Path(__file__).parent / f"{other if colon else name}.safetensors"
         known = ", ".join(sorted(p.stem for p in path.parent.glob("*.safetensors")))
-        remedy = f"Those of {known} ship; train weights with `genre train {name}`, or give a path by `{setting}`."
+        remedy = f"Those of {known} ship; train weights with `genre train {name}`, or give a path by `{key}`."
     else:
         path = Path(configured).expanduser()
-        remedy = f"Check `{setting}`, or leave it at `builtin`."
+        remedy = f"Check `{key}`, or leave it at `builtin`."
     if not path.exists():
         raise InputError(f"the weights of {name} do not exist", remedy=remedy, file=path, stage=name)
     return path

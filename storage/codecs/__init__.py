@@ -5,13 +5,13 @@ They are imported when they are used: looking up a key should not pay for torch 
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol, cast
 
 from genre_tasks.errors import ConfigError
+from genre_tasks.suggestions import did_you_mean
 
 KINDS: dict[str, str] = {
     "chunk": "storage.codecs.chunk",
@@ -29,22 +29,62 @@ class Codec(Protocol):
     """Takes a value of the domain to files in a folder and back; the same value gives the same bytes."""
 
     def write(self, folder: Path, value: Any) -> None:
-        """Write the payload into an empty folder. Raises ``ConfigError``, ``NonFiniteError`` for an unfit value."""
+        """Writes the payload.
+
+        Args:
+            folder: an empty folder.
+            value: the value to store.
+
+        Raises:
+            ConfigError: a dtype, shape or name breaks the codec's contract.
+            NonFiniteError: a number that must be finite is not.
+        """
         ...
 
     def read(self, folder: Path, measurements: Mapping[str, Any] | None = None) -> Any:
-        """The value; raises ``ArtifactCorruptError`` naming file and column, channel or part."""
+        """Reads the payload.
+
+        Args:
+            folder: the folder that :meth:`write` filled.
+            measurements: what :meth:`measurements` gave, from the manifest.
+
+        Returns:
+            The value, with tensors on the CPU.
+
+        Raises:
+            ArtifactCorruptError: a file is missing or does not decode; it names the file and the column or channel.
+        """
         ...
 
     def measurements(self, value: Any) -> dict[str, Any]:
-        """What of the value is a measurement: it goes into the manifest and comes back through :meth:`read`."""
+        """Selects what of a value is a measurement: it differs between runs, so it belongs in the manifest.
+
+        Args:
+            value: the value to store.
+
+        Returns:
+            JSON values by name, which come back through :meth:`read`.
+        """
         ...
 
 
-def codec_of(kind: str) -> Codec:
-    """The codec of a kind. Raises ``ConfigError`` that lists the known kinds."""
+def get_codec(kind: str) -> Codec:
+    """Finds the codec of a kind of artifact.
+
+    Args:
+        kind: a key of :data:`KINDS`.
+
+    Returns:
+        The codec's module.
+
+    Raises:
+        ConfigError: the kind is unknown; the known ones are listed.
+
+    >>> get_codec("evaluation").__name__
+    'storage.codecs.evaluation'
+    """
     if kind not in KINDS:
-        near = difflib.get_close_matches(kind, KINDS, 1)
-        hint = f"Did you mean {near[0]!r}? " if near else ""
+        hint = did_you_mean(kind, KINDS)
         raise ConfigError(f"There is no artifact kind {kind!r}", remedy=f"{hint}Known kinds: {', '.join(KINDS)}.")
+    # A module fits the protocol with its functions, which a type checker cannot see through a name.
     return cast(Codec, import_module(KINDS[kind]))

@@ -10,24 +10,33 @@ import numpy as np
 import pyarrow as pa
 
 from genre_tasks.errors import ArtifactCorruptError
-from genre_tasks.scene.chunk import Actor, Chunk, Mark, Points, View
-from storage.codecs.lenses import LENS_AND_POSE, lens_columns, pose_and_lens
+from genre_tasks.scene.chunk import Actor, Chunk, LogIssue, Points, View
+from storage.codecs.actors import read_actors, write_actors
 from storage.codecs.tables import (
     POSE,
     REMEDY,
-    array_of,
-    checked,
+    check_array,
     column,
-    pose_rows,
-    poses_of,
+    column_array,
+    poses_from_rows,
+    poses_to_column,
+    read_records,
+    read_rows,
     read_table,
     schema,
+    write_records,
     write_table,
 )
+from storage.codecs.view_columns import CAMERA_AND_FRAME, FRAME, LENS_AND_POSE, lens_columns, pose_and_lens
 
-STATIC, FIRST_ACTOR = 0, 2
-"""Values of the column ``node``, as in the scene graph: the static background, and 2 + k for actor k."""
+STATIC = 0
+"""Value of the column ``node`` for the static background, as in the scene graph."""
 
+# Node 1 is the distant shell, to which no LiDAR point belongs.
+FIRST_ACTOR = 2
+"""Value of the column ``node`` for the first actor; the next one has 3."""
+
+# A table of one row instead of JSON: one format, with types and checksums, for everything that is stored.
 CHUNK = schema(
     "chunk/1",
     [
@@ -43,21 +52,21 @@ CHUNK = schema(
 FRAMES = schema(
     "frames/1",
     [
-        column("frame", pa.int64(), "frame of the log"),
+        FRAME,
         column("chunk_SE3_ego", POSE, "LiDAR pose: ego coordinates (x forward, y left, z up) to chunk, metres"),
     ],
 )
 VIEWS = schema(
     "chunk_views/1",
     [
-        column("camera", pa.string(), "name"),
-        column("frame", pa.int64(), "frame of the log"),
+        *CAMERA_AND_FRAME,
         column("role", pa.string(), "source or heldout"),
         column("timestamp_s", pa.float64(), "seconds"),
         *LENS_AND_POSE,
         column("image", pa.large_binary(), "encoded image, the bytes of the log"),
     ],
 )
+# One table for all nodes, because a chunk may have a hundred actors with a few points each.
 POINTS = schema(
     "points/1",
     [
@@ -72,19 +81,7 @@ POINTS = schema(
         column("frame", pa.int16(), "frame of the log of its sweep"),
     ],
 )
-ACTORS = schema(
-    "actors/1",
-    [
-        column("track_id", pa.string(), "name of the track"),
-        column("label", pa.string(), "class in the log's own words"),
-        column("length_m", pa.float64(), "metres"),
-        column("width_m", pa.float64(), "metres"),
-        column("height_m", pa.float64(), "metres"),
-        column("frames", pa.list_(pa.int64()), "frames of the log in which it exists"),
-        column("chunk_SE3_box", pa.list_(POSE), "box coordinates to chunk coordinates at those frames, metres"),
-    ],
-)
-MARKS = schema(
+LOG_ISSUES = schema(
     "marks/1",
     [
         column("kind", pa.string(), "what is lacking or set aside"),
@@ -95,75 +92,52 @@ MARKS = schema(
 )
 
 
-def actor_columns(actors: Any) -> dict[str, Any]:
-    """Columns of :data:`ACTORS` for ``Actor`` or ``ActorNode`` values (they share these fields)."""
-    for a in actors:
-        checked(a.frames, f"frames of actor {a.track_id}", np.int64, (None,))
-        checked(a.chunk_SE3_box, f"chunk_SE3_box of actor {a.track_id}", np.float64, (len(a.frames), 4, 4))
-    return {
-        "track_id": [a.track_id for a in actors],
-        "label": [a.label for a in actors],
-        "length_m": [float(a.size_m[0]) for a in actors],
-        "width_m": [float(a.size_m[1]) for a in actors],
-        "height_m": [float(a.size_m[2]) for a in actors],
-        "frames": [a.frames.tolist() for a in actors],
-        "chunk_SE3_box": [a.chunk_SE3_box.reshape(-1, 16).tolist() for a in actors],
-    }
-
-
-def actor_fields(path: Path, row: dict[str, Any]) -> dict[str, Any]:
-    """The fields that ``Actor`` and ``ActorNode`` share, of one row."""
-    frames, poses = np.array(row["frames"], np.int64), poses_of(row["chunk_SE3_box"])
-    if len(frames) != len(poses):
-        raise ArtifactCorruptError(
-            f"Actor {row['track_id']!r} has {len(frames)} frames and {len(poses)} poses", remedy=REMEDY, file=path
-        )
-    return {
-        "track_id": row["track_id"],
-        "label": row["label"],
-        "size_m": (row["length_m"], row["width_m"], row["height_m"]),
-        "frames": frames,
-        "chunk_SE3_box": poses,
-    }
-
-
 def write(folder: Path, value: Chunk) -> None:
-    """Write all tables of a chunk."""
-    pose = checked(value.world_SE3_chunk, "world_SE3_chunk", np.float64, (4, 4))
-    write_table(
-        folder / "chunk.parquet",
-        CHUNK,
-        {
-            "dataset": [value.dataset],
-            "log": [value.log],
-            "index": [value.index],
-            "width_px": [value.width_px],
-            "height_px": [value.height_px],
-            "camera_names": [list(value.camera_names)],
-            "world_SE3_chunk": pose_rows(pose[None], "world_SE3_chunk"),
-        },
-    )
-    ego = checked(value.chunk_SE3_ego, "chunk_SE3_ego", np.float64, (len(value.frames), 4, 4))
-    frames = {"frame": list(value.frames), "chunk_SE3_ego": pose_rows(ego, "chunk_SE3_ego")}
+    """Writes all tables of a chunk.
+
+    Args:
+        folder: an empty folder.
+        value: the chunk.
+
+    Raises:
+        ConfigError: an array has another dtype or shape.
+        NonFiniteError: a pose or a position is NaN or infinite.
+    """
+    pose = check_array(value.world_SE3_chunk, "world_SE3_chunk", np.float64, (4, 4))
+    chunk = {
+        "dataset": [value.dataset],
+        "log": [value.log],
+        "index": [value.index],
+        "width_px": [value.width_px],
+        "height_px": [value.height_px],
+        "camera_names": [list(value.camera_names)],
+        "world_SE3_chunk": poses_to_column(pose[None], "world_SE3_chunk"),
+    }
+    write_table(folder / "chunk.parquet", CHUNK, chunk)
+    ego = check_array(value.chunk_SE3_ego, "chunk_SE3_ego", np.float64, (len(value.frames), 4, 4))
+    frames = {"frame": list(value.frames), "chunk_SE3_ego": poses_to_column(ego, "chunk_SE3_ego")}
     write_table(folder / "frames.parquet", FRAMES, frames)
     _write_views(folder, value.views)
     _write_points(folder, [(STATIC, value.static)] + [(FIRST_ACTOR + k, a.points) for k, a in enumerate(value.actors)])
-    write_table(folder / "actors.parquet", ACTORS, actor_columns(value.actors))
-    write_table(
-        folder / "marks.parquet",
-        MARKS,
-        {
-            "kind": [m.kind for m in value.marks],
-            "detail": [m.detail for m in value.marks],
-            "frame": [m.frame for m in value.marks],
-            "camera": [m.camera for m in value.marks],
-        },
-    )
+    write_actors(folder / "actors.parquet", value.actors)
+    write_records(folder / "marks.parquet", LOG_ISSUES, value.log_issues)
 
 
 def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> Chunk:
-    """The chunk; NumPy arrays are writable copies."""
-    rows = read_table(folder / "chunk.parquet", CHUNK)[0].to_pylist()
+    """Reads a chunk.
+
+    Args:
+        folder: the folder that :func:`write` filled.
+        measurements: not used: a chunk is all payload.
+
+    Returns:
+        The chunk; its NumPy arrays are writable copies.
+
+    Raises:
+        ArtifactCorruptError: a table is damaged, or points belong to no actor.
+    """
+    rows = read_rows(folder / "chunk.parquet", CHUNK)
+    # A valid table may still hold no row or several, which the schema cannot forbid.
     if len(rows) != 1:
         raise ArtifactCorruptError(
             f"There are {len(rows)} rows, expected 1", remedy=REMEDY, file=folder / "chunk.parquet"
@@ -171,8 +145,9 @@ def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> Chunk:
     (head,) = rows
     frames = read_table(folder / "frames.parquet", FRAMES)[0]
     points = _read_points(folder)
-    actors = read_table(folder / "actors.parquet", ACTORS)[0].to_pylist()
+    actors = read_actors(folder / "actors.parquet")
     stray = set(points) - {STATIC, *(FIRST_ACTOR + k for k in range(len(actors)))}
+    # Points of an unknown node would be dropped silently, and the scene would lack them without any sign.
     if stray:
         raise ArtifactCorruptError(
             f"Column 'node' names unknown nodes {sorted(stray)}", remedy=REMEDY, file=folder / "points.parquet"
@@ -185,20 +160,23 @@ def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> Chunk:
         camera_names=tuple(head["camera_names"]),
         width_px=head["width_px"],
         height_px=head["height_px"],
-        world_SE3_chunk=poses_of(head["world_SE3_chunk"])[0],
-        chunk_SE3_ego=poses_of(frames.column("chunk_SE3_ego").to_pylist()),
+        world_SE3_chunk=poses_from_rows(head["world_SE3_chunk"])[0],
+        chunk_SE3_ego=poses_from_rows(frames.column("chunk_SE3_ego").to_pylist()),
         views=_read_views(folder),
         static=points.get(STATIC, _no_points()),
         actors=tuple(
-            Actor(**actor_fields(folder / "actors.parquet", row), points=points.get(FIRST_ACTOR + k, _no_points()))
-            for k, row in enumerate(actors)
+            Actor(**actor, points=points.get(FIRST_ACTOR + k, _no_points())) for k, actor in enumerate(actors)
         ),
-        marks=tuple(Mark(**row) for row in read_table(folder / "marks.parquet", MARKS)[0].to_pylist()),
+        log_issues=read_records(folder / "marks.parquet", LOG_ISSUES, LogIssue),
     )
 
 
 def measurements(value: Chunk) -> dict[str, Any]:
-    """None: a chunk is all payload."""
+    """Selects no measurements: a chunk is all payload.
+
+    Returns:
+        An empty dictionary.
+    """
     return {}
 
 
@@ -211,13 +189,15 @@ def _write_views(folder: Path, views: tuple[View, ...]) -> None:
         **lens_columns([v.chunk_SE3_camera for v in views], [v.lens for v in views]),
         "image": [v.image for v in views],
     }
+    # The log's own bytes are kept: encoding an image again would cost quality, and compressing it saves nothing.
     write_table(folder / "views.parquet", VIEWS, columns, raw=("image",))
 
 
 def _read_views(folder: Path) -> tuple[View, ...]:
     path = folder / "views.parquet"
     views = []
-    for row in read_table(path, VIEWS)[0].to_pylist():
+    for row in read_rows(path, VIEWS):
+        # An unknown role would be neither trained nor evaluated, and nobody would notice.
         if row["role"] not in ("source", "heldout"):
             raise ArtifactCorruptError(f"Column 'role' holds {row['role']!r}", remedy=REMEDY, file=path)
         pose, lens = pose_and_lens(row)
@@ -226,11 +206,12 @@ def _read_views(folder: Path) -> tuple[View, ...]:
 
 
 def _write_points(folder: Path, nodes: list[tuple[int, Points]]) -> None:
+    # All nodes are checked before anything is joined, so that the error can name the node.
     for node, p in nodes:
-        checked(p.positions, f"positions of node {node}", np.float32, (None, 3))
-        checked(p.colors, f"colors of node {node}", np.uint8, (len(p), 3))
-        checked(p.colored, f"colored of node {node}", np.bool_, (len(p),))
-        checked(p.frames, f"frames of node {node}", np.int16, (len(p),))
+        check_array(p.positions, f"positions of node {node}", np.float32, (None, 3))
+        check_array(p.colors, f"colors of node {node}", np.uint8, (len(p), 3))
+        check_array(p.colored, f"colored of node {node}", np.bool_, (len(p),))
+        check_array(p.frames, f"frames of node {node}", np.int16, (len(p),))
     positions = np.concatenate([p.positions for _, p in nodes])
     colors = np.concatenate([p.colors for _, p in nodes])
     columns = {
@@ -245,17 +226,20 @@ def _write_points(folder: Path, nodes: list[tuple[int, Points]]) -> None:
 
 def _read_points(folder: Path) -> dict[int, Points]:
     table = read_table(folder / "points.parquet", POINTS)[0]
-    node = array_of(table, "node")
+    node = column_array(table, "node")
+    # Sorted nodes make each one a slice, found by bisection.
     if np.any(np.diff(node) < 0):
         raise ArtifactCorruptError("Column 'node' is not sorted", remedy=REMEDY, file=folder / "points.parquet")
-    positions = np.stack([array_of(table, c) for c in ("x", "y", "z")], 1)
-    colors = np.stack([array_of(table, c) for c in ("red", "green", "blue")], 1)
-    colored, frame = array_of(table, "colored"), array_of(table, "frame")
-    out = {}
+    positions = np.stack([column_array(table, c) for c in ("x", "y", "z")], 1)
+    colors = np.stack([column_array(table, c) for c in ("red", "green", "blue")], 1)
+    colored = column_array(table, "colored")
+    frame = column_array(table, "frame")
+    points = {}
     for n in np.unique(node).tolist():
-        at = slice(*np.searchsorted(node, [n, n + 1]).tolist())
-        out[n] = Points(positions[at].copy(), colors[at].copy(), colored[at].copy(), frame[at].copy())
-    return out
+        rows = slice(*np.searchsorted(node, [n, n + 1]).tolist())
+        # Copied, because a slice would keep the points of all nodes in memory.
+        points[n] = Points(positions[rows].copy(), colors[rows].copy(), colored[rows].copy(), frame[rows].copy())
+    return points
 
 
 def _no_points() -> Points:

@@ -1,21 +1,42 @@
-"""Plan of effects ↔ ``effects.parquet``, a row an effect; what those that are on need to be
-applied: ``gains.parquet``, ``shutters.parquet``, ``blurs.parquet``, ``own/CAMERA.png``."""
+"""Plan of effects ↔ ``effects.parquet``, a row an effect, and what those that are on need to be applied.
+
+That is ``gains.parquet``, ``shutters.parquet``, ``blurs.parquet`` and ``own/CAMERA.png``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
 
-from genre_tasks.effects.types import Decision, EffectsPlan, Fitted
+from genre_tasks.effects.types import Decision, EffectParameters, EffectsPlan
 from genre_tasks.logs.types import MotionBlur, RollingShutter
 from storage.codecs.png import read_png, write_png
-from storage.codecs.tables import column, read_table, schema, write_table
+from storage.codecs.tables import column, read_records, read_rows, schema, write_records, write_table
+from storage.codecs.view_columns import CAMERA_AND_FRAME, image_columns
+
+CameraMotion = TypeVar("CameraMotion", RollingShutter, MotionBlur)
 
 _CHANNELS = ("red", "green", "blue")
+_MOTION = ("velocity_x", "velocity_y", "velocity_z", "turn_x", "turn_y", "turn_z")
+
+
+def _motion_schema(table: str, duration: str, note: str) -> pa.Schema:
+    """A table of how cameras move while something lasts, which the column ``duration`` says in seconds."""
+    return schema(
+        table,
+        [
+            *CAMERA_AND_FRAME,
+            column(duration, pa.float64(), note),
+            column("frame_s", pa.float64(), "seconds to the next frame; 0: not stated"),
+            *(column(n, pa.float64(), "of the camera in its own axes, m/s or rad/s") for n in _MOTION),
+        ],
+    )
+
+
 EFFECTS = schema(
     "effects/1",
     [
@@ -30,87 +51,95 @@ EFFECTS = schema(
         column("cost", pa.string(), "what enabling costs"),
     ],
 )
-
 GAINS = schema(
     "gains/1",
     [
-        column("camera", pa.string(), "name"),
-        column("frame", pa.int64(), "frame of the log"),
+        *CAMERA_AND_FRAME,
         *(column(c, pa.float64(), "natural logarithm of the image's gain in linear light") for c in _CHANNELS),
     ],
 )
-
-_MOTION = ("velocity_x", "velocity_y", "velocity_z", "turn_x", "turn_y", "turn_z")
-SHUTTERS = schema(
-    "shutters/1",
-    [
-        column("camera", pa.string(), "name"),
-        column("frame", pa.int64(), "frame of the log"),
-        column("readout_s", pa.float64(), "seconds from the first row to the last"),
-        column("frame_s", pa.float64(), "seconds to the next frame; 0: not stated"),
-        *(column(n, pa.float64(), "of the camera in its own axes, m/s or rad/s") for n in _MOTION),
-    ],
-)
-
-BLURS = schema(
-    "blurs/1",
-    [
-        column("camera", pa.string(), "name"),
-        column("frame", pa.int64(), "frame of the log"),
-        column("exposure_s", pa.float64(), "seconds for which the shutter is open"),
-        column("frame_s", pa.float64(), "seconds to the next frame; 0: not stated"),
-        *(column(n, pa.float64(), "of the camera in its own axes, m/s or rad/s") for n in _MOTION),
-    ],
-)
+SHUTTERS = _motion_schema("shutters/1", "readout_s", "seconds from the first row to the last")
+BLURS = _motion_schema("blurs/1", "exposure_s", "seconds for which the shutter is open")
 
 
 def write(folder: Path, value: EffectsPlan) -> None:
-    """Write the table, the gains and a picture of the vehicle itself a camera: white where it is."""
-    rows = {name: [getattr(d, name) for d in value.decisions] for name in EFFECTS.names}
-    write_table(folder / "effects.parquet", EFFECTS, rows)
-    images, gains = list(value.fitted.gains), np.array(list(value.fitted.gains.values())).reshape(-1, 3)
-    which = {"camera": [camera for camera, _ in images], "frame": [frame for _, frame in images]}
-    write_table(folder / "gains.parquet", GAINS, which | {c: gains[:, k] for k, c in enumerate(_CHANNELS)})
-    write_table(folder / "shutters.parquet", SHUTTERS, _motions(value.fitted.shutters, "readout_s"))
-    write_table(folder / "blurs.parquet", BLURS, _motions(value.fitted.blurs, "exposure_s"))
-    if value.fitted.own:
+    """Writes the tables, and for each camera a picture that is white where the vehicle itself is in view.
+
+    Args:
+        folder: an empty folder.
+        value: the plan.
+    """
+    # Tables without rows are written too: a missing one is damage, not a plan with fewer effects.
+    write_records(folder / "effects.parquet", EFFECTS, value.decisions)
+    # Without the reshape a plan without gains would be an array of no columns.
+    gains = np.array(list(value.parameters.gains.values())).reshape(-1, 3)
+    columns = image_columns(list(value.parameters.gains)) | {c: gains[:, k] for k, c in enumerate(_CHANNELS)}
+    write_table(folder / "gains.parquet", GAINS, columns)
+    _write_motions(folder / "shutters.parquet", SHUTTERS, value.parameters.shutters, "readout_s")
+    _write_motions(folder / "blurs.parquet", BLURS, value.parameters.blurs, "exposure_s")
+    if value.parameters.ego_masks:
         (folder / "own").mkdir()
-    for camera, own in value.fitted.own.items():
-        write_png(folder / "own" / f"{camera}.png", np.repeat(np.uint8(255) * own[..., None], 3, 2))
+    for camera, mask in value.parameters.ego_masks.items():
+        # Three equal channels, because that is the one PNG format of the store, and any viewer shows it.
+        write_png(folder / "own" / f"{camera}.png", np.repeat(np.uint8(255) * mask[..., None], 3, 2))
 
 
 def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> EffectsPlan:
-    """The plan, in its order."""
-    table, _ = read_table(folder / "effects.parquet", EFFECTS)
-    rows = read_table(folder / "gains.parquet", GAINS)[0].to_pylist()
+    """Reads a plan.
+
+    Args:
+        folder: the folder that :func:`write` filled.
+        measurements: not used: a plan is all payload.
+
+    Returns:
+        The plan, its decisions in their order.
+
+    Raises:
+        ArtifactCorruptError: a table or a picture is damaged.
+    """
+    rows = read_rows(folder / "gains.parquet", GAINS)
     gains = {(row["camera"], row["frame"]): (row["red"], row["green"], row["blue"]) for row in rows}
-    own = {path.stem: read_png(path)[..., 0] > 0 for path in sorted((folder / "own").glob("*.png"))}
-    shutters = {
-        (row["camera"], row["frame"]): RollingShutter(row["readout_s"], *_motion(row), row["frame_s"])
-        for row in read_table(folder / "shutters.parquet", SHUTTERS)[0].to_pylist()
-    }
-    blurs = {
-        (row["camera"], row["frame"]): MotionBlur(row["exposure_s"], *_motion(row), row["frame_s"])
-        for row in read_table(folder / "blurs.parquet", BLURS)[0].to_pylist()
-    }
-    return EffectsPlan(tuple(Decision(**row) for row in table.to_pylist()), Fitted(gains, own, shutters, blurs))
-
-
-def _motions(
-    moving: Mapping[tuple[str, int], RollingShutter] | Mapping[tuple[str, int], MotionBlur], time: str
-) -> dict[str, Any]:
-    """Columns; ``time`` names what it is that takes the time."""
-    rates = np.array([[*m.velocity_m_s, *m.turn_rad_s] for m in moving.values()]).reshape(-1, 6)
-    rows = {"camera": [camera for camera, _ in moving], "frame": [frame for _, frame in moving]}
-    rows |= {name: [getattr(m, name) for m in moving.values()] for name in (time, "frame_s")}
-    return rows | {n: rates[:, k] for k, n in enumerate(_MOTION)}
-
-
-def _motion(row: Mapping[str, Any]) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    vx, vy, vz, wx, wy, wz = (row[n] for n in _MOTION)
-    return (vx, vy, vz), (wx, wy, wz)
+    # Sorted, because the order of a folder's files depends on the file system.
+    masks = {path.stem: read_png(path)[..., 0] > 0 for path in sorted((folder / "own").glob("*.png"))}
+    shutters = _read_motions(folder / "shutters.parquet", SHUTTERS, RollingShutter, "readout_s")
+    blurs = _read_motions(folder / "blurs.parquet", BLURS, MotionBlur, "exposure_s")
+    decisions = read_records(folder / "effects.parquet", EFFECTS, Decision)
+    return EffectsPlan(decisions, EffectParameters(gains, masks, shutters, blurs))
 
 
 def measurements(value: EffectsPlan) -> dict[str, Any]:
-    """Nothing: all of it follows from the log."""
+    """Selects no measurements: all of a plan follows from the log.
+
+    Returns:
+        An empty dictionary.
+    """
     return {}
+
+
+def _write_motions(
+    path: Path,
+    declared: pa.Schema,
+    by_image: Mapping[tuple[str, int], RollingShutter] | Mapping[tuple[str, int], MotionBlur],
+    duration: str,
+) -> None:
+    rows: list[RollingShutter | MotionBlur] = list(by_image.values())
+    # The reshape gives an empty table its six columns too.
+    velocities = np.array([[*row.velocity_m_s, *row.turn_rad_s] for row in rows]).reshape(-1, 6)
+    columns = image_columns(list(by_image))
+    columns |= {name: [getattr(row, name) for row in rows] for name in (duration, "frame_s")}
+    columns |= {name: velocities[:, k] for k, name in enumerate(_MOTION)}
+    write_table(path, declared, columns)
+
+
+def _read_motions(
+    path: Path, declared: pa.Schema, motion: Callable[..., CameraMotion], duration: str
+) -> dict[tuple[str, int], CameraMotion]:
+    by_image = {}
+    for row in read_rows(path, declared):
+        # Single columns and not lists, so that tools which only read flat tables can plot them.
+        velocity = tuple(row[name] for name in _MOTION[:3])
+        turn = tuple(row[name] for name in _MOTION[3:])
+        by_image[row["camera"], row["frame"]] = motion(
+            row[duration], velocity_m_s=velocity, turn_rad_s=turn, frame_s=row["frame_s"]
+        )
+    return by_image

@@ -1,4 +1,4 @@
-"""EXR: ZIP, scene-linear half colour, float32 the rest; written whole, checked strictly on read."""
+"""EXR: ZIP, scene-linear half colour, float32 the rest; written completely, checked strictly on read."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from storage.codecs.tables import REMEDY
 from storage.files import write_file
 from storage.srgb import to_linear_half
 
+# More threads do not pay for images of this size, and stages run beside each other.
 EXR_THREADS = 2
 
 
@@ -28,7 +29,7 @@ def _stop_threads_before_forks() -> None:
     os.register_at_fork(before=lambda: OpenEXR.set_global_thread_count(0))
 
 
-def _openexr() -> Any:
+def _load_openexr() -> Any:
     """The module, with its pool of threads started."""
     import OpenEXR
 
@@ -38,8 +39,16 @@ def _openexr() -> Any:
 
 
 def write_channels(path: Path, channels: Mapping[str, NDArray[Any]]) -> None:
-    """Write channels [H, W], float16 or float32, as one scan-line part. No timestamps: equal input, equal bytes."""
-    OpenEXR = _openexr()
+    """Writes channels as one scan-line part. Equal input gives equal bytes: there is no timestamp.
+
+    Args:
+        path: the new file.
+        channels: name → pixels [H, W], float16 or float32, all of one size.
+
+    Raises:
+        ConfigError: a channel has another dtype, is not two-dimensional or has no pixel.
+    """
+    OpenEXR = _load_openexr()
     for name, pixels in channels.items():
         if pixels.dtype not in (np.float16, np.float32) or pixels.ndim != 2 or 0 in pixels.shape:
             raise ConfigError(
@@ -47,35 +56,48 @@ def write_channels(path: Path, channels: Mapping[str, NDArray[Any]]) -> None:
                 remedy="Fix the stage that made this image: sizes are at least 1 × 1.",
             )
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    # Written in memory first, so that the file itself is written and synced like all others.
     sink = io.BytesIO()
+    # Sorted, so that the order in which a caller lists channels does not change the bytes.
     with OpenEXR.File(header, {k: np.ascontiguousarray(channels[k]) for k in sorted(channels)}) as file:
         file.write(sink)
     write_file(path, sink.getbuffer())
 
 
 def read_channels(path: Path, dtypes: Mapping[str, Any], shape: tuple[int, int]) -> dict[str, NDArray[Any]]:
-    """The channels, exactly those of ``dtypes``, each of its dtype and of ``shape`` (H, W).
+    """Reads channels, exactly those that are expected.
 
-    A truncated or altered file does not raise in OpenEXR: it has no parts, or channels without pixels. Here each of
-    these raises ``ArtifactCorruptError`` naming file and channel.
+    Args:
+        path: the EXR file.
+        dtypes: name → dtype of each channel.
+        shape: (height, width) in pixels.
+
+    Returns:
+        Name → pixels [H, W].
+
+    Raises:
+        ArtifactCorruptError: the file is missing, truncated or altered, or has other channels, dtypes or sizes.
     """
-    OpenEXR = _openexr()
+    OpenEXR = _load_openexr()
 
     def corrupt(problem: str) -> ArtifactCorruptError:
         return ArtifactCorruptError(problem, remedy=REMEDY, file=path)
 
     if not path.is_file():
         raise corrupt("An image is missing")
+    # OpenEXR does not raise for a truncated or altered file: it has no parts, or channels without pixels.
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             if len(file.parts) != 1:
                 raise corrupt(f"The image has {len(file.parts)} parts, expected 1")
+            # Copied, because the arrays of OpenEXR die with the file.
             found = {name: np.array(c.pixels) for name, c in file.parts[0].channels.items() if c.pixels is not None}
     except (RuntimeError, ValueError, TypeError) as error:
         raise corrupt(f"The image does not decode ({error})") from error
     if set(found) != set(dtypes):
         raise corrupt(f"The image has channels {sorted(found)}, expected {sorted(dtypes)}")
     for name, dtype in dtypes.items():
+        # Converting silently would hide that another program has rewritten the file with less precision.
         if found[name].dtype != np.dtype(dtype) or found[name].shape != shape:
             raise corrupt(
                 f"Channel {name} is {found[name].dtype} {found[name].shape}, expected {np.dtype(dtype)} {shape}"
@@ -86,12 +108,24 @@ def read_channels(path: Path, dtypes: Mapping[str, Any], shape: tuple[int, int])
 def write_exr(
     path: Path,
     color: NDArray[np.float32],  # [H, W, 3] sRGB, premultiplied
-    alpha: NDArray[np.float32] | None = None,  # [H, W]; None: opaque
+    alpha: NDArray[np.float32] | None = None,  # [H, W]
     depth: NDArray[np.float32] | None = None,  # [H, W] metres
 ) -> None:
-    """One display-referred image as a scene-linear EXR with R, G, B and what is given of A and Z."""
+    """Writes one display-referred image as a scene-linear EXR, for other programs to open.
+
+    Args:
+        path: the new file.
+        color: [H, W, 3] sRGB, premultiplied; channels R, G, B.
+        alpha: [H, W] in [0, 1], channel A; ``None`` for an opaque image.
+        depth: [H, W] in metres, channel Z, if there is one.
+
+    Raises:
+        NonFiniteError: a colour is NaN, infinite or too bright for half precision.
+    """
     light = to_linear_half(color, alpha, path.name)
     channels: dict[str, NDArray[Any]] = {c: light[..., k] for k, c in enumerate("RGB")}
-    channels |= {} if alpha is None else {"A": alpha}
-    channels |= {} if depth is None else {"Z": depth}
+    if alpha is not None:
+        channels["A"] = alpha
+    if depth is not None:
+        channels["Z"] = depth
     write_channels(path, channels)

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from genre_tasks.errors import ArtifactCorruptError
-from genre_tasks.fixer.conditioning import Degraded
-from genre_tasks.fixer.pairs import NAMES, Pairs
-from storage.codecs.tables import REMEDY, array_of, checked, column, read_table, schema, write_table
+from genre_tasks.fixer.inputs import FixerInputs
+from genre_tasks.fixer.pairs import INPUT_NAMES, Pairs
+from storage.codecs.png import encode_png
+from storage.codecs.tables import REMEDY, check_array, column, column_array, read_table, schema, write_table
 
 IMAGES: dict[str, tuple[str, ...]] = {
     "render": ("color", "alpha"),
@@ -26,7 +27,9 @@ IMAGES: dict[str, tuple[str, ...]] = {
     "lidar_warped": ("lidar_warped", "lidar_warp_mask"),
     "doubt": ("warp_spread", "lidar_warp_spread", "depth_gap"),
 }
-"""Picture → the tensors of ``Degraded`` in its channels."""
+"""Picture → the tensors of ``FixerInputs`` in its channels. Masks are packed where PNG has opacity, to save files."""
+
+_COLOR_TENSORS = {"color", "lidar_color", "reference", "warped", "lidar_warped"}
 
 TABLE = schema(
     "pairs/1",
@@ -41,57 +44,76 @@ _FILE = "pairs.parquet"
 
 
 def write(folder: Path, value: Pairs) -> None:
-    """Write the table. Raises ``ConfigError`` for other types than bytes and for mixed sizes."""
+    """Writes the table.
+
+    Args:
+        folder: an empty folder.
+        value: N pairs, uint8 on the CPU.
+
+    Raises:
+        ConfigError: a tensor is not uint8, or images differ in size.
+    """
     height, width = value.truth.shape[-2:]
-    for name in NAMES:
-        checked(getattr(value.views, name).numpy(), name, np.uint8, (len(value), None, height, width))
+    for name in INPUT_NAMES:
+        check_array(getattr(value.views, name).numpy(), name, np.uint8, (len(value), None, height, width))
     columns: dict[str, Any] = {"kind": value.kinds, "shift_m": np.asarray(value.shift_m, np.float32)}
     for name, parts in IMAGES.items():
         stacked = torch.cat([getattr(value.views, part) for part in parts], 1)
-        columns[name] = [_encoded(image) for image in stacked]
-    columns["truth"] = [_encoded(image) for image in value.truth]
+        columns[name] = [_encode(image) for image in stacked]
+    columns["truth"] = [_encode(image) for image in value.truth]
+    # PNG is compressed already; compressing it again only costs time.
     write_table(folder / _FILE, TABLE, columns, raw=[*IMAGES, "truth"])
 
 
 def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> Pairs:
-    """The pairs. Raises ``ArtifactCorruptError`` for a picture that does not decode or has other channels."""
+    """Reads pairs.
+
+    Args:
+        folder: the folder that :func:`write` filled.
+        measurements: not used: pairs are all payload.
+
+    Returns:
+        The pairs on the CPU.
+
+    Raises:
+        ArtifactCorruptError: the table is damaged, or a picture does not decode or has other channels.
+    """
     path = folder / _FILE
     table = read_table(path, TABLE)[0]
     tensors: dict[str, Tensor] = {}
     for name, parts in IMAGES.items():
-        images = _decoded(table, name, path)
-        counts = [3 if part in _COLOURS else 1 for part in parts]
+        images = _decode_column(table, name, path)
+        counts = [3 if part in _COLOR_TENSORS else 1 for part in parts]
+        # Otherwise the split below would fail with an error that names neither file nor column.
         if images.shape[1] != sum(counts):
             raise ArtifactCorruptError(f"{name} has {images.shape[1]} channels", remedy=REMEDY, file=path)
         tensors.update(zip(parts, images.split(counts, 1), strict=True))
-    views = Degraded(**{name: tensors[name].contiguous() for name in NAMES})
-    return Pairs(
-        views, _decoded(table, "truth", path), tuple(table.column("kind").to_pylist()), array_of(table, "shift_m")
-    )
-
-
-_COLOURS = {"color", "lidar_color", "reference", "warped", "lidar_warped"}
+    views = FixerInputs(**{name: tensors[name].contiguous() for name in INPUT_NAMES})
+    truth = _decode_column(table, "truth", path)
+    return Pairs(views, truth, tuple(table.column("kind").to_pylist()), column_array(table, "shift_m"))
 
 
 def measurements(value: Pairs) -> dict[str, Any]:
-    """None."""
+    """Selects no measurements: pairs are all payload.
+
+    Returns:
+        An empty dictionary.
+    """
     return {}
 
 
-def _encoded(image: Tensor) -> bytes:
-    from PIL import Image
-
-    sink = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(image.permute(1, 2, 0).numpy())).save(sink, "PNG")
-    return sink.getvalue()
+def _encode(image: Tensor) -> bytes:
+    return encode_png(image.permute(1, 2, 0).numpy())
 
 
-def _decoded(table: pa.Table, name: str, path: Path) -> Tensor:
+def _decode_column(table: pa.Table, name: str, path: Path) -> Tensor:
+    """The pictures of a column, [N, C, H, W] uint8."""
     from PIL import Image
 
     images: list[NDArray[np.uint8]] = []
     try:
         for data in table.column(name).to_pylist():
+            # Only this format: other decoders need not see bytes that claim to be a PNG.
             with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
                 images.append(np.array(image))
         stacked = np.stack(images)

@@ -13,30 +13,67 @@ from storage.codecs.tables import REMEDY
 from storage.files import write_file
 
 
-def write_png(path: Path, image: NDArray[np.uint8]) -> None:
-    """Write an sRGB image [H, W, 3] uint8, lossless, without timestamps."""
+def encode_png(image: NDArray[np.uint8]) -> bytes:
+    """Encodes an image without timestamps.
+
+    Args:
+        image: [H, W, C] uint8 with 3 or 4 channels.
+
+    Returns:
+        The bytes of a PNG file.
+
+    >>> encode_png(np.zeros((2, 3, 3), np.uint8))[:4]
+    b'\\x89PNG'
+    """
     from PIL import Image
 
+    # The same function serves files and table columns, so it makes bytes.
+    sink = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(image)).save(sink, "PNG")
+    return sink.getvalue()
+
+
+def write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    """Writes an sRGB image, lossless and without timestamps.
+
+    Args:
+        path: the new file.
+        image: [H, W, 3] uint8.
+
+    Raises:
+        ConfigError: the image has another dtype or shape, or no pixel.
+    """
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise ConfigError(
             f"Picture {path.stem} is {image.dtype} {list(image.shape)}, expected uint8 [H, W, 3]",
             remedy="Fix the stage that made this picture.",
         )
-    sink = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(image)).save(sink, "PNG")
-    write_file(path, sink.getbuffer())
+    write_file(path, encode_png(image))
 
 
 def read_png(path: Path) -> NDArray[np.uint8]:
-    """[H, W, 3] uint8. Raises ``ArtifactCorruptError`` for anything that is no RGB PNG."""
+    """Reads an sRGB image.
+
+    Args:
+        path: the file.
+
+    Returns:
+        [H, W, 3] uint8.
+
+    Raises:
+        ArtifactCorruptError: the file is no RGB PNG, or does not decode.
+    """
     from PIL import Image
 
     try:
+        # Only this format: other decoders need not see a file that claims to be a PNG.
         with Image.open(path, formats=["PNG"]) as image:
+            # Converting a grey or palette image would succeed, and hide that another program wrote it.
             if image.mode != "RGB":
                 raise ArtifactCorruptError(f"The picture has mode {image.mode}, expected RGB", remedy=REMEDY, file=path)
             return np.array(image)
     except (OSError, SyntaxError, ValueError) as error:
+        # Pillow raises OSError without a number for damage; one with a number is the operating system's.
         if isinstance(error, OSError) and error.errno is not None:
             raise
         raise ArtifactCorruptError(f"The picture does not decode ({error})", remedy=REMEDY, file=path) from error

@@ -5,7 +5,7 @@ import os
 import pytest
 
 from benchmarks.common import runner
-from benchmarks.common.task import Task
+from benchmarks.common.task import OptimisationTask
 from flows.cli import bench as command
 from tests.benchmarks import small_cells
 from tests.optimiser import street_scenes
@@ -17,14 +17,14 @@ def bench(monkeypatch: pytest.MonkeyPatch, tmp_path: os.PathLike[str]) -> small_
     made = small_cells.Tiny()
     monkeypatch.setattr(small_cells, "BENCH", made)
     monkeypatch.setattr(command, "_BENCHES", dict(command._BENCHES))
-    monkeypatch.setattr(runner, "machine", lambda: "a machine")
-    command.register("tiny", "tests.benchmarks.small_cells:BENCH")
+    monkeypatch.setattr(runner, "describe_machine", lambda: "a machine")
+    command.register_bench("tiny", "tests.benchmarks.small_cells:BENCH")
     monkeypatch.chdir(tmp_path)
     return made
 
 
 @pytest.fixture(scope="module")
-def task() -> Task:
+def task() -> OptimisationTask:
     truth = street_scenes.scene()
     views = street_scenes.targets(truth)
-    return Task(street_scenes.blurred(truth), views, views[:2])
+    return OptimisationTask(street_scenes.blurred(truth), views, views[:2])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from benchmarks.common.bench import Cell, Row
+from benchmarks.common.bench import Cell, Row, SmallestForm
 from benchmarks.common.claims import Claim, claim
 
 
@@ -14,6 +14,7 @@ class Tiny:
 
     name = "tiny"
     code: tuple[str, ...] = ("tests.benchmarks.small_cells",)
+    smallest = SmallestForm({}, "first")
 
     def __init__(self) -> None:
         self.options: Mapping[str, str] = {"size": "1"}

@@ -62,7 +62,7 @@ def test_what_is_measured_again(bench: Tiny, monkeypatch: pytest.MonkeyPatch) ->
 
     assert [measured(), measured(), measured("--fresh"), measured()] == [2, 0, 2, 0]
     assert [measured("--set", "size=2"), measured("--quick"), measured()] == [2, 2, 0]
-    monkeypatch.setattr(runner, "machine", lambda: "another machine")
+    monkeypatch.setattr(runner, "describe_machine", lambda: "another machine")
     assert measured() == 2
     monkeypatch.setattr(runner, "code_digest", lambda module, also: "changed code")
     assert measured() == 2
@@ -85,8 +85,8 @@ def test_what_cannot_be_measured_says_why_and_is_tried_again(bench: Tiny) -> Non
 
 
 def test_a_quick_run_leaves_out_what_would_not_end_in_time(bench: Tiny) -> None:
-    plans = runner.plan(bench, bench.options, quick=True, fresh=False)
-    rows = runner.measure(plans, lambda text: None, limit_s=59.0)
+    plans = runner.find_cached_rows(bench, bench.options, quick=True, fresh=False)
+    rows = runner.measure_cells(plans, lambda text: None, limit_s=59.0)
     assert bench.measured == []
     assert all("would not end" in row["not_measured"] for row in rows.values())
 
@@ -122,19 +122,29 @@ def test_mistakes_are_answered_with_a_remedy(bench: Tiny, arguments: tuple[str, 
 
 
 def test_a_benchmark_that_cannot_be_imported_says_how(bench: Tiny) -> None:
-    command.register("absent", "tests.benchmarks.nowhere:BENCH")
+    command.register_bench("absent", "tests.benchmarks.nowhere:BENCH")
     with pytest.raises(ConfigError, match="pip install"):
-        command.load("absent")
+        command.load_bench("absent")
     with pytest.raises(ValueError, match="exists already"):
-        command.register("absent", "another:BENCH")
+        command.register_bench("absent", "another:BENCH")
 
 
-@pytest.mark.parametrize("name", ["main_job", "raster"])
+@pytest.mark.parametrize("name", ["pipeline", "raster"])
 def test_quick_runs_are_predicted_to_end_in_time(name: str) -> None:
-    known = command.load(name)
+    known = command.load_bench(name)
     quick, full = (known.cells(known.options, quick=q) for q in (True, False))
     assert 0 < sum(cell.seconds for cell in quick) <= runner.QUICK_S
     assert sum(cell.seconds for cell in quick) < sum(cell.seconds for cell in full)
     assert len({cell.name for cell in full}) == len(full)
     for module in known.code:
         importlib.import_module(module)
+
+
+def test_cells_without_the_text_in_their_names_are_left_out_and_not_cached(bench: Tiny) -> None:
+    done = _bench("tiny", "--json", "result.json", "--only", "second")
+    assert done.exit_code == 0 and bench.measured == ["second"]
+    rows = json.loads(Path("result.json").read_text())["rows"]
+    assert "left out" in rows[0]["not_measured"] and rows[1] == {"cell": "second", "number": 5.0}
+    assert "about 60 s" in _bench("tiny", "--dry-run", "--only", "first").stdout
+    _bench("tiny", "--json", "result.json")
+    assert bench.measured == ["second", "first"]

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from benchmarks.common.claims import Claim, Result, claim, write_json
 
-DOCUMENTS = sorted((Path(__file__).parents[2] / "docs/benchmarks").glob("*.json"))
+DOCUMENTS = sorted((Path(__file__).parents[2] / "docs/results/data").glob("*.json"))
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)

@@ -5,16 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.effects import EFFECTS, calibrated
-from benchmarks.effects.cases import CASES, LITTLE, LONGEST_S
-from benchmarks.effects.measures import APART, _apart
-from flows.cli.bench import load
+from benchmarks.effects import EFFECTS
+from benchmarks.effects.cases import CASES, LONGEST_S, MILD_FACTOR
+from benchmarks.effects.measures import FOOTPRINT_RATIO, psnr_where_footprints_change
+from benchmarks.effects.report import find_threshold
+from flows.cli.bench import load_bench
 from genre_tasks.config import IngestConfig, InitialConfig
-from genre_tasks.effects.anti_aliasing import ratios
-from genre_tasks.effects.plan import EFFECTS as NAMES
+from genre_tasks.effects.anti_aliasing import footprint_ratios
+from genre_tasks.effects.plan import EFFECT_NAMES as NAMES
 from genre_tasks.logs.registry import open_log
-from genre_tasks.metrics.scoring import view_image
-from genre_tasks.scene.visibility import visible
+from genre_tasks.metrics.scoring import decode_view_image
+from genre_tasks.scene.visibility import find_visible_points
 from genre_tasks.stages.ingest import ingest
 from genre_tasks.stages.initial import initial
 
@@ -37,7 +38,7 @@ def row(name: str, factor: float, on: float, off: float, value: float = 3.0, uni
 
 
 def test_it_is_registered_and_its_cases_are_effects() -> None:
-    assert load("effects") is EFFECTS and set(CASES) < set(NAMES)
+    assert load_bench("effects") is EFFECTS and set(CASES) < set(NAMES)
 
 
 @pytest.mark.parametrize("name", list(CASES))
@@ -50,7 +51,7 @@ def test_streets_can_be_asked_to_call_for_each(name: str) -> None:
 def test_a_slow_street_takes_longer_for_as_many_pixels() -> None:
     case = CASES["rolling_shutter"]
     seconds = [float(case.query(*at).rpartition("=")[2]) for at in ((4.0, 800.0), (4.0, 400.0), (0.0, 400.0))]
-    assert seconds == pytest.approx([seconds[0], 2 * seconds[0], 2 * seconds[0] * LITTLE / 4], rel=1e-3)
+    assert seconds == pytest.approx([seconds[0], 2 * seconds[0], 2 * seconds[0] * MILD_FACTOR / 4], rel=1e-3)
     assert float(case.query(4.0, 1.0).rpartition("=")[2]) == LONGEST_S
 
 
@@ -95,8 +96,8 @@ def test_whole_plans_are_claimed_by_what_auto_leaves_and_what_a_plan_adds() -> N
 
 def test_a_threshold_is_read_between_two_measurements() -> None:
     rows = [row("exposure", f, 27.0 + g, 27.0, value=v) for f, g, v in ((1.0, 0.0, 2.0), (2.0, 0.2, 4.0))]
-    assert calibrated(rows, 0.1) == pytest.approx(3.0)
-    assert calibrated(rows[:1], 0.1) is None
+    assert find_threshold(rows, 0.1) == pytest.approx(3.0)
+    assert find_threshold(rows[:1], 0.1) is None
     assert any("0.1 dB at 3 px" in line for line in EFFECTS.table(dict(zip("ab", rows, strict=True))))
 
 
@@ -104,16 +105,18 @@ def test_what_is_seen_from_far_and_near_is_judged_alone() -> None:
     street = open_log("synthetic:street?seed=1020&frames=8&cameras=2&width=160&height=90&samples=1")
     chunk = ingest(IngestConfig(width_px=160, height_px=90), street, 0)
     scene = initial(InitialConfig(max_points=2000, distant_count=200), chunk).scene
-    view = chunk.of_role("heldout")[0]
-    image = view_image(view).numpy()
+    view = chunk.views_with_role("heldout")[0]
+    image = decode_view_image(view).numpy()
     points = chunk.static.positions[chunk.static.frames >= 0]
-    index, uv, _ = visible(points, view)
-    u, v = uv[ratios(chunk, points)[index] > APART].astype(int).T
+    index, uv, _ = find_visible_points(points, view)
+    u, v = uv[footprint_ratios(chunk, points)[index] > FOOTPRINT_RATIO].astype(int).T
     judged = np.zeros(image.shape[:2], bool)
     judged[v, u] = True
     assert 0.01 < judged.mean() < 0.5
     inside, outside = image.copy(), image.copy()
     inside[judged], outside[~judged] = 1 - inside[judged], 1 - outside[~judged]
-    as_it_is, elsewhere, there = (_apart(chunk, scene, [(view, x)]) for x in (image, outside, inside))
+    as_it_is, elsewhere, there = (
+        psnr_where_footprints_change(chunk, scene, [(view, x)]) for x in (image, outside, inside)
+    )
     assert elsewhere == as_it_is and there < as_it_is - 1
-    assert np.isnan(_apart(chunk, scene, []))
+    assert np.isnan(psnr_where_footprints_change(chunk, scene, []))

@@ -12,17 +12,15 @@ import pytest
 from benchmarks.common.bench import NotMeasuredError
 from benchmarks.common.claims import Claim
 from benchmarks.evaluation import EVALUATION
-from benchmarks.evaluation.budgets import claims_of, run_within, table_of
-from benchmarks.evaluation.reliability import claims_of as guard_claims
-from benchmarks.evaluation.reliability import fitted, true_reach
-from benchmarks.evaluation.reliability import table_of as guard_table
-from flows.budget.cost_table import load, shipped_table
-from genre_tasks.reliability.guards import ESTIMATE
+from benchmarks.evaluation.budgets import budget_claims, budget_table, run_with_budget
+from benchmarks.evaluation.reliability import fit_estimate, reliability_claims, reliability_table, true_reach_m
+from flows.budget.cost_table import find_shipped_table, load_cost_table
+from genre_tasks.reliability.guards import PSNR_COEFFICIENTS
 
 
 def run(budget_s: float, used_s: float, distance: float, log: str = "a", point: str = "preset") -> Any:
     """A run at the shipped table's own pace."""
-    own = next(p for p in load(shipped_table("small"), "small").points if p.name == point)
+    own = next(p for p in load_cost_table(find_shipped_table("small"), "small").points if p.name == point)
     return {
         "log": log,
         "budget_s": budget_s,
@@ -41,7 +39,7 @@ def by_name(claims: Any) -> dict[str, Claim]:
 
 def test_budgets_are_kept_used_and_worth_it() -> None:
     rows = [run(10 * k, 9.0 * k, 0.7 - 0.01 * k) for k in range(1, 10)] + [run(100, 104, 0.6)]
-    found = by_name(claims_of(rows))
+    found = by_name(budget_claims(rows))
     assert all(c.holds for c in found.values())
     assert found["budget_kept"].measured == pytest.approx(0.9)
     assert found["budget_overrun"].measured == pytest.approx(1.04)
@@ -60,7 +58,7 @@ def test_budgets_are_kept_used_and_worth_it() -> None:
     ],
 )
 def test_each_claim_can_fail(row: Any, failing: set[str]) -> None:
-    found = by_name(claims_of([run(20, 19, 0.65), run(60, 55, 0.6), row]))
+    found = by_name(budget_claims([run(20, 19, 0.65), run(60, 55, 0.6), row]))
     assert {name for name, c in found.items() if not c.holds} == failing
 
 
@@ -80,16 +78,16 @@ def test_guards_are_judged_beside_the_path_over_all_streets_and_on_the_worst() -
         guards("s?seed=1", "enet", [30.0, 29.0, 28.0, 27.0, 26.0]),
         guards("s?seed=2", "enet", [30.0, 27.0, 32.0, 37.0, 42.0]),
     )
-    found = by_name(guard_claims([good]))
+    found = by_name(reliability_claims([good]))
     assert found["reliability"].measured == pytest.approx(1.0)
     assert found["reliability"].holds and found["reliability"].n == 10
     assert found["reliability_gnet"].measured is None and not found["reliability_gnet"].holds
-    both = by_name(guard_claims([good, bad]))
+    both = by_name(reliability_claims([good, bad]))
     assert not both["reliability"].holds and both["reliability_worst"].measured == pytest.approx(-1.0)
-    lost = ESTIMATE["agreement_db"] - ESTIMATE["shift_m"]  # dB told a metre; in truth 1
-    assert any(f"{3 / lost:.1f} m / {3 / lost:.1f} m | 3.0 m / 3.0 m |" in line for line in guard_table([good]))
+    lost = PSNR_COEFFICIENTS["agreement_db"] - PSNR_COEFFICIENTS["shift_m"]  # dB told a metre; in truth 1
+    assert any(f"{3 / lost:.1f} m / {3 / lost:.1f} m | 3.0 m / 3.0 m |" in line for line in reliability_table([good]))
     farther = [v | {"psnr": 30.0 - 2 * abs(v["shift_m"])} for v in good["views"]]
-    assert true_reach(farther, 1) == true_reach(farther, -1) == pytest.approx(1.5)
+    assert true_reach_m(farther, 1) == true_reach_m(farther, -1) == pytest.approx(1.5)
 
 
 def test_the_estimate_can_be_fitted_again() -> None:
@@ -102,14 +100,14 @@ def test_the_estimate_can_be_fitted_again() -> None:
         for v in views:
             v["psnr"] = 5 + 0.5 * v["agreement_db"] + 9 * v["shown"] - 0.7 * abs(v["shift_m"])
         rows.append({"log": log, "views": views})
-    found, apart = fitted(rows)
-    assert found == pytest.approx({"constant": 5, "agreement_db": 0.5, "shown": 9, "shift_m": -0.7})
-    assert apart == pytest.approx(1.0) and math.isnan(fitted(rows[:1])[1])
+    fit = fit_estimate(rows)
+    assert fit.coefficients == pytest.approx({"constant": 5, "agreement_db": 0.5, "shown": 9, "shift_m": -0.7})
+    assert fit.rank_correlation == pytest.approx(1.0) and math.isnan(fit_estimate(rows[:1]).rank_correlation)
     path = [v for row in rows for v in row["views"] if v["shift_m"] == 0]
     for v in path:
         v["psnr"] += 3  # what the path alone shows is fitted, too: ranges are relative to it
-    again, apart = fitted(rows)
-    assert again["shift_m"] < -0.8 and apart > 0.9
+    again = fit_estimate(rows)
+    assert again.coefficients["shift_m"] < -0.8 and again.rank_correlation > 0.9
 
 
 def test_rounds_bring_every_budget_to_every_seed() -> None:
@@ -125,9 +123,9 @@ def test_a_run_that_fails_says_what_the_command_said(tmp_path: Path, monkeypatch
     monkeypatch.chdir(tmp_path)
     (tmp_path / ".genre" / "prefect-budgets").mkdir(parents=True)  # else a whole run would make it
     with pytest.raises(NotMeasuredError, match=r"there is no table.*nothing\.parquet"):
-        run_within("900", 60.0, str(tmp_path / "nothing.parquet"))
+        run_with_budget("900", 60.0, str(tmp_path / "nothing.parquet"))
 
 
 def test_the_table_names_what_was_chosen() -> None:
-    lines = list(table_of([run(20, 19, 0.65)]))
+    lines = list(budget_table([run(20, 19, 0.65)]))
     assert "| 20 | " in lines[2] and "the preset" in lines[2] and "0.95" in lines[-1]

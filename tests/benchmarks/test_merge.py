@@ -26,7 +26,9 @@ def _result(machine: str, commit: str, **numbers: float | None) -> Result:
 
 
 def test_the_last_row_of_a_cell_counts_and_claims_are_of_all_rows() -> None:
-    found = merge.merged(Tiny(), [_result("m", A, first=3.0, second=5.0), _result("m", A, second=2.0, third=9.0)])
+    found = merge.merge_results(
+        Tiny(), [_result("m", A, first=3.0, second=5.0), _result("m", A, second=2.0, third=9.0)]
+    )
     assert [(row["cell"], row["number"]) for row in found.rows] == [("first", 3.0), ("second", 2.0), ("third", 9.0)]
     assert [(c.id, c.measured, c.holds) for c in found.claims] == [
         ("tiny.first", 3.0, True),
@@ -36,13 +38,13 @@ def test_the_last_row_of_a_cell_counts_and_claims_are_of_all_rows() -> None:
 
 
 def test_a_row_from_elsewhere_says_its_machine_and_commit_through_two_merges() -> None:
-    once = merge.merged(Tiny(), [_result("old", A, first=3.0), _result("new", B, second=5.0)])
+    once = merge.merge_results(Tiny(), [_result("old", A, first=3.0), _result("new", B, second=5.0)])
     assert (once.machine, once.commit) == ("new", B)
     assert once.rows == [
         {"machine": "old", "commit": A, "cell": "first", "number": 3.0},
         {"cell": "second", "number": 5.0},
     ]
-    twice = merge.merged(Tiny(), [once, _result("old", A, third=1.0)])
+    twice = merge.merge_results(Tiny(), [once, _result("old", A, third=1.0)])
     assert twice.rows == [
         {"cell": "first", "number": 3.0},
         {"machine": "new", "commit": B, "cell": "second", "number": 5.0},
@@ -51,7 +53,7 @@ def test_a_row_from_elsewhere_says_its_machine_and_commit_through_two_merges() -
 
 
 def test_a_cell_that_was_not_measured_leaves_the_one_that_was() -> None:
-    found = merge.merged(Tiny(), [_result("m", A, first=3.0), _result("m", A, first=None, second=None)])
+    found = merge.merge_results(Tiny(), [_result("m", A, first=3.0), _result("m", A, first=None, second=None)])
     assert found.rows == [{"cell": "first", "number": 3.0}, {"cell": "second", "not_measured": "no time"}]
 
 
@@ -69,6 +71,6 @@ def test_files_are_read_and_written_in_place(tmp_path: Path, monkeypatch: pytest
 def test_what_is_no_result_is_said_with_its_file(tmp_path: Path) -> None:
     (tmp_path / "half.json").write_text('{"machine": "m"')
     with pytest.raises(ArtifactCorruptError, match=r"half\.json"):
-        merge.read(tmp_path / "half.json")
+        merge.read_result(tmp_path / "half.json")
     with pytest.raises(ValueError, match="at least one"):
-        merge.merged(Tiny(), [])
+        merge.merge_results(Tiny(), [])

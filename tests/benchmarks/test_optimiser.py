@@ -13,9 +13,9 @@ import torch
 from benchmarks.common import runner
 from benchmarks.common.bench import NotMeasuredError
 from benchmarks.common.claims import Result
-from benchmarks.common.task import Task
+from benchmarks.common.task import OptimisationTask
 from benchmarks.optimiser import BENCH, cells, claims, iteration_tradeoff, race
-from benchmarks.optimiser.network_speed import measure_network, scene_of
+from benchmarks.optimiser.network_speed import measure_network, street_scene_graph
 from benchmarks.optimiser.plots import draw, draw_network, envelope
 from benchmarks.optimiser.race import Point
 from genre_tasks.config import (
@@ -26,25 +26,27 @@ from genre_tasks.config import (
 )
 from genre_tasks.errors import ConfigError
 from genre_tasks.learned.learned_optimiser import LearnedOptimiser
-from genre_tasks.learned.weights import load
+from genre_tasks.learned.weights import load_optimiser
 from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.tuned_adam import TunedAdam
-from genre_tasks.optimiser.unroll import Plan, unroll
+from genre_tasks.optimiser.unroll import UnrollSettings, unroll
 from genre_tasks.scene.graph import DISTANT
+from genre_tasks.stages.optimise import UnrolledOptimiser, UnrolledPart
 from genre_tasks.weights import resolve_weights
 from tests.benchmarks.small_races import ADAM, LOSS, NEVER, learned
 from tests.optimiser import street_scenes
 
 
-def test_walking_is_unrolling(task: Task) -> None:
+def test_walking_is_unrolling(task: OptimisationTask) -> None:
     plan, novel, objective = (
-        Plan(5, 2, 1, seed=3),
+        UnrollSettings(5, 2, 1, seed=3),
         street_scenes.targets(street_scenes.scene(), novel=True),
         Objective(LOSS),
     )
     expected = unroll(TunedAdam(), task.scene, task.source, novel, objective, plan)
-    moments = list(itertools.islice(race.walk(lambda: (TunedAdam(), objective), task, plan, novel), 5))
-    assert torch.equal(moments[-1].scene.gaussians.packed(), expected.scene.gaussians.packed())
+    optimiser = UnrolledOptimiser(objective, (UnrolledPart(TunedAdam(), plan),))
+    moments = list(itertools.islice(race.timed_steps(lambda: optimiser, task, novel), 5))
+    assert torch.equal(moments[-1].scene.gaussians.pack(), expected.scene.gaussians.pack())
     assert [m.renders for m in moments] == [3, 6, 9, 12, 15]
     assert all(a.seconds < b.seconds for a, b in itertools.pairwise(moments))
 
@@ -61,19 +63,19 @@ def test_of_a_walk_to_its_end_one_moment_is_kept_at_a_time() -> None:
         def __del__(self) -> None:
             Counted.alive -= 1
 
-    end: Any = race.at_end((Counted(i + 1) for i in itertools.count()), 7)  # type: ignore[misc]
+    end: Any = race.take_last((Counted(i + 1) for i in itertools.count()), 7)  # type: ignore[misc]
     assert end.iteration == 7 and Counted.most <= 2
 
 
-def test_loading_counts_and_judging_does_not(task: Task, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_loading_counts_and_judging_does_not(task: OptimisationTask, monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
     monkeypatch.setattr(race.time, "perf_counter", lambda: now[0])
 
-    def load() -> tuple[TunedAdam, Objective]:
+    def load() -> UnrolledOptimiser:
         now[0] += 7.0
-        return TunedAdam(), Objective(LOSS)
+        return UnrolledOptimiser(Objective(LOSS), (UnrolledPart(TunedAdam(), UnrollSettings(5, 2)),))
 
-    steps = race.walk(load, task, Plan(5, 2))
+    steps = race.timed_steps(load, task)
     first = next(steps)
     now[0] += 100.0
     assert (first.seconds, next(steps).seconds) == (7.0, 7.0)
@@ -81,37 +83,37 @@ def test_loading_counts_and_judging_does_not(task: Task, monkeypatch: pytest.Mon
 
 def test_a_curve_is_read_between_its_points() -> None:
     curve = [Point(0.0, 0, 10.0, 1), Point(2.0, 4, 20.0, 1), Point(4.0, 8, 18.0, 1), Point(6.0, 12, 22.0, 1)]
-    assert race.reached(curve, 15.0) == pytest.approx(1.0)
-    assert race.reached(curve, 20.0) == pytest.approx(2.0)
-    assert race.reached(curve, 21.0) == pytest.approx(5.5)
-    assert race.reached(curve, 22.1) is None
-    assert (race.at_renders(curve, 5), race.at_renders(curve, 13)) == (18.0, None)
-    assert race.looks(4.0, 2.0) == pytest.approx([1.0, 1.25, 1.5625, 1.953125])
+    assert race.time_to_reach(curve, 15.0) == pytest.approx(1.0)
+    assert race.time_to_reach(curve, 20.0) == pytest.approx(2.0)
+    assert race.time_to_reach(curve, 21.0) == pytest.approx(5.5)
+    assert race.time_to_reach(curve, 22.1) is None
+    assert (race.psnr_at_renders(curve, 5), race.psnr_at_renders(curve, 13)) == (18.0, None)
+    assert race.score_times(4.0, 2.0) == pytest.approx([1.0, 1.25, 1.5625, 1.953125])
 
 
-def test_adam_stops_at_its_goal_its_length_or_the_cap(task: Task, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_adam_stops_at_its_goal_its_length_or_the_cap(task: OptimisationTask, monkeypatch: pytest.MonkeyPatch) -> None:
     easy = Point(0.05, 8, task.psnr(task.scene) + 0.05, 300)
-    early = race.adam(task, ADAM, 0, easy, 60.0)
-    assert race.reached(early, easy.psnr) is not None and early[-1].renders >= 8
-    assert race.adam(task, ADAM, 0, NEVER, 60.0)[-1].renders == 12  # the cosine ends with its length
+    early = race.run_adam(task, ADAM, 0, easy, 60.0)
+    assert race.time_to_reach(early, easy.psnr) is not None and early[-1].renders >= 8
+    assert race.run_adam(task, ADAM, 0, NEVER, 60.0)[-1].renders == 12  # the cosine ends with its length
     endless = ADAM.model_copy(update={"adam": AdamConfig(schedule="constant")})
     ticks = itertools.count()
     monkeypatch.setattr(race.time, "perf_counter", lambda: 0.01 * next(ticks))  # a step takes a hundredth of a second
-    capped = race.adam(task, endless, 0, NEVER, 0.2)
+    capped = race.run_adam(task, endless, 0, NEVER, 0.2)
     assert capped[-1].seconds >= 0.2 > capped[-2].seconds and capped[-1].renders > 12
 
 
 @pytest.mark.parametrize("method", ["standard_3dgs", "street_gs"])
-def test_per_scene_training_stops_at_its_goal_its_length_or_the_cap(task: Task, method: Any) -> None:
+def test_per_scene_training_stops_at_its_goal_its_length_or_the_cap(task: OptimisationTask, method: Any) -> None:
     config = GnetConfig(method=method, per_scene=PerSceneConfig(iterations=40))
-    assert race.per_scene(task, config, 0, NEVER, 60.0)[-1].renders == 40
-    capped = race.per_scene(task, config, 0, NEVER, 1e-6)
+    assert race.run_per_scene(task, config, 0, NEVER, 60.0)[-1].renders == 40
+    capped = race.run_per_scene(task, config, 0, NEVER, 1e-6)
     assert capped[-1].renders <= 1
     easy = Point(1e-4, 1, capped[0].psnr - 3, 300)
-    assert race.per_scene(task, config, 0, easy, 60.0)[-1].renders < 40
+    assert race.run_per_scene(task, config, 0, easy, 60.0)[-1].renders < 40
 
 
-def test_a_race_says_how_each_variant_ended(task: Task, tmp_path: Path) -> None:
+def test_a_race_says_how_each_variant_ended(task: OptimisationTask, tmp_path: Path) -> None:
     row = cells.race_row(task, learned(4), {"short": ADAM}, 0, "tuned_adam", 1000.0)
     assert row["gnet"]["renders"] == 16 and row["gnet"]["curve"][0][:2] == [0.0, 0]
     short = row["variants"]["short"]
@@ -122,13 +124,13 @@ def test_a_race_says_how_each_variant_ended(task: Task, tmp_path: Path) -> None:
     assert (tmp_path / "curves.png").stat().st_size > 1000
 
 
-def test_far_past_its_length_the_loss_is_compared_with_that_at_t(task: Task) -> None:
+def test_far_past_its_length_the_loss_is_compared_with_that_at_t(task: OptimisationTask) -> None:
     row = cells.stability_row(task, "gnet", learned(2))
     assert list(row["loss"]) == ["1", "2", "5", "10"]
     assert row["ratio"] == pytest.approx(row["loss"]["10"] / row["loss"]["1"])
 
 
-def test_enet_past_its_length_is_judged_on_its_fixed_views_too(task: Task) -> None:
+def test_enet_past_its_length_is_judged_on_its_fixed_views_too(task: OptimisationTask) -> None:
     fixed = street_scenes.targets(street_scenes.scene(), novel=True)
     config = OptimiserConfig(
         iterations=1, views_per_iteration=1, novel_views_per_iteration=1, split_fraction=0.1, loss=LOSS
@@ -143,7 +145,7 @@ def test_the_network_is_measured_at_every_count() -> None:
     row = measure_network(LearnedOptimiser, (200, 400, 800), 2)
     assert list(row["seconds"]) == ["200", "400", "800"] and row["seconds"]["800"]["n"] == 2
     assert set(row["fit"]) == {"seconds", "us_per_gaussian", "r2"}
-    assert bool((scene_of(400).nodes == DISTANT).any())
+    assert bool((street_scene_graph(400).nodes == DISTANT).any())
 
 
 def _race(method: str, times: list[float | None], psnr: list[float | None]) -> dict[str, Any]:
@@ -172,11 +174,11 @@ def test_claims_take_the_earliest_variant_and_the_cap_where_there_is_none() -> N
     assert by_id["optimiser.network_100k"].measured is None
 
 
-def test_a_race_is_judged_beside_the_path_where_there_is_truth(task: Task, tmp_path: Path) -> None:
-    with_truth = replace(task, beside=street_scenes.targets(street_scenes.scene(), novel=True))
+def test_a_race_is_judged_beside_the_path_where_there_is_truth(task: OptimisationTask, tmp_path: Path) -> None:
+    with_truth = replace(task, novel_targets=street_scenes.targets(street_scenes.scene(), novel=True))
     row = cells.race_row(with_truth, learned(4), {"short": ADAM}, 0, "tuned_adam", 1000.0)
     assert all(len(point) == 5 for point in row["gnet"]["curve"] + row["variants"]["short"]["curve"])
-    assert row["gnet"]["curve"][0][4] == pytest.approx(with_truth.psnr_beside(task.scene), abs=1e-3)
+    assert row["gnet"]["curve"][0][4] == pytest.approx(with_truth.psnr_novel(task.scene), abs=1e-3)
     rows = [{"log": name, "chunk": 0, "order": k, **row} for name, k in (("a", 0), ("a", 1), ("b", 1))]
     draw(rows, tmp_path / "curves.png")
     draw_network(measure_network(LearnedOptimiser, (200, 400), 2), tmp_path / "network.png")
@@ -200,14 +202,14 @@ def test_what_is_not_measured_does_not_count() -> None:
     assert "no time" in "\n".join(BENCH.table(rows))
 
 
-def test_the_trade_counts_renders_and_judges_the_end(task: Task) -> None:
-    named = iteration_tradeoff.settings(learned(4))
+def test_the_trade_counts_renders_and_judges_the_end(task: OptimisationTask) -> None:
+    named = iteration_tradeoff.variant_configs(learned(4))
     assert named["preset"] == learned(4)
     assert [named[n].loss.perceptual_every for n in iteration_tradeoff.PERCEPTUAL] == [1, 4]
     config = learned(4).model_copy(update={"views_per_iteration": 1000})
-    found = iteration_tradeoff.trade(replace(task, beside=task.heldout), config)
-    rule, plan = load(resolve_weights("gnet", "builtin")), Plan(4, 1000)
-    expected = unroll(rule, task.scene, task.source, (), Objective(LOSS), plan).scene
+    found = iteration_tradeoff.measure_config(replace(task, novel_targets=task.heldout), config)
+    rule, settings = load_optimiser(resolve_weights("gnet", "builtin")), UnrollSettings(4, 1000)
+    expected = unroll(rule, task.scene, task.source, (), Objective(LOSS), settings).scene
     assert found["renders"] == 4 * len(task.source) and found["seconds"] > 0
     assert found["psnr"] == found["psnr_3m"] == task.psnr(expected)
     rows = {f"trade/{k}": {"log": "a", "chunk": 0, "trade": {"4x30": found | {"seconds": k}}} for k in (1.0, 2.0)}
@@ -245,7 +247,7 @@ def test_an_envelope_is_the_best_so_far_of_all_curves_without_their_starts() -> 
 
 
 def test_committed_rows_make_the_committed_claims() -> None:
-    path = Path(__file__).parents[2] / "docs/benchmarks/optimiser.json"
+    path = Path(__file__).parents[2] / "docs/results/data/optimiser.json"
     result = Result.model_validate_json(path.read_text(encoding="utf-8"))
     rows = {str(row["cell"]): dict(row) for row in result.rows}
     assert list(BENCH.claims(rows)) == result.claims

@@ -31,8 +31,9 @@ def test_a_log_has_one_line_of_the_means_over_its_orders() -> None:
     head, _, line, *rest = pages({"a": _race(0, 6.0, 1.0), "b": _race(1, None, 2.0)})
     cells = dict(zip(head.split(" | "), line.split(" | "), strict=True))
     assert cells["| log"] == "| street?seed=1 chunk 0" and cells["orders"] == "2"
-    assert cells["GNet: s"] == "3.0" and cells["at 3 m"] == "23.00" and cells["its best at 3 m"] == "22.00"
-    assert cells["over tuned Adam of as many renders, dB"] == "1.50"
+    assert cells["GNet, s"] == "3.0" and cells["GNet, PSNR at 3 m"] == "23.00"
+    assert cells["tuned Adam, best PSNR at 3 m"] == "22.00"
+    assert cells["GNet over tuned Adam at equal renders, dB"] == "1.50"
     assert rest == [""]
 
 

@@ -1,4 +1,4 @@
-"""The main job's claims are those that its committed rows make."""
+"""The pipeline benchmark's claims are those that its committed rows make."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from benchmarks.common.claims import Result
 from benchmarks.pipeline import BENCH
 
-RESULT = Result.model_validate_json((Path(__file__).parents[2] / "docs/benchmarks/main_job.json").read_text())
+RESULT = Result.model_validate_json((Path(__file__).parents[2] / "docs/results/data/pipeline.json").read_text())
 
 
 def test_committed_rows_make_the_committed_claims() -> None:

@@ -11,7 +11,7 @@ import pytest
 from genre_tasks.errors import ArtifactCorruptError, ConfigError, NonFiniteError
 from storage.address import Address
 from storage.manifest import MANIFEST
-from storage.store import Store
+from storage.store import Provenance, Store
 from tests.storage.artifact_values import COLORS, MAKERS, assert_same, make
 
 KEY, OTHER = "a" * 64, "b" * 64
@@ -34,7 +34,7 @@ class StoreSuite:
         raise NotImplementedError
 
     def commit(self, store: Store, kind: str, at: Address | None = None, seed: int = 0, **fields: Any) -> Any:
-        return store.commit(at or address(), kind, make(kind, seed), **fields)
+        return store.commit(at or address(), kind, make(kind, seed), Provenance(**fields))
 
     @pytest.mark.parametrize("kind", MAKERS)
     def test_what_is_committed_is_read_back(self, store: Store, second: Store, kind: str) -> None:

@@ -10,8 +10,8 @@ def assert_imports_no_effect(code: str) -> None:
     """Runs it in a fresh interpreter; its own assertions count too."""
     after = (
         "\nimport sys\n"
-        "from genre_tasks.effects.plan import EFFECTS\n"
-        "loaded = [n for n in EFFECTS if f'genre_tasks.effects.{n}' in sys.modules]\n"
+        "from genre_tasks.effects.plan import EFFECT_NAMES\n"
+        "loaded = [n for n in EFFECT_NAMES if f'genre_tasks.effects.{n}' in sys.modules]\n"
         "loaded += [n for n in sys.modules if n.endswith(('.gloss', '.harmonics'))]\n"
         "assert not loaded, loaded\n"
     )

@@ -18,28 +18,29 @@ from genre_tasks.config import (
     NovelViewsConfig,
     PerSceneConfig,
 )
-from genre_tasks.effects import exposure
-from genre_tasks.effects.apply_plan import applied
-from genre_tasks.effects.plan import EFFECTS, plan
-from genre_tasks.effects.types import UNPLANNED, Decision, EffectsPlan, Fitted
-from genre_tasks.fixer.source_images import recorded
-from genre_tasks.fixer.warping import SourceImage, look_up, surface_of
+from genre_tasks.effects import color_gain
+from genre_tasks.effects.apply_plan import apply_plan
+from genre_tasks.effects.plan import EFFECT_NAMES, plan_effects
+from genre_tasks.effects.types import DEFAULT_PLAN, Decision, EffectParameters, EffectsPlan
+from genre_tasks.fixer.source_images import load_source_images
+from genre_tasks.fixer.view_surface import unproject_surface
+from genre_tasks.fixer.warping import SourceImage, sample_source
 from genre_tasks.logs.registry import open_log
-from genre_tasks.logs.synthetic.imaging import bonnet
+from genre_tasks.logs.synthetic.camera_effects import bonnet_mask
 from genre_tasks.logs.synthetic.parameters import StreetParameters
-from genre_tasks.losses.rendering_loss import image_gradients, plan_loss
-from genre_tasks.losses.targets import Target, of_views
-from genre_tasks.metrics.scoring import scored, view_image
+from genre_tasks.losses.rendering_loss import image_gradients, select_loss_terms
+from genre_tasks.losses.targets import Target, view_targets
+from genre_tasks.metrics.scoring import decode_view_image, score_views
 from genre_tasks.render import cpu
-from genre_tasks.render.motion_blur import Moments, mean
+from genre_tasks.render.motion_blur import BlurSamples, mean_in_linear_light
 from genre_tasks.scene.chunk import Chunk
-from genre_tasks.scene.novel_poses import novel_view_poses
-from genre_tasks.stages.evaluate import as_recorded
+from genre_tasks.scene.novel_poses import place_novel_views
+from genre_tasks.stages.evaluation_renders import apply_view_gains
 from genre_tasks.stages.gnet import gnet
 from genre_tasks.stages.ingest import ingest
 from genre_tasks.stages.initial import initial
 from genre_tasks.stages.novel_views import novel_views
-from genre_tasks.stages.optimise import planned
+from genre_tasks.stages.optimise import drop_unplanned_losses
 from tests.effects.imports import assert_imports_no_effect
 
 SMALL = "&frames=8&cameras=2&width=160&height=90&samples=1"
@@ -51,38 +52,38 @@ def chunk(uri: str = STREET) -> Chunk:
     return ingest(IngestConfig(width_px=160, height_px=90), open_log(uri), 0)
 
 
-def with_(*on: str, fitted: Fitted | None = None) -> EffectsPlan:
-    rows = [Decision(n, "", 1.0, "", 0.0, "auto", "on" if n in on else "off", "", "") for n in EFFECTS]
-    return EffectsPlan(tuple(rows), fitted or Fitted())
+def with_(*on: str, parameters: EffectParameters | None = None) -> EffectsPlan:
+    rows = [Decision(n, "", 1.0, "", 0.0, "auto", "on" if n in on else "off", "", "") for n in EFFECT_NAMES]
+    return EffectsPlan(tuple(rows), parameters or EffectParameters())
 
 
-BASIC = ("rigid_actors", "distant_region", "lidar_depth")
+DEFAULT_EFFECTS = ("rigid_actors", "distant_region", "lidar_depth")
 
 
 def test_a_plan_without_anything_to_apply_leaves_the_chunk_itself() -> None:
-    assert applied(chunk(), UNPLANNED) is chunk()
-    assert applied(chunk(), with_(*BASIC)) is chunk()
+    assert apply_plan(chunk(), DEFAULT_PLAN) is chunk()
+    assert apply_plan(chunk(), with_(*DEFAULT_EFFECTS)) is chunk()
 
 
 def test_what_is_off_gives_the_same_bytes_as_no_plan() -> None:
     first = initial(InitialConfig(max_points=2000, distant_count=200), chunk())
-    again = initial(InitialConfig(max_points=2000, distant_count=200), chunk(), with_(*BASIC))
-    assert torch.equal(first.scene.gaussians.packed(), again.scene.gaussians.packed())
+    again = initial(InitialConfig(max_points=2000, distant_count=200), chunk(), with_(*DEFAULT_EFFECTS))
+    assert torch.equal(first.scene.gaussians.pack(), again.scene.gaussians.pack())
     config = GnetConfig(iterations=3, views_per_iteration=2, method="adam", loss=LossConfig(perceptual=0))
-    one, two = gnet(config, chunk(), first), gnet(config, chunk(), first, with_(*BASIC))
-    assert torch.equal(one.scene.gaussians.packed(), two.scene.gaussians.packed()) and one.losses == two.losses
+    one, two = gnet(config, chunk(), first), gnet(config, chunk(), first, with_(*DEFAULT_EFFECTS))
+    assert torch.equal(one.scene.gaussians.pack(), two.scene.gaussians.pack()) and one.losses == two.losses
 
 
 def test_stages_of_a_plan_without_effects_import_none() -> None:
     code = (
         "import tests.effects.test_effects_plan as t\n"
-        "from genre_tasks.effects.plan import EFFECTS, plan\n"
+        "from genre_tasks.effects.plan import EFFECT_NAMES, plan_effects\n"
         "from genre_tasks.config import *\n"
         "from genre_tasks.stages.initial import initial\n"
         "from genre_tasks.stages.gnet import gnet\n"
         "from genre_tasks.stages.novel_views import novel_views\n"
         "from genre_tasks.stages.evaluate import evaluate_scene\n"
-        "none = plan(EffectsConfig(**dict.fromkeys(EFFECTS, 'off')), t.chunk(), t.cameras())\n"
+        "none = plan_effects(EffectsConfig(**dict.fromkeys(EFFECT_NAMES, 'off')), t.chunk(), t.cameras())\n"
         "first = initial(InitialConfig(max_points=2000, distant_count=200), t.chunk(), none)\n"
         "config = GnetConfig(iterations=1, method='adam', loss=LossConfig(perceptual=0))\n"
         "scene = gnet(config, t.chunk(), first, none)\n"
@@ -95,7 +96,7 @@ def test_stages_of_a_plan_without_effects_import_none() -> None:
 
 
 def test_without_rigid_actors_their_points_stand_where_the_sweeps_saw_them() -> None:
-    still = applied(chunk(), with_("distant_region", "lidar_depth"))
+    still = apply_plan(chunk(), with_("distant_region", "lidar_depth"))
     assert not still.actors
     assert len(still.static) == len(chunk().static) + sum(len(a.points) for a in chunk().actors)
     actor = chunk().actors[0]
@@ -108,7 +109,7 @@ def test_without_rigid_actors_their_points_stand_where_the_sweeps_saw_them() -> 
 def test_without_the_depth_term_no_depth_pulls() -> None:
     config = GnetConfig(iterations=2, method="adam", loss=LossConfig(perceptual=0, depth=5.0))
     first = initial(InitialConfig(max_points=2000, distant_count=200), chunk())
-    pulled = gnet(config, chunk(), first, with_(*BASIC))
+    pulled = gnet(config, chunk(), first, with_(*DEFAULT_EFFECTS))
     left = gnet(config, chunk(), first, with_("rigid_actors", "distant_region"))
     assert left.losses[0] < pulled.losses[0]
 
@@ -117,16 +118,16 @@ def test_the_exposures_derivatives_are_those_of_finite_differences() -> None:
     g = torch.Generator().manual_seed(0)
     color = torch.rand(2, 5, 4, 3, generator=g, dtype=torch.float64, requires_grad=True)
     gains = torch.randn(2, 1, 1, 3, generator=g, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(exposure.toned, (color, gains))
+    assert torch.autograd.gradcheck(color_gain.apply_gain, (color, gains))
 
 
 def test_the_loss_takes_its_gradient_through_the_gain() -> None:
-    view = chunk().of_role("source")[0]
-    (target,) = of_views(chunk(), [replace(view, log_gain=(0.5, -0.3, 0.1))])
+    view = chunk().views_with_role("source")[0]
+    (target,) = view_targets(chunk(), [replace(view, log_gain=(0.5, -0.3, 0.1))])
     g = torch.Generator().manual_seed(1)
     color = torch.rand(1, 90, 160, 3, generator=g)
     config = LossConfig(perceptual=0)
-    loss_plan = plan_loss(config, [target], 0, g, perceptual=False)
+    loss_plan = select_loss_terms(config, [target], 0, g, perceptual=False)
     depth = torch.zeros(1, 90, 160)
 
     def loss(at: torch.Tensor) -> float:
@@ -137,26 +138,26 @@ def test_the_loss_takes_its_gradient_through_the_gain() -> None:
     step = 1e-3
     found = (loss(color + step * way) - loss(color - step * way)) / (2 * step)
     assert float((by_color * way).sum()) == pytest.approx(found, rel=0.02)
-    (plain,) = of_views(chunk(), [view])
+    (plain,) = view_targets(chunk(), [view])
     assert image_gradients(config, color, depth, [plain], loss_plan)[0] != pytest.approx(loss(color), rel=0.01)
 
 
 def test_nothing_pulls_where_the_vehicle_itself_is() -> None:
-    view = chunk().of_role("source")[0]
+    view = chunk().views_with_role("source")[0]
     own = np.zeros((90, 160), bool)
     own[70:] = True
-    (target,) = of_views(chunk(), [replace(view, own=own)])
+    (target,) = view_targets(chunk(), [replace(view, ego_mask=own)])
     color = torch.rand(1, 90, 160, 3, generator=torch.Generator().manual_seed(2))
     config = LossConfig(perceptual=0)
-    loss_plan = plan_loss(config, [target], 0, torch.Generator(), perceptual=False)
+    loss_plan = select_loss_terms(config, [target], 0, torch.Generator(), perceptual=False)
     by_color = image_gradients(config, color, torch.ones(1, 90, 160), [target], loss_plan)[1]
     assert not by_color[0, 70:].any() and by_color[0, :60].any()
     images = torch.rand(1, 90, 160, 3, generator=torch.Generator().manual_seed(3))
     worse = images.clone()
     worse[:, 70:] = 0
-    kept = [scored([replace(view, own=own)], i, view_image(view)[None])[0] for i in (images, worse)]
+    kept = [score_views([replace(view, ego_mask=own)], i, decode_view_image(view)[None])[0] for i in (images, worse)]
     assert kept[0] == kept[1]
-    assert scored([view], images, view_image(view)[None])[0].psnr != kept[0].psnr
+    assert score_views([view], images, decode_view_image(view)[None])[0].psnr != kept[0].psnr
 
 
 @pytest.mark.parametrize("gain", [0.0, 1.5, -1.5, -30.0, 30.0])
@@ -164,9 +165,9 @@ def test_neutral_undoes_what_a_gain_does_and_stays_finite(gain: float) -> None:
     """Hard case 52: a gain towards zero, or without bound, is applied up to a factor of 55."""
     own = torch.rand(40, 30, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     gains = own.new_tensor([gain, 0.5 * gain, 0.0])
-    shown = exposure.toned(own, gains)
+    shown = color_gain.apply_gain(own, gains)
     assert torch.isfinite(shown).all()
-    back = exposure.neutral(shown, gains)
+    back = color_gain.remove_gain(shown, gains)
     seen = shown < 1
     torch.testing.assert_close(back[seen], own[seen])
     assert torch.isfinite(back).all() and (back >= 0).all() and (back <= 1).all()
@@ -175,10 +176,12 @@ def test_neutral_undoes_what_a_gain_does_and_stays_finite(gain: float) -> None:
 def test_gains_of_a_street_are_found_and_held_out_views_take_their_neighbours() -> None:
     uri = "synthetic:street?seed=1020&cameras=2&width=160&height=90&samples=1&exposure_jitter=0.3"
     log = open_log(uri)
-    found = plan(EffectsConfig(**{n: "on" if n == "exposure" else "off" for n in EFFECTS}), chunk(uri), log.cameras)
+    found = plan_effects(
+        EffectsConfig(**{n: "on" if n == "exposure" else "off" for n in EFFECT_NAMES}), chunk(uri), log.cameras
+    )
     views = chunk(uri).views
-    true = np.array([log.imaging.log_gain(v.camera, v.frame * 0.1) for v in views])
-    gains = np.array([found.fitted.gains[v.camera, v.frame] for v in views])
+    true = np.array([log.camera_effects.log_gain(v.camera, v.frame * 0.1) for v in views])
+    gains = np.array([found.parameters.gains[v.camera, v.frame] for v in views])
     assert true.std() > 0.1
     assert np.sqrt(np.square((gains - gains.mean(0)) - (true - true.mean(0))).mean()) < 0.06
     held = [k for k, v in enumerate(views) if v.role == "heldout"]
@@ -188,15 +191,18 @@ def test_gains_of_a_street_are_found_and_held_out_views_take_their_neighbours() 
 
 
 def test_renders_take_a_views_gain_and_recorded_images_lose_it() -> None:
-    view = chunk().of_role("source")[0]
+    view = chunk().views_with_role("source")[0]
     color = torch.rand(2, 90, 160, 3, generator=torch.Generator().manual_seed(5))
     gained = replace(view, log_gain=(0.4, 0.4, 0.4))
-    assert as_recorded(color, [view, view]) is color
-    shown = as_recorded(color, [view, gained])
+    assert apply_view_gains(color, [view, view]) is color
+    shown = apply_view_gains(color, [view, gained])
     assert torch.equal(shown[0], color[0]) and (shown[1] > color[1]).all()
     gains = {(v.camera, v.frame): (0.4, 0.4, 0.4) for v in chunk().views}
     own = {view.camera: np.ones((90, 160), bool)}
-    plain, planned = recorded(chunk()), recorded(applied(chunk(), with_(*BASIC, fitted=Fitted(gains, own))))
+    plain, planned = (
+        load_source_images(chunk()),
+        load_source_images(apply_plan(chunk(), with_(*DEFAULT_EFFECTS, parameters=EffectParameters(gains, own)))),
+    )
     assert all(b.image.mean() < a.image.mean() for a, b in zip(plain, planned, strict=True))
     assert all((b.depth <= 0.11).all() == (b.camera == view.camera) for b in planned)
 
@@ -204,14 +210,16 @@ def test_renders_take_a_views_gain_and_recorded_images_lose_it() -> None:
 def test_the_streets_bonnet_is_found_where_it_is() -> None:
     uri = STREET + "&bonnet=0.08"
     log = open_log(uri)
-    found = plan(EffectsConfig(**{n: "auto" if n == "ego_mask" else "off" for n in EFFECTS}), chunk(uri), log.cameras)
-    assert found["ego_mask"].choice == "on" and list(found.fitted.own) == ["front_camera"]
+    found = plan_effects(
+        EffectsConfig(**{n: "auto" if n == "ego_mask" else "off" for n in EFFECT_NAMES}), chunk(uri), log.cameras
+    )
+    assert found["ego_mask"].choice == "on" and list(found.parameters.ego_masks) == ["front_camera"]
     lens = chunk(uri).views[0].lens
-    true = bonnet(StreetParameters(bonnet=0.08), "front_camera", lens)
-    mask = found.fitted.own["front_camera"]
+    true = bonnet_mask(StreetParameters(bonnet=0.08), "front_camera", lens)
+    mask = found.parameters.ego_masks["front_camera"]
     assert (mask & true).sum() > 0.97 * true.sum() and (mask & ~true).sum() < 0.6 * true.sum()
     truth = log.truth.image(0, log.world_SE3_camera("front_camera", 0), lens).astype(float)
-    image = view_image(chunk(uri).views[0]).numpy() * 255
+    image = decode_view_image(chunk(uri).views[0]).numpy() * 255
     assert np.abs(image - truth)[~true].max() <= 1 and np.abs(image - truth)[true].mean() > 20
 
 
@@ -219,17 +227,17 @@ def test_shutters_are_the_cameras_own_motion() -> None:
     uri = "synthetic:street?seed=1020&frames=8&cameras=2&width=160&height=90&samples=1&rolling_shutter_s=0.03"
     log = open_log(uri)
     found = _planned(uri, "rolling_shutter")
-    shutters = found.fitted.shutters
+    shutters = found.parameters.shutters
     assert set(shutters) == {(v.camera, v.frame) for v in chunk(uri).views}
     for view in chunk(uri).views[2:-2]:
-        near = [log.imaging.camera_pose(view.camera, 0.1 * view.frame + s) for s in (-1e-3, 1e-3)]
+        near = [log.camera_effects.street_SE3_camera(view.camera, 0.1 * view.frame + s) for s in (-1e-3, 1e-3)]
         true = view.chunk_SE3_camera[:3, :3].T @ (near[1][:3, 3] - near[0][:3, 3]) / 2e-3
         shutter = shutters[view.camera, view.frame]
         assert np.abs(np.array(shutter.velocity_m_s) - true).max() < 0.05 and shutter.readout_s == 0.03
         assert shutter.frame_s == pytest.approx(0.1, rel=1e-4)
-    view = applied(chunk(uri), found).views[0]
+    view = apply_plan(chunk(uri), found).views[0]
     assert view.shutter == shutters[view.camera, view.frame]
-    (target,) = of_views(chunk(uri), [view])
+    (target,) = view_targets(chunk(uri), [view])
     assert target.shutter == view.shutter
     assert float(np.linalg.norm(view.shutter.velocity_m_s)) > 3
 
@@ -240,40 +248,46 @@ def test_a_rolling_shutters_images_are_undone_by_what_the_plan_says() -> None:
         "synthetic:street?seed=1020&frames=8&cameras=3&width=160&height=90&rolling_shutter_s=0.1&moving=0&pedestrians=0"
     )
     log = open_log(uri)
-    views = [v for v in applied(chunk(uri), _planned(uri, "rolling_shutter")).views if v.camera == "front_right_camera"]
+    views = [
+        v for v in apply_plan(chunk(uri), _planned(uri, "rolling_shutter")).views if v.camera == "front_right_camera"
+    ]
     off = {True: [], False: []}
     for view in views[1:-1:2]:
         pose = chunk(uri).world_SE3_chunk @ view.chunk_SE3_camera
         depth = torch.tensor(log.depth(view.frame, pose, view.lens)).float()
         near = depth < 60
-        surface = surface_of(depth * near, near.float(), view.chunk_SE3_camera, view.lens, (), view.frame)
+        surface = unproject_surface(depth * near, near.float(), view.chunk_SE3_camera, view.lens, (), view.frame)
         true = torch.tensor(log.truth.image(view.frame, pose, view.lens) / 255).float()
         for shutter in (True, False):
-            image = view_image(view).permute(2, 0, 1)
+            image = decode_view_image(view).permute(2, 0, 1)
             rows = SourceImage(view.camera, view.frame, view.chunk_SE3_camera, view.lens, image, torch.zeros(90, 160))
-            color, seen = look_up(surface, replace(rows, shutter=view.shutter if shutter else None), (), view.frame)
+            color, seen = sample_source(
+                surface, replace(rows, shutter=view.shutter if shutter else None), (), view.frame
+            )
             off[shutter].append(float((color.permute(1, 2, 0) - true).abs()[seen & near].mean()))
     assert np.mean(off[True]) < 0.65 * np.mean(off[False])  # what is left is blurred by resampling
     assert np.mean(off[False]) > 0.02
 
 
 def _planned(uri: str, name: str) -> EffectsPlan:
-    return plan(EffectsConfig(**{n: "on" if n == name else "off" for n in EFFECTS}), chunk(uri), open_log(uri).cameras)
+    return plan_effects(
+        EffectsConfig(**{n: "on" if n == name else "off" for n in EFFECT_NAMES}), chunk(uri), open_log(uri).cameras
+    )
 
 
 def test_a_lens_that_is_off_is_taken_to_be_straight() -> None:
     uri = STREET + "&distortion=0.1"
-    bent = applied(chunk(uri), with_(*BASIC, "lens_distortion"))
-    assert bent is chunk(uri) and applied(chunk(uri), UNPLANNED) is chunk(uri)
-    assert all(not v.lens.distortion for v in applied(chunk(uri), with_(*BASIC)).views)
+    bent = apply_plan(chunk(uri), with_(*DEFAULT_EFFECTS, "lens_distortion"))
+    assert bent is chunk(uri) and apply_plan(chunk(uri), DEFAULT_PLAN) is chunk(uri)
+    assert all(not v.lens.distortion for v in apply_plan(chunk(uri), with_(*DEFAULT_EFFECTS)).views)
 
 
 def test_an_exposure_of_no_time_is_no_blur() -> None:
     """Hard case 54."""
     log, plain = open_log(STREET + "&exposure_s=0"), open_log(STREET)
     assert log.image_bytes("front_camera", 3) == plain.image_bytes("front_camera", 3)
-    names = EffectsConfig(**{n: "auto" if n == "motion_blur" else "off" for n in EFFECTS})
-    found = plan(names, chunk(), log.cameras)["motion_blur"]
+    names = EffectsConfig(**{n: "auto" if n == "motion_blur" else "off" for n in EFFECT_NAMES})
+    found = plan_effects(names, chunk(), log.cameras)["motion_blur"]
     assert found.choice == "off" and "no exposure time" in found.reason
     assert open_log(STREET + "&exposure_s=0.05").image_bytes("front_camera", 3) != plain.image_bytes("front_camera", 3)
 
@@ -282,44 +296,46 @@ def test_an_exposed_streets_images_are_the_mean_of_what_the_plans_moments_see() 
     """Of sharp true images: nothing moves but the camera."""
     uri = STREET + "&exposure_s=0.05&moving=0&pedestrians=0"
     log = open_log(uri)
-    views = [v for v in applied(chunk(uri), _planned(uri, "motion_blur")).views if v.camera == "front_left_camera"]
+    views = [v for v in apply_plan(chunk(uri), _planned(uri, "motion_blur")).views if v.camera == "front_left_camera"]
     off: dict[str, list[float]] = {"moments": [], "pose": []}
     for view in views[1:-1:2]:
-        moments = Moments.of([view])
+        moments = BlurSamples.from_views([view])
         assert view.blur is not None and view.blur.exposure_s == 0.05 and moments is not None
         assert view.blur.frame_s == pytest.approx(0.1) and float(np.linalg.norm(view.blur.velocity_m_s)) > 3
         poses = [chunk(uri).world_SE3_chunk @ v.chunk_SE3_camera for v in moments.views]
         true = torch.tensor(np.stack([log.truth.image(view.frame, p, view.lens) for p in poses]) / 255).float()
-        for name, image in (("moments", mean(true)), ("pose", true[len(true) // 2])):
-            off[name].append(float((image - view_image(view)).abs().mean()))
+        for name, image in (("moments", mean_in_linear_light(true)), ("pose", true[len(true) // 2])):
+            off[name].append(float((image - decode_view_image(view)).abs().mean()))
     assert np.mean(off["moments"]) < 0.4 * np.mean(off["pose"]), off
 
 
 def test_a_camera_with_one_image_is_not_blurred() -> None:
     """No second image, no motion; what the log states of it is not enough."""
     uri = STREET + "&exposure_s=0.05"
-    first = chunk(uri).of_role("source")[0]
+    first = chunk(uri).views_with_role("source")[0]
     alone = replace(chunk(uri), views=(first, *(v for v in chunk(uri).views if v.camera != first.camera)))
-    setting = EffectsConfig(**{n: "on" if n == "motion_blur" else "off" for n in EFFECTS})
-    found = plan(setting, alone, open_log(uri).cameras)
-    assert found.on("motion_blur") and {camera for camera, _ in found.fitted.blurs} == {"front_left_camera"}
-    blurred = applied(alone, found)
+    setting = EffectsConfig(**{n: "on" if n == "motion_blur" else "off" for n in EFFECT_NAMES})
+    found = plan_effects(setting, alone, open_log(uri).cameras)
+    assert found.is_on("motion_blur") and {camera for camera, _ in found.parameters.blurs} == {"front_left_camera"}
+    blurred = apply_plan(alone, found)
     assert blurred.views[0] is first and all(v.blur is not None for v in blurred.views[1:])
-    (target,) = of_views(blurred, [blurred.views[1]])
+    (target,) = view_targets(blurred, [blurred.views[1]])
     assert target.blur == blurred.views[1].blur
-    single = plan(setting, replace(chunk(uri), views=(first,)), open_log(uri).cameras)
-    assert not single.fitted.blurs and "two images" in single["motion_blur"].reason
+    single = plan_effects(setting, replace(chunk(uri), views=(first,)), open_log(uri).cameras)
+    assert not single.parameters.blurs and "two images" in single["motion_blur"].reason
 
 
 def test_novel_views_and_hiding_points_know_no_blur(monkeypatch: pytest.MonkeyPatch) -> None:
     uri = STREET + "&exposure_s=0.05"
-    blurred = applied(chunk(uri), with_(*BASIC, "motion_blur", fitted=_planned(uri, "motion_blur").fitted))
-    assert Moments.of(blurred.of_role("source")) is not None
-    assert Moments.of(novel_view_poses(blurred, (3.0,))) is None
+    blurred = apply_plan(
+        chunk(uri), with_(*DEFAULT_EFFECTS, "motion_blur", parameters=_planned(uri, "motion_blur").parameters)
+    )
+    assert BlurSamples.from_views(blurred.views_with_role("source")) is not None
+    assert BlurSamples.from_views(place_novel_views(blurred, (3.0,))) is None
     calls: list[int] = []
     real = cpu.forward
     monkeypatch.setattr(cpu, "forward", lambda *a, **k: calls.append(len(a[1])) or real(*a, **k))
-    plain, planned = recorded(chunk(uri)), recorded(blurred)
+    plain, planned = load_source_images(chunk(uri)), load_source_images(blurred)
     assert calls[: len(calls) // 2] == calls[len(calls) // 2 :]
     assert all(torch.equal(a.depth, b.depth) for a, b in zip(plain, planned, strict=True))
 
@@ -332,7 +348,7 @@ def test_a_plain_log_makes_the_kernel_calls_of_none(monkeypatch: pytest.MonkeyPa
         monkeypatch.setattr(cpu, name, lambda *a, _real=real, _name=name, **k: calls.append(_name) or _real(*a, **k))
     counts = []
     for setting in ("auto", "off"):
-        found = plan(EffectsConfig(**dict.fromkeys(EFFECTS, setting)), chunk(uri), open_log(uri).cameras)
+        found = plan_effects(EffectsConfig(**dict.fromkeys(EFFECT_NAMES, setting)), chunk(uri), open_log(uri).cameras)
         first = initial(InitialConfig(max_points=2000, distant_count=200), chunk(uri), found)
         config = GnetConfig(iterations=3, views_per_iteration=2, method="adam", loss=LossConfig(perceptual=0))
         calls.clear()
@@ -355,21 +371,24 @@ def test_gloss_is_in_images_and_truth_and_without_it_no_bit_changes() -> None:
 def test_harmonics_are_where_the_plan_has_them() -> None:
     uri = STREET + "&gloss=1"
     first = initial(InitialConfig(max_points=2000, distant_count=200), chunk(uri))
-    assert first.scene.harmonics is None
+    assert first.scene.spherical_harmonics is None
     config = GnetConfig(iterations=12, views_per_iteration=4, method="adam", loss=LossConfig(perceptual=0, depth=0))
-    without = gnet(config, chunk(uri), first, with_(*BASIC))
-    within = gnet(config, chunk(uri), first, with_(*BASIC, "view_dependent_colour"))
-    assert without.scene.harmonics is None
-    assert within.scene.harmonics is not None and within.scene.harmonics.any()
+    without = gnet(config, chunk(uri), first, with_(*DEFAULT_EFFECTS))
+    within = gnet(config, chunk(uri), first, with_(*DEFAULT_EFFECTS, "view_dependent_colour"))
+    assert without.scene.spherical_harmonics is None
+    assert within.scene.spherical_harmonics is not None and within.scene.spherical_harmonics.any()
     assert within.losses[0] == without.losses[0] and within.losses[-1] != without.losses[-1]
     config = config.model_copy(update={"method": "street_gs", "per_scene": PerSceneConfig(iterations=2)})
-    assert gnet(config, chunk(uri), first, with_(*BASIC, "view_dependent_colour")).scene.harmonics is None
+    assert (
+        gnet(config, chunk(uri), first, with_(*DEFAULT_EFFECTS, "view_dependent_colour")).scene.spherical_harmonics
+        is None
+    )
 
 
 def test_a_per_scene_depth_term_is_there_where_the_plan_has_it() -> None:
     config = GnetConfig(method="street_gs", per_scene=PerSceneConfig(iterations=2, depth=0.5))
-    assert planned(config, with_("lidar_depth")) == config
-    none = planned(config, with_("rigid_actors"))
+    assert drop_unplanned_losses(config, with_("lidar_depth")) == config
+    none = drop_unplanned_losses(config, with_("rigid_actors"))
     assert isinstance(none, GnetConfig) and (none.per_scene.depth, none.loss.depth) == (0.0, 0.0)
     first = initial(InitialConfig(max_points=2000, distant_count=200), chunk(STREET))
     told, untold = (gnet(config, chunk(STREET), first, with_(*p)) for p in (("lidar_depth",), ()))
@@ -377,6 +396,6 @@ def test_a_per_scene_depth_term_is_there_where_the_plan_has_it() -> None:
 
 
 def test_targets_carry_what_effects_say() -> None:
-    view = replace(chunk().of_role("source")[0], log_gain=(0.1, 0.2, 0.3), own=np.zeros((90, 160), bool))
-    (target,) = of_views(chunk(), [view])
-    assert isinstance(target, Target) and target.log_gain == (0.1, 0.2, 0.3) and target.own is not None
+    view = replace(chunk().views_with_role("source")[0], log_gain=(0.1, 0.2, 0.3), ego_mask=np.zeros((90, 160), bool))
+    (target,) = view_targets(chunk(), [view])
+    assert isinstance(target, Target) and target.log_gain == (0.1, 0.2, 0.3) and target.ego_mask is not None

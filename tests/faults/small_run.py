@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from flows.pipeline.stage_runner import ArtifactRef, Job, produce
+from flows.pipeline.stage_runner import ArtifactRef, Job, run_stage
 
 ROOT = Path(__file__).resolve().parents[2]
 GENRE = str(Path(sys.executable).parent / "genre")
@@ -108,13 +108,13 @@ class Stopped(Exception):
 
 
 def stopping(after: int) -> tuple[list[str], Callable[[str, Job, dict[str, ArtifactRef]], ArtifactRef]]:
-    """A ``produce`` that lists what it computes and raises ``Stopped`` while exactly ``after`` are listed."""
+    """A ``run_stage`` that lists what it computes and raises ``Stopped`` while exactly ``after`` are listed."""
     computed: list[str] = []
 
     def counted(stage: str, job: Job, inputs: dict[str, ArtifactRef]) -> ArtifactRef:
         if len(computed) == after:
             raise Stopped
-        ref = produce(stage, job, inputs)
+        ref = run_stage(stage, job, inputs)
         computed.extend([] if ref.cached else [stage])
         return ref
 

@@ -25,14 +25,14 @@ SERVER = """
 import os, sys
 from pathlib import Path
 from storage.address import Address
-from storage.codecs import codec_of
+from storage.codecs import get_codec
 from storage.local import LocalStore
 from tests.storage.artifact_values import make
 
 store = LocalStore(Path(sys.argv[1]))
 values = {kind: make(kind) for kind in sys.argv[2:]}
 for kind in values:
-    codec_of(kind)
+    get_codec(kind)
 store.commit(Address("d", "l", 0, "reconstruction", "warm"), "reconstruction", values["reconstruction"])
 print("ready", flush=True)
 for line in sys.stdin:
@@ -73,7 +73,7 @@ def test_kills_inside_commits(tmp_path: Path) -> None:
             os.kill(child, signal.SIGKILL)
             assert server.stdout.readline() == "done\n"
             half_written += len(list(tmp_path.rglob(".tmp-*")))
-            for path, error in store.check():
+            for path, error in store.verify_all():
                 assert error is None, path
             store.clean_temporaries(older_than_s=0)
     finally:

@@ -9,8 +9,9 @@ import pytest
 import torch
 from PIL import Image
 
-from genre_tasks.fixer.conditioning import Degraded
-from genre_tasks.fixer.network import Fnet, build, small_architecture
+from genre_tasks.fixer.architectures import build_fnet, small_architecture
+from genre_tasks.fixer.inputs import FixerInputs
+from genre_tasks.fixer.network import Fnet
 from genre_tasks.logs.types import Lens
 from genre_tasks.scene.chunk import Chunk, Points, View
 from genre_tasks.scene.novel_views import NovelView, NovelViews
@@ -18,7 +19,7 @@ from genre_tasks.scene.novel_views import NovelView, NovelViews
 
 def toy(seed: int = 0, trained: bool = True) -> Fnet:
     """A toy network; ``trained`` gives the zero-initialised parts random weights, so that everything has an effect."""
-    fnet = build(small_architecture((8, 8, 16, 16), 4, (16, 16)), seed)
+    fnet = build_fnet(small_architecture((8, 8, 16, 16), 4, (16, 16)), seed)
     if trained:
         generator = torch.Generator().manual_seed(seed)
         for module in (*fnet.skips, fnet.vae.decoder.conv_out, fnet.unet.conv_out):
@@ -27,7 +28,7 @@ def toy(seed: int = 0, trained: bool = True) -> Fnet:
     return fnet.eval().requires_grad_(False)
 
 
-def random_views(count: int, height: int, width: int, seed: int = 0) -> Degraded:
+def random_views(count: int, height: int, width: int, seed: int = 0) -> FixerInputs:
     """Views of random content with alpha between 0 and 1."""
     generator = torch.Generator().manual_seed(seed)
 
@@ -36,7 +37,7 @@ def random_views(count: int, height: int, width: int, seed: int = 0) -> Degraded
 
     alpha, lidar_alpha, mask, other = rand(1), rand(1), (rand(1) > 0.5).float(), (rand(1) > 0.5).float()
     warps = (rand(3) * mask, mask, rand(1), rand(3) * other, other, rand(1))
-    return Degraded(rand(3) * alpha, alpha, rand(3) * lidar_alpha, lidar_alpha, rand(3), *warps, rand(1))
+    return FixerInputs(rand(3) * alpha, alpha, rand(3) * lidar_alpha, lidar_alpha, rand(3), *warps, rand(1))
 
 
 @pytest.fixture

@@ -8,8 +8,10 @@ import pytest
 import torch
 
 from benchmarks.common.bench import Row
-from benchmarks.fixer import BENCH, interval
-from benchmarks.fixer.cells import flicker, time_row, truth_row
+from benchmarks.fixer import BENCH
+from benchmarks.fixer.cells import compare_with_truth, measure_seconds
+from benchmarks.fixer.flicker import flicker
+from benchmarks.fixer.view_statistics import interval
 from genre_tasks.config import FnetConfig
 from tests.fixer.conftest import toy
 
@@ -123,15 +125,15 @@ def test_flicker_follows_the_camera(scene):
 def test_render_fixed_and_clean_are_judged_against_the_truth(scene):
     chunk, novel = scene
     truth = torch.rand(novel.color.shape, generator=torch.Generator().manual_seed(1))
-    row = truth_row(toy(), FnetConfig(), chunk, novel, truth)
+    row = compare_with_truth(toy(), FnetConfig(), chunk, novel, truth)
     assert set(row) == {"render", "fixed", "clean"} and all(len(v["psnr"]) == 5 for v in row.values())
     assert max(row["render"]["psnr"]) < 15 and min(row["clean"]["psnr"]) > max(row["render"]["psnr"])
-    identity = truth_row(toy(trained=False), FnetConfig(), chunk, novel, truth)
+    identity = compare_with_truth(toy(trained=False), FnetConfig(), chunk, novel, truth)
     assert min(identity["clean"]["psnr"]) > 60 and max(identity["clean"]["perceptual"]) < 1e-3
 
 
 def test_every_run_is_timed(scene):
     chunk, novel = scene
-    row = time_row(toy(), FnetConfig(), chunk, novel)
+    row = measure_seconds(toy(), FnetConfig(), chunk, novel)
     assert (row["views"], row["size"], len(row["seconds"])) == (5, [36, 52], 3)
     assert row["seconds"] == sorted(row["seconds"]) and row["seconds"][0] > 0

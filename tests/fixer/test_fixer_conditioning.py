@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from genre_tasks.fixer.conditioning import Degraded, bound_colour_shift, conditions, depth_gap, fill_holes, given
-from genre_tasks.fixer.network import HINTS, INPUTS
-from genre_tasks.fixer.pairs import NAMES
+from genre_tasks.fixer.conditioning import bound_colour_shift, build_conditions, fill_holes
+from genre_tasks.fixer.inputs import FixerInputs, depth_gap, mask_inputs
+from genre_tasks.fixer.network import HINT_CHANNELS, INPUTS
+from genre_tasks.fixer.pairs import INPUT_NAMES
 from tests.fixer.conftest import random_views
 
 
@@ -65,9 +66,11 @@ def test_without_opaque_pixels_nothing_is_corrected():
 def test_agreement_and_sharpness_are_told():
     sharp = torch.rand(1, 3, 16, 24)
     one, zero = torch.ones(1, 1, 16, 24), torch.zeros(1, 1, 16, 24)
-    views = Degraded(sharp * 0 + 0.5, one, sharp * 0, zero, sharp, sharp, one, one / 8, sharp * 0, zero, zero, one / 2)
-    hints = conditions(views).hints
-    assert hints.shape == (1, HINTS, 16, 24)
+    views = FixerInputs(
+        sharp * 0 + 0.5, one, sharp * 0, zero, sharp, sharp, one, one / 8, sharp * 0, zero, zero, one / 2
+    )
+    hints = build_conditions(views).hints
+    assert hints.shape == (1, HINT_CHANNELS, 16, 24)
     lidar, warp, lidar_warp, render_sharp, warp_sharp, lidar_warp_sharp = hints[0, 10:16]
     assert not lidar.any() and not lidar_warp.any()  # nothing there, nothing that disagrees
     assert warp.mean() > 0.1 and warp_sharp.mean() > 2
@@ -77,14 +80,14 @@ def test_agreement_and_sharpness_are_told():
 
 def test_what_a_fixer_is_not_given_is_blank():
     views = random_views(2, 16, 24)
-    alone = given(views, ("render",))
-    kept = {name for name in NAMES if torch.equal(getattr(alone, name), getattr(views, name))}
+    alone = mask_inputs(views, ("render",))
+    kept = {name for name in INPUT_NAMES if torch.equal(getattr(alone, name), getattr(views, name))}
     assert kept == {"color", "alpha"}
-    assert all(not getattr(alone, name).any() for name in set(NAMES) - kept)
-    pair = given(views, ("reference", "lidar"))
+    assert all(not getattr(alone, name).any() for name in set(INPUT_NAMES) - kept)
+    pair = mask_inputs(views, ("reference", "lidar"))
     assert not pair.color.any() and not pair.warped.any() and torch.equal(pair.lidar_warped, views.lidar_warped)
-    assert not given(views, ("render", "reference")).lidar_warped.any()
-    assert given(views, INPUTS) == views
+    assert not mask_inputs(views, ("render", "reference")).lidar_warped.any()
+    assert mask_inputs(views, INPUTS) == views
 
 
 def test_depths_that_differ_are_told_where_both_are_known():

@@ -10,15 +10,17 @@ import torch
 import torch.nn.functional as F
 
 from genre_tasks.errors import NonFiniteError
+from genre_tasks.fixer.architectures import add_lora, build_fnet, small_architecture
 from genre_tasks.fixer.attention import ViewMixingProcessor
-from genre_tasks.fixer.conditioning import Degraded, conditions, given, padded
-from genre_tasks.fixer.inference import OVERLAP_PX, _fade, _windows, fix, noise_of
-from genre_tasks.fixer.network import add_lora, build, noise_level, small_architecture
+from genre_tasks.fixer.conditioning import build_conditions, pad_to_stride
+from genre_tasks.fixer.inference import OVERLAP_PX, _fade, _windows, draw_noise, fix
+from genre_tasks.fixer.inputs import FixerInputs, mask_inputs
+from genre_tasks.fixer.network import compute_noise_level
 from tests.fixer.conftest import random_views, toy
 
 
 def test_sigma_of_the_papers_timestep():
-    sigma, scale = noise_level(200)
+    sigma, scale = compute_noise_level(200)
     assert sigma == pytest.approx(0.5717, abs=1e-3)
     assert scale == pytest.approx((1 + sigma**2) ** -0.5)
     from diffusers import EulerDiscreteScheduler
@@ -33,8 +35,8 @@ def test_sigma_of_the_papers_timestep():
 def test_an_untrained_fixer_returns_the_filled_render():
     fnet = toy(trained=False)
     views = random_views(2, 32, 48)
-    out = fix(fnet, views, noise_of(fnet, 0, range(2), 32, 48))
-    torch.testing.assert_close(out, conditions(views).render, rtol=0, atol=1e-6)
+    out = fix(fnet, views, draw_noise(fnet, 0, range(2), 32, 48))
+    torch.testing.assert_close(out, build_conditions(views).render, rtol=0, atol=1e-6)
 
 
 def test_latent_follows_the_papers_equations(monkeypatch):
@@ -89,24 +91,24 @@ def test_the_batch_must_hold_whole_samples():
 @pytest.mark.parametrize("name", ["color", "lidar_color", "reference", "warped", "lidar_warped", "alpha"])
 def test_every_input_has_an_effect(name):
     fnet, views = toy(), random_views(1, 32, 48)
-    noise = noise_of(fnet, 0, range(1), 32, 48)
-    before = fnet(conditions(views), noise)
+    noise = draw_noise(fnet, 0, range(1), 32, 48)
+    before = fnet(build_conditions(views), noise)
     changed = replace(views, **{name: getattr(views, name).flip(-1)})
-    assert (fnet(conditions(changed), noise) - before).abs().max() > 1e-6
+    assert (fnet(build_conditions(changed), noise) - before).abs().max() > 1e-6
 
 
 def test_samples_of_a_batch_do_not_mix():
     fnet, views = toy(), random_views(3, 32, 48)
-    noise = noise_of(fnet, 0, range(3), 32, 48)
+    noise = draw_noise(fnet, 0, range(3), 32, 48)
     together = fix(fnet, views, noise)
-    alone = torch.cat([fix(fnet, views.at(slice(k, k + 1)), noise[k : k + 1]) for k in range(3)])
+    alone = torch.cat([fix(fnet, views.select(slice(k, k + 1)), noise[k : k + 1]) for k in range(3)])
     torch.testing.assert_close(together, alone, rtol=0, atol=1e-5)
 
 
 def test_gradients_reach_everything_that_is_trained():
     fnet = toy().requires_grad_(True)
     fnet.vae.encoder.requires_grad_(False)
-    fnet(conditions(random_views(1, 32, 48)), noise_of(fnet, 0, range(1), 32, 48)).square().sum().backward()
+    fnet(build_conditions(random_views(1, 32, 48)), draw_noise(fnet, 0, range(1), 32, 48)).square().sum().backward()
     trained = {n: p for n, p in fnet.named_parameters() if p.requires_grad and "quant_conv" not in n}
     silent = [n for n, p in trained.items() if p.grad is None or not p.grad.abs().sum() > 0]
     assert silent == []
@@ -121,7 +123,7 @@ def test_lora_trains_adapters_and_skips_only():
     assert any(n.startswith("unet") for n in trained) and any(n.startswith("vae.decoder") for n in trained)
     assert not any("encoder" in n for n in trained)
     optimiser = torch.optim.SGD([p for p in fnet.parameters() if p.requires_grad], 1e-3)
-    fnet(conditions(random_views(1, 32, 48)), noise_of(fnet, 0, range(1), 32, 48)).square().sum().backward()
+    fnet(build_conditions(random_views(1, 32, 48)), draw_noise(fnet, 0, range(1), 32, 48)).square().sum().backward()
     optimiser.step()
     after = {k.replace(".base_layer", ""): v for k, v in fnet.state_dict().items()}
     assert all(torch.equal(v, after[k]) for k, v in before.items() if not k.startswith("skips"))
@@ -130,13 +132,13 @@ def test_lora_trains_adapters_and_skips_only():
 def test_sizes_that_do_not_fit_the_stride_are_refused():
     fnet = toy()
     with pytest.raises(ValueError, match="multiples of 16, got 36 × 52"):
-        fnet(conditions(random_views(1, 36, 52)), torch.zeros(1, 4, 4, 6))
+        fnet(build_conditions(random_views(1, 36, 52)), torch.zeros(1, 4, 4, 6))
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (17, 33), (36, 52), (90, 160)])
 def test_any_size_comes_back_at_its_size(height, width):
     fnet, views = toy(), random_views(1, height, width)
-    out = fix(fnet, views, noise_of(fnet, 0, range(1), height, width))
+    out = fix(fnet, views, draw_noise(fnet, 0, range(1), height, width))
     assert out.shape == (1, 3, height, width)
     assert torch.isfinite(out).all() and out.min() >= 0 and out.max() <= 1
 
@@ -148,41 +150,41 @@ def test_black_and_saturated_images_stay_finite(level, dtype):
     full, one = torch.full((1, 3, 32, 48), level, dtype=dtype), torch.full((1, 1, 32, 48), level, dtype=dtype)
     out = fix(
         fnet,
-        Degraded(full, one, full, one, full, full, one, one, full, one, one, one),
-        noise_of(fnet, 0, range(1), 32, 48).to(dtype),
+        FixerInputs(full, one, full, one, full, full, one, one, full, one, one, one),
+        draw_noise(fnet, 0, range(1), 32, 48).to(dtype),
     )
     assert out.dtype == dtype and torch.isfinite(out).all() and out.min() >= 0 and out.max() <= 1
 
 
 def test_a_seed_gives_one_image_and_another_seed_another():
     fnet, views = toy(), random_views(2, 32, 48)
-    first, again, other = (fix(fnet, views, noise_of(fnet, seed, range(2), 32, 48)) for seed in (0, 0, 1))
+    first, again, other = (fix(fnet, views, draw_noise(fnet, seed, range(2), 32, 48)) for seed in (0, 0, 1))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
 
 
 def test_noise_depends_on_the_view_and_not_on_its_batch():
     fnet = toy()
-    noise = noise_of(fnet, 7, range(5), 36, 52)
-    assert torch.equal(noise[3:5], noise_of(fnet, 7, range(3, 5), 36, 52))
+    noise = draw_noise(fnet, 7, range(5), 36, 52)
+    assert torch.equal(noise[3:5], draw_noise(fnet, 7, range(3, 5), 36, 52))
     assert noise.shape == (5, 4, 6, 8) and not torch.equal(noise[0], noise[1])
-    assert padded(conditions(random_views(1, 36, 52)), 16).render.shape[-2:] == (48, 64)
+    assert pad_to_stride(build_conditions(random_views(1, 36, 52)), 16).render.shape[-2:] == (48, 64)
 
 
 def test_a_render_that_is_not_finite_is_named():
     fnet, views = toy(), random_views(1, 32, 48)
     views.color[0, 1, 2, 3] = float("nan")
     with pytest.raises(NonFiniteError, match=r"render holds 1 non-finite values, the first at index \(0, 1, 2, 3\)"):
-        fix(fnet, views, noise_of(fnet, 0, range(1), 32, 48))
+        fix(fnet, views, draw_noise(fnet, 0, range(1), 32, 48))
 
 
 def test_building_leaves_the_global_random_state_alone():
     torch.manual_seed(3)
     expected = torch.rand(3)
     torch.manual_seed(3)
-    first = build(small_architecture((8, 8, 16, 16), 4, (16, 16)), 5)
+    first = build_fnet(small_architecture((8, 8, 16, 16), 4, (16, 16)), 5)
     assert torch.equal(torch.rand(3), expected)
-    second = build(small_architecture((8, 8, 16, 16), 4, (16, 16)), 5)
+    second = build_fnet(small_architecture((8, 8, 16, 16), 4, (16, 16)), 5)
     assert all(
         torch.equal(a, b) for a, b in zip(first.state_dict().values(), second.state_dict().values(), strict=True)
     )
@@ -191,7 +193,7 @@ def test_building_leaves_the_global_random_state_alone():
 def test_large_images_are_fixed_in_tiles():
     """A tile cuts off what the network sees around a pixel: away from seams the whole image's values come back."""
     fnet, views = toy(), random_views(1, 300, 520)
-    noise = noise_of(fnet, 0, range(1), 300, 520)
+    noise = draw_noise(fnet, 0, range(1), 300, 520)
     whole = fix(fnet, views, noise)
     reference = fnet.encode(F.pad(views.reference, (0, -520 % fnet.stride, 0, -300 % fnet.stride), mode="replicate"))
     tiled = fix(fnet, views, noise, reference, tile_px=256)
@@ -217,12 +219,12 @@ def test_windows_cover_and_overlap(size, tile, stride):
 
 def test_an_input_that_is_not_given_changes_nothing():
     views = random_views(1, 32, 48)
-    noise = noise_of(toy(), 0, range(1), 32, 48)
+    noise = draw_noise(toy(), 0, range(1), 32, 48)
     for inputs in (("render",), ("render", "reference"), ("reference", "lidar")):
         architecture = replace(small_architecture((8, 8, 16, 16), 4, (16, 16)), inputs=inputs)
-        fnet = build(architecture).eval()
+        fnet = build_fnet(architecture).eval()
         fnet.load_state_dict(toy().state_dict())
-        blank = given(views, inputs)
+        blank = mask_inputs(views, inputs)
         first, second = (fix(fnet, v, noise, fnet.encode(v.reference)) for v in (views, blank))
         assert torch.equal(first, second)
     with pytest.raises(ValueError, match="expected inputs among"):

@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from genre_tasks.errors import InputError, NonFiniteError
-from genre_tasks.fixer.network import small_architecture
-from genre_tasks.fixer.training import TrainingSettings, train
+from genre_tasks.fixer.architectures import small_architecture
+from genre_tasks.fixer.training import train
+from genre_tasks.fixer.training_settings import TrainingSettings
 from tests.fixer.test_fixer_pairs import some_pairs
 
 TOY = small_architecture((8, 8, 16, 16), 4, (16, 16))

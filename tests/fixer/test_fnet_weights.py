@@ -7,17 +7,18 @@ import torch
 import torch.nn.functional as F
 
 from genre_tasks.config import FnetConfig
-from genre_tasks.fixer.conditioning import MAX_COLOUR_SHIFT, Degraded
-from genre_tasks.fixer.inference import fix, noise_of
+from genre_tasks.fixer.conditioning import MAX_COLOUR_SHIFT
+from genre_tasks.fixer.inference import draw_noise, fix
+from genre_tasks.fixer.inputs import FixerInputs
 from genre_tasks.fixer.network import Fnet
 from genre_tasks.logs.registry import open_log
-from genre_tasks.stages.fnet import load_configured
+from genre_tasks.stages.fnet import load_configured_fnet
 from genre_tasks.weights import resolve_weights
 
 
 @pytest.fixture(scope="module")
 def shipped() -> Fnet:
-    return load_configured(FnetConfig())
+    return load_configured_fnet(FnetConfig())
 
 
 @pytest.fixture(scope="module")
@@ -29,21 +30,21 @@ def image() -> torch.Tensor:
     return torch.from_numpy(picture).permute(2, 0, 1)[None] / 255
 
 
-def views_of(render: torch.Tensor, warped: torch.Tensor | None = None) -> Degraded:
+def views_of(render: torch.Tensor, warped: torch.Tensor | None = None) -> FixerInputs:
     """An opaque render, without LiDAR; the reference is the warp, or the render itself."""
     one, zero = torch.ones_like(render[:, :1]), torch.zeros_like(render[:, :1])
     if warped is None:
         nothing = (render * 0, zero, zero)
-        return Degraded(render, one, render * 0, zero, render, *nothing, *nothing, zero)
-    return Degraded(render, one, render * 0, zero, warped, *(2 * (warped, one, zero)), zero)
+        return FixerInputs(render, one, render * 0, zero, render, *nothing, *nothing, zero)
+    return FixerInputs(render, one, render * 0, zero, warped, *(2 * (warped, one, zero)), zero)
 
 
 def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
     return float(-10 * (a - b).square().mean().clamp_min(1e-10).log10())
 
 
-def repair(shipped: Fnet, views: Degraded, seed: int = 0) -> torch.Tensor:
-    return fix(shipped, views, noise_of(shipped, seed, range(1), *views.color.shape[-2:]))
+def repair(shipped: Fnet, views: FixerInputs, seed: int = 0) -> torch.Tensor:
+    return fix(shipped, views, draw_noise(shipped, seed, range(1), *views.color.shape[-2:]))
 
 
 def test_they_are_small_and_described():
@@ -66,7 +67,7 @@ def test_a_blurred_render_beside_a_sharp_reference_is_repaired(shipped, image):
 
 def test_half_precision_changes_less_than_a_grey_level(shipped, image):
     blurred = F.avg_pool2d(F.pad(image, (4, 4, 4, 4), mode="replicate"), 9, 1)
-    views, noise = views_of(blurred, image), noise_of(shipped, 0, range(1), *image.shape[-2:])
+    views, noise = views_of(blurred, image), draw_noise(shipped, 0, range(1), *image.shape[-2:])
     whole, half = (fix(shipped, views, noise, half=h) for h in (False, True))
     assert 0 < (whole - half).abs().mean() < 1 / 255
 
@@ -74,9 +75,9 @@ def test_half_precision_changes_less_than_a_grey_level(shipped, image):
 @pytest.mark.parametrize("level", [0.0, 1.0])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_black_and_saturated_images_stay_as_they_are(image, level, dtype):
-    network = load_configured(FnetConfig()).to(dtype)
+    network = load_configured_fnet(FnetConfig()).to(dtype)
     flat = torch.full_like(image, level).to(dtype)
-    noise = noise_of(network, 0, range(1), 180, 320).to(dtype)
+    noise = draw_noise(network, 0, range(1), 180, 320).to(dtype)
     out = fix(network, views_of(flat), noise)
     assert torch.isfinite(out).all() and out.min() >= 0 and out.max() <= 1
     assert (out - flat).abs().mean() <= 0.03

@@ -9,8 +9,9 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from genre_tasks.fixer.network import sd_turbo
-from genre_tasks.fixer.training import PRESETS, train
+from genre_tasks.fixer.architectures import load_sd_turbo
+from genre_tasks.fixer.training import train
+from genre_tasks.fixer.training_settings import PRESETS
 from genre_tasks.fixer.weights import load_fnet, save_fnet, trainable_state
 from tests.fixer.test_fixer_pairs import some_pairs
 
@@ -49,7 +50,7 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_real_shapes_train_a_step_save_and_reload(base, tmp_path):
-    network = sd_turbo(str(base), rank=16).float()
+    network = load_sd_turbo(str(base), rank=16).float()
     count = sum(p.numel() for p in network.unet.parameters()) + sum(p.numel() for p in network.vae.parameters())
     assert 0.8e9 < count < 1.1e9
     trained = sum(p.numel() for p in trainable_state(network).values())

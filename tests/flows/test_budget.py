@@ -15,15 +15,15 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from flows.budget import budget as budgets
-from flows.budget.chooser import BORDER_S, Chooser, images_of
-from flows.budget.cost_table import Point, Table, load, shipped_table
-from flows.budget.deadline import Clock
+from flows.budget.chooser import STAGE_OVERHEAD_S, Chooser, count_images
+from flows.budget.cost_table import CostPoint, CostTable, find_shipped_table, load_cost_table
+from flows.budget.deadline import Deadline
 from flows.cli.main import app
-from flows.cli.parsing import seconds
-from flows.configuration import load_configuration, with_settings
-from flows.cost_sweep.parquet import read_lines, write_lines
-from flows.cost_sweep.summary import lines_of
-from flows.pipeline.definition import reconstructing_until
+from flows.cli.parsing import parse_duration
+from flows.configuration import apply_settings, load_configuration
+from flows.cost_sweep.parquet import read_settings, write_settings
+from flows.cost_sweep.summary import summarise_settings
+from flows.pipeline.definition import stages_until
 from flows.reconstruction import flow
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
 from tests.faults.small_run import LOG, SETTINGS
@@ -33,11 +33,11 @@ LATE = {"novel_views": 2.0, "fnet": 10.0}
 SMALL = load_configuration("small")
 
 
-def point(name: str, gnet: int, enet: int, accuracy: float) -> Point:
+def point(name: str, gnet: int, enet: int, accuracy: float) -> CostPoint:
     """GNet takes a second an iteration, ENet two; 0 iterations of ENet: the scene is GNet's."""
     later = LATE | {"enet": 2.0 * enet} if enet else {}
     changes = (f"gnet.iterations={gnet}", *((f"enet.iterations={enet}",) if enet else ()))
-    return Point(name, changes, "enet" if enet else "gnet", accuracy, EARLY | {"gnet": float(gnet)} | later)
+    return CostPoint(name, changes, "enet" if enet else "gnet", accuracy, EARLY | {"gnet": float(gnet)} | later)
 
 
 POINTS = (
@@ -48,10 +48,10 @@ POINTS = (
     point("long", 10, 8, 26.0),
     point("most", 30, 8, 27.0),
 )
-TABLE = Table("small", "accuracy", POINTS, 120.0, 0.1, {"ingest": 3.0}, "somewhere")
+TABLE = CostTable("small", "accuracy", POINTS, 120.0, 0.1, {"ingest": 3.0}, "somewhere")
 
 
-class Frozen(Clock):
+class Frozen(Deadline):
     """A clock that a test moves."""
 
     def __init__(self, budget_s: float) -> None:
@@ -63,42 +63,44 @@ class Frozen(Clock):
         return self.now
 
 
-def chooser(clock: Clock, speed: float = 1.0) -> Chooser:
+def chooser(clock: Deadline, speed: float = 1.0) -> Chooser:
     by = Chooser(TABLE, SMALL, clock, 1.0, lambda: speed)
     by.calibrate()
     return by
 
 
-def simulated(budget_s: float, slower: Callable[[str], float], points: Sequence[Point] = POINTS) -> tuple[Frozen, str]:
+def simulated(
+    budget_s: float, slower: Callable[[str], float], points: Sequence[CostPoint] = POINTS
+) -> tuple[Frozen, str]:
     """A run whose stages take ``slower`` times what the table says: the clock at its end, and the last point."""
     clock = Frozen(budget_s)
     by = Chooser(replace(TABLE, points=tuple(points)), SMALL, clock, 1.0, lambda: 1.0)
-    while (step := by.next()) is not None:
+    while (step := by.next_stage()) is not None:
         own = next(p for p in points if p.name == by.choices[-1].point)
-        took = slower(step[0]) * (own.seconds[step[0]] + TABLE.cold.get(step[0], 0.0) + BORDER_S)
+        took = slower(step[0]) * (own.seconds[step[0]] + TABLE.first_call_s.get(step[0], 0.0) + STAGE_OVERHEAD_S)
         clock.now += took
-        by.done(step[0], took, cached=False)
+        by.record_stage(step[0], took, cached=False)
     return clock, by.choices[-1].point
 
 
 def test_the_most_accurate_that_fits_is_chosen_and_says_why() -> None:
     by = chooser(Frozen(45.0))
-    step = by.next()
+    step = by.next_stage()
     assert step is not None and step[0] == "ingest"
     assert step[1].gnet.iterations == 10 and step[1].enet.iterations == 2
     (choice,) = by.choices
-    assert choice.point == "short" and choice.predicted_s == pytest.approx(1.06 * (34 + 3 + 7 * BORDER_S))
+    assert choice.point == "short" and choice.predicted_s == pytest.approx(1.06 * (34 + 3 + 7 * STAGE_OVERHEAD_S))
     assert "the best accuracy that fits; long would take" in str(choice)
 
 
 def test_a_slower_machine_gets_a_shorter_setting() -> None:
     fast, slow = chooser(Frozen(60.0), 1.0), chooser(Frozen(60.0), 1.8)
-    assert [by.next() and by.choices[0].point for by in (fast, slow)] == ["long", "alone"]
+    assert [by.next_stage() and by.choices[0].point for by in (fast, slow)] == ["long", "alone"]
 
 
 def test_more_than_all_takes_the_best_and_less_than_any_the_shortest() -> None:
     rich, poor = chooser(Frozen(1000.0)), chooser(Frozen(1.0))
-    assert rich.next() and poor.next()
+    assert rich.next_stage() and poor.next_stage()
     assert rich.choices[0].point == "most" and "of all 6" in rich.choices[0].why
     assert poor.choices[0].point == "least" and "nothing fits" in poor.choices[0].why
 
@@ -122,11 +124,11 @@ def test_a_fixer_that_overran_leaves_the_scene_that_is_there() -> None:
 def test_a_chunks_share_is_of_what_was_left_when_it_began() -> None:
     clock = Frozen(90.0)
     by = Chooser(TABLE, SMALL, clock, 1.0, lambda: 1.0)
-    while (step := by.next(0.5)) is not None:  # the first of two chunks
+    while (step := by.next_stage(0.5)) is not None:  # the first of two chunks
         own = next(p for p in POINTS if p.name == by.choices[-1].point)
-        took = own.seconds[step[0]] + TABLE.cold.get(step[0], 0.0) + BORDER_S
+        took = own.seconds[step[0]] + TABLE.first_call_s.get(step[0], 0.0) + STAGE_OVERHEAD_S
         clock.now += took
-        by.done(step[0], took, cached=False)
+        by.record_stage(step[0], took, cached=False)
     assert by.choices[0].left_s == 45.0 and {c.point for c in by.choices} == {"short"}
     assert clock.now < 45.0 and by._until_s == 45.0
 
@@ -140,12 +142,12 @@ def test_accuracy_does_not_fall_as_the_budget_grows(budget_s: float, pace: float
 
 def test_stages_from_the_store_tell_nothing_of_the_pace() -> None:
     by = chooser(Frozen(60.0))
-    while (step := by.next()) is not None:
-        by.done(step[0], 0.01, cached=True)
-    assert by.predicted_s(POINTS[-1]) == 0
+    while (step := by.next_stage()) is not None:
+        by.record_stage(step[0], 0.01, cached=True)
+    assert by.predict_s(POINTS[-1]) == 0
     fresh = chooser(Frozen(60.0))
-    assert fresh.next()
-    assert fresh.predicted_s(POINTS[0]) == pytest.approx(1.06 * (8 + 3 + 2 + 4 * BORDER_S))
+    assert fresh.next_stage()
+    assert fresh.predict_s(POINTS[0]) == pytest.approx(1.06 * (8 + 3 + 2 + 4 * STAGE_OVERHEAD_S))
 
 
 def test_speed_is_asked_for_once_and_only_when_something_was_computed() -> None:
@@ -156,20 +158,20 @@ def test_speed_is_asked_for_once_and_only_when_something_was_computed() -> None:
         return 1.5
 
     by = Chooser(TABLE, SMALL, Frozen(80.0), 1.0, speed)
-    assert by.next() and by.choices[0].pace == 1.0
-    by.done("ingest", 0.01, cached=True)
-    assert by.next() and not asked
-    by.done("effects", 1.5 * (1.0 + BORDER_S), cached=False)
-    assert by.next() and asked == [1.5]
-    by.done("initial", 1.5 * (2.0 + BORDER_S), cached=False)
-    assert by.next() and asked == [1.5] and by.choices[-1].pace == pytest.approx(1.5)
+    assert by.next_stage() and by.choices[0].pace == 1.0
+    by.record_stage("ingest", 0.01, cached=True)
+    assert by.next_stage() and not asked
+    by.record_stage("effects", 1.5 * (1.0 + STAGE_OVERHEAD_S), cached=False)
+    assert by.next_stage() and asked == [1.5]
+    by.record_stage("initial", 1.5 * (2.0 + STAGE_OVERHEAD_S), cached=False)
+    assert by.next_stage() and asked == [1.5] and by.choices[-1].pace == pytest.approx(1.5)
 
 
 def test_what_the_user_has_set_is_not_turned(tmp_path: Path) -> None:
     table = written(tmp_path / "cost.parquet")
     with pytest.raises(ConfigError, match=r"gnet.iterations is what a budget decides.*Leave out"):
-        load(table, "demo", own=("gnet.iterations", "ingest.strict"))
-    assert load(table, "demo", own=("ingest.strict",))
+        load_cost_table(table, "demo", user_keys=("gnet.iterations", "ingest.strict"))
+    assert load_cost_table(table, "demo", user_keys=("ingest.strict",))
 
 
 def test_the_command_says_what_does_not_fit_before_a_server_is_started(
@@ -183,13 +185,13 @@ def test_the_command_says_what_does_not_fit_before_a_server_is_started(
 
 
 def test_images_of_a_chunk_are_frames_times_cameras() -> None:
-    assert images_of("synthetic:street?seed=900&frames=25&cameras=2", 1, SMALL) == 10
+    assert count_images("synthetic:street?seed=900&frames=25&cameras=2", 1, SMALL) == 10
     one = load_configuration("small", settings=["ingest.cameras=[front_camera]"])
-    assert images_of("synthetic:street?seed=900&frames=25&cameras=2", 0, one) == 20
+    assert count_images("synthetic:street?seed=900&frames=25&cameras=2", 0, one) == 20
 
 
 def test_the_clock_stands_still_while_it_is_paused() -> None:
-    clock = Clock(10.0, time.time() - 4.0)
+    clock = Deadline(10.0, time.time() - 4.0)
     with clock.paused():
         time.sleep(0.2)
     assert 3.9 < clock.used_s < 4.15 and clock.left_s == pytest.approx(6.0, abs=0.15)
@@ -197,13 +199,13 @@ def test_the_clock_stands_still_while_it_is_paused() -> None:
 
 @pytest.mark.parametrize(("text", "value"), [("90", 90), ("90s", 90), ("1.5m", 90), ("2min", 120), ("1h", 3600)])
 def test_times_are_read(text: str, value: float) -> None:
-    assert seconds(text, "--budget") == value and seconds(None, "--budget") is None
+    assert parse_duration(text, "--budget") == value and parse_duration(None, "--budget") is None
 
 
 @pytest.mark.parametrize("text", ["soon", "0", "-3s", "3d", ""])
 def test_other_times_are_refused(text: str) -> None:
     with pytest.raises(ConfigError, match="--budget"):
-        seconds(text, "--budget")
+        parse_duration(text, "--budget")
 
 
 def written(path: Path, preset: str = "demo", **facts: str) -> Path:
@@ -216,7 +218,7 @@ def written(path: Path, preset: str = "demo", **facts: str) -> Path:
         table_row("coarse", ("ingest.width_px=32", "ingest.height_px=18"), "gnet", 0.001, 31.0),
         table_row("rigid_actors off", ("effects.rigid_actors=off",), "enet", 0.001, 30.0, "effects"),
     ]
-    write_lines(path, lines_of(rows), said | facts)
+    write_settings(path, summarise_settings(rows), said | facts)
     return path
 
 
@@ -245,26 +247,26 @@ def table_row(
 
 def test_a_table_comes_back_as_written_and_effects_and_sizes_are_no_choice(tmp_path: Path) -> None:
     path = written(tmp_path / "cost.parquet")
-    lines, facts = read_lines(path)
+    lines, facts = read_settings(path)
     settings = ["preset", "together=short", "together=alone", "together=coarse", "effects=rigid_actors off"]
     assert [x.setting for x in lines] == settings
     assert lines[1].changes == ("gnet.iterations=1", "enet.iterations=1") and facts["machine"] == "somewhere"
-    table = load(path, "demo")
+    table = load_cost_table(path, "demo")
     assert [p.name for p in table.points] == ["preset", "together=short", "together=alone"]
     part = tmp_path / "part.parquet"  # with a setting that was not measured wherever the preset was
-    write_lines(part, [lines[0], replace(lines[1], n=2), *lines[2:]], facts)
-    assert [p.name for p in load(part, "demo").points] == ["preset", "together=alone"]
+    write_settings(part, [lines[0], replace(lines[1], n=2), *lines[2:]], facts)
+    assert [p.name for p in load_cost_table(part, "demo").points] == ["preset", "together=alone"]
     assert table.points[2].accuracy == 24.0 and set(table.points[2].seconds) == {*EARLY, "gnet"}
 
 
 def test_tables_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"of the preset demo.*genre cost LOG --preset small"):
-        load(written(tmp_path / "cost.parquet"), "small")
+        load_cost_table(written(tmp_path / "cost.parquet"), "small")
     with pytest.raises(ConfigError, match="no times were measured for the preset paper"):
-        shipped_table("paper")
+        find_shipped_table("paper")
     (tmp_path / "other.parquet").write_bytes(b"no table")
     with pytest.raises(ArtifactCorruptError, match=r"other\.parquet"):
-        load(tmp_path / "other.parquet", "demo")
+        load_cost_table(tmp_path / "other.parquet", "demo")
 
 
 @pytest.fixture(scope="module")
@@ -279,7 +281,7 @@ def prefect() -> Iterator[None]:
 def test_a_run_ends_where_its_budget_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     own = [s for s in SETTINGS if not s.startswith(("gnet.iterations", "enet.iterations"))]
     table = str(written(tmp_path / "cost.parquet"))
-    monkeypatch.setattr(budgets, "calibration_s", lambda: 0.1)
+    monkeypatch.setattr(budgets, "measure_calibration_s", lambda: 0.1)
 
     def run(budget_s: float) -> tuple[list[str], dict[str, Any]]:
         """The stages that were made, and the record; the report says, too, what the scene was made with."""
@@ -320,11 +322,11 @@ def test_the_command_says_what_it_would_choose(tmp_path: Path) -> None:
 
 
 def test_the_shipped_table_is_of_today_s_settings() -> None:
-    table = load(shipped_table("small"), "small")
-    lines, facts = read_lines(shipped_table("small"))
+    table = load_cost_table(find_shipped_table("small"), "small")
+    lines, facts = read_settings(find_shipped_table("small"))
     assert len(table.points) >= 20 and min(x.n for x in lines) >= 3 and facts["machine"] == table.machine
     for p in table.points:
-        config = with_settings(SMALL, p.changes)
+        config = apply_settings(SMALL, p.changes)
         assert p.name == "preset" or p.end == "gnet" or config != SMALL, p.name
-        assert set(p.seconds) == set(reconstructing_until(p.end)) and all(s >= 0 for s in p.seconds.values())
-    assert set(table.cold) == set(reconstructing_until("enet")) and table.calibration_s > 0 and table.images > 1
+        assert set(p.seconds) == set(stages_until(p.end)) and all(s >= 0 for s in p.seconds.values())
+    assert set(table.first_call_s) == set(stages_until("enet")) and table.calibration_s > 0 and table.images > 1

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from flows.configuration import PRESETS, RENAMED_KEYS, _section_type, differences, load_configuration
+from flows.configuration import PRESETS, RENAMED_KEYS, _section_type, diff_from_preset, load_configuration
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ConfigError
 
@@ -20,11 +20,11 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.mark.parametrize("preset", PRESETS)
 def test_presets_are_valid(preset: str) -> None:
     config = load_configuration(preset)
-    assert config.gnet.iterations == {"fine": 144, "long": 120, "paper": 24}.get(preset, 72)
-    enet = {"paper": (12, 0.0), "demo": (72, 0.7), "fine": (72, 0.3)}
+    assert config.gnet.iterations == {"fine": 120, "long": 120, "paper": 24}.get(preset, 72)
+    enet = {"paper": (12, 0.0), "demo": (72, 0.7), "fine": (96, 0.5)}
     assert (config.enet.iterations, config.enet.split_fraction) == enet.get(preset, (96, 1.0))
-    assert config.gnet.refine_iterations == {"demo": 48, "small": 48, "long": 72}.get(preset, 0)
-    assert differences(config, preset) == {}
+    assert config.gnet.refine_iterations == {"demo": 48, "small": 48, "fine": 80, "long": 72}.get(preset, 0)
+    assert diff_from_preset(config, preset) == {}
 
 
 def test_paper_preset_has_the_papers_numbers() -> None:
@@ -40,7 +40,7 @@ def test_settings_win_over_file_over_preset(tmp_path: Path) -> None:
     file.write_text("gnet: {iterations: 7, seed: 5}\n")
     config = load_configuration("demo", file, ["gnet.iterations=8", "evaluate.shifts_m=[1, 2]"])
     assert (config.gnet.iterations, config.gnet.seed, config.evaluate.shifts_m) == (8, 5, (1.0, 2.0))
-    assert differences(config, "demo")["gnet.iterations"] == (72, 8)
+    assert diff_from_preset(config, "demo")["gnet.iterations"] == (72, 8)
 
 
 @pytest.mark.parametrize(

@@ -12,12 +12,11 @@ from typer.testing import CliRunner
 
 from flows.cli.main import app
 from flows.configuration import load_configuration
-from flows.cost_sweep.cell import Cell, Sweep, cells_of, run_cell
-from flows.cost_sweep.flow import command_of, write
-from flows.cost_sweep.knobs import PRESET_ITSELF, Setting, settings_of
-from flows.cost_sweep.prediction import predicted
-from flows.cost_sweep.summary import KERNEL_3M, PERCEPTUAL_3M, beside, front, lines_of
-from flows.cost_sweep.warm_up import cold_seconds
+from flows.cost_sweep.cell import Cell, Sweep, list_cells, measure_cold_start, predict_cells, run_cell
+from flows.cost_sweep.flow import SweepRequest, write_results
+from flows.cost_sweep.knobs import PRESET_ITSELF, Setting, list_settings
+from flows.cost_sweep.summary import KERNEL_3M, PERCEPTUAL_3M, novel_view_measure, pareto_front, summarise_settings
+from flows.experiments.log_chunks import LogChunk
 from genre_tasks.errors import ConfigError
 from tests.faults.small_run import LOG, SETTINGS, Stopped, stopping
 
@@ -61,47 +60,47 @@ ROWS = [
 
 
 def test_lines_are_means_with_spreads_over_seeds_and_gains_in_the_same_place() -> None:
-    preset, fewer, more = lines_of(ROWS)
+    preset, fewer, more = summarise_settings(ROWS)
     assert (preset.setting, preset.n, preset.seconds) == (PRESET_ITSELF, 4, 5.0)
-    assert preset.values["psnr"].middle == pytest.approx(23.5)
+    assert preset.values["psnr"].average == pytest.approx(23.5)
     assert preset.values["psnr"].sd == pytest.approx(math.sqrt(2))  # of the seeds, not of the logs
-    assert fewer.gains["psnr"].middle == pytest.approx(-1.0) and fewer.gains["psnr"].sd == pytest.approx(0.0)
-    assert fewer.gains["seconds"].middle == pytest.approx(2.0)  # less is better
-    assert more.gains["psnr"].middle == pytest.approx(-0.25)
-    assert fewer.values["cpu_seconds"].middle == pytest.approx(5.5)
+    assert fewer.gains["psnr"].average == pytest.approx(-1.0) and fewer.gains["psnr"].sd == pytest.approx(0.0)
+    assert fewer.gains["seconds"].average == pytest.approx(2.0)  # less is better
+    assert more.gains["psnr"].average == pytest.approx(-0.25)
+    assert fewer.values["cpu_seconds"].average == pytest.approx(5.5)
     assert fewer.on_front and preset.on_front and not more.on_front
-    assert math.isnan(lines_of(ROWS[:1])[0].values["psnr"].sd)
+    assert math.isnan(summarise_settings(ROWS[:1])[0].values["psnr"].sd)
 
 
 def test_what_was_not_measured_everywhere_is_not_on_the_front() -> None:
     easier = [row("2", 0, 1.0, 26.0), row("2", 1, 1.0, 26.5)]  # on one of two logs
-    *whole, part = lines_of([*ROWS, *easier])
-    assert [x.on_front for x in whole] == [x.on_front for x in lines_of(ROWS)] and part.on_front == ()
+    *whole, part = summarise_settings([*ROWS, *easier])
+    assert [x.on_front for x in whole] == [x.on_front for x in summarise_settings(ROWS)] and part.on_front == ()
 
 
 def test_the_front_is_what_no_other_setting_beats() -> None:
     points = [(1.0, 20.0), (2.0, 25.0), (3.0, 24.0), (2.0, 25.0), (2.0, 24.0), (5.0, math.nan)]
-    assert front(points, more_is_better=True) == {0, 1, 3}
-    assert front([(1.0, 0.5), (2.0, 0.6), (3.0, 0.4)], more_is_better=False) == {0, 2}
-    assert front([], more_is_better=True) == set()
+    assert pareto_front(points, more_is_better=True) == {0, 1, 3}
+    assert pareto_front([(1.0, 0.5), (2.0, 0.6), (3.0, 0.4)], more_is_better=False) == {0, 2}
+    assert pareto_front([], more_is_better=True) == set()
 
 
 def test_beside_the_path_the_truth_judges_where_there_is_one() -> None:
-    assert beside(ROWS) is KERNEL_3M
-    assert beside([row("", 0, 1.0, 25.0, **{"shift_3m/perceptual": 0.5})]) is PERCEPTUAL_3M
+    assert novel_view_measure(ROWS) is KERNEL_3M
+    assert novel_view_measure([row("", 0, 1.0, 25.0, **{"shift_3m/perceptual": 0.5})]) is PERCEPTUAL_3M
 
 
 def test_settings_start_with_the_preset_and_differ_from_it() -> None:
-    settings = settings_of("small")
+    settings = list_settings("small")
     base = load_configuration("small")
     assert settings[0].name == PRESET_ITSELF and settings[0].configuration("small", (), 0) == base
     assert len({s.name for s in settings}) == len(settings)
     for s in settings[1:]:
         assert s.end == "gnet" or s.threads or s.configuration("small", (), 0) != base, s.name
-    assert [s.value for s in settings_of("small", knobs=["views"])[1:]] == ["1", "6", "12"]
+    assert [s.value for s in list_settings("small", knobs=["views"])[1:]] == ["1", "6", "12"]
     assert {s.knob for s in settings} >= {"gnet_iterations", "resolution", "gaussians", "fixer", "shifts", "threads"}
-    with pytest.raises(ConfigError, match=r"no knob 'view'.*Did you mean views"):
-        settings_of("small", knobs=["view"])
+    with pytest.raises(ConfigError, match=r"no knob 'view'.*Did you mean 'views'"):
+        list_settings("small", knobs=["view"])
 
 
 COMMAND = "genre cost 'synthetic:street?seed=900' --preset small --seeds 0,1 --knobs fixer --set enet.snapshots=0"
@@ -109,13 +108,16 @@ COMMAND = "genre cost 'synthetic:street?seed=900' --preset small --seeds 0,1 --k
 
 def test_the_command_is_the_one_that_was_given() -> None:
     sweep = Sweep("small", ("enet.snapshots=0",), "store")
-    assert command_of(sweep, ["synthetic:street?seed=900"], None, [0, 1], ["fixer"]) == COMMAND
-    assert command_of(Sweep("demo", (), "s"), ["a"], [2], None, None) == "genre cost a --preset demo --chunks 2"
+    request = SweepRequest(sweep, ["synthetic:street?seed=900"], None, [0, 1], ["fixer"])
+    assert request.command == COMMAND
+    assert SweepRequest(Sweep("demo", (), "s"), ["a"], [2]).command == "genre cost a --preset demo --chunks 2"
 
 
 def test_the_files_say_the_same(tmp_path: Path) -> None:
-    write(tmp_path, Sweep("small", (), "store"), ROWS[:2], [], "", {})  # an earlier one, whose files are written anew
-    files = write(
+    write_results(
+        tmp_path, Sweep("small", (), "store"), ROWS[:2], [], "", {}
+    )  # an earlier one, whose files are written anew
+    files = write_results(
         tmp_path, Sweep("small", (), "store"), ROWS, ["views=99: memory ran out"], COMMAND, {"calibration_s": "0.1"}
     )
     lines, cells, picture, page = (Path(f) for f in files)
@@ -132,7 +134,7 @@ def test_the_files_say_the_same(tmp_path: Path) -> None:
 
 SWEEP_SETTINGS = tuple(s for s in SETTINGS if "snapshots" not in s)
 CELLS = [
-    Cell(LOG, 0, 0, s)
+    Cell(LogChunk(LOG, 0), 0, s)
     for s in (
         Setting(PRESET_ITSELF, ""),
         Setting("resolution", "96x54", ("ingest.width_px=96", "ingest.height_px=54"), end="gnet"),
@@ -162,13 +164,13 @@ def test_a_sweep_goes_on_where_it_was_stopped_and_judges_alike(tmp_path: Path) -
     assert whole["cpu_seconds"]["gnet"] > 0 and left["gaussians"] < whole["gaussians"] <= 1 + 1.7 * left["gaussians"]
     before = len(computed)
     assert [run_cell(sweep, cell, counted) for cell in CELLS] == rows and len(computed) == before
-    told = predicted(sweep, CELLS[:1])
+    told = predict_cells(sweep, CELLS[:1])
     assert told[0]["seconds"] == 0 and told[0]["cached"] == "8 of 8 stages"
 
 
 def test_a_stage_that_settings_share_is_predicted_once(tmp_path: Path) -> None:
     settings = [Setting(PRESET_ITSELF, ""), Setting("enet_iterations", "4", ("enet.iterations=4",))]
-    both = predicted(Sweep("small", (), str(tmp_path)), cells_of([(LOG, 0)], [0], settings))
+    both = predict_cells(Sweep("small", (), str(tmp_path)), list_cells([LogChunk(LOG, 0)], [0], settings))
     assert 0 < both[1]["seconds"] < both[0]["seconds"]
 
 
@@ -182,6 +184,6 @@ def test_the_command_lists_what_it_would_run_and_refuses_what_it_does_not_know(t
 
 
 def test_first_calls_are_told_apart_from_the_stages_own_time() -> None:
-    cold = cold_seconds(Sweep("demo", SWEEP_SETTINGS, "never-used"))
+    cold = measure_cold_start(Sweep("demo", SWEEP_SETTINGS, "never-used"))
     assert list(cold) == ["ingest", "effects", "initial", "gnet", "novel_views", "fnet", "enet"]
     assert all(0 <= s < 60 for s in cold.values()) and not Path("never-used").exists()

@@ -9,8 +9,8 @@ from typer.testing import CliRunner
 
 from flows.cli.main import app
 from flows.configuration import load_configuration
-from flows.pipeline.definition import BY_NAME
-from flows.pipeline.stage_runner import ArtifactRef, Job, produce
+from flows.pipeline.definition import STAGE_BY_NAME
+from flows.pipeline.stage_runner import ArtifactRef, Job, run_stage
 from storage.local import open_store
 from tests.faults.small_run import LOG, SETTINGS
 
@@ -21,7 +21,7 @@ def refs(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, dict[str, Artif
     job = Job(LOG, 0, store, load_configuration("demo", settings=SETTINGS).model_dump(mode="json"))
     made: dict[str, ArtifactRef] = {}
     for stage in ("ingest", "effects", "initial", "gnet", "novel_views", "fnet", "enet"):
-        made[stage] = produce(stage, job, {name: made[name] for name in BY_NAME[stage].inputs})
+        made[stage] = run_stage(stage, job, {name: made[name] for name in STAGE_BY_NAME[stage].inputs})
     return store, made
 
 

@@ -12,16 +12,17 @@ import numpy as np
 import pytest
 import torch
 
-from flows.training import fixer_pairs, fixer_training, recipes
-from flows.training.curve_table import FIXING, FIXING_SCORES, read_rows
+from flows.training import fixer_job, fixer_pairs, fixer_training, scene_lists
+from flows.training.curve_table import FIXER_CURVE, FIXER_SCORES, load_rows
 from flows.training.fixer_flow import train_fnet, train_pairs
-from flows.training.fixer_pairs import PAIRS, PairRecipe, PairSet
-from flows.training.fixer_training import CURVE, SCORES, FixerJob, load_pairs, train_fixer
+from flows.training.fixer_job import CURVE_FILE, SCORES_FILE, FixerJob
+from flows.training.fixer_pairs import TRAINING_PAIRS, PairRecipe, PairSet
+from flows.training.fixer_training import load_pairs, train_fixer
 from flows.training.training_scenes import SceneRecipe
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.fixer import training
-from genre_tasks.fixer.network import small_architecture
-from genre_tasks.fixer.training import TrainingSettings
+from genre_tasks.fixer.architectures import small_architecture
+from genre_tasks.fixer.training_settings import TrainingSettings
 from genre_tasks.fixer.weights import load_fnet
 from storage.files import digest_file
 
@@ -29,10 +30,10 @@ SMALL = "&frames=12&cameras=2&width=64&height=36&lidar_beams=16&lidar_azimuths=1
 SETS = PairRecipe(
     sets=(
         PairSet("beside", 4, "beside"),
-        PairSet("under-trained", 1, "beside", young=True),
+        PairSet("under-trained", 1, "beside", early_snapshot=True),
         PairSet("sparse", 2, "unseen", keep_every=2),
         PairSet("cross-camera", 1, "camera"),
-        PairSet("perturbed", 2, "beside", perturbed=(0.3, 1.0)),
+        PairSet("perturbed", 2, "beside", perturbation=(0.3, 1.0)),
     ),
     iterations=6,
 )
@@ -59,14 +60,12 @@ def prefect() -> Iterator[None]:
 
 
 def make_tiny(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(recipes, "dense_scenes", tiny_scenes)
-    patch.setattr(fixer_pairs, "PAIRS", SETS)
-    patch.setattr(fixer_training, "VALIDATION", PairRecipe(sets=(PairSet("side", 1, "side"),), iterations=6))
-    patch.setattr(fixer_training, "validation_scenes", lambda: [tiny_scene(900)])
+    patch.setattr(scene_lists, "list_dense_scenes", tiny_scenes)
+    patch.setattr(fixer_pairs, "TRAINING_PAIRS", SETS)
+    patch.setattr(fixer_training, "VALIDATION_PAIRS", PairRecipe(sets=(PairSet("side", 1, "side"),), iterations=6))
+    patch.setattr(fixer_training, "list_validation_scenes", lambda: [tiny_scene(900)])
     further = replace(SETTINGS, steps=2)
-    patch.setattr(
-        fixer_training, "PRESETS", {"small": SETTINGS, "further": further, "last": further, "paper": SETTINGS}
-    )
+    patch.setattr(fixer_job, "PRESETS", {"small": SETTINGS, "further": further, "last": further, "paper": SETTINGS})
     patch.setattr(fixer_training, "small_architecture", lambda: small_architecture((8, 8, 16, 16), 4, (16, 16)))
 
 
@@ -81,16 +80,16 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict[s
     folder = tmp_path_factory.mktemp("training")
     with pytest.MonkeyPatch.context() as patch:
         make_tiny(patch)
-        said = [train_pairs(str(folder), None, 2) for _ in range(2)]
-        said += [train_fnet(str(folder), None, 2, validate=True) for _ in range(2)]
-    return folder, said
+        results = [train_pairs(str(folder), None, 2) for _ in range(2)]
+        results += [train_fnet(str(folder), None, 2, validate=True) for _ in range(2)]
+    return folder, results
 
 
 def test_pairs_are_of_the_stated_kinds_and_made_once(trained) -> None:
-    folder, said = trained
-    assert said[0] == said[1]
-    assert (said[0]["scenes"], said[0]["pairs"]) == (2, 20)
-    found = said[0]["shares"]
+    folder, results = trained
+    assert results[0] == results[1]
+    assert (results[0]["scenes"], results[0]["pairs"]) == (2, 20)
+    found = results[0]["shares"]
     assert found["beside"] == pytest.approx(0.4) and found["perturbed"] == pytest.approx(0.2)
     assert found["optimiser"] == pytest.approx(0.8) and found["lateral"] == pytest.approx(0.7)
     artifacts = list(folder.glob("store/**/pairs/*/pairs.parquet"))
@@ -108,20 +107,20 @@ def test_pairs_are_the_same_when_made_again(trained, tmp_path) -> None:
 
 
 def test_the_shipped_recipe_has_the_shares_that_were_asked_for() -> None:
-    counts = {s.kind: s.count for s in PAIRS.sets}
+    counts = {s.kind: s.count for s in TRAINING_PAIRS.sets}
     total = sum(counts.values())
     assert counts["perturbed"] / total <= 0.4  # real optimiser output: at least 40 %, here all but the perturbed
     assert (counts["beside"] + counts["under-trained"]) / total >= 0.2  # true lateral shifts
 
 
 def test_a_fixer_is_trained_once_with_its_curve_scores_and_pictures(trained) -> None:
-    folder, said = trained
-    assert said[2] == said[3] == {"weights": str(folder / "fnet" / "fnet.safetensors")}
+    folder, results = trained
+    assert results[2] == results[3] == {"weights": str(folder / "fnet" / "fnet.safetensors")}
     load_fnet(folder / "fnet")
-    rows = read_rows(folder / "fnet" / CURVE, FIXING)
+    rows = load_rows(folder / "fnet" / CURVE_FILE, FIXER_CURVE)
     assert [row["step"] for row in rows] == [0, 1, 2, 3]
     assert any(row["loss"] > 0 for row in rows)  # an untrained fixer leaves a clean crop alone: its loss is 0
-    scores = read_rows(folder / "fnet" / SCORES, FIXING_SCORES)
+    scores = load_rows(folder / "fnet" / SCORES_FILE, FIXER_SCORES)
     assert [row["step"] for row in scores] == [2, 4] and all(row["psnr_identity"] > 20 for row in scores)
     assert {p.name for p in (folder / "fnet").glob("sample-*.png")} == {"sample-000002.png", "sample-000004.png"}
 
@@ -140,9 +139,9 @@ def test_a_stopped_training_resumes_to_the_same_bytes(trained, tmp_path, monkeyp
     job = FixerJob(str(tmp_path), streets=2)
     with pytest.raises(StoppedError):
         train_fixer(job, stop)
-    assert len(read_rows(tmp_path / "fnet" / CURVE, FIXING)) == 2
+    assert len(load_rows(tmp_path / "fnet" / CURVE_FILE, FIXER_CURVE)) == 2
     assert train_fixer(job) == (tmp_path / "fnet" / "fnet.safetensors", True)
-    assert len(read_rows(tmp_path / "fnet" / CURVE, FIXING)) == 4
+    assert len(load_rows(tmp_path / "fnet" / CURVE_FILE, FIXER_CURVE)) == 4
     assert digest_file(tmp_path / "fnet" / "fnet.safetensors") == digest_file(folder / "fnet" / "fnet.safetensors")
 
 
@@ -176,14 +175,14 @@ def test_what_is_trained_is_not_taken_for_another_training(trained, tmp_path) ->
 def test_a_kill_at_the_last_checkpoint_loses_no_weights(trained, tmp_path, monkeypatch) -> None:
     folder, _ = trained
     (tmp_path / "store").symlink_to(folder / "store")
-    job, kept = FixerJob(str(tmp_path), streets=2), training._save
+    job, save = FixerJob(str(tmp_path), streets=2), training.save_checkpoint
 
     def killed(state, *where) -> None:
-        kept(state, *where)
+        save(state, *where)
         if state.step == SETTINGS.steps:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(training, "_save", killed)
+    monkeypatch.setattr(training, "save_checkpoint", killed)
     with pytest.raises(KeyboardInterrupt):
         train_fixer(job)
     monkeypatch.undo()
@@ -220,6 +219,8 @@ def test_faults_are_said(monkeypatch) -> None:
         FixerJob("x", preset="paper")
     with pytest.raises(ConfigError, match="nothing to make pairs of"):
         train_pairs("x", None, 0)
-    monkeypatch.setattr(recipes, "dense_scenes", lambda *_: [replace(tiny_scene(1), uri="synthetic:street?seed=1001")])
+    monkeypatch.setattr(
+        scene_lists, "list_dense_scenes", lambda *_: [replace(tiny_scene(1), uri="synthetic:street?seed=1001")]
+    )
     with pytest.raises(ConfigError, match="seed 1001"):
         train_pairs("x", None, 1)

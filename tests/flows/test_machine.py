@@ -7,15 +7,15 @@ from pathlib import Path
 
 import torch
 
-from flows.machine.facts import commit, machine
-from genre_tasks.compiled.loader import supported_isas
+from flows.machine.facts import describe_machine, git_commit
+from genre_tasks.compiled.loader import supported_instruction_sets
 
 
 def test_machine_names_cores_instruction_set_and_torch() -> None:
-    model, *rest = machine().split(", ")
+    model, *rest = describe_machine().split(", ")
     assert len(model) > 2
     assert rest[0].split()[1] == "cores" and int(rest[0].split()[0]) >= 1
-    assert rest[1:3] == [supported_isas()[0], f"torch {torch.__version__}"]
+    assert rest[1:3] == [supported_instruction_sets()[0], f"torch {torch.__version__}"]
 
 
 def test_commit_says_whether_the_tree_was_changed(tmp_path: Path) -> None:
@@ -24,14 +24,14 @@ def test_commit_says_whether_the_tree_was_changed(tmp_path: Path) -> None:
         done = subprocess.run(["git", *identity, *arguments], cwd=tmp_path, capture_output=True, text=True, check=True)
         return done.stdout.strip()
 
-    assert commit(tmp_path) == "unknown"
+    assert git_commit(tmp_path) == "unknown"
     git("init", "-q")
     (tmp_path / "file").write_text("a")
     git("add", "file")
     git("commit", "-qm", "a")
-    assert commit(tmp_path.resolve()) == git("rev-parse", "HEAD")
+    assert git_commit(tmp_path.resolve()) == git("rev-parse", "HEAD")
     (tmp_path / "file").write_text("b")
-    assert commit(tmp_path.resolve()) == git("rev-parse", "HEAD") + "+changes"
+    assert git_commit(tmp_path.resolve()) == git("rev-parse", "HEAD") + "+changes"
     below = tmp_path / "below"
     below.mkdir()
-    assert commit(below.resolve()) == "unknown"
+    assert git_commit(below.resolve()) == "unknown"

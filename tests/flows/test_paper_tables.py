@@ -15,16 +15,21 @@ from typer.testing import CliRunner
 
 from flows.cli.main import app
 from flows.configuration import load_configuration
-from flows.paper_tables.figure import SHIFTS_M, TABLE, Kind, drawn, strips
-from flows.paper_tables.flow import paper_table, write
-from flows.paper_tables.layouts import LAYOUTS, PROTOCOL, Cell, layout_of
-from flows.paper_tables.measure import Basis, Place, measure, stages_of
-from flows.paper_tables.methods import BUILT_IN, Method, read_method, read_weights
-from flows.paper_tables.page import differences_from_the_paper, mean_of, page, put_into
-from flows.paper_tables.prediction import not_stored, predicted
+from flows.experiments.log_chunks import LogChunk
+from flows.paper_tables.builtin_methods import BUILT_IN
+from flows.paper_tables.columns import MeasuredCell, mean_over_cells
+from flows.paper_tables.figure import SHIFTS_M, TABLE, Kind, comparison_strips, draw_strips
+from flows.paper_tables.flow import paper_table, write_results
+from flows.paper_tables.layouts import LAYOUTS, PROTOCOL, get_layout
+from flows.paper_tables.measure import Basis, list_stages, measure_cell
+from flows.paper_tables.methods import Method
+from flows.paper_tables.page import list_differences, render_page
+from flows.paper_tables.page_sections import replace_section
 from flows.paper_tables.published_numbers import PAPER
-from flows.paper_tables.request import Planned, Request
-from flows.pipeline.stage_runner import produce
+from flows.paper_tables.request import CheckedRequest, TableRequest, find_unstored_methods, predict_table
+from flows.paper_tables.user_methods import read_method
+from flows.paper_tables.weights_slots import read_weights
+from flows.pipeline.stage_runner import run_stage
 from genre_tasks.errors import ConfigError, GenreError, InputError
 from tests.faults.small_run import LOG, SETTINGS, Stopped, stopping
 
@@ -74,12 +79,12 @@ def test_a_method_of_ones_own_is_a_small_file(tmp_path: Path) -> None:
     file.write_text("name: GNet, 24 iterations\nsettings: [gnet.iterations=24]\nend: gnet\nnote: shorter\n")
     method = read_method(file, "small")
     assert method == Method("GNet, 24 iterations", ("gnet.iterations=24",), "gnet", "shorter")
-    assert [r.label for r in layout_of(4, [method]).rows][-1] == "GNet, 24 iterations"
-    assert layout_of(4, [method]).rows[-1].paper == ""
+    assert [r.label for r in get_layout(4, [method]).rows][-1] == "GNet, 24 iterations"
+    assert get_layout(4, [method]).rows[-1].paper == ""
     with pytest.raises(ConfigError, match=r"ends at gnet.*takes methods that end at fnet"):
-        layout_of(3, [method])
+        get_layout(3, [method])
     with pytest.raises(ConfigError, match="two methods have one name"):
-        layout_of(4, [method, method])
+        get_layout(4, [method, method])
 
 
 @pytest.mark.parametrize(("name", "end"), [("gnet", "gnet"), ("genre", "enet")])
@@ -94,7 +99,7 @@ def test_the_examples_of_methods_are_the_preset_fine(name: str, end: str) -> Non
     [
         ("settings: [gnet.iterations=24]", "has no name"),
         ("name: GNet", "built-in method is called 'GNet'"),
-        ("name: a\nsetting: []", "no 'setting'.*Did you mean settings"),
+        ("name: a\nsetting: []", "no 'setting'.*Did you mean 'settings'"),
         ("name: a\nsettings: gnet.iterations=2", "no list of strings"),
         ("name: a\nsettings: [gnet.iteration=2]", r"no configuration key.*Did you mean 'gnet.iterations'"),
         ("name: a\nend: initial", "ends at 'initial'"),
@@ -117,11 +122,11 @@ def test_weights_are_given_by_name_and_a_fixers_inputs_are_checked(tmp_path: Pat
     fixer.write_bytes(b"")
     (tmp_path / "fnet.json").write_text(json.dumps({"architecture": {"inputs": ["render", "reference"]}}))
     given = read_weights([f"difix={fixer}", f"enet-g3r={fixer}"])
-    method = BUILT_IN["difix"].given(given)
+    method = BUILT_IN["difix"].with_weights(given)
     assert method.configuration("small", ()).fnet.weights == str(fixer)
     assert "fnet.safetensors" in method.note and "stands in" not in method.note
-    assert "stands in" in BUILT_IN["difix"].given({}).note
-    assert not BUILT_IN["fixer-difix"].given(given).needs_weights
+    assert "stands in" in BUILT_IN["difix"].with_weights({}).note
+    assert not BUILT_IN["fixer-difix"].with_weights(given).needs_weights
     with pytest.raises(InputError, match=r"trained with render, reference.*--inputs reference\+lidar"):
         read_weights([f"streetcrafter={fixer}"])
     (tmp_path / "fnet.json").write_text(json.dumps({"architecture": {}}))
@@ -129,35 +134,39 @@ def test_weights_are_given_by_name_and_a_fixers_inputs_are_checked(tmp_path: Pat
         read_weights([f"difix={fixer}"])
     with pytest.raises(InputError, match="no such weights"):
         read_weights([f"difix={tmp_path / 'none'}"])
-    with pytest.raises(ConfigError, match="Did you mean difix"):
+    with pytest.raises(ConfigError, match="Did you mean 'difix'"):
         read_weights(["difx=x"])
 
 
-def cell(method: str, psnr: float, kernel: float, chunk: int = 0, **seconds: float) -> Cell:
+def cell(method: str, psnr: float, kernel: float, chunk: int = 0, **seconds: float) -> MeasuredCell:
     metrics = {"interpolation/psnr": psnr, "interpolation/n": 45.0, "shift_3m/n": 120.0}
     metrics |= {f"shift_{n}m/kernel": kernel * n for n in range(1, 6)}
     own = {"ingest": 60.0, "initial": 6.0, "gnet": 30.0} | seconds
-    return Cell(method, "synthetic:street?seed=1001", chunk, own, dict.fromkeys(own, math.nan), metrics, 1000, 0)
+    return MeasuredCell(
+        method, "synthetic:street?seed=1001", chunk, own, dict.fromkeys(own, math.nan), metrics, 1000, 0
+    )
 
 
-def plan(number: int, *places: int) -> Planned:
-    request = Request(number, ("synthetic:street?seed=1001",), chunks=tuple(places or (0,)))
-    return request.planned()
+def plan(number: int, *places: int) -> CheckedRequest:
+    request = TableRequest(number, ("synthetic:street?seed=1001",), chunks=tuple(places or (0,)))
+    return request.check()
 
 
 def test_means_are_over_places_and_only_of_what_all_have() -> None:
     column = LAYOUTS[1].columns[0]
-    assert mean_of(column, [cell("GNet", 20.0, 0.1), cell("GNet", 24.0, 0.1)]) == 22.0
+    assert mean_over_cells(column, [cell("GNet", 20.0, 0.1), cell("GNet", 24.0, 0.1)]) == 22.0
     lacking = replace(cell("GNet", 20.0, 0.1), metrics={})
-    assert math.isnan(mean_of(column, [cell("GNet", 20.0, 0.1), lacking])) and math.isnan(mean_of(column, []))
+    assert math.isnan(mean_over_cells(column, [cell("GNet", 20.0, 0.1), lacking])) and math.isnan(
+        mean_over_cells(column, [])
+    )
 
 
 def test_the_page_has_the_papers_numbers_beside_and_says_what_differs() -> None:
     layout = plan(1).layout
     cells = [cell("GNet", 29.4, 0.1), cell("3DGS", 25.0, 0.3, enet=24.0), cell("StreetGS-style", 25.5, 0.2)]
     config = load_configuration("small", settings=["gnet.per_scene.iterations=3000"])
-    apart = differences_from_the_paper(layout, config, "synthetic", 1)
-    text = page(layout, cells, {"SplatAD-style": "it failed: no memory"}, ["* commit: abc"], apart, "synthetic")
+    apart = list_differences(layout, config, "synthetic", 1)
+    text = render_page(layout, cells, {"SplatAD-style": "it failed: no memory"}, ["* commit: abc"], apart, "synthetic")
     first = text.split("Measured beside it")[0]
     rows = {line.split(" | ")[0]: line.split(" | ") for line in first.splitlines() if line.startswith("| ")}
     head = rows["| method"]
@@ -177,7 +186,7 @@ def test_the_page_has_the_papers_numbers_beside_and_says_what_differs() -> None:
     ):
         assert said in text
     paper = load_configuration("paper")
-    assert not any("iterations" in t for t in differences_from_the_paper(layout, paper, "pandaset", 10))
+    assert not any("iterations" in t for t in list_differences(layout, paper, "pandaset", 10))
 
 
 def test_fid_takes_the_papers_columns_once_it_was_measured() -> None:
@@ -185,13 +194,13 @@ def test_fid_takes_the_papers_columns_once_it_was_measured() -> None:
     kernel = cell("GNet", 29.4, 0.1)
     both = replace(kernel, metrics=dict(kernel.metrics) | {f"shift_{n}m/fid": 80.0 + n for n in range(1, 6)})
     config = load_configuration("small", settings=["evaluate.inception=i.pt"])
-    apart = differences_from_the_paper(planned.layout, config, "synthetic", 1)
-    text = page(planned.layout, [both], {}, [], apart, "synthetic")
+    apart = list_differences(planned.layout, config, "synthetic", 1)
+    text = render_page(planned.layout, [both], {}, [], apart, "synthetic")
     assert "| FID @1m | FID @2m |" in text and "| 81.00 / 70.04 | 82.00 / 86.43 |" in text
     assert "not measured: weights" not in text and "FID is biased" in text
     assert "| kernel @1m |" in text.split("Measured beside it")[1]
-    assert "FID @1m |" in page(planned.layout, [kernel], {}, [], apart, "synthetic")
-    assert "81.00" not in page(planned.layout, [kernel], {}, [], apart, "synthetic")
+    assert "FID @1m |" in render_page(planned.layout, [kernel], {}, [], apart, "synthetic")
+    assert "81.00" not in render_page(planned.layout, [kernel], {}, [], apart, "synthetic")
 
 
 def test_rows_without_weights_are_not_measured_and_say_what_to_give() -> None:
@@ -199,28 +208,28 @@ def test_rows_without_weights_are_not_measured_and_say_what_to_give() -> None:
     assert set(missing) == {"StreetCrafter-V's inputs", "Difix3D's inputs"}
     assert "--weights difix=PATH" in missing["Difix3D's inputs"]
     assert set(plan(2).missing) == {"G3R-style + GenRe (fine-tuned)"} and not plan(1).missing
-    rows = predicted(plan(3))
+    rows = predict_table(plan(3))
     assert [r["seconds"] > 0 for r in rows] == [False, False, True]
 
 
 def test_a_section_is_written_anew_and_the_others_stay(tmp_path: Path) -> None:
     file = tmp_path / "tables.md"
     for number, on, text in ((4, "b", "four"), (1, "b", "one"), (4, "b", "again"), (5, "a", "five"), (4, "a", "real")):
-        put_into(file, number, on, text)
+        replace_section(file, number, on, text)
     text = file.read_text()
     assert "four" not in text
     places = [text.index(word) for word in ("# The paper's tables", "\none", "\nreal", "\nagain", "\nfive")]
     assert places == sorted(places)
-    put_into(file, 1, "b", "one")
+    replace_section(file, 1, "b", "one")
     assert file.read_text() == text
     file.write_text(text.replace("<!-- end of table 4 on a -->", ""))
     with pytest.raises(InputError, match="does not hold one section"):
-        put_into(file, 4, "a", "more")
+        replace_section(file, 4, "a", "more")
     assert [f.name for f in tmp_path.iterdir()] == ["tables.md"]
 
 
 def test_the_files_say_the_same(tmp_path: Path) -> None:
-    request = Request(
+    request = TableRequest(
         2,
         ("synthetic:street?seed=1001",),
         chunks=(0,),
@@ -229,9 +238,9 @@ def test_the_files_say_the_same(tmp_path: Path) -> None:
         settings=("gnet.iterations=7",),
         remarks=("measured at night",),
     )
-    planned = request.planned()
-    write(request, planned, [cell("3DGS", 20.0, 0.7)], planned.missing)
-    files = write(request, planned, [cell("3DGS", 25.0, 0.3)], planned.missing)  # in the place of the first
+    planned = request.check()
+    write_results(request, planned, [cell("3DGS", 20.0, 0.7)], planned.missing)
+    files = write_results(request, planned, [cell("3DGS", 25.0, 0.3)], planned.missing)  # in the place of the first
     assert [Path(f).name for f in files] == ["table2_synthetic.parquet", "table2_synthetic.md", "all.md"]
     table = pq.read_table(files[0]).to_pydict()
     assert table["method"] == [r.label for r in planned.layout.rows]
@@ -251,29 +260,29 @@ TABLE_SETTINGS = (*(s for s in SETTINGS if "snapshots" not in s), "gnet.per_scen
 
 
 def test_a_table_goes_on_where_it_was_stopped_and_methods_share_stages(tmp_path: Path) -> None:
-    basis, layout, place = Basis("demo", TABLE_SETTINGS, str(tmp_path)), LAYOUTS[4], Place(LOG, 0)
+    basis, layout, place = Basis("demo", TABLE_SETTINGS, str(tmp_path)), LAYOUTS[4], LogChunk(LOG, 0)
     computed, counted = stopping(after=6)
     with pytest.raises(Stopped):
         for row in layout.rows:
-            measure(basis, layout, row.method, place, counted)
+            measure_cell(basis, layout, row.method, place, counted)
     assert computed == ["ingest", "effects", "initial", "gnet", "evaluate/gnet", "novel_views"]
     computed.append("stopped here")
-    cells = [measure(basis, layout, row.method, place, counted) for row in layout.rows]
+    cells = [measure_cell(basis, layout, row.method, place, counted) for row in layout.rows]
     assert computed[7:] == ["fnet", "enet", "evaluate/enet", "enet", "evaluate/enet"]
     gnet, again, enhanced = cells
     assert "enet" not in gnet.seconds and again.seconds["gnet"] == gnet.seconds["gnet"] > 0
     kernels = [c.metrics["shift_3m/kernel"] for c in cells]
     assert len(set(kernels)) == 3 and all(math.isfinite(k) for k in kernels)
-    assert enhanced.fixed == 4 and gnet.fixed == 0  # two source frames, both sides
-    request = Request(4, (LOG,), "demo", str(tmp_path), settings=TABLE_SETTINGS)
-    rows = predicted(request.planned())
+    assert enhanced.fixed_views == 4 and gnet.fixed_views == 0  # two source frames, both sides
+    request = TableRequest(4, (LOG,), "demo", str(tmp_path), settings=TABLE_SETTINGS)
+    rows = predict_table(request.check())
     assert [r["seconds"] for r in rows] == [0.0] * 3 and rows[0]["cached"] == "5 of 5 stages"
-    assert not_stored(request.planned()) == {}
-    longer = replace(request, settings=(*TABLE_SETTINGS, "enet.seed=7")).planned()
-    assert not_stored(longer)["GNet → FNet → ENet"] == f"the store has no enet of {place} yet."
-    assert set(not_stored(longer)) == {"GNet → FNet → GNet", "GNet → FNet → ENet"}
+    assert find_unstored_methods(request.check()) == {}
+    longer = replace(request, settings=(*TABLE_SETTINGS, "enet.seed=7")).check()
+    assert find_unstored_methods(longer)["GNet → FNet → ENet"] == f"the store has no enet of {place} yet."
+    assert set(find_unstored_methods(longer)) == {"GNet → FNet → GNet", "GNet → FNet → ENet"}
     before = len(computed)
-    assert [measure(basis, layout, row.method, place, counted) for row in layout.rows] == cells
+    assert [measure_cell(basis, layout, row.method, place, counted) for row in layout.rows] == cells
     assert len(computed) == before
 
 
@@ -281,16 +290,16 @@ def test_per_scene_rows_run_to_their_end_and_times_fall_into_phases(tmp_path: Pa
     basis, layout, place = (
         Basis("demo", (*TABLE_SETTINGS, "evaluate.distributions=false"), str(tmp_path)),
         LAYOUTS[5],
-        Place(LOG, 0),
+        LogChunk(LOG, 0),
     )
     method = replace(BUILT_IN["difix"], settings=(*BUILT_IN["difix"].settings, "enet.iterations=3"))
-    found = measure(basis, layout, method, place, produce)
-    assert found.metrics == {} and stages_of(layout, method)[-1] == "enet"
+    found = measure_cell(basis, layout, method, place, run_stage)
+    assert found.metrics == {} and list_stages(layout, method)[-1] == "enet"
     by = {c.key: c.read(found) for c in layout.columns}
     assert by["reconstruction"] == (found.seconds["initial"] + found.seconds["gnet"]) / 60
     assert by["total"] == pytest.approx(by["reconstruction"] + by["fixer"] + by["distillation"]) and by["fixer"] > 0
-    splatad = measure(basis, LAYOUTS[1], BUILT_IN["splatad"], place, produce)
-    streetgs = measure(basis, LAYOUTS[1], BUILT_IN["streetgs"], place, produce)
+    splatad = measure_cell(basis, LAYOUTS[1], BUILT_IN["splatad"], place, run_stage)
+    streetgs = measure_cell(basis, LAYOUTS[1], BUILT_IN["streetgs"], place, run_stage)
     assert splatad.metrics["interpolation/psnr"] != streetgs.metrics["interpolation/psnr"]
 
 
@@ -314,15 +323,15 @@ def test_the_command_lists_what_it_would_run_and_refuses_what_it_does_not_know(t
 def test_logs_of_several_datasets_make_no_table(monkeypatch: pytest.MonkeyPatch) -> None:
     both = ("synthetic:street?seed=1001", "synthetic:street?seed=1002")
     assert plan(4).dataset == "synthetic"
-    assert len(Request(4, both, chunks=(0,)).planned().places) == 2
+    assert len(TableRequest(4, both, chunks=(0,)).check().places) == 2
 
     class Elsewhere:
         def __init__(self, uri: str) -> None:
             self.dataset = uri[-4:]
 
-    monkeypatch.setattr("flows.paper_tables.request.opened_log", Elsewhere)
+    monkeypatch.setattr("flows.paper_tables.request.cached_log", Elsewhere)
     with pytest.raises(ConfigError, match=r"several datasets \(1001, 1002\).*--into keeps a section for each"):
-        Request(4, both, chunks=(0,)).planned()
+        TableRequest(4, both, chunks=(0,)).check()
 
 
 @pytest.mark.parametrize(
@@ -330,19 +339,19 @@ def test_logs_of_several_datasets_make_no_table(monkeypatch: pytest.MonkeyPatch)
     [("recon", ["3DGS", "GNet", "the truth"]), ("fixers", ["what they are given", "FNet", "the truth"])],
 )
 def test_a_figure_has_a_row_for_each_method_and_the_truth(kind: Kind, labels: list[str], tmp_path: Path) -> None:
-    request = Request(TABLE[kind], (LOG,), "demo", str(tmp_path), settings=TABLE_SETTINGS)
-    planned = request.planned()
+    request = TableRequest(TABLE[kind], (LOG,), "demo", str(tmp_path), settings=TABLE_SETTINGS)
+    planned = request.check()
     few = tuple(r for r in planned.layout.rows if r.label in (*labels, *planned.missing))
-    found = strips(kind, replace(planned, layout=replace(planned.layout, rows=few)), produce)
+    found = comparison_strips(kind, replace(planned, layout=replace(planned.layout, rows=few)), run_stage)
     assert [s.label for s in found] == labels
     for strip in found:
         assert [i.shape for i in strip.images] == [(36, 64, 3)] * len(SHIFTS_M[kind])
         assert not np.array_equal(strip.images[0], strip.images[-1])
     assert not np.array_equal(found[0].images[0], found[1].images[0])
-    picture = drawn(kind, found, "a street")
+    picture = draw_strips(kind, found, "a street")
     assert picture.dtype == np.uint8 and picture.shape[1] > 64 * len(SHIFTS_M[kind])
     with pytest.raises(InputError, match="no source image of camera back at frame"):
-        strips(kind, planned, produce, camera="back")
+        comparison_strips(kind, planned, run_stage, camera="back")
 
 
 def test_the_flow_leaves_out_what_fails_and_says_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from flows.pipeline import stage_task
 from flows.pipeline.definition import PIPELINE
-from flows.pipeline.log_cache import expanded, opened_log
+from flows.pipeline.log_cache import cached_log, expand_logs
 from flows.pipeline.stage_runner import Job
 from flows.reconstruction import flow, run_records
 from genre_tasks.errors import ConfigError, InputError, ResourceError, TransientIOError
@@ -62,7 +62,7 @@ def test_a_hit_ends_in_a_state_named_cached(tmp_path: Path) -> None:
 def test_what_a_retry_can_cure_is_retried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: type) -> None:
     attempts: list[int] = []
     monkeypatch.setattr(stage_task.stage_task, "retry_delay_seconds", 0)
-    real = stage_task.produce
+    real = stage_task.run_stage
 
     def failing(stage: str, job: Job, inputs: Any, attempt: int, progress: Any) -> Any:
         attempts.append(attempt)
@@ -70,7 +70,7 @@ def test_what_a_retry_can_cure_is_retried(tmp_path: Path, monkeypatch: pytest.Mo
             raise kind("not now", remedy="Wait.")
         return real(stage, job, inputs, attempt, progress)
 
-    monkeypatch.setattr(stage_task, "produce", failing)
+    monkeypatch.setattr(stage_task, "run_stage", failing)
     assert served(run(tmp_path)) == [False] * 3
     assert attempts == [0, 0, 0, 1, 2]
 
@@ -82,7 +82,7 @@ def test_what_no_retry_can_cure_is_not_retried(tmp_path: Path, monkeypatch: pyte
         calls.append(stage)
         raise ConfigError("wrong", remedy="Mend it.")
 
-    monkeypatch.setattr(stage_task, "produce", failing)
+    monkeypatch.setattr(stage_task, "run_stage", failing)
     with pytest.raises(ConfigError, match="wrong"):
         run(tmp_path)
     assert calls == ["ingest"]
@@ -93,7 +93,7 @@ def test_a_chunk_that_cannot_be_made_leaves_the_others(tmp_path: Path) -> None:
     log = LOG.replace("frames=8", "frames=7")  # the second chunk has one frame, hence one source view
     with pytest.raises(InputError, match="source"):
         flow.reconstruct_log(log, preset="demo", store=str(tmp_path), settings=settings)
-    (record,) = run_records.recorded_runs(str(tmp_path))
+    (record,) = run_records.list_runs(str(tmp_path))
     assert [c["chunk"] for c in record["chunks"]] == [0]
 
 
@@ -101,7 +101,7 @@ def test_a_log_that_fails_does_not_stop_the_dataset(tmp_path: Path) -> None:
     logs = ["synthetic:nothing", LOG, OTHER_LOG]
     with pytest.raises((InputError, ConfigError), match="nothing"):
         flow.reconstruct_dataset(logs, preset="demo", store=str(tmp_path), settings=list(SETTINGS))
-    assert {r["log"] for r in run_records.recorded_runs(str(tmp_path))} == {LOG, OTHER_LOG}
+    assert {r["log"] for r in run_records.list_runs(str(tmp_path))} == {LOG, OTHER_LOG}
 
 
 def test_an_unknown_chunk_is_named(tmp_path: Path) -> None:
@@ -112,19 +112,19 @@ def test_an_unknown_chunk_is_named(tmp_path: Path) -> None:
 def test_a_folder_of_sequences_is_expanded(tmp_path: Path) -> None:
     for name in ("002", "001"):
         (tmp_path / name).mkdir()
-    assert expanded([f"pandaset:{tmp_path}/*", LOG]) == [
+    assert expand_logs([f"pandaset:{tmp_path}/*", LOG]) == [
         f"pandaset:{tmp_path}/001",
         f"pandaset:{tmp_path}/002",
         LOG,
     ]
     with pytest.raises(InputError, match="no log matches"):
-        expanded([f"pandaset:{tmp_path}/none/*"])
+        expand_logs([f"pandaset:{tmp_path}/none/*"])
 
 
 def test_a_stages_value_can_be_had_back(tmp_path: Path) -> None:
     summary = run(tmp_path)
-    number, chunk = run_records.stage_value(str(tmp_path), summary["run"][:6], None, "ingest")
-    assert number == 0 and chunk.log == opened_log(LOG).name
+    number, chunk = run_records.read_stage_value(str(tmp_path), summary["run"][:6], None, "ingest")
+    assert number == 0 and chunk.log == cached_log(LOG).name
     shutil.rmtree(next(tmp_path.glob("synthetic/*/0000/initial")))
     with pytest.raises(InputError, match="gone"):
-        run_records.stage_value(str(tmp_path), summary["run"], 0, "initial")
+        run_records.read_stage_value(str(tmp_path), summary["run"], 0, "initial")

@@ -10,8 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from flows.reconstruction.report import MEASURED, headline, metric_rows, picture_rows, write_report
+from flows.reconstruction.report import write_report
 from flows.reconstruction.report_curve import accuracy_curve
+from flows.reconstruction.report_metrics import SCORED_STAGES, build_headline, build_metric_rows
+from flows.reconstruction.report_pictures import build_picture_rows
 from flows.reconstruction.run_summary import ChunkSummary, RunSummary, StageSummary
 
 PNG = bytes.fromhex(
@@ -120,37 +122,37 @@ def test_the_same_run_writes_the_same_bytes(tmp_path: Path) -> None:
 
 
 def test_best_is_marked_in_the_right_direction() -> None:
-    rows = metric_rows({s.stage: s for s in chunk().stages if s.stage in MEASURED})
+    rows = build_metric_rows({s.stage: s for s in chunk().stages if s.stage in SCORED_STAGES})
     best = {}
     group = ""
     for row in rows:
         group = row.group or group
-        best[group, row.label] = [MEASURED[i] for i, c in enumerate(row.cells) if c is not None and c.best]
+        best[group, row.label] = [SCORED_STAGES[i] for i, c in enumerate(row.values) if c is not None and c.best]
     assert best["Held-out frames", "PSNR, dB"] == ["gnet"]
     assert best["3 m to the side", "PSNR, dB"] == ["fnet"]
     assert best["3 m to the side", "Kernel"] == ["enet"]
     assert best["3 m to the side", "PSNR, dB of the renders given"] == []
     assert [r.group for r in rows if r.group] == ["Held-out frames", "3 m to the side", "10 m to the side"]
-    assert rows[0].cells[2] is None and rows[0].cells[1].text == "24.00"
+    assert rows[0].values[2] is None and rows[0].values[1].text == "24.00"
 
 
 def test_stages_measured_on_fewer_images_and_ties_win_nothing() -> None:
     few = StageSummary("fnet", "f", False, 1, 1, {"shift_3m/psnr": 99.0, "shift_3m/n": 8.0})
-    rows = metric_rows({"gnet": scene("gnet", 24.0, 1.0), "enet": scene("enet", 24.0, 0.5), "fnet": few})
+    rows = build_metric_rows({"gnet": scene("gnet", 24.0, 1.0), "enet": scene("enet", 24.0, 0.5), "fnet": few})
     row = next(r for r in rows if r.group == "3 m to the side")
-    assert not any(c.best for c in row.cells if c is not None)
-    nan = metric_rows({"gnet": scene("gnet", float("nan"), 1.0), "enet": scene("enet", 20.0, 1.0)})
-    assert nan[0].cells[1].text == "not finite" and not any(c.best for c in nan[0].cells if c is not None)
+    assert not any(c.best for c in row.values if c is not None)
+    nan = build_metric_rows({"gnet": scene("gnet", float("nan"), 1.0), "enet": scene("enet", 20.0, 1.0)})
+    assert nan[0].values[1].text == "not finite" and not any(c.best for c in nan[0].values if c is not None)
 
 
 def test_pictures_say_what_is_missing() -> None:
-    ((first, on_path), (second, beside)) = picture_rows(chunk())
+    ((first, on_path), (second, beside)) = build_picture_rows(chunk())
     assert first == "On the path · front camera · frame 5" and second.startswith("3 m to the left")
     assert [p.label for p in on_path] == ["Truth", "GNet", "Fixed", "ENet"]
     assert [bool(p.url) for p in on_path] == [True, True, False, False]
     assert [bool(p.url) for p in beside] == [True, True, True, False]
     real = ChunkSummary(0, (StageSummary("gnet", "g", False, 1, 1, {}, {"3m_right_left_camera_10": PNG}),))
-    ((label, pictures),) = picture_rows(real)
+    ((label, pictures),) = build_picture_rows(real)
     assert label == "3 m to the right · left camera · frame 10"
     assert not pictures[0].url and "no true image" in pictures[0].why
 
@@ -175,7 +177,7 @@ def test_curve_continues_where_gnet_ended() -> None:
 @pytest.mark.parametrize("stages", [(), (StageSummary("ingest", "k", False, 0.0, 0.0),)])
 def test_a_run_with_nothing_to_show_still_has_a_report(tmp_path: Path, stages: tuple[StageSummary, ...]) -> None:
     empty = ChunkSummary(0, stages)
-    assert headline(empty) == []
+    assert build_headline(empty) == []
     Reader(write_report(tmp_path / "r.html", run(empty)).read_text())
 
 

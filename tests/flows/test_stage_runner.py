@@ -9,12 +9,13 @@ from typing import Any
 import pytest
 
 from flows.configuration import load_configuration
+from flows.machine.resource_usage import measure_usage
 from flows.pipeline import stage_runner as room
-from flows.pipeline.definition import BY_NAME, PIPELINE, stage_key
-from flows.pipeline.stage_runner import ArtifactRef, Job, key_of, measured, produce
+from flows.pipeline.definition import PIPELINE, STAGE_BY_NAME, stage_key
+from flows.pipeline.stage_runner import ArtifactRef, Job, compute_key, run_stage
 from genre_tasks.config import EffectsConfig, EvaluateConfig, PipelineConfig
 from genre_tasks.errors import InputError, ResourceError
-from storage.code_digest import closure
+from storage.code_digest import import_closure
 from tests.faults.small_run import LOG, SETTINGS
 
 EARLY = ("ingest", "effects", "initial")
@@ -28,7 +29,7 @@ def job(store: Path, *settings: str, log: str = LOG) -> Job:
 def run(work: Job, *stages: str) -> dict[str, ArtifactRef]:
     refs: dict[str, ArtifactRef] = {}
     for stage in stages:
-        refs[stage] = produce(stage, work, {name: refs[name] for name in BY_NAME[stage].inputs})
+        refs[stage] = run_stage(stage, work, {name: refs[name] for name in STAGE_BY_NAME[stage].inputs})
     return refs
 
 
@@ -69,20 +70,20 @@ def test_an_unrelated_setting_keeps_the_key_and_a_related_one_changes_it(store: 
 def test_a_plan_of_effects_is_part_of_later_keys(store: Path) -> None:
     other = run(job(store, "effects.lidar_depth=off"), *EARLY)
     assert cached(other) == {"ingest": True, "effects": False, "initial": False}
-    spec, config = BY_NAME["gnet"], load_configuration("demo")
+    spec, config = STAGE_BY_NAME["gnet"], load_configuration("demo")
     keys = {stage_key(spec, config, {"ingest": "a", "initial": "b", "effects": e}, "w") for e in "cd"}
     assert len(keys) == 2
 
 
 def test_the_effects_code_is_part_of_the_plans_key() -> None:
-    spec, root = BY_NAME["effects"], Path(room.__file__).parents[2]
-    files, _ = closure(spec.module, spec.lazy, root)
+    spec, root = STAGE_BY_NAME["effects"], Path(room.__file__).parents[2]
+    files, _ = import_closure(spec.module, spec.lazy_modules, root)
     assert {f"genre_tasks.effects.{name}" for name in EffectsConfig.model_fields} <= set(files)
-    assert "genre_tasks.effects.exposure" not in closure(spec.module, (), root)[0]  # why it has to be said
+    assert "genre_tasks.effects.exposure" not in import_closure(spec.module, (), root)[0]  # why it has to be said
 
 
 def test_a_setting_that_only_bounds_memory_keeps_the_key(store: Path) -> None:
-    spec = BY_NAME["fnet"]
+    spec = STAGE_BY_NAME["fnet"]
     inputs = {"ingest": "a", "novel_views": "b"}
     keys = {
         stage_key(spec, load_configuration("demo", settings=[f"fnet.batch_views={n}"]), inputs, "w") for n in (1, 4)
@@ -91,11 +92,11 @@ def test_a_setting_that_only_bounds_memory_keeps_the_key(store: Path) -> None:
 
 
 def test_inputs_weights_and_reader_are_part_of_the_key() -> None:
-    spec, config = BY_NAME["gnet"], load_configuration("demo")
+    spec, config = STAGE_BY_NAME["gnet"], load_configuration("demo")
     base = stage_key(spec, config, {"ingest": "a", "initial": "b"}, "w")
     assert base != stage_key(spec, config, {"ingest": "a", "initial": "c"}, "w")
     assert base != stage_key(spec, config, {"ingest": "a", "initial": "b"}, "v")
-    ingest = BY_NAME["ingest"]
+    ingest = STAGE_BY_NAME["ingest"]
     readers = {
         stage_key(ingest, config, {"log": "x"}, None, (f"genre_tasks.logs.{m}",))
         for m in ("pandaset.reader", "validation")
@@ -104,9 +105,9 @@ def test_inputs_weights_and_reader_are_part_of_the_key() -> None:
 
 
 def test_the_key_follows_the_logs_content_and_the_chunk(store: Path) -> None:
-    spec = BY_NAME["ingest"]
-    here, _ = key_of(spec, job(store), {})
-    other, _ = key_of(spec, job(store, log=LOG.replace("seed=900", "seed=901")), {})
+    spec = STAGE_BY_NAME["ingest"]
+    here, _ = compute_key(spec, job(store), {})
+    other, _ = compute_key(spec, job(store, log=LOG.replace("seed=900", "seed=901")), {})
     assert here != other
 
 
@@ -139,9 +140,9 @@ def test_a_damaged_file_is_found_named_and_computed_again(store: Path, damage: s
 
 
 def test_out_of_memory_becomes_a_resource_error() -> None:
-    with pytest.raises(ResourceError, match="memory ran out"), measured():
+    with pytest.raises(ResourceError, match="memory ran out"), measure_usage():
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes")
-    with pytest.raises(RuntimeError, match="shapes"), measured():
+    with pytest.raises(RuntimeError, match="shapes"), measure_usage():
         raise RuntimeError("shapes do not fit")
 
 
@@ -149,7 +150,7 @@ def test_a_retry_after_out_of_memory_is_smaller_and_the_key_stays(store: Path, m
     seen: list[int] = []
     section = load_configuration("demo").fnet
     for attempt in range(4):
-        smaller: Any = room._smaller(BY_NAME["fnet"], section, attempt)
+        smaller: Any = room._shrink_batch(STAGE_BY_NAME["fnet"], section, attempt)
         seen.append(smaller.batch_views)
     assert seen == [4, 2, 1, 1]
 
@@ -161,7 +162,7 @@ def test_an_impossible_chunk_leaves_nothing_behind(tmp_path: Path) -> None:
 
 
 def test_the_bytes_of_a_network_are_part_of_an_evaluations_key_and_its_name_is_not(tmp_path: Path) -> None:
-    spec = BY_NAME["evaluate/gnet"]
+    spec = STAGE_BY_NAME["evaluate/gnet"]
     inputs = dict.fromkeys((*spec.inputs, "log", "chunk"), "x")
 
     def key(file: Path) -> str:

@@ -7,13 +7,13 @@ from dataclasses import replace
 import pytest
 
 from flows.training import recipes
-from flows.training.device import chosen_device
-from flows.training.optimiser_stages import places
-from flows.training.recipes import GNET_STAGES, ordered, table_of
+from flows.training.device import choose_device
+from flows.training.recipes import GNET_STAGES, get_recipe, select_stages
 from flows.training.scene_starts import Adam, ByGnet, PerScene
-from flows.training.validation import validation_recipes
+from flows.training.stage_scenes import list_stage_scenes
+from flows.training.validation import list_validation_recipes
 from genre_tasks.errors import ConfigError
-from genre_tasks.learned.weights import load
+from genre_tasks.learned.weights import load_optimiser
 from genre_tasks.weights import resolve_weights
 
 REAL = "pandaset:002"
@@ -21,57 +21,57 @@ REAL = "pandaset:002"
 
 @pytest.mark.parametrize("recipe", recipes.RECIPES)
 def test_every_recipe_is_in_order_and_of_training_chunks(recipe: str) -> None:
-    table = table_of(recipe)
-    assert {stage.of for stage in table} == ({"gnet"} if recipe == "effects" else {"gnet", "enet"})
+    table = get_recipe(recipe)
+    assert {stage.network_name for stage in table} == ({"gnet"} if recipe == "effects" else {"gnet", "enet"})
     for stage in table:
-        at = places(stage, REAL)
+        at = list_stage_scenes(stage, REAL)
         assert len(at) == stage.scenes.rounds * len(
-            places(replace(stage, scenes=replace(stage.scenes, rounds=1)), REAL)
+            list_stage_scenes(replace(stage, scenes=replace(stage.scenes, rounds=1)), REAL)
         )
-        assert [r.uri.count("seed=90") for r in validation_recipes(stage.scenes)] == [1, 1, 1]
+        assert [r.uri.count("seed=90") for r in list_validation_recipes(stage.scenes)] == [1, 1, 1]
 
 
 def test_the_shipped_weights_are_described() -> None:
-    table = {stage.name: stage for stage in table_of("shipped")}
+    table = {stage.name: stage for stage in get_recipe("shipped")}
     assert [table[s.name].config.steps for s in GNET_STAGES] == [1200, 240, 240, 200, 110, 420, 0]
-    streets = [len(places(table[name], None)) for name in ("gnet/coarse", "gnet/fine", "enet/coarse")]
+    streets = [len(list_stage_scenes(table[name], None)) for name in ("gnet/coarse", "gnet/fine", "enet/coarse")]
     assert streets == [40, 15, 24]
-    assert len(places(table["gnet/many"], REAL)) == 15 + 4
-    assert len(places(table["gnet/dense"], REAL)) == 28 + 9
-    begins = [place.begin for place in places(table["enet/fine"], REAL)]
+    assert len(list_stage_scenes(table["gnet/many"], REAL)) == 15 + 4
+    assert len(list_stage_scenes(table["gnet/dense"], REAL)) == 28 + 9
+    begins = [scene.start for scene in list_stage_scenes(table["enet/fine"], REAL)]
     gnet = ByGnet("gnet/fine")
     assert begins[:6] == [gnet, gnet, Adam(24), gnet, gnet, Adam(48)]
-    names = [stage.name for stage in ordered(table_of("shipped"), "enet")]
+    names = [stage.name for stage in select_stages(get_recipe("shipped"), "enet")]
     gnet = ["gnet/coarse", "gnet/fine", "gnet/finer", "gnet/unseen", "gnet/many", "gnet/dense"]
-    assert table["gnet/told"].network == load(resolve_weights("gnet", "builtin")).config
-    assert table["gnet/told"].network == load(resolve_weights("g3r", "builtin")).config
+    assert table["gnet/told"].network == load_optimiser(resolve_weights("gnet", "builtin")).config
+    assert table["gnet/told"].network == load_optimiser(resolve_weights("g3r", "builtin")).config
     enet = ["enet/coarse", "enet/fine", "enet/dense", "enet/strides", "enet/held", "enet/many"]
     assert names == [*gnet, "gnet/told", *enet, "enet/swept"]
-    assert table["enet/swept"].network == load(resolve_weights("enet", "builtin")).config
+    assert table["enet/swept"].network == load_optimiser(resolve_weights("enet", "builtin")).config
 
 
 def test_the_paper_begins_with_enet() -> None:
-    names = [stage.name for stage in ordered(table_of("paper"), "gnet")]
+    names = [stage.name for stage in select_stages(get_recipe("paper"), "gnet")]
     assert names == ["enet/coarse_3dgs", "enet/3dgs", "gnet/coarse", "gnet/fine"]
 
 
 @pytest.mark.parametrize("recipe", recipes.RECIPES)
 def test_g3r_sees_recorded_views_alone(recipe: str) -> None:
-    table = table_of(recipe, novel=0)
-    assert {stage.of for stage in table} == {"g3r"}
+    table = get_recipe(recipe, novel=0)
+    assert {stage.network_name for stage in table} == {"g3r"}
     for stage in table:
-        assert stage.config.judge_loss.novel == 0 and stage.config.novel_views == 0 and stage.images is None
-        assert all(name.startswith("g3r/") for name in stage.needs())
-    assert table_of(recipe, novel=0.2)[-1].name == table_of(recipe)[-1].name
+        assert stage.config.held_out_loss.novel == 0 and stage.config.novel_views == 0 and stage.fixed_images is None
+        assert all(name.startswith("g3r/") for name in stage.required_stages())
+    assert get_recipe(recipe, novel=0.2)[-1].name == get_recipe(recipe)[-1].name
 
 
 def test_training_with_effects_and_without_differ_in_the_scenes_alone() -> None:
-    plain, effects = table_of("effects")
-    assert plain.config == effects.config and plain.start == effects.start == "builtin:gnet"
-    assert plain.needs() == effects.needs() == ()
-    pairs = list(zip(places(plain, REAL), places(effects, REAL), strict=True))
+    plain, effects = get_recipe("effects")
+    assert plain.config == effects.config and plain.initial_weights == effects.initial_weights == "builtin:gnet"
+    assert plain.required_stages() == effects.required_stages() == ()
+    pairs = list(zip(list_stage_scenes(plain, REAL), list_stage_scenes(effects, REAL), strict=True))
     assert all(b.recipe == replace(a.recipe, uri=b.recipe.uri, planned=True) for a, b in pairs)
-    assert all(b.recipe.uri.startswith(a.recipe.uri) and a.begin == b.begin for a, b in pairs)
+    assert all(b.recipe.uri.startswith(a.recipe.uri) and a.start == b.start for a, b in pairs)
     counts = [sum(name in b.recipe.uri for _, b in pairs) for name in ("rolling", "distortion", "exposure", "bonnet")]
     assert counts == sorted(counts, reverse=True) and counts[-1] > 0
     assert any(a.recipe.uri == b.recipe.uri for a, b in pairs if "street" in a.recipe.uri)
@@ -80,9 +80,9 @@ def test_training_with_effects_and_without_differ_in_the_scenes_alone() -> None:
 def test_a_table_out_of_order_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recipes, "RECIPES", {"turned": tuple(reversed(GNET_STAGES)), "twice": 2 * GNET_STAGES[:1]})
     with pytest.raises(ConfigError, match="gnet/told needs gnet/dense"):
-        table_of("turned")
+        get_recipe("turned")
     with pytest.raises(ConfigError, match="two stages are called gnet/coarse"):
-        table_of("twice")
+        get_recipe("twice")
 
 
 def test_an_age_beyond_its_run_is_refused() -> None:
@@ -92,6 +92,6 @@ def test_an_age_beyond_its_run_is_refused() -> None:
 
 def test_devices(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    assert chosen_device("cpu").type == "cpu"
+    assert choose_device("cpu").type == "cpu"
     with pytest.raises(ConfigError, match="Give auto, cpu or cuda"):
-        chosen_device("tpu")
+        choose_device("tpu")

@@ -1,4 +1,4 @@
-"""Sections of the list of hard cases, and the tests that have no measured error in ``docs/stability.md``.
+"""Sections of the list of hard cases, and the tests that have no measured error in ``docs/reference/stability.md``.
 
 A plain string says why there is no test. A test holds that what is named here exists.
 """

@@ -1,4 +1,4 @@
-"""The rows of ``docs/stability.md``: those of the scenes, and those of tests of their own."""
+"""The rows of ``docs/reference/stability.md``: those of the scenes, and those of tests of their own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``docs/stability.md``: every measured row of the hard cases, and the tests of those without a measured error.
+"""``docs/reference/stability.md``: measured rows of the hard cases, and the tests of those without a measured error.
 
 The words, bounds and tests come from the tables beside this file; only the measured numbers come from a run.
 """
@@ -15,18 +15,26 @@ BACKENDS = ("reference", "cpu")
 
 HEAD = """# Hard cases: what stays stable, by how much, and where it is tested
 
-Written by `pytest -m "slow or not slow" tests/hard_cases/test_geometry.py tests/hard_cases/test_compositing.py
-tests/hard_cases/test_effects.py --stability-report docs/stability.md`; a test holds that rows, bounds and named tests
-are those of the suite. To add a case, add a line to a table in `tests/hard_cases/` (`render_cases.py`, `measured.py`,
-`listed.py`).
+This page is written by the command below. A test holds that rows, bounds and named tests are those of the suite.
+To add a case, add a line to a table in `tests/hard_cases`: `render_cases.py`, `case_measurements.py` or `case_list.py`.
 
-Errors are against the float64 reference of the same input, the largest found. *image*: colour, alpha, and depth as a
-share of the farthest, absolute, outside of the band of pixels where rounding may decide (alpha beside 1/255 or the
-clamp, transmittance beside the stop, depths too near to be told apart; `tests/render/oracles.py`). *gradient*:
-relative L2 of the worst of the five attributes, with no weight on those pixels; *whole gradient*: with them.
-`reference` is the same code in float32. `cuda` (gsplat) has no column: its images are held to 0.02 where there is a
-GPU, and no numbers have been taken. Tests that are slow or inject faults are part of `make test-all`, the others of
-`make test`.
+```text
+pytest -m "slow or not slow" tests/hard_cases/test_geometry.py tests/hard_cases/test_compositing.py
+  tests/hard_cases/test_effects.py --stability-report docs/reference/stability.md
+```
+
+Errors are against the float64 reference of the same input, the largest found.
+
+| quantity | meaning |
+|---|---|
+| image | largest absolute error of colour, alpha, and depth as a fraction of the farthest |
+| gradient | relative L2 error of the worst of the five attributes |
+| whole gradient | the same, with the pixels that are left out otherwise |
+
+Pixels where rounding may decide are left out: alpha near 1/255 or the clamp, transmittance near the stop, and depths
+too near to be told apart (`tests/render/oracles.py`). `reference` is the same code in float32.
+`cuda` (gsplat) has no column: its images are held to 0.02 where there is a GPU, and no numbers have been taken.
+Tests that are slow or inject faults are part of `make test-all`, the others of `make test`.
 """
 
 

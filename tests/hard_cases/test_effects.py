@@ -18,7 +18,7 @@ from tests.render.oracles import agreement, survey
 from tests.scenes import NAMES, Scene, cloud, gradients
 
 BARREL = (-0.3, 0.0, 0.001, -0.002, 0.0)
-TOWARDS = RollingShutter(0.03, (0.0, 0.5, 30.0), (0.1, -0.2, 0.3))
+TOWARDS = RollingShutter(0.03, velocity_m_s=(0.0, 0.5, 30.0), turn_rad_s=(0.1, -0.2, 0.3))
 
 
 def _around(radius: float) -> Scene:
@@ -66,7 +66,7 @@ def test_what_would_fold_back_touches_no_pixel(backend):
 def test_crossing_the_near_plane_during_the_readout(backend, z, stability):
     """The camera comes 0.9 m nearer: a row of Gaussians from above the image to below it, some of which it passes."""
     splats, cameras = cloud(300, 33, 17)
-    cameras = replace(cameras, camera_SE3_chunk=torch.eye(4)[None], shutter=Shutter.of([TOWARDS]))
+    cameras = replace(cameras, camera_SE3_chunk=torch.eye(4)[None], shutter=Shutter.from_rolling_shutters([TOWARDS]))
     hard = torch.arange(300) % 7 == 0
     place = torch.stack([0.1 * torch.ones(300), z * torch.linspace(-0.6, 0.6, 300), torch.full((300,), z)], 1)
     means = torch.where(hard[:, None], place, splats.means)
@@ -84,7 +84,7 @@ def test_crossing_the_near_plane_during_the_readout(backend, z, stability):
 @on_both
 def test_a_readout_of_0_is_no_shutter(backend, stability):
     splats, cameras = cloud(300, 33, 17, views=2)
-    still = replace(cameras, shutter=Shutter.of([replace(TOWARDS, readout_s=0.0)] * 2))
+    still = replace(cameras, shutter=Shutter.from_rolling_shutters([replace(TOWARDS, readout_s=0.0)] * 2))
     plain, expected = gradients(splats, cameras, SETTINGS[backend])
     for one in (still, replace(still, distortion=torch.zeros(2, 5))):
         image, found = gradients(splats, one, SETTINGS[backend])

@@ -79,7 +79,7 @@ def _seen_by(chunk: Chunk, view: int) -> Scene:
     colors = torch.from_numpy(chunk.static.colors)[::5].float() / 255
     splats = Splats(means, torch.tensor([[0.3, 0.1, 0.2]]).expand(n, 3), turn, torch.full((n,), 0.6), colors)
     seen = chunk.views[view]
-    return splats, Cameras.of([seen.chunk_SE3_camera], [seen.lens])
+    return splats, Cameras.from_poses([seen.chunk_SE3_camera], [seen.lens])
 
 
 @pytest.fixture(scope="module")

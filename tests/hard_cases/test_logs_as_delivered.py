@@ -15,7 +15,7 @@ from PIL import Image
 
 from flows.configuration import load_configuration
 from flows.pipeline.definition import PIPELINE
-from flows.pipeline.stage_runner import ArtifactRef, Job, produce
+from flows.pipeline.stage_runner import ArtifactRef, Job, run_stage
 from genre_tasks.errors import InputError
 from genre_tasks.logs.pandaset.writer import write_pandaset
 from genre_tasks.logs.registry import open_log
@@ -41,10 +41,10 @@ def whole_run(folder: Path, log: Path | str, *settings: str, chunk: int = 0) -> 
     job = Job(uri, chunk, str(folder / "store"), config.model_dump(mode="json"))
     refs: dict[str, ArtifactRef] = {}
     for spec in PIPELINE:
-        refs[spec.name] = produce(spec.name, job, {name: refs[name] for name in spec.inputs})
+        refs[spec.name] = run_stage(spec.name, job, {name: refs[name] for name in spec.inputs})
     for stage in ("gnet", "enet"):
         scene = value(folder, refs[stage], Reconstruction).scene
-        assert bool(scene.gaussians.packed().isfinite().all())
+        assert bool(scene.gaussians.pack().isfinite().all())
     for stage in ("initial", "gnet", "fnet", "enet"):
         found = value(folder, refs[f"evaluate/{stage}"], Evaluation)
         assert found.metrics and all(math.isfinite(m.value) for m in found.metrics)
@@ -60,7 +60,7 @@ def value(folder: Path, ref: ArtifactRef, kind: type[T]) -> T:
 
 
 def marks(folder: Path, refs: dict[str, ArtifactRef]) -> set[str]:
-    return {mark.kind for mark in value(folder, refs["ingest"], Chunk).marks}
+    return {mark.kind for mark in value(folder, refs["ingest"], Chunk).log_issues}
 
 
 def _drop_sweep(log: Path) -> None:

@@ -1,4 +1,4 @@
-"""``docs/stability.md`` is what the tables say, its numbers hold, and the tests that it names exist."""
+"""``docs/reference/stability.md`` is what the tables say, its numbers hold, and the tests that it names exist."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from tests.hard_cases.case_measurements import ROWS
 from tests.hard_cases.stability import Row, document, key, parsed
 
 ROOT = Path(__file__).parents[2]
-DOCUMENT = ROOT / "docs/stability.md"
+DOCUMENT = ROOT / "docs/reference/stability.md"
 
 
 def test_the_document_has_the_rows_of_the_tests():
     text = DOCUMENT.read_text()
     measured = parsed(text)
     expected = {key(row, backend) for row in ROWS for backend in row.backends}
-    assert set(measured) == expected, "run the command at the head of docs/stability.md"
-    assert document(ROWS, measured) == text, "run the command at the head of docs/stability.md"
+    assert set(measured) == expected, "run the command at the head of docs/reference/stability.md"
+    assert document(ROWS, measured) == text, "run the command at the head of docs/reference/stability.md"
     over = [row for row in ROWS for b in row.backends if float(measured[key(row, b)]) > row.bound * 1.05]
     assert over == []
 

@@ -15,8 +15,10 @@ from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import FIRST_ACTOR, SceneGraph
-from genre_tasks.scene.transforms import interpolate_pose, quat_to_matrix, rigid
-from genre_tasks.stages.ingest import NO_SWEEP, ingest
+from genre_tasks.scene.rotations import quats_to_matrices_numpy
+from genre_tasks.scene.transforms import interpolate_pose, is_rigid_transform
+from genre_tasks.stages.ingest import ingest
+from genre_tasks.stages.ingest_points import NO_SWEEP
 from tests.fakes import FakeCar, FakeLog, camera_turn, yaw_pose
 
 CONFIG = IngestConfig(width_px=96, height_px=64)
@@ -33,7 +35,7 @@ def chunk(log: FakeLog) -> Chunk:
 
 
 def _kinds(chunk: Chunk) -> list[str]:
-    return [m.kind for m in chunk.marks]
+    return [m.kind for m in chunk.log_issues]
 
 
 @pytest.mark.parametrize("offset", [(1e6, -1e6, 0.0), (4.4e5, 4.6e6, 100.0)])
@@ -76,7 +78,7 @@ def test_cuboids_that_are_unfit(log: FakeLog) -> None:
     out = ingest(CONFIG, log.with_(extra_tracks=tracks), 0)
     assert [a.track_id for a in out.actors] == ["mover"]
     assert sorted(_kinds(out)) == ["actor_few_points"] * 2 + ["cuboid_invalid"] * 2 + ["cuboid_outside"]
-    (outside,) = [m for m in out.marks if m.kind == "cuboid_outside"]
+    (outside,) = [m for m in out.log_issues if m.kind == "cuboid_outside"]
     assert outside.detail.startswith("2 tracks")
 
 
@@ -94,7 +96,7 @@ def test_interpolation_is_the_shortest_turn(yaw: float) -> None:
     assert np.allclose(interpolate_pose(start, end, 0.0), start, atol=1e-9)
     assert np.allclose(interpolate_pose(start, end, 1.0), end, atol=1e-9)
     middle = interpolate_pose(start, end, 0.5)
-    assert rigid(middle, 1e-9) and np.allclose(middle[:3, 3], [1, 2, 0])
+    assert is_rigid_transform(middle, 1e-9) and np.allclose(middle[:3, 3], [1, 2, 0])
     angle = np.arccos(np.clip((np.trace(start[:3, :3].T @ middle[:3, :3]) - 1) / 2, -1, 1))
     shortest = abs((yaw + np.pi) % (2 * np.pi) - np.pi)
     assert angle == pytest.approx(shortest / 2, abs=1e-6)
@@ -114,26 +116,28 @@ def _one_actor_graph(yaw: float) -> SceneGraph:
 
 @pytest.mark.parametrize("yaw", [0.0, 0.4, np.pi, -np.pi])
 def test_actor_at_any_yaw_also_a_half_turn(yaw: float) -> None:
-    posed = _one_actor_graph(yaw).at(3)
+    posed = _one_actor_graph(yaw).gaussians_at(3)
     assert torch.allclose(posed.means[0], torch.tensor([1.0, 0, 0]))
     assert np.allclose(posed.means[1].numpy(), [10 + np.cos(yaw), np.sin(yaw), 0], atol=1e-6)
-    assert np.allclose(quat_to_matrix(posed.quats[1].double().numpy()), yaw_pose(yaw, (0, 0, 0))[:3, :3], atol=1e-6)
+    assert np.allclose(
+        quats_to_matrices_numpy(posed.quats[1].double().numpy()), yaw_pose(yaw, (0, 0, 0))[:3, :3], atol=1e-6
+    )
 
 
 def test_actor_absent_past_its_track() -> None:
-    posed = _one_actor_graph(0.0).at(4)
+    posed = _one_actor_graph(0.0).gaussians_at(4)
     assert float(torch.sigmoid(posed.logit_opacities[1])) < 1 / 255 and float(posed.logit_opacities[0]) == 0.0
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 def test_an_actor_inside_the_background_renders_finite(backend: str) -> None:
     graph = _one_actor_graph(np.pi)
-    packed = graph.gaussians.packed().clone()
+    packed = graph.gaussians.pack().clone()
     packed[0, :3] = torch.tensor([9.0, 0.0, 0.0])  # where the actor's Gaussian comes to lie
     pose = np.eye(4)
     pose[:3, :3] = camera_turn(0.0)
-    cameras = Cameras.of([pose], [Lens(20.0, 20.0, 16.0, 12.0, 32, 24)])
-    splats = graph.with_gaussians(Gaussians.unpacked(packed)).at(3).activated()
+    cameras = Cameras.from_poses([pose], [Lens(20.0, 20.0, 16.0, 12.0, 32, 24)])
+    splats = graph.with_gaussians(Gaussians.unpack(packed)).gaussians_at(3).activate()
     image = render(splats, cameras, RenderSettings(backend=backend))
     assert torch.allclose(splats.means[0], splats.means[1], atol=1e-5)
     assert image.color.isfinite().all() and 0.7 < float(image.alpha.max()) <= 1.0

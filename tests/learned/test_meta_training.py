@@ -12,21 +12,21 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from flows.training import checkpoint
-from flows.training.curve_table import LEARNING, read_rows
-from flows.training.optimiser_training import network_from, train_optimiser
-from genre_tasks.config import LossConfig
+from flows.training.curve_table import LEARNING_CURVE, load_rows
+from flows.training.optimiser_training import initialise_network, train_optimiser
+from genre_tasks.config import LearningRates, LossConfig
 from genre_tasks.errors import InputError
-from genre_tasks.learned.features import features
+from genre_tasks.learned.features import compute_features
 from genre_tasks.learned.learned_optimiser import LearnedOptimiser
-from genre_tasks.learned.meta_episodes import Course, Episode, TrainingScene
+from genre_tasks.learned.meta_episodes import Episode, EpisodeConfig, TrainingScene
 from genre_tasks.learned.meta_training import MetaConfig, MetaTraining
 from genre_tasks.learned.network import NetworkConfig
 from genre_tasks.optimiser.objective import Objective
-from genre_tasks.optimiser.tuned_adam import TunedAdam
-from genre_tasks.optimiser.unroll import Plan, unroll
+from genre_tasks.optimiser.tuned_adam import GNET_LEARNING_RATES, TunedAdam
+from genre_tasks.optimiser.unroll import UnrollSettings, unroll
 from tests.optimiser import street_scenes
 
-RATES = tuple(0.3 * r for r in TunedAdam().rates)
+RATES = tuple(0.3 * r for r in GNET_LEARNING_RATES.as_tuple())
 NETWORK = NetworkConfig(hidden=16, channels=(8, 12), rates=RATES)
 LOSS = LossConfig(perceptual=0)
 CONFIG = MetaConfig(
@@ -36,10 +36,10 @@ CONFIG = MetaConfig(
     iterations=(6, 9),
     views=(2, 3),
     novel_views=1,
-    rate=1e-2,
+    learning_rate=1e-2,
     warm_up=4,
     loss=LOSS,
-    judge_loss=LOSS,
+    held_out_loss=LOSS,
 )
 
 
@@ -52,29 +52,29 @@ def _scene(seed: int) -> TrainingScene:
 
 def test_training_beats_the_rates_it_starts_from() -> None:
     scenes = [_scene(seed) for seed in range(3)]
-    training = MetaTraining(network_from(NETWORK, 0), scenes, CONFIG)
+    training = MetaTraining(initialise_network(NETWORK, 0), scenes, CONFIG)
     records = [training.step() for _ in range(CONFIG.steps)]
-    assert all(torch.isfinite(torch.tensor([r.judged_loss, r.gradient_norm])).all() for r in records)
+    assert all(torch.isfinite(torch.tensor([r.held_out_loss, r.gradient_norm])).all() for r in records)
     unseen, results = _scene(9), []
-    for rule in (TunedAdam(RATES), training.network.eval()):
-        run = unroll(rule, unseen.scene, unseen.source, (), Objective(LOSS), Plan(8, 3))
+    for rule in (TunedAdam(LearningRates.from_sequence(RATES)), training.network.eval()):
+        run = unroll(rule, unseen.scene, unseen.source, (), Objective(LOSS), UnrollSettings(8, 3))
         results.append(run.losses[-1])
     assert results[1] < 0.97 * results[0]
 
 
 def test_a_share_of_the_gaussians_gives_the_gradient_of_all_on_average() -> None:
-    network, generator = network_from(NETWORK, 0), torch.Generator().manual_seed(0)
+    network, generator = initialise_network(NETWORK, 0), torch.Generator().manual_seed(0)
     with torch.no_grad():
         network.head.weight.normal_(generator=generator)
     scene = _scene(0)
-    course = Course(0, 6, 3, 0, 0.0, 0.0)
-    episode = Episode.start(course, scene, network, generator)
-    sight = episode.look(Objective(LOSS), generator)
-    state, count = episode.state.saw(sight.gradient), len(scene.scene)
-    inputs = features(episode.frame, episode.columns, state, sight.gradient, 6)
+    config = EpisodeConfig(0, 6, 3, 0, 0.0, 0.0)
+    episode = Episode.start(config, scene, network, Objective(LOSS), generator)
+    gradient = episode.loop.evaluate().gradients.gaussians
+    state, count = episode.state.accumulate(gradient), len(scene.scene)
+    inputs = compute_features(episode.parameterization, episode.static_features, state, gradient, 6)
 
     def gradients(delta: torch.Tensor, rows: torch.Tensor) -> list[torch.Tensor]:
-        total = (delta * sight.gradient[rows]).sum() * (count / len(rows))
+        total = (delta * gradient[rows]).sum() * (count / len(rows))
         return list(torch.autograd.grad(total, list(network.parameters())))
 
     order = torch.randperm(count, generator=generator)
@@ -96,17 +96,21 @@ def test_the_step_that_training_differentiates_is_the_one_that_is_made() -> None
     scene, count = _scene(0), len(_scene(0).scene)
     flat = torch.tensor([0.2, 0.1, 0.01]).log().repeat(count, 1)
     lying = replace(scene.scene.gaussians, log_scales=flat, quats=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1))
-    course = Course(0, 6, 3, 0, 0.0, 0.0)
-    episode = Episode.start(course, replace(scene, scene=scene.scene.with_gaussians(lying)), network, generator)
-    assert bool((episode.frame.planes != 0).any())
-    episode.sight = episode.look(Objective(LOSS), generator)
-    before, rows = episode.state.offsets, torch.arange(count)
-    told = episode.step(network, episode.mover(network), rows)
+    config = EpisodeConfig(0, 6, 3, 0, 0.0, 0.0)
+    start = replace(scene, scene=scene.scene.with_gaussians(lying))
+    episode = Episode.start(config, start, network, Objective(LOSS), generator)
+    ground_constraint = episode.parameterization.ground_constraint
+    assert bool((ground_constraint != 0).any())
+    gradients = episode.loop.evaluate().gradients
+    before = episode.state.offsets
+    recorded = episode.record_steps(network, torch.arange(count))
+    episode.loop.advance(gradients)
+    (differentiable,) = recorded.deltas
     made = episode.state.offsets - before
-    free = episode.frame.low == -torch.inf  # attributes without a bound
-    torch.testing.assert_close(made[free], told.detach()[free], atol=1e-5, rtol=1e-4)
-    ground = (episode.frame.planes != 0).any(1)
-    assert bool((told[ground, 2] == 0).all()) and bool((told[ground, 0] != 0).any())
+    free = episode.parameterization.lower == -torch.inf  # attributes without a bound
+    torch.testing.assert_close(made[free], differentiable.detach()[free], atol=1e-5, rtol=1e-4)
+    ground = (ground_constraint != 0).any(1)
+    assert bool((differentiable[ground, 2] == 0).all()) and bool((differentiable[ground, 0] != 0).any())
 
 
 def _weights(training: MetaTraining) -> list[torch.Tensor]:
@@ -115,11 +119,11 @@ def _weights(training: MetaTraining) -> list[torch.Tensor]:
 
 def test_resuming_gives_the_same_bytes(tmp_path: Path) -> None:
     scenes = [_scene(seed) for seed in range(2)]
-    whole = MetaTraining(network_from(NETWORK, 0), scenes, CONFIG)
+    whole = MetaTraining(initialise_network(NETWORK, 0), scenes, CONFIG)
     for _ in range(5):
         whole.step()
     checkpoint.save(whole, tmp_path / "c.safetensors")
-    again = MetaTraining(network_from(NETWORK, 1), scenes, CONFIG)
+    again = MetaTraining(initialise_network(NETWORK, 1), scenes, CONFIG)
     checkpoint.resume(again, tmp_path / "c.safetensors")
     assert [whole.step() for _ in range(4)] == [again.step() for _ in range(4)]
     for a, b in zip(_weights(whole), _weights(again), strict=True):
@@ -128,22 +132,22 @@ def test_resuming_gives_the_same_bytes(tmp_path: Path) -> None:
 
 def test_a_checkpoint_from_before_networks_were_told_residuals_resumes(tmp_path: Path) -> None:
     scenes, path = [_scene(0)], tmp_path / "c.safetensors"
-    whole = MetaTraining(network_from(NETWORK, 0), scenes, CONFIG)
+    whole = MetaTraining(initialise_network(NETWORK, 0), scenes, CONFIG)
     whole.step()
     checkpoint.save(whole, path)
     with safe_open(path, "pt") as file:
         described, tensors = json.loads(file.metadata()["training"]), {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118
     del described["network"]["residuals"], described["network"]["relaxation"]
     save_file(tensors, path, {"training": json.dumps(described)})
-    again = MetaTraining(network_from(NETWORK, 1), scenes, CONFIG)
+    again = MetaTraining(initialise_network(NETWORK, 1), scenes, CONFIG)
     checkpoint.resume(again, path)
     assert again.done == 1 and whole.step() == again.step()
 
 
 def test_a_checkpoint_of_other_settings_is_refused(tmp_path: Path) -> None:
     scenes = [_scene(0)]
-    checkpoint.save(MetaTraining(network_from(NETWORK, 0), scenes, CONFIG), tmp_path / "c.safetensors")
-    other = MetaTraining(network_from(NETWORK, 0), scenes, CONFIG.model_copy(update={"rate": 1.0}))
+    checkpoint.save(MetaTraining(initialise_network(NETWORK, 0), scenes, CONFIG), tmp_path / "c.safetensors")
+    other = MetaTraining(initialise_network(NETWORK, 0), scenes, CONFIG.model_copy(update={"learning_rate": 1.0}))
     with pytest.raises(InputError, match="other config"):
         checkpoint.resume(other, tmp_path / "c.safetensors")
 
@@ -157,8 +161,8 @@ def test_an_interrupted_training_goes_on_and_writes_its_curve(tmp_path: Path) ->
             if done == stop:
                 raise KeyboardInterrupt
 
-        network = network_from(NETWORK, 0)
-        trained = train_optimiser(network, scenes, config, folder, save_every=2, watch=watch, progress=progress)
+        network = initialise_network(NETWORK, 0)
+        trained = train_optimiser(network, scenes, config, folder, save_every=2, on_checkpoint=watch, progress=progress)
         return [p.clone() for p in trained.parameters()]
 
     watched: list[int] = []
@@ -175,7 +179,7 @@ def test_an_interrupted_training_goes_on_and_writes_its_curve(tmp_path: Path) ->
     assert checkpoint.describe(tmp_path / "parts/checkpoint.safetensors")["done"] == 2
     resumed = run(tmp_path / "parts", None)
     assert all(torch.equal(a, b) for a, b in zip(whole, resumed, strict=True))
-    curves = [read_rows(tmp_path / name / "curve.parquet", LEARNING) for name in ("whole", "parts")]
+    curves = [load_rows(tmp_path / name / "curve.parquet", LEARNING_CURVE) for name in ("whole", "parts")]
     assert watched == [2, 4, 2, 4, 4]
     steps, again = ([{**row, "seconds": 0.0} for row in rows] for rows in curves)
     assert steps == again and [row["step"] for row in steps] == [0, 1, 2, 3]

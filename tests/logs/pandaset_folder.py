@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from genre_tasks.logs.pandaset.pickle_reader import read_frame
-from genre_tasks.logs.pandaset.pickle_writer import pickle_frame
+from genre_tasks.logs.pandaset.pickle_reader import read_table
+from genre_tasks.logs.pandaset.pickle_writer import pickle_table
 from tests.fakes import FakeLog
 
 FRAMES = 4
@@ -32,12 +32,12 @@ def edit_json(path: Path, change: Callable[[Any], Any]) -> None:
 
 def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(gzip.compress(pickle_frame(columns)))
+    path.write_bytes(gzip.compress(pickle_table(columns)))
 
 
 def edit_table(path: Path, **changed: NDArray[Any] | None) -> None:
     """Replaces columns of a table; ``None`` drops one."""
-    columns = dict(read_frame(path).columns)
+    columns = dict(read_table(path).columns)
     for name, values in changed.items():
         if values is None:
             del columns[name]

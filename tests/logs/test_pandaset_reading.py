@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from genre_tasks.errors import InputError
-from genre_tasks.logs.pandaset.layout import pose_matrix, seconds, to_our_axes, to_panda_axes
-from genre_tasks.logs.pandaset.pickle_reader import read_frame
+from genre_tasks.logs.pandaset.layout import convert_to_seconds, parse_pose, to_flu_axes, to_panda_axes
+from genre_tasks.logs.pandaset.pickle_reader import read_table
 from genre_tasks.logs.pandaset.reader import PandaSetLog, open_pandaset
 from genre_tasks.logs.pandaset.writer import write_pandaset
 from tests.logs.pandaset_folder import FRAMES, cuboids, edit_json, edit_table, small_log, write_table
@@ -40,7 +40,7 @@ def opened(folder: Path) -> PandaSetLog:
 class TestConversions:
     def test_ego_axes_turn(self) -> None:
         """PandaSet's y is forward and its x is right."""
-        ours = to_our_axes(np.eye(4))
+        ours = to_flu_axes(np.eye(4))
         np.testing.assert_array_equal(ours[:3, 0], [0, 1, 0])
         np.testing.assert_array_equal(ours[:3, 1], [-1, 0, 0])
         np.testing.assert_array_equal(ours[:3, 2], [0, 0, 1])
@@ -49,18 +49,18 @@ class TestConversions:
     def test_quaternion_order(self) -> None:
         """w first: a quarter turn about z takes x to y; the scale of the quaternion does not matter."""
         pose = {"position": {"x": 1, "y": 2, "z": 3}, "heading": {"w": 3.0, "x": 0, "y": 0, "z": 3.0}}
-        matrix = pose_matrix(pose, file=Path("poses.json"), log="l", frame=0)
+        matrix = parse_pose(pose, file=Path("poses.json"), log="l", frame=0)
         np.testing.assert_allclose(matrix[:3, 0], [0, 1, 0], atol=1e-15)
         np.testing.assert_array_equal(matrix[:3, 3], [1, 2, 3])
 
     @pytest.mark.parametrize("per_second", [1, 1e3, 1e6, 1e9])
     def test_units_of_time(self, per_second: float) -> None:
         times = np.array([1557539959.250697, 1557539959.350659])
-        np.testing.assert_allclose(seconds(times * per_second), times, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(convert_to_seconds(times * per_second), times, rtol=0, atol=1e-6)
 
     def test_relative_times_are_seconds(self) -> None:
-        np.testing.assert_array_equal(seconds(np.array([0.0, 0.1, 1000.0])), [0.0, 0.1, 1000.0])
-        assert np.isnan(seconds(np.array([np.nan, 1.0]))[0])
+        np.testing.assert_array_equal(convert_to_seconds(np.array([0.0, 0.1, 1000.0])), [0.0, 0.1, 1000.0])
+        assert np.isnan(convert_to_seconds(np.array([np.nan, 1.0]))[0])
 
     def test_principal_point_counts_from_the_corner(self, folder: Path) -> None:
         path = folder / "camera/front/intrinsics.json"
@@ -167,7 +167,7 @@ class TestTime:
 
     def test_microseconds_in_a_sweep(self, folder: Path) -> None:
         path = folder / "lidar/01.pkl.gz"
-        rows = read_frame(path).row_count
+        rows = read_table(path).row_count
         edit_table(path, t=np.full(rows, 1557539959300518, dtype=np.int64))
         sweep = opened(folder).sweep(1)
         assert sweep is not None
@@ -177,21 +177,21 @@ class TestTime:
 class TestSweeps:
     def test_only_the_spinning_sensor(self, folder: Path) -> None:
         path = folder / "lidar/01.pkl.gz"
-        rows = read_frame(path).row_count
+        rows = read_table(path).row_count
         edit_table(path, d=np.arange(rows) % 2)
         sweep = opened(folder).sweep(1)
         assert sweep is not None
-        np.testing.assert_array_equal(sweep.points_world[:, 0], read_frame(path).columns["x"][::2])
+        np.testing.assert_array_equal(sweep.points_world[:, 0], read_table(path).columns["x"][::2])
 
     def test_without_a_sensor_column(self, folder: Path) -> None:
         path = folder / "lidar/01.pkl.gz"
         edit_table(path, d=None)
         sweep = opened(folder).sweep(1)
-        assert sweep is not None and len(sweep.points_world) == read_frame(path).row_count
+        assert sweep is not None and len(sweep.points_world) == read_table(path).row_count
 
     def test_points_that_are_not_finite_are_left_out_and_reported(self, folder: Path) -> None:
         path = folder / "lidar/01.pkl.gz"
-        x = read_frame(path).columns["x"].copy()
+        x = read_table(path).columns["x"].copy()
         x[[0, 5]] = np.nan, np.inf
         edit_table(path, x=x)
         log = opened(folder)
@@ -203,7 +203,7 @@ class TestSweeps:
     @pytest.mark.parametrize("damage", ["truncated", "text", "empty", "hostile", "no column", "text column"])
     def test_unreadable_names_file_and_frame(self, folder: Path, damage: str) -> None:
         path = folder / "lidar/01.pkl.gz"
-        table = read_frame(path)
+        table = read_table(path)
         data = path.read_bytes()
         if damage == "no column":
             edit_table(path, z=None)

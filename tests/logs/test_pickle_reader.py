@@ -24,13 +24,13 @@ from hypothesis import strategies as st
 
 from genre_tasks.errors import InputError
 from genre_tasks.logs.pandaset.pickle_machine import PickleBrokenError, PickleRefusedError
-from genre_tasks.logs.pandaset.pickle_reader import Frame, parse_frame, read_frame
-from genre_tasks.logs.pandaset.pickle_writer import pickle_frame
+from genre_tasks.logs.pandaset.pickle_reader import Table, parse_table, read_table
+from genre_tasks.logs.pandaset.pickle_writer import pickle_table
 
 REAL = Path(__file__).resolve().parents[3] / "shared/data/pandaset/002"
 
 
-def assert_same(frame: Frame, table: Any) -> None:
+def assert_same(frame: Table, table: Any) -> None:
     """Columns, order, dtypes and cells as pandas reads them (text columns as objects)."""
     import pandas as pd
 
@@ -83,20 +83,20 @@ class TestAgreesWithPandas:
         pd = pytest.importorskip("pandas")
         path = tmp_path / "00.pkl.gz"
         TABLES[kind](make_table()).to_pickle(path, compression="gzip", protocol=protocol)
-        assert_same(read_frame(path), pd.read_pickle(path))
+        assert_same(read_table(path), pd.read_pickle(path))
 
     def test_python_string_storage(self) -> None:
         pd = pytest.importorskip("pandas")
         dtype = pd.StringDtype("python", na_value=np.nan)
         table = pd.DataFrame({"a": pd.array(["x", None, "z"], dtype=dtype)})
-        frame = parse_frame(pickle.dumps(table))
+        frame = parse_table(pickle.dumps(table))
         assert list(frame.columns["a"][[0, 2]]) == ["x", "z"]
         assert np.isnan(frame.columns["a"][1])
 
     def test_not_compressed(self, tmp_path: Path) -> None:
         pd = pytest.importorskip("pandas")
         make_table().to_pickle(tmp_path / "00.pkl")
-        assert_same(read_frame(tmp_path / "00.pkl"), pd.read_pickle(tmp_path / "00.pkl"))
+        assert_same(read_table(tmp_path / "00.pkl"), pd.read_pickle(tmp_path / "00.pkl"))
 
     def test_pandas_reads_what_we_write(self) -> None:
         pytest.importorskip("pandas")
@@ -107,11 +107,11 @@ class TestAgreesWithPandas:
             "still": np.array([True, False, True]),
             "y": np.array([4.0, 5.0, 6.0]),
         }
-        table = pickle.loads(pickle_frame(columns))
+        table = pickle.loads(pickle_table(columns))
         assert list(table.columns) == list(columns)
         assert list(table.index) == [0, 1, 2]
-        assert_same(parse_frame(pickle_frame(columns)), table.astype({"label": object}))
-        assert pickle_frame(columns) == pickle_frame(columns)
+        assert_same(parse_table(pickle_table(columns)), table.astype({"label": object}))
+        assert pickle_table(columns) == pickle_table(columns)
 
     @pytest.mark.real
     @pytest.mark.skipif(not REAL.is_dir(), reason=f"no PandaSet sequence beside the checkout ({REAL})")
@@ -121,7 +121,7 @@ class TestAgreesWithPandas:
         paths = sorted(REAL.glob(pattern))
         assert len(paths) >= 4
         for path in paths:
-            assert_same(read_frame(path), pd.read_pickle(path))
+            assert_same(read_table(path), pd.read_pickle(path))
 
 
 class Reduces:
@@ -180,8 +180,8 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     "set": lambda: frame_with_cell({1, 2}),
     "dates": lambda: pickle.dumps(pytest.importorskip("pandas").DataFrame({"t": np.array(["2020"], "M8[ns]")})),
     "categories": lambda: pickle.dumps(pytest.importorskip("pandas").DataFrame({"t": ["a"]}).astype("category")),
-    "void cells": lambda: pickle_frame({"x": np.zeros(3)}).replace(b"f8", b"V8"),
-    "a dtype with a size of its own": lambda: pickle_frame({"x": np.zeros(3)}).replace(
+    "void cells": lambda: pickle_table({"x": np.zeros(3)}).replace(b"f8", b"V8"),
+    "a dtype with a size of its own": lambda: pickle_table({"x": np.zeros(3)}).replace(
         b"\x02\0\0\0f8", b"\x03\0\0\0U99"
     ),
 }
@@ -198,7 +198,7 @@ class TestRefuses:
         path = tmp_path / "07.pkl.gz"
         path.write_bytes(gzip.compress(HOSTILE[kind]()))
         with pytest.raises(InputError) as caught:
-            read_frame(path, frame=7, log="pandaset:here")
+            read_table(path, frame=7, log="pandaset:here")
         assert caught.value.file == str(path)
         assert caught.value.frame == 7
         assert caught.value.remedy
@@ -221,20 +221,20 @@ class TestRefuses:
     )
     def test_names_what_it_asked_for(self, kind: str, named: str) -> None:
         with pytest.raises(PickleRefusedError, match=named):
-            parse_frame(HOSTILE[kind]())
+            parse_table(HOSTILE[kind]())
 
     def test_a_registered_extension_is_not_looked_up(self) -> None:
         copyreg.add_extension("os", "system", 0x70)
         try:
             with pytest.raises(PickleRefusedError, match="EXT1"):
-                parse_frame(b"\x80\x02\x82\x70.")
+                parse_table(b"\x80\x02\x82\x70.")
         finally:
             copyreg.remove_extension("os", "system", 0x70)
 
     def test_other_values_are_no_frame(self) -> None:
         for value in (None, 3, [1], {"DataFrame": 1}, np.zeros(3)):
             with pytest.raises(PickleBrokenError):
-                parse_frame(pickle.dumps(value))
+                parse_table(pickle.dumps(value))
 
 
 class TestBounds:
@@ -242,14 +242,14 @@ class TestBounds:
         tracemalloc.start()
         try:
             with pytest.raises((PickleBrokenError, PickleRefusedError)):
-                parse_frame(data)
+                parse_table(data)
             return tracemalloc.get_traced_memory()[1]
         finally:
             tracemalloc.stop()
 
     @pytest.mark.parametrize("rows", [10**9, 2**40])
     def test_declared_shapes_do_not_allocate(self, rows: int) -> None:
-        data = pickle_frame({"x": np.zeros(3), "name": np.array(["a"] * 3, dtype=object)})
+        data = pickle_table({"x": np.zeros(3), "name": np.array(["a"] * 3, dtype=object)})
         shaped = data.replace(b"J\x03\x00\x00\x00", b"\x8a\x06" + rows.to_bytes(6, "little"))
         assert shaped != data
         assert self._peak(shaped) < 2**20
@@ -261,29 +261,29 @@ class TestBounds:
     def test_deep_nesting_is_no_crash(self) -> None:
         deep = b"\x80\x03)" + b"\x85" * 100_000 + b"."
         with pytest.raises(PickleBrokenError):
-            parse_frame(deep)
+            parse_table(deep)
         with pytest.raises(PickleRefusedError):
-            parse_frame(b"\x80\x03})" + b"\x85" * 100_000 + b"Ns.")
+            parse_table(b"\x80\x03})" + b"\x85" * 100_000 + b"Ns.")
 
     def test_deep_calls_are_no_crash(self) -> None:
-        data = pickle_frame({"x": np.zeros(3)})
+        data = pickle_table({"x": np.zeros(3)})
         numbers = b"B" + struct.pack("<I", 24) + bytes(24)
         wrapped = b"cbuiltins\nbytearray\n" * 5000 + numbers + b"\x85R" * 5000
         assert data.count(numbers) == 1
         with pytest.raises(PickleBrokenError, match="RecursionError"):
-            parse_frame(data.replace(numbers, wrapped))
+            parse_table(data.replace(numbers, wrapped))
 
     def test_bomb(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr("genre_tasks.logs.pandaset.pickle_reader.MAX_UNPACKED_BYTES", 2**20)
         path = tmp_path / "00.pkl.gz"
         path.write_bytes(gzip.compress(bytes(2**22)))
         with pytest.raises(InputError, match="more than 1 MiB unpacked"):
-            read_frame(path)
+            read_table(path)
 
 
 class TestBroken:
     def _packed(self) -> bytes:
-        return gzip.compress(pickle_frame({"x": np.linspace(0, 1, 500)}))
+        return gzip.compress(pickle_table({"x": np.linspace(0, 1, 500)}))
 
     @pytest.mark.parametrize(
         "damage",
@@ -301,26 +301,26 @@ class TestBroken:
         path = tmp_path / "03.pkl.gz"
         path.write_bytes(damage(self._packed()))
         with pytest.raises(InputError) as caught:
-            read_frame(path, frame=3)
+            read_table(path, frame=3)
         assert (caught.value.file, caught.value.frame) == (str(path), 3)
 
     @settings(max_examples=300, deadline=None)
     @given(st.data())
     def test_any_damage_is_one_of_two_errors(self, data: st.DataObject) -> None:
         """Flipped bytes either still give a frame or raise one of the two errors, never anything else."""
-        good = bytearray(pickle_frame({"x": np.arange(4.0), "label": np.array(list("abcd"), dtype=object)}))
+        good = bytearray(pickle_table({"x": np.arange(4.0), "label": np.array(list("abcd"), dtype=object)}))
         for _ in range(data.draw(st.integers(1, 4))):
             good[data.draw(st.integers(0, len(good) - 1))] = data.draw(st.integers(0, 255))
         with contextlib.suppress(PickleRefusedError, PickleBrokenError):
-            parse_frame(bytes(good))
+            parse_table(bytes(good))
 
     @pytest.mark.parametrize("columns", [{}, {"a": np.zeros(2), "b": np.zeros(3)}, {"a": np.zeros((2, 2))}])
     def test_writer_rejects(self, columns: dict[str, Any]) -> None:
         with pytest.raises(ValueError, match="one length"):
-            pickle_frame(columns)
+            pickle_table(columns)
 
     def test_writer_rejects_dtypes_and_cells(self) -> None:
         with pytest.raises(ValueError, match="complex128"):
-            pickle_frame({"a": np.zeros(2, dtype=complex)})
+            pickle_table({"a": np.zeros(2, dtype=complex)})
         with pytest.raises(ValueError, match="BytesIO"):
-            pickle_frame({"a": np.array([io.BytesIO()], dtype=object)})
+            pickle_table({"a": np.array([io.BytesIO()], dtype=object)})

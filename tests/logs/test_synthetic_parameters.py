@@ -16,7 +16,7 @@ def test_defaults():
 
 
 def test_unknown_parameter_names_the_nearest():
-    with pytest.raises(ConfigError, match="Did you mean cameras") as caught:
+    with pytest.raises(ConfigError, match="Did you mean 'cameras'") as caught:
         parse_parameters({"camera": "3"})
     assert "'camera'" in caught.value.problem
 

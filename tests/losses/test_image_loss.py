@@ -12,13 +12,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from genre_tasks.compiled.loader import supported_isas
+from genre_tasks.compiled.loader import supported_instruction_sets
 from genre_tasks.config import LossConfig
 from genre_tasks.errors import ResourceError
 from genre_tasks.losses import constants as constants
 from genre_tasks.losses import image_loss as module
 from genre_tasks.losses.build_image_loss import KERNEL
-from genre_tasks.losses.image_loss import ImageLoss, image_loss, load_image_loss, takes
+from genre_tasks.losses.image_loss import ImageLoss, image_loss, is_supported, load_image_loss
 from genre_tasks.losses.rendering_loss import torch_image_loss
 from genre_tasks.losses.ssim import SsimTarget
 from genre_tasks.losses.targets import Target
@@ -29,7 +29,7 @@ Batch = tuple[Tensor, Tensor, list[Target], list[float]]
 
 
 def _target(image: Tensor, depth: Tensor | None = None) -> Target:
-    return Target("c", 0, pose(0.0), LENS, SsimTarget.of(image), depth, depth is None)
+    return Target("c", 0, pose(0.0), LENS, SsimTarget.from_image(image), depth, depth is None)
 
 
 def _batch(views: int = 3, height: int = 37, width: int = 53, seed: int = 0) -> Batch:
@@ -50,7 +50,9 @@ def _batch(views: int = 3, height: int = 37, width: int = 53, seed: int = 0) -> 
 def _oracle(batch: Batch, config: LossConfig = CONFIG) -> ImageLoss:
     color, depth, targets, weights = batch
     exact = [
-        replace(t, image=SsimTarget.of(t.image.image.double()), depth=None if t.depth is None else t.depth.double())
+        replace(
+            t, image=SsimTarget.from_image(t.image.pixels.double()), depth=None if t.depth is None else t.depth.double()
+        )
         for t in targets
     ]
     return torch_image_loss(config, color.double(), depth.double(), exact, weights)
@@ -59,7 +61,7 @@ def _oracle(batch: Batch, config: LossConfig = CONFIG) -> ImageLoss:
 def _close(ours: ImageLoss, exact: ImageLoss, bound: float = 1e-5) -> None:
     assert ours.losses.dtype == torch.float64
     assert ours.losses.tolist() == pytest.approx(exact.losses.tolist(), rel=bound)
-    for name in ("by_color", "by_depth"):
+    for name in ("color_gradient", "depth_gradient"):
         a, b = getattr(ours, name).double(), getattr(exact, name)
         assert a.shape == b.shape
         assert float((a - b).abs().max()) <= bound * max(float(b.abs().max()), 1e-30), name
@@ -79,7 +81,7 @@ def test_each_term_can_be_left_out(change: dict[str, float]) -> None:
     _close(image_loss(config, *batch), _oracle(batch, config))
 
 
-@pytest.mark.parametrize("isa", supported_isas())
+@pytest.mark.parametrize("isa", supported_instruction_sets())
 def test_every_instruction_set_is_right(isa: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GENRE_RENDER_ISA", isa)
     monkeypatch.setattr(module, "load_image_loss", load_image_loss.__wrapped__)
@@ -101,7 +103,7 @@ def test_no_lidar_return_is_no_depth_loss(returns: float) -> None:
     targets = [replace(targets[0], depth=torch.full(depth.shape[1:], returns))]
     with_depth = image_loss(CONFIG, color, depth + 1, targets, weights)
     without = image_loss(CONFIG, color, depth + 1, [replace(targets[0], depth=None)], weights)
-    assert torch.equal(with_depth.losses, without.losses) and not with_depth.by_depth.any()
+    assert torch.equal(with_depth.losses, without.losses) and not with_depth.depth_gradient.any()
 
 
 def test_depth_gradients_stop_where_they_are_clamped() -> None:
@@ -111,9 +113,9 @@ def test_depth_gradients_stop_where_they_are_clamped() -> None:
     color = torch.zeros(1, 1, 10, 3)
     batch = color, depth, [_target(color[0], returns)], [1.0]
     ours, torchs = image_loss(CONFIG, *batch), torch_image_loss(CONFIG, *batch)
-    assert ours.by_depth.tolist()[0][0] == pytest.approx(torchs.by_depth.tolist()[0][0], rel=1e-6)
+    assert ours.depth_gradient.tolist()[0][0] == pytest.approx(torchs.depth_gradient.tolist()[0][0], rel=1e-6)
     assert ours.losses.tolist() == pytest.approx(torchs.losses.tolist(), rel=1e-6)
-    assert [bool(x) for x in ours.by_depth[0, 0]] == [i in (2, 3) for i in range(10)]
+    assert [bool(x) for x in ours.depth_gradient[0, 0]] == [i in (2, 3) for i in range(10)]
 
 
 @pytest.mark.parametrize("broken", [float("nan"), float("inf"), float("-inf")])
@@ -123,21 +125,21 @@ def test_what_is_not_finite_shows_in_its_view_and_nowhere_else(broken: float, wh
     if where == "color":
         color[1, 20, 30, 1] = broken
     else:
-        image = targets[1].image.image.clone()
+        image = targets[1].image.pixels.clone()
         image[20, 30, 1] = broken
-        targets[1] = replace(targets[1], image=SsimTarget.of(image))
+        targets[1] = replace(targets[1], image=SsimTarget.from_image(image))
     batch = color, depth, targets, weights
     ours, torchs = image_loss(CONFIG, *batch), torch_image_loss(CONFIG, *batch)
     assert torch.isfinite(ours.losses).tolist() == torch.isfinite(torchs.losses).tolist() == [True, False, True]
-    assert torch.equal(torch.isfinite(ours.by_color), torch.isfinite(torchs.by_color))
-    assert torch.equal(torch.isfinite(ours.by_depth), torch.isfinite(torchs.by_depth))
+    assert torch.equal(torch.isfinite(ours.color_gradient), torch.isfinite(torchs.color_gradient))
+    assert torch.equal(torch.isfinite(ours.depth_gradient), torch.isfinite(torchs.depth_gradient))
 
 
 def test_identical_images_have_no_loss_and_no_gradient() -> None:
     color, depth, _, _ = _batch(1)
     ours = image_loss(CONFIG, color, depth, [_target(color[0])], [1.0])
     assert abs(float(ours.losses)) < 1e-6
-    assert float(ours.by_color.abs().max()) < 1e-5 / color.numel()
+    assert float(ours.color_gradient.abs().max()) < 1e-5 / color.numel()
 
 
 def test_the_same_bits_at_any_thread_count_and_alone() -> None:
@@ -150,7 +152,7 @@ def test_the_same_bits_at_any_thread_count_and_alone() -> None:
     finally:
         torch.set_num_threads(before)
     alone = [image_loss(CONFIG, color[i : i + 1], depth[i : i + 1], [targets[i]], [weights[i]]) for i in range(4)]
-    for name in ("losses", "by_color", "by_depth"):
+    for name in ("losses", "color_gradient", "depth_gradient"):
         first = getattr(results[0], name)
         assert all(torch.equal(first, getattr(r, name)) for r in results[1:])
         assert torch.equal(first, torch.cat([getattr(r, name) for r in alone]))
@@ -159,8 +161,8 @@ def test_the_same_bits_at_any_thread_count_and_alone() -> None:
 def test_tensors_need_not_be_contiguous() -> None:
     color, depth, targets, weights = batch = _batch()
     strided = color.permute(3, 0, 1, 2).contiguous().permute(1, 2, 3, 0), depth.mT.contiguous().mT, targets, weights
-    assert torch.equal(image_loss(CONFIG, *strided).by_color, image_loss(CONFIG, *batch).by_color)
-    assert torch.equal(image_loss(CONFIG, *strided).by_depth, image_loss(CONFIG, *batch).by_depth)
+    assert torch.equal(image_loss(CONFIG, *strided).color_gradient, image_loss(CONFIG, *batch).color_gradient)
+    assert torch.equal(image_loss(CONFIG, *strided).depth_gradient, image_loss(CONFIG, *batch).depth_gradient)
 
 
 def _refused(color: Tensor, depth: Tensor, targets: Sequence[Target], weights: Sequence[float], match: str) -> None:
@@ -184,10 +186,12 @@ def test_what_does_not_fit_is_refused() -> None:
 
 def test_it_is_for_float32_on_the_cpu() -> None:
     color, depth, targets, _ = _batch()
-    assert takes(color, depth, targets)
-    assert not takes(color.double(), depth, targets)
-    assert not takes(color.to("meta"), depth, targets)
-    assert not takes(color, depth, [replace(targets[0], image=SsimTarget.of(targets[0].image.image.double()))])
+    assert is_supported(color, depth, targets)
+    assert not is_supported(color.double(), depth, targets)
+    assert not is_supported(color.to("meta"), depth, targets)
+    assert not is_supported(
+        color, depth, [replace(targets[0], image=SsimTarget.from_image(targets[0].image.pixels.double()))]
+    )
 
 
 @pytest.mark.parametrize(("status", "match"), [(1, "not enough memory.*fewer views"), (2, "kernel failed")])

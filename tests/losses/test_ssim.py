@@ -31,19 +31,19 @@ def test_agrees_with_scikit_image_inside() -> None:
         use_sample_covariance=False,
         full=True,
     )
-    assert float(ssim(a, SsimTarget.of(b))) == pytest.approx(float(full.mean()), abs=2e-4)
+    assert float(ssim(a, SsimTarget.from_image(b))) == pytest.approx(float(full.mean()), abs=2e-4)
 
 
 def test_gradient_is_the_derivative() -> None:
     a, b = _images(12, 13)
-    target = SsimTarget.of(b)
+    target = SsimTarget.from_image(b)
     assert torch.autograd.gradcheck(lambda x: ssim(x, target), (a.clone().requires_grad_(),), atol=1e-6)
 
 
 def test_identical_images_score_one_with_no_gradient() -> None:
     a, _ = _images()
     x = a.clone().requires_grad_()
-    value = ssim(x, SsimTarget.of(a))
+    value = ssim(x, SsimTarget.from_image(a))
     value.backward()
     assert float(value.detach()) == pytest.approx(1.0, abs=1e-12)
     assert float(x.grad.abs().max()) < 1e-10
@@ -53,14 +53,14 @@ def test_identical_images_score_one_with_no_gradient() -> None:
 @pytest.mark.parametrize("right", [0.0, 0.5, 1.0])
 def test_constant_images_are_finite(left: float, right: float) -> None:
     x = torch.full((9, 7, 3), left, requires_grad=True)
-    value = ssim(x, SsimTarget.of(torch.full((9, 7, 3), right)))
+    value = ssim(x, SsimTarget.from_image(torch.full((9, 7, 3), right)))
     value.backward()
     assert bool(torch.isfinite(value)) and bool(torch.isfinite(x.grad).all())
     assert -1.0 <= float(value.detach()) <= 1.0 + 1e-6
 
 
 def test_one_pixel() -> None:
-    assert bool(torch.isfinite(ssim(torch.rand(1, 1, 3), SsimTarget.of(torch.rand(1, 1, 3)))))
+    assert bool(torch.isfinite(ssim(torch.rand(1, 1, 3), SsimTarget.from_image(torch.rand(1, 1, 3)))))
 
 
 def test_blur_keeps_a_constant_inside_and_dims_the_border() -> None:
@@ -71,4 +71,4 @@ def test_blur_keeps_a_constant_inside_and_dims_the_border() -> None:
 
 def test_other_sizes_are_refused() -> None:
     with pytest.raises(ValueError, match="expected an image of shape"):
-        ssim(torch.rand(4, 4, 3), SsimTarget.of(torch.rand(4, 5, 3)))
+        ssim(torch.rand(4, 4, 3), SsimTarget.from_image(torch.rand(4, 5, 3)))

@@ -86,8 +86,8 @@ def test_lpips_is_the_squared_distance_of_what_the_network_gives(tmp_path: Path)
 
 def test_files_that_are_no_such_network_are_named(tmp_path: Path) -> None:
     (tmp_path / "text.pt").write_text("no")
-    for file, said in (("none.pt", "no such file"), ("text.pt", "no TorchScript")):
-        with pytest.raises(InputError, match=said) as caught:
+    for file, message in (("none.pt", "no such file"), ("text.pt", "no TorchScript")):
+        with pytest.raises(InputError, match=message) as caught:
             Inception(tmp_path / file)
         assert file in str(caught.value) and "evaluate.inception" in str(caught.value)
     with pytest.raises(InputError, match=r"takes self, img.*forward takes return_lpips"):

@@ -48,7 +48,11 @@ def targets(truth: SceneGraph, novel: bool = False) -> tuple[Target, ...]:
     """Two cameras at two frames; with LiDAR depth on half the pixels, or at shifted poses without depth."""
     bare = [
         Target(
-            f"c{c}", f, pose(0.5 * c + 0.2 * f + (1.0 if novel else 0.0)), LENS, SsimTarget.of(torch.zeros(32, 48, 3))
+            f"c{c}",
+            f,
+            pose(0.5 * c + 0.2 * f + (1.0 if novel else 0.0)),
+            LENS,
+            SsimTarget.from_image(torch.zeros(32, 48, 3)),
         )
         for f in (0, 1)
         for c in (0, 1)
@@ -59,7 +63,7 @@ def targets(truth: SceneGraph, novel: bool = False) -> tuple[Target, ...]:
     for i, t in enumerate(bare):
         depth = image.expected_depth()[i].clone()
         depth[::2] = 0
-        picture = SsimTarget.of(image.color[i].contiguous())
+        picture = SsimTarget.from_image(image.color[i].contiguous())
         out.append(Target(t.camera, t.frame, t.chunk_SE3_camera, t.lens, picture, None if novel else depth, novel))
     return tuple(out)
 

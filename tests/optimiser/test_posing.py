@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,28 +10,29 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from genre_tasks.compiled.loader import supported_isas
+from genre_tasks.compiled.loader import supported_instruction_sets
 from genre_tasks.config import LossConfig
-from genre_tasks.errors import NonFiniteError, ResourceError
+from genre_tasks.errors import NonFiniteError
 from genre_tasks.logs.types import MotionBlur, RollingShutter
 from genre_tasks.losses.ssim import SsimTarget
 from genre_tasks.losses.targets import Target
 from genre_tasks.optimiser import objective as objective_module
-from genre_tasks.optimiser.differentiable_render import BlurredPass, CompiledPass, TorchPass, begin
+from genre_tasks.optimiser.autograd_render import AutogradRender
+from genre_tasks.optimiser.differentiable_render import render_differentiable
+from genre_tasks.optimiser.kernel_render import KernelRender
 from genre_tasks.optimiser.kernels import posing as module
-from genre_tasks.optimiser.kernels.build_posing import KERNEL
-from genre_tasks.optimiser.kernels.posing import arrays, load_posing
+from genre_tasks.optimiser.kernels.posing import allocate_splats, load_posing
+from genre_tasks.optimiser.motion_blur_render import MotionBlurRender
 from genre_tasks.optimiser.objective import Objective
-from genre_tasks.optimiser.state import Frame
+from genre_tasks.optimiser.state import Parameterization
 from genre_tasks.optimiser.tuned_adam import TunedAdam
-from genre_tasks.optimiser.unroll import Plan, unroll
+from genre_tasks.optimiser.unroll import UnrollSettings, unroll
 from genre_tasks.render import render_views
 from genre_tasks.render.types import Render, RenderSettings
-from genre_tasks.scene import constants
 from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR, SceneGraph
-from genre_tasks.scene.transforms import se3
+from genre_tasks.scene.transforms import compose_se3
 from tests.optimiser import street_scenes
 
 NAMES = ("means", "scales", "quats", "opacities", "colors")
@@ -49,7 +47,7 @@ def _scene(count: int = 3000, actors: int = 2) -> SceneGraph:
     paths = []
     for k in range(actors):
         turns = Rotation.from_euler("zyx", [[0.3 + k, 0.1, -0.2], [2.9, -0.4, 0.5 * k]]).as_matrix()
-        poses = se3(turns, np.array([[0.5, 0.2, 7.0 + k], [1.0, -0.1 * k, 6.0]]))
+        poses = compose_se3(turns, np.array([[0.5, 0.2, 7.0 + k], [1.0, -0.1 * k, 6.0]]))
         paths.append(ActorNode(f"a{k}", "Car", (1.0, 1.0, 1.0), np.array([k, k + 1]), poses))
     nodes, at = plain.nodes.clone(), torch.arange(count)
     for k in range(actors):
@@ -62,22 +60,26 @@ def _offsets(scene: SceneGraph) -> Tensor:
     return 0.1 * torch.randn(len(scene), 14, generator=torch.Generator().manual_seed(5))
 
 
-def _exact(scene: SceneGraph) -> Frame:
-    wide = Gaussians.unpacked(scene.gaussians.packed().double())
-    return replace(Frame.of(scene), scene=scene.with_gaussians(wide), unit=Frame.of(scene).unit.double())
+def _exact(scene: SceneGraph) -> Parameterization:
+    wide = Gaussians.unpack(scene.gaussians.pack().double())
+    return replace(
+        Parameterization.from_scene(scene),
+        scene=scene.with_gaussians(wide),
+        unit_m=Parameterization.from_scene(scene).unit_m.double(),
+    )
 
 
 def _both(scene: SceneGraph, frames: tuple[int, ...] = FRAMES) -> list[tuple[list[Tensor], Tensor]]:
     """Splats, and the gradient of a random linear function of them, compiled and as torch has them in float64."""
-    offsets, frame = _offsets(scene), Frame.of(scene)
+    offsets, parameterization = _offsets(scene), Parameterization.from_scene(scene)
     leaf, exact = offsets.double().requires_grad_(), _exact(scene)
-    splats = exact.scene.with_gaussians(exact.gaussians(leaf)).posed(frames)[0].activated()
+    splats = exact.scene.with_gaussians(exact.gaussians_at(leaf)).gaussians_at_frames(frames)[0].activate()
     theirs = [getattr(splats, name) for name in NAMES]
     generator = torch.Generator().manual_seed(6)
     by_splats = [torch.randn(t.shape, generator=generator) for t in theirs]
     torch.autograd.backward(theirs, [g.double() for g in by_splats])
-    posed = frame.posing.splats(offsets, frames, 2)
-    gradient = frame.posing.gradient(posed, tuple(by_splats), 2)
+    posed = parameterization.posing.pose(offsets, frames, 2)
+    gradient = parameterization.posing.offsets_gradient(posed, tuple(by_splats), 2)
     assert leaf.grad is not None
     return [(list(posed.splats), gradient), ([t.detach() for t in theirs], leaf.grad)]
 
@@ -126,7 +128,7 @@ def test_actors_without_gaussians_and_gaussians_of_no_actor() -> None:
     assert len(ours[0]) == len(exact[0]) == 100
 
 
-@pytest.mark.parametrize("isa", supported_isas())
+@pytest.mark.parametrize("isa", supported_instruction_sets())
 def test_every_instruction_set_is_right(isa: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GENRE_RENDER_ISA", isa)
     monkeypatch.setattr(module, "load_posing", load_posing.__wrapped__)
@@ -135,39 +137,41 @@ def test_every_instruction_set_is_right(isa: str, monkeypatch: pytest.MonkeyPatc
 
 def test_no_gaussian_at_all() -> None:
     full = _scene(100)
-    frame = Frame.of(replace(full, gaussians=Gaussians.unpacked(torch.empty(0, 14)), nodes=full.nodes[:0]))
-    posed = frame.posing.splats(torch.empty(0, 14), FRAMES, 2)
-    assert frame.posing.gradient(posed, arrays(0), 2).shape == (0, 14)
+    parameterization = Parameterization.from_scene(
+        replace(full, gaussians=Gaussians.unpack(torch.empty(0, 14)), nodes=full.nodes[:0])
+    )
+    posed = parameterization.posing.pose(torch.empty(0, 14), FRAMES, 2)
+    assert parameterization.posing.offsets_gradient(posed, allocate_splats(0), 2).shape == (0, 14)
 
 
 def test_the_same_bits_at_any_thread_count() -> None:
     scene = _scene()
-    frame, offsets = Frame.of(scene), _offsets(scene)
+    parameterization, offsets = Parameterization.from_scene(scene), _offsets(scene)
     results = []
     for threads in (1, 2, 3):
-        posed = frame.posing.splats(offsets, FRAMES, threads)
-        results.append([*posed.splats, frame.posing.gradient(posed, posed.splats, threads)])
+        posed = parameterization.posing.pose(offsets, FRAMES, threads)
+        results.append([*posed.splats, parameterization.posing.offsets_gradient(posed, posed.splats, threads)])
     assert all(torch.equal(a, b) for r in results[1:] for a, b in zip(results[0], r, strict=True))
 
 
 def test_extreme_and_broken_values_are_torchs() -> None:
     scene = _scene(12, actors=0)
-    packed = scene.gaussians.packed()
+    packed = scene.gaussians.pack()
     packed[:, 3:6] = torch.tensor([-100.0, -80, -30, 0, 30, 80, 87, 90, 200, torch.nan, torch.inf, -torch.inf])[:, None]
     packed[:, 10] = torch.tensor([-200.0, -80.1, -80, -79.9, -30, -9, 0, 9, 30, torch.nan, torch.inf, -torch.inf])
     packed[9, 0], packed[10, 12] = torch.nan, torch.inf
-    scene = scene.with_gaussians(Gaussians.unpacked(packed))
-    frame, leaf = Frame.of(scene), torch.zeros(12, 14, requires_grad=True)
-    frame = replace(frame, unit=torch.ones(12, 1))
-    splats = frame.gaussians(leaf).activated()
+    scene = scene.with_gaussians(Gaussians.unpack(packed))
+    parameterization, leaf = Parameterization.from_scene(scene), torch.zeros(12, 14, requires_grad=True)
+    parameterization = replace(parameterization, unit_m=torch.ones(12, 1))
+    splats = parameterization.gaussians_at(leaf).activate()
     theirs = [getattr(splats, name) for name in NAMES]
-    ones = arrays(12)
+    ones = allocate_splats(12)
     for t in ones:
         t.fill_(1.0)
     torch.autograd.backward(theirs, list(ones))
     assert leaf.grad is not None
-    posed = frame.posing.splats(torch.zeros(12, 14), FRAMES, 1)
-    ours = [*posed.splats, frame.posing.gradient(posed, ones, 1)]
+    posed = parameterization.posing.pose(torch.zeros(12, 14), FRAMES, 1)
+    ours = [*posed.splats, parameterization.posing.offsets_gradient(posed, ones, 1)]
     for a, b in zip(ours, [*theirs, leaf.grad], strict=True):
         torch.testing.assert_close(a, b, rtol=4e-5, atol=2e-35, equal_nan=True)
 
@@ -187,16 +191,20 @@ def test_expected_depth_and_its_gradient_are_torchs() -> None:
     torch.testing.assert_close(by_depth, d.grad, rtol=1e-6, atol=0)
 
 
-ROLLING = RollingShutter(0.05, (1.0, 0.2, 4.0), (0.1, -0.3, 0.2), frame_s=0.1)
+ROLLING = RollingShutter(0.05, velocity_m_s=(1.0, 0.2, 4.0), turn_rad_s=(0.1, -0.3, 0.2), frame_s=0.1)
 
 
 def _passes(
     scene: SceneGraph, settings: RenderSettings = SETTINGS, shutter: RollingShutter | None = None
-) -> list[CompiledPass | TorchPass]:
-    views = [
-        _Rolling(t, f, shutter) for t, f in zip(street_scenes.targets(street_scenes.scene()), (1, 7, 1, 2), strict=True)
-    ]
-    return [p(Frame.of(scene), _offsets(scene), views, settings) for p in (CompiledPass, TorchPass)]
+) -> list[KernelRender | AutogradRender]:
+    parameterization = Parameterization.from_scene(scene)
+    kinds = (KernelRender, AutogradRender)
+    return [kind(parameterization, _offsets(scene), _views(shutter), settings) for kind in kinds]
+
+
+def _views(shutter: RollingShutter | None) -> list[_Rolling]:
+    targets = street_scenes.targets(street_scenes.scene())
+    return [_Rolling(target, frame, shutter) for target, frame in zip(targets, (1, 7, 1, 2), strict=True)]
 
 
 class _Rolling:
@@ -223,49 +231,49 @@ def test_a_whole_pass_is_torchs(shutter: RollingShutter | None) -> None:
     assert ours.culled == torchs.culled
     torch.testing.assert_close(ours.color, torchs.color, atol=1e-4, rtol=0)
     by_color, by_depth = torch.randn(ours.color.shape), torch.randn(ours.depth.shape)
-    expected = torchs.gradient(by_color, by_depth.clone())
-    _close(ours.gradient(by_color, by_depth), expected, 1e-3)
+    expected = torchs.gradient(by_color, by_depth.clone()).gaussians
+    _close(ours.gradient(by_color, by_depth).gaussians, expected, 1e-3)
 
 
 @pytest.mark.parametrize("shutter", [None, ROLLING], ids=["global", "rolling"])
 def test_a_blurred_pass_is_torchs_and_that_of_its_moments(shutter: RollingShutter | None) -> None:
-    """Compiled and by torch: what ``begin`` takes, and by autograd through ``render_views``; again at known moments."""
-    scene, blur = _scene(), MotionBlur(0.05, ROLLING.velocity_m_s, ROLLING.turn_rad_s, 0.1)
-    views = [
-        _Rolling(t, f, shutter) for t, f in zip(street_scenes.targets(street_scenes.scene()), (1, 7, 1, 2), strict=True)
-    ]
+    """The render that is chosen, and autograd through ``render_views``; the second time at moments that it knows."""
+    scene = _scene()
+    blur = MotionBlur(0.05, velocity_m_s=ROLLING.velocity_m_s, turn_rad_s=ROLLING.turn_rad_s, frame_s=0.1)
+    views = _views(shutter)
     for view in views[:3]:
         view.blur = blur
-    frame, offsets = Frame.of(scene), _offsets(scene)
+    parameterization, offsets = Parameterization.from_scene(scene), _offsets(scene)
     leaf = offsets.clone().requires_grad_()
-    image = render_views(scene.with_gaussians(frame.gaussians(leaf)), views)
+    image = render_views(scene.with_gaussians(parameterization.gaussians_at(leaf)), views)
     by_color, by_depth = torch.randn(image.color.shape), torch.randn(image.depth.shape)
     torch.autograd.backward([image.color, image.expected_depth()], [by_color, by_depth])
     for _ in range(2):
-        ours = begin(frame, offsets, views, SETTINGS)
-        assert isinstance(ours, BlurredPass) and len(ours.color) == 4
+        ours = render_differentiable(parameterization, offsets, views, SETTINGS)
+        assert isinstance(ours, MotionBlurRender) and len(ours.color) == 4
         torch.testing.assert_close(ours.color, image.color.detach(), atol=1e-4, rtol=0)
-        _close(ours.gradient(by_color, by_depth.clone()), leaf.grad, 1e-3)
-    sharp = begin(frame, offsets, [_Rolling(views[3], 2, shutter)], SETTINGS)
-    assert not isinstance(sharp, BlurredPass) and torch.equal(sharp.color[0], ours.color[3])
+        _close(ours.gradient(by_color, by_depth.clone()).gaussians, leaf.grad, 1e-3)
+    sharp = render_differentiable(parameterization, offsets, [_Rolling(views[3], 2, shutter)], SETTINGS)
+    assert not isinstance(sharp, MotionBlurRender) and torch.equal(sharp.color[0], ours.color[3])
 
 
 def test_a_blurred_street_is_recovered_sharp_where_blur_is_known() -> None:
     """By the PSNR of what an ideal camera would see, of images 48 px wide that are blurred by four."""
     truth = _scene(600)
-    blur = MotionBlur(0.1, (7.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.1)  # 40 px / 7 m of depth · 0.7 m
+    # 40 px / 7 m of depth · 0.7 m
+    blur = MotionBlur(0.1, velocity_m_s=(7.0, 0.0, 0.0), turn_rad_s=(0.0, 0.0, 0.0), frame_s=0.1)
     plain = street_scenes.targets(truth)
     moving = [replace(t, blur=blur) for t in plain]
     with torch.no_grad():
         images = render_views(truth, moving).color
-    blurred = [replace(t, image=SsimTarget.of(i.contiguous())) for t, i in zip(moving, images, strict=True)]
+    blurred = [replace(t, image=SsimTarget.from_image(i.contiguous())) for t, i in zip(moving, images, strict=True)]
     error = {}
     for name, views in (("known", blurred), ("ignored", [replace(t, blur=None) for t in blurred])):
         objective = Objective(LossConfig(perceptual=0, depth=0.0))
-        found = unroll(TunedAdam(), street_scenes.blurred(truth), views, (), objective, Plan(60, 4)).scene
+        found = unroll(TunedAdam(), street_scenes.blurred(truth), views, (), objective, UnrollSettings(60, 4)).scene
         with torch.no_grad():
             seen = render_views(found, plain).color
-        true = torch.stack([t.image.image for t in plain])
+        true = torch.stack([t.image.pixels for t in plain])
         error[name] = float((seen - true).square().mean())
     assert 10 * np.log10(error["ignored"] / error["known"]) > 0.5, error
 
@@ -273,56 +281,40 @@ def test_a_blurred_street_is_recovered_sharp_where_blur_is_known() -> None:
 @pytest.mark.parametrize("depth", [0.0, 0.1])
 def test_an_unrolled_optimisation_with_actors_is_torchs(depth: float, monkeypatch: pytest.MonkeyPatch) -> None:
     truth = _scene(600)
-    start, views, plan = street_scenes.blurred(truth), street_scenes.targets(truth), Plan(6, 3)
+    start, views, settings = street_scenes.blurred(truth), street_scenes.targets(truth), UnrollSettings(6, 3)
     objective = Objective(LossConfig(perceptual=0, depth=depth))
-    ours = unroll(TunedAdam(), start, views, (), objective, plan)
-    monkeypatch.setattr(objective_module, "begin", TorchPass)
-    torchs = unroll(TunedAdam(), start, views, (), objective, plan)
+    ours = unroll(TunedAdam(), start, views, (), objective, settings)
+    monkeypatch.setattr(objective_module, "render_differentiable", AutogradRender)
+    torchs = unroll(TunedAdam(), start, views, (), objective, settings)
     assert ours.losses == pytest.approx(torchs.losses, rel=1e-4)
     assert ours.losses[-1] < ours.losses[0] and ours.culled == torchs.culled
-    difference = (ours.scene.gaussians.packed() - torchs.scene.gaussians.packed()).abs()
+    difference = (ours.scene.gaussians.pack() - torchs.scene.gaussians.pack()).abs()
     assert float(difference.median()) < 1e-5 and float(difference.mean()) < 1e-3
 
 
 def test_it_is_for_float32_on_the_cpu_and_its_backend() -> None:
     scene, views = _scene(50), street_scenes.targets(street_scenes.scene())[:1]
-    frame, offsets = Frame.of(scene), torch.zeros(50, 14)
+    parameterization, offsets = Parameterization.from_scene(scene), torch.zeros(50, 14)
     for settings in (SETTINGS, RenderSettings("cpu", 1)):
-        assert isinstance(begin(frame, offsets, views, settings), CompiledPass)
-    assert isinstance(begin(frame, offsets, views, RenderSettings("reference")), TorchPass)
-    assert isinstance(begin(_exact(scene), offsets.double(), views, SETTINGS), TorchPass)
+        assert isinstance(render_differentiable(parameterization, offsets, views, settings), KernelRender)
+    assert isinstance(
+        render_differentiable(parameterization, offsets, views, RenderSettings("reference")), AutogradRender
+    )
+    assert isinstance(render_differentiable(_exact(scene), offsets.double(), views, SETTINGS), AutogradRender)
 
 
 def test_what_does_not_fit_is_refused() -> None:
-    frame = Frame.of(_scene(50))
+    parameterization = Parameterization.from_scene(_scene(50))
     with pytest.raises(ValueError, match=r"expected offsets of shape \[50, 14\], got \[49, 14\]"):
-        frame.posing.splats(torch.zeros(49, 14), FRAMES, 1)
+        parameterization.posing.pose(torch.zeros(49, 14), FRAMES, 1)
     pose = street_scenes.pose(torch.nan)
     view = replace(street_scenes.targets(street_scenes.scene())[0], chunk_SE3_camera=pose)
     with pytest.raises(NonFiniteError):
-        CompiledPass(frame, torch.zeros(50, 14), [view], SETTINGS)
+        KernelRender(parameterization, torch.zeros(50, 14), [view], SETTINGS)
 
 
 def test_offsets_need_not_be_contiguous() -> None:
     scene = _scene(100)
-    frame, offsets = Frame.of(scene), _offsets(scene)
-    a, b = (frame.posing.splats(o, FRAMES, 1) for o in (offsets, offsets.T.contiguous().T))
+    parameterization, offsets = Parameterization.from_scene(scene), _offsets(scene)
+    a, b = (parameterization.posing.pose(o, FRAMES, 1) for o in (offsets, offsets.T.contiguous().T))
     assert all(torch.equal(x, y) for x, y in zip(a.splats, b.splats, strict=True))
-
-
-def test_a_failing_kernel_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    frame = Frame.of(_scene(50))
-    monkeypatch.setattr(module, "load_posing", lambda: SimpleNamespace(genre_pose=lambda *arguments: 2))
-    with pytest.raises(ResourceError, match="posing of Gaussians on the CPU failed"):
-        frame.posing.splats(torch.zeros(50, 14), FRAMES, 1)
-
-
-def test_constants_live_in_one_place() -> None:
-    text = (KERNEL.folder / "posing.cpp").read_text()
-    assert {n for n in vars(constants) if n.isupper()} == set(KERNEL.constants)
-    assert all(re.search(rf"\b{name}\b", text) for name in KERNEL.constants)
-
-
-def test_a_missing_library_says_what_to_run(tmp_path: Path) -> None:
-    with pytest.raises(ResourceError, match=r"posing of Gaussians on the CPU is not compiled.*pip install -e \."):
-        load_posing(tmp_path)

@@ -10,17 +10,20 @@ import pytest
 import torch
 from torch import Tensor
 
-from genre_tasks.config import LossConfig
+from genre_tasks.config import LearningRates, LossConfig
 from genre_tasks.losses.ssim import SsimTarget
-from genre_tasks.optimiser.differentiable_render import Beside, CompiledPass, TorchPass
+from genre_tasks.optimiser.autograd_render import AutogradRender
+from genre_tasks.optimiser.auxiliary import AuxiliaryParameters
+from genre_tasks.optimiser.gradients import ShGradients
+from genre_tasks.optimiser.kernel_render import KernelRender
 from genre_tasks.optimiser.objective import Objective
-from genre_tasks.optimiser.sh_optimiser import RATE, GlossSight, GlossState
-from genre_tasks.optimiser.state import Frame
+from genre_tasks.optimiser.sh_optimiser import LEARNING_RATE, ShState
+from genre_tasks.optimiser.state import Parameterization
 from genre_tasks.optimiser.tuned_adam import TunedAdam
-from genre_tasks.optimiser.unroll import Plan, unroll
+from genre_tasks.optimiser.unroll import UnrollSettings, unroll
 from genre_tasks.render import RenderSettings, render_views
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.spherical_harmonics import starting
+from genre_tasks.scene.spherical_harmonics import with_zero_spherical_harmonics
 from tests.optimiser import street_scenes
 from tests.optimiser.test_posing import _offsets, _scene
 
@@ -29,7 +32,7 @@ SETTINGS = RenderSettings()
 
 def _glossy(scene: SceneGraph, size: float = 0.3) -> SceneGraph:
     g = torch.Generator().manual_seed(8)
-    return scene.with_harmonics(size * torch.randn(len(scene), 3, 3, generator=g))
+    return scene.with_spherical_harmonics(size * torch.randn(len(scene), 3, 3, generator=g))
 
 
 def test_a_whole_pass_is_torchs() -> None:
@@ -37,22 +40,29 @@ def test_a_whole_pass_is_torchs() -> None:
     views = [
         replace(t, frame=f) for t, f in zip(street_scenes.targets(street_scenes.scene()), (1, 7, 1, 2), strict=True)
     ]
-    offsets, harmonics = _offsets(scene), scene.harmonics
-    fixed = Frame.of(scene), offsets, views, SETTINGS, Beside(harmonics=harmonics)
-    ours, torchs = (p(*fixed) for p in (CompiledPass, TorchPass))
+    offsets, spherical_harmonics = _offsets(scene), scene.spherical_harmonics
+    fixed = (
+        Parameterization.from_scene(scene),
+        offsets,
+        views,
+        SETTINGS,
+        AuxiliaryParameters(spherical_harmonics=spherical_harmonics),
+    )
+    ours, torchs = (p(*fixed) for p in (KernelRender, AutogradRender))
     torch.testing.assert_close(ours.color, torchs.color, atol=2e-4, rtol=0)
-    plain = CompiledPass(Frame.of(scene), offsets, views, SETTINGS)
+    plain = KernelRender(Parameterization.from_scene(scene), offsets, views, SETTINGS)
     assert (plain.color - ours.color).abs().max() > 0.05
     generator = torch.Generator().manual_seed(5)
     by = [torch.randn(x.shape, generator=generator) for x in (ours.color, ours.depth)]
-    grads = [p.gradient(by[0].clone(), by[1].clone()) for p in (ours, torchs)]
-    assert ours.gloss is not None and torchs.gloss is not None
-    pairs = [grads, *zip(vars(ours.gloss).values(), vars(torchs.gloss).values(), strict=True)]
+    found, expected = (p.gradient(by[0].clone(), by[1].clone()) for p in (ours, torchs))
+    assert found.spherical_harmonics is not None and expected.spherical_harmonics is not None
+    names = ("coefficients", "basis_sums", "view_counts")
+    pairs = [(getattr(found.spherical_harmonics, n), getattr(expected.spherical_harmonics, n)) for n in names]
+    pairs.append((found.gaussians, expected.gaussians))
     for mine, exact in pairs:
         assert mine.shape == exact.shape and float((mine - exact).norm() / exact.norm()) < 2e-3
-    assert 0 < float(ours.gloss.views.max()) <= 4
-    plain.gradient(by[0].clone(), by[1].clone())
-    assert plain.gloss is None
+    assert 0 < float(found.spherical_harmonics.view_counts.max()) <= 4
+    assert plain.gradient(by[0].clone(), by[1].clone()).spherical_harmonics is None
 
 
 def test_an_unrolled_optimisation_learns_gloss_at_any_number_of_threads() -> None:
@@ -60,53 +70,53 @@ def test_an_unrolled_optimisation_learns_gloss_at_any_number_of_threads() -> Non
     views = street_scenes.targets(truth)
     with torch.no_grad():
         images = render_views(truth, views).color
-    views = [replace(v, image=SsimTarget.of(i.contiguous())) for v, i in zip(views, images, strict=True)]
-    begun = starting(truth.with_harmonics(None))
-    objective, plan = Objective(LossConfig(perceptual=0, depth=0)), Plan(12, 3, snapshots=2)
-    rule = TunedAdam((0.0, 0.0, 0.0, 0.0, 0.02))
-    still = unroll(rule, begun.with_harmonics(None), views, (), objective, plan)
-    ours = unroll(rule, begun, views, (), objective, plan)
+    views = [replace(v, image=SsimTarget.from_image(i.contiguous())) for v, i in zip(views, images, strict=True)]
+    begun = with_zero_spherical_harmonics(truth.with_spherical_harmonics(None))
+    objective, settings = Objective(LossConfig(perceptual=0, depth=0)), UnrollSettings(12, 3, snapshots=2)
+    rule = TunedAdam(LearningRates.from_sequence((0.0, 0.0, 0.0, 0.0, 0.02)))
+    still = unroll(rule, begun.with_spherical_harmonics(None), views, (), objective, settings)
+    ours = unroll(rule, begun, views, (), objective, settings)
     assert still.losses[0] == pytest.approx(ours.losses[0], rel=0.02)
     assert ours.losses[-1] < still.losses[-1]
-    learnt = ours.scene.harmonics
+    learnt = ours.scene.spherical_harmonics
     assert learnt is not None and learnt.any()
-    assert torch.equal(ours.scene.gaussians.packed()[:, :11], begun.gaussians.packed()[:, :11])
-    assert all(s.harmonics is not None for s in ours.snapshots.values())
+    assert torch.equal(ours.scene.gaussians.pack()[:, :11], begun.gaussians.pack()[:, :11])
+    assert all(s.spherical_harmonics is not None for s in ours.snapshots.values())
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(1 if threads > 1 else 2)
-        again = unroll(rule, begun, views, (), objective, plan)
+        again = unroll(rule, begun, views, (), objective, settings)
     finally:
         torch.set_num_threads(threads)
-    assert again.scene.harmonics is not None and torch.equal(again.scene.harmonics, learnt)
+    assert again.scene.spherical_harmonics is not None and torch.equal(again.scene.spherical_harmonics, learnt)
 
 
-def _sight(gradient: Tensor, mean: float) -> GlossSight:
+def _gradients(gradient: Tensor, mean: float) -> ShGradients:
     """Two views saw each Gaussian, in directions where the mean of each harmonic is ``mean``."""
-    return GlossSight(gradient, torch.full((3, 3, 3), 2 * mean), torch.full((3, 3), 2.0))
+    return ShGradients(gradient, torch.full((3, 3, 3), 2 * mean), torch.full((3, 3), 2.0))
 
 
 def test_a_step_moves_what_is_seen_and_no_farther_than_its_rate() -> None:
-    state, gradient = GlossState.start(torch.zeros(3, 3, 3)), torch.zeros(3, 3, 3)
+    state, gradient = ShState.from_coefficients(torch.zeros(3, 3, 3)), torch.zeros(3, 3, 3)
     by_colors = torch.tensor([1e-3, 0.0, 1e4])[:, None].expand(3, 3)
     gradient[0, 0], gradient[2] = 0.5e-3, 0.5e4 * torch.randn(3, 3, generator=torch.Generator().manual_seed(1)).sign()
-    moved, shift = state.moved(_sight(gradient, 0.0), by_colors, 0.5)
-    assert not moved.harmonics[1].any() and moved.seen[:, 0, 0].tolist() == [1.0, 0.0, 1.0]
-    assert (moved.harmonics[0, 0] < 0).all() and not moved.harmonics[0, 1:].any() and not shift.any()
-    torch.testing.assert_close(moved.harmonics[2].abs(), torch.full((3, 3), 0.25 * RATE))
-    rest, _ = moved.moved(_sight(torch.zeros(3, 3, 3), 0.0), torch.zeros(3, 3), 1.0)
-    assert torch.equal(rest.harmonics, moved.harmonics)
+    moved, shift = state.apply_step(_gradients(gradient, 0.0), by_colors, 0.5)
+    assert not moved.coefficients[1].any() and moved.visit_count[:, 0, 0].tolist() == [1.0, 0.0, 1.0]
+    assert (moved.coefficients[0, 0] < 0).all() and not moved.coefficients[0, 1:].any() and not shift.any()
+    torch.testing.assert_close(moved.coefficients[2].abs(), torch.full((3, 3), 0.25 * LEARNING_RATE))
+    rest, _ = moved.apply_step(_gradients(torch.zeros(3, 3, 3), 0.0), torch.zeros(3, 3), 1.0)
+    assert torch.equal(rest.coefficients, moved.coefficients)
 
 
 def test_what_all_views_ask_for_is_left_to_the_colour() -> None:
     """A gradient that is the same in each view moves no harmonics; another leaves the views' mean colour as it is."""
-    by_colors, state = torch.full((3, 3), 0.7), GlossState.start(torch.zeros(3, 3, 3))
-    moved, shift = state.moved(_sight(torch.full((3, 3, 3), 0.3 * 0.7), 0.3), by_colors, 1.0)
-    assert moved.harmonics.abs().max() < 1e-3 * RATE and shift.abs().max() < 1e-3 * RATE
+    by_colors, state = torch.full((3, 3), 0.7), ShState.from_coefficients(torch.zeros(3, 3, 3))
+    moved, shift = state.apply_step(_gradients(torch.full((3, 3, 3), 0.3 * 0.7), 0.3), by_colors, 1.0)
+    assert moved.coefficients.abs().max() < 1e-3 * LEARNING_RATE and shift.abs().max() < 1e-3 * LEARNING_RATE
     generator = torch.Generator().manual_seed(2)
-    moved, shift = state.moved(_sight(torch.randn(3, 3, 3, generator=generator), 0.3), by_colors, 1.0)
-    assert moved.harmonics.abs().max() > 0.1 * RATE
-    torch.testing.assert_close(shift + 0.3 * moved.harmonics.sum(1), torch.zeros(3, 3), atol=1e-7, rtol=0)
+    moved, shift = state.apply_step(_gradients(torch.randn(3, 3, 3, generator=generator), 0.3), by_colors, 1.0)
+    assert moved.coefficients.abs().max() > 0.1 * LEARNING_RATE
+    torch.testing.assert_close(shift + 0.3 * moved.coefficients.sum(1), torch.zeros(3, 3), atol=1e-7, rtol=0)
 
 
 def test_without_harmonics_nothing_of_them_is_imported() -> None:
@@ -115,11 +125,12 @@ def test_without_harmonics_nothing_of_them_is_imported() -> None:
         "from genre_tasks.config import LossConfig\n"
         "from genre_tasks.optimiser.tuned_adam import TunedAdam\n"
         "from genre_tasks.optimiser.objective import Objective\n"
-        "from genre_tasks.optimiser.unroll import Plan, unroll\n"
+        "from genre_tasks.optimiser.unroll import UnrollSettings, unroll\n"
         "from tests.optimiser import street_scenes\n"
         "s = street_scenes.scene()\n"
-        "done = unroll(TunedAdam(), s, street_scenes.targets(s), (), Objective(LossConfig(perceptual=0)), Plan(2, 2))\n"
-        "assert done.scene.harmonics is None\n"
+        "objective = Objective(LossConfig(perceptual=0))\n"
+        "done = unroll(TunedAdam(), s, street_scenes.targets(s), (), objective, UnrollSettings(2, 2))\n"
+        "assert done.scene.spherical_harmonics is None\n"
         "loaded = [n for n in sys.modules if n.endswith(('harmonics', 'sh_optimiser'))]\n"
         "assert not loaded, loaded\n"
     )

@@ -9,28 +9,22 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.optimiser.rate_sweep import (
-    Scores,
-    Setting,
-    Subject,
-    network_moves,
-    network_of,
-    search,
-    validation_seeds,
-)
+from benchmarks.optimiser.rate_search import Setting, network_moves, search
+from benchmarks.optimiser.rate_sweep import Scores, TuningScene, load_network, validation_seeds
 from genre_tasks.errors import ConfigError
 from genre_tasks.learned.learned_optimiser import LearnedOptimiser
 from genre_tasks.learned.meta_episodes import TrainingScene
 from genre_tasks.learned.network import NetworkConfig
-from genre_tasks.learned.weights import save
-from genre_tasks.optimiser.tuned_adam import GNET_RATES
+from genre_tasks.learned.weights import save_optimiser
+from genre_tasks.optimiser.tuned_adam import GNET_LEARNING_RATES
 from genre_tasks.scene.graph import SceneGraph
 from tests.optimiser import street_scenes
 
 
 def test_it_finds_rates_that_are_all_far_off_and_a_schedule() -> None:
     best = Setting(
-        tuple(r * f for r, f in zip(GNET_RATES, (0.125, 0.125, 0.25, 0.03125, 2.0), strict=True)), "constant"
+        tuple(r * f for r, f in zip(GNET_LEARNING_RATES.as_tuple(), (0.125, 0.125, 0.25, 0.03125, 2.0), strict=True)),
+        "constant",
     )
 
     def measure(setting: Setting) -> float:
@@ -43,12 +37,12 @@ def test_it_finds_rates_that_are_all_far_off_and_a_schedule() -> None:
 
 
 def test_scores_are_kept_and_not_measured_again(tmp_path: Path) -> None:
-    def scene() -> Subject:
+    def scene() -> TuningScene:
         truth = street_scenes.scene()
         views, novel = street_scenes.targets(truth), street_scenes.targets(truth, novel=True)
-        return Subject(TrainingScene("tiny", street_scenes.blurred(truth), views, novel))
+        return TuningScene(TrainingScene("tiny", street_scenes.blurred(truth), views, novel))
 
-    def never() -> Subject:
+    def never() -> TuningScene:
         raise AssertionError("measured again")
 
     first = Scores(tmp_path / "scores.json", {900: scene}).mean(Setting(), 2, 2)
@@ -61,8 +55,8 @@ def test_scores_are_kept_and_not_measured_again(tmp_path: Path) -> None:
 
 def test_a_networks_rates_are_searched_with_its_relaxation(tmp_path: Path) -> None:
     config = NetworkConfig(hidden=8, channels=(4,), residuals=True, rates=(0.1,) * 5, relaxation=0.2)
-    save(LearnedOptimiser(config), tmp_path / "w.safetensors")
-    start, rule_of = network_of(tmp_path / "w.safetensors")
+    save_optimiser(LearnedOptimiser(config), tmp_path / "w.safetensors")
+    start, rule_of = load_network(tmp_path / "w.safetensors")
     assert start == Setting((0.1,) * 5, relaxation=0.2)
 
     def measure(setting: Setting) -> float:
@@ -79,9 +73,9 @@ def test_a_networks_rates_are_searched_with_its_relaxation(tmp_path: Path) -> No
 def test_what_is_beside_the_path_counts_where_it_is_asked_for(tmp_path: Path) -> None:
     truth = street_scenes.scene()
     views, novel = street_scenes.targets(truth), street_scenes.targets(truth, novel=True)
-    scenes = {900: lambda: Subject(TrainingScene("s", street_scenes.blurred(truth), views, views, truth=novel))}
+    scenes = {900: lambda: TuningScene(TrainingScene("s", street_scenes.blurred(truth), views, views, truth=novel))}
     at, there = (
-        Scores(tmp_path / f"{beside}.json", scenes, beside=beside).mean(Setting(), 2, 2) for beside in (0.0, 0.5)
+        Scores(tmp_path / f"{weight}.json", scenes, novel_weight=weight).mean(Setting(), 2, 2) for weight in (0.0, 0.5)
     )
     assert there > at + 2.5
 
@@ -96,10 +90,10 @@ def test_an_enhancer_is_scored_by_what_it_is_given_and_by_how_close_it_comes(tmp
         seen.append(len(result))
         return 7.0
 
-    plain = Scores(tmp_path / "a.json", {900: lambda: Subject(scene)}).mean(Setting(), 2, 2)
-    alone = Scores(tmp_path / "b.json", {900: lambda: Subject(replace(scene, fixed=()))}).mean(Setting(), 2, 2)
-    whole = Scores(tmp_path / "c.json", {900: lambda: Subject(scene, closeness=closeness)}).mean(Setting(), 2, 2)
-    split = Scores(tmp_path / "d.json", {900: lambda: Subject(scene, 0.1, closeness)}).mean(Setting(), 2, 2)
+    plain = Scores(tmp_path / "a.json", {900: lambda: TuningScene(scene)}).mean(Setting(), 2, 2)
+    alone = Scores(tmp_path / "b.json", {900: lambda: TuningScene(replace(scene, fixed=()))}).mean(Setting(), 2, 2)
+    whole = Scores(tmp_path / "c.json", {900: lambda: TuningScene(scene, closeness=closeness)}).mean(Setting(), 2, 2)
+    split = Scores(tmp_path / "d.json", {900: lambda: TuningScene(scene, 0.1, closeness)}).mean(Setting(), 2, 2)
     assert plain != alone and whole == plain + 7.0 and split != whole
     assert seen == [300, 330]
 

@@ -1,4 +1,4 @@
-"""Density control: who is cloned, split, pruned and reset, and that nodes and moments follow."""
+"""Density control: which Gaussians are cloned, split, pruned and reset, and that nodes and moments follow."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 
 from genre_tasks.config import DensityConfig
 from genre_tasks.per_scene import densification
-from genre_tasks.per_scene.densification import Population
+from genre_tasks.per_scene.densification import GaussiansWithMoments
 from genre_tasks.scene.gaussians import Gaussians, map_attributes
 from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR, STATIC
 
@@ -20,7 +20,7 @@ SMALL, LARGE = math.log(0.05), math.log(0.5)
 
 def _population(
     log_scales: list[float], nodes: list[int] | None = None, opacity: float | list[float] = 0.5
-) -> Population:
+) -> GaussiansWithMoments:
     """Remembering moments of one everywhere."""
     n = len(log_scales)
     quats = torch.nn.functional.normalize(torch.randn(n, 4, generator=torch.Generator().manual_seed(1)), dim=1)
@@ -33,31 +33,35 @@ def _population(
         torch.full((n, 3), 0.3),
     )
     ones = map_attributes(torch.ones_like, g)
-    return Population(g, ones, ones, torch.tensor(nodes or [STATIC] * n))
+    return GaussiansWithMoments(g, ones, ones, torch.tensor(nodes or [STATIC] * n))
 
 
-def _grown(population: Population, pull: list[float], config: DensityConfig = CONFIG, seed: int = 0) -> Population:
+def _grown(
+    population: GaussiansWithMoments, screen_gradient: list[float], config: DensityConfig = CONFIG, seed: int = 0
+) -> GaussiansWithMoments:
     extent = torch.full((len(population),), 10.0)
-    return densification.grown(population, torch.tensor(pull), extent, config, torch.Generator().manual_seed(seed))
+    return densification.densify(
+        population, torch.tensor(screen_gradient), extent, config, torch.Generator().manual_seed(seed)
+    )
 
 
-def test_who_is_pulled_hard_is_cloned_if_small_and_split_if_large() -> None:
+def test_large_gradients_clone_small_gaussians_and_split_large_ones() -> None:
     before = _population([SMALL, SMALL, LARGE, LARGE])
     after = _grown(before, [1e-5, 1e-3, 1e-5, 1e-3])
     assert len(after) == 6
-    packed = after.gaussians.packed()
-    assert torch.equal(packed[:3], before.gaussians.packed()[:3])  # the fourth went into its halves
-    assert torch.equal(packed[3], before.gaussians.packed()[1])
+    packed = after.gaussians.pack()
+    assert torch.equal(packed[:3], before.gaussians.pack()[:3])  # the fourth went into its halves
+    assert torch.equal(packed[3], before.gaussians.pack()[1])
     assert torch.allclose(after.gaussians.log_scales[4:].exp(), torch.tensor(0.5 / 1.6))
     assert not torch.equal(packed[4], packed[5])
     assert float((after.gaussians.means[4:] - before.gaussians.means[3]).abs().max()) < 4 * 0.5
-    assert torch.equal(packed[4:, 6:], before.gaussians.packed()[3:, 6:].repeat(2, 1))
+    assert torch.equal(packed[4:, 6:], before.gaussians.pack()[3:, 6:].repeat(2, 1))
 
 
 def test_the_new_have_no_memory_and_the_old_keep_theirs() -> None:
     after = _grown(_population([SMALL, LARGE, SMALL]), [1e-3, 1e-3, 0.0])
-    for moments in (after.first, after.second):
-        assert moments.packed().mean(1).tolist() == [1, 1, 0, 0, 0]
+    for moments in (after.first_moments, after.second_moments):
+        assert moments.pack().mean(1).tolist() == [1, 1, 0, 0, 0]
 
 
 def test_halves_are_drawn_from_their_parent() -> None:
@@ -70,7 +74,7 @@ def test_halves_are_drawn_from_their_parent() -> None:
         torch.zeros(n),
         torch.zeros(n, 3),
     )
-    parents = Population.newborn(g, torch.full((n,), STATIC))
+    parents = GaussiansWithMoments.with_zero_moments(g, torch.full((n,), STATIC))
     halves = _grown(parents, [1.0] * n).gaussians.means
     assert len(halves) == 2 * n
     axis = torch.tensor([math.cos(2 * turn), math.sin(2 * turn), 0.0])
@@ -86,36 +90,36 @@ def test_children_belong_to_their_parents_node_and_the_distant_keep_their_number
 
 def test_size_is_measured_by_the_nodes_own_extent() -> None:
     population = _population([SMALL, SMALL], [STATIC, FIRST_ACTOR])
-    after = densification.grown(population, torch.ones(2), torch.tensor([10.0, 3.0]), CONFIG, torch.Generator())
+    after = densification.densify(population, torch.ones(2), torch.tensor([10.0, 3.0]), CONFIG, torch.Generator())
     assert after.nodes.tolist() == [STATIC, STATIC, FIRST_ACTOR, FIRST_ACTOR]  # cloned; split
     assert bool((after.gaussians.log_scales[2:] < SMALL).all())
 
 
 @pytest.mark.parametrize(("bound", "count"), [(4, 4), (6, 6), (8, 8), (100, 8), (2, 4)])
-def test_the_bound_lets_those_pulled_hardest_in_first(bound: int, count: int) -> None:
+def test_the_bound_lets_the_largest_gradients_in_first(bound: int, count: int) -> None:
     config = CONFIG.model_copy(update={"max_gaussians": bound})
     after = _grown(_population([SMALL] * 4), [0.1, 0.4, 0.3, 0.2], config)
     assert len(after) == count
-    newborn = after.gaussians.means[4:, 0].tolist()
-    assert newborn == sorted([3.0, 6.0, 9.0, 0.0][: max(count - 4, 0)])
+    clones = after.gaussians.means[4:, 0].tolist()
+    assert clones == sorted([3.0, 6.0, 9.0, 0.0][: max(count - 4, 0)])
 
 
 def test_the_transparent_go_and_the_too_large_when_asked() -> None:
     huge = math.log(1.5)
     population = _population([SMALL, SMALL, huge, huge, SMALL], [0, 0, 0, 1, 1], [0.5, 0.004, 0.5, 0.5, 0.001])
     extent = torch.full((5,), 10.0)
-    assert densification.pruned(population, extent, CONFIG, too_large=False).nodes.tolist() == [0, 0, 1, 1]
-    left = densification.pruned(population, extent, CONFIG, too_large=True)
+    assert densification.prune(population, extent, CONFIG, too_large=False).nodes.tolist() == [0, 0, 1, 1]
+    left = densification.prune(population, extent, CONFIG, too_large=True)
     assert left.gaussians.means[:, 0].tolist() == [0.0, 9.0, 12.0]
 
 
 def test_a_reset_lowers_opacities_and_forgets_their_moments_alone() -> None:
-    after = densification.reset(_population([SMALL] * 3, [0, 0, 1], [0.5, 0.007, 0.5]), CONFIG)
-    assert after.gaussians.activated().opacities.tolist() == pytest.approx([0.01, 0.007, 0.5])
-    assert after.first.logit_opacities.tolist() == [0, 0, 1] == after.second.logit_opacities.tolist()
-    assert bool((after.first.means == 1).all())
+    after = densification.reset_opacity(_population([SMALL] * 3, [0, 0, 1], [0.5, 0.007, 0.5]), CONFIG)
+    assert after.gaussians.activate().opacities.tolist() == pytest.approx([0.01, 0.007, 0.5])
+    assert after.first_moments.logit_opacities.tolist() == [0, 0, 1] == after.second_moments.logit_opacities.tolist()
+    assert bool((after.first_moments.means == 1).all())
 
 
 def test_nobody_may_be_left() -> None:
-    nobody = densification.pruned(_population([SMALL], opacity=0.001), torch.ones(1), CONFIG, too_large=True)
+    nobody = densification.prune(_population([SMALL], opacity=0.001), torch.ones(1), CONFIG, too_large=True)
     assert len(nobody) == 0 and len(_grown(nobody, [])) == 0

@@ -13,8 +13,8 @@ from genre_tasks.errors import NonFiniteError
 from genre_tasks.losses.rendering_loss import depth_loss
 from genre_tasks.losses.ssim import SsimTarget
 from genre_tasks.losses.targets import Target
-from genre_tasks.per_scene.run import reconstruct, snapshots
-from genre_tasks.per_scene.setup import node_extents, timetable, world_static
+from genre_tasks.per_scene.run import reconstruct_per_scene, train_with_snapshots
+from genre_tasks.per_scene.setup import freeze_actors, measure_node_extents, scale_density_schedule
 from genre_tasks.per_scene.training import SH_C0, PerSceneTraining
 from genre_tasks.render import render_views
 from genre_tasks.scene.gaussians import Gaussians
@@ -33,13 +33,13 @@ def _training(config: PerSceneConfig = ALIVE, seed: int = 0) -> PerSceneTraining
 
 
 def _packed(training: PerSceneTraining) -> torch.Tensor:
-    return training.scene.gaussians.packed()
+    return training.scene.gaussians.pack()
 
 
 def test_it_recovers_grows_within_its_bound_and_keeps_the_distant() -> None:
     training = _training()
     start = training.scene
-    result = reconstruct(training, frozenset({60, 200}))
+    result = reconstruct_per_scene(training, frozenset({60, 200}))
     assert np.mean(result.losses[-20:]) < 0.5 * np.mean(result.losses[:4])
     assert sorted(result.snapshots) == [60, 200]
     counts = [len(result.snapshots[60]), len(result.scene)]
@@ -50,7 +50,7 @@ def test_it_recovers_grows_within_its_bound_and_keeps_the_distant() -> None:
         assert set(scene.nodes.tolist()) == {STATIC, DISTANT, FIRST_ACTOR}
     assert len(result.seconds_per_iteration) == 300
     assert not result.scene.gaussians.means.requires_grad
-    assert torch.equal(start.gaussians.packed(), street_scenes.blurred(street_scenes.scene()).gaussians.packed())
+    assert torch.equal(start.gaussians.pack(), street_scenes.blurred(street_scenes.scene()).gaussians.pack())
 
 
 def test_it_grows_where_the_picture_disagrees_alone() -> None:
@@ -66,8 +66,8 @@ def test_it_grows_where_the_picture_disagrees_alone() -> None:
     training = PerSceneTraining(config, truth.with_gaussians(replace(g, means=means)), views)
     for _ in range(9):
         training.step()
-    pull = training.state()[0]["pull"]
-    assert int(pull.argmax()) == int(seen)
+    screen_gradient = training.state()[0]["screen_gradient"]
+    assert int(screen_gradient.argmax()) == int(seen)
     training.step()
     grown = training.scene
     assert len(grown) > len(truth)
@@ -109,7 +109,9 @@ def test_interrupted_and_taken_up_again_it_ends_in_the_same_bytes(at: int) -> No
 def test_looking_changes_nothing_and_costs_no_time() -> None:
     looked, silent = _training(), _training()
     seen = []
-    for snapshot in snapshots(looked, iterations=(10, 20), seconds=(0.0, looked.seconds + 1e-9, 1e9), budget_s=1e9):
+    for snapshot in train_with_snapshots(
+        looked, iterations=(10, 20), seconds=(0.0, looked.seconds + 1e-9, 1e9), budget_s=1e9
+    ):
         seen.append(snapshot)
         snapshot.scene.gaussians.means.zero_()
         if snapshot.iteration == 20:
@@ -119,9 +121,9 @@ def test_looking_changes_nothing_and_costs_no_time() -> None:
     assert [s.iteration for s in seen] == [1, 10, 20]
     assert seen[0].seconds < seen[1].seconds < seen[2].seconds == looked.seconds
     assert torch.equal(_packed(looked), _packed(silent))
-    *_, last = snapshots(looked, budget_s=looked.seconds + 1e-9)
+    *_, last = train_with_snapshots(looked, budget_s=looked.seconds + 1e-9)
     assert last.iteration == 21
-    assert [s.iteration for s in snapshots(looked)] == [300]
+    assert [s.iteration for s in train_with_snapshots(looked)] == [300]
 
 
 def test_the_first_step_moves_each_attribute_by_its_rate() -> None:
@@ -130,7 +132,7 @@ def test_the_first_step_moves_each_attribute_by_its_rate() -> None:
     before = _packed(training)
     training.step()
     nodes, moved = training.scene.nodes, (_packed(training) - before).abs()
-    extent = node_extents(training.scene, training.source)
+    extent = measure_node_extents(training.scene, training.source)
     for node, metres in enumerate(extent.tolist()):
         largest = moved[nodes == node].amax(0)
         assert float(largest[:3].max()) == pytest.approx(1.6e-4 * metres, rel=2e-2)
@@ -144,33 +146,36 @@ def test_extents_are_of_the_cameras_and_of_the_actors_box() -> None:
     scene = street_scenes.scene()
     box = replace(scene.actors[0], size_m=(4.0, 2.0, 1.5))
     views = street_scenes.targets(scene)  # at x = 0, 0.5, 0.2, 0.7
-    extents = node_extents(replace(scene, actors=(box,)), views)
+    extents = measure_node_extents(replace(scene, actors=(box,)), views)
     assert extents.tolist() == [1.0, 1.0, 3.0]
     far = [replace(t, chunk_SE3_camera=street_scenes.pose(20.0 * k)) for k, t in enumerate(views)]
-    assert float(node_extents(scene, far)[STATIC]) == pytest.approx(1.1 * 30)
+    assert float(measure_node_extents(scene, far)[STATIC]) == pytest.approx(1.1 * 30)
 
 
 def test_the_timetable_scales_with_the_length_but_sees_all_views_between_growths() -> None:
-    assert timetable(PerSceneConfig(), 15) == DensityConfig()
-    short = timetable(PerSceneConfig(iterations=3000), 4)
+    assert scale_density_schedule(PerSceneConfig(), 15) == DensityConfig()
+    short = scale_density_schedule(PerSceneConfig(iterations=3000), 4)
     assert (short.start, short.stop, short.every, short.reset_every) == (50, 1500, 10, 300)
-    assert timetable(PerSceneConfig(iterations=3000), 15).every == 15
+    assert scale_density_schedule(PerSceneConfig(iterations=3000), 15).every == 15
 
 
 def test_without_motion_an_actor_stands_where_it_is_in_the_middle_of_its_path() -> None:
     scene = street_scenes.scene()
-    still = world_static(scene)
+    still = freeze_actors(scene)
     moving = scene.nodes == FIRST_ACTOR
     assert not still.actors and still.nodes[moving].unique().tolist() == [STATIC]
     assert torch.equal(still.nodes == DISTANT, scene.nodes == DISTANT)
     middle = scene.gaussians.means[moving] + torch.tensor([1.0, 0.0, 6.0])
     assert torch.allclose(still.gaussians.means[moving], middle)
-    assert torch.equal(still.gaussians.packed()[~moving], scene.gaussians.packed()[~moving])
+    assert torch.equal(still.gaussians.pack()[~moving], scene.gaussians.pack()[~moving])
 
 
 def test_a_loss_that_is_not_finite_is_named() -> None:
     truth = street_scenes.scene()
-    views = [replace(t, image=SsimTarget.of(torch.full((32, 48, 3), torch.nan))) for t in street_scenes.targets(truth)]
+    views = [
+        replace(t, image=SsimTarget.from_image(torch.full((32, 48, 3), torch.nan)))
+        for t in street_scenes.targets(truth)
+    ]
     with pytest.raises(NonFiniteError, match="loss") as raised:
         PerSceneTraining(ALIVE, truth, views, stage="gnet").step()
     assert raised.value.stage == "gnet"
@@ -178,8 +183,8 @@ def test_a_loss_that_is_not_finite_is_named() -> None:
 
 def test_an_empty_scene_stays_empty() -> None:
     full = street_scenes.scene(actor=False)
-    nobody = SceneGraph(Gaussians.unpacked(full.gaussians.packed()[:0]), full.nodes[:0], ())
-    result = reconstruct(
+    nobody = SceneGraph(Gaussians.unpack(full.gaussians.pack()[:0]), full.nodes[:0], ())
+    result = reconstruct_per_scene(
         PerSceneTraining(ALIVE.model_copy(update={"iterations": 12}), nobody, street_scenes.targets(full))
     )
     assert len(result.scene) == 0 and len(result.losses) == 12
@@ -193,11 +198,11 @@ def test_without_its_depth_term_lidar_changes_no_bit_and_with_it_depths_come_nea
     quiet = ALIVE.model_copy(update={"iterations": 60})
 
     def trained(depth: float, targets: tuple[Target, ...]) -> SceneGraph:
-        return reconstruct(PerSceneTraining(quiet.model_copy(update={"depth": depth}), start, targets)).scene
+        return reconstruct_per_scene(PerSceneTraining(quiet.model_copy(update={"depth": depth}), start, targets)).scene
 
     plain = trained(0.0, views)
-    assert torch.equal(plain.gaussians.packed(), trained(0.0, bare).gaussians.packed())
-    assert torch.equal(plain.gaussians.packed(), trained(1.0, bare).gaussians.packed())
+    assert torch.equal(plain.gaussians.pack(), trained(0.0, bare).gaussians.pack())
+    assert torch.equal(plain.gaussians.pack(), trained(1.0, bare).gaussians.pack())
 
     def error(scene: SceneGraph) -> float:
         depth = render_views(scene, views).expected_depth()

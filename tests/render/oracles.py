@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from genre_tasks.render import constants as const
-from genre_tasks.render.reference import BLOCK_PX, _block, _Footprints, _project
+from genre_tasks.render.reference import BLOCK_PX, _Footprints, _project, _render_block
 from genre_tasks.render.types import Cameras, Render
 from genre_tasks.scene.gaussians import Splats
 
@@ -88,7 +88,7 @@ def reference_bands(splats: Splats, cameras: Cameras, bands: Sequence[int]) -> R
         front = _project(splats, cameras, v, culled)
         image = splats.means.new_zeros(cameras.height_px, cameras.width_px, 5)
         for box, inside in _blocks(front, cameras, bands):
-            image[box[2] : box[3], box[0] : box[1]] = _block(front, inside, box)
+            image[box[2] : box[3], box[0] : box[1]] = _render_block(front, inside, box)
         images.append(image)
     image = torch.stack(images)
     return Render(image[..., :3], image[..., 4], image[..., 3], {k: n for k, n in culled.items() if n})
@@ -141,7 +141,7 @@ def alpha_excess(alpha: Tensor, seen: Survey) -> float:
 
 def _blocks(front: _Footprints, cameras: Cameras, bands: Sequence[int] | None) -> list[tuple[Box, Tensor]]:
     """Each block of the bands (all by default) and the footprints that can reach it, front to back."""
-    low, high = (front.center - front.half).detach(), (front.center + front.half).detach()
+    low, high = (front.center - front.half_extent).detach(), (front.center + front.half_extent).detach()
     width, height = cameras.width_px, cameras.height_px
     out = []
     for y in range(0, height, BLOCK_PX) if bands is None else [BLOCK_PX * b for b in bands]:

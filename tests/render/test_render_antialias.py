@@ -11,7 +11,7 @@ import torch
 from genre_tasks.errors import ConfigError
 from genre_tasks.logs.types import RollingShutter
 from genre_tasks.render import Cameras, RenderSettings, constants, render
-from genre_tasks.render.cuda import _effects
+from genre_tasks.render.cuda import _camera_options
 from genre_tasks.render.types import Shutter
 from genre_tasks.scene.gaussians import Splats
 from tests.render.oracles import agreement, relative_l2, survey
@@ -20,7 +20,7 @@ from tests.scenes import NAMES, cloud, smooth
 CPU, REFERENCE = RenderSettings("cpu", 1), RenderSettings("reference")
 BOTH = pytest.mark.parametrize("settings", [CPU, REFERENCE], ids=lambda s: s.backend)
 BARREL = (-0.3, 0.12, 0.002, -0.0015, -0.01)
-MOTION = RollingShutter(0.03, (9.0, -0.5, 14.0), (0.2, -0.5, 0.3))
+MOTION = RollingShutter(0.03, velocity_m_s=(9.0, -0.5, 14.0), turn_rad_s=(0.2, -0.5, 0.3))
 KINDS = pytest.mark.parametrize("kind", ["pinhole", "lens", "shutter", "lens, shutter"])
 
 
@@ -28,7 +28,9 @@ def _kind(cameras: Cameras, kind: str) -> Cameras:
     if "lens" in kind:
         cameras = replace(cameras, distortion=torch.tensor(BARREL).repeat(len(cameras), 1))
     if "shutter" in kind:
-        cameras = replace(cameras, shutter=Shutter.of([MOTION] * len(cameras), cameras.focal_px.dtype))
+        cameras = replace(
+            cameras, shutter=Shutter.from_rolling_shutters([MOTION] * len(cameras), cameras.focal_px.dtype)
+        )
     return replace(cameras, antialiased=True)
 
 
@@ -64,9 +66,9 @@ def test_reference_gradients_against_finite_differences(kind):
 
 def test_gsplat_is_not_asked_for_what_it_does_not_have():
     splats, cameras = cloud(3)
-    assert _effects(splats, replace(cameras, antialiased=True)) == {}
+    assert _camera_options(splats, replace(cameras, antialiased=True)) == {}
     with pytest.raises(ConfigError, match="no anti-aliasing with a lens distortion"):
-        _effects(splats, _kind(cameras, "lens"))
+        _camera_options(splats, _kind(cameras, "lens"))
 
 
 @BOTH

@@ -90,7 +90,9 @@ def test_views_of_moving_actors_keep_their_order(scene):
     views = [NovelView("c", f, 0.0, poses[v], lens, ("c", 0)) for f, v in ((1, 0), (0, 1), (1, 1), (2, 0), (0, 0))]
     out = render_views(graph, views, ONE)
     for i, view in enumerate(views):
-        alone = render(graph.at(view.frame).activated(), Cameras.of([view.chunk_SE3_camera], [lens]), ONE)
+        alone = render(
+            graph.gaussians_at(view.frame).activate(), Cameras.from_poses([view.chunk_SE3_camera], [lens]), ONE
+        )
         assert all(torch.equal(getattr(out, n)[i], getattr(alone, n)[0]) for n in IMAGES)
     assert not torch.equal(out.color[0], out.color[4])
     still = render_views(replace(graph, actors=()), views, ONE)

@@ -12,11 +12,11 @@ import torch
 from genre_tasks.logs.types import Lens
 from genre_tasks.render import Cameras, RenderSettings, render, render_views
 from genre_tasks.render.constants import JACOBIAN_MARGIN
-from genre_tasks.render.lens_domain import domain_of
+from genre_tasks.render.lens_domain import find_valid_domain
 from genre_tasks.render.surface import render_surfaces
 from genre_tasks.scene.gaussians import Gaussians, Splats
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.lens_distortion import distort, fold_radius, rays_at, slopes, undistort
+from genre_tasks.scene.lens_distortion import distort, distortion_jacobian, fold_radius, pixels_to_rays, undistort
 from genre_tasks.scene.projection import project
 from tests.render.oracles import agreement, relative_l2, survey
 from tests.scenes import NAMES, pose_gradient_error, smooth, street
@@ -79,8 +79,8 @@ def test_it_is_the_pinhole_image_resampled(settings):
     )
     lens = Lens(60.0, 62.0, 40.0, 31.0, 80, 60, BARREL)
     wide = Lens(60.0, 62.0, 60.0, 51.0, 120, 100)
-    image = render(splats, Cameras.of([np.eye(4)], [lens]), settings).color[0]
-    plain = render(splats, Cameras.of([np.eye(4)], [wide]), settings).color
+    image = render(splats, Cameras.from_poses([np.eye(4)], [lens]), settings).color[0]
+    plain = render(splats, Cameras.from_poses([np.eye(4)], [wide]), settings).color
     v, u = np.meshgrid(np.arange(60) + 0.5, np.arange(80) + 0.5, indexing="ij")
     at = undistort((u - lens.cx_px) / lens.fx_px, (v - lens.cy_px) / lens.fy_px, lens.coefficients)
     px, py = at[0] * wide.fx_px + wide.cx_px, at[1] * wide.fy_px + wide.cy_px
@@ -121,10 +121,10 @@ def test_centres_are_where_points_are_projected(lens):
     points = np.array([[0.9, -0.4, 4.0], [-0.5, 0.6, 3.0]], np.float32)
     at = Lens(55.0, 60.0, 31.0, 25.0, 64, 48, lens)
     seen = project(points, np.eye(4), at)
-    rays = np.stack(rays_at(*seen.uv.astype(np.float64).T, at), 1)
+    rays = np.stack(pixels_to_rays(*seen.uv.astype(np.float64).T, at), 1)
     assert np.allclose(rays, points[seen.index, :2] / points[seen.index, 2:], atol=1e-5) and len(rays) == 2
     for k, uv in zip(seen.index, seen.uv, strict=True):
-        out = render(_dot(points[k]), Cameras.of([np.eye(4)], [at], torch.float64), REFERENCE)
+        out = render(_dot(points[k]), Cameras.from_poses([np.eye(4)], [at], torch.float64), REFERENCE)
         assert np.allclose(_centroid(out.alpha[0]), uv, atol=0.05)
 
 
@@ -151,7 +151,7 @@ def test_undistort_is_the_inverse_and_slopes_are_the_derivatives(lens):
     step = 1e-6
     by_x = [(a - b) / (2 * step) for a, b in zip(distort(x + step, y, lens), distort(x - step, y, lens), strict=True)]
     by_y = [(a - b) / (2 * step) for a, b in zip(distort(x, y + step, lens), distort(x, y - step, lens), strict=True)]
-    xx, xy, yy = slopes(x, y, lens)
+    xx, xy, yy = distortion_jacobian(x, y, lens)
     for found, expected in ((by_x[0], xx), (by_x[1], xy), (by_y[0], xy), (by_y[1], yy)):
         assert np.allclose(found, expected, atol=1e-8)
 
@@ -161,7 +161,7 @@ def test_fold_radius_is_where_the_radius_stops_growing():
     assert fold_radius(PINCUSHION) == math.inf and fold_radius((-0.3, 0.1, 0, 0, 0)) == math.inf
     k = (-0.2, -0.05, 0, 0, 0.01)
     r = fold_radius(k)
-    slope = [float(slopes(np.array(r * f), np.array(0.0), k)[0]) for f in (0.999, 1.001)]
+    slope = [float(distortion_jacobian(np.array(r * f), np.array(0.0), k)[0]) for f in (0.999, 1.001)]
     assert slope[0] > 0 > slope[1]
     on = undistort(np.array([5.0]), np.array([0.0]), k)
     assert float(np.hypot(*on)[0]) == pytest.approx(r), "no ray arrives so far out"
@@ -170,13 +170,13 @@ def test_fold_radius_is_where_the_radius_stops_growing():
 @LENSES
 def test_the_linearisation_reaches_over_the_whole_image(lens):
     at = Lens(55.0, 60.0, 30.0, 25.0, 64, 48, lens)
-    domain = domain_of(Cameras.of([np.eye(4)], [at]), 0)
+    domain = find_valid_domain(Cameras.from_poses([np.eye(4)], [at]), 0)
     u, v = np.meshgrid(np.linspace(0, 64, 65), np.linspace(0, 48, 49))
     x, y = undistort((u - 30) / 55, (v - 25) / 60, lens)
     mx, my = JACOBIAN_MARGIN * 64 / 110, JACOBIAN_MARGIN * 48 / 120
     found = (-domain.left, domain.right, -domain.top, domain.bottom)
     assert found == pytest.approx((x.min() - mx, x.max() + mx, y.min() - my, y.max() + my), abs=1e-3)
-    assert domain_of(Cameras.of([np.eye(4)], [replace(at, distortion=())]), 0) is None
+    assert find_valid_domain(Cameras.from_poses([np.eye(4)], [replace(at, distortion=())]), 0) is None
 
 
 @dataclass(frozen=True)

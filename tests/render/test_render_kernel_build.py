@@ -35,7 +35,7 @@ def test_missing_library_says_what_to_run(tmp_path, fresh_loader):
 
 
 def test_stale_library_is_refused(tmp_path, fresh_loader, monkeypatch):
-    for isa in loader.supported_isas():
+    for isa in loader.supported_instruction_sets():
         shutil.copy(KERNEL.folder / KERNEL.library_name(isa), tmp_path)
     assert fresh_loader(tmp_path)
     fresh_loader.cache_clear()
@@ -45,7 +45,7 @@ def test_stale_library_is_refused(tmp_path, fresh_loader, monkeypatch):
 
 
 def test_broken_library_is_refused(tmp_path, fresh_loader):
-    (tmp_path / KERNEL.library_name(loader.supported_isas()[0])).write_bytes(b"not a library")
+    (tmp_path / KERNEL.library_name(loader.supported_instruction_sets()[0])).write_bytes(b"not a library")
     with pytest.raises(ResourceError, match="does not load"):
         fresh_loader(tmp_path)
 
@@ -56,16 +56,18 @@ def test_an_instruction_set_that_is_lacking_is_never_loaded(fresh_loader, monkey
         fresh_loader()
     monkeypatch.delenv("GENRE_RENDER_ISA")
     monkeypatch.setattr(loader, "_cpu_flags", lambda: {"sse4_2", "popcnt", "ssse3"})
-    if "generic" not in build.isas():
-        assert loader.candidate_isas() == ["sse42"]
+    if "generic" not in build.instruction_sets():
+        assert loader.candidate_instruction_sets() == ["sse42"]
 
 
 @pytest.mark.parametrize("beyond", [False, True], ids=["pinhole", "lens and shutter"])
-@pytest.mark.parametrize("isa", loader.supported_isas())
+@pytest.mark.parametrize("isa", loader.supported_instruction_sets())
 def test_every_instruction_set_draws_the_same_picture(isa, beyond, scene, gradients, fresh_loader, monkeypatch):
     splats, cameras = scene(300)
     if beyond:
-        shutter = Shutter.of([RollingShutter(0.03, (9.0, -0.5, 14.0), (0.2, -0.5, 0.3))])
+        shutter = Shutter.from_rolling_shutters(
+            [RollingShutter(0.03, velocity_m_s=(9.0, -0.5, 14.0), turn_rad_s=(0.2, -0.5, 0.3))]
+        )
         cameras = replace(cameras, distortion=torch.tensor([[-0.3, 0.12, 0.002, -0.0015, -0.01]]), shutter=shutter)
     truth, exact = gradients(splats, cameras, RenderSettings("reference"), torch.float64)
     monkeypatch.setenv("GENRE_RENDER_ISA", isa)
@@ -96,7 +98,9 @@ def test_a_failing_compiler_leaves_nothing(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_a_fresh_build_loads(tmp_path, fresh_loader):
     paths = build.build([(KERNEL, tmp_path)])
-    assert [p.name for p in paths] == [KERNEL.library_name(i) for i in build.isas_for(build.find_compiler())]
+    assert [p.name for p in paths] == [
+        KERNEL.library_name(i) for i in build.instruction_sets_for(build.find_compiler())
+    ]
     assert fresh_loader(tmp_path).genre_digest().decode() == KERNEL.source_digest()
 
 

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from genre_tasks.errors import ConfigError, NonFiniteError, ResourceError
 from genre_tasks.logs.types import Lens, RollingShutter
 from genre_tasks.render import Cameras, RenderSettings, constants, render, render_views
-from genre_tasks.render.cuda import _effects
-from genre_tasks.render.reference_camera import OneCamera
+from genre_tasks.render.cuda import _camera_options
+from genre_tasks.render.reference_camera import ReferenceCamera
 from genre_tasks.render.types import Shutter
 from genre_tasks.scene import projection
 from genre_tasks.scene.actor_node import ActorNode
@@ -30,11 +30,11 @@ from tests.scenes import NAMES, cloud, pose_gradient_error, smooth, twist
 CPU, REFERENCE = RenderSettings("cpu", 1), RenderSettings("reference")
 BOTH = pytest.mark.parametrize("settings", [CPU, REFERENCE], ids=lambda s: s.backend)
 BARREL = (-0.3, 0.12, 0.002, -0.0015, -0.01)
-MOTION = RollingShutter(0.03, (9.0, -0.5, 14.0), (0.2, -0.5, 0.3))
+MOTION = RollingShutter(0.03, velocity_m_s=(9.0, -0.5, 14.0), turn_rad_s=(0.2, -0.5, 0.3))
 
 
 def rolling(cameras: Cameras, how: RollingShutter = MOTION) -> Cameras:
-    return replace(cameras, shutter=Shutter.of([how] * len(cameras), cameras.focal_px.dtype))
+    return replace(cameras, shutter=Shutter.from_rolling_shutters([how] * len(cameras), cameras.focal_px.dtype))
 
 
 def drifting(splats: Splats, speed: float = 8.0) -> Splats:
@@ -109,7 +109,7 @@ def test_no_readout_is_no_shutter_to_the_bit(scene, gradients, settings):
 @BOTH
 def test_what_moves_with_the_camera_stands_still(scene, settings):
     splats, cameras = scene(300)
-    moving = rolling(cameras, RollingShutter(0.03, (9.0, -0.5, 14.0), (0.0, 0.0, 0.0)))
+    moving = rolling(cameras, RollingShutter(0.03, velocity_m_s=(9.0, -0.5, 14.0), turn_rad_s=(0.0, 0.0, 0.0)))
     own = torch.tensor([9.0, -0.5, 14.0]) @ cameras.camera_SE3_chunk[0, :3, :3]
     carried = replace(splats, velocities=own.expand(len(splats), 3))
     plain = render(splats, cameras, settings)
@@ -120,7 +120,7 @@ def test_what_moves_with_the_camera_stands_still(scene, settings):
 def test_views_of_one_call_are_as_alone_at_any_thread_count(scene, gradients):
     splats, cameras = scene(300, views=3)
     shutters = [MOTION, None, replace(MOTION, readout_s=0.1)]
-    cameras = replace(cameras, shutter=Shutter.of(shutters))
+    cameras = replace(cameras, shutter=Shutter.from_rolling_shutters(shutters))
     together, grads = gradients(drifting(splats), cameras, CPU)
     assert torch.equal(together.color[1], render(splats, replace(cameras.select([1]), shutter=None), CPU).color[0])
     for v in range(3):
@@ -158,14 +158,14 @@ def test_one_newton_step_finds_the_row(distortion):
     table = None if distortion is None else torch.tensor([distortion])
     lens = torch.full((1, 2), 930.0), torch.tensor([[960.0, 540.0]])
     cameras = rolling(Cameras(torch.eye(4)[None], *lens, 1920, 1080, table))
-    camera = OneCamera(cameras, 0, torch.zeros((), dtype=torch.float64))
+    camera = ReferenceCamera(cameras, 0, torch.zeros((), dtype=torch.float64))
     g = torch.Generator().manual_seed(3)
     posed = (torch.rand(500, 3, generator=g, dtype=torch.float64) * 2 - 1) * torch.tensor([8.0, 4.0, 0.0])
     posed[:, 2] = 8 + 30 * torch.rand(500, generator=g, dtype=torch.float64)
-    pixels = camera.pixels(*camera.exposed(posed, None).unbind(1))
-    before = camera.pixels(*posed.unbind(1))
+    pixels = camera.to_pixels(*camera.move_to_exposure(posed, None).unbind(1))
+    before = camera.to_pixels(*posed.unbind(1))
     moved = pixels - before
-    motion = (camera.exposed(posed, None) - posed).norm(dim=1)
+    motion = (camera.move_to_exposure(posed, None) - posed).norm(dim=1)
     speed = torch.tensor(MOTION.velocity_m_s).double() + torch.linalg.cross(
         torch.tensor(MOTION.turn_rad_s).double().expand_as(posed), posed
     )
@@ -181,12 +181,14 @@ def test_points_that_outrun_the_rows_stay_within_the_readout(scene, gradients, s
     """Towards the camera at the rows' own speed and faster: the divisor is limited, value and gradient stay finite."""
     splats, cameras = scene(100)
     for speed in (1e2, 1e3, 1e4, -1e4):
-        how = RollingShutter(0.03, (0.0, -speed, 0.0), (0.0, 0.0, 0.0))
+        how = RollingShutter(0.03, velocity_m_s=(0.0, -speed, 0.0), turn_rad_s=(0.0, 0.0, 0.0))
         out, grads = gradients(splats, rolling(cameras, how), settings)
         assert all(torch.isfinite(x).all() for x in (out.color, out.alpha, out.depth, *grads.values()))
-    camera = OneCamera(rolling(cameras, RollingShutter(0.03, (0.0, -1e4, 0.0), (0.0,) * 3)), 0, splats.means)
-    posed = camera.posed(splats.means)
-    moved = (camera.exposed(posed, None) - posed).norm(dim=1)
+    camera = ReferenceCamera(
+        rolling(cameras, RollingShutter(0.03, velocity_m_s=(0.0, -1e4, 0.0), turn_rad_s=(0.0,) * 3)), 0, splats.means
+    )
+    posed = camera.to_camera(splats.means)
+    moved = (camera.move_to_exposure(posed, None) - posed).norm(dim=1)
     assert float(moved.max()) <= 1e4 * 0.015 * (1 + 1e-4)
 
 
@@ -197,9 +199,11 @@ def test_points_are_projected_to_the_centres_of_gaussians(distortion):
     points = (g.uniform(-1, 1, (400, 3)) * [6, 5, 12] + [0, 0, 10]).astype(np.float32)
     pose = np.linalg.inv(torch.linalg.matrix_exp(twist(torch.tensor([0.1, 0.2, -0.1, 0.3, 0.1, 0.2]))).double().numpy())
     seen = projection.project(points, pose, lens, MOTION)
-    camera = OneCamera(Cameras.of([pose], [lens], torch.float64, [MOTION]), 0, torch.zeros((), dtype=torch.float64))
-    exposed = camera.exposed(camera.posed(torch.from_numpy(points).double()), None)
-    pixels = camera.pixels(*exposed.unbind(1)).numpy()
+    camera = ReferenceCamera(
+        Cameras.from_poses([pose], [lens], torch.float64, [MOTION]), 0, torch.zeros((), dtype=torch.float64)
+    )
+    exposed = camera.move_to_exposure(camera.to_camera(torch.from_numpy(points).double()), None)
+    pixels = camera.to_pixels(*exposed.unbind(1)).numpy()
     assert len(seen.index) > 100
     assert np.abs(pixels[seen.index] - seen.uv).max() < 1e-3
     assert np.allclose(exposed[seen.index, 2], seen.depth, rtol=1e-5)
@@ -255,25 +259,28 @@ def _actor_pose(time_s: float) -> np.ndarray:
     return pose
 
 
-PARKED = RollingShutter(0.06, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), frame_s=0.1)
+PARKED = RollingShutter(0.06, velocity_m_s=(0.0, 0.0, 0.0), turn_rad_s=(0.0, 0.0, 0.0), frame_s=0.1)
 
 
 @pytest.mark.parametrize("frame", range(5))
 def test_actors_move_on_as_from_frame_to_frame(frame):
     scene = _driving()
-    posed, moving = scene.posed([frame])
-    velocities = scene.velocities(posed.means, [frame], [0.1])
+    posed, moving = scene.gaussians_at_frames([frame])
+    velocities = scene.velocities_at_frames(posed.means, [frame], [0.1])
     still = len(scene) - len(moving)
     assert not velocities[:still].any() and len(moving) == 100
     step = 1e-4
     after = replace(scene.actors[0], chunk_SE3_box=np.stack([_actor_pose(0.1 * f + step) for f in range(5)]))
-    moved = replace(scene, actors=(after,)).posed([frame])[0].means
+    moved = replace(scene, actors=(after,)).gaussians_at_frames([frame])[0].means
     expected = (moved.double() - posed.means.double())[still:] / step
     # One-sided at the ends of the path: the turn's direction is that of 0.05 s off.
     assert (velocities[still:] - expected).abs().max() < 0.3 and expected.abs().max() > 12
-    at = scene.at(frame).means
+    at = scene.gaussians_at(frame).means
     assert torch.equal(scene.velocities_at(at, frame, 0.1)[moving], velocities[still:])
-    assert not scene.velocities_at(at, frame, 0.0).any() and not scene.velocities(posed.means, [frame], [0.0]).any()
+    assert (
+        not scene.velocities_at(at, frame, 0.0).any()
+        and not scene.velocities_at_frames(posed.means, [frame], [0.0]).any()
+    )
 
 
 def test_an_actor_is_rendered_as_it_moves_during_the_readout():
@@ -354,9 +361,9 @@ def gsplat(monkeypatch) -> ModuleType:
 
 def test_gsplat_is_told_of_lens_and_shutter(scene, gsplat):
     splats, cameras = scene(5)
-    assert _effects(splats, cameras) == {}, "a pinhole camera takes the plain way"
-    assert _effects(splats, rolling(cameras, replace(MOTION, readout_s=0.0))) == {}
-    told = _effects(splats, replace(rolling(cameras), distortion=torch.tensor([BARREL])))
+    assert _camera_options(splats, cameras) == {}, "a pinhole camera takes the plain way"
+    assert _camera_options(splats, rolling(cameras, replace(MOTION, readout_s=0.0))) == {}
+    told = _camera_options(splats, replace(rolling(cameras), distortion=torch.tensor([BARREL])))
     assert told["with_ut"] and told["with_eval3d"]
     k1, k2, p1, p2, k3 = BARREL
     assert told["radial_coeffs"].tolist() == [pytest.approx([k1, k2, k3, 0, 0, 0])]
@@ -372,18 +379,18 @@ def test_gsplat_is_told_of_lens_and_shutter(scene, gsplat):
 def test_gsplat_takes_what_it_is_told(scene):
     gsplat = pytest.importorskip("gsplat", reason="gsplat is not installed")
     splats, cameras = scene(5)
-    told = _effects(splats, replace(rolling(cameras), distortion=torch.tensor([BARREL])))
+    told = _camera_options(splats, replace(rolling(cameras), distortion=torch.tensor([BARREL])))
     assert set(told) <= set(inspect.signature(gsplat.rasterization).parameters)
 
 
 def test_what_gsplat_cannot_is_refused(scene, gsplat):
     splats, cameras = scene(5)
-    assert _effects(drifting(splats), cameras) == {}
+    assert _camera_options(drifting(splats), cameras) == {}
     with pytest.raises(ConfigError, match=r"cannot move Gaussians during a readout.*backend cpu"):
-        _effects(drifting(splats), rolling(cameras))
+        _camera_options(drifting(splats), rolling(cameras))
     pose = cameras.camera_SE3_chunk.clone().requires_grad_()
     with pytest.raises(ValueError, match="no gradient in camera_SE3_chunk with a distortion or a shutter"):
-        _effects(splats, rolling(replace(cameras, camera_SE3_chunk=pose)))
+        _camera_options(splats, rolling(replace(cameras, camera_SE3_chunk=pose)))
     del gsplat.RollingShutterType
     with pytest.raises(ResourceError, match=r"renders neither lens distortion nor rolling shutter.*gsplat>=1.5.3"):
-        _effects(splats, rolling(cameras))
+        _camera_options(splats, rolling(cameras))

@@ -10,7 +10,7 @@ import torch
 
 from genre_tasks.logs.types import Lens
 from genre_tasks.render import render_views
-from genre_tasks.render.surface import normals, render_surfaces
+from genre_tasks.render.surface import compute_normals, render_surfaces
 from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import FIRST_ACTOR, SceneGraph
@@ -98,10 +98,10 @@ def test_normals_are_along_the_shortest_axis():
         torch.zeros(3, 3),
     )
     expected = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, -1, 0]])  # a quarter turn about x takes z to −y
-    torch.testing.assert_close(normals(g.activated()), expected, atol=1e-6, rtol=0)
+    torch.testing.assert_close(compute_normals(g.activate()), expected, atol=1e-6, rtol=0)
 
 
 def test_nothing_drawn_is_finite():
-    empty = Gaussians.unpacked(torch.zeros(0, 14))
+    empty = Gaussians.unpack(torch.zeros(0, 14))
     out = render_surfaces(graph(empty), [Posed(0, np.eye(4))])
     assert not out.alpha.any() and torch.isfinite(out.depth).all() and torch.isfinite(out.expected_depth()).all()

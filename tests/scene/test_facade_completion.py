@@ -11,7 +11,7 @@ from PIL import Image
 
 from genre_tasks.logs.types import Lens
 from genre_tasks.scene.chunk import View
-from genre_tasks.scene.facade_completion import LOWEST_TOP_M, SPACING_M, STEP_M, wall_fill
+from genre_tasks.scene.facade_completion import LOWEST_TOP_M, SPACING_M, STEP_M, complete_facades
 from tests.fakes import camera_turn
 
 LENS = Lens(160.0, 160.0, 160.0, 120.0, 320, 240)
@@ -67,7 +67,7 @@ def _swept(height: float) -> np.ndarray:
 
 def _heights(height: float, views: Sequence[View]) -> np.ndarray:
     """Above the road, of the points that were added over the part of the façade that several views see."""
-    points = wall_fill(_swept(height), PATH, views)
+    points = complete_facades(_swept(height), PATH, views)
     assert points.dtype == np.float32
     assert np.allclose(points[:, 1], WALL_M)
     seen = (points[:, 0] > 2) & (points[:, 0] < 10)
@@ -95,18 +95,18 @@ def test_a_wall_that_ends_does_not_grow(behind: float, plain_sky: bool) -> None:
 
 def test_the_views_have_a_say() -> None:
     views = _views(7.0)
-    assert len(wall_fill(_swept(7.0), PATH, views)) > 1000
-    assert len(wall_fill(_swept(7.0), PATH, views[:1])) == 0, "one view cannot tell"
-    assert len(wall_fill(_swept(7.0), PATH, [])) == 0
-    assert len(wall_fill(_swept(LOWEST_TOP_M - 0.2), PATH, views)) == 0, "a fence is whole"
+    assert len(complete_facades(_swept(7.0), PATH, views)) > 1000
+    assert len(complete_facades(_swept(7.0), PATH, views[:1])) == 0, "one view cannot tell"
+    assert len(complete_facades(_swept(7.0), PATH, [])) == 0
+    assert len(complete_facades(_swept(LOWEST_TOP_M - 0.2), PATH, views)) == 0, "a fence is whole"
     far = _swept(7.0) + np.array([0, 60, 0], np.float32)
-    assert len(wall_fill(far, PATH, views)) == 0, "out of reach"
-    assert len(wall_fill(np.empty((0, 3), np.float32), PATH, views)) == 0
+    assert len(complete_facades(far, PATH, views)) == 0, "out of reach"
+    assert len(complete_facades(np.empty((0, 3), np.float32), PATH, views)) == 0
 
 
 def test_the_order_of_the_points_does_not_matter() -> None:
     points, views = _swept(6.0), _views(6.0)
     shuffled = np.random.default_rng(0).permutation(points)
-    a, b = (wall_fill(p, PATH, views) for p in (points, shuffled))
+    a, b = (complete_facades(p, PATH, views) for p in (points, shuffled))
     assert np.allclose(np.sort(a, 0), np.sort(b, 0), atol=1e-4)
-    assert np.array_equal(a, wall_fill(points, PATH, views))
+    assert np.array_equal(a, complete_facades(points, PATH, views))

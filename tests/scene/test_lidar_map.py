@@ -14,8 +14,8 @@ from genre_tasks.render.surface import render_surfaces
 from genre_tasks.scene.chunk import Points
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.initial_gaussians import node_gaussians
-from genre_tasks.scene.lidar_map import ACTOR_VOXEL_M, MAX_GAP_M, closed
+from genre_tasks.scene.initial_gaussians import fit_discs
+from genre_tasks.scene.lidar_map import ACTOR_VOXEL_M, MAX_GAP_M, close_gaps
 
 LENS = Lens(80.0, 80.0, 48.0, 32.0, 96, 64)
 
@@ -46,7 +46,7 @@ def _rings(gap_m: float, rings: int = 5) -> Points:
 
 
 def _discs(points: Points) -> Gaussians:
-    return node_gaussians(points, np.zeros(len(points)), 10_000, InitialConfig(opacity=0.95), ACTOR_VOXEL_M)
+    return fit_discs(points, np.zeros(len(points)), 10_000, InitialConfig(opacity=0.95), ACTOR_VOXEL_M)
 
 
 def _drawn(discs: Gaussians) -> tuple[torch.Tensor, torch.Tensor]:
@@ -63,35 +63,35 @@ def _rows(gap_m: float, rings: int = 5) -> slice:
 def test_gaps_between_rings_are_closed_at_their_surface(gap_m: float, was: float, least: float) -> None:
     discs, where = _discs(_rings(gap_m)), (_rows(gap_m), slice(34, 62))
     before = _drawn(discs)[0][where]
-    alpha, depth = (image[where] for image in _drawn(closed(discs)))
+    alpha, depth = (image[where] for image in _drawn(close_gaps(discs)))
     assert float((before > 0.5).float().mean()) < was
     assert float((alpha > 0.5).float().mean()) >= least
     assert float((depth / 8 - 1)[alpha > 0.5].abs().quantile(0.9)) < 0.04
 
 
 def test_the_outline_stays_and_what_is_farther_apart_is_left_open() -> None:
-    alpha = _drawn(closed(_discs(_rings(0.3))))[0]
+    alpha = _drawn(close_gaps(_discs(_rings(0.3))))[0]
     rows = _rows(0.3)
     assert float(alpha[: rows.start - 6].max()) < 0.3 and float(alpha[rows.stop + 6 :].max()) < 0.3
     apart = _discs(_rings(1.5 * MAX_GAP_M, rings=2))
-    wide = [discs.log_scales.exp()[:, :2].median(0).values for discs in (closed(apart), apart)]
+    wide = [discs.log_scales.exp()[:, :2].median(0).values for discs in (close_gaps(apart), apart)]
     torch.testing.assert_close(*wide, rtol=0.1, atol=0)
-    assert float(_drawn(closed(apart))[0][32, 48]) < 0.1
+    assert float(_drawn(close_gaps(apart))[0][32, 48]) < 0.1
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_hardly_any_points_are_left_as_they_are_or_finite(count: int) -> None:
-    few = Gaussians.unpacked(torch.zeros(count, 14))
+    few = Gaussians.unpack(torch.zeros(count, 14))
     few = Gaussians(
         torch.randn(count, 3),
         few.log_scales,
         torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
-        *few.packed()[:, 10:11].T,
+        *few.pack()[:, 10:11].T,
         few.colors,
     )
-    assert len(closed(few)) == count and bool(closed(few).packed().isfinite().all())
+    assert len(close_gaps(few)) == count and bool(close_gaps(few).pack().isfinite().all())
 
 
 def test_points_at_one_place_stay_finite() -> None:
     here = _discs(_rings(0.0, rings=3))
-    assert bool(closed(here).packed().isfinite().all())
+    assert bool(close_gaps(here).pack().isfinite().all())

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from genre_tasks.logs.types import Lens
+from genre_tasks.scene.actor_track import ActorTrack
 from genre_tasks.scene.chunk import View
-from genre_tasks.scene.moving_actors import Path
 from genre_tasks.scene.projection import project, splat_depth
-from genre_tasks.scene.road_completion import road_fill
-from genre_tasks.scene.visibility import GREY, Cloud, color_clouds
-from genre_tasks.scene.voxel_grid import count_voxels, group, levels, voxel_size_for
+from genre_tasks.scene.road_completion import complete_road
+from genre_tasks.scene.visibility import GREY, PointCloud, color_point_clouds
+from genre_tasks.scene.voxel_grid import count_voxels, distance_octaves, find_voxel_size, group_by_voxel
 from tests.fakes import camera_turn, yaw_pose
 
 LENS = Lens(100.0, 100.0, 50.0, 40.0, 100, 80)
@@ -51,9 +51,9 @@ def test_splat_keeps_the_nearest() -> None:
 
 def test_occluded_points_stay_grey() -> None:
     front, behind = _wall(5.0, 1.0), _wall(20.0, 8.0, 0.1)
-    cloud = Cloud(np.concatenate([front, behind]), np.zeros(len(front) + len(behind), np.int16))
+    cloud = PointCloud(np.concatenate([front, behind]), np.zeros(len(front) + len(behind), np.int16))
     pixels = np.full((80, 100, 3), 77, np.uint8)
-    ((colors, colored),) = color_clouds([cloud], [(_view(), pixels)])
+    ((colors, colored),) = color_point_clouds([cloud], [(_view(), pixels)])
     assert colored[: len(front)].all() and (colors[: len(front)] == 77).all()
     shadow = (np.abs(behind[:, 1:]) < 3.6).all(1)
     assert not colored[len(front) :][shadow].any() and (colors[len(front) :][shadow] == GREY).all()
@@ -62,40 +62,40 @@ def test_occluded_points_stay_grey() -> None:
 
 
 def test_the_view_that_resolves_best_wins_whatever_the_order() -> None:
-    cloud = Cloud(np.array([[10.0, 0, 0]], np.float32), np.zeros(1, np.int16))
+    cloud = PointCloud(np.array([[10.0, 0, 0]], np.float32), np.zeros(1, np.int16))
     far, near = np.full((80, 100, 3), 10, np.uint8), np.full((80, 100, 3), 200, np.uint8)
     images = [(_view(), far), (_view(position=(6.0, 0.0, 0.0)), near)]
     for order in (images, images[::-1]):
-        assert color_clouds([cloud], order)[0][0].tolist() == [[200, 200, 200]]
+        assert color_point_clouds([cloud], order)[0][0].tolist() == [[200, 200, 200]]
 
 
 def test_an_actor_is_coloured_where_it_is_at_the_view_and_occludes() -> None:
-    path = Path(
+    path = ActorTrack(
         "a", "car", (1.0, 1.0, 1.0), np.array([0, 4]), np.stack([yaw_pose(0, (5, 0, 0)), yaw_pose(0, (5, 2, 0))])
     )
-    actor = Cloud(_wall(0.0, 0.5), np.full(len(_wall(0.0, 0.5)), 4, np.int16), path)
-    wall = Cloud(_wall(15.0, 1.0), np.zeros(len(_wall(15.0, 1.0)), np.int16))
+    actor = PointCloud(_wall(0.0, 0.5), np.full(len(_wall(0.0, 0.5)), 4, np.int16), path)
+    wall = PointCloud(_wall(15.0, 1.0), np.zeros(len(_wall(15.0, 1.0)), np.int16))
     at_0, at_4 = np.full((80, 100, 3), 10, np.uint8), np.full((80, 100, 3), 200, np.uint8)
-    one = color_clouds([wall, actor], [(_view(0), at_0)])
+    one = color_point_clouds([wall, actor], [(_view(0), at_0)])
     assert not one[0][1][np.abs(_wall(15.0, 1.0)[:, 1:]).max(1) < 0.9].any(), "the actor hides the wall at frame 0"
-    both = color_clouds([wall, actor], [(_view(0), at_0), (_view(4), at_4)])
+    both = color_point_clouds([wall, actor], [(_view(0), at_0), (_view(4), at_4)])
     assert (both[1][0] == 200).all(), "the view at the points' own frame wins"
     assert both[0][1].all() and (both[0][0][both[0][1]] == 200).any()
 
 
 def test_voxels_grow_in_octaves() -> None:
-    assert levels(np.array([0.0, 7.9, 15.9, 16.0, 31.9, 32.0])).tolist() == [0, 0, 0, 1, 1, 2]
+    assert distance_octaves(np.array([0.0, 7.9, 15.9, 16.0, 31.9, 32.0])).tolist() == [0, 0, 0, 1, 1, 2]
 
 
 def test_voxel_count_and_size_search() -> None:
     points = np.random.default_rng(1).uniform(-5, 5, (20_000, 3)).astype(np.float32)
     level = np.zeros(len(points), np.int64)
-    size = voxel_size_for(points, level, 900)
+    size = find_voxel_size(points, level, 900)
     assert 800 < count_voxels(points, level, size) <= 900
-    voxels = group(points, level, size)
+    voxels = group_by_voxel(points, level, size)
     assert voxels.count == count_voxels(points, level, size)
-    assert np.bincount(voxels.which).min() >= 1
-    assert np.abs(voxels.mean(points)[voxels.which] - points).max() < size
+    assert np.bincount(voxels.voxel_of).min() >= 1
+    assert np.abs(voxels.mean(points)[voxels.voxel_of] - points).max() < size
     assert count_voxels(points[:0], level[:0], 1.0) == 0
 
 
@@ -105,12 +105,12 @@ def test_road_is_filled_where_lidar_is_blind(slope: float) -> None:
     ring = grid[np.hypot(*grid.T) > 4.0]
     road = np.column_stack([ring, slope * ring[:, 0] - 1.8]).astype(np.float32)
     box = np.random.default_rng(0).uniform([5, 5, -1.4], [7, 7, 0.0], (5000, 3)).astype(np.float32)
-    fill = road_fill(np.concatenate([road, box]), np.eye(4)[None])
+    fill = complete_road(np.concatenate([road, box]), np.eye(4)[None])
     assert np.abs(fill[:, 2] - (slope * fill[:, 0] - 1.8)).max() < 0.03
     # A cell beside one with road points counts as known: 1.5 cells less than the hole's radius.
     assert len(fill) == pytest.approx(np.pi * 3.85**2 / 0.01, rel=0.02) and np.hypot(*fill[:, :2].T).max() < 4.0
 
 
 def test_no_road_no_fill() -> None:
-    assert len(road_fill(_wall(5.0, 2.0), np.eye(4)[None])) == 0
-    assert len(road_fill(np.empty((0, 3), np.float32), np.eye(4)[None])) == 0
+    assert len(complete_road(_wall(5.0, 2.0), np.eye(4)[None])) == 0
+    assert len(complete_road(np.empty((0, 3), np.float32), np.eye(4)[None])) == 0

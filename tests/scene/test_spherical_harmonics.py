@@ -12,15 +12,20 @@ from torch import Tensor
 
 from genre_tasks.logs.types import Lens
 from genre_tasks.render import RenderSettings, render_views
-from genre_tasks.render.spherical_harmonics import seen_colors
+from genre_tasks.render.spherical_harmonics import compute_view_dependent_colors
 from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.gaussians import Gaussians
-from genre_tasks.scene.graph import COUNTS, DEGREE, FIRST_ACTOR, SceneGraph
+from genre_tasks.scene.graph import DEFAULT_SH_DEGREE, FIRST_ACTOR, SH_COUNTS, SceneGraph
 from genre_tasks.scene.novel_views import NovelView
-from genre_tasks.scene.spherical_harmonics import basis, colors_by_view, shown_colors, starting
+from genre_tasks.scene.spherical_harmonics import (
+    evaluate_sh_basis,
+    evaluate_sh_colors,
+    evaluate_sh_colors_by_view,
+    with_zero_spherical_harmonics,
+)
 
 LENS = Lens(40.0, 42.0, 16.5, 11.0, 32, 24)
-KNOWN = pytest.mark.parametrize("count", COUNTS.values())
+KNOWN = pytest.mark.parametrize("count", SH_COUNTS.values())
 
 
 def _pose(turn: Rotation, shift: tuple[float, float, float]) -> np.ndarray:
@@ -58,7 +63,9 @@ def _street(count: int = 60, k: int = 3, dtype: torch.dtype = torch.float32) -> 
         for a in (0, 1)
     ]
     actors = tuple(ActorNode(str(a), "Car", (3.0, 2.0, 2.0), np.arange(3), paths[a]) for a in (0, 1))
-    scene = SceneGraph(_gaussians(count, dtype), torch.arange(count) % 3, actors, harmonics=_waves(count, k, dtype))
+    scene = SceneGraph(
+        _gaussians(count, dtype), torch.arange(count) % 3, actors, spherical_harmonics=_waves(count, k, dtype)
+    )
     return replace(scene, nodes=torch.where(scene.nodes > 0, scene.nodes - 1 + FIRST_ACTOR, 0))
 
 
@@ -74,12 +81,12 @@ def test_harmonics_are_orthonormal_and_without_a_constant(count: int) -> None:
         ],
         -1,
     )
-    values = torch.stack(basis(torch.as_tensor(grid), count), -1).flatten(0, 1)
+    values = torch.stack(evaluate_sh_basis(torch.as_tensor(grid), count), -1).flatten(0, 1)
     area = torch.as_tensor(np.repeat(weight * 2 * np.pi / 24, 24))
     torch.testing.assert_close((values * area[:, None]).T @ values, torch.eye(count, dtype=torch.float64))
     torch.testing.assert_close((values * area[:, None]).sum(0), torch.zeros(count, dtype=torch.float64))
     with pytest.raises(ValueError, match="expected 3, 8, 15 harmonics, got 4"):
-        basis(torch.zeros(3), 4)
+        evaluate_sh_basis(torch.zeros(3), 4)
 
 
 @KNOWN
@@ -93,7 +100,7 @@ def test_an_actor_turned_with_its_camera_shows_the_same(count: int) -> None:
         seen = []
         for actors, eye in ((scene.actors, np.eye(4)), (turned, quarter)):
             centre = (eye @ _pose(at, (0.5, 0.1, -1.0)))[:3, 3]
-            seen.append(colors_by_view(replace(scene, actors=actors), [1], centre[None])[0])
+            seen.append(evaluate_sh_colors_by_view(replace(scene, actors=actors), [1], centre[None])[0])
         still = int((scene.nodes == 0).sum())
         torch.testing.assert_close(seen[0][still:], seen[1][still:])
         assert (seen[0][:still] - seen[1][:still]).abs().max() > 0.01
@@ -104,14 +111,18 @@ def test_a_scene_looks_as_its_actor_would() -> None:
     count = 60
     pose = _pose(Rotation.from_euler("xyz", [0.4, -0.2, 1.3]), (0.2, 0.1, 5.0))
     actor = ActorNode("a", "Car", (3.0, 2.0, 2.0), np.arange(1), pose[None])
-    moved = SceneGraph(_gaussians(count), torch.full((count,), FIRST_ACTOR), (actor,), harmonics=_waves(count, 3))
-    fixed = SceneGraph(_gaussians(count), torch.zeros(count, dtype=torch.int64), (), harmonics=_waves(count, 3))
+    moved = SceneGraph(
+        _gaussians(count), torch.full((count,), FIRST_ACTOR), (actor,), spherical_harmonics=_waves(count, 3)
+    )
+    fixed = SceneGraph(
+        _gaussians(count), torch.zeros(count, dtype=torch.int64), (), spherical_harmonics=_waves(count, 3)
+    )
     images = []
     for scene, camera in ((moved, np.eye(4)), (fixed, np.linalg.inv(pose))):
         view = _view(camera, 0)
         images.append(render_views(scene, [view]).color)
     assert (images[0] - images[1]).abs().max() < 2e-5 and images[0].max() > 0.2
-    plain = render_views(moved.with_harmonics(None), [view]).color
+    plain = render_views(moved.with_spherical_harmonics(None), [view]).color
     assert (plain - images[0]).abs().max() > 0.02
 
 
@@ -119,11 +130,16 @@ def test_a_scene_looks_as_its_actor_would() -> None:
 def test_the_kernel_sees_what_torch_sees_to_the_gradient(count: int) -> None:
     frames, centres = [0, 2, 0, 1], np.random.default_rng(0).normal(size=(4, 3))
     found, exact = [], []
-    for out, seen, dtype in ((found, seen_colors, torch.float32), (exact, colors_by_view, torch.float64)):
+    for out, seen, dtype in (
+        (found, compute_view_dependent_colors, torch.float32),
+        (exact, evaluate_sh_colors_by_view, torch.float64),
+    ):
         scene = _street(3000, count)
-        g, waves = scene.gaussians, scene.harmonics
+        g, waves = scene.gaussians, scene.spherical_harmonics
         leaves = [t.to(dtype).requires_grad_() for t in (g.means, g.colors, waves)]
-        with_leaves = replace(scene, gaussians=replace(g, means=leaves[0], colors=leaves[1]), harmonics=leaves[2])
+        with_leaves = replace(
+            scene, gaussians=replace(g, means=leaves[0], colors=leaves[1]), spherical_harmonics=leaves[2]
+        )
         colors = seen(with_leaves, frames, centres)
         weights = torch.randn(colors.shape, generator=torch.Generator().manual_seed(1)).to(dtype)
         out += [colors.detach(), *torch.autograd.grad((colors * weights).sum(), leaves)]
@@ -141,7 +157,7 @@ def test_views_see_their_own_colours_whatever_the_backend(settings: RenderSettin
     assert torch.equal(together, alone)
     one = render_views(scene, views, RenderSettings("reference")).color
     assert (together - one).abs().max() < 1e-4
-    assert (render_views(scene.with_harmonics(None), views, settings).color - together).abs().max() > 0.02
+    assert (render_views(scene.with_spherical_harmonics(None), views, settings).color - together).abs().max() > 0.02
 
 
 def test_gradients_are_those_of_finite_differences_on_the_reference() -> None:
@@ -150,10 +166,10 @@ def test_gradients_are_those_of_finite_differences_on_the_reference() -> None:
     weights = torch.randn(1, 24, 32, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
 
     def loss(means: Tensor, waves: Tensor) -> Tensor:
-        moved = replace(scene, gaussians=replace(scene.gaussians, means=means), harmonics=waves)
+        moved = replace(scene, gaussians=replace(scene.gaussians, means=means), spherical_harmonics=waves)
         return (render_views(moved, [view], RenderSettings("reference")).color * weights).sum()
 
-    means, waves = scene.gaussians.means.clone().requires_grad_(), scene.harmonics.clone().requires_grad_()
+    means, waves = scene.gaussians.means.clone().requires_grad_(), scene.spherical_harmonics.clone().requires_grad_()
     grads = torch.autograd.grad(loss(means, waves), (means, waves))
     generator = torch.Generator().manual_seed(4)
     for which, grad in enumerate(grads):
@@ -169,7 +185,7 @@ def _at_distance(distance: float, dtype: torch.dtype) -> tuple[Tensor, ...]:
     away = distance * torch.tensor([[0.48, -0.6, 0.64]], dtype=dtype)
     leaves = [away.clone(), torch.full((1, 3), 0.5, dtype=dtype), _waves(1, 8, dtype)]
     leaves = [t.requires_grad_() for t in leaves]
-    seen = shown_colors(torch.zeros(3, dtype=dtype), *leaves)
+    seen = evaluate_sh_colors(torch.zeros(3, dtype=dtype), *leaves)
     return seen, *torch.autograd.grad(seen.sum(), leaves)
 
 
@@ -183,20 +199,20 @@ def test_a_direction_at_zero_distance_is_finite(distance: float) -> None:
     torch.testing.assert_close(seen.double(), exact, atol=1e-6, rtol=0)
     g = replace(_gaussians(1), means=distance * torch.tensor([[0.48, -0.6, 0.64]]), colors=torch.full((1, 3), 0.5))
     g.means.requires_grad_()
-    scene = SceneGraph(g, torch.zeros(1, dtype=torch.int64), (), harmonics=_waves(1, 8))
-    compiled = seen_colors(scene, [0], np.zeros((1, 3)))
+    scene = SceneGraph(g, torch.zeros(1, dtype=torch.int64), (), spherical_harmonics=_waves(1, 8))
+    compiled = compute_view_dependent_colors(scene, [0], np.zeros((1, 3)))
     torch.testing.assert_close(compiled[0].double(), exact, atol=1e-6, rtol=0)
     (by_compiled,) = torch.autograd.grad(compiled.sum(), [g.means])
     torch.testing.assert_close(by_compiled, by_mean, atol=1e-4, rtol=1e-4)
 
 
-@pytest.mark.parametrize("see", [seen_colors, colors_by_view], ids=["compiled", "torch"])
+@pytest.mark.parametrize("see", [compute_view_dependent_colors, evaluate_sh_colors_by_view], ids=["compiled", "torch"])
 def test_what_is_not_finite_is_not_drawn_and_passes_no_gradient(see) -> None:
     scene = _street()
-    means, waves = scene.gaussians.means.clone(), scene.harmonics.clone()
+    means, waves = scene.gaussians.means.clone(), scene.spherical_harmonics.clone()
     means[0, 1], waves[3, 0, 2] = torch.nan, torch.inf
     leaves = [means.requires_grad_(), waves.requires_grad_()]
-    broken = replace(scene, gaussians=replace(scene.gaussians, means=means), harmonics=waves)
+    broken = replace(scene, gaussians=replace(scene.gaussians, means=means), spherical_harmonics=waves)
     colors = see(broken, [1], np.zeros((1, 3)))
     assert int(colors.isnan().all(2).sum()) == 2 and int(colors.isnan().any(2).sum()) == 2
     kept = torch.where(colors.isnan(), torch.zeros_like(colors), colors)
@@ -207,11 +223,15 @@ def test_what_is_not_finite_is_not_drawn_and_passes_no_gradient(see) -> None:
 
 
 def test_harmonics_of_zero_change_nothing_but_colours_below_it() -> None:
-    scene = _street().with_harmonics(None)
-    begun = starting(scene)
-    assert begun.harmonics is not None and begun.harmonics.shape == (60, COUNTS[DEGREE], 3)
-    assert not begun.harmonics.any() and starting(begun) is begun
+    scene = _street().with_spherical_harmonics(None)
+    begun = with_zero_spherical_harmonics(scene)
+    assert begun.spherical_harmonics is not None and begun.spherical_harmonics.shape == (
+        60,
+        SH_COUNTS[DEFAULT_SH_DEGREE],
+        3,
+    )
+    assert not begun.spherical_harmonics.any() and with_zero_spherical_harmonics(begun) is begun
     view = _view(np.eye(4), 1)
     assert torch.equal(render_views(begun, [view]).color, render_views(scene, [view]).color)
     with pytest.raises(ValueError, match="expected a scene with harmonics"):
-        seen_colors(scene, [1], np.zeros((1, 3)))
+        compute_view_dependent_colors(scene, [1], np.zeros((1, 3)))

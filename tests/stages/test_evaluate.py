@@ -15,15 +15,15 @@ from genre_tasks.errors import NonFiniteError
 from genre_tasks.logs.types import Float64, Lens
 from genre_tasks.metrics import scoring
 from genre_tasks.metrics.results import Evaluation
-from genre_tasks.metrics.scoring import real_images
+from genre_tasks.metrics.scoring import real_image_features
 from genre_tasks.render.types import Render
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import STATIC, SceneGraph
-from genre_tasks.scene.novel_poses import novel_view_poses
+from genre_tasks.scene.novel_poses import place_novel_views
 from genre_tasks.scene.novel_views import FixedViews, NovelViews
 from genre_tasks.scene.reconstruction import Reconstruction
-from genre_tasks.stages import evaluate
+from genre_tasks.stages import evaluation_renders
 from genre_tasks.stages.evaluate import evaluate_fixed, evaluate_scene
 from genre_tasks.stages.ingest import ingest
 from tests.fakes import FakeLog
@@ -81,7 +81,7 @@ def by_name(evaluation: Evaluation) -> dict[str, float]:
 
 def test_a_perfect_renderer_scores_perfectly(chunk: Chunk, scene: SceneGraph, monkeypatch) -> None:
     """Poses, frames, sides and the pairing with images and truth are right."""
-    monkeypatch.setattr(evaluate, "render_views", oracle(chunk))
+    monkeypatch.setattr(evaluation_renders, "render_views", oracle(chunk))
     result = evaluate_scene(CONFIG, chunk, "gnet", Reconstruction(scene, (0.5,) * 3), FakeTruth(LOG))
     values = by_name(result)
     for group in ("interpolation", "shift_1m", "shift_3m"):
@@ -112,7 +112,7 @@ def test_a_perfect_renderer_scores_perfectly(chunk: Chunk, scene: SceneGraph, mo
 def test_worse_renders_score_worse(chunk: Chunk, scene: SceneGraph, monkeypatch) -> None:
     results = []
     for noise in (0.02, 0.15):
-        monkeypatch.setattr(evaluate, "render_views", oracle(chunk, noise))
+        monkeypatch.setattr(evaluation_renders, "render_views", oracle(chunk, noise))
         results.append(by_name(evaluate_scene(CONFIG, chunk, "gnet", Reconstruction(scene), FakeTruth(LOG))))
     better, worse = results
     assert better["interpolation/psnr"] == pytest.approx(-20 * np.log10(0.02), abs=1.0)
@@ -142,7 +142,7 @@ def test_without_truth_and_by_the_real_renderer(chunk: Chunk, scene: SceneGraph)
 
 
 def test_pictures_have_the_same_names_in_every_stage(chunk: Chunk, scene: SceneGraph, monkeypatch) -> None:
-    monkeypatch.setattr(evaluate, "render_views", oracle(chunk))
+    monkeypatch.setattr(evaluation_renders, "render_views", oracle(chunk))
     truth = FakeTruth(LOG)
     pictures = evaluate_scene(CONFIG, chunk, "gnet", Reconstruction(scene), truth).pictures
     names = ["0m_front_03", "3m_left_front_04", "3m_right_front_04"]
@@ -171,7 +171,7 @@ def test_curve_follows_the_snapshots(chunk: Chunk, scene: SceneGraph) -> None:
 
 def views_of(chunk: Chunk, better: float = 0.02, worse: float = 0.1) -> tuple[FixedViews, NovelViews]:
     """Noisy truth as the fixer's images, noisier truth as the renders it was given."""
-    views = novel_view_poses(chunk, (3.0, -3.0))
+    views = place_novel_views(chunk, (3.0, -3.0))
     fine, coarse = (oracle(chunk, noise)(None, views, None) for noise in (better, worse))
     blank = torch.zeros_like(fine.alpha)
     novel = NovelViews(views, coarse.color, coarse.alpha, coarse.depth, fine.color, blank, blank)
@@ -205,12 +205,12 @@ def test_a_render_that_is_not_finite_is_named(chunk: Chunk) -> None:
 
 
 def test_real_features_are_taken_once(chunk: Chunk, monkeypatch) -> None:
-    first = real_images(chunk)
+    first = real_image_features(chunk)
     assert first.features.shape == (16, 1280) and first.frames == tuple(v.frame for v in chunk.views)
     monkeypatch.setattr(scoring, "decode_image", None)
-    assert real_images(chunk) is first
+    assert real_image_features(chunk) is first
     with pytest.raises(TypeError):
-        real_images(replace(chunk, views=chunk.views[1:]))
+        real_image_features(replace(chunk, views=chunk.views[1:]))
 
 
 def test_truth_is_cast_once_for_all_stages(chunk: Chunk, monkeypatch) -> None:
@@ -229,9 +229,9 @@ def test_truth_is_cast_once_for_all_stages(chunk: Chunk, monkeypatch) -> None:
     assert len(asked) == len(fixed.views)
     evaluate_fixed(CONFIG, chunk, fixed, novel, Counting(LOG))  # another truth is asked anew
     assert len(asked) == 2 * len(fixed.views)
-    monkeypatch.setattr(scoring, "_KEPT_TRUTH_BYTES", 1)
+    monkeypatch.setattr(scoring, "_CACHED_TRUTH_BYTES", 1)
     evaluate_fixed(CONFIG, chunk, fixed, novel, Counting(LOG))
-    assert len(scoring._true) == 1
+    assert len(scoring._truth_images) == 1
 
 
 def test_same_bytes_at_any_thread_count(chunk: Chunk, scene: SceneGraph) -> None:
@@ -240,7 +240,7 @@ def test_same_bytes_at_any_thread_count(chunk: Chunk, scene: SceneGraph) -> None
     try:
         for threads in (1, 3):
             torch.set_num_threads(threads)
-            scoring._real.clear()
+            scoring._real_features.clear()
             results.append(evaluate_scene(config, chunk, "gnet", Reconstruction(scene), FakeTruth(LOG)))
     finally:
         torch.set_num_threads(before)
@@ -257,7 +257,7 @@ def test_fid_and_lpips_are_there_once_their_networks_are_given(
     config = CONFIG.model_copy(update=files)
     found = []
     for noise in (0.02, 0.3):
-        monkeypatch.setattr(evaluate, "render_views", oracle(chunk, noise))
+        monkeypatch.setattr(evaluation_renders, "render_views", oracle(chunk, noise))
         found.append(by_name(evaluate_scene(config, chunk, "gnet", Reconstruction(scene), FakeTruth(LOG))))
     better, worse = found
     assert {n for n in better if n.endswith(("fid", "lpips"))} == {

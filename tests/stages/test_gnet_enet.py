@@ -11,15 +11,15 @@ import torch
 
 from genre_tasks.config import IngestConfig, InitialConfig, LossConfig, OptimiserConfig
 from genre_tasks.errors import InputError
-from genre_tasks.learned.weights import load
+from genre_tasks.learned.weights import load_optimiser
 from genre_tasks.logs.registry import open_log
-from genre_tasks.losses.targets import Target, of_fixed, of_source, of_views
+from genre_tasks.losses.targets import Target, novel_targets, source_targets, view_targets
 from genre_tasks.optimiser.objective import Objective
-from genre_tasks.optimiser.unroll import Plan, unroll
+from genre_tasks.optimiser.unroll import UnrollSettings, unroll
 from genre_tasks.render import render_views
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.scene.novel_poses import novel_view_poses
+from genre_tasks.scene.novel_poses import place_novel_views
 from genre_tasks.scene.novel_views import FixedViews
 from genre_tasks.scene.reconstruction import Reconstruction
 from genre_tasks.stages.enet import enet
@@ -51,14 +51,14 @@ def reconstructed(chunk: Chunk, start: Reconstruction) -> Reconstruction:
 def _psnr(scene: SceneGraph, targets: tuple[Target, ...]) -> float:
     with torch.no_grad():
         images = render_views(scene, targets).color.clamp(0, 1)
-    error = (images - torch.stack([t.image.image for t in targets])).square().mean((1, 2, 3))
+    error = (images - torch.stack([t.image.pixels for t in targets])).square().mean((1, 2, 3))
     return float((-10 * torch.log10(error)).mean())
 
 
 def test_gnet_improves_frames_that_it_did_not_see(
     chunk: Chunk, start: Reconstruction, reconstructed: Reconstruction
 ) -> None:
-    heldout = of_views(chunk, chunk.of_role("heldout"))
+    heldout = view_targets(chunk, chunk.views_with_role("heldout"))
     assert _psnr(reconstructed.scene, heldout) > _psnr(start.scene, heldout) + 1.0
     assert sorted(reconstructed.snapshots) == [4, 8]
     assert reconstructed.losses[-1] < reconstructed.losses[0]
@@ -66,13 +66,13 @@ def test_gnet_improves_frames_that_it_did_not_see(
 
 def test_enet_takes_up_what_the_fixed_views_show(chunk: Chunk, reconstructed: Reconstruction) -> None:
     log = open_log(LOG)
-    views = novel_view_poses(chunk, (3.0, -3.0))
+    views = place_novel_views(chunk, (3.0, -3.0))
     assert log.truth is not None
     images = [log.truth.image(v.frame, chunk.world_SE3_chunk @ v.chunk_SE3_camera, v.lens) for v in views]
     fixed = FixedViews(views, torch.from_numpy(np.stack(images).astype(np.float32) / np.float32(255)))
     config = OptimiserConfig(iterations=12, views_per_iteration=4, novel_views_per_iteration=4, loss=LOSS)
     result = enet(config, chunk, reconstructed, fixed)
-    novel, heldout = of_fixed(fixed), of_views(chunk, chunk.of_role("heldout"))
+    novel, heldout = novel_targets(fixed), view_targets(chunk, chunk.views_with_role("heldout"))
     assert _psnr(result.scene, novel) > _psnr(reconstructed.scene, novel) + 0.3
     assert _psnr(result.scene, heldout) > _psnr(reconstructed.scene, heldout) - 0.5
 
@@ -89,23 +89,23 @@ def test_an_unreadable_image_is_named(chunk: Chunk, start: Reconstruction) -> No
     broken = tuple(replace(v, image=v.image[:100]) if v.role == "source" else v for v in chunk.views)
     with pytest.raises(InputError, match="decode") as raised:
         gnet(OptimiserConfig(iterations=1, loss=LOSS, method="adam"), replace(chunk, views=broken), start)
-    first = chunk.of_role("source")[0]
+    first = chunk.views_with_role("source")[0]
     assert (raised.value.camera, raised.value.frame, raised.value.log) == (first.camera, first.frame, chunk.log)
 
 
 def test_a_chunk_without_source_views_is_refused(chunk: Chunk) -> None:
     with pytest.raises(InputError, match="no source view"):
-        of_source(replace(chunk, views=chunk.of_role("heldout")), depth=False)
+        source_targets(replace(chunk, views=chunk.views_with_role("heldout")), depth=False)
 
 
 @pytest.mark.parametrize("name", ["gnet", "enet"])
 def test_the_shipped_weights_stay_stable_at_ten_times_their_horizon(name: str) -> None:
     path = resolve_weights(name, "builtin")
     assert path.stat().st_size < 2_000_000
-    rule, truth = load(path), street_scenes.scene()
+    rule, truth = load_optimiser(path), street_scenes.scene()
     start, views, objective = street_scenes.blurred(truth), street_scenes.targets(truth), Objective(LOSS)
     horizon = 24 if name == "gnet" else 12
-    short = unroll(rule, start, views, (), objective, Plan(horizon, 4))
-    long = unroll(rule, start, views, (), objective, Plan(10 * horizon, 4))
+    short = unroll(rule, start, views, (), objective, UnrollSettings(horizon, 4))
+    long = unroll(rule, start, views, (), objective, UnrollSettings(10 * horizon, 4))
     assert long.losses[-1] <= short.losses[-1] * 1.05
-    assert bool(torch.isfinite(long.scene.gaussians.packed()).all())
+    assert bool(torch.isfinite(long.scene.gaussians.pack()).all())

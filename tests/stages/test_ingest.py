@@ -10,9 +10,10 @@ import pytest
 
 from genre_tasks.config import IngestConfig
 from genre_tasks.errors import ConfigError, InputError
-from genre_tasks.scene.chunk import Chunk, Mark
+from genre_tasks.scene.chunk import Chunk, LogIssue
 from genre_tasks.scene.facade_completion import STEP_M
-from genre_tasks.stages.ingest import NO_SWEEP, chunk_count, ingest
+from genre_tasks.stages.ingest import chunk_count, ingest
+from genre_tasks.stages.ingest_points import NO_SWEEP
 from tests.fakes import SENSOR_HEIGHT_M, WALL_HEIGHT_M, FakeLog
 
 CONFIG = IngestConfig(width_px=96, height_px=64)
@@ -28,14 +29,14 @@ def chunk(log: FakeLog) -> Chunk:
     return ingest(CONFIG, log, 0)
 
 
-def _kinds(marks: tuple[Mark, ...]) -> list[str]:
+def _kinds(marks: tuple[LogIssue, ...]) -> list[str]:
     return [m.kind for m in marks]
 
 
 def test_roles_views_and_origin(log: FakeLog, chunk: Chunk) -> None:
-    assert chunk_count(CONFIG, log) == 1 and chunk.frames == tuple(range(20)) and chunk.marks == ()
-    assert {v.frame for v in chunk.of_role("source")} == {0, 4, 8, 12, 16}
-    assert len(chunk.of_role("heldout")) == 30
+    assert chunk_count(CONFIG, log) == 1 and chunk.frames == tuple(range(20)) and chunk.log_issues == ()
+    assert {v.frame for v in chunk.views_with_role("source")} == {0, 4, 8, 12, 16}
+    assert len(chunk.views_with_role("heldout")) == 30
     assert [(v.frame, v.camera) for v in chunk.views[:3]] == [(0, "front"), (0, "left"), (1, "front")]
     assert np.array_equal(chunk.world_SE3_chunk[:3, :3], np.eye(3))
     assert np.allclose(chunk.chunk_SE3_ego[10, :3, 3], 0) and np.allclose(chunk.world_SE3_chunk[:3, 3], [3, 0, 1.8])
@@ -73,7 +74,7 @@ def test_the_moving_car_is_an_actor_and_the_parked_one_is_not(chunk: Chunk) -> N
 
 
 def test_colours_come_from_source_views_only(log: FakeLog, chunk: Chunk) -> None:
-    heldout = {(v.camera, v.frame): b"" for v in chunk.of_role("heldout")}
+    heldout = {(v.camera, v.frame): b"" for v in chunk.views_with_role("heldout")}
     other = log.with_(missing_images=frozenset(heldout))
     again = ingest(CONFIG, other, 0)
     assert np.array_equal(again.static.colors, chunk.static.colors)
@@ -94,7 +95,7 @@ def test_missing_and_unreadable_parts_are_marked(log: FakeLog) -> None:
         unreadable_sweeps=frozenset({6}),
     )
     out = ingest(CONFIG, broken, 0)
-    marks = {(m.kind, m.camera, m.frame) for m in out.marks}
+    marks = {(m.kind, m.camera, m.frame) for m in out.log_issues}
     assert marks == {
         ("missing_image", "front", 4),
         ("unreadable_image", "left", 5),
@@ -136,7 +137,7 @@ def test_short_last_chunk(log: FakeLog) -> None:
     longer = log.with_(frame_count=26)
     out = ingest(CONFIG, longer, 1)
     assert chunk_count(CONFIG, longer) == 2 and out.frames == tuple(range(20, 26))
-    assert {v.frame for v in out.of_role("source")} == {20, 24}
+    assert {v.frame for v in out.views_with_role("source")} == {20, 24}
 
 
 def test_fewer_than_two_source_frames(log: FakeLog) -> None:
@@ -168,7 +169,7 @@ def test_no_lidar_needs_points(log: FakeLog, tmp_path: Path) -> None:
     file.write_text(header + "end_header\n" + body)
     out = ingest(CONFIG.model_copy(update={"points": str(file)}), blind, 0)
     assert np.allclose(out.static.positions, [[17.5, 8, 1 - SENSOR_HEIGHT_M], [17.5, 7, 1 - SENSOR_HEIGHT_M]])
-    assert out.static.colored.all() and _kinds(out.marks) == ["actor_few_points"]
+    assert out.static.colored.all() and _kinds(out.log_issues) == ["actor_few_points"]
 
 
 def test_progress_rises_to_the_end(log: FakeLog) -> None:

@@ -15,12 +15,12 @@ from genre_tasks.scene.chunk import Chunk, Points
 from genre_tasks.scene.distant_shell import fibonacci_directions
 from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR, STATIC
 from genre_tasks.scene.image_decoding import decode_image
-from genre_tasks.scene.initial_gaussians import MAX_SCALE_M, surface_frames
-from genre_tasks.scene.lidar_depth import lidar_depth
-from genre_tasks.scene.lidar_map import lidar_scene
-from genre_tasks.scene.novel_poses import nearest_reference, novel_view_poses
+from genre_tasks.scene.initial_gaussians import MAX_SCALE_M, estimate_surface_axes
+from genre_tasks.scene.lidar_depth import compute_lidar_depth
+from genre_tasks.scene.lidar_map import build_lidar_scene
+from genre_tasks.scene.novel_poses import find_nearest_reference, place_novel_views
 from genre_tasks.scene.reconstruction import Reconstruction
-from genre_tasks.scene.transforms import quat_to_matrix
+from genre_tasks.scene.rotations import quats_to_matrices_numpy
 from genre_tasks.stages.ingest import ingest
 from genre_tasks.stages.initial import initial
 from genre_tasks.stages.novel_views import novel_views
@@ -53,20 +53,20 @@ def test_counts_and_finiteness(reconstruction: Reconstruction) -> None:
     near = int((nodes != DISTANT).sum())
     assert 0.9 * CONFIG.max_points < near <= CONFIG.max_points
     assert int((nodes == DISTANT).sum()) == 500 and int((nodes == FIRST_ACTOR).sum()) > 100
-    assert reconstruction.scene.gaussians.packed().isfinite().all()
-    assert reconstruction.scene.gaussians.packed().dtype == torch.float32
+    assert reconstruction.scene.gaussians.pack().isfinite().all()
+    assert reconstruction.scene.gaussians.pack().dtype == torch.float32
 
 
 def test_same_bytes_again(chunk: Chunk, reconstruction: Reconstruction) -> None:
-    again = initial(CONFIG, chunk).scene.gaussians.packed()
-    assert torch.equal(again, reconstruction.scene.gaussians.packed())
+    again = initial(CONFIG, chunk).scene.gaussians.pack()
+    assert torch.equal(again, reconstruction.scene.gaussians.pack())
 
 
 def test_discs_lie_on_their_surfaces(chunk: Chunk, reconstruction: Reconstruction) -> None:
     g = reconstruction.scene.gaussians
     static = reconstruction.scene.nodes == STATIC
     world = g.means[static].double().numpy() + chunk.world_SE3_chunk[:3, 3]
-    normal = quat_to_matrix(g.quats[static].double().numpy())[:, :, 2]
+    normal = quats_to_matrices_numpy(g.quats[static].double().numpy())[:, :, 2]
     scales = g.log_scales[static].exp().numpy()
     floor = (np.abs(world[:, 2]) < 0.02) & (np.abs(world[:, 1]) < 6.5) & (np.abs(world[:, 0]) < 12)
     assert np.median(np.abs(normal[floor, 2])) > 0.999
@@ -77,13 +77,13 @@ def test_discs_lie_on_their_surfaces(chunk: Chunk, reconstruction: Reconstructio
 
 def test_principal_frames_are_rotations() -> None:
     cloud = np.random.default_rng(0).normal(size=(400, 3)) * [3.0, 1.0, 0.01]
-    axes, spread = surface_frames(cloud[:50], cloud, 30)
+    axes, spread = estimate_surface_axes(cloud[:50], cloud, 30)
     assert np.allclose(np.swapaxes(axes, 1, 2) @ axes, np.eye(3), atol=1e-9) and (np.linalg.det(axes) > 0).all()
     assert (np.diff(spread, axis=1) <= 0).all() and np.abs(axes[:, 2, 2]).min() > 0.99
 
 
 def test_the_scene_resembles_heldout_images(chunk: Chunk, reconstruction: Reconstruction) -> None:
-    views = chunk.of_role("heldout")[::5]
+    views = chunk.views_with_role("heldout")[::5]
     images = render_views(reconstruction.scene, views).color
     scores = [_psnr(c, decode_image(v.image, 96, 64)) for c, v in zip(images, views, strict=True)]
     assert np.mean(scores) > 20
@@ -117,13 +117,13 @@ def test_a_handful_of_points_is_enough(chunk: Chunk, count: int) -> None:
     at = np.random.default_rng(0).uniform(-5, 5, (count, 3)).astype(np.float32)
     few = Points(at, np.full((count, 3), 9, np.uint8), np.zeros(count, bool), np.zeros(count, np.int16))
     out = initial(CONFIG.model_copy(update={"distant_count": 0}), replace(chunk, static=few, actors=()))
-    assert len(out.scene) == count and out.scene.gaussians.packed().isfinite().all()
+    assert len(out.scene) == count and out.scene.gaussians.pack().isfinite().all()
     assert torch.allclose(out.scene.gaussians.colors, torch.tensor(0.5)), "no colour near: grey"
 
 
 def test_lidar_depth_is_the_distance_along_the_axis(chunk: Chunk) -> None:
     view = next(v for v in chunk.views if v.camera == "left" and v.frame == 8)
-    depth = lidar_depth(chunk, view)
+    depth = compute_lidar_depth(chunk, view)
     assert depth.shape == (64, 96) and depth.dtype == torch.float32
     wall = depth[25:32][depth[25:32] > 7.5]
     assert len(wall) > 50 and torch.allclose(wall, torch.tensor(8.0), atol=0.01)
@@ -134,7 +134,7 @@ def test_lidar_depth_follows_the_actor(chunk: Chunk) -> None:
     view = next(v for v in chunk.views if v.camera == "front" and v.frame == 12)
     pose = np.linalg.inv(view.chunk_SE3_camera) @ actor.chunk_SE3_box[12]
     rear = pose[2, 3] - actor.size_m[0] / 2
-    depth = lidar_depth(chunk, view)
+    depth = compute_lidar_depth(chunk, view)
     assert ((depth - rear).abs() < 0.02).sum() > 5
 
 
@@ -142,27 +142,27 @@ def test_lidar_depth_without_a_sweep_is_zero(chunk: Chunk) -> None:
     keep = chunk.static.frames != 8
     static = Points(*(getattr(chunk.static, n)[keep] for n in ("positions", "colors", "colored", "frames")))
     view = next(v for v in chunk.views if v.frame == 8)
-    assert float(lidar_depth(replace(chunk, static=static, actors=()), view).abs().sum()) == 0
+    assert float(compute_lidar_depth(replace(chunk, static=static, actors=()), view).abs().sum()) == 0
 
 
 def test_novel_poses_and_references(chunk: Chunk) -> None:
-    views = novel_view_poses(chunk, (3.0, -3.0))
+    views = place_novel_views(chunk, (3.0, -3.0))
     assert len(views) == 2 * 10 and [v.shift_m for v in views] == [3.0] * 10 + [-3.0] * 10
     by_frame = {(v.camera, v.frame): v for v in chunk.views}
     for view in views:
         moved = view.chunk_SE3_camera[:3, 3] - by_frame[view.camera, view.frame].chunk_SE3_camera[:3, 3]
         assert np.allclose(moved, [0, view.shift_m, 0], atol=1e-9) and view.reference == (view.camera, view.frame)
-    every = novel_view_poses(chunk, (1.0,), chunk.frames)
+    every = place_novel_views(chunk, (1.0,), chunk.frames)
     assert len(every) == 40 and {v.reference[1] for v in every} == {0, 4, 8, 12, 16}
     assert next(v for v in every if v.frame == 7).reference == ("front", 8)
     with pytest.raises(ValueError, match="expected frames of chunk 0, 0 to 19, got \\[99\\]"):
-        novel_view_poses(chunk, (1.0,), [99])
+        place_novel_views(chunk, (1.0,), [99])
 
 
 def test_reference_of_a_camera_without_images_is_the_nearest_other(chunk: Chunk) -> None:
-    fronts = [v for v in chunk.of_role("source") if v.camera == "front"]
+    fronts = [v for v in chunk.views_with_role("source") if v.camera == "front"]
     left = next(v for v in chunk.views if v.camera == "left" and v.frame == 9)
-    near = nearest_reference("left", left.chunk_SE3_camera, fronts)
+    near = find_nearest_reference("left", left.chunk_SE3_camera, fronts)
     assert (near.camera, near.frame) == ("front", 8)
 
 
@@ -188,9 +188,9 @@ def test_novel_views_contract(log: FakeLog, chunk: Chunk, reconstruction: Recons
 
 
 def test_lidar_scene_is_thinned_and_coloured(chunk: Chunk) -> None:
-    scene = lidar_scene(chunk, 3000)
+    scene = build_lidar_scene(chunk, 3000)
     scales = scene.gaussians.log_scales.exp()
     assert 2500 < len(scene) <= 3000 and float(scales.max()) <= MAX_SCALE_M
     assert float((scales[:, 2] / scales[:, 0]).median()) < 0.3  # discs on surfaces, not balls
     empty = Points(*(getattr(chunk.static, n)[:0] for n in ("positions", "colors", "colored", "frames")))
-    assert len(lidar_scene(replace(chunk, static=empty, actors=()), 3000)) == 0
+    assert len(build_lidar_scene(replace(chunk, static=empty, actors=()), 3000)) == 0

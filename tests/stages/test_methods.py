@@ -10,7 +10,7 @@ import torch
 
 from flows.configuration import load_configuration
 from flows.paper_tables.baselines import load_baselines
-from flows.pipeline.definition import BY_NAME, weights_file
+from flows.pipeline.definition import STAGE_BY_NAME, find_weights_file
 from genre_tasks.config import (
     AdamConfig,
     DensityConfig,
@@ -24,8 +24,8 @@ from genre_tasks.config import (
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.learned.learned_optimiser import LearnedOptimiser
 from genre_tasks.losses.targets import Target
-from genre_tasks.optimiser.state import Frame, State
-from genre_tasks.optimiser.tuned_adam import ENET_RATES, GNET_RATES, TunedAdam
+from genre_tasks.optimiser.state import Parameterization, State
+from genre_tasks.optimiser.tuned_adam import ENET_LEARNING_RATES, GNET_LEARNING_RATES, TunedAdam
 from genre_tasks.scene.reconstruction import Reconstruction
 from genre_tasks.stages import optimise
 from genre_tasks.weights import resolve_weights
@@ -39,7 +39,7 @@ SHORT = PerSceneConfig(iterations=150, density=DensityConfig(every=10_000, reset
 def views(monkeypatch: pytest.MonkeyPatch) -> tuple[Target, ...]:
     """Served in place of a chunk's own."""
     made = street_scenes.targets(street_scenes.scene())
-    monkeypatch.setattr(optimise.targets, "of_source", lambda chunk, depth: made)
+    monkeypatch.setattr(optimise.targets, "source_targets", lambda chunk, depth: made)
     return made
 
 
@@ -76,10 +76,10 @@ def test_only_gnet_can_be_replaced_by_what_knows_no_fixed_views(method: str) -> 
 @pytest.mark.parametrize("stage", ["gnet", "enet"])
 def test_the_learned_optimisers_rates_are_the_weights_own_or_those_that_are_given(stage: optimise.StageName) -> None:
     config = GnetConfig() if stage == "gnet" else OptimiserConfig()
-    own = optimise.step_rule(stage, config)
+    own = optimise.load_step_rule(stage, config)
     assert isinstance(own, LearnedOptimiser)
-    given = optimise.step_rule(
-        stage, config.model_copy(update={"learning_rates": LearningRates.of((0.5, 0.4, 0.3, 0.2, 0.0))})
+    given = optimise.load_step_rule(
+        stage, config.model_copy(update={"learning_rates": LearningRates.from_sequence((0.5, 0.4, 0.3, 0.2, 0.0))})
     )
     assert isinstance(given, LearnedOptimiser) and given.config.rates == (0.5, 0.4, 0.3, 0.2, 0.0) != own.config.rates
     assert given.config.relaxation == own.config.relaxation
@@ -91,30 +91,29 @@ def test_g3r_has_weights_of_its_own_or_those_that_are_named(views: tuple[Target,
     own = GnetConfig(method="g3r", iterations=2, views_per_iteration=2, loss=LossConfig(perceptual=0.0))
     weights = str(resolve_weights("gnet", "builtin"))
     named = own.model_copy(update={"weights": weights})
-    g3r, gnet = _gnet(own).scene.gaussians.packed(), _gnet(named).scene.gaussians.packed()
+    g3r, gnet = _gnet(own).scene.gaussians.pack(), _gnet(named).scene.gaussians.pack()
     assert not torch.equal(g3r, gnet)
-    assert torch.equal(gnet, _gnet(named.model_copy(update={"method": "learned"})).scene.gaussians.packed())
-    spec = BY_NAME["gnet"]
-    assert weights_file(spec, PipelineConfig(gnet=named)) == Path(weights)  # its bytes are part of the key
-    assert weights_file(spec, PipelineConfig(gnet=own)) == resolve_weights("g3r", "builtin")
-    assert weights_file(spec, PipelineConfig(gnet=GnetConfig(method="street_gs"))) is None
+    assert torch.equal(gnet, _gnet(named.model_copy(update={"method": "learned"})).scene.gaussians.pack())
+    spec = STAGE_BY_NAME["gnet"]
+    assert find_weights_file(spec, PipelineConfig(gnet=named)) == Path(weights)  # its bytes are part of the key
+    assert find_weights_file(spec, PipelineConfig(gnet=own)) == resolve_weights("g3r", "builtin")
+    assert find_weights_file(spec, PipelineConfig(gnet=GnetConfig(method="street_gs"))) is None
 
 
 def test_adam_takes_the_stages_rates_unless_others_are_set() -> None:
-    rules = [optimise.step_rule(stage, OptimiserConfig(method="adam")) for stage in ("gnet", "enet")]
-    assert rules == [TunedAdam(GNET_RATES), TunedAdam(ENET_RATES)]
-    adam = AdamConfig(learning_rates=LearningRates.of((1, 2, 3, 4, 5)), schedule="constant")
-    assert optimise.step_rule("enet", OptimiserConfig(method="adam", adam=adam)) == TunedAdam(
-        (1, 2, 3, 4, 5), "constant"
-    )
+    rules = [optimise.load_step_rule(stage, OptimiserConfig(method="adam")) for stage in ("gnet", "enet")]
+    assert rules == [TunedAdam(GNET_LEARNING_RATES), TunedAdam(ENET_LEARNING_RATES)]
+    rates = LearningRates.from_sequence((1, 2, 3, 4, 5))
+    adam = AdamConfig(learning_rates=rates, schedule="constant")
+    assert optimise.load_step_rule("enet", OptimiserConfig(method="adam", adam=adam)) == TunedAdam(rates, "constant")
 
 
 def test_a_constant_schedule_steps_as_far_at_the_end_as_a_cosine_at_the_start() -> None:
     scene = street_scenes.scene()
     gradient = torch.randn(len(scene), 14, generator=torch.Generator().manual_seed(0))
-    state, frame = State.start(len(scene), gradient).saw(gradient), Frame.of(scene)
+    state, parameterization = State.zeros(len(scene), gradient).accumulate(gradient), Parameterization.from_scene(scene)
     late = replace(state, iteration=24)
-    cosine, constant = (TunedAdam(decay=d).start(frame, torch.zeros(3)) for d in ("cosine", "constant"))
+    cosine, constant = (TunedAdam(schedule=d).prepare(parameterization, torch.zeros(3)) for d in ("cosine", "constant"))
     assert torch.equal(constant(late, gradient, 24), cosine(state, gradient, 24))
     assert torch.allclose(cosine(late, gradient, 24), 0.05 * cosine(state, gradient, 24))
 
@@ -138,7 +137,7 @@ def test_the_table_of_baselines_is_sound(preset: str) -> None:
             elif "3" in name or name == "street_gs":
                 assert variant in ("default", str(config.per_scene.iterations))
     with pytest.raises(ConfigError, match=r"no variant '1'.*Known: 30000"):
-        table["standard_3dgs"].at("1")
+        table["standard_3dgs"].variant("1")
 
 
 @pytest.mark.parametrize(
@@ -159,6 +158,6 @@ def test_mistakes_in_the_table_are_named(text: str, said: str, tmp_path: Path) -
 def test_a_stage_can_run_with_the_weights_that_ship_for_another() -> None:
     assert resolve_weights("enet", "builtin:gnet") == resolve_weights("gnet", "builtin")
     enet = PipelineConfig(enet=OptimiserConfig(weights="builtin:gnet"))
-    assert weights_file(BY_NAME["enet"], enet) == resolve_weights("gnet", "builtin")
+    assert find_weights_file(STAGE_BY_NAME["enet"], enet) == resolve_weights("gnet", "builtin")
     with pytest.raises(InputError, match=r"do not exist.*Those of enet, fnet, g3r, gnet ship"):
         resolve_weights("enet", "builtin:hnet")

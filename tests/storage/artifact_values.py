@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from genre_tasks.effects.types import Decision, EffectsPlan, Fitted
-from genre_tasks.fixer.conditioning import Degraded
-from genre_tasks.fixer.pairs import NAMES, Pairs
+from genre_tasks.effects.types import Decision, EffectParameters, EffectsPlan
+from genre_tasks.fixer.inputs import FixerInputs
+from genre_tasks.fixer.pairs import INPUT_NAMES, Pairs
 from genre_tasks.logs.types import Lens, MotionBlur, RollingShutter
 from genre_tasks.metrics.results import Evaluation, Metric, ViewScore
 from genre_tasks.scene.actor_node import ActorNode
-from genre_tasks.scene.chunk import Actor, Chunk, Mark, Points, Role, View
+from genre_tasks.scene.chunk import Actor, Chunk, LogIssue, Points, Role, View
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.novel_views import FixedViews, NovelView, NovelViews
@@ -52,7 +52,11 @@ def chunk(rng: np.random.Generator, frames: int = 3, actors: int = 2, count: int
         for f in range(frames)
         for c in names
     )
-    marks = (Mark("missing_sweep", "none", frame=1), Mark("missing_image", "gone", 2, "zurück"), Mark("standstill", ""))
+    issues = (
+        LogIssue("missing_sweep", "none", frame=1),
+        LogIssue("missing_image", "gone", 2, "zurück"),
+        LogIssue("standstill", ""),
+    )
     made = []
     for k in range(actors):
         n = int(rng.integers(0, frames + 1))
@@ -72,14 +76,14 @@ def chunk(rng: np.random.Generator, frames: int = 3, actors: int = 2, count: int
         views=views,
         static=points(rng, count),
         actors=tuple(made),
-        marks=marks,
+        log_issues=issues,
     )
 
 
 def scene(rng: np.random.Generator, count: int = 13, actors: tuple[ActorNode, ...] = ()) -> SceneGraph:
     packed = torch.from_numpy((rng.normal(size=(count, 14)) * 10 ** rng.uniform(-6, 3, (count, 14))).astype(np.float32))
     nodes = torch.from_numpy(rng.integers(0, 2 + len(actors), count))
-    return SceneGraph(Gaussians.unpacked(packed), nodes, actors)
+    return SceneGraph(Gaussians.unpack(packed), nodes, actors)
 
 
 def reconstruction(rng: np.random.Generator, count: int = 13, actors: int = 2, snapshots: int = 2) -> Reconstruction:
@@ -125,7 +129,7 @@ def pairs(rng: np.random.Generator, count: int = 2, width: int = 7, height: int 
         return torch.from_numpy(rng.integers(0, 256, (count, channels, height, width), dtype=np.uint8))
 
     colours = ("color", "lidar_color", "reference", "warped", "lidar_warped")
-    views = Degraded(**{name: image(3 if name in colours else 1) for name in NAMES})
+    views = FixerInputs(**{name: image(3 if name in colours else 1) for name in INPUT_NAMES})
     return Pairs(views, image(3), tuple(f"kind {k}" for k in range(count)), rng.random(count).astype(np.float32))
 
 
@@ -160,14 +164,18 @@ def effects(rng: np.random.Generator, count: int = 3) -> EffectsPlan:
     gains = {(f"camera_{k}", k): tuple(float(x) for x in rng.normal(size=3)) for k in range(count)}
     numbers = rng.normal(size=(count, 8)).tolist()
     shutters = {
-        (f"camera_{k}", k): RollingShutter(x[0], (x[1], x[2], x[3]), (x[4], x[5], x[6]), x[7])
+        (f"camera_{k}", k): RollingShutter(
+            x[0], velocity_m_s=(x[1], x[2], x[3]), turn_rad_s=(x[4], x[5], x[6]), frame_s=x[7]
+        )
         for k, x in enumerate(numbers)
     }
     blurs = {
-        (f"camera_{k}", k): MotionBlur(x[7], (x[1], x[2], x[3]), (x[4], x[5], x[6]), x[0])
+        (f"camera_{k}", k): MotionBlur(
+            x[7], velocity_m_s=(x[1], x[2], x[3]), turn_rad_s=(x[4], x[5], x[6]), frame_s=x[0]
+        )
         for k, x in enumerate(numbers)
     }
-    return EffectsPlan(tuple(rows), Fitted(gains, own, shutters, blurs))
+    return EffectsPlan(tuple(rows), EffectParameters(gains, own, shutters, blurs))
 
 
 MAKERS = {

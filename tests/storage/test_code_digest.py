@@ -10,7 +10,7 @@ import pytest
 
 from genre_tasks.errors import ConfigError
 from storage import code_digest as module
-from storage.code_digest import closure, code_digest, strip_cpp_comments
+from storage.code_digest import code_digest, import_closure, strip_cpp_comments
 
 TREE = {
     "__init__.py": '"""Package."""\n',
@@ -107,8 +107,8 @@ def test_a_kernel_counts_only_with_its_room(digest_with, kernel: dict[str, str],
 
 def test_versions_of_imported_packages_count(digest_with, monkeypatch: pytest.MonkeyPatch) -> None:
     before, other = digest_with(), digest_with("genre_tasks.stages.other")
-    real = module._version
-    monkeypatch.setattr(module, "_version", lambda name: "0" if name == "torch" else real(name))
+    real = module._installed_version
+    monkeypatch.setattr(module, "_installed_version", lambda name: "0" if name == "torch" else real(name))
     assert digest_with() != before and digest_with("genre_tasks.stages.other") == other
 
 
@@ -122,15 +122,15 @@ def test_cycles_end_and_unknown_modules_are_named(digest_with) -> None:
 
 
 def test_closure_of_the_real_package() -> None:
-    files, packages = closure("genre_tasks.scene.reconstruction", (), Path(module.__file__).parents[1])
+    files, packages = import_closure("genre_tasks.scene.reconstruction", (), Path(module.__file__).parents[1])
     assert {"genre_tasks", "genre_tasks.scene.graph", "genre_tasks.logs.types"} <= set(files)
     assert "genre_tasks.config" not in files and {"torch", "numpy", "kornia"} <= packages
 
 
 def test_every_kernel_of_the_real_package_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     covered: set[str] = set()
-    monkeypatch.setattr(module, "_add", lambda digest, name, text: covered.add(name))
-    module._cached.__wrapped__("genre_tasks.stages.gnet", ("genre_tasks.render.cpu",), None)
+    monkeypatch.setattr(module, "_update", lambda digest, name, text: covered.add(name))
+    module._digest_closure.__wrapped__("genre_tasks.stages.gnet", ("genre_tasks.render.cpu",), None)
     root = Path(module.__file__).parents[1]
     sources = {p.relative_to(root).as_posix() for p in (root / "genre_tasks").rglob("*") if p.suffix in (".cpp", ".h")}
     assert "genre_tasks/losses/image_loss.cpp" in sources and sources <= covered

@@ -18,11 +18,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from genre_tasks.errors import ArtifactCorruptError, ConfigError, NonFiniteError
-from genre_tasks.scene.graph import COUNTS, DEGREE
-from storage.codecs import KINDS, codec_of, tables
+from genre_tasks.scene.graph import DEFAULT_SH_DEGREE, SH_COUNTS
+from storage.codecs import KINDS, get_codec, tables
 from storage.codecs.exr import read_channels, write_channels, write_exr
 from storage.codecs.png import read_png, write_png
-from storage.codecs.reconstruction import GAUSSIANS
+from storage.codecs.scene_tables import GAUSSIANS
 from tests.storage import artifact_values as values
 from tests.storage.artifact_values import COLORS, assert_same
 
@@ -36,7 +36,7 @@ def fresh(tmp_path_factory: pytest.TempPathFactory):
 
 
 def there_and_back(kind: str, value: object, folder: Path) -> None:
-    codec = codec_of(kind)
+    codec = get_codec(kind)
     codec.write(folder, value)
     assert_same(value, codec.read(folder, codec.measurements(value)), kind, COLORS)
 
@@ -90,11 +90,11 @@ def test_parquet_keeps_every_bit_of_a_float(fresh, single: np.ndarray, double: n
         declared = tables.schema("t/1", [tables.column("v", kind, "any")])
         path = fresh() / "t.parquet"
         tables.write_table(path, declared, {"v": array})
-        assert tables.array_of(tables.read_table(path, declared)[0], "v").tobytes() == array.tobytes()
+        assert tables.column_array(tables.read_table(path, declared)[0], "v").tobytes() == array.tobytes()
 
 
 def test_tensors_read_back_are_contiguous_and_writable(tmp_path: Path) -> None:
-    codec = codec_of("reconstruction")
+    codec = get_codec("reconstruction")
     codec.write(tmp_path, values.make("reconstruction"))
     g = codec.read(tmp_path).scene.gaussians
     for tensor in (g.means, g.log_scales, g.quats, g.logit_opacities, g.colors):
@@ -103,7 +103,7 @@ def test_tensors_read_back_are_contiguous_and_writable(tmp_path: Path) -> None:
 
 
 def test_gaussians_columns_are_named_and_documented(tmp_path: Path) -> None:
-    codec_of("reconstruction").write(tmp_path, values.make("reconstruction"))
+    get_codec("reconstruction").write(tmp_path, values.make("reconstruction"))
     found = pq.read_schema(tmp_path / "gaussians.parquet")
     assert found.names == [
         "x",
@@ -133,26 +133,31 @@ def test_gaussians_columns_are_named_and_documented(tmp_path: Path) -> None:
 
 
 def test_harmonics_lie_beside_the_gaussians_and_old_artifacts_have_none(tmp_path: Path) -> None:
-    value, codec = values.make("reconstruction"), codec_of("reconstruction")
+    value, codec = values.make("reconstruction"), get_codec("reconstruction")
     (tmp_path / "old").mkdir()
     codec.write(tmp_path / "old", value)
-    assert not (tmp_path / "old" / "harmonics").exists() and codec.read(tmp_path / "old").scene.harmonics is None
-    waves = torch.randn(13, COUNTS[DEGREE], 3, generator=torch.Generator().manual_seed(0))
+    assert (
+        not (tmp_path / "old" / "harmonics").exists() and codec.read(tmp_path / "old").scene.spherical_harmonics is None
+    )
+    waves = torch.randn(13, SH_COUNTS[DEFAULT_SH_DEGREE], 3, generator=torch.Generator().manual_seed(0))
     assert len(value.scene) == 13
     snapshots = {
-        n: s.with_harmonics(torch.full((len(s), COUNTS[DEGREE], 3), float(n))) for n, s in value.snapshots.items()
+        n: s.with_spherical_harmonics(torch.full((len(s), SH_COUNTS[DEFAULT_SH_DEGREE], 3), float(n)))
+        for n, s in value.snapshots.items()
     }
-    glossy = replace(value, scene=value.scene.with_harmonics(waves), snapshots=snapshots)
+    glossy = replace(value, scene=value.scene.with_spherical_harmonics(waves), snapshots=snapshots)
     (tmp_path / "new").mkdir()
     codec.write(tmp_path / "new", glossy)
     back = codec.read(tmp_path / "new")
-    assert torch.equal(back.scene.harmonics, waves)
-    assert {n: float(s.harmonics.mean()) for n, s in back.snapshots.items()} == {8: 8.0, 16: 16.0}
+    assert torch.equal(back.scene.spherical_harmonics, waves)
+    assert {n: float(s.spherical_harmonics.mean()) for n, s in back.snapshots.items()} == {8: 8.0, 16: 16.0}
     names = pq.read_schema(tmp_path / "new" / "harmonics" / "gaussians.parquet").names
     assert names[:4] == ["red_1", "green_1", "blue_1", "red_2"]
     (tmp_path / "bad").mkdir()
     with pytest.raises(ConfigError, match=r"harmonics of gaussians.parquet is float32 \[13, 15, 3\]"):
-        codec.write(tmp_path / "bad", replace(value, scene=value.scene.with_harmonics(torch.zeros(13, 15, 3))))
+        codec.write(
+            tmp_path / "bad", replace(value, scene=value.scene.with_spherical_harmonics(torch.zeros(13, 15, 3)))
+        )
     (tmp_path / "new" / "harmonics" / "iteration_0008.parquet").unlink()
     with pytest.raises(ArtifactCorruptError, match="A table is missing"):
         codec.read(tmp_path / "new")
@@ -160,7 +165,7 @@ def test_harmonics_lie_beside_the_gaussians_and_old_artifacts_have_none(tmp_path
 
 def test_images_of_a_chunk_lie_uncompressed_as_they_came(tmp_path: Path) -> None:
     value = values.make("chunk")
-    codec_of("chunk").write(tmp_path, value)
+    get_codec("chunk").write(tmp_path, value)
     data = (tmp_path / "views.parquet").read_bytes()
     assert all(v.image in data for v in value.views)
 
@@ -198,7 +203,7 @@ def _with_node_99(t: pa.Table) -> pa.Table:
     ],
 )
 def test_a_table_of_another_schema_is_named(tmp_path: Path, change, message: str) -> None:
-    codec = codec_of("reconstruction")
+    codec = get_codec("reconstruction")
     codec.write(tmp_path, values.make("reconstruction"))
     _rewrite(tmp_path / "gaussians.parquet", change)
     with pytest.raises(ArtifactCorruptError, match=message) as caught:
@@ -218,7 +223,7 @@ def test_flipped_bits_in_pages_are_found_without_digests(tmp_path: Path) -> None
         (tmp_path / "t.parquet").write_bytes(flipped)
         try:
             table, _ = tables.read_table(tmp_path / "t.parquet", GAUSSIANS)
-            harmless += all(np.array_equal(tables.array_of(table, k), v) for k, v in columns.items())
+            harmless += all(np.array_equal(tables.column_array(table, k), v) for k, v in columns.items())
         except ArtifactCorruptError:
             found += 1
     assert found + harmless == 60 and found >= 57
@@ -298,7 +303,7 @@ def test_light_above_half_is_an_error_and_not_clamped(tmp_path: Path, layer: str
     getattr(value, layer)[1, 0, 2, 1] = 150.0
     (value.alpha if layer == "color" else value.lidar_alpha)[1, 0, 2] = 1.0
     with pytest.raises(NonFiniteError, match=r"scene-linear, as half\) holds 1 .*\(0, 2, 1\)"):
-        codec_of("novel_views").write(tmp_path, value)
+        get_codec("novel_views").write(tmp_path, value)
 
 
 def test_values_that_break_a_contract_are_refused(tmp_path: Path) -> None:
@@ -307,15 +312,15 @@ def test_values_that_break_a_contract_are_refused(tmp_path: Path) -> None:
     chunk = values.make("chunk")
     wide = replace(chunk.static, positions=chunk.static.positions.astype(np.float64))
     with pytest.raises(ConfigError, match=r"positions of node 0 is float64 \[11, 3\], expected float32 \['N', 3\]"):
-        codec_of("chunk").write(tmp_path, replace(chunk, static=wide))
+        get_codec("chunk").write(tmp_path, replace(chunk, static=wide))
     scene = values.make("reconstruction")
     scene.scene.gaussians.means[4, 1] = float("inf")
     with pytest.raises(NonFiniteError, match=r"gaussians of gaussians.parquet holds 1 .*\(4, 1\)"):
-        codec_of("reconstruction").write(tmp_path, scene)
+        get_codec("reconstruction").write(tmp_path, scene)
     picture = replace(values.make("evaluation"), pictures={"../x": np.zeros((2, 2, 3), np.uint8)})
     (tmp_path / "e").mkdir()
     with pytest.raises(ConfigError, match="cannot be a file's name"):
-        codec_of("evaluation").write(tmp_path / "e", picture)
+        get_codec("evaluation").write(tmp_path / "e", picture)
 
 
 def test_png(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
-from storage.local import LocalStore, open_store
+from storage.local import LocalStore, Provenance, open_store
 from storage.manifest import MANIFEST, NewerSchemaError
 from tests.contracts.store_suite import KEY, StoreSuite, address
 from tests.storage.artifact_values import COLORS, MAKERS, assert_same, make
@@ -56,11 +56,11 @@ def test_an_artifact_moved_to_another_key_is_refused(tmp_path: Path) -> None:
     store = LocalStore(tmp_path)
     artifact = store.commit(address(), "evaluation", make("evaluation"))
     elsewhere = address(key="f" * 64)
-    shutil.copytree(artifact.path, tmp_path / elsewhere.relative)
+    shutil.copytree(artifact.path, tmp_path / elsewhere.relative_path)
     with pytest.raises(ArtifactCorruptError, match="belongs to"):
         store.find(elsewhere)
     assert [a.address for a in store.artifacts()] == [artifact.address]
-    assert {path.name: error is None for path, error in store.check()} == {KEY: True, "f" * 64: False}
+    assert {path.name: error is None for path, error in store.verify_all()} == {KEY: True, "f" * 64: False}
 
 
 def test_no_manifest_no_artifact(tmp_path: Path) -> None:
@@ -78,7 +78,7 @@ def test_an_unreadable_manifest_is_found_checked_and_replaced(tmp_path: Path) ->
     (artifact.path / MANIFEST).write_text("{")
     with pytest.raises(ArtifactCorruptError, match=r"not readable.*manifest\.json"):
         store.find(address())
-    ((_, error),) = store.check()
+    ((_, error),) = store.verify_all()
     assert error is not None
     store.verify(store.commit(address(), "evaluation", make("evaluation")))
 
@@ -144,7 +144,7 @@ def test_a_corrupt_one_that_another_writer_repaired_meanwhile_is_kept(
     artifact = store.commit(address(), "evaluation", make("evaluation"))
     good = {p: p.read_bytes() for p in artifact.path.rglob("*") if p.is_file()}
     (artifact.path / "curve.parquet").write_bytes(b"bad")
-    judge, calls = LocalStore._sound, []
+    judge, calls = LocalStore._is_sound, []
 
     def repaired_after_the_first_look(self: LocalStore, path: Path, at: object) -> bool:
         answer = judge(self, path, at)  # type: ignore[arg-type]
@@ -154,15 +154,16 @@ def test_a_corrupt_one_that_another_writer_repaired_meanwhile_is_kept(
         calls.append(answer)
         return answer
 
-    monkeypatch.setattr(LocalStore, "_sound", repaired_after_the_first_look)
-    after = store.commit(address(), "evaluation", make("evaluation"), warnings=("late",))
+    monkeypatch.setattr(LocalStore, "_is_sound", repaired_after_the_first_look)
+    after = store.commit(address(), "evaluation", make("evaluation"), Provenance(warnings=("late",)))
     assert calls[:2] == [False, True] and after.manifest.warnings == ()
     store.verify(after)
 
 
 def _commit(root: str, seed: int, start: object, results: object) -> None:
     start.wait()  # type: ignore[attr-defined]
-    made = LocalStore(Path(root)).commit(address(), "evaluation", make("evaluation", seed), warnings=(str(seed),))
+    provenance = Provenance(warnings=(str(seed),))
+    made = LocalStore(Path(root)).commit(address(), "evaluation", make("evaluation", seed), provenance)
     results.put(made.manifest.warnings)  # type: ignore[attr-defined]
 
 

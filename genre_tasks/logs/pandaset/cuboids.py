@@ -7,23 +7,40 @@ other (``cuboids.sibling_id``: at times only one does, or with a truncated id). 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from genre_tasks.errors import InputError
-from genre_tasks.logs.pandaset.layout import BOX_HEADING, PANDA_R_OURS, SPINNING_SENSOR, rotations
-from genre_tasks.logs.pandaset.pickle_reader import Frame
-from genre_tasks.logs.types import CuboidTrack, Float64, LogProblem
+from genre_tasks.logs.pandaset.layout import BOX_HEADING, PANDA_R_FLU, SPINNING_SENSOR, quats_to_matrices
+from genre_tasks.logs.pandaset.pickle_reader import Table
+from genre_tasks.logs.reader_problems import ReaderProblem
+from genre_tasks.logs.types import CuboidTrack, Float64
 
-_BOX = ("position.x", "position.y", "position.z", "dimensions.x", "dimensions.y", "dimensions.z", "yaw")
-_MIN_ID_PREFIX = 24  # a sibling id cut off by a few characters still names one uuid
+_BOX_COLUMNS = ("position.x", "position.y", "position.z", "dimensions.x", "dimensions.y", "dimensions.z", "yaw")
+# Of a box row: PandaSet's dimensions x (width), y (length), z (height).
+_SIZE = slice(3, 6)
+# Of a box row, behind the columns above.
+_QUATERNION = slice(7, 11)
+# A sibling id cut off by a few characters still names one uuid.
+_MIN_ID_PREFIX = 24
+_NO_SENSOR = -1
+_NO_SIBLING = "-"
 
 
 @dataclass
-class _Annotated:
-    """What the files say under one uuid: frame → the seven numbers of ``_BOX``, and a quaternion."""
+class _AnnotatedObject:
+    """What the files say under one uuid.
+
+    Attributes:
+        uuid: the object, as one sensor saw it.
+        label: its class.
+        sensor: ``SPINNING_SENSOR``, 1 for the forward LiDAR, or ``_NO_SENSOR``.
+        sibling: uuid of the same object as the other sensor saw it.
+        boxes: frame → [11] as ``_read_boxes`` gives them.
+        moving: whether any frame says that it moves.
+    """
 
     uuid: str
     label: str
@@ -33,91 +50,108 @@ class _Annotated:
     moving: bool = False
 
 
-def tracks_of_cuboids(frames: Iterable[tuple[int, Frame]]) -> tuple[tuple[CuboidTrack, ...], tuple[LogProblem, ...]]:
-    """The tracks of a sequence, in the order in which they are first seen, and the boxes that were left out.
+def build_tracks(frames: Iterable[tuple[int, Table]]) -> tuple[tuple[CuboidTrack, ...], tuple[ReaderProblem, ...]]:
+    """Builds the tracks of a sequence from the cuboids of its frames.
+
+    A box with a non-finite number or without volume is left out (``ReaderProblem`` of kind ``invalid_box``). An object
+    moves if ``attributes.object_motion`` says so in any frame; pedestrians have none: they move where they walk.
 
     Args:
         frames: (frame, its cuboids) in increasing order; columns uuid, label, yaw, position.*, dimensions.* are needed.
 
-    A box with a non-finite number or without volume is left out (``LogProblem`` of kind ``invalid_box``). *Moving* is
-    what ``attributes.object_motion`` says in any frame; pedestrians have none: they move where they walk.
+    Returns:
+        The tracks, in the order in which they first appear, and the boxes that were left out.
 
     Raises:
         InputError: a needed column is missing (names the frame).
     """
-    objects: dict[str, _Annotated] = {}
-    problems: list[LogProblem] = []
+    objects: dict[str, _AnnotatedObject] = {}
+    problems: list[ReaderProblem] = []
     for frame, table in frames:
-        problems += _collect(objects, frame, table)
-    tracks = []
-    for group in _groups(objects):
-        track = _track(group)
-        if track is not None:
-            tracks.append(track)
-    return tuple(tracks), tuple(problems)
+        problems += _add_frame(objects, frame, table)
+    tracks = (_build_track(group) for group in _group_siblings(objects))
+    return tuple(track for track in tracks if track is not None), tuple(problems)
 
 
-def _collect(objects: dict[str, _Annotated], frame: int, table: Frame) -> list[LogProblem]:
-    missing = [name for name in ("uuid", "label", *_BOX) if name not in table.columns]
+def _add_frame(objects: dict[str, _AnnotatedObject], frame: int, table: Table) -> list[ReaderProblem]:
+    """Adds the boxes of one frame to their objects; returns those that were left out."""
+    missing = [name for name in ("uuid", "label", *_BOX_COLUMNS) if name not in table.columns]
     if missing:
         remedy = "Copy the cuboids of the sequence again, or remove them: a log without tracks is survived."
         raise InputError(f"the cuboids lack the columns {', '.join(missing)}", remedy=remedy, frame=frame)
-    boxes = _boxes(table)
-    column = {name: values.tolist() for name, values in table.columns.items() if name not in _BOX}
+    boxes = _read_boxes(table)
+    attributes = {name: values.tolist() for name, values in table.columns.items() if name not in _BOX_COLUMNS}
     problems = []
-    for row, uuid in enumerate(map(str, column["uuid"])):
-        sensor = int(column["cuboids.sensor_id"][row]) if "cuboids.sensor_id" in column else -1
-        sibling = str(column["cuboids.sibling_id"][row]) if "cuboids.sibling_id" in column else "-"
-        seen = objects.setdefault(uuid, _Annotated(uuid, str(column["label"][row]), sensor, sibling))
-        box = boxes[row]
-        if not np.isfinite(box).all() or (box[3:6] <= 0).any() or not box[7:].any():
-            problems.append(LogProblem("invalid_box", f"the box of {seen.label} {uuid} in frame {frame} is not finite"))
+    for index, box in enumerate(boxes):
+        row = {name: values[index] for name, values in attributes.items()}
+        new_object = _AnnotatedObject(
+            uuid=str(row["uuid"]),
+            label=str(row["label"]),
+            sensor=int(row.get("cuboids.sensor_id", _NO_SENSOR)),
+            sibling=str(row.get("cuboids.sibling_id", _NO_SIBLING)),
+        )
+        annotated = objects.setdefault(new_object.uuid, new_object)
+        if not np.isfinite(box).all() or (box[_SIZE] <= 0).any() or not box[_QUATERNION].any():
+            message = f"the box of {annotated.label} {annotated.uuid} in frame {frame} is not finite"
+            problems.append(ReaderProblem("invalid_box", message))
             continue
-        seen.boxes.setdefault(frame, box)
-        seen.moving |= _moves({name: values[row] for name, values in column.items()})
+        # A uuid that stands twice in a frame keeps its first box.
+        annotated.boxes.setdefault(frame, box)
+        annotated.moving |= _is_moving(row)
     return problems
 
 
-def _boxes(table: Frame) -> Float64:
-    """[N, 11]: ``_BOX`` and the orientation as a quaternion, which is about z by the yaw unless the file says more."""
-    box = [np.asarray(table.columns[name], dtype=np.float64) for name in _BOX]
+def _read_boxes(table: Table) -> Float64:
+    """[N, 11] position, size and yaw as in the file, and the orientation as a quaternion (w, x, y, z).
+
+    The orientation is a turn about z by the yaw, unless the file says more.
+    """
+    box = [np.asarray(table.columns[name], dtype=np.float64) for name in _BOX_COLUMNS]
     if all(name in table.columns for name in BOX_HEADING):
-        heading = [np.asarray(table.columns[name], dtype=np.float64) for name in BOX_HEADING]
+        quat = [np.asarray(table.columns[name], dtype=np.float64) for name in BOX_HEADING]
     else:
-        half = np.where(np.isfinite(box[-1]), box[-1], 0.0) / 2  # such a box is left out for its yaw
-        heading = [np.cos(half), np.zeros_like(half), np.zeros_like(half), np.sin(half)]
-    return np.stack([*box, *heading], axis=1)
+        yaw = box[-1]
+        # A box whose yaw is not finite is left out later, by its yaw; the quaternion only must not warn.
+        half = np.where(np.isfinite(yaw), yaw, 0.0) / 2
+        quat = [np.cos(half), np.zeros_like(half), np.zeros_like(half), np.sin(half)]
+    return np.stack([*box, *quat], axis=1)
 
 
-def _moves(row: dict[str, object]) -> bool:
-    motion, behaviour = row.get("attributes.object_motion"), row.get("attributes.pedestrian_behavior")
+def _is_moving(row: Mapping[str, object]) -> bool:
+    motion = row.get("attributes.object_motion")
+    behaviour = row.get("attributes.pedestrian_behavior")
     if isinstance(motion, str):
         return motion == "Moving"
     if isinstance(behaviour, str):
         return behaviour == "Walking"
+    # Compared by identity: a missing or NaN attribute says nothing.
     return row.get("stationary") is False
 
 
-def _groups(objects: dict[str, _Annotated]) -> list[list[_Annotated]]:
+def _group_siblings(objects: dict[str, _AnnotatedObject]) -> list[list[_AnnotatedObject]]:
     """The objects, each with its siblings of the other sensor; the 64-beam sensor's first."""
-    leader = {uuid: uuid for uuid in objects}
+    # Union-find: links may be one-sided, or join more than two uuids.
+    parent = {uuid: uuid for uuid in objects}
 
-    def find(uuid: str) -> str:
-        while leader[uuid] != uuid:
-            uuid = leader[uuid]
+    def find_root(uuid: str) -> str:
+        while parent[uuid] != uuid:
+            uuid = parent[uuid]
         return uuid
 
-    for uuid, seen in objects.items():
-        other = _named(seen.sibling, objects)
-        if other is not None and objects[other].sensor != seen.sensor:
-            leader[find(other)] = find(uuid)
-    groups: dict[str, list[_Annotated]] = {}
-    for uuid, seen in objects.items():
-        groups.setdefault(find(uuid), []).append(seen)
-    return [sorted(group, key=lambda seen: seen.sensor != SPINNING_SENSOR) for group in groups.values()]
+    for uuid, annotated in objects.items():
+        sibling = _find_sibling(annotated.sibling, objects)
+        # Ids that point at an object of the same sensor are errors of annotation.
+        if sibling is not None and objects[sibling].sensor != annotated.sensor:
+            parent[find_root(sibling)] = find_root(uuid)
+    groups: dict[str, list[_AnnotatedObject]] = {}
+    for uuid, annotated in objects.items():
+        groups.setdefault(find_root(uuid), []).append(annotated)
+    # The sort is stable: among equals, the order of the files stays.
+    return [sorted(group, key=lambda member: member.sensor != SPINNING_SENSOR) for group in groups.values()]
 
 
-def _named(sibling: str, objects: dict[str, _Annotated]) -> str | None:
+def _find_sibling(sibling: str, objects: dict[str, _AnnotatedObject]) -> str | None:
+    """The uuid that a possibly truncated sibling id names, if it names exactly one."""
     if sibling in objects:
         return sibling
     if len(sibling) < _MIN_ID_PREFIX:
@@ -126,25 +160,32 @@ def _named(sibling: str, objects: dict[str, _Annotated]) -> str | None:
     return matches[0] if len(matches) == 1 else None
 
 
-def _track(group: list[_Annotated]) -> CuboidTrack | None:
+def _build_track(group: list[_AnnotatedObject]) -> CuboidTrack | None:
+    """The track of one object; ``None`` where all its boxes were left out."""
     boxes: dict[int, Float64] = {}
-    for seen in group:
-        for frame, box in seen.boxes.items():
+    # The 64-beam sensor comes first, so the other one only fills its gaps.
+    for annotated in group:
+        for frame, box in annotated.boxes.items():
             boxes.setdefault(frame, box)
     if not boxes:
         return None
     frames = np.array(sorted(boxes), dtype=np.int64)
     rows = np.stack([boxes[int(frame)] for frame in frames])
-    width, length, height = (float(v) for v in np.median(rows[:, 3:6], axis=0))
-    main = group[0]
+    # Annotators adjust a box from frame to frame; the object itself keeps its size.
+    width, length, height = (float(size) for size in np.median(rows[:, _SIZE], axis=0))
     return CuboidTrack(
-        main.uuid, main.label, frames, _box_poses(rows), (length, width, height), any(seen.moving for seen in group)
+        track_id=group[0].uuid,
+        label=group[0].label,
+        frames=frames,
+        world_SE3_box=_box_poses(rows),
+        size_m=(length, width, height),
+        moving=any(annotated.moving for annotated in group),
     )
 
 
 def _box_poses(rows: Float64) -> Float64:
-    """[F, 4, 4] from rows [F, 11] of ``_boxes``."""
+    """[F, 4, 4] world_SE3_box, axes x forward, y left, z up, from rows [F, 11] of ``_read_boxes``."""
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = rotations(rows[:, 7:]) @ PANDA_R_OURS
+    poses[:, :3, :3] = quats_to_matrices(rows[:, _QUATERNION]) @ PANDA_R_FLU
     poses[:, :3, 3] = rows[:, :3]
     return poses

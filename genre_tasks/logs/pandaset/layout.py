@@ -1,8 +1,12 @@
-"""The PandaSet layout on disk: names, axes and numbers, as the reader and the writer share them.
+"""The PandaSet layout on disk: names, axes, units and numbers, as the reader and the writer share them.
 
-Checked by overlay on a real sequence: images are undistorted; ``poses.json`` is sensor → world; LiDAR and box axes are
-x right, y forward, z up (ours: x forward, y left, z up); principal points count from the centre of the first pixel
-(ours: from its corner). The LiDAR pose's origin lies near the ground, about 1.8 m below the front camera.
+Where PandaSet differs from this project (see ``genre_tasks.logs.types``), checked by overlay on a real sequence:
+
+* ``poses.json`` holds world_SE3_sensor; quaternions are w, x, y, z in both.
+* LiDAR and box axes are x right, y forward, z up; here they are x forward, y left, z up ("FLU").
+* Principal points count from the centre of the first pixel; here from its corner, half a pixel further up and left.
+* Images are undistorted.
+* The origin of the LiDAR pose lies near the ground, about 1.8 m below the front camera.
 """
 
 from __future__ import annotations
@@ -18,75 +22,157 @@ from genre_tasks.logs.types import Float64
 
 RIG_ORDER = ("front_camera", "front_left_camera", "front_right_camera", "left_camera", "right_camera", "back_camera")
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
-SPINNING_SENSOR = 0  # column d, and cuboids.sensor_id: the 64-beam Pandar64; 1 is the forward PandarGT
-READOUT_S = 0.03  # rolling shutter of PandaSet's cameras, top to bottom row
+# Column d, and cuboids.sensor_id: the 64-beam Pandar64; 1 is the forward PandarGT.
+SPINNING_SENSOR = 0
+# Rolling shutter of PandaSet's cameras, top to bottom row.
+READOUT_S = 0.03
+# PandaSet's principal points count from the centre of the first pixel, which lies here.
 PIXEL_CENTRE = 0.5
+# Intensities are 0 to 255 in the files.
 INTENSITY_SCALE = 255.0
+# Extra cuboid columns of this project's writer, for boxes on a slope; PandaSet's own files have the yaw alone.
 BOX_HEADING = ("heading.w", "heading.x", "heading.y", "heading.z")
-"""Extra cuboid columns of this project's writer, for boxes on a slope; PandaSet's own files have the yaw alone."""
 
-# Takes coordinates in our axes (x forward, y left, z up) to PandaSet's (x right, y forward, z up).
-PANDA_R_OURS = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+# [3, 3] takes coordinates in x forward, y left, z up to PandaSet's x right, y forward, z up.
+PANDA_R_FLU = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+_POSE_REMEDY = "Correct the pose in that file, or leave its chunk out with --chunks."
+# Below that, rounding alone would decide where the sensor points.
+_MIN_QUATERNION_NORM = 1e-6
+
+# 1e11 s would be the year 5138, and 1e11 ms is 1973: no log's clock is in doubt.
+_UNITS_PER_SECOND = ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3))
 
 
 def frame_stem(frame: int) -> str:
-    """``00``, ``01``, … ``99``, ``100``."""
+    """Names the files of a frame.
+
+    Args:
+        frame: log frame.
+
+    Returns:
+        The file name without its suffix.
+
+    >>> frame_stem(3), frame_stem(100)
+    ('03', '100')
+    """
+    # PandaSet has 80 frames; a longer log of this writer goes on with three digits.
     return f"{frame:02d}"
 
 
-def seconds(timestamps: Float64) -> Float64:
-    """Unix times given in s, ms, µs or ns, as seconds in float64; the unit is told by the magnitude.
+def convert_to_seconds(timestamps: Float64) -> Float64:
+    """Converts Unix times given in s, ms, µs or ns; the magnitude says which.
 
-    1e11 s would be the year 5138, and 1e11 ms is 1973: no log's clock is in doubt. Relative times (small) are seconds.
+    Args:
+        timestamps: [N] times of one file; relative times, which are small, count as seconds.
+
+    Returns:
+        [N] seconds, float64.
+
+    >>> convert_to_seconds(np.array([1557539959250.0]))
+    array([1.55753996e+09])
     """
     times = np.asarray(timestamps, dtype=np.float64)
     finite = np.abs(times[np.isfinite(times)])
+    # One unit for the file: the first frames of a relative clock are small in any unit.
     largest = float(finite.max()) if finite.size else 0.0
-    for limit, per_second in ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3)):
+    for limit, units_per_second in _UNITS_PER_SECOND:
         if largest > limit:
-            return times / per_second
+            return times / units_per_second
     return times
 
 
 def read_json(path: Path, log: str) -> Any:
-    """The JSON value of a file. Raises ``InputError`` naming it if it is missing or malformed."""
+    """Reads a JSON file of a sequence.
+
+    Args:
+        path: the file.
+        log: URI of the log, for the error.
+
+    Returns:
+        The value.
+
+    Raises:
+        InputError: the file is missing or malformed.
+    """
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        raise InputError(
-            "the sequence lacks a file", remedy="Copy the whole sequence folder again.", file=path, log=log
-        ) from error
+        remedy = "Copy the whole sequence folder again."
+        raise InputError("the sequence lacks a file", remedy=remedy, file=path, log=log) from error
     except (OSError, ValueError) as error:
-        raise InputError(
-            f"the file is no readable JSON ({error})", remedy="Copy it again.", file=path, log=log
-        ) from error
+        problem = f"the file is no readable JSON ({error})"
+        raise InputError(problem, remedy="Copy it again.", file=path, log=log) from error
 
 
-def pose_matrix(pose: Any, *, file: Path, log: str, frame: int, camera: str | None = None) -> Float64:
-    """[4, 4] world_SE3_sensor of one entry of a ``poses.json``; the quaternion (w, x, y, z) is normalised.
+def parse_pose(pose: Any, *, file: Path, log: str, frame: int, camera: str | None = None) -> Float64:
+    """Converts one entry of a ``poses.json`` to a matrix.
+
+    Args:
+        pose: the entry: position x, y, z in metres and heading w, x, y, z, a quaternion of any non-zero length.
+        file: the file, for the error.
+        log: URI of the log, for the error.
+        frame: log frame, for the error.
+        camera: name of the camera, for the error; ``None`` for the LiDAR.
+
+    Returns:
+        [4, 4] world_SE3_sensor.
 
     Raises:
         InputError: keys are missing, a value is not finite, or the quaternion is zero.
     """
+    where: dict[str, Any] = {"file": file, "log": log, "frame": frame, "camera": camera}
     try:
-        position = np.array([float(pose["position"][k]) for k in "xyz"])
-        quaternion = np.array([float(pose["heading"][k]) for k in "wxyz"])
+        position = np.array([float(pose["position"][axis]) for axis in "xyz"])
+        quat = np.array([float(pose["heading"][axis]) for axis in "wxyz"])
     except (KeyError, TypeError, ValueError) as error:
         problem = f"the pose lacks position x, y, z or heading w, x, y, z ({error!r})"
-        raise InputError(problem, remedy=_POSE_REMEDY, file=file, log=log, frame=frame, camera=camera) from error
-    norm = float(np.linalg.norm(quaternion))
-    if not (np.isfinite(position).all() and np.isfinite(norm)) or norm < 1e-6:
+        raise InputError(problem, remedy=_POSE_REMEDY, **where) from error
+    # Normalised later on: files round to a few digits.
+    norm = float(np.linalg.norm(quat))
+    if not (np.isfinite(position).all() and np.isfinite(norm)) or norm < _MIN_QUATERNION_NORM:
         problem = "the pose is not finite, or its quaternion is zero"
-        raise InputError(problem, remedy=_POSE_REMEDY, file=file, log=log, frame=frame, camera=camera)
+        raise InputError(problem, remedy=_POSE_REMEDY, **where)
     matrix = np.eye(4)
-    matrix[:3, :3] = rotations(quaternion[None])[0]
+    matrix[:3, :3] = quats_to_matrices(quat[None])[0]
     matrix[:3, 3] = position
     return matrix
 
 
-def rotations(quaternions: Float64) -> Float64:
-    """[N, 3, 3] from quaternions [N, 4] (w, x, y, z) of any non-zero length."""
-    w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
+def format_pose(world_SE3_sensor: Float64) -> dict[str, dict[str, float]]:
+    """Converts a pose to an entry of a ``poses.json``; the inverse of ``parse_pose``.
+
+    Args:
+        world_SE3_sensor: [4, 4].
+
+    Returns:
+        Position x, y, z in metres and heading w, x, y, z.
+
+    >>> format_pose(np.eye(4))["heading"]
+    {'w': 1.0, 'x': 0.0, 'y': 0.0, 'z': 0.0}
+    """
+    quat = matrices_to_quats(world_SE3_sensor[None, :3, :3])[0]
+    position = world_SE3_sensor[:3, 3]
+    return {
+        "position": {axis: float(value) for axis, value in zip("xyz", position, strict=True)},
+        "heading": {axis: float(value) for axis, value in zip("wxyz", quat, strict=True)},
+    }
+
+
+def quats_to_matrices(quats: Float64) -> Float64:
+    """Converts quaternions to rotation matrices.
+
+    Args:
+        quats: [N, 4] w, x, y, z of any non-zero length.
+
+    Returns:
+        [N, 3, 3] float64.
+
+    >>> quats_to_matrices(np.array([[2.0, 0.0, 0.0, 2.0]])).round(9)[0, :, 0]
+    array([0., 1., 0.])
+    """
+    # Written out: SciPy rounds differently, and the poses of a log are part of every result.
+    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -96,36 +182,51 @@ def rotations(quaternions: Float64) -> Float64:
     return matrices
 
 
-_POSE_REMEDY = "Correct the pose in that file, or leave its chunk out with --chunks."
+def matrices_to_quats(rotations: Float64) -> Float64:
+    """Converts rotation matrices to unit quaternions.
 
+    Args:
+        rotations: [N, 3, 3].
 
-def pose_entry(world_SE3_sensor: Float64) -> dict[str, dict[str, float]]:
-    """The entry of a ``poses.json`` for a [4, 4] pose."""
-    heading = quaternions(world_SE3_sensor[None, :3, :3])[0]
-    position = world_SE3_sensor[:3, 3]
-    return {
-        "position": {axis: float(value) for axis, value in zip("xyz", position, strict=True)},
-        "heading": {axis: float(value) for axis, value in zip("wxyz", heading, strict=True)},
-    }
-
-
-def quaternions(rotation: Float64) -> Float64:
-    """[N, 4] unit quaternions (w, x, y, z) of rotations [N, 3, 3]."""
+    Returns:
+        [N, 4] w, x, y, z.
+    """
+    # Imported late: only the writer needs SciPy.
     from scipy.spatial.transform import Rotation
 
-    turned: Float64 = Rotation.from_matrix(rotation).as_quat()[:, [3, 0, 1, 2]]
-    return turned
+    # SciPy puts the scalar part last.
+    quats: Float64 = Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]]
+    return quats
 
 
-def to_our_axes(world_SE3_panda: Float64) -> Float64:
-    """The same pose, its own axes turned from PandaSet's to x forward, y left, z up."""
-    turned = world_SE3_panda.copy()
-    turned[:3, :3] = world_SE3_panda[:3, :3] @ PANDA_R_OURS
-    return turned
+def to_flu_axes(world_SE3_panda: Float64) -> Float64:
+    """Turns the axes of a LiDAR or box pose from PandaSet's to x forward, y left, z up; its position stays.
+
+    Args:
+        world_SE3_panda: [4, 4] pose whose axes are x right, y forward, z up.
+
+    Returns:
+        [4, 4] world_SE3_flu.
+
+    >>> to_flu_axes(np.eye(4))[:3, 0]
+    array([0., 1., 0.])
+    """
+    return _turn_axes(world_SE3_panda, PANDA_R_FLU)
 
 
-def to_panda_axes(world_SE3_ours: Float64) -> Float64:
-    """The inverse of ``to_our_axes``."""
-    turned = world_SE3_ours.copy()
-    turned[:3, :3] = world_SE3_ours[:3, :3] @ PANDA_R_OURS.T
-    return turned
+def to_panda_axes(world_SE3_flu: Float64) -> Float64:
+    """Turns the axes of a pose from x forward, y left, z up to PandaSet's; the inverse of ``to_flu_axes``.
+
+    Args:
+        world_SE3_flu: [4, 4] pose whose axes are x forward, y left, z up.
+
+    Returns:
+        [4, 4] world_SE3_panda.
+    """
+    return _turn_axes(world_SE3_flu, PANDA_R_FLU.T)
+
+
+def _turn_axes(world_SE3_a: Float64, a_R_b: Float64) -> Float64:
+    world_SE3_b = world_SE3_a.copy()
+    world_SE3_b[:3, :3] = world_SE3_a[:3, :3] @ a_R_b
+    return world_SE3_b

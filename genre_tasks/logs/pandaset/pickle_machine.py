@@ -16,7 +16,11 @@ from typing import Any
 
 
 class PickleRefusedError(Exception):
-    """The pickle asks for something that is not allowed: ``asked_for`` names it."""
+    """The pickle asks for something that is not allowed.
+
+    Attributes:
+        asked_for: names it.
+    """
 
     def __init__(self, asked_for: str) -> None:
         super().__init__(f"refused: {asked_for}")
@@ -29,83 +33,99 @@ class PickleBrokenError(Exception):
 
 @dataclass(frozen=True)
 class Global:
-    """A global of the allow-list, by its name there; never an object of Python."""
+    """A global of the allow-list; never an object of Python.
+
+    Attributes:
+        name: the name that the allow-list gives it.
+    """
 
     name: str
 
 
 @dataclass(eq=False)
 class Call:
-    """The note "``function(*args)`` was asked for", with the state that BUILD handed over afterwards (at most once)."""
+    """A note that the pickle asked for ``function(*args)``.
+
+    Attributes:
+        function: the function's name on the allow-list.
+        args: its arguments, values and notes.
+        state: what the opcode BUILD set afterwards, at most once; ``None`` before.
+    """
 
     function: str
     args: tuple[Any, ...]
     state: Any = None
 
 
+# An object of its own, which no pickle can push as a value.
 _MARK = object()
-_LITERALS: Mapping[str, object] = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
-_ARGUMENT_IS_VALUE = frozenset(
+_CONSTANTS: Mapping[str, object] = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
+# Opcodes whose argument is the value that they push.
+_VALUE_OPCODES = frozenset(
     {"BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT", "SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8"}
     | {"SHORT_BINBYTES", "BINBYTES", "BINBYTES8", "BYTEARRAY8"}
 )
-_SHORT_TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
+
+_TUPLE_LENGTHS = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 
 
-class _Machine:
-    """The stack, the memo, and one method per kind of opcode."""
+class _StackMachine:
+    """The stack and the memo of an unpickler, and one method per kind of opcode."""
 
     def __init__(self, allowed: Mapping[tuple[str, str], str]) -> None:
         self.allowed = allowed
         self.stack: list[object] = []
         self.memo: dict[int, object] = {}
-        self.steps: dict[str, Callable[[object], None]] = {
+        self.handlers: dict[str, Callable[[object], None]] = {
+            # Protocol and framing only help a reader of streams.
             "PROTO": lambda _: None,
             "FRAME": lambda _: None,
             "MARK": lambda _: self.stack.append(_MARK),
-            "POP": lambda _: self._drop(),
+            "POP": lambda _: self._discard(),
             "EMPTY_LIST": lambda _: self.stack.append([]),
             "EMPTY_DICT": lambda _: self.stack.append({}),
-            "TUPLE": lambda _: self.stack.append(tuple(self._since_mark())),
-            "APPEND": lambda _: self._extend([self.pop()]),
-            "APPENDS": lambda _: self._extend(self._since_mark()),
-            "SETITEM": lambda _: self._update([self.pop(), self.pop()][::-1]),
-            "SETITEMS": lambda _: self._update(self._since_mark()),
-            "MEMOIZE": lambda _: self._put(len(self.memo)),
-            "BINPUT": self._put,
-            "LONG_BINPUT": self._put,
-            "BINGET": self._get,
-            "LONG_BINGET": self._get,
-            "GLOBAL": lambda arg: self._global(*str(arg).split(" ", 1)),
-            "STACK_GLOBAL": lambda _: self._global(*[self.pop(), self.pop()][::-1]),
-            "REDUCE": lambda _: self._call(),
-            "NEWOBJ": lambda _: self._call(),
-            "BUILD": lambda _: self._build(),
+            "TUPLE": lambda _: self.stack.append(tuple(self._pop_to_mark())),
+            "APPEND": lambda _: self._extend_list([self.pop()]),
+            "APPENDS": lambda _: self._extend_list(self._pop_to_mark()),
+            "SETITEM": lambda _: self._update_dict(self._pop_many(2)),
+            "SETITEMS": lambda _: self._update_dict(self._pop_to_mark()),
+            "MEMOIZE": lambda _: self._memorise(len(self.memo)),
+            "BINPUT": self._memorise,
+            "LONG_BINPUT": self._memorise,
+            "BINGET": self._recall,
+            "LONG_BINGET": self._recall,
+            "GLOBAL": lambda argument: self._push_global(*str(argument).split(" ", 1)),
+            "STACK_GLOBAL": lambda _: self._push_global(*self._pop_many(2)),
+            "REDUCE": lambda _: self._push_call(),
+            "NEWOBJ": lambda _: self._push_call(),
+            "BUILD": lambda _: self._set_state(),
         }
 
+    def execute(self, opcode: str, argument: object) -> None:
+        """Carries out one opcode, named as in ``pickletools``."""
+        if opcode in _CONSTANTS:
+            self.stack.append(_CONSTANTS[opcode])
+        elif opcode in _VALUE_OPCODES:
+            self.stack.append(argument)
+        elif opcode in _TUPLE_LENGTHS:
+            self.stack.append(tuple(self._pop_many(_TUPLE_LENGTHS[opcode])))
+        elif opcode in self.handlers:
+            self.handlers[opcode](argument)
+        else:
+            raise PickleRefusedError(f"opcode {opcode}")
+
     def pop(self) -> object:
+        """Takes the topmost value from the stack; a mark is no value."""
         if not self.stack or self.stack[-1] is _MARK:
             raise PickleBrokenError("the pickle takes more from its stack than it put there")
         return self.stack.pop()
 
-    def step(self, opcode: str, argument: object) -> None:
-        if opcode in _LITERALS:
-            self.stack.append(_LITERALS[opcode])
-        elif opcode in _ARGUMENT_IS_VALUE:
-            self.stack.append(argument)
-        elif opcode in _SHORT_TUPLES:
-            self.stack.append(tuple([self.pop() for _ in range(_SHORT_TUPLES[opcode])][::-1]))
-        elif opcode in self.steps:
-            self.steps[opcode](argument)
-        else:
-            raise PickleRefusedError(f"opcode {opcode}")
+    def _pop_many(self, count: int) -> list[object]:
+        """The topmost values, in the order in which they were pushed."""
+        return [self.pop() for _ in range(count)][::-1]
 
-    def _drop(self) -> None:
-        if not self.stack:
-            raise PickleBrokenError("the pickle takes more from its stack than it put there")
-        self.stack.pop()
-
-    def _since_mark(self) -> list[object]:
+    def _pop_to_mark(self) -> list[object]:
+        # From the top down, since marks nest.
         for start in range(len(self.stack) - 1, -1, -1):
             if self.stack[start] is _MARK:
                 values = self.stack[start + 1 :]
@@ -113,67 +133,87 @@ class _Machine:
                 return values
         raise PickleBrokenError("the pickle closes a list that it did not open")
 
-    def _extend(self, values: list[object]) -> None:
+    def _discard(self) -> None:
+        if not self.stack:
+            raise PickleBrokenError("the pickle takes more from its stack than it put there")
+        self.stack.pop()
+
+    def _extend_list(self, values: list[object]) -> None:
         target = self.stack[-1] if self.stack else None
         if not isinstance(target, list):
             raise PickleRefusedError("appending to something that is not a list")
         target.extend(values)
 
-    def _update(self, pairs: list[object]) -> None:
+    def _update_dict(self, pairs: list[object]) -> None:
         target = self.stack[-1] if self.stack else None
         # Keys are strings only: hashing a deeply nested tuple overflows the interpreter's own stack.
         if not isinstance(target, dict) or len(pairs) % 2 or not all(type(key) is str for key in pairs[::2]):
             raise PickleRefusedError("a dictionary whose keys are not strings")
         target.update(zip(pairs[::2], pairs[1::2], strict=True))
 
-    def _put(self, index: object) -> None:
+    def _memorise(self, index: object) -> None:
         if not self.stack or self.stack[-1] is _MARK or not isinstance(index, int):
             raise PickleBrokenError("the pickle memorises nothing")
         self.memo[index] = self.stack[-1]
 
-    def _get(self, index: object) -> None:
+    def _recall(self, index: object) -> None:
         if index not in self.memo:
             raise PickleBrokenError("the pickle recalls what it did not memorise")
         self.stack.append(self.memo[index])  # type: ignore[index]
 
-    def _global(self, *names: object) -> None:
+    def _push_global(self, *names: object) -> None:
         if len(names) != 2 or not all(type(name) is str for name in names):
             raise PickleRefusedError("a global whose name is not text")
-        module, name = str(names[0]), str(names[1])
-        if (module, name) not in self.allowed:
-            raise PickleRefusedError(f"{module}.{name}")
-        self.stack.append(Global(self.allowed[module, name]))
+        key = (str(names[0]), str(names[1]))
+        # Looked up as an exact pair and never imported: a dotted name cannot reach into an allowed module.
+        if key not in self.allowed:
+            raise PickleRefusedError(".".join(key))
+        self.stack.append(Global(self.allowed[key]))
 
-    def _call(self) -> None:
-        args, function = self.pop(), self.pop()
+    def _push_call(self) -> None:
+        function, args = self._pop_many(2)
+        # What a call returned is no function: ``getattr(os, "system")(…)`` ends here.
         if not isinstance(function, Global) or not isinstance(args, tuple):
             raise PickleRefusedError("a call of something that is not a global")
         self.stack.append(Call(function.name, args))
 
-    def _build(self) -> None:
-        state, target = self.pop(), self.stack[-1] if self.stack else None
+    def _set_state(self) -> None:
+        state = self.pop()
+        target = self.stack[-1] if self.stack else None
+        # At most once, or a pickle could replace a state after its parts were checked.
         if not isinstance(target, Call) or target.state is not None:
             raise PickleRefusedError("a change of something that the pickle did not make")
         target.state = state
 
 
 def read_pickle_tree(data: bytes, allowed: Mapping[tuple[str, str], str]) -> object:
-    """The value that a pickle describes, with ``Call`` nodes where it asks for a global.
+    """Reads the value that a pickle describes, with ``Call`` nodes where it asks for a global.
 
     Args:
         data: the pickle, protocol 2 to 5; nothing is allocated beyond what its bytes hold.
         allowed: (module, name) → the name that ``Call.function`` and ``Global.name`` carry.
 
+    Returns:
+        The value.
+
     Raises:
-        PickleRefusedError: it asks for a global, or uses an opcode, that is not allowed.
-        PickleBrokenError: truncated or malformed.
+        PickleRefusedError: the pickle asks for a global, or uses an opcode, that is not allowed.
+        PickleBrokenError: truncated or malformed bytes.
+
+    >>> import pickle
+    >>> read_pickle_tree(pickle.dumps({"x": [1.0, "a"]}), {})
+    {'x': [1.0, 'a']}
+    >>> read_pickle_tree(pickle.dumps(print), {})
+    Traceback (most recent call last):
+    ...
+    genre_tasks.logs.pandaset.pickle_machine.PickleRefusedError: refused: builtins.print
     """
-    machine = _Machine(allowed)
+    machine = _StackMachine(allowed)
     try:
         for opcode, argument, _ in pickletools.genops(data):
             if opcode.name == "STOP":
                 return machine.pop()
-            machine.step(opcode.name, argument)
+            machine.execute(opcode.name, argument)
     except (ValueError, IndexError, OverflowError) as error:
         # What pickletools raises on truncated or malformed bytes (UnicodeDecodeError and struct.error's cousins).
         raise PickleBrokenError(str(error)) from error

@@ -1,8 +1,8 @@
 """Reads a pickled pandas DataFrame of numbers and strings, without pandas and without running the pickle.
 
-The allow-list below is what pandas 0.25 to 3 writes for such a frame (block manager, index, numpy arrays, Arrow string
-columns) and nothing else; see ``pickle_machine`` for how the pickle is read. Sizes are bounded by the bytes that are
-really there: a declared shape allocates nothing.
+The allow-list ``ALLOWED`` is what pandas 0.25 to 3 writes for such a table (block manager, index, numpy arrays, Arrow
+string columns) and nothing else; see ``pickle_machine`` for how the pickle is read. Sizes are bounded by the bytes that
+are really there: a declared shape allocates nothing.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from genre_tasks.errors import InputError
-from genre_tasks.logs.pandaset.pickle_arrays import call, need, values
+from genre_tasks.logs.pandaset.pickle_arrays import expect_call, read_array, require
 from genre_tasks.logs.pandaset.pickle_machine import (
     Call,
     Global,
@@ -29,17 +29,26 @@ from genre_tasks.logs.pandaset.pickle_machine import (
 # A PandaSet sweep is 8 MB unpacked; a file that unpacks to more than this is no sweep (a "gzip bomb").
 MAX_UNPACKED_BYTES = 512 * 2**20
 
+_COPY_AGAIN = "Copy or download it again; or remove it: a missing sweep is survived."
+_DO_NOT_OPEN = (
+    "Do not open it by other means before you know where it comes from: a pickle can run code. Get the file from its "
+    "publisher, or write it with pandas.DataFrame.to_pickle from numbers and strings only."
+)
+
 ALLOWED: Mapping[tuple[str, str], str] = {
+    # Frames and blocks. Names without a module path are those of pandas 3.
     ("pandas.core.frame", "DataFrame"): "DataFrame",
     ("pandas", "DataFrame"): "DataFrame",
     ("pandas.core.internals.managers", "BlockManager"): "BlockManager",
     ("pandas._libs.internals", "_unpickle_block"): "block",
+    # Labels of rows and columns; whole numbers have had a class of their own up to pandas 1.5.
     ("pandas.core.indexes.base", "_new_Index"): "new_index",
     ("pandas.core.indexes.base", "Index"): "Index",
     ("pandas", "Index"): "Index",
     ("pandas.core.indexes.numeric", "Int64Index"): "Index",
     ("pandas.core.indexes.range", "RangeIndex"): "RangeIndex",
     ("pandas", "RangeIndex"): "RangeIndex",
+    # Text, as Arrow buffers or as Python objects.
     ("pandas.arrays", "ArrowStringArray"): "ArrowStringArray",
     ("pandas.core.arrays.string_arrow", "ArrowStringArray"): "ArrowStringArray",
     ("pandas.core.arrays.string_arrow", "ArrowStringArrayNumpySemantics"): "ArrowStringArray",
@@ -53,6 +62,7 @@ ALLOWED: Mapping[tuple[str, str], str] = {
     ("pyarrow.lib", "_restore_array"): "arrow_array",
     ("pyarrow.lib", "type_for_alias"): "arrow_type",
     ("pyarrow.lib", "py_buffer"): "py_buffer",
+    # Arrays; numpy 2 moved the functions that make them to ``numpy._core``.
     ("numpy", "ndarray"): "ndarray",
     ("numpy", "dtype"): "dtype",
     ("numpy.core.multiarray", "_reconstruct"): "reconstruct",
@@ -61,6 +71,7 @@ ALLOWED: Mapping[tuple[str, str], str] = {
     ("numpy._core.multiarray", "scalar"): "scalar",
     ("numpy.core.numeric", "_frombuffer"): "frombuffer",
     ("numpy._core.numeric", "_frombuffer"): "frombuffer",
+    # Python. Protocol 2 calls the module ``__builtin__``, and writes bytes as encoded text.
     ("builtins", "slice"): "slice",
     ("builtins", "bytearray"): "bytearray",
     ("__builtin__", "slice"): "slice",
@@ -71,22 +82,28 @@ ALLOWED: Mapping[tuple[str, str], str] = {
 
 
 @dataclass(frozen=True)
-class Frame:
-    """The columns of a frame, in order: numbers with their own dtype, strings (and mixed cells) as object arrays.
+class Table:
+    """A table of numbers and strings.
 
-    Every column is one-dimensional of length ``row_count``. Missing strings are ``None`` or NaN, as they were written.
+    Attributes:
+        columns: name → [``row_count``], in order: numbers with their own dtype, strings (and mixed columns) as object
+            arrays. Missing strings are ``None`` or NaN, as they were written.
+        row_count: how many rows every column has.
     """
 
     columns: Mapping[str, NDArray[Any]]
     row_count: int
 
 
-def read_frame(path: Path, **where: Any) -> Frame:
+def read_table(path: Path, **where: Any) -> Table:
     """Reads a ``.pkl`` or ``.pkl.gz`` of one pandas DataFrame.
 
     Args:
         path: the file; gzip is recognised by its first bytes.
         where: ``log``, ``frame``, … of the error, should there be one.
+
+    Returns:
+        The table.
 
     Raises:
         InputError: no such file; truncated or corrupt; a pickle that asks for anything else.
@@ -94,111 +111,124 @@ def read_frame(path: Path, **where: Any) -> Frame:
     try:
         data = _unpack(path)
     except (OSError, EOFError, zlib.error) as error:
-        raise InputError(
-            f"the file cannot be unpacked ({error})",
-            remedy="Copy or download it again; or remove it: a missing sweep is survived.",
-            file=path,
-            **where,
-        ) from error
+        problem = f"the file cannot be unpacked ({error})"
+        raise InputError(problem, remedy=_COPY_AGAIN, file=path, **where) from error
     try:
-        return parse_frame(data)
+        return parse_table(data)
     except PickleRefusedError as error:
-        raise InputError(
-            f"the pickle was refused: it asks for what no table of numbers and strings needs, {error.asked_for}",
-            remedy="Do not open it by other means before you know where it comes from: a pickle can run code. Get the "
-            "file from its publisher, or write it with pandas.DataFrame.to_pickle from numbers and strings only.",
-            file=path,
-            **where,
-        ) from error
+        problem = f"the pickle was refused: it asks for what no table of numbers and strings needs, {error.asked_for}"
+        raise InputError(problem, remedy=_DO_NOT_OPEN, file=path, **where) from error
     except PickleBrokenError as error:
-        raise InputError(
-            f"the file holds no readable pickle of a pandas DataFrame ({error})",
-            remedy="Copy or download it again; or remove it: a missing sweep is survived.",
-            file=path,
-            **where,
-        ) from error
+        problem = f"the file holds no readable pickle of a pandas DataFrame ({error})"
+        raise InputError(problem, remedy=_COPY_AGAIN, file=path, **where) from error
 
 
-def parse_frame(data: bytes) -> Frame:
-    """The frame in a pickle's bytes. Raises ``PickleRefusedError`` or ``PickleBrokenError``."""
+def parse_table(data: bytes) -> Table:
+    """Reads the table in a pickle's bytes.
+
+    Args:
+        data: the pickle of a pandas DataFrame, unpacked.
+
+    Returns:
+        The table; its arrays are views of ``data`` where they can be.
+
+    Raises:
+        PickleRefusedError: the pickle asks for something that no table of numbers and strings needs.
+        PickleBrokenError: it is malformed, or no DataFrame.
+
+    >>> import numpy as np
+    >>> from genre_tasks.logs.pandaset.pickle_writer import pickle_table
+    >>> parse_table(pickle_table({"x": np.array([1.0, 2.0])}))
+    Table(columns={'x': array([1., 2.])}, row_count=2)
+    """
     tree = read_pickle_tree(data, ALLOWED)
     try:
-        return _frame(tree)
+        return _read_dataframe(tree)
     except (ValueError, TypeError, LookupError, OverflowError, AttributeError, RecursionError) as error:
+        # A tree of the wrong shape shows as any of these; the caller only needs to know that it is no table.
         raise PickleBrokenError(f"{type(error).__name__}: {error}") from error
 
 
 def _unpack(path: Path) -> bytes:
     with path.open("rb") as raw:
-        packed = raw.read(2) == b"\x1f\x8b"
+        is_gzip = raw.read(2) == b"\x1f\x8b"
         raw.seek(0)
-        data = (gzip.GzipFile(fileobj=raw) if packed else raw).read(MAX_UNPACKED_BYTES + 1)
+        # One byte beyond the limit tells a file that is too large without unpacking all of it.
+        data = (gzip.GzipFile(fileobj=raw) if is_gzip else raw).read(MAX_UNPACKED_BYTES + 1)
     if len(data) > MAX_UNPACKED_BYTES:
         raise EOFError(f"more than {MAX_UNPACKED_BYTES >> 20} MiB unpacked")
     return data
 
 
-def _frame(tree: Any) -> Frame:
-    state = call(tree, "DataFrame").state
-    need(isinstance(state, dict), "a frame's state")
-    blocks, axes = _manager(state.get("_mgr", state.get("_data")))
-    need(isinstance(axes, list) and len(axes) == 2, "two axes")
-    names = _labels(axes[0])
-    row_count = _index_length(axes[1])
+def _read_dataframe(tree: Any) -> Table:
+    state = expect_call(tree, "DataFrame").state
+    require(isinstance(state, dict), "a frame's state")
+    blocks, axes = _read_block_manager(state.get("_mgr", state.get("_data")))
+    require(isinstance(axes, list) and len(axes) == 2, "two axes")
+    names = _read_column_names(axes[0])
+    row_count = _read_row_count(axes[1])
     columns: list[NDArray[Any] | None] = [None] * len(names)
     for block, places in blocks:
-        array = values(block)
+        array = read_array(block)
+        # A block of a single column may come as a vector.
         array = array.reshape(1, -1) if array.ndim == 1 else array
-        at = _places(places, len(names))
-        need(array.shape == (len(at), row_count), f"a block of {len(at)} columns and {row_count} rows")
-        for row, column in enumerate(at):
-            need(columns[column] is None, "each column once")
-            columns[column] = array[row]
-    need(all(column is not None for column in columns), "a block for every column")
-    need(len(set(names)) == len(names), "columns of different names")
-    return Frame({name: column for name, column in zip(names, columns, strict=True) if column is not None}, row_count)
+        indices = _read_column_indices(places, len(names))
+        require(array.shape == (len(indices), row_count), f"a block of {len(indices)} columns and {row_count} rows")
+        for row, index in enumerate(indices):
+            # Blocks that overlap, or leave a column out, would give a table of other values than pandas.
+            require(columns[index] is None, "each column once")
+            columns[index] = array[row]
+    require(all(column is not None for column in columns), "a block for every column")
+    require(len(set(names)) == len(names), "columns of different names")
+    return Table({name: column for name, column in zip(names, columns, strict=True) if column is not None}, row_count)
 
 
-def _manager(node: Any) -> tuple[list[tuple[Any, Any]], Any]:
-    """(values, places) of every block, and the axes: pandas ≥ 1.3 passes them, before that they are the state."""
-    manager = call(node, "BlockManager")
+def _read_block_manager(node: Any) -> tuple[list[tuple[Any, Any]], Any]:
+    """(values, column indices) of every block, and the axes.
+
+    pandas 1.3 and later pass them as arguments; before that, they are the state.
+    """
+    manager = expect_call(node, "BlockManager")
     if manager.state is None:
         blocks, axes = manager.args
-        return [call(block, "block").args[:2] for block in blocks], axes
+        return [expect_call(block, "block").args[:2] for block in blocks], axes
     state = manager.state[3]["0.14.1"]
     return [(block["values"], block["mgr_locs"]) for block in state["blocks"]], state["axes"]
 
 
-def _places(node: Any, count: int) -> list[int]:
+def _read_column_indices(node: Any, count: int) -> list[int]:
+    """Which of ``count`` columns a block holds: a slice or an array of numbers."""
     if isinstance(node, Call) and node.function == "slice":
-        return list(range(count))[slice(*_integers(node.args))]
-    at = values(node)
-    need(at.ndim == 1 and at.dtype.kind in "iu" and bool(((at >= 0) & (at < count)).all()), "column numbers")
-    return [int(column) for column in at]
+        return list(range(count))[slice(*_require_integers(node.args))]
+    indices = read_array(node)
+    in_range = indices.ndim == 1 and indices.dtype.kind in "iu" and bool(((indices >= 0) & (indices < count)).all())
+    require(in_range, "column numbers")
+    return [int(index) for index in indices]
 
 
-def _integers(values: tuple[Any, ...]) -> tuple[Any, ...]:
-    need(all(v is None or type(v) is int for v in values), "whole numbers")
+def _require_integers(values: tuple[Any, ...]) -> tuple[Any, ...]:
+    require(all(value is None or type(value) is int for value in values), "whole numbers")
     return values
 
 
-def _index(node: Any) -> tuple[str, dict[str, Any]]:
-    kind, state = call(node, "new_index").args
-    need(isinstance(kind, Global) and isinstance(state, dict), "an index")
+def _read_index(node: Any) -> tuple[str, dict[str, Any]]:
+    """Class and state of a pandas index."""
+    kind, state = expect_call(node, "new_index").args
+    require(isinstance(kind, Global) and isinstance(state, dict), "an index")
     return kind.name, state
 
 
-def _labels(node: Any) -> list[str]:
-    kind, state = _index(node)
-    need(kind == "Index", "named columns")
-    names = list(values(state["data"]))
-    need(all(type(name) is str for name in names), "columns named by text")
+def _read_column_names(node: Any) -> list[str]:
+    kind, state = _read_index(node)
+    require(kind == "Index", "named columns")
+    names = list(read_array(state["data"]))
+    require(all(type(name) is str for name in names), "columns named by text")
     return names
 
 
-def _index_length(node: Any) -> int:
-    kind, state = _index(node)
+def _read_row_count(node: Any) -> int:
+    kind, state = _read_index(node)
     if kind == "RangeIndex":
-        start, stop, step = _integers((state["start"], state["stop"], state["step"]))
+        start, stop, step = _require_integers((state["start"], state["stop"], state["step"]))
         return len(range(start, stop, step))
-    return len(values(state["data"]))
+    return len(read_array(state["data"]))

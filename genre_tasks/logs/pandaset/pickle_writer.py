@@ -6,6 +6,7 @@ The same structure as PandaSet's own files (protocol 3, a block manager with sta
 
 from __future__ import annotations
 
+import pickle
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,95 +15,121 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+# The oldest protocol that has bytes, so that old versions of pandas read it too.
+_PROTOCOL = b"\x03"
+# Numpy's flags of an object dtype, as its own pickles state them.
+_NUMPY_OBJECT_FLAGS = 63
+_TYPE_CODES = {"float64": "f8", "int64": "i8", "bool": "b1", "object": "O8"}
+
 
 @dataclass(frozen=True)
-class _Name:
-    """A global: module and name."""
+class _GlobalName:
+    """A class or function that the pickle asks for."""
 
     module: str
     name: str
 
 
 @dataclass(frozen=True)
-class _Made:
-    """``function(*args)``, with a state if there is one; ``new`` for ``cls.__new__``."""
+class _CallNode:
+    """What makes the unpickler call ``function(*args)`` and then set the state, if there is one."""
 
-    function: _Name
+    function: _GlobalName
     args: tuple[Any, ...]
     state: Any = None
-    new: bool = False
 
 
-_INDEX = _Name("pandas.core.indexes.base", "Index")
-_RANGE_INDEX = _Name("pandas.core.indexes.range", "RangeIndex")
-_NEW_INDEX = _Name("pandas.core.indexes.base", "_new_Index")
-_RECONSTRUCT = _Name("numpy.core.multiarray", "_reconstruct")
-_NDARRAY = _Name("numpy", "ndarray")
-_DTYPE = _Name("numpy", "dtype")
+@dataclass(frozen=True)
+class _NewNode(_CallNode):
+    """The same, by ``function.__new__``."""
 
 
-def pickle_frame(columns: Mapping[str, NDArray[Any]]) -> bytes:
-    """The pickle of a DataFrame with these columns and rows numbered from 0.
+_INDEX = _GlobalName("pandas.core.indexes.base", "Index")
+_RANGE_INDEX = _GlobalName("pandas.core.indexes.range", "RangeIndex")
+_NEW_INDEX = _GlobalName("pandas.core.indexes.base", "_new_Index")
+_BLOCK_MANAGER = _GlobalName("pandas.core.internals.managers", "BlockManager")
+_DATA_FRAME = _GlobalName("pandas.core.frame", "DataFrame")
+_RECONSTRUCT = _GlobalName("numpy.core.multiarray", "_reconstruct")
+_NDARRAY = _GlobalName("numpy", "ndarray")
+_DTYPE = _GlobalName("numpy", "dtype")
+
+
+def pickle_table(columns: Mapping[str, NDArray[Any]]) -> bytes:
+    """Pickles a DataFrame with these columns and rows numbered from 0.
 
     Args:
         columns: name → [N] of float64, int64, bool, or object (str, float, None), all of one length; at least one.
 
+    Returns:
+        The pickle, protocol 3.
+
     Raises:
         ValueError: no columns, columns of different lengths, or a dtype that is none of these.
+
+    >>> from genre_tasks.logs.pandaset.pickle_reader import parse_table
+    >>> parse_table(pickle_table({"label": np.array(["Car", None], dtype=object)})).columns["label"]
+    array(['Car', None], dtype=object)
     """
     lengths = {len(values) for values in columns.values()}
     if len(lengths) != 1 or any(values.ndim != 1 for values in columns.values()):
         raise ValueError(f"expected columns of one length, got lengths {sorted(lengths)}")
     blocks = []
+    # One block a dtype, in the order in which they first appear: the bytes follow from the table alone.
     for dtype in dict.fromkeys(values.dtype for values in columns.values()):
-        places = [at for at, values in enumerate(columns.values()) if values.dtype == dtype]
+        indices = [index for index, values in enumerate(columns.values()) if values.dtype == dtype]
         block = np.stack([values for values in columns.values() if values.dtype == dtype])
-        blocks.append({"values": _array(block), "mgr_locs": _array(np.array(places, dtype=np.int64))})
-    names = _Made(_NEW_INDEX, (_INDEX, {"data": _array(np.array(list(columns), dtype=object)), "name": None}))
-    extent = {"name": None, "start": 0, "stop": lengths.pop(), "step": 1}
-    axes = [names, _Made(_NEW_INDEX, (_RANGE_INDEX, extent))]
+        blocks.append({"values": _array_node(block), "mgr_locs": _array_node(np.array(indices, dtype=np.int64))})
+    names = np.array(list(columns), dtype=object)
+    column_index = _CallNode(_NEW_INDEX, (_INDEX, {"data": _array_node(names), "name": None}))
+    row_range = {"name": None, "start": 0, "stop": lengths.pop(), "step": 1}
+    axes = [column_index, _CallNode(_NEW_INDEX, (_RANGE_INDEX, row_range))]
     # The first three entries are what pandas before 0.14.1 read; nothing reads them any more.
     state: tuple[Any, ...] = ([], [], [], {"0.14.1": {"axes": axes, "blocks": blocks}})
-    manager = _Made(_Name("pandas.core.internals.managers", "BlockManager"), (), state, new=True)
-    frame = {"_data": manager, "_typ": "dataframe", "_metadata": []}
-    return b"\x80\x03" + _emit(_Made(_Name("pandas.core.frame", "DataFrame"), (), frame, new=True)) + b"."
+    manager = _NewNode(_BLOCK_MANAGER, (), state)
+    frame = _NewNode(_DATA_FRAME, (), {"_data": manager, "_typ": "dataframe", "_metadata": []})
+    return pickle.PROTO + _PROTOCOL + _emit(frame) + pickle.STOP
 
 
-def _array(values: NDArray[Any]) -> _Made:
-    code = {"float64": "f8", "int64": "i8", "bool": "b1", "object": "O8"}.get(str(values.dtype))
+def _array_node(values: NDArray[Any]) -> _CallNode:
+    """The call that makes an array, as numpy writes it."""
+    code = _TYPE_CODES.get(str(values.dtype))
     if code is None:
         raise ValueError(f"expected float64, int64, bool or object, got {values.dtype}")
-    swapped = "|" if code in ("b1", "O8") else "<"
-    flags = 63 if code == "O8" else 0  # numpy's item flags of objects
-    dtype = _Made(_DTYPE, (code, False, True), (3, swapped, None, None, None, -1, -1, flags))
-    data = values.ravel().tolist() if code == "O8" else values.astype(f"{swapped}{code}").tobytes()
-    return _Made(_RECONSTRUCT, (_NDARRAY, (0,), b"b"), (1, values.shape, dtype, False, data))
+    is_object = code == "O8"
+    byte_order = "|" if code in ("b1", "O8") else "<"
+    flags = _NUMPY_OBJECT_FLAGS if is_object else 0
+    dtype = _CallNode(_DTYPE, (code, False, True), (3, byte_order, None, None, None, -1, -1, flags))
+    data = values.ravel().tolist() if is_object else values.astype(f"{byte_order}{code}").tobytes()
+    return _CallNode(_RECONSTRUCT, (_NDARRAY, (0,), b"b"), (1, values.shape, dtype, False, data))
 
 
 def _emit(value: Any) -> bytes:
-    """The opcodes that put a value on the unpickler's stack (see ``pickletools`` for their names)."""
+    """The opcodes that put a value on the unpickler's stack; ``pickle``'s constants are their bytes."""
     if value is None:
-        return b"N"
+        return pickle.NONE
+    # Before the integers, since a bool is one.
     if value is True or value is False:
-        return b"\x88" if value else b"\x89"
+        return pickle.NEWTRUE if value else pickle.NEWFALSE
     if isinstance(value, int):
-        return b"J" + struct.pack("<i", value)
+        return pickle.BININT + struct.pack("<i", value)
     if isinstance(value, float):
-        return b"G" + struct.pack(">d", value)
+        return pickle.BINFLOAT + struct.pack(">d", value)
     if isinstance(value, str):
         data = value.encode()
-        return b"X" + struct.pack("<I", len(data)) + data
+        return pickle.BINUNICODE + struct.pack("<I", len(data)) + data
     if isinstance(value, bytes):
-        return b"B" + struct.pack("<I", len(value)) + value
+        return pickle.BINBYTES + struct.pack("<I", len(value)) + value
     if isinstance(value, tuple):
-        return b"(" + b"".join(map(_emit, value)) + b"t"
+        return pickle.MARK + b"".join(map(_emit, value)) + pickle.TUPLE
     if isinstance(value, list):
-        return b"](" + b"".join(map(_emit, value)) + b"e"
+        return pickle.EMPTY_LIST + pickle.MARK + b"".join(map(_emit, value)) + pickle.APPENDS
     if isinstance(value, dict):
-        return b"}(" + b"".join(_emit(key) + _emit(item) for key, item in value.items()) + b"u"
-    if isinstance(value, _Name):
-        return f"c{value.module}\n{value.name}\n".encode()
-    if isinstance(value, _Made):
-        made = _emit(value.function) + _emit(value.args) + (b"\x81" if value.new else b"R")
-        return made if value.state is None else made + _emit(value.state) + b"b"
+        items = b"".join(_emit(key) + _emit(item) for key, item in value.items())
+        return pickle.EMPTY_DICT + pickle.MARK + items + pickle.SETITEMS
+    if isinstance(value, _GlobalName):
+        return pickle.GLOBAL + f"{value.module}\n{value.name}\n".encode()
+    if isinstance(value, _CallNode):
+        opcode = pickle.NEWOBJ if isinstance(value, _NewNode) else pickle.REDUCE
+        call = _emit(value.function) + _emit(value.args) + opcode
+        return call if value.state is None else call + _emit(value.state) + pickle.BUILD
     raise ValueError(f"a cell must be a number, text or None, got {type(value).__name__}")

@@ -6,18 +6,30 @@ the plane y = 0 and looks towards −y.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from genre_tasks.logs.synthetic.facades import (
+    BayGrid,
+    Openings,
+    Proportions,
+    boxes_along_axes,
+    build_panes,
+    build_wall_around,
+    lay_out_openings,
+    stack_corners,
+    upright_rectangles,
+)
 from genre_tasks.logs.synthetic.materials import Material
-from genre_tasks.logs.synthetic.mesh import Mesh, joined, masonry, quads
+from genre_tasks.logs.synthetic.mesh import Mesh, Surface, join_meshes, quad_mesh, wall_mesh
 from genre_tasks.logs.types import Float64
 
 Colour = tuple[float, float, float]
 
-WALLS: dict[Material, tuple[Colour, ...]] = {
+# In this order the wall is drawn; the shares add up to 1.
+_WALL_SHARES = {Material.BRICK: 0.42, Material.PLASTER: 0.38, Material.PANEL: 0.2}
+_WALL_COLOURS: dict[Material, tuple[Colour, ...]] = {
     Material.BRICK: (
         (0.62, 0.33, 0.26),
         (0.55, 0.40, 0.32),
@@ -35,239 +47,230 @@ WALLS: dict[Material, tuple[Colour, ...]] = {
     ),
     Material.PANEL: ((0.66, 0.64, 0.60), (0.52, 0.53, 0.55), (0.76, 0.70, 0.60)),
 }
-FRAMES: tuple[Colour, ...] = ((0.90, 0.90, 0.88), (0.25, 0.22, 0.20), (0.32, 0.20, 0.13), (0.25, 0.36, 0.30))
+_FRAME_COLOURS: tuple[Colour, ...] = ((0.90, 0.90, 0.88), (0.25, 0.22, 0.20), (0.32, 0.20, 0.13), (0.25, 0.36, 0.30))
+# Railings.
+_METAL = Surface(Material.METAL, (0.15,) * 3)
+# Walls reach so far into the ground, which may slope.
 _SINK_M = 1.5
+_DOORSTEP_M = 0.1
+_GROUND_RECESS_M = 0.2
+_MAX_COLOUR = 0.95
 
 
 @dataclass(frozen=True)
-class _Front:
-    """Openings of one façade: [N] left, right, bottom, top edges, and what surrounds them."""
+class _Style:
+    """Colours and proportions of one building.
 
-    left: Float64
-    right: Float64
-    bottom: Float64
-    top: Float64
-    cell_left: Float64
-    cell_right: Float64
-    cell_bottom: Float64
-    cell_top: Float64
+    Attributes:
+        wall: material of the façade.
+        tone: [3] sRGB of the wall.
+        trim: [3] sRGB of cornice, sills and lintels.
+        frame: sRGB of window frames.
+        parameters: of the wall's texture.
+        ground_m: height of the ground floor.
+        storey_m: height of the other floors.
+        floors: how many there are above the ground floor.
+        bays: columns of windows.
+        bay_m: width of a bay.
+    """
+
+    wall: Material
+    tone: Float64
+    trim: Float64
+    frame: Colour
+    parameters: tuple[float, ...]
+    ground_m: float
+    storey_m: float
+    floors: int
+    bays: int
+    bay_m: float
+
+    @property
+    def top_m(self) -> float:
+        """Height of the eaves."""
+        return self.ground_m + self.floors * self.storey_m
+
+    def wall_surface(self, shade: float = 1.0) -> Surface:
+        """The wall, its colour multiplied by ``shade``."""
+        return Surface(self.wall, self.tone * shade, self.parameters)
 
 
-def building(rng: np.random.Generator, width: float, height: float, depth: float) -> Mesh:
-    """One building of about ``height`` (whole floors)."""
-    wall = (Material.BRICK, Material.PLASTER, Material.PANEL)[rng.choice(3, p=(0.42, 0.38, 0.2))]
-    tones = WALLS[wall]
-    tone = np.clip(np.array(tones[rng.integers(len(tones))]) * rng.uniform(0.85, 1.1), 0, 0.95)
-    frame = FRAMES[rng.integers(len(FRAMES))]
-    trim = np.clip(tone * rng.choice([0.72, 1.2]), 0, 0.95)
-    free = (0.0, 0.0, rng.uniform(0, 100), 0.0)
-    ground, storey = rng.uniform(3.5, 4.3), rng.uniform(2.85, 3.3)
-    floors = max(1, round((height - ground) / storey))
-    top = ground + floors * storey
-    bays = max(2, round(width / rng.uniform(2.3, 3.4)))
-    bay = width / bays
+def build_building(rng: np.random.Generator, width: float, height: float, depth: float) -> Mesh:
+    """Builds one building of a random style.
 
-    parts = [_upper_floors(rng, bays, bay, ground, storey, floors, wall, tone, free, frame, trim)]
-    parts.append(_ground_floor(rng, bays, bay, ground, wall, tone, free, frame))
-    parts.append(_shell(width, depth, top, wall, tone, free))
+    Args:
+        rng: draws the style.
+        width: of the façade, metres.
+        height: about how high it becomes, in complete floors, metres.
+        depth: metres.
+
+    Returns:
+        The building, from x = 0 to its width.
+    """
+    style = _draw_style(rng, width, height)
+    top = style.top_m
+    parts = [_build_upper_floors(rng, style)]
+    parts.append(_build_ground_floor(rng, style))
+    parts.append(_build_shell(width, depth, style))
     eave = rng.uniform(0.15, 0.5)
-    parts.append(
-        masonry((-0.05, -eave, top - 0.1), (width + 0.05, 0.3, top + rng.uniform(0.25, 0.8)), wall, trim, free)
-    )
-    parts.append(masonry((0, -0.1, ground - 0.18), (width, 0.05, ground + 0.05), Material.PLASTER, trim, free))
-    count = int(rng.integers(0, 4))
-    at = np.stack(
-        [rng.uniform(1, width - 2, count), rng.uniform(1, max(1.5, depth - 3), count), np.full(count, top)], 1
-    )
-    if count:
-        parts.append(masonry(at, np.add(at, [1.1, 1.1, 1.9]), Material.BRICK, (0.5, 0.35, 0.3)))
-    return joined(parts)
+    cornice = Surface(style.wall, style.trim, style.parameters)
+    cornice_top = top + rng.uniform(0.25, 0.8)
+    parts.append(wall_mesh((-0.05, -eave, top - 0.1), (width + 0.05, 0.3, cornice_top), cornice))
+    belt = Surface(Material.PLASTER, style.trim, style.parameters)
+    parts.append(wall_mesh((0, -0.1, style.ground_m - 0.18), (width, 0.05, style.ground_m + 0.05), belt))
+    chimneys = int(rng.integers(0, 4))
+    x = rng.uniform(1, width - 2, chimneys)
+    y = rng.uniform(1, max(1.5, depth - 3), chimneys)
+    if chimneys:
+        low = np.stack([x, y, np.full(chimneys, top)], 1)
+        parts.append(wall_mesh(low, np.add(low, [1.1, 1.1, 1.9]), Surface(Material.BRICK, (0.5, 0.35, 0.3))))
+    return join_meshes(parts)
 
 
-def _shell(width: float, depth: float, top: float, wall: int, tone: Float64, free: tuple[float, ...]) -> Mesh:
+def _draw_style(rng: np.random.Generator, width: float, height: float) -> _Style:
+    wall = list(_WALL_SHARES)[rng.choice(len(_WALL_SHARES), p=tuple(_WALL_SHARES.values()))]
+    colours = _WALL_COLOURS[wall]
+    tone = np.clip(np.array(colours[rng.integers(len(colours))]) * rng.uniform(0.85, 1.1), 0, _MAX_COLOUR)
+    frame = _FRAME_COLOURS[rng.integers(len(_FRAME_COLOURS))]
+    # Darker or brighter than the wall, never of another hue.
+    trim = np.clip(tone * rng.choice([0.72, 1.2]), 0, _MAX_COLOUR)
+    parameters = (0.0, 0.0, rng.uniform(0, 100), 0.0)
+    ground_m = rng.uniform(3.5, 4.3)
+    storey_m = rng.uniform(2.85, 3.3)
+    bays = max(2, round(width / rng.uniform(2.3, 3.4)))
+    return _Style(
+        wall=wall,
+        tone=tone,
+        trim=trim,
+        frame=frame,
+        parameters=parameters,
+        ground_m=ground_m,
+        storey_m=storey_m,
+        # Complete floors, so a building is a little higher or lower than asked for.
+        floors=max(1, round((height - ground_m) / storey_m)),
+        bays=bays,
+        bay_m=width / bays,
+    )
+
+
+def _build_shell(width: float, depth: float, style: _Style) -> Mesh:
     """Side walls, back and roof."""
-    z = (-_SINK_M, top)
-    corner = lambda x, y, h: [x, y, h]  # noqa: E731
-    walls, tex = [], []
+    bottom = -_SINK_M
+    top = style.top_m
+    walls = []
+    texture = []
     for (x0, y0), (x1, y1) in (((0, 0), (0, depth)), ((width, 0), (width, depth)), ((0, depth), (width, depth))):
-        walls.append([corner(x0, y0, z[0]), corner(x1, y1, z[0]), corner(x1, y1, z[1]), corner(x0, y0, z[1])])
-        run = float(np.hypot(x1 - x0, y1 - y0))
-        tex.append([[0, z[0], 0], [run, z[0], 0], [run, z[1], 0], [0, z[1], 0]])
+        # No wall at y = 0: that is the façade.
+        walls.append([[x0, y0, bottom], [x1, y1, bottom], [x1, y1, top], [x0, y0, top]])
+        length = float(np.hypot(x1 - x0, y1 - y0))
+        texture.append([[0, bottom, 0], [length, bottom, 0], [length, top, 0], [0, top, 0]])
     roof = [[[0, 0, top], [width, 0, top], [width, depth, top], [0, depth, top]]]
-    return joined([quads(walls, tex, wall, tone * 0.92, free), quads(roof, None, Material.ROOF, (0.35, 0.33, 0.32))])
-
-
-def _openings(bays: int, bay: float, floors: int, base: float, storey: float, sizes: Float64) -> _Front:
-    """A regular grid of openings; ``sizes``: width share, sill height share, lintel height share."""
-    i, j = (a.ravel() for a in np.meshgrid(np.arange(bays), np.arange(floors)))
-    left, bottom = np.asarray(i * bay, np.float64), np.asarray(base + j * storey, np.float64)
-    half = bay * sizes[0] / 2
-    return _Front(
-        left + bay / 2 - half,
-        left + bay / 2 + half,
-        bottom + storey * sizes[1],
-        bottom + storey * sizes[2],
-        left,
-        left + bay,
-        bottom,
-        bottom + storey,
-    )
-
-
-def _rectangle(x0: Float64, x1: Float64, z0: Float64, z1: Float64, y: float) -> Float64:
-    """[N, 4, 3] upright rectangles at depth ``y``."""
-    depth = np.full_like(x0, y)
-    pairs = ((x0, z0), (x1, z0), (x1, z1), (x0, z1))
-    return np.stack([np.stack([x, depth, z], -1) for x, z in pairs], 1)
-
-
-def _wall_around(f: _Front, wall: int, tone: Float64, free: tuple[float, ...], recess: float) -> Mesh:
-    """The wall of each cell around its opening, and the reveals."""
-    flat = np.concatenate(
+    return join_meshes(
         [
-            _rectangle(f.cell_left, f.left, f.cell_bottom, f.cell_top, 0),
-            _rectangle(f.right, f.cell_right, f.cell_bottom, f.cell_top, 0),
-            _rectangle(f.left, f.right, f.cell_bottom, f.bottom, 0),
-            _rectangle(f.left, f.right, f.top, f.cell_top, 0),
+            quad_mesh(walls, texture, style.wall_surface(0.92)),
+            quad_mesh(roof, None, Surface(Material.ROOF, (0.35, 0.33, 0.32))),
         ]
     )
-    edges = []
-    for x0, z0, x1, z1 in (
-        (f.left, f.bottom, f.left, f.top),
-        (f.right, f.bottom, f.right, f.top),
-        (f.left, f.bottom, f.right, f.bottom),
-        (f.left, f.top, f.right, f.top),
-    ):
-        near, far = np.zeros_like(x0), np.full_like(x0, recess)
-        ring = ((x0, near, z0), (x1, near, z1), (x1, far, z1), (x0, far, z0))
-        edges.append(np.stack([np.stack(k, -1) for k in ring], 1))
-    reveal = np.concatenate(edges)
-    tex_flat = np.stack([flat[..., 0], flat[..., 2], np.zeros_like(flat[..., 0])], -1)
-    tex_reveal = np.stack([reveal[..., 0], reveal[..., 2], reveal[..., 1]], -1)
-    return joined([quads(flat, tex_flat, wall, tone, free), quads(reveal, tex_reveal, wall, tone * 0.95, free)])
 
 
-def _panes(rng: np.random.Generator, f: _Front, material: int, frame: Colour, recess: float) -> Mesh:
-    corners = _rectangle(f.left, f.right, f.bottom, f.top, recess)
-    tex = corners - corners[:, :1]
-    tex = np.stack([tex[..., 0], tex[..., 2], np.zeros_like(tex[..., 0])], -1)
-    bars = rng.choice([0.2, 0.5, 0.9])
-    n = len(f.left)
-    free = np.stack([f.right - f.left, f.top - f.bottom, rng.random(n), np.full(n, bars)], 1)
-    return quads(corners, tex, material, frame, free)
-
-
-def _upper_floors(
-    rng: np.random.Generator,
-    bays: int,
-    bay: float,
-    base: float,
-    storey: float,
-    floors: int,
-    wall: int,
-    tone: Float64,
-    free: tuple[float, ...],
-    frame: Colour,
-    trim: Float64,
-) -> Mesh:
+def _build_upper_floors(rng: np.random.Generator, style: _Style) -> Mesh:
+    """Walls with windows and sills, and on some buildings lintels and balconies."""
     recess = float(rng.uniform(0.10, 0.30))
-    sizes = np.array([rng.uniform(0.38, 0.66), rng.uniform(0.2, 0.32), rng.uniform(0.76, 0.88)])
-    f = _openings(bays, bay, floors, base, storey, sizes)
-    parts = [_wall_around(f, wall, tone, free, recess), _panes(rng, f, Material.WINDOW, frame, recess)]
-    low = np.stack([f.left - 0.1, np.full_like(f.left, -0.12), f.bottom - 0.1], 1)
-    high = np.stack([f.right + 0.1, np.full_like(f.left, 0.05), f.bottom], 1)
-    parts.append(masonry(low, high, Material.PLASTER, trim))
+    sizes = Proportions(width=rng.uniform(0.38, 0.66), sill=rng.uniform(0.2, 0.32), lintel=rng.uniform(0.76, 0.88))
+    grid = BayGrid(style.bays, style.bay_m, floors=style.floors, base_m=style.ground_m, storey_m=style.storey_m)
+    openings = lay_out_openings(grid, sizes)
+    left = openings.left
+    right = openings.right
+    trim = Surface(Material.PLASTER, style.trim)
+    parts = [
+        build_wall_around(openings, style.wall_surface(), recess),
+        build_panes(rng, openings, Material.WINDOW, style.frame, recess),
+    ]
+    sill_z = (openings.bottom - 0.1, openings.bottom)
+    parts.append(boxes_along_axes((left - 0.1, right + 0.1), (-0.12, 0.05), sill_z, trim))
     if rng.random() < 0.4:
-        low = np.stack([f.left - 0.12, np.full_like(f.left, -0.06), f.top], 1)
-        high = np.stack([f.right + 0.12, np.full_like(f.left, 0.05), f.top + 0.22], 1)
-        parts.append(masonry(low, high, Material.PLASTER, trim))
+        lintel_z = (openings.top, openings.top + 0.22)
+        parts.append(boxes_along_axes((left - 0.12, right + 0.12), (-0.06, 0.05), lintel_z, trim))
     if rng.random() < 0.4:
-        with_balcony = np.isin(np.arange(len(f.left)) % bays, rng.choice(bays, max(1, bays // 3), replace=False))
-        parts.append(_balconies(f, with_balcony))
-    return joined(parts)
+        # Balconies lie above each other, in a third of the bays.
+        bays = rng.choice(style.bays, max(1, style.bays // 3), replace=False)
+        with_balcony = np.isin(np.arange(len(openings)) % style.bays, bays)
+        parts.append(_build_balconies(openings.select(with_balcony)))
+    return join_meshes(parts)
 
 
-def _balconies(f: _Front, pick: NDArray[np.bool_]) -> Mesh:
-    """A slab and a railing of bars."""
-    left, right, floor = f.left[pick] - 0.25, f.right[pick] + 0.25, f.cell_bottom[pick] + 0.05
-    n = len(left)
-    y = lambda v: np.full(n, v)  # noqa: E731
-    slab = masonry(
-        np.stack([left, y(-0.95), floor], 1), np.stack([right, y(0), floor + 0.14], 1), Material.PLASTER, (0.6,) * 3
-    )
-    rail = masonry(
-        np.stack([left, y(-0.95), floor + 1.0], 1),
-        np.stack([right, y(-0.90), floor + 1.06], 1),
-        Material.METAL,
-        (0.15,) * 3,
-    )
-    share = np.linspace(0, 1, 8)
-    x = (left[:, None] + (right - left)[:, None] * share).ravel()
+def _build_balconies(openings: Openings) -> Mesh:
+    """A slab and a railing of eight bars before every opening."""
+    left = openings.left - 0.25
+    right = openings.right + 0.25
+    floor = openings.bay_bottom + 0.05
+    concrete = Surface(Material.PLASTER, (0.6,) * 3)
+    slab = boxes_along_axes((left, right), (-0.95, 0), (floor, floor + 0.14), concrete)
+    rail = boxes_along_axes((left, right), (-0.95, -0.90), (floor + 1.0, floor + 1.06), _METAL)
+    x = (left[:, None] + (right - left)[:, None] * np.linspace(0, 1, 8)).ravel()
     z = floor.repeat(8)
-    bars = masonry(
-        np.stack([x - 0.015, np.full_like(x, -0.94), z], 1),
-        np.stack([x + 0.015, np.full_like(x, -0.91), z + 1.0], 1),
-        Material.METAL,
-        (0.15,) * 3,
-    )
-    return joined([slab, rail, bars])
+    bars = boxes_along_axes((x - 0.015, x + 0.015), (-0.94, -0.91), (z, z + 1.0), _METAL)
+    return join_meshes([slab, rail, bars])
 
 
-def _ground_floor(
-    rng: np.random.Generator,
-    bays: int,
-    bay: float,
-    height: float,
-    wall: int,
-    tone: Float64,
-    free: tuple[float, ...],
-    frame: Colour,
-) -> Mesh:
-    shops = rng.random() < 0.5
-    sizes = np.array([0.84, 0.1, 0.74] if shops else [rng.uniform(0.36, 0.5), 0.3, 0.78])
-    f = _openings(bays, bay, 1, 0.0, height, sizes)
-    door = int(rng.integers(bays))
-    f.bottom[door] = 0.1
-    parts = [_wall_around(f, wall, tone * (0.8 if shops else 0.95), free, 0.2)]
-    keep = np.arange(bays) != door
-    rest = _Front(**{k: v[keep] for k, v in vars(f).items()})
-    parts.append(_panes(rng, rest, Material.SHOP if shops else Material.WINDOW, frame, 0.2))
-    leaf = _rectangle(f.left[[door]], f.right[[door]], f.bottom[[door]], f.top[[door]], 0.2)
-    parts.append(quads(leaf, None, Material.WOOD, rng.uniform(0.12, 0.55, 3)))
-    base = masonry((0, -0.04, -_SINK_M), (bays * bay, 0.0, 0.35), Material.PANEL, tone * 0.6)
-    step = masonry((f.left[door] - 0.1, -0.4, -0.2), (f.right[door] + 0.1, 0, 0.24), Material.KERB, (0.6, 0.6, 0.6))
-    parts += [base, step]
-    if shops:
-        parts += _shop_fittings(rng, rest, height)
-    return joined(parts)
+def _build_ground_floor(rng: np.random.Generator, style: _Style) -> Mesh:
+    """Shops or flats, with a door in one of the bays."""
+    has_shops = rng.random() < 0.5
+    if has_shops:
+        sizes = Proportions(width=0.84, sill=0.1, lintel=0.74)
+    else:
+        sizes = Proportions(width=rng.uniform(0.36, 0.5), sill=0.3, lintel=0.78)
+    grid = BayGrid(style.bays, style.bay_m, floors=1, base_m=0.0, storey_m=style.ground_m)
+    openings = lay_out_openings(grid, sizes)
+    door = int(rng.integers(style.bays))
+    # The door takes the place of a window or shop, and reaches down to the step.
+    is_door = np.arange(style.bays) == door
+    openings = replace(openings, bottom=np.where(is_door, _DOORSTEP_M, openings.bottom))
+    doorway = openings.select(is_door)
+    windows = openings.select(~is_door)
+    recess = _GROUND_RECESS_M
+    parts = [build_wall_around(openings, style.wall_surface(0.8 if has_shops else 0.95), recess)]
+    glass = Material.SHOP if has_shops else Material.WINDOW
+    parts.append(build_panes(rng, windows, glass, style.frame, recess))
+    leaf = upright_rectangles(doorway.left, doorway.right, doorway.bottom, doorway.top, recess)
+    parts.append(quad_mesh(leaf, None, Surface(Material.WOOD, rng.uniform(0.12, 0.55, 3))))
+    plinth = Surface(Material.PANEL, style.tone * 0.6)
+    parts.append(wall_mesh((0, -0.04, -_SINK_M), (style.bays * style.bay_m, 0.0, 0.35), plinth))
+    stone = Surface(Material.KERB, (0.6, 0.6, 0.6))
+    parts.append(boxes_along_axes((doorway.left - 0.1, doorway.right + 0.1), (-0.4, 0), (-0.2, 0.24), stone))
+    if has_shops:
+        parts += _build_shop_fittings(rng, windows, style.ground_m)
+    return join_meshes(parts)
 
 
-def _shop_fittings(rng: np.random.Generator, f: _Front, height: float) -> list[Mesh]:
+def _build_shop_fittings(rng: np.random.Generator, windows: Openings, height: float) -> list[Mesh]:
     """A lettered band above, and awnings over some bays."""
-    n = len(f.left)
-    band = rng.uniform(0.1, 0.8, 3)
-    low = np.stack([f.left, np.full(n, -0.08), f.top + 0.08], 1)
-    high = np.stack([f.right, np.zeros(n), np.full(n, height - 0.2)], 1)
-    parts = [masonry(low, high, Material.PLAIN, band)]
-    marks = rng.random((n, 9)) < 0.75
-    i, j = np.nonzero(marks)
-    pitch = (f.right - f.left) / 11
-    x = f.left[i] + pitch[i] * (j + 1.2)
-    z = (f.top + 0.08 + height - 0.2)[i] / 2
-    tall = rng.uniform(0.07, 0.14, len(i))
-    parts.append(
-        masonry(
-            np.stack([x, np.full(len(i), -0.12), z - tall], 1),
-            np.stack([x + pitch[i] * 0.6, np.full(len(i), -0.08), z + tall], 1),
-            Material.PLAIN,
-            1.0 - band,
+    band_colour = rng.uniform(0.1, 0.8, 3)
+    band_z = (windows.top + 0.08, height - 0.2)
+    band = boxes_along_axes((windows.left, windows.right), (-0.08, 0.0), band_z, Surface(Material.PLAIN, band_colour))
+    # Nine places for letters over every window, some of them empty.
+    window, place = np.nonzero(rng.random((len(windows), 9)) < 0.75)
+    pitch = ((windows.right - windows.left) / 11)[window]
+    x = windows.left[window] + pitch * (place + 1.2)
+    z = (windows.top + 0.08 + height - 0.2)[window] / 2
+    half_height = rng.uniform(0.07, 0.14, len(window))
+    lettering = Surface(Material.PLAIN, 1.0 - band_colour)
+    letters = boxes_along_axes((x, x + pitch * 0.6), (-0.12, -0.08), (z - half_height, z + half_height), lettering)
+    parts = [band, letters]
+    with_awning = rng.random(len(windows)) < 0.5
+    if with_awning.any():
+        shaded = windows.select(with_awning)
+        wall_y = np.zeros_like(shaded.left)
+        edge_y = np.full_like(shaded.left, -1.1)
+        upper = shaded.top + 0.1
+        lower = shaded.top - 0.5
+        corners = stack_corners(
+            [
+                (shaded.left, wall_y, upper),
+                (shaded.right, wall_y, upper),
+                (shaded.right, edge_y, lower),
+                (shaded.left, edge_y, lower),
+            ]
         )
-    )
-    pick = rng.random(n) < 0.5
-    if pick.any():
-        a, b, t = f.left[pick], f.right[pick], f.top[pick]
-        reach = np.full_like(a, -1.1)
-        ring = ((a, 0 * a, t + 0.1), (b, 0 * a, t + 0.1), (b, reach, t - 0.5), (a, reach, t - 0.5))
-        corners = np.stack([np.stack(k, -1) for k in ring], 1)
-        parts.append(quads(corners, None, Material.AWNING, rng.uniform(0.1, 0.7, 3)))
+        parts.append(quad_mesh(corners, None, Surface(Material.AWNING, rng.uniform(0.1, 0.7, 3))))
     return parts

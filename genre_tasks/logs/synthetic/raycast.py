@@ -1,29 +1,40 @@
 """Nearest hits and shadows with Embree: one scene for what stands, one for each rigid part of an actor.
 
 Rays are turned into a moving part's own frame at the ray's own time, so nothing is rebuilt from frame to frame and a
-LiDAR sweep sees every point of a moving car where it was when the beam met it.
+LiDAR sweep sees every point of a moving car where it was when the beam met it. Coordinates are the street's own, in
+which float32 suffices.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from genre_tasks.logs.synthetic.actors import Actor, Part
-from genre_tasks.logs.synthetic.layout import Layout
-from genre_tasks.logs.synthetic.mesh import Mesh, joined
-from genre_tasks.logs.synthetic.noise import Reals, dot3, rotated
+from genre_tasks.logs.synthetic.mesh import Mesh, join_meshes
+from genre_tasks.logs.synthetic.noise import Reals, dot_rows, rotate
+from genre_tasks.logs.synthetic.street_actors import Actor, Part
+from genre_tasks.logs.synthetic.street_layout import StreetLayout
 from genre_tasks.logs.types import Float32, Float64
 
+# A shadow ray starts so far above its face, or the face would shade itself.
 _SHADOW_OFFSET_M = 0.01
+_RADIUS_MARGIN_M = 0.02
 
 
 @dataclass(frozen=True)
 class Hits:
-    """``distance_m`` [n] (inf: sky), ``face`` [n] into the scene's table (−1: sky), ``u``, ``v`` [n] barycentric,
-    ``normal`` [n, 3] unit, towards the ray's origin."""
+    """What n rays met first.
+
+    Attributes:
+        distance_m: [n] along the ray; inf: sky.
+        face: [n] into ``RayCaster.faces``; -1: sky.
+        u: [n] barycentric coordinate of the face's second vertex.
+        v: [n] of its third vertex.
+        normal: [n, 3] unit, towards the ray's origin.
+    """
 
     distance_m: Float32
     face: NDArray[np.int64]
@@ -31,23 +42,51 @@ class Hits:
     v: Float32
     normal: Float32
 
+    def select(self, indices: NDArray[np.int64]) -> Hits:
+        """Picks some of the rays.
+
+        Args:
+            indices: [m].
+
+        Returns:
+            m hits.
+        """
+        return Hits(
+            self.distance_m[indices],
+            self.face[indices],
+            self.u[indices],
+            self.v[indices],
+            self.normal[indices],
+        )
+
 
 @dataclass(frozen=True)
-class _Moving:
+class _MovingPart:
+    """A part of an actor with its Embree scene, and a sphere around it in the part's own frame.
+
+    Attributes:
+        actor: to which the part belongs.
+        part: the part.
+        scene: Embree's.
+        first_face: of the part in ``RayCaster.faces``.
+        centre: [3] of the sphere, metres.
+        radius: of the sphere.
+    """
+
     actor: Actor
     part: Part
-    scene: object
+    scene: Any
     first_face: int
     centre: Float64
     radius: float
 
-    def world_SE3_part(self, times: Float64) -> Float64:
-        """[n, 4, 4]."""
-        pose = self.actor.world_SE3_actor(times)
+    def street_SE3_part(self, times: Float64) -> Float64:
+        """Where the part is at times [n]: [n, 4, 4]."""
+        pose = self.actor.street_SE3_actor(times)
         return pose if self.part.actor_SE3_part is None else pose @ self.part.actor_SE3_part(times)
 
 
-def _embree(vertices: Float64) -> object:
+def _build_embree_scene(vertices: Float64) -> Any:
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
@@ -57,93 +96,161 @@ def _embree(vertices: Float64) -> object:
 
 
 def _face_normals(mesh: Mesh) -> Float32:
-    a, b, c = (mesh.vertices[:, k] for k in range(3))
-    n = np.cross(b - a, c - a)
-    return (n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12)).astype(np.float32)
+    """[T, 3] unit; a face without area has the normal 0."""
+    a, b, c = np.moveaxis(mesh.vertices, 1, 0)
+    normals = np.cross(b - a, c - a)
+    return (normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)).astype(np.float32)
 
 
-class Scene:
-    """The street as something to cast rays at; coordinates are the street's own (float32 suffices there)."""
+class RayCaster:
+    """The street as something to cast rays at.
 
-    def __init__(self, layout: Layout) -> None:
-        self._static = _embree(layout.static.vertices)
-        self._moving: list[_Moving] = []
-        meshes, first = [layout.static], len(layout.static)
+    Args:
+        layout: the street.
+
+    Attributes:
+        faces: all faces, those of what stands first, in the order that ``Hits.face`` counts.
+    """
+
+    def __init__(self, layout: StreetLayout) -> None:
+        self._static: Any = _build_embree_scene(layout.static.vertices)
+        self._moving: list[_MovingPart] = []
+        meshes = [layout.static]
+        first_face = len(layout.static)
         for actor in layout.actors:
             for part in actor.parts:
                 corners = part.mesh.vertices.reshape(-1, 3)
+                # The sphere around the box is a little larger than the smallest one, and needs no search.
                 centre = (corners.min(0) + corners.max(0)) / 2
-                radius = float(np.linalg.norm(corners - centre, axis=1).max()) + 0.02
-                self._moving.append(_Moving(actor, part, _embree(part.mesh.vertices), first, centre, radius))
+                radius = float(np.linalg.norm(corners - centre, axis=1).max()) + _RADIUS_MARGIN_M
+                scene = _build_embree_scene(part.mesh.vertices)
+                self._moving.append(_MovingPart(actor, part, scene, first_face, centre=centre, radius=radius))
                 meshes.append(part.mesh)
-                first += len(part.mesh)
-        self.faces = joined(meshes)
+                first_face += len(part.mesh)
+        self.faces = join_meshes(meshes)
         self._normals = _face_normals(self.faces)
 
     def cast(
         self,
         origin: Float64,  # [3] or [n, 3]
-        direction: Reals,  # [n, 3] unit
-        time: float | Float64,  # seconds; one, or one a ray
+        direction: Reals,  # [n, 3]
+        time: float | Float64,  # one, or [n]
         slack_m: float = 0.0,
     ) -> Hits:
-        """Nearest hit of each ray. ``slack_m``: how far an actor may move within the spread of ``time``."""
-        d = np.ascontiguousarray(direction, np.float32)
-        o = np.ascontiguousarray(np.broadcast_to(origin, d.shape), np.float32)
-        found = self._static.run(o, d, output=1)  # type: ignore[attr-defined]
+        """Finds the nearest hit of each ray.
+
+        Args:
+            origin: [3] of all rays or [n, 3], metres.
+            direction: [n, 3] unit.
+            time: seconds since the first frame, of all rays or [n].
+            slack_m: how far an actor may move within the spread of ``time``.
+
+        Returns:
+            n hits.
+        """
+        directions = np.ascontiguousarray(direction, np.float32)
+        # Embree reads contiguous float32 alone.
+        origins = np.ascontiguousarray(np.broadcast_to(origin, directions.shape), np.float32)
+        found = self._static.run(origins, directions, output=1)
         face = found["primID"].astype(np.int64)
-        miss = face < 0
-        distance = np.where(miss, np.float32(np.inf), found["tfar"])
-        u, v = found["u"].copy(), found["v"].copy()
-        normal = self._normals[np.where(miss, 0, face)]
-        for m in self._moving:
-            times = np.atleast_1d(np.asarray(time, float))
-            middle = m.world_SE3_part(times[[len(times) // 2]])[0]
-            pick = _near_sphere(origin, d, middle[:3, :3] @ m.centre + middle[:3, 3], m.radius + slack_m)
-            if len(pick) == 0:
+        is_miss = face < 0
+        hits = Hits(
+            distance_m=np.where(is_miss, np.float32(np.inf), found["tfar"]),
+            face=face,
+            u=found["u"].copy(),
+            v=found["v"].copy(),
+            normal=self._normals[np.where(is_miss, 0, face)],
+        )
+        times = np.atleast_1d(np.asarray(time, float))
+        for moving in self._moving:
+            # One sphere for all rays of a sweep, at the middle of their times; the slack covers the rest.
+            middle_pose = moving.street_SE3_part(times[[len(times) // 2]])[0]
+            centre = middle_pose[:3, :3] @ moving.centre + middle_pose[:3, 3]
+            near = _find_rays_near_sphere(origin, directions, centre, moving.radius + slack_m)
+            if len(near):
+                self._add_nearer_hits(hits, moving, origins, directions, times, near)
+        # Faces have no outside: whichever side a ray meets is the one that is lit.
+        facing_away = dot_rows(hits.normal, directions) > 0
+        np.multiply(hits.normal, np.where(facing_away, np.float32(-1), np.float32(1))[:, None], out=hits.normal)
+        return hits
+
+    def _add_nearer_hits(
+        self,
+        hits: Hits,
+        moving: _MovingPart,
+        origins: Float32,  # [n, 3]
+        directions: Float32,  # [n, 3]
+        times: Float64,  # [1] or [n]
+        near: NDArray[np.int64],  # [m] the rays that may meet the part
+    ) -> None:
+        """Replaces hits, in place, where a moving part is nearer."""
+        pose = moving.street_SE3_part(times if len(times) == 1 else times[near])
+        # The transposed rotation turns world rays into the part's frame; distances along them stay.
+        rotation = pose[:, :3, :3]
+        local_origins = np.einsum("nji,nj->ni", rotation, origins[near] - pose[:, :3, 3])
+        local_directions = np.einsum("nji,nj->ni", rotation, directions[near].astype(float))
+        found = moving.scene.run(local_origins.astype(np.float32), local_directions.astype(np.float32), output=1)
+        is_nearer = (found["primID"] >= 0) & (found["tfar"] < hits.distance_m[near])
+        rays = near[is_nearer]
+        hits.distance_m[rays] = found["tfar"][is_nearer]
+        hits.u[rays] = found["u"][is_nearer]
+        hits.v[rays] = found["v"][is_nearer]
+        hits.face[rays] = found["primID"][is_nearer] + moving.first_face
+        rotations = np.broadcast_to(rotation, (len(near), 3, 3))[is_nearer]
+        hits.normal[rays] = np.einsum("nij,nj->ni", rotations, self._normals[hits.face[rays]])
+
+    def find_shadowed(self, points: Float32, normals: Float32, sun: Float64, time: float) -> NDArray[np.bool_]:
+        """Finds out which points lie in the shadow.
+
+        Args:
+            points: [n, 3] on faces, metres.
+            normals: [n, 3] of the faces, on the side of the sun.
+            sun: [3] unit vector towards the sun.
+            time: seconds since the first frame.
+
+        Returns:
+            [n] whether something lies between each point and the sun.
+        """
+        origins = (points + normals * np.float32(_SHADOW_OFFSET_M)).astype(np.float32)
+        directions = np.broadcast_to(sun.astype(np.float32), origins.shape).copy()
+        is_dark: NDArray[np.bool_] = self._static.run(origins, directions, query="OCCLUDED") >= 0
+        # On the plane across the sun's direction, all rays are points: a part can only shade those in its circle.
+        plane_axes = np.linalg.svd(sun[None])[2][1:]
+        on_plane = origins @ plane_axes.T.astype(np.float32)
+        for moving in self._moving:
+            pose = moving.street_SE3_part(np.array([time]))[0]
+            centre = pose[:3, :3] @ moving.centre + pose[:3, 3]
+            offset = on_plane - (plane_axes @ centre).astype(np.float32)
+            is_near = offset[:, 0] ** 2 + offset[:, 1] ** 2 < moving.radius**2
+            near = np.flatnonzero(is_near & ~is_dark)
+            if len(near) == 0:
                 continue
-            pose = m.world_SE3_part(times if len(times) == 1 else times[pick])
-            local_o = np.einsum("nji,nj->ni", pose[:, :3, :3], o[pick] - pose[:, :3, 3])
-            local_d = np.einsum("nji,nj->ni", pose[:, :3, :3], d[pick].astype(float))
-            part = m.scene.run(local_o.astype(np.float32), local_d.astype(np.float32), output=1)  # type: ignore[attr-defined]
-            near = (part["primID"] >= 0) & (part["tfar"] < distance[pick])
-            to = pick[near]
-            distance[to], u[to], v[to] = part["tfar"][near], part["u"][near], part["v"][near]
-            face[to] = part["primID"][near] + m.first_face
-            rotation = np.broadcast_to(pose[:, :3, :3], (len(pick), 3, 3))[near]
-            normal[to] = np.einsum("nij,nj->ni", rotation, self._normals[face[to]])
-        np.multiply(normal, np.where(dot3(normal, d) > 0, np.float32(-1), np.float32(1))[:, None], out=normal)
-        return Hits(distance, face, u, v, normal)
+            local_origins = rotate(pose[:3, :3].T, origins[near] - pose[:3, 3]).astype(np.float32)
+            local_directions = np.broadcast_to(sun @ pose[:3, :3], local_origins.shape).astype(np.float32)
+            # Occlusion only: the first thing in the way ends the search.
+            hit = moving.scene.run(local_origins, local_directions, query="OCCLUDED")
+            is_dark[near[hit >= 0]] = True
+        return is_dark
 
-    def shadowed(self, points: Float32, normals: Float32, sun: Float64, time: float) -> NDArray[np.bool_]:
-        """[n] whether something lies between each point and the sun (unit vector towards it)."""
-        o = (points + normals * np.float32(_SHADOW_OFFSET_M)).astype(np.float32)
-        d = np.broadcast_to(sun.astype(np.float32), o.shape).copy()
-        dark = self._static.run(o, d, query="OCCLUDED") >= 0  # type: ignore[attr-defined]
-        across = np.linalg.svd(sun[None])[2][1:]
-        flat = o @ across.T.astype(np.float32)
-        for m in self._moving:
-            pose = m.world_SE3_part(np.array([time]))[0]
-            centre = pose[:3, :3] @ m.centre + pose[:3, 3]
-            off = flat - (across @ centre).astype(np.float32)
-            pick = np.flatnonzero((off[:, 0] ** 2 + off[:, 1] ** 2 < m.radius**2) & ~dark)
-            if len(pick) == 0:
-                continue
-            local_o = rotated(pose[:3, :3].T, o[pick] - pose[:3, 3])
-            local_d = np.broadcast_to(sun @ pose[:3, :3], local_o.shape)
-            hit = m.scene.run(local_o.astype(np.float32), local_d.astype(np.float32), query="OCCLUDED")  # type: ignore[attr-defined]
-            dark[pick[hit >= 0]] = True
-        return dark
+    def texture_coordinates(self, hits: Hits) -> Float32:
+        """Interpolates the texture coordinates of faces.
 
-    def texture_points(self, hits: Hits) -> Float32:
-        """[n, 3] object coordinates of hits (``face`` must be valid)."""
-        t = self.faces.texture[hits.face]
-        u, v = hits.u[:, None], hits.v[:, None]
-        return t[:, 0] * (1 - u - v) + t[:, 1] * u + t[:, 2] * v
+        Args:
+            hits: n hits of which none is sky.
+
+        Returns:
+            [n, 3] metres.
+        """
+        corners = self.faces.texture[hits.face]
+        u = hits.u[:, None]
+        v = hits.v[:, None]
+        return corners[:, 0] * (1 - u - v) + corners[:, 1] * u + corners[:, 2] * v
 
 
-def _near_sphere(origin: Float64, d: Float32, centre: Float64, radius: float) -> NDArray[np.int64]:
-    """Rays that pass a sphere; a single origin ([3]) is much the faster."""
-    to = (centre - origin).astype(np.float32)
-    along = np.maximum(d @ to if to.ndim == 1 else dot3(to, d), 0)
-    return np.flatnonzero(dot3(to, to) - along * along < radius**2)
+def _find_rays_near_sphere(origin: Float64, directions: Float32, centre: Float64, radius: float) -> NDArray[np.int64]:
+    """The rays that pass a sphere, of n directions [n, 3] from one origin [3] or from n origins."""
+    to_centre = (centre - origin).astype(np.float32)
+    # From a single origin, one matrix product is much the faster.
+    along = directions @ to_centre if to_centre.ndim == 1 else dot_rows(to_centre, directions)
+    along = np.maximum(along, 0)
+    return np.flatnonzero(dot_rows(to_centre, to_centre) - along * along < radius**2)

@@ -1,4 +1,7 @@
-"""What the optimiser's CPU kernel is compiled from. Imports no torch: ``setup.py`` runs this file by its path."""
+"""What the optimiser's CPU kernel is compiled from.
+
+It imports no torch, because ``setup.py`` runs this file by its path in an environment that may lack it.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,8 @@ KERNEL = Kernel(
     folder=Path(__file__).resolve().parent,
     sources=SOURCES,
     constants_file="constants.py",
-    constants=("BLOCK", "DEVIATION_FLOOR", "SHARE_FLOOR_PX", "VARYING", "RESIDUALS"),
+    constants=("BLOCK_GAUSSIANS", "RMS_FLOOR", "WEIGHT_FLOOR_PX", "VARYING_FEATURES", "IMAGE_RESIDUALS"),
+    # No -freciprocal-math: tuned Adam's step and that of an untrained network must be the same bits.
     flags=("-fno-signed-zeros",),
 )
-"""No -freciprocal-math: tuned Adam's step and that of an untrained network are the same bits."""
+"""The recipe of the kernel's libraries."""

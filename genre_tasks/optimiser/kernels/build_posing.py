@@ -1,4 +1,7 @@
-"""What the way from offsets to splats is compiled from. Imports no torch: ``setup.py`` runs this file by its path."""
+"""What the kernel from offsets to splats is compiled from.
+
+It imports no torch, because ``setup.py`` runs this file by its path in an environment that may lack it.
+"""
 
 from __future__ import annotations
 
@@ -14,3 +17,4 @@ KERNEL = Kernel(
     constants_file="../../scene/constants.py",
     constants=("ABSENT_LOGIT", "LOWEST_LOGIT"),
 )
+"""The recipe of the kernel's libraries."""

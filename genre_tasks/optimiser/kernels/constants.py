@@ -1,19 +1,22 @@
-"""Constants that the optimiser's torch code and its compiled kernel share, each once.
+"""Constants that the optimiser's torch code and its compiled kernel share.
 
 No imports: the kernel's build reads this file without torch.
 """
 
 from __future__ import annotations
 
-DEVIATION_FLOOR = 1e-20
-"""Added to the root of the second moment, so that an attribute without gradient has none, instead of 0/0."""
+RMS_FLOOR = 1e-20
+"""Added to the root of the second moment, so that an attribute without gradient gets a step of 0 instead of 0/0."""
 
-SHARE_FLOOR_PX = 0.5
-"""Added to the pixels that a Gaussian has shares of, where something is divided by them."""
+WEIGHT_FLOOR_PX = 0.5
+"""Added to a Gaussian's total blending weight, in pixels, where something is divided by it."""
 
-VARYING, RESIDUALS = 62, 5
-"""Features that differ between Gaussians, the first ones, and of residuals, where a network asks for them. Those behind
-them are the same for all."""
+VARYING_FEATURES = 62
+"""The first features of the network, which differ between Gaussians. Those behind them are the same for all."""
 
-BLOCK = 48
-"""Gaussians that the kernel takes at once: their features and hidden rows stay in the first-level cache."""
+IMAGE_RESIDUALS = 5
+"""Columns of image residuals, and as many features where a network uses them, between the varying and the others."""
+
+# Features and hidden rows of this many Gaussians stay in the first-level cache.
+BLOCK_GAUSSIANS = 48
+"""Gaussians that a thread of the kernel takes at a time."""

@@ -13,7 +13,7 @@ from genre_tasks.compiled.loader import load
 from genre_tasks.errors import ResourceError
 from genre_tasks.optimiser.kernels.build_network import KERNEL
 
-# The structures hold pointers and 64-bit numbers only, in the order of network.cpp and features.h.
+# The structures hold pointers and 64-bit numbers only, in the order of network.cpp and features.h: so no compiler pads.
 _Fields = list[tuple[str, type]]
 
 
@@ -41,50 +41,77 @@ class Network(ctypes.Structure):
 
 
 class Scene(ctypes.Structure):
-    """What stays over the iterations, and memory to work in."""
+    """What does not change over the iterations of one scene, and memory to work in."""
 
     _fields_ = [
         *_numbers("voxels"),
-        *_pointers("base fixed voxel_of starts points active slot own pooled around"),
+        *_pointers("base fixed voxel_of starts points active slot embedding pooled around"),
         ("layers", ctypes.POINTER(Layer)),
         *_numbers("layer_count"),
     ]
 
 
-class Now(ctypes.Structure):
-    """The state in one iteration, and where the step goes."""
+class StepInputs(ctypes.Structure):
+    """The state in one iteration, and where the step is written."""
 
     _fields_ = [
         *_numbers("count"),
-        *_pointers("offsets first second seen seen_now gradient by_seen"),
+        *_pointers("offsets first_moment second_moment visit_count visible gradient by_count"),
         *_numbers("counts"),
-        *_pointers("times rates delta residuals part"),
+        *_pointers("schedule_features signed_rates delta image_residuals lr_scale"),
     ]
 
 
 @cache
 def load_network(folder: Path = KERNEL.folder) -> ctypes.CDLL:
-    """The kernel with its argument types declared, loaded once.
+    """Loads the kernel once, with its argument types declared.
 
-    Raises ``ResourceError`` and ``ConfigError`` as :func:`genre_tasks.compiled.loader.load`.
+    Args:
+        folder: where its libraries are.
+
+    Returns:
+        The library of the best instruction set of this machine.
+
+    Raises:
+        ResourceError: as :func:`genre_tasks.compiled.loader.load`.
+        ConfigError: as there.
     """
     library = load(KERNEL, folder)
-    now = ctypes.POINTER(Now)
-    library.genre_network_step.argtypes = [ctypes.POINTER(Network), ctypes.POINTER(Scene), now, ctypes.c_int]
-    library.genre_adam_step.argtypes = [now, ctypes.c_int]
-    p, n, f = ctypes.c_void_p, ctypes.c_int64, ctypes.c_float
-    library.genre_saw.argtypes = [n, p, p, p, p, f, f, ctypes.c_int, p, p, p, p]
-    library.genre_moved.argtypes = [n, *[p] * 7, ctypes.c_int, p]
+    inputs = ctypes.POINTER(StepInputs)
+    pointer = ctypes.c_void_p
+    library.genre_network_step.argtypes = [ctypes.POINTER(Network), ctypes.POINTER(Scene), inputs, ctypes.c_int]
+    library.genre_adam_step.argtypes = [inputs, ctypes.c_int]
+    # The types must be declared: without them ctypes passes a pointer as an int of 32 bits.
+    learning_rates = [ctypes.c_float] * 2
+    library.genre_accumulate.argtypes = [ctypes.c_int64, *[pointer] * 4, *learning_rates, ctypes.c_int, *[pointer] * 4]
+    library.genre_apply_step.argtypes = [ctypes.c_int64, *[pointer] * 7, ctypes.c_int, pointer]
     return library
 
 
-def takes(*tensors: Tensor) -> bool:
-    """Whether the kernel is made for these tensors: all float32 on the CPU."""
-    return all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors)
+def is_supported(*tensors: Tensor) -> bool:
+    """Tells whether the kernel takes these tensors.
+
+    Args:
+        tensors: everything that it would read.
+
+    Returns:
+        Whether all are float32 on the CPU.
+
+    >>> is_supported(torch.zeros(2), torch.zeros(2, dtype=torch.float64))
+    False
+    """
+    return all(tensor.device.type == "cpu" and tensor.dtype == torch.float32 for tensor in tensors)
 
 
-def check(status: int) -> None:
-    """Raises ``ResourceError`` for what a function of the kernel returns other than 0."""
+def check_status(status: int) -> None:
+    """Turns what a function of the kernel returns into an error.
+
+    Args:
+        status: 0 for success.
+
+    Raises:
+        ResourceError: for any other status; 1 is a lack of memory.
+    """
     if status == 1:
         raise ResourceError("not enough memory for the optimiser's step", remedy="Take a scene with fewer Gaussians")
     if status:

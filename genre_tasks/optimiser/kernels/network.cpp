@@ -1,11 +1,11 @@
 // The learned optimiser's step in one call: features, a dense layer for each Gaussian, the UNet over voxels, the head. The
-// torch code in learned.py, features.py and sparse_unet.py is its oracle. Every number is made by one thread, in an order
+// torch code in network.py, features.py and sparse_unet.py is its oracle. Every number is computed by one thread, in an order
 // that does not depend on how many there are.
 #include "../../compiled/runtime.h"
 #include "thread_team.h"
 #include "features.h"
 
-// The structures hold pointers and 64-bit numbers only, in the order of fused_library.py.
+// The structures hold pointers and 64-bit numbers only, in the order of library.py.
 
 // output[o] = residual[o] + silu(bias + sum over the pairs (i, k) of o: input[i] @ weight[k]).
 struct Layer {
@@ -18,9 +18,9 @@ struct Layer {
 
 struct Network {
   int64_t hidden;                   // a multiple of 2 * LANES
-  int64_t varying;                  // VARYING, or with those of residuals
-  const float *entry, *entry_bias;  // [varying + TIMES, hidden]
-  const float* mix;                 // [hidden, hidden]: of the own row; voxels bring the bias
+  int64_t varying;                  // VARYING_FEATURES, plus IMAGE_RESIDUALS where the network takes them
+  const float *entry, *entry_bias;  // [varying + SCHEDULE_FEATURES, hidden]
+  const float* mix;                 // [hidden, hidden]: of the Gaussian's row; voxels bring the bias
   const float *head, *head_bias;    // [hidden, HEAD]: 14 gains, the relaxation and a zero, 14 offsets, two zeros
 };
 
@@ -28,8 +28,8 @@ struct Scene {
   int64_t voxels;
   const float *base, *fixed;                // [N, 14] and [N, 4], see features()
   const int32_t *voxel_of, *starts, *points;  // [N]; [voxels + 1] and [N]: each voxel's Gaussians
-  int32_t *active, *slot;                   // [N]: Gaussians that are seen now, and the place of each of all there or -1
-  float *own, *pooled;                      // [N up to a whole BLOCK, hidden] by slot, [voxels, hidden]
+  int32_t *active, *slot;                   // [N]: the visible Gaussians, and each one's index among them or -1
+  float *embedding, *pooled;                // [N rounded up to BLOCK_GAUSSIANS, hidden] by slot, [voxels, hidden]
   const float* around;                      // [voxels, hidden]: what the last layer writes, the mixing layer's bias included
   const Layer* layers;
   int64_t layer_count;
@@ -43,15 +43,15 @@ static size_t pieces(int64_t n, int size) { return ((size_t)n + size - 1) / size
 
 static void pool(const Scene& scene, size_t hidden, size_t voxel) {
   const int32_t *begin = scene.points + scene.starts[voxel], *end = scene.points + scene.starts[voxel + 1];
-  int seen = 0;
-  for (const int32_t* p = begin; p < end; p++) seen += scene.slot[*p] >= 0;
-  const Lanes count = broadcast((float)std::max(seen, 1));
+  int visible = 0;
+  for (const int32_t* p = begin; p < end; p++) visible += scene.slot[*p] >= 0;
+  const Lanes count = broadcast((float)std::max(visible, 1));
   for (size_t c = 0; c < hidden; c += 2 * LANES) {
     Lanes a{}, b{};
     for (const int32_t* p = begin; p < end; p++) {
       if (scene.slot[*p] < 0) continue;
-      const float* own = scene.own + scene.slot[*p] * hidden + c;
-      a += load(own), b += load(own + LANES);
+      const float* embedding = scene.embedding + scene.slot[*p] * hidden + c;
+      a += load(embedding), b += load(embedding + LANES);
     }
     float* out = scene.pooled + voxel * hidden + c;
     store(out, a / count), store(out + LANES, b / count);
@@ -60,7 +60,7 @@ static void pool(const Scene& scene, size_t hidden, size_t voxel) {
 
 static void convolve(const Layer& layer, size_t o) {
   for (int64_t column = 0; column < layer.out; column += LANES) {
-    Lanes sum[4] = {load(layer.bias + column)};  // one chain of additions would wait for itself
+    Lanes sum[4] = {load(layer.bias + column)};  // in one chain each addition would wait for the one before
     for (int32_t p = layer.starts[o]; p < layer.starts[o + 1]; p++) {
       const float* x = layer.input + layer.pairs[2 * p] * layer.in;
       const float* w = layer.weight + layer.pairs[2 * p + 1] * layer.in * layer.out + column;
@@ -74,160 +74,167 @@ static void convolve(const Layer& layer, size_t o) {
   }
 }
 
-// A thread's own rows.
+// A thread's rows.
 struct Rows {
   std::vector<Lanes> features, hidden, head;
-  explicit Rows(size_t width) : features(BLOCK * STRIDE / LANES), hidden(BLOCK * width / LANES), head(BLOCK * HEAD / LANES) {}
+  explicit Rows(size_t width) : features(BLOCK_GAUSSIANS * STRIDE / LANES), hidden(BLOCK_GAUSSIANS * width / LANES), head(BLOCK_GAUSSIANS * HEAD / LANES) {}
   static float* of(std::vector<Lanes>& rows) { return reinterpret_cast<float*>(rows.data()); }
 };
-static_assert(BLOCK % TILE_ROWS == 0, "whole tiles");
+static_assert(BLOCK_GAUSSIANS % TILE_ROWS == 0, "whole tiles");
 
-// What this iteration's views saw is all that moves; the rest has no part in the network. Returns how many these are.
-static size_t find_active(const Scene& scene, const Now& now) {
+// Finds the visible Gaussians: nothing else moves or has a part in the network. Returns how many they are.
+static size_t find_active(const Scene& scene, const StepInputs& in) {
   size_t n = 0;
-  for (int64_t i = 0; i < now.count; i++) {
-    const bool seen = now.seen_now[i] > 0;
-    scene.slot[i] = seen ? (int32_t)n : -1;
-    if (seen)
+  for (int64_t i = 0; i < in.count; i++) {
+    const bool visible = in.visible[i] > 0;
+    scene.slot[i] = visible ? (int32_t)n : -1;
+    if (visible)
       scene.active[n++] = (int32_t)i;
     else
-      store_attributes(now.delta + ATTRIBUTES * i, Lanes{});
+      store_attributes(in.delta + ATTRIBUTES * i, Lanes{});
   }
   return n;
 }
 
-static void enter(const Network& net, const Scene& scene, const Now& now, const Lanes& usual, const float* bias, size_t active,
-                  size_t block, Rows& rows) {
-  const size_t begin = block * BLOCK, n = std::min<size_t>(BLOCK, active - begin);
-  float *x = Rows::of(rows.features), *own = scene.own + begin * net.hidden;
-  for (size_t r = 0; r < n; r++) features(now, scene.base, scene.fixed, usual, scene.active[begin + r], x + STRIDE * r);
-  dense((int)n, x, STRIDE, (int)net.varying, net.entry, net.hidden, [&](int) { return bias; }, own);
-  silu_rows(own, n * net.hidden);
+// Embeds a block of Gaussians: their features, and the dense layer on them.
+static void embed(const Network& net, const Scene& scene, const StepInputs& in, const Lanes& inverse_group_rms, const float* bias,
+                  size_t active, size_t block, Rows& rows) {
+  const size_t begin = block * BLOCK_GAUSSIANS, n = std::min<size_t>(BLOCK_GAUSSIANS, active - begin);
+  float *x = Rows::of(rows.features), *embedding = scene.embedding + begin * net.hidden;
+  for (size_t r = 0; r < n; r++)
+    features(in, scene.base, scene.fixed, inverse_group_rms, scene.active[begin + r], x + STRIDE * r);
+  dense((int)n, x, STRIDE, (int)net.varying, net.entry, net.hidden, [&](int) { return bias; }, embedding);
+  silu_rows(embedding, n * net.hidden);
 }
 
-static void leave(const Network& net, const Scene& scene, const Now& now, size_t active, size_t block, Rows& rows) {
-  const size_t begin = block * BLOCK, n = std::min<size_t>(BLOCK, active - begin);
+// Mixes a block's embeddings with what is around them, and makes its steps.
+static void step(const Network& net, const Scene& scene, const StepInputs& in, size_t active, size_t block, Rows& rows) {
+  const size_t begin = block * BLOCK_GAUSSIANS, n = std::min<size_t>(BLOCK_GAUSSIANS, active - begin);
   const int depth = (int)net.hidden;
   float *hidden = Rows::of(rows.hidden), *head = Rows::of(rows.head);
-  const size_t ahead = std::min<size_t>(2 * BLOCK, active - begin) * net.hidden;  // this block and the next
-  for (size_t i = 0; i < ahead; i += LANES) __builtin_prefetch(scene.own + begin * net.hidden + i);
+  const size_t ahead = std::min<size_t>(2 * BLOCK_GAUSSIANS, active - begin) * net.hidden;  // this block and the next
+  for (size_t i = 0; i < ahead; i += LANES) __builtin_prefetch(scene.embedding + begin * net.hidden + i);
   const int32_t* points = scene.active + begin;
   auto around = [&](int r) { return scene.around + scene.voxel_of[points[std::min<size_t>(r, n - 1)]] * net.hidden; };
-  dense((int)n, scene.own + begin * net.hidden, net.hidden, depth, net.mix, net.hidden, around, hidden);
+  dense((int)n, scene.embedding + begin * net.hidden, net.hidden, depth, net.mix, net.hidden, around, hidden);
   silu_rows(hidden, n * net.hidden);
   dense((int)n, hidden, net.hidden, depth, net.head, HEAD, [&](int) { return net.head_bias; }, head);
-  const Lanes rates = load_attributes(now.rates);
+  const Lanes rates = load_attributes(in.signed_rates);
   for (size_t r = 0; r < n; r++) {
     const Lanes gain = load(head + HEAD * r), offset = load(head + HEAD * r + LANES);
     const Lanes factor = power_of_2(tanh(gain * (1 / 3.f)) * (3 * LOG2_E));
-    float* delta = now.delta + ATTRIBUTES * (size_t)points[r];  // holds the direction
+    float* delta = in.delta + ATTRIBUTES * (size_t)points[r];  // features() has left the direction here
     Lanes step = rates * (factor * load_attributes(delta) + tanh(offset));
-    if (now.residuals) step += relaxed(now, (size_t)points[r], tanh(gain)[14]);
+    if (in.image_residuals) step += residual_step(in, (size_t)points[r], tanh(gain)[14]);
     store_attributes(delta, step);
   }
 }
 
-static void evaluate(const Network& net, const Scene& scene, const Now& now, int threads) {
-  std::vector<Usual> parts(pieces(now.count, SUMMED));
+static void evaluate(const Network& net, const Scene& scene, const StepInputs& in, int threads) {
+  std::vector<SquaredRms> parts(pieces(in.count, SUMMED));
+  // Features that all Gaussians share are a constant of the dense layer: they go into its bias.
   std::vector<float> bias(net.entry_bias, net.entry_bias + net.hidden);
-  for (int t = 0; t < TIMES; t++)
-    for (int64_t c = 0; c < net.hidden; c++) bias[c] += now.times[t] * net.entry[(net.varying + t) * net.hidden + c];
+  for (int t = 0; t < SCHEDULE_FEATURES; t++)
+    for (int64_t c = 0; c < net.hidden; c++)
+      bias[c] += in.schedule_features[t] * net.entry[(net.varying + t) * net.hidden + c];
   std::vector<Rows> rows(threads, Rows(net.hidden));
-  const size_t active = find_active(scene, now), blocks = pieces(active, BLOCK);
-  Crew crew(4 + scene.layer_count);
-  crew.run(threads, [&](Crew::Member& member) {
+  const size_t active = find_active(scene, in), blocks = pieces(active, BLOCK_GAUSSIANS);
+  ThreadTeam team(4 + scene.layer_count);
+  team.run(threads, [&](ThreadTeam::Member& member) {
     auto each_voxel = [&](int64_t voxels, auto f) {
       member.each(pieces(voxels, VOXELS), [&](size_t p) {
         for (size_t v = p * VOXELS; v < std::min<size_t>((p + 1) * VOXELS, voxels); v++) f(v);
       });
     };
     member.each(parts.size(), [&](size_t p) {
-      parts[p] = sum_of_squares(now, p * SUMMED, std::min<size_t>((p + 1) * SUMMED, now.count));
+      parts[p] = sum_squared_rms(in, p * SUMMED, std::min<size_t>((p + 1) * SUMMED, in.count));
     });
-    const Lanes usual = inverse_usual(parts);
-    member.each(blocks, [&](size_t b) { enter(net, scene, now, usual, bias.data(), active, b, rows[member.number]); });
+    const Lanes group_rms = inverse_group_rms(parts);
+    member.each(blocks, [&](size_t b) { embed(net, scene, in, group_rms, bias.data(), active, b, rows[member.number]); });
     each_voxel(scene.voxels, [&](size_t v) { pool(scene, net.hidden, v); });
     for (int64_t l = 0; l < scene.layer_count; l++)
       each_voxel(scene.layers[l].outputs, [&](size_t v) { convolve(scene.layers[l], v); });
-    member.each(blocks, [&](size_t b) { leave(net, scene, now, active, b, rows[member.number]); });
+    member.each(blocks, [&](size_t b) { step(net, scene, in, active, b, rows[member.number]); });
   });
 }
 
 // f(i) for each Gaussian.
 template <class F>
 static void each_gaussian(int64_t count, int threads, F f) {
-  const int crew = std::max(1, threads);
-  parallel(crew, [&](int w) {
-    for (int64_t i = count * w / crew; i < count * (w + 1) / crew; i++) f(i);
+  const int workers = std::max(1, threads);
+  parallel(workers, [&](int w) {
+    for (int64_t i = count * w / workers; i < count * (w + 1) / workers; i++) f(i);
   });
 }
 
-constexpr int PLANE = 11;
+constexpr int CONSTRAINT = 11;
 
-// ground.along_ground: what of a row of 14 leads along its plane (normal, quaternion, the same turned within it), in
-// `along`; the row itself off the ground, where the plane is 0.
-static const float* along_ground(const float* delta, const float* plane, float* along) {
-  const float *normal = plane, *own = plane + 3, *turned = plane + 7;
+// project_onto_ground of ground_constraint.py: a row of 14 without what leads out of the ground's plane, in `along`. A
+// constraint is the normal, the unit quaternion, and that quaternion after half a turn within the plane. Off the ground it is
+// 0, and the row itself is returned.
+static const float* project_onto_ground(const float* delta, const float* constraint, float* along) {
+  const float *normal = constraint, *quat = constraint + 3, *turned = constraint + 7;
   if (normal[0] == 0.f && normal[1] == 0.f && normal[2] == 0.f) return delta;
   std::copy(delta, delta + ATTRIBUTES, along);
-  float off = 0.f, by_own = 0.f, by_turned = 0.f;
+  float off = 0.f, by_quat = 0.f, by_turned = 0.f;
   for (int c = 0; c < 3; c++) off += normal[c] * delta[c];
   for (int c = 0; c < 3; c++) along[c] = delta[c] - normal[c] * off;
-  for (int c = 0; c < 4; c++) by_own += own[c] * delta[6 + c], by_turned += turned[c] * delta[6 + c];
-  for (int c = 0; c < 4; c++) along[6 + c] = own[c] * by_own + turned[c] * by_turned;
+  for (int c = 0; c < 4; c++) by_quat += quat[c] * delta[6 + c], by_turned += turned[c] * delta[6 + c];
+  for (int c = 0; c < 4; c++) along[6 + c] = quat[c] * by_quat + turned[c] * by_turned;
   return along;
 }
 
 extern "C" {
 
-// Writes now->delta, the learned optimiser's step: 0 where nothing was seen now.
-int genre_network_step(const Network* network, const Scene* scene, const Now* now, int threads) {
-  return guarded([&] { evaluate(*network, *scene, *now, std::max(1, threads)); });
+// Writes in->delta, the learned optimiser's step: 0 for Gaussians that are not visible.
+int genre_network_step(const Network* network, const Scene* scene, const StepInputs* in, int threads) {
+  return guarded([&] { evaluate(*network, *scene, *in, std::max(1, threads)); });
 }
 
-// Writes now->delta, tuned Adam's step, 0 where nothing was seen now: the bits of an untrained network's.
-int genre_adam_step(const Now* now, int threads) {
+// Writes in->delta, tuned Adam's step, 0 for Gaussians that are not visible: the bits of an untrained network's step.
+int genre_adam_step(const StepInputs* in, int threads) {
   return guarded([&] {
-    const Lanes rates = load_attributes(now->rates);
-    each_gaussian(now->count, threads, [&](int64_t i) {
-      if (!(now->seen_now[i] > 0)) return store_attributes(now->delta + ATTRIBUTES * i, Lanes{});
-      const float* by_seen = counted(*now, i);
-      store_attributes(now->delta + ATTRIBUTES * i, rates * direction(*now, i, by_seen, deviation(*now, i, by_seen)));
+    const Lanes rates = load_attributes(in->signed_rates);
+    each_gaussian(in->count, threads, [&](int64_t i) {
+      if (!(in->visible[i] > 0)) return store_attributes(in->delta + ATTRIBUTES * i, Lanes{});
+      const float* factors = factors_of_count(*in, i);
+      store_attributes(in->delta + ATTRIBUTES * i, rates * adam_direction(*in, i, factors, rms_gradient(*in, i, factors)));
     });
   });
 }
 
-// State.saw: [N, 14] and [N]; the rates are 1 - decay.
-int genre_saw(int64_t count, const float* gradient, const float* first, const float* second, const float* seen,
-              float first_rate, float second_rate, int threads, float* new_first, float* new_second, float* new_seen,
-              float* seen_now) {
+// State.accumulate: [N, 14] and [N]; the rates are 1 - decay.
+int genre_accumulate(int64_t count, const float* gradient, const float* first_moment, const float* second_moment,
+                     const float* visit_count, float first_rate, float second_rate, int threads, float* new_first,
+                     float* new_second, float* new_count, float* visible) {
   return guarded([&] {
     each_gaussian(count, threads, [&](int64_t i) {
       const int64_t at = ATTRIBUTES * i;
-      const Lanes g = load_attributes(gradient + at), m = load_attributes(first + at), v = load_attributes(second + at);
+      const Lanes g = load_attributes(gradient + at), m = load_attributes(first_moment + at);
+      const Lanes v = load_attributes(second_moment + at);
       const float now = any(~((g >= 0.f) & (g <= 0.f))) ? 1.f : 0.f;  // also where it is NaN
       store_attributes(new_first + at, m + (g - m) * (now * first_rate));
       store_attributes(new_second + at, v + (g * g - v) * (now * second_rate));
-      new_seen[i] = seen[i] + now;
-      seen_now[i] = now;
+      new_count[i] = visit_count[i] + now;
+      visible[i] = now;
     });
   });
 }
 
-// State.moved and Frame.bounded: [N, 14], seen_now [N], planes [N, 11]. Off the ground additions and choices only:
-// torch's bits.
-int genre_moved(int64_t count, const float* offsets, const float* delta, const float* seen_now, const float* start,
-                const float* low, const float* high, const float* planes, int threads, float* out) {
+// State.apply_step and Parameterization.clamp: [N, 14], visible [N], constraints [N, 11]. Off the ground there are additions
+// and choices only, so that the bits are torch's.
+int genre_apply_step(int64_t count, const float* offsets, const float* delta, const float* visible, const float* initial,
+                     const float* lower, const float* upper, const float* constraints, int threads, float* out) {
   return guarded([&] {
     each_gaussian(count, threads, [&](int64_t i) {
       const int64_t at = ATTRIBUTES * i;
       Lanes moved = load_attributes(offsets + at);
-      if (seen_now[i] > 0) {
+      if (visible[i] > 0) {
         float along[ATTRIBUTES];
-        moved = moved + load_attributes(along_ground(delta + at, planes + PLANE * i, along));
-        const Lanes from = load_attributes(start + at), least = load_attributes(low + at), there = from + moved;
-        const Lanes held = bounded(there, least, load_attributes(high + at)), back = held - from;
-        const Mask inside = ((there >= held) & (there <= held)) | (least <= -INFINITY);
+        moved = moved + load_attributes(project_onto_ground(delta + at, constraints + CONSTRAINT * i, along));
+        const Lanes from = load_attributes(initial + at), least = load_attributes(lower + at), there = from + moved;
+        const Lanes clamped = bounded(there, least, load_attributes(upper + at)), back = clamped - from;
+        const Mask inside = ((there >= clamped) & (there <= clamped)) | (least <= -INFINITY);
         moved = select(inside, moved, back);
       }
       store_attributes(out + at, moved);

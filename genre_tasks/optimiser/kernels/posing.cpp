@@ -9,7 +9,7 @@
 
 #include "../../compiled/runtime.h"
 
-constexpr int BLOCK = 64, ATTRIBUTES = 14, RESIDUALS = 5;
+constexpr int BLOCK = 64, ATTRIBUTES = 14, IMAGE_RESIDUALS = 5;
 enum Attribute { MEAN = 0, SCALE = 3, QUAT = 6, OPACITY = 10, COLOR = 11 };
 
 // An actor at a frame; where it is absent, it does not move.
@@ -17,11 +17,11 @@ struct Pose {
   float turn[9], shift[3], quat[4], present;
 };
 
-// What stays over the iterations. A Gaussian that does not move has one splat, `slot`; one of an actor has a splat for each
-// frame, `slot` for the first, each `moving` behind the one before.
+// What does not change over the iterations. A Gaussian that does not move has one splat, at `slot`. One of an actor has a splat
+// for each frame: at `slot` for the first, and `moving` further for each next.
 struct Gaussians {
   int64_t count, moving, actors;
-  const float *start, *unit;      // [N, 14], [N]
+  const float *start, *unit_m;    // [N, 14], [N]
   const int32_t *slot, *actor;    // [N]; the actor is -1 for what does not move
   const Pose* poses;              // [., actors]
 };
@@ -37,9 +37,9 @@ struct Splats {
 
 // e^x within 2e-7, relative, from -87 to 88; constant below, infinite above.
 static inline float exponential(float x) {
-  const float held = x < -87.f ? -87.f : x > 88.f ? 88.f : x;
-  const float n = (held * 1.44269504f + 12582912.f) - 12582912.f;  // 1.5 * 2^23: rounds to the nearest integer
-  const float r = (held - n * 0.693359375f) + n * 2.12194440e-4f;  // ln 2 in two parts
+  const float clamped = x < -87.f ? -87.f : x > 88.f ? 88.f : x;
+  const float n = (clamped * 1.44269504f + 12582912.f) - 12582912.f;  // 1.5 * 2^23: rounds to the nearest integer
+  const float r = (clamped - n * 0.693359375f) + n * 2.12194440e-4f;  // ln 2 in two parts
   float p = 1.9875691500e-4f;
   p = p * r + 1.3981999507e-3f;
   p = p * r + 8.3334519073e-3f;
@@ -59,9 +59,9 @@ static inline float opacity_of(float exponent) { return 1.f / (1.f + exponent); 
 template <class F>
 static void each_block(int64_t count, int threads, F f) {
   const int64_t blocks = (count + BLOCK - 1) / BLOCK;
-  const int crew = (int)std::max<int64_t>(1, std::min<int64_t>(threads, blocks / 8));
-  parallel(crew, [&](int w) {
-    for (int64_t b = blocks * w / crew; b < blocks * (w + 1) / crew; b++)
+  const int workers = (int)std::max<int64_t>(1, std::min<int64_t>(threads, blocks / 8));
+  parallel(workers, [&](int w) {
+    for (int64_t b = blocks * w / workers; b < blocks * (w + 1) / workers; b++)
       f(b * BLOCK, (int)std::min<int64_t>(BLOCK, count - b * BLOCK));
   });
 }
@@ -77,7 +77,7 @@ static void pose_block(const Gaussians& in, const Frames& frames, const float* o
   std::fill(scales + 3 * count, scales + 3 * BLOCK, 0.f);
   for (int i = 0; i < count; i++) {
     const float *start = in.start + ATTRIBUTES * (first + i), *offset = offsets + ATTRIBUTES * (first + i);
-    const float unit = in.unit[first + i];
+    const float unit = in.unit_m[first + i];
     for (int k = 0; k < 3; k++) at[i][k] = start[k] + offset[k] * unit;
     for (int k = 3; k < ATTRIBUTES; k++) at[i][k] = start[k] + offset[k];
     for (int k = 0; k < 3; k++) scales[3 * i + k] = at[i][SCALE + k];
@@ -117,7 +117,7 @@ static void gradient_of_one(const Gaussians& in, const Frames& frames, int64_t i
                             const Splats& by_splats, float* out) {
   int64_t slot = in.slot[i];
   const int actor = in.actor[i];
-  const float *scale = scales + 3 * slot, unit = in.unit[i];
+  const float *scale = scales + 3 * slot, unit = in.unit_m[i];
   float sum[ATTRIBUTES] = {};
   for (int64_t f = 0; f < (actor < 0 ? 1 : frames.count); f++, slot += in.moving) {
     const float *m = by_splats.means + 3 * slot, *q = by_splats.quats + 4 * slot;
@@ -162,16 +162,16 @@ int genre_pose_gradient(const Gaussians* in, const Frames* frames, const float* 
   });
 }
 
-// What Gaussians show of a residual image, [N, RESIDUALS], from what their splats show.
+// Sums what the splats of each Gaussian show of a residual image, [N, IMAGE_RESIDUALS].
 int genre_pose_residuals(const Gaussians* in, int64_t frames, const float* by_splats, int threads, float* out) {
   return guarded([&] {
     each_block(in->count, threads, [&](int64_t first, int count) {
       for (int64_t i = first; i < first + count; i++) {
-        float sum[RESIDUALS] = {};
+        float sum[IMAGE_RESIDUALS] = {};
         int64_t slot = in->slot[i];
         for (int64_t f = 0; f < (in->actor[i] < 0 ? 1 : frames); f++, slot += in->moving)
-          for (int k = 0; k < RESIDUALS; k++) sum[k] += by_splats[RESIDUALS * slot + k];
-        put<RESIDUALS>(out + RESIDUALS * i, sum);
+          for (int k = 0; k < IMAGE_RESIDUALS; k++) sum[k] += by_splats[IMAGE_RESIDUALS * slot + k];
+        put<IMAGE_RESIDUALS>(out + IMAGE_RESIDUALS * i, sum);
       }
     });
   });

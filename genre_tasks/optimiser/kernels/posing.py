@@ -1,6 +1,7 @@
-"""From offsets to splats, a render of them and the way back to the offsets' gradient, compiled: no autograd in between.
+"""From offsets to splats, and from a render of them back to the gradient of the offsets: compiled, without autograd.
 
-``Frame.gaussians``, ``SceneGraph.posed``, ``Gaussians.activated`` and ``Render.expected_depth`` are its oracle.
+``Parameterization.gaussians_at``, ``SceneGraph.gaussians_at_frames``, ``Gaussians.activate`` and
+``Render.expected_depth`` are its oracle.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from genre_tasks.compiled.loader import load
 from genre_tasks.errors import ResourceError
 from genre_tasks.optimiser.kernels.build_posing import KERNEL
 from genre_tasks.render import cpu
-from genre_tasks.render.types import Shown
+from genre_tasks.render.types import VisibleRanges
 from genre_tasks.scene.graph import FIRST_ACTOR, SceneGraph
-from genre_tasks.scene.transforms import matrix_to_quat
+from genre_tasks.scene.rotations import matrices_to_quats
 
 
 class _Gaussians(ctypes.Structure):
@@ -29,7 +30,7 @@ class _Gaussians(ctypes.Structure):
 
     _fields_ = [
         *((name, ctypes.c_int64) for name in ("count", "moving", "actors")),
-        *((name, ctypes.c_void_p) for name in ("start", "unit", "slot", "actor", "poses")),
+        *((name, ctypes.c_void_p) for name in ("start", "unit_m", "slot", "actor", "poses")),
     ]
 
 
@@ -41,137 +42,261 @@ class _Splats(ctypes.Structure):
     _fields_ = [(name, ctypes.c_void_p) for name in ("means", "scales", "quats", "opacities", "colors")]
 
     @staticmethod
-    def of(arrays: cpu.Arrays) -> _Splats:
-        return _Splats(*(a.data_ptr() for a in arrays))
+    def from_arrays(arrays: cpu.SplatTensors) -> _Splats:
+        return _Splats(*(array.data_ptr() for array in arrays))
 
 
 @cache
 def load_posing(folder: Path = KERNEL.folder) -> ctypes.CDLL:
-    """The kernel with its argument types declared, loaded once.
+    """Loads the kernel once, with its argument types declared.
 
-    Raises ``ResourceError`` and ``ConfigError`` as :func:`genre_tasks.compiled.loader.load`.
+    Args:
+        folder: where its libraries are.
+
+    Returns:
+        The library of the best instruction set of this machine.
+
+    Raises:
+        ResourceError: as :func:`genre_tasks.compiled.loader.load`.
+        ConfigError: as there.
     """
     library = load(KERNEL, folder)
-    p, i, n = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64
-    gaussians, frames, splats = (ctypes.POINTER(s) for s in (_Gaussians, _Frames, _Splats))
-    library.genre_pose.argtypes = [gaussians, frames, p, i, splats, p]
-    library.genre_pose_gradient.argtypes = [gaussians, frames, p, p, splats, i, p]
-    library.genre_pose_residuals.argtypes = [gaussians, n, p, i, p]
-    library.genre_expected_depth.argtypes = [n, p, p, p]
-    library.genre_expected_depth_gradient.argtypes = [n, p, p, p]
+    pointer = ctypes.c_void_p
+    threads = ctypes.c_int
+    number = ctypes.c_int64
+    gaussians = ctypes.POINTER(_Gaussians)
+    frames = ctypes.POINTER(_Frames)
+    splats = ctypes.POINTER(_Splats)
+    library.genre_pose.argtypes = [gaussians, frames, pointer, threads, splats, pointer]
+    library.genre_pose_gradient.argtypes = [gaussians, frames, pointer, pointer, splats, threads, pointer]
+    library.genre_pose_residuals.argtypes = [gaussians, number, pointer, threads, pointer]
+    library.genre_expected_depth.argtypes = [number, pointer, pointer, pointer]
+    library.genre_expected_depth_gradient.argtypes = [number, pointer, pointer, pointer]
     return library
 
 
 @dataclass(frozen=True)
-class Posed:
-    """The splats at some frames, laid out as by ``SceneGraph.posed``; ``slopes`` [N]: of opacity by its logit."""
+class PosedSplats:
+    """The splats at F frames, laid out as ``SceneGraph.gaussians_at_frames``.
 
-    frames: Tensor  # [F] rows of the poses
-    splats: cpu.Arrays
-    slopes: Tensor
+    Attributes:
+        frame_rows: [F] rows of the table of poses.
+        splats: means, scales, quaternions, opacities, colours.
+        opacity_slopes: [N] derivative of each Gaussian's opacity by its logit.
+    """
+
+    frame_rows: Tensor
+    splats: cpu.SplatTensors
+    opacity_slopes: Tensor
 
 
 class Posing:
-    """The Gaussians of an unrolled optimisation at any offsets and frames, as splats; float32 on the CPU.
+    """Turns the Gaussians of an unrolled optimisation into splats, at any offsets and frames; float32 on the CPU.
 
     Args:
         scene: at its start.
         start: [N, 14] the scene's Gaussians, packed.
-        unit: [N, 1] metres.
+        unit_m: [N, 1] metres.
+
+    Attributes:
+        moving: number of Gaussians that belong to actors.
+        still: number of all others.
     """
 
-    def __init__(self, scene: SceneGraph, start: Tensor, unit: Tensor) -> None:
+    def __init__(self, scene: SceneGraph, start: Tensor, unit_m: Tensor) -> None:
+        # A scene that lists no actors is static, whatever its nodes say.
         nodes = scene.nodes if scene.actors else torch.zeros_like(scene.nodes)
-        moves = nodes >= FIRST_ACTOR
-        self.moving = int(moves.sum())
+        is_actor = nodes >= FIRST_ACTOR
+        self.moving = int(is_actor.sum())
         self.still = len(nodes) - self.moving
-        self._slot = torch.where(moves, self.still + torch.cumsum(moves, 0), torch.cumsum(~moves, 0)).int() - 1
-        self._actor = torch.where(moves, nodes - FIRST_ACTOR, -1).int()
-        self._start, self._unit = start.contiguous(), unit.contiguous()
-        self._frames = sorted({int(f) for actor in scene.actors for f in actor.frames})
-        self._scene, self._poses = scene, _pose_table(scene, self._frames)
-        self._row: dict[float, int] = {frame: i for i, frame in enumerate(self._frames)}
-        self._in = _Gaussians(
+        # Static splats come first, each at its rank among the static; an actor's follow at its rank among the moving.
+        moving_slots = self.still + torch.cumsum(is_actor, 0)
+        still_slots = torch.cumsum(~is_actor, 0)
+        self._slot = torch.where(is_actor, moving_slots, still_slots).int() - 1
+        self._actor = torch.where(is_actor, nodes - FIRST_ACTOR, -1).int()
+        # Attributes and not locals: the kernel's structure below holds addresses of these tensors only.
+        self._start = start.contiguous()
+        self._unit_m = unit_m.contiguous()
+        self._frames = sorted({int(frame) for actor in scene.actors for frame in actor.frames})
+        self._scene = scene
+        self._poses = _pose_table(scene, self._frames)
+        self._row_of_frame: dict[float, int] = {frame: i for i, frame in enumerate(self._frames)}
+        self._gaussians = _Gaussians(
             len(nodes),
             self.moving,
             len(scene.actors),
-            *(t.data_ptr() for t in (self._start, self._unit, self._slot, self._actor, self._poses)),
+            *(t.data_ptr() for t in (self._start, self._unit_m, self._slot, self._actor, self._poses)),
         )
 
-    def shown(self, frames: Sequence[float]) -> Shown:
-        """Which splats of :meth:`splats` views at these log frames have."""
-        return Shown.of_frames(self.still, self.moving, frames)
+    def visible_ranges(self, frames: Sequence[float]) -> VisibleRanges:
+        """Tells which splats of :meth:`pose` the views at these log frames show."""
+        return VisibleRanges.for_frames(self.still, self.moving, frames)
 
-    def splats(self, offsets: Tensor, frames: Sequence[float], threads: int) -> Posed:
-        """At ``offsets`` [N, 14] and at distinct log frames, or moments between them."""
+    def pose(self, offsets: Tensor, frames: Sequence[float], threads: int) -> PosedSplats:
+        """Applies offsets, moves actors to their poses, and activates scales and opacities.
+
+        Args:
+            offsets: [N, 14] from the start.
+            frames: [F] distinct log frames, or moments between them.
+            threads: how many to use; the bits do not depend on it.
+
+        Returns:
+            PosedSplats: S + F · M splats.
+
+        Raises:
+            ValueError: the offsets are of another scene.
+            ResourceError: the kernel is not compiled, or fails.
+        """
         offsets = offsets.contiguous()
         if offsets.shape != self._start.shape:
             raise ValueError(f"expected offsets of shape {list(self._start.shape)}, got {list(offsets.shape)}")
-        self._know([f for f in frames if f % 1 and f not in self._row])
-        nowhere = len(self._frames)
-        rows = torch.tensor([self._row.get(f, nowhere) for f in frames], dtype=torch.int64)
-        posed = Posed(rows, arrays(self.still + len(frames) * self.moving), torch.empty(len(offsets)))
-        pointers = offsets.data_ptr(), threads, _Splats.of(posed.splats), posed.slopes.data_ptr()
-        _check(load_posing().genre_pose(self._in, _Frames(len(rows), rows.data_ptr()), *pointers))
+        # Moments between log frames come with motion blur; the log frames are in the table from the start.
+        self._add_poses([frame for frame in frames if frame % 1 and frame not in self._row_of_frame])
+        # The last row of the first table says that no actor exists; all frames without an actor share it.
+        row_without_actors = len(self._frames)
+        rows = [self._row_of_frame.get(frame, row_without_actors) for frame in frames]
+        frame_rows = torch.tensor(rows, dtype=torch.int64)
+        splats = allocate_splats(self.still + len(frames) * self.moving)
+        posed = PosedSplats(frame_rows, splats, torch.empty(len(offsets)))
+        status = load_posing().genre_pose(
+            self._gaussians,
+            _Frames(len(frame_rows), frame_rows.data_ptr()),
+            offsets.data_ptr(),
+            threads,
+            _Splats.from_arrays(posed.splats),
+            posed.opacity_slopes.data_ptr(),
+        )
+        _check_status(status)
         return posed
 
-    def _know(self, between: Sequence[float]) -> None:
-        """Adds rows of poses between log frames to the table; those that it has stay where they are."""
-        if not between or not self._scene.actors:
-            return
-        begin = len(self._poses)
-        self._row |= {frame: begin + i for i, frame in enumerate(between)}
-        self._poses = torch.cat([self._poses, _pose_table(self._scene, between)])
-        self._in.poses = self._poses.data_ptr()
+    def offsets_gradient(self, posed: PosedSplats, by_splats: cpu.SplatTensors, threads: int) -> Tensor:
+        """Takes the gradient of the splats to the offsets.
 
-    def gradient(self, posed: Posed, by_splats: cpu.Arrays, threads: int) -> Tensor:
-        """The gradient [N, 14] with respect to the offsets from that of the splats."""
+        Args:
+            posed: the splats.
+            by_splats: gradients with respect to them, in the same layout.
+            threads: how many to use; the bits do not depend on it.
+
+        Returns:
+            [N, 14]; an actor's Gaussian has the sum over its frames.
+
+        Raises:
+            ResourceError: the kernel fails.
+        """
         out = torch.empty_like(self._start)
-        frames = _Frames(len(posed.frames), posed.frames.data_ptr())
-        scales, slopes = posed.splats[1].data_ptr(), posed.slopes.data_ptr()
-        pointers = scales, slopes, _Splats.of(by_splats), threads, out.data_ptr()
-        _check(load_posing().genre_pose_gradient(self._in, frames, *pointers))
+        status = load_posing().genre_pose_gradient(
+            self._gaussians,
+            _Frames(len(posed.frame_rows), posed.frame_rows.data_ptr()),
+            posed.splats[1].data_ptr(),
+            posed.opacity_slopes.data_ptr(),
+            _Splats.from_arrays(by_splats),
+            threads,
+            out.data_ptr(),
+        )
+        _check_status(status)
         return out
 
-    def residuals(self, posed: Posed, by_splats: Tensor, threads: int) -> Tensor:
-        """What the Gaussians show of a residual image, [N, 5], from what their splats show (``cpu.backward``)."""
-        out = torch.empty(len(self._start), by_splats.shape[1])
-        pointers = by_splats.data_ptr(), threads, out.data_ptr()
-        _check(load_posing().genre_pose_residuals(self._in, len(posed.frames), *pointers))
+    def gather_residuals(self, posed: PosedSplats, splat_residuals: Tensor, threads: int) -> Tensor:
+        """Sums what the splats of each Gaussian show of a residual image.
+
+        Args:
+            posed: the splats.
+            splat_residuals: [N', 5] of the splats, as ``cpu.backward`` returns them.
+            threads: how many to use; the bits do not depend on it.
+
+        Returns:
+            [N, 5] image residuals.
+
+        Raises:
+            ResourceError: the kernel fails.
+        """
+        out = torch.empty(len(self._start), splat_residuals.shape[1])
+        status = load_posing().genre_pose_residuals(
+            self._gaussians, len(posed.frame_rows), splat_residuals.data_ptr(), threads, out.data_ptr()
+        )
+        _check_status(status)
         return out
+
+    def _add_poses(self, frames: Sequence[float]) -> None:
+        """Adds rows for moments between log frames to the table of poses; those that it has keep their places."""
+        if not frames or not self._scene.actors:
+            return
+        # Rows are appended and never moved, since splats that were posed before refer to theirs by number.
+        first_row = len(self._poses)
+        self._row_of_frame |= {frame: first_row + i for i, frame in enumerate(frames)}
+        self._poses = torch.cat([self._poses, _pose_table(self._scene, frames)])
+        # The table has moved in memory.
+        self._gaussians.poses = self._poses.data_ptr()
 
 
 def expected_depth(alpha: Tensor, depth: Tensor) -> Tensor:
-    """As ``Render.expected_depth``; contiguous [V, H, W]."""
+    """Divides depth by alpha, as ``Render.expected_depth``.
+
+    Args:
+        alpha: [V, H, W], contiguous.
+        depth: [V, H, W] weighted sum of depths in metres, contiguous.
+
+    Returns:
+        [V, H, W] metres, 0 where nothing was rendered.
+
+    >>> expected_depth(torch.tensor([[[0.5, 0.0]]]), torch.tensor([[[4.0, 0.0]]])).tolist()
+    [[[8.0, 0.0]]]
+    """
     out = torch.empty_like(depth)
-    _check(load_posing().genre_expected_depth(out.numel(), alpha.data_ptr(), depth.data_ptr(), out.data_ptr()))
+    status = load_posing().genre_expected_depth(out.numel(), alpha.data_ptr(), depth.data_ptr(), out.data_ptr())
+    _check_status(status)
     return out
 
 
 def expected_depth_gradient(alpha: Tensor, expected: Tensor, by_expected: Tensor) -> tuple[Tensor, Tensor]:
-    """The gradients by alpha and by depth, written over ``expected`` and ``by_expected``."""
-    pointers = alpha.data_ptr(), expected.data_ptr(), by_expected.data_ptr()
-    _check(load_posing().genre_expected_depth_gradient(alpha.numel(), *pointers))
+    """Takes the gradient of :func:`expected_depth` to its arguments.
+
+    Args:
+        alpha: [V, H, W].
+        expected: [V, H, W] what :func:`expected_depth` returned; it is overwritten.
+        by_expected: [V, H, W] gradient with respect to it; it is overwritten.
+
+    Returns:
+        tuple: the gradients with respect to alpha and to depth, in the memory of the last two arguments.
+    """
+    pointers = (alpha.data_ptr(), expected.data_ptr(), by_expected.data_ptr())
+    _check_status(load_posing().genre_expected_depth_gradient(alpha.numel(), *pointers))
     return expected, by_expected
 
 
-def arrays(count: int) -> cpu.Arrays:
-    """Room for splats or their gradients."""
-    shapes = (count, 3), (count, 3), (count, 4), (count,), (count, 3)
-    means, scales, quats, opacities, colors = (torch.empty(shape) for shape in shapes)
+def allocate_splats(count: int) -> cpu.SplatTensors:
+    """Makes room for splats or their gradients.
+
+    Args:
+        count: number of splats.
+
+    Returns:
+        Means, scales, quaternions, opacities and colours, not initialised.
+
+    >>> [tuple(array.shape) for array in allocate_splats(2)]
+    [(2, 3), (2, 3), (2, 4), (2,), (2, 3)]
+    """
+    # Not zeroed: the kernels write every row.
+    means = torch.empty(count, 3)
+    scales = torch.empty(count, 3)
+    quats = torch.empty(count, 4)
+    opacities = torch.empty(count)
+    colors = torch.empty(count, 3)
     return means, scales, quats, opacities, colors
 
 
 def _pose_table(scene: SceneGraph, frames: Sequence[float]) -> Tensor:
     """[F + 1, A, 17]: rotation, translation, quaternion and presence; the last row for frames without any actor."""
-    nobody = -1 - max((abs(round(f)) for f in frames), default=0)
-    rotation, translation, present = scene.actor_poses([*frames, nobody])
-    turns = torch.as_tensor(rotation).float()
-    there = torch.as_tensor(present.astype(np.float32))[..., None]
-    parts = turns.flatten(2), torch.as_tensor(translation).float(), matrix_to_quat(turns), there
+    # A frame before all others, at which no actor exists.
+    frame_without_actors = -1 - max((abs(round(frame)) for frame in frames), default=0)
+    rotation, translation, present = scene.actor_poses([*frames, frame_without_actors])
+    rotations = torch.as_tensor(rotation).float()
+    translations = torch.as_tensor(translation).float()
+    presence = torch.as_tensor(present.astype(np.float32))[..., None]
+    parts = (rotations.flatten(2), translations, matrices_to_quats(rotations), presence)
     return torch.cat(parts, -1).contiguous()
 
 
-def _check(status: int) -> None:
+def _check_status(status: int) -> None:
     if status:
         raise ResourceError(f"{KERNEL.title} failed", remedy="Report the number of Gaussians and of views")

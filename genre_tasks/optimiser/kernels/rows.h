@@ -55,11 +55,11 @@ constexpr float LOG2_E = 1.44269504f;
 constexpr float POWER_1 = 6.931470037e-1f, POWER_2 = 2.402224243e-1f, POWER_3 = 5.550733581e-2f, POWER_4 = 9.671512991e-3f,
                 POWER_5 = 1.326472848e-3f;
 
-// 2^x, relative error 2e-7, with x held in [-125, 125].
+// 2^x, relative error 2e-7, with x clamped to [-125, 125].
 INLINE Lanes power_of_2(const Lanes& x) {
-  Lanes r, held = bounded(x, -125.f, 125.f);
+  Lanes r, clamped = bounded(x, -125.f, 125.f);
   EACH {
-    NativeF m = held.v[k] + 12582912.f, f = held.v[k] - (m - 12582912.f);  // 1.5 * 2^23: rounds to the nearest integer
+    NativeF m = clamped.v[k] + 12582912.f, f = clamped.v[k] - (m - 12582912.f);  // 1.5 * 2^23: rounds to the nearest integer
     NativeI n = ((NativeI)m) << 23;
     NativeF q = POWER_5 * f + POWER_4;
     q = q * f + POWER_3;

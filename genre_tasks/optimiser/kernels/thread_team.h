@@ -9,9 +9,9 @@
 #include <thread>
 #include <vector>
 
-// Which thread does a piece of a phase is left to chance; what is computed there is not. Nobody waits for a thread, only for
-// pieces: one that the machine has no time for holds nobody up.
-class Crew {
+// Which thread does a piece of a phase is left to chance; what is computed there is not. A phase waits for its pieces and not
+// for threads, so that a thread that the machine has no time for delays no other.
+class ThreadTeam {
   struct alignas(64) Phase {
     std::atomic<size_t> taken{0}, done{0};
   };
@@ -21,24 +21,24 @@ class Crew {
   class Member {
    public:
     const int number;
-    Member(Crew& crew, int number) : number(number), crew_(crew) {}
+    Member(ThreadTeam& team, int number) : number(number), team_(team) {}
 
     // A phase: piece(i) for each i in [0, pieces), and no member goes on before all are done.
     template <class F>
     void each(size_t pieces, F piece) {
-      Phase& phase = crew_.phases_[at_++];
+      Phase& phase = team_.phases_[at_++];
       size_t mine = 0;
       for (size_t i; (i = phase.taken.fetch_add(1, std::memory_order_relaxed)) < pieces; mine++) piece(i);
-      if (mine && phase.done.fetch_add(mine) + mine == pieces) crew_.wake();
-      crew_.wait([&] { return phase.done.load() == pieces; });
+      if (mine && phase.done.fetch_add(mine) + mine == pieces) team_.wake();
+      team_.wait([&] { return phase.done.load() == pieces; });
     }
 
    private:
-    Crew& crew_;
+    ThreadTeam& team_;
     size_t at_ = 0;
   };
 
-  explicit Crew(size_t phases) : phases_(phases) {}
+  explicit ThreadTeam(size_t phases) : phases_(phases) {}
 
   // work(member) on up to `threads` threads, as many as can be had, of which this is one. It must not throw.
   template <class F>

@@ -6,11 +6,12 @@
 constexpr int BLOCK = 4, TILE = 16, BLOCKS = 16;  // pixels a side, pixels a side, blocks of a tile
 static_assert(BLOCK * BLOCK == LANES && BLOCKS == LANES, "one vector is one block's pixels, or a value for each block");
 
+// A footprint and a tile that it reaches.
 struct Pair {
-  uint32_t place, slot;  // of the footprint; of the pair's gradient
+  uint32_t footprint_index, slot;  // the latter: where the pair's gradient goes
 };
 
-// Of lane i as a pixel: its place in the block, from the block's centre. Of lane i as a block: the block's centre.
+// Coordinates of lane i: as a pixel of a block, relative to the block's centre; as a block of a tile, of the block's centre.
 INLINE Lanes lane_x(float origin, float step) {
   Lanes r;
   for (int i = 0; i < LANES; i++) r[i] = origin + step * (i % 4 - 1.5f);
@@ -22,7 +23,7 @@ INLINE Lanes lane_y(float origin, float step) {
   return r;
 }
 
-// Pixels of a tile: block centres, and pixel places within a block.
+// Pixels of a tile: block centres, and pixels relative to their block's centre.
 struct Grid {
   Lanes block_x, block_y, x, y;
   Grid(int X, int Y)
@@ -49,7 +50,7 @@ struct Layer {
 
 // Blocks with a pixel centre at which the footprint may reach ALPHA_MIN: the least of the quadratic form over a rectangle
 // lies on one of the two edges that face the centre.
-INLINE uint32_t touched(const Footprint& g, const Lanes& dx, const Lanes& dy) {
+INLINE uint32_t touched_blocks(const Footprint& g, const Lanes& dx, const Lanes& dy) {
   const float reach = .5f * (BLOCK - 1);
   Lanes left = dx - reach, right = dx + reach, top = dy - reach, bottom = dy + reach;
   Lanes x1 = clamp(Lanes{}, left, right), y1 = clamp(x1 * g.dy_per_dx, top, bottom);
@@ -59,18 +60,19 @@ INLINE uint32_t touched(const Footprint& g, const Lanes& dx, const Lanes& dy) {
   return bits(min(s1 * s1 + ratio * y1 * y1, s2 * s2 + ratio * y2 * y2) <= g.level * g.inv_a);
 }
 
-// Pairs are taken a few at a time: alphas of all their blocks first, then the compositing. Each of the two loops is short
-// enough for the processor to overlap its rounds; in one they would wait for each other.
-constexpr int CHUNK = 8;
+// Pairs are blended a few at a time: alphas of all their blocks first, then the compositing. Each of the two loops is short
+// enough for the processor to overlap its rounds; in one loop they would wait for each other.
+constexpr int PAIRS_AT_ONCE = 8;
 
-// Transmittance of each pixel; negative: the ray has ended (or the pixel is outside of the image).
+// Blocks in which some ray goes on. T: transmittance of each pixel; negative: the ray has ended (or the pixel is outside of
+// the image).
 INLINE uint32_t alive_blocks(const Lanes (&T)[BLOCKS]) {
   uint32_t alive = 0;
   for (int b = 0; b < BLOCKS; b++) alive |= (uint32_t)any(T[b] > 0.f) << b;
   return alive;
 }
 
-// Pixels of a block that lie on the image: lane, and number in the image.
+// Calls f(lane, index in the image) for the pixels of a block that lie on the image.
 template <class F>
 INLINE void for_pixels(int block, int X, int Y, int width, int height, F f) {
   const int x = X + block % 4 * 4, y = Y + block / 4 * 4;
@@ -83,8 +85,8 @@ INLINE void for_pixels(int block, int X, int Y, int width, int height, F f) {
   }
 }
 
-// Writes the blocks that it visited of each pair, for the backward pass, and marks the slots of pairs with any. Returns
-// how many pairs it took until all rays had ended. With COUNT, adds to `contributions` the pixels that they changed.
+// Writes for each pair the blocks that it visited, for the backward pass, and whether it visited any. Returns how many pairs
+// it took until all rays had ended. With COUNT, adds to `contributions` the pixels that they changed.
 template <bool COUNT>
 static int blend_forward(const Footprint* footprints, const Pair* pair, const Pair* end, int X, int Y, int width, int height,
                          uint16_t* visited, uint8_t* reached, float* color, float* alpha_out, float* depth,
@@ -95,17 +97,17 @@ static int blend_forward(const Footprint* footprints, const Pair* pair, const Pa
     for_pixels(b, X, Y, width, height, [&](int i, size_t) { T[b][i] = 1.f; });
   }
   const Grid grid(X, Y);
-  Layer layers[CHUNK];
-  Lanes alphas[CHUNK * BLOCKS];
-  uint32_t work[CHUNK * BLOCKS + LANES];
+  Layer layers[PAIRS_AT_ONCE];
+  Lanes alphas[PAIRS_AT_ONCE * BLOCKS];
+  uint32_t work[PAIRS_AT_ONCE * BLOCKS + LANES];
   const Pair* const begin = pair;
   for (uint32_t alive = alive_blocks(T); pair < end && alive; alive = alive_blocks(T)) {
     int count = 0;
-    for (int n = 0; n < CHUNK && pair < end; n++, pair++) {
-      const Footprint& g = footprints[pair->place];
-      if (pair + 6 < end) __builtin_prefetch(&footprints[pair[6].place]);
+    for (int n = 0; n < PAIRS_AT_ONCE && pair < end; n++, pair++) {
+      const Footprint& g = footprints[pair->footprint_index];
+      if (pair + 6 < end) __builtin_prefetch(&footprints[pair[6].footprint_index]);
       const Lanes dx = grid.block_x - g.x, dy = grid.block_y - g.y;
-      uint32_t visit = touched(g, dx, dy) & alive;
+      uint32_t visit = touched_blocks(g, dx, dy) & alive;
       *visited++ = (uint16_t)visit;
       reached[pair->slot] = visit != 0;
       layers[n].set(g, grid, dx, dy);
@@ -139,16 +141,27 @@ struct Images {
   const float *color, *alpha, *depth;
 };
 
-// Also front to back: what lies behind a layer is the pixel's value minus what came so far, so no list per pixel is kept.
-// The sums of a pair go to its own slot and are added later: no atomics, the same bits at any thread count.
-// With BACK also what of `residual` [H, W, 3] each layer shows: the sums of w r, w |r|^2 and w, times the view's `share`.
-template <bool BACK>
+// Slots are written once, by one thread. GENRE_ABLATE_DETERMINISM, for timing only: each footprint has one slot, to which
+// threads add in a race.
+INLINE void store_sums(Lanes* slot, const Lanes& sum) {
+#ifdef GENRE_ABLATE_DETERMINISM
+  *slot += sum;
+#else
+  stream(slot, sum);
+#endif
+}
+
+// Also front to back: what lies behind a layer is the pixel's value minus what came so far, so no list per pixel is needed.
+// The sums of a pair go to a slot of their own and are added later: no atomics, the same bits at any thread count.
+// With RESIDUALS also how much of `residual` [H, W, 3] each layer covers: the sums of w r, w |r|^2 and w, times view_weight.
+template <bool RESIDUALS>
 static void blend_backward(const Footprint* footprints, const Pair* pair, const Pair* end, int X, int Y, int width, int height,
-                           const uint16_t* visited, Images out, Images grad, const float* residual, float share, Lanes* slots) {
+                           const uint16_t* visited, Images out, Images grad, const float* residual, float view_weight,
+                           Lanes* slots) {
   Lanes T[BLOCKS], behind[BLOCKS], vr[BLOCKS], vg[BLOCKS], vb[BLOCKS], vd[BLOCKS];
-  Lanes rr[BACK ? BLOCKS : 1], rg[BACK ? BLOCKS : 1], rb[BACK ? BLOCKS : 1];
+  Lanes rr[RESIDUALS ? BLOCKS : 1], rg[RESIDUALS ? BLOCKS : 1], rb[RESIDUALS ? BLOCKS : 1];
   for (int b = 0; b < BLOCKS; b++) {
-    if constexpr (BACK) {
+    if constexpr (RESIDUALS) {
       rr[b] = rg[b] = rb[b] = Lanes{};
       for_pixels(b, X, Y, width, height, [&](int i, size_t k) {
         rr[b][i] = residual[3 * k], rg[b][i] = residual[3 * k + 1], rb[b][i] = residual[3 * k + 2];
@@ -165,19 +178,23 @@ static void blend_backward(const Footprint* footprints, const Pair* pair, const 
     behind[b] = vr[b] * red + vg[b] * green + vb[b] * blue + vd[b] * z - (1.f - alpha) * v_alpha;
   }
   const Grid grid(X, Y);
-  Layer layers[CHUNK];
-  Lanes alphas[CHUNK * BLOCKS], ws[CHUNK * BLOCKS];
-  uint32_t work[CHUNK * BLOCKS + LANES], slot[CHUNK];
-  int stop[CHUNK];
+  Layer layers[PAIRS_AT_ONCE];
+  Lanes alphas[PAIRS_AT_ONCE * BLOCKS], ws[PAIRS_AT_ONCE * BLOCKS];
+  uint32_t work[PAIRS_AT_ONCE * BLOCKS + LANES], slot[PAIRS_AT_ONCE];
+  int stop[PAIRS_AT_ONCE];
   while (pair < end) {
     int count = 0, n = 0;
-    for (; n < CHUNK && pair < end; pair++) {
+    for (; n < PAIRS_AT_ONCE && pair < end; pair++) {
       uint32_t visit = *visited++;
-      if (pair + 6 < end) __builtin_prefetch(&footprints[pair[6].place]);
+      if (pair + 6 < end) __builtin_prefetch(&footprints[pair[6].footprint_index]);
       if (!visit) continue;
-      const Footprint& g = footprints[pair->place];
+      const Footprint& g = footprints[pair->footprint_index];
       layers[n].set(g, grid, grid.block_x - g.x, grid.block_y - g.y);
+#ifdef GENRE_ABLATE_DETERMINISM
+      slot[n] = pair->footprint_index;
+#else
       slot[n] = pair->slot;
+#endif
       count += list_bits(visit, n * BLOCKS, work + count);
       stop[n++] = count;
     }
@@ -201,24 +218,26 @@ static void blend_backward(const Footprint* footprints, const Pair* pair, const 
     for (int i = 0, k = 0; k < n; k++) {
       const Layer& layer = layers[k];
       Lanes sum_v{}, sum_s{}, sum_ss{}, sum_sy{}, sum_y{}, sum_yy{}, red{}, green{}, blue{}, z{};
-      Lanes back_red{}, back_green{}, back_blue{}, back_square{}, weight{};
+      Lanes residual_red{}, residual_green{}, residual_blue{}, residual_square{}, weight{};
       for (; i < stop[k]; i++) {
         const int b = work[i] % BLOCKS;
         Lanes w = ws[i], v = alphas[i];
         red += w * vr[b], green += w * vg[b], blue += w * vb[b], z += w * vd[b];
         Lanes s = layer.s_at(b), dy = layer.dy_at(b, grid), vs = v * s, vy = v * dy;
         sum_v += v, sum_s += vs, sum_y += vy, sum_ss += vs * s, sum_sy += vs * dy, sum_yy += vy * dy;
-        if constexpr (BACK) {
+        if constexpr (RESIDUALS) {
           Lanes wr = w * rr[b], wg = w * rg[b], wb = w * rb[b];
-          back_red += wr, back_green += wg, back_blue += wb, weight += w;
-          back_square += wr * rr[b] + wg * rg[b] + wb * rb[b];
+          residual_red += wr, residual_green += wg, residual_blue += wb, weight += w;
+          residual_square += wr * rr[b] + wg * rg[b] + wb * rb[b];
         }
       }
-      if constexpr (BACK)
-        stream(&slots[slot[k]], sums({sum_v, sum_s, sum_ss, sum_sy, sum_y, sum_yy, red, green, blue, z, share * back_red,
-                                      share * back_green, share * back_blue, share * back_square, share * weight}));
+      if constexpr (RESIDUALS)
+        store_sums(&slots[slot[k]],
+                   sums({sum_v, sum_s, sum_ss, sum_sy, sum_y, sum_yy, red, green, blue, z, view_weight * residual_red,
+                         view_weight * residual_green, view_weight * residual_blue, view_weight * residual_square,
+                         view_weight * weight}));
       else
-        stream(&slots[slot[k]], sums({sum_v, sum_s, sum_ss, sum_sy, sum_y, sum_yy, red, green, blue, z}));
+        store_sums(&slots[slot[k]], sums({sum_v, sum_s, sum_ss, sum_sy, sum_y, sum_yy, red, green, blue, z}));
     }
   }
   stream_end();

@@ -19,6 +19,10 @@ CONSTANTS = (
     "SHUTTER_MIN_RATE",
     "COMPENSATION_MIN",
 )
+ABLATIONS = ("GENRE_ABLATE_GUARDS", "GENRE_ABLATE_DETERMINISM")
+"""Compile-time switches of the sources, off by default: each leaves out what makes the kernel safe or deterministic, so
+that a benchmark can time what it costs."""
+
 SOURCES = (
     "kernel.cpp",
     "view.h",

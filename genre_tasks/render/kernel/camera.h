@@ -1,5 +1,5 @@
-// A camera, and where it sees Gaussians, sixteen at a time: lens distortion and rolling shutter, and the way back. What a
-// view does not have is compiled out. reference_camera.py says the same for reading.
+// A camera, and where it sees Gaussians, sixteen at a time: lens distortion and rolling shutter, forward and backward. What a
+// view does not have is compiled out. reference_camera.py is the same in plain torch, written for reading.
 #pragma once
 #include <type_traits>
 
@@ -9,18 +9,17 @@ struct Camera {
   float R[9], t[3], fx, fy, cx, cy;
   int width, height;
   float right, left, bottom, top;  // limits of x/z and y/z at which the projection is linearised
-  bool bends, rolls, smooths;
+  bool has_distortion, has_rolling_shutter, antialiased;
   float k1, k2, p1, p2, k3, fold_radius2;
   float readout, velocity[3], turn[3];  // s; m/s and rad/s in camera axes
 };
 
-// The linear map of a view (pose: row-major 4x4, chunk to camera; lens: fx, fy, cx, cy), and of its distortion (k1, k2, p1,
-// p2, k3; square of the fold radius; limits left, right, top, bottom) and shutter (readout, velocity, turn) what is there.
-// `smooths`: anti-aliasing.
-static Camera make_camera(const float* pose, const float* lens, const float* distortion, const float* shutter, bool smooths,
-                          int width, int height) {
+// pose: row-major 4x4, chunk to camera. lens: fx, fy, cx, cy. distortion, or null: k1, k2, p1, p2, k3, square of the fold
+// radius, limits left, right, top, bottom. shutter, or null: readout, velocity, turn.
+static Camera make_camera(const float* pose, const float* lens, const float* distortion, const float* shutter,
+                          bool antialiased, int width, int height) {
   Camera c{};
-  c.smooths = smooths;
+  c.antialiased = antialiased;
   for (int i = 0; i < 3; i++) {
     for (int j = 0; j < 3; j++) c.R[3 * i + j] = pose[4 * i + j];
     c.t[i] = pose[4 * i + 3];
@@ -29,36 +28,38 @@ static Camera make_camera(const float* pose, const float* lens, const float* dis
   float mx = JACOBIAN_MARGIN * .5f * width / c.fx, my = JACOBIAN_MARGIN * .5f * height / c.fy;
   c.right = (width - c.cx) / c.fx + mx, c.left = c.cx / c.fx + mx;
   c.bottom = (height - c.cy) / c.fy + my, c.top = c.cy / c.fy + my;
-  for (int k = 0; distortion && k < 5; k++) c.bends |= distortion[k] != 0.f;
-  if (c.bends) {
+  for (int k = 0; distortion && k < 5; k++) c.has_distortion |= distortion[k] != 0.f;
+  if (c.has_distortion) {
     c.k1 = distortion[0], c.k2 = distortion[1], c.p1 = distortion[2], c.p2 = distortion[3], c.k3 = distortion[4];
     c.fold_radius2 = distortion[5];
     c.left = distortion[6], c.right = distortion[7], c.top = distortion[8], c.bottom = distortion[9];
   }
-  c.rolls = shutter && shutter[0] != 0.f;
-  if (c.rolls) {
+  c.has_rolling_shutter = shutter && shutter[0] != 0.f;
+  if (c.has_rolling_shutter) {
     c.readout = shutter[0];
     for (int k = 0; k < 3; k++) c.velocity[k] = shutter[1 + k], c.turn[k] = shutter[4 + k];
   }
   return c;
 }
 
-// Calls f(rolls, bends, smooths) with what a camera has as constants.
+// Calls f(has_rolling_shutter, has_distortion, antialiased) with compile-time constants: one copy of the code for each camera
+// that occurs.
 template <class F>
-static void specialised(const Camera& c, F f) {
+static void specialise_for(const Camera& c, F f) {
   const std::true_type yes;
   const std::false_type no;
-  auto with = [&](auto smooths) {
-    if (c.rolls) c.bends ? f(yes, yes, smooths) : f(yes, no, smooths);
-    else c.bends ? f(no, yes, smooths) : f(no, no, smooths);
+  auto choose = [&](auto antialiased) {
+    if (c.has_rolling_shutter) c.has_distortion ? f(yes, yes, antialiased) : f(yes, no, antialiased);
+    else c.has_distortion ? f(no, yes, antialiased) : f(no, no, antialiased);
   };
-  c.smooths ? with(yes) : with(no);
+  c.antialiased ? choose(yes) : choose(no);
 }
 
-// Normalised image coordinates after the distortion, and its slopes; d y' / d x is xy, too: it is a potential's gradient.
-struct Bend {
+// Normalised image coordinates x, y after the distortion, and its slopes: xx = dx/du, xy = dx/dv = dy/du, yy = dy/dv. The two
+// mixed ones are equal, since the distortion is the gradient of a potential.
+struct DistortedPoint {
   Lanes x, y, xx, xy, yy;
-  INLINE_MEMBER Bend(const Camera& c, const Lanes& u, const Lanes& v) {
+  INLINE_MEMBER DistortedPoint(const Camera& c, const Lanes& u, const Lanes& v) {
     const Lanes r2 = u * u + v * v, radial = 1.f + r2 * (c.k1 + r2 * (c.k2 + r2 * c.k3));
     const Lanes slope = c.k1 + r2 * (2.f * c.k2 + r2 * (3.f * c.k3)), cross = 2.f * u * v;
     x = u * radial + c.p1 * cross + c.p2 * (r2 + 2.f * u * u), y = v * radial + c.p1 * (r2 + 2.f * v * v) + c.p2 * cross;
@@ -70,98 +71,101 @@ struct Bend {
   static INLINE_MEMBER void slopes_backward(const Camera& c, const Lanes& u, const Lanes& v, const Lanes& vxx, const Lanes& vxy,
                                             const Lanes& vyy, Lanes& vu, Lanes& vv) {
     const Lanes r2 = u * u + v * v, slope = 2.f * (c.k1 + r2 * (2.f * c.k2 + r2 * (3.f * c.k3)));
-    const Lanes bow = 8.f * c.k2 + 24.f * c.k3 * r2;
-    const Lanes xxx = u * (3.f * slope + u * u * bow) + 6.f * c.p2, xxy = v * (slope + u * u * bow) + 2.f * c.p1;
-    const Lanes xyy = u * (slope + v * v * bow) + 2.f * c.p2, yyy = v * (3.f * slope + v * v * bow) + 6.f * c.p1;
+    const Lanes curvature = 8.f * c.k2 + 24.f * c.k3 * r2;
+    const Lanes xxx = u * (3.f * slope + u * u * curvature) + 6.f * c.p2, xxy = v * (slope + u * u * curvature) + 2.f * c.p1;
+    const Lanes xyy = u * (slope + v * v * curvature) + 2.f * c.p2, yyy = v * (3.f * slope + v * v * curvature) + 6.f * c.p1;
     vu += vxx * xxx + vxy * xxy + vyy * xyy, vv += vxx * xxy + vxy * xyy + vyy * yyy;
   }
 };
 
-// Camera coordinates from which Gaussians are projected.
-struct Place {
-  Lanes at[3];
-  template <class Geometry>
-  INLINE_MEMBER Place(const Camera& c, const Geometry& g) {
+// Camera coordinates of Gaussians at the time of the pose. For a global shutter they are projected from there.
+struct PosedPosition {
+  Lanes position[3];
+  template <class Gaussian>
+  INLINE_MEMBER PosedPosition(const Camera& c, const Gaussian& g) {
     const Lanes(&m)[3] = g.mean;
-    for (int i = 0; i < 3; i++) at[i] = c.R[3 * i] * m[0] + c.R[3 * i + 1] * m[1] + c.R[3 * i + 2] * m[2] + c.t[i];
+    for (int i = 0; i < 3; i++) position[i] = c.R[3 * i] * m[0] + c.R[3 * i + 1] * m[1] + c.R[3 * i + 2] * m[2] + c.t[i];
   }
   INLINE_MEMBER void shear(Lanes (&)[6]) const {}
   INLINE_MEMBER void shear_backward(const Lanes (&)[3], Lanes (&)[6], Lanes (&)[2]) const {}
   INLINE_MEMBER void backward(const Camera&, const Lanes (&)[2], Lanes (&)[3]) const {}
-  INLINE_MEMBER Mask ahead() const { return at[2] >= NEAR_M; }
-  INLINE_MEMBER Mask unfolded(const Camera& c) const { return within(c, at); }
+  INLINE_MEMBER Mask ahead() const { return position[2] >= NEAR_M; }
+  INLINE_MEMBER Mask unfolded(const Camera& c) const { return within(c, position); }
   static INLINE_MEMBER Mask within(const Camera& c, const Lanes (&p)[3]) {
     const Lanes rz = 1.f / p[2], u = p[0] * rz, v = p[1] * rz;
     return u * u + v * v <= c.fold_radius2;
   }
 };
 
-// With a rolling shutter: where they are when their rows are exposed, and how their footprints are sheared as lower rows
-// come later (see Shutter in types.py for the formulas).
-template <bool BENDS>
-struct Exposure {
-  Place posed;
-  Lanes at[3], motion[3], rz, u, v, u_rate, v_rate, time;
+// Camera coordinates of Gaussians when their rows are exposed by a rolling shutter, and how their footprints are sheared as
+// lower rows come later. Shutter in types.py has the formulas.
+template <bool DISTORTION>
+struct ExposedPosition {
+  PosedPosition posed;
+  Lanes position[3], motion[3], rz, u, v, u_rate, v_rate, time;
   Lanes column_rate, row_rate;  // px/s
-  Lanes rate, later;            // 1 - T row_rate / H, at least SHUTTER_MIN_RATE; s a row
+  Lanes rate, delay_per_row;    // 1 - T row_rate / H, at least SHUTTER_MIN_RATE; s a row, 0 where the time is limited
   Mask rate_limited, time_limited;
 
-  template <class Geometry>
-  INLINE_MEMBER Exposure(const Camera& c, const Geometry& g) : posed(c, g) {
-    const Lanes(&p)[3] = posed.at, (&own)[3] = g.velocity;
+  template <class Gaussian>
+  INLINE_MEMBER ExposedPosition(const Camera& c, const Gaussian& g) : posed(c, g) {
+    const Lanes(&p)[3] = posed.position, (&w)[3] = g.velocity;
     for (int i = 0, j = 1, k = 2; i < 3; i++, j = (j + 1) % 3, k = (k + 1) % 3)
-      motion[i] = c.R[3 * i] * own[0] + c.R[3 * i + 1] * own[1] + c.R[3 * i + 2] * own[2] - c.velocity[i] -
+      motion[i] = c.R[3 * i] * w[0] + c.R[3 * i + 1] * w[1] + c.R[3 * i + 2] * w[2] - c.velocity[i] -
                   (c.turn[j] * p[k] - c.turn[k] * p[j]);
     rz = 1.f / p[2], u = p[0] * rz, v = p[1] * rz;
     u_rate = (motion[0] - u * motion[2]) * rz, v_rate = (motion[1] - v * motion[2]) * rz;
     Lanes row;
-    if constexpr (BENDS) {
-      const Bend bend(c, u, v);
-      row = c.fy * bend.y + c.cy, row_rate = c.fy * (bend.xy * u_rate + bend.yy * v_rate);
-      column_rate = c.fx * (bend.xx * u_rate + bend.xy * v_rate);
+    if constexpr (DISTORTION) {
+      const DistortedPoint distorted(c, u, v);
+      row = c.fy * distorted.y + c.cy, row_rate = c.fy * (distorted.xy * u_rate + distorted.yy * v_rate);
+      column_rate = c.fx * (distorted.xx * u_rate + distorted.xy * v_rate);
     } else {
       row = c.fy * v + c.cy, row_rate = c.fy * v_rate, column_rate = c.fx * u_rate;
     }
     const float per_row = c.readout / c.height, half = .5f * c.readout;
-    const Lanes free = 1.f - per_row * row_rate;
-    rate_limited = free < SHUTTER_MIN_RATE, rate = max(free, broadcast(SHUTTER_MIN_RATE));
-    const Lanes due = (per_row * row - half) / rate;
-    time_limited = (due > half) | (due < -half), time = clamp(due, broadcast(-half), broadcast(half));
-    later = keep(per_row / rate, ~time_limited);
-    for (int i = 0; i < 3; i++) at[i] = p[i] + time * motion[i];
+    const Lanes unclamped_rate = 1.f - per_row * row_rate;
+    rate_limited = unclamped_rate < SHUTTER_MIN_RATE, rate = max(unclamped_rate, broadcast(SHUTTER_MIN_RATE));
+    const Lanes row_time = (per_row * row - half) / rate;
+    time_limited = (row_time > half) | (row_time < -half), time = clamp(row_time, broadcast(-half), broadcast(half));
+    delay_per_row = keep(per_row / rate, ~time_limited);
+    for (int i = 0; i < 3; i++) position[i] = p[i] + time * motion[i];
   }
-  INLINE_MEMBER Mask ahead() const { return posed.ahead() & (at[2] >= NEAR_M); }
-  INLINE_MEMBER Mask unfolded(const Camera& c) const { return posed.unfolded(c) & Place::within(c, at); }
+  INLINE_MEMBER Mask ahead() const { return posed.ahead() & (position[2] >= NEAR_M); }
+  INLINE_MEMBER Mask unfolded(const Camera& c) const { return posed.unfolded(c) & PosedPosition::within(c, position); }
 
-  // Of W's rows, the pixel's column and row by chunk axes: what lies a row lower is seen `later`.
+  // W's rows are the slopes of the pixel's column and row by chunk axes. What lies a row lower is seen delay_per_row later.
   INLINE_MEMBER void shear(Lanes (&W)[6]) const {
-    for (int k = 0; k < 3; k++) W[k] += later * column_rate * W[3 + k], W[3 + k] += later * row_rate * W[3 + k];
+    for (int k = 0; k < 3; k++)
+      W[k] += delay_per_row * column_rate * W[3 + k], W[3 + k] += delay_per_row * row_rate * W[3 + k];
   }
-  // Turns the gradient by the sheared W into that by W, whose second row was `row`, and by the shear's two entries.
-  INLINE_MEMBER void shear_backward(const Lanes (&row)[3], Lanes (&vW)[6], Lanes (&by_shear)[2]) const {
-    by_shear[0] = by_shear[1] = Lanes{};
+  // Turns the gradient by the sheared W into those by W, whose second row was `row`, and by the shear's two entries.
+  INLINE_MEMBER void shear_backward(const Lanes (&row)[3], Lanes (&vW)[6], Lanes (&grad_shear)[2]) const {
+    grad_shear[0] = grad_shear[1] = Lanes{};
     for (int k = 0; k < 3; k++) {
-      by_shear[0] += vW[k] * row[k], by_shear[1] += vW[3 + k] * row[k];
-      vW[3 + k] += later * (column_rate * vW[k] + row_rate * vW[3 + k]);
+      grad_shear[0] += vW[k] * row[k], grad_shear[1] += vW[3 + k] * row[k];
+      vW[3 + k] += delay_per_row * (column_rate * vW[k] + row_rate * vW[3 + k]);
     }
   }
-  // Turns the gradient g by `at` into that by the place at the pose's time.
-  INLINE_MEMBER void backward(const Camera& c, const Lanes (&by_shear)[2], Lanes (&g)[3]) const {
+  // Turns the gradient g by `position` into that by the camera coordinates at the pose's time.
+  INLINE_MEMBER void backward(const Camera& c, const Lanes (&grad_shear)[2], Lanes (&g)[3]) const {
     const float per_row = c.readout / c.height;
-    const Lanes by_due = keep((g[0] * motion[0] + g[1] * motion[1] + g[2] * motion[2]) / rate, ~time_limited);
-    const Lanes by_later = by_shear[0] * column_rate + by_shear[1] * row_rate;
-    const Lanes by_row = per_row * c.fy * by_due, by_column_rate = c.fx * later * by_shear[0];
-    const Lanes by_row_rate =
-        c.fy * (later * by_shear[1] + per_row * keep(time * by_due + later / rate * by_later, ~rate_limited));
+    const Lanes grad_row_time = keep((g[0] * motion[0] + g[1] * motion[1] + g[2] * motion[2]) / rate, ~time_limited);
+    const Lanes grad_delay = grad_shear[0] * column_rate + grad_shear[1] * row_rate;
+    const Lanes grad_row = per_row * c.fy * grad_row_time, grad_column_rate = c.fx * delay_per_row * grad_shear[0];
+    const Lanes grad_row_rate =
+        c.fy * (delay_per_row * grad_shear[1] +
+                per_row * keep(time * grad_row_time + delay_per_row / rate * grad_delay, ~rate_limited));
     Lanes vu{}, vv{}, vu_rate{}, vv_rate{};
-    if constexpr (BENDS) {
-      const Bend bend(c, u, v);
-      vu = by_row * bend.xy, vv = by_row * bend.yy;
-      vu_rate = by_column_rate * bend.xx + by_row_rate * bend.xy, vv_rate = by_column_rate * bend.xy + by_row_rate * bend.yy;
-      Bend::slopes_backward(c, u, v, by_column_rate * u_rate, by_column_rate * v_rate + by_row_rate * u_rate,
-                            by_row_rate * v_rate, vu, vv);
+    if constexpr (DISTORTION) {
+      const DistortedPoint distorted(c, u, v);
+      vu = grad_row * distorted.xy, vv = grad_row * distorted.yy;
+      vu_rate = grad_column_rate * distorted.xx + grad_row_rate * distorted.xy;
+      vv_rate = grad_column_rate * distorted.xy + grad_row_rate * distorted.yy;
+      DistortedPoint::slopes_backward(c, u, v, grad_column_rate * u_rate, grad_column_rate * v_rate + grad_row_rate * u_rate,
+                                      grad_row_rate * v_rate, vu, vv);
     } else {
-      vv = by_row, vu_rate = by_column_rate, vv_rate = by_row_rate;
+      vv = grad_row, vu_rate = grad_column_rate, vv_rate = grad_row_rate;
     }
     vu_rate = vu_rate * rz, vv_rate = vv_rate * rz;
     vu = (vu - vu_rate * motion[2]) * rz, vv = (vv - vv_rate * motion[2]) * rz;

@@ -12,16 +12,28 @@ from genre_tasks.render.kernel.build import KERNEL
 
 @cache
 def load_kernel(folder: Path = KERNEL.folder) -> ctypes.CDLL:
-    """The best kernel in ``folder`` that this machine can run, with its argument types declared; loaded once.
+    """Loads the best kernel that this machine can run, once, with its argument types declared.
 
-    Raises ``ResourceError`` and ``ConfigError`` as :func:`genre_tasks.compiled.loader.load`.
+    Args:
+        folder: where the libraries are.
+
+    Returns:
+        The library; its functions are described in kernel.cpp.
+
+    Raises:
+        ConfigError: ``GENRE_RENDER_ISA`` names what this machine cannot run.
+        ResourceError: the library was never compiled, is older than its sources, or does not load.
     """
     library = load(KERNEL, folder)
-    p, i = ctypes.c_void_p, ctypes.c_int
+    # Pointers are passed as integers: ctypes would check and convert typed ones at each of thousands of calls.
+    p = ctypes.c_void_p
+    i = ctypes.c_int
     library.genre_forward.argtypes = [i, *[p] * 5, i, p, i, *[p] * 4, i, i, i, i, i, *[p] * 6]
     library.genre_backward.argtypes = [p, i, *[p] * 5, i, p, *[p] * 8, i, *[p] * 6]
-    library.genre_gloss.argtypes = [p, i, p]
-    library.genre_gloss_backward.argtypes = [p, i, *[p] * 5]
+    library.genre_sh_colors.argtypes = [p, i, p]
+    library.genre_sh_colors_backward.argtypes = [p, i, *[p] * 5]
     library.genre_work.argtypes = [p, p]
-    library.genre_free.argtypes, library.genre_free.restype = [p], None
+    # Declared although it is simple: ctypes passes undeclared integers with 32 bits, which would cut the pointer.
+    library.genre_free.argtypes = [p]
+    library.genre_free.restype = None
     return library

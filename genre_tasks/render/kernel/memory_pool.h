@@ -1,4 +1,4 @@
-// Shares of work, memory that grows, and shelves on which used memory waits.
+// The part of the work that is a thread's, memory that grows, and pools in which used memory waits.
 #pragma once
 #include <cstdint>
 #include <cstdlib>
@@ -13,7 +13,8 @@
 #include <sys/mman.h>
 #endif
 
-static size_t share(size_t n, int worker, int threads) { return n * worker / threads; }
+// Where worker's part of n items begins, and the one before it ends.
+static size_t work_begin(size_t n, int worker, int threads) { return n * worker / threads; }
 
 constexpr size_t HUGE_PAGE = 2u << 20;
 
@@ -50,22 +51,22 @@ struct Buffer {
   size_t bytes() const { return capacity * sizeof(T); }
 };
 
-// Used memory is handed on, up to LIMIT of each kind: fresh pages cost more than the work on a small view.
+// Used memory is handed on to later calls, up to LIMIT of each kind: fresh pages cost more than the work on a small view.
 template <class T>
-struct Shelf {
+struct MemoryPool {
   static constexpr size_t LIMIT = 512u << 20;
   std::mutex guard;
   std::vector<std::unique_ptr<T>> free;
-  size_t held = 0;
+  size_t pooled_bytes = 0;
   std::unique_ptr<T> take() {
     std::lock_guard<std::mutex> lock(guard);
     if (free.empty()) return std::make_unique<T>();
     auto x = std::move(free.back());
-    free.pop_back(), held -= x->bytes();
+    free.pop_back(), pooled_bytes -= x->bytes();
     return x;
   }
   void give(std::unique_ptr<T> x) {
     std::lock_guard<std::mutex> lock(guard);
-    if (held + x->bytes() <= LIMIT) held += x->bytes(), free.push_back(std::move(x));
+    if (pooled_bytes + x->bytes() <= LIMIT) pooled_bytes += x->bytes(), free.push_back(std::move(x));
   }
 };

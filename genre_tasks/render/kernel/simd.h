@@ -71,7 +71,9 @@ COMPARE(<, _CMP_LT_OQ) COMPARE(>, _CMP_GT_OQ) COMPARE(>=, _CMP_GE_OQ) COMPARE(<=
 INLINE Mask operator&(Mask a, Mask b) { return {(__mmask16)(a.k & b.k)}; }
 INLINE Mask operator|(Mask a, Mask b) { return {(__mmask16)(a.k | b.k)}; }
 INLINE Mask operator~(Mask a) { return {(__mmask16)~a.k}; }
-INLINE Lanes select(Mask m, const Lanes& a, const Lanes& b) { return {{(NativeF)_mm512_mask_mov_ps((__m512)b.v[0], m.k, (__m512)a.v[0])}}; }
+INLINE Lanes select(Mask m, const Lanes& a, const Lanes& b) {
+  return {{(NativeF)_mm512_mask_mov_ps((__m512)b.v[0], m.k, (__m512)a.v[0])}};
+}
 INLINE Lanes keep(const Lanes& a, Mask m) { return {{(NativeF)_mm512_maskz_mov_ps(m.k, (__m512)a.v[0])}}; }
 INLINE Mask is_finite(const Lanes& a) {
   const __m512i exponent = _mm512_set1_epi32(0x7f800000);
@@ -85,8 +87,16 @@ COMPARE(<) COMPARE(>) COMPARE(>=) COMPARE(<=)
 INLINE Mask operator&(const Mask& a, const Mask& b) { Mask r; EACH r.v[k] = a.v[k] & b.v[k]; return r; }
 INLINE Mask operator|(const Mask& a, const Mask& b) { Mask r; EACH r.v[k] = a.v[k] | b.v[k]; return r; }
 INLINE Mask operator~(const Mask& a) { Mask r; EACH r.v[k] = ~a.v[k]; return r; }
-INLINE Lanes select(const Mask& m, const Lanes& a, const Lanes& b) { Lanes r; EACH r.v[k] = m.v[k] ? a.v[k] : b.v[k]; return r; }
-INLINE Lanes keep(const Lanes& a, const Mask& m) { Lanes r; EACH r.v[k] = (NativeF)((NativeI)a.v[k] & m.v[k]); return r; }
+INLINE Lanes select(const Mask& m, const Lanes& a, const Lanes& b) {
+  Lanes r;
+  EACH r.v[k] = m.v[k] ? a.v[k] : b.v[k];
+  return r;
+}
+INLINE Lanes keep(const Lanes& a, const Mask& m) {
+  Lanes r;
+  EACH r.v[k] = (NativeF)((NativeI)a.v[k] & m.v[k]);
+  return r;
+}
 INLINE Mask is_finite(const Lanes& a) { Mask r; EACH r.v[k] = ((NativeI)a.v[k] & 0x7f800000) != 0x7f800000; return r; }
 INLINE uint32_t bits(const Mask& m) {
 #if VECTOR_BYTES == 32
@@ -122,8 +132,8 @@ INLINE int list_bits(uint32_t set, uint32_t base, uint32_t* out) {
 constexpr float EXP2_0 = 1.000000072f, EXP2_1 = 6.931469671e-1f, EXP2_2 = 2.402211972e-1f, EXP2_3 = 5.550713273e-2f,
                 EXP2_4 = 9.675541334e-3f, EXP2_5 = 1.327647199e-3f;
 
-// 2^p for p in [-126, 127], polynomial's relative error 7.5e-8: exponent by integer addition, fraction in [-1/2, 1/2] by a minimax
-// polynomial. Below -126 it gives 2^-126, far under the alpha cut.
+// 2^p for p in [-126, 127]: exponent by integer addition, fraction in [-1/2, 1/2] by a minimax polynomial with a relative error
+// of 7.5e-8. Below -126 it gives 2^-126, far under the alpha cut.
 INLINE Lanes exp2(const Lanes& x) {
   Lanes r;
   EACH {

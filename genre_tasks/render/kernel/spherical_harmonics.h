@@ -1,5 +1,5 @@
-// What views see of Gaussians with spherical harmonics, and the way back; scene/harmonics.py is the oracle. Each Gaussian adds
-// up its views in their order: every result has the same bits at any number of threads.
+// The colours that views see of Gaussians with spherical harmonics, forward and backward; scene/spherical_harmonics.py is the
+// oracle. Each Gaussian adds up its views in their order: every result has the same bits at any number of threads.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -7,18 +7,19 @@
 
 #include "../../compiled/runtime.h"
 
-struct Glossy {
-  int64_t count, harmonics;             // N, K
-  const float *means, *colors, *waves;  // [N, 3], [N, 3], [N, K, 3], in each Gaussian's own frame
-  const int32_t *frame, *slot;          // [N]: whose frame that is, 0 the chunk's; place among the splats of the first log frame
-  int64_t views, frames, splats;        // V, frames of an eye, splats of all log frames
-  const float* eyes;                    // [V, frames, 3] the camera's centre
-  const int64_t* later;                 // [V]: a moving Gaussian's splat is so many places behind its slot
+struct ShGaussians {
+  int64_t count, sh_count;                     // N, K
+  const float *means, *colors, *coefficients;  // [N, 3], [N, 3], [N, K, 3], in each Gaussian's own coordinate frame
+  const int32_t* coordinate_frame;             // [N]: which one that is; 0 is the chunk's, the others are the actors' boxes
+  const int32_t* slot;                         // [N]: index among the splats of the first log frame
+  int64_t views, coordinate_frames, splats;    // V, 1 + A, splats of all log frames
+  const float* camera_centers;                 // [V, 1 + A, 3] the camera's centre in each coordinate frame
+  const int64_t* frame_offset;                 // [V]: a moving Gaussian's splat comes so many after its slot
 };
 
 // Y[k] of the unit direction, and with GRADIENT its derivatives by x, y and z. Signs and order of 3DGS.
 template <bool GRADIENT>
-static inline void waves_at(int64_t count, float x, float y, float z, float* Y, float (*D)[3]) {
+static inline void evaluate_sh_basis(int64_t count, float x, float y, float z, float* Y, float (*D)[3]) {
   auto put = [&](int k, float value, float dx, float dy, float dz) {
     Y[k] = value;
     if (GRADIENT) D[k][0] = dx, D[k][1] = dy, D[k][2] = dz;
@@ -32,75 +33,79 @@ static inline void waves_at(int64_t count, float x, float y, float z, float* Y, 
   put(6, -a * x * z, -a * z, 0, -a * x), put(7, e * (x * x - y * y), 2 * e * x, -2 * e * y, 0);
 }
 
-// f(view, splat, direction, 1 / distance, whether the distance is held) for each view.
+// Calls f(view, splat, direction, 1 / distance, whether the distance is clamped) for each view.
 template <class F>
-static inline void each_sight(const Glossy& g, int64_t i, F f) {
+static inline void for_each_view_direction(const ShGaussians& g, int64_t i, F f) {
   const float* mean = g.means + 3 * i;
   for (int64_t v = 0; v < g.views; v++) {
-    const float* eye = g.eyes + 3 * (v * g.frames + g.frame[i]);
-    const float x = mean[0] - eye[0], y = mean[1] - eye[1], z = mean[2] - eye[2], square = x * x + y * y + z * z;
-    const bool held = !(square >= NEAR_M * NEAR_M);
-    const float inverse = 1.f / std::sqrt(held ? NEAR_M * NEAR_M : square);
+    const float* camera_center = g.camera_centers + 3 * (v * g.coordinate_frames + g.coordinate_frame[i]);
+    const float x = mean[0] - camera_center[0], y = mean[1] - camera_center[1], z = mean[2] - camera_center[2];
+    const float square = x * x + y * y + z * z;
+    const bool distance_clamped = !(square >= NEAR_M * NEAR_M);
+    const float inverse = 1.f / std::sqrt(distance_clamped ? NEAR_M * NEAR_M : square);
     const float d[3] = {x * inverse, y * inverse, z * inverse};
-    f(v, v * g.splats + g.slot[i] + (g.frame[i] ? g.later[v] : 0), d, inverse, held);
+    f(v, v * g.splats + g.slot[i] + (g.coordinate_frame[i] ? g.frame_offset[v] : 0), d, inverse, distance_clamped);
   }
 }
 
-constexpr int MOST_WAVES = 8;
+constexpr int MAX_SH_COUNT = 8;
 
-static inline bool sound(const Glossy& g, int64_t i) {
+static inline bool is_finite_gaussian(const ShGaussians& g, int64_t i) {
   bool finite = true;
   for (int k = 0; k < 3; k++) finite &= std::isfinite(g.means[3 * i + k]);
-  for (int64_t k = 0; k < 3 * g.harmonics; k++) finite &= std::isfinite(g.waves[3 * g.harmonics * i + k]);
+  for (int64_t k = 0; k < 3 * g.sh_count; k++) finite &= std::isfinite(g.coefficients[3 * g.sh_count * i + k]);
   return finite;
 }
 
 template <class F>
-static void each_share(int64_t count, int threads, F f) {
-  const int crew = (int)std::max<int64_t>(1, std::min<int64_t>(threads, count / 512));
-  parallel(crew, [&](int w) {
-    for (int64_t i = count * w / crew; i < count * (w + 1) / crew; i++) f(i);
+static void parallel_for(int64_t count, int threads, F f) {
+  const int team = (int)std::max<int64_t>(1, std::min<int64_t>(threads, count / 512));
+  parallel(team, [&](int w) {
+    for (int64_t i = count * w / team; i < count * (w + 1) / team; i++) f(i);
   });
 }
 
 // out [V, splats, 3]; what a view does not show is 0.
-static void gloss_forward(const Glossy& g, int threads, float* out) {
+static void sh_colors_forward(const ShGaussians& g, int threads, float* out) {
   std::fill(out, out + 3 * g.views * g.splats, 0.f);
-  each_share(g.count, threads, [&](int64_t i) {
-    const float *waves = g.waves + 3 * g.harmonics * i, *own = g.colors + 3 * i;
-    const bool fine = sound(g, i);
-    each_sight(g, i, [&](int64_t, int64_t splat, const float* d, float, bool) {
-      float Y[MOST_WAVES], sum[3] = {own[0], own[1], own[2]};
-      waves_at<false>(g.harmonics, d[0], d[1], d[2], Y, nullptr);
-      for (int64_t k = 0; k < g.harmonics; k++)
-        for (int c = 0; c < 3; c++) sum[c] += Y[k] * waves[3 * k + c];
-      for (int c = 0; c < 3; c++) out[3 * splat + c] = !fine ? NAN : sum[c] < 0 ? 0.f : sum[c];
+  parallel_for(g.count, threads, [&](int64_t i) {
+    const float *coefficients = g.coefficients + 3 * g.sh_count * i, *color = g.colors + 3 * i;
+    const bool finite = is_finite_gaussian(g, i);
+    for_each_view_direction(g, i, [&](int64_t, int64_t splat, const float* d, float, bool) {
+      float Y[MAX_SH_COUNT], sum[3] = {color[0], color[1], color[2]};
+      evaluate_sh_basis<false>(g.sh_count, d[0], d[1], d[2], Y, nullptr);
+      for (int64_t k = 0; k < g.sh_count; k++)
+        for (int c = 0; c < 3; c++) sum[c] += Y[k] * coefficients[3 * k + c];
+      for (int c = 0; c < 3; c++) out[3 * splat + c] = !finite ? NAN : sum[c] < 0 ? 0.f : sum[c];
     });
   });
 }
 
-// seen [V, splats, 3] is what gloss_forward wrote.
-static void gloss_backward(const Glossy& g, int threads, const float* seen, const float* by_seen, float* by_means,
-                           float* by_colors, float* by_waves) {
-  each_share(g.count, threads, [&](int64_t i) {
-    const int64_t K = g.harmonics;
-    const float* waves = g.waves + 3 * K * i;
-    float *mean = by_means + 3 * i, *own = by_colors + 3 * i, *wave = by_waves + 3 * K * i;
-    std::fill(mean, mean + 3, 0.f), std::fill(own, own + 3, 0.f), std::fill(wave, wave + 3 * K, 0.f);
-    if (!sound(g, i)) return;
-    each_sight(g, i, [&](int64_t, int64_t splat, const float* d, float inverse, bool held) {
-      float v[3], Y[MOST_WAVES], D[MOST_WAVES][3], by_d[3] = {};
-      for (int c = 0; c < 3; c++) v[c] = seen[3 * splat + c] > 0 ? by_seen[3 * splat + c] : 0.f;
+// view_colors [V, splats, 3] is what sh_colors_forward wrote.
+static void sh_colors_backward(const ShGaussians& g, int threads, const float* view_colors, const float* grad_view_colors,
+                               float* grad_means, float* grad_colors, float* grad_coefficients) {
+  parallel_for(g.count, threads, [&](int64_t i) {
+    const int64_t K = g.sh_count;
+    const float* coefficients = g.coefficients + 3 * K * i;
+    float *grad_mean = grad_means + 3 * i, *grad_color = grad_colors + 3 * i, *grad_coefficient = grad_coefficients + 3 * K * i;
+    std::fill(grad_mean, grad_mean + 3, 0.f), std::fill(grad_color, grad_color + 3, 0.f);
+    std::fill(grad_coefficient, grad_coefficient + 3 * K, 0.f);
+    if (!is_finite_gaussian(g, i)) return;
+    for_each_view_direction(g, i, [&](int64_t, int64_t splat, const float* d, float inverse, bool distance_clamped) {
+      float v[3], Y[MAX_SH_COUNT], D[MAX_SH_COUNT][3], grad_direction[3] = {};
+      for (int c = 0; c < 3; c++) v[c] = view_colors[3 * splat + c] > 0 ? grad_view_colors[3 * splat + c] : 0.f;
       if (v[0] == 0 && v[1] == 0 && v[2] == 0) return;
-      waves_at<true>(K, d[0], d[1], d[2], Y, D);
-      for (int c = 0; c < 3; c++) own[c] += v[c];
+      evaluate_sh_basis<true>(K, d[0], d[1], d[2], Y, D);
+      for (int c = 0; c < 3; c++) grad_color[c] += v[c];
       for (int64_t k = 0; k < K; k++) {
-        float by_Y = 0;
-        for (int c = 0; c < 3; c++) wave[3 * k + c] += Y[k] * v[c], by_Y += waves[3 * k + c] * v[c];
-        for (int j = 0; j < 3; j++) by_d[j] += by_Y * D[k][j];
+        float grad_Y = 0;
+        for (int c = 0; c < 3; c++) grad_coefficient[3 * k + c] += Y[k] * v[c], grad_Y += coefficients[3 * k + c] * v[c];
+        for (int j = 0; j < 3; j++) grad_direction[j] += grad_Y * D[k][j];
       }
-      const float along = held ? 0.f : d[0] * by_d[0] + d[1] * by_d[1] + d[2] * by_d[2];
-      for (int j = 0; j < 3; j++) mean[j] += (by_d[j] - along * d[j]) * inverse;
+      // The direction's length has no gradient, unless the distance is clamped: then the direction is not normalised.
+      const float along =
+          distance_clamped ? 0.f : d[0] * grad_direction[0] + d[1] * grad_direction[1] + d[2] * grad_direction[2];
+      for (int j = 0; j < 3; j++) grad_mean[j] += (grad_direction[j] - along * d[j]) * inverse;
     });
   });
 }

@@ -1,0 +1,96 @@
+"""The arguments of a training of FNet, and where its files are found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from genre_tasks.errors import ConfigError
+from genre_tasks.fixer.network import INPUTS
+from genre_tasks.fixer.training_settings import PRESETS, STARTS_FROM, TrainingSettings
+from storage.local import LocalStore
+
+CURVE_FILE = "curve.parquet"
+SCORES_FILE = "validation.parquet"
+WEIGHTS_FILE = "fnet.safetensors"
+
+
+@dataclass(frozen=True)
+class FixerJob:
+    """The arguments of a training of FNet: plain values.
+
+    Attributes:
+        folder: holds the store of scenes and pairs and a folder for each set of inputs.
+        real: URI of a log whose chunk 0 is trained on, if any.
+        streets: how many synthetic streets.
+        inputs: what the fixer is given, joined by "+".
+        preset: ``small``; ``further`` and ``last``, each from the weights of the one before or from ``start``;
+            ``paper``, from SD-Turbo at ``start``.
+        start: weights to start from, in place of the preset's.
+        steps: weight updates, in place of the preset's.
+        validate: score on validation streets at each checkpoint, with a picture.
+
+    Raises:
+        ConfigError: an input or the preset is unknown, or ``paper`` lacks its start.
+    """
+
+    folder: str
+    real: str | None = None
+    streets: int = 28
+    inputs: str = "+".join(INPUTS)
+    preset: str = "small"
+    start: str | None = None
+    steps: int | None = None
+    validate: bool = False
+
+    def __post_init__(self) -> None:
+        # Checked here, because making the pairs takes hours before the network reads its inputs.
+        unknown = sorted(set(self.inputs.split("+")) - set(INPUTS))
+        if unknown:
+            raise ConfigError(f"no input is called {' or '.join(unknown)}", remedy=f"Join by +: {', '.join(INPUTS)}.")
+        if self.preset not in PRESETS:
+            raise ConfigError(f"no preset is called {self.preset!r}", remedy=f"Known: {', '.join(PRESETS)}.")
+        if self.preset == "paper" and self.start is None:
+            raise ConfigError(
+                "the paper's fixer starts from SD-Turbo",
+                remedy="Give a folder with its vae and unet in diffusers' layout, or a hub id, by --start.",
+            )
+
+    @property
+    def store(self) -> LocalStore:
+        """Where scenes and pairs are kept."""
+        return LocalStore(Path(self.folder) / "store")
+
+    @property
+    def run_folder(self) -> Path:
+        """The training's own folder: its name tells inputs and preset, unless they are the usual ones."""
+        # The usual training has the short name, under which the stages and the model card know it.
+        parts = ["fnet"]
+        if self.inputs != "+".join(INPUTS):
+            parts.append(self.inputs)
+        if self.preset != "small":
+            parts.append(self.preset)
+        return Path(self.folder) / "-".join(parts)
+
+    @property
+    def settings(self) -> TrainingSettings:
+        """The preset's settings, with the job's length."""
+        settings = PRESETS[self.preset]
+        return settings if self.steps is None else replace(settings, steps=self.steps)
+
+    @property
+    def sd_turbo(self) -> str | None:
+        """Where SD-Turbo is, for the preset that trains its adapters; ``None`` for the small network."""
+        return self.start if self.preset == "paper" else None
+
+    @property
+    def initial_weights(self) -> Path | None:
+        """The small network's weights to start from; ``None`` for random weights."""
+        # The paper's network has another shape: it starts from SD-Turbo, not from a file of weights.
+        if self.preset == "paper":
+            return None
+        if self.start is not None:
+            return Path(self.start)
+        if self.preset in STARTS_FROM:
+            return replace(self, preset=STARTS_FROM[self.preset]).run_folder / WEIGHTS_FILE
+        return None

@@ -1,0 +1,98 @@
+"""The arguments of a training of GNet or ENet, and where its stages and their weights are found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from flows.training import checkpoint
+from flows.training.optimiser_training import CHECKPOINT_FILE, WEIGHTS_FILE
+from flows.training.recipes import get_recipe
+from flows.training.stage_recipe import SHIPPED, Stage
+from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.weights import resolve_weights
+from storage.local import LocalStore
+
+
+@dataclass(frozen=True)
+class TrainJob:
+    """The arguments of a training: plain values.
+
+    Attributes:
+        folder: holds the store of scenes and a folder for each stage.
+        recipe: name of the recipe.
+        real: URI of a log whose chunk 0 is trained on, if any.
+        novel: λ_novel of GNet; ``None`` for the recipe's.
+        fnet: FNet's weights: a path, or ``builtin``.
+        device: ``auto``, ``cpu`` or ``cuda``.
+        save_every: weight updates between checkpoints.
+        validate_every: weight updates between validations, each at the next checkpoint; 0 for none.
+    """
+
+    folder: str
+    recipe: str = "shipped"
+    real: str | None = None
+    novel: float | None = None
+    fnet: str = "builtin"
+    device: str = "auto"
+    save_every: int = 50
+    validate_every: int = 0
+
+    @property
+    def store(self) -> LocalStore:
+        """Where chunks, initial scenes, true views, scene starts and fixed images are kept."""
+        return LocalStore(Path(self.folder) / "store")
+
+    def stages(self) -> tuple[Stage, ...]:
+        """Lists the recipe's stages.
+
+        Returns:
+            The stages in the order of training.
+        """
+        return get_recipe(self.recipe, self.novel)
+
+    def get_stage(self, name: str) -> Stage:
+        """Finds a stage by its name.
+
+        Args:
+            name: for instance ``gnet/fine``.
+
+        Returns:
+            The stage.
+
+        Raises:
+            ConfigError: the recipe has no such stage.
+        """
+        # Looked up in the recipe as λ_novel changes it: G3R's stages have names of their own.
+        found = {stage.name: stage for stage in self.stages()}
+        if name not in found:
+            raise ConfigError(f"the recipe {self.recipe} has no stage {name!r}", remedy=f"Known: {', '.join(found)}.")
+        return found[name]
+
+    def stage_weights(self, name: str) -> Path:
+        """Finds the weights of a stage.
+
+        Args:
+            name: a stage of the recipe, or weights that ship, such as ``builtin:gnet``.
+
+        Returns:
+            The weights' path.
+
+        Raises:
+            InputError: the stage is not trained to its end.
+        """
+        # Weights that ship were trained to their end, and have no checkpoint.
+        if name.startswith(SHIPPED):
+            return resolve_weights("gnet", name)
+        folder = Path(self.folder) / name
+        path = folder / CHECKPOINT_FILE
+        remedy = f"Run `genre train {name.split('/', maxsplit=1)[0]} --stage {name}` first."
+        # Weights are written at every checkpoint, so that the file alone does not tell whether training is done.
+        if not path.is_file():
+            raise InputError(f"the stage {name} is not trained yet", remedy=remedy, file=path)
+        described = checkpoint.describe(path)
+        done = described["done"]
+        steps = described["config"]["steps"]
+        if done < steps:
+            raise InputError(f"the stage {name} has made {done} of {steps} weight updates", remedy=remedy, file=path)
+        return folder / WEIGHTS_FILE

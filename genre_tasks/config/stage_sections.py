@@ -1,0 +1,149 @@
+"""Sections of the stages that do not optimise: reading a log, the first Gaussians, novel views, fixing, evaluation."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from genre_tasks.config.section import Section
+
+
+class IngestConfig(Section):
+    """Chunks, source views and the working resolution (paper Sec. III-C, IV-A)."""
+
+    chunk_frames: int = Field(20, ge=2, le=200, description="Frames of a chunk; the last chunk may be shorter.")
+    source_every: int = Field(
+        4,
+        ge=1,
+        le=20,
+        description="Every n-th frame has source views, which scenes are fitted to; others are held out.",
+    )
+    # The paper's resolution (Sec. IV-A). Presets for a CPU take a sixteenth of its pixels.
+    width_px: int = Field(1280, ge=16, le=4096, description="Working width of all images, pixels.")
+    height_px: int = Field(720, ge=16, le=4096, description="Working height of all images, pixels.")
+    cameras: tuple[str, ...] | None = Field(None, description="Names of the cameras to use; null: all.")
+    points: str | None = Field(None, description="Path of a PLY file with coloured points, for a log without LiDAR.")
+    complete_facades: bool = Field(
+        True, description="Complete façades above the LiDAR's field of view, as far as images support it."
+    )
+    strict: bool = Field(
+        False, description="Fail on a missing or unreadable image or sweep, instead of reporting it and going on."
+    )
+    min_actor_travel_m: float = Field(
+        0.5, ge=0, description="A track that moves less than this, in metres, is part of the background."
+    )
+    min_actor_points: int = Field(
+        10, ge=1, description="An actor with fewer LiDAR points than this is left out and reported."
+    )
+    min_actor_frames: int = Field(
+        3, ge=1, description="An actor that exists in fewer frames than this is left out and reported."
+    )
+
+
+class InitialConfig(Section):
+    """Gaussians on LiDAR points, and a fixed number of them far away (paper Sec. III-A)."""
+
+    max_points: int = Field(
+        400_000, ge=100, description="Largest number of Gaussians on LiDAR points; the voxel size follows from it."
+    )
+    distant_count: int = Field(10_000, ge=0, description="Number of Gaussians of the distant region.")
+    distant_radius_m: float = Field(
+        200.0, gt=10, description="Radius in metres of the shell that the distant region starts on."
+    )
+    neighbours: int = Field(
+        16, ge=4, le=64, description="LiDAR points that give a Gaussian its normal and its thickness."
+    )
+    opacity: float = Field(0.6, gt=0, lt=1, description="Opacity of the Gaussians on LiDAR points at the start.")
+    max_range_m: float = Field(
+        100.0,
+        gt=1,
+        description="LiDAR points farther than this from the path, in metres, are left to the distant region.",
+    )
+
+
+class NovelViewsConfig(Section):
+    """Views beside the path that the fixer repairs: the poses of the source frames, shifted."""
+
+    shifts_m: tuple[float, ...] = Field(
+        (3.0, -3.0), description="Distances from the path in metres; positive is to the left."
+    )
+    lidar_max_points: int = Field(200_000, ge=100, description="Largest number of points drawn in the LiDAR map.")
+
+
+class FnetConfig(Section):
+    """FNet: the one-step diffusion model that repairs renders (paper Sec. III-B)."""
+
+    # The small network is the default, as it runs on a CPU and its weights ship.
+    model: Literal["small", "sd-turbo"] = Field(
+        "small", description="small: the network that ships; sd-turbo: the paper's, which needs a GPU and its weights."
+    )
+    weights: str = Field("builtin", description="builtin, or the path of a folder with the model's weights.")
+    timestep: int = Field(
+        200,
+        ge=1,
+        le=999,
+        description="Diffusion timestep τ of the single step; the one that the weights were trained at.",
+    )
+    batch_views: int = Field(4, ge=1, description="Views that are fixed at once; more need more memory.")
+    seed: int = Field(0, ge=0, description="Seed of the diffusion noise.")
+    gate: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="A view is fixed where more than this fraction of its pixels is thinly covered or not supported by "
+        "recorded images; 0: every view is fixed.",
+    )
+    half: bool | None = Field(None, description="Compute in bfloat16; null: where the device is faster with it.")
+
+
+class EvaluateConfig(Section):
+    """What is measured after a stage."""
+
+    shifts_m: tuple[float, ...] = Field(
+        (1.0, 2.0, 3.0, 4.0, 5.0), description="Distances from the path in metres; each is rendered on both sides."
+    )
+    distributions: bool = Field(
+        True, description="Measure Fréchet and kernel distances between renders and the chunk's real images."
+    )
+    every: int = Field(1, ge=1, description="Beside the path, every n-th frame of the chunk is rendered.")
+    bootstrap: int = Field(
+        200, ge=0, description="Resamples over frames for the 95 % interval of the kernel distance; 0: no interval."
+    )
+    pictures: int = Field(3, ge=0, description="Number of pictures kept for the report.")
+    inception: str | None = Field(
+        None, description="Path of a TorchScript file of InceptionV3; with it FID is measured, too."
+    )
+    lpips: str | None = Field(
+        None,
+        description="Path of a TorchScript file of LPIPS on VGG; with it LPIPS is measured where there is a truth.",
+    )
+
+
+# No stage has this section: it belongs to the command ``genre range``.
+class RangeConfig(Section):
+    """Where a scene counts as reliable beside the path: how much worse its guards may be than on the path."""
+
+    shifts_m: tuple[float, ...] = Field(
+        (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0),
+        min_length=1,
+        description="Distances from the path in metres; each is rendered on both sides.",
+    )
+    every: int = Field(4, ge=1, description="Every n-th frame of the chunk is rendered.")
+    max_drop_db: float = Field(
+        3.0, gt=0, description="Largest drop of the median view's estimated PSNR against the path, dB."
+    )
+    max_hidden: float = Field(
+        0.1, gt=0, le=1, description="Largest extra fraction of pixels whose depth agrees with no recorded image."
+    )
+    max_thin: float = Field(
+        0.02, gt=0, le=1, description="Largest extra fraction of pixels that Gaussians cover by less than half."
+    )
+    max_floating: float = Field(
+        0.02, gt=0, le=1, description="Largest extra fraction of pixels rendered far before the LiDAR's depth."
+    )
+    max_undetected: float = Field(
+        0.3, gt=0, le=1, description="Largest fraction of a detector's detections on the path that may be lost."
+    )
+    # Fewer than for the fixer: here the map only tells what floats.
+    lidar_max_points: int = Field(20_000, ge=100, description="Largest number of points drawn in the LiDAR map.")

@@ -1,0 +1,76 @@
+"""A track of cuboids, cut to a chunk: where an object is at each of the chunk's frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from genre_tasks.logs.types import CuboidTrack, Float64
+from genre_tasks.scene.actor_node import ActorNode
+from genre_tasks.scene.transforms import interpolate_pose, invert_se3, is_rigid_transform
+
+
+@dataclass(frozen=True)
+class ActorTrack(ActorNode):
+    """A track inside a chunk, before it is known whether it becomes an actor of the scene."""
+
+    @property
+    def travel_m(self) -> float:
+        """The largest distance between the box's centre and where it was first."""
+        centres = self.chunk_SE3_box[:, :3, 3]
+        return float(np.linalg.norm(centres - centres[0], axis=1).max())
+
+
+def cut_track_to_chunk(
+    track: CuboidTrack, frames: Sequence[int], world_SE3_chunk: Float64
+) -> tuple[ActorTrack | None, int]:
+    """Cuts a log's track to a chunk's frames and takes it to chunk coordinates.
+
+    Frames between two annotated ones are interpolated. Before the first and after the last the object is absent, since
+    poses are never extrapolated.
+
+    Args:
+        track: of the log, in world coordinates.
+        frames: log frames of the chunk, in order.
+        world_SE3_chunk: [4, 4].
+
+    Returns:
+        The track, ``None`` if it is in no frame of the chunk or its size is not finite and positive; and how many of
+        its annotations were invalid and left out.
+    """
+    size = np.asarray(track.size_m, dtype=np.float64)
+    if not (np.isfinite(size).all() and (size > 0).all()):
+        return None, len(track.frames)
+    valid = np.array([is_rigid_transform(pose) for pose in track.world_SE3_box], dtype=bool)
+    # A frame that is annotated twice counts once, by its first cuboid.
+    annotated, first = np.unique(track.frames[valid], return_index=True)
+    poses = track.world_SE3_box[valid][first]
+    invalid = int((~valid).sum())
+    inside = [f for f in frames if len(annotated) and annotated[0] <= f <= annotated[-1]]
+    if not inside:
+        return None, invalid
+    # Logs are kilometres from their origin; in the chunk poses are small enough for float32.
+    chunk_SE3_world = invert_se3(world_SE3_chunk)
+    chunk_SE3_box = np.stack([chunk_SE3_world @ _interpolate_annotations(annotated, poses, f) for f in inside])
+    length, width, height = (float(s) for s in size)
+    cut = ActorTrack(
+        track_id=track.track_id,
+        label=track.label,
+        size_m=(length, width, height),
+        frames=np.asarray(inside, np.int64),
+        chunk_SE3_box=chunk_SE3_box,
+    )
+    return cut, invalid
+
+
+def _interpolate_annotations(annotated: NDArray[np.int64], poses: Float64, frame: int) -> Float64:
+    # Over frame numbers, not timestamps: in some logs timestamps are out of order, frame numbers never are.
+    after = int(np.searchsorted(annotated, frame))
+    if annotated[after] == frame:
+        return poses[after]
+    low = annotated[after - 1]
+    high = annotated[after]
+    return interpolate_pose(poses[after - 1], poses[after], float(frame - low) / float(high - low))

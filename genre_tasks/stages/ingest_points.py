@@ -1,0 +1,174 @@
+"""Points of a chunk: from LiDAR sweeps, divided into background and moving actors, or from a file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from genre_tasks.errors import InputError
+from genre_tasks.logs.types import Float32, Float64
+from genre_tasks.scene.actor_track import ActorTrack
+from genre_tasks.scene.chunk import View
+from genre_tasks.scene.facade_completion import complete_facades
+from genre_tasks.scene.moving_actors import MovingActors, find_points_in_box, select_moving_actors
+from genre_tasks.scene.ply_reader import read_ply
+from genre_tasks.scene.road_completion import complete_road
+from genre_tasks.scene.visibility import PointCloud
+from genre_tasks.stages.chunk_reading import ChunkReading
+from genre_tasks.stages.ingest_views import REMEDY
+
+EGO_BOX_M = (2.6, 1.3, 2.6)
+"""Half length, width and height, about the LiDAR pose, of what is the ego vehicle itself and its sensors. Some logs
+put that pose on the road, others at the sensor: the height covers both."""
+
+NO_SWEEP = -1
+"""The frame of points that are of no sweep: those of a file, and of the road where LiDAR is blind."""
+
+FramePoints = tuple[int, Float32]
+"""A log frame and points [P, 3]."""
+
+
+@dataclass(frozen=True)
+class ChunkPoints:
+    """Points of a chunk, not coloured yet.
+
+    Attributes:
+        background: points of what stands still.
+        actors: points of each moving actor, in its box's coordinates.
+        background_colors: [P, 3] the background's colours, where its file has any.
+    """
+
+    background: PointCloud
+    actors: list[PointCloud]
+    background_colors: NDArray[np.uint8] | None = None
+
+
+def read_points_from_file(reading: ChunkReading, file: str) -> ChunkPoints:
+    """Reads the points of a log without LiDAR.
+
+    Args:
+        reading: the chunk; actors, which a file has no points for, are noted in its issues.
+        file: PLY in world coordinates.
+
+    Returns:
+        A background without actors.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    positions, colors = read_ply(file)
+    # Subtracted in float64, as sweeps are.
+    local = (positions - reading.world_SE3_chunk[:3, 3]).astype(np.float32)
+    for track in _select_actors(reading).tracks:
+        reading.add_issue("actor_few_points", f"track {track.track_id}: points come from a file")
+    return ChunkPoints(PointCloud(local, np.full(len(local), NO_SWEEP, np.int16)), [], colors)
+
+
+def read_points_from_sweeps(reading: ChunkReading, sources: Sequence[View]) -> ChunkPoints:
+    """Reads the chunk's LiDAR sweeps, and completes road and façades.
+
+    Args:
+        reading: the chunk; its issues grow.
+        sources: the source views, which façades are completed by.
+
+    Returns:
+        Background and actors; actors with too few points or frames are left out.
+
+    Raises:
+        InputError: the chunk has no sweep, or under ``strict`` one is missing or unreadable.
+    """
+    moving = _select_actors(reading)
+    background: list[FramePoints] = []
+    points_of_track: list[list[FramePoints]] = [[] for _ in moving.tracks]
+    for n, frame in enumerate(reading.frames):
+        reading.report(len(reading.frames) + n, "sweeps")
+        points = _read_sweep(reading, frame)
+        if points is None:
+            continue
+        # Returns from the vehicle itself would become a Gaussian vehicle at every frame of the path.
+        points = _remove_ego(points, reading.chunk_SE3_ego[n])
+        unassigned = np.ones(len(points), dtype=bool)
+        # Points of brief tracks belong neither to an actor nor to the background.
+        for k, track in enumerate((*moving.tracks, *moving.brief_tracks)):
+            index, in_box = find_points_in_box(points, track, frame)
+            # Where boxes overlap the first track takes the points: one point must not be in two nodes.
+            newly_assigned = unassigned[index]
+            unassigned[index] = False
+            if k < len(points_of_track) and newly_assigned.any():
+                points_of_track[k].append((frame, in_box[newly_assigned]))
+        background.append((frame, points[unassigned]))
+    if not background:
+        remedy = "Give points by ingest.points=FILE.ply, or choose other chunks with --chunks."
+        raise reading.input_error("the chunk has no LiDAR sweep", remedy)
+    # Completion looks at measured points alone; road points that it adds do not take part in completing façades.
+    swept = np.concatenate([points for _, points in background])
+    background.append((NO_SWEEP, complete_road(swept, reading.chunk_SE3_ego)))
+    if reading.config.complete_facades:
+        background.append((NO_SWEEP, complete_facades(swept, reading.chunk_SE3_ego, sources)))
+    return ChunkPoints(_join(background, None), _build_actor_clouds(reading, moving.tracks, points_of_track))
+
+
+def _select_actors(reading: ChunkReading) -> MovingActors:
+    config = reading.config
+    moving = select_moving_actors(
+        reading.log.tracks(),
+        reading.frames,
+        reading.world_SE3_chunk,
+        config.min_actor_travel_m,
+        config.min_actor_frames,
+    )
+    reading.log_issues.extend(moving.log_issues)
+    return moving
+
+
+def _build_actor_clouds(
+    reading: ChunkReading, tracks: Sequence[ActorTrack], points_of_track: Sequence[list[FramePoints]]
+) -> list[PointCloud]:
+    """Leaves out, and notes, tracks with too few points or frames."""
+    config = reading.config
+    clouds = []
+    for track, parts in zip(tracks, points_of_track, strict=True):
+        count = sum(len(points) for _, points in parts)
+        # Too few points make no vehicle, and in the background they would be a smear: they are left out of both.
+        if count < config.min_actor_points or len(parts) < config.min_actor_frames:
+            detail = f"track {track.track_id}: {count} LiDAR points in {len(parts)} frames"
+            reading.add_issue("actor_few_points", detail)
+        else:
+            clouds.append(_join(parts, track))
+    return clouds
+
+
+def _join(parts: Sequence[FramePoints], track: ActorTrack | None) -> PointCloud:
+    # The frame goes with each point: it says when an actor's point was seen, and what a frame's depth term may use.
+    counts = [len(points) for _, points in parts]
+    frames = np.repeat(np.array([frame for frame, _ in parts], np.int16), counts)
+    return PointCloud(np.concatenate([points for _, points in parts]), frames, track)
+
+
+def _read_sweep(reading: ChunkReading, frame: int) -> Float32 | None:
+    """Points [P, 3] of a sweep in chunk coordinates; non-finite returns are dropped."""
+    try:
+        sweep = reading.log.sweep(frame)
+    except InputError as error:
+        if reading.config.strict:
+            raise
+        reading.add_issue("unreadable_sweep", error.problem, frame)
+        return None
+    if sweep is None:
+        if reading.config.strict:
+            raise reading.input_error("there is no LiDAR sweep", REMEDY, frame=frame)
+        reading.add_issue("missing_sweep", "there is no LiDAR sweep", frame)
+        return None
+    # World coordinates can be kilometres: they are subtracted in float64, and only then rounded.
+    points = (sweep.points_world - reading.world_SE3_chunk[:3, 3]).astype(np.float32)
+    # Some sensors mark a missing return by NaN or infinity.
+    return points[np.isfinite(points).all(1)]
+
+
+def _remove_ego(points: Float32, chunk_SE3_ego: Float64) -> Float32:
+    """Leaves out points on the ego vehicle itself."""
+    local = (points - chunk_SE3_ego[:3, 3].astype(np.float32)) @ chunk_SE3_ego[:3, :3].astype(np.float32)
+    return points[~(np.abs(local) < np.array(EGO_BOX_M, np.float32)).all(1)]

@@ -1,0 +1,81 @@
+"""Every ``genre`` command of the README and the guides runs, on small logs and with small settings.
+
+A command is what stands in a ``bash`` block. Names of logs and runs are replaced by small ones of the test.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from flows.cli.main import app
+from genre_tasks.logs.pandaset.writer import write_pandaset
+from genre_tasks.logs.registry import open_log
+from tests.faults.small_run import LOG, SETTINGS
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = (ROOT / "README.md", ROOT / "docs/quickstart.md", *sorted((ROOT / "docs/guides").glob("*.md")))
+TAKES_SETTINGS = ("run", "effects", "cost", "table", "figure")
+TAKES_STORE = ("run", "effects", "show", "render", "range", "verify", "cost", "table", "figure")
+
+
+def commands(page: Path) -> list[str]:
+    """The ``genre`` commands of a page's ``bash`` blocks, in order."""
+    blocks = re.findall(r"```bash\n(.*?)```", page.read_text(), flags=re.DOTALL)
+    return [line for block in blocks for line in block.splitlines() if line.startswith("genre ")]
+
+
+FOUND = [pytest.param(command, id=f"{page.stem}: {command}") for page in PAGES for command in commands(page)]
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, str, str]]:
+    """A folder with a store, a finished small run in it, and a small log in the PandaSet layout.
+
+    Yields the folder, the run's name and the log's URI.
+    """
+    from prefect.testing.utilities import prefect_test_harness
+
+    from flows.reconstruction.flow import reconstruct_log
+
+    folder = tmp_path_factory.mktemp("commands")
+    write_pandaset(open_log(LOG), folder / "pandaset/002")
+    with prefect_test_harness(server_startup_timeout=120):
+        done = reconstruct_log(LOG, preset="demo", store=str(folder / "store"), settings=list(SETTINGS))
+        yield folder, done["run"], f"pandaset:{folder}/pandaset/002"
+
+
+def small(command: str, folder: Path, run: str, pandaset: str) -> list[str]:
+    """The command's arguments, with the test's log, run, store and settings in place of the page's."""
+    words = shlex.split(command.split("   #")[0])[1:]
+    words = [re.sub(r"^synthetic:street\?seed=\d+$", LOG, word) for word in words]
+    words = [run if word == "RUN" else word for word in words]
+    words = [pandaset if word == "pandaset:/data/pandaset/002" else word for word in words]
+    if "--budget" in words:  # a budget chooses these settings itself, and is not given them
+        return [*words, "--store", str(folder / "store"), "--dry-run"]
+    more = ("gnet.per_scene.iterations=20",) if words[0] in ("table", "figure") else ()
+    sets = [part for setting in (*SETTINGS, *more) for part in ("--set", setting)]
+    sets = sets if words[0] in TAKES_SETTINGS else []
+    store = ["--store", str(folder / "store")] if words[0] in TAKES_STORE else []
+    return [*words[:1], *sets, *store, *words[1:]]
+
+
+@pytest.mark.parametrize("command", FOUND)
+def test_a_command_of_the_documents_runs(
+    command: str, workplace: tuple[Path, str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if "FastestDet.onnx" in command:
+        pytest.skip("the detector is a file that the user brings")
+    monkeypatch.chdir(workplace[0])
+    monkeypatch.setenv("PREFECT_HOME", str(workplace[0] / "prefect"))  # as the command itself sets it
+    done = CliRunner().invoke(app, small(command, *workplace), catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+
+
+def test_the_readme_has_commands() -> None:
+    assert len(commands(ROOT / "README.md")) >= 6

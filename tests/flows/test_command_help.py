@@ -1,0 +1,77 @@
+"""The help of every command: an example that parses, options that say what they do, and an answer at once."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+import time
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from flows.cli.main import app
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def all_commands() -> Iterator[tuple[str, Any]]:
+    """(words, command) of every command that does something, such as ``train gnet``."""
+    for name, command in typer.main.get_command(app).commands.items():  # type: ignore[attr-defined]
+        if hasattr(command, "commands"):
+            for part, subcommand in command.commands.items():
+                yield f"{name} {part}", subcommand
+        else:
+            yield name, command
+
+
+COMMANDS = dict(all_commands())
+
+
+def examples(command: Any) -> list[str]:
+    return [line.strip() for line in command.help.splitlines() if line.startswith("    genre ")]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_example_in_the_help_parses(name: str) -> None:
+    found = examples(COMMANDS[name])
+    assert found
+    for example in found:
+        _, *words = shlex.split(example)
+        assert " ".join(words).startswith(name)
+        COMMANDS[name].make_context(name, words[len(name.split()) :])
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_help_is_in_sentences(name: str) -> None:
+    command = COMMANDS[name]
+    first = command.help.splitlines()[0]
+    assert first[0].isupper() and first.endswith(".") and len(first) <= 67, first
+    for parameter in command.params:
+        text = getattr(parameter, "help", None)
+        assert text and text.endswith("."), (name, parameter.name)
+
+
+def test_the_version_is_that_of_the_package() -> None:
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    done = CliRunner().invoke(app, ["--version"])
+    assert done.exit_code == 0
+    assert done.output == f"genre {version}\n", "after a change of the version, run `make setup`"
+
+
+def test_the_help_answers_within_a_second() -> None:
+    seconds = []
+    for _ in range(3):
+        start = time.perf_counter()
+        done = subprocess.run(
+            [sys.executable, "-m", "flows.cli.main", "--help"], cwd=ROOT, capture_output=True, check=True
+        )
+        seconds.append(time.perf_counter() - start)
+        assert b"Usage: " in done.stdout
+    # The fastest of three, as other tests may take the cores meanwhile.
+    assert min(seconds) < 1.0
