@@ -217,18 +217,6 @@ def pipeline_seconds() -> str:
     return table(["seconds", *stages, "all"], lines)
 
 
-def raster_times() -> str:
-    """Milliseconds of the renderer beside gsplat's torch reference."""
-    lines = []
-    for row in result("raster")["rows"]:
-        if not row["cell"].startswith(("scene/", "peer/")) or "milliseconds" not in row:
-            continue
-        for name, found in row["milliseconds"].items():
-            spread = f"{number(found['low'])}–{number(found['high'])}"
-            lines.append([row["cell"].split("/")[1], name, number(found["median"]), spread, str(found["n"])])
-    return table(["Gaussians", "what, threads", "median, ms", "quartiles, ms", "n"], lines)
-
-
 def budget_runs() -> str:
     """Every budget that was tried: seconds used, and what was made of them."""
     lines = []
@@ -380,8 +368,6 @@ BLOCKS: Mapping[str, Callable[[], str]] = {
     "pipeline-claims": lambda: claims("pipeline"),
     "optimiser-claims": lambda: claims("optimiser"),
     "optimiser-logs": optimiser_logs,
-    "raster-times": raster_times,
-    "raster-claims": lambda: claims("raster"),
     "budget-runs": budget_runs,
     "evaluation-claims": lambda: claims("evaluation"),
 }

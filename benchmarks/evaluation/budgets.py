@@ -76,6 +76,7 @@ def run_with_budget(seed: str, budget_s: float, table: str, settings: Sequence[s
         command_s = time.perf_counter() - began
     # The record is the last line; warnings of libraries may come before it.
     record = json.loads(out.strip().splitlines()[-1])
+    # A street has a single chunk.
     (chunk,) = record["chunks"]
     (chosen,) = record["budget"]["chunks"]
     stages = {s["stage"]: s for s in chunk["stages"]}
@@ -126,6 +127,7 @@ def budget_claims(rows: Sequence[Row]) -> Iterator[Claim]:
     least = min(with_time_left, default=None)
     note = f"seconds used over the budget, the least of the runs that had time for a better setting; {data}"
     yield claim("evaluation.budget_used", least, ">=", LEAST_USED, "ratio", note, len(with_time_left))
+    # More time may not make a scene worse than runs of one setting differ among themselves.
     rises = [after - before for values in _distances_by_log(rows) for before, after in itertools.pairwise(values)]
     note = f"{DISTANCE}: how much it rises from a budget to the next on one street, the worst; {data}"
     worst = max(rises, default=None)

@@ -120,6 +120,7 @@ def _measure_against_truth(network: Fnet, case: FixerCase, inputs: PipelineInput
     return {
         "truth": compare_with_truth(network, config, inputs.chunk, novel, truth),
         "loose": compare_with_truth(network, config, inputs.chunk, novel_unconstrained, truth),
+        # The same renders for every fixer: only their inputs differ.
         "inputs": {
             name: score_ablation(load_fnet(path), config, inputs.chunk, novel, truth)
             for name, path in find_ablation_weights(case.ablations).items()
@@ -129,7 +130,7 @@ def _measure_against_truth(network: Fnet, case: FixerCase, inputs: PipelineInput
 
 
 def render_views_for_fixer(inputs: PipelineInputs, views: Sequence[NovelView]) -> NovelViews:
-    """Renders GNet's scene with all that the fixer reads beside the colours.
+    """Renders GNet's scene with all that the fixer reads: colours, depths and LiDAR maps.
 
     Args:
         inputs: the scene and its chunk.
@@ -157,6 +158,7 @@ def compare_with_truth(network: Fnet, config: FnetConfig, chunk: Chunk, novel: N
         as the render, which a fixer should leave alone.
     """
     # Depth stays the render's, because the warped references need one and the truth has none.
+    # A true image has no holes, so that its alpha is 1 everywhere.
     clean = replace(novel, color=truth, alpha=torch.ones_like(novel.alpha))
     images = {
         "render": novel.color.clamp(0, 1),

@@ -50,6 +50,7 @@ def compare(before: Path, after: Path) -> Iterator[str]:
     new_store = open_store(str(after))
     old = newest_artifacts(old_store)
     new = newest_artifacts(new_store)
+    # Keys are left out of the address: a change of code changes them, and is what is being compared.
     both = sorted(old.keys() & new.keys())
     # Two stores without a common artifact would print nothing, which looks like no difference.
     if not both:

@@ -143,6 +143,7 @@ def main() -> int:
     found: dict[str, dict[str, str]] = {}
     for name in options.cases.split(","):
         print_progress(name)
+        # An empty store: an artifact of the old code would prove nothing.
         with tempfile.TemporaryDirectory() as store:
             found[name] = digests_of(CASES[name], options.pandaset, store)
     if options.out:

@@ -146,7 +146,7 @@ def run_cell(sweep: Sweep, cell: Cell, runner: StageRunner) -> dict[str, Any] | 
 def _evaluation_inputs(
     sweep: Sweep, cell: Cell, refs: dict[str, ArtifactRef], runner: StageRunner
 ) -> dict[str, ArtifactRef]:
-    # Every setting is judged at the preset's resolution, else fewer pixels would look like better quality.
+    # Every setting is compared at the preset's resolution, else fewer pixels would look like better quality.
     inputs = {name: refs[name] for name in STAGE_BY_NAME[f"evaluate/{cell.setting.end}"].inputs}
     reference = sweep.reference_job(cell)
     ingest = runner("ingest", reference, {})

@@ -20,7 +20,7 @@ _DISTILLED = (
     "enet.loss.perceptual=0",
     "enet.split_fraction=0",
 )
-# Said explicitly, so that a user's settings for all methods cannot turn the learned ones into others.
+# Written out, so that a user's settings for all methods cannot turn the learned ones into others.
 _LEARNED = ("gnet.method=learned", "enet.method=learned")
 _STREET_GS = ("gnet.method=street_gs", *_AS_PUBLISHED)
 _ONE_SHOT = "Distilled by Adam, 480 iterations of 3 + 3 views; once, at 3 m, not progressively."

@@ -99,6 +99,7 @@ def seconds_per_fixed_view(cell: MeasuredCell) -> float:
     0.5
     """
     # Loading the network is in them, so a short chunk has more seconds a view than a long one.
+    # A gate may have left every view as it is.
     return cell.seconds["fnet"] / cell.fixed_views if cell.fixed_views else math.nan
 
 
