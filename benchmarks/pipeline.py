@@ -1,6 +1,9 @@
 """The pipeline's claims, measured: claim seeds of the synthetic street and chunk 1 of the real sequence.
 
 genre bench pipeline --json docs/results/data/pipeline.json [--set seeds=1001,1002] [--set store=DIR]
+genre bench pipeline --json docs/results/data/preset_choice.json --set seeds=900,901,902 --set real_chunk=0
+
+The second command measures validation logs, by which the default preset was chosen.
 
 Each log goes through the pipeline with the presets ``small`` and ``fine``, without Prefect, from and into a store, so
 that a run that was stopped goes on. Tuned Adam has the same initial scene, renderer, loss and number of view renders
@@ -190,6 +193,7 @@ class PipelineBench:
         "seeds": "1001,1002,1003",
         "store": "genre-store",
         "pandaset": "../shared/data/pandaset/002",
+        "real_chunk": "1",
         "settings": "",
         "per_scene_iterations": "1000",
     }

@@ -127,10 +127,10 @@ def logs_from_options(options: Mapping[str, str]) -> list[tuple[str, int]]:
 
     Args:
         options: ``seeds`` of synthetic streets, each with further URI parameters if need be; ``pandaset``, the folder
-            of a real sequence, or empty to leave it out.
+            of a real sequence, or empty to leave it out; ``real_chunk``, its chunk, where a benchmark has the option.
 
     Returns:
-        URI and chunk of each: chunk 0 of the streets, chunk 1 of the real sequence.
+        URI and chunk of each: chunk 0 of the streets, and of the real sequence chunk 1, which nothing was tuned on.
 
     >>> logs_from_options({"seeds": "1001", "pandaset": "data/002"})
     [('synthetic:street?seed=1001', 0), ('pandaset:data/002', 1)]
@@ -138,7 +138,7 @@ def logs_from_options(options: Mapping[str, str]) -> list[tuple[str, int]]:
     logs = [(f"synthetic:street?seed={seed}", 0) for seed in split_option(options["seeds"])]
     # Real data is not shipped, so a benchmark has to run without it.
     if options["pandaset"]:
-        logs.append((f"pandaset:{options['pandaset']}", 1))
+        logs.append((f"pandaset:{options['pandaset']}", int(options.get("real_chunk", "1"))))
     return logs
 
 
