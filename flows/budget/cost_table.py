@@ -78,8 +78,8 @@ def find_shipped_table(preset: str) -> Path:
         known = ", ".join(p.stem.removeprefix("cost_") for p in sorted(_CONFIGS.glob("cost_*.parquet"))) or "none"
         raise ConfigError(
             f"no times were measured for the preset {preset}",
-            remedy=f"Measure them with `genre cost LOG --preset {preset}` and give its cost.parquet with --table. "
-            f"Measured: {known}.",
+            remedy=f"Choose a preset whose times ship ({known}), or measure them with "
+            f"`genre cost LOG --preset {preset}` and give its cost.parquet with --table.",
         )
     return path
 

@@ -7,15 +7,8 @@ from typing import Annotated
 
 import typer
 
-from flows.cli.options import (
-    DEFAULT_STORE,
-    ChunksOption,
-    DryRunOption,
-    LogsArgument,
-    PresetOption,
-    SettingsOption,
-    StoreOption,
-)
+from flows.cli.options import ChunksOption, DryRunOption, LogsArgument, PresetOption, SettingsOption, StoreOption
+from flows.defaults import DEFAULT_STORE
 
 
 def cost(

@@ -9,14 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flows.cli.options import (
-    DEFAULT_STORE,
-    ChunkOption,
-    LogArgument,
-    PresetOption,
-    SettingsOption,
-    StoreOption,
-)
+from flows.cli.options import ChunkOption, LogArgument, PresetOption, SettingsOption, StoreOption
+from flows.defaults import DEFAULT_PRESET, DEFAULT_STORE
 
 if TYPE_CHECKING:
     from genre_tasks.effects.types import EffectsPlan
@@ -25,7 +19,7 @@ if TYPE_CHECKING:
 def effects(
     log: LogArgument,
     chunk: ChunkOption = 0,
-    preset: PresetOption = "small",
+    preset: PresetOption = DEFAULT_PRESET,
     settings: SettingsOption = None,
     store: StoreOption = DEFAULT_STORE,
     out: Annotated[

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flows.cli.options import (
-    DEFAULT_STORE,
     ChunkOption,
     LogArgument,
     MethodsOption,
@@ -17,6 +16,7 @@ from flows.cli.options import (
     StoreOption,
     WeightsOption,
 )
+from flows.defaults import DEFAULT_STORE
 
 if TYPE_CHECKING:
     from flows.pipeline.stage_runner import ArtifactRef, Job

@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 # Typer shows a default after the help text. A default of None says nothing, so those texts say what None means.
-DEFAULT_STORE = "genre-store"
 
 LogArgument = Annotated[
     str,

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flows.cli.options import (
-    DEFAULT_STORE,
     ChunksOption,
     DryRunOption,
     LogsArgument,
@@ -18,6 +17,7 @@ from flows.cli.options import (
     StoreOption,
     WeightsOption,
 )
+from flows.defaults import DEFAULT_STORE
 
 if TYPE_CHECKING:
     from flows.paper_tables.request import TableRequest

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flows.cli.options import DEFAULT_STORE, RunArgument, RunChunkOption, SceneStageOption, StoreOption
+from flows.cli.options import RunArgument, RunChunkOption, SceneStageOption, StoreOption
+from flows.defaults import DEFAULT_STORE
 
 if TYPE_CHECKING:
     from genre_tasks.config import RangeConfig

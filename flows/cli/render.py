@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flows.cli.options import DEFAULT_STORE, RunArgument, RunChunkOption, SceneStageOption, StoreOption
+from flows.cli.options import RunArgument, RunChunkOption, SceneStageOption, StoreOption
+from flows.defaults import DEFAULT_STORE
 
 if TYPE_CHECKING:
     import numpy as np

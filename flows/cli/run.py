@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flows.cli.options import (
-    DEFAULT_STORE,
     ChunksOption,
     DryRunOption,
     JsonOption,
@@ -19,12 +18,10 @@ from flows.cli.options import (
     SettingsOption,
     StoreOption,
 )
+from flows.defaults import DEFAULT_PRESET, DEFAULT_STORE
 
 if TYPE_CHECKING:
     from genre_tasks.config import PipelineConfig
-
-DEFAULT_PRESET = "fine"
-"""Chosen on validation logs: the better one for real logs (docs/guides/presets.md)."""
 
 
 ConfigFileOption = Annotated[
@@ -89,7 +86,7 @@ def run(
     \b
         genre run 'synthetic:street?seed=1000' --preset demo
         genre run pandaset:data/002 --chunks 0,1 --set gnet.iterations=96
-        genre run pandaset:data/002 --budget 5m
+        genre run pandaset:data/002 --preset small --budget 5m
     """
     import psutil
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flows.cli.options import DEFAULT_STORE, PresetOption, StoreOption
+from flows.cli.options import PresetOption, StoreOption
+from flows.defaults import DEFAULT_PRESET, DEFAULT_STORE
 
 if TYPE_CHECKING:
     from storage.local import LocalStore
@@ -23,7 +24,7 @@ def show(
         ),
     ] = "runs",
     store: StoreOption = DEFAULT_STORE,
-    preset: PresetOption = "small",
+    preset: PresetOption = DEFAULT_PRESET,
     picture: Annotated[
         Path | None, typer.Option(help="Write the artifact's picture to this PNG file, if `what` is a key.")
     ] = None,

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import typer
 
-from flows.cli.options import DEFAULT_STORE, StoreOption
+from flows.cli.options import StoreOption
+from flows.defaults import DEFAULT_STORE
 
 
 def verify(store: StoreOption = DEFAULT_STORE) -> None:

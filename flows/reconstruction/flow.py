@@ -14,6 +14,7 @@ from prefect.artifacts import create_image_artifact, create_table_artifact
 from flows.budget.budget import Budget
 from flows.budget.chooser import Chooser
 from flows.configuration import diff_from_preset, load_configuration, validate_config
+from flows.defaults import DEFAULT_PRESET, DEFAULT_STORE
 from flows.pipeline.definition import PIPELINE, RECONSTRUCTION_STAGES, STAGE_BY_NAME, StageSpec
 from flows.pipeline.log_cache import expand_logs, select_chunks
 from flows.pipeline.progress import get_reporter
@@ -32,8 +33,8 @@ _log = logging.getLogger("genre")
 @flow(name="reconstruct-log", flow_run_name="{log}", persist_result=False, validate_parameters=False)
 def reconstruct_log(
     log: str,
-    preset: str = "small",
-    store: str = "genre-store",
+    preset: str = DEFAULT_PRESET,
+    store: str = DEFAULT_STORE,
     chunks: list[int] | None = None,
     config: dict[str, Any] | None = None,
     settings: list[str] | None = None,
@@ -101,8 +102,8 @@ def reconstruct_log(
 @flow(name="reconstruct-dataset", persist_result=False, validate_parameters=False)
 def reconstruct_dataset(
     logs: list[str],
-    preset: str = "small",
-    store: str = "genre-store",
+    preset: str = DEFAULT_PRESET,
+    store: str = DEFAULT_STORE,
     settings: list[str] | None = None,
 ) -> list[dict[str, Any]]:
     """Reconstructs many logs, each in a child flow run; a log that fails does not stop the others.
