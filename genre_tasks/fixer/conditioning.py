@@ -72,13 +72,13 @@ def _pull_push(color: Tensor, weight: Tensor) -> Tensor:
 
 
 def build_conditions(views: FixerInputs) -> Conditions:
-    """Builds the network's input.
+    """Builds the network's input from renders, LiDAR maps and sampled images, scaled to about unit size.
 
     Args:
-        views: what the views are fixed from.
+        views: what V views of H × W pixels are fixed from.
 
     Returns:
-        Conditions of the same size.
+        Conditions of the same V, H and W.
     """
     render = fill_holes(views.color, views.alpha, views.lidar_color, views.lidar_alpha)
     aligned = [views.alpha, views.lidar_alpha, views.warped, views.warp_mask, views.lidar_warped, views.lidar_warp_mask]

@@ -32,7 +32,7 @@ ACTORS = schema(
 
 
 def write_actors(path: Path, actors: Sequence[Actor | ActorNode]) -> None:
-    """Writes what chunks and reconstructions store alike of actors: all but the points of a chunk's.
+    """Writes the actors of a chunk or of a reconstruction, without their points.
 
     Args:
         path: the new file.

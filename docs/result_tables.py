@@ -1,0 +1,258 @@
+"""Tables of measurements for the documents, from the JSON files that ``genre bench`` writes."""
+
+from __future__ import annotations
+
+import json
+import re
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+DATA = ROOT / "docs/results/data"
+
+CLAIM_WORDS = {
+    "main.gnet_over_initial_db": "GNet gains over the initial scene, held-out frames",
+    "main.gnet_vs_adam_db": "GNet gains over tuned Adam with as many renders",
+    "main.enet_interpolation_db": "ENet keeps held-out PSNR: ENet minus GNet",
+    "main.minutes_per_chunk": "Stages of one chunk with preset `fine`, without evaluation",
+    "main.fine_heldout_db": "Preset `fine` over `small`, held-out frames",
+    "main.fine_kernel_3m": "Kernel distance at 3 m, preset `fine` minus `small`",
+    "main.fnet_psnr_3m_db": "FNet's images gain over the renders at 3 m",
+    "main.fnet_perceptual_3m": "Perceptual distance at 3 m, FNet over renders",
+    "main.enet_perceptual_3m": "Perceptual distance at 3 m, ENet over GNet",
+    "main.enet_kernel_3m": "Kernel distance at 3 m, ENet minus GNet",
+    "optimiser.vs_standard_3dgs": "Time of standard 3DGS to GNet's held-out PSNR, over GNet's time",
+    "optimiser.vs_tuned_adam": "Time of the best tuned Adam to GNet's held-out PSNR, over GNet's time",
+    "optimiser.equal_renders_db": "GNet over the best tuned Adam with as many renders",
+    "optimiser.converged": "Time of preset `long` to within 0.2 dB of converged Adam, over Adam's time",
+    "optimiser.distillation": "ENet's time over that of the best distillation by tuned Adam",
+    "optimiser.distillation_standard": "ENet's time over that of distillation by the 3DGS recipe",
+    "optimiser.enhance_1m": "Fraction of runs in which ENet beats GNet at 1 m",
+    "optimiser.enhance_2m": "Fraction of runs in which ENet beats GNet at 2 m",
+    "optimiser.enhance_3m": "Fraction of runs in which ENet beats GNet at 3 m",
+    "optimiser.enhance_4m": "Fraction of runs in which ENet beats GNet at 4 m",
+    "optimiser.enhance_5m": "Fraction of runs in which ENet beats GNet at 5 m",
+    "optimiser.enet_vs_gnet": "Distance to the truth that ENet removes, minus what GNet's network removes",
+    "optimiser.interpolation": "Held-out PSNR, ENet minus GNet, worst run",
+    "optimiser.stable_10x": "Loss after ten times the iterations, over the loss at the end, worst run",
+    "optimiser.network_100k": "Seconds of the network on 100,000 Gaussians",
+    "raster.vs_gsplat_torch": "Speed over gsplat's torch reference, forward and backward",
+    "raster.ns_per_pair": "Nanoseconds a contributing Gaussian-pixel pair, forward and backward",
+    "raster.gemm_share": "Fraction of the floating-point rate of a matrix product",
+    "raster.many_views": "Time a view of 32 views in one call, over single calls",
+    "raster.threads": "Speed of two threads over one",
+    "raster.avx2": "Time with AVX2 over time with AVX-512",
+    "raster.build_s": "Seconds to compile all instruction sets",
+    "evaluation.budget_kept": "Fraction of runs that end within their budget",
+    "evaluation.budget_overrun": "Seconds used over the budget, worst run",
+    "evaluation.budget_used": "Seconds used over the budget, least of the runs that had something better to spend on",
+    "evaluation.budget_worth": "Rise of perceptual distance from a budget to the next larger one, worst",
+    "evaluation.reliability_gnet": "Rank correlation of estimated and true PSNR, scenes of GNet",
+    "evaluation.reliability": "Rank correlation of estimated and true PSNR, scenes of ENet",
+    "evaluation.reliability_worst": "Rank correlation of estimated and true PSNR, worst street",
+}
+"""What each claim says, for people. A claim without words is an error."""
+
+
+def result(name: str) -> dict[str, Any]:
+    """The JSON of one benchmark, as ``genre bench NAME --json`` wrote it."""
+    loaded: dict[str, Any] = json.loads((DATA / f"{name}.json").read_text(encoding="utf-8"))
+    return loaded
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table.
+
+    Args:
+        head: titles of the columns.
+        rows: cells of each row, as many as titles.
+    """
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    lines += ["| " + " | ".join(row) + " |" for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def number(value: float) -> str:
+    """A number with three significant digits or two decimals, whichever is shorter to read.
+
+    >>> number(212.29), number(1.6807), number(0.0214), number(-0.0822)
+    ('212', '1.68', '0.021', '-0.082')
+    """
+    size = abs(value)
+    if size >= 100:
+        return f"{value:.0f}"
+    return f"{value:.2f}" if size >= 1 or size == 0 else f"{value:.3f}"
+
+
+def provenance(name: str) -> str:
+    """One line that says what a table was measured on, and how to measure it again."""
+    loaded = result(name)
+    return (
+        f"Measured on {loaded['machine']} at commit `{loaded['commit'][:12]}` by "
+        f"`genre bench {name} --json docs/results/data/{name}.json`.\n"
+    )
+
+
+def claims(name: str) -> str:
+    """Every claim of a benchmark: target, measured number, and whether it holds. Several logs share a row."""
+    grouped: dict[str, list[dict[str, Any]]] = {}
+    for claim in result(name)["claims"]:
+        grouped.setdefault(claim["id"], []).append(claim)
+    rows = []
+    for claim_id, found in grouped.items():
+        measured = [c["measured"] for c in found if c["measured"] is not None]
+        values = ", ".join(number(m) for m in measured) or "not measured"
+        held = sum(c["holds"] for c in found)
+        verdict = "yes" if held == len(found) else "**missed**" if held == 0 else f"**{held} of {len(found)}**"
+        unit = {"share": "", "ratio": "", "share of runs": ""}.get(found[0]["unit"], found[0]["unit"])
+        runs = ", ".join(str(c["n"]) for c in found) if len(found) == 1 else f"{len(found)} logs"
+        target = f"{found[0]['op']} {found[0]['target']:g} {unit}".strip()
+        rows.append([CLAIM_WORDS[claim_id], target, values, runs, verdict])
+    return table(["claim", "target", "measured", "n", "holds"], rows) + "\n" + provenance(name)
+
+
+def short_log(row: Mapping[str, Any]) -> str:
+    """``street 1001`` or ``PandaSet 002, chunk 1``."""
+    seed = re.search(r"seed=(\d+)", row["log"])
+    return f"street {seed[1]}" if seed else f"PandaSet 002, chunk {row['chunk']}"
+
+
+METHODS = {
+    "initial": "initial scene from LiDAR",
+    "street_gs": "per-scene 3DGS, 1,000 iterations, actors in 3D boxes",
+    "adam": "tuned Adam in GNet's place, preset `small`",
+    "small_gnet": "GNet, preset `small`",
+    "small_enet": "GenRe, preset `small`",
+    "fine_gnet": "GNet, preset `fine`",
+    "fine_enet": "GenRe, preset `fine`",
+}
+"""The rows of the table at a glance, in order: key in the JSON → words."""
+
+
+def glance() -> str:
+    """Results at a glance: a row a method; streets as a mean, the real chunk by itself."""
+    rows = result("pipeline")["rows"]
+    streets = [r for r in rows if r["log"].startswith("synthetic")]
+    real = [r for r in rows if not r["log"].startswith("synthetic")]
+
+    def mean(found: Sequence[Mapping[str, Any]], method: str, metric: str, digits: int) -> str:
+        values = [r["methods"][method]["metrics"].get(metric) for r in found]
+        known = [v for v in values if v is not None]
+        return f"{statistics.fmean(known):.{digits}f}" if known and len(known) == len(found) else "–"
+
+    lines = []
+    for method, words in METHODS.items():
+        seconds = [r["methods"][method]["cpu_seconds"] for r in rows]
+        lines.append(
+            [
+                words,
+                mean(real, method, "interpolation/psnr", 2),
+                mean(real, method, "shift_3m/kernel", 3),
+                mean(streets, method, "interpolation/psnr", 2),
+                mean(streets, method, "shift_3m/psnr", 2),
+                mean(streets, method, "shift_3m/perceptual", 3),
+                f"{statistics.median(seconds):.0f}",
+            ]
+        )
+    head = [
+        "method",
+        "real: held-out PSNR, dB ↑",
+        "real: kernel distance at 3 m ↓",
+        "streets: held-out PSNR, dB ↑",
+        "streets: PSNR at 3 m, dB ↑",
+        "streets: perceptual distance at 3 m ↓",
+        "CPU seconds a chunk ↓",
+    ]
+    return table(head, lines)
+
+
+def pipeline_stages() -> str:
+    """Metrics after each stage, a row a log and stage."""
+    columns = {
+        "held-out PSNR": "interpolation/psnr",
+        "SSIM": "interpolation/ssim",
+        "perceptual": "interpolation/perceptual",
+        "PSNR at 3 m": "shift_3m/psnr",
+        "perceptual at 3 m": "shift_3m/perceptual",
+        "kernel at 3 m": "shift_3m/kernel",
+    }
+    lines = []
+    for row in result("pipeline")["rows"]:
+        for method, found in row["methods"].items():
+            metrics = found["metrics"]
+            cells = [f"{metrics[key]:.3f}" if key in metrics else "–" for key in columns.values()]
+            lines.append([short_log(row), METHODS.get(method, METHOD_WORDS.get(method, method)), *cells])
+    return table(["log", "after", *columns], lines)
+
+
+METHOD_WORDS = {
+    "small_fnet": "FNet's images, preset `small`",
+    "fine_fnet": "FNet's images, preset `fine`",
+}
+
+
+def pipeline_seconds() -> str:
+    """Seconds and peak memory of every stage, median over logs, for both presets."""
+    stages = ("ingest", "effects", "initial", "gnet", "novel_views", "fnet", "enet")
+    lines = []
+    for preset in ("small", "fine"):
+        for kind, words in (("seconds", "wall"), ("cpu_seconds", "CPU")):
+            rows = [r[kind][preset] for r in result("pipeline")["rows"]]
+            cells = [statistics.median(row[stage] for row in rows) for stage in stages]
+            lines.append([f"`{preset}`, {words}", *(f"{c:.1f}" for c in cells), f"{sum(cells):.0f}"])
+        memory = [
+            statistics.median(r["peak_mib"][preset][stage] for r in result("pipeline")["rows"]) for stage in stages
+        ]
+        lines.append([f"`{preset}`, peak memory, MiB", *(f"{m:.0f}" for m in memory), f"{max(memory):.0f}"])
+    return table(["seconds or MiB", *stages, "all"], lines)
+
+
+def preset_choice() -> str:
+    """Both presets on validation logs, by which the default was chosen."""
+    columns = {
+        "held-out PSNR, dB ↑": ("interpolation/psnr", 2),
+        "held-out perceptual distance ↓": ("interpolation/perceptual", 3),
+        "kernel distance at 3 m ↓": ("shift_3m/kernel", 3),
+        "PSNR at 3 m, dB ↑": ("shift_3m/psnr", 2),
+        "perceptual distance at 3 m ↓": ("shift_3m/perceptual", 3),
+    }
+    lines = []
+    for row in result("preset_choice")["rows"]:
+        for preset in ("small", "fine"):
+            found = row["methods"][f"{preset}_enet"]
+            metrics = found["metrics"]
+            cells = [f"{metrics[k]:.{digits}f}" if k in metrics else "–" for k, digits in columns.values()]
+            lines.append([short_log(row), f"`{preset}`", *cells, f"{found['cpu_seconds']:.0f}"])
+    return table(["validation log", "preset", *columns, "CPU seconds ↓"], lines)
+
+
+def budget_runs() -> str:
+    """Every budget that was tried: seconds used, and what was made of them."""
+    lines = []
+    for row in result("evaluation")["rows"]:
+        if "budget_s" in row:
+            used = f"{row['used_s']:.1f}"
+            ratio = f"{row['used_s'] / row['budget_s']:.2f}"
+            made = ", ".join(row["settings"]) or "the preset"
+            lines.append([short_log(row), f"{row['budget_s']:.0f}", used, ratio, made, row["end"]])
+    return table(["log", "budget, s", "used, s", "used over budget", "settings", "last stage"], lines)
+
+
+LOG_TABLES = (
+    "The race",
+    "How far it goes",
+    "Distillation by tuned Adam",
+    "Distillation by the 3DGS recipe",
+    "Enhancement: GNet → ENet",
+)
+
+
+def optimiser_logs() -> str:
+    """Tables of the optimiser's benchmark, log by log."""
+    from benchmarks.optimiser import per_log_tables
+
+    rows = {row["cell"]: row for row in result("optimiser")["rows"]}
+    tables = "\n".join(per_log_tables.pages(rows)).strip().split("\n\n")
+    return "\n".join(f"### {title}\n\n{text}\n" for title, text in zip(LOG_TABLES, tables, strict=True))
