@@ -11,7 +11,8 @@ import typer
 from flows.cli.options import JsonOption, LogArgument
 
 if TYPE_CHECKING:
-    from genre_tasks.logs.findings import CameraCheck, Finding, LogCheck
+    from genre_tasks.log_checks.results import CameraCheck, LogCheck
+    from genre_tasks.logs.findings import Finding
 
 
 def check(log: LogArgument, as_json: JsonOption = False) -> None:
@@ -27,8 +28,8 @@ def check(log: LogArgument, as_json: JsonOption = False) -> None:
     \b
         genre check pandaset:data/002
     """
+    from genre_tasks.log_checks.check_log import check_log
     from genre_tasks.logs.registry import open_log
-    from genre_tasks.logs.validation import check_log
 
     report = check_log(open_log(log))
     if as_json:
@@ -61,5 +62,5 @@ def _describe_camera(camera: CameraCheck) -> str:
 
 
 def _describe_finding(finding: Finding) -> str:
-    text = f"{finding.severity}: {finding.message}"
+    text = f"{finding.severity} [{finding.word}]: {finding.message}"
     return f"{text}. {finding.remedy}" if finding.remedy else text

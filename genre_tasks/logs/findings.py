@@ -1,15 +1,12 @@
-"""Results of checking a driving log: findings, and what each camera and the log as a unit has and lacks."""
+"""What is to be known of a driving log before it is trusted: findings, with their numbers and what to do about them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
-
-# A chunk with less travel has next to no parallax: its geometry comes from the LiDAR alone.
-STANDSTILL_M = 0.5
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, Protocol, runtime_checkable
 
 Severity = Literal["fatal", "warning", "note"]
-Verdict = Literal["good", "usable", "unusable"]
 
 
 @dataclass(frozen=True)
@@ -17,89 +14,37 @@ class Finding:
     """One thing to know about a log.
 
     Attributes:
-        severity: ``fatal`` (the log cannot be reconstructed), ``warning`` or ``note``.
+        word: what it is, one word with underscores that programs can select by, such as ``odd_principal_point``.
+        severity: ``fatal`` (the log cannot be reconstructed), ``warning`` (the result will be worse) or ``note``.
         message: what was found, without a full stop.
         remedy: what the user can do about it; may be empty.
+        numbers: what was measured and what it was compared with, by name with the unit, such as ``offset_px``.
+        camera: the camera that it is about; ``None`` for the log as a unit.
+        frames: the frames that it is about; empty where it is about none in particular.
+
+    >>> finding = Finding("far_jump", "warning", "the path jumps", numbers={"jump_m": 60.0}, frames=(3,))
+    >>> finding.numbers["jump_m"]
+    60.0
     """
 
+    word: str
     severity: Severity
     message: str
     remedy: str = ""
+    numbers: Mapping[str, float] = field(default_factory=dict)
+    camera: str | None = None
+    frames: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True)
-class CameraCheck:
-    """What one camera has and lacks.
+# Apart from ``DrivingLog``, since most readers leave nothing out.
+@runtime_checkable
+class ReportsFindings(Protocol):
+    """A log whose reader leaves things out or meets what it does not read, such as images under another name."""
 
-    Attributes:
-        name: the camera.
-        width_px: native width of its images.
-        height_px: native height of its images.
-        missing: frames without an image.
-        unreadable: frames whose image does not decode.
-        odd_size: frames whose image has another size.
-    """
-
-    name: str
-    width_px: int
-    height_px: int
-    missing: tuple[int, ...]
-    unreadable: tuple[int, ...]
-    odd_size: tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class LogCheck:
-    """What ``check_log`` found.
-
-    Attributes:
-        uri: the log.
-        frames: how many frames it has.
-        duration_s: seconds from the first frame to the last.
-        cameras: one entry per camera.
-        missing_sweeps: frames without a LiDAR sweep.
-        unreadable_sweeps: frames whose sweep cannot be read.
-        points: fewest, median and most points of the readable sweeps.
-        tracks_moving: annotated objects that move.
-        tracks_static: annotated objects that do not.
-        invalid: (kind, count) of what the reader left out.
-        travel_m: length of the ego vehicle's path.
-        chunk_travel_m: the same for every chunk.
-        findings: everything to know, in the order in which it was found.
-    """
-
-    uri: str
-    frames: int
-    duration_s: float
-    cameras: tuple[CameraCheck, ...]
-    missing_sweeps: tuple[int, ...]
-    unreadable_sweeps: tuple[int, ...]
-    points: tuple[int, int, int]
-    tracks_moving: int
-    tracks_static: int
-    invalid: tuple[tuple[str, int], ...]
-    travel_m: float
-    chunk_travel_m: tuple[float, ...]
-    findings: tuple[Finding, ...]
-
-    @property
-    def chunk_count(self) -> int:
-        """How many chunks the log is cut into."""
-        return len(self.chunk_travel_m)
-
-    @property
-    def standstill_chunks(self) -> tuple[int, ...]:
-        """The chunks in which the ego vehicle moves less than ``STANDSTILL_M``."""
-        return tuple(k for k, travel in enumerate(self.chunk_travel_m) if travel < STANDSTILL_M)
-
-    @property
-    def verdict(self) -> Verdict:
-        """Whether the log can be reconstructed.
+    def findings(self) -> tuple[Finding, ...]:
+        """What the reader left out or could not use so far, in the order in which it was met.
 
         Returns:
-            ``unusable`` if any finding is fatal, ``usable`` with warnings, else ``good``.
+            One entry per thing; sweeps count from when they were read.
         """
-        severities = {finding.severity for finding in self.findings}
-        if "fatal" in severities:
-            return "unusable"
-        return "usable" if "warning" in severities else "good"
+        ...

@@ -14,17 +14,6 @@ from genre_tasks.logs.types import Float32, Float64, Lens, MotionBlur, RollingSh
 Role = Literal["source", "heldout"]
 Gain = tuple[float, float, float]
 """Logarithm of an image's gain in linear light: red, green, blue."""
-LogIssueKind = Literal[
-    "missing_image",
-    "unreadable_image",
-    "missing_sweep",
-    "unreadable_sweep",
-    "cuboid_outside",
-    "cuboid_invalid",
-    "actor_few_points",
-    "timestamps",
-    "standstill",
-]
 
 
 @dataclass(frozen=True)
@@ -107,13 +96,13 @@ class LogIssue:
     """Something that the log lacks or that was set aside, for reports to name.
 
     Attributes:
-        kind: what it is.
+        kind: what it is, one word: that of a finding of ``genre check`` where the same thing is found there.
         detail: one clause for a reader.
         frame: log frame, where it is about one.
         camera: where it is about one.
     """
 
-    kind: LogIssueKind
+    kind: str
     detail: str
     frame: int | None = None
     camera: str | None = None

@@ -8,7 +8,7 @@ from genre_tasks.config import IngestConfig
 from genre_tasks.errors import InputError
 from genre_tasks.logs.types import DrivingLog, Float64
 from genre_tasks.progress import Progress
-from genre_tasks.scene.chunk import LogIssue, LogIssueKind
+from genre_tasks.scene.chunk import LogIssue
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class ChunkReading:
         """
         self.progress(done, 3 * len(self.frames), note)
 
-    def add_issue(self, kind: LogIssueKind, detail: str, frame: int | None = None, camera: str | None = None) -> None:
+    def add_issue(self, kind: str, detail: str, frame: int | None = None, camera: str | None = None) -> None:
         """Notes something that the log lacks or that was left out.
 
         Args:

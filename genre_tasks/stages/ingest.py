@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from genre_tasks.config import IngestConfig
 from genre_tasks.errors import ConfigError
+from genre_tasks.log_checks.plausibility import assess_plausibility
 from genre_tasks.logs.types import Camera, DrivingLog
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.actor_track import ActorTrack
@@ -68,6 +69,7 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
     chunk_SE3_ego = invert_se3(world_SE3_chunk) @ poses
     reading = ChunkReading(config, log, chunk_index, frames, world_SE3_chunk, chunk_SE3_ego, progress)
     _note_path_issues(reading)
+    _note_implausible(reading, cameras)
     views, pixels = read_views(reading, cameras)
     sources = [view for view in views if view.role == "source"]
     # Frames and not views: six cameras at one moment have no parallax over time.
@@ -149,6 +151,21 @@ def _note_path_issues(reading: ChunkReading) -> None:
     travel = np.linalg.norm(centers - centers[0], axis=1).max()
     if travel < STANDSTILL_M:
         reading.add_issue("standstill", f"the ego vehicle travels {travel:.2f} m: no parallax")
+
+
+def _note_implausible(reading: ChunkReading, cameras: tuple[Camera, ...]) -> None:
+    """Notes what ``genre check`` would warn of; raises where the log cannot be reconstructed.
+
+    Under ``strict``, a warning is an error too.
+    """
+    for finding in assess_plausibility(reading.log, reading.frames, cameras):
+        stops = finding.severity == "fatal" or (finding.severity == "warning" and reading.config.strict)
+        frame = finding.frames[0] if finding.frames else None
+        if stops:
+            raise reading.input_error(finding.message, finding.remedy, finding.camera, frame)
+        if finding.severity == "warning":
+            detail = f"{finding.message}. {finding.remedy}" if finding.remedy else finding.message
+            reading.add_issue(finding.word, detail, frame, finding.camera)
 
 
 def _report_images(

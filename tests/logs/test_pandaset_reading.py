@@ -118,7 +118,7 @@ class TestOpening:
             path.unlink()
         log = opened(folder)
         assert [c.name for c in log.cameras] == ["front"]
-        assert [p.kind for p in log.problems()] == ["camera_without_images"]
+        assert [f.word for f in log.findings()] == ["camera_without_images"]
 
     @pytest.mark.parametrize("lens", [{"fx": 1.0}, {"fx": float("nan"), "fy": 1, "cx": 1, "cy": 1}, [1], "text"])
     def test_bad_intrinsics(self, folder: Path, lens: Any) -> None:
@@ -198,7 +198,7 @@ class TestSweeps:
         sweep = log.sweep(1)
         assert sweep is not None and len(sweep.points_world) == len(x) - 2
         assert np.isfinite(sweep.points_world).all()
-        assert [p.kind for p in log.problems()] == ["invalid_points"]
+        assert [f.word for f in log.findings()] == ["invalid_points"]
 
     @pytest.mark.parametrize("damage", ["truncated", "text", "empty", "hostile", "no column", "text column"])
     def test_unreadable_names_file_and_frame(self, folder: Path, damage: str) -> None:
@@ -251,7 +251,7 @@ class TestTracks:
         log = self._tracks(folder, cuboids(good, only_bad), cuboids(bad, flat), cuboids(good))
         (track,) = log.tracks()
         assert track.track_id == "b" and track.frames.tolist() == [0, 2]
-        assert [p.kind for p in log.problems()] == ["invalid_box"] * 3
+        assert [f.word for f in log.findings()] == ["invalid_box"] * 3
 
     def test_an_object_seen_by_both_sensors_is_one(self, folder: Path) -> None:
         """The spinning sensor's box counts; the other sensor's fills its gaps."""

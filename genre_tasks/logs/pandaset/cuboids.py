@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from genre_tasks.errors import InputError
+from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.pandaset.layout import BOX_HEADING, PANDA_R_FLU, SPINNING_SENSOR, quats_to_matrices
 from genre_tasks.logs.pandaset.pickle_reader import Table
-from genre_tasks.logs.reader_problems import ReaderProblem
 from genre_tasks.logs.types import CuboidTrack, Float64
 
 _BOX_COLUMNS = ("position.x", "position.y", "position.z", "dimensions.x", "dimensions.y", "dimensions.z", "yaw")
@@ -50,10 +50,10 @@ class _AnnotatedObject:
     moving: bool = False
 
 
-def build_tracks(frames: Iterable[tuple[int, Table]]) -> tuple[tuple[CuboidTrack, ...], tuple[ReaderProblem, ...]]:
+def build_tracks(frames: Iterable[tuple[int, Table]]) -> tuple[tuple[CuboidTrack, ...], tuple[Finding, ...]]:
     """Builds the tracks of a sequence from the cuboids of its frames.
 
-    A box with a non-finite number or without volume is left out (``ReaderProblem`` of kind ``invalid_box``). An object
+    A box with a non-finite number or without volume is left out (``Finding`` with the word ``invalid_box``). An object
     moves if ``attributes.object_motion`` says so in any frame; pedestrians have none: they move where they walk.
 
     Args:
@@ -66,14 +66,14 @@ def build_tracks(frames: Iterable[tuple[int, Table]]) -> tuple[tuple[CuboidTrack
         InputError: a needed column is missing (names the frame).
     """
     objects: dict[str, _AnnotatedObject] = {}
-    problems: list[ReaderProblem] = []
+    findings: list[Finding] = []
     for frame, table in frames:
-        problems += _add_frame(objects, frame, table)
+        findings += _add_frame(objects, frame, table)
     tracks = (_build_track(group) for group in _group_siblings(objects))
-    return tuple(track for track in tracks if track is not None), tuple(problems)
+    return tuple(track for track in tracks if track is not None), tuple(findings)
 
 
-def _add_frame(objects: dict[str, _AnnotatedObject], frame: int, table: Table) -> list[ReaderProblem]:
+def _add_frame(objects: dict[str, _AnnotatedObject], frame: int, table: Table) -> list[Finding]:
     """Adds the boxes of one frame to their objects; returns those that were left out."""
     missing = [name for name in ("uuid", "label", *_BOX_COLUMNS) if name not in table.columns]
     if missing:
@@ -81,7 +81,7 @@ def _add_frame(objects: dict[str, _AnnotatedObject], frame: int, table: Table) -
         raise InputError(f"the cuboids lack the columns {', '.join(missing)}", remedy=remedy, frame=frame)
     boxes = _read_boxes(table)
     attributes = {name: values.tolist() for name, values in table.columns.items() if name not in _BOX_COLUMNS}
-    problems = []
+    findings = []
     for index, box in enumerate(boxes):
         row = {name: values[index] for name, values in attributes.items()}
         new_object = _AnnotatedObject(
@@ -93,12 +93,13 @@ def _add_frame(objects: dict[str, _AnnotatedObject], frame: int, table: Table) -
         annotated = objects.setdefault(new_object.uuid, new_object)
         if not np.isfinite(box).all() or (box[_SIZE] <= 0).any() or not box[_QUATERNION].any():
             message = f"the box of {annotated.label} {annotated.uuid} in frame {frame} is not finite"
-            problems.append(ReaderProblem("invalid_box", message))
+            remedy = "Correct the box; it is left out."
+            findings.append(Finding("invalid_box", "warning", message, remedy, frames=(frame,)))
             continue
         # A uuid that stands twice in a frame keeps its first box.
         annotated.boxes.setdefault(frame, box)
         annotated.moving |= _is_moving(row)
-    return problems
+    return findings
 
 
 def _read_boxes(table: Table) -> Float64:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from genre_tasks.errors import InputError
+from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.pandaset.cuboids import build_tracks
 from genre_tasks.logs.pandaset.layout import (
     IMAGE_SUFFIXES,
@@ -26,7 +27,6 @@ from genre_tasks.logs.pandaset.layout import (
     to_flu_axes,
 )
 from genre_tasks.logs.pandaset.pickle_reader import Table, read_table
-from genre_tasks.logs.reader_problems import ReaderProblem
 from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Lens, Sweep, Truth
 from genre_tasks.suggestions import did_you_mean
 
@@ -87,7 +87,7 @@ class PandaSetLog:
         self._lidar_poses = self._read_list("lidar/poses.json")
         self.frame_count = len(self._lidar_poses)
         self._lidar_times = self._read_times("lidar/timestamps.json")
-        self._problems: dict[str, ReaderProblem] = {}
+        self._findings: dict[str, Finding] = {}
 
     def _read_list(self, name: str) -> list[object]:
         """The entries of a JSON file of the sequence, which has one for every frame."""
@@ -131,7 +131,9 @@ class PandaSetLog:
         intrinsics = read_json(path, self.uri)
         size = self._read_image_size(name)
         if size is None:
-            self._report_problem("camera_without_images", f"{name} has no readable image and is left out")
+            message = f"{name} has no readable image and is left out"
+            remedy = "Copy the camera's folder again, or remove it."
+            self._report(Finding("camera_without_images", "warning", message, remedy, camera=name))
             return None
         where: dict[str, Any] = {"file": path, "log": self.uri, "camera": name}
         try:
@@ -267,7 +269,8 @@ class PandaSetLog:
         finite = np.isfinite(rows).all(axis=1)
         if not finite.all():
             count = int((~finite).sum())
-            self._report_problem("invalid_points", f"{count} points of sweep {frame} are not finite and left out")
+            message = f"{count} points of sweep {frame} are not finite and left out"
+            self._report(Finding("invalid_points", "warning", message, numbers={"points": count}, frames=(frame,)))
             rows = rows[finite]
         return Sweep(
             # Copies, or the few columns that are used would keep the rows of the file in memory.
@@ -278,9 +281,9 @@ class PandaSetLog:
 
     @cached_property
     def _tracks(self) -> tuple[CuboidTrack, ...]:
-        tracks, problems = build_tracks(self._read_cuboids())
-        for problem in problems:
-            self._report_problem(problem.kind, problem.message)
+        tracks, findings = build_tracks(self._read_cuboids())
+        for finding in findings:
+            self._report(finding)
         return tracks
 
     def _read_cuboids(self) -> Iterator[tuple[int, Table]]:
@@ -297,18 +300,18 @@ class PandaSetLog:
         """
         return self._tracks
 
-    def _report_problem(self, kind: str, message: str) -> None:
+    def _report(self, finding: Finding) -> None:
         # By message, since a sweep that is read twice must count once.
-        self._problems[message] = ReaderProblem(kind, message)
+        self._findings[finding.message] = finding
 
-    def problems(self) -> tuple[ReaderProblem, ...]:
+    def findings(self) -> tuple[Finding, ...]:
         """What cameras and tracks, and the sweeps read so far, had to leave out.
 
         Returns:
             One entry per thing left out.
         """
         _ = self.cameras, self._tracks
-        return tuple(self._problems.values())
+        return tuple(self._findings.values())
 
     def digest(self) -> str:
         """Identifies the name, size and content of every file of cameras, LiDAR and cuboids, in name order.

@@ -10,9 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from genre_tasks.logs.findings import LogCheck
-from genre_tasks.logs.inspection import LogInspector, format_frames
-from genre_tasks.logs.reader_problems import ReportsProblems
+from genre_tasks.log_checks.inspection import LogInspector, format_frames
+from genre_tasks.log_checks.plausibility import assess_plausibility
+from genre_tasks.log_checks.results import STANDSTILL_M, LogCheck
+from genre_tasks.logs.findings import Finding, ReportsFindings
 from genre_tasks.logs.types import DrivingLog
 from genre_tasks.progress import Progress, silent
 
@@ -43,7 +44,7 @@ def check_log(log: DrivingLog, chunk_frames: int = 20, progress: Progress = sile
     times = inspector.read_times()
     cameras = tuple(inspector.check_camera(index) for index in range(len(inspector.cameras)))
     missing, unreadable, point_counts = inspector.read_sweeps()
-    tracks = inspector.try_reading(log.tracks, "warning") or ()
+    tracks = inspector.try_reading(log.tracks, "warning", "unreadable_cuboids") or ()
     steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     chunk_starts = range(0, log.frame_count, chunk_frames)
     # Clocks that fail for some frames were reported; the others still say how long the log is.
@@ -77,67 +78,109 @@ def _summarise_counts(counts: Sequence[int]) -> tuple[int, int, int]:
 
 
 def _count_left_out(log: DrivingLog, inspector: LogInspector) -> tuple[tuple[str, int], ...]:
-    """(kind, count) of what the reader left out, sorted by kind."""
-    if not isinstance(log, ReportsProblems):
+    """(word, count) of what the reader left out, sorted by word."""
+    if not isinstance(log, ReportsFindings):
         return ()
-    kinds = [problem.kind for problem in inspector.try_reading(log.problems, "warning") or ()]
-    return tuple((kind, kinds.count(kind)) for kind in sorted(set(kinds)))
+    words = [finding.word for finding in inspector.try_reading(log.findings, "warning", "unreadable_log") or ()]
+    return tuple((word, words.count(word)) for word in sorted(set(words)))
 
 
 def _report_findings(check: LogCheck, inspector: LogInspector, chunk_frames: int) -> None:
     """Adds what the counts of a log mean for its reconstruction."""
     _report_cameras(check, inspector)
     _report_lidar(check, inspector)
-    for kind, count in check.invalid:
-        message = f"the reader left out {count} × {kind.replace('_', ' ')}"
-        inspector.report("warning", message, "They are not used; see the log.")
+    _report_reader_findings(inspector)
     if not check.tracks_moving and not check.tracks_static:
-        inspector.report("note", "no cuboids: everything is taken as static", "Moving objects will smear.")
+        message = "no cuboids: everything is taken as static"
+        inspector.report(Finding("no_cuboids", "note", message, "Moving objects will smear."))
+    _report_plausibility(inspector, chunk_frames)
     _report_chunks(check, inspector, chunk_frames)
+
+
+def _report_reader_findings(inspector: LogInspector) -> None:
+    """Adds what the reader left out, one finding for each word: a log may have thousands of bad boxes."""
+    if not isinstance(inspector.log, ReportsFindings):
+        return
+    by_word: dict[str, list[Finding]] = {}
+    for finding in inspector.try_reading(inspector.log.findings, "warning", "unreadable_log") or ():
+        by_word.setdefault(finding.word, []).append(finding)
+    for found in by_word.values():
+        first = found[0]
+        more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+        inspector.report(replace(first, message=first.message + more))
+
+
+def _report_plausibility(inspector: LogInspector, chunk_frames: int) -> None:
+    """Adds what is implausible, chunk by chunk as a run would meet it; each thing once, with the chunks it is in."""
+    log = inspector.log
+    found: dict[tuple[str, str | None], tuple[Finding, list[int]]] = {}
+    for chunk, start in enumerate(range(0, log.frame_count, chunk_frames)):
+        frames = tuple(range(start, min(start + chunk_frames, log.frame_count)))
+        for finding in assess_plausibility(log, frames, inspector.cameras):
+            _, chunks = found.setdefault((finding.word, finding.camera), (finding, []))
+            chunks.append(chunk)
+    for finding, chunks in found.values():
+        suffix = f" (chunks {format_frames(chunks)})" if log.frame_count > chunk_frames else ""
+        inspector.report(replace(finding, message=finding.message + suffix))
 
 
 def _report_chunks(check: LogCheck, inspector: LogInspector, chunk_frames: int) -> None:
     for chunk in check.standstill_chunks:
         travel = check.chunk_travel_m[chunk]
         message = f"chunk {chunk}: the ego vehicle stands still ({travel:.2f} m), no parallax"
-        inspector.report("warning", message, "Novel views rest on the LiDAR alone there; leave it out with --chunks.")
+        remedy = "Novel views rest on the LiDAR alone there; leave it out with --chunks."
+        numbers = {"travel_m": travel, "limit_m": STANDSTILL_M}
+        inspector.report(Finding("standstill", "warning", message, remedy, numbers))
     last_chunk_frames = check.frames - (check.chunk_count - 1) * chunk_frames
     if last_chunk_frames < _MIN_CHUNK_FRAMES:
-        inspector.report("warning", f"the last chunk has {last_chunk_frames} frame", "Leave it out with --chunks.")
+        message = f"the last chunk has {last_chunk_frames} frame"
+        inspector.report(Finding("single_frame_chunk", "warning", message, "Leave it out with --chunks."))
     elif last_chunk_frames < chunk_frames:
-        inspector.report("note", f"the last chunk is short: {last_chunk_frames} of {chunk_frames} frames")
+        message = f"the last chunk is short: {last_chunk_frames} of {chunk_frames} frames"
+        inspector.report(Finding("short_chunk", "note", message))
 
 
 def _report_cameras(check: LogCheck, inspector: LogInspector) -> None:
     if not check.cameras:
-        inspector.report("fatal", "no camera has an image", "Copy the camera folders of the sequence.")
+        message = "no camera has an image"
+        inspector.report(Finding("no_images", "fatal", message, "Copy the camera folders of the sequence."))
     elif len(check.cameras) == 1:
-        inspector.report("note", "one camera only", "Shifted views see more that no camera saw.")
+        inspector.report(Finding("one_camera", "note", "one camera only", "Shifted views see more that no camera saw."))
     readable_images = 0
     for camera in check.cameras:
         readable_images += check.frames - len(camera.missing) - len(camera.unreadable)
         if camera.missing:
             message = f"{camera.name}: no image at frames {format_frames(camera.missing)}"
-            inspector.report("warning", message, "They are left out.")
+            finding = Finding("missing_image", "warning", message, "They are left out.", camera=camera.name)
+            inspector.report(replace(finding, frames=camera.missing))
         if camera.unreadable:
             message = f"{camera.name}: unreadable images at frames {format_frames(camera.unreadable)}"
-            inspector.report("warning", message, "Copy them again; they are left out, or stop the run under --strict.")
+            remedy = "Copy them again; they are left out, or stop the run under --strict."
+            finding = Finding("unreadable_image", "warning", message, remedy, camera=camera.name)
+            inspector.report(replace(finding, frames=camera.unreadable))
         if camera.odd_size:
             frames = format_frames(camera.odd_size)
             message = f"{camera.name}: frames {frames} are not {camera.width_px}×{camera.height_px}"
-            inspector.report("warning", message, "Export them at the size of the intrinsics.")
+            remedy = "Export them at the size of the intrinsics; they are left out."
+            finding = Finding("odd_image_size", "warning", message, remedy, camera=camera.name)
+            inspector.report(replace(finding, frames=camera.odd_size))
     if check.cameras and not readable_images:
-        inspector.report("fatal", "no image can be read", "Copy the camera folders of the sequence again.")
+        remedy = "Copy the camera folders of the sequence again."
+        inspector.report(Finding("no_readable_image", "fatal", "no image can be read", remedy))
 
 
 def _report_lidar(check: LogCheck, inspector: LogInspector) -> None:
     readable_sweeps = check.frames - len(check.missing_sweeps) - len(check.unreadable_sweeps)
     if not readable_sweeps:
-        inspector.report("fatal", "no LiDAR sweep can be read", "Give points by ingest.points=FILE.ply.")
+        message = "no LiDAR sweep can be read"
+        inspector.report(Finding("no_lidar", "fatal", message, "Give points by ingest.points=FILE.ply."))
     elif check.missing_sweeps:
         message = f"no LiDAR sweep at frames {format_frames(check.missing_sweeps)}"
-        inspector.report("warning", message, "The other sweeps are used.")
+        finding = Finding("missing_sweep", "warning", message, "The other sweeps are used.")
+        inspector.report(replace(finding, frames=check.missing_sweeps))
     # ``points`` is 0 where no sweep is readable, which was reported as fatal already.
     if readable_sweeps and check.points[0] < _MIN_SWEEP_POINTS:
         message = f"a sweep has only {check.points[0]} points"
-        inspector.report("warning", message, "Look at the LiDAR files of the sequence.")
+        numbers = {"points": check.points[0], "limit": _MIN_SWEEP_POINTS}
+        remedy = "Look at the LiDAR files of the sequence."
+        inspector.report(Finding("few_lidar_points", "warning", message, remedy, numbers))

@@ -9,9 +9,11 @@ from functools import partial
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from genre_tasks.errors import InputError
-from genre_tasks.logs.findings import CameraCheck, Finding, Severity
+from genre_tasks.errors import GenreError
+from genre_tasks.log_checks.results import CameraCheck
+from genre_tasks.logs.findings import Finding, Severity
 from genre_tasks.logs.types import Camera, DrivingLog, Float64
 from genre_tasks.progress import Progress
 
@@ -43,43 +45,44 @@ class LogInspector:
         self.log = log
         self.findings: list[Finding] = []
         # Without a rig there is nothing to check: the reader cannot be asked for a single image.
-        rig = self.try_reading(lambda: log.cameras, "fatal") or ()
+        rig = self.try_reading(lambda: log.cameras, "fatal", "unreadable_camera") or ()
         self.cameras = tuple(camera for camera in rig if self._can_open(camera))
         self._progress = progress
         self._total_steps = log.frame_count * (len(self.cameras) + 1)
 
     def _can_open(self, camera: Camera) -> bool:
         # A reader opens the files of a camera when it is first asked for a time.
-        return self.try_reading(lambda: self.log.camera_timestamp_s(camera.name, 0), "fatal") is not None
+        first_time = self.try_reading(lambda: self.log.camera_timestamp_s(camera.name, 0), "fatal", "unreadable_camera")
+        return first_time is not None
 
-    def report(self, severity: Severity, message: str, remedy: str = "") -> None:
-        """Adds a finding, unless the same one is there already.
+    def report(self, finding: Finding) -> None:
+        """Adds a finding, unless one with the same message is there already.
 
         Args:
-            severity: ``fatal``, ``warning`` or ``note``.
-            message: what was found, without a full stop.
-            remedy: what the user can do about it.
+            finding: what was found.
         """
-        finding = Finding(severity, message, remedy)
         # One broken file may be met twice, by its poses and by its timestamps.
-        if finding not in self.findings:
+        if all(known.message != finding.message for known in self.findings):
             self.findings.append(finding)
 
-    def try_reading(self, read: Callable[[], Value], severity: Severity) -> Value | None:
+    def try_reading(self, read: Callable[[], Value], severity: Severity, word: str) -> Value | None:
         """Calls a function of the log, and reports its error as a finding.
 
         Args:
             read: what to call.
-            severity: of the finding, should ``read`` raise ``InputError``.
+            severity: of the finding, should ``read`` raise an error.
+            word: of the finding.
 
         Returns:
             What ``read`` returns, or ``None`` after an error.
         """
         try:
             return read()
-        except InputError as error:
+        except GenreError as error:
             location = f" ({error.where})" if error.where else ""
-            self.report(severity, f"{error.problem}{location}", error.remedy)
+            frames = () if error.frame is None else (error.frame,)
+            message = f"{error.problem}{location}"
+            self.report(Finding(word, severity, message, error.remedy, camera=error.camera, frames=frames))
             return None
 
     def check_camera(self, index: int) -> CameraCheck:
@@ -106,7 +109,7 @@ class LogInspector:
             elif size != expected_size:
                 odd_size.append(frame)
             # A camera pose that cannot be read costs one image, not the log.
-            self.try_reading(partial(self.log.world_SE3_camera, camera.name, frame), "warning")
+            self.try_reading(partial(self.log.world_SE3_camera, camera.name, frame), "warning", "unreadable_pose")
             done = index * self.log.frame_count + frame + 1
             self._progress(done, self._total_steps, f"{camera.name} {frame}")
         return CameraCheck(
@@ -130,9 +133,10 @@ class LogInspector:
         for frame in range(self.log.frame_count):
             try:
                 sweep = self.log.sweep(frame)
-            except InputError as error:
+            except GenreError as error:
                 unreadable.append(frame)
-                self.report("warning", f"{error.problem} ({error.where})", error.remedy)
+                message = f"{error.problem} ({error.where})"
+                self.report(Finding("unreadable_sweep", "warning", message, error.remedy, frames=(frame,)))
             else:
                 if sweep is None:
                     missing.append(frame)
@@ -150,7 +154,7 @@ class LogInspector:
         """
         positions = np.full((self.log.frame_count, 3), np.nan)
         for frame in range(self.log.frame_count):
-            pose = self.try_reading(partial(self.log.world_SE3_lidar, frame), "warning")
+            pose = self.try_reading(partial(self.log.world_SE3_lidar, frame), "warning", "unreadable_pose")
             if pose is not None:
                 positions[frame] = pose[:3, 3]
         return positions
@@ -169,29 +173,39 @@ class LogInspector:
             # The comparison is negated so that a NaN counts as late.
             late = np.flatnonzero(~(np.abs(offsets) <= _MAX_CAMERA_OFFSET_S))
             if late.size:
-                frames = format_frames(late)
-                message = f"{camera.name}: frames {frames} are over {_MAX_CAMERA_OFFSET_S} s from their sweep"
-                self.report("warning", message, _CLOCK_REMEDY)
+                frames = tuple(int(frame) for frame in late)
+                listed = format_frames(frames)
+                message = f"{camera.name}: frames {listed} are over {_MAX_CAMERA_OFFSET_S} s from their sweep"
+                numbers = {"largest_offset_s": float(np.nanmax(np.abs(offsets), initial=0.0))}
+                finding = Finding("camera_clock", "warning", message, _CLOCK_REMEDY, numbers, camera.name, frames)
+                self.report(finding)
         return times
 
     def _check_order(self, times: Float64) -> None:
         """Reports sweep times that are not finite, equal, decreasing or implausibly far apart."""
         # A step from or to a time that is not finite is NaN, which no comparison below counts.
         steps = np.diff(times)
-        if not np.isfinite(times).all():
-            frames = format_frames(np.flatnonzero(~np.isfinite(times)))
-            self.report("warning", f"frames {frames} have no finite timestamp", _CLOCK_REMEDY)
+        not_finite = np.flatnonzero(~np.isfinite(times))
+        if not_finite.size:
+            self._report_clock("missing_timestamp", "frames {} have no finite timestamp", not_finite)
         if (steps == 0).any():
-            frames = format_frames(np.flatnonzero(steps == 0) + 1)
-            self.report("warning", f"duplicated timestamps at frames {frames}", _CLOCK_REMEDY)
+            equal = np.flatnonzero(steps == 0) + 1
+            self._report_clock("repeated_timestamp", "duplicated timestamps at frames {}", equal)
         if (steps < 0).any():
-            frames = format_frames(np.flatnonzero(steps < 0) + 1)
-            self.report("warning", f"time runs backwards at frames {frames}", _CLOCK_REMEDY)
+            backwards = np.flatnonzero(steps < 0) + 1
+            self._report_clock("decreasing_timestamp", "time runs backwards at frames {}", backwards)
         # The median, so that one gap in the log does not hide a wrong unit.
         period = float(np.median(steps[steps > 0])) if (steps > 0).any() else math.nan
         shortest, longest = _FRAME_PERIOD_RANGE_S
         if steps.size and not shortest <= period <= longest:
-            self.report("warning", f"the time between frames is {period:g} s", _UNIT_REMEDY)
+            message = f"the time between frames is {period:g} s"
+            numbers = {"period_s": period, "shortest_s": shortest, "longest_s": longest}
+            self.report(Finding("implausible_frame_period", "warning", message, _UNIT_REMEDY, numbers))
+
+    def _report_clock(self, word: str, template: str, frames: NDArray[np.int64]) -> None:
+        numbers = tuple(int(frame) for frame in frames)
+        message = template.format(format_frames(numbers))
+        self.report(Finding(word, "warning", message, _CLOCK_REMEDY, frames=numbers))
 
 
 def _decode_size(data: bytes) -> tuple[int, int] | None:

