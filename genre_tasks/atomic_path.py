@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from genre_tasks.temporary_names import describe_owner, remove_abandoned
+
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
@@ -25,8 +27,10 @@ def atomic_path(path: Path) -> Iterator[Path]:
         with atomic_path(Path("report.html")) as part:
             part.write_text(html)
     """
-    # The process's number keeps two writers apart; the suffix stays, since libraries choose the format by it.
-    part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    # A process that was killed in the block could not tidy up.
+    remove_abandoned(path.parent)
+    # The owner keeps two writers apart; the suffix stays, since libraries choose the format by it.
+    part = path.with_name(f".{path.stem}.{describe_owner()}.part{path.suffix}")
     try:
         yield part
         part.replace(path)

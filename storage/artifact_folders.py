@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from genre_tasks.errors import ArtifactCorruptError
+from genre_tasks.temporary_names import describe_owner
 from storage.manifest import MANIFEST, Manifest, NewerSchemaError, parse_manifest
 
 TEMPORARY_PREFIX = ".tmp-"
@@ -83,7 +84,7 @@ def move_to_trash(folder: Path) -> Path | None:
     Raises:
         OSError: the folder cannot be renamed.
     """
-    trash = folder.parent / f"{TRASH_PREFIX}{uuid.uuid4().hex}"
+    trash = folder.parent / f"{TRASH_PREFIX}{describe_owner()}-{uuid.uuid4().hex}"
     try:
         folder.rename(trash)
     except FileNotFoundError:

@@ -15,6 +15,7 @@ from typing import Any
 from urllib.parse import unquote, urlparse
 
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
+from genre_tasks.temporary_names import describe_owner, is_abandoned, remove_path
 from storage.address import Address
 from storage.artifact_folders import (
     TEMPORARY_PREFIX,
@@ -61,9 +62,10 @@ class LocalStore:
         codec = get_codec(kind)
         provenance = provenance or Provenance()
         target = self.root / address.relative_path
-        # Beside the target, because a rename is atomic only within one file system. The process's number tells people
-        # whose folder it is, the random part keeps two writers of one process apart.
-        temporary = target.parent / f"{TEMPORARY_PREFIX}{address.key[:12]}-{os.getpid()}-{uuid.uuid4().hex}"
+        # Beside the target, because a rename is atomic only within one file system. The owner tells whether a folder
+        # is still in use, the random part keeps two writers of one process apart.
+        name = f"{TEMPORARY_PREFIX}{address.key[:12]}-{describe_owner()}-{uuid.uuid4().hex}"
+        temporary = target.parent / name
 
         def make_manifest(files: tuple[FileEntry, ...]) -> Manifest:
             # Called by the writer once all files are known, so that the manifest can list them.
@@ -212,19 +214,23 @@ class LocalStore:
         """Removes what killed processes left behind.
 
         Args:
-            older_than_s: only folders in which nothing was touched for so many seconds: others may be in use.
+            older_than_s: folders of other machines, whose processes cannot be asked for, go when nothing in them was
+                touched for so many seconds.
 
         Returns:
-            How many folders were removed.
+            How many files and folders were removed.
         """
         removed = 0
-        for folder, names, _ in os.walk(self.root):
-            for name in [n for n in names if n.startswith((TEMPORARY_PREFIX, TRASH_PREFIX))]:
-                # Removed from the walk too, which would otherwise enter a folder that is going away.
-                names.remove(name)
+        for folder, names, files in os.walk(self.root):
+            for name in [name for name in (*names, *files) if name.startswith(".")]:
                 path = Path(folder) / name
-                if time.time() - last_modified(path) >= older_than_s:
-                    shutil.rmtree(path, ignore_errors=True)
+                is_temporary = name.startswith((TEMPORARY_PREFIX, TRASH_PREFIX))
+                is_old = is_temporary and time.time() - last_modified(path) >= older_than_s
+                # Removed from the walk too, which would otherwise enter a folder that is going away.
+                if is_temporary and name in names:
+                    names.remove(name)
+                if is_old or is_abandoned(path):
+                    remove_path(path)
                     removed += 1
         return removed
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -58,18 +57,19 @@ def effects(
 def _write_plan(plan: EffectsPlan, folder: Path, title: str) -> list[str]:
     """Writes the plan's files and its picture into the folder, over those of an earlier plan; their paths."""
     from flows.plots.effects_plot import plot_effects_plan
+    from genre_tasks.temporary_names import temporary_folder
     from storage.codecs import get_codec
     from storage.codecs.png import write_png
 
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     # Everything is written beside the old files first, so that an error leaves the old ones as they were.
-    with TemporaryDirectory(dir=folder) as temporary:
-        get_codec("effects").write(Path(temporary), plan)
-        write_png(Path(temporary) / "effects.png", plot_effects_plan(plan, title))
+    with temporary_folder(folder) as temporary:
+        get_codec("effects").write(temporary, plan)
+        write_png(temporary / "effects.png", plot_effects_plan(plan, title))
         # An earlier plan may have had masks of the ego vehicle that this one does not have.
         shutil.rmtree(folder / "own", ignore_errors=True)
-        for source in sorted(Path(temporary).rglob("*")):
+        for source in sorted(temporary.rglob("*")):
             if source.is_file():
                 target = folder / source.relative_to(temporary)
                 target.parent.mkdir(parents=True, exist_ok=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -20,8 +19,10 @@ from flows.cli.range import range_command
 from flows.cli.render import render
 from flows.cli.run import run
 from flows.cli.show import show
+from flows.cli.signals import Interrupted, end_on_signals
 from flows.cli.train import app as train_app
 from flows.cli.verify import verify
+from flows.prefect_api.state_folder import find_state_folder
 
 app = typer.Typer(
     name="genre",
@@ -82,12 +83,10 @@ def prepare_environment(debug: bool) -> None:
     Args:
         debug: whether Prefect's own messages are shown.
     """
-    # Each project has its own Prefect database, and nothing is sent to Prefect's makers.
-    os.environ.setdefault("PREFECT_HOME", str(Path.cwd() / ".genre" / "prefect"))
+    # Not the working folder, which may be read-only. Nothing is sent to Prefect's makers.
+    os.environ.setdefault("PREFECT_HOME", str(find_state_folder() / "prefect"))
     os.environ.setdefault("DO_NOT_TRACK", "1")
     os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
-    # Twenty seconds, Prefect's default, are not enough for its server on a busy machine.
-    os.environ.setdefault("PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS", "180")
     os.environ.setdefault("PREFECT_LOGGING_LEVEL", "INFO" if debug else "CRITICAL")
     os.environ.setdefault("PREFECT_LOGGING_TO_API_ENABLED", "false")
     # Idle OpenMP threads would spin and take the cores from the renderer's threads: ten times as slow on two cores.
@@ -100,15 +99,19 @@ def main() -> None:
     Raises:
         SystemExit: always, with the exit status, unless ``--debug`` shows the error's traceback.
     """
+    end_on_signals()
     # Any command takes --debug, in any place, so it is taken out before the arguments are parsed.
     debug = "--debug" in sys.argv
     if debug:
         sys.argv.remove("--debug")
-    prepare_environment(debug)
     from genre_tasks.errors import ConfigError, GenreError, InputError
 
     try:
+        prepare_environment(debug)
         app()
+    except Interrupted as interruption:
+        typer.echo("stopped", err=True)
+        raise SystemExit(interruption.exit_status) from None
     except GenreError as error:
         if debug:
             raise

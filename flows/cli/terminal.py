@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import sys
-import threading
 import time
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from contextlib import AbstractContextManager, nullcontext
+from typing import TYPE_CHECKING
 
 import typer
+
+from flows.cli.signals import Interrupted
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -25,18 +24,17 @@ _PLAIN_PERIOD_S = 10.0
 class TerminalReporter:
     """Reports progress on stderr: a line that rewrites itself on a terminal, a line every ten seconds elsewhere.
 
-    To be used in a ``with`` statement; Ctrl-C in it ends the command with exit status 130.
+    To be used in a ``with`` statement; Ctrl-C in it, and any other signal to stop, ends the command.
 
     Args:
         title: what is shown until the first stage or part starts.
-        with_prefect: whether flows run meanwhile, for which Prefect may start a server of its own.
+        prefect: a context in which flows run; nothing for a command without flows.
     """
 
-    def __init__(self, title: str, with_prefect: bool = False) -> None:
+    def __init__(self, title: str, prefect: AbstractContextManager[None] | None = None) -> None:
         self._is_live = sys.stderr.isatty()
         self._title = title
-        self._with_prefect = with_prefect
-        self._handles_ctrl_c = False
+        self._prefect = prefect or nullcontext()
         self._start_s = time.monotonic()
         self._last_line_s = self._start_s
         # Steps of the current part, and how many were done when they were first reported, at which time.
@@ -46,23 +44,18 @@ class TerminalReporter:
 
     def __enter__(self) -> TerminalReporter:
         self._write(self._title, end=not self._is_live)
-        # With a server of the user's own, Prefect stops in order by itself.
-        if self._with_prefect and _ends_on_ctrl_c() and _prefect_starts_a_server():
-            signal.signal(signal.SIGINT, self._stop_at_once)
-            self._handles_ctrl_c = True
+        self._prefect.__enter__()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        if self._handles_ctrl_c:
-            # Whatever runs after this block is to be stopped as usual.
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+        self._prefect.__exit__(kind, error, traceback)
         if self._is_live:
             self._write("")
-        if kind is KeyboardInterrupt:
+        if isinstance(error, Interrupted):
             self.stopped()
-            raise typer.Exit(130)
+            raise typer.Exit(error.exit_status)
 
     def stopped(self) -> None:
         """Writes that the command was stopped and how to go on."""
@@ -116,20 +109,6 @@ class TerminalReporter:
         """Writes a line of its own."""
         self._write(text, end=True)
 
-    def _stop_at_once(self, number: int, frame: Any) -> None:
-        """Ends the process on Ctrl-C.
-
-        Prefect's own server gets the signal too and is gone, and Prefect would try to reach it for a minute. All files
-        are written atomically, so the process may end at any moment.
-        """
-        import psutil
-
-        self.stopped()
-        for child in psutil.Process().children():
-            child.terminate()
-        # Not sys.exit, which would run Prefect's handlers: they wait for the server that is gone.
-        os._exit(130)
-
     def _write(self, text: str, end: bool = False) -> None:
         if self._is_live:
             # Back to the line's start, and delete what is on it; in one write, so that the line does not flicker.
@@ -141,7 +120,7 @@ class TerminalReporter:
 
 
 def report_on_terminal(title: str = "starting Prefect") -> TerminalReporter:
-    """Makes a reporter that receives the events of all runs in this process, and the folder of Prefect's database.
+    """Makes a reporter that receives the events of all runs in this process, connected to Prefect while it is entered.
 
     Args:
         title: what is shown until the first stage or part starts.
@@ -150,22 +129,8 @@ def report_on_terminal(title: str = "starting Prefect") -> TerminalReporter:
         The reporter, to be used in a ``with`` statement.
     """
     from flows.pipeline.progress import set_reporter
+    from flows.prefect_api.connection import connect_to_prefect
 
-    # Prefect makes its database there, but not the folder itself.
-    Path(os.environ["PREFECT_HOME"]).mkdir(parents=True, exist_ok=True)
-    reporter = TerminalReporter(title, with_prefect=True)
+    reporter = TerminalReporter(title, connect_to_prefect())
     set_reporter(reporter)
     return reporter
-
-
-def _ends_on_ctrl_c() -> bool:
-    """Whether Ctrl-C ends this thread: a shell may have started the process with the signal ignored."""
-    is_main_thread = threading.current_thread() is threading.main_thread()
-    return is_main_thread and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-def _prefect_starts_a_server() -> bool:
-    """Whether Prefect starts a server of its own, because neither the environment nor a profile names one."""
-    from prefect.settings import get_current_settings
-
-    return get_current_settings().api.url is None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +16,7 @@ from flows.experiments.warm_up import run_on_tiny_log
 from flows.pipeline.definition import STAGE_BY_NAME, stages_until
 from flows.pipeline.stage_runner import ArtifactRef, Job, read_artifact, run_stage
 from genre_tasks.config import PipelineConfig
+from genre_tasks.temporary_names import temporary_folder
 from genre_tasks.threads import torch_threads
 
 
@@ -202,8 +202,8 @@ def read_logs_once(sweep: Sweep, cells: Sequence[Cell]) -> None:
     config = load_configuration(sweep.preset, settings=sweep.settings).model_dump(mode="json")
     # Many cells share a chunk, and only the first reading of a log is slow.
     for where in dict.fromkeys(c.where for c in cells):
-        with tempfile.TemporaryDirectory() as store:
-            run_stage("ingest", Job(where.log, where.chunk, store, config), {})
+        with temporary_folder() as store:
+            run_stage("ingest", Job(where.log, where.chunk, str(store), config), {})
 
 
 def measure_cold_start(sweep: Sweep) -> dict[str, float]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 
 from flows.experiments.stages import read_stage_costs, run_stages
 from flows.pipeline.stage_runner import Job, run_stage
 from genre_tasks.config import PipelineConfig
+from genre_tasks.temporary_names import temporary_folder
 
 # Seed 900 is for tuning, so that no training or test street is touched.
 TINY_LOG = "synthetic:street?seed=900&frames=8&cameras=1"
@@ -24,7 +24,7 @@ def run_on_tiny_log(config: PipelineConfig, names: Sequence[str]) -> dict[str, f
         Wall seconds by stage.
     """
     # A store of its own: from the user's, the stages could come without running.
-    with tempfile.TemporaryDirectory() as store:
-        job = Job(TINY_LOG, 0, store, config.model_dump(mode="json"))
+    with temporary_folder() as store:
+        job = Job(TINY_LOG, 0, str(store), config.model_dump(mode="json"))
         refs = run_stages(names, job, run_stage)
         return dict(read_stage_costs(job, refs).seconds)

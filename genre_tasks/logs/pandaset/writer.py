@@ -27,6 +27,7 @@ from genre_tasks.logs.pandaset.layout import (
 from genre_tasks.logs.pandaset.pickle_writer import pickle_table
 from genre_tasks.logs.types import Camera, CuboidTrack, DrivingLog, Float64, Sweep
 from genre_tasks.progress import Progress, silent
+from genre_tasks.temporary_names import describe_owner, remove_abandoned
 
 _SUFFIX_OF_SIGNATURE = {b"\xff\xd8\xff": ".jpg", b"\x89PNG\r\n\x1a\n": ".png"}
 # Coordinates are noise in their low bits: higher levels take three times as long for 2 %.
@@ -63,7 +64,8 @@ def write_pandaset(log: DrivingLog, folder: Path, progress: Progress = silent) -
         remedy = "Give a folder that does not exist yet, or remove this one first."
         raise InputError("the folder to write holds something already", remedy=remedy, file=folder, log=log.uri)
     # Beside the target, since only a rename within one file system is atomic.
-    partial = folder.parent / f".{folder.name}.{uuid.uuid4().hex[:8]}.partial"
+    remove_abandoned(folder.parent)
+    partial = folder.parent / f".{folder.name}.{describe_owner()}-{uuid.uuid4().hex[:8]}.partial"
     try:
         partial.mkdir(parents=True)
         _write_cameras(log, partial, progress)

@@ -1,0 +1,65 @@
+"""SIGINT, SIGTERM and SIGHUP end a command in order: what is finished is kept, and no process stays behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from types import FrameType
+
+# A user who stops a command waits for it; what takes longer than this is not worth the wait.
+_MAX_SECONDS_TO_END = 8.0
+_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
+# A shell reports a command that a signal ended by this number plus that of the signal.
+_EXIT_STATUS_BASE = 128
+
+
+# No KeyboardInterrupt, which the parser of commands would turn into a status of its own.
+class Interrupted(BaseException):
+    """A signal asks the command to end.
+
+    Args:
+        number: the signal's number.
+
+    >>> Interrupted(signal.SIGTERM).exit_status
+    143
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
+
+    @property
+    def exit_status(self) -> int:
+        """What a shell would report: 130 for Ctrl-C, 143 for SIGTERM, 129 for SIGHUP."""
+        return _EXIT_STATUS_BASE + self.number
+
+
+def end_on_signals() -> None:
+    """Makes the three signals raise ``Interrupted`` in the main thread, and end the process soon in any case.
+
+    A signal that the process was started to ignore stays ignored, as ``nohup`` and background jobs of a shell ask.
+    A second signal ends the process at once.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return
+    for name in _SIGNALS:
+        # SIGHUP does not exist everywhere.
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, _interrupt)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    for name in _SIGNALS:
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), _end_at_once)
+    # Everything is written atomically, so the process may end at any moment, wherever it hangs.
+    guard = threading.Timer(_MAX_SECONDS_TO_END, os._exit, (_EXIT_STATUS_BASE + number,))
+    guard.daemon = True
+    guard.start()
+    raise Interrupted(number)
+
+
+def _end_at_once(number: int, frame: FrameType | None) -> None:
+    os._exit(_EXIT_STATUS_BASE + number)

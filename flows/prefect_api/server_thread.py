@@ -1,0 +1,138 @@
+"""Prefect's API in a thread of this process: it needs no port of its own, and is gone whenever the process is.
+
+Prefect itself would start a second process. That one is reached through the proxy that the environment names, stays
+behind after a kill, and takes three times as long to start.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import fcntl
+import socket
+import sqlite3
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+from genre_tasks.errors import GenreError, ResourceError
+
+if TYPE_CHECKING:
+    import uvicorn
+
+_START_TIMEOUT_S = 120.0
+_STOP_TIMEOUT_S = 5.0
+_DATABASE = "prefect.db"
+
+
+def database_url(folder: Path) -> str:
+    """Writes the address of Prefect's SQLite database in a folder.
+
+    Args:
+        folder: an absolute path; any name is fine, also with ``?``, ``#`` or ``%2F`` in it.
+
+    Returns:
+        A URL for SQLAlchemy.
+
+    >>> database_url(Path("/data/50%/a?b"))
+    'sqlite+aiosqlite:///file:/data/50%25/a%3Fb/prefect.db?uri=true'
+    """
+    # As a file URI, which SQLite decodes itself: SQLAlchemy would take what follows a question mark for options.
+    return f"sqlite+aiosqlite:///file:{quote(str(folder / _DATABASE))}?uri=true"
+
+
+class ServerThread:
+    """Prefect's API server in a daemon thread.
+
+    Args:
+        folder: where its database is; it exists. Several processes may share it.
+
+    Attributes:
+        url: address of the API; requests wait until the server has started.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        # The system chooses a free port, so that two runs never meet. Requests queue from now on.
+        self._socket = socket.create_server(("127.0.0.1", 0))
+        self.url = f"http://127.0.0.1:{self._socket.getsockname()[1]}/api"
+        self._ended_start = threading.Event()
+        self._error: BaseException | None = None
+        self._server: uvicorn.Server | None = None
+        self._thread = threading.Thread(target=self._serve, name="prefect-api", daemon=True)
+
+    def start(self) -> None:
+        """Starts the server and waits until it answers.
+
+        Raises:
+            ResourceError: it cannot start; the message has its reason.
+        """
+        self._thread.start()
+        if not self._ended_start.wait(_START_TIMEOUT_S):
+            raise self._start_error(f"it has not started within {_START_TIMEOUT_S:.0f} s")
+        if self._error is not None:
+            raise self._start_error(_last_line(self._error)) from self._error
+
+    def stop(self) -> None:
+        """Ends the server, once it has answered what it was asked; it never waits for long."""
+        if self._server is not None:
+            self._server.should_exit = True
+        self._thread.join(_STOP_TIMEOUT_S)
+        self._socket.close()
+
+    def _serve(self) -> None:
+        # Whatever ends the thread is for the one who waits in ``start``: a thread's own traceback helps nobody.
+        try:
+            asyncio.run(self._run())
+        except BaseException as error:
+            self._error = error
+        finally:
+            self._ended_start.set()
+
+    async def _run(self) -> None:
+        # Imported here, as it takes seconds, and only commands that compute something need it.
+        import uvicorn
+        from prefect.server.api.server import create_app
+
+        app = create_app(ephemeral=True, final=True, ignore_cache=True)
+        config = uvicorn.Config(app, log_config=None, log_level="critical", access_log=False, lifespan="off")
+        server = uvicorn.Server(config)
+        # Run here and not by uvicorn, which would log an error of the start and go on without it.
+        lifespan = app.router.lifespan_context(app)
+        with _alone_in(self._folder):
+            await lifespan.__aenter__()
+        self._server = server
+        self._ended_start.set()
+        try:
+            await server.serve(sockets=[self._socket])
+        finally:
+            await lifespan.__aexit__(None, None, None)
+
+    def _start_error(self, reason: str) -> GenreError:
+        database = self._folder / _DATABASE
+        remedy = "Free disk space and memory there."
+        if isinstance(_root_cause(self._error), sqlite3.DatabaseError) or "revision" in reason:
+            remedy = "Delete that file if it is damaged or of another version: it holds records of runs, no results."
+        return ResourceError(f"Prefect's local API cannot start: {reason}", remedy=remedy, file=database)
+
+
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Keeps other processes out of the folder: two that bring one database up to date at a time spoil each other."""
+    with (folder / "start.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def _root_cause(error: BaseException | None) -> Any:
+    while error is not None and (error.__cause__ or getattr(error, "orig", None)):
+        error = error.__cause__ or getattr(error, "orig", None)
+    return error
+
+
+def _last_line(error: BaseException) -> str:
+    lines = str(error).strip().splitlines()
+    # SQLAlchemy explains an error in many lines, of which the first is the error itself.
+    return lines[0] if lines else type(error).__name__

@@ -1,0 +1,85 @@
+"""Where a setting of Prefect comes from, so that an error can say what to change."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from genre_tasks.errors import ConfigError
+
+_ENV_FILE = Path(".env")
+# Prefect reads these in the working folder: (file, the table that holds its settings).
+_TOML_FILES = ((Path("prefect.toml"), ()), (Path("pyproject.toml"), ("tool", "prefect")))
+
+
+def check_settings_files() -> None:
+    """Checks the files of settings in the working folder that Prefect reads whenever it is imported.
+
+    Raises:
+        ConfigError: one of them cannot be read, which Prefect would answer with a traceback.
+    """
+    for path, _ in _TOML_FILES:
+        _read_toml(path)
+    try:
+        _ENV_FILE.read_text(encoding="utf-8")
+    except (FileNotFoundError, IsADirectoryError):
+        pass
+    except (OSError, UnicodeDecodeError) as error:
+        raise _unreadable(_ENV_FILE, error) from error
+
+
+def describe_source(variable: str) -> str:
+    """Says where Prefect has a setting from, and how to undo it.
+
+    Args:
+        variable: the setting as a variable of the environment, such as ``PREFECT_API_URL``.
+
+    Returns:
+        One sentence for an error's remedy.
+
+    >>> os.environ["PREFECT_EXAMPLE"] = "1"
+    >>> describe_source("PREFECT_EXAMPLE")
+    'It comes from the environment: unset PREFECT_EXAMPLE.'
+    """
+    # In Prefect's own order, first hit wins.
+    if variable in os.environ:
+        return f"It comes from the environment: unset {variable}."
+    for path, setting in _settings_in_files(variable):
+        return f"It comes from {path.absolute()}: remove {setting} there."
+    profiles = Path(os.environ.get("PREFECT_HOME", "~/.prefect")).expanduser() / "profiles.toml"
+    return f"It comes from a Prefect profile ({profiles}): prefect config unset {variable}."
+
+
+def _settings_in_files(variable: str) -> Iterator[tuple[Path, str]]:
+    """(file, name of the setting in it) of every file of the working folder that sets a variable."""
+    if _ENV_FILE.is_file():
+        lines = _ENV_FILE.read_text(encoding="utf-8").splitlines()
+        names = {line.removeprefix("export ").partition("=")[0].strip() for line in lines}
+        if variable in names:
+            yield _ENV_FILE, variable
+    # PREFECT_API_URL is api.url in a file of tables.
+    keys = variable.removeprefix("PREFECT_").lower().split("_", 1)
+    for path, table in _TOML_FILES:
+        value: Any = _read_toml(path)
+        for key in (*table, *keys):
+            value = value.get(key) if isinstance(value, Mapping) else None
+        if value is not None:
+            yield path, ".".join(keys)
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, IsADirectoryError):
+        return {}
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> ConfigError:
+    problem = f"Prefect reads its settings from the working folder, and a file there cannot be read ({error})"
+    remedy = "Mend or remove the file, or run the command in another folder."
+    return ConfigError(problem, remedy=remedy, file=path.absolute())
