@@ -71,9 +71,9 @@ def remove_abandoned(folder: Path) -> int:
     removed = 0
     # Another process may tidy up at the same moment.
     with suppress(OSError):
-        for name in os.listdir(folder):
-            if is_abandoned(folder / name):
-                remove_path(folder / name)
+        for path in folder.iterdir():
+            if is_abandoned(path):
+                remove_path(path)
                 removed += 1
     return removed
 
@@ -113,7 +113,7 @@ def _machine() -> str:
     known = [socket.gethostname()]
     for path in (Path("/proc/sys/kernel/random/boot_id"), Path("/proc/self/ns/pid")):
         with suppress(OSError):
-            known.append(os.readlink(path) if path.is_symlink() else path.read_text())
+            known.append(str(path.readlink()) if path.is_symlink() else path.read_text())
     return hashlib.sha256("\n".join(known).encode()).hexdigest()[:8]
 
 
