@@ -107,8 +107,12 @@ def check_server_answers(url: str) -> None:
 
 
 def _server_settings(url: str, home: Path) -> dict[str, str]:
+    import certifi
+
     settings = {
         API_URL: url,
+        # Certificates are read for every client, and those of SSL_CERT_FILE were noted when Prefect was imported.
+        "PREFECT_API_SSL_CERT_FILE": certifi.where(),
         # Prefect must never start a second server: it would stay behind.
         "PREFECT_SERVER_ALLOW_EPHEMERAL_MODE": "false",
         # Nothing is configured by blocks here, and they take a second of the start.

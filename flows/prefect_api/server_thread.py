@@ -36,11 +36,16 @@ def database_url(folder: Path) -> str:
     Returns:
         A URL for SQLAlchemy.
 
-    >>> database_url(Path("/data/50%/a?b"))
-    'sqlite+aiosqlite:///file:/data/50%25/a%3Fb/prefect.db?uri=true'
+    >>> database_url(Path("/data/logs"))
+    'sqlite+aiosqlite:///file%3A/data/logs/prefect.db?uri=true'
     """
-    # As a file URI, which SQLite decodes itself: SQLAlchemy would take what follows a question mark for options.
-    return f"sqlite+aiosqlite:///file:{quote(str(folder / _DATABASE))}?uri=true"
+    from sqlalchemy import URL
+
+    # As a file URI, which SQLite decodes itself: a bare path would lose what follows a question mark.
+    database = f"file:{quote(str(folder / _DATABASE))}"
+    # SQLAlchemy writes what it will read: its versions differ in what they decode.
+    url = URL.create("sqlite+aiosqlite", database=database, query={"uri": "true"})
+    return url.render_as_string(hide_password=False)
 
 
 class ServerThread:

@@ -1,0 +1,164 @@
+"""Connecting to Prefect on machines as people have them: proxies, odd folders, servers that are not there."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from flows.prefect_api.connection import check_server_answers, connect_to_prefect
+from flows.prefect_api.settings_sources import check_settings_files, describe_source
+from flows.prefect_api.state_folder import find_state_folder
+from genre_tasks.errors import ConfigError
+
+ROOT = Path(__file__).resolve().parents[2]
+NOBODY = "http://127.0.0.1:9/api"
+FLOW = textwrap.dedent(
+    """
+    import os, pathlib, sqlite3, psutil
+    from flows.prefect_api.connection import connect_to_prefect
+    with connect_to_prefect():
+        from prefect import flow, task
+        children = len(psutil.Process().children())
+        @task
+        def twice(x): return 2 * x
+        @flow
+        def add(): return sum(twice(k) for k in range(5))
+        print(add(), children, os.environ.get("HTTP_PROXY"))
+    database = sqlite3.connect(pathlib.Path(os.environ["PREFECT_HOME"]) / "prefect.db")
+    for table in ("flow_run", "task_run"):
+        print(table, database.execute(f"select state_name, count(*) from {table} group by state_name").fetchall())
+    print(os.environ.get("HTTP_PROXY"), os.environ.get("PREFECT_API_URL"))
+    """
+)
+
+
+def run_flow(folder: Path, script: str = FLOW, **variables: str) -> subprocess.CompletedProcess[str]:
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
+    settings = {"PREFECT_HOME": str(folder / "prefect"), "PYTHONPATH": str(ROOT), "PREFECT_LOGGING_LEVEL": "CRITICAL"}
+    return subprocess.run(
+        [sys.executable, "-c", script],
+        env=inherited | settings | variables,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def test_a_flow_keeps_its_records_behind_a_proxy_and_in_a_folder_of_any_name(tmp_path: Path) -> None:
+    """A company's machine, and a folder that looks like part of a URL.
+
+    Reports: axios/axios#3355 (127.0.0.1 through a proxy), sqlalchemy/alembic#700 (a % in a database's address).
+    """
+    folder = tmp_path / "50%2F off? #1 – é"
+    folder.mkdir()
+    proxies = dict.fromkeys(("HTTP_PROXY", "http_proxy", "https_proxy"), "http://10.255.255.1:3128")
+    done = run_flow(folder, ALL_PROXY="socks5://10.255.255.1:1080", SSL_CERT_FILE="/nowhere/ca.pem", **proxies)
+    assert done.returncode == 0, done.stderr
+    # One process, the records are complete, and the environment is put back.
+    assert done.stdout.splitlines() == [
+        "20 0 None",
+        "flow_run [('Completed', 1)]",
+        "task_run [('Completed', 5)]",
+        "http://10.255.255.1:3128 None",
+    ]
+    assert {path.name for path in folder.iterdir()} == {"prefect"}
+
+
+def test_two_at_once_share_a_new_database(tmp_path: Path) -> None:
+    """Reports: PrefectHQ/prefect#19771 (locked database), Mibayy/token-savior#70 (two first starts at once)."""
+    environment = os.environ | {"PREFECT_HOME": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    commands = [
+        subprocess.Popen([sys.executable, "-c", FLOW], env=environment, stdout=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    outputs = [command.communicate(timeout=120)[0] for command in commands]
+    assert [output.split()[0] for output in outputs] == ["20", "20"]
+
+
+def damage(database: Path) -> None:
+    database.write_bytes(b"no database" * 1000)
+
+
+def make_newer(database: Path) -> None:
+    with sqlite3.connect(database) as connection:
+        connection.execute("create table alembic_version (version_num varchar(32) not null)")
+        connection.execute("insert into alembic_version values ('abcdef')")
+
+
+@pytest.mark.parametrize(("change", "reason"), [(damage, "file is not a database"), (make_newer, "'abcdef'")])
+def test_a_database_that_cannot_be_used_is_named_at_once(
+    change: Callable[[Path], None], reason: str, tmp_path: Path
+) -> None:
+    """Report: PrefectHQ/prefect#5118 (a server that does not start, and a page of traceback)."""
+    database = tmp_path / "prefect" / "prefect.db"
+    database.parent.mkdir()
+    change(database)
+    done = run_flow(tmp_path)
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("genre_tasks.errors.ResourceError: Prefect's local API cannot start")
+    assert reason in last and str(database) in last and "Delete that file" in last
+
+
+def test_a_server_that_is_not_there_is_named_with_its_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Report: PrefectHQ/prefect#5837 (a traceback of a refused connection, and nothing says which address)."""
+    monkeypatch.setenv("PREFECT_API_URL", NOBODY)
+    with pytest.raises(ConfigError) as caught:
+        check_server_answers(NOBODY)
+    assert NOBODY in str(caught.value) and "unset PREFECT_API_URL" in str(caught.value)
+    monkeypatch.delenv("PREFECT_API_URL")
+    monkeypatch.setenv("PREFECT_HOME", str(tmp_path))
+    assert str(tmp_path / "profiles.toml") in describe_source("PREFECT_API_URL")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pyproject.toml").write_text('[tool.prefect.api]\nurl = "http://x"\n')
+    assert str(tmp_path / "pyproject.toml") in describe_source("PREFECT_API_URL")
+    (tmp_path / "prefect.toml").write_text('[api]\nurl = "http://x"\n')
+    assert str(tmp_path / "prefect.toml") in describe_source("PREFECT_API_URL")
+    (tmp_path / ".env").write_text("PREFECT_API_URL=http://x\n")
+    assert str(tmp_path / ".env") in describe_source("PREFECT_API_URL")
+
+
+@pytest.mark.parametrize("name", ["pyproject.toml", "prefect.toml"])
+@pytest.mark.parametrize("content", [b"[tool\n", b"\xff\xfe\x00a", b"a = 1\na = 2\n"])
+def test_a_broken_file_of_settings_is_one_error(
+    name: str, content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Report: PrefectHQ/prefect#18295 (a pyproject.toml that its reader does not take)."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ConfigError) as caught:
+        check_settings_files()
+    assert caught.value.file == str(tmp_path / name)
+
+
+def test_a_setting_that_prefect_refuses_is_one_line(tmp_path: Path) -> None:
+    script = FLOW.replace("with connect", "import flows.prefect_api.connection as c\nwith c.connect", 1)
+    done = run_flow(tmp_path, script, PREFECT_SERVER_API_PORT="many")
+    assert "genre_tasks.errors.ConfigError: Prefect does not accept its settings" in done.stderr
+
+
+def test_the_state_folder_is_one_that_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports: DCAN-Labs/BIBSnet#43 (a home that is read-only), PrefectHQ/prefect#11121 (a shared temporary folder)."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    assert find_state_folder() == tmp_path / "state" / "genre"
+    # A home that is a file: nothing can be made below it, whoever asks.
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
+    monkeypatch.setenv("HOME", str(tmp_path / "file"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert find_state_folder() == tmp_path / f"genre-{os.getuid()}"
+    assert find_state_folder().stat().st_mode & 0o077 == 0
+
+
+def test_nothing_is_started_beside_a_server_of_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flows.prefect_api.connection.read_api_url", lambda: NOBODY)
+    with pytest.raises(ConfigError, match="no Prefect server answers"), connect_to_prefect():
+        raise AssertionError("the block must not run")
