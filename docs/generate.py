@@ -30,6 +30,8 @@ BLOCKS: Mapping[str, Callable[[], str]] = {
     "pipeline-claims": lambda: result_tables.claims("pipeline"),
     "optimiser-claims": lambda: result_tables.claims("optimiser"),
     "optimiser-logs": result_tables.optimiser_logs,
+    "raster-times": result_tables.raster_times,
+    "raster-claims": lambda: result_tables.claims("raster"),
     "budget-runs": result_tables.budget_runs,
     "evaluation-claims": lambda: result_tables.claims("evaluation"),
 }

@@ -228,6 +228,18 @@ def preset_choice() -> str:
     return table(["validation log", "preset", *columns, "CPU seconds ↓"], lines)
 
 
+def raster_times() -> str:
+    """Milliseconds of the renderer beside gsplat's torch reference."""
+    lines = []
+    for row in result("raster")["rows"]:
+        if not row["cell"].startswith(("scene/", "peer/")) or "milliseconds" not in row:
+            continue
+        for name, found in row["milliseconds"].items():
+            spread = f"{number(found['low'])}–{number(found['high'])}"
+            lines.append([row["cell"].split("/")[1], name, number(found["median"]), spread, str(found["n"])])
+    return table(["Gaussians", "what, threads", "median, ms", "quartiles, ms", "n"], lines)
+
+
 def budget_runs() -> str:
     """Every budget that was tried: seconds used, and what was made of them."""
     lines = []
