@@ -5,9 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import os
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,10 +14,11 @@ import numpy as np
 
 from benchmarks.common.bench import NotMeasuredError, Row
 from benchmarks.common.claims import Claim, claim
+from benchmarks.common.command import run_genre
 from flows.budget.chooser import STAGE_OVERHEAD_S
 from flows.budget.cost_table import CostPoint, CostTable, find_shipped_table, load_cost_table
 from flows.experiments.warm_up import TINY_LOG
-from flows.machine.facts import CHECKOUT, git_commit
+from flows.machine.facts import git_commit
 from flows.pipeline.definition import stages_until
 
 EVALUATION_SETTINGS = (
@@ -33,7 +31,6 @@ EVALUATION_SETTINGS = (
 )
 """No more evaluation than the claims need, which no budget counts; no snapshots for its curve."""
 
-COMMAND = (sys.executable, "-P", "-c", "from flows.cli.main import main; main()")
 DISTANCE = "shift_3m/perceptual"
 KEPT_SHARE = 0.9
 MOST_OVERRUN = 1.15
@@ -63,7 +60,7 @@ def run_with_budget(seed: str, budget_s: float, table: str, settings: Sequence[s
     # A user's first run ever makes Prefect's database, which takes some twelve seconds that are no run's.
     if not prefect_home.is_dir():
         with tempfile.TemporaryDirectory() as store:
-            _run_genre(TINY_LOG, prefect_home, "--preset", "demo", "--store", store)
+            run_genre(TINY_LOG, prefect_home, "--preset", "demo", "--store", store)
     options = ["--preset", "small"]
     for setting in (*EVALUATION_SETTINGS, *settings):
         options += ["--set", setting]
@@ -72,7 +69,7 @@ def run_with_budget(seed: str, budget_s: float, table: str, settings: Sequence[s
     with tempfile.TemporaryDirectory() as store:
         # The whole command is timed from outside, because a run cannot time its own start of Python.
         began = time.perf_counter()
-        out = _run_genre(log, prefect_home, "--budget", f"{budget_s:g}s", *options, "--store", store, "--json")
+        out = run_genre(log, prefect_home, "--budget", f"{budget_s:g}s", *options, "--store", store, "--json")
         command_s = time.perf_counter() - began
     # The record is the last line; warnings of libraries may come before it.
     record = json.loads(out.strip().splitlines()[-1])
@@ -96,16 +93,6 @@ def run_with_budget(seed: str, budget_s: float, table: str, settings: Sequence[s
         "commit": git_commit(),
     }
 
-
-def _run_genre(log: str, prefect_home: Path, *arguments: str) -> str:
-    """Runs ``genre run`` to its end, and gives what it prints."""
-    # A home of its own, so that a user's Prefect server and its settings play no part.
-    environment = os.environ | {"PYTHONPATH": str(CHECKOUT), "PREFECT_HOME": str(prefect_home)}
-    command = [*COMMAND, "run", log, *arguments]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise NotMeasuredError(f"genre run ended with {done.returncode}: {done.stderr[-500:]}")
-    return done.stdout
 
 
 def budget_claims(rows: Sequence[Row]) -> Iterator[Claim]:

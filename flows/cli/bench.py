@@ -46,6 +46,7 @@ _BENCHES: dict[str, BenchEntry] = {
     "raster": BenchEntry(
         "benchmarks.raster:BENCH", "the renderer's speed against gsplat's torch reference and the machine's limits"
     ),
+    "start_up": BenchEntry("benchmarks.start_up:BENCH", "seconds before anything is computed"),
 }
 
 
