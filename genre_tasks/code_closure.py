@@ -43,12 +43,12 @@ def import_closure(module: str, lazy_modules: Sequence[str], root: Path) -> Impo
     Raises:
         ConfigError: one of the modules does not exist.
     """
-    todo = [module, *lazy_modules]
-    for name in todo:
+    for name in (module, *lazy_modules):
         if find_module_file(name, root) is None:
             raise ConfigError(
                 f"There is no module {name!r}", remedy="Name a module inside the package, as genre_tasks.stages.gnet."
             )
+    todo = [part for name in (module, *lazy_modules) for part in _with_packages(name)]
     modules: dict[str, Path] = {}
     packages: set[str] = set()
     cpp_files: list[Path] = []
@@ -62,13 +62,19 @@ def import_closure(module: str, lazy_modules: Sequence[str], root: Path) -> Impo
         # Kernels are not imported: the Python file that names their sources stands for the import.
         cpp_files += [path.parent / cpp_name for cpp_name in source.cpp_names]
         for imported in source.imports:
-            parts = imported.split(".")
-            if parts[0] != PACKAGE:
-                packages.add(parts[0])
-                continue
-            # Importing a.b.c runs a and a.b too; the last part of "from a.b import c" may be a name and no module.
-            todo += [".".join(parts[: i + 1]) for i in range(len(parts))]
+            package = imported.partition(".")[0]
+            if package == PACKAGE:
+                # The last part of "from a.b import c" may be a name and no module.
+                todo += _with_packages(imported)
+            else:
+                packages.add(package)
     return ImportClosure(modules, tuple(include_closure(cpp_files)), frozenset(packages))
+
+
+def _with_packages(name: str) -> list[str]:
+    """Lists a, a.b and a.b.c for a.b.c, since importing a module runs its packages too."""
+    parts = name.split(".")
+    return [".".join(parts[: i + 1]) for i in range(len(parts))]
 
 
 def digest_modules(module: str, root: Path) -> list[tuple[str, str]]:

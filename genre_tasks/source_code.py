@@ -158,8 +158,8 @@ def _write(value: object, parts: list[str]) -> None:
             parts.append(",")
         parts.append("]")
     else:
-        # Names, numbers of levels, and None, which a list can hold.
-        parts.append(_write_literal(value))
+        # A name or a number of the grammar's own. A list can lack an item, which is not the literal None.
+        parts.append("absent" if value is None else _write_literal(value))
 
 
 @lru_cache(maxsize=256)
