@@ -141,7 +141,7 @@ def _write(value: object, parts: list[str]) -> None:
         _write_f_string(value, parts)
     elif isinstance(value, ast.AST):
         parts.append(f"{type(value).__name__}(")
-        for name in _field_names(type(value)):
+        for name in _order_fields(value._fields):
             field = getattr(value, name, None)
             if isinstance(field, list):
                 field = [item for item in field if not _is_without_effect(item)]
@@ -163,9 +163,9 @@ def _write(value: object, parts: list[str]) -> None:
 
 
 @lru_cache(maxsize=256)
-def _field_names(kind: type[ast.AST]) -> list[str]:
-    # Sorted, since the order of fields is each version's own.
-    return sorted(set(kind._fields) - _FIELDS_WITHOUT_MEANING)
+def _order_fields(names: tuple[str, ...]) -> list[str]:
+    # Sorted, since versions have them in different orders.
+    return sorted(set(names) - _FIELDS_WITHOUT_MEANING)
 
 
 def _write_literal(value: object) -> str:

@@ -84,10 +84,11 @@ def list_weights_files(path: Path) -> dict[str, Path]:
     configuration = tensors.with_suffix(".json")
     files = {"tensors": tensors, "configuration": configuration}
     base = _find_base(configuration)
-    for part in () if base is None else ("vae", "unet"):
-        # The names that diffusers looks for; it takes the first format that it finds, so names count too.
-        read = [base / part / "config.json", *(base / part).glob("diffusion_pytorch_model*")]
-        files |= {f"{part}/{file.name}": file for file in sorted(read)}
+    if base is not None:
+        for part in (base / "vae", base / "unet"):
+            # The names that diffusers looks for; it takes the first format that it finds, so names count too.
+            read = [part / "config.json", *part.glob("diffusion_pytorch_model*")]
+            files |= {f"{part.name}/{file.name}": file for file in sorted(read)}
     return {use: file for use, file in files.items() if file.is_file()}
 
 
