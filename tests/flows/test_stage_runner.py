@@ -99,7 +99,7 @@ def test_inputs_weights_and_reader_are_part_of_the_key() -> None:
     ingest = STAGE_BY_NAME["ingest"]
     readers = {
         stage_key(ingest, config, {"log": "x"}, None, (f"genre_tasks.logs.{m}",))
-        for m in ("pandaset.reader", "validation")
+        for m in ("pandaset.reader", "synthetic.log")
     }
     assert len(readers) == 2
 
