@@ -6,6 +6,7 @@ cache never pays for torch.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -125,6 +126,9 @@ STAGE_BY_NAME: Mapping[str, StageSpec] = {spec.name: spec for spec in PIPELINE}
 _FILE_SETTINGS = {"ingest": ("points",), "evaluate": ("inception", "lpips")}
 """Settings that name files, by section."""
 
+_WEIGHTS_SETTINGS = {"weights": True, "refine": {"weights"}}
+"""Settings that name weights: their digest is part of the key, so where they lie is not."""
+
 
 def stages_until(end: str) -> tuple[str, ...]:
     """Lists the stages that a run goes through when the scene of stage ``end`` is its result.
@@ -209,7 +213,9 @@ def digest_stage_weights(spec: StageSpec, config: PipelineConfig) -> str | None:
 
 
 def digest_weights(path: Path | None) -> str | None:
-    """Digests weights by their content: a file with the JSON beside it, or all files of a folder.
+    """Digests weights by the content of the files that are read when they are loaded.
+
+    Where they lie, their name and other files beside them do not count.
 
     Args:
         path: the file or folder; ``None`` for a stage without weights.
@@ -219,12 +225,20 @@ def digest_weights(path: Path | None) -> str | None:
     """
     if path is None:
         return None
-    if path.is_dir():
-        # Sorted, because the order in which a file system lists files is no part of the weights.
-        files = sorted(file for file in path.rglob("*") if file.is_file())
-    else:
-        files = [path, path.with_suffix(".json")]
-    return digest_value([[file.name, digest_file(file)] for file in files if file.exists()])
+    from genre_tasks.weights import list_weights_files
+
+    return digest_value({use: _digest_weights_file(file) for use, file in list_weights_files(path).items()})
+
+
+def _digest_weights_file(file: Path) -> str:
+    if file.suffix == ".json":
+        try:
+            # The value and not the bytes: a checkout may change the line endings of a text file.
+            return digest_value(json.loads(file.read_bytes()))
+        except ValueError:
+            # Not JSON after all: loading it will be an error that names the file.
+            return digest_file(file)
+    return digest_file(file)
 
 
 def stage_key(
@@ -247,7 +261,9 @@ def stage_key(
         64 hex digits of sha256.
     """
     # A retry with a smaller batch makes the same payload, so it must have the same key.
-    excluded = {spec.batch_setting} if spec.batch_setting else set()
+    excluded: dict[str, Any] = dict(_WEIGHTS_SETTINGS)
+    if spec.batch_setting:
+        excluded[spec.batch_setting] = True
     configuration = config_section(spec, config).model_dump(mode="json", exclude=excluded)
     for key in _FILE_SETTINGS.get(spec.section, ()):
         # A file that a setting names is an input: its bytes count, not its name alone.

@@ -1,4 +1,4 @@
-"""Compiles C++ kernels into shared libraries, one per instruction set. Imports nothing but the standard library.
+"""Compiles C++ kernels into shared libraries, one per instruction set. Imports no package but this one.
 
 ``setup.py`` uses it where torch may be absent; the loader uses the same names and digest.
 """
@@ -18,6 +18,8 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+
+from genre_tasks.source_code import digest_source
 
 SHARED_SOURCES = ("runtime.h", "vectors.h", "build.py")
 """Files of this folder that every library depends on."""
@@ -78,13 +80,13 @@ class Kernel:
         """Identifies the sources, so that a library that is older than them is noticed when it is loaded.
 
         Returns:
-            First 16 hexadecimal digits of the SHA-256 of all sources; compiled into the libraries.
+            First 16 hexadecimal digits of the SHA-256 over the code of all sources; compiled into the libraries.
         """
-        # Contents, not times: a checkout or a copy of the sources must not make libraries stale.
+        # Code, not times or bytes: a checkout, a copy or another comment must not make libraries stale.
         digest = hashlib.sha256()
         files = [self.folder / name for name in self.sources]
         for path in files + [Path(__file__).parent / name for name in SHARED_SOURCES]:
-            digest.update(path.name.encode() + b"\0" + path.read_bytes())
+            digest.update(f"{path.name}\0{digest_source(path)}\n".encode())
         return digest.hexdigest()[:16]
 
     def defines(self) -> list[str]:

@@ -17,6 +17,7 @@ from genre_tasks.errors import InputError
 from genre_tasks.fixer.architectures import build_fnet, load_sd_turbo
 from genre_tasks.fixer.network import Fnet, FnetArchitecture
 from genre_tasks.weight_checks import require_weights_fit
+from genre_tasks.weights import find_tensors_file
 
 REMEDY = "Give weights that `genre train fnet` wrote for this version, or leave `fnet.weights` at builtin."
 # Files are in half precision; weights of other tools are in any of these, and all are used in float32.
@@ -65,7 +66,7 @@ def load_fnet(path: Path, model: str = "small") -> Fnet:
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
-    path = path / "fnet.safetensors" if path.is_dir() else path
+    path = find_tensors_file(path)
     document = _read_document(path.with_suffix(".json"))
     # Checked before the tensors are read, which takes long for the larger model.
     if document.get("model") != model:

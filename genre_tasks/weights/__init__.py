@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 from genre_tasks.errors import InputError
@@ -55,3 +56,46 @@ def resolve_weights(name: str, configured: str, setting: str = "") -> Path:
     if not path.exists():
         raise InputError(f"the weights of {name} do not exist", remedy=remedy, file=path, stage=name)
     return path
+
+
+def find_tensors_file(path: Path) -> Path:
+    """Finds the file with the tensors; its configuration is the JSON file of the same name.
+
+    Args:
+        path: the file, or a folder with the weights of a fixer.
+
+    Returns:
+        The path of a ``.safetensors`` file, which need not exist.
+    """
+    return path / "fnet.safetensors" if path.is_dir() else path
+
+
+def list_weights_files(path: Path) -> dict[str, Path]:
+    """Lists the files that are read when weights are loaded, and no other files that lie beside them.
+
+    Args:
+        path: the file of the tensors, or a folder with the weights of a fixer.
+
+    Returns:
+        What the file is for → the file, of those that exist: the tensors, their configuration, and the parts of the
+        model that a fixer's weights are based on, where it is in a folder of this machine.
+    """
+    tensors = find_tensors_file(path)
+    configuration = tensors.with_suffix(".json")
+    files = {"tensors": tensors, "configuration": configuration}
+    base = _find_base(configuration)
+    if base is not None:
+        for part in (base / "vae", base / "unet"):
+            # The names that diffusers looks for; it takes the first format that it finds, so names count too.
+            read = [part / "config.json", *part.glob("diffusion_pytorch_model*")]
+            files |= {f"{part.name}/{file.name}": file for file in sorted(read)}
+    return {use: file for use, file in files.items() if file.is_file()}
+
+
+def _find_base(configuration: Path) -> Path | None:
+    try:
+        base = configuration.parent / json.loads(configuration.read_bytes())["base"]
+    # Weights without a base have no such key; what cannot be read is an error when they are loaded.
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return base if base.is_dir() else None

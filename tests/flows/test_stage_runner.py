@@ -13,9 +13,9 @@ from flows.machine.resource_usage import measure_usage
 from flows.pipeline import stage_runner as room
 from flows.pipeline.definition import PIPELINE, STAGE_BY_NAME, stage_key
 from flows.pipeline.stage_runner import ArtifactRef, Job, compute_key, run_stage
+from genre_tasks.code_closure import import_closure
 from genre_tasks.config import EffectsConfig, EvaluateConfig, PipelineConfig
 from genre_tasks.errors import InputError, ResourceError
-from storage.code_digest import import_closure
 from tests.faults.small_run import LOG, SETTINGS
 
 EARLY = ("ingest", "effects", "initial")
@@ -77,9 +77,9 @@ def test_a_plan_of_effects_is_part_of_later_keys(store: Path) -> None:
 
 def test_the_effects_code_is_part_of_the_plans_key() -> None:
     spec, root = STAGE_BY_NAME["effects"], Path(room.__file__).parents[2]
-    files, _ = import_closure(spec.module, spec.lazy_modules, root)
+    files = import_closure(spec.module, spec.lazy_modules, root).modules
     assert {f"genre_tasks.effects.{name}" for name in EffectsConfig.model_fields} <= set(files)
-    assert "genre_tasks.effects.exposure" not in import_closure(spec.module, (), root)[0]  # why it has to be said
+    assert "genre_tasks.effects.exposure" not in import_closure(spec.module, (), root).modules  # why it has to be said
 
 
 def test_a_setting_that_only_bounds_memory_keeps_the_key(store: Path) -> None:
@@ -99,7 +99,7 @@ def test_inputs_weights_and_reader_are_part_of_the_key() -> None:
     ingest = STAGE_BY_NAME["ingest"]
     readers = {
         stage_key(ingest, config, {"log": "x"}, None, (f"genre_tasks.logs.{m}",))
-        for m in ("pandaset.reader", "validation")
+        for m in ("pandaset.reader", "synthetic.log")
     }
     assert len(readers) == 2
 

@@ -11,10 +11,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from genre_tasks.code_closure import include_closure
 from genre_tasks.compiled import build, loader
 from genre_tasks.compiled.build import Kernel
 from genre_tasks.errors import ConfigError, ResourceError
 from genre_tasks.logs.types import RollingShutter
+from genre_tasks.losses import build_image_loss
+from genre_tasks.optimiser.kernels import build_network, build_posing
 from genre_tasks.render import RenderSettings, constants, cpu, render
 from genre_tasks.render.kernel import library
 from genre_tasks.render.kernel.build import KERNEL
@@ -129,3 +132,36 @@ def test_cuda_against_the_reference(scene):
     truth = render(splats.to(torch.float64), cameras, RenderSettings("reference"))
     assert (out.color.cpu().double() - truth.color).abs().max() < 0.02  # 0.999 against 0.99, and the alpha cut
     assert (out.depth.cpu().double() - truth.depth).abs().mean() < 0.01
+
+
+KERNELS = (KERNEL, build_image_loss.KERNEL, build_network.KERNEL, build_posing.KERNEL)
+
+
+def copied_kernel(folder: Path, changed: dict[str, tuple[str, str]]) -> Kernel:
+    shutil.copytree(KERNEL.folder.parent, folder, ignore=shutil.ignore_patterns("*.so", "__pycache__"))
+    for name, (old, new) in changed.items():
+        text = (folder / "kernel" / name).read_text()
+        assert old in text
+        (folder / "kernel" / name).write_text(text.replace(old, new, 1))
+    return replace(KERNEL, folder=folder / "kernel")
+
+
+def test_comments_make_no_library_stale(tmp_path: Path) -> None:
+    """Report: taikinman/imker#31 (comments and docstrings change a task's hash)."""
+    comments = {
+        "kernel.cpp": ("\n", "\r\n  // why\n"),
+        "build.py": ('"""', '"""More about it: '),
+        "../constants.py": ("\n\n", "\n\n# why\n"),
+    }
+    assert copied_kernel(tmp_path / "a", comments).source_digest() == KERNEL.source_digest()
+    code = {"../constants.py": ("\n\nNEAR_M = ", "\n\nNEAR_M = 2 * ")}
+    assert copied_kernel(tmp_path / "b", code).source_digest() != KERNEL.source_digest()
+    code = {"view.h": ("#include", "int added;\n#include")}
+    assert copied_kernel(tmp_path / "c", code).source_digest() != KERNEL.source_digest()
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=lambda kernel: kernel.stem)
+def test_every_file_that_a_kernel_includes_makes_its_library_stale(kernel: Kernel) -> None:
+    listed = {(kernel.folder / name).resolve() for name in kernel.sources}
+    shared = {Path(build.__file__).parent / name for name in build.SHARED_SOURCES}
+    assert set(include_closure([kernel.folder / kernel.sources[0]])) <= listed | shared

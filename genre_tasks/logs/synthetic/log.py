@@ -18,6 +18,7 @@ from urllib.parse import parse_qsl
 import numpy as np
 from numpy.typing import NDArray
 
+from genre_tasks.code_closure import digest_modules
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.logs.synthetic.annotations import annotate_actors
 from genre_tasks.logs.synthetic.camera_effects import CameraEffects
@@ -210,15 +211,15 @@ class SyntheticStreet:
         return annotate_actors(self._layout, self._ego, self.parameters.frames, self.offset_m)
 
     def digest(self) -> str:
-        """Identifies the log by its parameters and the generator's own source; nothing is rendered.
+        """Identifies the log by its parameters and the generator's own code; nothing is rendered.
 
         Returns:
             sha256, hexadecimal.
         """
         state = hashlib.sha256(self.parameters.query(all_keys=True).encode())
         # A change of the generator is another log: what was computed from the old one no longer fits.
-        for file in sorted(Path(__file__).parent.glob("*.py")):
-            state.update(file.name.encode() + b"\0" + file.read_bytes())
+        for name, digest in digest_modules(__name__, Path(__file__).resolve().parents[3]):
+            state.update(f"\0{name}\0{digest}".encode())
         return state.hexdigest()
 
     def depth(self, frame: int, world_SE3_camera: Float64, lens: Lens) -> Float64:
