@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common.bench import NotMeasuredError, Row
+from benchmarks.common.bench import Row
 from benchmarks.common.claims import Claim, claim
 from benchmarks.common.command import run_genre
 from flows.budget.chooser import STAGE_OVERHEAD_S
@@ -92,7 +92,6 @@ def run_with_budget(seed: str, budget_s: float, table: str, settings: Sequence[s
         "metrics": {n: metrics[n] for n in ("interpolation/psnr", "shift_3m/psnr", DISTANCE)},
         "commit": git_commit(),
     }
-
 
 
 def budget_claims(rows: Sequence[Row]) -> Iterator[Claim]:
