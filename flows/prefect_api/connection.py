@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from flows.prefect_api.server_thread import ServerThread, database_url
-from flows.prefect_api.settings_sources import check_settings_files, describe_source
+from flows.prefect_api.settings_sources import check_settings_files, find_source
 from genre_tasks.errors import ConfigError
 
 API_URL = "PREFECT_API_URL"
@@ -102,7 +102,7 @@ def check_server_answers(url: str) -> None:
         reason = getattr(error, "reason", error)
         raise ConfigError(
             f"no Prefect server answers at {API_URL}={url} ({reason})",
-            remedy=f"Start it, or go on without it. {describe_source(API_URL)}",
+            remedy=f"Start it, or go on without it. {find_source(API_URL) or ''}".strip(),
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""Where a setting of Prefect comes from, so that an error can say what to change."""
+"""Where a setting of Prefect comes from: files, the environment or a profile, read without importing Prefect."""
 
 from __future__ import annotations
 
@@ -31,26 +31,46 @@ def check_settings_files() -> None:
         raise _unreadable(_ENV_FILE, error) from error
 
 
-def describe_source(variable: str) -> str:
-    """Says where Prefect has a setting from, and how to undo it.
+def find_source(variable: str) -> str | None:
+    """Finds where Prefect has a setting from, without importing Prefect, which takes a second.
 
     Args:
         variable: the setting as a variable of the environment, such as ``PREFECT_API_URL``.
 
     Returns:
-        One sentence for an error's remedy.
+        One sentence for an error's remedy, which says how to undo it; ``None`` for a setting that nobody made.
+
+    Raises:
+        ConfigError: a file that Prefect reads cannot be read.
 
     >>> os.environ["PREFECT_EXAMPLE"] = "1"
-    >>> describe_source("PREFECT_EXAMPLE")
+    >>> find_source("PREFECT_EXAMPLE")
     'It comes from the environment: unset PREFECT_EXAMPLE.'
+    >>> del os.environ["PREFECT_EXAMPLE"]
     """
-    # In Prefect's own order, first hit wins.
-    if variable in os.environ:
+    # In Prefect's own order, first hit wins. An empty variable counts as none there.
+    if os.environ.get(variable):
         return f"It comes from the environment: unset {variable}."
     for path, setting in _settings_in_files(variable):
         return f"It comes from {path.absolute()}: remove {setting} there."
-    profiles = Path(os.environ.get("PREFECT_HOME", "~/.prefect")).expanduser() / "profiles.toml"
-    return f"It comes from a Prefect profile ({profiles}): prefect config unset {variable}."
+    profiles = _profiles_file()
+    if variable in _read_active_profile(profiles):
+        return f"It comes from a Prefect profile ({profiles}): prefect config unset {variable}."
+    return None
+
+
+def _profiles_file() -> Path:
+    stated = os.environ.get("PREFECT_PROFILES_PATH")
+    home = os.environ.get("PREFECT_HOME") or "~/.prefect"
+    return Path(stated or f"{home}/profiles.toml").expanduser()
+
+
+def _read_active_profile(profiles: Path) -> Mapping[str, Any]:
+    known = _read_toml(profiles)
+    active = os.environ.get("PREFECT_PROFILE") or known.get("active", "")
+    settings = known.get("profiles", {})
+    profile = settings.get(active, {}) if isinstance(settings, Mapping) else {}
+    return profile if isinstance(profile, Mapping) else {}
 
 
 def _settings_in_files(variable: str) -> Iterator[tuple[Path, str]]:
@@ -80,6 +100,6 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 
 def _unreadable(path: Path, error: Exception) -> ConfigError:
-    problem = f"Prefect reads its settings from the working folder, and a file there cannot be read ({error})"
-    remedy = "Mend or remove the file, or run the command in another folder."
+    problem = f"Prefect reads settings from this file, and it cannot be read ({error})"
+    remedy = "Mend or remove the file, or run the command in another folder if it is of this one."
     return ConfigError(problem, remedy=remedy, file=path.absolute())

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from flows.prefect_api.connection import check_server_answers, connect_to_prefect
-from flows.prefect_api.settings_sources import check_settings_files, describe_source
+from flows.prefect_api.settings_sources import check_settings_files, find_source
 from flows.prefect_api.state_folder import find_state_folder
 from genre_tasks.errors import ConfigError
 
@@ -116,14 +116,17 @@ def test_a_server_that_is_not_there_is_named_with_its_source(tmp_path: Path, mon
     assert NOBODY in str(caught.value) and "unset PREFECT_API_URL" in str(caught.value)
     monkeypatch.delenv("PREFECT_API_URL")
     monkeypatch.setenv("PREFECT_HOME", str(tmp_path))
-    assert str(tmp_path / "profiles.toml") in describe_source("PREFECT_API_URL")
+    assert find_source("PREFECT_API_URL") is None
+    profile = f'active = "own"\n[profiles.own]\nPREFECT_API_URL = "{NOBODY}"\n'
+    (tmp_path / "profiles.toml").write_text(profile)
+    assert str(tmp_path / "profiles.toml") in str(find_source("PREFECT_API_URL"))
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pyproject.toml").write_text('[tool.prefect.api]\nurl = "http://x"\n')
-    assert str(tmp_path / "pyproject.toml") in describe_source("PREFECT_API_URL")
+    assert str(tmp_path / "pyproject.toml") in str(find_source("PREFECT_API_URL"))
     (tmp_path / "prefect.toml").write_text('[api]\nurl = "http://x"\n')
-    assert str(tmp_path / "prefect.toml") in describe_source("PREFECT_API_URL")
+    assert str(tmp_path / "prefect.toml") in str(find_source("PREFECT_API_URL"))
     (tmp_path / ".env").write_text("PREFECT_API_URL=http://x\n")
-    assert str(tmp_path / ".env") in describe_source("PREFECT_API_URL")
+    assert str(tmp_path / ".env") in str(find_source("PREFECT_API_URL"))
 
 
 @pytest.mark.parametrize("name", ["pyproject.toml", "prefect.toml"])
