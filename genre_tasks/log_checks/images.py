@@ -59,12 +59,12 @@ def find_unfit(lens: Lens, facts: ImageFacts) -> Finding | None:
     if (facts.width_px, facts.height_px) != (lens.width_px, lens.height_px):
         size = f"{facts.width_px}×{facts.height_px}"
         message = f"the image is {size}, the camera's lens is {lens.width_px}×{lens.height_px}"
-        remedy = "Export them at the size of the intrinsics; they are left out."
+        remedy = "Images of another size than the intrinsics' are left out; export them at that size."
         numbers = {"width_px": facts.width_px, "height_px": facts.height_px}
         return Finding(ODD_SIZE, "warning", message, remedy, numbers)
     if facts.is_blank:
         message = "the image has one colour all over"
-        remedy = "Check the camera's recording; they are left out, since nothing can be learned from them."
+        remedy = "Such images are left out, since nothing can be learned from them; check the recording."
         return Finding(BLANK, "warning", message, remedy)
     return None
 

@@ -245,4 +245,4 @@ def _is_blank(rgb: Image.Image) -> bool:
     """Whether all areas of an image have the same mean, to within a rounding."""
     grid = (min(rgb.width, _BLANK_GRID[0]), min(rgb.height, _BLANK_GRID[1]))
     means = rgb if rgb.size == grid else rgb.resize(grid, Image.Resampling.BOX)
-    return all(high - low <= _BLANK_LEVELS for low, high in means.getextrema())
+    return bool((np.ptp(np.asarray(means), axis=(0, 1)) <= _BLANK_LEVELS).all())

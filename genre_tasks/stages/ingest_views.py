@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from genre_tasks.log_checks.images import find_unfit, read_image, summarise_findings
+from genre_tasks.log_checks.images import LEFT_OUT, find_unfit, read_image, summarise_findings
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.types import Camera
 from genre_tasks.scene.chunk import View
@@ -19,7 +19,7 @@ from genre_tasks.stages.chunk_reading import ChunkReading
 REMEDY = "Fetch the file again, or run without strict to go on without it."
 
 _STRICT_REMEDY = "Or run without strict to go on without it."
-_MISSING = Finding("missing_image", "warning", "there is no image", "Fetch the file.")
+_MISSING = Finding("missing_image", "warning", "there is no image")
 
 
 def read_views(reading: ChunkReading, cameras: Sequence[Camera]) -> tuple[list[View], list[NDArray[np.uint8] | None]]:
@@ -75,12 +75,29 @@ def read_views(reading: ChunkReading, cameras: Sequence[Camera]) -> tuple[list[V
     return views, pixels
 
 
+def describe_left_out(reading: ChunkReading) -> str:
+    """Says why images were left out, where a chunk has too few of them.
+
+    Args:
+        reading: the chunk, after its images were read.
+
+    Returns:
+        A clause to follow the problem, or nothing.
+    """
+    left_out = [issue for issue in reading.log_issues if issue.kind in LEFT_OUT]
+    if not left_out:
+        return ""
+    first = left_out[0]
+    detail = first.detail.removesuffix(".")
+    return f"; {len(left_out)} images are left out, the first one ({first.camera}, frame {first.frame}): {detail}"
+
+
 def _note_or_raise(reading: ChunkReading, problem: Finding, camera: Camera, frame: int) -> None:
     # A long log has a bad image now and then: without ``strict`` the rest of it is still worth a scene.
     if reading.config.strict:
-        remedy = f"{problem.remedy} {_STRICT_REMEDY}".strip()
+        remedy = f"{problem.remedy} {_STRICT_REMEDY}" if problem.remedy else REMEDY
         raise reading.input_error(problem.message, remedy, camera.name, frame)
-    reading.add_issue(problem.word, problem.message, frame, camera.name)
+    reading.add_issue(problem.word, _describe(problem), frame, camera.name)
 
 
 def _note_remarks(reading: ChunkReading, remarks: Mapping[str, Sequence[tuple[int, Finding]]]) -> None:
@@ -89,4 +106,8 @@ def _note_remarks(reading: ChunkReading, remarks: Mapping[str, Sequence[tuple[in
         for finding in summarise_findings(camera, found):
             if reading.config.strict:
                 raise reading.input_error(finding.message, finding.remedy, camera, finding.frames[0])
-            reading.add_issue(finding.word, f"{finding.message}. {finding.remedy}", finding.frames[0], camera)
+            reading.add_issue(finding.word, _describe(finding), finding.frames[0], camera)
+
+
+def _describe(finding: Finding) -> str:
+    return f"{finding.message}. {finding.remedy}" if finding.remedy else finding.message
