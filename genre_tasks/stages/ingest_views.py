@@ -75,21 +75,29 @@ def read_views(reading: ChunkReading, cameras: Sequence[Camera]) -> tuple[list[V
     return views, pixels
 
 
-def describe_left_out(reading: ChunkReading) -> str:
-    """Says why images were left out, where a chunk has too few of them.
+def require_source_frames(reading: ChunkReading, sources: Sequence[View]) -> None:
+    """Checks that a chunk can be reconstructed from its images.
 
     Args:
         reading: the chunk, after its images were read.
+        sources: its source views.
 
-    Returns:
-        A clause to follow the problem, or nothing.
+    Raises:
+        InputError: they are of fewer than two frames; the error says why images were left out.
     """
+    # Frames and not views: six cameras at one moment have no parallax over time.
+    count = len({view.frame for view in sources})
+    if count >= 2:
+        return
+    problem = f"the chunk has {count} source frames with images, at least two are needed"
     left_out = [issue for issue in reading.log_issues if issue.kind in LEFT_OUT]
-    if not left_out:
-        return ""
-    first = left_out[0]
-    detail = first.detail.removesuffix(".")
-    return f"; {len(left_out)} images are left out, the first one ({first.camera}, frame {first.frame}): {detail}"
+    if left_out:
+        first = left_out[0]
+        detail = first.detail.removesuffix(".")
+        problem += (
+            f"; {len(left_out)} images are left out, the first one ({first.camera}, frame {first.frame}): {detail}"
+        )
+    raise reading.input_error(problem, "Choose other chunks with --chunks, or a smaller ingest.source_every.")
 
 
 def _note_or_raise(reading: ChunkReading, problem: Finding, camera: Camera, frame: int) -> None:
