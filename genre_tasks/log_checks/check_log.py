@@ -10,12 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from genre_tasks.log_checks.frame_lists import format_frames
 from genre_tasks.log_checks.images import summarise_findings
 from genre_tasks.log_checks.inspection import LogInspector
 from genre_tasks.log_checks.plausibility import assess_plausibility
 from genre_tasks.log_checks.results import STANDSTILL_M, LogCheck
-from genre_tasks.logs.findings import Finding, ReportsFindings
+from genre_tasks.logs.findings import Finding, ReportsFindings, format_frames
 from genre_tasks.logs.types import DrivingLog
 from genre_tasks.progress import Progress, silent
 
@@ -145,7 +144,8 @@ def _report_chunks(check: LogCheck, inspector: LogInspector, chunk_frames: int) 
 def _report_cameras(check: LogCheck, inspector: LogInspector) -> None:
     if not check.cameras:
         message = "no camera has an image"
-        inspector.report(Finding("no_images", "fatal", message, "Copy the camera folders of the sequence."))
+        remedy = "Copy the camera folders of the sequence; other findings name what lies in their place."
+        inspector.report(Finding("no_images", "fatal", message, remedy))
     elif len(check.cameras) == 1:
         inspector.report(Finding("one_camera", "note", "one camera only", "Shifted views see more that no camera saw."))
     usable_images = 0

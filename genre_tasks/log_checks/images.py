@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TypeVar
 
 from genre_tasks.errors import GenreError, InputError
-from genre_tasks.log_checks.frame_lists import format_frames
-from genre_tasks.logs.findings import Finding
+from genre_tasks.logs.findings import Finding, format_frames
 from genre_tasks.logs.types import Lens
 from genre_tasks.scene.image_decoding import ImageFacts
 
@@ -42,7 +42,9 @@ def read_image(
         data = read()
         return (None if data is None else decode(data)), None
     except errors as error:
-        return None, Finding(UNREADABLE, "warning", error.problem, error.remedy)
+        # The name alone: where the log lies must not change what a run stores.
+        file = f" (file {Path(error.file).name})" if error.file else ""
+        return None, Finding(UNREADABLE, "warning", error.problem + file, error.remedy)
 
 
 def find_unfit(lens: Lens, facts: ImageFacts) -> Finding | None:

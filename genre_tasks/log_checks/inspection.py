@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from genre_tasks.errors import GenreError
-from genre_tasks.log_checks.frame_lists import format_frames
 from genre_tasks.log_checks.images import BLANK, LEFT_OUT, ODD_SIZE, UNREADABLE, find_unfit, read_image
 from genre_tasks.log_checks.results import CameraCheck
-from genre_tasks.logs.findings import Finding, Severity
+from genre_tasks.logs.findings import Finding, Severity, format_frames
 from genre_tasks.logs.types import Camera, DrivingLog, Float64
 from genre_tasks.progress import Progress
 from genre_tasks.scene.image_decoding import inspect_image

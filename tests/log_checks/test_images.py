@@ -98,3 +98,17 @@ def test_a_log_of_which_every_image_is_refused_is_unusable() -> None:
     assert check.verdict == "unusable" and {f.word for f in check.findings} >= {"unreadable_image", "no_readable_image"}
     with pytest.raises(InputError, match=r"4 images are left out.*orientation is 6"):
         ingest(CONFIG, log, 0)
+
+
+def test_a_file_that_the_reader_cannot_open_is_one_finding() -> None:
+    """Report: none found; case 13 of the list of odd logs."""
+
+    class Locked(FakeLog):
+        def image_bytes(self, camera: str, frame: int) -> bytes | None:
+            if (camera, frame) == ("front", 2):
+                raise InputError("permission denied", remedy="Change its mode.", file="/data/002/camera/front/02.png")
+            return super().image_bytes(camera, frame)
+
+    found, issues, used = judge(Locked(frame_count=4, width_px=48, height_px=32, speed_mps=20.0, lidar_azimuths=360))
+    assert "front: unreadable images at frames 2: permission denied (file 02.png)" in found["unreadable_image"].message
+    assert issues["unreadable_image"] == ["permission denied (file 02.png). Change its mode."] and used == 3
