@@ -78,7 +78,7 @@ class TestBitDepth:
         assert data.startswith(b"MM") and np.array_equal(decode(data), np.stack([GREY] * 3, -1))
 
     def test_zero_is_white_in_a_tiff_of_16_bits(self) -> None:
-        """Report: python-pillow/Pillow#5655 (Pillow inverts for 1 and 8 bits alone)."""
+        """Report: python-pillow/Pillow#5655 (grey TIFFs whose zero is white)."""
         samples = GREY.astype(np.uint16) * 257
         data = encode(Image.fromarray(65535 - samples), "TIFF", tiffinfo={262: 0})
         assert np.array_equal(decode(data)[..., 0], GREY)
@@ -309,7 +309,7 @@ class TestRefused:
             assert "cannot decode the image" in refusal(data[:size]).problem
 
     def test_a_jpeg_whose_end_is_zeros(self) -> None:
-        """Report: none found; a download into a file of the final size that broke off."""
+        """Report: none found; case 1 of the list of odd logs."""
         data = encode(COLORS, "JPEG", quality=95)
         assert "zeros" in refusal(data[: len(data) // 2].ljust(len(data), b"\0")).problem
         assert words(data + bytes(100)) == []
