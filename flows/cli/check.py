@@ -56,6 +56,7 @@ def _describe_camera(camera: CameraCheck) -> str:
         "missing": camera.missing,
         "unreadable": camera.unreadable,
         "odd_size": camera.odd_size,
+        "blank": camera.blank,
     }
     counts = [f", {len(frames)} {problem}" for problem, frames in problems.items() if frames]
     return f"{camera.width_px}×{camera.height_px}" + "".join(counts)

@@ -10,10 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from genre_tasks.log_checks.inspection import LogInspector, format_frames
+from genre_tasks.log_checks.images import summarise_findings
+from genre_tasks.log_checks.inspection import LogInspector
 from genre_tasks.log_checks.plausibility import assess_plausibility
 from genre_tasks.log_checks.results import STANDSTILL_M, LogCheck
-from genre_tasks.logs.findings import Finding, ReportsFindings
+from genre_tasks.logs.findings import Finding, ReportsFindings, format_frames
 from genre_tasks.logs.types import DrivingLog
 from genre_tasks.progress import Progress, silent
 
@@ -143,30 +144,23 @@ def _report_chunks(check: LogCheck, inspector: LogInspector, chunk_frames: int) 
 def _report_cameras(check: LogCheck, inspector: LogInspector) -> None:
     if not check.cameras:
         message = "no camera has an image"
-        inspector.report(Finding("no_images", "fatal", message, "Copy the camera folders of the sequence."))
+        remedy = "Copy the camera folders of the sequence; other findings name what lies in their place."
+        inspector.report(Finding("no_images", "fatal", message, remedy))
     elif len(check.cameras) == 1:
         inspector.report(Finding("one_camera", "note", "one camera only", "Shifted views see more that no camera saw."))
-    readable_images = 0
+    usable_images = 0
     for camera in check.cameras:
-        readable_images += check.frames - len(camera.missing) - len(camera.unreadable)
+        left_out = {*camera.missing, *camera.unreadable, *camera.odd_size, *camera.blank}
+        usable_images += check.frames - len(left_out)
         if camera.missing:
             message = f"{camera.name}: no image at frames {format_frames(camera.missing)}"
             finding = Finding("missing_image", "warning", message, "They are left out.", camera=camera.name)
             inspector.report(replace(finding, frames=camera.missing))
-        if camera.unreadable:
-            message = f"{camera.name}: unreadable images at frames {format_frames(camera.unreadable)}"
-            remedy = "Copy them again; they are left out, or stop the run under --strict."
-            finding = Finding("unreadable_image", "warning", message, remedy, camera=camera.name)
-            inspector.report(replace(finding, frames=camera.unreadable))
-        if camera.odd_size:
-            frames = format_frames(camera.odd_size)
-            message = f"{camera.name}: frames {frames} are not {camera.width_px}×{camera.height_px}"
-            remedy = "Export them at the size of the intrinsics; they are left out."
-            finding = Finding("odd_image_size", "warning", message, remedy, camera=camera.name)
-            inspector.report(replace(finding, frames=camera.odd_size))
-    if check.cameras and not readable_images:
-        remedy = "Copy the camera folders of the sequence again."
-        inspector.report(Finding("no_readable_image", "fatal", "no image can be read", remedy))
+        for finding in summarise_findings(camera.name, inspector.image_findings[camera.name]):
+            inspector.report(finding)
+    if check.cameras and not usable_images:
+        remedy = "Copy the camera folders of the sequence again, or export their images as 8-bit JPEG or PNG."
+        inspector.report(Finding("no_readable_image", "fatal", "no image can be used", remedy))
 
 
 def _report_lidar(check: LogCheck, inspector: LogInspector) -> None:

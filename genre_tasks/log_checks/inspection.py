@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import partial
 from typing import TypeVar
 
@@ -12,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from genre_tasks.errors import GenreError
+from genre_tasks.log_checks.images import BLANK, LEFT_OUT, ODD_SIZE, UNREADABLE, find_unfit, read_image
 from genre_tasks.log_checks.results import CameraCheck
-from genre_tasks.logs.findings import Finding, Severity
+from genre_tasks.logs.findings import Finding, Severity, format_frames
 from genre_tasks.logs.types import Camera, DrivingLog, Float64
 from genre_tasks.progress import Progress
+from genre_tasks.scene.image_decoding import inspect_image
 
 # A camera of a 10 Hz rig fires within one period of its sweep.
 _MAX_CAMERA_OFFSET_S = 0.15
 # Plausible time between frames; outside, the timestamps' unit is in doubt.
 _FRAME_PERIOD_RANGE_S = (0.005, 2.0)
-# A log with a hole in every second frame would fill the screen.
-_MAX_RUNS_LISTED = 8
 _CLOCK_REMEDY = "Frames keep the order of the files; effects that need time (rolling shutter, moving actors) suffer."
 _UNIT_REMEDY = "Check the unit of the timestamps: seconds, milliseconds and microseconds since 1970 are understood."
 
@@ -39,11 +38,13 @@ class LogInspector:
     Attributes:
         cameras: the cameras that can be opened.
         findings: what was found so far, without repetitions.
+        image_findings: camera → frame and finding of the images that were checked, for a summary of each camera.
     """
 
     def __init__(self, log: DrivingLog, progress: Progress) -> None:
         self.log = log
         self.findings: list[Finding] = []
+        self.image_findings: dict[str, list[tuple[int, Finding]]] = {}
         # Without a rig there is nothing to check: the reader cannot be asked for a single image.
         rig = self.try_reading(lambda: log.cameras, "fatal", "unreadable_camera") or ()
         self.cameras = tuple(camera for camera in rig if self._can_open(camera))
@@ -92,33 +93,34 @@ class LogInspector:
             index: position in ``cameras``.
 
         Returns:
-            The frames whose image is missing, unreadable, or of another size than the lens.
+            The frames whose image is missing, unreadable, of another size than the lens, or blank.
         """
         camera = self.cameras[index]
-        expected_size = (camera.lens.width_px, camera.lens.height_px)
         missing: list[int] = []
-        unreadable: list[int] = []
-        odd_size: list[int] = []
+        found = self.image_findings[camera.name] = []
         for frame in range(self.log.frame_count):
-            data = self.log.image_bytes(camera.name, frame)
-            size = None if data is None else _decode_size(data)
-            if data is None:
+            facts, problem = read_image(partial(self.log.image_bytes, camera.name, frame), inspect_image, GenreError)
+            if facts is not None:
+                problem = find_unfit(camera.lens, facts)
+            if problem is not None:
+                found.append((frame, problem))
+            elif facts is None:
                 missing.append(frame)
-            elif size is None:
-                unreadable.append(frame)
-            elif size != expected_size:
-                odd_size.append(frame)
+            else:
+                found.extend((frame, finding) for finding in facts.findings)
             # A camera pose that cannot be read costs one image, not the log.
             self.try_reading(partial(self.log.world_SE3_camera, camera.name, frame), "warning", "unreadable_pose")
             done = index * self.log.frame_count + frame + 1
             self._progress(done, self._total_steps, f"{camera.name} {frame}")
+        frames = {word: tuple(n for n, finding in found if finding.word == word) for word in LEFT_OUT}
         return CameraCheck(
             name=camera.name,
             width_px=camera.lens.width_px,
             height_px=camera.lens.height_px,
             missing=tuple(missing),
-            unreadable=tuple(unreadable),
-            odd_size=tuple(odd_size),
+            unreadable=frames[UNREADABLE],
+            odd_size=frames[ODD_SIZE],
+            blank=frames[BLANK],
         )
 
     def read_sweeps(self) -> tuple[tuple[int, ...], tuple[int, ...], list[int]]:
@@ -206,46 +208,3 @@ class LogInspector:
         numbers = tuple(int(frame) for frame in frames)
         message = template.format(format_frames(numbers))
         self.report(Finding(word, "warning", message, _CLOCK_REMEDY, frames=numbers))
-
-
-def _decode_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height of an encoded image, or ``None`` if it does not decode."""
-    from PIL import Image
-
-    try:
-        with Image.open(io.BytesIO(data)) as image:
-            size = image.size
-            if image.format == "JPEG":
-                # An eighth of the size needs all bytes of the file, in a fraction of the time.
-                image.draft("RGB", (size[0] // 8, size[1] // 8))
-                image.load()
-            else:
-                # A PNG has checksums, which need no decoding.
-                image.verify()
-            return size
-    # What Pillow raises on damaged files, and on more pixels than any camera has.
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        return None
-
-
-def format_frames(frames: Iterable[int]) -> str:
-    """Lists frames for a message, with runs of neighbours shortened.
-
-    Args:
-        frames: increasing frame numbers.
-
-    Returns:
-        The frames, at most eight runs of them.
-
-    >>> format_frames([3, 28, 29, 30])
-    '3, 28–30'
-    """
-    runs: list[list[int]] = []
-    for frame in frames:
-        if runs and frame == runs[-1][1] + 1:
-            runs[-1][1] = int(frame)
-        else:
-            runs.append([int(frame), int(frame)])
-    texts = [str(first) if first == last else f"{first}–{last}" for first, last in runs]
-    suffix = ", …" if len(texts) > _MAX_RUNS_LISTED else ""
-    return ", ".join(texts[:_MAX_RUNS_LISTED]) + suffix

@@ -22,8 +22,9 @@ class CameraCheck:
         width_px: native width of its images.
         height_px: native height of its images.
         missing: frames without an image.
-        unreadable: frames whose image does not decode.
+        unreadable: frames whose image cannot be decoded, or is refused.
         odd_size: frames whose image has another size.
+        blank: frames whose image has one colour all over.
     """
 
     name: str
@@ -32,6 +33,7 @@ class CameraCheck:
     missing: tuple[int, ...]
     unreadable: tuple[int, ...]
     odd_size: tuple[int, ...]
+    blank: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from genre_tasks.scene.transforms import invert_se3
 from genre_tasks.scene.visibility import color_point_clouds
 from genre_tasks.stages.chunk_reading import ChunkReading
 from genre_tasks.stages.ingest_points import read_points_from_file, read_points_from_sweeps
-from genre_tasks.stages.ingest_views import read_views
+from genre_tasks.stages.ingest_views import read_views, require_source_frames
 
 STANDSTILL_M = 0.1
 """An ego vehicle that travels less than this in a chunk stands still: there is no parallax."""
@@ -72,11 +72,7 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
     _note_implausible(reading, cameras)
     views, pixels = read_views(reading, cameras)
     sources = [view for view in views if view.role == "source"]
-    # Frames and not views: six cameras at one moment have no parallax over time.
-    source_frames = {view.frame for view in sources}
-    if len(source_frames) < 2:
-        problem = f"the chunk has {len(source_frames)} source frames with images, at least two are needed"
-        raise reading.input_error(problem, "Choose other chunks with --chunks, or a smaller ingest.source_every.")
+    require_source_frames(reading, sources)
     if config.points is not None:
         found = read_points_from_file(reading, config.points)
     else:

@@ -1,24 +1,25 @@
-"""Views of a chunk from a log's images; unreadable ones are noted, or an error under ``strict``."""
+"""Views of a chunk from a log's images; those of no use are noted and left out, or an error under ``strict``."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from genre_tasks.config import IngestConfig
-from genre_tasks.errors import InputError
+from genre_tasks.log_checks.images import LEFT_OUT, find_unfit, read_image, summarise_findings
+from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.types import Camera
 from genre_tasks.scene.chunk import View
-from genre_tasks.scene.image_decoding import decode_pixels, read_image_size
+from genre_tasks.scene.image_decoding import decode_with_facts
 from genre_tasks.scene.transforms import invert_se3
 from genre_tasks.stages.chunk_reading import ChunkReading
 
 REMEDY = "Fetch the file again, or run without strict to go on without it."
 
-_MAX_ASPECT_ERROR = 0.01
-"""Sides of an image may be in another proportion than the lens's by so much: files are rounded to whole pixels."""
+_STRICT_REMEDY = "Or run without strict to go on without it."
+_MISSING = Finding("missing_image", "warning", "there is no image")
 
 
 def read_views(reading: ChunkReading, cameras: Sequence[Camera]) -> tuple[list[View], list[NDArray[np.uint8] | None]]:
@@ -34,26 +35,28 @@ def read_views(reading: ChunkReading, cameras: Sequence[Camera]) -> tuple[list[V
         Views ordered by frame and camera, and the decoded pixels [H, W, 3] of source views (``None`` for the others).
 
     Raises:
-        InputError: an image is missing or unreadable, under ``strict``.
+        InputError: an image is missing, unreadable, of another size than the lens, blank or in doubt, under ``strict``.
     """
     config = reading.config
     log = reading.log
     views: list[View] = []
     pixels: list[NDArray[np.uint8] | None] = []
     chunk_SE3_world = invert_se3(reading.world_SE3_chunk)
+    remarks: dict[str, list[tuple[int, Finding]]] = {camera.name: [] for camera in cameras}
+    # Held-out images are decoded too, so that an unreadable one is found here and not hours later.
+    decode = partial(decode_with_facts, width_px=config.width_px, height_px=config.height_px)
     for n, frame in enumerate(reading.frames):
         reading.report(n, "images")
         # Counted within the chunk: its first frame is a source frame, wherever the chunk begins in the log.
         is_source = n % config.source_every == 0
         for camera in cameras:
-            data = log.image_bytes(camera.name, frame)
-            if data is None:
-                _note_or_raise(reading, "there is no image", camera, frame, missing=True)
+            image, problem = read_image(partial(log.image_bytes, camera.name, frame), decode)
+            if image is not None:
+                problem = find_unfit(camera.lens, image.facts)
+            if image is None or problem is not None:
+                _note_or_raise(reading, problem or _MISSING, camera, frame)
                 continue
-            problem, decoded = _decode(config, camera, data)
-            if problem:
-                _note_or_raise(reading, problem, camera, frame, missing=False)
-                continue
+            remarks[camera.name] += [(frame, f) for f in image.facts.findings if f.severity == "warning"]
             view = View(
                 camera=camera.name,
                 frame=frame,
@@ -62,32 +65,57 @@ def read_views(reading: ChunkReading, cameras: Sequence[Camera]) -> tuple[list[V
                 chunk_SE3_camera=chunk_SE3_world @ log.world_SE3_camera(camera.name, frame),
                 # The bytes are stored as they came; the lens is of the working resolution, to which they are decoded.
                 lens=camera.lens.resized(config.width_px, config.height_px),
-                image=data,
+                image=image.data,
             )
             views.append(view)
             # Pixels are for colouring points, which must not look at held-out images. They are large, and dropped at
             # once.
-            pixels.append(decoded if is_source else None)
+            pixels.append(image.pixels if is_source else None)
+    _note_remarks(reading, remarks)
     return views, pixels
 
 
-def _note_or_raise(reading: ChunkReading, problem: str, camera: Camera, frame: int, missing: bool) -> None:
+def require_source_frames(reading: ChunkReading, sources: Sequence[View]) -> None:
+    """Checks that a chunk can be reconstructed from its images.
+
+    Args:
+        reading: the chunk, after its images were read.
+        sources: its source views.
+
+    Raises:
+        InputError: they are of fewer than two frames; the error says why images were left out.
+    """
+    # Frames and not views: six cameras at one moment have no parallax over time.
+    count = len({view.frame for view in sources})
+    if count >= 2:
+        return
+    problem = f"the chunk has {count} source frames with images, at least two are needed"
+    left_out = [issue for issue in reading.log_issues if issue.kind in LEFT_OUT]
+    if left_out:
+        first = left_out[0]
+        detail = first.detail.removesuffix(".")
+        problem += (
+            f"; {len(left_out)} images are left out, the first one ({first.camera}, frame {first.frame}): {detail}"
+        )
+    raise reading.input_error(problem, "Choose other chunks with --chunks, or a smaller ingest.source_every.")
+
+
+def _note_or_raise(reading: ChunkReading, problem: Finding, camera: Camera, frame: int) -> None:
     # A long log has a bad image now and then: without ``strict`` the rest of it is still worth a scene.
     if reading.config.strict:
-        raise reading.input_error(problem, REMEDY, camera.name, frame)
-    reading.add_issue("missing_image" if missing else "unreadable_image", problem, frame, camera.name)
+        remedy = f"{problem.remedy} {_STRICT_REMEDY}" if problem.remedy else REMEDY
+        raise reading.input_error(problem.message, remedy, camera.name, frame)
+    reading.add_issue(problem.word, _describe(problem), frame, camera.name)
 
 
-def _decode(config: IngestConfig, camera: Camera, data: bytes) -> tuple[str, NDArray[np.uint8] | None]:
-    """(what is wrong or "", pixels at the working resolution)."""
-    try:
-        width, height = read_image_size(data)
-        # Held-out images are decoded too, so that an unreadable one is found here and not hours later.
-        pixels = decode_pixels(data, config.width_px, config.height_px)
-    except InputError as error:
-        return error.problem, None
-    # An image of another shape is cropped or of another camera: its intrinsics would be wrong.
-    lens = camera.lens
-    if abs(width * lens.height_px - height * lens.width_px) > _MAX_ASPECT_ERROR * width * lens.height_px:
-        return f"the image is {width}×{height}, the camera's lens is {lens.width_px}×{lens.height_px}", None
-    return "", pixels
+def _note_remarks(reading: ChunkReading, remarks: Mapping[str, Sequence[tuple[int, Finding]]]) -> None:
+    """Notes what is in doubt of images that are used, once a camera."""
+    for camera, found in remarks.items():
+        for finding in summarise_findings(camera, found):
+            if reading.config.strict:
+                raise reading.input_error(finding.message, finding.remedy, camera, finding.frames[0])
+            reading.add_issue(finding.word, _describe(finding), finding.frames[0], camera)
+
+
+def _describe(finding: Finding) -> str:
+    return f"{finding.message}. {finding.remedy}" if finding.remedy else finding.message

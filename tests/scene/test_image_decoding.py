@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from genre_tasks.errors import InputError
-from genre_tasks.scene.image_decoding import decode_image, decode_pixels, is_decodable, read_image_size
+from genre_tasks.scene.image_decoding import decode_image, decode_pixels, inspect_image, read_image_size
 
 
 def _encoded(pixels: np.ndarray, form: str, **options: object) -> bytes:
@@ -53,9 +53,12 @@ def test_grey_and_transparent_images_become_rgb() -> None:
 @pytest.mark.parametrize("form", ["PNG", "JPEG"])
 def test_broken_files_raise(form: str) -> None:
     data = _encoded(_noise(64, 64), form)
-    assert is_decodable(data) and read_image_size(data) == (64, 64)
+    assert read_image_size(data) == (64, 64)
+    facts = inspect_image(data)
+    assert (facts.width_px, facts.height_px, facts.findings) == (64, 64, ())
     for broken in (data[: len(data) // 2], data[:10], b"", b"nothing of an image"):
-        assert not is_decodable(broken)
+        with pytest.raises(InputError, match="cannot decode"):
+            inspect_image(broken)
         with pytest.raises(InputError, match="cannot decode"):
             decode_image(broken, 16, 16)
 
@@ -63,4 +66,5 @@ def test_broken_files_raise(form: str) -> None:
 def test_a_flipped_png_byte_raises() -> None:
     data = bytearray(_encoded(_noise(64, 64), "PNG"))
     data[len(data) // 2] ^= 0xFF
-    assert not is_decodable(bytes(data))
+    with pytest.raises(InputError, match="cannot decode"):
+        inspect_image(bytes(data))
