@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from genre_tasks.log_checks.log_sample import LogSample
 from genre_tasks.logs.findings import Finding
@@ -39,7 +40,8 @@ def find_implausible_camera_poses(sample: LogSample) -> Iterator[Finding]:
         return
     for camera in sample.cameras:
         world_SE3_camera = sample.world_SE3_camera(camera)
-        readable = np.isfinite(world_SE3_camera).all(axis=(1, 2)) & np.isfinite(sample.world_SE3_lidar).all(axis=(1, 2))
+        both = np.concatenate([world_SE3_camera, sample.world_SE3_lidar], axis=2)
+        readable: NDArray[np.bool_] = np.isfinite(both).all(axis=(1, 2))
         if not readable.any():
             continue
         if not _all_rigid(world_SE3_camera):
@@ -102,7 +104,7 @@ def _judge_mount_motion(
     sample: LogSample,
     camera: Camera,
     world_SE3_camera: Float64,  # [F, 4, 4]
-    readable: np.ndarray[tuple[int, ...], np.dtype[np.bool_]],  # [F]
+    readable: NDArray[np.bool_],  # [F]
 ) -> Iterator[Finding]:
     """A finding where a camera moves against the vehicle, at the times of its images and at those of the sweeps."""
     at_image_times = _poses_at(sample, sample.camera_times_s(camera))

@@ -133,8 +133,8 @@ def _judge_position_jumps(sample: LogSample, weight: Float64, to_acceleration: F
     if jumps.size:
         largest = int(jumps[offsets_m[jumps].argmax()])
         message = (
-            f"the path jumps at {jumps.size} frames: frame {sample.frames[largest + 1]} is {offsets_m[largest]:.2f} m off "
-            f"its neighbours ({accelerations[largest]:.0f} m/s², {_MAX_ACCELERATION_M_S2:.0f} m/s² is plausible)"
+            f"the path jumps at {jumps.size} frames: frame {sample.frames[largest + 1]} is {offsets_m[largest]:.2f} m "
+            f"off its neighbours ({accelerations[largest]:.0f} m/s², {_MAX_ACCELERATION_M_S2:.0f} m/s² is plausible)"
         )
         remedy = "Smooth the poses, check them against the times of the frames, or leave the chunk out with --chunks."
         numbers = {

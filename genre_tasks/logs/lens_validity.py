@@ -12,6 +12,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from genre_tasks.errors import InputError
 from genre_tasks.logs.brown_conrady import distort, distortion_jacobian
@@ -226,7 +227,7 @@ def _smallest_slope(x: Float64, y: Float64, coefficients: tuple[float, ...]) -> 
 def _refine_fold(
     angles: Float64,  # [A]
     radii: Float64,  # [R]
-    first_fold: np.ndarray[Any, np.dtype[np.int64]],  # [A] index of a radius beyond the fold
+    first_fold: NDArray[np.int64],  # [A] index of a radius beyond the fold
     coefficients: tuple[float, ...],
 ) -> Float64:
     """[A] undistorted radius of the fold in every direction, by bisection."""
