@@ -207,8 +207,10 @@ def _judge_headings(paths: list[_TrackPath]) -> Iterator[Finding]:
         reason = "length and width, or the axes, are swapped"
     else:
         reason = "yaw may be in degrees, or turn clockwise"
-    message = f"{len(angles)} driving boxes move {angle:.0f}° off their x axis, where {_MAX_HEADING_DEG:.0f}° are plausible: "
-        f"{reason}"
+    message = (
+        f"{len(angles)} driving boxes move {angle:.0f}° off their x axis; "
+        f"{_MAX_HEADING_DEG:.0f}° are plausible: {reason}"
+    )
     numbers = {"angle_deg": angle, "limit_deg": _MAX_HEADING_DEG, "tracks": float(len(angles))}
     yield Finding("odd_box_heading", severity, message, _HEADING_REMEDY, numbers)
 
