@@ -24,8 +24,8 @@ _FIELD_OF_VIEW_RANGE_DEG = (8.0, 150.0)
 _MIN_FOCAL_PX = 10.0
 # In units of the image's width, a middle has coordinates below 1; half a pixel may have been added.
 _MAX_NORMALISED = 1.6
-# Calibrations of square pixels give 0.995 to 1.005.
-_ASPECT_RANGE = (0.9, 1.1)
+# Calibrations of square pixels give 0.995 to 1.005; images for networks are resized to sides that differ by 10 %.
+_ASPECT_RANGE = (0.85, 1.18)
 # Factors by which people resize images.
 _COMMON_FACTORS = (1 / 8, 1 / 4, 1 / 3, 3 / 8, 1 / 2, 2 / 3, 3 / 4, 1.5, 2.0, 3.0, 4.0, 8.0)
 _FACTOR_TOLERANCE = 0.08

@@ -82,9 +82,12 @@ def read_distortion(intrinsics: Mapping[str, Any], **where: Any) -> tuple[float,
     values = intrinsics.get("distortion")
     if values is None:
         return ()
+    # The digits of a text would pass for numbers.
+    if isinstance(values, str):
+        problem = f"distortion is the text {values!r}; a list of numbers was expected"
+        raise InputError(problem, remedy=f"Write [{_MODEL}].", **where)
     try:
-        # The digits of a text would pass for numbers.
-        coefficients = tuple(float(value) for value in ([values] if isinstance(values, str) else values))
+        coefficients = tuple(float(value) for value in values)
     except (TypeError, ValueError) as error:
         problem = f"distortion is no list of numbers ({error})"
         raise InputError(problem, remedy=f"Write {_MODEL}.", **where) from error
