@@ -60,7 +60,9 @@ class TestReading:
         assert raised.value.remedy and raised.value.file == "intrinsics.json"
 
     @pytest.mark.parametrize("key", ["distortion_model", "camera_model", "model"])
-    @pytest.mark.parametrize("name", ["fisheye", "equidistant", "OPENCV_FISHEYE", "Kannala-Brandt", "thin prism", "mei"])
+    @pytest.mark.parametrize(
+        "name", ["fisheye", "equidistant", "OPENCV_FISHEYE", "Kannala-Brandt", "thin prism", "mei"]
+    )
     def test_other_lens_models(self, key: str, name: str) -> None:
         """Report: nerfstudio-project/nerfstudio#868 (fisheye coefficients used as those of a perspective lens)."""
         with pytest.raises(InputError, match=name):
