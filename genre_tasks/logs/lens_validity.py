@@ -7,7 +7,7 @@ would bend every image a little wrongly, and nothing later would notice.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -99,19 +99,26 @@ def read_distortion(intrinsics: Mapping[str, Any], **where: Any) -> tuple[float,
     return coefficients if any(coefficients[_COUNT:]) else coefficients[:_COUNT]
 
 
-def refuse_invalid_lens(lens: Lens, **where: Any) -> None:
-    """Refuses a lens whose distortion no image can be reconstructed with.
+def with_distortion(lens: Lens, intrinsics: Mapping[str, Any], **where: Any) -> Lens:
+    """Adds the distortion that a file states to a lens, and refuses what no image can be reconstructed with.
 
     Args:
-        lens: of a camera.
+        lens: of the camera, without distortion.
+        intrinsics: of the camera, as a JSON file has them.
         where: file, log and camera for the error, as ``GenreError`` takes them.
 
+    Returns:
+        The lens with its distortion.
+
     Raises:
-        InputError: too many coefficients, not finite ones, or a distortion that folds back or is out of all proportion.
+        InputError: as ``read_distortion`` raises, and for too many coefficients, coefficients that are not finite, and
+            a distortion that folds back inside the image or is out of all proportion.
     """
-    for finding in find_distortion_faults(lens):
+    distorted = replace(lens, distortion=read_distortion(intrinsics, **where))
+    for finding in find_distortion_faults(distorted):
         if finding.severity == "fatal":
             raise InputError(finding.message, remedy=finding.remedy, **where)
+    return distorted
 
 
 @lru_cache(maxsize=256)
