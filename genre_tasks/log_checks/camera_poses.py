@@ -36,7 +36,7 @@ def find_implausible_camera_poses(sample: LogSample) -> Iterator[Finding]:
         For each camera ``improper_rotation``, ``odd_camera_orientation``, ``far_camera``, ``loose_camera`` or
         ``camera_pose_time``.
     """
-    if not _all_rigid(sample.world_SE3_lidar):
+    if find_improper(sample.world_SE3_lidar).size:
         return
     for camera in sample.cameras:
         world_SE3_camera = sample.world_SE3_camera(camera)
@@ -44,7 +44,7 @@ def find_implausible_camera_poses(sample: LogSample) -> Iterator[Finding]:
         readable: NDArray[np.bool_] = np.isfinite(both).all(axis=(1, 2))
         if not readable.any():
             continue
-        if not _all_rigid(world_SE3_camera):
+        if find_improper(world_SE3_camera).size:
             message = f"{camera.name}: the pose is mirrored, scaled or not at right angles"
             yield Finding("improper_rotation", "fatal", message, _AXES_REMEDY, camera=camera.name)
             continue
@@ -55,8 +55,21 @@ def find_implausible_camera_poses(sample: LogSample) -> Iterator[Finding]:
         yield from (far,) if far else _judge_mount_motion(sample, camera, world_SE3_camera, readable)
 
 
-def _all_rigid(poses: Float64) -> bool:
-    return all(is_rigid_transform(pose, _RIGID_TOLERANCE) for pose in poses if np.isfinite(pose).all())
+def find_improper(poses: Float64) -> NDArray[np.int64]:
+    """Finds poses that are no rotation and translation.
+
+    Args:
+        poses: [F, 4, 4]; NaN where there is none.
+
+    Returns:
+        Indices of poses whose axes are mirrored, scaled or not at right angles, or whose last row is not 0, 0, 0, 1.
+    """
+    known = np.flatnonzero(np.isfinite(poses).all(axis=(1, 2)))
+    bad = [
+        not (is_rigid_transform(poses[k], _RIGID_TOLERANCE) and np.array_equal(poses[k, 3], (0, 0, 0, 1)))
+        for k in known
+    ]
+    return known[np.array(bad, dtype=bool)]
 
 
 def _judge_orientation(

@@ -8,10 +8,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from genre_tasks.log_checks.camera_poses import find_improper
 from genre_tasks.log_checks.log_sample import LogSample
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.types import Camera, Float64
-from genre_tasks.scene.transforms import is_rigid_transform
 
 # 250 km/h: no recording vehicle is faster on a public road.
 _MAX_SPEED_M_S = 70.0
@@ -32,7 +32,6 @@ _MAX_SLIP_DEG = 45.0
 _MAX_REVERSE_M_S = 4.0
 # No road banks or climbs so far; a pose beyond is of other axes.
 _MAX_TILT_DEG = 45.0
-_RIGID_TOLERANCE = 1e-3
 # Poses of a standing vehicle differ by less: by nothing, or by the noise of its positioning.
 _STANDING_M = 0.05
 # Fraction of an image's pixels that change: traffic that passes a standing vehicle gives 0.2, 3 m of travel 0.4.
@@ -56,11 +55,10 @@ def find_implausible_motion(sample: LogSample) -> Iterator[Finding]:
         ``improper_rotation``, ``tilted_pose``, ``implausible_speed``, ``position_jump``, ``rotation_jump``,
         ``odd_travel_direction`` or ``frozen_pose``.
     """
-    poses = sample.world_SE3_lidar
-    improper = [k for k, pose in enumerate(poses) if np.isfinite(pose).all() and not _is_rigid(pose)]
-    if improper:
+    improper = find_improper(sample.world_SE3_lidar)
+    if improper.size:
         message = "the axes of the LiDAR's pose are mirrored, scaled or not at right angles"
-        frames = tuple(sample.frames[k] for k in improper)
+        frames = _frames(sample, improper)
         # Everything else takes poses for rigid.
         yield Finding("improper_rotation", "fatal", message, _AXES_REMEDY, frames=frames)
         return
@@ -70,10 +68,6 @@ def find_implausible_motion(sample: LogSample) -> Iterator[Finding]:
     yield from _judge_direction(sample)
     yield from _judge_repetitions(sample)
     yield from _judge_standstill(sample)
-
-
-def _is_rigid(pose: Float64) -> bool:
-    return is_rigid_transform(pose, _RIGID_TOLERANCE)
 
 
 def _speeds(sample: LogSample) -> Float64:

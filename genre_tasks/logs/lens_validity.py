@@ -150,7 +150,9 @@ def find_distortion_faults(lens: Lens, camera: str | None = None) -> tuple[Findi
 
 
 def _judge_reach(lens: Lens, camera: str | None) -> list[Finding]:
-    reach = measure_distortion_reach(lens)
+    # Absurd coefficients overflow far out, to infinities that compare as they should.
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        reach = measure_distortion_reach(lens)
     if reach.lost_fraction > 0:
         numbers = {
             "fold_radius_px": reach.fold_radius_px,
