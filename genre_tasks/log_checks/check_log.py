@@ -10,10 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from genre_tasks.log_checks.inspection import LogInspector, format_frames
+from genre_tasks.log_checks.inspection import LogInspector
 from genre_tasks.log_checks.plausibility import assess_plausibility
 from genre_tasks.log_checks.results import STANDSTILL_M, LogCheck
-from genre_tasks.logs.findings import Finding, ReportsFindings
+from genre_tasks.logs.findings import Finding, ReportsFindings, format_frames
 from genre_tasks.logs.types import DrivingLog
 from genre_tasks.progress import Progress, silent
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import partial
 from typing import TypeVar
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from genre_tasks.errors import GenreError
 from genre_tasks.log_checks.results import CameraCheck
-from genre_tasks.logs.findings import Finding, Severity
+from genre_tasks.logs.findings import Finding, Severity, format_frames
 from genre_tasks.logs.types import Camera, DrivingLog, Float64
 from genre_tasks.progress import Progress
 
@@ -21,8 +21,6 @@ from genre_tasks.progress import Progress
 _MAX_CAMERA_OFFSET_S = 0.15
 # Plausible time between frames; outside, the timestamps' unit is in doubt.
 _FRAME_PERIOD_RANGE_S = (0.005, 2.0)
-# A log with a hole in every second frame would fill the screen.
-_MAX_RUNS_LISTED = 8
 _CLOCK_REMEDY = "Frames keep the order of the files; effects that need time (rolling shutter, moving actors) suffer."
 _UNIT_REMEDY = "Check the unit of the timestamps: seconds, milliseconds and microseconds since 1970 are understood."
 
@@ -226,26 +224,3 @@ def _decode_size(data: bytes) -> tuple[int, int] | None:
     # What Pillow raises on damaged files, and on more pixels than any camera has.
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         return None
-
-
-def format_frames(frames: Iterable[int]) -> str:
-    """Lists frames for a message, with runs of neighbours shortened.
-
-    Args:
-        frames: increasing frame numbers.
-
-    Returns:
-        The frames, at most eight runs of them.
-
-    >>> format_frames([3, 28, 29, 30])
-    '3, 28–30'
-    """
-    runs: list[list[int]] = []
-    for frame in frames:
-        if runs and frame == runs[-1][1] + 1:
-            runs[-1][1] = int(frame)
-        else:
-            runs.append([int(frame), int(frame)])
-    texts = [str(first) if first == last else f"{first}–{last}" for first, last in runs]
-    suffix = ", …" if len(texts) > _MAX_RUNS_LISTED else ""
-    return ", ".join(texts[:_MAX_RUNS_LISTED]) + suffix
