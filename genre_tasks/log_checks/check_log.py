@@ -12,6 +12,7 @@ import numpy as np
 
 from genre_tasks.log_checks.inspection import LogInspector
 from genre_tasks.log_checks.plausibility import assess_plausibility
+from genre_tasks.log_checks.reader_findings import collect_reader_findings
 from genre_tasks.log_checks.results import STANDSTILL_M, LogCheck
 from genre_tasks.logs.findings import Finding, ReportsFindings, format_frames
 from genre_tasks.logs.types import DrivingLog
@@ -81,7 +82,8 @@ def _count_left_out(log: DrivingLog, inspector: LogInspector) -> tuple[tuple[str
     """(word, count) of what the reader left out, sorted by word."""
     if not isinstance(log, ReportsFindings):
         return ()
-    words = [finding.word for finding in inspector.try_reading(log.findings, "warning", "unreadable_log") or ()]
+    findings = inspector.try_reading(log.findings, "warning", "unreadable_log") or ()
+    words = [finding.word for finding in findings if finding.severity != "note"]
     return tuple((word, words.count(word)) for word in sorted(set(words)))
 
 
@@ -98,16 +100,12 @@ def _report_findings(check: LogCheck, inspector: LogInspector, chunk_frames: int
 
 
 def _report_reader_findings(inspector: LogInspector) -> None:
-    """Adds what the reader left out, one finding for each word: a log may have thousands of bad boxes."""
-    if not isinstance(inspector.log, ReportsFindings):
-        return
-    by_word: dict[str, list[Finding]] = {}
-    for finding in inspector.try_reading(inspector.log.findings, "warning", "unreadable_log") or ():
-        by_word.setdefault(finding.word, []).append(finding)
-    for found in by_word.values():
-        first = found[0]
-        more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-        inspector.report(replace(first, message=first.message + more))
+    """Adds what the reader left out, unless the images or sweeps showed the same thing of that camera already."""
+    log = inspector.log
+    known = {(finding.word, finding.camera) for finding in inspector.findings}
+    for finding in collect_reader_findings(log, range(log.frame_count), inspector.cameras):
+        if (finding.word, finding.camera) not in known:
+            inspector.report(finding)
 
 
 def _report_plausibility(inspector: LogInspector, chunk_frames: int) -> None:
@@ -143,7 +141,8 @@ def _report_chunks(check: LogCheck, inspector: LogInspector, chunk_frames: int) 
 def _report_cameras(check: LogCheck, inspector: LogInspector) -> None:
     if not check.cameras:
         message = "no camera has an image"
-        inspector.report(Finding("no_images", "fatal", message, "Copy the camera folders of the sequence."))
+        remedy = "Copy the camera folders of the sequence; other findings name what lies in their place."
+        inspector.report(Finding("no_images", "fatal", message, remedy))
     elif len(check.cameras) == 1:
         inspector.report(Finding("one_camera", "note", "one camera only", "Shifted views see more that no camera saw."))
     readable_images = 0

@@ -98,7 +98,12 @@ class LogInspector:
         unreadable: list[int] = []
         odd_size: list[int] = []
         for frame in range(self.log.frame_count):
-            data = self.log.image_bytes(camera.name, frame)
+            try:
+                data = self.log.image_bytes(camera.name, frame)
+            except GenreError as error:
+                data = b""
+                message = f"{error.problem} ({error.where})"
+                self.report(Finding("unreadable_image", "warning", message, error.remedy, {}, camera.name, (frame,)))
             size = None if data is None else _decode_size(data)
             if data is None:
                 missing.append(frame)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from genre_tasks.config import IngestConfig
-from genre_tasks.errors import ConfigError
+from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.log_checks.plausibility import assess_plausibility
+from genre_tasks.log_checks.reader_findings import collect_reader_findings
+from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.types import Camera, DrivingLog
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.actor_track import ActorTrack
@@ -62,6 +64,8 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
     """
     frames = _select_frames(config, log, chunk_index)
     cameras = _select_cameras(config, log)
+    if not cameras:
+        raise _describe_no_camera(log, chunk_index)
     poses = np.stack([log.world_SE3_lidar(frame) for frame in frames])
     world_SE3_chunk = np.eye(4)
     # A translation alone, to the middle of the path: coordinates are then small enough for float32.
@@ -69,7 +73,9 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
     chunk_SE3_ego = invert_se3(world_SE3_chunk) @ poses
     reading = ChunkReading(config, log, chunk_index, frames, world_SE3_chunk, chunk_SE3_ego, progress)
     _note_path_issues(reading)
-    _note_implausible(reading, cameras)
+    known = collect_reader_findings(log, frames, cameras)
+    _note_findings(reading, known)
+    _note_findings(reading, assess_plausibility(log, frames, cameras))
     views, pixels = read_views(reading, cameras)
     sources = [view for view in views if view.role == "source"]
     # Frames and not views: six cameras at one moment have no parallax over time.
@@ -81,6 +87,8 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
         found = read_points_from_file(reading, config.points)
     else:
         found = read_points_from_sweeps(reading, sources)
+    # What reading the sweeps and cuboids showed.
+    _note_findings(reading, [f for f in collect_reader_findings(log, frames, cameras) if f not in known])
     clouds = [found.background, *found.actors]
     # Background and actors together, because they hide each other.
     colored = color_point_clouds(clouds, _report_images(reading, views, pixels))
@@ -153,12 +161,21 @@ def _note_path_issues(reading: ChunkReading) -> None:
         reading.add_issue("standstill", f"the ego vehicle travels {travel:.2f} m: no parallax")
 
 
-def _note_implausible(reading: ChunkReading, cameras: tuple[Camera, ...]) -> None:
+def _describe_no_camera(log: DrivingLog, chunk: int) -> InputError:
+    """The error for a log without cameras, with what its reader met in their place."""
+    findings = collect_reader_findings(log, range(log.frame_count), ())
+    reasons = [finding for finding in findings if finding.severity != "note"]
+    problem = "; ".join(["no camera has an image that can be read", *(reason.message for reason in reasons[:1])])
+    remedy = (reasons[0].remedy if reasons else "") or "Copy the camera folders of the sequence."
+    return InputError(problem, remedy=remedy, log=log.name, chunk=chunk)
+
+
+def _note_findings(reading: ChunkReading, findings: Iterable[Finding]) -> None:
     """Notes what ``genre check`` would warn of; raises where the log cannot be reconstructed.
 
     Under ``strict``, a warning is an error too.
     """
-    for finding in assess_plausibility(reading.log, reading.frames, cameras):
+    for finding in findings:
         stops = finding.severity == "fatal" or (finding.severity == "warning" and reading.config.strict)
         frame = finding.frames[0] if finding.frames else None
         if stops:

@@ -46,7 +46,11 @@ def read_views(reading: ChunkReading, cameras: Sequence[Camera]) -> tuple[list[V
         # Counted within the chunk: its first frame is a source frame, wherever the chunk begins in the log.
         is_source = n % config.source_every == 0
         for camera in cameras:
-            data = log.image_bytes(camera.name, frame)
+            try:
+                data = log.image_bytes(camera.name, frame)
+            except InputError as error:
+                _note_or_raise(reading, error.problem, camera, frame, missing=False)
+                continue
             if data is None:
                 _note_or_raise(reading, "there is no image", camera, frame, missing=True)
                 continue

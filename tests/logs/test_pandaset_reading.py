@@ -249,9 +249,9 @@ class TestTracks:
         good, bad = {"uuid": "b"}, {"uuid": "b", "position.y": float("nan")}
         only_bad = {"uuid": "c", "yaw": float("inf")}
         flat = {"uuid": "d", "dimensions.z": 0.0}
-        log = self._tracks(folder, cuboids(good, only_bad), cuboids(bad, flat), cuboids(good))
+        log = self._tracks(folder, cuboids(good, only_bad), cuboids(bad, flat), cuboids(good), cuboids(good))
         (track,) = log.tracks()
-        assert track.track_id == "b" and track.frames.tolist() == [0, 2]
+        assert track.track_id == "b" and track.frames.tolist() == [0, 2, 3]
         assert [f.word for f in log.findings()] == ["invalid_box"] * 3
 
     def test_an_object_seen_by_both_sensors_is_one(self, folder: Path) -> None:

@@ -178,8 +178,8 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     "dictionary with keys of another kind": lambda: b"\x80\x03}K\x01Ns.",
     "class as a cell": lambda: frame_with_cell(int),
     "set": lambda: frame_with_cell({1, 2}),
-    "dates": lambda: pickle.dumps(pytest.importorskip("pandas").DataFrame({"t": np.array(["2020"], "M8[ns]")})),
-    "categories": lambda: pickle.dumps(pytest.importorskip("pandas").DataFrame({"t": ["a"]}).astype("category")),
+    "durations": lambda: pickle.dumps(pytest.importorskip("pandas").DataFrame({"t": np.array([1], "m8[ns]")})),
+    "sparse": lambda: pickle.dumps(pytest.importorskip("pandas").DataFrame({"t": [0.0]}).astype("Sparse[float]")),
     "void cells": lambda: pickle_table({"x": np.zeros(3)}).replace(b"f8", b"V8"),
     "a dtype with a size of its own": lambda: pickle_table({"x": np.zeros(3)}).replace(
         b"\x02\0\0\0f8", b"\x03\0\0\0U99"

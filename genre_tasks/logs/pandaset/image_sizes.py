@@ -141,7 +141,7 @@ def report_problems(measured: ImageSizes, camera: str) -> list[Finding]:
             "not_an_image",
             "warning",
             f"{camera}: frames {format_frames(frames)} have no image: {problem}",
-            "Without them, the camera has no images of these frames.",
+            "Put the images themselves there, or remove the files.",
             {"images": len(frames)},
             camera,
             tuple(frames),

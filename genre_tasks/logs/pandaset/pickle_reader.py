@@ -144,9 +144,10 @@ def read_table(path: Path, **where: Any) -> Table:
         data = unpack(path, MAX_UNPACKED_BYTES)
     except UNPACKING_ERRORS as error:
         # An error of the system has a number, one of an unpacker has none.
-        refused = isinstance(error, OSError) and error.errno is not None
-        problem = describe_os_error(error) if refused else f"the file cannot be unpacked ({error})"
-        raise InputError(problem, remedy=_MAKE_READABLE if refused else _COPY_AGAIN, file=path, **where) from error
+        if isinstance(error, OSError) and error.errno is not None:
+            raise InputError(describe_os_error(error), remedy=_MAKE_READABLE, file=path, **where) from error
+        problem = f"the file cannot be unpacked ({error})"
+        raise InputError(problem, remedy=_COPY_AGAIN, file=path, **where) from error
     # A pointer, a page or an array is no broken pickle, and copying it again would not help.
     kind = describe_non_pickle(data)
     if kind is not None:

@@ -135,10 +135,10 @@ class PandaSetLog:
         intrinsics = read_json(path, self.uri)
         files = self._index.cameras[name].files
         measured = measure_images({frame: files[frame] for frame in files if frame < self.frame_count})
-        self._report(*report_problems(measured, name))
         if measured.majority is None:
             self._report(_describe_no_images(measured, name))
             return None
+        self._report(*report_problems(measured, name))
         where: dict[str, Any] = {"file": path, "log": self.uri, "camera": name}
         try:
             fx, fy, cx, cy = (read_number(intrinsics[key]) for key in ("fx", "fy", "cx", "cy"))
@@ -244,7 +244,7 @@ class PandaSetLog:
         """The boxes of the frames that have readable ones; one bad file must not take all tracks with it."""
         files = self._index.cuboids.files
         frames = []
-        errors = []
+        errors: list[InputError] = []
         for frame in range(self.frame_count):
             if frame in files:
                 try:
@@ -254,10 +254,10 @@ class PandaSetLog:
                     errors.append(error)
         if errors and not frames:
             raise errors[0]
-        for error in errors:
-            message = f"the cuboids of frame {error.frame} are left out: {error.problem} ({error.file})"
-            bad_frames = () if error.frame is None else (error.frame,)
-            self._report(Finding("unreadable_cuboids", "warning", message, error.remedy, frames=bad_frames))
+        for unread in errors:
+            message = f"the cuboids of frame {unread.frame} are left out: {unread.problem} ({unread.file})"
+            bad_frames = () if unread.frame is None else (unread.frame,)
+            self._report(Finding("unreadable_cuboids", "warning", message, unread.remedy, frames=bad_frames))
         return frames
 
     def tracks(self) -> tuple[CuboidTrack, ...]:
