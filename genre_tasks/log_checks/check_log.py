@@ -14,8 +14,8 @@ from genre_tasks.log_checks.inspection import LogInspector
 from genre_tasks.log_checks.plausibility import assess_plausibility
 from genre_tasks.log_checks.reader_findings import collect_reader_findings
 from genre_tasks.log_checks.results import STANDSTILL_M, LogCheck
-from genre_tasks.logs.findings import Finding, ReportsFindings, format_frames
-from genre_tasks.logs.types import DrivingLog
+from genre_tasks.logs.findings import Finding, ReportsFindings, Severity, format_frames
+from genre_tasks.logs.types import DrivingLog, Float64
 from genre_tasks.progress import Progress, silent
 
 # With a single frame, no point is seen from two positions of the same camera.
@@ -67,8 +67,22 @@ def check_log(log: DrivingLog, chunk_frames: int = 20, progress: Progress = sile
         chunk_travel_m=tuple(float(np.nansum(steps_m[start : start + chunk_frames - 1])) for start in chunk_starts),
         findings=(),
     )
+    _report_lost_chunks(positions, inspector, chunk_frames)
     _report_findings(check, inspector, chunk_frames)
     return replace(check, findings=tuple(inspector.findings))
+
+
+def _report_lost_chunks(positions: Float64, inspector: LogInspector, chunk_frames: int) -> None:
+    """Adds which chunks a run refuses, because the vehicle's pose [F, 3] cannot be read at one of their frames."""
+    lost_frames = np.flatnonzero(~np.isfinite(positions).all(axis=1))
+    lost = sorted({int(frame) // chunk_frames for frame in lost_frames})
+    if lost:
+        chunk_count = -(-len(positions) // chunk_frames)
+        message = f"chunks {format_frames(lost)} cannot be reconstructed: the vehicle's pose is unreadable"
+        message += f" at frames {format_frames(lost_frames)}"
+        remedy = "Correct the poses, or leave these chunks out with --chunks."
+        severity: Severity = "fatal" if len(lost) == chunk_count else "warning"
+        inspector.report(Finding("lost_chunk", severity, message, remedy, {"chunks": len(lost)}))
 
 
 def _summarise_counts(counts: Sequence[int]) -> tuple[int, int, int]:

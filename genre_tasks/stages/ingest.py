@@ -66,6 +66,9 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
     cameras = _select_cameras(config, log)
     if not cameras:
         raise _describe_no_camera(log, chunk_index)
+    for camera in cameras:
+        # Raises where the poses or times of a camera cannot be opened at all, which ``genre check`` calls fatal.
+        log.camera_timestamp_s(camera.name, frames[0])
     poses = np.stack([log.world_SE3_lidar(frame) for frame in frames])
     world_SE3_chunk = np.eye(4)
     # A translation alone, to the middle of the path: coordinates are then small enough for float32.

@@ -34,7 +34,7 @@ def read_views(reading: ChunkReading, cameras: Sequence[Camera]) -> tuple[list[V
         Views ordered by frame and camera, and the decoded pixels [H, W, 3] of source views (``None`` for the others).
 
     Raises:
-        InputError: an image is missing or unreadable, under ``strict``.
+        InputError: an image is missing, or it or its pose is unreadable, under ``strict``.
     """
     config = reading.config
     log = reading.log
@@ -58,12 +58,20 @@ def read_views(reading: ChunkReading, cameras: Sequence[Camera]) -> tuple[list[V
             if problem:
                 _note_or_raise(reading, problem, camera, frame, missing=False)
                 continue
+            try:
+                world_SE3_camera = log.world_SE3_camera(camera.name, frame)
+            except InputError as error:
+                # The error itself names the file of poses.
+                if config.strict:
+                    raise
+                reading.add_issue("unreadable_pose", error.problem, frame, camera.name)
+                continue
             view = View(
                 camera=camera.name,
                 frame=frame,
                 role="source" if is_source else "heldout",
                 timestamp_s=log.camera_timestamp_s(camera.name, frame),
-                chunk_SE3_camera=chunk_SE3_world @ log.world_SE3_camera(camera.name, frame),
+                chunk_SE3_camera=chunk_SE3_world @ world_SE3_camera,
                 # The bytes are stored as they came; the lens is of the working resolution, to which they are decoded.
                 lens=camera.lens.resized(config.width_px, config.height_px),
                 image=data,

@@ -53,6 +53,9 @@ def read_file(path: Path, **where: Any) -> bytes:
         InputError: the file is missing, or cannot be read.
     """
     try:
+        # A pipe would wait for a writer for ever.
+        if path.exists() and not path.is_file():
+            raise InputError("this is no file", remedy=_MAKE_READABLE, file=path, **where)
         return path.read_bytes()
     except FileNotFoundError as error:
         remedy = "Copy the whole sequence folder again."
