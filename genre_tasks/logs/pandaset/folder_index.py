@@ -186,7 +186,7 @@ class _Indexer:
     def _index_frames(self, folder: Path, suffixes: tuple[str, ...], expected_settings: Iterable[str]) -> FrameFolder:
         entries = self._list(folder)
         spellings = {name: _find_spelling(entries, name, _FILE) for name in expected_settings}
-        settings = {name: folder / found for name, found in spellings.items() if found in entries}
+        settings = {name: folder / found for name, found in spellings.items() if entries.get(found) == _FILE}
         candidates: dict[int, list[str]] = {}
         for name, kind in entries.items():
             match = _FRAME_NAME.fullmatch(name)

@@ -85,7 +85,7 @@ def read_array(node: Any) -> NDArray[Any]:
         return _read_ndarray(node)
     if node.function == "frombuffer":
         buffer, dtype, shape, order = node.args
-        return _view_bytes(_read_bytes(buffer), _read_dtype(dtype), shape, order == "F")
+        return _read_values(buffer, dtype, shape, order == "F")
     if node.function in ("ArrowStringArray", "ArrowExtensionArray"):
         return _read_arrow(node.state["_pa_array"])
     if node.function == "MaskedArray":
@@ -101,12 +101,12 @@ def read_array(node: Any) -> NDArray[Any]:
 def _read_backed(node: Call) -> NDArray[Any]:
     """An array of pandas that is a numpy array and a dtype: text, categories or times."""
     kind = node.args[0]
-    arrays = [part for part in node.state if isinstance(part, Call) and part.function == "reconstruct"]
+    arrays = [part for part in node.state if isinstance(part, Call) and part.function in ("reconstruct", "frombuffer")]
     if kind == Global("Categorical"):
         dtypes = [part for part in node.state if isinstance(part, Call) and part.function == "CategoricalDtype"]
         return _read_categories(dtypes[0], arrays[0])
     if kind in (Global("StringArray"), Global("DatetimeArray")):
-        return _read_ndarray(arrays[0])
+        return read_array(arrays[0])
     raise PickleRefusedError(f"a column stored as {getattr(kind, 'name', kind)}")
 
 
@@ -148,12 +148,17 @@ def _read_ndarray(node: Call) -> NDArray[Any]:
     _, shape, dtype_node, fortran, data = node.state
     dtype = _read_dtype(dtype_node)
     if not dtype.hasobject:
-        values = _view_bytes(_read_bytes(data), dtype, shape, bool(fortran))
-        return _convert_times(values, dtype_node) if dtype_node.args[0] == "M8" else values
+        return _read_values(data, dtype_node, shape, bool(fortran))
     require(isinstance(data, list) and len(data) == math.prod(_read_shape(shape)), "as many cells as the shape says")
     objects: NDArray[Any] = np.empty(len(data), dtype=np.object_)
     objects[:] = [_read_object(value) for value in data]
     return objects.reshape(_read_shape(shape), order="F" if fortran else "C")
+
+
+def _read_values(data: Any, dtype_node: Call, shape: Any, fortran: bool) -> NDArray[Any]:
+    """Numbers and booleans, or times in seconds, from their bytes."""
+    values = _view_bytes(_read_bytes(data), _read_dtype(dtype_node), shape, fortran)
+    return _convert_times(values, dtype_node) if dtype_node.args[0] == "M8" else values
 
 
 def _read_shape(node: Any) -> tuple[int, ...]:
@@ -187,7 +192,8 @@ def _read_dtype(node: Any) -> np.dtype[Any]:
 
 def _convert_times(counts: NDArray[Any], dtype_node: Call) -> NDArray[Any]:
     """Seconds since 1970 of counts of a unit, which the dtype's metadata names."""
-    unit, step = dtype_node.state[8][1][:2]
+    unit_node, step = dtype_node.state[8][1][:2]
+    unit = _read_bytes(unit_node)
     if unit not in _TIME_UNITS or step != 1:
         raise PickleRefusedError(f"times in units of {step} {unit!r}")
     return np.where(counts == _NOT_A_TIME, math.nan, counts / _TIME_UNITS[unit])
