@@ -131,7 +131,7 @@ def _read_tracks(reading: ChunkReading) -> tuple[CuboidTrack, ...]:
     except InputError as error:
         if reading.config.strict:
             raise
-        reading.add_issue("unreadable_cuboids", f"{error.problem} ({error.where})")
+        reading.add_issue("unreadable_cuboids", error.problem, error.frame)
         return ()
 
 

@@ -17,9 +17,6 @@ from genre_tasks.stages.chunk_reading import ChunkReading
 
 REMEDY = "Fetch the file again, or run without strict to go on without it."
 
-_MAX_ASPECT_ERROR = 0.01
-"""Sides of an image may be in another proportion than the lens's by so much: files are rounded to whole pixels."""
-
 
 def read_views(reading: ChunkReading, cameras: Sequence[Camera]) -> tuple[list[View], list[NDArray[np.uint8] | None]]:
     """Reads the images of a chunk.
@@ -98,8 +95,8 @@ def _decode(config: IngestConfig, camera: Camera, data: bytes) -> tuple[str, NDA
         pixels = decode_pixels(data, config.width_px, config.height_px)
     except InputError as error:
         return error.problem, None
-    # An image of another shape is cropped or of another camera: its intrinsics would be wrong.
+    # A crop, a thumbnail or another camera's image: the intrinsics of this camera would be wrong for it.
     lens = camera.lens
-    if abs(width * lens.height_px - height * lens.width_px) > _MAX_ASPECT_ERROR * width * lens.height_px:
+    if (width, height) != (lens.width_px, lens.height_px):
         return f"the image is {width}×{height}, the camera's lens is {lens.width_px}×{lens.height_px}", None
     return "", pixels

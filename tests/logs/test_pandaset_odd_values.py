@@ -115,7 +115,7 @@ class TestImageSizes:
         """Report: jinnovation/rainy-image-dataset#2 (Git LFS pointers in place of images)."""
         (folder / "camera/left/01.png").write_bytes(data)
         log = opened(folder)
-        found = findings(log)["not_an_image"]
+        found = findings(log)["unreadable_image"]
         assert words in found.message and found.frames == (1,) and len(log.cameras) == 2
         for path in folder.glob("camera/left/*.png"):
             path.write_bytes(data)

@@ -131,16 +131,16 @@ def report_problems(measured: ImageSizes, camera: str) -> list[Finding]:
         camera: name of the camera.
 
     Returns:
-        Findings ``not_an_image``.
+        Findings ``unreadable_image``.
     """
     by_problem: dict[str, list[int]] = {}
     for frame, problem in measured.problems.items():
         by_problem.setdefault(problem, []).append(frame)
     return [
         Finding(
-            "not_an_image",
+            "unreadable_image",
             "warning",
-            f"{camera}: frames {format_frames(frames)} have no image: {problem}",
+            f"{camera}: frames {format_frames(frames)} have no readable image: {problem}",
             "Put the images themselves there, or remove the files.",
             {"images": len(frames)},
             camera,

@@ -255,7 +255,8 @@ class PandaSetLog:
         if errors and not frames:
             raise errors[0]
         for unread in errors:
-            message = f"the cuboids of frame {unread.frame} are left out: {unread.problem} ({unread.file})"
+            # The file's place must not change what a run stores: the frame says which file it is.
+            message = f"the cuboids of frame {unread.frame} are left out: {unread.problem}"
             bad_frames = () if unread.frame is None else (unread.frame,)
             self._report(Finding("unreadable_cuboids", "warning", message, unread.remedy, frames=bad_frames))
         return frames
