@@ -13,9 +13,10 @@ import numpy as np
 from genre_tasks.log_checks.images import summarise_findings
 from genre_tasks.log_checks.inspection import LogInspector
 from genre_tasks.log_checks.plausibility import assess_plausibility
+from genre_tasks.log_checks.reader_findings import collect_reader_findings
 from genre_tasks.log_checks.results import STANDSTILL_M, LogCheck
-from genre_tasks.logs.findings import Finding, ReportsFindings, format_frames
-from genre_tasks.logs.types import DrivingLog
+from genre_tasks.logs.findings import Finding, ReportsFindings, Severity, format_frames
+from genre_tasks.logs.types import DrivingLog, Float64
 from genre_tasks.progress import Progress, silent
 
 # With a single frame, no point is seen from two positions of the same camera.
@@ -67,8 +68,22 @@ def check_log(log: DrivingLog, chunk_frames: int = 20, progress: Progress = sile
         chunk_travel_m=tuple(float(np.nansum(steps_m[start : start + chunk_frames - 1])) for start in chunk_starts),
         findings=(),
     )
+    _report_lost_chunks(positions, inspector, chunk_frames)
     _report_findings(check, inspector, chunk_frames)
     return replace(check, findings=tuple(inspector.findings))
+
+
+def _report_lost_chunks(positions: Float64, inspector: LogInspector, chunk_frames: int) -> None:
+    """Adds which chunks a run refuses, because the vehicle's pose [F, 3] cannot be read at one of their frames."""
+    lost_frames = np.flatnonzero(~np.isfinite(positions).all(axis=1))
+    lost = sorted({int(frame) // chunk_frames for frame in lost_frames})
+    if lost:
+        chunk_count = -(-len(positions) // chunk_frames)
+        message = f"chunks {format_frames(lost)} cannot be reconstructed: the vehicle's pose is unreadable"
+        message += f" at frames {format_frames(lost_frames)}"
+        remedy = "Correct the poses, or leave these chunks out with --chunks."
+        severity: Severity = "fatal" if len(lost) == chunk_count else "warning"
+        inspector.report(Finding("lost_chunk", severity, message, remedy, {"chunks": len(lost)}))
 
 
 def _summarise_counts(counts: Sequence[int]) -> tuple[int, int, int]:
@@ -82,7 +97,8 @@ def _count_left_out(log: DrivingLog, inspector: LogInspector) -> tuple[tuple[str
     """(word, count) of what the reader left out, sorted by word."""
     if not isinstance(log, ReportsFindings):
         return ()
-    words = [finding.word for finding in inspector.try_reading(log.findings, "warning", "unreadable_log") or ()]
+    findings = inspector.try_reading(log.findings, "warning", "unreadable_log") or ()
+    words = [finding.word for finding in findings if finding.severity != "note"]
     return tuple((word, words.count(word)) for word in sorted(set(words)))
 
 
@@ -99,16 +115,12 @@ def _report_findings(check: LogCheck, inspector: LogInspector, chunk_frames: int
 
 
 def _report_reader_findings(inspector: LogInspector) -> None:
-    """Adds what the reader left out, one finding for each word: a log may have thousands of bad boxes."""
-    if not isinstance(inspector.log, ReportsFindings):
-        return
-    by_word: dict[str, list[Finding]] = {}
-    for finding in inspector.try_reading(inspector.log.findings, "warning", "unreadable_log") or ():
-        by_word.setdefault(finding.word, []).append(finding)
-    for found in by_word.values():
-        first = found[0]
-        more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-        inspector.report(replace(first, message=first.message + more))
+    """Adds what the reader left out, unless the images or sweeps showed the same thing of that camera already."""
+    log = inspector.log
+    known = {(finding.word, finding.camera) for finding in inspector.findings}
+    for finding in collect_reader_findings(log, range(log.frame_count), inspector.cameras):
+        if (finding.word, finding.camera) not in known:
+            inspector.report(finding)
 
 
 def _report_plausibility(inspector: LogInspector, chunk_frames: int) -> None:

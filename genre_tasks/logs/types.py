@@ -297,10 +297,13 @@ class DrivingLog(Protocol):
         ...
 
     def image_bytes(self, camera: str, frame: int) -> bytes | None:
-        """The encoded image (JPEG or PNG) as it was recorded.
+        """The encoded image as it was recorded: JPEG, PNG, or another format that Pillow reads.
 
         Returns:
             The file's bytes, or ``None`` where the log has no image.
+
+        Raises:
+            InputError: the file is there and cannot be read.
         """
         ...
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from genre_tasks.config import IngestConfig
-from genre_tasks.errors import ConfigError
+from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.log_checks.images import LEFT_OUT
 from genre_tasks.log_checks.plausibility import assess_plausibility
+from genre_tasks.log_checks.reader_findings import collect_reader_findings
+from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.types import Camera, DrivingLog
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.actor_track import ActorTrack
@@ -17,9 +20,10 @@ from genre_tasks.scene.chunk import Actor, Chunk, Points, View
 from genre_tasks.scene.transforms import invert_se3
 from genre_tasks.scene.visibility import color_point_clouds
 from genre_tasks.stages.chunk_reading import ChunkReading
-from genre_tasks.stages.ingest_points import read_points_from_file, read_points_from_sweeps
+from genre_tasks.stages.ingest_points import ChunkPoints, read_points_from_file, read_points_from_sweeps
 from genre_tasks.stages.ingest_views import read_views, require_source_frames
 
+_NOTED_WITH_IMAGES = frozenset(LEFT_OUT)
 STANDSTILL_M = 0.1
 """An ego vehicle that travels less than this in a chunk stands still: there is no parallax."""
 
@@ -62,6 +66,7 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
     """
     frames = _select_frames(config, log, chunk_index)
     cameras = _select_cameras(config, log)
+    _require_cameras(log, cameras, chunk_index)
     poses = np.stack([log.world_SE3_lidar(frame) for frame in frames])
     world_SE3_chunk = np.eye(4)
     # A translation alone, to the middle of the path: coordinates are then small enough for float32.
@@ -69,7 +74,8 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
     chunk_SE3_ego = invert_se3(world_SE3_chunk) @ poses
     reading = ChunkReading(config, log, chunk_index, frames, world_SE3_chunk, chunk_SE3_ego, progress)
     _note_path_issues(reading)
-    _note_implausible(reading, cameras)
+    known = _note_reader_findings(reading, cameras, ())
+    _note_findings(reading, assess_plausibility(log, frames, cameras))
     views, pixels = read_views(reading, cameras)
     sources = [view for view in views if view.role == "source"]
     require_source_frames(reading, sources)
@@ -77,16 +83,9 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
         found = read_points_from_file(reading, config.points)
     else:
         found = read_points_from_sweeps(reading, sources)
-    clouds = [found.background, *found.actors]
-    # Background and actors together, because they hide each other.
-    colored = color_point_clouds(clouds, _report_images(reading, views, pixels))
-    # A file's own colours take precedence over those of the chunk's images.
-    if found.background_colors is not None:
-        colored[0] = (found.background_colors, np.ones(len(found.background_colors), dtype=bool))
-    points = [
-        Points(cloud.positions, colors, is_colored, cloud.frames)
-        for cloud, (colors, is_colored) in zip(clouds, colored, strict=True)
-    ]
+    # Sweeps and cuboids have been read by now.
+    _note_reader_findings(reading, cameras, known)
+    points = _color_points(reading, found, views, pixels)
     actors = [_build_actor(c.track, p) for c, p in zip(found.actors, points[1:], strict=True) if c.track]
     reading.report(3 * len(frames), "ingest")
     return Chunk(
@@ -149,12 +148,34 @@ def _note_path_issues(reading: ChunkReading) -> None:
         reading.add_issue("standstill", f"the ego vehicle travels {travel:.2f} m: no parallax")
 
 
-def _note_implausible(reading: ChunkReading, cameras: tuple[Camera, ...]) -> None:
+def _require_cameras(log: DrivingLog, cameras: tuple[Camera, ...], chunk: int) -> None:
+    """Raises what ``genre check`` calls fatal: no camera at all, or one whose poses or times cannot be opened."""
+    for camera in cameras:
+        log.camera_timestamp_s(camera.name, 0)
+    if cameras:
+        return
+    findings = collect_reader_findings(log, range(log.frame_count), ())
+    reasons = [finding for finding in findings if finding.severity != "note"]
+    problem = "; ".join(["no camera has an image that can be read", *(reason.message for reason in reasons[:1])])
+    remedy = (reasons[0].remedy if reasons else "") or "Copy the camera folders of the sequence."
+    raise InputError(problem, remedy=remedy, log=log.name, chunk=chunk)
+
+
+def _note_reader_findings(
+    reading: ChunkReading, cameras: tuple[Camera, ...], known: tuple[Finding, ...]
+) -> tuple[Finding, ...]:
+    """Notes what the reader left out and is not known yet, but for what reading the images notes for each of them."""
+    findings = collect_reader_findings(reading.log, reading.frames, cameras)
+    _note_findings(reading, [f for f in findings if f not in known and f.word not in _NOTED_WITH_IMAGES])
+    return findings
+
+
+def _note_findings(reading: ChunkReading, findings: Iterable[Finding]) -> None:
     """Notes what ``genre check`` would warn of; raises where the log cannot be reconstructed.
 
     Under ``strict``, a warning is an error too.
     """
-    for finding in assess_plausibility(reading.log, reading.frames, cameras):
+    for finding in findings:
         stops = finding.severity == "fatal" or (finding.severity == "warning" and reading.config.strict)
         frame = finding.frames[0] if finding.frames else None
         if stops:
@@ -173,6 +194,22 @@ def _report_images(
         if image is not None:
             reading.report(2 * count + n * count // len(views), "colours")
             yield view, image
+
+
+def _color_points(
+    reading: ChunkReading, found: ChunkPoints, views: Sequence[View], pixels: Sequence[NDArray[np.uint8] | None]
+) -> list[Points]:
+    """The points of the background and of each actor, coloured from the source views."""
+    clouds = [found.background, *found.actors]
+    # Background and actors together, because they hide each other.
+    colored = color_point_clouds(clouds, _report_images(reading, views, pixels))
+    # A file's own colours take precedence over those of the chunk's images.
+    if found.background_colors is not None:
+        colored[0] = (found.background_colors, np.ones(len(found.background_colors), dtype=bool))
+    return [
+        Points(cloud.positions, colors, is_colored, cloud.frames)
+        for cloud, (colors, is_colored) in zip(clouds, colored, strict=True)
+    ]
 
 
 def _build_actor(track: ActorTrack, points: Points) -> Actor:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from genre_tasks.errors import InputError
-from genre_tasks.logs.types import Float32, Float64
+from genre_tasks.logs.types import CuboidTrack, Float32, Float64
 from genre_tasks.scene.actor_track import ActorTrack
 from genre_tasks.scene.chunk import View
 from genre_tasks.scene.facade_completion import complete_facades
@@ -114,7 +114,7 @@ def read_points_from_sweeps(reading: ChunkReading, sources: Sequence[View]) -> C
 def _select_actors(reading: ChunkReading) -> MovingActors:
     config = reading.config
     moving = select_moving_actors(
-        reading.log.tracks(),
+        _read_tracks(reading),
         reading.frames,
         reading.world_SE3_chunk,
         config.min_actor_travel_m,
@@ -122,6 +122,17 @@ def _select_actors(reading: ChunkReading) -> MovingActors:
     )
     reading.log_issues.extend(moving.log_issues)
     return moving
+
+
+def _read_tracks(reading: ChunkReading) -> tuple[CuboidTrack, ...]:
+    """The annotated objects of the log; without ``strict``, a log whose annotations cannot be read has none."""
+    try:
+        return reading.log.tracks()
+    except InputError as error:
+        if reading.config.strict:
+            raise
+        reading.add_issue("unreadable_cuboids", error.problem, error.frame)
+        return ()
 
 
 def _build_actor_clouds(

@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from genre_tasks.errors import InputError
 from genre_tasks.log_checks.images import LEFT_OUT, find_unfit, read_image, summarise_findings
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.types import Camera
@@ -57,12 +58,20 @@ def read_views(reading: ChunkReading, cameras: Sequence[Camera]) -> tuple[list[V
                 _note_or_raise(reading, problem or _MISSING, camera, frame)
                 continue
             remarks[camera.name] += [(frame, f) for f in image.facts.findings if f.severity == "warning"]
+            try:
+                world_SE3_camera = log.world_SE3_camera(camera.name, frame)
+            except InputError as error:
+                # The error itself names the file of poses.
+                if config.strict:
+                    raise
+                reading.add_issue("unreadable_pose", error.problem, frame, camera.name)
+                continue
             view = View(
                 camera=camera.name,
                 frame=frame,
                 role="source" if is_source else "heldout",
                 timestamp_s=log.camera_timestamp_s(camera.name, frame),
-                chunk_SE3_camera=chunk_SE3_world @ log.world_SE3_camera(camera.name, frame),
+                chunk_SE3_camera=chunk_SE3_world @ world_SE3_camera,
                 # The bytes are stored as they came; the lens is of the working resolution, to which they are decoded.
                 lens=camera.lens.resized(config.width_px, config.height_px),
                 image=image.data,

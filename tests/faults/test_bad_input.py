@@ -87,7 +87,7 @@ def test_a_pose_that_is_not_a_number(log: Path, tmp_path: Path) -> None:
     poses = json.loads(file.read_text())
     poses[4]["position"]["x"] = float("nan")
     file.write_text(json.dumps(poses))
-    refused(tmp_path, *run_of(log, tmp_path / "store"), words=("poses.json", "frame 4"))
+    refused(tmp_path, *run_of(log, tmp_path / "store", "--strict"), words=("poses.json", "frame 4"))
 
 
 @pytest.mark.slow

@@ -170,6 +170,11 @@ class TestPandaSet:
         (folder / "annotations/cuboids/01.pkl.gz").write_bytes(b"text")
         check = check_log(open_pandaset(str(folder)))
         assert messages(check, "warning").count("no readable pickle") == 1
+        assert (check.tracks_moving, check.tracks_static) == (1, 1)
+        for path in (folder / "annotations/cuboids").iterdir():
+            path.write_bytes(b"text")
+        check = check_log(open_pandaset(str(folder)))
+        assert messages(check, "warning").count("no readable pickle") == 1
         assert check.tracks_moving == check.tracks_static == 0
 
 

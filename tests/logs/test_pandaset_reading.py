@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from genre_tasks.errors import InputError
-from genre_tasks.logs.pandaset.layout import convert_to_seconds, parse_pose, to_flu_axes, to_panda_axes
+from genre_tasks.logs.pandaset.file_reading import convert_to_seconds
+from genre_tasks.logs.pandaset.layout import parse_pose, to_flu_axes, to_panda_axes
 from genre_tasks.logs.pandaset.pickle_reader import read_table
 from genre_tasks.logs.pandaset.reader import PandaSetLog, open_pandaset
 from genre_tasks.logs.pandaset.writer import write_pandaset
@@ -248,9 +249,9 @@ class TestTracks:
         good, bad = {"uuid": "b"}, {"uuid": "b", "position.y": float("nan")}
         only_bad = {"uuid": "c", "yaw": float("inf")}
         flat = {"uuid": "d", "dimensions.z": 0.0}
-        log = self._tracks(folder, cuboids(good, only_bad), cuboids(bad, flat), cuboids(good))
+        log = self._tracks(folder, cuboids(good, only_bad), cuboids(bad, flat), cuboids(good), cuboids(good))
         (track,) = log.tracks()
-        assert track.track_id == "b" and track.frames.tolist() == [0, 2]
+        assert track.track_id == "b" and track.frames.tolist() == [0, 2, 3]
         assert [f.word for f in log.findings()] == ["invalid_box"] * 3
 
     def test_an_object_seen_by_both_sensors_is_one(self, folder: Path) -> None:

@@ -110,6 +110,16 @@ class TestRoundTrip:
         assert (written / "camera/front/00.png").is_file()
         assert open_pandaset(str(written)).image_bytes("front", 1) == stream.getvalue()
 
+    @pytest.mark.parametrize(("kind", "suffix"), [("WEBP", ".webp"), ("TIFF", ".tif"), ("BMP", ".bmp")])
+    def test_other_formats_keep_their_bytes(self, tmp_path: Path, kind: str, suffix: str) -> None:
+        stream = io.BytesIO()
+        Image.new("RGB", (48, 32), (10, 200, 30)).save(stream, kind)
+        log = small_log()
+        log._images[("front", 1)] = stream.getvalue()
+        written = write_pandaset(log, tmp_path / "002")
+        assert (written / f"camera/front/01{suffix}").read_bytes() == stream.getvalue()
+        assert open_pandaset(str(written)).image_bytes("front", 1) == stream.getvalue()
+
     def test_progress_ends_at_its_total(self, tmp_path: Path) -> None:
         calls: list[tuple[int, int]] = []
         write_pandaset(small_log(), tmp_path / "002", lambda done, total, note="": calls.append((done, total)))

@@ -76,6 +76,24 @@ TABLES: dict[str, Callable[[Any], Any]] = {
 }
 
 
+EXTENSION_DTYPES: dict[str, list[Any]] = {
+    "category": ["Car", "Bus", None, "Car"],
+    "Int64": [1, 2, None],
+    "UInt8": [1, 2, 3],
+    "Float32": [1.5, None],
+    "Float64": [1.5, 2.0],
+    "boolean": [True, None, False],
+    "string": ["a", None, "b"],
+    "datetime64[ns]": ["2019-05-06T21:46:00.5", None],
+    "datetime64[ms]": ["2019-05-06T21:46:00.5", "2020-01-01"],
+    "datetime64[ns, UTC]": ["2019-05-06T21:46:00.5", "2020-01-01"],
+    "int16[pyarrow]": [1, None],
+    "double[pyarrow]": [1.5, None],
+    "bool[pyarrow]": [True, None, False],
+    "string[pyarrow]": ["a", None, "b"],
+}
+
+
 class TestAgreesWithPandas:
     @pytest.mark.parametrize("protocol", [2, 3, 4, 5])
     @pytest.mark.parametrize("kind", TABLES)
@@ -84,6 +102,32 @@ class TestAgreesWithPandas:
         path = tmp_path / "00.pkl.gz"
         TABLES[kind](make_table()).to_pickle(path, compression="gzip", protocol=protocol)
         assert_same(read_table(path), pd.read_pickle(path))
+
+    @pytest.mark.parametrize("protocol", [2, 3, 4, 5])
+    @pytest.mark.parametrize("dtype", EXTENSION_DTYPES)
+    def test_dtypes_of_pandas(self, protocol: int, dtype: str) -> None:
+        """Report: pandas-dev/pandas#61763 (dtypes that come and go with the version of pandas)."""
+        pd = pytest.importorskip("pandas")
+        if "pyarrow" in dtype:
+            pytest.importorskip("pyarrow")
+        values = EXTENSION_DTYPES[dtype]
+        table = pd.DataFrame({"x": range(len(values)), "a": pd.Series(values).astype(dtype)})
+        found = parse_table(pickle.dumps(table, protocol=protocol)).columns["a"].tolist()
+        expected = [value.timestamp() if isinstance(value, pd.Timestamp) else value for value in table["a"]]
+        assert [None if pd.isna(value) else value for value in found] == [
+            None if pd.isna(value) else value for value in expected
+        ]
+
+    def test_rows_with_several_keys(self) -> None:
+        pd = pytest.importorskip("pandas")
+        table = pd.concat({"a": make_table(), "b": make_table()})
+        assert parse_table(pickle.dumps(table)).row_count == 8
+
+    def test_a_range_of_categories_is_bounded(self) -> None:
+        pd = pytest.importorskip("pandas")
+        dtype = pd.CategoricalDtype(pd.RangeIndex(0, 100_000))
+        with pytest.raises(PickleBrokenError, match="65536 categories"):
+            parse_table(pickle.dumps(pd.DataFrame({"a": pd.Series([1, 2], dtype=dtype)})))
 
     def test_python_string_storage(self) -> None:
         pd = pytest.importorskip("pandas")
@@ -178,8 +222,8 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     "dictionary with keys of another kind": lambda: b"\x80\x03}K\x01Ns.",
     "class as a cell": lambda: frame_with_cell(int),
     "set": lambda: frame_with_cell({1, 2}),
-    "dates": lambda: pickle.dumps(pytest.importorskip("pandas").DataFrame({"t": np.array(["2020"], "M8[ns]")})),
-    "categories": lambda: pickle.dumps(pytest.importorskip("pandas").DataFrame({"t": ["a"]}).astype("category")),
+    "durations": lambda: pickle.dumps(pytest.importorskip("pandas").DataFrame({"t": np.array([1], "m8[ns]")})),
+    "sparse": lambda: pickle.dumps(pytest.importorskip("pandas").DataFrame({"t": [0.0]}).astype("Sparse[float]")),
     "void cells": lambda: pickle_table({"x": np.zeros(3)}).replace(b"f8", b"V8"),
     "a dtype with a size of its own": lambda: pickle_table({"x": np.zeros(3)}).replace(
         b"\x02\0\0\0f8", b"\x03\0\0\0U99"

@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from genre_tasks.errors import InputError
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.pandaset.layout import BOX_HEADING, PANDA_R_FLU, SPINNING_SENSOR, quats_to_matrices
 from genre_tasks.logs.pandaset.pickle_reader import Table
+from genre_tasks.logs.pandaset.sweeps import read_numbers, require_columns
 from genre_tasks.logs.types import CuboidTrack, Float64
 
 _BOX_COLUMNS = ("position.x", "position.y", "position.z", "dimensions.x", "dimensions.y", "dimensions.z", "yaw")
@@ -43,7 +44,7 @@ class _AnnotatedObject:
         label: its class.
         sensor: ``SPINNING_SENSOR``, 1 for the forward LiDAR, or ``_NO_SENSOR``.
         sibling: uuid of the same object as the other sensor saw it.
-        boxes: frame → [11] as ``_read_boxes`` gives them.
+        boxes: frame → [11] as ``read_boxes`` gives them.
         moving: whether any frame says that it moves.
     """
 
@@ -55,25 +56,68 @@ class _AnnotatedObject:
     moving: bool = False
 
 
-def build_tracks(frames: Iterable[tuple[int, Table]]) -> tuple[tuple[CuboidTrack, ...], tuple[Finding, ...]]:
-    """Builds the tracks of a sequence from the cuboids of its frames.
+@dataclass(frozen=True)
+class FrameBoxes:
+    """The boxes of one frame, checked: every needed column is there and of a usable type.
 
-    A box with a non-finite number or without volume is left out (``Finding`` with the word ``invalid_box``). An object
-    moves if ``attributes.object_motion`` says so in any frame; pedestrians have none: they move where they walk.
+    Attributes:
+        frame: log frame.
+        boxes: [N, 11] position, size and yaw as in the file, and the orientation as a quaternion (w, x, y, z).
+        attributes: for every box, the values of the other columns by name.
+    """
+
+    frame: int
+    boxes: Float64
+    attributes: tuple[Mapping[str, Any], ...]
+
+
+def read_boxes(table: Table, frame: int, **where: Any) -> FrameBoxes:
+    """Reads the boxes of a frame from its table.
 
     Args:
-        frames: (frame, its cuboids) in increasing order; columns uuid, label, yaw, position.*, dimensions.* are needed.
+        table: columns uuid, label, yaw, position.*, dimensions.* are needed.
+        frame: log frame.
+        where: ``log``, ``file``, … of the error, should there be one.
+
+    Returns:
+        The boxes, those with impossible numbers too.
+
+    Raises:
+        InputError: a needed column is missing, or not numeric.
+    """
+    where = {**where, "frame": frame}
+    require_columns(table, ("uuid", "label", *_BOX_COLUMNS), "the table of cuboids", **where)
+    box = [read_numbers(table, name, **where) for name in _BOX_COLUMNS]
+    if all(name in table.columns for name in BOX_HEADING):
+        quat = [read_numbers(table, name, **where) for name in BOX_HEADING]
+    else:
+        # A turn about z by the yaw. A yaw that is not finite is left out later; the quaternion only must not warn.
+        yaw = box[-1]
+        half = np.where(np.isfinite(yaw), yaw, 0.0) / 2
+        quat = [np.cos(half), np.zeros_like(half), np.zeros_like(half), np.sin(half)]
+    names = [name for name in table.columns if name not in _BOX_COLUMNS]
+    columns = [table.columns[name].tolist() for name in names]
+    rows = tuple(dict(zip(names, values, strict=True)) for values in zip(*columns, strict=True))
+    return FrameBoxes(frame, np.stack([*box, *quat], axis=1), rows)
+
+
+def build_tracks(frames: Iterable[FrameBoxes]) -> tuple[tuple[CuboidTrack, ...], tuple[Finding, ...]]:
+    """Builds the tracks of a sequence from the cuboids of its frames.
+
+    A box with a non-finite number, without volume or without a uuid is left out (``Finding`` with the word
+    ``invalid_box``). An object moves if ``attributes.object_motion`` says so in any frame; pedestrians have none: they
+    move where they walk.
+
+    Args:
+        frames: the boxes of each frame, in increasing order of frames.
 
     Returns:
         The tracks, in the order in which they first appear, and the boxes that were left out.
-
-    Raises:
-        InputError: a needed column is missing (names the frame).
     """
     objects: dict[str, _AnnotatedObject] = {}
     findings: list[Finding] = []
-    for frame, table in frames:
-        findings += _add_frame(objects, frame, table)
+    for frame_boxes in frames:
+        findings += _add_frame(objects, frame_boxes)
     findings += _judge_yaw(objects)
     tracks = (_build_track(group) for group in _group_siblings(objects))
     return tuple(track for track in tracks if track is not None), tuple(findings)
@@ -90,60 +134,63 @@ def _judge_yaw(objects: Mapping[str, _AnnotatedObject]) -> list[Finding]:
     return [Finding("odd_box_yaw", "warning", message, "Convert yaw from degrees to radians.", numbers)]
 
 
-def _add_frame(objects: dict[str, _AnnotatedObject], frame: int, table: Table) -> list[Finding]:
+def _add_frame(objects: dict[str, _AnnotatedObject], frame_boxes: FrameBoxes) -> list[Finding]:
     """Adds the boxes of one frame to their objects; returns those that were left out."""
-    missing = [name for name in ("uuid", "label", *_BOX_COLUMNS) if name not in table.columns]
-    if missing:
-        remedy = "Copy the cuboids of the sequence again, or remove them: a log without tracks is survived."
-        raise InputError(f"the cuboids lack the columns {', '.join(missing)}", remedy=remedy, frame=frame)
-    boxes = _read_boxes(table)
-    attributes = {name: values.tolist() for name, values in table.columns.items() if name not in _BOX_COLUMNS}
+    frame = frame_boxes.frame
     findings = []
-    for index, box in enumerate(boxes):
-        row = {name: values[index] for name, values in attributes.items()}
+    for box, row in zip(frame_boxes.boxes, frame_boxes.attributes, strict=True):
         new_object = _AnnotatedObject(
             uuid=str(row["uuid"]),
             label=str(row["label"]),
-            sensor=int(row.get("cuboids.sensor_id", _NO_SENSOR)),
+            sensor=_parse_sensor(row.get("cuboids.sensor_id")),
             sibling=str(row.get("cuboids.sibling_id", _NO_SIBLING)),
         )
-        annotated = objects.setdefault(new_object.uuid, new_object)
-        if not np.isfinite(box).all() or (box[_SIZE] <= 0).any() or not box[_QUATERNION].any():
-            message = f"the box of {annotated.label} {annotated.uuid} in frame {frame} is not finite"
+        is_valid = np.isfinite(box).all() and (box[_SIZE] > 0).all() and box[_QUATERNION].any()
+        # Boxes without a name would all become one object.
+        if not is_valid or _is_missing(row["uuid"]):
+            problem = "is not finite" if not is_valid else "has no uuid"
+            annotated = objects.get(new_object.uuid, new_object)
+            message = f"the box of {annotated.label} {annotated.uuid} in frame {frame} {problem}"
             remedy = "Correct the box; it is left out."
             findings.append(Finding("invalid_box", "warning", message, remedy, frames=(frame,)))
-            continue
-        # A uuid that stands twice in a frame keeps its first box.
-        annotated.boxes.setdefault(frame, box)
-        annotated.moving |= _is_moving(row)
+            if _is_missing(row["uuid"]):
+                continue
+        annotated = objects.setdefault(new_object.uuid, new_object)
+        if is_valid:
+            # A uuid that stands twice in a frame keeps its first box.
+            annotated.boxes.setdefault(frame, box)
+            annotated.moving |= _is_moving(row)
     return findings
 
 
-def _read_boxes(table: Table) -> Float64:
-    """[N, 11] position, size and yaw as in the file, and the orientation as a quaternion (w, x, y, z).
+def _is_missing(value: object) -> bool:
+    # NaN is the one value that differs from itself.
+    return value is None or value != value or value == ""
 
-    The orientation is a turn about z by the yaw, unless the file says more.
-    """
-    box = [np.asarray(table.columns[name], dtype=np.float64) for name in _BOX_COLUMNS]
-    if all(name in table.columns for name in BOX_HEADING):
-        quat = [np.asarray(table.columns[name], dtype=np.float64) for name in BOX_HEADING]
-    else:
-        yaw = box[-1]
-        # A box whose yaw is not finite is left out later, by its yaw; the quaternion only must not warn.
-        half = np.where(np.isfinite(yaw), yaw, 0.0) / 2
-        quat = [np.cos(half), np.zeros_like(half), np.zeros_like(half), np.sin(half)]
-    return np.stack([*box, *quat], axis=1)
+
+def _parse_sensor(value: object) -> int:
+    """The sensor that a box was annotated for; ``_NO_SENSOR`` where the file does not say."""
+    try:
+        return int(float(str(value)))
+    except (ValueError, OverflowError):
+        return _NO_SENSOR
+
+
+def _is_false(value: object) -> bool:
+    """Whether a column of booleans says no, however it is written; a missing value says nothing."""
+    if isinstance(value, str):
+        return value.strip().lower() in ("false", "0", "no")
+    return not _is_missing(value) and not value
 
 
 def _is_moving(row: Mapping[str, object]) -> bool:
     motion = row.get("attributes.object_motion")
     behaviour = row.get("attributes.pedestrian_behavior")
     if isinstance(motion, str):
-        return motion == "Moving"
+        return motion.strip().lower() == "moving"
     if isinstance(behaviour, str):
-        return behaviour == "Walking"
-    # Compared by identity: a missing or NaN attribute says nothing.
-    return row.get("stationary") is False
+        return behaviour.strip().lower() == "walking"
+    return _is_false(row.get("stationary"))
 
 
 def _group_siblings(objects: dict[str, _AnnotatedObject]) -> list[list[_AnnotatedObject]]:
@@ -202,7 +249,7 @@ def _build_track(group: list[_AnnotatedObject]) -> CuboidTrack | None:
 
 
 def _box_poses(rows: Float64) -> Float64:
-    """[F, 4, 4] world_SE3_box, axes x forward, y left, z up, from rows [F, 11] of ``_read_boxes``."""
+    """[F, 4, 4] world_SE3_box, axes x forward, y left, z up, from rows [F, 11] of ``read_boxes``."""
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3] = quats_to_matrices(rows[:, _QUATERNION]) @ PANDA_R_FLU
     poses[:, :3, 3] = rows[:, :3]

@@ -11,17 +11,25 @@ Where PandaSet differs from this project (see ``genre_tasks.logs.types``), check
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from genre_tasks.errors import InputError
+from genre_tasks.logs.pandaset.file_reading import read_number
 from genre_tasks.logs.types import Float64
 
 RIG_ORDER = ("front_camera", "front_left_camera", "front_right_camera", "left_camera", "right_camera", "back_camera")
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
+# Of two images of a frame, the one whose suffix comes first is read. Capitals count as small letters.
+IMAGE_SUFFIXES = (
+    *(".jpg", ".jpeg", ".png", ".jpe", ".jfif", ".webp", ".tif", ".tiff", ".bmp", ".dib"),
+    *(".ppm", ".pgm", ".pnm", ".jp2", ".j2k", ".avif", ".gif"),
+)
+# What pandas writes, in the same order; gzip is PandaSet's.
+TABLE_SUFFIXES = tuple(
+    f".{name}{packed}" for packed in (".gz", "", ".bz2", ".xz", ".zip", ".gzip") for name in ("pkl", "pickle")
+)
 # Column d, and cuboids.sensor_id: the 64-beam Pandar64; 1 is the forward PandarGT.
 SPINNING_SENSOR = 0
 # Rolling shutter of PandaSet's cameras, top to bottom row.
@@ -40,9 +48,6 @@ _POSE_REMEDY = "Correct the pose in that file, or leave its chunk out with --chu
 # Below that, rounding alone would decide where the sensor points.
 _MIN_QUATERNION_NORM = 1e-6
 
-# 1e11 s would be the year 5138, and 1e11 ms is 1973: no log's clock is in doubt.
-_UNITS_PER_SECOND = ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3))
-
 
 def frame_stem(frame: int) -> str:
     """Names the files of a frame.
@@ -58,51 +63,6 @@ def frame_stem(frame: int) -> str:
     """
     # PandaSet has 80 frames; a longer log of this writer goes on with three digits.
     return f"{frame:02d}"
-
-
-def convert_to_seconds(timestamps: Float64) -> Float64:
-    """Converts Unix times given in s, ms, µs or ns; the magnitude says which.
-
-    Args:
-        timestamps: [N] times of one file; relative times, which are small, count as seconds.
-
-    Returns:
-        [N] seconds, float64.
-
-    >>> convert_to_seconds(np.array([1557539959250.0]))
-    array([1.55753996e+09])
-    """
-    times = np.asarray(timestamps, dtype=np.float64)
-    finite = np.abs(times[np.isfinite(times)])
-    # One unit for the file: the first frames of a relative clock are small in any unit.
-    largest = float(finite.max()) if finite.size else 0.0
-    for limit, units_per_second in _UNITS_PER_SECOND:
-        if largest > limit:
-            return times / units_per_second
-    return times
-
-
-def read_json(path: Path, log: str) -> Any:
-    """Reads a JSON file of a sequence.
-
-    Args:
-        path: the file.
-        log: URI of the log, for the error.
-
-    Returns:
-        The value.
-
-    Raises:
-        InputError: the file is missing or malformed.
-    """
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        remedy = "Copy the whole sequence folder again."
-        raise InputError("the sequence lacks a file", remedy=remedy, file=path, log=log) from error
-    except (OSError, ValueError) as error:
-        problem = f"the file is no readable JSON ({error})"
-        raise InputError(problem, remedy="Copy it again.", file=path, log=log) from error
 
 
 def parse_pose(pose: Any, *, file: Path, log: str, frame: int, camera: str | None = None) -> Float64:
@@ -123,8 +83,8 @@ def parse_pose(pose: Any, *, file: Path, log: str, frame: int, camera: str | Non
     """
     where: dict[str, Any] = {"file": file, "log": log, "frame": frame, "camera": camera}
     try:
-        position = np.array([float(pose["position"][axis]) for axis in "xyz"])
-        quat = np.array([float(pose["heading"][axis]) for axis in "wxyz"])
+        position = np.array([read_number(pose["position"][axis]) for axis in "xyz"])
+        quat = np.array([read_number(pose["heading"][axis]) for axis in "wxyz"])
     except (KeyError, TypeError, ValueError) as error:
         problem = f"the pose lacks position x, y, z or heading w, x, y, z ({error!r})"
         raise InputError(problem, remedy=_POSE_REMEDY, **where) from error

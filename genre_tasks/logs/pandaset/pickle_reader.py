@@ -7,9 +7,7 @@ are really there: a declared shape allocates nothing.
 
 from __future__ import annotations
 
-import gzip
-import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,8 @@ from typing import Any
 from numpy.typing import NDArray
 
 from genre_tasks.errors import InputError
+from genre_tasks.logs.file_kinds import describe_non_pickle
+from genre_tasks.logs.pandaset.file_reading import describe_os_error
 from genre_tasks.logs.pandaset.pickle_arrays import expect_call, read_array, require
 from genre_tasks.logs.pandaset.pickle_machine import (
     Call,
@@ -25,15 +25,24 @@ from genre_tasks.logs.pandaset.pickle_machine import (
     PickleRefusedError,
     read_pickle_tree,
 )
+from genre_tasks.logs.pandaset.unpacking import UNPACKING_ERRORS, unpack
 
 # A PandaSet sweep is 8 MB unpacked; a file that unpacks to more than this is no sweep (a "gzip bomb").
 MAX_UNPACKED_BYTES = 512 * 2**20
 
 _COPY_AGAIN = "Copy or download it again; or remove it: a missing sweep is survived."
+_EXPECTED = "A pickled pandas DataFrame was expected; without the file, its frame has no sweep or no cuboids."
+_MAKE_READABLE = "Make it readable; or remove it: a missing sweep is survived."
 _DO_NOT_OPEN = (
     "Do not open it by other means before you know where it comes from: a pickle can run code. Get the file from its "
     "publisher, or write it with pandas.DataFrame.to_pickle from numbers and strings only."
 )
+
+
+def _in_every_pandas(module: str, names: Iterable[str], name: str) -> dict[tuple[str, str], str]:
+    """Entries of the allow-list for classes in their module, and where pandas 3 has them."""
+    return {(place, cls): name for cls in names for place in (module, "pandas", "pandas.arrays")}
+
 
 ALLOWED: Mapping[tuple[str, str], str] = {
     # Frames and blocks. Names without a module path are those of pandas 3.
@@ -46,8 +55,9 @@ ALLOWED: Mapping[tuple[str, str], str] = {
     ("pandas.core.indexes.base", "Index"): "Index",
     ("pandas", "Index"): "Index",
     ("pandas.core.indexes.numeric", "Int64Index"): "Index",
-    ("pandas.core.indexes.range", "RangeIndex"): "RangeIndex",
-    ("pandas", "RangeIndex"): "RangeIndex",
+    ("pandas.core.indexes.numeric", "Float64Index"): "Index",
+    **_in_every_pandas("pandas.core.indexes.range", ["RangeIndex"], "RangeIndex"),
+    **_in_every_pandas("pandas.core.indexes.multi", ["MultiIndex"], "MultiIndex"),
     # Text, as Arrow buffers or as Python objects.
     ("pandas.arrays", "ArrowStringArray"): "ArrowStringArray",
     ("pandas.core.arrays.string_arrow", "ArrowStringArray"): "ArrowStringArray",
@@ -55,6 +65,28 @@ ALLOWED: Mapping[tuple[str, str], str] = {
     ("pandas.arrays", "StringArray"): "StringArray",
     ("pandas.core.arrays.string_", "StringArray"): "StringArray",
     ("pandas._libs.arrays", "__pyx_unpickle_NDArrayBacked"): "backed",
+    # Columns with a dtype of pandas: categories, numbers that may be missing, times, Arrow arrays.
+    **_in_every_pandas("pandas.core.arrays.categorical", ["Categorical"], "Categorical"),
+    **_in_every_pandas("pandas.core.dtypes.dtypes", ["CategoricalDtype"], "CategoricalDtype"),
+    **_in_every_pandas("pandas.core.arrays.integer", ["IntegerArray"], "MaskedArray"),
+    **_in_every_pandas("pandas.core.arrays.floating", ["FloatingArray"], "MaskedArray"),
+    **_in_every_pandas("pandas.core.arrays.boolean", ["BooleanArray"], "MaskedArray"),
+    **_in_every_pandas("pandas.core.arrays.boolean", ["BooleanDtype"], "MaskedDtype"),
+    **_in_every_pandas("pandas.core.arrays.floating", ["Float32Dtype", "Float64Dtype"], "MaskedDtype"),
+    **_in_every_pandas(
+        "pandas.core.arrays.integer",
+        [f"{kind}{bits}Dtype" for kind in ("Int", "UInt") for bits in (8, 16, 32, 64)],
+        "MaskedDtype",
+    ),
+    **_in_every_pandas("pandas.core.arrays.datetimes", ["DatetimeArray"], "DatetimeArray"),
+    # Times are stored in UTC, so that the zone is of no account.
+    **_in_every_pandas("pandas.core.dtypes.dtypes", ["DatetimeTZDtype"], "DatetimeTZDtype"),
+    ("datetime", "timezone"): "timezone",
+    ("datetime", "timedelta"): "timedelta",
+    ("pytz", "_UTC"): "timezone",
+    **_in_every_pandas("pandas.core.arrays.arrow.array", ["ArrowExtensionArray"], "ArrowExtensionArray"),
+    **_in_every_pandas("pandas.core.dtypes.dtypes", ["ArrowDtype"], "ArrowDtype"),
+    ("uuid", "UUID"): "UUID",
     ("pandas", "StringDtype"): "StringDtype",
     ("pandas.core.arrays.string_", "StringDtype"): "StringDtype",
     ("pandas", "NA"): "NA",
@@ -96,10 +128,10 @@ class Table:
 
 
 def read_table(path: Path, **where: Any) -> Table:
-    """Reads a ``.pkl`` or ``.pkl.gz`` of one pandas DataFrame.
+    """Reads a ``.pkl`` of one pandas DataFrame, compressed or not.
 
     Args:
-        path: the file; gzip is recognised by its first bytes.
+        path: the file; gzip, bzip2, xz and ZIP are recognised by their first bytes.
         where: ``log``, ``frame``, … of the error, should there be one.
 
     Returns:
@@ -109,10 +141,17 @@ def read_table(path: Path, **where: Any) -> Table:
         InputError: no such file; truncated or corrupt; a pickle that asks for anything else.
     """
     try:
-        data = _unpack(path)
-    except (OSError, EOFError, zlib.error) as error:
+        data = unpack(path, MAX_UNPACKED_BYTES)
+    except UNPACKING_ERRORS as error:
+        # An error of the system has a number, one of an unpacker has none.
+        if isinstance(error, OSError) and error.errno is not None:
+            raise InputError(describe_os_error(error), remedy=_MAKE_READABLE, file=path, **where) from error
         problem = f"the file cannot be unpacked ({error})"
         raise InputError(problem, remedy=_COPY_AGAIN, file=path, **where) from error
+    # A pointer, a page or an array is no broken pickle, and copying it again would not help.
+    kind = describe_non_pickle(data)
+    if kind is not None:
+        raise InputError(f"the file is {kind}", remedy=_EXPECTED, file=path, **where)
     try:
         return parse_table(data)
     except PickleRefusedError as error:
@@ -147,17 +186,6 @@ def parse_table(data: bytes) -> Table:
     except (ValueError, TypeError, LookupError, OverflowError, AttributeError, RecursionError) as error:
         # A tree of the wrong shape shows as any of these; the caller only needs to know that it is no table.
         raise PickleBrokenError(f"{type(error).__name__}: {error}") from error
-
-
-def _unpack(path: Path) -> bytes:
-    with path.open("rb") as raw:
-        is_gzip = raw.read(2) == b"\x1f\x8b"
-        raw.seek(0)
-        # One byte beyond the limit tells a file that is too large without unpacking all of it.
-        data = (gzip.GzipFile(fileobj=raw) if is_gzip else raw).read(MAX_UNPACKED_BYTES + 1)
-    if len(data) > MAX_UNPACKED_BYTES:
-        raise EOFError(f"more than {MAX_UNPACKED_BYTES >> 20} MiB unpacked")
-    return data
 
 
 def _read_dataframe(tree: Any) -> Table:
@@ -231,4 +259,6 @@ def _read_row_count(node: Any) -> int:
     if kind == "RangeIndex":
         start, stop, step = _require_integers((state["start"], state["stop"], state["step"]))
         return len(range(start, stop, step))
+    if kind == "MultiIndex":
+        return len(read_array(state["codes"][0]))
     return len(read_array(state["data"]))

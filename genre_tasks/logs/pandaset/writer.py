@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import re
 import shutil
 import uuid
 from pathlib import Path
@@ -29,7 +30,13 @@ from genre_tasks.logs.types import Camera, CuboidTrack, DrivingLog, Float64, Swe
 from genre_tasks.progress import Progress, silent
 from genre_tasks.temporary_names import describe_owner, remove_abandoned
 
-_SUFFIX_OF_SIGNATURE = {b"\xff\xd8\xff": ".jpg", b"\x89PNG\r\n\x1a\n": ".png"}
+_SUFFIX_OF_SIGNATURE = {
+    rb"\xff\xd8\xff": ".jpg",
+    rb"\x89PNG\r\n\x1a\n": ".png",
+    rb"RIFF....WEBP": ".webp",
+    rb"II\*\0|MM\0\*": ".tif",
+    rb"BM": ".bmp",
+}
 # Coordinates are noise in their low bits: higher levels take three times as long for 2 %.
 _GZIP_LEVEL = 4
 # Cuboids.sensor_id of a box that was annotated once, without a sibling.
@@ -39,9 +46,9 @@ _NO_SENSOR = -1
 def write_pandaset(log: DrivingLog, folder: Path, progress: Progress = silent) -> Path:
     """Writes a log as a PandaSet sequence folder, for tools that read that layout or to keep a synthetic log.
 
-    Images keep their bytes (``.jpg``, or ``.png`` for a lossless log); what is missing stays missing. The folder
-    appears complete or not at all. What PandaSet does not state (distortion, readout, a box's tilt) has fields of its
-    own. The same log gives the same bytes.
+    Images keep their bytes (``.jpg``, ``.png``, ``.webp``, ``.tif`` or ``.bmp``); what is missing stays missing. The
+    folder appears complete or not at all. What PandaSet does not state (distortion, readout, a box's tilt) has fields
+    of its own. The same log gives the same bytes.
 
     Args:
         log: the log to write.
@@ -52,7 +59,7 @@ def write_pandaset(log: DrivingLog, folder: Path, progress: Progress = silent) -
         ``folder``.
 
     Raises:
-        InputError: the folder holds something already; the log itself raises; an image is neither JPEG nor PNG.
+        InputError: the folder holds something already; the log itself raises; an image is of another format.
         ResourceError: the disk is full or not writable.
 
     Example::
@@ -133,10 +140,12 @@ def _format_intrinsics(camera: Camera) -> dict[str, Any]:
 def _find_suffix(image: bytes, log: DrivingLog, camera: str, frame: int) -> str:
     """The file name's suffix, by the first bytes of an encoded image."""
     for signature, suffix in _SUFFIX_OF_SIGNATURE.items():
-        if image.startswith(signature):
+        if re.match(signature, image, re.DOTALL):
             return suffix
     remedy = "Encode the image as JPEG or PNG, or remove it: a missing image is survived."
-    raise InputError("the image is neither JPEG nor PNG", remedy=remedy, log=log.uri, camera=camera, frame=frame)
+    raise InputError(
+        "the image is neither JPEG, PNG, WebP, TIFF nor BMP", remedy=remedy, log=log.uri, camera=camera, frame=frame
+    )
 
 
 def _write_lidar(log: DrivingLog, root: Path, progress: Progress) -> None:

@@ -1,0 +1,50 @@
+"""Identifies what is read of a sequence folder, so that results can be kept until any of it changes."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from pathlib import Path
+
+from genre_tasks.logs.findings import Finding
+
+# A sequence has gigabytes, and its digest is asked for again and again.
+_FILE_HASHES: dict[tuple[str, int, int], str] = {}
+
+
+def digest_files(root: Path, files: Iterable[Path], findings: Iterable[Finding]) -> str:
+    """Identifies the name, size and content of files, and what is to be warned of.
+
+    A file that cannot be read counts by its name and the reason: once it can be read, the digest changes.
+
+    Args:
+        root: the folder that names are relative to; its own path does not count.
+        files: the files that are read, in any order.
+        findings: of the folder; notes do not count, since results do not repeat them.
+
+    Returns:
+        sha256, hexadecimal.
+    """
+    total = hashlib.sha256()
+    for name, path in sorted((path.relative_to(root).as_posix(), path) for path in files):
+        try:
+            line = f"{name}\0{path.stat().st_size}\0{_hash_file(path)}\n"
+        except OSError as error:
+            line = f"{name}\0{error.strerror}\n"
+        # Lengths and separators keep two different sequences from giving the same stream of bytes. Names need not be
+        # text in this system's encoding.
+        total.update(line.encode(errors="surrogateescape"))
+    for finding in findings:
+        if finding.severity != "note":
+            total.update(f"{finding.word}\0{finding.message}\n".encode(errors="surrogateescape"))
+    return total.hexdigest()
+
+
+def _hash_file(path: Path) -> str:
+    """sha256 of a file, remembered in this process by path, size and time of change."""
+    stat = path.stat()
+    key = (str(path.resolve()), stat.st_size, stat.st_mtime_ns)
+    if key not in _FILE_HASHES:
+        with path.open("rb") as file:
+            _FILE_HASHES[key] = hashlib.file_digest(file, "sha256").hexdigest()
+    return _FILE_HASHES[key]
