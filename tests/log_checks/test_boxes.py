@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from genre_tasks.logs.findings import Finding
-from genre_tasks.logs.pandaset.cuboids import build_tracks
+from genre_tasks.logs.pandaset.cuboids import build_tracks, read_boxes
 from genre_tasks.logs.pandaset.pickle_reader import Table
 from genre_tasks.logs.types import CuboidTrack, Float64
 from tests.fakes import yaw_pose
@@ -126,7 +126,8 @@ def test_headings_of_what_drives() -> None:
 @pytest.mark.parametrize(("yaw", "fires"), [(3.1, False), (-6.2, False), (12.0, False), (45.0, True), (-180.0, True)])
 def test_yaw_in_degrees_is_seen_in_the_file(yaw: float, fires: bool) -> None:
     """Report: tyagi-iiitv/PointPillars#4."""
-    _, findings = build_tracks([(0, Table(cuboids({"yaw": yaw}, {"uuid": "b"}), 2))])
+    table = Table(cuboids({"yaw": yaw}, {"uuid": "b"}), 2)
+    _, findings = build_tracks([read_boxes(table, frame=0)])
     assert [finding.word for finding in findings] == (["odd_box_yaw"] if fires else [])
 
 
