@@ -29,6 +29,7 @@ from genre_tasks.logs.pandaset.layout import (
 from genre_tasks.logs.pandaset.pickle_reader import Table, read_table
 from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Lens, Sweep, Truth
 from genre_tasks.suggestions import did_you_mean
+from genre_tasks.user_paths import expand_user_path
 
 _REQUIRED_FILES = ("lidar/poses.json", "lidar/timestamps.json")
 _DIGESTED_FILES = ("camera/*/*", "lidar/*", "annotations/cuboids/*")
@@ -47,7 +48,7 @@ def open_pandaset(rest: str) -> PandaSetLog:
     Raises:
         InputError: no such folder, or no sequence in it (names what was looked for).
     """
-    folder = Path(rest).expanduser()
+    folder = expand_user_path(rest)
     uri = f"pandaset:{rest}"
     remedy = "Give the folder of one sequence, as in pandaset:PATH/002."
     if not rest or not folder.is_dir():
