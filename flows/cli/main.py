@@ -18,6 +18,7 @@ from flows.cli.figure import figure
 from flows.cli.last_resort import run_guarded
 from flows.cli.outcome import start_outcome, wants_json
 from flows.cli.paper_table import table
+from flows.cli.parsing import check_words
 from flows.cli.range import range_command
 from flows.cli.render import render
 from flows.cli.run import run
@@ -111,7 +112,13 @@ def main() -> None:
     prepare_environment(debug)
     prepare_streams()
     start_outcome(as_json=wants_json(typer.main.get_command(app), sys.argv[1:]))
-    raise SystemExit(run_guarded(lambda: app(prog_name="genre", standalone_mode=False), debug))
+    raise SystemExit(run_guarded(_run_command, debug))
+
+
+def _run_command() -> object:
+    check_words(sys.argv[1:])
+    # Not standalone, where typer would print errors and choose exit statuses by itself.
+    return app(prog_name="genre", standalone_mode=False)
 
 
 if __name__ == "__main__":

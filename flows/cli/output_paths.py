@@ -27,13 +27,15 @@ def check_output_file(path: Path, option: str, suffixes: Collection[str] = ()) -
     Raises:
         InputError: the ending is another one, the path is a folder or lies under a file, or it may not be written.
     """
+    known = " or ".join(f"x{suffix}" for suffix in suffixes)
+    is_there = _exists(path, option)
+    if is_there and path.is_dir():
+        example = f", such as {path / f'x{next(iter(suffixes))}'}" if suffixes else ""
+        raise InputError(f"{option} is a folder", remedy=f"Name a file in it{example}.", file=path)
     if suffixes and path.suffix.lower() not in suffixes:
-        known = " or ".join(f"x{suffix}" for suffix in suffixes)
         found = f"ends with '{path.suffix}'" if path.suffix else "has no ending"
         raise InputError(f"{option} {found}, so its format is unknown", remedy=f"Give {option} {known}.", file=path)
-    if _exists(path, option):
-        if path.is_dir():
-            raise InputError(f"{option} is a folder", remedy="Name a file in it.", file=path)
+    if is_there:
         if not path.is_file():
             raise InputError(f"{option} is no regular file", remedy="Name another file.", file=path)
         if not os.access(path, os.W_OK):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import re
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 # A bare number counts as seconds.
@@ -63,6 +65,30 @@ def check_number(value: float, option: str, low: float, high: float) -> float:
 
         raise ConfigError(f"{option} {value:g} is out of range", remedy=f"Give a number from {low:g} to {high:g}.")
     return value
+
+
+def check_words(words: Sequence[str]) -> None:
+    """Checks that the words of a command line are text: Prefect and the records could not hold them otherwise.
+
+    Args:
+        words: the command line without the program's name.
+
+    Raises:
+        InputError: a word holds bytes that are no text in the encoding of this system's file names.
+
+    >>> check_words(["run", "pandaset:/data/caf\udce9"])
+    Traceback (most recent call last):
+    genre_tasks.errors.InputError: 'pandaset:/data/caf\\udce9' is no text in utf-8 ...
+    """
+    for word in words:
+        # Python keeps such bytes as half characters, which only the system's own functions take.
+        if any("\ud800" <= character <= "\udfff" for character in word):
+            from genre_tasks.errors import InputError
+
+            raise InputError(
+                f"{word!r} is no text in {sys.getfilesystemencoding()}",
+                remedy="Rename the folder or link to it by another name, or set PYTHONUTF8=1.",
+            )
 
 
 def parse_path(text: str | Path) -> Path:
