@@ -31,14 +31,14 @@ _ERRORS_WITHOUT_A_FILE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, err
 _MAX_MESSAGE_LENGTH = 300
 
 
-def run_guarded(command: Callable[[], Any], debug: bool) -> int:
+def run_guarded(command: Callable[[], None], debug: bool) -> int:
     """Runs a command and translates whatever it raises into one line and an exit status.
 
     The traceback of a fault goes into a file: in ``.genre/faults`` of the working folder, or else in
     ``~/.local/state/genre/faults`` (``$XDG_STATE_HOME``), or else in the folder for temporary files.
 
     Args:
-        command: takes no arguments; an integer that it returns is the exit status.
+        command: takes no arguments; to end with a status of its choice it raises ``typer.Exit``.
         debug: whether the traceback is shown too.
 
     Returns:
@@ -48,25 +48,23 @@ def run_guarded(command: Callable[[], Any], debug: bool) -> int:
     if not debug:
         _keep_background_faults_in_the_log()
     try:
-        result = command()
+        command()
         # What waits in the buffer is part of the command: a full disk shows here.
         sys.stdout.flush()
     except BaseException as error:
-        if debug and not isinstance(error, SystemExit):
+        if debug and not isinstance(error, SystemExit | typer.Exit):
             traceback.print_exception(error)
         return _report(_find_cause(error))
-    code = result if isinstance(result, int) else 0
-    if code != 0:
-        print_unfinished(_STATUS_BY_CODE.get(code, "failed"), code)
-    return code
+    return 0
 
 
 def _report(error: BaseException) -> int:
     """Prints what an error means, as a line and, if wanted, as JSON; the exit status."""
     from genre_tasks.errors import GenreError
 
-    if isinstance(error, SystemExit):
-        code = error.code if isinstance(error.code, int) else int(error.code is not None)
+    if isinstance(error, SystemExit | typer.Exit):
+        stated = error.code if isinstance(error, SystemExit) else error.exit_code
+        code = stated if isinstance(stated, int) else int(stated is not None)
         if code != 0:
             print_unfinished(_STATUS_BY_CODE.get(code, "failed"), code)
         return code
@@ -131,14 +129,10 @@ def _report_fault(error: BaseException) -> int:
 
 
 def _find_cause(error: BaseException) -> BaseException:
-    """The error that a library has wrapped: one of a group, or an end of file that typer takes for an abort."""
-    while True:
-        if isinstance(error, BaseExceptionGroup):
-            error = error.exceptions[0]
-        elif isinstance(error, typer.Abort) and error.__cause__ is not None:
-            error = error.__cause__
-        else:
-            return error
+    """The first error of a group, in which some libraries wrap even a single one."""
+    while isinstance(error, BaseExceptionGroup):
+        error = error.exceptions[0]
+    return error
 
 
 def _translate(error: BaseException) -> GenreError | None:

@@ -111,14 +111,17 @@ def main() -> None:
         sys.argv.remove("--debug")
     prepare_environment(debug)
     prepare_streams()
-    start_outcome(as_json=wants_json(typer.main.get_command(app), sys.argv[1:]))
-    raise SystemExit(run_guarded(_run_command, debug))
+    command = typer.main.get_command(app)
+    words = sys.argv[1:]
+    start_outcome(as_json=wants_json(command, words))
 
+    def invoke() -> None:
+        check_words(words)
+        # Not by `app()`, which prints errors and chooses exit statuses by itself.
+        with command.make_context("genre", words) as context:
+            command.invoke(context)
 
-def _run_command() -> object:
-    check_words(sys.argv[1:])
-    # Not standalone, where typer would print errors and choose exit statuses by itself.
-    return app(prog_name="genre", standalone_mode=False)
+    raise SystemExit(run_guarded(invoke, debug))
 
 
 if __name__ == "__main__":

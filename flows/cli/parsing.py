@@ -68,7 +68,7 @@ def check_number(value: float, option: str, low: float, high: float) -> float:
 
 
 def check_words(words: Sequence[str]) -> None:
-    """Checks that the words of a command line are text: Prefect and the records could not hold them otherwise.
+    r"""Checks that the words of a command line are text: Prefect and the records could not hold them otherwise.
 
     Args:
         words: the command line without the program's name.
@@ -76,9 +76,9 @@ def check_words(words: Sequence[str]) -> None:
     Raises:
         InputError: a word holds bytes that are no text in the encoding of this system's file names.
 
-    >>> check_words(["run", "pandaset:/data/caf\udce9"])
+    >>> check_words(["check", "pandaset:/data/caf\udce9"])
     Traceback (most recent call last):
-    genre_tasks.errors.InputError: 'pandaset:/data/caf\\udce9' is no text in utf-8 ...
+    genre_tasks.errors.InputError: 'pandaset:/data/caf\udce9' is no text in utf-8 ...
     """
     for word in words:
         # Python keeps such bytes as half characters, which only the system's own functions take.

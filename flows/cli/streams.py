@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import errno
 import io
@@ -103,6 +104,15 @@ class _ForgivingFile(io.FileIO):
         return count
 
 
+class _AsciiText(io.TextIOWrapper):
+    """A text stream in ASCII that does not say so: click takes such a stream for a mistake and writes UTF-8 into it."""
+
+    @property
+    def encoding(self) -> str:  # type: ignore[override]
+        """The smallest encoding that is a superset of the real one."""
+        return "latin-1"
+
+
 def _prepare_output(stream: TextIO | None, is_result: bool) -> TextIO:
     if stream is None:
         return Path(os.devnull).open("w", encoding="utf-8", errors="replace")
@@ -112,7 +122,8 @@ def _prepare_output(stream: TextIO | None, is_result: bool) -> TextIO:
         # An object without a descriptor, as tests put in place of a stream, takes any text.
         return stream
     is_unbuffered = bool(getattr(stream, "write_through", False))
-    return io.TextIOWrapper(
+    is_ascii = codecs.lookup(stream.encoding).name == "ascii"
+    return (_AsciiText if is_ascii else io.TextIOWrapper)(
         raw if is_unbuffered else io.BufferedWriter(raw),  # type: ignore[arg-type]
         encoding=stream.encoding,
         errors="replace",
