@@ -60,7 +60,7 @@ class LogsFailedError(GenreError):
 
     def __init__(self, outcomes: Sequence[Mapping[str, Any]]) -> None:
         problems = [
-            f"{outcome['log']} {outcome['status'].replace('_', ' ')}: {outcome['why']}"
+            f"{outcome['log']} {outcome['status'].replace('_', ' ')}: {outcome['why'].rstrip('.')}"
             for outcome in outcomes
             if outcome["status"] != "done"
         ]
