@@ -11,6 +11,15 @@ from flows.cli.options import ChunksOption, DryRunOption, LogsArgument, PresetOp
 from flows.cli.parsing import parse_path
 from flows.defaults import DEFAULT_STORE
 
+CostFolderOption = Annotated[
+    Path,
+    typer.Option(
+        parser=parse_path,
+        metavar="PATH",
+        help="The folder for cost.parquet, cost.png and cost.md; those that are there are replaced.",
+    ),
+]
+
 
 def cost(
     logs: LogsArgument,
@@ -25,14 +34,7 @@ def cost(
     chunks: ChunksOption = None,
     settings: SettingsOption = None,
     store: StoreOption = DEFAULT_STORE,
-    out: Annotated[
-        Path,
-        typer.Option(
-            parser=parse_path,
-            metavar="PATH",
-            help="The folder for cost.parquet, cost.png and cost.md; those that are there are replaced.",
-        ),
-    ] = Path("cost"),
+    out: CostFolderOption = Path("cost"),
     dry_run: DryRunOption = False,
 ) -> None:
     """Measure what each setting gains and what it costs in time.

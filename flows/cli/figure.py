@@ -28,6 +28,15 @@ FrameOption = Annotated[
     int | None, typer.Option(help="The frame of the log to show, a source frame. The middle one if not given.")
 ]
 
+FigureFileOption = Annotated[
+    Path,
+    typer.Option(
+        parser=parse_path,
+        metavar="PATH",
+        help="The PNG file to write, such as figure.png; an existing one is replaced.",
+    ),
+]
+
 
 def figure(
     kind: Annotated[
@@ -35,14 +44,7 @@ def figure(
         typer.Argument(help="The methods to compare: recon for those of table 1, fixers for those of table 3."),
     ],
     log: LogArgument,
-    out: Annotated[
-        Path,
-        typer.Option(
-            parser=parse_path,
-            metavar="PATH",
-            help="The PNG file to write, such as figure.png; an existing one is replaced.",
-        ),
-    ],
+    out: FigureFileOption,
     preset: PresetOption = "small",
     chunk: ChunkOption = 0,
     camera: CameraOption = None,

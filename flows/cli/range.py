@@ -16,6 +16,24 @@ if TYPE_CHECKING:
     from genre_tasks.config import RangeConfig
     from genre_tasks.reliability.reliable_range import CurvePoint
 
+DetectorOption = Annotated[
+    Path | None,
+    typer.Option(
+        parser=parse_path,
+        metavar="PATH",
+        help="An ONNX model that detects road users, in the form of FastestDet. The fraction of actors that it "
+        "finds is then one more guard.",
+    ),
+]
+RangeFolderOption = Annotated[
+    Path,
+    typer.Option(
+        parser=parse_path,
+        metavar="PATH",
+        help="The folder for range.parquet and range.png; those that are there are replaced.",
+    ),
+]
+
 
 def range_command(
     run: RunArgument,
@@ -26,23 +44,8 @@ def range_command(
     ] = 3.0,
     every: Annotated[int, typer.Option(help="Render every n-th frame.")] = 4,
     store: StoreOption = DEFAULT_STORE,
-    detector: Annotated[
-        Path | None,
-        typer.Option(
-            parser=parse_path,
-            metavar="PATH",
-            help="An ONNX model that detects road users, in the form of FastestDet. The fraction of actors that it "
-            "finds is then one more guard.",
-        ),
-    ] = None,
-    out: Annotated[
-        Path,
-        typer.Option(
-            parser=parse_path,
-            metavar="PATH",
-            help="The folder for range.parquet and range.png; those that are there are replaced.",
-        ),
-    ] = Path("range"),
+    detector: DetectorOption = None,
+    out: RangeFolderOption = Path("range"),
 ) -> None:
     """Estimate how far beside the path a scene can be trusted.
 

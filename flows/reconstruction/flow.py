@@ -79,11 +79,6 @@ def reconstruct_log(
     budget = None if budget_s is None else Budget(budget_s, start_time, table, preset, effective)
     values = effective.model_dump(mode="json")
     done, failures = _reconstruct_chunks(log, store, values, selected, budget)
-    # Without any chunk there is nothing to report on. With a single one the error itself is the message.
-    if not done and len(selected) == 1:
-        raise failures[selected[0]]
-    if not done and failures:
-        raise ChunksLeftOutError(log, len(selected), failures)
     notes = {} if budget is None else {chunk: budget.choosers[chunk].describe() for chunk in done}
     run = FinishedRun(
         log=log,
@@ -185,10 +180,15 @@ def _reconstruct_chunks(
             # A setting that is wrong for one chunk is wrong for all of them, and there is nothing to wait for.
             raise
         except GenreError as error:
-            # With a single chunk the error itself is the message: the caller raises it.
+            # With a single chunk the error itself is the message.
             if len(chunks) > 1:
                 get_reporter().message(f"chunk {chunk} is left out: {error}")
             failures[chunk] = error
+    # Without any chunk there is nothing to report on.
+    if not done and len(chunks) == 1:
+        raise failures[chunks[0]]
+    if not done and failures:
+        raise ChunksLeftOutError(log, len(chunks), failures)
     return done, failures
 
 

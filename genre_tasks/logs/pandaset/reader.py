@@ -51,10 +51,8 @@ def open_pandaset(rest: str) -> PandaSetLog:
     folder = expand_user_path(rest)
     uri = f"pandaset:{rest}"
     remedy = "Give the folder of one sequence, as in pandaset:PATH/002."
-    if "*" in rest and not folder.is_dir():
-        # The commands for many logs expand it; a command for one log must be given one.
-        remedy = f"{remedy} `genre cost` and `genre table` take several logs."
-        raise InputError("one log is wanted here, and a star stands for several", remedy=remedy, log=uri)
+    if "*" in rest:
+        remedy += " Only `genre cost` and `genre table` take several, for which a star stands."
     if not rest or not folder.is_dir():
         raise InputError("there is no such sequence folder", remedy=remedy, file=folder, log=uri)
     missing = [name for name in _REQUIRED_FILES if not (folder / name).is_file()]
