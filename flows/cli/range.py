@@ -59,6 +59,7 @@ def range_command(
     \b
         genre range 4b1c --max-drop-db 2 --out range
     """
+    from flows.cli.existing_store import open_existing_store
     from flows.cli.output_paths import check_output_folder
     from flows.cli.parsing import check_number
     from flows.cli.printing import print_rows
@@ -71,6 +72,7 @@ def range_command(
     check_output_folder(out, "--out", ("range.parquet", "range.png"))
     check_number(max_drop_db, "--max-drop-db", 0, 100)
     config = _range_config(max_drop_db, every)
+    open_existing_store(store)
     # Without a detector the other guards decide alone.
     network = None
     if detector is not None:
@@ -105,7 +107,9 @@ def _range_config(max_drop_db: float, every: int) -> RangeConfig:
     try:
         return RangeConfig(max_drop_db=max_drop_db, every=every)
     except ValidationError as error:
-        raise ConfigError(f"{error.errors()[0]['msg']}", remedy="See `genre range --help`.") from error
+        wrong = error.errors()[0]
+        option = "--" + str(wrong["loc"][0]).replace("_", "-")
+        raise ConfigError(f"{option}: {wrong['msg']}", remedy="See `genre range --help`.") from error
 
 
 def _point_row(point: CurvePoint) -> dict[str, Any]:

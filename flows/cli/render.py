@@ -55,6 +55,7 @@ def render(
     \b
         genre render 4b1c --shift 3 --camera front_camera --out beside.mp4
     """
+    from flows.cli.existing_store import open_existing_store
     from flows.cli.output_paths import check_output_file
     from flows.cli.parsing import check_number
     from flows.reconstruction.run_records import find_last_stage, read_stage_scene, read_stage_value
@@ -67,6 +68,7 @@ def render(
         remedy = "Give --out x.png for that frame alone, or leave out --frame."
         raise ConfigError(f"--frame {frame} is for one image, and a film has all frames", remedy=remedy)
     check_number(shift, "--shift", -_MAX_SHIFT_M, _MAX_SHIFT_M)
+    open_existing_store(store)
     number, ingested = read_stage_value(store, run, chunk, "ingest")
     stage = find_last_stage(store, run, number) if stage is None else stage
     scene = read_stage_scene(store, run, number, stage)

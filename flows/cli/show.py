@@ -49,6 +49,7 @@ def show(
         genre show 4b1c
         genre show 9f02ab --picture artifact.png
     """
+    from flows.cli.existing_store import open_existing_store
     from flows.cli.output_paths import check_output_file
     from flows.cli.printing import print_fields, print_rows
 
@@ -61,22 +62,21 @@ def show(
         from flows.configuration import load_configuration
 
         print_fields(f"preset {preset}", load_configuration(preset).model_dump())
-    elif what == "runs":
+        return
+    opened = open_existing_store(store)
+    if what == "runs":
         from flows.reconstruction.run_records import list_runs
 
         print_rows("runs", [_run_row(record) for record in list_runs(store)])
     elif what == "stages":
-        from storage.local import open_store
-
-        print_rows("artifacts", [_artifact_row(artifact) for artifact in open_store(store).artifacts()])
+        print_rows("artifacts", [_artifact_row(artifact) for artifact in opened.artifacts()])
     else:
-        _show_run_or_artifact(what, store, picture)
+        _show_run_or_artifact(what, opened, store, picture)
 
 
-def _show_run_or_artifact(name: str, store: str, picture: Path | None) -> None:
+def _show_run_or_artifact(name: str, opened: LocalStore, store: str, picture: Path | None) -> None:
     from flows.reconstruction.run_records import list_runs
     from genre_tasks.errors import InputError
-    from storage.local import open_store
 
     # Names of runs and keys of artifacts are both hex digits. Runs are fewer and asked for more often.
     runs = [record for record in list_runs(store) if record["run"].startswith(name)]
@@ -85,7 +85,6 @@ def _show_run_or_artifact(name: str, store: str, picture: Path | None) -> None:
             raise _no_picture("a run")
         _print_record(runs[0])
         return
-    opened = open_store(store)
     artifacts = [artifact for artifact in opened.artifacts() if artifact.manifest.key.startswith(name)]
     # Several may share the first digits; to guess which one is meant would show the wrong one.
     if runs or len(artifacts) != 1 or not name:

@@ -118,7 +118,18 @@ def test_an_option_that_would_be_ignored_is_refused(tmp_path: Path) -> None:
     assert "--frame 3" in film.problem and "x.png" in film.remedy
     # An unset variable of a script's is no name.
     assert "0 runs" in refusal("show", "", "--store", str(tmp_path)).problem
+    assert "knob" in refusal("cost", STREET, "--knobs", "", "--dry-run").problem
     assert "0 runs" in refusal("render", "", "--out", picture, "--store", str(tmp_path)).problem
+
+
+def test_a_mistyped_store_is_no_empty_store(tmp_path: Path) -> None:
+    """Report: none found; case 25 of the list of odd logs."""
+    (tmp_path / "file").touch()
+    for words in (["show"], ["show", "stages"], ["show", "4b1c"], ["verify"], ["render", "4b1c"], ["range", "4b1c"]):
+        out = ["--out", str(tmp_path / "x.png")] if words[0] in ("render", "range") else []
+        for store in ("nowhere", "file"):
+            error = refusal(*words, *out, "--store", str(tmp_path / store))
+            assert error.problem == "there is no store" and error.file == str(tmp_path / store)
 
 
 @pytest.mark.parametrize("text", ["", " ", "1-", "2..0", "0,", "-1", "0,0", "1_0", "٣", "1.5", "9" * 5000, "nan"])
