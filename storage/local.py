@@ -16,6 +16,7 @@ from urllib.parse import unquote, urlparse
 
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
 from genre_tasks.temporary_names import describe_owner, is_abandoned, remove_path
+from genre_tasks.user_paths import expand_user_path
 from storage.address import Address
 from storage.artifact_folders import (
     TEMPORARY_PREFIX,
@@ -51,7 +52,7 @@ class LocalStore:
     """
 
     def __init__(self, root: Path) -> None:
-        self.root = Path(root).expanduser().absolute()
+        self.root = expand_user_path(root).absolute()
 
     def commit(self, address: Address, kind: str, value: Any, provenance: Provenance | None = None) -> Artifact:
         """Writes a value to a temporary folder and renames it into place: see :meth:`storage.store.Store.commit`.

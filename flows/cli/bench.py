@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from flows.cli.parsing import parse_path
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -106,7 +108,13 @@ def bench(
         ),
     ],
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="The JSON file to write; required, except for a dry run.")
+        Path | None,
+        typer.Option(
+            "--json",
+            parser=parse_path,
+            metavar="PATH",
+            help="The JSON file to write, over an existing one; required, except for a dry run.",
+        ),
     ] = None,
     quick: Annotated[bool, typer.Option(help="Measure less, so that it ends within 20 minutes.")] = False,
     dry_run: Annotated[
@@ -131,8 +139,12 @@ def bench(
     \b
         genre bench pipeline --json pipeline.json --set seeds=1001
     """
+    from flows.cli.output_paths import check_output_file
     from genre_tasks.errors import ConfigError
 
+    # Before the benchmark is imported, which takes seconds.
+    if json_file is not None:
+        check_output_file(json_file, "--json")
     benchmark = load_bench(name)
     runner = importlib.import_module("benchmarks.common.runner")
     # The options are read before anything is measured, so that a mistyped one costs nothing.

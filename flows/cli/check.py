@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from typing import TYPE_CHECKING
 
 import typer
@@ -28,17 +27,19 @@ def check(log: LogArgument, as_json: JsonOption = False) -> None:
     \b
         genre check pandaset:data/002
     """
+    from flows.cli.outcome import add_facts, print_outcome
     from genre_tasks.log_checks.check_log import check_log
     from genre_tasks.logs.registry import open_log
 
+    add_facts(uri=log, verdict=None)
     report = check_log(open_log(log))
+    # With the exit status a script can check a whole dataset before it spends hours on it.
+    exit_code = 1 if report.verdict == "unusable" else 0
     if as_json:
-        typer.echo(json.dumps({"verdict": report.verdict} | dataclasses.asdict(report), default=str))
+        print_outcome("done", {"verdict": report.verdict} | dataclasses.asdict(report), exit_code=exit_code)
     else:
         _print_report(log, report)
-    # With the exit status a script can check a whole dataset before it spends hours on it.
-    if report.verdict == "unusable":
-        raise typer.Exit(1)
+    raise typer.Exit(exit_code)
 
 
 def _print_report(log: str, report: LogCheck) -> None:

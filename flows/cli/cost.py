@@ -8,7 +8,17 @@ from typing import Annotated
 import typer
 
 from flows.cli.options import ChunksOption, DryRunOption, LogsArgument, PresetOption, SettingsOption, StoreOption
+from flows.cli.parsing import parse_path
 from flows.defaults import DEFAULT_STORE
+
+CostFolderOption = Annotated[
+    Path,
+    typer.Option(
+        parser=parse_path,
+        metavar="PATH",
+        help="The folder for cost.parquet, cost.png and cost.md; those that are there are replaced.",
+    ),
+]
 
 
 def cost(
@@ -24,7 +34,7 @@ def cost(
     chunks: ChunksOption = None,
     settings: SettingsOption = None,
     store: StoreOption = DEFAULT_STORE,
-    out: Annotated[Path, typer.Option(help="The folder for cost.parquet, cost.png and cost.md.")] = Path("cost"),
+    out: CostFolderOption = Path("cost"),
     dry_run: DryRunOption = False,
 ) -> None:
     """Measure what each setting gains and what it costs in time.
@@ -39,14 +49,16 @@ def cost(
     \b
         genre cost 'synthetic:street?seed=1000' --knobs gnet_iterations --seeds 0 --out cost
     """
+    from flows.cli.output_paths import check_output_folder
     from flows.cli.parsing import parse_numbers
     from flows.cli.printing import print_rows
     from flows.cost_sweep.cell import Sweep, predict_cells
     from flows.cost_sweep.flow import SweepRequest, cost_of_accuracy
 
+    check_output_folder(out, "--out", ("cost.parquet", "cost_cells.parquet", "cost.png", "cost.md"))
     chunk_numbers = parse_numbers(chunks, "--chunks")
     seed_numbers = parse_numbers(seeds, "--seeds")
-    knob_names = knobs.split(",") if knobs else None
+    knob_names = None if knobs is None else knobs.split(",")
     sweep = Sweep(preset, tuple(settings or ()), store)
     # Mistakes in the request show here, before Prefect's server takes seconds to start.
     cells = SweepRequest(sweep, logs, chunk_numbers, seed_numbers, knob_names).cells()

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
-import json
 import os
 import platform
 from dataclasses import dataclass
 from typing import Any
-
-import typer
 
 from flows.cli.options import JsonOption
 
@@ -57,7 +54,9 @@ def doctor(as_json: JsonOption = False) -> None:
     """
     report = {**_describe_hardware(), "renderer": _renderer(), "weights": _weights(), "packages": _packages()}
     if as_json:
-        typer.echo(json.dumps(report))
+        from flows.cli.outcome import print_outcome
+
+        print_outcome("done", report)
         return
     from flows.cli.printing import print_fields
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flows.cli.options import ChunkOption, LogArgument, PresetOption, SettingsOption, StoreOption
+from flows.cli.parsing import parse_path
 from flows.defaults import DEFAULT_PRESET, DEFAULT_STORE
 
 if TYPE_CHECKING:
@@ -22,7 +23,12 @@ def effects(
     settings: SettingsOption = None,
     store: StoreOption = DEFAULT_STORE,
     out: Annotated[
-        Path | None, typer.Option(help="A folder for effects.parquet, effects.png and the plan's other files.")
+        Path | None,
+        typer.Option(
+            parser=parse_path,
+            metavar="PATH",
+            help="A folder for effects.parquet, effects.png and the plan's other files, over those of an earlier plan.",
+        ),
     ] = None,
 ) -> None:
     """Show which effects a log calls for, and why.
@@ -36,11 +42,14 @@ def effects(
     \b
         genre effects pandaset:data/002 --chunk 1 --out effects
     """
+    from flows.cli.output_paths import check_output_folder
     from flows.cli.printing import print_rows
     from flows.configuration import load_configuration
     from flows.pipeline.effects_plan import plan_effects
     from flows.pipeline.stage_runner import Job
 
+    if out is not None:
+        check_output_folder(out, "--out", ("effects.parquet", "effects.png"))
     config = load_configuration(preset, settings=settings or [])
     # Both stages go through the store: a run with the same settings finds this plan there and takes it.
     plan = plan_effects(Job(log, chunk, store, config.model_dump(mode="json")))

@@ -16,6 +16,7 @@ from flows.cli.options import (
     StoreOption,
     WeightsOption,
 )
+from flows.cli.parsing import parse_path
 from flows.defaults import DEFAULT_STORE
 
 if TYPE_CHECKING:
@@ -27,6 +28,15 @@ FrameOption = Annotated[
     int | None, typer.Option(help="The frame of the log to show, a source frame. The middle one if not given.")
 ]
 
+FigureFileOption = Annotated[
+    Path,
+    typer.Option(
+        parser=parse_path,
+        metavar="PATH",
+        help="The PNG file to write, such as figure.png; an existing one is replaced.",
+    ),
+]
+
 
 def figure(
     kind: Annotated[
@@ -34,7 +44,7 @@ def figure(
         typer.Argument(help="The methods to compare: recon for those of table 1, fixers for those of table 3."),
     ],
     log: LogArgument,
-    out: Annotated[Path, typer.Option(help="The PNG file to write, such as figure.png.")],
+    out: FigureFileOption,
     preset: PresetOption = "small",
     chunk: ChunkOption = 0,
     camera: CameraOption = None,
@@ -54,18 +64,17 @@ def figure(
     \b
         genre figure recon 'synthetic:street?seed=1000' --out figure.png
     """
+    from flows.cli.output_paths import check_output_file
     from flows.cli.terminal import TerminalReporter
     from flows.paper_tables.figure import TABLE, comparison_strips, draw_strips, parse_kind
     from flows.paper_tables.request import TableRequest
     from flows.pipeline.stage_runner import run_stage
     from genre_tasks.atomic_path import atomic_path
-    from genre_tasks.errors import ConfigError
     from storage.codecs.png import write_png
 
     parsed_kind = parse_kind(kind)
     # Checked before any stage is computed, which may take minutes.
-    if out.suffix != ".png":
-        raise ConfigError(f"cannot write {out.name!r}", remedy="Give --out x.png.")
+    check_output_file(out, "--out", (".png",))
     request = TableRequest(
         number=TABLE[parsed_kind],
         logs=(log,),

@@ -14,22 +14,26 @@ from flows.cli.cost import cost
 from flows.cli.doctor import doctor
 from flows.cli.effects import effects
 from flows.cli.figure import figure
+from flows.cli.last_resort import run_guarded
+from flows.cli.outcome import start_outcome, wants_json
 from flows.cli.paper_table import table
+from flows.cli.parsing import check_words
 from flows.cli.range import range_command
 from flows.cli.render import render
 from flows.cli.run import run
 from flows.cli.show import show
-from flows.cli.signals import Interrupted, end_on_signals
+from flows.cli.signals import end_on_signals
+from flows.cli.streams import prepare_streams
 from flows.cli.train import app as train_app
 from flows.cli.verify import verify
-from flows.prefect_api.state_folder import find_state_folder
+from flows.machine.state_folder import find_state_folder
 
 app = typer.Typer(
     name="genre",
     no_args_is_help=True,
     # Installing completion would write into the user's shell files.
     add_completion=False,
-    # An unexpected error shows Python's own traceback, which a report of a bug can quote.
+    # Errors are translated in one place, `run_guarded`.
     pretty_exceptions_enable=False,
     # Plain help starts faster, and the reference of commands is generated from the same text.
     rich_markup_mode=None,
@@ -68,7 +72,8 @@ def describe_program(
     """Make driving logs re-simulatable: reconstruct them as 3D Gaussian scenes and enhance the scenes.
 
     Add --debug to any command to see a traceback after an error. The exit status is 0 after success, 2 after a mistake
-    in the input or the configuration, 1 after another error, and 130 after Ctrl-C.
+    in the input or the configuration, 1 after another error or where a part was left out, 130 after Ctrl-C, and 70
+    after a fault of the program, whose traceback is then written to a file.
 
     Example:
 
@@ -94,30 +99,29 @@ def prepare_environment(debug: bool) -> None:
 
 
 def main() -> None:
-    """Runs the command. An expected error becomes one line on stderr and an exit status.
+    """Runs the command. An error becomes one line on stderr and an exit status.
 
     Raises:
-        SystemExit: always, with the exit status, unless ``--debug`` shows the error's traceback.
+        SystemExit: always, with the exit status.
     """
     end_on_signals()
     # Any command takes --debug, in any place, so it is taken out before the arguments are parsed.
     debug = "--debug" in sys.argv
     if debug:
         sys.argv.remove("--debug")
-    from genre_tasks.errors import ConfigError, GenreError, InputError
+    prepare_environment(debug)
+    prepare_streams()
+    command = typer.main.get_command(app)
+    words = sys.argv[1:]
+    start_outcome(as_json=wants_json(command, words))
 
-    try:
-        prepare_environment(debug)
-        app()
-    except Interrupted as interruption:
-        typer.echo("stopped", err=True)
-        raise SystemExit(interruption.exit_status) from None
-    except GenreError as error:
-        if debug:
-            raise
-        # Not on stdout: what a command prints there may go into another program.
-        typer.echo(f"error: {error}", err=True)
-        raise SystemExit(2 if isinstance(error, ConfigError | InputError) else 1) from None
+    def invoke() -> None:
+        check_words(words)
+        # Not by `app()`, which prints errors and chooses exit statuses by itself.
+        with command.make_context("genre", words) as context:
+            command.invoke(context)
+
+    raise SystemExit(run_guarded(invoke, debug))
 
 
 if __name__ == "__main__":

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from flows.cli.parsing import parse_path
+
 # Typer shows a default after the help text. A default of None says nothing, so those texts say what None means.
 
 LogArgument = Annotated[
@@ -43,7 +45,10 @@ ChunkOption = Annotated[int, typer.Option(help="The number of the chunk in the l
 DryRunOption = Annotated[
     bool, typer.Option("--dry-run", help="Print what would be computed and how long it would take, then stop.")
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")]
+JsonOption = Annotated[
+    bool,
+    typer.Option("--json", help="Print one JSON object instead of tables, whether or not the command succeeds."),
+]
 
 RunArgument = Annotated[
     str,
@@ -61,6 +66,8 @@ MethodsOption = Annotated[
     list[Path] | None,
     typer.Option(
         "--method",
+        parser=parse_path,
+        metavar="PATH",
         help="A YAML file that describes one more method, with the keys name, settings, end and note. May be given "
         "several times.",
     ),

@@ -17,6 +17,7 @@ from flows.cli.options import (
     StoreOption,
     WeightsOption,
 )
+from flows.cli.parsing import parse_path
 from flows.defaults import DEFAULT_STORE
 
 if TYPE_CHECKING:
@@ -30,11 +31,20 @@ TableNumberArgument = Annotated[
     ),
 ]
 TableFolderOption = Annotated[
-    Path, typer.Option(help="The folder for the table as Markdown and as Parquet, tableN_DATASET.md and .parquet.")
+    Path,
+    typer.Option(
+        parser=parse_path,
+        metavar="PATH",
+        help="The folder for the table as Markdown and as Parquet, tableN_DATASET.md and .parquet, over earlier ones.",
+    ),
 ]
 PageOption = Annotated[
     Path | None,
-    typer.Option(help="A Markdown page that collects several tables; the section of this table is replaced."),
+    typer.Option(
+        parser=parse_path,
+        metavar="PATH",
+        help="A Markdown page that collects several tables; the section of this table is replaced.",
+    ),
 ]
 RemarksOption = Annotated[
     list[str] | None,
@@ -72,10 +82,14 @@ def table(
     \b
         genre table 4 'synthetic:street?seed=1000' --chunks 0 --out tables
     """
+    from flows.cli.output_paths import check_output_file, check_output_folder
     from flows.cli.parsing import parse_numbers
     from flows.cli.printing import print_rows
     from flows.paper_tables.request import TableRequest, predict_table
 
+    check_output_folder(out, "--out")
+    if into is not None:
+        check_output_file(into, "--into")
     chunk_numbers = parse_numbers(chunks, "--chunks")
     request = TableRequest(
         number=number,

@@ -9,11 +9,30 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flows.cli.options import RunArgument, RunChunkOption, SceneStageOption, StoreOption
+from flows.cli.parsing import parse_path
 from flows.defaults import DEFAULT_STORE
 
 if TYPE_CHECKING:
     from genre_tasks.config import RangeConfig
     from genre_tasks.reliability.reliable_range import CurvePoint
+
+DetectorOption = Annotated[
+    Path | None,
+    typer.Option(
+        parser=parse_path,
+        metavar="PATH",
+        help="An ONNX model that detects road users, in the form of FastestDet. The fraction of actors that it "
+        "finds is then one more guard.",
+    ),
+]
+RangeFolderOption = Annotated[
+    Path,
+    typer.Option(
+        parser=parse_path,
+        metavar="PATH",
+        help="The folder for range.parquet and range.png; those that are there are replaced.",
+    ),
+]
 
 
 def range_command(
@@ -25,14 +44,8 @@ def range_command(
     ] = 3.0,
     every: Annotated[int, typer.Option(help="Render every n-th frame.")] = 4,
     store: StoreOption = DEFAULT_STORE,
-    detector: Annotated[
-        Path | None,
-        typer.Option(
-            help="An ONNX model that detects road users, in the form of FastestDet. The fraction of actors that it "
-            "finds is then one more guard."
-        ),
-    ] = None,
-    out: Annotated[Path, typer.Option(help="The folder for range.parquet and range.png.")] = Path("range"),
+    detector: DetectorOption = None,
+    out: RangeFolderOption = Path("range"),
 ) -> None:
     """Estimate how far beside the path a scene can be trusted.
 
@@ -46,6 +59,9 @@ def range_command(
     \b
         genre range 4b1c --max-drop-db 2 --out range
     """
+    from flows.cli.existing_store import open_existing_store
+    from flows.cli.output_paths import check_output_folder
+    from flows.cli.parsing import check_number
     from flows.cli.printing import print_rows
     from flows.cli.terminal import TerminalReporter
     from flows.reconstruction.reliable_range import write_range
@@ -53,7 +69,10 @@ def range_command(
     from genre_tasks.reliability.chunk_seam import measure_seam, median_psnr_by_distance
     from genre_tasks.reliability.reliable_range import estimate_reliable_range
 
+    check_output_folder(out, "--out", ("range.parquet", "range.png"))
+    check_number(max_drop_db, "--max-drop-db", 0, 100)
     config = _range_config(max_drop_db, every)
+    open_existing_store(store)
     # Without a detector the other guards decide alone.
     network = None
     if detector is not None:
@@ -61,7 +80,7 @@ def range_command(
 
         network = Detector.load(detector)
     number, ingested = read_stage_value(store, run, chunk, "ingest")
-    scene_stage = stage or find_last_stage(store, run, number)
+    scene_stage = find_last_stage(store, run, number) if stage is None else stage
     _, plan = read_stage_value(store, run, number, "effects")
     scene = read_stage_scene(store, run, number, scene_stage)
     with TerminalReporter(f"chunk {number}  guards") as reporter:
@@ -88,7 +107,9 @@ def _range_config(max_drop_db: float, every: int) -> RangeConfig:
     try:
         return RangeConfig(max_drop_db=max_drop_db, every=every)
     except ValidationError as error:
-        raise ConfigError(f"{error.errors()[0]['msg']}", remedy="See `genre range --help`.") from error
+        wrong = error.errors()[0]
+        option = "--" + str(wrong["loc"][0]).replace("_", "-")
+        raise ConfigError(f"{option}: {wrong['msg']}", remedy="See `genre range --help`.") from error
 
 
 def _point_row(point: CurvePoint) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flows.cli.options import RunArgument, RunChunkOption, SceneStageOption, StoreOption
+from flows.cli.parsing import parse_path
 from flows.defaults import DEFAULT_STORE
 
 if TYPE_CHECKING:
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from genre_tasks.scene.graph import SceneGraph
 
 _FRAMES_PER_SECOND = 10
+_MAX_SHIFT_M = 1000.0
+"""Farther beside the path no log has recorded anything."""
 
 
 def render(
@@ -26,8 +29,10 @@ def render(
     out: Annotated[
         Path,
         typer.Option(
+            parser=parse_path,
+            metavar="PATH",
             help="The file to write: x.mp4 for a film of all frames, x.png for one frame, or x.exr for one frame with "
-            "opacity and depth."
+            "opacity and depth. An existing file is replaced.",
         ),
     ],
     stage: SceneStageOption = None,
@@ -50,17 +55,25 @@ def render(
     \b
         genre render 4b1c --shift 3 --camera front_camera --out beside.mp4
     """
+    from flows.cli.existing_store import open_existing_store
+    from flows.cli.output_paths import check_output_file
+    from flows.cli.parsing import check_number
     from flows.reconstruction.run_records import find_last_stage, read_stage_scene, read_stage_value
-    from genre_tasks.errors import InputError
+    from genre_tasks.errors import ConfigError, InputError
 
     # Checked first, because reading a scene takes seconds.
-    if out.suffix not in (".mp4", ".png", ".exr"):
-        raise InputError(f"cannot write '{out.suffix}'", remedy="Use .mp4, .png or .exr.", file=out)
+    check_output_file(out, "--out", (".mp4", ".png", ".exr"))
+    is_film = out.suffix.lower() == ".mp4"
+    if is_film and frame is not None:
+        remedy = "Give --out x.png for that frame alone, or leave out --frame."
+        raise ConfigError(f"--frame {frame} is for one image, and a film has all frames", remedy=remedy)
+    check_number(shift, "--shift", -_MAX_SHIFT_M, _MAX_SHIFT_M)
+    open_existing_store(store)
     number, ingested = read_stage_value(store, run, chunk, "ingest")
-    stage = stage or find_last_stage(store, run, number)
+    stage = find_last_stage(store, run, number) if stage is None else stage
     scene = read_stage_scene(store, run, number, stage)
-    frames = list(ingested.frames) if out.suffix == ".mp4" else [_select_frame(ingested, frame)]
-    camera = camera or ingested.camera_names[0]
+    frames = list(ingested.frames) if is_film else [_select_frame(ingested, frame)]
+    camera = ingested.camera_names[0] if camera is None else camera
     if camera not in ingested.camera_names:
         raise InputError(
             f"the chunk has no camera '{camera}'", remedy=f"It has {', '.join(ingested.camera_names)}.", chunk=number
@@ -107,7 +120,7 @@ def _write_images(path: Path, images: Render) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     # A film takes a while to encode: until it is complete, an earlier file of that name stays.
     with atomic_path(path) as part:
-        if path.suffix == ".exr":
+        if path.suffix.lower() == ".exr":
             _write_exr(part, images)
         else:
             _write_pixels(part, images)
@@ -123,9 +136,11 @@ def _write_pixels(path: Path, images: Render) -> None:
     import imageio.v3 as imageio
 
     pixels: NDArray[np.uint8] = (images.color.clamp(0, 1) * 255).round().byte().numpy()
-    if path.suffix == ".png":
-        imageio.imwrite(path, pixels[0])
+    # Named here, as the library looks for suffixes in lower case alone.
+    suffix = path.suffix.lower()
+    if suffix == ".png":
+        imageio.imwrite(path, pixels[0], extension=suffix)
         return
     # H.264 stores colour for blocks of 2 × 2 pixels, so width and height must be even.
     even = pixels[:, : pixels.shape[1] // 2 * 2, : pixels.shape[2] // 2 * 2]
-    imageio.imwrite(path, even, fps=_FRAMES_PER_SECOND, codec="libx264", macro_block_size=2)
+    imageio.imwrite(path, even, extension=suffix, fps=_FRAMES_PER_SECOND, codec="libx264", macro_block_size=2)

@@ -18,14 +18,19 @@ from flows.cli.options import (
     SettingsOption,
     StoreOption,
 )
+from flows.cli.parsing import parse_path
 from flows.defaults import DEFAULT_PRESET, DEFAULT_STORE
 
 if TYPE_CHECKING:
+    from flows.reconstruction.left_out import ChunksLeftOutError
     from genre_tasks.config import PipelineConfig
 
 
 ConfigFileOption = Annotated[
-    Path | None, typer.Option(help="A YAML file with settings over the preset; --set goes over both.")
+    Path | None,
+    typer.Option(
+        parser=parse_path, metavar="PATH", help="A YAML file with settings over the preset; --set goes over both."
+    ),
 ]
 StrictOption = Annotated[
     bool, typer.Option("--strict", help="Stop at a missing or unreadable image or sweep, instead of leaving it out.")
@@ -40,8 +45,10 @@ BudgetOption = Annotated[
 TableOption = Annotated[
     Path | None,
     typer.Option(
+        parser=parse_path,
+        metavar="PATH",
         help="The settings that --budget chooses from: a cost.parquet of `genre cost`. The preset's own table if not "
-        "given."
+        "given.",
     ),
 ]
 
@@ -90,9 +97,12 @@ def run(
     """
     import psutil
 
+    from flows.cli.outcome import add_facts
     from flows.cli.parsing import parse_duration, parse_numbers
     from flows.configuration import load_configuration
 
+    # Known from here on, whatever happens: what a program reads where the run does not come to its end.
+    add_facts(log=log, preset=preset, store=store, run=None, report=None, chunks=[], left_out=[])
     # Over the settings, as --strict is the more explicit wish.
     strict_settings = ["ingest.strict=true"] if strict else []
     request = _RunRequest(
@@ -128,26 +138,42 @@ def _check_request(request: _RunRequest) -> None:
 
 
 def _reconstruct(request: _RunRequest, as_json: bool) -> None:
-    from flows.cli.run_tables import print_run
+    from flows.cli.outcome import add_facts
     from flows.cli.terminal import report_on_terminal
 
     with report_on_terminal():
         from flows.reconstruction.flow import reconstruct_log
+        from flows.reconstruction.left_out import ChunksLeftOutError
 
-        record = reconstruct_log(
-            request.log,
-            preset=request.preset,
-            store=request.store,
-            chunks=request.chunks,
-            config=request.config.model_dump(mode="json"),
-            budget_s=request.budget_s,
-            start_time=request.start_time,
-            table=request.table,
-        )
+        try:
+            record = reconstruct_log(
+                request.log,
+                preset=request.preset,
+                store=request.store,
+                chunks=request.chunks,
+                config=request.config.model_dump(mode="json"),
+                budget_s=request.budget_s,
+                start_time=request.start_time,
+                table=request.table,
+            )
+        except ChunksLeftOutError as error:
+            if error.record is None:
+                add_facts(left_out=error.left_out)
+            else:
+                _print_result(error.record, as_json, error)
+            raise
+    _print_result(record, as_json)
+
+
+def _print_result(record: dict[str, Any], as_json: bool, error: ChunksLeftOutError | None = None) -> None:
+    from flows.cli.outcome import print_outcome
+    from flows.cli.run_tables import print_run
+
     if as_json:
         # Without the configuration, which `genre show RUN` prints: a program that reads this wants results.
-        shown = ("log", "preset", "store", "run", "report", "chunks", "budget")
-        typer.echo(json.dumps({key: record[key] for key in shown if key in record}))
+        shown = ("log", "preset", "store", "run", "report", "chunks", "left_out", "budget")
+        facts = {key: record[key] for key in shown if key in record}
+        print_outcome(record["status"], facts, error)
     else:
         print_run(record)
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from rich import box
-from rich.console import Console
-from rich.table import Table
+
+from flows.cli.printing import make_console, print_table
+from flows.error_record import describe_record
 
 _METRIC_HEADINGS = {
     "interpolation/psnr": "PSNR",
@@ -28,14 +28,16 @@ def print_run(record: Mapping[str, Any]) -> None:
     Args:
         record: the run's record, as ``reconstruct_log`` returns it.
     """
-    console = _make_console()
+    console = make_console()
     for chunk in record["chunks"]:
-        console.print(_metrics_table(f"{record['log']}, chunk {chunk['chunk']}", chunk["stages"]))
+        _print_metrics(f"{record['log']}, chunk {chunk['chunk']}", chunk["stages"])
         # Evaluation is apart, since it is no part of making a scene: its time would hide that of the stages.
         evaluation_s = sum(s["seconds"] for s in chunk["stages"] if s["stage"].startswith("evaluate/"))
         console.print(f"  evaluation took {evaluation_s:.1f} s, which no stage's seconds include")
         for warning in chunk["warnings"]:
-            console.print(f"  note: {warning}", markup=False)
+            console.print(f"  note: {warning}")
+    for entry in record.get("left_out", ()):
+        console.print(f"chunk {entry['chunk']} is left out: {describe_record(entry)}")
     stages = [stage for chunk in record["chunks"] for stage in chunk["stages"]]
     hits = sum(stage["cached"] for stage in stages)
     all_of_them = " (all of them)" if hits == len(stages) else ""
@@ -57,42 +59,35 @@ def print_prediction(prediction: Mapping[str, Any]) -> None:
         prediction: what ``predict_run`` returns, with ``differs``: (before, after) of each setting that the run has
             otherwise than its preset.
     """
-    console = _make_console()
-    table = Table(title=f"{prediction['log']} (dry run)", title_justify="left")
-    for heading in ("chunk", "stage", "key", "cache", "seconds", "GB"):
-        table.add_column(heading, justify="right" if heading in ("seconds", "GB") else "left")
-    for row in prediction["stages"]:
-        table.add_row(
+    console = make_console()
+    rows = [
+        [
             str(row["chunk"]),
             row["stage"],
             (row["key"] or "")[:12],
             row["cache"],
             f"{row['seconds']:.0f}",
             f"{row['gigabytes']:.1f}",
-        )
-    console.print(table)
+        ]
+        for row in prediction["stages"]
+    ]
+    headings = ("chunk", "stage", "key", "cache", "seconds", "GB")
+    print_table(f"{prediction['log']} (dry run)", headings, rows, right=("seconds", "GB"))
     cost = f"about {prediction['seconds']:.0f} s to compute, {prediction['gigabytes']:.1f} GB at the peak"
     console.print(f"{cost}; predicted from {prediction['basis']}")
     for key, (before, after) in prediction["differs"].items():
-        console.print(f"  {key}: {before} → {after}", markup=False)
+        console.print(f"  {key}: {before} → {after}")
 
 
-def _metrics_table(title: str, stages: list[dict[str, Any]]) -> Table:
-    table = Table(title=title, title_justify="left", box=box.SIMPLE, padding=(0, 1, 0, 0))
+def _print_metrics(title: str, stages: list[dict[str, Any]]) -> None:
     shown = [name for name in _METRIC_HEADINGS if any(name in stage["metrics"] for stage in stages)]
-    for heading in ("stage", "", "s", "MiB", *(_METRIC_HEADINGS[name] for name in shown)):
-        table.add_column(heading, justify="left" if heading in ("stage", "") else "right", no_wrap=True)
+    numbers = ("s", "MiB", *(_METRIC_HEADINGS[name] for name in shown))
+    rows = []
     for stage in stages:
         if stage["stage"].startswith("evaluate/"):
             continue
         metrics = stage["metrics"]
         values = [f"{metrics[name]:.3f}" if name in metrics else "" for name in shown]
         served = "cached" if stage["cached"] else "new"
-        table.add_row(stage["stage"], served, f"{stage['seconds']:.1f}", f"{stage['peak_mib']:.0f}", *values)
-    return table
-
-
-def _make_console() -> Console:
-    """As wide as the terminal; wide enough for the tables where there is none."""
-    # A pipe or a file has no width, and the 80 columns that Rich assumes would cut the metrics off.
-    return Console() if sys.stdout.isatty() else Console(width=110)
+        rows.append([stage["stage"], served, f"{stage['seconds']:.1f}", f"{stage['peak_mib']:.0f}", *values])
+    print_table(title, ("stage", "", *numbers), rows, right=numbers, box=box.SIMPLE)

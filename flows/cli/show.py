@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flows.cli.options import PresetOption, StoreOption
+from flows.cli.parsing import parse_path
 from flows.defaults import DEFAULT_PRESET, DEFAULT_STORE
 
 if TYPE_CHECKING:
@@ -26,7 +27,12 @@ def show(
     store: StoreOption = DEFAULT_STORE,
     preset: PresetOption = DEFAULT_PRESET,
     picture: Annotated[
-        Path | None, typer.Option(help="Write the artifact's picture to this PNG file, if `what` is a key.")
+        Path | None,
+        typer.Option(
+            parser=parse_path,
+            metavar="PATH",
+            help="Write the artifact's picture to this PNG file, over an existing one. `what` must be a key.",
+        ),
     ] = None,
 ) -> None:
     """Show what a store holds: runs, stages, one run or one artifact.
@@ -43,54 +49,74 @@ def show(
         genre show 4b1c
         genre show 9f02ab --picture artifact.png
     """
+    from flows.cli.existing_store import open_existing_store
+    from flows.cli.output_paths import check_output_file
     from flows.cli.printing import print_fields, print_rows
 
+    if picture is not None:
+        # The picture is a PNG under any name, and a PNG called x.jpg would not open everywhere.
+        check_output_file(picture, "--picture", (".png",))
+        if what in ("config", "runs", "stages"):
+            raise _no_picture(f"a list of {what}" if what != "config" else "a configuration")
     if what == "config":
         from flows.configuration import load_configuration
 
         print_fields(f"preset {preset}", load_configuration(preset).model_dump())
-    elif what == "runs":
+        return
+    opened = open_existing_store(store)
+    if what == "runs":
         from flows.reconstruction.run_records import list_runs
 
         print_rows("runs", [_run_row(record) for record in list_runs(store)])
     elif what == "stages":
-        from storage.local import open_store
-
-        print_rows("artifacts", [_artifact_row(artifact) for artifact in open_store(store).artifacts()])
+        print_rows("artifacts", [_artifact_row(artifact) for artifact in opened.artifacts()])
     else:
-        _show_run_or_artifact(what, store, picture)
+        _show_run_or_artifact(what, opened, store, picture)
 
 
-def _show_run_or_artifact(name: str, store: str, picture: Path | None) -> None:
+def _show_run_or_artifact(name: str, opened: LocalStore, store: str, picture: Path | None) -> None:
     from flows.reconstruction.run_records import list_runs
     from genre_tasks.errors import InputError
-    from storage.local import open_store
 
     # Names of runs and keys of artifacts are both hex digits. Runs are fewer and asked for more often.
-    for record in list_runs(store):
-        if record["run"].startswith(name):
-            _print_record(record)
-            return
-    opened = open_store(store)
+    runs = [record for record in list_runs(store) if record["run"].startswith(name)]
+    if len(runs) == 1 and name:
+        if picture is not None:
+            raise _no_picture("a run")
+        _print_record(runs[0])
+        return
     artifacts = [artifact for artifact in opened.artifacts() if artifact.manifest.key.startswith(name)]
-    # Several stages may share the first digits; to guess which one is meant would show the wrong one.
-    if len(artifacts) != 1:
+    # Several may share the first digits; to guess which one is meant would show the wrong one.
+    if runs or len(artifacts) != 1 or not name:
         raise InputError(
-            f"{len(artifacts)} runs or artifacts begin with '{name}'",
+            f"{len(runs) + len(artifacts)} runs or artifacts begin with '{name}'",
             remedy="`genre show runs` and `genre show stages` list them; give more of the name.",
             file=store,
         )
+    if picture is not None:
+        # Before the tables, which would hide an error about the picture.
+        _write_picture(opened, artifacts[0], picture)
     _print_artifact(opened, artifacts[0])
     if picture is not None:
-        _write_picture(opened, artifacts[0], picture)
         typer.echo(f"wrote {picture}")
+
+
+def _no_picture(what: str) -> Exception:
+    from genre_tasks.errors import ConfigError
+
+    return ConfigError(
+        f"{what} has no picture", remedy="Give --picture with the key of an artifact; `genre show stages` lists them."
+    )
 
 
 def _print_record(record: dict[str, Any]) -> None:
     from flows.cli.printing import print_fields
+    from flows.error_record import describe_record
 
-    fields = ("log", "preset", "report", "differs", "config")
-    print_fields(f"run {record['run']}", {field: record[field] for field in fields})
+    fields = {field: record[field] for field in ("log", "preset", "report", "differs", "config")}
+    # Records of earlier versions do not have it.
+    left_out = {f"chunk {entry['chunk']}": describe_record(entry) for entry in record.get("left_out", ())}
+    print_fields(f"run {record['run']}", fields | ({"left_out": left_out} if left_out else {}))
     for chunk in record["chunks"]:
         for stage in chunk["stages"]:
             row = {"key": stage["key"][:12], "seconds": stage["seconds"], **stage["metrics"]}
@@ -114,9 +140,6 @@ def _write_picture(store: LocalStore, artifact: Artifact, path: Path) -> None:
     from genre_tasks.errors import InputError
     from storage.codecs.png import write_png
 
-    # The picture is a PNG under any name, and a PNG called x.jpg would not open everywhere.
-    if path.suffix != ".png":
-        raise InputError(f"cannot write {path.name!r}", remedy="Give --picture x.png.", file=path)
     image = draw_artifact(store, artifact)
     if image is None:
         raise InputError("this artifact has no picture", remedy="Leave out --picture.", stage=artifact.manifest.stage)
@@ -132,6 +155,7 @@ def _run_row(record: dict[str, Any]) -> dict[str, Any]:
         "log": record["log"],
         "preset": record["preset"],
         "chunks": len(record["chunks"]),
+        "left out": len(record.get("left_out", ())),
         "computed": sum(not stage["cached"] for stage in stages),
         "seconds": sum(stage["seconds"] for stage in stages),
         "report": record["report"],

@@ -9,14 +9,15 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from flows.cli.outcome import add_stage, print_unfinished
 from flows.cli.signals import Interrupted
+from flows.cli.streams import is_rewritable, terminal_width
 
 if TYPE_CHECKING:
     from types import TracebackType
 
     from flows.pipeline.stage_runner import ArtifactRef
 
-_LIVE_LINE_WIDTH = 118
 _LIVE_PERIOD_S = 0.2
 _PLAIN_PERIOD_S = 10.0
 
@@ -32,7 +33,7 @@ class TerminalReporter:
     """
 
     def __init__(self, title: str, prefect: AbstractContextManager[None] | None = None) -> None:
-        self._is_live = sys.stderr.isatty()
+        self._is_live = is_rewritable(sys.stderr)
         self._title = title
         self._prefect = prefect or nullcontext()
         self._start_s = time.monotonic()
@@ -54,12 +55,17 @@ class TerminalReporter:
         if self._is_live:
             self._write("")
         if isinstance(error, Interrupted):
-            self.stopped()
+            self.stopped(error.exit_status)
             raise typer.Exit(error.exit_status)
 
-    def stopped(self) -> None:
-        """Writes that the command was stopped and how to go on."""
+    def stopped(self, exit_status: int) -> None:
+        """Writes that the command was stopped and how to go on.
+
+        Args:
+            exit_status: of the command.
+        """
         self._write("stopped; what is finished is kept: run the same command again to go on", end=True)
+        print_unfinished("interrupted", exit_status)
 
     def stage_started(self, stage: str, chunk: int) -> None:
         """Starts the line of a stage."""
@@ -86,6 +92,7 @@ class TerminalReporter:
 
     def stage_ended(self, stage: str, chunk: int, ref: ArtifactRef) -> None:
         """Ends the line of a stage, with its seconds; the artifact's note follows as a warning."""
+        add_stage(chunk, stage, ref.key, ref.cached)
         seconds = time.monotonic() - self._start_s
         outcome = "from the cache" if ref.cached else f"computed in {seconds:.1f} s"
         self._write(f"chunk {chunk}  {stage:<18} {outcome}", end=True)
@@ -112,7 +119,7 @@ class TerminalReporter:
     def _write(self, text: str, end: bool = False) -> None:
         if self._is_live:
             # Back to the line's start, and delete what is on it; in one write, so that the line does not flicker.
-            line = f"{text}\n" if end else text[:_LIVE_LINE_WIDTH]
+            line = f"{text}\n" if end else _shorten(text)
             sys.stderr.write(f"\r\x1b[2K{line}")
         else:
             sys.stderr.write(f"{text}\n")
@@ -134,3 +141,12 @@ def report_on_terminal(title: str = "starting Prefect") -> TerminalReporter:
     reporter = TerminalReporter(title, connect_to_prefect())
     set_reporter(reporter)
     return reporter
+
+
+def _shorten(text: str) -> str:
+    """The text in one line of the terminal: a longer one would leave its first part behind when it is rewritten."""
+    from rich.cells import cell_len, set_cell_size
+
+    # A cell less than the terminal has: some terminals break the line once the last one is written.
+    width = terminal_width(sys.stderr) - 1
+    return text if cell_len(text) <= width else f"{set_cell_size(text, width - 3)}..."

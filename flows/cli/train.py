@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from flows.cli.parsing import parse_path
+
 app = typer.Typer(
     help="""Train the networks (tens of minutes each on a CPU).
 
@@ -21,7 +23,22 @@ app = typer.Typer(
     no_args_is_help=True,
 )
 
-FolderOption = Annotated[Path, typer.Option(help="The folder for pairs, scenes, checkpoints, curves and weights.")]
+
+def _parse_folder(text: str | Path) -> Path:
+    from flows.cli.output_paths import check_output_folder
+
+    # Checked here for all commands: a training that cannot write its first checkpoint has lost minutes.
+    folder = parse_path(text)
+    check_output_folder(folder, "--folder")
+    return folder
+
+
+FolderOption = Annotated[
+    Path,
+    typer.Option(
+        parser=_parse_folder, metavar="PATH", help="The folder for pairs, scenes, checkpoints, curves and weights."
+    ),
+]
 StreetsOption = Annotated[int, typer.Option(min=0, help="How many synthetic streets to train on.")]
 RealLogOption = Annotated[
     str | None,
@@ -177,8 +194,11 @@ def gnet(
     \b
         genre train gnet --folder training --validate-every 200
     """
+    from flows.cli.parsing import check_number
     from flows.cli.terminal import report_on_terminal
 
+    if novel is not None:
+        check_number(novel, "--novel", 0, 1e6)
     with report_on_terminal("training gnet"):
         from flows.training.optimiser_flow import train_network
 

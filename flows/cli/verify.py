@@ -19,13 +19,9 @@ def verify(store: StoreOption = DEFAULT_STORE) -> None:
     \b
         genre verify --store genre-store
     """
-    from genre_tasks.errors import InputError
-    from storage.local import open_store
+    from flows.cli.existing_store import open_existing_store
 
-    opened = open_store(store)
-    # A mistyped path must not look like an empty store in which nothing is damaged.
-    if not opened.root.is_dir():
-        raise InputError("there is no store", remedy="Give the folder of one by --store.", file=opened.root)
+    opened = open_existing_store(store)
     sound = 0
     damaged = 0
     for _, error in opened.verify_all():

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.suggestions import did_you_mean
+from genre_tasks.user_paths import expand_user_path
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ def read_weights(options: Sequence[str]) -> dict[str, str]:
             remedy = f"{did_you_mean(name, SLOTS)}Write NAME=PATH. {known}."
             raise ConfigError(f"cannot read --weights {option!r}", remedy=remedy)
         # Checked now, because the stage that loads them may run hours later.
-        _check_weights(SLOTS[name], Path(path))
+        _check_weights(SLOTS[name], expand_user_path(path))
         weights[name] = path
     return weights
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import functools
+import glob
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import InputError
+from genre_tasks.user_paths import expand_user_path
 
 if TYPE_CHECKING:
     from genre_tasks.logs.types import DrivingLog
@@ -68,29 +70,39 @@ def select_chunks(log: str, config: PipelineConfig, chunks: list[int] | None) ->
 
 
 def expand_logs(logs: list[str]) -> list[str]:
-    """Replaces every ``reader:PATH/*`` by one URI for each folder in ``PATH``, sorted by name.
+    """Replaces every ``reader:PATH/*`` by one URI for each folder that matches, sorted by name.
 
     Args:
-        logs: URIs of logs, with or without a star at the end.
+        logs: URIs of logs, with or without stars in the path; ``~`` is the home folder.
 
     Returns:
         URIs without stars, in the order of ``logs``.
 
     Raises:
-        InputError: a star matches no folder.
+        InputError: a star matches no folder; or ``~NAME`` names no user.
 
     >>> expand_logs(["synthetic:street?seed=1", "pandaset:logs/002"])
     ['synthetic:street?seed=1', 'pandaset:logs/002']
     """
     expanded: list[str] = []
     for uri in logs:
-        reader, _, path = uri.partition(":")
-        if not path.endswith("/*"):
+        reader, _, text = uri.partition(":")
+        path = expand_user_path(text)
+        # A folder may really have a star in its name.
+        if "*" not in text or path.is_dir():
             expanded.append(uri)
             continue
-        # Sorted by name, so that a dataset runs in the same order on every file system.
-        folders = sorted(folder for folder in Path(path[:-2]).glob("*") if folder.is_dir())
+        folders = _match_folders(path)
         if not folders:
-            raise InputError(f"no log matches {uri}", remedy="Name a folder that holds sequences.", file=path[:-2])
+            raise InputError(f"no log matches {uri}", remedy="Name a folder that holds sequences.", file=path.parent)
         expanded += [f"{reader}:{folder}" for folder in folders]
     return expanded
+
+
+def _match_folders(path: Path) -> list[Path]:
+    start = next(index for index, part in enumerate(path.parts) if "*" in part)
+    # Only a star stands for other characters: brackets and question marks are parts of names.
+    names = ["*".join(glob.escape(text) for text in part.split("*")) for part in path.parts[start:]]
+    found = Path(*path.parts[:start]).glob("/".join(names))
+    # Sorted by name, so that a dataset runs in the same order on every file system. Hidden folders hold no logs.
+    return sorted(folder for folder in found if folder.is_dir() and not folder.name.startswith("."))

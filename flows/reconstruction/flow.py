@@ -20,10 +20,11 @@ from flows.pipeline.log_cache import expand_logs, select_chunks
 from flows.pipeline.progress import get_reporter
 from flows.pipeline.stage_runner import ArtifactRef, Job
 from flows.pipeline.stage_task import stage_task
+from flows.reconstruction.left_out import ChunksLeftOutError, LogsFailedError, describe_log, record_failures
 from flows.reconstruction.run_records import FinishedRun, summarise_run, write_run_record
 from flows.reconstruction.run_summary import RunSummary
 from genre_tasks.config import PipelineConfig
-from genre_tasks.errors import GenreError, InputError
+from genre_tasks.errors import ConfigError, GenreError
 from storage.local import open_store
 
 _log = logging.getLogger("genre")
@@ -45,7 +46,8 @@ def reconstruct_log(
     """Reconstructs and enhances one driving log, chunk by chunk, and writes a report into the store.
 
     With a budget, the most accurate setting that fits into the time is chosen, and again before each stage. A chunk
-    that cannot be reconstructed is left out; the others go on, and the error is raised at the end.
+    that cannot be reconstructed is left out; the others go on. Record and report are then written with what was left
+    out, and the error is raised at the end.
 
     Args:
         log: the log's URI, such as ``pandaset:PATH/002`` or ``synthetic:street?seed=1000``.
@@ -63,8 +65,8 @@ def reconstruct_log(
 
     Raises:
         ConfigError: a setting is wrong, or no table fits to the budget.
-        InputError: the log or one of its chunks cannot be reconstructed.
-        GenreError: any other kind, as a stage raises it.
+        ChunksLeftOutError: some of several chunks cannot be reconstructed; it has the record of the others.
+        GenreError: any other kind, as a stage of the only chunk raises it.
 
     Example::
 
@@ -77,9 +79,6 @@ def reconstruct_log(
     budget = None if budget_s is None else Budget(budget_s, start_time, table, preset, effective)
     values = effective.model_dump(mode="json")
     done, failures = _reconstruct_chunks(log, store, values, selected, budget)
-    # Without any chunk there is nothing to report on.
-    if not done and failures:
-        raise failures[0]
     notes = {} if budget is None else {chunk: budget.choosers[chunk].describe() for chunk in done}
     run = FinishedRun(
         log=log,
@@ -89,13 +88,14 @@ def reconstruct_log(
         differs=diff_from_preset(effective, preset),
         chunks=done,
         notes=notes,
+        left_out=record_failures(log, failures),
     )
     summary = summarise_run(run)
     record = write_run_record(run, summary, {} if budget is None else {"budget": budget.as_record()})
     # After the record is written: if Prefect's server fails now, the run is complete nevertheless.
     _publish_to_prefect(summary)
     if failures:
-        raise failures[0]
+        raise ChunksLeftOutError(log, len(selected), failures, record)
     return record
 
 
@@ -108,6 +108,8 @@ def reconstruct_dataset(
 ) -> list[dict[str, Any]]:
     """Reconstructs many logs, each in a child flow run; a log that fails does not stop the others.
 
+    At the end a line for each log says how it ended and why; Prefect shows the same as a table.
+
     Args:
         logs: URIs of logs; ``pandaset:PATH/*`` stands for every sequence in a folder.
         preset: demo, small, fine, long or paper.
@@ -118,18 +120,35 @@ def reconstruct_dataset(
         The record of each log, in order.
 
     Raises:
-        GenreError: the first error, once all logs were tried.
+        InputError: a star matches no folder.
+        LogsFailedError: some logs are not complete, raised once all were tried; its ``outcomes`` has all of them.
+
+    Example::
+
+        try:
+            records = reconstruct_dataset(["pandaset:data/*"], preset="small")
+        except LogsFailedError as error:
+            failed = [outcome["log"] for outcome in error.outcomes if outcome["status"] == "failed"]
     """
     records: list[dict[str, Any]] = []
-    failures: list[Exception] = []
+    outcomes: list[dict[str, Any]] = []
     for log in expand_logs(logs):
         try:
-            records.append(reconstruct_log(log, preset=preset, store=store, settings=settings))
-        except GenreError as error:
-            _log.error("%s failed: %s", log, error)
-            failures.append(error)
-    if failures:
-        raise failures[0]
+            record = reconstruct_log(log, preset=preset, store=store, settings=settings)
+        except Exception as error:
+            # A fault of ours with one log is no reason to leave the others either.
+            if not isinstance(error, GenreError):
+                _log.exception("%s failed by a fault of ours", log)
+            outcomes.append(describe_log(log, getattr(error, "record", None), error))
+        else:
+            records.append(record)
+            outcomes.append(describe_log(log, record, None))
+    for outcome in outcomes:
+        get_reporter().message("  ".join(f"{name} {value}" for name, value in outcome.items() if value not in ("", 0)))
+    # After the lines: if Prefect's server fails now, they are there nevertheless.
+    create_table_artifact(table=outcomes, key="logs", description=f"{len(records)} of {len(outcomes)} logs are done")
+    if len(records) < len(outcomes):
+        raise LogsFailedError(outcomes)
     return records
 
 
@@ -142,10 +161,10 @@ def _effective_config(preset: str, config: dict[str, Any] | None, settings: list
 
 def _reconstruct_chunks(
     log: str, store: str, config: dict[str, Any], chunks: list[int], budget: Budget | None
-) -> tuple[dict[int, dict[str, ArtifactRef]], list[GenreError]]:
+) -> tuple[dict[int, dict[str, ArtifactRef]], dict[int, GenreError]]:
     """The references of every chunk that could be reconstructed, and the errors of those that could not."""
     done: dict[int, dict[str, ArtifactRef]] = {}
-    failures: list[GenreError] = []
+    failures: dict[int, GenreError] = {}
     if budget is not None:
         get_reporter().message(budget.describe())
     for position, chunk in enumerate(chunks):
@@ -157,11 +176,19 @@ def _reconstruct_chunks(
                 # Chunks that are not begun yet share the time that is left equally.
                 fraction = 1 / (len(chunks) - position)
                 done[chunk] = _reconstruct_within(job, budget.make_chooser(log, chunk), fraction)
-        except InputError as error:
-            # With a single chunk the error itself is the message: the caller raises it.
+        except ConfigError:
+            # A setting that is wrong for one chunk is wrong for all of them, and there is nothing to wait for.
+            raise
+        except GenreError as error:
+            # With a single chunk the error itself is the message.
             if len(chunks) > 1:
-                _log.error("chunk %d is left out: %s", chunk, error)
-            failures.append(error)
+                get_reporter().message(f"chunk {chunk} is left out: {error}")
+            failures[chunk] = error
+    # Without any chunk there is nothing to report on.
+    if not done and len(chunks) == 1:
+        raise failures[chunks[0]]
+    if not done and failures:
+        raise ChunksLeftOutError(log, len(chunks), failures)
     return done, failures
 
 

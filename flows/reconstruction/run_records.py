@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import io
-import itertools
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from flows.error_record import describe_record
 from flows.pipeline.definition import PIPELINE
 from flows.pipeline.stage_runner import ArtifactRef
-from flows.reconstruction.run_summary import ChunkSummary, RunSummary, StageSummary
+from flows.reconstruction.run_summary import ChunkSummary, RunSummary, StageSummary, add_counts, place_over_seconds
 from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import InputError
 from storage.address import Address
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from genre_tasks.metrics.results import Evaluation, Metric
+    from genre_tasks.metrics.results import Evaluation
     from genre_tasks.scene.chunk import Chunk
     from genre_tasks.scene.graph import SceneGraph
     from storage.local import Artifact
@@ -45,6 +45,7 @@ class FinishedRun:
         differs: (the preset's value, the value used) of each ``section.key`` that was set otherwise.
         chunks: references by chunk and stage.
         notes: by chunk, what it was made with if that is not what was asked for.
+        left_out: of each chunk that could not be reconstructed, its error as plain values with ``chunk``.
     """
 
     log: str
@@ -54,6 +55,7 @@ class FinishedRun:
     differs: dict[str, tuple[Any, Any]]
     chunks: dict[int, dict[str, ArtifactRef]]
     notes: Mapping[int, str] = field(default_factory=dict)
+    left_out: Sequence[Mapping[str, Any]] = ()
 
     @property
     def name(self) -> str:
@@ -88,6 +90,7 @@ def write_run_record(run: FinishedRun, summary: RunSummary, extra: Mapping[str, 
     run.folder.mkdir(parents=True, exist_ok=True)
     report = write_report(run.folder / "report.html", summary)
     record = {
+        "status": "partly_done" if run.left_out else "done",
         "log": run.log,
         "preset": run.preset,
         "store": run.store,
@@ -103,11 +106,12 @@ def write_run_record(run: FinishedRun, summary: RunSummary, extra: Mapping[str, 
             }
             for chunk in summary.chunks
         ],
+        "left_out": [dict(entry) for entry in run.left_out],
         **extra,
     }
     # Written last: a folder without run.json belongs to a run that did not end.
     with atomic_path(run.folder / "run.json") as part:
-        part.write_text(json.dumps(record, indent=1))
+        part.write_text(json.dumps(record, indent=1), encoding="utf-8")
     return record
 
 
@@ -125,7 +129,15 @@ def summarise_run(run: FinishedRun) -> RunSummary:
         ArtifactCorruptError: an evaluation artifact is damaged.
     """
     chunks = tuple(_summarise_chunk(run, chunk, refs) for chunk, refs in sorted(run.chunks.items()))
-    return RunSummary(run=run.name, log=run.log, preset=run.preset, store=run.store, chunks=chunks, differs=run.differs)
+    return RunSummary(
+        run=run.name,
+        log=run.log,
+        preset=run.preset,
+        store=run.store,
+        chunks=chunks,
+        differs=run.differs,
+        left_out=tuple(f"chunk {entry['chunk']} is left out: {describe_record(entry)}" for entry in run.left_out),
+    )
 
 
 def list_runs(store: str) -> list[dict[str, Any]]:
@@ -139,7 +151,7 @@ def list_runs(store: str) -> list[dict[str, Any]]:
     """
     # The time of the file is when the run ended; the record itself holds no time.
     paths = sorted((open_store(store).root / _FOLDER).glob("*/run.json"), key=lambda path: path.stat().st_mtime)
-    return [json.loads(path.read_text()) for path in paths]
+    return [json.loads(path.read_text(encoding="utf-8")) for path in paths]
 
 
 def read_stage_value(store: str, run: str, chunk: int | None, stage: str) -> tuple[int, Any]:
@@ -285,25 +297,11 @@ def _summarise_stage(artifact: Artifact, cached: bool, evaluation: Evaluation | 
         return summary
     return replace(
         summary,
-        metrics=_metrics_with_counts(evaluation.metrics),
+        metrics=add_counts(evaluation.metrics),
         pictures={name: _encode_png(image) for name, image in evaluation.pictures.items()},
-        curve=_curve_over_seconds(evaluation.curve, manifest.measurements.get("seconds_per_iteration", ())),
+        curve=place_over_seconds(evaluation.curve, manifest.measurements.get("seconds_per_iteration", ())),
         intervals={m.name: (m.low, m.high) for m in evaluation.metrics if m.low is not None and m.high is not None},
     )
-
-
-def _metrics_with_counts(metrics: Sequence[Metric]) -> dict[str, float]:
-    """Metric values by name, and for each group of them the number of images as ``…/n``."""
-    values = {metric.name: metric.value for metric in metrics}
-    return values | {metric.name.rpartition("/")[0] + "/n": float(metric.n) for metric in metrics}
-
-
-def _curve_over_seconds(
-    curve: Iterable[tuple[int, float]], seconds_per_iteration: Iterable[float]
-) -> tuple[tuple[float, float], ...]:
-    spent_s = [0.0, *itertools.accumulate(seconds_per_iteration)]
-    # An artifact of an earlier version may have kept the curve without the seconds.
-    return tuple((spent_s[iteration], psnr) for iteration, psnr in curve if iteration < len(spent_s))
 
 
 def _encode_png(image: NDArray[np.uint8]) -> bytes:
@@ -327,7 +325,8 @@ def _find_by_path(store: str, ref: ArtifactRef) -> Artifact:
 
 def _find_record(store: str, run: str) -> dict[str, Any]:
     found = [record for record in list_runs(store) if record["run"].startswith(run)]
-    if len(found) != 1:
+    # Every name begins with an empty text, which an unset variable of a script's leaves.
+    if len(found) != 1 or not run:
         raise InputError(
             f"{len(found)} runs of this store begin with '{run}'", remedy="`genre show runs` lists them.", file=store
         )

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from genre_tasks.metrics.results import Metric
 
 
 @dataclass(frozen=True)
@@ -76,6 +80,7 @@ class RunSummary:
         store: folder (or URI) of the store.
         chunks: the chunks that were reconstructed.
         differs: (the preset's value, the value used) of each ``section.key`` that was set otherwise.
+        left_out: a sentence for each chunk that could not be reconstructed.
     """
 
     run: str
@@ -84,3 +89,37 @@ class RunSummary:
     store: str
     chunks: tuple[ChunkSummary, ...]
     differs: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
+    left_out: tuple[str, ...] = ()
+
+
+def add_counts(metrics: Sequence[Metric]) -> dict[str, float]:
+    """Arranges metrics by name, with the number of images of each group.
+
+    Args:
+        metrics: of one stage.
+
+    Returns:
+        Value by name, and for each group of them the number of images as ``…/n``.
+    """
+    values = {metric.name: metric.value for metric in metrics}
+    return values | {metric.name.rpartition("/")[0] + "/n": float(metric.n) for metric in metrics}
+
+
+def place_over_seconds(
+    curve: Iterable[tuple[int, float]], seconds_per_iteration: Iterable[float]
+) -> tuple[tuple[float, float], ...]:
+    """Places an accuracy curve over the seconds that its iterations took.
+
+    Args:
+        curve: (iteration, held-out PSNR in dB).
+        seconds_per_iteration: of every iteration; fewer where an artifact of an earlier version lacks them.
+
+    Returns:
+        (seconds so far, PSNR in dB) of the points whose time is known.
+
+    >>> place_over_seconds([(0, 20.0), (2, 24.0)], [0.5, 0.25])
+    ((0.0, 20.0), (0.75, 24.0))
+    """
+    spent_s = [0.0, *itertools.accumulate(seconds_per_iteration)]
+    # An artifact of an earlier version may have kept the curve without the seconds.
+    return tuple((spent_s[iteration], psnr) for iteration, psnr in curve if iteration < len(spent_s))

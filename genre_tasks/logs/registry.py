@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from genre_tasks.errors import InputError
 from genre_tasks.logs.types import DrivingLog
 from genre_tasks.suggestions import did_you_mean
+from genre_tasks.user_paths import expand_user_path
 
 
 @dataclass(frozen=True)
@@ -98,10 +99,12 @@ def open_log(uri: str) -> DrivingLog:
     name, colon, rest = uri.partition(":")
     entry = _READERS.get(name)
     examples = f"Known: {', '.join(_READERS[reader].example for reader in known_readers())}."
-    if not colon:
-        raise InputError(f"a log is given as reader:where, {uri!r} names no reader", remedy=examples, log=uri)
     if entry is None:
-        raise InputError(f"unknown reader {name!r}", remedy=did_you_mean(name, _READERS) + examples, log=uri)
+        # A path alone is the most frequent slip; it may hold a colon itself.
+        is_folder = uri != "" and expand_user_path(uri).is_dir()
+        hint = f"Did you mean 'pandaset:{uri}'? " if is_folder else did_you_mean(name, _READERS)
+        problem = f"unknown reader {name!r}" if colon else f"a log is given as reader:where, {uri!r} names no reader"
+        raise InputError(problem, remedy=hint + examples, log=uri)
     module_name, _, function = entry.target.partition(":")
     # Imported here, since a reader may need packages that users of other readers do not have.
     try:

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 from genre_tasks.errors import InputError
+from genre_tasks.user_paths import expand_user_path
 
 
 def select_network(stage: str, method: str) -> str:
@@ -51,7 +52,7 @@ def resolve_weights(name: str, configured: str, setting: str = "") -> Path:
         known = ", ".join(sorted(p.stem for p in path.parent.glob("*.safetensors")))
         remedy = f"Those of {known} ship; train weights with `genre train {name}`, or give a path by `{key}`."
     else:
-        path = Path(configured).expanduser()
+        path = expand_user_path(configured)
         remedy = f"Check `{key}`, or leave it at `builtin`."
     if not path.exists():
         raise InputError(f"the weights of {name} do not exist", remedy=remedy, file=path, stage=name)

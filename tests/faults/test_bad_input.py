@@ -39,7 +39,10 @@ class Hostile:
 def refused(folder: Path, *args: str, words: tuple[str, ...]) -> None:
     done = small_run.genre(folder, *args)
     assert done.returncode not in (0, -9), done.stdout
-    assert done.stdout == ""
+    # One object, which says the same as the line on stderr.
+    outcome = json.loads(done.stdout)
+    assert outcome["exit_code"] == done.returncode and outcome["status"] in ("refused", "failed")
+    assert outcome["error"]["message"] in done.stderr
     error = done.stderr.strip().splitlines()[-1]
     for word in words:
         assert word in error, done.stderr[-2000:]

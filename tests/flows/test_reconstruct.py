@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from prefect.artifacts import Artifact
 
 from flows.pipeline import stage_task
 from flows.pipeline.definition import PIPELINE
 from flows.pipeline.log_cache import cached_log, expand_logs
 from flows.pipeline.stage_runner import Job
 from flows.reconstruction import flow, run_records
+from flows.reconstruction.left_out import ChunksLeftOutError, LogsFailedError
 from genre_tasks.errors import ConfigError, InputError, ResourceError, TransientIOError
 from tests.faults.small_run import LOG, SETTINGS
 
@@ -91,17 +94,70 @@ def test_what_no_retry_can_cure_is_not_retried(tmp_path: Path, monkeypatch: pyte
 def test_a_chunk_that_cannot_be_made_leaves_the_others(tmp_path: Path) -> None:
     settings = [*SETTINGS, "ingest.chunk_frames=6", "ingest.source_every=2"]
     log = LOG.replace("frames=8", "frames=7")  # the second chunk has one frame, hence one source view
-    with pytest.raises(InputError, match="source"):
+    with pytest.raises(ChunksLeftOutError, match=r"1 of 2 chunks left out: chunk 1: .*source") as caught:
         flow.reconstruct_log(log, preset="demo", store=str(tmp_path), settings=settings)
     (record,) = run_records.list_runs(str(tmp_path))
+    assert record == json.loads(json.dumps(caught.value.record))
     assert [c["chunk"] for c in record["chunks"]] == [0]
+    (entry,) = record["left_out"]
+    assert (entry["class"], entry["chunk"], entry["log"]) == ("InputError", 1, log) and entry["remedy"]
+    assert (record["status"], caught.value.status) == ("partly_done", "partly_done")
+    assert "chunk 1 is left out" in Path(record["report"]).read_text()
 
 
-def test_a_log_that_fails_does_not_stop_the_dataset(tmp_path: Path) -> None:
-    logs = ["synthetic:nothing", LOG, OTHER_LOG]
-    with pytest.raises((InputError, ConfigError), match="nothing"):
-        flow.reconstruct_dataset(logs, preset="demo", store=str(tmp_path), settings=list(SETTINGS))
-    assert {r["log"] for r in run_records.list_runs(str(tmp_path))} == {LOG, OTHER_LOG}
+@pytest.mark.parametrize(("kind", "status"), [(InputError, "refused"), (ResourceError, "failed")])
+def test_all_failures_are_listed_where_no_chunk_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: type, status: str
+) -> None:
+    """Report: none found; case 20 of the list of odd logs."""
+    monkeypatch.setattr(stage_task.stage_task, "retry_delay_seconds", 0)
+
+    def failing(stage: str, job: Job, *args: Any, **kwargs: Any) -> Any:
+        raise kind(f"reason {job.chunk}", remedy="Mend it.")
+
+    monkeypatch.setattr(stage_task, "run_stage", failing)
+    settings = [*SETTINGS, "ingest.chunk_frames=4", "ingest.source_every=2"]
+    with pytest.raises(ChunksLeftOutError, match="chunk 0: reason 0; chunk 1: reason 1") as caught:
+        flow.reconstruct_log(LOG, preset="demo", store=str(tmp_path), settings=settings)
+    assert (caught.value.record, caught.value.status) == (None, status)
+    assert [entry["message"] for entry in caught.value.left_out] == ["reason 0", "reason 1"]
+    assert not run_records.list_runs(str(tmp_path))
+
+
+def test_a_dataset_ends_with_a_table_of_all_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports: PrefectHQ/prefect#9193, ploigos/ploigos-step-runner#179."""
+    short = LOG.replace("frames=8", "frames=6")
+    partly = LOG.replace("frames=8", "frames=7")
+    settings = [*SETTINGS, "ingest.chunk_frames=6", "ingest.source_every=2"]
+    logs = ["synthetic:nothing", short, partly, OTHER_LOG]
+    real = stage_task.run_stage
+
+    def faulty(stage: str, job: Job, *args: Any, **kwargs: Any) -> Any:
+        if job.log == OTHER_LOG:
+            raise IndexError("list index out of range")
+        return real(stage, job, *args, **kwargs)
+
+    monkeypatch.setattr(stage_task, "run_stage", faulty)
+    with pytest.raises(LogsFailedError, match="3 of 4 logs are not complete") as caught:
+        flow.reconstruct_dataset(logs, preset="demo", store=str(tmp_path), settings=settings)
+    rows = caught.value.outcomes
+    assert [row["log"] for row in rows] == logs
+    assert [row["status"] for row in rows] == ["failed", "done", "partly_done", "failed"]
+    assert "no synthetic log 'nothing'" in rows[0]["why"] and "source" in rows[2]["why"]
+    assert "a fault of ours: IndexError" in rows[3]["why"]
+    assert (rows[2]["chunks"], rows[2]["left_out"]) == (1, 1)
+    for row in rows:
+        assert row["log"] in str(caught.value) or row["status"] == "done"
+    assert {r["run"] for r in run_records.list_runs(str(tmp_path))} == {rows[1]["run"], rows[2]["run"]}
+    # Prefect shows the same table.
+    shown = Artifact.get("logs")
+    assert shown is not None and json.loads(str(shown.data)) == rows
+
+
+def test_a_dataset_that_is_done_gives_its_records(tmp_path: Path) -> None:
+    records = flow.reconstruct_dataset([LOG, OTHER_LOG], preset="demo", store=str(tmp_path), settings=list(SETTINGS))
+    assert [record["log"] for record in records] == [LOG, OTHER_LOG]
+    assert {record["status"] for record in records} == {"done"}
 
 
 def test_an_unknown_chunk_is_named(tmp_path: Path) -> None:

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from flows.machine.state_folder import find_state_folder
 from flows.prefect_api.connection import check_server_answers, connect_to_prefect
 from flows.prefect_api.settings_sources import check_settings_files, find_source
-from flows.prefect_api.state_folder import find_state_folder
 from genre_tasks.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -24,6 +24,7 @@ from genre_tasks.logs.pandaset.sweeps import build_sweep
 from genre_tasks.logs.pandaset.unread_files import find_unread_files
 from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Lens, Sweep, Truth
 from genre_tasks.suggestions import did_you_mean
+from genre_tasks.user_paths import expand_user_path
 
 _MAX_SEQUENCES_LISTED = 10
 
@@ -42,11 +43,13 @@ def open_pandaset(rest: str) -> PandaSetLog:
     """
     uri = f"pandaset:{rest}"
     remedy = "Give the folder of one sequence, as in pandaset:PATH/002."
+    if "*" in rest:
+        remedy += " Only `genre cost` and `genre table` take several, for which a star stands."
+    folder = expand_user_path(rest)
     try:
-        folder = Path(rest).expanduser()
         is_folder = bool(rest) and folder.is_dir()
-    # No such home, a name that is too long, or a folder above it that may not be entered.
-    except (OSError, RuntimeError, ValueError) as error:
+    # A name that is too long, or a folder above it that may not be entered.
+    except (OSError, ValueError) as error:
         raise InputError(f"the folder cannot be opened ({error})", remedy=remedy, file=rest, log=uri) from error
     if not is_folder:
         problem = "there is no such sequence folder"
