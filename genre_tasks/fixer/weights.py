@@ -16,6 +16,7 @@ from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import InputError
 from genre_tasks.fixer.architectures import build_fnet, load_sd_turbo
 from genre_tasks.fixer.network import Fnet, FnetArchitecture
+from genre_tasks.json_files import read_json_object
 from genre_tasks.weight_checks import require_weights_fit
 
 REMEDY = "Give weights that `genre train fnet` wrote for this version, or leave `fnet.weights` at builtin."
@@ -66,7 +67,7 @@ def load_fnet(path: Path, model: str = "small") -> Fnet:
     from safetensors.torch import load_file
 
     path = path / "fnet.safetensors" if path.is_dir() else path
-    document = _read_document(path.with_suffix(".json"))
+    document = read_json_object(path.with_suffix(".json"), "configuration of the weights", REMEDY, stage="fnet")
     # Checked before the tensors are read, which takes long for the larger model.
     if document.get("model") != model:
         raise InputError(
@@ -115,16 +116,3 @@ def _build_described(document: dict[str, Any], path: Path) -> Fnet:
             file=path.with_suffix(".json"),
             stage="fnet",
         ) from error
-
-
-def _read_document(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"the configuration of the weights cannot be read: {error}", remedy=REMEDY, file=path, stage="fnet"
-        ) from error
-    # A list or a number is valid JSON, and would fail later with an error that names no file.
-    if not isinstance(document, dict):
-        raise InputError("the configuration of the weights is no object", remedy=REMEDY, file=path, stage="fnet")
-    return document
