@@ -85,12 +85,13 @@ def parse_yaml(text: str) -> Any:
     return _parse(text)[0]
 
 
-def read_yaml_mapping(path: Path, about: str, remedy: str) -> YamlMapping:
+def read_yaml_mapping(path: Path, about: str, expected: str, remedy: str) -> YamlMapping:
     """Reads a YAML file that holds a mapping.
 
     Args:
         path: the file; a leading ``~`` is the user's home folder.
         about: what the file is, for errors, such as ``configuration file``.
+        expected: what it holds, for errors, such as ``sections``.
         remedy: what to do where the file is missing, unreadable or no mapping.
 
     Returns:
@@ -108,7 +109,7 @@ def read_yaml_mapping(path: Path, about: str, remedy: str) -> YamlMapping:
     if values is None:
         return YamlMapping({}, {})
     if not isinstance(values, dict):
-        raise ConfigError(f"the {about} holds no keys at its top level", remedy=remedy, file=path)
+        raise ConfigError(f"expected {expected} at the top level", remedy=remedy, file=path)
     return YamlMapping(values, lines)
 
 
@@ -130,8 +131,6 @@ def read_text(path: Path, about: str, remedy: str) -> str:
         with path.expanduser().open("rb") as stream:
             # Bounded, as the path may name a device that never ends.
             data = stream.read(MAX_BYTES + 1)
-    except FileNotFoundError as error:
-        raise ConfigError(f"no such {about}", remedy=remedy, file=path) from error
     except (OSError, ValueError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise ConfigError(f"the {about} cannot be read: {reason}", remedy=remedy, file=path) from error

@@ -6,10 +6,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-from genre_tasks.errors import InputError
+from genre_tasks.errors import GenreError, InputError
 
 
-def read_json_object(path: Path, about: str, remedy: str, stage: str | None = None) -> dict[str, Any]:
+def read_json_object(
+    path: Path, about: str, remedy: str, stage: str | None = None, kind: type[GenreError] = InputError
+) -> dict[str, Any]:
     """Reads a JSON file that holds an object.
 
     Args:
@@ -17,13 +19,14 @@ def read_json_object(path: Path, about: str, remedy: str, stage: str | None = No
         about: what it is, for errors, such as ``configuration of the weights``.
         remedy: what the user can do.
         stage: the stage that reads it, for errors.
+        kind: the class of errors.
 
     Returns:
         Its values.
 
     Raises:
-        InputError: the file is missing, unreadable or no JSON object in UTF-8, has a key twice, or a number that is not
-            finite.
+        GenreError: of that class: the file is missing, unreadable or no JSON object in UTF-8, has a key twice, or a
+            number that is not finite.
     """
     try:
         values = json.loads(
@@ -34,10 +37,10 @@ def read_json_object(path: Path, about: str, remedy: str, stage: str | None = No
     except (OSError, ValueError, RecursionError) as error:
         # A file that is nested without end exhausts Python's stack, and its message says nothing of the file.
         reason = "it is nested too deep" if isinstance(error, RecursionError) else error
-        raise InputError(f"the {about} cannot be read: {reason}", remedy=remedy, file=path, stage=stage) from error
+        raise kind(f"the {about} cannot be read: {reason}", remedy=remedy, file=path, stage=stage) from error
     # A list or a number is valid JSON, and would fail later with an error that names no file.
     if not isinstance(values, dict):
-        raise InputError(f"the {about} is no object", remedy=remedy, file=path, stage=stage)
+        raise kind(f"the {about} is no object", remedy=remedy, file=path, stage=stage)
     return values
 
 

@@ -39,7 +39,9 @@ def load_configuration(preset: str, file: Path | None = None, settings: Sequence
     values = read_preset(preset)
     places = Places(Place(f"preset {preset}"), {})
     if file is not None:
-        change = read_yaml_mapping(file, "configuration file", "Write sections, such as 'gnet: {iterations: 8}'.")
+        change = read_yaml_mapping(
+            file, "configuration file", "sections", "Check --config, and write e.g. 'gnet: {iterations: 8}'."
+        )
         values = _merge(values, _expand_effects_word(change.values))
         by_key = {path: Place(str(file), line) for path, line in change.lines.items()}
         places = Places(places.default, by_key)
@@ -86,7 +88,8 @@ def read_preset(preset: str) -> dict[str, Any]:
             f"no preset is called {describe_value(preset)}",
             remedy=f"{did_you_mean(str(preset), PRESETS)}Known: {', '.join(PRESETS)}.",
         )
-    return read_yaml_mapping(_PRESET_FOLDER / f"{preset}.yaml", "preset", "Install the package again.").values
+    file = _PRESET_FOLDER / f"{preset}.yaml"
+    return read_yaml_mapping(file, "preset", "sections", "Install the package again.").values
 
 
 def diff_from_preset(config: PipelineConfig, preset: str) -> dict[str, tuple[Any, Any]]:

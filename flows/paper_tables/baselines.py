@@ -65,7 +65,7 @@ def load_baselines(preset: str, file: Path = FILE) -> dict[str, Baseline]:
     # Baselines share the preset's views and losses, so that only the method differs.
     gnet = read_preset(preset).get("gnet", {})
     baselines = {}
-    content = read_yaml_mapping(file, "file of baselines", "Install the package again.")
+    content = read_yaml_mapping(file, "file of baselines", "baselines", "Install the package again.")
     for name, section in content.values.items():
         # A baseline without its source or reason could not be defended against its authors.
         if missing := {"source", "why", "gnet"} - section.keys():

@@ -37,8 +37,8 @@ def read_method(file: Path, preset: str, settings: Sequence[str] = ()) -> Method
         ConfigError: the file is not there or no such YAML, a key or setting is not allowed, or a built-in method
             has this name. The error names the file.
     """
-    remedy = "Check --method, and write the keys name, settings and end."
-    content = read_yaml_mapping(file, "method's file", remedy)
+    remedy = "Check --method; flows/paper_tables/user_methods.py shows such a file."
+    content = read_yaml_mapping(file, "method's file", "name, settings, end", remedy)
     values = content.values
     for key in values:
         # An unknown key is most likely a typo, and ignoring it would measure another method.

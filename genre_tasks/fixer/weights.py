@@ -16,10 +16,9 @@ from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import InputError
 from genre_tasks.fixer.architectures import build_fnet, load_sd_turbo
 from genre_tasks.fixer.network import Fnet, FnetArchitecture
-from genre_tasks.json_files import read_json_object
+from genre_tasks.fixer.weight_files import REMEDY, WEIGHTS_FILE, read_fixer_document
 from genre_tasks.weight_checks import require_weights_fit
 
-REMEDY = "Give weights that `genre train fnet` wrote for this version, or leave `fnet.weights` at builtin."
 # Files are in half precision; weights of other tools are in any of these, and all are used in float32.
 _FILE_DTYPES = (torch.float16, torch.bfloat16, torch.float32)
 
@@ -66,16 +65,9 @@ def load_fnet(path: Path, model: str = "small") -> Fnet:
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
-    path = path / "fnet.safetensors" if path.is_dir() else path
-    document = read_json_object(path.with_suffix(".json"), "configuration of the weights", REMEDY, stage="fnet")
+    path = path / WEIGHTS_FILE if path.is_dir() else path
     # Checked before the tensors are read, which takes long for the larger model.
-    if document.get("model") != model:
-        raise InputError(
-            f"the weights are of the model {document.get('model')!r}, the configuration says {model!r}",
-            remedy="Set `fnet.model` to the weights' model, or give other weights.",
-            file=path,
-            stage="fnet",
-        )
+    document = read_fixer_document(path, model)
     try:
         tensors = load_file(path)
     except (OSError, SafetensorError) as error:

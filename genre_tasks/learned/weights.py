@@ -12,10 +12,9 @@ from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.json_files import read_json_object
 from genre_tasks.learned.learned_optimiser import LearnedOptimiser
 from genre_tasks.learned.network import NetworkConfig
+from genre_tasks.learned.weight_files import REMEDY
 from genre_tasks.optimiser.kernels.constants import IMAGE_RESIDUALS, VARYING_FEATURES
 from genre_tasks.weight_checks import require_weights_fit
-
-REMEDY = "Give weights made by `genre train gnet` or `genre train enet`, or use `builtin`."
 
 
 def load_optimiser(weights: Path) -> LearnedOptimiser:
@@ -39,7 +38,7 @@ def load_optimiser(weights: Path) -> LearnedOptimiser:
     for path in (weights, config_file):
         if not path.is_file():
             raise InputError("The optimiser's weights are missing", remedy=REMEDY, file=path)
-    values = read_json_object(config_file, "network's configuration", REMEDY)
+    values = read_json_object(config_file, "network's configuration", REMEDY, kind=ConfigError)
     try:
         config = NetworkConfig.model_validate(values)
     except ValidationError as error:
