@@ -114,11 +114,12 @@ def run(
 
 
 def _check_request(request: _RunRequest) -> None:
-    """Opens the log and reads the table: a mistake shows here, before Prefect's server takes seconds to start."""
-    from flows.pipeline.log_cache import cached_log
+    """Checks all that the run needs: a mistake shows here, before Prefect's server takes seconds to start."""
+    from flows.preflight.requirements import check_requirements
     from genre_tasks.errors import ConfigError
 
-    cached_log(request.log)
+    # Warnings are left to the run itself, which checks again wherever it runs.
+    check_requirements(request.log, request.store, request.chunks, request.config)
     if request.budget_s is not None:
         from flows.budget.budget import resolve_table
 
@@ -157,8 +158,10 @@ def _print_dry_run(request: _RunRequest, as_json: bool) -> None:
     from flows.configuration import diff_from_preset
     from flows.pipeline.definition import RECONSTRUCTION_STAGES
     from flows.pipeline.prediction import predict_run
+    from flows.preflight.requirements import check_requirements
 
     config = request.config
+    report = check_requirements(request.log, request.store, request.chunks, config)
     # A budget may end the first chunk earlier; without one every chunk goes to the last stage.
     end = RECONSTRUCTION_STAGES[-1]
     if request.budget_s is not None:
@@ -166,6 +169,7 @@ def _print_dry_run(request: _RunRequest, as_json: bool) -> None:
     prediction: dict[str, Any] = predict_run(request.log, request.store, request.chunks, config, end)
     differs = {key: list(values) for key, values in diff_from_preset(config, request.preset).items()}
     prediction |= {"preset": request.preset, "differs": differs}
+    prediction |= {"checked": list(report.checked), "warnings": list(report.warnings)}
     if as_json:
         typer.echo(json.dumps(prediction))
     else:

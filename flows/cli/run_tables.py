@@ -55,7 +55,7 @@ def print_prediction(prediction: Mapping[str, Any]) -> None:
 
     Args:
         prediction: what ``predict_run`` returns, with ``differs``: (before, after) of each setting that the run has
-            otherwise than its preset.
+            otherwise than its preset; ``checked``: what is there; ``warnings``: what may not suffice.
     """
     console = _make_console()
     table = Table(title=f"{prediction['log']} (dry run)", title_justify="left")
@@ -75,6 +75,11 @@ def print_prediction(prediction: Mapping[str, Any]) -> None:
     console.print(f"{cost}; predicted from {prediction['basis']}")
     for key, (before, after) in prediction["differs"].items():
         console.print(f"  {key}: {before} → {after}", markup=False)
+    console.print("checked:")
+    for line in prediction["checked"]:
+        console.print(f"  {line}", markup=False, soft_wrap=True)
+    for warning in prediction["warnings"]:
+        console.print(f"warning: {warning}", markup=False, soft_wrap=True)
 
 
 def _metrics_table(title: str, stages: list[dict[str, Any]]) -> Table:

@@ -64,7 +64,7 @@ def select_chunks(log: str, config: PipelineConfig, chunks: list[int] | None) ->
     known = f"Chunks are 0 to {count - 1}."
     selected = list(range(count)) if chunks is None else chunks
     # None of these does anything that could be wanted, and a run of nothing would count as done.
-    if not isinstance(selected, list) or not selected:
+    if not isinstance(selected, list | tuple) or not selected:
         raise InputError("no chunk is chosen", remedy=known, log=log)
     for position, chunk in enumerate(selected):
         # All are checked before the first one is computed, as that takes minutes. A flow's parameters may be anything.
@@ -72,7 +72,7 @@ def select_chunks(log: str, config: PipelineConfig, chunks: list[int] | None) ->
             raise InputError(f"there is no chunk {chunk}", remedy=known, log=log)
         if chunk in selected[:position]:
             raise InputError(f"chunk {chunk} is chosen twice", remedy="Name each chunk once.", log=log)
-    return selected
+    return list(selected)
 
 
 def expand_logs(logs: list[str]) -> list[str]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flows.pipeline.definition import PIPELINE, StageSpec, find_weights_file
 from flows.pipeline.log_cache import cached_log, select_chunks
+from flows.pipeline.stage_runner import Job
 from flows.preflight.machine_checks import assess_disk, assess_memory, estimate_disk_mib
 from flows.preflight.store_checks import check_store
 from genre_tasks.config import PipelineConfig
@@ -44,6 +45,23 @@ class RequirementReport:
     warnings: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class CheckedInputs:
+    """What a run reads of its log.
+
+    Attributes:
+        log: the opened log.
+        cameras: those that are used.
+        chunks: numbers of the chunks.
+        lines: what was checked, for the user.
+    """
+
+    log: DrivingLog
+    cameras: tuple[Camera, ...]
+    chunks: tuple[int, ...]
+    lines: tuple[str, ...]
+
+
 def check_requirements(
     log: str,
     store: str,
@@ -76,29 +94,77 @@ def check_requirements(
     >>> report.checked[0]
     'log synthetic:street?seed=1000: 20 frames'
     """
-    wanted = set(stages)
-    specs = [spec for spec in PIPELINE if spec.name in wanted]
+    inputs = check_inputs(log, chunks, config)
+    files = check_files(config, stages)
+    root = check_store(store, (inputs.log.dataset, inputs.log.name))
+    needed_mib = estimate_disk_mib(inputs.log, inputs.cameras, config, len(inputs.chunks))
+    checked = (
+        *inputs.lines,
+        *files,
+        f"store {root}: can be written to",
+        f"disk: about {needed_mib:.0f} MiB for a run from nothing",
+    )
+    found = (assess_disk(root, needed_mib), assess_memory(config))
+    return RequirementReport(checked, tuple(warning for warning in found if warning is not None))
+
+
+def check_jobs(jobs: Iterable[tuple[Job, Sequence[str]]]) -> None:
+    """Checks what many jobs need, such as the cells of a table; what they share is checked once.
+
+    Args:
+        jobs: each with the stages that it runs.
+
+    Raises:
+        GenreError: as :func:`check_requirements` raises it.
+    """
+    done: set[Hashable] = set()
+
+    def is_new(*about: Hashable) -> bool:
+        before = about in done
+        done.add(about)
+        return not before
+
+    for job, stages in jobs:
+        config = PipelineConfig.model_validate(job.config)
+        if is_new(job.log, job.chunk, config.ingest):
+            check_inputs(job.log, [job.chunk], config)
+        if is_new(config.gnet, config.fnet, config.enet, config.evaluate, tuple(stages)):
+            check_files(config, stages)
+        if is_new(job.store, job.log):
+            log = cached_log(job.log)
+            check_store(job.store, (log.dataset, log.name))
+
+
+def check_inputs(log: str, chunks: list[int] | None, config: PipelineConfig) -> CheckedInputs:
+    """Checks what a run reads of its log; no image is read, and one sweep.
+
+    Args:
+        log: the log's URI.
+        chunks: numbers of chunks; ``None`` for all.
+        config: the effective configuration.
+
+    Returns:
+        What there is.
+
+    Raises:
+        InputError: the log cannot be opened, has no such chunk or no camera, or there are no points to begin with.
+        ConfigError: a camera is unknown.
+    """
     opened = cached_log(log)
     cameras = _check_cameras(config, opened)
     selected = select_chunks(log, config, chunks)
     _require_source_frames(config, opened, selected)
-    checked = [
+    lines = (
         f"log {log}: {opened.frame_count} frames",
         f"cameras: {', '.join(camera.name for camera in cameras)}",
         f"chunks: {', '.join(map(str, selected))}",
         _check_points(config, opened, selected),
-    ]
-    _check_packages(specs)
-    checked += check_files(config, wanted)
-    root = check_store(store, (opened.dataset, opened.name))
-    needed_mib = estimate_disk_mib(opened, cameras, config, len(selected))
-    checked += [f"store {root}: can be written to", f"disk: about {needed_mib:.0f} MiB for a run from nothing"]
-    found = (assess_disk(root, needed_mib), assess_memory(config))
-    return RequirementReport(tuple(checked), tuple(warning for warning in found if warning is not None))
+    )
+    return CheckedInputs(opened, tuple(cameras), tuple(selected), lines)
 
 
 def check_files(config: PipelineConfig, stages: Iterable[str] = ALL_STAGES) -> list[str]:
-    """Checks the weights and networks of a configuration, as far as the headers of their files tell.
+    """Checks packages, and weights and networks as far as the headers of their files tell.
 
     Args:
         config: the effective configuration.
@@ -109,9 +175,10 @@ def check_files(config: PipelineConfig, stages: Iterable[str] = ALL_STAGES) -> l
 
     Raises:
         InputError: a file is missing or unreadable, or does not fit the configuration.
-        ConfigError: the configuration of weights is no JSON object.
+        ConfigError: a package is not installed, or the configuration of weights is no JSON object.
     """
     wanted = set(stages)
+    _check_packages(spec for spec in PIPELINE if spec.name in wanted)
     lines = []
     for spec in PIPELINE:
         if spec.name in wanted and spec.weights is not None:
@@ -201,7 +268,6 @@ def _check_weights(spec: StageSpec, config: PipelineConfig) -> list[Path]:
         return [check_fixer_files(config.fnet)]
     from genre_tasks.learned.weight_files import check_optimiser_files
 
-    check: Callable[[Path], None] = check_optimiser_files
     found = [find_weights_file(spec, config)]
     refinement = getattr(getattr(config, spec.section), "refinement", None)
     if refinement is not None:
@@ -210,5 +276,5 @@ def _check_weights(spec: StageSpec, config: PipelineConfig) -> list[Path]:
         found.append(resolve_weights("gnet", refinement.weights, "gnet.refine.weights"))
     paths = [path for path in found if path is not None]
     for path in paths:
-        check(path)
+        check_optimiser_files(path)
     return paths

@@ -20,6 +20,7 @@ from flows.pipeline.log_cache import expand_logs, select_chunks
 from flows.pipeline.progress import get_reporter
 from flows.pipeline.stage_runner import ArtifactRef, Job
 from flows.pipeline.stage_task import stage_task
+from flows.preflight.requirements import check_requirements
 from flows.reconstruction.run_records import FinishedRun, summarise_run, write_run_record
 from flows.reconstruction.run_summary import RunSummary
 from genre_tasks.config import PipelineConfig
@@ -71,6 +72,9 @@ def reconstruct_log(
         print(reconstruct_log("synthetic:street?seed=1000", preset="demo", store="genre-store")["report"])
     """
     effective = _effective_config(preset, config, settings)
+    # Before any work: the command has checked this, too, but a worker may be on another machine.
+    for warning in check_requirements(log, store, chunks, effective).warnings:
+        get_reporter().message(f"warning: {warning}")
     # A killed run may have left half-written folders behind; no artifact is among them.
     open_store(store).clean_temporaries()
     selected = select_chunks(log, effective, chunks)

@@ -84,7 +84,7 @@ def require_timestep(trained: object, configured: int) -> None:
 
 
 def check_fixer_files(config: FnetConfig) -> Path:
-    """Checks that a fixer's weights are there, complete and those of the configured model, as far as headers tell.
+    """Checks that a fixer's weights are there, complete and those of the configuration, as far as headers tell.
 
     Args:
         config: with model, weights and timestep.
@@ -95,41 +95,63 @@ def check_fixer_files(config: FnetConfig) -> Path:
     Raises:
         InputError: a file, a package or SD-Turbo itself is missing, or the weights do not fit the configuration.
     """
-    found = find_fixer_weights(config)
-    path = found / WEIGHTS_FILE if found.is_dir() else found
-    document = read_fixer_document(path, config.model)
-    if not read_tensor_shapes(path, REMEDY, stage="fnet"):
-        raise InputError("the file holds no weights", remedy=REMEDY, file=path, stage="fnet")
-    described = document.get("architecture") if config.model == "small" else document
-    if not isinstance(described, dict):
-        raise InputError("the configuration of the weights has no architecture", remedy=REMEDY, file=path, stage="fnet")
+    path, described = check_described_weights(find_fixer_weights(config), config.model)
     require_timestep(described.get("timestep", config.timestep), config.timestep)
     if config.model == "sd-turbo":
-        _check_sd_turbo(path, document.get("base"))
+        # A base next to the weights moves with them; anything else is a hub id.
+        check_sd_turbo(described.get("base"), path.parent)
     return path
 
 
-def _check_sd_turbo(path: Path, base: object) -> None:
-    """Checks what SD-Turbo needs beyond the adapters: its packages, and its own weights."""
-    if not isinstance(base, str) or not base:
-        raise InputError(
-            "the configuration of the weights does not name SD-Turbo's folder", remedy=REMEDY, file=path, stage="fnet"
-        )
+def check_described_weights(found: Path, model: str) -> tuple[Path, dict[str, Any]]:
+    """Checks that a file of weights is complete and described by the JSON beside it.
+
+    Args:
+        found: the file, or a folder that holds ``fnet.safetensors``.
+        model: ``small`` or ``sd-turbo``, which the weights must be of.
+
+    Returns:
+        The file of the weights, and what the JSON says of their network.
+
+    Raises:
+        InputError: a file is missing, unreadable or of the other model.
+    """
+    path = found / WEIGHTS_FILE if found.is_dir() else found
+    document = read_fixer_document(path, model)
+    if not read_tensor_shapes(path, REMEDY, stage="fnet"):
+        raise InputError("the file holds no weights", remedy=REMEDY, file=path, stage="fnet")
+    described = document.get("architecture") if model == "small" else document
+    if not isinstance(described, dict):
+        raise InputError("the configuration of the weights has no architecture", remedy=REMEDY, file=path, stage="fnet")
+    return path, described
+
+
+def check_sd_turbo(base: object, folder: Path) -> None:
+    """Checks what SD-Turbo's adapters need: their package, and SD-Turbo's own weights on this machine.
+
+    Args:
+        base: a folder, or a hub id.
+        folder: that a relative path of ``base`` starts from.
+
+    Raises:
+        InputError: the package is not installed, or a part of SD-Turbo is missing.
+    """
     if importlib.util.find_spec("peft") is None:
         raise InputError(
             "SD-Turbo's adapters need the package peft", remedy="Run `pip install 'genre[sd-turbo]'`.", stage="fnet"
         )
-    # A base next to the weights moves with them; anything else is a hub id.
-    local = path.parent / base
+    if not isinstance(base, str) or not base:
+        raise InputError("the weights do not name SD-Turbo's folder", remedy=REMEDY, file=folder, stage="fnet")
+    local = folder / base
     if local.exists():
         missing = [name for name in _BASE_FOLDERS if not (local / name / "config.json").is_file()]
     else:
         missing = [name for name in _BASE_FOLDERS if not _is_downloaded(base, name)]
+    # It would be downloaded when FNet begins, which is late for a machine without a network.
     if missing:
         raise InputError(
-            f"the weights are adapters of SD-Turbo, of which {base} has no {' and no '.join(missing)} here",
-            remedy=f"Download it once, e.g. by `hf download {base}`, or copy its folder beside the weights.",
-            file=path,
+            f"SD-Turbo ({base}) is not on this machine: it has no {' and no '.join(missing)}",
+            remedy=f"Download it once, e.g. by `hf download {base}`, or give a folder with vae and unet.",
             stage="fnet",
         )
 
