@@ -202,7 +202,8 @@ def _to_plain(node: yaml.Node, path: KeyPath, lines: dict[KeyPath, int]) -> Any:
     if isinstance(node, yaml.SequenceNode):
         return [_to_plain(item, (*path, str(index)), lines) for index, item in enumerate(node.value)]
     # Quotes and block styles say that a value is text.
-    return node.value if node.style else _parse_scalar(node.value, node.start_mark.line + 1)
+    is_quoted = isinstance(node, yaml.ScalarNode) and bool(node.style)
+    return node.value if is_quoted else _parse_scalar(node.value, node.start_mark.line + 1)
 
 
 def _to_dict(node: yaml.MappingNode, path: KeyPath, lines: dict[KeyPath, int]) -> dict[str, Any]:

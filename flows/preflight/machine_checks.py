@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from genre_tasks.logs.types import Camera, DrivingLog
 
 # Measured on demo and small runs. Images are stored as they were recorded; EXR compresses renders little.
-_RECORDED_BYTES_PER_PX = 0.3
+_RECORDED_BYTES_PER_PX = 0.2
 _NOVEL_VIEW_BYTES_PER_PX = 28
 _FIXED_VIEW_BYTES_PER_PX = 6
-_BYTES_PER_GAUSSIAN = 64
+_BYTES_PER_GAUSSIAN = 120
 _BYTES_PER_POINT = 16
 _POINTS_PER_SWEEP = 100_000
 _REPORT_MIB = 5
