@@ -48,12 +48,14 @@ def range_command(
     """
     from flows.cli.printing import print_rows
     from flows.cli.terminal import TerminalReporter
+    from flows.preflight.store_checks import check_readable_store
     from flows.reconstruction.reliable_range import write_range
     from flows.reconstruction.run_records import find_last_stage, read_next_scene, read_stage_scene, read_stage_value
     from genre_tasks.reliability.chunk_seam import measure_seam, median_psnr_by_distance
     from genre_tasks.reliability.reliable_range import estimate_reliable_range
 
     config = _range_config(max_drop_db, every)
+    check_readable_store(store)
     # Without a detector the other guards decide alone.
     network = None
     if detector is not None:
