@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from flows.budget.deadline import Deadline
 from flows.configuration import diff_from_preset
 from flows.machine.calibration import measure_calibration_s
 from genre_tasks.config import PipelineConfig
+from genre_tasks.errors import ConfigError
 
 
 def resolve_table(table: str | None, preset: str, config: PipelineConfig) -> CostTable:
@@ -47,12 +49,15 @@ class Budget:
         choosers: the chooser of each chunk that was begun, by chunk.
 
     Raises:
-        ConfigError: as :func:`resolve_table` raises it.
+        ConfigError: the budget is no time, or as :func:`resolve_table` raises it.
     """
 
     def __init__(
         self, budget_s: float, start_time: float | None, table: str | None, preset: str, config: PipelineConfig
     ) -> None:
+        # A flow's parameters may be anything, and NaN would compare as enough time for every setting.
+        if isinstance(budget_s, bool) or not isinstance(budget_s, int | float) or not 0 < budget_s < math.inf:
+            raise ConfigError(f"the budget is no time above 0: {budget_s!r}", remedy="Give seconds, such as 90.")
         self.deadline = Deadline(budget_s, start_time)
         self._table = resolve_table(table, preset, config)
         self._config = config

@@ -53,7 +53,7 @@ def cost(
     from flows.cli.parsing import parse_numbers
     from flows.cli.printing import print_rows
     from flows.cost_sweep.cell import Sweep, predict_cells
-    from flows.cost_sweep.flow import SweepRequest, cost_of_accuracy
+    from flows.cost_sweep.request import SweepRequest
 
     check_output_folder(out, "--out", ("cost.parquet", "cost_cells.parquet", "cost.png", "cost.md"))
     chunk_numbers = parse_numbers(chunks, "--chunks")
@@ -67,6 +67,7 @@ def cost(
         print_rows(f"{len(rows)} cells, {sum(row['seconds'] for row in rows) / 60:.0f} minutes", rows)
         return
     from flows.cli.terminal import report_on_terminal
+    from flows.cost_sweep.flow import cost_of_accuracy
 
     # The sweep is a flow: Prefect shows its cells, and a cell that fails is left out and named.
     with report_on_terminal():

@@ -47,10 +47,12 @@ def effects(
     from flows.configuration import load_configuration
     from flows.pipeline.effects_plan import plan_effects
     from flows.pipeline.stage_runner import Job
+    from flows.preflight.requirements import check_requirements
 
     if out is not None:
         check_output_folder(out, "--out", ("effects.parquet", "effects.png"))
     config = load_configuration(preset, settings=settings or [])
+    check_requirements(log, store, [chunk], config, ("ingest", "effects"))
     # Both stages go through the store: a run with the same settings finds this plan there and takes it.
     plan = plan_effects(Job(log, chunk, store, config.model_dump(mode="json")))
     rows = [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -124,11 +123,12 @@ def run(
 
 
 def _check_request(request: _RunRequest) -> None:
-    """Opens the log and reads the table: a mistake shows here, before Prefect's server takes seconds to start."""
-    from flows.pipeline.log_cache import cached_log
+    """Checks all that the run needs: a mistake shows here, before Prefect's server takes seconds to start."""
+    from flows.preflight.requirements import check_requirements
     from genre_tasks.errors import ConfigError
 
-    cached_log(request.log)
+    # Warnings are left to the run itself, which checks again wherever it runs.
+    check_requirements(request.log, request.store, request.chunks, request.config)
     if request.budget_s is not None:
         from flows.budget.budget import resolve_table
 
@@ -140,10 +140,14 @@ def _check_request(request: _RunRequest) -> None:
 def _reconstruct(request: _RunRequest, as_json: bool) -> None:
     from flows.cli.outcome import add_facts
     from flows.cli.terminal import report_on_terminal
+    from flows.reconstruction.left_out import ChunksLeftOutError
 
+    record = _find_stored_record(request)
+    if record is not None:
+        _print_result(record, as_json)
+        return
     with report_on_terminal():
         from flows.reconstruction.flow import reconstruct_log
-        from flows.reconstruction.left_out import ChunksLeftOutError
 
         try:
             record = reconstruct_log(
@@ -165,6 +169,26 @@ def _reconstruct(request: _RunRequest, as_json: bool) -> None:
     _print_result(record, as_json)
 
 
+def _find_stored_record(request: _RunRequest) -> dict[str, Any] | None:
+    """The record of a run that finds every stage in the store, without Prefect; ``None`` for any other."""
+    from flows.cli.terminal import TerminalReporter
+    from flows.prefect_api.settings_sources import API_URL, find_source
+    from flows.reconstruction.run_records import summarise_run, write_run_record
+    from flows.reconstruction.stored_run import find_stored_run
+
+    # A budget chooses the stages while it goes on, and who has a server wants to see every run there.
+    if request.budget_s is not None or find_source(API_URL) is not None:
+        return None
+    with TerminalReporter("looking into the store") as reporter:
+        run = find_stored_run(request.log, request.preset, request.store, request.chunks, request.config)
+        if run is None:
+            return None
+        for chunk, refs in run.chunks.items():
+            for stage, ref in refs.items():
+                reporter.stage_ended(stage, chunk, ref)
+        return write_run_record(run, summarise_run(run), {})
+
+
 def _print_result(record: dict[str, Any], as_json: bool, error: ChunksLeftOutError | None = None) -> None:
     from flows.cli.outcome import print_outcome
     from flows.cli.run_tables import print_run
@@ -179,12 +203,15 @@ def _print_result(record: dict[str, Any], as_json: bool, error: ChunksLeftOutErr
 
 
 def _print_dry_run(request: _RunRequest, as_json: bool) -> None:
+    from flows.cli.outcome import print_outcome
     from flows.cli.run_tables import print_prediction
     from flows.configuration import diff_from_preset
     from flows.pipeline.definition import RECONSTRUCTION_STAGES
     from flows.pipeline.prediction import predict_run
+    from flows.preflight.requirements import check_requirements
 
     config = request.config
+    report = check_requirements(request.log, request.store, request.chunks, config)
     # A budget may end the first chunk earlier; without one every chunk goes to the last stage.
     end = RECONSTRUCTION_STAGES[-1]
     if request.budget_s is not None:
@@ -192,8 +219,9 @@ def _print_dry_run(request: _RunRequest, as_json: bool) -> None:
     prediction: dict[str, Any] = predict_run(request.log, request.store, request.chunks, config, end)
     differs = {key: list(values) for key, values in diff_from_preset(config, request.preset).items()}
     prediction |= {"preset": request.preset, "differs": differs}
+    prediction |= {"checked": list(report.checked), "warnings": list(report.warnings)}
     if as_json:
-        typer.echo(json.dumps(prediction))
+        print_outcome("done", prediction)
     else:
         print_prediction(prediction)
 

@@ -57,7 +57,7 @@ def print_prediction(prediction: Mapping[str, Any]) -> None:
 
     Args:
         prediction: what ``predict_run`` returns, with ``differs``: (before, after) of each setting that the run has
-            otherwise than its preset.
+            otherwise than its preset; ``checked``: what is there; ``warnings``: what may not suffice.
     """
     console = make_console()
     rows = [
@@ -77,6 +77,11 @@ def print_prediction(prediction: Mapping[str, Any]) -> None:
     console.print(f"{cost}; predicted from {prediction['basis']}")
     for key, (before, after) in prediction["differs"].items():
         console.print(f"  {key}: {before} → {after}")
+    console.print("checked:")
+    for line in prediction["checked"]:
+        console.print(f"  {line}", soft_wrap=True)
+    for warning in prediction["warnings"]:
+        console.print(f"warning: {warning}", soft_wrap=True)
 
 
 def _print_metrics(title: str, stages: list[dict[str, Any]]) -> None:

@@ -94,7 +94,11 @@ def pairs(folder: FolderOption = Path("training"), real: RealLogOption = None, s
         genre train pairs --folder training --streets 28
     """
     from flows.cli.terminal import report_on_terminal
+    from flows.training.fixer_job import FixerJob
+    from flows.training.requirements import check_fixer_training
 
+    # Here and below: what is missing shows before Prefect is imported, which takes seconds.
+    check_fixer_training(FixerJob(str(folder), real, streets), is_training=False)
     with report_on_terminal("training pairs"):
         # Imported inside the block, here and below: Prefect takes seconds to import, and the live line is there
         # meanwhile.
@@ -138,7 +142,10 @@ def fnet(
         genre train fnet --folder training --preset small
     """
     from flows.cli.terminal import report_on_terminal
+    from flows.training.fixer_job import FixerJob
+    from flows.training.requirements import check_fixer_training
 
+    check_fixer_training(FixerJob(str(folder), real, streets, inputs, preset, start, steps, validate))
     with report_on_terminal("training fnet"):
         from flows.training.fixer_flow import train_fnet
 
@@ -164,7 +171,10 @@ def scenes(
         genre train scenes --folder training
     """
     from flows.cli.terminal import report_on_terminal
+    from flows.training.requirements import check_optimiser_training
+    from flows.training.train_job import TrainJob
 
+    check_optimiser_training(TrainJob(str(folder), recipe, real, fnet=fnet))
     with report_on_terminal("training scenes"):
         from flows.training.optimiser_flow import train_scenes
 
@@ -196,9 +206,13 @@ def gnet(
     """
     from flows.cli.parsing import check_number
     from flows.cli.terminal import report_on_terminal
+    from flows.training.requirements import check_optimiser_training
+    from flows.training.train_job import TrainJob
 
     if novel is not None:
         check_number(novel, "--novel", 0, 1e6)
+    job = TrainJob(str(folder), recipe, real, novel, fnet, device, save_every, validate_every)
+    check_optimiser_training(job, job.weights_name("gnet"), stage)
     with report_on_terminal("training gnet"):
         from flows.training.optimiser_flow import train_network
 
@@ -238,7 +252,11 @@ def enet(
         genre train enet --folder training --recipe paper
     """
     from flows.cli.terminal import report_on_terminal
+    from flows.training.requirements import check_optimiser_training
+    from flows.training.train_job import TrainJob
 
+    job = TrainJob(str(folder), recipe, real, None, fnet, device, save_every, validate_every)
+    check_optimiser_training(job, "enet", stage)
     with report_on_terminal("training enet"):
         from flows.training.optimiser_flow import train_network
 

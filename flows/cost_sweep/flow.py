@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import json
-import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from flows.cost_sweep.cell import Cell, Sweep, list_cells, measure_cold_start, read_logs_once, run_cell
-from flows.cost_sweep.knobs import PRESET_ITSELF, list_settings
+from flows.cost_sweep.cell import Cell, Sweep, measure_cold_start, read_logs_once, run_cell
+from flows.cost_sweep.knobs import PRESET_ITSELF
 from flows.cost_sweep.page import render_page
 from flows.cost_sweep.parquet import write_cells, write_settings
 from flows.cost_sweep.plot import draw_sweep
+from flows.cost_sweep.request import SweepRequest
 from flows.cost_sweep.summary import novel_view_measure, summarise_settings
-from flows.experiments.log_chunks import select_log_chunks
 from flows.experiments.result_files import machine_facts, write_text
 from flows.experiments.stages import run_reported_stage
 from flows.machine.calibration import measure_calibration_s
@@ -27,54 +25,6 @@ from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import GenreError
 from storage.codecs.png import write_png
 from storage.local import open_store
-
-DEFAULT_SEEDS = (0, 1, 2)
-
-
-@dataclass(frozen=True)
-class SweepRequest:
-    """What a user asks to sweep.
-
-    Attributes:
-        sweep: preset, settings and store.
-        logs: URIs; ``pandaset:PATH/*`` stands for every sequence in a folder.
-        chunks: of each log; all if ``None``.
-        seeds: see :class:`flows.cost_sweep.cell.Cell`; three if ``None``.
-        knobs: names of knobs; all if ``None``.
-    """
-
-    sweep: Sweep
-    logs: Sequence[str]
-    chunks: list[int] | None = None
-    seeds: Sequence[int] | None = None
-    knobs: Sequence[str] | None = None
-
-    def cells(self) -> list[Cell]:
-        """Lists the cells in the order in which they run.
-
-        Raises:
-            ConfigError: there is no such knob, or a setting is not allowed.
-            InputError: a log does not have one of the chunks.
-        """
-        settings = list_settings(self.sweep.preset, self.sweep.settings, self.knobs or ())
-        base = settings[0].configuration(self.sweep.preset, self.sweep.settings, 0)
-        places = select_log_chunks(self.logs, self.chunks, base)
-        return list_cells(places, DEFAULT_SEEDS if self.seeds is None else self.seeds, settings)
-
-    @property
-    def command(self) -> str:
-        """The command that sweeps the same cells again.
-
-        >>> SweepRequest(Sweep("demo", (), "store"), ["synthetic:street"], chunks=[2]).command
-        'genre cost synthetic:street --preset demo --chunks 2'
-        """
-        parts = ["genre", "cost", *self.logs, "--preset", self.sweep.preset]
-        for option, values in (("--chunks", self.chunks), ("--seeds", self.seeds), ("--knobs", self.knobs)):
-            if values:
-                parts += [option, ",".join(map(str, values))]
-        for setting in self.sweep.settings:
-            parts += ["--set", setting]
-        return shlex.join(parts)
 
 
 @flow(name="cost-of-accuracy", persist_result=False, validate_parameters=False)

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from flows.configuration import read_preset, validate_config
+from flows.yaml_values import read_yaml_mapping
 from genre_tasks.config import GnetConfig
 from genre_tasks.errors import ConfigError
 
@@ -66,7 +65,8 @@ def load_baselines(preset: str, file: Path = FILE) -> dict[str, Baseline]:
     # Baselines share the preset's views and losses, so that only the method differs.
     gnet = read_preset(preset).get("gnet", {})
     baselines = {}
-    for name, section in yaml.safe_load(file.read_text(encoding="utf-8")).items():
+    content = read_yaml_mapping(file, "file of baselines", "baselines", "Install the package again.")
+    for name, section in content.values.items():
         # A baseline without its source or reason could not be defended against its authors.
         if missing := {"source", "why", "gnet"} - section.keys():
             raise ConfigError(

@@ -15,6 +15,8 @@ from flows.paper_tables.measure import PRESET_METHOD, Basis, list_stages
 from flows.paper_tables.user_methods import read_method
 from flows.paper_tables.weights_slots import SLOTS, read_weights
 from flows.pipeline.log_cache import cached_log
+from flows.pipeline.stage_runner import Job
+from flows.preflight.requirements import check_jobs
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ConfigError
 
@@ -52,12 +54,12 @@ class TableRequest:
     stored: bool = False
 
     def check(self) -> CheckedRequest:
-        """Reads the files, and finds the table's rows and chunks.
+        """Reads the files, finds the table's rows and chunks, and checks that all stages can run.
 
         Raises:
             ConfigError: a table, method, setting or name of weights does not exist, or the logs are of several
                 datasets.
-            InputError: a log, chunk or file of weights does not exist.
+            InputError: a log, chunk or file of weights does not exist, or the store cannot be written to.
         """
         basis = Basis(self.preset, self.settings, self.store)
         # Files are read once, as they could change while the table is measured.
@@ -81,7 +83,11 @@ class TableRequest:
         }
         # Weights change the notes too, so the layout itself is rebuilt.
         rows = tuple(replace(row, method=row.method.with_weights(weights)) for row in layout.rows)
-        return CheckedRequest(basis, replace(layout, rows=rows), tuple(places), missing, "".join(datasets))
+        checked = CheckedRequest(basis, replace(layout, rows=rows), tuple(places), missing, "".join(datasets))
+        # What is only read from the store needs neither weights nor a store that can be written to.
+        if not self.stored:
+            check_jobs(checked.list_jobs())
+        return checked
 
     @property
     def command(self) -> str:
@@ -124,6 +130,14 @@ class CheckedRequest:
     def config(self) -> PipelineConfig:
         """The preset with the protocol and the user's settings, without any method's."""
         return load_configuration(self.basis.preset, settings=(*self.layout.protocol, *self.basis.settings))
+
+    def list_jobs(self) -> list[tuple[Job, tuple[str, ...]]]:
+        """Lists the job of each cell that can be measured, with its stages."""
+        return [
+            (self.basis.job(self.layout, row.method, where), tuple(list_stages(self.layout, row.method)))
+            for where in self.places
+            for row in self.measurable_rows
+        ]
 
     @property
     def measurable_rows(self) -> tuple[Row, ...]:

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
-import yaml
-
+from flows.configuration.keys import Place, describe_value
 from flows.paper_tables.builtin_methods import BUILT_IN
 from flows.paper_tables.methods import End, Method
+from flows.yaml_values import read_yaml_mapping
 from genre_tasks.errors import ConfigError
 from genre_tasks.suggestions import did_you_mean
 
@@ -37,12 +37,14 @@ def read_method(file: Path, preset: str, settings: Sequence[str] = ()) -> Method
         ConfigError: the file is not there or no such YAML, a key or setting is not allowed, or a built-in method
             has this name. The error names the file.
     """
-    values = _read_yaml(file)
+    remedy = "Check --method; flows/paper_tables/user_methods.py shows such a file."
+    content = read_yaml_mapping(file, "method's file", "name, settings, end", remedy)
+    values = content.values
     for key in values:
         # An unknown key is most likely a typo, and ignoring it would measure another method.
         if key not in _KEYS:
             remedy = f"{did_you_mean(key, _KEYS)}Known: {', '.join(_KEYS)}."
-            raise ConfigError(f"a method has no {key!r}", remedy=remedy, file=file)
+            raise Place(str(file), content.lines[(key,)]).error(f"a method has no {describe_value(key)}", remedy)
     name = values.get("name")
     own_settings = values.get("settings", [])
     end = values.get("end", "enet")
@@ -63,17 +65,3 @@ def read_method(file: Path, preset: str, settings: Sequence[str] = ()) -> Method
     except ConfigError as error:
         raise ConfigError(error.problem, remedy=error.remedy, file=file) from error
     return method
-
-
-def _read_yaml(file: Path) -> dict[str, Any]:
-    try:
-        values = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError("the method's file cannot be read", remedy="Check --method.", file=file) from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"the file is not YAML: {error}", remedy="Mend the line it names.", file=file) from error
-    if not isinstance(values, dict):
-        raise ConfigError(
-            "expected name, settings, end", remedy="See flows/paper_tables/user_methods.py for one.", file=file
-        )
-    return values

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.json_files import read_json_object
 from genre_tasks.suggestions import did_you_mean
 from genre_tasks.user_paths import expand_user_path
 
@@ -91,11 +91,11 @@ def _check_weights(slot: WeightsSlot, path: Path) -> None:
 def _read_trained_inputs(path: Path) -> list[str] | None:
     """Reads which inputs a fixer was trained with from the JSON beside its weights; ``None`` stands for all."""
     file = path / "fnet.json" if path.is_dir() else path.with_suffix(".json")
-    try:
-        document = json.loads(file.read_text(encoding="utf-8"))
-        inputs: list[str] | None = document["architecture"].get("inputs")
-    except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
-        raise InputError(
-            f"the fixer's inputs cannot be read: {error}", remedy="Give weights of `genre train fnet`.", file=file
-        ) from error
+    remedy = "Give weights of `genre train fnet`."
+    architecture = read_json_object(file, "fixer's configuration", remedy).get("architecture")
+    if not isinstance(architecture, dict):
+        raise InputError("the fixer's configuration has no architecture", remedy=remedy, file=file)
+    inputs: list[str] | None = architecture.get("inputs")
+    if inputs is not None and not (isinstance(inputs, list) and all(isinstance(name, str) for name in inputs)):
+        raise InputError("the fixer's configuration does not list its inputs", remedy=remedy, file=file)
     return inputs

@@ -53,20 +53,28 @@ def select_chunks(log: str, config: PipelineConfig, chunks: list[int] | None) ->
         The numbers of the chunks to run.
 
     Raises:
-        InputError: the log does not have one of the chunks.
+        InputError: the log does not have one of the chunks, one is chosen twice, or there is none.
 
     >>> select_chunks("synthetic:street?seed=1000&frames=30", PipelineConfig(), None)
     [0, 1]
     """
-    from genre_tasks.stages.ingest import chunk_count
+    from genre_tasks.logs.log_selection import chunk_count
 
     count = chunk_count(config.ingest, cached_log(log))
+    if count == 0:
+        raise InputError("the log has no frames", remedy="Copy it again, or choose another one.", log=log)
+    known = f"Chunks are 0 to {count - 1}."
     selected = list(range(count)) if chunks is None else chunks
-    for chunk in selected:
-        # All are checked before the first one is computed, as that takes minutes.
-        if not 0 <= chunk < count:
-            raise InputError(f"there is no chunk {chunk}", remedy=f"Chunks are 0 to {count - 1}.", log=log)
-    return selected
+    # None of these does anything that could be wanted, and a run of nothing would count as done.
+    if not isinstance(selected, list | tuple) or not selected:
+        raise InputError("no chunk is chosen", remedy=known, log=log)
+    for position, chunk in enumerate(selected):
+        # All are checked before the first one is computed, as that takes minutes. A flow's parameters may be anything.
+        if not isinstance(chunk, int) or isinstance(chunk, bool) or not 0 <= chunk < count:
+            raise InputError(f"there is no chunk {chunk}", remedy=known, log=log)
+        if chunk in selected[:position]:
+            raise InputError(f"chunk {chunk} is chosen twice", remedy="Name each chunk once.", log=log)
+    return list(selected)
 
 
 def expand_logs(logs: list[str]) -> list[str]:

@@ -86,6 +86,18 @@ def median_stage_seconds(store: str) -> dict[str, float]:
     return typical | {stage: statistics.median(values) for stage, values in stored.items()}
 
 
+def typical_gigabytes(config: PipelineConfig) -> float:
+    """Gives the memory that the largest stage usually takes.
+
+    Args:
+        config: its image size counts.
+
+    Returns:
+        GiB.
+    """
+    return max(_typical_stage(spec, config)[1] for spec in PIPELINE)
+
+
 def _predict_stage(
     spec: StageSpec,
     job: Job,

@@ -10,10 +10,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from flows.prefect_api.server_thread import ServerThread, database_url
-from flows.prefect_api.settings_sources import check_settings_files, find_source
+from flows.prefect_api.settings_sources import API_URL, check_settings_files, find_source
 from genre_tasks.errors import ConfigError
 
-API_URL = "PREFECT_API_URL"
 _ANSWER_TIMEOUT_S = 10.0
 # What httpx and websockets read when a client is made: a proxy of the company cannot reach this machine's loopback, and
 # one that they cannot speak to, or certificates that are not there, stop them before they look at the address.

@@ -10,6 +10,9 @@ from typing import Any
 
 from genre_tasks.errors import ConfigError
 
+API_URL = "PREFECT_API_URL"
+"""The setting with the address of the user's own Prefect server."""
+
 _ENV_FILE = Path(".env")
 # Prefect reads these in the working folder: (file, the table that holds its settings).
 _TOML_FILES = ((Path("prefect.toml"), ()), (Path("pyproject.toml"), ("tool", "prefect")))

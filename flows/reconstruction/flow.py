@@ -20,6 +20,7 @@ from flows.pipeline.log_cache import expand_logs, select_chunks
 from flows.pipeline.progress import get_reporter
 from flows.pipeline.stage_runner import ArtifactRef, Job
 from flows.pipeline.stage_task import stage_task
+from flows.preflight.requirements import check_requirements
 from flows.reconstruction.left_out import ChunksLeftOutError, LogsFailedError, describe_log, record_failures
 from flows.reconstruction.run_records import FinishedRun, summarise_run, write_run_record
 from flows.reconstruction.run_summary import RunSummary
@@ -73,9 +74,9 @@ def reconstruct_log(
         print(reconstruct_log("synthetic:street?seed=1000", preset="demo", store="genre-store")["report"])
     """
     effective = _effective_config(preset, config, settings)
+    selected = _check_needs(log, store, chunks, effective)
     # A killed run may have left half-written folders behind; no artifact is among them.
     open_store(store).clean_temporaries()
-    selected = select_chunks(log, effective, chunks)
     budget = None if budget_s is None else Budget(budget_s, start_time, table, preset, effective)
     values = effective.model_dump(mode="json")
     done, failures = _reconstruct_chunks(log, store, values, selected, budget)
@@ -157,6 +158,14 @@ def _effective_config(preset: str, config: dict[str, Any] | None, settings: list
         return load_configuration(preset, settings=settings or ())
     # The values may come from a worker's parameters, which anyone can write by hand.
     return validate_config(config, "parameters of the flow")
+
+
+def _check_needs(log: str, store: str, chunks: list[int] | None, config: PipelineConfig) -> list[int]:
+    """Checks all that the run needs before any work; the chunks to run."""
+    # The command has checked this, too, but a worker may be on another machine.
+    for warning in check_requirements(log, store, chunks, config).warnings:
+        get_reporter().message(f"warning: {warning}")
+    return select_chunks(log, config, chunks)
 
 
 def _reconstruct_chunks(

@@ -14,6 +14,7 @@ from flows.training.curve_table import FIXER_CURVE, load_rows
 from flows.training.fixer_job import CURVE_FILE, FixerJob
 from flows.training.fixer_pairs import get_pairs, list_pair_scenes
 from flows.training.fixer_training import kind_fractions, train_fixer
+from flows.training.requirements import check_fixer_training
 from flows.training.training_scenes import SceneRecipe
 
 
@@ -34,6 +35,7 @@ def train_pairs(folder: str = "training", real: str | None = None, streets: int 
         ConfigError: there is nothing to make pairs of, or a chunk is not for training.
     """
     job = FixerJob(folder, real, streets)
+    check_fixer_training(job, is_training=False)
     job.store.clean_temporaries()
     scenes = list_pair_scenes(streets, real)
     reporter = get_reporter()
@@ -78,6 +80,7 @@ def train_fnet(
         InputError: the folder holds another training, or the weights to start from do not fit.
     """
     job = FixerJob(folder, real, streets, inputs, preset, start, steps, validate)
+    check_fixer_training(job)
     return {"weights": fixer_task(job.run_folder.name, job, return_state=True).result()}
 
 

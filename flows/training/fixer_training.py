@@ -137,6 +137,22 @@ def train_fixer(job: FixerJob, progress: Progress = silent) -> tuple[Path, bool]
     return folder / WEIGHTS_FILE, recorder.is_trained
 
 
+def require_same_inputs(inputs: Sequence[str], job: FixerJob, path: Path) -> None:
+    """Refuses weights to start from that were trained with other inputs.
+
+    Args:
+        inputs: of the weights.
+        job: the training.
+        path: of the weights, for the error.
+
+    Raises:
+        InputError: the inputs differ.
+    """
+    # The first layer's shape follows from the inputs, so other weights would fail with a less helpful error.
+    if tuple(inputs) != tuple(job.inputs.split("+")):
+        raise InputError("the weights to start from have other inputs", remedy="Give the same.", file=path)
+
+
 def _load_initial(job: FixerJob) -> Fnet | None:
     if job.sd_turbo is not None:
         return load_sd_turbo(job.sd_turbo, rank=RANK)
@@ -144,9 +160,7 @@ def _load_initial(job: FixerJob) -> Fnet | None:
     if path is None:
         return None
     fnet = load_fnet(path)
-    # The first layer's shape follows from the inputs, so other weights would fail with a less helpful error.
-    if fnet.architecture.inputs != tuple(job.inputs.split("+")):
-        raise InputError("the weights to start from have other inputs", remedy="Give the same.", file=path)
+    require_same_inputs(fnet.architecture.inputs, job, path)
     return fnet
 
 

@@ -19,6 +19,7 @@ from flows.training.curve_plot import CURVE_FILE
 from flows.training.curve_table import LEARNING_CURVE, load_rows
 from flows.training.optimiser_stages import TrainedStage, train_stage
 from flows.training.recipes import select_stages
+from flows.training.requirements import check_optimiser_training
 from flows.training.scene_starts import SceneStart
 from flows.training.stage_recipe import Stage
 from flows.training.stage_scenes import list_scene_uses, make_scene_artifacts
@@ -48,6 +49,7 @@ def train_scenes(
         ConfigError: the recipe is unknown, or a chunk is not for training.
     """
     job = TrainJob(folder, recipe, real, fnet=fnet)
+    check_optimiser_training(job)
     job.store.clean_temporaries()
     uses = list_scene_uses(job.stages(), real)
     reporter = get_reporter()
@@ -97,8 +99,8 @@ def train_network(
         InputError: a stage that is needed is not trained, or a folder holds another training.
     """
     job = TrainJob(folder, recipe, real, novel, fnet, device, save_every, validate_every)
-    # Without λ_novel the network is G3R's, whose weights must not overwrite GNet's.
-    wanted = "g3r" if network == "gnet" and novel == 0 else network
+    wanted = job.weights_name(network)
+    check_optimiser_training(job, wanted, stage)
     stages = select_stages(job.stages(), wanted)
     last = stages[-1].name
     if stage is not None:

@@ -51,6 +51,20 @@ class TrainJob:
         """
         return get_recipe(self.recipe, self.novel)
 
+    def weights_name(self, network: str) -> str:
+        """Names the weights that a training makes.
+
+        Args:
+            network: ``gnet`` or ``enet``.
+
+        Returns:
+            The network; without λ_novel that is G3R, whose weights must not overwrite GNet's.
+
+        >>> TrainJob("training", novel=0.0).weights_name("gnet")
+        'g3r'
+        """
+        return "g3r" if network == "gnet" and self.novel == 0 else network
+
     def get_stage(self, name: str) -> Stage:
         """Finds a stage by its name.
 

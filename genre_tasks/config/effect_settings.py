@@ -10,7 +10,7 @@ from genre_tasks.config.section import Section
 
 
 def _restore_word(value: object) -> object:
-    # YAML reads the words on and off as true and false.
+    # Readers of YAML 1.1, such as Prefect's of deployments, take the words on and off for true and false.
     return {True: "on", False: "off"}[value] if isinstance(value, bool) else value
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from genre_tasks.config.section import Section
+from genre_tasks.config.section import Distances, FilePath, Section, Seed, Shifts, Text, TextList
 
 
 class IngestConfig(Section):
@@ -22,8 +22,10 @@ class IngestConfig(Section):
     # The paper's resolution (Sec. IV-A). Presets for a CPU take a sixteenth of its pixels.
     width_px: int = Field(1280, ge=16, le=4096, description="Working width of all images, pixels.")
     height_px: int = Field(720, ge=16, le=4096, description="Working height of all images, pixels.")
-    cameras: tuple[str, ...] | None = Field(None, description="Names of the cameras to use; null: all.")
-    points: str | None = Field(None, description="Path of a PLY file with coloured points, for a log without LiDAR.")
+    cameras: TextList | None = Field(None, description="Names of the cameras to use; null: all.")
+    points: FilePath | None = Field(
+        None, description="Path of a PLY file with coloured points, for a log without LiDAR."
+    )
     complete_facades: bool = Field(
         True, description="Complete façades above the LiDAR's field of view, as far as images support it."
     )
@@ -31,33 +33,50 @@ class IngestConfig(Section):
         False, description="Fail on a missing or unreadable image or sweep, instead of reporting it and going on."
     )
     min_actor_travel_m: float = Field(
-        0.5, ge=0, description="A track that moves less than this, in metres, is part of the background."
+        0.5, ge=0, le=1e6, description="A track that moves less than this, in metres, is part of the background."
     )
     min_actor_points: int = Field(
-        10, ge=1, description="An actor with fewer LiDAR points than this is left out and reported."
+        10, ge=1, le=1_000_000_000, description="An actor with fewer LiDAR points than this is left out and reported."
     )
     min_actor_frames: int = Field(
-        3, ge=1, description="An actor that exists in fewer frames than this is left out and reported."
+        3, ge=1, le=1_000_000, description="An actor that exists in fewer frames than this is left out and reported."
     )
+
+    @model_validator(mode="after")
+    def _require_two_source_frames(self) -> Self:
+        # Frames 0, n, 2n, … of a chunk are source frames, and one alone has no parallax.
+        if self.source_every >= self.chunk_frames:
+            raise ValueError(
+                f"source_every ({self.source_every}) must be less than chunk_frames ({self.chunk_frames}): "
+                "a chunk needs two source frames"
+            )
+        return self
 
 
 class InitialConfig(Section):
     """Gaussians on LiDAR points, and a fixed number of them far away (paper Sec. III-A)."""
 
     max_points: int = Field(
-        400_000, ge=100, description="Largest number of Gaussians on LiDAR points; the voxel size follows from it."
+        400_000,
+        ge=100,
+        le=100_000_000,
+        description="Largest number of Gaussians on LiDAR points; the voxel size follows from it.",
     )
-    distant_count: int = Field(10_000, ge=0, description="Number of Gaussians of the distant region.")
+    distant_count: int = Field(10_000, ge=0, le=100_000_000, description="Number of Gaussians of the distant region.")
     distant_radius_m: float = Field(
-        200.0, gt=10, description="Radius in metres of the shell that the distant region starts on."
+        200.0, gt=10, le=1e6, description="Radius in metres of the shell that the distant region starts on."
     )
     neighbours: int = Field(
         16, ge=4, le=64, description="LiDAR points that give a Gaussian its normal and its thickness."
     )
-    opacity: float = Field(0.6, gt=0, lt=1, description="Opacity of the Gaussians on LiDAR points at the start.")
+    # Nearer to 0 or 1 its logit leaves float32.
+    opacity: float = Field(
+        0.6, ge=0.001, le=0.999, description="Opacity of the Gaussians on LiDAR points at the start."
+    )
     max_range_m: float = Field(
         100.0,
         gt=1,
+        le=1e6,
         description="LiDAR points farther than this from the path, in metres, are left to the distant region.",
     )
 
@@ -65,10 +84,13 @@ class InitialConfig(Section):
 class NovelViewsConfig(Section):
     """Views beside the path that the fixer repairs: the poses of the source frames, shifted."""
 
-    shifts_m: tuple[float, ...] = Field(
+    # Without one there is no image to fix.
+    shifts_m: Annotated[Shifts, Field(min_length=1)] = Field(
         (3.0, -3.0), description="Distances from the path in metres; positive is to the left."
     )
-    lidar_max_points: int = Field(200_000, ge=100, description="Largest number of points drawn in the LiDAR map.")
+    lidar_max_points: int = Field(
+        200_000, ge=100, le=100_000_000, description="Largest number of points drawn in the LiDAR map."
+    )
 
 
 class FnetConfig(Section):
@@ -78,15 +100,15 @@ class FnetConfig(Section):
     model: Literal["small", "sd-turbo"] = Field(
         "small", description="small: the network that ships; sd-turbo: the paper's, which needs a GPU and its weights."
     )
-    weights: str = Field("builtin", description="builtin, or the path of a folder with the model's weights.")
+    weights: Text = Field("builtin", description="builtin, or the path of a folder with the model's weights.")
     timestep: int = Field(
         200,
         ge=1,
         le=999,
         description="Diffusion timestep τ of the single step; the one that the weights were trained at.",
     )
-    batch_views: int = Field(4, ge=1, description="Views that are fixed at once; more need more memory.")
-    seed: int = Field(0, ge=0, description="Seed of the diffusion noise.")
+    batch_views: int = Field(4, ge=1, le=10_000, description="Views that are fixed at once; more need more memory.")
+    seed: Seed = Field(0, description="Seed of the diffusion noise.")
     gate: float = Field(
         0.0,
         ge=0,
@@ -100,21 +122,24 @@ class FnetConfig(Section):
 class EvaluateConfig(Section):
     """What is measured after a stage."""
 
-    shifts_m: tuple[float, ...] = Field(
+    shifts_m: Distances = Field(
         (1.0, 2.0, 3.0, 4.0, 5.0), description="Distances from the path in metres; each is rendered on both sides."
     )
     distributions: bool = Field(
         True, description="Measure Fréchet and kernel distances between renders and the chunk's real images."
     )
-    every: int = Field(1, ge=1, description="Beside the path, every n-th frame of the chunk is rendered.")
+    every: int = Field(1, ge=1, le=1_000_000, description="Beside the path, every n-th frame of the chunk is rendered.")
     bootstrap: int = Field(
-        200, ge=0, description="Resamples over frames for the 95 % interval of the kernel distance; 0: no interval."
+        200,
+        ge=0,
+        le=1_000_000,
+        description="Resamples over frames for the 95 % interval of the kernel distance; 0: no interval.",
     )
-    pictures: int = Field(3, ge=0, description="Number of pictures kept for the report.")
-    inception: str | None = Field(
+    pictures: int = Field(3, ge=0, le=1000, description="Number of pictures kept for the report.")
+    inception: FilePath | None = Field(
         None, description="Path of a TorchScript file of InceptionV3; with it FID is measured, too."
     )
-    lpips: str | None = Field(
+    lpips: FilePath | None = Field(
         None,
         description="Path of a TorchScript file of LPIPS on VGG; with it LPIPS is measured where there is a truth.",
     )
@@ -124,14 +149,13 @@ class EvaluateConfig(Section):
 class RangeConfig(Section):
     """Where a scene counts as reliable beside the path: how much worse its guards may be than on the path."""
 
-    shifts_m: tuple[float, ...] = Field(
+    shifts_m: Annotated[Distances, Field(min_length=1)] = Field(
         (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0),
-        min_length=1,
         description="Distances from the path in metres; each is rendered on both sides.",
     )
-    every: int = Field(4, ge=1, description="Every n-th frame of the chunk is rendered.")
+    every: int = Field(4, ge=1, le=1_000_000, description="Every n-th frame of the chunk is rendered.")
     max_drop_db: float = Field(
-        3.0, gt=0, description="Largest drop of the median view's estimated PSNR against the path, dB."
+        3.0, gt=0, le=1000, description="Largest drop of the median view's estimated PSNR against the path, dB."
     )
     max_hidden: float = Field(
         0.1, gt=0, le=1, description="Largest extra fraction of pixels whose depth agrees with no recorded image."
@@ -146,4 +170,6 @@ class RangeConfig(Section):
         0.3, gt=0, le=1, description="Largest fraction of a detector's detections on the path that may be lost."
     )
     # Fewer than for the fixer: here the map only tells what floats.
-    lidar_max_points: int = Field(20_000, ge=100, description="Largest number of points drawn in the LiDAR map.")
+    lidar_max_points: int = Field(
+        20_000, ge=100, le=100_000_000, description="Largest number of points drawn in the LiDAR map."
+    )

@@ -16,10 +16,10 @@ from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import InputError
 from genre_tasks.fixer.architectures import build_fnet, load_sd_turbo
 from genre_tasks.fixer.network import Fnet, FnetArchitecture
+from genre_tasks.fixer.weight_files import REMEDY, read_fixer_document
 from genre_tasks.weight_checks import require_weights_fit
 from genre_tasks.weights import find_tensors_file
 
-REMEDY = "Give weights that `genre train fnet` wrote for this version, or leave `fnet.weights` at builtin."
 # Files are in half precision; weights of other tools are in any of these, and all are used in float32.
 _FILE_DTYPES = (torch.float16, torch.bfloat16, torch.float32)
 
@@ -67,15 +67,8 @@ def load_fnet(path: Path, model: str = "small") -> Fnet:
     from safetensors.torch import load_file
 
     path = find_tensors_file(path)
-    document = _read_document(path.with_suffix(".json"))
     # Checked before the tensors are read, which takes long for the larger model.
-    if document.get("model") != model:
-        raise InputError(
-            f"the weights are of the model {document.get('model')!r}, the configuration says {model!r}",
-            remedy="Set `fnet.model` to the weights' model, or give other weights.",
-            file=path,
-            stage="fnet",
-        )
+    document = read_fixer_document(path, model)
     try:
         tensors = load_file(path)
     except (OSError, SafetensorError) as error:
@@ -116,16 +109,3 @@ def _build_described(document: dict[str, Any], path: Path) -> Fnet:
             file=path.with_suffix(".json"),
             stage="fnet",
         ) from error
-
-
-def _read_document(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"the configuration of the weights cannot be read: {error}", remedy=REMEDY, file=path, stage="fnet"
-        ) from error
-    # A list or a number is valid JSON, and would fail later with an error that names no file.
-    if not isinstance(document, dict):
-        raise InputError("the configuration of the weights is no object", remedy=REMEDY, file=path, stage="fnet")
-    return document

@@ -28,7 +28,7 @@ from genre_tasks.optimiser.tuned_adam import GNET_LEARNING_RATES
 class NetworkConfig(BaseModel):
     """The network's shape and the learning rates that it scales; stored as JSON beside the weights."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     hidden: int = Field(default=64, ge=4, le=512, description="Width of the head for each Gaussian.")
     channels: tuple[int, ...] = Field(
@@ -38,9 +38,7 @@ class NetworkConfig(BaseModel):
     residuals: bool = Field(
         default=False, description="Whether the network uses image residuals and moves colours by them."
     )
-    relaxation: float = Field(
-        default=0.0, allow_inf_nan=False, description="c₀: residuals move colours by 1 + tanh(c₀) of themselves."
-    )
+    relaxation: float = Field(default=0.0, description="c₀: residuals move colours by 1 + tanh(c₀) of themselves.")
     rates: tuple[float, ...] = Field(
         default=GNET_LEARNING_RATES.as_tuple(),
         min_length=len(ATTRIBUTE_COLUMNS),

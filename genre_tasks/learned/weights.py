@@ -9,12 +9,12 @@ from pydantic import ValidationError
 
 from genre_tasks.atomic_path import write_atomically
 from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.json_files import read_json_object
 from genre_tasks.learned.learned_optimiser import LearnedOptimiser
 from genre_tasks.learned.network import NetworkConfig
+from genre_tasks.learned.weight_files import REMEDY
 from genre_tasks.optimiser.kernels.constants import IMAGE_RESIDUALS, VARYING_FEATURES
 from genre_tasks.weight_checks import require_weights_fit
-
-REMEDY = "Give weights made by `genre train gnet` or `genre train enet`, or use `builtin`."
 
 
 def load_optimiser(weights: Path) -> LearnedOptimiser:
@@ -38,9 +38,10 @@ def load_optimiser(weights: Path) -> LearnedOptimiser:
     for path in (weights, config_file):
         if not path.is_file():
             raise InputError("The optimiser's weights are missing", remedy=REMEDY, file=path)
+    values = read_json_object(config_file, "network's configuration", REMEDY, kind=ConfigError)
     try:
-        config = NetworkConfig.model_validate_json(config_file.read_text())
-    except (ValidationError, ValueError) as error:
+        config = NetworkConfig.model_validate(values)
+    except ValidationError as error:
         # pydantic's message goes on with links; its first lines name the keys.
         detail = "; ".join(str(error).splitlines()[:4])
         raise ConfigError(

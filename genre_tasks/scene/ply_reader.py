@@ -7,6 +7,7 @@ place where that matters.
 from __future__ import annotations
 
 import io
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,6 +36,8 @@ _TYPES = {
     "float64": "<f8",
 }
 _COLORS = ("red", "green", "blue")
+# Comments may be long, but no program writes more of them.
+_MAX_HEADER_BYTES = 1 << 18
 _REMEDY = "Give ingest.points a PLY file (ascii or binary_little_endian) with x, y, z and red, green, blue per vertex."
 
 
@@ -58,17 +61,13 @@ def read_ply(path: str | Path) -> tuple[Float64, NDArray[np.uint8] | None]:
     except OSError as error:
         raise InputError(f"cannot read the point file: {error.strerror}", remedy=_REMEDY, file=file) from error
     header = _read_header(data, file)
+    _check_columns(header, file)
     table = _read_ascii(data, header, file) if header.format == "ascii" else _read_binary(header, file)
-    missing = [c for c in "xyz" if c not in header.columns]
-    if missing:
-        raise InputError(f"the vertices have no {', '.join(missing)}", remedy=_REMEDY, file=file)
     # In float64, whatever the file has: world coordinates do not fit into float32.
     positions = np.stack([table[c].astype(np.float64) for c in "xyz"], 1)
     bad = np.flatnonzero(~np.isfinite(positions).all(1))
     if len(bad):
         raise InputError(f"{len(bad)} vertices are not finite, the first is {bad[0]}", remedy=_REMEDY, file=file)
-    if not len(positions):
-        raise InputError("the file has no vertices", remedy=_REMEDY, file=file)
     # Missing colours are no error: the images can colour the points.
     if not set(_COLORS) <= set(header.columns):
         return positions, None
@@ -78,6 +77,33 @@ def read_ply(path: str | Path) -> tuple[Float64, NDArray[np.uint8] | None]:
         # Rounded, because the cast below truncates.
         colors = np.round(colors.clip(0, 1) * 255)
     return positions, colors.clip(0, 255).astype(np.uint8)
+
+
+def check_ply_header(path: str | Path) -> int:
+    """Checks what can be checked of a PLY file without reading its vertices.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        How many vertices the file has.
+
+    Raises:
+        InputError: the file cannot be read, its header is none that :func:`read_ply` reads, or the file is too short
+            for its vertices.
+    """
+    file = Path(path)
+    try:
+        with file.open("rb") as stream:
+            start = stream.read(_MAX_HEADER_BYTES)
+            size = os.fstat(stream.fileno()).st_size
+    except OSError as error:
+        raise InputError(f"cannot read the point file: {error.strerror}", remedy=_REMEDY, file=file) from error
+    header = _read_header(start, file)
+    _check_columns(header, file)
+    if header.format != "ascii":
+        _check_length(header, size - (len(start) - len(header.body)), file)
+    return header.count
 
 
 @dataclass(frozen=True)
@@ -120,13 +146,26 @@ def _read_header(data: bytes, file: Path) -> _Header:
     return _Header(form, count, columns, body)
 
 
-def _read_binary(header: _Header, file: Path) -> NDArray:
+def _check_columns(header: _Header, file: Path) -> None:
+    missing = [c for c in "xyz" if c not in header.columns]
+    if missing:
+        raise InputError(f"the vertices have no {', '.join(missing)}", remedy=_REMEDY, file=file)
+    if not header.count:
+        raise InputError("the file has no vertices", remedy=_REMEDY, file=file)
+
+
+def _check_length(header: _Header, available: int, file: Path) -> None:
+    """Raises if fewer bytes are available than the vertices take."""
     row = np.dtype(list(header.columns.items()))
     # NumPy's own error names neither the file nor how much of it is there.
-    if len(header.body) < header.count * row.itemsize:
-        complete = len(header.body) // max(row.itemsize, 1)
+    if available < header.count * row.itemsize:
+        complete = available // row.itemsize
         raise InputError(f"the file ends after {complete} of {header.count} vertices", remedy=_REMEDY, file=file)
-    return np.frombuffer(header.body, row, header.count)
+
+
+def _read_binary(header: _Header, file: Path) -> NDArray:
+    _check_length(header, len(header.body), file)
+    return np.frombuffer(header.body, np.dtype(list(header.columns.items())), header.count)
 
 
 def _read_ascii(data: bytes, header: _Header, file: Path) -> NDArray:

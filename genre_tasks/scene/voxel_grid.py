@@ -119,14 +119,19 @@ def find_voxel_size(points: Float32, octave: NDArray[np.int64], max_count: int, 
         max_size_m: where the search starts; it goes beyond if even that fills too many.
 
     Returns:
-        Size in metres of a voxel in octave 0, at least ``MIN_VOXEL_M``, to 2 %.
+        Size in metres of a voxel in octave 0, at least ``MIN_VOXEL_M``, to 2 %. Points about the origin fill up to
+        eight voxels of any size in each octave: where these are too many, the size is that of the points' extent.
     """
     low = MIN_VOXEL_M
     high = max_size_m
     if count_voxels(points, octave, low) <= max_count:
         return low
     # A size that is large enough must be known before the interval can be halved.
+    extent = float(np.abs(points).max(initial=0.0))
     while count_voxels(points, octave, high) > max_count:
+        # Larger voxels would hold the same points, however large they are.
+        if high > extent:
+            return high
         high *= 2
     while high / low > 1.02:
         # Halved on a logarithmic scale: the result is to be exact in relation to its size.

@@ -14,19 +14,18 @@ from genre_tasks.checks import check_finite
 from genre_tasks.config import FnetConfig
 from genre_tasks.effects.apply_plan import apply_plan
 from genre_tasks.effects.types import DEFAULT_PLAN, EffectsPlan
-from genre_tasks.errors import InputError
 from genre_tasks.fixer.inference import draw_noise, fix, prefers_bfloat16
 from genre_tasks.fixer.inputs import build_inputs
 from genre_tasks.fixer.network import Encoded, Fnet
 from genre_tasks.fixer.source_images import find_references, load_source_images
 from genre_tasks.fixer.view_surface import unproject_surface
 from genre_tasks.fixer.warping import SourceImage, unseen_fraction
+from genre_tasks.fixer.weight_files import find_fixer_weights, require_timestep
 from genre_tasks.fixer.weights import load_fnet
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.novel_views import FixedViews, NovelViews
 from genre_tasks.threads import map_single_threaded
-from genre_tasks.weights import resolve_weights
 
 
 def fnet(
@@ -70,21 +69,8 @@ def load_configured_fnet(config: FnetConfig) -> Fnet:
     Raises:
         InputError: the weights are missing, do not fit, or were trained at another timestep.
     """
-    # SD-Turbo's weights are large and have a licence of their own.
-    if config.model == "sd-turbo" and config.weights == "builtin":
-        raise InputError(
-            "no weights of sd-turbo ship with the package",
-            remedy="Give by `fnet.weights` a folder that `genre train fnet` wrote, or set `fnet.model` to small.",
-            stage="fnet",
-        )
-    network = load_fnet(resolve_weights("fnet", config.weights), config.model)
-    # The network has learned the noise of one timestep; at another one its output is wrong without any error.
-    if network.architecture.timestep != config.timestep:
-        raise InputError(
-            f"the weights were trained at timestep {network.architecture.timestep}, configured is {config.timestep}",
-            remedy="Set `fnet.timestep` to the weights' timestep, or train others.",
-            stage="fnet",
-        )
+    network = load_fnet(find_fixer_weights(config), config.model)
+    require_timestep(network.architecture.timestep, config.timestep)
     return network
 
 

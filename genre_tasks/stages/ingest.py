@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from genre_tasks.config import IngestConfig
-from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.errors import InputError
 from genre_tasks.log_checks.images import LEFT_OUT
 from genre_tasks.log_checks.plausibility import assess_plausibility
 from genre_tasks.log_checks.reader_findings import collect_reader_findings
 from genre_tasks.logs.findings import Finding
+from genre_tasks.logs.log_selection import chunk_count, select_cameras, select_frames
 from genre_tasks.logs.types import Camera, DrivingLog
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.actor_track import ActorTrack
@@ -23,26 +24,11 @@ from genre_tasks.stages.chunk_reading import ChunkReading
 from genre_tasks.stages.ingest_points import ChunkPoints, read_points_from_file, read_points_from_sweeps
 from genre_tasks.stages.ingest_views import read_views, require_source_frames
 
+__all__ = ["STANDSTILL_M", "chunk_count", "ingest"]
+
 _NOTED_WITH_IMAGES = frozenset(LEFT_OUT)
 STANDSTILL_M = 0.1
 """An ego vehicle that travels less than this in a chunk stands still: there is no parallax."""
-
-
-def chunk_count(config: IngestConfig, log: DrivingLog) -> int:
-    """Counts the chunks of a log; the last one may be short.
-
-    Args:
-        config: with the frames of a chunk.
-        log: to divide.
-
-    Returns:
-        Number of chunks; 0 for a log without frames.
-
-    >>> from types import SimpleNamespace
-    >>> chunk_count(IngestConfig(chunk_frames=20), SimpleNamespace(frame_count=41))
-    3
-    """
-    return -(-log.frame_count // config.chunk_frames)
 
 
 def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Progress = silent) -> Chunk:
@@ -64,8 +50,8 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
         InputError: fewer than two source frames have images, or there is neither LiDAR nor ``points``.
         ConfigError: the chunk or a camera is unknown.
     """
-    frames = _select_frames(config, log, chunk_index)
-    cameras = _select_cameras(config, log)
+    frames = select_frames(config, log, chunk_index)
+    cameras = select_cameras(config, log)
     _require_cameras(log, cameras, chunk_index)
     poses = np.stack([log.world_SE3_lidar(frame) for frame in frames])
     world_SE3_chunk = np.eye(4)
@@ -103,35 +89,6 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
         actors=tuple(actors),
         log_issues=tuple(reading.log_issues),
     )
-
-
-def _select_frames(config: IngestConfig, log: DrivingLog, chunk_index: int) -> tuple[int, ...]:
-    count = chunk_count(config, log)
-    if not 0 <= chunk_index < count:
-        known = "it has none" if count == 0 else f"it has 0 to {count - 1}"
-        raise ConfigError(
-            f"the log has no chunk {chunk_index}",
-            remedy=f"Choose from its chunks with --chunks: {known}.",
-            log=log.name,
-        )
-    # Chunks do not overlap; the last one may be short.
-    start = chunk_index * config.chunk_frames
-    return tuple(range(start, min(start + config.chunk_frames, log.frame_count)))
-
-
-def _select_cameras(config: IngestConfig, log: DrivingLog) -> tuple[Camera, ...]:
-    if config.cameras is None:
-        return log.cameras
-    known = {camera.name for camera in log.cameras}
-    unknown = [name for name in config.cameras if name not in known]
-    if unknown or not config.cameras:
-        raise ConfigError(
-            f"unknown cameras {', '.join(unknown)}" if unknown else "no camera is chosen",
-            remedy=f"Choose ingest.cameras from {', '.join(camera.name for camera in log.cameras)}.",
-            log=log.name,
-        )
-    # In the order of the rig, whatever the order in the configuration: the result must not depend on it.
-    return tuple(camera for camera in log.cameras if camera.name in config.cameras)
 
 
 def _note_path_issues(reading: ChunkReading) -> None:

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 import yaml
 
-from flows.configuration import PRESETS, RENAMED_KEYS, _section_type, diff_from_preset, load_configuration
+from flows.configuration import PRESETS, RENAMED_KEYS, diff_from_preset, load_configuration
+from flows.configuration.keys import section_type
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ConfigError
 
@@ -99,7 +100,7 @@ def test_every_renamed_key_leads_to_a_key_that_exists() -> None:
         model: Any = PipelineConfig
         for part in new.split("."):
             field = model.model_fields[part]
-            model, _ = _section_type(field.annotation)
+            model, _ = section_type(field.annotation)
 
 
 def test_a_removed_key_says_what_to_do_instead() -> None:

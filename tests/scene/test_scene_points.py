@@ -99,6 +99,14 @@ def test_voxel_count_and_size_search() -> None:
     assert count_voxels(points[:0], level[:0], 1.0) == 0
 
 
+@pytest.mark.parametrize("max_count", [7, 1, 0, -3])
+def test_the_size_search_ends_where_no_size_is_large_enough(max_count: int) -> None:
+    """Report: none found; case 16 of the list of odd logs (a bound on Gaussians below eight for each actor)."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
+    size = find_voxel_size(corners, np.zeros(8, np.int64), max_count)
+    assert 1 < size < 10 and count_voxels(corners, np.zeros(8, np.int64), size) == 8
+
+
 @pytest.mark.parametrize("slope", [0.0, 0.05])
 def test_road_is_filled_where_lidar_is_blind(slope: float) -> None:
     grid = np.mgrid[-15:15:0.05, -15:15:0.05].reshape(2, -1).T

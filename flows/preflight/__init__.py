@@ -1,0 +1,1 @@
+"""What a run needs, checked before any work: log, files, weights, packages, store, disk and memory."""

@@ -1,0 +1,105 @@
+"""Whether disk and memory are likely to suffice: estimates from sizes of images and numbers of Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flows.machine.memory import memory_limit_gib
+from flows.pipeline.prediction import typical_gigabytes
+from flows.preflight.store_checks import free_space_mib
+from genre_tasks.config import PipelineConfig
+
+if TYPE_CHECKING:
+    from genre_tasks.logs.types import Camera, DrivingLog
+
+# Measured on demo and small runs. Images are stored as they were recorded; EXR compresses renders little.
+_RECORDED_BYTES_PER_PX = 0.2
+_NOVEL_VIEW_BYTES_PER_PX = 28
+_FIXED_VIEW_BYTES_PER_PX = 6
+_BYTES_PER_GAUSSIAN = 120
+_BYTES_PER_POINT = 16
+_POINTS_PER_SWEEP = 100_000
+_REPORT_MIB = 5
+
+_BYTES_PER_OPTIMISED_GAUSSIAN = 1500
+"""Memory of the learned optimiser: attributes, gradients, moments, features and one layer of the network."""
+
+_CLEARLY_TOO_LITTLE = 0.7
+"""Memory is estimated from other machines, so that less than the estimate may still suffice."""
+
+
+def estimate_disk_mib(log: DrivingLog, cameras: Sequence[Camera], config: PipelineConfig, chunks: int) -> float:
+    """Estimates how much a run adds to the store.
+
+    Args:
+        log: what is reconstructed.
+        cameras: those that are used.
+        config: the effective configuration.
+        chunks: how many chunks are computed.
+
+    Returns:
+        MiB, as if nothing were in the store yet.
+    """
+    frames = min(config.ingest.chunk_frames, log.frame_count)
+    source_frames = -(-frames // config.ingest.source_every)
+    recorded_px = sum(camera.lens.width_px * camera.lens.height_px for camera in cameras)
+    images = frames * recorded_px * _RECORDED_BYTES_PER_PX
+    points = frames * _POINTS_PER_SWEEP * _BYTES_PER_POINT
+    novel_views = source_frames * len(cameras) * len(config.novel_views.shifts_m)
+    rendered_px = novel_views * config.ingest.width_px * config.ingest.height_px
+    views = rendered_px * (_NOVEL_VIEW_BYTES_PER_PX + _FIXED_VIEW_BYTES_PER_PX)
+    gnet, enet = _count_gaussians(config)
+    start = config.initial.max_points + config.initial.distant_count
+    gaussians = start + gnet * (1 + config.gnet.snapshots) + enet * (1 + config.enet.snapshots)
+    return chunks * ((images + points + views + gaussians * _BYTES_PER_GAUSSIAN) / 2**20 + _REPORT_MIB)
+
+
+def assess_disk(root: Path, needed_mib: float) -> str | None:
+    """Compares the free space with an estimate.
+
+    Args:
+        root: the store's folder.
+        needed_mib: what the run may add.
+
+    Returns:
+        A warning, or ``None``.
+    """
+    free_mib = free_space_mib(root)
+    if free_mib >= needed_mib:
+        return None
+    return (
+        f"the disk of the store ({root}) has {free_mib / 1024:.1f} GiB of free space, and the run may add about "
+        f"{needed_mib / 1024:.1f} GiB to what is stored"
+    )
+
+
+def assess_memory(config: PipelineConfig) -> str | None:
+    """Compares the memory that this process may use with an estimate.
+
+    Args:
+        config: the effective configuration.
+
+    Returns:
+        A warning, or ``None``.
+    """
+    needed_gib = typical_gigabytes(config) + max(_count_gaussians(config)) * _BYTES_PER_OPTIMISED_GAUSSIAN / 2**30
+    limit_gib = memory_limit_gib()
+    if limit_gib >= _CLEARLY_TOO_LITTLE * needed_gib:
+        return None
+    return (
+        f"this process may use {limit_gib:.1f} GiB of memory, and the run needs about {needed_gib:.1f} GiB; "
+        "smaller images or fewer Gaussians (ingest.width_px, initial.max_points) need less"
+    )
+
+
+def _count_gaussians(config: PipelineConfig) -> tuple[int, int]:
+    """The most Gaussians after GNet and after ENet; LiDAR may give fewer."""
+    count = config.initial.max_points + config.initial.distant_count
+    refinement = config.gnet.refinement
+    splits = [config.gnet.split_fraction, 0.0 if refinement is None else refinement.split_fraction]
+    gnet = round(count * (1 + splits[0]) * (1 + splits[1]))
+    if config.gnet.method in ("standard_3dgs", "street_gs"):
+        gnet = max(gnet, config.gnet.per_scene.density.max_gaussians)
+    return gnet, round(gnet * (1 + config.enet.split_fraction))

@@ -1,0 +1,73 @@
+"""Checks all that a training needs before any work; scenes take hours before a network reads its weights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from flows.configuration import load_configuration
+from flows.preflight.requirements import check_inputs
+from flows.preflight.store_checks import check_store
+from flows.training.device import choose_device
+from flows.training.fixer_job import FixerJob
+from flows.training.fixer_pairs import list_pair_scenes
+from flows.training.fixer_training import require_same_inputs
+from flows.training.recipes import select_stages
+from flows.training.stage_scenes import list_scene_uses
+from flows.training.train_job import TrainJob
+from flows.training.training_scenes import check_for_training
+from genre_tasks.config import FnetConfig
+from genre_tasks.fixer.network import INPUTS
+from genre_tasks.fixer.weight_files import check_described_weights, check_fixer_files, check_sd_turbo
+
+_TRAINING_PRESET = "small"
+
+
+def check_optimiser_training(job: TrainJob, network: str | None = None, stage: str | None = None) -> None:
+    """Checks what a training of GNet or ENet needs, or the making of its scenes.
+
+    Args:
+        job: the training.
+        network: gnet, enet or g3r; ``None`` for scenes alone.
+        stage: this stage alone; ``None`` for all of the network.
+
+    Raises:
+        ConfigError: the recipe, the stage or the device is unknown, or a chunk is not for training.
+        InputError: the real log or the fixer's weights are missing or unfit, or the folder cannot be written to.
+    """
+    stages = list(job.stages()) if network is None else select_stages(job.stages(), network)
+    if stage is not None:
+        stages = [job.get_stage(stage)]
+    choose_device(job.device)
+    for scene in list_scene_uses(stages, job.real):
+        check_for_training(scene)
+    _check_real_log(job.real)
+    check_fixer_files(FnetConfig(weights=job.fnet))
+    check_store(str(job.store.root))
+
+
+def check_fixer_training(job: FixerJob, is_training: bool = True) -> None:
+    """Checks what a training of FNet needs, or the making of its pairs.
+
+    Args:
+        job: the training.
+        is_training: whether the network is trained, too.
+
+    Raises:
+        ConfigError: there is nothing to make pairs of, or a chunk is not for training.
+        InputError: the real log or the weights to start from are missing or unfit, or the folder cannot be written to.
+    """
+    list_pair_scenes(job.streets, job.real)
+    _check_real_log(job.real)
+    check_store(str(job.store.root))
+    if not is_training:
+        return
+    if job.sd_turbo is not None:
+        check_sd_turbo(job.sd_turbo, Path())
+    elif job.initial_weights is not None:
+        path, described = check_described_weights(job.initial_weights, "small")
+        require_same_inputs(described.get("inputs", INPUTS), job, path)
+
+
+def _check_real_log(real: str | None) -> None:
+    if real is not None:
+        check_inputs(real, [0], load_configuration(_TRAINING_PRESET))

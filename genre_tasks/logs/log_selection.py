@@ -1,0 +1,81 @@
+"""Which frames and cameras of a log a run uses; no image and no sweep is read for that."""
+
+from __future__ import annotations
+
+from genre_tasks.config import IngestConfig
+from genre_tasks.errors import ConfigError
+from genre_tasks.logs.types import Camera, DrivingLog
+
+
+def chunk_count(config: IngestConfig, log: DrivingLog) -> int:
+    """Counts the chunks of a log; the last one may be short.
+
+    Args:
+        config: with the frames of a chunk.
+        log: to divide.
+
+    Returns:
+        Number of chunks; 0 for a log without frames.
+
+    >>> from types import SimpleNamespace
+    >>> chunk_count(IngestConfig(chunk_frames=20), SimpleNamespace(frame_count=41))
+    3
+    """
+    return -(-log.frame_count // config.chunk_frames)
+
+
+def select_frames(config: IngestConfig, log: DrivingLog, chunk_index: int) -> tuple[int, ...]:
+    """Selects the frames of a chunk; chunks do not overlap, and the last one may be short.
+
+    Args:
+        config: with the frames of a chunk.
+        log: to divide.
+        chunk_index: from 0.
+
+    Returns:
+        The frames, in order.
+
+    Raises:
+        ConfigError: the log has no such chunk.
+
+    >>> from types import SimpleNamespace
+    >>> select_frames(IngestConfig(chunk_frames=20), SimpleNamespace(frame_count=22, name="002"), 1)
+    (20, 21)
+    """
+    count = chunk_count(config, log)
+    if not 0 <= chunk_index < count:
+        known = "it has none" if count == 0 else f"it has 0 to {count - 1}"
+        raise ConfigError(
+            f"the log has no chunk {chunk_index}",
+            remedy=f"Choose from its chunks with --chunks: {known}.",
+            log=log.name,
+        )
+    start = chunk_index * config.chunk_frames
+    return tuple(range(start, min(start + config.chunk_frames, log.frame_count)))
+
+
+def select_cameras(config: IngestConfig, log: DrivingLog) -> tuple[Camera, ...]:
+    """Selects the cameras to use.
+
+    Args:
+        config: names them, or none for all.
+        log: with its rig.
+
+    Returns:
+        The cameras in the order of the rig.
+
+    Raises:
+        ConfigError: the log has no camera of a name.
+    """
+    if config.cameras is None:
+        return log.cameras
+    known = {camera.name for camera in log.cameras}
+    unknown = [name for name in config.cameras if name not in known]
+    if unknown or not config.cameras:
+        raise ConfigError(
+            f"unknown cameras {', '.join(unknown)}" if unknown else "no camera is chosen",
+            remedy=f"Choose ingest.cameras from {', '.join(camera.name for camera in log.cameras)}.",
+            log=log.name,
+        )
+    # In the order of the rig, whatever the order in the configuration: the result must not depend on it.
+    return tuple(camera for camera in log.cameras if camera.name in config.cameras)
