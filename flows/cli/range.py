@@ -70,8 +70,8 @@ def range_command(
     from genre_tasks.reliability.reliable_range import estimate_reliable_range
 
     check_output_folder(out, "--out", ("range.parquet", "range.png"))
-    check_number(max_drop_db, "--max-drop-db", 0, 100)
     config = _range_config(max_drop_db, every)
+    check_number(max_drop_db, "--max-drop-db", 0, 100)
     open_existing_store(store)
     # Without a detector the other guards decide alone.
     network = None
