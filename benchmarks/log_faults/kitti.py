@@ -81,7 +81,7 @@ class KittiLog:
         poses = {}
         for name, number in _CAMERAS.items():
             projection = self._camera_calibration[f"P_rect_{number}"].reshape(3, 4)
-            offset = np.linalg.solve(projection[:, :3], projection[:, 3])
+            offset = np.asarray(np.linalg.solve(projection[:, :3], projection[:, 3]), dtype=np.float64)
             camera_SE3_lidar = compose_se3(np.eye(3), offset) @ rectified_SE3_camera0 @ camera0_SE3_lidar
             poses[name] = invert_se3(camera_SE3_lidar)
         return poses

@@ -66,9 +66,8 @@ class AngularGrid:
         """
         u = np.array([0.0, lens.width_px, lens.cx_px, lens.cx_px])
         v = np.array([lens.cy_px, lens.cy_px, 0.0, lens.height_px])
-        x, y = (u - lens.cx_px) / lens.fx_px, (v - lens.cy_px) / lens.fy_px
-        if any(lens.distortion):
-            x, y = undistort(x, y, lens.coefficients)
+        rays = ((u - lens.cx_px) / lens.fx_px, (v - lens.cy_px) / lens.fy_px)
+        x, y = undistort(*rays, lens.coefficients) if any(lens.distortion) else rays
         step = np.deg2rad(CELL_DEG)
         azimuth = np.arange(np.arctan(x[0]), np.arctan(x[1]), step)
         return cls(azimuth, np.arange(np.arctan(y[2]), np.arctan(y[3]), step))

@@ -8,7 +8,7 @@ from genre_tasks.log_checks.calibration import find_miscalibration
 from genre_tasks.log_checks.lidar_frame import find_misplaced_lidar
 from genre_tasks.log_checks.log_sample import LogSample
 from genre_tasks.log_checks.motion import find_implausible_motion
-from genre_tasks.log_checks.pose_axes import find_odd_pose_axes
+from genre_tasks.log_checks.pose_axes import find_misread_poses
 from genre_tasks.log_checks.sweep_overlap import find_inconsistent_sweeps
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.types import Camera, DrivingLog
@@ -16,7 +16,7 @@ from genre_tasks.logs.types import Camera, DrivingLog
 # In the order in which a person would look for the cause: a wrong unit explains most of what comes after it.
 _CHECKS: tuple[Callable[[LogSample], Iterable[Finding]], ...] = (
     find_implausible_motion,
-    find_odd_pose_axes,
+    find_misread_poses,
     find_misplaced_lidar,
     find_inconsistent_sweeps,
     find_miscalibration,

@@ -69,7 +69,7 @@ def find_inconsistent_sweeps(sample: LogSample) -> Iterator[Finding]:
         ``lidar_not_in_world`` where another placement fits clearly better, with its name, or ``sweeps_apart`` where
         sweeps fit nowhere. A vehicle that stands gives no verdict.
     """
-    is_posed = np.isfinite(sample.world_SE3_lidar).all(axis=(1, 2))
+    is_posed = np.asarray(np.isfinite(sample.world_SE3_lidar).all(axis=(1, 2)))
     if not is_posed.any():
         return
     # Frames without a pose are in no pair.
