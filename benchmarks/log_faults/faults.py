@@ -221,7 +221,8 @@ def _misread(name: str, with_points: bool) -> Callable[[DrivingLog, float], Chan
 
 
 _ONCE = (1.0,)
-_ORDER = "quaternions read as x, y, z, w"
+# What a file with x, y, z, w gives to a reader that expects w, x, y, z.
+_ORDER = "quaternions whose w, x, y, z were taken for x, y, z, w"
 _CONJUGATE = "conjugate quaternions"
 
 FAULTS: tuple[Fault, ...] = (

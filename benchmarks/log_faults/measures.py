@@ -7,6 +7,7 @@ import time
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 from benchmarks.common.bench import NotMeasuredError, Row
 from benchmarks.common.task import require_log_folder
@@ -19,7 +20,7 @@ from genre_tasks.log_checks.plausibility import assess_plausibility
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.pandaset.writer import write_pandaset
 from genre_tasks.logs.registry import open_log
-from genre_tasks.logs.types import DrivingLog
+from genre_tasks.logs.types import DrivingLog, Sweep
 
 _CHUNK_FRAMES = 20
 
@@ -60,11 +61,29 @@ class ChunkOfLog:
         return tuple(range(start, min(start + _CHUNK_FRAMES, log.frame_count)))
 
 
+class _CachedSweeps:
+    """A log whose sweeps are read once: each fault would read them again."""
+
+    def __init__(self, log: DrivingLog) -> None:
+        self._log = log
+        self._sweeps: dict[int, Sweep | None] = {}
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._log, name)
+
+    def sweep(self, frame: int) -> Sweep | None:
+        """See ``DrivingLog``."""
+        if frame not in self._sweeps:
+            self._sweeps[frame] = self._log.sweep(frame)
+        return self._sweeps[frame]
+
+
 @dataclass(frozen=True)
 class _OpenLog:
-    """A log, and the folder that goes when the log does."""
+    """A log, the same with its sweeps in memory, and the folder that goes when the log does."""
 
     log: DrivingLog
+    cached: Any
     folder: tempfile.TemporaryDirectory[str] | None = None
 
 
@@ -74,12 +93,14 @@ def _open_chunk_log(uri: str) -> _OpenLog:
     kind, _, rest = uri.partition(":")
     if kind != "kitti":
         require_log_folder(uri)
-        return _OpenLog(open_log(uri))
+        log = open_log(uri)
+        return _OpenLog(log, _CachedSweeps(log))
     if not Path(rest).is_dir():
         raise NotMeasuredError(f"there is no folder {rest}; give it with --set kitti=PATH")
     folder = tempfile.TemporaryDirectory(prefix="genre-kitti-")
     written = write_pandaset(KittiLog(Path(rest)), Path(folder.name) / "0009")
-    return _OpenLog(open_log(f"pandaset:{written}"), folder)
+    log = open_log(f"pandaset:{written}")
+    return _OpenLog(log, _CachedSweeps(log), folder)
 
 
 def measure_sound_log(chunk: ChunkOfLog) -> Row:
@@ -124,7 +145,7 @@ def measure_fault(chunk: ChunkOfLog, fault: Fault) -> Row:
     Raises:
         NotMeasuredError: the log's folder is missing.
     """
-    log = _open_chunk_log(chunk.uri).log
+    log = _open_chunk_log(chunk.uri).cached
     found = []
     for strength in fault.strengths:
         changed = ChangedLog(log, fault.change(log, strength))

@@ -21,7 +21,6 @@ from genre_tasks.log_checks.edge_agreement import (
 from genre_tasks.log_checks.log_sample import LogSample
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.types import Camera, Float32, Float64, Lens
-from genre_tasks.scene.transforms import invert_se3
 
 # Images of a camera that are compared, spread over the chunk. Scores grow with the root of their number, so that a
 # camera with a low one is compared again by more of them.
@@ -160,8 +159,9 @@ def _view_camera(sample: LogSample, camera: Camera, images: int) -> CameraView |
         sweep = sample.sweep(frame)
         if edges is None or sweep is None or not np.isfinite(poses[index]).all():
             continue
-        camera_SE3_world = invert_se3(poses[index])
-        view.points[frame] = sweep.points_world @ camera_SE3_world[:3, :3].T + camera_SE3_world[:3, 3]
+        # By einsum: a matrix product would start threads for a matrix of three columns.
+        offset = sweep.points_world - poses[index, :3, 3]
+        view.points[frame] = np.einsum("ni,ij->nj", offset, poses[index, :3, :3])
         view.image_edges[frame] = edges
     return view if view.has_edges else None
 
@@ -275,7 +275,9 @@ def _roll(roll_deg: float) -> Float64:
 def _score_points(view: CameraView, matrix: Float64) -> float:
     """Score with the points changed by [3, 3]; of a few images, since many changes are tried."""
     frames = view.few_frames
-    range_edges = {frame: find_range_edges(view.points[frame] @ matrix.T, view.grid) for frame in frames}
+    range_edges = {
+        frame: find_range_edges(np.einsum("ni,ji->nj", view.points[frame], matrix), view.grid) for frame in frames
+    }
     agreement = _score(range_edges, {frame: view.image_edges[frame] for frame in frames})
     return -np.inf if agreement is None else agreement.score
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from genre_tasks.logs.types import Float32, Float64, Lens
-from genre_tasks.scene.lens_distortion import distort, fold_radius, undistort
+from genre_tasks.scene.lens_distortion import Reals, distort, fold_radius, undistort
 
 CELL_DEG = 0.3
 """Side of a cell of the grid: LiDARs measure every 0.1° to 0.4°."""
@@ -28,7 +28,7 @@ STRIPS = 3
 # A jump of the range by 8 % is an edge; more than 23 % counts no more.
 _JUMP = 0.08
 _MAX_JUMP = 0.15
-_MIN_RANGE_M = 1.0
+_MIN_DEPTH_M = 0.3
 # Contrast is relative to what is around within so many cells: trees and façades would decide alone.
 _CONTRAST_CELLS = 8.0
 _MAX_CONTRAST = 3.0
@@ -66,11 +66,13 @@ class AngularGrid:
         """
         u = np.array([0.0, lens.width_px, lens.cx_px, lens.cx_px])
         v = np.array([lens.cy_px, lens.cy_px, 0.0, lens.height_px])
-        rays = ((u - lens.cx_px) / lens.fx_px, (v - lens.cy_px) / lens.fy_px)
-        x, y = undistort(*rays, lens.coefficients) if any(lens.distortion) else rays
-        step = np.deg2rad(CELL_DEG)
-        azimuth = np.arange(np.arctan(x[0]), np.arctan(x[1]), step)
-        return cls(azimuth, np.arange(np.arctan(y[2]), np.arctan(y[3]), step))
+        x: Reals = (u - lens.cx_px) / lens.fx_px
+        y: Reals = (v - lens.cy_px) / lens.fy_px
+        if any(lens.distortion):
+            x, y = undistort(np.asarray(x, np.float64), np.asarray(y, np.float64), lens.coefficients)
+        step = float(np.deg2rad(CELL_DEG))
+        left, right, top, bottom = np.arctan([x[0], x[1], y[2], y[3]]).tolist()
+        return cls(np.arange(left, right, step), np.arange(top, bottom, step))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -92,7 +94,8 @@ def find_image_edges(pixels: NDArray[np.uint8], lens: Lens, grid: AngularGrid) -
     from scipy import ndimage
 
     azimuth, elevation = np.meshgrid(grid.azimuth_rad, grid.elevation_rad)
-    x, y = np.tan(azimuth), np.tan(elevation) / np.cos(azimuth)
+    x: Reals = np.tan(azimuth)
+    y: Reals = np.tan(elevation) / np.cos(azimuth)
     inside = np.ones(grid.shape, dtype=bool)
     if any(lens.distortion):
         inside &= x * x + y * y < fold_radius(lens.coefficients) ** 2
@@ -121,7 +124,8 @@ def find_range_edges(points_camera: Float64, grid: AngularGrid) -> Float32:
     """
     from scipy import ndimage
 
-    points = points_camera[np.abs(points_camera).max(axis=1) > _MIN_RANGE_M].astype(np.float32)
+    # A pinhole lens sees nothing beside itself or behind.
+    points = points_camera[points_camera[:, 2] > _MIN_DEPTH_M].astype(np.float32)
     horizontal_m = np.hypot(points[:, 0], points[:, 2])
     step = np.float32(np.deg2rad(CELL_DEG))
     column = np.rint((np.arctan2(points[:, 0], points[:, 2]) - grid.azimuth_rad[0]) / step).astype(np.int64)

@@ -97,7 +97,8 @@ def _locate_sweeps(sample: LogSample) -> Iterator[SweepLocation]:
         times = sweep.timestamps_s
         # A log without times of points has the same number, often 0, for all of them.
         offset_s = float(np.median(times) - sample.times_s[index]) if np.any(times) else np.nan
-        in_lidar_axes = (sweep.points_world - pose[:3, 3]) @ pose[:3, :3]
+        # By einsum: a matrix product would start threads for a matrix of three columns.
+        in_lidar_axes = np.einsum("ni,ij->nj", sweep.points_world - pose[:3, 3], pose[:3, :3])
         yield SweepLocation(sample.frames[index], sweep.points_world, in_lidar_axes, offset_s)
 
 

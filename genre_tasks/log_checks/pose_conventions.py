@@ -22,7 +22,7 @@ _MIRROR = np.diag([1.0, -1.0, 1.0])
 
 @dataclass(frozen=True)
 class Reading:
-    """A way to read the poses of a log.
+    """A way to read the poses of a log, or to place its points.
 
     Attributes:
         name: completes the sentence "it fits better with …".
@@ -81,6 +81,8 @@ def list_placements(world_SE3_lidar: Float64) -> Iterator[Reading]:
     yield Reading("points mirrored in the LiDAR's axes", mirrored @ lidar_SE3_world)
     for reading in reread_rotations(world_SE3_lidar):
         yield Reading(reading.name, reading.world_SE3_lidar @ lidar_SE3_world)
+        undone = world_SE3_lidar @ invert_se3(reading.world_SE3_lidar)
+        yield Reading(f"points that were placed by {reading.name} placed by the poses", undone)
 
 
 def _quats_from_matrices(rotation: Float64) -> Float64:
