@@ -76,14 +76,14 @@ class LogFaultsBench:
         return cells
 
     def claims(self, rows: Mapping[str, Row]) -> Iterator[Claim]:
-        """Claims that sound logs give no warning, that strong faults give one, and that it takes little time."""
+        """Claims that sound logs give no finding, that strong faults give one, and that it takes little time."""
         measured = measured_rows(rows)
         sound = [row for row in measured if row["fault"] == "none"]
         for name, is_street in (("streets", True), ("real", False)):
             found = [row for row in sound if row["log"].startswith("synthetic:") == is_street]
-            alarms = float(sum(len(row["warnings"]) for row in found)) if found else None
-            note = f"warnings on {len(found)} sound chunks"
-            yield claim(f"log_faults.false_alarms_{name}", alarms, "<=", 0, "warnings", note, len(found))
+            alarms = float(sum(len(row["words"]) for row in found)) if found else None
+            note = f"findings on {len(found)} sound chunks"
+            yield claim(f"log_faults.false_alarms_{name}", alarms, "<=", 0, "findings", note, len(found))
         faulty = [row for row in measured if row["fault"] != "none"]
         strongest = [float(bool(row["found"][-1])) for row in faulty]
         fraction = sum(strongest) / len(strongest) if strongest else None
@@ -99,7 +99,7 @@ class LogFaultsBench:
         yield "|---|---|---|---|---|"
         for row in measured_rows(rows):
             if row["fault"] == "none":
-                if row["warnings"]:
+                if row["words"]:
                     yield f"| {row['name']} | none | | | **{', '.join(row['warnings'])}** |"
                 continue
             yield f"| {row['name']} | {row['fault']} | {' | '.join(format_strengths(row))} |"

@@ -110,7 +110,7 @@ def measure_sound_log(chunk: ChunkOfLog) -> Row:
         chunk: of the log.
 
     Returns:
-        A row: ``warnings`` and ``notes``, words; ``scores``, agreement of edges by camera; ``cpu_seconds``.
+        A row: ``words`` of findings; ``scores``, agreement of edges by camera; ``cpu_seconds``.
 
     Raises:
         NotMeasuredError: the log's folder is missing.
@@ -128,8 +128,8 @@ def measure_sound_log(chunk: ChunkOfLog) -> Row:
         agreement = measure_agreement(sample, camera)
         if agreement is not None:
             scores[camera.name] = round(agreement.score, 2)
-    row: Row = {"log": chunk.uri, "name": chunk.name, "fault": "none", "warnings": _warnings(found)}
-    return row | {"notes": _words(found, ("note",)), "scores": scores, "cpu_seconds": seconds}
+    row: Row = {"log": chunk.uri, "name": chunk.name, "fault": "none", "words": _words(found)}
+    return row | {"scores": scores, "cpu_seconds": round(seconds, 3)}
 
 
 def measure_fault(chunk: ChunkOfLog, fault: Fault) -> Row:
@@ -140,7 +140,7 @@ def measure_fault(chunk: ChunkOfLog, fault: Fault) -> Row:
         fault: what is done to it.
 
     Returns:
-        A row: ``strengths``, and ``found``, the words of warnings for each of them.
+        A row: ``strengths``, and ``found``, the words of findings for each of them.
 
     Raises:
         NotMeasuredError: the log's folder is missing.
@@ -149,15 +149,11 @@ def measure_fault(chunk: ChunkOfLog, fault: Fault) -> Row:
     found = []
     for strength in fault.strengths:
         changed = ChangedLog(log, fault.change(log, strength))
-        found.append(_warnings(assess_plausibility(changed, chunk.frames(log), changed.cameras)))
+        found.append(_words(assess_plausibility(changed, chunk.frames(log), changed.cameras)))
     row: Row = {"log": chunk.uri, "name": chunk.name, "fault": fault.name, "unit": fault.unit}
     return row | {"strengths": list(fault.strengths), "found": found}
 
 
-def _warnings(findings: tuple[Finding, ...]) -> list[str]:
-    return _words(findings, ("warning", "fatal"))
-
-
-def _words(findings: tuple[Finding, ...], severities: tuple[str, ...]) -> list[str]:
+def _words(findings: tuple[Finding, ...]) -> list[str]:
     """Words without repetitions: several cameras have the same one."""
-    return list(dict.fromkeys(finding.word for finding in findings if finding.severity in severities))
+    return list(dict.fromkeys(finding.word for finding in findings))

@@ -35,11 +35,12 @@ _MAX_CONTRAST = 3.0
 # Of an 8-bit image under a square root: less is noise.
 _NOISE = 0.02
 
-# Cells on either side within which turns count as one, and from which on a turn counts as another.
+# Cells on either side within which turns count as one: upright edges say less about pitch.
 _YAW_BLUR = 2
 _PITCH_BLUR = 3
-_YAW_APART = 3
-_PITCH_APART = 6
+# Cells on either side within which a turn is a matter of accuracy: cameras of a well-kept data set are off by 1.8°,
+# where they and the LiDAR see near objects from different sides and at different times.
+_TOLERANCE = 8
 # Cells by which the left and the right of an image are shifted to opposite sides; two thirds of them lie between.
 _MAX_STRETCH = 12
 _MAX_SLOPE = 12
@@ -184,23 +185,36 @@ def correlate_edges(range_edges: Float32, image_edges: Float32) -> Float32:
 
 
 @dataclass(frozen=True)
-class Agreement:
-    """How well edges agree, in standard deviations of what chance gives.
+class Turn:
+    """A turn of the camera, and how well edges agree with it.
 
     Attributes:
-        score: as the log has the camera, with the small turns that the measurement cannot tell apart.
-        best: for the best other turn.
-        yaw_deg: of that turn, the points to the right.
-        pitch_deg: of that turn, the points down.
-        best_stretch: for the best opposite shift of the image's left and right parts.
+        score: standard deviations above what chance gives.
+        yaw_deg: the points to the right.
+        pitch_deg: the points down.
+    """
+
+    score: float
+    yaw_deg: float
+    pitch_deg: float
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well edges agree, in standard deviations above what chance gives.
+
+    Attributes:
+        score: as the log has the camera, with the turns that the measurement cannot tell apart.
+        near: the best turn within the accuracy of good calibrations, and of edges that are not quite the same.
+        far: the best turn beyond.
+        best_stretch: score of the best opposite shift of the image's left and right parts.
         stretch_deg: of that shift, the right part's points to the right and the left part's to the left.
         slope_deg: of that shift, the right part's points down and the left part's up.
     """
 
     score: float
-    best: float
-    yaw_deg: float
-    pitch_deg: float
+    near: Turn
+    far: Turn
     best_stretch: float
     stretch_deg: float
     slope_deg: float
@@ -223,23 +237,27 @@ def score_turns(surface: Float32) -> Agreement | None:
         return None
     row, column = total.shape[0] // 2, total.shape[1] // 2
     scores = (total - median) / deviation
-    others = scores.copy()
-    others[row - _PITCH_APART : row + _PITCH_APART + 1, column - _YAW_APART : column + _YAW_APART + 1] = -np.inf
-    best = np.unravel_index(others.argmax(), others.shape)
+    is_near = np.zeros(scores.shape, dtype=bool)
+    is_near[row - _TOLERANCE : row + _TOLERANCE + 1, column - _TOLERANCE : column + _TOLERANCE + 1] = True
     stretched, stretch, slope = _find_best_stretch(surface, row, column)
     return Agreement(
         score=float(scores[_window(row, column)].max()),
-        best=float(others[best]),
-        yaw_deg=float(best[1] - column) * CELL_DEG,
-        pitch_deg=float(best[0] - row) * CELL_DEG,
+        near=_find_best_turn(np.where(is_near, scores, -np.inf)),
+        far=_find_best_turn(np.where(is_near, -np.inf, scores)),
         best_stretch=(stretched - median) / deviation,
         stretch_deg=stretch * CELL_DEG,
         slope_deg=slope * CELL_DEG,
     )
 
 
+def _find_best_turn(scores: Float32) -> Turn:
+    row, column = np.unravel_index(scores.argmax(), scores.shape)
+    pitch_deg = float(row - scores.shape[0] // 2) * CELL_DEG
+    return Turn(float(scores[row, column]), float(column - scores.shape[1] // 2) * CELL_DEG, pitch_deg)
+
+
 def _window(row: int, column: int) -> tuple[slice, slice]:
-    """Turns that the measurement cannot tell apart: upright edges say less about pitch."""
+    """Turns that the measurement cannot tell apart."""
     return (
         slice(row - _PITCH_BLUR, row + _PITCH_BLUR + 1),
         slice(column - _YAW_BLUR, column + _YAW_BLUR + 1),

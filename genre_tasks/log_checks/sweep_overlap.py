@@ -39,8 +39,8 @@ _NEAR_M = 1.0
 _MIN_MISFIT_M = 0.12
 _MAX_RATIO = 0.7
 # Another placement must fit well, as one of twenty fits a little better by chance.
-_MAX_GOOD_MISFIT_M = 0.2
-_MAX_MISFIT_SOUND_M = 0.33
+_MAX_GOOD_MISFIT_M = 0.15
+_MAX_MISFIT_SOUND_M = 0.25
 _REMEDY = "Give points in world coordinates, metres, by the poses of the same frames (sensor to world; w, x, y, z)."
 
 
@@ -80,7 +80,8 @@ def find_inconsistent_sweeps(sample: LogSample) -> Iterator[Finding]:
     pairs = select_pairs(sample, origin)
     if not pairs:
         return
-    misfit_m = measure_misfit(pairs, np.broadcast_to(np.eye(4), poses.shape))
+    as_they_are = np.broadcast_to(np.eye(4), poses.shape)
+    misfit_m = measure_misfit(pairs, as_they_are)
     if misfit_m < _MIN_MISFIT_M:
         return
     best_m = np.inf
@@ -98,8 +99,12 @@ def find_inconsistent_sweeps(sample: LogSample) -> Iterator[Finding]:
             f"they fit better ({best_m:.2f} m) with {best_name}"
         )
         yield Finding("lidar_not_in_world", "warning", message, _REMEDY, numbers, frames=frames)
-    elif misfit_m > _MAX_MISFIT_SOUND_M:
-        message = f"the LiDAR sweeps do not overlap: surfaces lie {misfit_m:.2f} m apart"
+        return
+    # The worst pair: a jump of the path is between the sweeps of one of them.
+    worst_m = max(measure_misfit([pair], as_they_are) for pair in pairs)
+    if worst_m > _MAX_MISFIT_SOUND_M:
+        message = f"the LiDAR sweeps do not overlap: surfaces lie {worst_m:.2f} m apart"
+        numbers["misfit_m"] = worst_m
         yield Finding("sweeps_apart", "warning", message, _REMEDY, numbers, frames=frames)
 
 
