@@ -6,8 +6,8 @@ import numpy as np
 
 from genre_tasks.effects.measurements import ChunkMeasurements
 from genre_tasks.effects.types import Effect, Measurement
+from genre_tasks.logs.brown_conrady import distort
 from genre_tasks.logs.types import Lens
-from genre_tasks.scene.lens_distortion import distort
 
 _GRID_SIZE = 33
 

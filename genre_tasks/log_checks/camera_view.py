@@ -18,7 +18,9 @@ from genre_tasks.log_checks.edge_agreement import (
     score_turns,
 )
 from genre_tasks.log_checks.log_sample import LogSample
+from genre_tasks.log_checks.pose_conventions import find_measurable
 from genre_tasks.logs.types import Camera, Float32, Float64, Lens
+from genre_tasks.scene.transforms import is_rigid_transform
 
 FEW_IMAGES = 3
 """Images of a camera that are compared at first, spread over the chunk."""
@@ -102,10 +104,10 @@ def view_camera(sample: LogSample, camera: Camera, images: int) -> CameraView | 
         frame = sample.frames[index]
         edges = read_image_edges(sample, view, camera, frame)
         sweep = sample.sweep(frame)
-        if edges is None or sweep is None or not np.isfinite(poses[index]).all():
+        if edges is None or sweep is None or not is_rigid_transform(poses[index]):
             continue
         # By einsum: a matrix product would start threads for a matrix of three columns.
-        offset = sweep.points_world - poses[index, :3, 3]
+        offset = sweep.points_world[find_measurable(sweep.points_world)] - poses[index, :3, 3]
         view.points[frame] = np.einsum("ni,ij->nj", offset, poses[index, :3, :3])
         view.image_edges[frame] = edges
     return view if view.has_edges else None

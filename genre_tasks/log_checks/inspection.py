@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import TypeVar
@@ -17,14 +16,9 @@ from genre_tasks.logs.findings import Finding, Severity
 from genre_tasks.logs.types import Camera, DrivingLog, Float64
 from genre_tasks.progress import Progress
 
-# A camera of a 10 Hz rig fires within one period of its sweep.
-_MAX_CAMERA_OFFSET_S = 0.15
-# Plausible time between frames; outside, the timestamps' unit is in doubt.
-_FRAME_PERIOD_RANGE_S = (0.005, 2.0)
 # A log with a hole in every second frame would fill the screen.
 _MAX_RUNS_LISTED = 8
 _CLOCK_REMEDY = "Frames keep the order of the files; effects that need time (rolling shutter, moving actors) suffer."
-_UNIT_REMEDY = "Check the unit of the timestamps: seconds, milliseconds and microseconds since 1970 are understood."
 
 Value = TypeVar("Value")
 
@@ -160,29 +154,17 @@ class LogInspector:
         return positions
 
     def read_times(self) -> Float64:
-        """Reads the times of all sweeps and images, and reports what is wrong with their clocks.
+        """Reads the times of all sweeps, and reports frames whose order they do not give.
 
         Returns:
             [F] seconds, of the sweeps.
         """
         times = np.array([self.log.frame_timestamp_s(frame) for frame in range(self.log.frame_count)])
         self._check_order(times)
-        for camera in self.cameras:
-            camera_times = [self.log.camera_timestamp_s(camera.name, frame) for frame in range(len(times))]
-            offsets = np.array(camera_times) - times
-            # The comparison is negated so that a NaN counts as late.
-            late = np.flatnonzero(~(np.abs(offsets) <= _MAX_CAMERA_OFFSET_S))
-            if late.size:
-                frames = tuple(int(frame) for frame in late)
-                listed = format_frames(frames)
-                message = f"{camera.name}: frames {listed} are over {_MAX_CAMERA_OFFSET_S} s from their sweep"
-                numbers = {"largest_offset_s": float(np.nanmax(np.abs(offsets), initial=0.0))}
-                finding = Finding("camera_clock", "warning", message, _CLOCK_REMEDY, numbers, camera.name, frames)
-                self.report(finding)
         return times
 
     def _check_order(self, times: Float64) -> None:
-        """Reports sweep times that are not finite, equal, decreasing or implausibly far apart."""
+        """Reports sweep times that are not finite, equal or decreasing."""
         # A step from or to a time that is not finite is NaN, which no comparison below counts.
         steps = np.diff(times)
         not_finite = np.flatnonzero(~np.isfinite(times))
@@ -194,13 +176,6 @@ class LogInspector:
         if (steps < 0).any():
             backwards = np.flatnonzero(steps < 0) + 1
             self._report_clock("decreasing_timestamp", "time runs backwards at frames {}", backwards)
-        # The median, so that one gap in the log does not hide a wrong unit.
-        period = float(np.median(steps[steps > 0])) if (steps > 0).any() else math.nan
-        shortest, longest = _FRAME_PERIOD_RANGE_S
-        if steps.size and not shortest <= period <= longest:
-            message = f"the time between frames is {period:g} s"
-            numbers = {"period_s": period, "shortest_s": shortest, "longest_s": longest}
-            self.report(Finding("implausible_frame_period", "warning", message, _UNIT_REMEDY, numbers))
 
     def _report_clock(self, word: str, template: str, frames: NDArray[np.int64]) -> None:
         numbers = tuple(int(frame) for frame in frames)

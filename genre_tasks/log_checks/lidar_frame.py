@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from genre_tasks.log_checks.log_sample import LogSample
+from genre_tasks.log_checks.pose_conventions import find_measurable
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.types import Float64
+from genre_tasks.scene.transforms import is_rigid_transform
 
 # Sweeps that are looked at, spread over the chunk: a wrong frame shows in each of them.
 _SWEEPS = 3
@@ -92,14 +94,17 @@ def _locate_sweeps(sample: LogSample) -> Iterator[SweepLocation]:
     for index in sorted({k * (count - 1) // (_SWEEPS - 1) for k in range(_SWEEPS)}):
         sweep = sample.sweep(sample.frames[index])
         pose = sample.world_SE3_lidar[index]
-        if sweep is None or not len(sweep.points_world) or not np.isfinite(pose).all():
+        if sweep is None or not is_rigid_transform(pose):
+            continue
+        points = sweep.points_world[find_measurable(sweep.points_world)]
+        if not len(points):
             continue
         times = sweep.timestamps_s
         # A log without times of points has the same number, often 0, for all of them.
         offset_s = float(np.median(times) - sample.times_s[index]) if np.any(times) else np.nan
         # By einsum: a matrix product would start threads for a matrix of three columns.
-        in_lidar_axes = np.einsum("ni,ij->nj", sweep.points_world - pose[:3, 3], pose[:3, :3])
-        yield SweepLocation(sample.frames[index], sweep.points_world, in_lidar_axes, offset_s)
+        in_lidar_axes = np.einsum("ni,ij->nj", points - pose[:3, 3], pose[:3, :3])
+        yield SweepLocation(sample.frames[index], points, in_lidar_axes, offset_s)
 
 
 def _measure_spread(points: Float64) -> float:

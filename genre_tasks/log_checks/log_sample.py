@@ -47,7 +47,7 @@ class LogSample:
     @cached_property
     def world_SE3_lidar(self) -> Float64:
         """[F, 4, 4] poses of the LiDAR; NaN where one cannot be read."""
-        return np.stack([_read_or(_no_pose(), self.log.world_SE3_lidar, frame) for frame in self.frames])
+        return np.stack([_read_pose(self.log.world_SE3_lidar, frame) for frame in self.frames])
 
     @cached_property
     def tracks(self) -> tuple[CuboidTrack, ...]:
@@ -74,8 +74,7 @@ class LogSample:
         Returns:
             [F, 4, 4]; NaN where a pose cannot be read.
         """
-        poses = (_read_or(_no_pose(), self.log.world_SE3_camera, camera.name, frame) for frame in self.frames)
-        return np.stack(list(poses))
+        return np.stack([_read_pose(self.log.world_SE3_camera, camera.name, frame) for frame in self.frames])
 
     def sweep(self, frame: int) -> Sweep | None:
         """Reads a sweep.
@@ -109,8 +108,11 @@ class LogSample:
         return self._pixels[key]
 
 
-def _no_pose() -> Float64:
-    return np.full((4, 4), np.nan)
+def _read_pose(read: Callable[..., Float64], *arguments: object) -> Float64:
+    """A pose of the log; NaN in all places where it cannot be read, or is not finite in one."""
+    gap = np.full((4, 4), np.nan)
+    pose = _read_or(gap, read, *arguments)
+    return pose if np.isfinite(pose).all() else gap
 
 
 def _read_or(gap: Value, read: Callable[..., Value], *arguments: object) -> Value:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from genre_tasks.log_checks.log_sample import LogSample
-from genre_tasks.log_checks.pose_conventions import reread_rotations
+from genre_tasks.log_checks.pose_conventions import find_rigid, reread_rotations
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.types import Float64
 
@@ -32,8 +32,7 @@ def find_misread_poses(sample: LogSample) -> Iterator[Finding]:
     Yields:
         ``misread_poses`` with the reading that fits; nothing where none does, as motion and tilt are judged elsewhere.
     """
-    poses = sample.world_SE3_lidar
-    poses = poses[np.isfinite(poses).all(axis=(1, 2))]
+    poses = sample.world_SE3_lidar[find_rigid(sample.world_SE3_lidar)]
     if not len(poses):
         return
     heading_deg = measure_heading_deg(poses)

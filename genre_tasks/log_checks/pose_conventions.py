@@ -6,9 +6,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from genre_tasks.logs.types import Float64
-from genre_tasks.scene.transforms import compose_se3, invert_se3
+from genre_tasks.scene.transforms import compose_se3, invert_se3, is_rigid_transform
 
 # [3, 3] x forward, y left, z up expressed in other axes that recordings use for a vehicle or its LiDAR.
 _AXES: dict[str, Float64] = {
@@ -16,6 +17,8 @@ _AXES: dict[str, Float64] = {
     "x forward, y right, z down": np.diag([1.0, -1.0, -1.0]),
     "x right, y down, z forward": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
 }
+# Twice the circumference of the Earth: sums of larger numbers lose centimetres, or overflow.
+_MAX_COORDINATE_M = 1e8
 # Mirror images are no rotations: the y axis points to the other side.
 _MIRROR = np.diag([1.0, -1.0, 1.0])
 
@@ -31,6 +34,29 @@ class Reading:
 
     name: str
     world_SE3_lidar: Float64
+
+
+def find_rigid(poses: Float64) -> NDArray[np.bool_]:
+    """Finds the poses that can be compared: others find what is wrong with the rest.
+
+    Args:
+        poses: [F, 4, 4], with NaN where one cannot be read.
+
+    Returns:
+        [F] true where a pose is finite, not absurdly far, and turns without mirroring or scaling.
+
+    >>> find_rigid(np.stack([np.eye(4), 2 * np.eye(4), np.full((4, 4), np.nan)])).tolist()
+    [True, False, False]
+    """
+    near = np.abs(np.nan_to_num(poses[:, :3, 3], nan=np.inf)).max(axis=1) < _MAX_COORDINATE_M
+    return near & np.array([is_rigid_transform(pose) for pose in poses], dtype=bool)
+
+
+def find_measurable(points: Float64) -> NDArray[np.bool_]:
+    """Finds the points [N, 3] whose coordinates are numbers that can be compared: [N]."""
+    # NaN compares false.
+    found: NDArray[np.bool_] = (np.abs(points) < _MAX_COORDINATE_M).all(axis=1)
+    return found
 
 
 def reread_rotations(world_SE3_lidar: Float64) -> Iterator[Reading]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from genre_tasks.log_checks.log_sample import LogSample
-from genre_tasks.log_checks.pose_conventions import list_placements
+from genre_tasks.log_checks.pose_conventions import find_measurable, find_rigid, list_placements
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.types import Float64
 from genre_tasks.scene.transforms import invert_se3
@@ -71,7 +71,7 @@ def find_inconsistent_sweeps(sample: LogSample) -> Iterator[Finding]:
         ``lidar_not_in_world`` where another placement fits clearly better, with its name, or ``sweeps_apart`` where
         sweeps fit nowhere. A vehicle that stands gives no verdict.
     """
-    is_posed = np.asarray(np.isfinite(sample.world_SE3_lidar).all(axis=(1, 2)))
+    is_posed = find_rigid(sample.world_SE3_lidar)
     if not is_posed.any():
         return
     # Frames without a pose are in no pair.
@@ -119,7 +119,7 @@ def select_pairs(sample: LogSample, origin: Float64) -> list[SweepPair]:
         The pairs; none where the vehicle stands or sweeps are missing.
     """
     positions = sample.world_SE3_lidar[:, :3, 3]
-    posed = np.flatnonzero(np.isfinite(sample.world_SE3_lidar).all(axis=(1, 2)))
+    posed = np.flatnonzero(find_rigid(sample.world_SE3_lidar))
     pairs = []
     for start in sorted({int(posed[k * len(posed) // _PAIRS]) for k in range(_PAIRS)} if len(posed) else ()):
         later = posed[posed > start]
@@ -141,7 +141,9 @@ def _read_standing_points(sample: LogSample, index: int, origin: Float64) -> Flo
     sweep = sample.sweep(sample.frames[index])
     if sweep is None or not len(sweep.points_world):
         return np.zeros((0, 3))
-    points = sweep.points_world - origin
+    points = sweep.points_world[find_measurable(sweep.points_world)] - origin
+    if not len(points):
+        return points
     # About the sweep's own middle: where the points lie is in question.
     points = points[np.linalg.norm(points - np.median(points, axis=0), axis=1) < _RADIUS_M]
     if not len(points):

@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from genre_tasks.logs.brown_conrady import distort, distortion_jacobian
 from genre_tasks.render import constants as const
 from genre_tasks.render.lens_domain import find_valid_domain
 from genre_tasks.render.types import Cameras
 from genre_tasks.scene.gaussians import Splats
-from genre_tasks.scene.lens_distortion import distort, distortion_jacobian
 
 
 class ReferenceCamera:

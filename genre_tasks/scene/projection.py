@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from genre_tasks.logs.brown_conrady import distort, distortion_jacobian
 from genre_tasks.logs.types import Float32, Float64, Lens, RollingShutter
-from genre_tasks.scene.lens_distortion import Reals, distort, distortion_jacobian, fold_radius
+from genre_tasks.scene.lens_distortion import Reals, fold_radius
 
 NEAR_M = 0.1
 """Points nearer to the camera plane than this are behind it."""

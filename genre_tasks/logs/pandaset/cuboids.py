@@ -7,6 +7,7 @@ other (``cuboids.sibling_id``: at times only one does, or with a truncated id). 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
@@ -21,6 +22,10 @@ from genre_tasks.logs.types import CuboidTrack, Float64
 _BOX_COLUMNS = ("position.x", "position.y", "position.z", "dimensions.x", "dimensions.y", "dimensions.z", "yaw")
 # Of a box row: PandaSet's dimensions x (width), y (length), z (height).
 _SIZE = slice(3, 6)
+# Of a box row.
+_YAW = 6
+# Two full turns: a tracker may add up a few turns, and degrees are soon beyond.
+_MAX_YAW_RAD = 4 * math.pi
 # Of a box row, behind the columns above.
 _QUATERNION = slice(7, 11)
 # A sibling id cut off by a few characters still names one uuid.
@@ -69,8 +74,20 @@ def build_tracks(frames: Iterable[tuple[int, Table]]) -> tuple[tuple[CuboidTrack
     findings: list[Finding] = []
     for frame, table in frames:
         findings += _add_frame(objects, frame, table)
+    findings += _judge_yaw(objects)
     tracks = (_build_track(group) for group in _group_siblings(objects))
     return tuple(track for track in tracks if track is not None), tuple(findings)
+
+
+def _judge_yaw(objects: Mapping[str, _AnnotatedObject]) -> list[Finding]:
+    """A finding where angles are too large for radians: turned into rotations, they would look like any others."""
+    yaws = [abs(float(box[_YAW])) for annotated in objects.values() for box in annotated.boxes.values()]
+    largest = max(yaws, default=0.0)
+    if largest <= _MAX_YAW_RAD:
+        return []
+    message = f"the yaw of a box is {largest:.4g}, radians within ±{_MAX_YAW_RAD:.3g} were expected"
+    numbers = {"yaw": largest, "limit": _MAX_YAW_RAD}
+    return [Finding("odd_box_yaw", "warning", message, "Convert yaw from degrees to radians.", numbers)]
 
 
 def _add_frame(objects: dict[str, _AnnotatedObject], frame: int, table: Table) -> list[Finding]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from genre_tasks.errors import InputError
 from genre_tasks.logs.findings import Finding
+from genre_tasks.logs.lens_validity import with_distortion
 from genre_tasks.logs.pandaset.cuboids import build_tracks
 from genre_tasks.logs.pandaset.layout import (
     IMAGE_SUFFIXES,
@@ -140,7 +141,6 @@ class PandaSetLog:
             fx, fy, cx, cy = (float(intrinsics[key]) for key in ("fx", "fy", "cx", "cy"))
             readout_s = float(intrinsics.get("readout_s", READOUT_S))
             exposure_s = float(intrinsics.get("exposure_s", 0.0))
-            distortion = tuple(float(k) for k in intrinsics.get("distortion", ()))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             problem = f"fx, fy, cx, cy were expected ({error!r})"
             raise InputError(problem, remedy="Copy it again.", **where) from error
@@ -155,9 +155,8 @@ class PandaSetLog:
             cy_px=cy + PIXEL_CENTRE,
             width_px=size[0],
             height_px=size[1],
-            distortion=distortion,
         )
-        return Camera(name, lens, readout_s, exposure_s)
+        return Camera(name, with_distortion(lens, intrinsics, **where), readout_s, exposure_s)
 
     def _read_image_size(self, camera: str) -> tuple[int, int] | None:
         """Width and height from the header of the first image that has one."""
