@@ -30,7 +30,7 @@ class LogFaultsBench:
         "seeds": "1001",
         "sound_seeds": "0-99",
         "street": f"{_STREET}&cameras=2",
-        "sound_street": f"{_STREET}&cameras=3",
+        "sound_street": f"{_STREET}&cameras=2",
         "pandaset": "../shared/data/pandaset/002",
         "real_chunk": "1",
         "kitti": "../shared/data/kitti/2011_09_26/2011_09_26_drive_0009_sync",

@@ -17,8 +17,8 @@ _AXES: dict[str, Float64] = {
     "x forward, y right, z down": np.diag([1.0, -1.0, -1.0]),
     "x right, y down, z forward": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
 }
-# Twice the circumference of the Earth: sums of larger numbers lose centimetres, or overflow.
-_MAX_COORDINATE_M = 1e8
+# Far more than the circumference of the Earth: sums of larger numbers lose centimetres, or overflow.
+_MAX_COORDINATE_M = 1e9
 # Mirror images are no rotations: the y axis points to the other side.
 _MIRROR = np.diag([1.0, -1.0, 1.0])
 
@@ -55,8 +55,7 @@ def find_rigid(poses: Float64) -> NDArray[np.bool_]:
 def find_measurable(points: Float64) -> NDArray[np.bool_]:
     """Finds the points [N, 3] whose coordinates are numbers that can be compared: [N]."""
     # NaN compares false.
-    found: NDArray[np.bool_] = (np.abs(points) < _MAX_COORDINATE_M).all(axis=1)
-    return found
+    return np.asarray((np.abs(points) < _MAX_COORDINATE_M).all(axis=1))
 
 
 def reread_rotations(world_SE3_lidar: Float64) -> Iterator[Reading]:
