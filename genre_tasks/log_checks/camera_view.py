@@ -90,8 +90,8 @@ def view_camera(sample: LogSample, camera: Camera, images: int) -> CameraView | 
         Their edges and points; ``None`` where there are too few of either.
     """
     lens = camera.lens
-    # NaN compares false.
-    if not (0 < lens.fx_px < np.inf and 0 < lens.fy_px < np.inf):
+    numbers = (lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, *lens.distortion)
+    if not np.isfinite(numbers).all() or lens.fx_px <= 0 or lens.fy_px <= 0:
         return None
     field_deg = np.rad2deg(np.arctan(lens.cx_px / lens.fx_px) + np.arctan((lens.width_px - lens.cx_px) / lens.fx_px))
     if not 0 < field_deg * _MIN_PIXELS_PER_DEG <= lens.width_px:

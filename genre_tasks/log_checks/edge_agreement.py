@@ -72,7 +72,8 @@ class AngularGrid:
         if any(lens.distortion):
             x, y = undistort(np.asarray(x, np.float64), np.asarray(y, np.float64), lens.coefficients)
         step = float(np.deg2rad(CELL_DEG))
-        left, right, top, bottom = np.arctan([x[0], x[1], y[2], y[3]]).tolist()
+        # A lens that is damaged sees nothing.
+        left, right, top, bottom = np.nan_to_num(np.arctan([x[0], x[1], y[2], y[3]])).tolist()
         return cls(np.arange(left, right, step), np.arange(top, bottom, step))
 
     @property
