@@ -34,6 +34,8 @@ BLOCKS: Mapping[str, Callable[[], str]] = {
     "raster-claims": lambda: result_tables.claims("raster"),
     "budget-runs": result_tables.budget_runs,
     "evaluation-claims": lambda: result_tables.claims("evaluation"),
+    "log-faults": result_tables.log_faults,
+    "log-faults-claims": lambda: result_tables.claims("log_faults"),
 }
 FILES: Mapping[str, Callable[[], str]] = {
     "docs/reference/cli.md": references.cli_reference,

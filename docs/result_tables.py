@@ -55,6 +55,10 @@ CLAIM_WORDS = {
     "evaluation.reliability_gnet": "Rank correlation of estimated and true PSNR, scenes of GNet",
     "evaluation.reliability": "Rank correlation of estimated and true PSNR, scenes of ENet",
     "evaluation.reliability_worst": "Rank correlation of estimated and true PSNR, worst street",
+    "log_faults.false_alarms_streets": "Findings on sound streets",
+    "log_faults.false_alarms_real": "Findings on sound real chunks",
+    "log_faults.found_strongest": "Fraction of faults and logs of which the strongest form is found",
+    "log_faults.seconds": "CPU seconds of all checks of a chunk, six cameras",
 }
 """What each claim says, for people. A claim without words is an error."""
 
@@ -271,3 +275,32 @@ def optimiser_logs() -> str:
     rows = {row["cell"]: row for row in result("optimiser")["rows"]}
     tables = "\n".join(per_log_tables.pages(rows)).strip().split("\n\n")
     return "\n".join(f"### {title}\n\n{text}\n" for title, text in zip(LOG_TABLES, tables, strict=True))
+
+
+def log_faults() -> str:
+    """Every fault: the strengths that are found on each log, in brackets those that are not."""
+    rows = [row for row in result("log_faults")["rows"] if row.get("fault", "none") != "none"]
+    logs = list(dict.fromkeys(row["name"] for row in rows))
+    lines = []
+    for fault in dict.fromkeys(row["fault"] for row in rows):
+        by_log = {row["name"]: row for row in rows if row["fault"] == fault}
+        words = [word for row in by_log.values() for found in row["found"] for word in found]
+        ranked = sorted(dict.fromkeys(words), key=words.count, reverse=True)[:3]
+        unit = next(iter(by_log.values()))["unit"]
+        title = f"{fault}, {unit}" if unit else fault
+        cells = [_found_strengths(by_log[log]) if log in by_log else "–" for log in logs]
+        lines.append([title, *cells, ", ".join(f"`{word}`" for word in ranked)])
+    head = ["fault", *(_log_title(log) for log in logs), "named as"]
+    return table(head, lines) + "\n" + provenance("log_faults")
+
+
+def _log_title(name: str) -> str:
+    """A log's name for the head of a table."""
+    return name.replace("seed=", "street ").replace("002", "PandaSet 002").replace("2011_09_26_drive_0009_sync", "KITTI")
+
+
+def _found_strengths(row: Mapping[str, Any]) -> str:
+    if not row["unit"]:
+        return "found" if row["found"][0] else "(not found)"
+    pairs = zip(row["strengths"], row["found"], strict=True)
+    return ", ".join(f"{strength:g}" if found else f"({strength:g})" for strength, found in pairs)

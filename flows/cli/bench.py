@@ -41,6 +41,9 @@ _BENCHES: dict[str, BenchEntry] = {
     ),
     "fixer": BenchEntry("benchmarks.fixer:BENCH", "what FNet gains beside the path, and what it costs"),
     "ground": BenchEntry("benchmarks.optimiser.ablation:GROUND", "what constraining the ground to its plane gains"),
+    "log_faults": BenchEntry(
+        "benchmarks.log_faults:BENCH", "from which strength faults of logs are found, and false alarms on sound logs"
+    ),
     "optimiser": BenchEntry(
         "benchmarks.optimiser:BENCH", "GNet's seconds and renders against per-scene 3DGS and tuned Adam"
     ),

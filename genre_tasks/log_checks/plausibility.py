@@ -8,11 +8,15 @@ import numpy as np
 
 from genre_tasks.log_checks.box_points import find_boxes_without_points
 from genre_tasks.log_checks.boxes import find_implausible_boxes
+from genre_tasks.log_checks.calibration import find_miscalibration
 from genre_tasks.log_checks.camera_poses import find_implausible_camera_poses
 from genre_tasks.log_checks.clocks import find_clock_faults
 from genre_tasks.log_checks.lenses import find_implausible_lenses
+from genre_tasks.log_checks.lidar_frame import find_misplaced_lidar
 from genre_tasks.log_checks.log_sample import LogSample
 from genre_tasks.log_checks.motion import find_implausible_motion
+from genre_tasks.log_checks.pose_axes import find_misread_poses
+from genre_tasks.log_checks.sweep_overlap import find_inconsistent_sweeps
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.types import Camera, DrivingLog
 
@@ -21,9 +25,13 @@ _CHECKS: tuple[Callable[[LogSample], Iterable[Finding]], ...] = (
     find_implausible_lenses,
     find_clock_faults,
     find_implausible_motion,
+    find_misread_poses,
     find_implausible_camera_poses,
+    find_misplaced_lidar,
+    find_inconsistent_sweeps,
     find_implausible_boxes,
     find_boxes_without_points,
+    find_miscalibration,
 )
 
 

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from genre_tasks.log_checks.lenses import find_implausible_lenses
+from genre_tasks.log_checks.log_sample import LogSample
 from genre_tasks.log_checks.plausibility import assess_plausibility
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.types import Camera, DrivingLog, Float64, Lens
@@ -68,6 +70,12 @@ def assess(log: Any) -> dict[str, Finding]:
     """What the plausibility checks find in all frames, by word."""
     found = assess_plausibility(log, tuple(range(log.frame_count)), log.cameras)
     return {finding.word: finding for finding in found}
+
+
+def assess_lenses(log: Any) -> dict[str, Finding]:
+    """What the check of lenses alone finds, by word: the images of a street do not fit other cameras' lenses."""
+    sample = LogSample(log, tuple(range(log.frame_count)), log.cameras)
+    return {finding.word: finding for finding in find_implausible_lenses(sample)}
 
 
 def is_complete(finding: Finding) -> bool:

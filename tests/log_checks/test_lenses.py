@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from genre_tasks.logs.types import Lens
-from tests.log_checks.edited_log import EditedLog, assess, is_complete, street, with_lens
+from tests.log_checks.edited_log import EditedLog, assess_lenses, is_complete, street, with_lens
 
 # Calibrations as the datasets have them, cx and cy from the corner of the image where a reader says so.
 REAL = {
@@ -29,7 +29,7 @@ REAL = {
 @pytest.mark.parametrize("name", REAL)
 def test_real_lenses_are_plausible(name: str) -> None:
     """Report: waymo-research/waymo-open-dataset#24 has the numbers of Waymo's front camera."""
-    assert assess(with_lens(street(), lambda _: REAL[name])) == {}
+    assert assess_lenses(with_lens(street(), lambda _: REAL[name])) == {}
 
 
 def resize_images(lens: Lens, factor: float) -> Lens:
@@ -41,7 +41,7 @@ def resize_images(lens: Lens, factor: float) -> Lens:
 @pytest.mark.parametrize("factor", [0.25, 0.5, 2.0])
 def test_resized_images_are_named_with_their_factor(name: str, factor: float) -> None:
     """Report: nv-tlabs/lift-splat-shoot#35."""
-    finding = assess(with_lens(street(), lambda _: resize_images(REAL[name], factor)))["odd_principal_point"]
+    finding = assess_lenses(with_lens(street(), lambda _: resize_images(REAL[name], factor)))["odd_principal_point"]
     assert finding.severity == "warning" and is_complete(finding)
     assert finding.numbers["factor"] == pytest.approx(factor, rel=0.1)
     assert f"look resized by {finding.numbers['factor']:.2g}" in finding.remedy
@@ -53,7 +53,7 @@ def test_where_resizing_is_seen() -> None:
     found = [
         factor
         for factor in (0.5, 0.6, 0.7, 0.75, 0.9, 1.0, 1.1, 1.5, 2.0)
-        if assess(with_lens(street(), lambda _, factor=factor: resize_images(lens, factor)))
+        if assess_lenses(with_lens(street(), lambda _, factor=factor: resize_images(lens, factor)))
     ]
     assert found == [0.5, 0.6, 0.7, 0.75, 1.5, 2.0]
 
@@ -72,13 +72,15 @@ def test_where_resizing_is_seen() -> None:
 )
 def test_cropped_stretched_or_foreign_images(change: dict[str, float]) -> None:
     """Report: colmap/colmap#365 has a principal point of (0, 0)."""
-    finding = assess(with_lens(street(), lambda _: replace(REAL["nuscenes front"], **change)))["odd_principal_point"]
+    finding = assess_lenses(with_lens(street(), lambda _: replace(REAL["nuscenes front"], **change)))[
+        "odd_principal_point"
+    ]
     assert is_complete(finding) and finding.camera == "left"
 
 
 def test_images_of_waymo_sides_are_cropped_and_sound() -> None:
     """A principal point a quarter of the height from the upper edge is that of images whose sky was cut off."""
-    assert assess(with_lens(street(), lambda _: Lens(2055.0, 2055.0, 968.0, 240.0, 1920, 886))) == {}
+    assert assess_lenses(with_lens(street(), lambda _: Lens(2055.0, 2055.0, 968.0, 240.0, 1920, 886))) == {}
 
 
 @pytest.mark.parametrize(
@@ -93,7 +95,7 @@ def test_images_of_waymo_sides_are_cropped_and_sound() -> None:
 )
 def test_focal_lengths_in_other_units(lens: Lens, reason: str) -> None:
     """Report: nianticlabs/monodepth2#6 (intrinsics divided by the image's size), zhenzhiwang/HumanVid#12."""
-    found = assess(with_lens(street(), lambda _: lens))
+    found = assess_lenses(with_lens(street(), lambda _: lens))
     assert set(found) == {"odd_focal_length"} and is_complete(found["odd_focal_length"])
     assert reason in found["odd_focal_length"].remedy
 
@@ -101,7 +103,7 @@ def test_focal_lengths_in_other_units(lens: Lens, reason: str) -> None:
 @pytest.mark.parametrize(("aspect", "fires"), [(0.5, True), (0.8, True), (0.9, False), (1.1, False), (1.25, True)])
 def test_pixels_that_are_not_square(aspect: float, fires: bool) -> None:
     """Report: diode-dataset/diode-devkit#2; princeton-vl/DeepV2D#5 has 10 % that are right."""
-    found = assess(with_lens(street(), lambda lens: replace(lens, fx_px=lens.fy_px * aspect)))
+    found = assess_lenses(with_lens(street(), lambda lens: replace(lens, fx_px=lens.fy_px * aspect)))
     assert set(found) == ({"odd_pixel_aspect"} if fires else set())
     assert all(is_complete(finding) for finding in found.values())
 
@@ -109,13 +111,13 @@ def test_pixels_that_are_not_square(aspect: float, fires: bool) -> None:
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 0.0, -50.0])
 def test_focal_lengths_that_are_none(value: float) -> None:
     """Report: none found; case 2 of the list of odd logs."""
-    found = assess(with_lens(street(), lambda lens: replace(lens, fx_px=value)))
+    found = assess_lenses(with_lens(street(), lambda lens: replace(lens, fx_px=value)))
     assert found["odd_focal_length"].severity == "fatal"
 
 
 def test_a_distortion_that_folds_is_fatal_for_any_reader() -> None:
     """Report: opencv/opencv#14596 (a calibration whose distortion is not monotonic)."""
-    found = assess(with_lens(street(), lambda lens: replace(lens, distortion=(-0.9, 0.0, 0.0, 0.0, 0.0))))
+    found = assess_lenses(with_lens(street(), lambda lens: replace(lens, distortion=(-0.9, 0.0, 0.0, 0.0, 0.0))))
     assert set(found) == {"folding_distortion"}
     assert found["folding_distortion"].severity == "fatal" and is_complete(found["folding_distortion"])
 
@@ -123,4 +125,4 @@ def test_a_distortion_that_folds_is_fatal_for_any_reader() -> None:
 def test_each_camera_is_judged() -> None:
     front, left = street().cameras
     log = EditedLog(street(), cameras=(front, replace(left, lens=resize_images(left.lens, 0.5))))
-    assert assess(log)["odd_principal_point"].camera == "left"
+    assert assess_lenses(log)["odd_principal_point"].camera == "left"
