@@ -42,7 +42,8 @@ def genre(folder: Path, *words: str, **more: str) -> subprocess.CompletedProcess
 def faulty(folder: Path, statement: str, *words: str) -> subprocess.CompletedProcess[str]:
     """A command that executes a statement, with the words after its name."""
     command = [sys.executable, "-c", FAULTY.format(statement=statement), "faulty", *words]
-    return subprocess.run(command, cwd=folder, env=environment(), capture_output=True, text=True, check=False)
+    env = environment(XDG_STATE_HOME=str(folder / "state"))
+    return subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, check=False)
 
 
 def shell(folder: Path, script: str, **more: str) -> subprocess.CompletedProcess[str]:

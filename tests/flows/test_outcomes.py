@@ -62,7 +62,7 @@ def test_a_fault_is_one_line_and_its_traceback_a_file(tmp_path: Path) -> None:
     found = parse(done.stdout)
     assert (found["status"], found["exit_code"]) == ("failed", 70)
     log = Path(found["error"]["log_file"])
-    assert log.parent == tmp_path / ".genre" / "faults" and str(log) in done.stderr
+    assert log.parent == tmp_path / "state" / "genre" / "faults" and str(log) in done.stderr
     assert "Traceback" in log.read_text() and "IndexError" in log.read_text()
     shown = faulty(tmp_path, "[][3]", "--debug")
     assert shown.returncode == 70 and "Traceback" in shown.stderr
@@ -71,10 +71,10 @@ def test_a_fault_is_one_line_and_its_traceback_a_file(tmp_path: Path) -> None:
 def test_the_log_of_a_fault_goes_where_the_user_may_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Report: none found; case 12 of the list of odd logs."""
     # A file in the folder's place cannot be written into by anybody, not even by the superuser.
-    (tmp_path / ".genre").touch()
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    (tmp_path / "state").touch()
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
     done = faulty(tmp_path, "[][3]")
-    (log,) = (tmp_path / "state" / "genre" / "faults").iterdir()
+    (log,) = (tmp_path / "home" / ".local" / "state" / "genre" / "faults").iterdir()
     assert done.returncode == 70 and str(log) in done.stderr
 
 
@@ -111,7 +111,7 @@ def test_an_error_in_a_thread_is_no_traceback(tmp_path: Path) -> None:
     statement = "import threading; thread = threading.Thread(target=lambda: 1 / 0); thread.start(); thread.join()"
     done = faulty(tmp_path, statement)
     assert (done.returncode, done.stderr) == (0, "")
-    (log,) = (tmp_path / ".genre" / "faults").iterdir()
+    (log,) = (tmp_path / "state" / "genre" / "faults").iterdir()
     assert "ZeroDivisionError" in log.read_text()
 
 

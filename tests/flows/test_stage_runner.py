@@ -157,7 +157,8 @@ def test_a_retry_after_out_of_memory_is_smaller_and_the_key_stays(store: Path, m
 
 def test_an_impossible_chunk_leaves_nothing_behind(tmp_path: Path) -> None:
     with pytest.raises(InputError):
-        run(job(tmp_path / "store", "ingest.source_every=20"), "ingest")
+        # Frame 0 alone is a source frame, and two are needed.
+        run(job(tmp_path / "store", "ingest.source_every=8", log=LOG.replace("frames=8", "frames=4")), "ingest")
     assert not [p for p in (tmp_path / "store").rglob("*") if p.is_file()]
 
 
