@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import threading
+import time
 from types import FrameType
 
 # A user who stops a command waits for it; what takes longer than this is not worth the wait.
-_MAX_SECONDS_TO_END = 8.0
+_MAX_SECONDS_TO_END = 6.0
 _SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 # A shell reports a command that a signal ended by this number plus that of the signal.
 _EXIT_STATUS_BASE = 128
@@ -48,16 +50,36 @@ def end_on_signals() -> None:
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, _interrupt)
+    _end_soon_after_signals()
+
+
+def _end_soon_after_signals() -> None:
+    """Ends the process some seconds after a signal, whatever becomes of it.
+
+    Prefect puts a handler of its own in the place of ours while a flow runs, and an exception that a handler raises may
+    meet code that catches everything. Everything is written atomically, so the process may end at any moment.
+    """
+    # Python writes the number of every signal that it handles there, whoever's handler it is.
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+    numbers = {getattr(signal, name) for name in _SIGNALS if hasattr(signal, name)}
+
+    def watch() -> None:
+        # The socket for writing is kept open by this thread as well.
+        while writer.fileno() >= 0:
+            for number in reader.recv(1):
+                if number in numbers:
+                    time.sleep(_MAX_SECONDS_TO_END)
+                    os._exit(_EXIT_STATUS_BASE + number)
+
+    threading.Thread(target=watch, name="end-after-signal", daemon=True).start()
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
     for name in _SIGNALS:
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), _end_at_once)
-    # Everything is written atomically, so the process may end at any moment, wherever it hangs.
-    guard = threading.Timer(_MAX_SECONDS_TO_END, os._exit, (_EXIT_STATUS_BASE + number,))
-    guard.daemon = True
-    guard.start()
     raise Interrupted(number)
 
 

@@ -14,6 +14,7 @@ from flows.prefect_api.settings_sources import API_URL, check_settings_files, fi
 from genre_tasks.errors import ConfigError
 
 _ANSWER_TIMEOUT_S = 10.0
+_SEND_TIMEOUT_S = 3.0
 # What httpx and websockets read when a client is made: a proxy of the company cannot reach this machine's loopback, and
 # one that they cannot speak to, or certificates that are not there, stop them before they look at the address.
 _NETWORK_VARIABLES = (
@@ -150,4 +151,4 @@ def _send_remaining_events() -> None:
     """Waits until the states of all tasks have reached the server, which Prefect sends in the background."""
     from prefect.events.worker import EventsWorker
 
-    EventsWorker.drain_all(timeout=_ANSWER_TIMEOUT_S, at_exit=True)
+    EventsWorker.drain_all(timeout=_SEND_TIMEOUT_S, at_exit=True)

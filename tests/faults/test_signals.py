@@ -19,6 +19,7 @@ pytestmark = pytest.mark.fault
 MOMENTS = 20
 # From the first import to the report: a tiny run takes about so long on two cores.
 LATEST_S = 14.0
+MAX_SECONDS_TO_END = 10
 
 
 def start(folder: Path, store: Path) -> subprocess.Popen[str]:
@@ -65,7 +66,7 @@ def test_a_run_leaves_nothing_behind(number: signal.Signals, tmp_path: Path) -> 
         time.sleep(moments.uniform(0.05, LATEST_S))
         ended_early += process.poll() is None
         process.send_signal(number)
-        _, error = process.communicate(timeout=10)
+        _, error = process.communicate(timeout=MAX_SECONDS_TO_END)
         assert not processes_of_session(process.pid)
         assert "Traceback" not in error or "site-packages" not in error, error
         if process.returncode not in (0, -signal.SIGKILL, -number):
