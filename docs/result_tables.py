@@ -281,7 +281,9 @@ def log_faults() -> str:
 
 def _log_title(name: str) -> str:
     """A log's name for the head of a table."""
-    return name.replace("seed=", "street ").replace("002", "PandaSet 002").replace("2011_09_26_drive_0009_sync", "KITTI")
+    return (
+        name.replace("seed=", "street ").replace("002", "PandaSet 002").replace("2011_09_26_drive_0009_sync", "KITTI")
+    )
 
 
 def _found_strengths(row: Mapping[str, Any]) -> str:
