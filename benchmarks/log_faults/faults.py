@@ -69,7 +69,7 @@ def _edit_pixels(edit: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]) -> Call
     def change(camera: str, frame: int, image: bytes) -> bytes:
         pixels = np.asarray(Image.open(io.BytesIO(image)).convert("RGB"))
         stream = io.BytesIO()
-        Image.fromarray(np.ascontiguousarray(edit(pixels))).save(stream, "PNG", compress_level=1)
+        Image.fromarray(np.ascontiguousarray(edit(pixels))).save(stream, "PNG", compress_level=0)
         return stream.getvalue()
 
     return change
@@ -180,6 +180,14 @@ def _apply(pose: Float64, points: Float64) -> Float64:
     return moved
 
 
+def _place_by_first_pose(log: DrivingLog, strength: float) -> Changes:
+    def place(frame: int, sweep: Sweep) -> Sweep:
+        move = log.world_SE3_lidar(0) @ invert_se3(log.world_SE3_lidar(frame))
+        return replace(sweep, points_world=_apply(move, sweep.points_world))
+
+    return Changes(sweep=place)
+
+
 def _mirror_points(points: Float64, world_SE3_lidar: Float64, strength: float) -> Float64:
     return _apply(world_SE3_lidar, _apply(invert_se3(world_SE3_lidar), points) * np.array([1.0, -1.0, 1.0]))
 
@@ -246,6 +254,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault("boxes raised", "m", (0.5, 1, 3), _change_boxes(_shift_box)),
     Fault("points in LiDAR coordinates", "", _ONCE, _change_points(lambda p, pose, _: _apply(invert_se3(pose), p))),
     Fault("LiDAR pose applied twice", "", _ONCE, _change_points(lambda p, pose, _: _apply(pose, p))),
+    Fault("all sweeps placed by the first pose", "", _ONCE, _place_by_first_pose),
     Fault("points scaled", "factor", (0.001, 0.3048, 3.28, 1000), _change_points(lambda p, _, s: s * p)),
     Fault("points mirrored left to right", "", _ONCE, _change_points(_mirror_points)),
     Fault("points upside down", "", _ONCE, _change_points(_turn_down)),
