@@ -127,8 +127,8 @@ def _drive_fast(log: DrivingLog, metres_a_frame: float) -> Changes:
 
 
 def _jump(log: DrivingLog, distance_m: float) -> Changes:
-    middle = log.frame_count // 2
-    return _move_everything(lambda frame: np.array([0.0, distance_m * (frame >= middle), 0.0]))
+    # To the side and back again, so that every chunk has a jump.
+    return _move_everything(lambda frame: np.array([0.0, distance_m * (frame // 4 % 2), 0.0]))
 
 
 def _offset_camera_clock(log: DrivingLog, offset_s: float) -> Changes:
