@@ -69,7 +69,7 @@ def _edit_pixels(edit: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]) -> Call
     def change(camera: str, frame: int, image: bytes) -> bytes:
         pixels = np.asarray(Image.open(io.BytesIO(image)).convert("RGB"))
         stream = io.BytesIO()
-        Image.fromarray(np.ascontiguousarray(edit(pixels))).save(stream, "PNG", compress_level=1)
+        Image.fromarray(np.ascontiguousarray(edit(pixels))).save(stream, "PNG", compress_level=0)
         return stream.getvalue()
 
     return change
@@ -127,8 +127,8 @@ def _drive_fast(log: DrivingLog, metres_a_frame: float) -> Changes:
 
 
 def _jump(log: DrivingLog, distance_m: float) -> Changes:
-    middle = log.frame_count // 2
-    return _move_everything(lambda frame: np.array([0.0, distance_m * (frame >= middle), 0.0]))
+    # To the side and back again, so that every chunk has a jump.
+    return _move_everything(lambda frame: np.array([0.0, distance_m * (frame // 4 % 2), 0.0]))
 
 
 def _offset_camera_clock(log: DrivingLog, offset_s: float) -> Changes:
@@ -178,6 +178,14 @@ def _change_points(change: Callable[[Float64, Float64, float], Float64]) -> Call
 def _apply(pose: Float64, points: Float64) -> Float64:
     moved: Float64 = points @ pose[:3, :3].T + pose[:3, 3]
     return moved
+
+
+def _place_by_first_pose(log: DrivingLog, strength: float) -> Changes:
+    def place(frame: int, sweep: Sweep) -> Sweep:
+        move = log.world_SE3_lidar(0) @ invert_se3(log.world_SE3_lidar(frame))
+        return replace(sweep, points_world=_apply(move, sweep.points_world))
+
+    return Changes(sweep=place)
 
 
 def _mirror_points(points: Float64, world_SE3_lidar: Float64, strength: float) -> Float64:
@@ -246,6 +254,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault("boxes raised", "m", (0.5, 1, 3), _change_boxes(_shift_box)),
     Fault("points in LiDAR coordinates", "", _ONCE, _change_points(lambda p, pose, _: _apply(invert_se3(pose), p))),
     Fault("LiDAR pose applied twice", "", _ONCE, _change_points(lambda p, pose, _: _apply(pose, p))),
+    Fault("all sweeps placed by the first pose", "", _ONCE, _place_by_first_pose),
     Fault("points scaled", "factor", (0.001, 0.3048, 3.28, 1000), _change_points(lambda p, _, s: s * p)),
     Fault("points mirrored left to right", "", _ONCE, _change_points(_mirror_points)),
     Fault("points upside down", "", _ONCE, _change_points(_turn_down)),

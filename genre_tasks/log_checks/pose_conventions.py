@@ -103,6 +103,9 @@ def list_placements(world_SE3_lidar: Float64) -> Iterator[Reading]:
     yield Reading("points taken as LiDAR coordinates with y mirrored", mirrored)
     lidar_SE3_world = invert_se3(world_SE3_lidar)
     yield Reading("the poses removed, which were applied twice", lidar_SE3_world)
+    # All of them, so that what stands still moves with the vehicle.
+    first = world_SE3_lidar @ invert_se3(world_SE3_lidar[0])
+    yield Reading("points that were all placed by the first pose placed by the pose of their frame", first)
     yield Reading("points mirrored in the LiDAR's axes", mirrored @ lidar_SE3_world)
     for reading in reread_rotations(world_SE3_lidar):
         yield Reading(reading.name, reading.world_SE3_lidar @ lidar_SE3_world)

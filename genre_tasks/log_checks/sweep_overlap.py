@@ -38,9 +38,9 @@ _NEAR_M = 1.0
 # From the synthetic streets 900 to 999 and chunk 0 of the real sequence: see the benchmark ``log_faults``.
 _MIN_MISFIT_M = 0.12
 _MAX_RATIO = 0.7
-# Another placement must fit well, as one of twenty fits a little better by chance.
-_MAX_GOOD_MISFIT_M = 0.15
-_MAX_MISFIT_SOUND_M = 0.25
+# Another placement must fit as well as sound sweeps do, as one of twenty fits a little better by chance.
+_MAX_GOOD_MISFIT_M = _MIN_MISFIT_M
+_MAX_MISFIT_SOUND_M = 0.2
 _REMEDY = "Give points in world coordinates, metres, by the poses of the same frames (sensor to world; w, x, y, z)."
 
 

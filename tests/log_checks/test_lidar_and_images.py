@@ -70,6 +70,12 @@ def test_poses_that_were_applied_twice_are_named_so(street: DrivingLog) -> None:
     assert finding.word == "lidar_not_in_world" and "applied twice" in finding.message
 
 
+def test_sweeps_that_move_with_the_vehicle_are_found(street: DrivingLog) -> None:
+    """Report: none found; points in the axes of the first pose, as after a registration that was not applied."""
+    finding = only(find_inconsistent_sweeps(broken(street, "all sweeps placed by the first pose")))
+    assert finding.word == "lidar_not_in_world" and "placed by the first pose" in finding.message
+
+
 def test_points_placed_by_quaternions_in_the_wrong_order_are_found(street: DrivingLog) -> None:
     """Report: once-for-auto-driving/once_devkit#22."""
     finding = only(find_inconsistent_sweeps(broken(street, "points placed by quaternions out of order")))
