@@ -189,6 +189,9 @@ def _report_cameras(check: LogCheck, inspector: LogInspector) -> None:
     if not check.cameras:
         message = "no camera has an image"
         remedy = "Copy the camera folders of the sequence; other findings name what lies in their place."
+        if any(finding.word == "unreadable_camera" for finding in inspector.findings):
+            message = "no camera can be used"
+            remedy = "Correct what the findings on cameras name."
         inspector.report(Finding("no_images", "fatal", message, remedy))
     elif len(check.cameras) == 1:
         inspector.report(Finding("one_camera", "note", "one camera only", "Shifted views see more that no camera saw."))

@@ -105,14 +105,18 @@ def require_source_frames(reading: ChunkReading, sources: Sequence[View]) -> Non
     if count >= 2:
         return
     problem = f"the chunk has {count} source frames with images, at least two are needed"
+    remedy = "Choose other chunks with --chunks, or a smaller ingest.source_every."
     left_out = [issue for issue in reading.log_issues if issue.kind in LEFT_OUT]
     if left_out:
+        if not count:
+            # Nothing is left that a denser choice of source frames could take.
+            remedy = "Correct the images, or choose other chunks with --chunks."
         first = left_out[0]
         detail = first.detail.removesuffix(".")
         problem += (
             f"; {len(left_out)} images are left out, the first one ({first.camera}, frame {first.frame}): {detail}"
         )
-    raise reading.input_error(problem, "Choose other chunks with --chunks, or a smaller ingest.source_every.")
+    raise reading.input_error(problem, remedy)
 
 
 def _note_or_raise(reading: ChunkReading, problem: Finding, camera: Camera, frame: int) -> None:
