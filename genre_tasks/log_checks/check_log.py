@@ -108,6 +108,9 @@ def _report_chunks_without_sources(
         usable = has_images[chunk * chunk_frames : (chunk + 1) * chunk_frames]
         # A chunk that is too short anyway is reported as short.
         is_long_enough = count_source_frames(source_every, [True] * len(usable)) >= _MIN_SOURCE_FRAMES
+        if check.chunk_count == 1 and not is_long_enough:
+            message = f"a run needs more than {source_every} frames, or a smaller ingest.source_every"
+            inspector.report(Finding("few_source_frames", "note", message))
         if is_long_enough and count_source_frames(source_every, usable) < _MIN_SOURCE_FRAMES:
             lost.append(chunk)
     if lost:
@@ -179,7 +182,9 @@ def _report_chunks(check: LogCheck, inspector: LogInspector, chunk_frames: int) 
     last_chunk_frames = check.frames - (check.chunk_count - 1) * chunk_frames
     if last_chunk_frames < _MIN_CHUNK_FRAMES:
         message = f"the last chunk has {last_chunk_frames} frame"
-        inspector.report(Finding("single_frame_chunk", "warning", message, "Leave it out with --chunks."))
+        # A log of one frame has no other chunk.
+        severity: Severity = "warning" if check.chunk_count > 1 else "fatal"
+        inspector.report(Finding("single_frame_chunk", severity, message, "Leave it out with --chunks."))
     elif last_chunk_frames < chunk_frames:
         message = f"the last chunk is short: {last_chunk_frames} of {chunk_frames} frames"
         inspector.report(Finding("short_chunk", "note", message))
@@ -219,6 +224,10 @@ def _report_lidar(check: LogCheck, inspector: LogInspector) -> None:
         message = f"no LiDAR sweep at frames {format_frames(check.missing_sweeps)}"
         finding = Finding("missing_sweep", "warning", message, "The other sweeps are used.")
         inspector.report(replace(finding, frames=check.missing_sweeps))
+    if readable_sweeps and not check.points[-1]:
+        message = "no LiDAR sweep has a point that can be used"
+        inspector.report(Finding("no_lidar", "fatal", message, "Give points by ingest.points=FILE.ply."))
+        return
     # ``points`` is 0 where no sweep is readable, which was reported as fatal already.
     if readable_sweeps and check.points[0] < _MIN_SWEEP_POINTS:
         message = f"a sweep has only {check.points[0]} points"

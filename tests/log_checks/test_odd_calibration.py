@@ -110,9 +110,9 @@ Numbers = dict[str, float]
     [
         (
             lambda v: {"K": [[v["fx"], 0, v["cx"]], [0, v["fy"], v["cy"]], [0, 0, 1]]},
-            "lack fx, fy, cx, cy; the keys are K",
+            "lacks fx, fy, cx, cy; its keys are K",
         ),
-        (lambda v: {key.upper(): number for key, number in v.items()}, "the keys are FX, FY, CX, CY"),
+        (lambda v: {key.upper(): number for key, number in v.items()}, "its keys are FX, FY, CX, CY"),
         (lambda v: list(v.values()), "found a list of"),
         (lambda v: {**v, "fx": None}, "null is no number"),
         (lambda v: {**v, "width": "48 px"}, "'48 px' is no number"),

@@ -410,4 +410,4 @@ def test_what_is_no_pose_is_named(pose: object, part: str) -> None:
     """Report: none found; case 17 of the list of odd logs."""
     with pytest.raises(InputError, match=part) as caught:
         parse_pose(pose, file=Path("poses.json"), log="log", frame=3)
-    assert caught.value.frame == 3 and "position x, y, z and heading w, x, y, z" in caught.value.problem
+    assert caught.value.frame == 3 and "the pose lacks position x, y, z or heading w, x, y, z" in caught.value.problem

@@ -320,7 +320,7 @@ def _describe_bad_intrinsics(intrinsics: object, error: Exception) -> str:
         names = [str(key) for key in intrinsics]
         more = ", …" if len(names) > _MAX_KEYS_LISTED else ""
         found = ", ".join(names[:_MAX_KEYS_LISTED]) or "none"
-        return f"the intrinsics lack {', '.join(missing)}; the keys are {found}{more}"
+        return f"fx, fy, cx, cy were expected: the file lacks {', '.join(missing)}; its keys are {found}{more}"
     return f"a number of the intrinsics cannot be read: {error}"
 
 
