@@ -67,6 +67,9 @@ _UNITS = {
 _UNIT_TOLERANCE = 1.2
 # Sizes that are all off by the same factor are of another unit, not of another object.
 _MAX_FACTOR_RATIO = 1.6
+# In real logs most objects stay for a second and more.
+_MIN_ANNOTATED_FRAMES = 3
+_MIN_SINGLE_FRACTION = 0.9
 _MAX_SPEED_M_S = 70.0
 # Pedestrians turn on the spot and walk backwards; nothing without wheels is so fast.
 _MIN_DRIVING_M_S = 3.0
@@ -88,14 +91,28 @@ def find_implausible_boxes(sample: LogSample) -> Iterator[Finding]:
         sample: the frames of a chunk.
 
     Yields:
-        ``odd_box_size``, ``implausible_track_speed``, ``odd_box_heading`` or ``moving_static_boxes``.
+        ``brief_tracks``, ``odd_box_size``, ``implausible_track_speed``, ``odd_box_heading`` or ``moving_static_boxes``.
     """
     tracks = [track for track in sample.tracks if np.isin(track.frames, sample.frames).any()]
+    yield from _judge_lengths(tracks, sample)
     yield from _judge_sizes(tracks)
     paths = [_TrackPath.from_track(track, sample) for track in tracks]
     yield from _judge_speeds(paths)
     yield from _judge_headings(paths)
     yield from _judge_static(paths)
+
+
+def _judge_lengths(tracks: list[CuboidTrack], sample: LogSample) -> Iterator[Finding]:
+    """A finding where nearly every object is in one frame alone, though many frames have boxes."""
+    counts = [int(np.isin(track.frames, sample.frames).sum()) for track in tracks]
+    annotated = len({int(frame) for track in tracks for frame in track.frames[np.isin(track.frames, sample.frames)]})
+    single = counts.count(1)
+    if annotated < _MIN_ANNOTATED_FRAMES or single < _MIN_SINGLE_FRACTION * len(tracks):
+        return
+    message = f"{single} of {len(tracks)} objects are in one frame alone, though {annotated} frames have boxes"
+    remedy = "Give an object the same id in all frames: nothing else says what moves where."
+    numbers = {"single": float(single), "tracks": float(len(tracks)), "limit_fraction": _MIN_SINGLE_FRACTION}
+    yield Finding("brief_tracks", "warning", message, remedy, numbers)
 
 
 @dataclass(frozen=True)

@@ -16,22 +16,25 @@ from genre_tasks.log_checks.plausibility import assess_plausibility
 from genre_tasks.log_checks.reader_findings import collect_reader_findings
 from genre_tasks.log_checks.results import STANDSTILL_M, LogCheck
 from genre_tasks.logs.findings import Finding, ReportsFindings, Severity, format_frames
+from genre_tasks.logs.log_selection import count_source_frames
 from genre_tasks.logs.types import DrivingLog, Float64
 from genre_tasks.progress import Progress, silent
 
 # With a single frame, no point is seen from two positions of the same camera.
 _MIN_CHUNK_FRAMES = 2
+_MIN_SOURCE_FRAMES = 2
 # A complete sweep has tens of thousands; fewer are a file that was cut off or a sensor that was covered.
 _MIN_SWEEP_POINTS = 1000
 
 
-def check_log(log: DrivingLog, chunk_frames: int = 20, progress: Progress = silent) -> LogCheck:
+def check_log(log: DrivingLog, chunk_frames: int = 20, progress: Progress = silent, source_every: int = 4) -> LogCheck:
     """Reads every frame of a log once and reports what it has and lacks; never raises on what the log holds.
 
     Args:
         log: the log to read.
         chunk_frames: frames of a chunk, as in ``ingest.chunk_frames``; the last chunk may be shorter.
         progress: called once an image and once a sweep.
+        source_every: distance of source frames, as in ``ingest.source_every``.
 
     Returns:
         Counts, and findings that say what to do about each fault.
@@ -70,6 +73,7 @@ def check_log(log: DrivingLog, chunk_frames: int = 20, progress: Progress = sile
     )
     _report_lost_chunks(positions, inspector, chunk_frames)
     _report_findings(check, inspector, chunk_frames)
+    _report_chunks_without_sources(check, inspector, chunk_frames, source_every)
     return replace(check, findings=tuple(inspector.findings))
 
 
@@ -84,6 +88,37 @@ def _report_lost_chunks(positions: Float64, inspector: LogInspector, chunk_frame
         remedy = "Correct the poses, or leave these chunks out with --chunks."
         severity: Severity = "fatal" if len(lost) == chunk_count else "warning"
         inspector.report(Finding("lost_chunk", severity, message, remedy, {"chunks": len(lost)}))
+
+
+def _report_chunks_without_sources(
+    check: LogCheck, inspector: LogInspector, chunk_frames: int, source_every: int
+) -> None:
+    """Adds which chunks a run refuses, because images were left out of too many frames."""
+    has_images = np.zeros(check.frames, dtype=bool)
+    for camera in check.cameras:
+        left_out = {*camera.missing, *camera.unreadable, *camera.odd_size, *camera.blank}
+        poses = [f.frames for f in inspector.findings if f.word == "unreadable_pose" and f.camera == camera.name]
+        left_out.update(frame for frames in poses for frame in frames)
+        has_images |= ~np.isin(np.arange(check.frames), list(left_out))
+    # Without any image, another finding says so.
+    if not has_images.any():
+        return
+    lost = []
+    for chunk in range(check.chunk_count):
+        usable = has_images[chunk * chunk_frames : (chunk + 1) * chunk_frames]
+        # A chunk that is too short anyway is reported as short.
+        is_long_enough = count_source_frames(source_every, [True] * len(usable)) >= _MIN_SOURCE_FRAMES
+        if check.chunk_count == 1 and not is_long_enough:
+            message = f"a run needs more than {source_every} frames, or a smaller ingest.source_every"
+            inspector.report(Finding("few_source_frames", "note", message))
+        if is_long_enough and count_source_frames(source_every, usable) < _MIN_SOURCE_FRAMES:
+            lost.append(chunk)
+    if lost:
+        message = f"chunks {format_frames(lost)} cannot be reconstructed: they have fewer than two source frames with"
+        message += f" images (ingest.source_every = {source_every})"
+        remedy = "Export the images that are left out, choose other chunks, or set a smaller ingest.source_every."
+        severity: Severity = "fatal" if len(lost) == check.chunk_count else "warning"
+        inspector.report(Finding("few_source_frames", severity, message, remedy, {"chunks": len(lost)}))
 
 
 def _summarise_counts(counts: Sequence[int]) -> tuple[int, int, int]:
@@ -147,7 +182,9 @@ def _report_chunks(check: LogCheck, inspector: LogInspector, chunk_frames: int) 
     last_chunk_frames = check.frames - (check.chunk_count - 1) * chunk_frames
     if last_chunk_frames < _MIN_CHUNK_FRAMES:
         message = f"the last chunk has {last_chunk_frames} frame"
-        inspector.report(Finding("single_frame_chunk", "warning", message, "Leave it out with --chunks."))
+        # A log of one frame has no other chunk.
+        severity: Severity = "warning" if check.chunk_count > 1 else "fatal"
+        inspector.report(Finding("single_frame_chunk", severity, message, "Leave it out with --chunks."))
     elif last_chunk_frames < chunk_frames:
         message = f"the last chunk is short: {last_chunk_frames} of {chunk_frames} frames"
         inspector.report(Finding("short_chunk", "note", message))
@@ -157,6 +194,9 @@ def _report_cameras(check: LogCheck, inspector: LogInspector) -> None:
     if not check.cameras:
         message = "no camera has an image"
         remedy = "Copy the camera folders of the sequence; other findings name what lies in their place."
+        if any(finding.word == "unreadable_camera" for finding in inspector.findings):
+            message = "no camera can be used"
+            remedy = "Correct what the findings on cameras name."
         inspector.report(Finding("no_images", "fatal", message, remedy))
     elif len(check.cameras) == 1:
         inspector.report(Finding("one_camera", "note", "one camera only", "Shifted views see more that no camera saw."))
@@ -184,6 +224,10 @@ def _report_lidar(check: LogCheck, inspector: LogInspector) -> None:
         message = f"no LiDAR sweep at frames {format_frames(check.missing_sweeps)}"
         finding = Finding("missing_sweep", "warning", message, "The other sweeps are used.")
         inspector.report(replace(finding, frames=check.missing_sweeps))
+    if readable_sweeps and not check.points[-1]:
+        message = "no LiDAR sweep has a point that can be used"
+        inspector.report(Finding("no_lidar", "fatal", message, "Give points by ingest.points=FILE.ply."))
+        return
     # ``points`` is 0 where no sweep is readable, which was reported as fatal already.
     if readable_sweeps and check.points[0] < _MIN_SWEEP_POINTS:
         message = f"a sweep has only {check.points[0]} points"

@@ -28,6 +28,8 @@ _CLOCK_REMEDY = "Frames keep the order of the files; effects that need time (rol
 _UNIT_REMEDY = "Check the unit of the timestamps: seconds, milliseconds and microseconds since 1970 are understood."
 # Quartz clocks differ by 1e-4 at most; more is another unit or another rate of frames.
 _MAX_DRIFT = 1e-3
+# More are no jumps of a clock that is right between them.
+_MAX_JUMPS = 2
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,10 @@ def _judge_camera(sample: LogSample, camera: Camera) -> Iterator[Finding]:
     if not late.size:
         return
     frames = tuple(sample.frames[int(k)] for k in late)
+    if not np.isfinite(offsets[late]).any():
+        message = f"{camera.name}: frames {format_frames(frames)} have no finite time, or their sweeps have none"
+        yield Finding("camera_clock", "warning", message, _CLOCK_REMEDY, {}, camera.name, frames)
+        return
     largest = float(np.nanmax(np.abs(offsets), initial=0.0))
     reason = _explain_offsets(sample.times_s, camera_times)
     message = (
@@ -149,6 +155,11 @@ def _explain_offsets(sweep_times: Float64, camera_times: Float64) -> str:
     shift = float(np.median(offsets))
     if float(np.abs(offsets - shift).max()) <= _MAX_CAMERA_OFFSET_S:
         return f": always by {shift:.6g} s{_explain_shift(shift)}"
+    jumps = np.flatnonzero(np.abs(np.diff(offsets)) > _MAX_CAMERA_OFFSET_S)
+    if 0 < jumps.size <= _MAX_JUMPS:
+        frames = np.flatnonzero(known)[jumps + 1]
+        sizes = ", ".join(f"{np.diff(offsets)[jump]:.6g} s" for jump in jumps)
+        return f": its clock jumps by {sizes} before image {format_frames(frames)} of the chunk"
     if abs(rate - 1) > _MAX_DRIFT:
         return f": its clock runs {rate:.4g} times as fast as the sweeps'"
     return ""

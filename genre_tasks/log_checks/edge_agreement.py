@@ -44,6 +44,8 @@ _TOLERANCE = 8
 # Cells by which the left and the right of an image are shifted to opposite sides; two thirds of them lie between.
 _MAX_STRETCH = 12
 _MAX_SLOPE = 12
+# Scores of sound logs are 5 to 40. Of a few edges most turns have none in common, and rounding alone would deviate.
+_MAX_SCORE = 1000.0
 
 
 @dataclass(frozen=True)
@@ -228,13 +230,13 @@ def score_turns(surface: Float32) -> Agreement | None:
         surface: [STRIPS, P, Y] sum over images of :func:`correlate_edges`.
 
     Returns:
-        The scores; ``None`` where there are no edges.
+        The scores; ``None`` where there are no edges, or so few that most turns have none in common.
     """
     total = surface.sum(axis=0)
     median = float(np.median(total))
     # By the median, which the peaks that are looked for hardly move.
     deviation = 1.4826 * float(np.median(np.abs(total - median)))
-    if deviation <= 0:
+    if deviation * _MAX_SCORE <= float(np.abs(total - median).max()):
         return None
     row, column = total.shape[0] // 2, total.shape[1] // 2
     scores = (total - median) / deviation

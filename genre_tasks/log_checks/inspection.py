@@ -91,6 +91,7 @@ class LogInspector:
         """
         camera = self.cameras[index]
         missing: list[int] = []
+        pose_errors: list[GenreError] = []
         found = self.image_findings[camera.name] = []
         for frame in range(self.log.frame_count):
             facts, problem = read_image(partial(self.log.image_bytes, camera.name, frame), inspect_image, GenreError)
@@ -103,9 +104,10 @@ class LogInspector:
             else:
                 found.extend((frame, finding) for finding in facts.findings)
             # A camera pose that cannot be read costs one image, not the log.
-            self.try_reading(partial(self.log.world_SE3_camera, camera.name, frame), "warning", "unreadable_pose")
+            _read_or_note(partial(self.log.world_SE3_camera, camera.name, frame), pose_errors)
             done = index * self.log.frame_count + frame + 1
             self._progress(done, self._total_steps, f"{camera.name} {frame}")
+        self._report_errors("unreadable_pose", pose_errors)
         frames = {word: tuple(n for n, finding in found if finding.word == word) for word in LEFT_OUT}
         return CameraCheck(
             name=camera.name,
@@ -125,14 +127,14 @@ class LogInspector:
         """
         missing: list[int] = []
         unreadable: list[int] = []
+        errors: list[GenreError] = []
         point_counts: list[int] = []
         for frame in range(self.log.frame_count):
             try:
                 sweep = self.log.sweep(frame)
             except GenreError as error:
                 unreadable.append(frame)
-                message = f"{error.problem} ({error.where})"
-                self.report(Finding("unreadable_sweep", "warning", message, error.remedy, frames=(frame,)))
+                errors.append(error)
             else:
                 if sweep is None:
                     missing.append(frame)
@@ -140,6 +142,7 @@ class LogInspector:
                     point_counts.append(len(sweep.points_world))
             done = self._total_steps - self.log.frame_count + frame + 1
             self._progress(done, self._total_steps, f"sweep {frame}")
+        self._report_errors("unreadable_sweep", errors)
         return tuple(missing), tuple(unreadable), point_counts
 
     def read_ego_positions(self) -> Float64:
@@ -149,10 +152,12 @@ class LogInspector:
             [F, 3] world coordinates, metres; NaN where the pose cannot be read.
         """
         positions = np.full((self.log.frame_count, 3), np.nan)
+        errors: list[GenreError] = []
         for frame in range(self.log.frame_count):
-            pose = self.try_reading(partial(self.log.world_SE3_lidar, frame), "warning", "unreadable_pose")
+            pose = _read_or_note(partial(self.log.world_SE3_lidar, frame), errors)
             if pose is not None:
                 positions[frame] = pose[:3, 3]
+        self._report_errors("unreadable_pose", errors)
         return positions
 
     def read_times(self) -> Float64:
@@ -164,6 +169,19 @@ class LogInspector:
         times = np.array([self.log.frame_timestamp_s(frame) for frame in range(self.log.frame_count)])
         self._check_order(times)
         return times
+
+    def _report_errors(self, word: str, errors: list[GenreError]) -> None:
+        """Reports what could not be read of single frames; one finding for all frames with the same problem."""
+        groups: dict[str, list[GenreError]] = {}
+        for error in errors:
+            groups.setdefault(error.problem, []).append(error)
+        for problem, group in groups.items():
+            first = group[0]
+            frames = tuple(sorted({error.frame for error in group if error.frame is not None}))
+            others = f"; frames {format_frames(frames)} alike" if len(frames) > 1 else ""
+            location = f" ({first.where}{others})" if first.where else ""
+            message = f"{problem}{location}"
+            self.report(Finding(word, "warning", message, first.remedy, camera=first.camera, frames=frames))
 
     def _check_order(self, times: Float64) -> None:
         """Reports sweep times that are not finite, equal or decreasing."""
@@ -183,3 +201,12 @@ class LogInspector:
         numbers = tuple(int(frame) for frame in frames)
         message = template.format(format_frames(numbers))
         self.report(Finding(word, "warning", message, _CLOCK_REMEDY, frames=numbers))
+
+
+def _read_or_note(read: Callable[[], Value], errors: list[GenreError]) -> Value | None:
+    """Calls a function of the log; its error is added to ``errors``."""
+    try:
+        return read()
+    except GenreError as error:
+        errors.append(error)
+        return None

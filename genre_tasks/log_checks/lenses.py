@@ -29,6 +29,8 @@ _ASPECT_RANGE = (0.85, 1.18)
 # Factors by which people resize images.
 _COMMON_FACTORS = (1 / 8, 1 / 4, 1 / 3, 3 / 8, 1 / 2, 2 / 3, 3 / 4, 1.5, 2.0, 3.0, 4.0, 8.0)
 _FACTOR_TOLERANCE = 0.08
+# Slow sensors read for 50 ms, and cameras at night expose for as long; milliseconds would be numbers from 1.
+_MAX_SHUTTER_S = 0.15
 _SIZE_REMEDY = "Export the images at the size of the intrinsics, or scale the intrinsics to the images."
 
 
@@ -39,8 +41,8 @@ def find_implausible_lenses(sample: LogSample) -> Iterator[Finding]:
         sample: the frames of a chunk.
 
     Yields:
-        For each camera ``odd_focal_length``, ``odd_principal_point`` or ``odd_pixel_aspect``, and what
-        ``find_distortion_faults`` finds.
+        For each camera ``odd_focal_length``, ``odd_principal_point`` or ``odd_pixel_aspect``, ``odd_shutter_time``, and
+        what ``find_distortion_faults`` finds.
     """
     for camera in sample.cameras:
         lens = camera.lens
@@ -52,6 +54,7 @@ def find_implausible_lenses(sample: LogSample) -> Iterator[Finding]:
         # A wrong unit makes every other number of the lens odd as well.
         yield from (focal,) if focal else (*_judge_principal_point(camera), *_judge_aspect(camera))
         yield from find_distortion_faults(lens, camera.name)
+        yield from _judge_shutter(camera)
 
 
 def _is_measurable(lens: Lens) -> bool:
@@ -141,3 +144,12 @@ def _judge_aspect(camera: Camera) -> Iterator[Finding]:
     remedy = "Check fx and fy; they are right only where the images were stretched by as much."
     numbers = {"aspect": aspect, "lowest": lowest, "highest": highest}
     yield Finding("odd_pixel_aspect", "warning", message, remedy, numbers, camera.name)
+
+
+def _judge_shutter(camera: Camera) -> Iterator[Finding]:
+    for name, seconds in (("readout_s", camera.readout_s), ("exposure_s", camera.exposure_s)):
+        if 0 <= seconds <= _MAX_SHUTTER_S:
+            continue
+        message = f"{camera.name}: {name} is {seconds:.4g} s; 0 to {_MAX_SHUTTER_S:g} s is plausible"
+        numbers = {name: seconds, "limit_s": _MAX_SHUTTER_S}
+        yield Finding("odd_shutter_time", "warning", message, "Write seconds: 30 ms are 0.03.", numbers, camera.name)

@@ -31,6 +31,9 @@ _OTHER_NAMES = (
     *("dist", "dist_coeffs", "distCoeffs", "distortion_coefficients", "distortion_coeffs", "distortion_params", "D"),
     *("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "radial", "tangential"),
 )
+# Pixels by which columns may lean from the top of an image to its bottom; calibrations that estimate it find less.
+_SKEW_NAMES = ("skew", "s", "alpha_c")
+_MAX_SKEW = 1.0
 # No calibration board covers the very corners: those of a real KITTI camera fold, 0.07 % of its image.
 _MAX_LOST_FRACTION = 1e-3
 # Undistorted over distorted radius at the image's edge. Wide-angle lenses reach 2, strong pincushions 0.8.
@@ -72,13 +75,15 @@ def read_distortion(intrinsics: Mapping[str, Any], **where: Any) -> tuple[float,
         None, 1, 2, 4 or 5 coefficients: k1, k2, p1, p2, k3.
 
     Raises:
-        InputError: another lens model, coefficients under another name, text, or a count whose meaning is not certain.
+        InputError: another lens model, skew, coefficients under another name, text, or a count whose meaning is not
+            certain.
 
     >>> read_distortion({"distortion": [-0.2, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]})
     (-0.2, 0.1, 0.0, 0.0, 0.0)
     """
     _refuse_other_model(intrinsics, where)
     _refuse_other_names(intrinsics, where)
+    _refuse_skew(intrinsics, where)
     values = intrinsics.get("distortion")
     if values is None:
         return ()
@@ -278,6 +283,16 @@ def _refuse_other_names(intrinsics: Mapping[str, Any], where: Mapping[str, Any])
     if names:
         problem = f"distortion coefficients stand under {', '.join(names)}, which is not read"
         raise InputError(problem, remedy=f"Write them as distortion: [{_MODEL}].", **where)
+
+
+def _refuse_skew(intrinsics: Mapping[str, Any], where: Mapping[str, Any]) -> None:
+    """Raises for pixels whose axes are not at right angles, which the lens model does not have."""
+    for name in _SKEW_NAMES:
+        skew = intrinsics.get(name)
+        if isinstance(skew, int | float) and not abs(skew) <= _MAX_SKEW:
+            problem = f"the intrinsics have a skew ({name} = {skew:g}), which is not read"
+            remedy = "Write 0 if it stands for something else, or rectify the images without skew."
+            raise InputError(problem, remedy=remedy, **where)
 
 
 def _has_value(value: Any) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from genre_tasks.config import IngestConfig
 from genre_tasks.errors import ConfigError
 from genre_tasks.logs.types import Camera, DrivingLog
@@ -79,3 +81,60 @@ def select_cameras(config: IngestConfig, log: DrivingLog) -> tuple[Camera, ...]:
         )
     # In the order of the rig, whatever the order in the configuration: the result must not depend on it.
     return tuple(camera for camera in log.cameras if camera.name in config.cameras)
+
+
+class SourceSchedule:
+    """Which frames of a chunk have source views: every n-th one, or the next one that has an image in its place.
+
+    Args:
+        source_every: distance of source frames, from 1.
+
+    >>> schedule = SourceSchedule(4)
+    >>> schedule.is_due(0), schedule.is_due(1)
+    (True, True)
+    >>> schedule.take(1)
+    >>> schedule.is_due(3), schedule.is_due(4)
+    (False, True)
+    """
+
+    def __init__(self, source_every: int) -> None:
+        self._source_every = source_every
+        self._next = 0
+
+    def is_due(self, index: int) -> bool:
+        """Tells whether a frame becomes a source frame if it has an image.
+
+        Args:
+            index: of the frame in its chunk, from 0.
+        """
+        return index >= self._next
+
+    def take(self, index: int) -> None:
+        """Makes a frame a source frame.
+
+        Args:
+            index: of the frame in its chunk, from 0.
+        """
+        self._next = (index // self._source_every + 1) * self._source_every
+
+
+def count_source_frames(source_every: int, has_images: Iterable[bool]) -> int:
+    """Counts the source frames of a chunk.
+
+    Args:
+        source_every: distance of source frames, from 1.
+        has_images: for each frame of the chunk, whether any of its images can be used.
+
+    Returns:
+        The count; a chunk needs two.
+
+    >>> count_source_frames(4, [False, True, True, True, True]), count_source_frames(4, [True, True, True])
+    (2, 1)
+    """
+    schedule = SourceSchedule(source_every)
+    count = 0
+    for index, has_image in enumerate(has_images):
+        if has_image and schedule.is_due(index):
+            schedule.take(index)
+            count += 1
+    return count

@@ -34,8 +34,9 @@ STANDSTILL_M = 0.1
 def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Progress = silent) -> Chunk:
     """Reads one chunk of a log.
 
-    Every ``source_every``-th frame of the chunk is a source view, the others are held out. Points take their colours
-    from source views only. What is missing or unreadable becomes a ``LogIssue``, or an ``InputError`` under ``strict``.
+    Every ``source_every``-th frame of the chunk, or the next one with an image, has source views; others are held out.
+    Points take their colours from source views only. What is missing or unreadable becomes a ``LogIssue``, or an
+    ``InputError`` under ``strict``.
 
     Args:
         config: frames, cameras and resolution.

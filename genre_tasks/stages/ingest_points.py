@@ -78,7 +78,7 @@ def read_points_from_sweeps(reading: ChunkReading, sources: Sequence[View]) -> C
         Background and actors; actors with too few points or frames are left out.
 
     Raises:
-        InputError: the chunk has no sweep, or under ``strict`` one is missing or unreadable.
+        InputError: the chunk has no sweep with points, or under ``strict`` one is missing or unreadable.
     """
     moving = _select_actors(reading)
     background: list[FramePoints] = []
@@ -100,15 +100,30 @@ def read_points_from_sweeps(reading: ChunkReading, sources: Sequence[View]) -> C
             if k < len(points_of_track) and newly_assigned.any():
                 points_of_track[k].append((frame, in_box[newly_assigned]))
         background.append((frame, points[unassigned]))
-    if not background:
-        remedy = "Give points by ingest.points=FILE.ply, or choose other chunks with --chunks."
-        raise reading.input_error("the chunk has no LiDAR sweep", remedy)
+    if not any(len(points) for _, points in background):
+        raise _describe_no_points(reading, has_sweeps=bool(background))
     # Completion looks at measured points alone; road points that it adds do not take part in completing façades.
     swept = np.concatenate([points for _, points in background])
     background.append((NO_SWEEP, complete_road(swept, reading.chunk_SE3_ego)))
     if reading.config.complete_facades:
         background.append((NO_SWEEP, complete_facades(swept, reading.chunk_SE3_ego, sources)))
     return ChunkPoints(_join(background, None), _build_actor_clouds(reading, moving.tracks, points_of_track))
+
+
+def _describe_no_points(reading: ChunkReading, has_sweeps: bool) -> InputError:
+    """The error for a chunk without points, with the first reason that was noted."""
+    remedy = "Give points by ingest.points=FILE.ply, or choose other chunks with --chunks."
+    unreadable = [issue for issue in reading.log_issues if issue.kind == "unreadable_sweep"]
+    unread = [issue for issue in reading.log_issues if issue.kind == "unread_files" and " in lidar:" in issue.detail]
+    problem = "the chunk has no LiDAR sweep"
+    if has_sweeps:
+        problem = "the LiDAR sweeps of the chunk have no point that can be used"
+    elif unreadable:
+        first = unreadable[0]
+        problem += f" that can be read; {len(unreadable)} cannot, the first one (frame {first.frame}): {first.detail}"
+    elif unread:
+        problem += f": {unread[0].detail.removesuffix('.')}"
+    return reading.input_error(problem, remedy)
 
 
 def _select_actors(reading: ChunkReading) -> MovingActors:

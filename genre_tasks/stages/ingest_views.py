@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from genre_tasks.errors import InputError
 from genre_tasks.log_checks.images import LEFT_OUT, find_unfit, read_image, summarise_findings
 from genre_tasks.logs.findings import Finding
+from genre_tasks.logs.log_selection import SourceSchedule
 from genre_tasks.logs.types import Camera
 from genre_tasks.scene.chunk import View
 from genre_tasks.scene.image_decoding import decode_with_facts
@@ -26,7 +27,8 @@ _MISSING = Finding("missing_image", "warning", "there is no image")
 def read_views(reading: ChunkReading, cameras: Sequence[Camera]) -> tuple[list[View], list[NDArray[np.uint8] | None]]:
     """Reads the images of a chunk.
 
-    Every ``source_every``-th frame is a source view, the others are held out.
+    Every ``source_every``-th frame has source views, the others are held out. Where none of its images can be used, the
+    next frame that has one takes its place.
 
     Args:
         reading: the chunk; its issues grow.
@@ -46,10 +48,12 @@ def read_views(reading: ChunkReading, cameras: Sequence[Camera]) -> tuple[list[V
     remarks: dict[str, list[tuple[int, Finding]]] = {camera.name: [] for camera in cameras}
     # Held-out images are decoded too, so that an unreadable one is found here and not hours later.
     decode = partial(decode_with_facts, width_px=config.width_px, height_px=config.height_px)
+    schedule = SourceSchedule(config.source_every)
     for n, frame in enumerate(reading.frames):
         reading.report(n, "images")
         # Counted within the chunk: its first frame is a source frame, wherever the chunk begins in the log.
-        is_source = n % config.source_every == 0
+        is_source = schedule.is_due(n)
+        count_before = len(views)
         for camera in cameras:
             image, problem = read_image(partial(log.image_bytes, camera.name, frame), decode)
             if image is not None:
@@ -80,6 +84,8 @@ def read_views(reading: ChunkReading, cameras: Sequence[Camera]) -> tuple[list[V
             # Pixels are for colouring points, which must not look at held-out images. They are large, and dropped at
             # once.
             pixels.append(image.pixels if is_source else None)
+        if is_source and len(views) > count_before:
+            schedule.take(n)
     _note_remarks(reading, remarks)
     return views, pixels
 
@@ -99,14 +105,18 @@ def require_source_frames(reading: ChunkReading, sources: Sequence[View]) -> Non
     if count >= 2:
         return
     problem = f"the chunk has {count} source frames with images, at least two are needed"
+    remedy = "Choose other chunks with --chunks, or a smaller ingest.source_every."
     left_out = [issue for issue in reading.log_issues if issue.kind in LEFT_OUT]
     if left_out:
+        if not count:
+            # Nothing is left that a denser choice of source frames could take.
+            remedy = "Correct the images, or choose other chunks with --chunks."
         first = left_out[0]
         detail = first.detail.removesuffix(".")
         problem += (
             f"; {len(left_out)} images are left out, the first one ({first.camera}, frame {first.frame}): {detail}"
         )
-    raise reading.input_error(problem, "Choose other chunks with --chunks, or a smaller ingest.source_every.")
+    raise reading.input_error(problem, remedy)
 
 
 def _note_or_raise(reading: ChunkReading, problem: Finding, camera: Camera, frame: int) -> None:

@@ -123,3 +123,16 @@ def test_check_and_run_report_the_same_clock() -> None:
     in_run = [issue.detail for issue in issues if issue.kind == "camera_clock"]
     assert len(in_check) == len(in_run) == 2
     assert all(detail.startswith(message) for detail, message in zip(in_run, in_check, strict=True))
+
+
+def test_a_camera_clock_that_jumps() -> None:
+    """Report: none found; case 6 of the list of odd logs."""
+    found = with_camera_clock(lambda time: time + 3600.0 * (time > START_S + 0.35))
+    assert "its clock jumps by 3600 s before image 4" in found["camera_clock"].message
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_camera_without_times(value: float) -> None:
+    """Report: none found; case 6 of the list of odd logs."""
+    message = with_camera_clock(lambda time: value)["camera_clock"].message
+    assert "frames 0–7 have no finite time" in message

@@ -11,6 +11,7 @@ import pytest
 from benchmarks.log_faults.changed_log import ChangedLog, Changes
 from benchmarks.log_faults.faults import FAULTS
 from genre_tasks.log_checks.calibration import find_miscalibration, measure_agreement
+from genre_tasks.log_checks.edge_agreement import correlate_edges, score_turns
 from genre_tasks.log_checks.lidar_frame import find_misplaced_lidar
 from genre_tasks.log_checks.log_sample import LogSample
 from genre_tasks.log_checks.pose_axes import find_misread_poses
@@ -208,3 +209,15 @@ def test_gaps_give_no_verdict(street: DrivingLog) -> None:
         assert words(check(sample_of(fake))) == []
     unposed = sample_of(ChangedLog(street, Changes(lidar_pose=lambda frame, pose: pose * np.nan)))
     assert words(find_inconsistent_sweeps(unposed)) == [] and words(find_misread_poses(unposed)) == []
+
+
+def test_few_edges_give_no_score() -> None:
+    """Report: none found; case 2 of the list of odd logs: images of 160 × 90 agreed by 134438.9 deviations."""
+    edges = np.zeros((40, 100), np.float32)
+    edges[10, 50] = 1.0
+    edges[30, 20] = 2.0
+    surface = correlate_edges(edges, edges)
+    assert score_turns(surface) is None
+    noise = np.random.default_rng(0).normal(size=edges.shape).astype(np.float32)
+    scores = score_turns(correlate_edges(noise, noise))
+    assert scores is not None and 10 < scores.near.score < 200

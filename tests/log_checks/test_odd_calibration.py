@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -99,3 +100,43 @@ def test_cameras_that_stay_where_the_vehicle_was(folder: Path) -> None:
     found = check(folder)
     assert words(found) == run_words(folder) == {"loose_camera"}
     assert [finding.camera for finding in found.findings] == ["left"]
+
+
+Numbers = dict[str, float]
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (
+            lambda v: {"K": [[v["fx"], 0, v["cx"]], [0, v["fy"], v["cy"]], [0, 0, 1]]},
+            "lacks fx, fy, cx, cy; its keys are K",
+        ),
+        (lambda v: {key.upper(): number for key, number in v.items()}, "its keys are FX, FY, CX, CY"),
+        (lambda v: list(v.values()), "found a list of"),
+        (lambda v: {**v, "fx": None}, "null is no number"),
+        (lambda v: {**v, "width": "48 px"}, "'48 px' is no number"),
+        (lambda v: {**v, "readout_s": -0.03}, "readout_s is -0.03"),
+        (lambda v: {**v, "exposure_s": float("nan")}, "exposure_s nan"),
+        (lambda v: {**v, "skew": 50.0}, "skew = 50"),
+    ],
+)
+def test_intrinsics_that_are_none(folder: Path, change: Callable[[Numbers], object], problem: str) -> None:
+    """Report: none found; case 2 of the list of odd logs."""
+    edit_json(folder / "camera/left/intrinsics.json", change)
+    found = check(folder)
+    assert found.verdict == "unusable"
+    messages = [finding.message for finding in found.findings if finding.word == "unreadable_camera"]
+    assert len(messages) == 1 and problem in messages[0] and "left/intrinsics.json" in messages[0]
+    assert not any("Copy the camera folders" in finding.remedy for finding in found.findings)
+    with pytest.raises(InputError, match=re.escape(problem)):
+        ingest(CONFIG, open_pandaset(str(folder)), 0)
+
+
+@pytest.mark.parametrize("name", ["readout_s", "exposure_s"])
+def test_milliseconds_for_seconds(folder: Path, name: str) -> None:
+    """Report: none found; case 2 of the list of odd logs."""
+    edit_json(folder / "camera/left/intrinsics.json", lambda value: {**value, name: 30.0})
+    found = check(folder)
+    assert found.verdict == "usable" and words(found) == run_words(folder) == {"odd_shutter_time"}
+    assert found.findings[0].camera == "left" and name in found.findings[0].message

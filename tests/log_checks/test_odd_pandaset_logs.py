@@ -16,6 +16,7 @@ from PIL import Image
 from genre_tasks.config import IngestConfig
 from genre_tasks.errors import InputError
 from genre_tasks.log_checks.check_log import check_log
+from genre_tasks.log_checks.results import LogCheck
 from genre_tasks.logs.pandaset.pickle_reader import read_table
 from genre_tasks.logs.pandaset.reader import open_pandaset
 from genre_tasks.logs.pandaset.writer import write_pandaset
@@ -191,3 +192,59 @@ def test_damaged_folders_are_judged_and_never_raise(folder: Path, seed: int) -> 
         assert verdict == "unusable" and error.remedy
     else:
         assert verdict != "unusable"
+
+
+def judge_alike(folder: Path) -> tuple[LogCheck, str]:
+    """What the check finds, and the words of the run's issues, or its error."""
+    found = check_log(open_pandaset(str(folder)))
+    try:
+        chunk = ingest(IngestConfig(width_px=48, height_px=32, source_every=1), open_pandaset(str(folder)), 0)
+    except InputError as error:
+        return found, f"error: {error.problem}"
+    return found, " ".join(issue.kind for issue in chunk.log_issues)
+
+
+@pytest.mark.parametrize(
+    ("columns", "check_text", "run_text"),
+    [
+        ({"x": np.nan}, "no LiDAR sweep has a point", "error: the LiDAR sweeps of the chunk have no point"),
+        ({"i": None}, "lacks the columns i; it has", "error: the chunk has no LiDAR sweep that can be read; 6 cannot"),
+    ],
+)
+def test_sweeps_without_points(folder: Path, columns: dict[str, float | None], check_text: str, run_text: str) -> None:
+    """Report: none found; case 21 of the list of odd logs."""
+    for file in folder.glob("lidar/*.pkl.gz"):
+        count = read_table(file).row_count
+        edit_table(file, **{name: None if v is None else np.full(count, v) for name, v in columns.items()})
+    found, run = judge_alike(folder)
+    assert found.verdict == "unusable" and run.startswith(run_text)
+    assert sum(check_text in finding.message for finding in found.findings) == 1
+
+
+def test_a_fault_of_all_poses_is_one_finding(folder: Path) -> None:
+    """Report: none found; case 17 of the list of odd logs."""
+    edit_json(folder / "lidar/poses.json", lambda poses: [{"translation": 0, "rotation": 0}] * len(poses))
+    found, run = judge_alike(folder)
+    unreadable = [finding for finding in found.findings if finding.word == "unreadable_pose"]
+    assert len(unreadable) == 1 and unreadable[0].frames == tuple(range(found.frames))
+    assert "the keys translation, rotation" in unreadable[0].message and "the keys translation, rotation" in run
+
+
+@pytest.mark.parametrize(("make_id", "word"), [(lambda frame: "same", "repeated_box_id"), (str, "brief_tracks")])
+def test_ids_of_boxes_that_name_no_object(folder: Path, make_id: Callable[[int], str], word: str) -> None:
+    """Report: none found; case 4 of the list of odd logs."""
+    for frame, file in enumerate(sorted(folder.glob("annotations/cuboids/*.pkl.gz"))):
+        # Another frame's id alone, or the same for all.
+        count = read_table(file).row_count
+        ids = [make_id(frame) if word == "repeated_box_id" else f"{make_id(frame)}-{row}" for row in range(count)]
+        edit_table(file, uuid=np.array(ids, dtype=object))
+    found, run = judge_alike(folder)
+    assert word in {finding.word for finding in found.findings} and word in run and found.verdict == "usable"
+
+
+def test_a_key_that_stands_twice(folder: Path) -> None:
+    """Report: none found; case 15 of the list of odd logs."""
+    file = folder / "camera/left/intrinsics.json"
+    file.write_text(file.read_text().replace('{"fx"', '{"fx": 1.0, "fx"'))
+    found, run = judge_alike(folder)
+    assert found.verdict == "unusable" and "the key fx stands twice" in run

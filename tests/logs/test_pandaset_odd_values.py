@@ -18,6 +18,7 @@ from PIL import Image
 
 from genre_tasks.errors import InputError
 from genre_tasks.logs.findings import Finding
+from genre_tasks.logs.pandaset.layout import parse_pose
 from genre_tasks.logs.pandaset.pickle_reader import read_table
 from genre_tasks.logs.pandaset.reader import PandaSetLog, open_pandaset
 from genre_tasks.logs.pandaset.writer import write_pandaset
@@ -393,3 +394,20 @@ class TestSweepColumns:
         with pytest.raises(InputError, match=words) as caught:
             opened(folder).sweep(1)
         assert (caught.value.file, caught.value.frame) == (str(path), 1)
+
+
+@pytest.mark.parametrize(
+    ("pose", "part"),
+    [
+        (None, "found null"),
+        ([1.0], "found a list of 1 entries"),
+        ({"translation": 1}, "found the keys translation"),
+        ({"position": [1, 2, 3], "heading": [1, 0, 0, 0]}, "position a list of 3 entries"),
+        ({"position": {"x": None, "y": 1, "z": 1}, "heading": {"w": 1}}, "x = null"),
+    ],
+)
+def test_what_is_no_pose_is_named(pose: object, part: str) -> None:
+    """Report: none found; case 17 of the list of odd logs."""
+    with pytest.raises(InputError, match=part) as caught:
+        parse_pose(pose, file=Path("poses.json"), log="log", frame=3)
+    assert caught.value.frame == 3 and "the pose lacks position x, y, z or heading w, x, y, z" in caught.value.problem

@@ -10,6 +10,7 @@ import pytest
 
 from genre_tasks.config import IngestConfig
 from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.log_checks.check_log import check_log
 from genre_tasks.scene.chunk import Chunk, LogIssue
 from genre_tasks.scene.facade_completion import STEP_M
 from genre_tasks.stages.ingest import chunk_count, ingest
@@ -144,6 +145,24 @@ def test_fewer_than_two_source_frames(log: FakeLog) -> None:
     with pytest.raises(InputError, match="1 source frames") as caught:
         ingest(CONFIG, log.with_(frame_count=23), 1)
     assert caught.value.chunk == 1 and "--chunks" in caught.value.remedy and "source_every" in caught.value.remedy
+
+
+@pytest.mark.parametrize(
+    ("lost", "sources"),
+    [((), {0, 4}), ((0,), {1, 4}), ((4,), {0, 5}), ((0, 1, 2, 3), {4}), ((4, 5, 6, 7), {0}), ((0, 4), {1, 5})],
+)
+def test_a_source_frame_without_images_is_replaced_by_the_next_one(lost: tuple[int, ...], sources: set[int]) -> None:
+    """Report: none found; case 3 of the list of odd logs. The check and the run agree which chunks are lost."""
+    missing = frozenset((camera, frame) for camera in ("front", "left") for frame in lost)
+    log = FakeLog(frame_count=8, width_px=48, height_px=32, lidar_azimuths=360, missing_images=missing)
+    found = {finding.word: finding for finding in check_log(log).findings}
+    if len(sources) < 2:
+        with pytest.raises(InputError, match="1 source frames"):
+            ingest(CONFIG, log, 0)
+        assert found["few_source_frames"].severity == "fatal"
+        return
+    assert {view.frame for view in ingest(CONFIG, log, 0).views_with_role("source")} == sources
+    assert "few_source_frames" not in found
 
 
 def test_unknown_chunk_and_camera(log: FakeLog) -> None:

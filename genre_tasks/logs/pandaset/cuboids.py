@@ -26,6 +26,7 @@ _SIZE = slice(3, 6)
 # Of a box row.
 _YAW = 6
 # Two full turns: a tracker may add up a few turns, and degrees are soon beyond.
+_UUID_REMEDY = "Give every object a uuid, the same one in all frames."
 _MAX_YAW_RAD = 4 * math.pi
 # Of a box row, behind the columns above.
 _QUATERNION = slice(7, 11)
@@ -138,6 +139,7 @@ def _add_frame(objects: dict[str, _AnnotatedObject], frame_boxes: FrameBoxes) ->
     """Adds the boxes of one frame to their objects; returns those that were left out."""
     frame = frame_boxes.frame
     findings = []
+    repeated = 0
     for box, row in zip(frame_boxes.boxes, frame_boxes.attributes, strict=True):
         new_object = _AnnotatedObject(
             uuid=str(row["uuid"]),
@@ -148,7 +150,9 @@ def _add_frame(objects: dict[str, _AnnotatedObject], frame_boxes: FrameBoxes) ->
         is_valid = np.isfinite(box).all() and (box[_SIZE] > 0).all() and box[_QUATERNION].any()
         # Boxes without a name would all become one object.
         if not is_valid or _is_missing(row["uuid"]):
-            problem = "is not finite" if not is_valid else "has no uuid"
+            problem = "has no uuid"
+            if not is_valid:
+                problem = "has a size that is not positive" if np.isfinite(box).all() else "is not finite"
             annotated = objects.get(new_object.uuid, new_object)
             message = f"the box of {annotated.label} {annotated.uuid} in frame {frame} {problem}"
             remedy = "Correct the box; it is left out."
@@ -157,9 +161,14 @@ def _add_frame(objects: dict[str, _AnnotatedObject], frame_boxes: FrameBoxes) ->
                 continue
         annotated = objects.setdefault(new_object.uuid, new_object)
         if is_valid:
+            repeated += frame in annotated.boxes
             # A uuid that stands twice in a frame keeps its first box.
             annotated.boxes.setdefault(frame, box)
             annotated.moving |= _is_moving(row)
+    if repeated:
+        message = f"{repeated} boxes of frame {frame} have the uuid of another box of that frame, and are left out"
+        numbers = {"boxes": repeated}
+        findings.append(Finding("repeated_box_id", "warning", message, _UUID_REMEDY, numbers, frames=(frame,)))
     return findings
 
 

@@ -16,6 +16,7 @@ from genre_tasks.logs.types import Float64
 
 _MAKE_READABLE = "Make it readable for this user, or copy it again."
 _COPY_AGAIN = "Copy it again."
+_JSON_REMEDY = "Copy it again, or write one JSON value, without comments and trailing commas."
 _TIMES_REMEDY = "Write times as numbers (s, ms, µs or ns since 1970), or all as ISO-8601 text."
 # A value may be a document of its own.
 _MAX_SHOWN_CHARACTERS = 60
@@ -79,12 +80,22 @@ def read_json(path: Path, log: str) -> Any:
     """
     data = read_file(path, log=log)
     try:
-        return json.loads(data)
+        return json.loads(data, object_pairs_hook=_build_object)
     # Brackets within brackets may overflow the interpreter's stack.
     except (ValueError, RecursionError) as error:
         kind = describe_non_json(data)
         problem = f"the file is no readable JSON ({error})" if kind is None else f"no JSON: the file is {kind}"
-        raise InputError(problem, remedy=_COPY_AGAIN, file=path, log=log) from error
+        remedy = _COPY_AGAIN if kind else _JSON_REMEDY
+        raise InputError(problem, remedy=remedy, file=path, log=log) from error
+
+
+def _build_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON; of a key that stands twice, nobody knows which value is meant."""
+    value = dict(pairs)
+    if len(value) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"the key {max(keys, key=keys.count)} stands twice")
+    return value
 
 
 def read_entries(path: Path, log: str) -> list[object]:
@@ -162,7 +173,7 @@ def read_times(path: Path, log: str) -> Float64:
         log: URI of the log, for the error.
 
     Returns:
-        [F] seconds; since 1970 where they are absolute.
+        [F] seconds, NaN where they are not finite; since 1970 where they are absolute.
 
     Raises:
         InputError: as ``read_entries``; an entry is no time; or times of different kinds are mixed.
@@ -180,6 +191,8 @@ def read_times(path: Path, log: str) -> Float64:
         if kind != kinds[0]:
             problem = f"entry {frame} is {kind}, but entry 0 is {kinds[0]}"
             raise InputError(problem, remedy=_TIMES_REMEDY, file=path, log=log, frame=frame)
+    # Infinity is no time either, and differences of two of them are invalid.
+    times[~np.isfinite(times)] = np.nan
     # Text of a date says its unit; the magnitude must not be asked.
     return times if kinds[0].startswith("a date") else convert_to_seconds(times)
 

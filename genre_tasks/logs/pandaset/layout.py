@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from genre_tasks.errors import InputError
-from genre_tasks.logs.pandaset.file_reading import read_number
+from genre_tasks.logs.pandaset.file_reading import describe_value, read_number
 from genre_tasks.logs.types import Float64
 
 RIG_ORDER = ("front_camera", "front_left_camera", "front_right_camera", "left_camera", "right_camera", "back_camera")
@@ -44,7 +44,10 @@ BOX_HEADING = ("heading.w", "heading.x", "heading.y", "heading.z")
 # [3, 3] takes coordinates in x forward, y left, z up to PandaSet's x right, y forward, z up.
 PANDA_R_FLU = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
+_POSE_FORM = "position x, y, z or heading w, x, y, z"
 _POSE_REMEDY = "Correct the pose in that file, or leave its chunk out with --chunks."
+# The Earth is 4e7 m around, and 4e10 mm; what overflows later on is no position.
+_MAX_POSITION_M = 1e12
 # Below that, rounding alone would decide where the sensor points.
 _MIN_QUATERNION_NORM = 1e-6
 
@@ -79,24 +82,40 @@ def parse_pose(pose: Any, *, file: Path, log: str, frame: int, camera: str | Non
         [4, 4] world_SE3_sensor.
 
     Raises:
-        InputError: keys are missing, a value is not finite, or the quaternion is zero.
+        InputError: keys are missing, a value is not finite or beyond the Earth, or the quaternion is zero.
     """
     where: dict[str, Any] = {"file": file, "log": log, "frame": frame, "camera": camera}
     try:
         position = np.array([read_number(pose["position"][axis]) for axis in "xyz"])
         quat = np.array([read_number(pose["heading"][axis]) for axis in "wxyz"])
     except (KeyError, TypeError, ValueError) as error:
-        problem = f"the pose lacks position x, y, z or heading w, x, y, z ({error!r})"
+        problem = f"the pose lacks {_POSE_FORM}; found {_describe_pose(pose)}"
         raise InputError(problem, remedy=_POSE_REMEDY, **where) from error
     # Normalised later on: files round to a few digits.
     norm = float(np.linalg.norm(quat))
-    if not (np.isfinite(position).all() and np.isfinite(norm)) or norm < _MIN_QUATERNION_NORM:
+    if not (np.abs(position).max() < _MAX_POSITION_M and np.isfinite(norm)) or norm < _MIN_QUATERNION_NORM:
         problem = "the pose is not finite, or its quaternion is zero"
         raise InputError(problem, remedy=_POSE_REMEDY, **where)
     matrix = np.eye(4)
     matrix[:3, :3] = quats_to_matrices(quat[None])[0]
     matrix[:3, 3] = position
     return matrix
+
+
+def _describe_pose(pose: object) -> str:
+    """What is there in place of a pose: its keys, or the part of it that is none."""
+    if not isinstance(pose, dict):
+        return describe_value(pose)
+    parts = {name: pose.get(name) for name in ("position", "heading")}
+    if any(name not in pose for name in parts):
+        return f"the keys {', '.join(map(str, pose)) or 'none'}"
+    return ", ".join(f"{name} {_describe_part(part)}" for name, part in parts.items())
+
+
+def _describe_part(part: object) -> str:
+    if not isinstance(part, dict):
+        return describe_value(part)
+    return "with " + ", ".join(f"{key} = {describe_value(value)}" for key, value in part.items())
 
 
 def format_pose(world_SE3_sensor: Float64) -> dict[str, dict[str, float]]:

@@ -14,7 +14,14 @@ from genre_tasks.errors import InputError
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.lens_validity import with_distortion
 from genre_tasks.logs.pandaset.cuboids import FrameBoxes, build_tracks, read_boxes
-from genre_tasks.logs.pandaset.file_reading import read_entries, read_file, read_json, read_number, read_times
+from genre_tasks.logs.pandaset.file_reading import (
+    describe_value,
+    read_entries,
+    read_file,
+    read_json,
+    read_number,
+    read_times,
+)
 from genre_tasks.logs.pandaset.folder_index import LIDAR_FILES, SequenceIndex, index_sequence
 from genre_tasks.logs.pandaset.image_sizes import ImageSizes, choose_lens, measure_images, report_problems
 from genre_tasks.logs.pandaset.layout import PIXEL_CENTRE, READOUT_S, RIG_ORDER, parse_pose, to_flu_axes
@@ -27,6 +34,9 @@ from genre_tasks.suggestions import did_you_mean
 from genre_tasks.user_paths import expand_user_path
 
 _MAX_SEQUENCES_LISTED = 10
+_MAX_KEYS_LISTED = 8
+_INTRINSIC_KEYS = ("fx", "fy", "cx", "cy")
+_INTRINSICS_REMEDY = 'Write {"fx": …, "fy": …, "cx": …, "cy": …} in pixels of the images.'
 
 
 def open_pandaset(rest: str) -> PandaSetLog:
@@ -150,11 +160,13 @@ class PandaSetLog:
             exposure_s = read_number(intrinsics.get("exposure_s", 0.0))
             width, height = (int(read_number(intrinsics.get(k, v))) for k, v in _name_sides(measured.majority))
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            problem = f"fx, fy, cx, cy were expected ({error!r})"
-            raise InputError(problem, remedy="Copy it again.", **where) from error
+            raise InputError(_describe_bad_intrinsics(intrinsics, error), remedy=_INTRINSICS_REMEDY, **where) from error
         if not (np.isfinite([fx, fy, cx, cy]).all() and fx > 0 and fy > 0 and width > 0 and height > 0):
             problem = "the intrinsics are not finite, or a focal length or a size is not positive"
             raise InputError(problem, remedy="Correct the file.", **where)
+        if not (np.isfinite([readout_s, exposure_s]).all() and readout_s >= 0 and exposure_s >= 0):
+            problem = f"readout_s is {readout_s:g} and exposure_s {exposure_s:g}; seconds from 0 were expected"
+            raise InputError(problem, remedy="Correct them; 0 stands for a global shutter.", **where)
         lens = Lens(
             fx_px=fx,
             fy_px=fy,
@@ -297,6 +309,19 @@ class PandaSetLog:
             sha256, hexadecimal; the folder's own path does not count.
         """
         return digest_files(self.folder, self._index.read_files(self.frame_count), self._unread)
+
+
+def _describe_bad_intrinsics(intrinsics: object, error: Exception) -> str:
+    """What is there in place of numbers for the keys of the layout."""
+    if not isinstance(intrinsics, dict):
+        return f"an object with fx, fy, cx and cy was expected, found {describe_value(intrinsics)}"
+    missing = [key for key in _INTRINSIC_KEYS if key not in intrinsics]
+    if missing:
+        names = [str(key) for key in intrinsics]
+        more = ", …" if len(names) > _MAX_KEYS_LISTED else ""
+        found = ", ".join(names[:_MAX_KEYS_LISTED]) or "none"
+        return f"fx, fy, cx, cy were expected: the file lacks {', '.join(missing)}; its keys are {found}{more}"
+    return f"a number of the intrinsics cannot be read: {error}"
 
 
 def _name_sides(size: tuple[int, int]) -> Iterator[tuple[str, int]]:

@@ -13,6 +13,7 @@ from genre_tasks.logs.pandaset.folder_index import FrameFolder, SequenceIndex
 from genre_tasks.logs.pandaset.layout import frame_stem
 
 _MAX_NAMES_LISTED = 4
+_MAX_NAME_CHARACTERS = 60
 # PandaSet has these too, and they are not needed.
 _KNOWN_UNREAD = frozenset({"meta/", "semseg/"})
 _DOCUMENTS = ("readme", "license", "licence", "changelog", "citation")
@@ -124,4 +125,8 @@ def _check_cuboid_gaps(folder: FrameFolder, frame_count: int) -> Iterator[Findin
 def _list_names(names: Iterable[str]) -> str:
     listed = list(names)
     more = len(listed) - _MAX_NAMES_LISTED
-    return ", ".join(listed[:_MAX_NAMES_LISTED]) + (f" and {more} more" if more > 0 else "")
+    shortened = [
+        name if len(name) <= _MAX_NAME_CHARACTERS else f"{name[: _MAX_NAME_CHARACTERS // 2]}…{name[-8:]}"
+        for name in listed[:_MAX_NAMES_LISTED]
+    ]
+    return ", ".join(shortened) + (f" and {more} more" if more > 0 else "")
