@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import fcntl
+import os
 import socket
 import sqlite3
 import threading
@@ -25,6 +26,17 @@ if TYPE_CHECKING:
 _START_TIMEOUT_S = 120.0
 _STOP_TIMEOUT_S = 5.0
 _DATABASE = "prefect.db"
+DATABASE_VARIABLES = ("PREFECT_API_DATABASE_CONNECTION_URL", "PREFECT_SERVER_DATABASE_CONNECTION_URL")
+"""Either names the database of a server, also of the one in this process."""
+
+
+def find_stated_database() -> str | None:
+    """Finds the variable by which the user names a database for Prefect.
+
+    Returns:
+        Its name; ``None`` where the database is the usual one.
+    """
+    return next((name for name in DATABASE_VARIABLES if os.environ.get(name)), None)
 
 
 def database_url(folder: Path) -> str:
@@ -60,6 +72,7 @@ class ServerThread:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
+        self._stated_database = find_stated_database()
         # The system chooses a free port, so that two runs never meet. Requests queue from now on.
         self._socket = socket.create_server(("127.0.0.1", 0))
         self.url = f"http://127.0.0.1:{self._socket.getsockname()[1]}/api"
@@ -84,7 +97,8 @@ class ServerThread:
         """Ends the server, once it has answered what it was asked; it never waits for long."""
         if self._server is not None:
             self._server.should_exit = True
-        self._thread.join(_STOP_TIMEOUT_S)
+        if self._thread.ident is not None:
+            self._thread.join(_STOP_TIMEOUT_S)
         self._socket.close()
 
     def _serve(self) -> None:
@@ -116,6 +130,9 @@ class ServerThread:
             await lifespan.__aexit__(None, None, None)
 
     def _start_error(self, reason: str) -> GenreError:
+        if self._stated_database is not None:
+            remedy = f"Correct or unset {self._stated_database}, which names its database."
+            return ResourceError(f"Prefect's local API cannot start: {reason}", remedy=remedy)
         database = self._folder / _DATABASE
         remedy = "Free disk space and memory there."
         if isinstance(_root_cause(self._error), sqlite3.DatabaseError) or "revision" in reason:
