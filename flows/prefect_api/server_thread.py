@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import fcntl
 import os
+import resource
 import socket
 import sqlite3
 import threading
@@ -25,6 +26,10 @@ if TYPE_CHECKING:
 
 _START_TIMEOUT_S = 120.0
 _STOP_TIMEOUT_S = 5.0
+# The server, its client and the event streams have about 30 open; a server that cannot accept waits forever.
+_MIN_OPEN_FILES = 64
+# What the file is to blame for; others, such as a full disk, are not cured by its removal.
+_DAMAGED_CODES = (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 _DATABASE = "prefect.db"
 DATABASE_VARIABLES = ("PREFECT_API_DATABASE_CONNECTION_URL", "PREFECT_SERVER_DATABASE_CONNECTION_URL")
 """Either names the database of a server, also of the one in this process."""
@@ -87,6 +92,7 @@ class ServerThread:
         Raises:
             ResourceError: it cannot start; the message has its reason.
         """
+        _ensure_open_files()
         self._thread.start()
         if not self._ended_start.wait(_START_TIMEOUT_S):
             raise self._start_error(f"it has not started within {_START_TIMEOUT_S:.0f} s")
@@ -135,9 +141,24 @@ class ServerThread:
             return ResourceError(f"Prefect's local API cannot start: {reason}", remedy=remedy)
         database = self._folder / _DATABASE
         remedy = "Free disk space and memory there."
-        if isinstance(_root_cause(self._error), sqlite3.DatabaseError) or "revision" in reason:
+        cause = _root_cause(self._error)
+        is_damaged = isinstance(cause, sqlite3.Error) and cause.sqlite_errorcode & 0xFF in _DAMAGED_CODES
+        if is_damaged or "revision" in reason:
             remedy = "Delete that file if it is damaged or of another version: it holds records of runs, no results."
         return ResourceError(f"Prefect's local API cannot start: {reason}", remedy=remedy, file=database)
+
+
+def _ensure_open_files() -> None:
+    """Raises the number of files that this process may have open where it is very low."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == resource.RLIM_INFINITY or soft >= _MIN_OPEN_FILES:
+        return
+    if hard != resource.RLIM_INFINITY and hard < _MIN_OPEN_FILES:
+        raise ResourceError(
+            f"Prefect's local API cannot start: this process may have only {hard} files open",
+            remedy=f"Allow {_MIN_OPEN_FILES} or more: ulimit -n 1024.",
+        )
+    resource.setrlimit(resource.RLIMIT_NOFILE, (_MIN_OPEN_FILES, hard))
 
 
 @contextmanager

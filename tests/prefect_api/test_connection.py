@@ -282,3 +282,32 @@ def test_warnings_as_errors_do_not_stop_the_server() -> None:
     command = [sys.executable, "-W", "error::UserWarning", "-c", script]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
     assert done.stdout == "on\n"
+
+
+@pytest.mark.parametrize(
+    ("code", "remedy"),
+    [
+        (sqlite3.SQLITE_FULL, "Free disk space"),
+        (sqlite3.SQLITE_IOERR_WRITE, "Free disk space"),
+        (sqlite3.SQLITE_CORRUPT, "Delete that file"),
+    ],
+)
+def test_a_full_disk_is_no_damaged_database(code: int, remedy: str, tmp_path: Path) -> None:
+    server = ServerThread(tmp_path)
+    server.stop()
+    cause = sqlite3.OperationalError("disk")
+    cause.sqlite_errorcode = code
+    server._error = RuntimeError("start")
+    server._error.__cause__ = cause
+    assert remedy in str(server._start_error("disk"))
+
+
+def test_too_few_open_files_are_one_error(tmp_path: Path) -> None:
+    """Report: none found; case 10 of the list of odd logs (a server that can accept nobody waits forever)."""
+    limit = "import resource\nresource.setrlimit(resource.RLIMIT_NOFILE, ({soft}, {hard}))\n"
+    script = (
+        limit + "from flows.prefect_api.server_thread import _ensure_open_files as ensure\n"
+        "ensure()\nprint(resource.getrlimit(resource.RLIMIT_NOFILE)[0])\n"
+    )
+    assert run_flow(tmp_path, script.format(soft=40, hard=40)).stderr.splitlines()[-1].endswith("ulimit -n 1024.")
+    assert run_flow(tmp_path, script.format(soft=40, hard=200)).stdout == "64\n"
