@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import os
 import secrets
+import sys
 import tempfile
 import urllib.error
 import urllib.request
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr
 from http.client import HTTPException
 from pathlib import Path
 
@@ -68,14 +70,17 @@ def read_api_url() -> str | None:
     # Whatever Prefect raises here is about its settings, which the user can change.
     try:
         # Prefect makes an HTTP client when it is imported, also where none is needed.
-        with _changed_environment(dict.fromkeys(find_unusable_files())):
+        with _changed_environment(dict.fromkeys(find_unusable_files())), redirect_stderr(io.StringIO()) as printed:
             from prefect.settings import get_current_settings
 
-            return get_current_settings().api.url
+            url = get_current_settings().api.url
     except Exception as error:
         first_line = " ".join(str(error).split())[:300]
         remedy = "Correct or unset the variable PREFECT_… that it names, in the environment, a file or a profile."
         raise ConfigError(f"Prefect does not accept its settings: {first_line}", remedy=remedy) from error
+    # What Prefect prints while it is imported is for the user, unless the error above says the same.
+    sys.stderr.write(printed.getvalue())
+    return url
 
 
 def check_server_answers(url: str) -> None:

@@ -160,6 +160,7 @@ def test_a_setting_that_prefect_refuses_is_one_line(tmp_path: Path) -> None:
     script = FLOW.replace("with connect", "import flows.prefect_api.connection as c\nwith c.connect", 1)
     done = run_flow(tmp_path, script, PREFECT_SERVER_API_PORT="many")
     assert "genre_tasks.errors.ConfigError: Prefect does not accept its settings" in done.stderr
+    assert "Failed to initialize plugins" not in done.stderr
 
 
 def test_the_state_folder_is_one_that_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
