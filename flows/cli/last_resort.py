@@ -29,6 +29,8 @@ FAULT_EXIT_CODE = 70
 _STATUS_BY_CODE: dict[int, Status] = {2: "refused", 129: "interrupted", 130: "interrupted", 143: "interrupted"}
 # Wrong paths of the user's that no check has met; other numbers without a file's name say nothing about the cause.
 _ERRORS_WITHOUT_A_FILE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.ENOMEM, errno.EMFILE, errno.ENFILE})
+# PyTorch's allocator, the C library, and its loader of shared libraries, which Python reports as an ImportError.
+_OUT_OF_MEMORY_PHRASES = ("can't allocate memory", "annot allocate memory", "failed to map segment from shared object")
 _MAX_MESSAGE_LENGTH = 300
 
 
@@ -143,7 +145,7 @@ def _translate(error: BaseException) -> GenreError | None:
     from storage.io_errors import as_genre_error
 
     is_out_of_memory = isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"
-    if is_out_of_memory or "can't allocate memory" in str(error):
+    if is_out_of_memory or any(phrase in str(error) for phrase in _OUT_OF_MEMORY_PHRASES):
         text = as_one_line(str(error))[:_MAX_MESSAGE_LENGTH]
         return ResourceError(
             f"there is not enough memory{f': {text}' if text else ''}",

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
+import warnings
 from typing import Annotated
 
 import typer
@@ -88,14 +90,29 @@ def prepare_environment(debug: bool) -> None:
     Args:
         debug: whether Prefect's own messages are shown.
     """
-    # Not the working folder, which may be read-only. Nothing is sent to Prefect's makers.
-    os.environ.setdefault("PREFECT_HOME", str(find_state_folder() / "prefect"))
-    os.environ.setdefault("DO_NOT_TRACK", "1")
-    os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
-    os.environ.setdefault("PREFECT_LOGGING_LEVEL", "INFO" if debug else "CRITICAL")
-    os.environ.setdefault("PREFECT_LOGGING_TO_API_ENABLED", "false")
-    # Idle OpenMP threads would spin and take the cores from the renderer's threads: ten times as slow on two cores.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    defaults = {
+        # Not the working folder, which may be read-only.
+        "PREFECT_HOME": str(find_state_folder() / "prefect"),
+        # Nothing is sent to Prefect's makers.
+        "DO_NOT_TRACK": "1",
+        "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+        "PREFECT_LOGGING_LEVEL": "INFO" if debug else "CRITICAL",
+        "PREFECT_LOGGING_TO_API_ENABLED": "false",
+        # Idle OpenMP threads would spin and take the cores from the renderer's threads: ten times as slow on two cores.
+        "OMP_WAIT_POLICY": "PASSIVE",
+    }
+    for name, value in defaults.items():
+        # An empty variable counts as none, as in Prefect: an empty home would be the working folder.
+        if not os.environ.get(name):
+            os.environ[name] = value
+    if not debug:
+        # Python prints what a library logs before it has set up its log.
+        logging.getLogger("prefect").addHandler(logging.NullHandler())
+        # Prefect reads a file `.env` of the working folder, which may be another program's, many times.
+        logging.getLogger("dotenv").setLevel(logging.ERROR)
+    if any(option.startswith("error") for option in sys.warnoptions):
+        # PYTHONWARNINGS=error makes deprecations inside Prefect's server errors, and it answers no more.
+        warnings.simplefilter("default")
 
 
 def main() -> None:

@@ -79,7 +79,7 @@ def _show_run_or_artifact(name: str, opened: LocalStore, store: str, picture: Pa
     from genre_tasks.errors import InputError
 
     # Names of runs and keys of artifacts are both hex digits. Runs are fewer and asked for more often.
-    runs = [record for record in list_runs(store) if record["run"].startswith(name)]
+    runs = list_runs(store, name)
     if len(runs) == 1 and name:
         if picture is not None:
             raise _no_picture("a run")

@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
+import io
 import os
+import secrets
+import sys
+import tempfile
 import urllib.error
 import urllib.request
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr
+from http.client import HTTPException
 from pathlib import Path
 
-from flows.prefect_api.server_thread import ServerThread, database_url
-from flows.prefect_api.settings_sources import API_URL, check_settings_files, find_source
+from flows.prefect_api.network_variables import find_unusable_files, is_network_variable
+from flows.prefect_api.server_thread import DATABASE_VARIABLES, ServerThread, database_url, find_stated_database
+from flows.prefect_api.settings_sources import API_URL, check_settings_files, find_prefect_home, find_source
 from genre_tasks.errors import ConfigError
 
 _ANSWER_TIMEOUT_S = 10.0
 _SEND_TIMEOUT_S = 3.0
-# What httpx and websockets read when a client is made: a proxy of the company cannot reach this machine's loopback, and
-# one that they cannot speak to, or certificates that are not there, stop them before they look at the address.
-_NETWORK_VARIABLES = (
-    "http_proxy",
-    "https_proxy",
-    "all_proxy",
-    "ws_proxy",
-    "wss_proxy",
-    "ssl_cert_file",
-    "ssl_cert_dir",
-)
+_WITHOUT_PERMISSION = (401, 403)
 
 
 @contextmanager
@@ -47,12 +43,12 @@ def connect_to_prefect() -> Iterator[None]:
     url = read_api_url()
     if url is not None:
         check_server_answers(url)
+        _check_client_is_accepted(url)
         yield
         return
-    home = Path(os.environ["PREFECT_HOME"]).expanduser().absolute()
-    home.mkdir(parents=True, exist_ok=True)
+    home = _make_home()
     server = ServerThread(home)
-    changes = dict.fromkeys(name for name in os.environ if name.lower() in _NETWORK_VARIABLES)
+    changes = dict.fromkeys(name for name in os.environ if is_network_variable(name))
     with _changed_environment({**changes, **_server_settings(server.url, home)}):
         server.start()
         try:
@@ -74,13 +70,18 @@ def read_api_url() -> str | None:
     check_settings_files()
     # Whatever Prefect raises here is about its settings, which the user can change.
     try:
-        from prefect.settings import get_current_settings
+        # Prefect makes an HTTP client when it is imported, also where none is needed.
+        with _changed_environment(dict.fromkeys(find_unusable_files())), redirect_stderr(io.StringIO()) as printed:
+            from prefect.settings import get_current_settings
 
-        return get_current_settings().api.url
+            url = get_current_settings().api.url
     except Exception as error:
         first_line = " ".join(str(error).split())[:300]
         remedy = "Correct or unset the variable PREFECT_… that it names, in the environment, a file or a profile."
         raise ConfigError(f"Prefect does not accept its settings: {first_line}", remedy=remedy) from error
+    # What Prefect prints while it is imported is for the user, unless the error above says the same.
+    sys.stderr.write(printed.getvalue())
+    return url
 
 
 def check_server_answers(url: str) -> None:
@@ -92,25 +93,67 @@ def check_server_answers(url: str) -> None:
     Raises:
         ConfigError: it does not answer; says where the address comes from and how to unset it.
     """
+    for variable, reason in find_unusable_files().items():
+        remedy = f"Correct or unset {variable}."
+        raise ConfigError(f"{variable}={os.environ[variable]} cannot be used ({reason})", remedy=remedy)
     try:
-        # A server that wants a password answers too: with an error that the flow will explain.
         with urllib.request.urlopen(f"{url.rstrip('/')}/health", timeout=_ANSWER_TIMEOUT_S):
             return
-    except urllib.error.HTTPError:
-        return
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "reason", error)
+    except urllib.error.HTTPError as error:
+        # A server that wants a password answers too; whether it takes ours, Prefect's client finds out.
+        if error.code in _WITHOUT_PERMISSION:
+            return
+        raise _no_server(url, f"HTTP status {error.code}") from error
+    except (OSError, ValueError, HTTPException) as error:
+        raise _no_server(url, getattr(error, "reason", error)) from error
+
+
+def _no_server(url: str, reason: object) -> ConfigError:
+    remedy = f"Start it, or go on without it. {find_source(API_URL) or ''}".strip()
+    return ConfigError(f"no Prefect server answers at {API_URL}={url} ({reason})", remedy=remedy)
+
+
+def _check_client_is_accepted(url: str) -> None:
+    """Asks the user's own server for its version, as every flow does at its start: with the password, if any."""
+    from prefect.client.orchestration import get_client
+
+    # Whatever Prefect's client raises here ends every flow.
+    try:
+        with get_client(sync_client=True) as client:
+            client.raise_for_api_version_mismatch()
+    except Exception as error:
+        first_line = next(iter(str(error).splitlines()), type(error).__name__)
+        remedy = f"Set PREFECT_API_AUTH_STRING or PREFECT_API_KEY if it wants one. {find_source(API_URL) or ''}".strip()
         raise ConfigError(
-            f"no Prefect server answers at {API_URL}={url} ({reason})",
-            remedy=f"Start it, or go on without it. {find_source(API_URL) or ''}".strip(),
+            f"{API_URL}={url} does not serve this client of Prefect: {first_line}", remedy=remedy
         ) from error
+
+
+def _make_home() -> Path:
+    """Makes the folder of the database, and tries to write there."""
+    home = find_prefect_home().absolute()
+    try:
+        home.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=home):
+            pass
+    except OSError as error:
+        problem = f"PREFECT_HOME is no folder that can be written ({error.strerror})"
+        remedy = "Unset PREFECT_HOME, or name a folder in which this user may write, and with space left."
+        raise ConfigError(problem, remedy=remedy, file=home) from error
+    return home
 
 
 def _server_settings(url: str, home: Path) -> dict[str, str]:
     import certifi
 
+    password = secrets.token_hex()
     settings = {
         API_URL: url,
+        # What the user has set for a server of the user's own would keep this process's client out. The password
+        # also keeps other users of this machine out.
+        "PREFECT_SERVER_API_BASE_PATH": "/api",
+        "PREFECT_SERVER_API_AUTH_STRING": password,
+        "PREFECT_API_AUTH_STRING": password,
         # Certificates are read for every client, and those of SSL_CERT_FILE were noted when Prefect was imported.
         "PREFECT_API_SSL_CERT_FILE": certifi.where(),
         # Prefect must never start a second server: it would stay behind.
@@ -118,9 +161,8 @@ def _server_settings(url: str, home: Path) -> dict[str, str]:
         # Nothing is configured by blocks here, and they take a second of the start.
         "PREFECT_API_BLOCKS_REGISTER_ON_START": "false",
     }
-    names = ("PREFECT_API_DATABASE_CONNECTION_URL", "PREFECT_SERVER_DATABASE_CONNECTION_URL")
-    if not any(name in os.environ for name in names):
-        settings[names[0]] = database_url(home)
+    if find_stated_database() is None:
+        settings[DATABASE_VARIABLES[0]] = database_url(home)
     return settings
 
 
@@ -136,13 +178,16 @@ def _changed_environment(changes: Mapping[str, str | None]) -> Iterator[None]:
 
 
 def _set_environment(variables: Mapping[str, str | None]) -> None:
-    from prefect.context import refresh_global_settings_context
-
+    # Prefect is not imported before it needs to be: with its import it reads the environment.
+    if not variables:
+        return
     for name, value in variables.items():
         if value is None:
             os.environ.pop(name, None)
         else:
             os.environ[name] = value
+    from prefect.context import refresh_global_settings_context
+
     # Prefect read the environment when it was imported; threads of its own read the settings from here.
     refresh_global_settings_context()
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import fcntl
+import os
+import resource
 import socket
 import sqlite3
 import threading
@@ -24,7 +26,22 @@ if TYPE_CHECKING:
 
 _START_TIMEOUT_S = 120.0
 _STOP_TIMEOUT_S = 5.0
+# The server, its client and the event streams have about 30 open; a server that cannot accept waits forever.
+_MIN_OPEN_FILES = 64
+# What the file is to blame for; others, such as a full disk, are not cured by its removal.
+_DAMAGED_CODES = (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 _DATABASE = "prefect.db"
+DATABASE_VARIABLES = ("PREFECT_API_DATABASE_CONNECTION_URL", "PREFECT_SERVER_DATABASE_CONNECTION_URL")
+"""Either names the database of a server, also of the one in this process."""
+
+
+def find_stated_database() -> str | None:
+    """Finds the variable by which the user names a database for Prefect.
+
+    Returns:
+        Its name; ``None`` where the database is the usual one.
+    """
+    return next((name for name in DATABASE_VARIABLES if os.environ.get(name)), None)
 
 
 def database_url(folder: Path) -> str:
@@ -60,6 +77,7 @@ class ServerThread:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
+        self._stated_database = find_stated_database()
         # The system chooses a free port, so that two runs never meet. Requests queue from now on.
         self._socket = socket.create_server(("127.0.0.1", 0))
         self.url = f"http://127.0.0.1:{self._socket.getsockname()[1]}/api"
@@ -74,6 +92,7 @@ class ServerThread:
         Raises:
             ResourceError: it cannot start; the message has its reason.
         """
+        _ensure_open_files()
         self._thread.start()
         if not self._ended_start.wait(_START_TIMEOUT_S):
             raise self._start_error(f"it has not started within {_START_TIMEOUT_S:.0f} s")
@@ -84,7 +103,8 @@ class ServerThread:
         """Ends the server, once it has answered what it was asked; it never waits for long."""
         if self._server is not None:
             self._server.should_exit = True
-        self._thread.join(_STOP_TIMEOUT_S)
+        if self._thread.ident is not None:
+            self._thread.join(_STOP_TIMEOUT_S)
         self._socket.close()
 
     def _serve(self) -> None:
@@ -116,11 +136,29 @@ class ServerThread:
             await lifespan.__aexit__(None, None, None)
 
     def _start_error(self, reason: str) -> GenreError:
+        if self._stated_database is not None:
+            remedy = f"Correct or unset {self._stated_database}, which names its database."
+            return ResourceError(f"Prefect's local API cannot start: {reason}", remedy=remedy)
         database = self._folder / _DATABASE
         remedy = "Free disk space and memory there."
-        if isinstance(_root_cause(self._error), sqlite3.DatabaseError) or "revision" in reason:
+        cause = _root_cause(self._error)
+        is_damaged = isinstance(cause, sqlite3.Error) and cause.sqlite_errorcode & 0xFF in _DAMAGED_CODES
+        if is_damaged or "revision" in reason:
             remedy = "Delete that file if it is damaged or of another version: it holds records of runs, no results."
         return ResourceError(f"Prefect's local API cannot start: {reason}", remedy=remedy, file=database)
+
+
+def _ensure_open_files() -> None:
+    """Raises the number of files that this process may have open where it is very low."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == resource.RLIM_INFINITY or soft >= _MIN_OPEN_FILES:
+        return
+    if hard != resource.RLIM_INFINITY and hard < _MIN_OPEN_FILES:
+        raise ResourceError(
+            f"Prefect's local API cannot start: this process may have only {hard} files open",
+            remedy=f"Allow {_MIN_OPEN_FILES} or more: ulimit -n 1024.",
+        )
+    resource.setrlimit(resource.RLIMIT_NOFILE, (_MIN_OPEN_FILES, hard))
 
 
 @contextmanager

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import os
+import re
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from genre_tasks.errors import ConfigError
+from genre_tasks.user_paths import expand_user_path
 
 API_URL = "PREFECT_API_URL"
 """The setting with the address of the user's own Prefect server."""
 
 _ENV_FILE = Path(".env")
+_ENV_ASSIGNMENT = re.compile(r"^\s*(?:export\s+)?(\w+)\s*=", re.MULTILINE)
 # Prefect reads these in the working folder: (file, the table that holds its settings).
 _TOML_FILES = ((Path("prefect.toml"), ()), (Path("pyproject.toml"), ("tool", "prefect")))
 
@@ -26,12 +29,7 @@ def check_settings_files() -> None:
     """
     for path, _ in _TOML_FILES:
         _read_toml(path)
-    try:
-        _ENV_FILE.read_text(encoding="utf-8")
-    except (FileNotFoundError, IsADirectoryError):
-        pass
-    except (OSError, UnicodeDecodeError) as error:
-        raise _unreadable(_ENV_FILE, error) from error
+    _read_env_file()
 
 
 def find_source(variable: str) -> str | None:
@@ -52,8 +50,9 @@ def find_source(variable: str) -> str | None:
     >>> del os.environ["PREFECT_EXAMPLE"]
     """
     # In Prefect's own order, first hit wins. An empty variable counts as none there.
-    if os.environ.get(variable):
-        return f"It comes from the environment: unset {variable}."
+    for name, value in os.environ.items():
+        if value and name.upper() == variable:
+            return f"It comes from the environment: unset {name}."
     for path, setting in _settings_in_files(variable):
         return f"It comes from {path.absolute()}: remove {setting} there."
     profiles = _profiles_file()
@@ -62,27 +61,38 @@ def find_source(variable: str) -> str | None:
     return None
 
 
+def find_prefect_home() -> Path:
+    """Finds the folder of Prefect's database and profiles.
+
+    Returns:
+        ``PREFECT_HOME``, or ``~/.prefect`` where that is unset or empty.
+
+    Raises:
+        InputError: it begins with the home folder of a user who is not there.
+    """
+    return expand_user_path(os.environ.get("PREFECT_HOME") or "~/.prefect")
+
+
 def _profiles_file() -> Path:
     stated = os.environ.get("PREFECT_PROFILES_PATH")
-    home = os.environ.get("PREFECT_HOME") or "~/.prefect"
-    return Path(stated or f"{home}/profiles.toml").expanduser()
+    return expand_user_path(stated) if stated else find_prefect_home() / "profiles.toml"
 
 
 def _read_active_profile(profiles: Path) -> Mapping[str, Any]:
     known = _read_toml(profiles)
     active = os.environ.get("PREFECT_PROFILE") or known.get("active", "")
     settings = known.get("profiles", {})
-    profile = settings.get(active, {}) if isinstance(settings, Mapping) else {}
+    is_readable = isinstance(settings, Mapping) and isinstance(active, str)
+    profile = settings.get(active, {}) if is_readable else {}
     return profile if isinstance(profile, Mapping) else {}
 
 
 def _settings_in_files(variable: str) -> Iterator[tuple[Path, str]]:
     """(file, name of the setting in it) of every file of the working folder that sets a variable."""
-    if _ENV_FILE.is_file():
-        lines = _ENV_FILE.read_text(encoding="utf-8").splitlines()
-        names = {line.removeprefix("export ").partition("=")[0].strip() for line in lines}
-        if variable in names:
-            yield _ENV_FILE, variable
+    for name in _ENV_ASSIGNMENT.findall(_read_env_file()):
+        # Prefect takes the names of variables in any case.
+        if name.upper() == variable:
+            yield _ENV_FILE, name
     # PREFECT_API_URL is api.url in a file of tables.
     keys = variable.removeprefix("PREFECT_").lower().split("_", 1)
     for path, table in _TOML_FILES:
@@ -93,10 +103,19 @@ def _settings_in_files(variable: str) -> Iterator[tuple[Path, str]]:
             yield path, ".".join(keys)
 
 
+def _read_env_file() -> str:
+    try:
+        return _ENV_FILE.read_text(encoding="utf-8")
+    except (FileNotFoundError, IsADirectoryError):
+        return ""
+    except (OSError, UnicodeDecodeError) as error:
+        raise _unreadable(_ENV_FILE, error) from error
+
+
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, IsADirectoryError):
+    except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         return {}
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise _unreadable(path, error) from error

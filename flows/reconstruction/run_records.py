@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from flows.error_record import describe_record
 from flows.pipeline.definition import PIPELINE
 from flows.pipeline.stage_runner import ArtifactRef
+from flows.reconstruction.record_files import read_record
 from flows.reconstruction.run_summary import ChunkSummary, RunSummary, StageSummary, add_counts, place_over_seconds
 from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import InputError
@@ -140,18 +141,24 @@ def summarise_run(run: FinishedRun) -> RunSummary:
     )
 
 
-def list_runs(store: str) -> list[dict[str, Any]]:
-    """Reads the records of all finished runs of a store.
+def list_runs(store: str, name: str = "") -> list[dict[str, Any]]:
+    """Reads the records of finished runs of a store.
 
     Args:
         store: folder (or URI) of the store.
+        name: how the names of the runs begin; the records of others are not read.
 
     Returns:
         The records, oldest first.
+
+    Raises:
+        InputError: a record is damaged.
     """
+    paths = [
+        path for path in (open_store(store).root / _FOLDER).glob("*/run.json") if path.parent.name.startswith(name)
+    ]
     # The time of the file is when the run ended; the record itself holds no time.
-    paths = sorted((open_store(store).root / _FOLDER).glob("*/run.json"), key=lambda path: path.stat().st_mtime)
-    return [json.loads(path.read_text(encoding="utf-8")) for path in paths]
+    return [read_record(path) for path in sorted(paths, key=lambda path: path.stat().st_mtime)]
 
 
 def read_stage_value(store: str, run: str, chunk: int | None, stage: str) -> tuple[int, Any]:
@@ -324,10 +331,9 @@ def _find_by_path(store: str, ref: ArtifactRef) -> Artifact:
 
 
 def _find_record(store: str, run: str) -> dict[str, Any]:
-    found = [record for record in list_runs(store) if record["run"].startswith(run)]
+    found = list_runs(store, run)
     # Every name begins with an empty text, which an unset variable of a script's leaves.
     if len(found) != 1 or not run:
-        raise InputError(
-            f"{len(found)} runs of this store begin with '{run}'", remedy="`genre show runs` lists them.", file=store
-        )
+        problem = f"{len(found)} runs of this store begin with '{run}'"
+        raise InputError(problem, remedy="`genre show runs` lists them.", file=store)
     return found[0]

@@ -86,6 +86,7 @@ def test_the_log_of_a_fault_goes_where_the_user_may_write(tmp_path: Path, monkey
         ("raise NotADirectoryError(20, 'Not a directory', '/data/x')", 2, "ENOTDIR"),
         ("raise MemoryError", 1, "not enough memory"),
         ('raise RuntimeError("DefaultCPUAllocator: can\'t allocate memory: 9 bytes")', 1, "not enough memory"),
+        ('raise ImportError("libtorch.so: failed to map segment from shared object")', 1, "not enough memory"),
         ("raise KeyboardInterrupt", 130, "stopped"),
         ("raise EOFError('Ran out of input')", 70, "a fault of ours: EOFError"),
         ("raise BaseExceptionGroup('tasks', [ValueError('odd')])", 70, "a fault of ours: ValueError: odd"),

@@ -7,15 +7,20 @@ import sqlite3
 import subprocess
 import sys
 import textwrap
+import threading
 from collections.abc import Callable
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
 
+from flows.cli.main import prepare_environment
 from flows.machine.state_folder import find_state_folder
 from flows.prefect_api.connection import check_server_answers, connect_to_prefect
-from flows.prefect_api.settings_sources import check_settings_files, find_source
-from genre_tasks.errors import ConfigError
+from flows.prefect_api.network_variables import find_unusable_files
+from flows.prefect_api.server_thread import ServerThread
+from flows.prefect_api.settings_sources import check_settings_files, find_prefect_home, find_source
+from genre_tasks.errors import ConfigError, InputError
 
 ROOT = Path(__file__).resolve().parents[2]
 NOBODY = "http://127.0.0.1:9/api"
@@ -42,6 +47,7 @@ FLOW = textwrap.dedent(
 def run_flow(folder: Path, script: str = FLOW, **variables: str) -> subprocess.CompletedProcess[str]:
     inherited = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
     settings = {"PREFECT_HOME": str(folder / "prefect"), "PYTHONPATH": str(ROOT), "PREFECT_LOGGING_LEVEL": "CRITICAL"}
+    settings |= {"DO_NOT_TRACK": "1", "PREFECT_SERVER_ANALYTICS_ENABLED": "false"}
     return subprocess.run(
         [sys.executable, "-c", script],
         env=inherited | settings | variables,
@@ -61,8 +67,12 @@ def test_a_flow_keeps_its_records_behind_a_proxy_and_in_a_folder_of_any_name(tmp
     folder = tmp_path / "50%2F off? #1 – é"
     folder.mkdir()
     proxies = dict.fromkeys(("HTTP_PROXY", "http_proxy", "https_proxy"), "http://10.255.255.1:3128")
-    done = run_flow(folder, ALL_PROXY="socks5://10.255.255.1:1080", SSL_CERT_FILE="/nowhere/ca.pem", **proxies)
+    # A company's server may want a password and serve below another path.
+    server = {"PREFECT_SERVER_API_AUTH_STRING": "a:b", "PREFECT_API_KEY": "x", "PREFECT_SERVER_API_BASE_PATH": "/p"}
+    files = {"SSL_CERT_FILE": "/nowhere/ca.pem", "SSLKEYLOGFILE": "/nowhere/keys"}
+    done = run_flow(folder, ALL_PROXY="socks5://10.255.255.1:1080", NO_PROXY="[::1,,*.x", **server, **files, **proxies)
     assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
     # One process, the records are complete, and the environment is put back.
     assert done.stdout.splitlines() == [
         "20 0 None",
@@ -125,8 +135,12 @@ def test_a_server_that_is_not_there_is_named_with_its_source(tmp_path: Path, mon
     assert str(tmp_path / "pyproject.toml") in str(find_source("PREFECT_API_URL"))
     (tmp_path / "prefect.toml").write_text('[api]\nurl = "http://x"\n')
     assert str(tmp_path / "prefect.toml") in str(find_source("PREFECT_API_URL"))
-    (tmp_path / ".env").write_text("PREFECT_API_URL=http://x\n")
-    assert str(tmp_path / ".env") in str(find_source("PREFECT_API_URL"))
+    for line in ("PREFECT_API_URL=http://x\n", "A=1\n export  prefect_api_url = http://x\n"):
+        (tmp_path / ".env").write_text(line)
+        assert str(tmp_path / ".env") in str(find_source("PREFECT_API_URL"))
+    (tmp_path / ".env").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        find_source("PREFECT_API_URL")
 
 
 @pytest.mark.parametrize("name", ["pyproject.toml", "prefect.toml"])
@@ -146,6 +160,7 @@ def test_a_setting_that_prefect_refuses_is_one_line(tmp_path: Path) -> None:
     script = FLOW.replace("with connect", "import flows.prefect_api.connection as c\nwith c.connect", 1)
     done = run_flow(tmp_path, script, PREFECT_SERVER_API_PORT="many")
     assert "genre_tasks.errors.ConfigError: Prefect does not accept its settings" in done.stderr
+    assert "Failed to initialize plugins" not in done.stderr
 
 
 def test_the_state_folder_is_one_that_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -165,3 +180,135 @@ def test_nothing_is_started_beside_a_server_of_the_user(monkeypatch: pytest.Monk
     monkeypatch.setattr("flows.prefect_api.connection.read_api_url", lambda: NOBODY)
     with pytest.raises(ConfigError, match="no Prefect server answers"), connect_to_prefect():
         raise AssertionError("the block must not run")
+
+
+@pytest.mark.parametrize("status", [404, 500, 503])
+def test_a_server_of_something_else_is_no_prefect_server(status: int) -> None:
+    """Report: none found; case 11 of the list of odd logs (an address at which another program answers)."""
+
+    class Other(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(status)
+            self.end_headers()
+
+        def log_message(self, *args: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Other) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        with pytest.raises(ConfigError, match=f"no Prefect server answers at .* .HTTP status {status}"):
+            check_server_answers(f"http://127.0.0.1:{server.server_port}/api")
+        server.shutdown()
+
+
+@pytest.mark.parametrize("url", ["http://a b/api", "garbage", "http://127.0.0.1:99999/api", "http://127.0.0.1:x/api"])
+def test_an_address_that_is_none_is_one_error(url: str) -> None:
+    with pytest.raises(ConfigError, match="no Prefect server answers"):
+        check_server_answers(url)
+
+
+def test_a_users_server_that_refuses_this_client_is_one_error(tmp_path: Path) -> None:
+    """Report: PrefectHQ/prefect#5837 (a traceback of the client, and nothing says which address)."""
+    script = textwrap.dedent(
+        """
+        import os
+        from flows.prefect_api.connection import connect_to_prefect
+        with connect_to_prefect():
+            # The server of the outer block is the user's own for the inner one.
+            with connect_to_prefect():
+                print("accepted")
+            os.environ["PREFECT_API_URL"] += "/of/another/program"
+            import flows.prefect_api.connection as connection
+            connection.check_server_answers = lambda url: None
+            connection._set_environment({"PREFECT_API_URL": os.environ["PREFECT_API_URL"]})
+            with connect_to_prefect():
+                print("accepted")
+        """
+    )
+    done = run_flow(tmp_path, script)
+    assert done.stdout == "accepted\n", done.stderr
+    assert "ConfigError: PREFECT_API_URL=http://127.0.0.1:" in done.stderr
+    assert "does not serve this client of Prefect" in done.stderr
+
+
+def test_certificates_that_are_not_there_are_named_for_a_users_server(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "ca.pem").write_text("no certificate")
+    monkeypatch.setenv("SSL_CERT_FILE", str(tmp_path / "ca.pem"))
+    monkeypatch.setenv("SSLKEYLOGFILE", str(tmp_path / "missing" / "keys"))
+    assert set(find_unusable_files()) == {"SSL_CERT_FILE", "SSLKEYLOGFILE"}
+    with pytest.raises(ConfigError, match=r"SSL_CERT_FILE=.*ca\.pem cannot be used"):
+        check_server_answers(NOBODY)
+    monkeypatch.delenv("SSL_CERT_FILE")
+    monkeypatch.setenv("SSLKEYLOGFILE", str(tmp_path / "keys"))
+    assert find_unusable_files() == {}
+
+
+def test_a_prefect_home_is_a_folder_that_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Report: none found; case 12 of the list of odd logs (a folder for the state that is none)."""
+    (tmp_path / "file").write_text("")
+    for home in (tmp_path / "file", tmp_path / "file" / "below"):
+        monkeypatch.setenv("PREFECT_HOME", str(home))
+        with pytest.raises(ConfigError, match="PREFECT_HOME is no folder that can be written"), connect_to_prefect():
+            raise AssertionError("the block must not run")
+    monkeypatch.setenv("PREFECT_HOME", "~nobody-of-this-name/x")
+    with pytest.raises(InputError, match="there is no home folder"):
+        find_prefect_home()
+    # An empty variable counts as none: the database must not land in the working folder.
+    monkeypatch.setenv("PREFECT_HOME", "")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    prepare_environment(debug=False)
+    assert os.environ["PREFECT_HOME"] == str(tmp_path / "state" / "genre" / "prefect")
+
+
+def test_odd_profiles_name_no_setting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PREFECT_HOME", str(tmp_path))
+    for text in ("active = [1]\n[profiles]\nx = 1\n", 'active = "x"\nprofiles = 3\n', "[profiles.x]\n"):
+        (tmp_path / "profiles.toml").write_text(text)
+        assert find_source("PREFECT_API_URL") is None
+
+
+def test_a_database_of_the_users_is_named_by_its_variable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PREFECT_API_DATABASE_CONNECTION_URL", "garbage")
+    server = ServerThread(tmp_path)
+    server.stop()
+    assert "unset PREFECT_API_DATABASE_CONNECTION_URL" in str(server._start_error("no"))
+
+
+def test_warnings_as_errors_do_not_stop_the_server() -> None:
+    """Report: none found; case 10 of the list of odd logs (PYTHONWARNINGS=error of a build machine: no answer)."""
+    script = "import flows.cli.main as m, warnings\nm.prepare_environment(False)\nwarnings.warn('x')\nprint('on')"
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-W", "error::UserWarning", "-c", script]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    assert done.stdout == "on\n"
+
+
+@pytest.mark.parametrize(
+    ("code", "remedy"),
+    [
+        (sqlite3.SQLITE_FULL, "Free disk space"),
+        (sqlite3.SQLITE_IOERR_WRITE, "Free disk space"),
+        (sqlite3.SQLITE_CORRUPT, "Delete that file"),
+    ],
+)
+def test_a_full_disk_is_no_damaged_database(code: int, remedy: str, tmp_path: Path) -> None:
+    server = ServerThread(tmp_path)
+    server.stop()
+    cause = sqlite3.OperationalError("disk")
+    cause.sqlite_errorcode = code
+    server._error = RuntimeError("start")
+    server._error.__cause__ = cause
+    assert remedy in str(server._start_error("disk"))
+
+
+def test_too_few_open_files_are_one_error(tmp_path: Path) -> None:
+    """Report: none found; case 10 of the list of odd logs (a server that can accept nobody waits forever)."""
+    limit = "import resource\nresource.setrlimit(resource.RLIMIT_NOFILE, ({soft}, {hard}))\n"
+    script = (
+        limit + "from flows.prefect_api.server_thread import _ensure_open_files as ensure\n"
+        "ensure()\nprint(resource.getrlimit(resource.RLIMIT_NOFILE)[0])\n"
+    )
+    assert run_flow(tmp_path, script.format(soft=40, hard=40)).stderr.splitlines()[-1].endswith("ulimit -n 1024.")
+    assert run_flow(tmp_path, script.format(soft=40, hard=200)).stdout == "64\n"
