@@ -73,7 +73,7 @@ LISTED: dict[int, tuple[str, tuple[str, ...] | str]] = {
             f"{_POSES}::test_standstill_and_odd_timestamps",
             f"{_POSES}::test_microseconds_survive",
             "tests/logs/test_pandaset_reading.py",
-            "tests/logs/test_log_validation.py",
+            "tests/log_checks/test_check_log.py",
         ),
     ),
     23: (
