@@ -43,7 +43,8 @@ def end_on_signals() -> None:
     A signal that the process was started to ignore stays ignored, as ``nohup`` and background jobs of a shell ask.
     A second signal ends the process at once.
     """
-    if threading.current_thread() is not threading.main_thread():
+    is_main_thread = threading.current_thread() is threading.main_thread()
+    if not is_main_thread or signal.getsignal(signal.SIGTERM) is _interrupt:
         return
     for name in _SIGNALS:
         # SIGHUP does not exist everywhere.

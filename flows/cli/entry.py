@@ -1,0 +1,23 @@
+"""What the installed command ``genre`` calls: signals are handled before anything else is imported."""
+
+from __future__ import annotations
+
+import sys
+
+from flows.cli.signals import Interrupted, end_on_signals
+
+
+def main() -> None:
+    """Runs the command.
+
+    Raises:
+        SystemExit: always, with the exit status.
+    """
+    end_on_signals()
+    try:
+        # Some tenths of a second, in which a user may think better of it.
+        from flows.cli.main import main as run_main
+    except Interrupted as interruption:
+        sys.stderr.write("stopped\n")
+        raise SystemExit(interruption.exit_status) from None
+    run_main()
