@@ -17,7 +17,9 @@ def main() -> None:
     try:
         # Some tenths of a second, in which a user may think better of it.
         from flows.cli.main import main as run_main
+
+        run_main()
     except Interrupted as interruption:
+        # Before the command itself has begun; later on it catches this, too.
         sys.stderr.write("stopped\n")
         raise SystemExit(interruption.exit_status) from None
-    run_main()

@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import sys
 import threading
 import time
+from contextlib import suppress
 from types import FrameType
 
 # A user who stops a command waits for it; what takes longer than this is not worth the wait.
@@ -81,7 +83,31 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     for name in _SIGNALS:
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), _end_at_once)
+    # Half a module stays behind where an import is broken off, and some packages go on with it.
+    if _is_importing(frame):
+        _say_stopped(_EXIT_STATUS_BASE + number)
+        _end_at_once(number, frame)
     raise Interrupted(number)
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _say_stopped(exit_status: int) -> None:
+    """What a command prints that is stopped: a word, and its JSON if it is to print any."""
+    # The import under way may be that of this very module.
+    print_unfinished = getattr(sys.modules.get("flows.cli.outcome"), "print_unfinished", None)
+    with suppress(OSError, ValueError):
+        sys.stderr.write("stopped\n")
+        if print_unfinished is not None:
+            print_unfinished("interrupted", exit_status)
+        sys.stdout.flush()
+        sys.stderr.flush()
 
 
 def _end_at_once(number: int, frame: FrameType | None) -> None:
