@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 from pathlib import Path
 
 import pytest
@@ -10,6 +9,7 @@ import pytest
 from tests.hard_cases.case_list import LISTED, SECTIONS
 from tests.hard_cases.case_measurements import ROWS
 from tests.hard_cases.stability import Row, document, key, parsed
+from tests.named_tests import is_test
 
 ROOT = Path(__file__).parents[2]
 DOCUMENT = ROOT / "docs/reference/stability.md"
@@ -36,10 +36,7 @@ NAMED = {test for _, tests in LISTED.values() if not isinstance(tests, str) for 
 
 @pytest.mark.parametrize("test", sorted(NAMED))
 def test_a_named_test_exists(test):
-    file, _, name = test.partition("::")
-    tree = ast.parse((ROOT / file).read_text())
-    names = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
-    assert name in names if name else any(n.startswith("test_") for n in names)
+    assert is_test(test)
 
 
 def test_a_measurement_over_its_bound_or_of_an_unknown_row_fails(stability):

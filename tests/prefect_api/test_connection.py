@@ -44,14 +44,16 @@ FLOW = textwrap.dedent(
 )
 
 
-def run_flow(folder: Path, script: str = FLOW, **variables: str) -> subprocess.CompletedProcess[str]:
+def run_flow(
+    folder: Path, script: str = FLOW, working_folder: Path | None = None, **variables: str
+) -> subprocess.CompletedProcess[str]:
     inherited = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
     settings = {"PREFECT_HOME": str(folder / "prefect"), "PYTHONPATH": str(ROOT), "PREFECT_LOGGING_LEVEL": "CRITICAL"}
     settings |= {"DO_NOT_TRACK": "1", "PREFECT_SERVER_ANALYTICS_ENABLED": "false"}
     return subprocess.run(
         [sys.executable, "-c", script],
         env=inherited | settings | variables,
-        cwd=folder,
+        cwd=working_folder or folder,
         capture_output=True,
         text=True,
         timeout=120,
@@ -174,6 +176,15 @@ def test_the_state_folder_is_one_that_can_be_written(tmp_path: Path, monkeypatch
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert find_state_folder() == tmp_path / f"genre-{os.getuid()}"
     assert find_state_folder().stat().st_mode & 0o077 == 0
+
+
+def test_a_working_folder_may_be_read_only(tmp_path: Path) -> None:
+    """Report: DCAN-Labs/BIBSnet#43."""
+    # Nobody can make a file there, not even the superuser.
+    done = run_flow(tmp_path, working_folder=Path("/proc"))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[0].startswith("20 0 ")
+    assert {path.name for path in tmp_path.iterdir()} == {"prefect"}
 
 
 def test_nothing_is_started_beside_a_server_of_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
