@@ -26,7 +26,7 @@ _MARGIN_M = 0.1
 # Fewer points at the ends of an object may be of something else.
 _MIN_END_POINTS = 5
 _MIN_POINTS = 20
-# In streets 0 to 99 and the real sequence, sound boxes lose 6 times the points they gain, or more.
+# In sound streets and the real sequence, other frames gain 5 % of the points that they lose at most.
 _MIN_VIEWS = 2
 _MIN_RATIO = 4.0
 _MIN_VIEW_FRACTION = 0.7
@@ -96,8 +96,8 @@ def find_boxes_of_another_frame(sample: LogSample) -> Iterator[Finding]:
     # The right order explains all objects; another one may by chance explain some of them as well.
     order, evidence = max(clear, key=lambda pair: (2 * pair[1].better_views - pair[1].views, pair[1].gained))
     message = (
-        f"{evidence.inside} LiDAR points lie in the boxes of moving objects, and {evidence.inside_other} where the boxes "
-        f"of {order.name} are taken"
+        f"{evidence.inside} LiDAR points lie in the boxes of moving objects, and {evidence.inside_other} "
+        f"where the boxes of {order.name} are taken"
     )
     numbers = {
         "points_inside": float(evidence.inside),
