@@ -192,7 +192,11 @@ def _points_around(
     high = world_SE3_box[:, :2, 3].max(axis=0) + reach_m
     first, end = np.searchsorted(points[:, 0], (low[0], high[0]))
     strip = points[first:end]
-    return strip[(strip[:, 1] > low[1]) & (strip[:, 1] < high[1])]
+    around = strip[(strip[:, 1] > low[1]) & (strip[:, 1] < high[1])]
+    if not len(around):
+        return around
+    # Boxes below the road would hold points of it.
+    return around[around[:, 2] > np.percentile(around[:, 2], 5) + _GROUND_MARGIN_M]
 
 
 def _is_inside(
