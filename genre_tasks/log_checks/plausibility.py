@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from genre_tasks.log_checks.box_points import find_boxes_without_points
+from genre_tasks.log_checks.box_times import find_boxes_of_another_frame
 from genre_tasks.log_checks.boxes import find_implausible_boxes
 from genre_tasks.log_checks.calibration import find_miscalibration
 from genre_tasks.log_checks.camera_poses import find_implausible_camera_poses
@@ -31,6 +32,7 @@ _CHECKS: tuple[Callable[[LogSample], Iterable[Finding]], ...] = (
     find_inconsistent_sweeps,
     find_implausible_boxes,
     find_boxes_without_points,
+    find_boxes_of_another_frame,
     find_miscalibration,
 )
 
