@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from flows.cli.signals import Interrupted, end_on_signals
+from flows.cli.signals import Interrupted, end_on_signals, exit_process
 
 
 def main() -> None:
@@ -22,4 +22,4 @@ def main() -> None:
     except Interrupted as interruption:
         # Before the command itself has begun; later on it catches this, too.
         sys.stderr.write("stopped\n")
-        raise SystemExit(interruption.exit_status) from None
+        exit_process(interruption.exit_status)

@@ -24,7 +24,7 @@ from flows.cli.range import range_command
 from flows.cli.render import render
 from flows.cli.run import run
 from flows.cli.show import show
-from flows.cli.signals import end_on_signals
+from flows.cli.signals import end_on_signals, exit_process
 from flows.cli.streams import prepare_streams
 from flows.cli.train import app as train_app
 from flows.cli.verify import verify
@@ -138,7 +138,7 @@ def main() -> None:
         with command.make_context("genre", words) as context:
             command.invoke(context)
 
-    raise SystemExit(run_guarded(invoke, debug))
+    exit_process(run_guarded(invoke, debug))
 
 
 if __name__ == "__main__":

@@ -56,6 +56,25 @@ def end_on_signals() -> None:
     _end_soon_after_signals()
 
 
+def exit_process(status: int) -> None:
+    """Ends the process with an exit status; after a signal at once, without waiting for any thread.
+
+    Args:
+        status: of the command.
+
+    Raises:
+        SystemExit: unless a signal ended the command.
+    """
+    numbers = [getattr(signal, name) for name in _SIGNALS if hasattr(signal, name)]
+    if status - _EXIT_STATUS_BASE in numbers:
+        # Prefect's API may still be starting in its thread, which Python cannot clean up after.
+        with suppress(OSError, ValueError):
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(status)
+    raise SystemExit(status)
+
+
 def _end_soon_after_signals() -> None:
     """Ends the process some seconds after a signal, whatever becomes of it.
 
