@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from genre_tasks.log_checks.camera_view import FEW_IMAGES, score_edges, view_camera
 from genre_tasks.log_checks.edge_agreement import Agreement
+from genre_tasks.log_checks.image_order import find_image_order
 from genre_tasks.log_checks.log_sample import LogSample
 from genre_tasks.log_checks.miscalibration_causes import explain_by_turn, list_explanations
 from genre_tasks.logs.findings import Finding, Severity
@@ -20,6 +21,8 @@ _CHANCE_SCORE = 3.5
 # A small turn is worth a note where the edges are this clear about it.
 _CLEAR_SCORE = 8.0
 _CLEAR_MARGIN = 4.0
+# In reversed or shifted order, images of streets mostly score 2 to 6: a higher bound costs time in every sound log.
+_ORDERED_SCORE = 6.0
 # Cameras whose cause is searched for by all means: where more are wrong, they mostly have one cause.
 _EXPLAINED_CAMERAS = 2
 
@@ -32,16 +35,19 @@ def find_miscalibration(sample: LogSample) -> Iterator[Finding]:
 
     Yields:
         For each camera at most one of ``turned_camera``, ``odd_field_of_view``, ``intrinsics_of_another_size``,
-        ``rolled_camera``, ``flipped_images``, ``images_of_another_camera``, ``images_of_another_frame`` and
-        ``lidar_image_mismatch``. Images or sweeps without enough edges give no verdict. A turn within the accuracy of
-        good calibrations is a note, and only where the edges are clear about it.
+        ``rolled_camera``, ``flipped_images``, ``images_of_another_camera``, ``images_of_another_frame``,
+        ``images_out_of_order`` and ``lidar_image_mismatch``. Images or sweeps without enough edges give no verdict.
+        A turn within the accuracy of good calibrations is a note, and only where the edges are clear about it.
     """
     found = 0
     for camera in sample.cameras:
         agreement = measure_agreement(sample, camera)
-        if agreement is None or _is_sound(agreement):
-            continue
-        finding = _explain(sample, camera, in_full=found < _EXPLAINED_CAMERAS)
+        finding = None
+        if agreement is not None and not _is_sound(agreement):
+            finding = _explain(sample, camera, in_full=found < _EXPLAINED_CAMERAS)
+        # Images of other frames agree a little, since roads look alike from one end to the other.
+        if (finding is None and not _is_ordered(agreement)) or _is_unexplained(finding):
+            finding = find_image_order(sample, camera) or finding
         if finding is not None:
             found += 1
             yield finding
@@ -66,6 +72,15 @@ def _is_sound(agreement: Agreement) -> bool:
     score = agreement.near.score
     others = max(agreement.far.score, agreement.best_stretch)
     return score >= _MIN_SCORE and others < score + _MIN_MARGIN and not _is_clearly_turned(agreement)
+
+
+def _is_ordered(agreement: Agreement | None) -> bool:
+    """Whether edges agree so well that the images cannot be those of other frames."""
+    return agreement is not None and agreement.near.score >= _ORDERED_SCORE
+
+
+def _is_unexplained(finding: Finding | None) -> bool:
+    return finding is not None and finding.word == "lidar_image_mismatch"
 
 
 def _is_clearly_turned(agreement: Agreement) -> bool:

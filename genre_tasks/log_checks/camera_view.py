@@ -28,7 +28,7 @@ FEW_IMAGES = 3
 _PIXELS_PER_DEG = 4.0
 _WIDTH_RANGE_PX = (160, 400)
 # Coarser images have no edges of their own at the scale of the grid.
-_MIN_PIXELS_PER_DEG = 2.0
+MIN_PIXELS_PER_DEG = 2.0
 _MIN_GRID = (40, 60)
 # LiDAR edges of an image on average: fewer give no verdict.
 _MIN_EDGES = 100
@@ -78,13 +78,16 @@ class CameraView:
         return bool(np.mean(counts) >= _MIN_EDGES and contrast and np.median(contrast) >= _MIN_CONTRAST)
 
 
-def view_camera(sample: LogSample, camera: Camera, images: int) -> CameraView | None:
+def view_camera(
+    sample: LogSample, camera: Camera, images: int, min_pixels_per_deg: float = MIN_PIXELS_PER_DEG
+) -> CameraView | None:
     """Reads images of a camera and the sweeps of their frames.
 
     Args:
         sample: the frames of a chunk.
         camera: one of its cameras.
         images: how many are read at most, spread over the chunk.
+        min_pixels_per_deg: coarser images are not compared.
 
     Returns:
         Their edges and points; ``None`` where there are too few of either.
@@ -94,7 +97,7 @@ def view_camera(sample: LogSample, camera: Camera, images: int) -> CameraView | 
     if not np.isfinite(numbers).all() or lens.fx_px <= 0 or lens.fy_px <= 0:
         return None
     field_deg = np.rad2deg(np.arctan(lens.cx_px / lens.fx_px) + np.arctan((lens.width_px - lens.cx_px) / lens.fx_px))
-    if not 0 < field_deg * _MIN_PIXELS_PER_DEG <= lens.width_px:
+    if not 0 < field_deg * min_pixels_per_deg <= lens.width_px:
         return None
     width_px = int(np.clip(field_deg * _PIXELS_PER_DEG, *_WIDTH_RANGE_PX))
     lens = lens.resized_to_width(min(width_px, lens.width_px))
