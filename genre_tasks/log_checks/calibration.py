@@ -41,13 +41,14 @@ def find_miscalibration(sample: LogSample) -> Iterator[Finding]:
     """
     found = 0
     for camera in sample.cameras:
-        agreement = measure_agreement(sample, camera)
+        view = view_camera(sample, camera, FEW_IMAGES)
+        agreement = None if view is None else score_edges(view.range_edges, view.image_edges)
         finding = None
         if agreement is not None and not _is_sound(agreement):
             finding = _explain(sample, camera, in_full=found < _EXPLAINED_CAMERAS)
         # Images of other frames agree a little, since roads look alike from one end to the other.
         if (finding is None and not _is_ordered(agreement)) or _is_unexplained(finding):
-            finding = find_image_order(sample, camera) or finding
+            finding = find_image_order(sample, camera, view) or finding
         if finding is not None:
             found += 1
             yield finding

@@ -30,26 +30,31 @@ _MIN_IMAGES = 2
 _REMEDY = "Check that images are sorted by number or time (10 after 9, not after 1), and that none is missing."
 
 
-def find_image_order(sample: LogSample, camera: Camera) -> Finding | None:
+def find_image_order(sample: LogSample, camera: Camera, few: CameraView | None = None) -> Finding | None:
     """Finds images that belong to the poses of other frames.
 
     Args:
         sample: the frames of a chunk.
         camera: one of its cameras.
+        few: its view of ``FEW_IMAGES``, where it is at hand.
 
     Returns:
         ``images_out_of_order`` where the order is reversed, ``images_of_another_frame`` where all are early or late;
         ``None`` where neither is clear. A vehicle that stands, or images without edges, give no verdict.
     """
-    steps = ((FEW_IMAGES, _LIKELY_OFFSETS, _LIKELY_MARGIN), (_MANY_IMAGES, _OFFSETS, _MIN_MARGIN))
-    for images, offsets, margin in steps:
-        view = view_camera(sample, camera, images, _MIN_PIXELS_PER_DEG)
-        if view is None:
-            return None
-        offset, score, best_score = _find_best_order(sample, view, offsets)
-        if best_score < max(_MIN_SCORE, score + margin):
-            return None
-    return _describe(view, offset, score, best_score)
+    few = few or view_camera(sample, camera, FEW_IMAGES, _MIN_PIXELS_PER_DEG)
+    if few is None:
+        return None
+    _, score, best_score = _find_best_order(sample, few, _LIKELY_OFFSETS)
+    if best_score < max(_MIN_SCORE, score + _LIKELY_MARGIN):
+        return None
+    many = view_camera(sample, camera, _MANY_IMAGES, _MIN_PIXELS_PER_DEG)
+    if many is None:
+        return None
+    offset, score, best_score = _find_best_order(sample, many, _OFFSETS)
+    if best_score < max(_MIN_SCORE, score + _MIN_MARGIN):
+        return None
+    return _describe(many, offset, score, best_score)
 
 
 def _find_best_order(sample: LogSample, view: CameraView, offsets: tuple[int, ...]) -> tuple[int, float, float]:

@@ -65,7 +65,7 @@ class TestRealSequence:
             assert find_words(f"pandaset:{REAL}", range(start, min(start + chunk_frames, 32))) == []
 
     def test_judging_costs_little(self) -> None:
-        """Everything but reading sweeps and cuboids takes under a second."""
+        """Everything but reading cuboids takes under two seconds a chunk, of which LiDAR and images take most."""
         log = open_log(f"pandaset:{REAL}")
         find_words(f"pandaset:{REAL}", range(2))
         log.tracks()
@@ -73,4 +73,4 @@ class TestRealSequence:
         sample.sweep(19)
         start = time.process_time()
         assert [finding for check in plausibility._CHECKS for finding in check(sample)] == []
-        assert time.process_time() - start < 1.0
+        assert time.process_time() - start < 2.0
