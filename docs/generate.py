@@ -32,6 +32,7 @@ BLOCKS: Mapping[str, Callable[[], str]] = {
     "optimiser-logs": result_tables.optimiser_logs,
     "raster-times": result_tables.raster_times,
     "raster-claims": lambda: result_tables.claims("raster"),
+    "start-up-claims": lambda: result_tables.claims("start_up"),
     "budget-runs": result_tables.budget_runs,
     "evaluation-claims": lambda: result_tables.claims("evaluation"),
     "log-faults": result_tables.log_faults,

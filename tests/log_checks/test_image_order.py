@@ -83,7 +83,8 @@ def test_rotated_images_are_named(streets: Streets, street: str, offset: int) ->
     assert isinstance(finding, Finding)
     assert (finding.word, finding.camera) == ("images_of_another_frame", CAMERA)
     assert finding.numbers["offset_frames"] == -offset
-    assert finding.numbers["best_score"] > finding.numbers["score"] + 2.5
+    # One of two checks names it, each with a margin of its own.
+    assert finding.numbers["best_score"] >= finding.numbers["score"] + finding.numbers["min_margin"]
 
 
 def test_a_vehicle_that_stands_gives_no_verdict(streets: Streets) -> None:
