@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.pandaset.pickle_reader import read_table
 from genre_tasks.logs.pandaset.pickle_writer import pickle_table
+from genre_tasks.logs.pandaset.reader import PandaSetLog, open_pandaset
 from tests.fakes import FakeLog
 
 FRAMES = 4
@@ -59,3 +61,11 @@ def cuboids(*rows: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
         name: np.array([row[name] for row in full], dtype=object if name in mixed else kinds[type(default[name])])
         for name in default
     }
+
+
+def opened(folder: Path) -> PandaSetLog:
+    return open_pandaset(str(folder))
+
+
+def findings(log: PandaSetLog) -> dict[str, Finding]:
+    return {finding.word: finding for finding in log.findings()}
