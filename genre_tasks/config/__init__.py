@@ -19,6 +19,7 @@ from genre_tasks.config.optimisation_sections import (
     RefineConfig,
 )
 from genre_tasks.config.section import LearningRate, LearningRates, LearningRateTuple, Section
+from genre_tasks.config.simulation_sections import KinematicBounds, SimulateConfig
 from genre_tasks.config.stage_sections import (
     EvaluateConfig,
     FnetConfig,
@@ -38,6 +39,7 @@ __all__ = [
     "GnetConfig",
     "IngestConfig",
     "InitialConfig",
+    "KinematicBounds",
     "LearningRate",
     "LearningRateTuple",
     "LearningRates",
@@ -50,12 +52,13 @@ __all__ = [
     "RefineConfig",
     "ReportOnlySetting",
     "Section",
+    "SimulateConfig",
 ]
 
 
 # Order matters: it is the order of the stages, of the printed configuration and of its reference.
 class PipelineConfig(Section):
-    """The complete configuration: one section for each stage.
+    """The complete configuration: one section for each stage, and one for simulations of a finished run.
 
     >>> PipelineConfig().gnet.iterations
     24
@@ -73,3 +76,4 @@ class PipelineConfig(Section):
     )
     evaluate: EvaluateConfig = Field(EvaluateConfig(), description="What is measured after a stage.")
     effects: EffectsConfig = Field(EffectsConfig(), description="Parts of the forward model that a scene gets.")
+    simulate: SimulateConfig = Field(SimulateConfig(), description="Re-simulation of a finished run.")

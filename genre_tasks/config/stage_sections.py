@@ -117,6 +117,9 @@ class FnetConfig(Section):
         "recorded images; 0: every view is fixed.",
     )
     half: bool | None = Field(None, description="Compute in bfloat16; null: where the device is faster with it.")
+    temporal: bool = Field(
+        False, description="In a simulation, look pixels up in the fixed image of the frame before, too."
+    )
 
 
 class EvaluateConfig(Section):
