@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicSpline, PchipInterpolator
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from genre_tasks.ego_paths.ego_path import EgoPath
@@ -38,14 +38,16 @@ class ReferencePoints:
         position_m: [N, 3] world.
         heading_rad: [N] direction of driving, counted from the world's x towards y.
         curvature_1_m: [N] change of heading over arc length; to the left is positive.
-        heading_SE3_ego: [N, 3] rotation vectors of the recorded vehicle against its direction of driving: roll, pitch,
-            and what its axes are turned against it.
+        curvature_change_1_m2: [N] change of the curvature over arc length.
+        attitude_rad: [N, 3] rotation vectors of the vehicle against its direction of driving: roll, pitch, and how far
+            its axes are turned away from it.
     """
 
     position_m: Float64
     heading_rad: Float64
     curvature_1_m: Float64
-    heading_SE3_ego: Float64
+    curvature_change_1_m2: Float64
+    attitude_rad: Float64
 
 
 class ReferencePath:
@@ -64,7 +66,7 @@ class ReferencePath:
         # A cubic keeps the third derivative of what is planned along it free of steps.
         self._table = CubicSpline(arc_m, table)
         self._arc_end_m = float(arc_m[-1])
-        self._distance = PchipInterpolator(times_s, distances_m) if len(times_s) > 1 else None
+        self._distance = CubicSpline(times_s, distances_m) if len(times_s) > 1 else None
 
     def sample(self, arc_m: Float64) -> ReferencePoints:
         """Finds places along the reference.
@@ -78,9 +80,15 @@ class ReferencePath:
         inside = np.minimum(arc_m, self._arc_end_m)
         values = self._table(inside)
         heading = values[:, 3]
-        beyond = (arc_m - inside)[:, None]
+        ahead = (arc_m - inside)[:, None]
         straight = np.stack([np.cos(heading), np.sin(heading), np.zeros_like(heading)], axis=1)
-        return ReferencePoints(values[:, :3] + beyond * straight, heading, values[:, 4], values[:, 5:])
+        return ReferencePoints(
+            position_m=values[:, :3] + ahead * straight,
+            heading_rad=heading,
+            curvature_1_m=values[:, 4],
+            curvature_change_1_m2=self._table(inside, nu=1)[:, 4],
+            attitude_rad=values[:, 5:],
+        )
 
     def locate(self, times_s: Float64) -> Float64:
         """Finds how far the recorded vehicle has driven.
@@ -95,23 +103,18 @@ class ReferencePath:
             return np.zeros(len(times_s))
         return np.asarray(self._distance(np.clip(times_s, 0.0, self.duration_s)), np.float64)
 
-    def measure_speed(self, time_s: float) -> tuple[float, float]:
+    def measure_speed(self, times_s: Float64) -> Float64:
         """Measures how fast the recorded vehicle drives.
 
         Args:
-            time_s: seconds since the first pose.
+            times_s: [N] seconds since the first pose.
 
         Returns:
-            Speed in m/s and acceleration in m/s².
+            [N] m/s.
         """
         if self._distance is None:
-            return 0.0, 0.0
-        step = min(0.1, 0.5 * self.duration_s)
-        middle = float(np.clip(time_s, step, self.duration_s - step))
-        before, now, after = self.locate(np.array([middle - step, middle, middle + step]))
-        acceleration = (after - 2 * now + before) / step**2
-        speed = (after - before) / (2 * step) + (time_s - middle) * acceleration
-        return max(float(speed), 0.0), float(acceleration)
+            return np.zeros(len(times_s))
+        return np.maximum(self._distance(np.clip(times_s, 0.0, self.duration_s), nu=1), 0.0)
 
 
 def fit_reference_path(recorded: EgoPath) -> ReferencePath:
