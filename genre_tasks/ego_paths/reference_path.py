@@ -120,8 +120,8 @@ class ReferencePath:
 def fit_reference_path(recorded: EgoPath) -> ReferencePath:
     """Fits a smooth curve to the recorded path.
 
-    Recorded poses jitter by centimetres, which differences at 10 Hz would turn into absurd accelerations. So speed comes
-    from a smooth curve over time, and the shape from a smooth curve over arc length, which standstill does not disturb.
+    Recorded poses jitter by centimetres, which differences at 10 Hz would turn into absurd accelerations. So speed
+    comes from a smooth curve over time, and the shape from one over arc length, which standstill does not disturb.
 
     Args:
         recorded: one pose for each log frame.
