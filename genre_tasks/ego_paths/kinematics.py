@@ -8,9 +8,13 @@ import numpy as np
 
 from genre_tasks.config.simulation_sections import KinematicBounds
 from genre_tasks.ego_paths.ego_path import EgoPath
-from genre_tasks.ego_paths.reference_path import SMOOTHING_S, STRAIGHT_M, choose_smoothing_m, integrate_speed
+from genre_tasks.ego_paths.reference_path import SMOOTHING_S, STRAIGHT_M, integrate_speed
 from genre_tasks.ego_paths.smoothing import fit_smooth_curve
 from genre_tasks.logs.types import Float64
+
+_SMOOTHING_M = 0.6
+"""Scale of the curve over arc length: half a car's turning radius comes through by 90 %, and a centimetre of jitter at
+10 Hz comes to a twentieth of a car's largest curvature."""
 
 _SAMPLES_PER_SMOOTHING = 6
 # A slower vehicle's direction of motion is that of its jitter.
@@ -19,8 +23,8 @@ _CRAWLING_M_S = 0.5
 _STANDING_M_S = 0.2
 # Who leaves so much of the smooth shape out on the way turns more sharply than it can follow.
 _SHORTENED = 0.7
-# Rounding: what is planned right at a bound does not break it.
-_TOLERANCE = 1e-6
+# As exact as the measurement is: a circle at the largest curvature does not break the bound.
+_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
@@ -119,7 +123,7 @@ def _measure_curvature(times: Float64, positions: Float64, dense: Float64, speed
     distances = integrate_speed(dense, speed)
     if distances[-1] < STRAIGHT_M:
         return np.zeros(len(dense))
-    curve = fit_smooth_curve(np.interp(times, dense, distances), positions, choose_smoothing_m(speed))
+    curve = fit_smooth_curve(np.interp(times, dense, distances), positions, _SMOOTHING_M)
     tangent = curve.evaluate(distances, 1)
     change = curve.evaluate(distances, 2)
     norm = np.linalg.norm(tangent, axis=1)
