@@ -201,7 +201,7 @@ def _read_poses(numbers: Mapping[str, Float64], recorded: EgoPath) -> Float64:
     offset = positions[:, None, :2] - recorded.world_SE3_ego[:, :2, 3]
     distance = np.sqrt(np.square(offset).sum(-1).min(axis=1))
     if distance.max() > _FARTHEST_M:
-        row = int(np.argmax(distance))
+        row = int(np.argmax(distance > _FARTHEST_M))
         raise InputError(
             f"row {row} (from 0) is {distance[row] / 1000:.1f} km away from the recorded path",
             remedy="Write positions in the log's world, as the poses of a rollout are.",

@@ -101,4 +101,6 @@ def test_bounds_are_those_of_the_configuration() -> None:
     path = straight(20, 8.0)
     (violation,) = find_bound_violations(path, BOUNDS.model_copy(update={"max_speed_m_s": 5.0}))
     assert violation.value == pytest.approx(8.0, abs=1e-3)
-    assert str(violation) == str(replace(violation, value=8.0)) == f"speed of 8 m/s at {violation.time_s:.1f} s (bound 5)"
+    assert (
+        str(violation) == str(replace(violation, value=8.0)) == f"speed of 8 m/s at {violation.time_s:.1f} s (bound 5)"
+    )
