@@ -99,8 +99,8 @@ def select_deformation(deformation: Deformation | None, number: int) -> Deformat
 def assemble_edited_scene(scene: SceneGraph, placed: Sequence[PlacedActor]) -> SceneGraph:
     """Puts an edited scene together.
 
-    What stays keeps its order, and what is new comes last: Gaussians of the same depth are drawn in their order, so that
-    pixels without edited actors keep their bytes.
+    What stays keeps its order, and what is new comes last. Gaussians of the same depth are drawn in their order, so
+    that pixels without edited actors keep their bytes.
 
     Args:
         scene: before the edit.
