@@ -154,7 +154,7 @@ def write_edited_run(store: str, run: str, edits: EditList, config: SimulateConf
         config=record["config"],
         differs={key: (before, after) for key, (before, after) in record["differs"].items()},
         chunks=chunks,
-        notes={number: f"the traffic of run {record['run']} is edited" for number in chunks},
+        notes=dict.fromkeys(chunks, f"the traffic of run {record['run']} is edited"),
     )
     edited = {"run": record["run"], "edits": scenes.edits.model_dump(mode="json")}
     return write_run_record(finished, summarise_run(finished), {"edited": edited})
