@@ -97,8 +97,24 @@ def open_edited_scenes(
         InputError: there is no such run, chunk or actor.
     """
     opened = open_run(store, run, stage, chunks)
-    library = ActorLibrary(lambda name: _open_library_run(store, name))
+    library = ActorLibrary(lambda name: open_shown_scenes(store, name))
     return EditedScenes(opened.recorded, opened.edits + edits, library, config)
+
+
+def open_shown_scenes(store: str, run: str) -> RunScenes | EditedScenes:
+    """Opens the scenes of a run as it is: of an edited run the edited ones.
+
+    Args:
+        store: folder (or URI) of the store.
+        run: the run's name, or the start of it.
+
+    Raises:
+        InputError: there is no such run.
+    """
+    opened = open_run(store, run)
+    if not len(opened.edits):
+        return opened.recorded
+    return open_edited_scenes(store, run, EditList(), SimulateConfig())
 
 
 def digest_edits(store: str, edits: EditList, config: SimulateConfig) -> str:
@@ -158,13 +174,6 @@ def write_edited_run(store: str, run: str, edits: EditList, config: SimulateConf
     )
     edited = {"run": record["run"], "edits": scenes.edits.model_dump(mode="json")}
     return write_run_record(finished, summarise_run(finished), {"edited": edited})
-
-
-def _open_library_run(store: str, name: str) -> RunScenes | EditedScenes:
-    opened = open_run(store, name)
-    if not len(opened.edits):
-        return opened.recorded
-    return open_edited_scenes(store, name, EditList(), SimulateConfig())
 
 
 def _write_chunk(store: str, run: str, number: int, scenes: EditedScenes, digest: str) -> dict[str, ArtifactRef]:
