@@ -146,6 +146,34 @@ def prepare_discs(
     )
 
 
+def select_discs_in_sector(discs: Discs, rays: Rays) -> Discs:
+    """Leaves out Gaussians that lie in directions in which no ray goes, by azimuth.
+
+    Args:
+        discs: all.
+        rays: of one part of a turn.
+
+    Returns:
+        Those that a ray may meet.
+    """
+    if not len(rays):
+        return discs
+    azimuth = np.arctan2(rays.directions[:, 1], rays.directions[:, 0])
+    middle = np.angle(np.exp(1j * azimuth).mean())
+    half = np.abs(_wrap(azimuth - middle)).max()
+    offset = discs.means - rays.origins.mean(0)
+    spread = np.linalg.norm(rays.origins - rays.origins.mean(0), axis=1).max()
+    reach = EXTENT_SIGMAS * discs.scales.max(1) + spread
+    flat = np.hypot(offset[:, 0], offset[:, 1])
+    widest = np.arcsin(np.minimum(reach / flat.clip(1e-6), 1.0))
+    apart = np.abs(_wrap(np.arctan2(offset[:, 1], offset[:, 0]) - middle))
+    return discs.select(np.flatnonzero((apart <= half + widest) | (flat <= reach)))
+
+
+def _wrap(angle: Float64) -> Float64:
+    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
+
+
 def cast_rays(discs: Discs, rays: Rays, settings: CastSettings = DEFAULT_CAST) -> RayHits:
     """Casts rays through Gaussians.
 

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from genre_tasks.lidar_simulation.ego_motion import interpolate_poses
-from genre_tasks.lidar_simulation.ray_casting import CastSettings, RayHits, Rays, cast_rays, prepare_discs
+from genre_tasks.lidar_simulation.ray_casting import CastSettings, RayHits, Rays, cast_rays, prepare_discs, select_discs_in_sector
 from genre_tasks.lidar_simulation.sweep_pattern import SweepPattern
 from genre_tasks.logs.types import Float64
 from genre_tasks.scene.graph import DISTANT, SceneGraph
@@ -35,7 +35,7 @@ class LidarModel:
 
     narrow: float = 0.6
     wide: float = 1.5
-    min_alpha: float = 0.5
+    min_alpha: float = 0.3
     min_cosine: float = 0.01
     max_range_m: float = 120.0
     beam_rad: float = 0.0005
@@ -128,7 +128,8 @@ def _cast_in_parts(surfaces: SceneGraph, rays: Rays, times_s: Float64, frame: fl
         discs = prepare_discs(splats, nodes, center, widening=widening, beam_rad=model.beam_rad)
         # In parts of the turn, within which the sensor moves by centimetres.
         for part in np.array_split(rows[np.argsort(times_s[rows], kind="stable")], _PARTS):
-            hits = cast_rays(discs, Rays(rays.origins[part], rays.directions[part]), settings)
+            some = Rays(rays.origins[part], rays.directions[part])
+            hits = cast_rays(select_discs_in_sector(discs, some), some, settings)
             for name, values in vars(hits).items():
                 if name not in found:
                     found[name] = np.zeros((len(rays), *values.shape[1:]), values.dtype)

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from genre_tasks.lidar_simulation.sensor import LidarSensor
 from genre_tasks.logs.types import Float64
+from genre_tasks.stages.ingest_points import EGO_BOX_M
 
 NO_RING = -1
 
 _RING_BIN_RAD = np.radians(0.02)
-_RING_DISTANCE_RAD = np.radians(0.06)
+_RING_DISTANCE_RAD = np.radians(0.14)
 _RING_FRACTION = 0.0005
-_MAX_GAP_TURNS = 1.1
+_RING_RANGE_M = 3.0
+
+STEEP_RAD = np.radians(12.0)
+"""A ray so far below the horizon meets the road within ten metres, and a road so near always answers: where nothing
+came back the vehicle itself is in the way."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +64,8 @@ def build_pattern(points: Float64, times_s: Float64, intensity: Float64, sensor:
     """
     offset = points - sensor.position_m
     range_m = np.linalg.norm(offset, axis=1)
-    usable = range_m > 0
+    # Rays that meet the vehicle itself say nothing about the scene, which has no such vehicle.
+    usable = (range_m > 0) & ~(np.abs(points) < np.array(EGO_BOX_M)).all(1)
     directions = offset[usable] / range_m[usable, None]
     returned = SweepPattern(
         sensor=sensor,
@@ -79,12 +85,14 @@ def _add_missing_rays(returned: SweepPattern) -> SweepPattern:
     seen = returned.directions @ sensor.axes
     elevation = np.arcsin(seen[:, 2].clip(-1, 1))
     phase = np.arctan2(seen[:, 1], seen[:, 0]) - sensor.turn_rad_s * returned.times_s
-    ring, levels = find_rings(elevation)
+    ring, levels = find_rings(elevation, returned.range_m)
     times = []
     azimuths = []
     rings = []
     bounds = (returned.times_s.min(), returned.times_s.max())
-    for k in range(len(levels)):
+    for k, level in enumerate(levels):
+        if level < -STEEP_RAD:
+            continue
         of_ring = ring == k
         missing = _find_missing_times(np.sort(returned.times_s[of_ring]), bounds, sensor.turn_rad_s)
         # The mean as a vector, since phases wrap around.
@@ -92,10 +100,13 @@ def _add_missing_rays(returned: SweepPattern) -> SweepPattern:
         times.append(missing)
         azimuths.append(mean_phase + sensor.turn_rad_s * missing)
         rings.append(np.full(len(missing), k, np.int64))
+    if not times:
+        return replace(returned, ring=ring)
     azimuth = np.concatenate(azimuths)
     added_ring = np.concatenate(rings)
-    level = levels[added_ring]
-    in_sensor = np.stack([np.cos(level) * np.cos(azimuth), np.cos(level) * np.sin(azimuth), np.sin(level)], 1)
+    upward = levels[added_ring]
+    flat = np.cos(upward)
+    in_sensor = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(upward)], 1)
     nothing = np.full(len(azimuth), np.nan)
     return SweepPattern(
         sensor=sensor,
@@ -107,22 +118,26 @@ def _add_missing_rays(returned: SweepPattern) -> SweepPattern:
     )
 
 
-def find_rings(elevation: Float64) -> tuple[NDArray[np.int64], Float64]:
+def find_rings(elevation: Float64, range_m: Float64) -> tuple[NDArray[np.int64], Float64]:
     """Finds the beams of a sensor by the peaks of its returns' elevations.
 
     Args:
         elevation: [N] radians about the sensor's axis.
+        range_m: [N] metres; near returns, whose elevations errors of the sensor's height blur, do not count.
 
     Returns:
         The beam of each return [N], and the beams' elevations [R] in radians, lowest first.
     """
-    lowest = elevation.min() - 2 * _RING_BIN_RAD
-    counts = np.bincount(((elevation - lowest) / _RING_BIN_RAD).astype(np.int64), minlength=5).astype(np.float64)
+    sharp = elevation[range_m > _RING_RANGE_M]
+    if not len(sharp):
+        sharp = elevation
+    lowest = sharp.min() - 2 * _RING_BIN_RAD
+    counts = np.bincount(((sharp - lowest) / _RING_BIN_RAD).astype(np.int64), minlength=5).astype(np.float64)
     smooth = np.convolve(counts, [0.25, 0.5, 0.25], mode="same")
     reach = round(_RING_DISTANCE_RAD / _RING_BIN_RAD)
     padded = np.pad(smooth, reach)
     highest = np.stack([padded[k : k + len(smooth)] for k in range(2 * reach + 1)]).max(0)
-    peaks = np.flatnonzero((smooth == highest) & (smooth > _RING_FRACTION * len(elevation) / 10))
+    peaks = np.flatnonzero((smooth == highest) & (smooth > _RING_FRACTION * len(sharp)))
     levels = lowest + (peaks + 0.5) * _RING_BIN_RAD
     # By the middle between two beams.
     ring = np.searchsorted((levels[1:] + levels[:-1]) / 2, elevation)
@@ -146,6 +161,5 @@ def _find_missing_times(times_s: Float64, bounds: tuple[float, float], turn_rad_
     parts = [first, last]
     for k in np.flatnonzero(gaps > 1.5 * step):
         count = round(gaps[k] / step)
-        if gaps[k] * abs(turn_rad_s) <= _MAX_GAP_TURNS * 2 * np.pi:
-            parts.append(times_s[k] + gaps[k] * np.arange(1, count) / count)
+        parts.append(times_s[k] + gaps[k] * np.arange(1, count) / count)
     return np.concatenate(parts)
