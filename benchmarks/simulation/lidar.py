@@ -14,7 +14,7 @@ from benchmarks.common.task import require_log_folder
 from flows.configuration import load_configuration
 from flows.pipeline.stage_runner import Job, read_artifact
 from genre_tasks.lidar_simulation.compare_sweeps import SweepComparison, compare_sweeps
-from genre_tasks.lidar_simulation.lidar_surfaces import build_lidar_surfaces
+from genre_tasks.lidar_simulation.lidar_surfaces import LidarSurfaces
 from genre_tasks.lidar_simulation.rollout_lidar import LidarSimulator
 from genre_tasks.lidar_simulation.simulate_sweep import simulate_sweep
 from genre_tasks.logs.registry import open_log
@@ -69,7 +69,7 @@ def measure_lidar(
     full_log = open_log(log)
     frames = _find_heldout_frames(full_log, chunk_scene.chunk.frames, every)
     start = time.perf_counter()
-    comparisons = _compare_frames(full_log, open_log(job.log), chunk_scene, frames, surfaces, max_range_m)
+    comparisons = _compare_frames(full_log, chunk_scene, frames, surfaces, max_range_m)
     seconds = (time.perf_counter() - start) / len(frames)
     row: dict[str, object] = {"log": full_log.name, "chunk": chunk, "every": every, "stage": stage}
     row |= {"surfaces": surfaces, "max_range_m": max_range_m, "sweeps": len(frames)}
@@ -85,16 +85,14 @@ def _find_heldout_frames(log: DrivingLog, frames: Sequence[int], every: int) -> 
 
 def _compare_frames(
     full_log: DrivingLog,
-    read_log: DrivingLog,
     chunk_scene: ChunkScene,
     frames: Sequence[int],
     surfaces: Surfaces,
     max_range_m: float,
 ) -> list[SweepComparison]:
+    # The first sweep, by which it finds the sensor, is one that was read: frame 0 is a multiple of any number.
     full = LidarSimulator(full_log)
-    # The first sweep of the log is one that was read: frame 0 is a multiple of any number.
-    full.sensor = LidarSimulator(read_log).sensor
-    scene = build_lidar_surfaces(chunk_scene) if surfaces == "points" else chunk_scene.scene
+    scene = LidarSurfaces().build(chunk_scene) if surfaces == "points" else chunk_scene.scene
     world_SE3_ego = np.stack([full_log.world_SE3_lidar(frame) for frame in range(full_log.frame_count)])
     poses = np.linalg.inv(chunk_scene.chunk.world_SE3_chunk) @ world_SE3_ego
     times_s = np.array([full_log.frame_timestamp_s(frame) for frame in range(full_log.frame_count)])

@@ -193,9 +193,7 @@ def cast_rays(discs: Discs, rays: Rays, settings: CastSettings = DEFAULT_CAST) -
     return _blend(discs, rays, ray[order], disc[order], range_m[order].astype(np.float64), alpha[order], settings)
 
 
-def _collect_responses(
-    discs: Discs, rays: Rays
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Float32, Float32]:
+def _collect_responses(discs: Discs, rays: Rays) -> tuple[NDArray[np.int64], NDArray[np.int64], Float32, Float32]:
     """Pairs of ray and disc that matter: ray, disc, range and alpha, [K] each."""
     parts: list[tuple[NDArray[np.int64], NDArray[np.int64], Float32, Float32]] = []
     for ray, disc in find_ray_pairs(

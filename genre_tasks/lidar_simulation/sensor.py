@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from genre_tasks.logs.types import Float64, Sweep
 from genre_tasks.lidar_simulation.ego_motion import interpolate_poses
+from genre_tasks.logs.types import Float64, Sweep
 
 SAMPLE_RANGE_M = (2.0, 40.0)
 """Nearer returns are of the vehicle itself; farther ones say little about where the sensor is."""

@@ -9,7 +9,14 @@ import torch
 from numpy.typing import NDArray
 
 from genre_tasks.lidar_simulation.ego_motion import interpolate_poses
-from genre_tasks.lidar_simulation.ray_casting import CastSettings, RayHits, Rays, cast_rays, prepare_discs, select_discs_in_sector
+from genre_tasks.lidar_simulation.ray_casting import (
+    CastSettings,
+    RayHits,
+    Rays,
+    cast_rays,
+    prepare_discs,
+    select_discs_in_sector,
+)
 from genre_tasks.lidar_simulation.sweep_pattern import SweepPattern
 from genre_tasks.logs.types import Float64
 from genre_tasks.scene.graph import DISTANT, SceneGraph
@@ -25,16 +32,15 @@ class LidarModel:
     """What comes back of a ray.
 
     Attributes:
-        narrow: factor on discs for the first cast: as narrow as outlines ask for.
-        wide: factor for rays that pass between narrow discs: wide enough to close gaps between a road's rings.
+        widenings: factors on discs within their planes. All rays meet the first: discs as narrow as outlines ask for.
+            Those that meet nothing then meet the next one: wide enough to close the gaps between a road's rings.
         min_alpha: a ray that less of is blocked has no return.
         min_cosine: between ray and normal; a surface seen more at a slant throws nothing back.
         max_range_m: what is farther does not come back.
         beam_rad: standard deviation of a beam's width.
     """
 
-    narrow: float = 0.6
-    wide: float = 1.5
+    widenings: tuple[float, ...] = (0.6, 1.5)
     min_alpha: float = 0.3
     min_cosine: float = 0.01
     max_range_m: float = 120.0
@@ -86,7 +92,7 @@ def simulate_sweep(
     those are measured when the beams pass.
 
     Args:
-        surfaces: what the rays meet, as of ``build_lidar_surfaces``, or any scene.
+        surfaces: what the rays meet, as of ``LidarSurfaces``, or any scene.
         pattern: the rays, as of ``build_pattern``.
         frame: of the log, or a moment between two.
         chunk_SE3_ego: [P, 4, 4] poses around the frame, chunk coordinates.
@@ -124,7 +130,7 @@ def _cast_in_parts(surfaces: SceneGraph, rays: Rays, times_s: Float64, frame: fl
     rows = np.arange(len(rays))
     found: dict[str, NDArray] = {}
     # Outlines first: discs wide enough to close a road's gaps would make every post a wall.
-    for widening in (model.narrow, model.wide):
+    for widening in model.widenings:
         discs = prepare_discs(splats, nodes, center, widening=widening, beam_rad=model.beam_rad)
         # In parts of the turn, within which the sensor moves by centimetres.
         for part in np.array_split(rows[np.argsort(times_s[rows], kind="stable")], _PARTS):

@@ -19,8 +19,8 @@ from genre_tasks.rollout.rig import RolloutView
 from genre_tasks.scene.lens_distortion import fold_radius, pixels_to_rays
 from genre_tasks.scene.transforms import invert_se3
 
-HIDDEN_FRACTION = 0.05
-HIDDEN_M = 0.2
+HIDDEN_FRACTION = 0.1
+HIDDEN_M = 0.3
 """A point is hidden in the next image where that shows a surface nearer than the point by more than both together."""
 
 _NEAR_M = 0.1
