@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from flows.simulation import simulate as simulate_module
+from flows.simulation.edit_file import parse_edit_options
 from flows.simulation.request import SimulationRequest
 from flows.simulation.rollout_metrics import METRICS_FILE
 from flows.simulation.run_scenes import RunScenes
@@ -21,6 +22,7 @@ from genre_tasks.errors import ConfigError, GenreError, InputError
 from genre_tasks.rollout.handover import plan_handovers
 from genre_tasks.rollout.render_rollout import render_rollout
 from genre_tasks.rollout.rig import estimate_rig
+from genre_tasks.scene_edits.actor_names import name_actors
 from storage.files import digest_file
 from storage.manifest import MANIFEST, parse_manifest
 from tests.flows.small_simulation import make_run
@@ -157,3 +159,16 @@ def test_an_interrupted_simulation_leaves_nothing(
     with pytest.raises(OSError, match="No space"):
         simulate_run(replace(recorded, out=tmp_path / "out", cameras=("front_camera",)))
     assert not list(tmp_path.iterdir())
+
+
+def test_what_a_removed_actor_hid_is_in_the_output(recorded: SimulationRequest, tmp_path: Path) -> None:
+    name = name_actors(RunScenes(recorded.store, recorded.run))["car-0"]
+    edits = parse_edit_options(remove=[name])
+    out = tmp_path / "out"
+    record = simulate_run(replace(recorded, out=out, edits=edits, cameras=("front_camera",), chunks=(0,)))
+    masks = [imageio.imread(out / "filled" / "front_camera" / f"{index:06d}.png") for index in range(6)]
+    assert all(mask.shape == (36, 64) and set(np.unique(mask)) <= {0, 255} for mask in masks)
+    plain = simulate_run(replace(recorded, out=tmp_path / "plain", cameras=("front_camera",), chunks=(0,)))
+    assert plain["key"] != record["key"]
+    with pytest.raises(InputError, match="no actor"):
+        simulate_run(replace(recorded, out=tmp_path / "none", edits=parse_edit_options(remove=["car-99"])))

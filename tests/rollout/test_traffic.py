@@ -1,10 +1,11 @@
-"""Traffic over the border of two chunks: tracks go on, looks and coordinates stay right, nothing vanishes or doubles."""
+"""Traffic over the border of two chunks: tracks go on, looks and coordinates stay right, no actor doubles."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
 
+from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.rollout.chunk_layout import ChunkLayout
 from genre_tasks.rollout.handover import Handover
 from genre_tasks.rollout.traffic import compose_scene, extend_traffic
@@ -103,8 +104,6 @@ def test_a_standing_vehicle_is_at_the_place_of_its_moment() -> None:
     # A path beside the recorded one that stands at x = 1 all the time.
     poses = np.tile(np.eye(4), (5, 1, 1))
     poses[:, :2, 3] = (1.0, 3.0)
-    from genre_tasks.ego_paths.ego_path import EgoPath
-
     places = layout.find_places(EgoPath(np.arange(5.0) / 10, np.arange(5.0), poses))
     assert np.allclose(places, [1, 1, 2, 3, 3], atol=0.05)
     assert layout.find_traffic(2) == (0,) and layout.find_traffic(2.4) == (0, 1) and layout.find_traffic(3) == (1,)
