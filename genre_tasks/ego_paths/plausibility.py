@@ -10,17 +10,22 @@ from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.ego_paths.kinematics import BoundViolation, find_bound_violations
 from genre_tasks.errors import ConfigError
 
+_NAMED_VIOLATIONS = 2
+
 
 def describe_violations(violations: Sequence[BoundViolation]) -> str:
-    """Writes violations for an error.
+    """Writes violations for an error, the worst ones first.
 
     Args:
         violations: at least one.
 
     Returns:
-        One clause.
+        One clause; of many violations it names two.
     """
-    return ", ".join(str(violation) for violation in violations)
+    worst = sorted(violations, key=lambda violation: violation.value / violation.bound, reverse=True)
+    named = ", ".join(str(violation) for violation in worst[:_NAMED_VIOLATIONS])
+    more = len(worst) - _NAMED_VIOLATIONS
+    return f"{named}, and {more} more" if more > 0 else named
 
 
 def check_recorded_driving(request: BehaviourRequest, path: EgoPath) -> EgoPath:
@@ -88,7 +93,7 @@ def check_rate(request: BehaviourRequest, rate_m_s2: float, bound_m_s2: float, q
     """
     rate = request.strength * rate_m_s2
     if rate > bound_m_s2:
-        problem = f"{request.name} at strength {request.strength:.3g} is a {quantity} of {rate:.3g} m/s²"
+        problem = f"{request.name} at strength {request.strength:.3g} has the {quantity} {rate:.3g} m/s²"
         # Rounded down, so that the strength in the remedy is one that works.
         largest = math.floor(100 * bound_m_s2 / rate_m_s2) / 100
         raise ConfigError(
