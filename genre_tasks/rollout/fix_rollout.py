@@ -273,8 +273,10 @@ class RolloutFixer:
 
     def _pose_actors(self, images: RolloutImages, chunk_images: _ChunkImages) -> tuple[Actor, ...]:
         moments = {THIS_MOMENT: images.views[0].frame}
-        # All cameras of a pose are of one moment.
-        moments |= {LAST_MOMENT: last.view.frame for last in self._last.values()}
+        followed = [last for last in self._last.values() if last.index == images.index - 1]
+        if followed:
+            # All cameras of a pose are of one moment.
+            moments[LAST_MOMENT] = followed[0].view.frame
         recorded = {actor.track_id: actor for actor in chunk_images.removed.recorded}
         frames = sorted({source.frame for source in chunk_images.removed.unshaded})
         return pose_actors(images.chunk_scene.scene.actors, moments, recorded, frames)

@@ -24,7 +24,7 @@ def test_every_camera_comes_back_fixed():
     images = images_at(recorded(), 2.5)[0]
     fixed = fixer().fix(images)
     assert fixed.color.shape == images.color.shape
-    assert 0 <= fixed.color.min() and fixed.color.max() <= 1
+    assert fixed.color.min() >= 0 and fixed.color.max() <= 1
     assert not torch.allclose(fixed.color, images.color, atol=1e-2)
     assert not fixed.filled.any() and not fixed.restored.any()
 

@@ -77,13 +77,12 @@ def test_the_shaded_ground_ends_a_margin_from_the_box():
     # A camera 10 m above the ground that looks down: a pixel is 10 cm of ground.
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[2, 3] = 10.0
-    depth = measure_depth_to_shadows(pose, Lens(100.0, 100.0, 50.0, 50.0, 100, 100), [car], 0.0)
+    lens = Lens(100.0, 100.0, 50.0, 50.0, 100, 100)
+    depth = measure_depth_to_shadows(pose, lens, [car], 0.0)
     hit = torch.isfinite(depth)
     assert np.isclose(hit[50].sum() / 10, 4.0 + 2 * SHADOW_MARGIN_M, atol=0.2)
     assert np.isclose(hit[:, 50].sum() / 10, 2.0 + 2 * SHADOW_MARGIN_M, atol=0.2)
-    assert not torch.isfinite(
-        measure_depth_to_shadows(pose, Lens(100.0, 100.0, 50.0, 50.0, 100, 100), [car], 5.0)
-    ).any()
+    assert not torch.isfinite(measure_depth_to_shadows(pose, lens, [car], 5.0)).any()
 
 
 def test_the_road_under_a_removed_actor_takes_the_colours_of_the_road():
