@@ -14,6 +14,7 @@ from flows.cli.bench import bench
 from flows.cli.check import check
 from flows.cli.cost import cost
 from flows.cli.doctor import doctor
+from flows.cli.edit import edit
 from flows.cli.effects import effects
 from flows.cli.figure import figure
 from flows.cli.last_resort import run_guarded
@@ -25,6 +26,7 @@ from flows.cli.render import render
 from flows.cli.run import run
 from flows.cli.show import show
 from flows.cli.signals import end_on_signals, exit_process
+from flows.cli.simulate import simulate
 from flows.cli.streams import prepare_streams
 from flows.cli.train import app as train_app
 from flows.cli.verify import verify
@@ -45,7 +47,9 @@ app.command(name="run")(run)
 app.command(name="check")(check)
 app.command(name="effects")(effects)
 app.command(name="render")(render)
+app.command(name="simulate")(simulate)
 app.command(name="range")(range_command)
+app.command(name="edit")(edit)
 app.command(name="show")(show)
 app.command(name="verify")(verify)
 app.command(name="doctor")(doctor)
