@@ -17,10 +17,18 @@ SMOOTHING_S = 0.15
 """Motion of a shorter period than 2π times this (0.9 s) counts as jitter of the recording. A car's lateral motion is
 slower; centimetres of jitter at 10 Hz would otherwise be accelerations of several m/s²."""
 
-_SMOOTHING_M = 1.0
+_SMOOTHING_M = 1.5
+# A fast vehicle leaves few samples in a metre, and turns gently.
+_SMOOTHING_S_OF_SHAPE = 0.25
 # Below this speed a vehicle stands, and jitter of centimetres is no driving.
 _STANDING_M_S = 0.05
-_STANDING_M = 0.5
+STRAIGHT_M = 1.0
+"""A vehicle that drives less than this drives straight on: jitter of a centimetre alone would bend the path by more
+than a car can steer."""
+
+# Jitter alone comes to a good part of this.
+_STANDING_M = 0.25
+
 _DENSE_S = 0.02
 _TABLE_STEP_M = 0.1
 # Over so many seconds the curvature fades past the last recorded pose: at once would be an endless jerk.
@@ -28,6 +36,10 @@ _FADE_S = 1.5
 _FADE_M = 5.0
 # Metres over which the slope of the road at the end of the recording is measured.
 _SLOPE_M = 5.0
+# So much nearer, per metre along the path, another branch of a path that crosses itself has to be.
+_EXPECTED_WEIGHT = 0.05
+# Positions that are compared with the whole reference at a time.
+_BLOCK = 256
 
 
 @dataclass(frozen=True)
@@ -90,6 +102,41 @@ class ReferencePath:
             attitude_rad=values[:, 5:],
         )
 
+    def project(self, position_m: Float64, expected_m: Float64) -> tuple[Float64, Float64]:
+        """Finds the nearest place of the reference, or of the straight lines that it goes on in at both ends.
+
+        Args:
+            position_m: [N, 2] world x and y.
+            expected_m: [N] arc length where the place is expected: it decides where a path crosses itself.
+
+        Returns:
+            Arc length [N], negative before the first recorded pose, and distance to the left [N], metres.
+        """
+        arcs = self._table.x
+        places = self._table(arcs)[:, :2]
+        nearest = np.empty(len(position_m))
+        for start in range(0, len(position_m), _BLOCK):
+            block = slice(start, start + _BLOCK)
+            squared = np.square(position_m[block, None] - places).sum(-1)
+            detour = _EXPECTED_WEIGHT * (arcs - expected_m[block, None])
+            nearest[block] = arcs[np.argmin(squared + np.square(detour), axis=1)]
+        arc = nearest
+        # The table's place is a few centimetres off: along the reference, two steps of Newton's method are exact.
+        for _ in range(2):
+            along, left, curvature = self._measure_offset(position_m, np.clip(arc, 0.0, self._arc_end_m))
+            arc = np.clip(arc, 0.0, self._arc_end_m) + along / np.maximum(1 - curvature * left, _EXPECTED_WEIGHT)
+        ended = np.clip(arc, 0.0, self._arc_end_m)
+        along, left, _ = self._measure_offset(position_m, ended)
+        return np.where(ended == arc, arc, ended + along), left
+
+    def _measure_offset(self, position_m: Float64, arc_m: Float64) -> tuple[Float64, Float64, Float64]:
+        """How far ahead and to the left of places of the reference positions are, and the curvature there."""
+        values = self._table(arc_m)
+        offset = position_m - values[:, :2]
+        cosine = np.cos(values[:, 3])
+        sine = np.sin(values[:, 3])
+        return cosine * offset[:, 0] + sine * offset[:, 1], cosine * offset[:, 1] - sine * offset[:, 0], values[:, 4]
+
     def locate(self, times_s: Float64) -> Float64:
         """Finds how far the recorded vehicle has driven.
 
@@ -120,8 +167,8 @@ class ReferencePath:
 def fit_reference_path(recorded: EgoPath) -> ReferencePath:
     """Fits a smooth curve to the recorded path.
 
-    Recorded poses jitter by centimetres, which differences at 10 Hz would turn into absurd accelerations. So speed comes
-    from a smooth curve over time, and the shape from a smooth curve over arc length, which standstill does not disturb.
+    Recorded poses jitter by centimetres, which differences at 10 Hz would turn into absurd accelerations. So speed
+    comes from a smooth curve over time, and the shape from one over arc length, which standstill does not disturb.
 
     Args:
         recorded: one pose for each log frame.
@@ -137,12 +184,12 @@ def fit_reference_path(recorded: EgoPath) -> ReferencePath:
     times = recorded.times_s - recorded.times_s[0]
     poses = recorded.world_SE3_ego
     if len(recorded) == 1:
-        return _place_standing_reference(np.zeros(1), np.zeros(1), poses)
+        return _place_straight_reference(np.zeros(1), np.zeros(1), poses)
     dense, distances = _measure_distances(times, poses)
-    if distances[-1] < _STANDING_M:
-        return _place_standing_reference(dense, np.zeros_like(dense), poses)
+    if distances[-1] < STRAIGHT_M:
+        return _place_straight_reference(dense, distances * (distances[-1] > _STANDING_M), poses)
     driven = np.interp(times, dense, distances)
-    scale = max(_SMOOTHING_M, SMOOTHING_S * distances[-1] / times[-1])
+    scale = choose_smoothing_m(np.gradient(distances, dense))
     curve = fit_smooth_curve(driven, poses[:, :3, 3], scale)
     grid = np.linspace(0.0, distances[-1], max(8, round(distances[-1] / _TABLE_STEP_M)) + 1)
     velocity = curve.evaluate(grid, 1)
@@ -161,6 +208,35 @@ def fit_reference_path(recorded: EgoPath) -> ReferencePath:
     return ReferencePath(dense, distances, arc, table)
 
 
+def choose_smoothing_m(speed_m_s: Float64) -> float:
+    """Chooses how smooth the shape of a path is.
+
+    Args:
+        speed_m_s: [T] along it.
+
+    Returns:
+        The scale of ``fit_smooth_curve`` over arc length, metres.
+    """
+    return max(_SMOOTHING_M, _SMOOTHING_S_OF_SHAPE * float(speed_m_s.max()))
+
+
+def integrate_speed(times_s: Float64, speed_m_s: Float64) -> Float64:
+    """Integrates a smooth speed; what is slower than jitter counts as standing.
+
+    Args:
+        times_s: [T] dense.
+        speed_m_s: [T]; negative counts as 0.
+
+    Returns:
+        [T] metres driven by then.
+    """
+    # Fades out below the speed of standing, rather than ending there with a step.
+    driving = np.maximum(speed_m_s, 0.0)
+    driving = driving**3 / (driving**2 + _STANDING_M_S**2)
+    steps = 0.5 * (driving[1:] + driving[:-1]) * np.diff(times_s)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
 def _measure_distances(times: Float64, poses: Float64) -> tuple[Float64, Float64]:
     """Dense times and the metres driven by then."""
     curve = fit_smooth_curve(times, poses[:, :2, 3], SMOOTHING_S)
@@ -173,11 +249,7 @@ def _measure_distances(times: Float64, poses: Float64) -> tuple[Float64, Float64
     if backwards_m > _STANDING_M and backwards_m > np.trapezoid(np.maximum(speed, 0.0), dense):
         problem = f"the recorded vehicle drives backwards, {backwards_m:.1f} m"
         raise InputError(problem, remedy="Behaviours are for vehicles that drive forwards: take other chunks.")
-    # Fades out below the speed of standing, rather than ending there with a step.
-    driving = np.maximum(speed, 0.0)
-    driving *= driving**2 / (driving**2 + _STANDING_M_S**2)
-    steps = 0.5 * (driving[1:] + driving[:-1]) * np.diff(dense)
-    return dense, np.concatenate([[0.0], np.cumsum(steps)])
+    return dense, integrate_speed(dense, speed)
 
 
 def _turn_back(rotations: Float64, heading: Float64) -> Float64:
@@ -187,9 +259,9 @@ def _turn_back(rotations: Float64, heading: Float64) -> Float64:
     return np.asarray((Rotation.from_rotvec(about_z) * Rotation.from_matrix(rotations)).as_rotvec(), np.float64)
 
 
-def _place_standing_reference(times: Float64, distances: Float64, poses: Float64) -> ReferencePath:
-    """A straight line from where the vehicle stands."""
-    position = poses[:, :3, 3].mean(0)
+def _place_straight_reference(times: Float64, distances: Float64, poses: Float64) -> ReferencePath:
+    """A straight line from where the vehicle starts, to where it points."""
+    position = poses[0, :3, 3]
     forward = poses[:, :2, 0].mean(0)
     heading = float(np.arctan2(forward[1], forward[0]))
     rotation = _turn_back(poses[:, :3, :3], np.full(len(poses), heading)).mean(0)
