@@ -118,6 +118,11 @@ class LogMeasurement:
         refs: the artifacts of each job's stages, by stage.
         end: the stage whose scenes are rendered.
 
+    Attributes:
+        scenes: of the method.
+        recorded: the recorded path through all chunks.
+        rig: the cameras, with a global shutter.
+
     Raises:
         ArtifactCorruptError: an artifact is gone or damaged.
     """
@@ -127,10 +132,10 @@ class LogMeasurement:
         self._config = PipelineConfig.model_validate(jobs[0].config)
         self._log = cached_log(jobs[0].log)
         self._store = open_store(jobs[0].store)
-        self._scenes = StageScenes(jobs, refs, end)
-        chunks = [self._scenes.read_chunk(number) for number in self._scenes.chunk_numbers]
-        self._recorded = join_recorded_path(chunks)
-        self._rig = use_global_shutter(estimate_rig(chunks))
+        self.scenes = StageScenes(jobs, refs, end)
+        chunks = [self.scenes.read_chunk(number) for number in self.scenes.chunk_numbers]
+        self.recorded = join_recorded_path(chunks)
+        self.rig = use_global_shutter(estimate_rig(chunks))
         self._first = chunks[0]
         self._actors = (*list_world_actors(chunks), *list_parked_actors(self._log.tracks(), chunks))
         self._scene_digests = [[found[s].payload_digest for s in ("ingest", "effects", end)] for found in refs]
@@ -163,7 +168,7 @@ class LogMeasurement:
 
     def plan(self, rollout: TableRollout) -> PlannedRollout:
         """Plans a rollout on this log, see :func:`flows.paper_tables.rollouts.plan_rollout`."""
-        return plan_rollout(rollout, self._recorded, self._config.simulate, self._actors)
+        return plan_rollout(rollout, self.recorded, self._config.simulate, self._actors)
 
     def is_stored(self, rollout: TableRollout, true_views: int = TRUE_VIEWS) -> bool:
         """Says whether a rollout was measured before.
@@ -180,15 +185,15 @@ class LogMeasurement:
 
     def read_real_images(self) -> RealImages:
         """Gives what rollouts of this log are compared with as a set."""
-        chunks = [self._scenes.read_chunk(number, planned=False) for number in self._scenes.chunk_numbers]
+        chunks = [self.scenes.read_chunk(number, planned=False) for number in self.scenes.chunk_numbers]
         return collect_real_images(chunks, self._config.evaluate)
 
     def _score(self, planned: PlannedRollout, true_views: int) -> RolloutScores:
         true_images = self._cast_truth(planned, true_views)
         path = self._select_poses(planned)
         # As `genre simulate` hands over from chunk to chunk, measured on all poses.
-        handovers = plan_handovers(self._scenes, planned.path, self._rig, self._config.simulate.handover_frames)
-        rendered = render_rollout(self._scenes, path, self._rig, handovers=handovers)
+        handovers = plan_handovers(self.scenes, planned.path, self.rig, self._config.simulate.handover_frames)
+        rendered = render_rollout(self.scenes, path, self.rig, handovers=handovers)
         return score_rollout(rendered, self._config.evaluate, self.read_real_images(), true_images)
 
     def _select_poses(self, planned: PlannedRollout) -> EgoPath:
@@ -201,11 +206,11 @@ class LogMeasurement:
         if truth is None:
             return None
         path = self._select_poses(planned)
-        views = place_true_views(path, self._rig, count, planned.rollout.start_offset_m)
+        views = place_true_views(path, self.rig, count, planned.rollout.start_offset_m)
         images = [[v.camera, v.frame, v.lens.width_px, v.lens.height_px] for v in views]
         reader = code_digest(type(self._log).__module__)
         fields = {"log": self._log.digest(), "code": reader, "views": images, "path": _digest_path(path)}
-        key = digest_value(fields | {"rig": _digest_rig(self._rig)})
+        key = digest_value(fields | {"rig": _digest_rig(self.rig)})
         return get_or_make(
             self._store, self._address(TRUTH, key), "fixed_views", lambda: cast_true_images(truth, views)
         )
@@ -215,7 +220,7 @@ class LogMeasurement:
             "code": code_digest("genre_tasks.rollout.rollout_scores", (*_RENDERING, type(self._log).__module__)),
             "scenes": self._scene_digests,
             "path": _digest_path(planned.path),
-            "rig": _digest_rig(self._rig),
+            "rig": _digest_rig(self.rig),
             "handover_frames": self._config.simulate.handover_frames,
             "evaluate": _describe_evaluation(self._config.evaluate),
             # A log without a truth has the same scores whatever number of true views is asked for.
