@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.simulation.heldout_sweeps import HeldOutSweepsLog
+from benchmarks.simulation.heldout_sweeps import HeldoutSweepsLog
 from genre_tasks.errors import InputError
 from genre_tasks.logs.registry import open_log
 from tests.fakes import FakeLog
@@ -12,12 +12,12 @@ from tests.fakes import FakeLog
 
 def test_sweeps_are_held_out_and_nothing_else():
     log = FakeLog(frame_count=6)
-    held_out = HeldOutSweepsLog(log, 2)
+    held_out = HeldoutSweepsLog(log, 2)
     assert [held_out.sweep(frame) is None for frame in range(6)] == [False, True] * 3
     assert held_out.image_bytes("front", 1) == log.image_bytes("front", 1)
     assert held_out.frame_count == 6
     assert held_out.name != log.name
-    assert len({log.digest(), held_out.digest(), HeldOutSweepsLog(log, 3).digest()}) == 3
+    assert len({log.digest(), held_out.digest(), HeldoutSweepsLog(log, 3).digest()}) == 3
 
 
 def test_it_opens_by_its_uri():
