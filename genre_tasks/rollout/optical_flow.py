@@ -77,11 +77,11 @@ def _pixel_centers(lens: Lens) -> Float64:
 def _unproject(view: RolloutView, depth: NDArray[np.float32]) -> Float64:
     """[H, W, 3] metres in chunk coordinates."""
     centers = _pixel_centers(view.lens)
-    x = (centers[..., 0] - view.lens.cx_px) / view.lens.fx_px
-    y = (centers[..., 1] - view.lens.cy_px) / view.lens.fy_px
+    x: Float64 = (centers[..., 0] - view.lens.cx_px) / view.lens.fx_px
+    y: Float64 = (centers[..., 1] - view.lens.cy_px) / view.lens.fy_px
     if any(view.lens.distortion):
         x, y = pixels_to_rays(centers[..., 0], centers[..., 1], view.lens)
-    points = np.stack([x, y, np.ones_like(x)], -1) * depth[..., None]
+    points = np.stack([x, y, np.ones_like(x)], -1) * depth[..., None].astype(np.float64)
     return _apply(view.chunk_SE3_camera, points)
 
 
@@ -125,7 +125,7 @@ def _project(points: Float64, view: RolloutView) -> tuple[Float64, Float64]:
     if any(lens.distortion):
         with np.errstate(invalid="ignore"):
             depth[x * x + y * y >= fold_radius(lens.coefficients) ** 2] = np.nan
-        x, y = distort(x, y, lens.coefficients)
+        x, y = (np.asarray(bent, np.float64) for bent in distort(x, y, lens.coefficients))
         x[np.isnan(depth)] = np.nan
     return np.stack([x * lens.fx_px + lens.cx_px, y * lens.fy_px + lens.cy_px], -1), depth
 
