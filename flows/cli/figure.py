@@ -20,7 +20,6 @@ from flows.cli.parsing import parse_path
 from flows.defaults import DEFAULT_STORE
 
 if TYPE_CHECKING:
-    from flows.experiments.stages import StageRunner
     from flows.paper_tables.comparison_strips import ComparisonStrip
     from flows.paper_tables.figure import Kind
     from flows.paper_tables.request import CheckedRequest
@@ -37,8 +36,7 @@ FigureKindArgument = Annotated[
 FigureChunkOption = Annotated[
     int | None,
     typer.Option(
-        help="The number of the chunk in the log, from 0. If not given, recon and fixers show chunk 0, and the others "
-        "use all chunks."
+        help="The number of the chunk in the log, from 0. If not given, chunk 0; a swerve goes through all chunks."
     ),
 ]
 CameraOption = Annotated[
@@ -101,40 +99,29 @@ def figure(
         genre figure recon 'synthetic:street?seed=1000' --out figure.png
     """
     from flows.cli.output_paths import check_output_file
-    from flows.cli.terminal import TerminalReporter
     from flows.paper_tables.comparison_strips import draw_strips
-    from flows.paper_tables.figure import SHIFTS_M, TABLE, parse_kind
+    from flows.paper_tables.figure import TABLE, parse_kind
     from flows.paper_tables.request import TableRequest
-    from flows.pipeline.stage_runner import run_stage
     from genre_tasks.atomic_path import atomic_path
     from storage.codecs.png import write_png
 
     parsed_kind = parse_kind(kind)
     # Checked before any stage is computed, which may take minutes.
     check_output_file(out, "--out", (".png",))
-    chunks = (0,) if chunk is None and parsed_kind in SHIFTS_M else None if chunk is None else (chunk,)
+    # Edits are shown at one moment, and reading more chunks for it would take minutes.
+    default_chunks = None if parsed_kind == "swerve" else (0,)
     request = TableRequest(
         number=TABLE[parsed_kind],
         logs=(log,),
         preset=preset,
         store=store,
-        chunks=chunks,
+        chunks=default_chunks if chunk is None else (chunk,),
         settings=tuple(settings or ()),
         methods=tuple(str(file) for file in methods or ()),
         weights=tuple(weights or ()),
     )
     checked = request.check()
-    # Without Prefect: one chunk needs neither its retries nor its server, which takes seconds to start.
-    reporter = TerminalReporter(f"figure {parsed_kind}")
-
-    def run_reported(stage: str, job: Job, inputs: dict[str, ArtifactRef]) -> ArtifactRef:
-        reporter.part_started(stage)
-        ref = run_stage(stage, job, inputs, progress=reporter.progress)
-        reporter.part_ended("cached" if ref.cached else "computed")
-        return ref
-
-    with reporter:
-        strips = _make_strips(parsed_kind, checked, run_reported, _Choice(camera, frame, actor))
+    strips = _make_strips(parsed_kind, checked, _Choice(camera, frame, actor))
     shown = ", ".join(str(where.chunk) for where in checked.places)
     title = " ".join([f"{log} chunk {shown}, preset {preset}", *request.settings])
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -152,12 +139,24 @@ class _Choice:
     actor: str | None
 
 
-def _make_strips(kind: Kind, checked: CheckedRequest, runner: StageRunner, choice: _Choice) -> list[ComparisonStrip]:
+def _make_strips(kind: Kind, checked: CheckedRequest, choice: _Choice) -> list[ComparisonStrip]:
+    from flows.cli.terminal import TerminalReporter
     from flows.paper_tables.figure import comparison_strips
     from flows.paper_tables.rollout_figures import manipulation_strips, swerve_strips
+    from flows.pipeline.stage_runner import run_stage
 
-    if kind == "swerve":
-        return swerve_strips(checked, runner, choice.camera)
-    if kind == "manipulation":
-        return manipulation_strips(checked, runner, choice.actor, choice.camera, choice.frame)
-    return comparison_strips(kind, checked, runner, choice.camera, choice.frame)
+    # Without Prefect: one log needs neither its retries nor its server, which takes seconds to start.
+    reporter = TerminalReporter(f"figure {kind}")
+
+    def run_reported(stage: str, job: Job, inputs: dict[str, ArtifactRef]) -> ArtifactRef:
+        reporter.part_started(stage)
+        ref = run_stage(stage, job, inputs, progress=reporter.progress)
+        reporter.part_ended("cached" if ref.cached else "computed")
+        return ref
+
+    with reporter:
+        if kind == "swerve":
+            return swerve_strips(checked, run_reported, choice.camera)
+        if kind == "manipulation":
+            return manipulation_strips(checked, run_reported, choice.actor, choice.camera, choice.frame)
+        return comparison_strips(kind, checked, run_reported, choice.camera, choice.frame)

@@ -34,7 +34,7 @@ from genre_tasks.scene_edits.actor_library import ActorLibrary
 from genre_tasks.scene_edits.actor_names import name_actors, resolve_actor
 from genre_tasks.scene_edits.chunk_scene import SceneSource
 from genre_tasks.scene_edits.edited_scenes import EditedScenes
-from genre_tasks.scene_edits.edits import EditList, Insert, Move, Remove
+from genre_tasks.scene_edits.edits import Edit, EditList, Insert, Move, Remove
 
 MOMENTS = 5
 """Columns of the figure of a swerve, spread evenly over its path."""
@@ -209,14 +209,14 @@ def _edit_actor(scenes: StageScenes, config: PipelineConfig, best: _ActorView, n
     # To the other side of the ego vehicle than the actor, where nothing of it was.
     left_m = -INSERTED_LEFT_M if best.left_of_ego else INSERTED_LEFT_M
     insert = Insert(actor=name, name="inserted", ahead_m=INSERTED_AHEAD_M, left_m=left_m, speed_m_s=0.0, start_s=moment)
-    edits = {
+    edits: dict[str, Edit] = {
         "removed": Remove(actor=name),
         "inserted again": insert,
         "moved": Move(actor=name, left_m=MOVED_M),
     }
 
     def open_run(run: str) -> SceneSource:
-        raise InputError(f"the figure has no run {run}")
+        raise InputError(f"the figure has no run {run}", remedy="Insert an actor of its log.")
 
     library = ActorLibrary(open_run)
     edited = {
