@@ -144,7 +144,9 @@ def _colored_box() -> Gaussians:
     right = _balls(np.stack([along[:, 0], np.full(len(along), -0.9), along[:, 1]], 1), RIGHT_COLOR)
     front = _balls(np.stack([np.full(len(across), 1.9), across[:, 0], across[:, 1]], 1), FRONT_COLOR)
     rear = _balls(np.stack([np.full(len(across), -1.9), across[:, 0], across[:, 1]], 1), REAR_COLOR)
-    return map_attributes(lambda *x: torch.cat(x), left, right, front, rear)
+    top = np.stack(np.meshgrid(np.linspace(-1.7, 1.7, 8), np.linspace(-0.8, 0.8, 5)), -1).reshape(-1, 2)
+    roof = _balls(np.concatenate([top, np.full((len(top), 1), 0.6)], 1), REAR_COLOR)
+    return map_attributes(lambda *x: torch.cat(x), left, right, front, rear, roof)
 
 
 def _balls(points: Float64, color: tuple[float, float, float]) -> Gaussians:
