@@ -55,16 +55,9 @@ def show(
         genre show actors 4b1c --picture actors.png
     """
     from flows.cli.existing_store import open_existing_store
-    from flows.cli.output_paths import check_output_file
     from flows.cli.printing import print_fields, print_rows
 
-    if picture is not None:
-        # The picture is a PNG under any name, and a PNG called x.jpg would not open everywhere.
-        check_output_file(picture, "--picture", (".png",))
-        if what in ("config", "runs", "stages"):
-            raise _no_picture(f"a list of {what}" if what != "config" else "a configuration")
-    if run is not None and what != "actors":
-        raise _second_word(what, run)
+    _check_options(what, run, picture)
     if what == "config":
         from flows.configuration import load_configuration
 
@@ -83,6 +76,18 @@ def show(
         print_rows("artifacts", [_artifact_row(artifact) for artifact in opened.artifacts()])
     else:
         _show_run_or_artifact(what, opened, store, picture)
+
+
+def _check_options(what: str, run: str | None, picture: Path | None) -> None:
+    from flows.cli.output_paths import check_output_file
+
+    if picture is not None:
+        # The picture is a PNG under any name, and a PNG called x.jpg would not open everywhere.
+        check_output_file(picture, "--picture", (".png",))
+        if what in ("config", "runs", "stages"):
+            raise _no_picture(f"a list of {what}" if what != "config" else "a configuration")
+    if run is not None and what != "actors":
+        raise _second_word(what, run)
 
 
 def _show_run_or_artifact(name: str, opened: LocalStore, store: str, picture: Path | None) -> None:
