@@ -21,6 +21,9 @@ from storage.files import write_file
 FILLED_FOLDER = "filled"
 """Masks of what FNet drew in place of removed actors: ``filled/CAMERA/000012.png``, white where it did."""
 
+RESTORED_FOLDER = "restored"
+"""The same for what removed actors did not hide, but shaded."""
+
 Repair = Callable[[RolloutImages], RolloutImages]
 
 
@@ -37,18 +40,20 @@ class FnetRepair:
         self, repair: Callable[[RolloutImages], FixedRolloutImages], folder: Path, rig: Sequence[RigCamera]
     ) -> None:
         self._repair = repair
-        self._folder = folder / FILLED_FOLDER
+        self._folder = folder
         self._rig = rig
 
     def __call__(self, images: RolloutImages) -> RolloutImages:
         """Repairs the images of a pose; poses follow each other in order."""
         fixed = self._repair(images)
         if images.chunk_scene.removed:
-            self._folder.mkdir(exist_ok=True)
-            make_camera_folders(self._folder, self._rig)
-            for view, mask in zip(images.views, fixed.filled.numpy(), strict=True):
-                path = image_path(self._folder, view.camera, images.index, ".png")
-                write_file(path, encode_png(mask.astype(np.uint8) * 255))
+            for name, masks in ((FILLED_FOLDER, fixed.filled), (RESTORED_FOLDER, fixed.restored)):
+                folder = self._folder / name
+                folder.mkdir(exist_ok=True)
+                make_camera_folders(folder, self._rig)
+                for view, mask in zip(images.views, masks.numpy(), strict=True):
+                    path = image_path(folder, view.camera, images.index, ".png")
+                    write_file(path, encode_png(mask.astype(np.uint8) * 255))
         return replace(images, color=fixed.color.clamp(0, 1))
 
 
