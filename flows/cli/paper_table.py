@@ -27,7 +27,7 @@ TableNumberArgument = Annotated[
     int,
     typer.Argument(
         help="The table's number: 1 comparison of methods, 2 GenRe after other methods, 3 fixers by their inputs, 4 "
-        "ablation, 5 runtime by phase."
+        "ablation, 5 runtime by phase, 6 re-simulation with other behaviours."
     ),
 ]
 TableFolderOption = Annotated[

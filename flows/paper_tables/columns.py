@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from flows.paper_tables.rollouts import BEHAVIOUR_LABELS
+
 RECONSTRUCTION = ("initial", "gnet")
 FIXER = ("novel_views", "fnet")
 DISTILLATION = ("enet",)
@@ -22,22 +24,24 @@ class MeasuredCell:
     Attributes:
         method: label of the row.
         log: URI of the log.
-        chunk: index of the chunk.
+        chunk: index of the chunk; ``None`` for all measured chunks of the log together.
         seconds: wall seconds by stage, as they were when the stage was computed.
         cpu_seconds: CPU seconds by stage; NaN where they were not counted.
         metrics: by name, with ``…/n`` images and ``…/low``, ``…/high`` of 95 % intervals.
         gaussians: number of Gaussians of the scene.
         fixed_views: number of novel views that were fixed.
+        remarks: what the reader should know of this cell, a clause each.
     """
 
     method: str
     log: str
-    chunk: int
+    chunk: int | None
     seconds: Mapping[str, float]
     cpu_seconds: Mapping[str, float]
     metrics: Mapping[str, float]
     gaussians: int
     fixed_views: int
+    remarks: tuple[str, ...] = ()
 
 
 Reader = Callable[[MeasuredCell], float]
@@ -144,5 +148,45 @@ def truth_columns(shifts_m: Sequence[int]) -> tuple[Column, ...]:
     for name, label, digits in (("perceptual", "perceptual", 3), ("lpips", "LPIPS", 3), ("frechet", "Fréchet", 2)):
         columns += [
             Column(f"{name}_{n}m", f"{label} @{n}m", read_metric(f"shift_{n}m/{name}"), digits) for n in shifts_m
+        ]
+    return tuple(columns)
+
+
+def behaviour_columns() -> tuple[Column, ...]:
+    """Makes columns of the kernel distance of each behaviour's rollouts, in the place of the paper's FID."""
+    return tuple(
+        Column(
+            f"kernel_{behaviour}",
+            f"kernel {label}",
+            read_metric(f"{behaviour}/kernel"),
+            digits=3,
+            paper=f"fid_{behaviour}",
+            paper_label=f"FID {label}",
+            read_papers_quantity=read_metric(f"{behaviour}/fid"),
+        )
+        for behaviour, label in BEHAVIOUR_LABELS.items()
+    )
+
+
+def behaviour_truth_columns() -> tuple[Column, ...]:
+    """Makes columns of what is measured against true images along rollouts, and of the Fréchet distance."""
+    columns = []
+    for name, label, digits in (
+        ("psnr", "PSNR", 2),
+        ("perceptual", "perceptual", 3),
+        ("ssim", "SSIM", 3),
+        ("lpips", "LPIPS", 3),
+        ("frechet", "Fréchet", 2),
+    ):
+        better = name in ("psnr", "ssim")
+        columns += [
+            Column(
+                f"{name}_{behaviour}",
+                f"{label} {words}",
+                read_metric(f"{behaviour}/{name}"),
+                digits,
+                more_is_better=better,
+            )
+            for behaviour, words in BEHAVIOUR_LABELS.items()
         ]
     return tuple(columns)

@@ -19,7 +19,14 @@ from flows.paper_tables.measure import measure_cell, warm_up
 from flows.paper_tables.page import list_differences, render_page
 from flows.paper_tables.page_sections import replace_section
 from flows.paper_tables.parquet import write_cells
-from flows.paper_tables.request import CheckedRequest, TableRequest, find_unstored_methods, predict_table
+from flows.paper_tables.request import (
+    CheckedRequest,
+    TableRequest,
+    describe_places,
+    find_unstored_methods,
+    predict_stages,
+)
+from flows.paper_tables.rollout_cells import measure_rollout_cell
 from flows.pipeline.progress import get_reporter
 from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import GenreError
@@ -47,7 +54,7 @@ def paper_table(
     is left out, and the table says so.
 
     Args:
-        number: of the table, 1 to 5.
+        number: of the table, 1 to 6.
         logs: URIs, all of one dataset; ``pandaset:PATH/*`` stands for every sequence in a folder.
         preset: name of the preset.
         store: folder of the store.
@@ -96,7 +103,7 @@ def paper_table(
 
 def _warm_up_if_timed(checked: CheckedRequest) -> None:
     # What comes from the store keeps the seconds of its first computation: nothing is timed then.
-    if any(row["seconds"] > 0 for row in predict_table(checked)):
+    if any(row["seconds"] > 0 for row in predict_stages(checked)):
         get_reporter().part_started("warming up")
         warm_up(checked.basis, checked.layout)
         get_reporter().part_ended("imports, weights and first calls are in no stage's seconds")
@@ -107,14 +114,14 @@ def _run_cells(checked: CheckedRequest) -> tuple[list[MeasuredCell], dict[str, G
     cells: list[MeasuredCell] = []
     failed: dict[str, GenreError] = {}
     reporter = get_reporter()
-    planned = [(where, row.label) for where in checked.places for row in checked.measurable_rows]
-    for k, (where, label) in enumerate(planned):
+    planned = [(places, row.label) for places in checked.group_places() for row in checked.measurable_rows]
+    for k, (places, label) in enumerate(planned):
         # Its row is left out anyway, so its further chunks would be hours for nothing.
         if label in failed:
             continue
-        reporter.part_started(f"{k + 1}/{len(planned)} {label} · {where}")
+        reporter.part_started(f"{k + 1}/{len(planned)} {label} · {describe_places(places)}")
         try:
-            cell = cell_task(checked, label, where)
+            cell = cell_task(checked, label, places)
         except GenreError as error:
             failed[label] = error
             reporter.part_ended(f"left out: {error}")
@@ -124,11 +131,19 @@ def _run_cells(checked: CheckedRequest) -> tuple[list[MeasuredCell], dict[str, G
     return cells, failed
 
 
-@task(name="table-cell", task_run_name="{label} {where}", persist_result=False, cache_policy=NO_CACHE)
-def cell_task(checked: CheckedRequest, label: str, where: LogChunk) -> MeasuredCell:
-    """Measures one cell as a Prefect task, see :func:`flows.paper_tables.measure.measure_cell`."""
-    method = next(row.method for row in checked.layout.rows if row.label == label)
-    return measure_cell(checked.basis, checked.layout, replace(method, name=label), where, run_reported_stage)
+@task(name="table-cell", task_run_name="{label} {places}", persist_result=False, cache_policy=NO_CACHE)
+def cell_task(checked: CheckedRequest, label: str, places: tuple[LogChunk, ...]) -> MeasuredCell:
+    """Measures one cell as a Prefect task, see :func:`flows.paper_tables.measure.measure_cell`.
+
+    Args:
+        checked: the table.
+        label: of the row.
+        places: the chunk, or all chunks of a log where the table has rollouts.
+    """
+    method = replace(next(row.method for row in checked.layout.rows if row.label == label), name=label)
+    if checked.layout.rollouts:
+        return measure_rollout_cell(checked.basis, checked.layout, method, places, run_reported_stage)
+    return measure_cell(checked.basis, checked.layout, method, places[0], run_reported_stage)
 
 
 def write_results(
@@ -191,6 +206,10 @@ def collect_facts(request: TableRequest, checked: CheckedRequest, cells: Sequenc
         counts = sorted({int(c.metrics[f"{group}/n"]) for c in cells if f"{group}/n" in c.metrics})
         if counts:
             facts[name] = ", ".join(map(str, counts))
+    # Every method drives the same rollouts, so a remark on one is written once.
+    remarks = list(dict.fromkeys(text for cell in cells for text in cell.remarks))
+    if remarks:
+        facts["rollouts"] = "; ".join(remarks)
     if request.remarks:
         facts["remark"] = " ".join(request.remarks)
     return facts

@@ -13,6 +13,8 @@ from flows.paper_tables.columns import (
     PREPARATION,
     RECONSTRUCTION,
     Column,
+    behaviour_columns,
+    behaviour_truth_columns,
     kernel_columns,
     read_metric,
     seconds_per_fixed_view,
@@ -22,6 +24,7 @@ from flows.paper_tables.columns import (
     truth_columns,
 )
 from flows.paper_tables.methods import Method
+from flows.paper_tables.rollouts import TABLE_ROLLOUTS, TableRollout
 from genre_tasks.errors import ConfigError
 
 PROTOCOL = (
@@ -63,6 +66,7 @@ class Layout:
         protocol: ``section.key=value`` over the preset, for all methods.
         evaluated: whether scenes or images are evaluated; a table of times needs none.
         notes: sentences below the table.
+        rollouts: what a method is measured along, on all chunks of a log together; none where every chunk is a cell.
     """
 
     number: int
@@ -73,6 +77,7 @@ class Layout:
     protocol: tuple[str, ...] = PROTOCOL
     evaluated: bool = True
     notes: tuple[str, ...] = ()
+    rollouts: tuple[TableRollout, ...] = ()
 
 
 def get_layout(number: int, user_methods: Sequence[Method] = ()) -> Layout:
@@ -217,5 +222,21 @@ _RUNTIME = Layout(
         "views and fixing them; distillation: ENet's stage. Ingest and plan of effects are not in the total.",
     ),
 )
-LAYOUTS: Mapping[int, Layout] = {x.number: x for x in (_COMPARISON, _PLUG_IN, _FIXERS, _ABLATION, _RUNTIME)}
+_RE_SIMULATION = Layout(
+    number=6,
+    rows=(_row("3dgs", "3DGS"), _row("difix", "Difix3D"), _row("genre+", "GenRe+")),
+    columns=behaviour_columns(),
+    extra_columns=(*behaviour_truth_columns(), _GAUSSIANS),
+    evaluated=False,
+    rollouts=TABLE_ROLLOUTS,
+    notes=(
+        "All chunks of a log make one recorded path. Each behaviour branches from it, 3 m to the left of its start "
+        "and 3 m to the right; a number is the mean of both sides. All cameras are rendered at every pose with a "
+        "global shutter, and their images are compared as a set with all real images of the log's chunks. Where a "
+        "truth is known, 24 images of each rollout are compared with it, spread over poses and cameras.",
+    ),
+)
+LAYOUTS: Mapping[int, Layout] = {
+    x.number: x for x in (_COMPARISON, _PLUG_IN, _FIXERS, _ABLATION, _RUNTIME, _RE_SIMULATION)
+}
 """The tables by their numbers in the paper."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from flows.experiments.log_chunks import LogChunk, select_log_chunks
 from flows.experiments.stage_prediction import StagePredictor, find_stored_stages
 from flows.paper_tables.layouts import Layout, Row, get_layout
 from flows.paper_tables.measure import PRESET_METHOD, Basis, list_stages
+from flows.paper_tables.rollout_cells import count_missing_rollouts, predict_rollouts
 from flows.paper_tables.user_methods import read_method
 from flows.paper_tables.weights_slots import SLOTS, read_weights
 from flows.pipeline.log_cache import cached_log
@@ -26,7 +28,7 @@ class TableRequest:
     """What a user asks for; its files are read by :meth:`check`.
 
     Attributes:
-        number: of the table, 1 to 5.
+        number: of the table, 1 to 6.
         logs: URIs; ``pandaset:PATH/*`` stands for every sequence in a folder.
         preset: name of the preset.
         store: folder of the store.
@@ -139,10 +141,31 @@ class CheckedRequest:
             for row in self.measurable_rows
         ]
 
+    def group_places(self) -> list[tuple[LogChunk, ...]]:
+        """Groups the chunks by cell: every chunk alone, or all chunks of a log where the table has rollouts."""
+        if not self.layout.rollouts:
+            return [(where,) for where in self.places]
+        logs = dict.fromkeys(where.log for where in self.places)
+        return [tuple(where for where in self.places if where.log == log) for log in logs]
+
     @property
     def measurable_rows(self) -> tuple[Row, ...]:
         """The rows that can be measured."""
         return tuple(row for row in self.layout.rows if row.label not in self.missing)
+
+
+def describe_places(places: Sequence[LogChunk]) -> str:
+    """Names the chunks of a cell.
+
+    Args:
+        places: chunks of one log.
+
+    >>> describe_places([LogChunk("pandaset:002", 0), LogChunk("pandaset:002", 1)])
+    'pandaset:002 chunks 0, 1'
+    """
+    if len(places) == 1:
+        return str(places[0])
+    return f"{places[0].log} chunks {', '.join(str(where.chunk) for where in places)}"
 
 
 def predict_table(checked: CheckedRequest) -> list[dict[str, Any]]:
@@ -152,8 +175,27 @@ def predict_table(checked: CheckedRequest) -> list[dict[str, Any]]:
         checked: what to measure.
 
     Returns:
-        A row for each cell, see :meth:`flows.experiments.stage_prediction.StagePredictor.predict`; for a method that
-        cannot be measured ``cached`` says why.
+        The rows of :func:`predict_stages`, and where the table has rollouts one for those of each method and log.
+    """
+    rows = predict_stages(checked)
+    if checked.layout.rollouts:
+        rows += [
+            predict_rollouts(checked.basis, checked.layout, row.method, places)
+            for places in checked.group_places()
+            for row in checked.measurable_rows
+        ]
+    return rows
+
+
+def predict_stages(checked: CheckedRequest) -> list[dict[str, Any]]:
+    """Predicts what the stages of a table would take.
+
+    Args:
+        checked: what to measure.
+
+    Returns:
+        A row for each method and chunk, see :meth:`flows.experiments.stage_prediction.StagePredictor.predict`; for a
+        method that cannot be measured ``cached`` says why.
     """
     predictor = StagePredictor(checked.basis.store)
     rows: list[dict[str, Any]] = []
@@ -179,7 +221,7 @@ def find_unstored_methods(checked: CheckedRequest) -> dict[str, str]:
         checked: what to measure.
 
     Returns:
-        Label of the row → the first stage that is missing, as a sentence.
+        Label of the row → the first stage that is missing, or the log that lacks rollouts, as a sentence.
     """
     unstored: dict[str, str] = {}
     for where in checked.places:
@@ -190,4 +232,18 @@ def find_unstored_methods(checked: CheckedRequest) -> dict[str, str]:
             if absent:
                 # The first chunk's reason is kept; one is enough to leave the method out.
                 unstored.setdefault(row.label, f"the store has no {absent[0]} of {where} yet.")
+    if checked.layout.rollouts:
+        _find_unstored_rollouts(checked, unstored)
     return unstored
+
+
+def _find_unstored_rollouts(checked: CheckedRequest, unstored: dict[str, str]) -> None:
+    """Adds the methods whose stages are stored and some of whose rollouts are not."""
+    for places in checked.group_places():
+        for row in checked.measurable_rows:
+            # A missing stage is the reason already, and without scenes no rollout can be looked up.
+            if row.label in unstored:
+                continue
+            missing = count_missing_rollouts(checked.basis, checked.layout, row.method, places)
+            if missing:
+                unstored[row.label] = f"the store has not {missing} of the rollouts of {places[0].log} yet."

@@ -21,6 +21,7 @@ KINDS: dict[str, str] = {
     "pairs": "storage.codecs.pairs",
     "evaluation": "storage.codecs.evaluation",
     "effects": "storage.codecs.effects",
+    "rollout_scores": "storage.codecs.rollout_scores",
 }
 """Kind of artifact → module of its codec. A new kind is one file and one line."""
 

@@ -1,0 +1,106 @@
+"""The rollouts of the paper's table 6: which behaviours, from where they start, and as strong as the log allows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from genre_tasks.config import SimulateConfig
+from genre_tasks.errors import InputError
+
+if TYPE_CHECKING:
+    from genre_tasks.ego_paths.ego_path import EgoPath
+
+BEHAVIOUR_LABELS = {"brake": "brake", "accelerate": "accelerate", "lane-change": "change lane", "swerve": "swerve"}
+"""The behaviours in the paper's order, with the words of its table's heading."""
+STRENGTHS = (1.0, 0.75, 0.5, 0.25)
+"""Strengths in the order in which they are tried: a short log has no room for a strong behaviour."""
+START_OFFSET_M = 3.0
+"""Paper Sec. IV-C: each rollout starts 3 m to the side of the recorded path."""
+
+
+@dataclass(frozen=True)
+class TableRollout:
+    """A rollout that a table measures.
+
+    Attributes:
+        behaviour: a name in ``BEHAVIOUR_LABELS``.
+        start_offset_m: metres to the left of the recorded path at its start; below 0 to the right.
+    """
+
+    behaviour: str
+    start_offset_m: float
+
+    @property
+    def name(self) -> str:
+        """The first part of its metrics' names.
+
+        >>> TableRollout("swerve", -3.0).name
+        'swerve_right'
+        """
+        return f"{self.behaviour}_{'left' if self.start_offset_m >= 0 else 'right'}"
+
+    def __str__(self) -> str:
+        return f"{self.behaviour} from {self.start_offset_m:+g} m"
+
+
+TABLE_ROLLOUTS = tuple(
+    TableRollout(name, offset) for name in BEHAVIOUR_LABELS for offset in (START_OFFSET_M, -START_OFFSET_M)
+)
+"""The rollouts of table 6: both sides of the recorded path, as in the evaluation of lateral shifts."""
+
+
+@dataclass(frozen=True)
+class PlannedRollout:
+    """A rollout on one log.
+
+    Attributes:
+        rollout: what was asked for.
+        path: where the vehicle drives.
+        strength: of the behaviour, the largest of ``STRENGTHS`` that the log has room for.
+    """
+
+    rollout: TableRollout
+    path: EgoPath
+    strength: float
+
+
+def plan_rollout(rollout: TableRollout, recorded: EgoPath, config: SimulateConfig) -> PlannedRollout:
+    """Plans a behaviour as strong as the log has room for.
+
+    Args:
+        rollout: what to drive.
+        recorded: the recorded path.
+        config: what a vehicle can do.
+
+    Returns:
+        The path of the largest of ``STRENGTHS`` that is possible.
+
+    Raises:
+        InputError: the log is too short for the least of them, or has no behaviour of that name.
+    """
+    # Imported here: a request is checked before anything numeric is loaded.
+    from genre_tasks.ego_paths.behaviours import plan_behaviour
+
+    for strength in STRENGTHS:
+        try:
+            path = plan_behaviour(
+                rollout.behaviour, recorded, config, start_offset_m=rollout.start_offset_m, strength=strength
+            )
+        except InputError:
+            # The last one's error says what is in the way, with its numbers.
+            if strength == STRENGTHS[-1]:
+                raise
+            continue
+        return PlannedRollout(rollout, path, strength)
+    raise AssertionError("STRENGTHS is not empty")
+
+
+def join_names(names: Sequence[str]) -> str:
+    """Joins names for a sentence.
+
+    >>> join_names(["brake", "swerve", "accelerate"])
+    'brake, swerve and accelerate'
+    """
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

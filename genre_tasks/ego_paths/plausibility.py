@@ -1,0 +1,95 @@
+"""The guarantee of every planned path: within the bounds, or an error that says what breaks them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from genre_tasks.ego_paths.behaviour_request import BehaviourRequest
+from genre_tasks.ego_paths.ego_path import EgoPath
+from genre_tasks.ego_paths.frenet import ConstantOffset, place_path
+from genre_tasks.ego_paths.kinematics import BoundViolation, find_bound_violations
+from genre_tasks.errors import ConfigError
+
+
+def describe_violations(violations: Sequence[BoundViolation]) -> str:
+    """Writes violations for an error.
+
+    Args:
+        violations: at least one.
+
+    Returns:
+        One clause.
+    """
+    return ", ".join(str(violation) for violation in violations)
+
+
+def check_recorded_driving(request: BehaviourRequest) -> None:
+    """Refuses a behaviour where the recorded driving alone, at the start offset, breaks the bounds.
+
+    Args:
+        request: of any behaviour.
+
+    Raises:
+        ConfigError: it does.
+    """
+    path = place_path(request.reference, request.recorded, request.reference, ConstantOffset(request.start_offset_m))
+    violations = find_bound_violations(path, request.config.bounds)
+    if violations:
+        offset = request.start_offset_m
+        moved = f", moved by {offset:g} m," if offset else ""
+        remedy = "Widen simulate.bounds in the configuration, or take other chunks."
+        if offset:
+            remedy = f"Start nearer to the recorded path: `--start-offset {0.5 * offset:g}`. Or: {remedy}"
+        raise ConfigError(
+            f"the recorded path itself{moved} breaks the bounds: {describe_violations(violations)}", remedy=remedy
+        )
+
+
+def check_planned_path(request: BehaviourRequest, path: EgoPath) -> EgoPath:
+    """Refuses a planned path that breaks the bounds.
+
+    Args:
+        request: what it was planned for.
+        path: the planned path.
+
+    Returns:
+        The path.
+
+    Raises:
+        ConfigError: it does.
+    """
+    violations = find_bound_violations(path, request.config.bounds)
+    if violations:
+        raise ConfigError(
+            f"{request.name} at strength {request.strength:g} breaks the bounds: {describe_violations(violations)}",
+            remedy=f"Ask for less: `--strength {0.5 * request.strength:g}`. Or widen simulate.bounds.",
+        )
+    return path
+
+
+def check_rate(request: BehaviourRequest, rate_m_s2: float, bound_m_s2: float, quantity: str) -> float:
+    """Scales an acceleration by the strength.
+
+    Args:
+        request: has the strength.
+        rate_m_s2: at strength 1.
+        bound_m_s2: the largest one.
+        quantity: its name for the error.
+
+    Returns:
+        The acceleration, m/s².
+
+    Raises:
+        ConfigError: it is more than the bound.
+    """
+    rate = request.strength * rate_m_s2
+    if rate > bound_m_s2:
+        problem = f"{request.name} at strength {request.strength:g} is a {quantity} of {rate:.3g} m/s²"
+        # Rounded down, so that the strength in the remedy is one that works.
+        largest = math.floor(100 * bound_m_s2 / rate_m_s2) / 100
+        raise ConfigError(
+            f"{problem}, the bound is {bound_m_s2:g}",
+            remedy=f"Ask for less: `--strength {largest:g}`, or widen simulate.bounds.",
+        )
+    return rate
