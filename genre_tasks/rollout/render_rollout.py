@@ -5,15 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.render import render_views
 from genre_tasks.render.types import RenderSettings
+from genre_tasks.rollout.camera_motion import place_rollout_views
+from genre_tasks.rollout.handover import Handover, cut_at_borders
 from genre_tasks.rollout.rig import RigCamera, RolloutView
+from genre_tasks.rollout.traffic import extend_traffic
 from genre_tasks.scene_edits.chunk_scene import ChunkScene, SceneSource
+
+__all__ = ["RolloutImages", "place_rollout_views", "render_rollout"]
 
 DEFAULT_SETTINGS = RenderSettings()
 
@@ -25,10 +29,14 @@ class RolloutImages:
     Attributes:
         index: of the pose in the path.
         views: C of them, in coordinates of the chunk.
-        chunk_scene: the chunk and scene that were rendered.
+        chunk_scene: the chunk and scene that were rendered; within a hand-over those that count more, with the traffic
+            of both chunks.
         color: [C, H, W, 3] sRGB premultiplied by alpha, in [0, 1].
         alpha: [C, H, W].
-        depth: [C, H, W] metres, 0 where nothing is.
+        depth: [C, H, W] metres, 0 where nothing is; of ``chunk_scene`` alone.
+        chunk: number of that chunk.
+        blended_chunk: number of the chunk whose scene is mixed in by a hand-over; ``None``: there is none.
+        blend_weight: how much that scene counts in colour and alpha, 0 to 0.5.
     """
 
     index: int
@@ -37,52 +45,123 @@ class RolloutImages:
     color: Tensor
     alpha: Tensor
     depth: Tensor
+    chunk: int = 0
+    blended_chunk: int | None = None
+    blend_weight: float = 0.0
+
+
+@dataclass(frozen=True)
+class ShownScene:
+    """A scene and how much it counts at a moment.
+
+    Attributes:
+        chunk: its number.
+        chunk_scene: what is rendered.
+        weight: in [0, 1]; those of a moment add up to 1.
+    """
+
+    chunk: int
+    chunk_scene: ChunkScene
+    weight: float
+
+
+class SceneSchedule:
+    """Which scenes show a moment of the log; at most those of two chunks are in memory.
+
+    Args:
+        source: the scenes of a run.
+        handovers: between chunks that follow each other, in their order.
+    """
+
+    def __init__(self, source: SceneSource, handovers: Sequence[Handover]) -> None:
+        self._source = source
+        self._handovers = handovers
+        # The scenes of the hand-over that is under way, with the traffic of both chunks.
+        self._extended: tuple[Handover, ChunkScene, ChunkScene] | None = None
+
+    def find(self, frame: float) -> tuple[ShownScene, ...]:
+        """Finds the scenes of a moment.
+
+        Args:
+            frame: log frame, or a moment between two.
+
+        Returns:
+            One scene, or two within a hand-over; the one that counts more comes first.
+        """
+        number = self._source.chunk_numbers[0]
+        for handover in self._handovers:
+            if handover.needs_traffic(frame):
+                return self._blend(handover, frame)
+            if handover.weigh(frame) == 1:
+                number = handover.after
+        self._extended = None
+        return (ShownScene(number, self._source.load(number), 1.0),)
+
+    def _blend(self, handover: Handover, frame: float) -> tuple[ShownScene, ...]:
+        # Built once for a hand-over: it copies the Gaussians where actors are added.
+        if self._extended is None or self._extended[0] != handover:
+            before = self._source.load(handover.before)
+            after = self._source.load(handover.after)
+            self._extended = (handover, extend_traffic(before, after), extend_traffic(after, before))
+        weight = handover.weigh(frame)
+        shown = [
+            ShownScene(handover.after, self._extended[2], weight),
+            ShownScene(handover.before, self._extended[1], 1 - weight),
+        ]
+        return tuple(sorted((s for s in shown if s.weight > 0), key=lambda s: -s.weight))
 
 
 def render_rollout(
-    source: SceneSource, path: EgoPath, rig: Sequence[RigCamera], settings: RenderSettings = DEFAULT_SETTINGS
+    source: SceneSource,
+    path: EgoPath,
+    rig: Sequence[RigCamera],
+    settings: RenderSettings = DEFAULT_SETTINGS,
+    handovers: Sequence[Handover] | None = None,
 ) -> Iterator[RolloutImages]:
     """Renders a path; actors are where they are at each pose's moment of the log.
+
+    Rolling shutter and motion blur follow the path's own motion.
 
     Args:
         source: the scenes of a run.
         path: P poses, in the order in which chunks follow each other.
         rig: the cameras.
         settings: backend and threads.
+        handovers: of :func:`~genre_tasks.rollout.handover.plan_handovers`; ``None``: cuts at the borders.
 
     Yields:
         The images of each pose.
     """
+    schedule = SceneSchedule(source, cut_at_borders(source) if handovers is None else handovers)
     for index, frame in enumerate(path.frames):
-        chunk_scene = source.load(_find_chunk(source, float(frame)))
-        views = place_rollout_views(path, index, rig, chunk_scene)
+        yield _render_pose(schedule.find(float(frame)), path, index, rig, settings)
+
+
+def _render_pose(
+    shown: Sequence[ShownScene], path: EgoPath, index: int, rig: Sequence[RigCamera], settings: RenderSettings
+) -> RolloutImages:
+    renders = []
+    views = []
+    for scene in shown:
+        views.append(place_rollout_views(path, index, rig, scene.chunk_scene))
         # Without gradients the renderer keeps nothing for a backward pass, which takes memory.
         with torch.no_grad():
-            image = render_views(chunk_scene.scene, views, settings)
-        yield RolloutImages(index, views, chunk_scene, image.color.clamp(0, 1), image.alpha, image.expected_depth())
-
-
-def place_rollout_views(
-    path: EgoPath, index: int, rig: Sequence[RigCamera], chunk_scene: ChunkScene
-) -> tuple[RolloutView, ...]:
-    """Places the cameras of a rig at one pose of a path.
-
-    Args:
-        path: in the log's world.
-        index: of the pose.
-        rig: C cameras.
-        chunk_scene: in whose coordinates the views are.
-
-    Returns:
-        C views.
-    """
-    chunk_SE3_ego = np.linalg.inv(chunk_scene.chunk.world_SE3_chunk) @ path.world_SE3_ego[index]
-    frame = float(path.frames[index])
-    return tuple(RolloutView(c.name, frame, chunk_SE3_ego @ c.ego_SE3_camera, c.lens) for c in rig)
-
-
-def _find_chunk(source: SceneSource, frame: float) -> int:
-    for number in source.chunk_numbers:
-        if round(frame) <= source.load(number).chunk.frames[-1]:
-            return number
-    return source.chunk_numbers[-1]
+            renders.append(render_views(scene.chunk_scene.scene, views[-1], settings))
+    color = renders[0].color.clamp(0, 1)
+    alpha = renders[0].alpha
+    if len(shown) > 1:
+        # Over display colours: a fade that is linear there looks steady to the eye.
+        color = torch.lerp(color, renders[1].color.clamp(0, 1), shown[1].weight)
+        alpha = torch.lerp(alpha, renders[1].alpha, shown[1].weight)
+    return RolloutImages(
+        index=index,
+        views=views[0],
+        chunk_scene=shown[0].chunk_scene,
+        color=color,
+        alpha=alpha,
+        # A mean of two depths would lie on neither surface.
+        depth=renders[0].expected_depth(),
+        chunk=shown[0].chunk,
+        blended_chunk=shown[1].chunk if len(shown) > 1 else None,
+        blend_weight=shown[1].weight if len(shown) > 1 else 0.0,
+    )
