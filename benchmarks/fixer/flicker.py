@@ -15,8 +15,7 @@ from benchmarks.common.task import SIDE_M
 from flows.pipeline.log_cache import cached_log
 from genre_tasks.config import FnetConfig
 from genre_tasks.fixer.network import Fnet
-from genre_tasks.fixer.view_surface import MIN_ALPHA, unproject_surface
-from genre_tasks.fixer.warping import SourceImage, warp
+from genre_tasks.rollout.flicker import DepthView, WarpedDifference, measure_warped_difference
 from genre_tasks.scene.chunk import Actor
 from genre_tasks.scene.novel_views import NovelViews
 from genre_tasks.stages.fnet import fix_views
@@ -66,25 +65,10 @@ def flicker(images: Tensor, novel: NovelViews, actors: Sequence[Actor] = ()) -> 
         Mean absolute difference over pixels and channels. A point that is outside of the next image or hidden there
         does not count.
     """
-    total = 0.0
-    count = 0.0
+    depths = [DepthView(v, a, d) for v, a, d in zip(novel.views, novel.alpha, novel.depth, strict=True)]
+    total = WarpedDifference()
     for k in range(len(images) - 1):
-        view = novel.views[k]
-        following = novel.views[k + 1]
-        # Where the following render is transparent nothing can hide a point.
-        opaque = novel.alpha[k + 1] >= MIN_ALPHA
-        hides = torch.where(opaque, novel.depth[k + 1], torch.zeros_like(novel.depth[k + 1]))
-        pixels = images[k + 1].permute(2, 0, 1)
-        # The following image plays the role of a source, so that the fixer's own warp can be used.
-        source = SourceImage(
-            following.camera, following.frame, following.chunk_SE3_camera, following.lens, pixels, hides
-        )
-        surface = unproject_surface(
-            novel.depth[k], novel.alpha[k], view.chunk_SE3_camera, view.lens, actors, view.frame
-        )
-        warped = warp(surface, [source], actors, view.frame)
         # Summed over pixels of all pairs, so that a pair with little overlap weighs little.
-        total += float(((warped.color - images[k].permute(2, 0, 1)).abs() * warped.mask).sum())
-        count += float(3 * warped.mask.sum())
+        total += measure_warped_difference((images[k], images[k + 1]), depths[k], depths[k + 1], actors)
     # Without any overlap the sum is zero, and so is the flicker.
-    return total / max(count, 1.0)
+    return total.mean
