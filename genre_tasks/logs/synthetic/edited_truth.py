@@ -80,10 +80,29 @@ class EditedStreet:
         Returns:
             [H, W] true where any sample of the pixel meets one of them.
         """
+        mask = np.zeros((view.lens.height_px, view.lens.width_px), bool)
+        for name, visible in self.find_actors(view).items():
+            if name in names:
+                mask |= visible
+        return mask
+
+    def find_actors(self, view: TruthView) -> dict[str, NDArray[np.bool_]]:
+        """Finds which actors a camera sees, and where.
+
+        Args:
+            view: camera and moment.
+
+        Returns:
+            By track id, [H, W] true where any sample of the pixel meets the actor; only those that are visible.
+        """
         hits, _ = self._cast_pixels(view, self._samples)
-        faces = self._list_faces(names)
-        is_actor = np.isin(hits.face, faces)
-        return np.asarray(is_actor.reshape(view.lens.height_px, view.lens.width_px, -1).any(2))
+        # The ray-caster counts the actors' faces in the layout's order, after those of what stands.
+        counts = [sum(len(part.mesh) for part in actor.parts) for actor in self.layout.actors]
+        ends = len(self.layout.static) + np.cumsum([0, *counts])
+        numbers = np.searchsorted(ends, hits.face, side="right") - 1
+        per_pixel = numbers.reshape(view.lens.height_px, view.lens.width_px, -1)
+        visible = np.unique(numbers[numbers >= 0])
+        return {self.layout.actors[k].name: (per_pixel == k).any(2) for k in visible}
 
     def find_background(self, view: TruthView) -> tuple[Float64, NDArray[np.bool_]]:
         """Finds what stands, or the sky, in the middle of each pixel.
@@ -130,17 +149,6 @@ class EditedStreet:
         pose = self._to_street(view.world_SE3_camera)
         directions = camera_rays(view.lens, samples) @ pose[:3, :3].T
         return self._caster.cast(pose[:3, 3], directions, view.moment * FRAME_S), directions
-
-    def _list_faces(self, names: Collection[str]) -> NDArray[np.int64]:
-        """Numbers of the actors' faces in the ray-caster, which counts them in the layout's order."""
-        faces = [np.zeros(0, np.int64)]
-        first = len(self.layout.static)
-        for actor in self.layout.actors:
-            count = sum(len(part.mesh) for part in actor.parts)
-            if actor.name in names:
-                faces.append(np.arange(first, first + count))
-            first += count
-        return np.concatenate(faces)
 
     def _to_street(self, world_SE3_camera: Float64) -> Float64:
         # In a copy: the caller's pose stays.
