@@ -24,6 +24,7 @@ from flows.cli.range import range_command
 from flows.cli.render import render
 from flows.cli.run import run
 from flows.cli.show import show
+from flows.cli.simulate import simulate
 from flows.cli.signals import end_on_signals, exit_process
 from flows.cli.streams import prepare_streams
 from flows.cli.train import app as train_app
@@ -45,6 +46,7 @@ app.command(name="run")(run)
 app.command(name="check")(check)
 app.command(name="effects")(effects)
 app.command(name="render")(render)
+app.command(name="simulate")(simulate)
 app.command(name="range")(range_command)
 app.command(name="show")(show)
 app.command(name="verify")(verify)

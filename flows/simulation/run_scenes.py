@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from pathlib import Path
 
 from flows.reconstruction.run_records import find_last_stage, list_runs, read_stage_scene, read_stage_value
 from genre_tasks.effects.apply_plan import apply_plan
 from genre_tasks.errors import InputError
 from genre_tasks.scene_edits.chunk_scene import ChunkScene
+from storage.local import open_store
 
 _CHUNKS_IN_MEMORY = 2
 """A rollout needs the scenes on both sides of a border, and no more."""
@@ -41,11 +43,41 @@ class RunScenes:
         self._store = store
         self._stage = stage
         self._loaded: OrderedDict[int, ChunkScene] = OrderedDict()
+        self._digests: dict[str, str] | None = None
 
     @property
     def chunk_numbers(self) -> Sequence[int]:
         """Numbers of the chunks, in the order of the log."""
         return self._numbers
+
+    @property
+    def folder(self) -> Path:
+        """The run's folder in the store."""
+        return open_store(self._store).root / "runs" / str(self.record["run"])
+
+    def find_stage(self, number: int) -> str:
+        """Finds the stage whose scene is read.
+
+        Args:
+            number: of the chunk.
+
+        Returns:
+            initial, gnet or enet.
+        """
+        return self._stage or find_last_stage(self._store, self.record["run"], number)
+
+    def payload_digests(self) -> dict[str, str]:
+        """Gives the digests of all that is read, for keys.
+
+        Returns:
+            Payload digest by chunk and stage, such as ``chunk 0 ingest``.
+
+        Raises:
+            InputError: the run has no such stage, or an artifact is gone.
+        """
+        if self._digests is None:
+            self._digests = self._find_digests()
+        return self._digests
 
     def load(self, number: int) -> ChunkScene:
         """Reads one chunk and its scene; the last two stay in memory.
@@ -62,7 +94,7 @@ class RunScenes:
         """
         if number not in self._loaded:
             run = self.record["run"]
-            stage = self._stage or find_last_stage(self._store, run, number)
+            stage = self.find_stage(number)
             chunk = read_stage_value(self._store, run, number, "ingest")[1]
             plan = read_stage_value(self._store, run, number, "effects")[1]
             scene = read_stage_scene(self._store, run, number, stage)
@@ -71,3 +103,26 @@ class RunScenes:
         while len(self._loaded) > _CHUNKS_IN_MEMORY:
             self._loaded.popitem(last=False)
         return self._loaded[number]
+
+    def _find_digests(self) -> dict[str, str]:
+        name_of: dict[str, str] = {}
+        for entry in self.record["chunks"]:
+            if entry["chunk"] not in self._numbers:
+                continue
+            keys = {stage["stage"]: stage["key"] for stage in entry["stages"]}
+            for stage in ("ingest", "effects", self.find_stage(entry["chunk"])):
+                if stage not in keys:
+                    raise InputError(
+                        f"the run has no stage '{stage}'", remedy=f"It has {', '.join(keys)}.", chunk=entry["chunk"]
+                    )
+                name_of[keys[stage]] = f"chunk {entry['chunk']} {stage}"
+        # One walk through the store for all keys.
+        found = {
+            name_of[artifact.manifest.key]: artifact.manifest.payload_digest
+            for artifact in open_store(self._store).artifacts()
+            if artifact.manifest.key in name_of
+        }
+        missing = sorted(set(name_of.values()) - set(found))
+        if missing:
+            raise InputError(f"the artifact of {missing[0]} is gone", remedy="Run the log again.", file=self._store)
+        return found

@@ -118,17 +118,31 @@ def place_path(reference: ReferencePath, recorded: EgoPath, progress: Progress, 
         One pose for each recorded one.
     """
     arc = progress.locate(recorded.times_s - recorded.times_s[0])
-    points = reference.sample(arc)
-    distance = offset.evaluate(arc)
-    turn = np.arctan2(offset.evaluate(arc, 1), 1 - points.curvature_1_m * distance)
-    about_z = np.zeros((len(arc), 3))
-    about_z[:, 2] = points.heading_rad + turn
-    poses = np.tile(np.eye(4), (len(arc), 1, 1))
+    poses = place_poses(reference, arc, offset.evaluate(arc), offset.evaluate(arc, 1))
+    return EgoPath(recorded.times_s, recorded.frames, poses)
+
+
+def place_poses(reference: ReferencePath, arc_m: Float64, offset_m: Float64, slope: Float64) -> Float64:
+    """Places poses next to the reference.
+
+    Args:
+        reference: of the recorded path.
+        arc_m: [P] along it.
+        offset_m: [P] to its left.
+        slope: [P] change of the offset over arc length.
+
+    Returns:
+        world_SE3_ego [P, 4, 4].
+    """
+    points = reference.sample(arc_m)
+    about_z = np.zeros((len(arc_m), 3))
+    about_z[:, 2] = points.heading_rad + np.arctan2(slope, 1 - points.curvature_1_m * offset_m)
+    poses = np.tile(np.eye(4), (len(arc_m), 1, 1))
     poses[:, :3, :3] = (Rotation.from_rotvec(about_z) * Rotation.from_rotvec(points.attitude_rad)).as_matrix()
     poses[:, :3, 3] = points.position_m
-    poses[:, 0, 3] -= distance * np.sin(points.heading_rad)
-    poses[:, 1, 3] += distance * np.cos(points.heading_rad)
-    return EgoPath(recorded.times_s, recorded.frames, poses)
+    poses[:, 0, 3] -= offset_m * np.sin(points.heading_rad)
+    poses[:, 1, 3] += offset_m * np.cos(points.heading_rad)
+    return poses
 
 
 def measure_lateral_motion(

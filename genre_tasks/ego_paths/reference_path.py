@@ -28,6 +28,10 @@ _FADE_S = 1.5
 _FADE_M = 5.0
 # Metres over which the slope of the road at the end of the recording is measured.
 _SLOPE_M = 5.0
+# So much nearer, per metre along the path, another branch of a path that crosses itself has to be.
+_EXPECTED_WEIGHT = 0.05
+# Positions that are compared with the whole reference at a time.
+_BLOCK = 256
 
 
 @dataclass(frozen=True)
@@ -90,6 +94,41 @@ class ReferencePath:
             attitude_rad=values[:, 5:],
         )
 
+    def project(self, position_m: Float64, expected_m: Float64) -> tuple[Float64, Float64]:
+        """Finds the nearest place of the reference, or of the straight lines that it goes on in at both ends.
+
+        Args:
+            position_m: [N, 2] world x and y.
+            expected_m: [N] arc length where the place is expected: it decides where a path crosses itself.
+
+        Returns:
+            Arc length [N], negative before the first recorded pose, and distance to the left [N], metres.
+        """
+        arcs = self._table.x
+        places = self._table(arcs)[:, :2]
+        nearest = np.empty(len(position_m))
+        for start in range(0, len(position_m), _BLOCK):
+            block = slice(start, start + _BLOCK)
+            squared = np.square(position_m[block, None] - places).sum(-1)
+            detour = _EXPECTED_WEIGHT * (arcs - expected_m[block, None])
+            nearest[block] = arcs[np.argmin(squared + np.square(detour), axis=1)]
+        arc = nearest
+        # The table's place is a few centimetres off: along the reference, two steps of Newton's method are exact.
+        for _ in range(2):
+            along, left, curvature = self._measure_offset(position_m, np.clip(arc, 0.0, self._arc_end_m))
+            arc = np.clip(arc, 0.0, self._arc_end_m) + along / np.maximum(1 - curvature * left, _EXPECTED_WEIGHT)
+        ended = np.clip(arc, 0.0, self._arc_end_m)
+        along, left, _ = self._measure_offset(position_m, ended)
+        return np.where(ended == arc, arc, ended + along), left
+
+    def _measure_offset(self, position_m: Float64, arc_m: Float64) -> tuple[Float64, Float64, Float64]:
+        """How far ahead and to the left of places of the reference positions are, and the curvature there."""
+        values = self._table(arc_m)
+        offset = position_m - values[:, :2]
+        cosine = np.cos(values[:, 3])
+        sine = np.sin(values[:, 3])
+        return cosine * offset[:, 0] + sine * offset[:, 1], cosine * offset[:, 1] - sine * offset[:, 0], values[:, 4]
+
     def locate(self, times_s: Float64) -> Float64:
         """Finds how far the recorded vehicle has driven.
 
@@ -120,8 +159,8 @@ class ReferencePath:
 def fit_reference_path(recorded: EgoPath) -> ReferencePath:
     """Fits a smooth curve to the recorded path.
 
-    Recorded poses jitter by centimetres, which differences at 10 Hz would turn into absurd accelerations. So speed comes
-    from a smooth curve over time, and the shape from a smooth curve over arc length, which standstill does not disturb.
+    Recorded poses jitter by centimetres, which differences at 10 Hz would turn into absurd accelerations. So speed
+    comes from a smooth curve over time, and the shape from one over arc length, which standstill does not disturb.
 
     Args:
         recorded: one pose for each log frame.

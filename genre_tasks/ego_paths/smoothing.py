@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+import math
+from functools import cache
 
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
-from scipy.sparse import csr_array, diags_array
 
 from genre_tasks.logs.types import Float64
 
 _DEGREE = 5
-# Three points integrate the square of a quintic's third derivative without error.
-_GAUSS_NODES = np.array([-np.sqrt(0.6), 0.0, np.sqrt(0.6)])
-_GAUSS_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
+# Of the derivative that is to be small; so many points also integrate its square without error.
+_ORDER = 3
 _MIN_SAMPLES = 3
 # Samples at one spot, as of a vehicle that stands, count a little together rather than not at all.
 _MIN_WEIGHT = 0.05
@@ -86,25 +85,37 @@ def fit_smooth_curve(parameter: Float64, values: Float64, scale: float) -> Smoot
         y = np.stack([y[0], y_middle, y[-1]])
     intervals = max(1, round(x[-1] / scale))
     step = x[-1] / intervals
-    knots = step * np.arange(-_DEGREE, intervals + _DEGREE + 1)
-    design = csr_array(BSpline.design_matrix(x, knots, _DEGREE))
     weights = np.maximum(np.gradient(x) / scale, _MIN_WEIGHT * min(1.0, x[-1] / scale / len(x)))
-    normal = design.T @ diags_array(weights) @ design + _penalise_third_derivative(knots, intervals, step, scale)
-    banded = np.zeros((_DEGREE + 1, normal.shape[0]))
-    for k in range(_DEGREE + 1):
-        diagonal = normal.diagonal(k)
-        banded[_DEGREE - k, k:] = diagonal
-    coefficients = solveh_banded(banded, design.T @ (weights[:, None] * y))
+    # Banded by hand: sparse matrices of this size would take ten times as long to build.
+    interval = np.minimum((x / step).astype(np.int64), intervals - 1)
+    basis = np.vander(x / step - interval, _DEGREE + 1) @ _cardinal_basis()
+    banded = np.zeros((_DEGREE + 1, intervals + _DEGREE))
+    right = np.zeros((intervals + _DEGREE, y.shape[1]))
+    penalty = _penalise_third_derivative() * (scale / step) ** (2 * _ORDER - 1)
+    for a in range(_DEGREE + 1):
+        np.add.at(right, interval + a, (weights * basis[:, a])[:, None] * y)
+        for b in range(a, _DEGREE + 1):
+            np.add.at(banded[_DEGREE - b + a], interval + b, weights * basis[:, a] * basis[:, b])
+            banded[_DEGREE - b + a, b : b + intervals] += penalty[a, b]
+    coefficients = solveh_banded(banded, right)
+    knots = step * np.arange(-_DEGREE, intervals + _DEGREE + 1)
     return SmoothCurve(BSpline(knots, coefficients, _DEGREE, extrapolate=True), origin, offset)
 
 
-def _penalise_third_derivative(knots: Float64, intervals: int, step: float, scale: float) -> csr_array:
-    """[C, C] matrix of ∫ |p'''|² over the parameter in units of ``scale``, for C coefficients."""
-    nodes = (step * (np.arange(intervals)[:, None] + 0.5 * (1 + _GAUSS_NODES))).ravel()
-    weights = np.tile(_GAUSS_WEIGHTS, intervals) * step / scale
-    quadratic = csr_array(BSpline.design_matrix(nodes, knots[3:-3], _DEGREE - 3))
-    count = intervals + _DEGREE
-    # The knots are uniform, so that a derivative is a difference of coefficients.
-    differences: Any = diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(count - 3, count))
-    third = quadratic @ differences * (scale / step) ** 3
-    return cast(csr_array, csr_array(third.T @ diags_array(weights) @ third))
+@cache
+def _cardinal_basis() -> Float64:
+    """[6, 6] polynomials of the six quintic B-splines that an interval of length 1 has: powers 5 to 0, splines."""
+    knots = np.arange(-_DEGREE, _DEGREE + 2, dtype=np.float64)
+    spline = BSpline(knots, np.eye(_DEGREE + 1), _DEGREE)
+    # The series of Taylor at the interval's start, which a polynomial is equal to.
+    series = [spline(0.0, nu=power) / math.factorial(power) for power in range(_DEGREE, -1, -1)]
+    return np.asarray(series, np.float64)
+
+
+@cache
+def _penalise_third_derivative() -> Float64:
+    """[6, 6] integrals of products of the third derivatives of those B-splines."""
+    nodes, weights = np.polynomial.legendre.leggauss(_ORDER)
+    powers = [np.polyder(polynomial, _ORDER) for polynomial in _cardinal_basis().T]
+    values = np.stack([np.polyval(polynomial, 0.5 * (1 + nodes)) for polynomial in powers])
+    return np.asarray((values * 0.5 * weights) @ values.T, np.float64)

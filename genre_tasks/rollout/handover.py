@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,10 +12,12 @@ import torch
 from torch import Tensor
 
 from genre_tasks.ego_paths.ego_path import EgoPath
+from genre_tasks.logs.types import Float64
 from genre_tasks.metrics.image_quality import psnr
 from genre_tasks.render import render_views
 from genre_tasks.render.types import RenderSettings
 from genre_tasks.rollout.camera_motion import place_rollout_views
+from genre_tasks.rollout.chunk_layout import ChunkLayout, lay_out_chunks
 from genre_tasks.rollout.rig import RigCamera
 from genre_tasks.scene.gaussians import map_attributes
 from genre_tasks.scene.graph import FIRST_ACTOR, SceneGraph
@@ -34,7 +36,8 @@ class Handover:
     Attributes:
         before: number of the chunk that is left.
         after: number of the chunk that is entered.
-        border_frame: the moment between the last log frame of the one and the first of the other.
+        border_frame: between the last log frame of the one and the first of the other. These three are places: where
+            the recorded vehicle was at that moment.
         start_frame: until there the scene of ``before`` is shown alone.
         end_frame: from there on that of ``after`` alone; equal to ``start_frame`` for a cut.
         psnr_db: how alike both scenes show the same views in the middle, without actors; NaN where not measured.
@@ -49,31 +52,22 @@ class Handover:
     psnr_db: float = math.nan
     candidates: tuple[tuple[float, float], ...] = ()
 
-    def weigh(self, frame: float) -> float:
-        """Gives how much the scene of ``after`` counts at a moment.
+    def weigh(self, place: float) -> float:
+        """Gives how much the scene of ``after`` counts at a place.
 
         Args:
-            frame: log frame, or a moment between two.
+            place: log frame, or a moment between two, at which the recorded vehicle was there.
 
         Returns:
-            0 to 1, linear in the moment.
+            0 to 1, linear in the place.
 
         >>> fade = Handover(before=0, after=1, border_frame=19.5, start_frame=17.0, end_frame=22.0)
-        >>> [fade.weigh(frame) for frame in (16, 19.5, 23)]
+        >>> [fade.weigh(place) for place in (16, 19.5, 23)]
         [0.0, 0.5, 1.0]
         """
         if self.end_frame <= self.start_frame:
-            return float(frame >= self.end_frame)
-        return min(max((frame - self.start_frame) / (self.end_frame - self.start_frame), 0.0), 1.0)
-
-    def needs_traffic(self, frame: float) -> bool:
-        """Tells whether a scene is shown at a moment that only the other chunk has actors of.
-
-        Args:
-            frame: log frame, or a moment between two.
-        """
-        # Actors of a moment are those of the nearest frame, so a half frame on both sides of the border counts too.
-        return min(self.start_frame, self.border_frame - 0.5) < frame < max(self.end_frame, self.border_frame + 0.5)
+            return float(place >= self.end_frame)
+        return min(max((place - self.start_frame) / (self.end_frame - self.start_frame), 0.0), 1.0)
 
 
 def plan_handovers(
@@ -83,51 +77,48 @@ def plan_handovers(
     handover_frames: float,
     settings: RenderSettings = DEFAULT_SETTINGS,
 ) -> tuple[Handover, ...]:
-    """Finds for every border between chunks the moment at which both scenes look most alike from the path.
+    """Finds for every border between chunks the place at which both scenes look most alike from the path.
 
     Args:
         source: the scenes of a run.
         path: P poses.
         rig: the cameras.
-        handover_frames: log frames that a fade takes; 0: a cut. Short chunks have shorter fades.
+        handover_frames: a fade goes from place to place as the recorded vehicle did in so many log frames; 0: a cut.
+            Short chunks have shorter fades.
         settings: backend and threads.
 
     Returns:
         One hand-over for each two chunks that follow each other, in their order.
     """
+    layout = lay_out_chunks(source)
+    places = layout.find_places(path)
     handovers = []
-    for cut in cut_at_borders(source):
+    for cut in cut_at_borders(layout):
         before = source.load(cut.before)
         after = source.load(cut.after)
-        # Within half of each chunk, so that no moment belongs to two hand-overs.
+        # Within half of each chunk, so that no place belongs to two hand-overs.
         room = min(len(before.chunk.frames), len(after.chunk.frames)) / 2
         half = min(handover_frames / 2, room)
-        offsets = [offset for offset in CANDIDATE_OFFSETS if abs(offset) + half <= room]
-        candidates = _measure_candidates((before, after), path, rig, [cut.border_frame + o for o in offsets], settings)
-        middle = cut.border_frame
-        best_db = math.nan
-        if candidates:
-            middle, best_db = max(candidates, key=lambda candidate: candidate[1])
+        middles = [cut.border_frame + offset for offset in CANDIDATE_OFFSETS if abs(offset) + half <= room]
+        poses = _find_poses(places, middles)
+        candidates = _measure_candidates((before, after), path, rig, poses, settings)
+        middle, best_db = max(candidates, key=lambda candidate: candidate[1], default=(cut.border_frame, math.nan))
         handovers.append(
             replace(cut, start_frame=middle - half, end_frame=middle + half, psnr_db=best_db, candidates=candidates)
         )
     return tuple(handovers)
 
 
-def cut_at_borders(source: SceneSource) -> tuple[Handover, ...]:
-    """Gives the hand-overs of a rollout without any fade: each chunk is shown at its frames.
+def cut_at_borders(layout: ChunkLayout) -> tuple[Handover, ...]:
+    """Gives the hand-overs of a rollout without any fade: each chunk is shown at its places.
 
     Args:
-        source: the scenes of a run.
+        layout: of the run's chunks.
 
     Returns:
         One cut for each two chunks that follow each other.
     """
-    # Every chunk once, in order: only the last few stay in memory.
-    spans = []
-    for number in source.chunk_numbers:
-        frames = source.load(number).chunk.frames
-        spans.append((number, frames[0], frames[-1]))
+    spans = zip(layout.numbers, layout.first_frames, layout.last_frames, strict=True)
     cuts = []
     for (before, _, last), (after, first, _) in itertools.pairwise(spans):
         border = (last + first) / 2
@@ -135,24 +126,27 @@ def cut_at_borders(source: SceneSource) -> tuple[Handover, ...]:
     return tuple(cuts)
 
 
+def _find_poses(places: Float64, middles: Sequence[float]) -> dict[float, int]:
+    """The pose nearest to each place; none where the path does not reach the border, which is the first of them."""
+    if not len(places) or not places.min() < middles[0] < places.max():
+        return {}
+    nearest = {middle: int(np.abs(places - middle).argmin()) for middle in middles}
+    return {middle: index for middle, index in nearest.items() if abs(places[index] - middle) <= 1}
+
+
 def _measure_candidates(
     scenes: tuple[ChunkScene, ChunkScene],
     path: EgoPath,
     rig: Sequence[RigCamera],
-    moments: Sequence[float],
+    poses: Mapping[float, int],
     settings: RenderSettings,
 ) -> tuple[tuple[float, float], ...]:
-    """(log frame, PSNR in dB) at the moments at which the path has a pose; none where it stays in one chunk."""
-    if not len(path) or not path.frames.min() < moments[0] < path.frames.max():
-        return ()
+    """(place, PSNR in dB between the two scenes' renders of the same views) of each pose."""
     without_traffic = [replace(scene, scene=_remove_actors(scene.scene)) for scene in scenes]
     measured = []
-    for moment in moments:
-        index = int(np.abs(path.frames - moment).argmin())
-        if abs(path.frames[index] - moment) > 1:
-            continue
+    for place, index in poses.items():
         images = [_render_sharp(scene, path, index, rig, settings) for scene in without_traffic]
-        measured.append((moment, psnr(images[0].flatten(0, 1).numpy(), images[1].flatten(0, 1).numpy())))
+        measured.append((place, psnr(images[0].flatten(0, 1).numpy(), images[1].flatten(0, 1).numpy())))
     return tuple(measured)
 
 

@@ -12,6 +12,7 @@ from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.render import render_views
 from genre_tasks.render.types import RenderSettings
 from genre_tasks.rollout.camera_motion import place_rollout_views
+from genre_tasks.rollout.chunk_layout import ChunkLayout, lay_out_chunks
 from genre_tasks.rollout.handover import Handover, cut_at_borders
 from genre_tasks.rollout.rig import RigCamera, RolloutView
 from genre_tasks.rollout.traffic import extend_traffic
@@ -29,8 +30,8 @@ class RolloutImages:
     Attributes:
         index: of the pose in the path.
         views: C of them, in coordinates of the chunk.
-        chunk_scene: the chunk and scene that were rendered; within a hand-over those that count more, with the traffic
-            of both chunks.
+        chunk_scene: the chunk and scene that were rendered, with the traffic of the moment; within a hand-over those
+            that count more.
         color: [C, H, W, 3] sRGB premultiplied by alpha, in [0, 1].
         alpha: [C, H, W].
         depth: [C, H, W] metres, 0 where nothing is; of ``chunk_scene`` alone.
@@ -66,49 +67,58 @@ class ShownScene:
 
 
 class SceneSchedule:
-    """Which scenes show a moment of the log; at most those of two chunks are in memory.
+    """Which scenes show a pose; the background of at most two chunks is in memory.
+
+    The background is that of the place where the vehicle is, and the traffic that of the log's moment: a vehicle that
+    brakes stays where an earlier chunk has recorded the street.
 
     Args:
         source: the scenes of a run.
+        layout: of its chunks.
         handovers: between chunks that follow each other, in their order.
     """
 
-    def __init__(self, source: SceneSource, handovers: Sequence[Handover]) -> None:
+    def __init__(self, source: SceneSource, layout: ChunkLayout, handovers: Sequence[Handover]) -> None:
         self._source = source
+        self._layout = layout
         self._handovers = handovers
-        # The scenes of the hand-over that is under way, with the traffic of both chunks.
-        self._extended: tuple[Handover, ChunkScene, ChunkScene] | None = None
+        # By the chunk that is shown and those whose traffic was added.
+        self._extended: dict[tuple[int, ...], ChunkScene] = {}
 
-    def find(self, frame: float) -> tuple[ShownScene, ...]:
-        """Finds the scenes of a moment.
+    def find(self, place: float, frame: float) -> tuple[ShownScene, ...]:
+        """Finds the scenes of a pose.
 
         Args:
-            frame: log frame, or a moment between two.
+            place: log frame at which the recorded vehicle was there.
+            frame: log frame of the traffic.
 
         Returns:
             One scene, or two within a hand-over; the one that counts more comes first.
         """
-        number = self._source.chunk_numbers[0]
+        weights = {self._source.chunk_numbers[0]: 1.0}
         for handover in self._handovers:
-            if handover.needs_traffic(frame):
-                return self._blend(handover, frame)
-            if handover.weigh(frame) == 1:
-                number = handover.after
-        self._extended = None
-        return (ShownScene(number, self._source.load(number), 1.0),)
+            weight = handover.weigh(place)
+            if weight > 0:
+                weights = {handover.after: weight, handover.before: 1 - weight}
+        shown = sorted((number for number, weight in weights.items() if weight > 0), key=lambda n: -weights[n])
+        traffic = self._layout.find_traffic(frame)
+        scenes = {number: self._load(number, traffic) for number in shown}
+        # Those of the poses before are dropped.
+        self._extended = {key: scene for key, scene in self._extended.items() if key[0] in scenes}
+        return tuple(ShownScene(number, scene, weights[number]) for number, scene in scenes.items())
 
-    def _blend(self, handover: Handover, frame: float) -> tuple[ShownScene, ...]:
-        # Built once for a hand-over: it copies the Gaussians where actors are added.
-        if self._extended is None or self._extended[0] != handover:
-            before = self._source.load(handover.before)
-            after = self._source.load(handover.after)
-            self._extended = (handover, extend_traffic(before, after), extend_traffic(after, before))
-        weight = handover.weigh(frame)
-        shown = [
-            ShownScene(handover.after, self._extended[2], weight),
-            ShownScene(handover.before, self._extended[1], 1 - weight),
-        ]
-        return tuple(sorted((s for s in shown if s.weight > 0), key=lambda s: -s.weight))
+    def _load(self, number: int, traffic: Sequence[int]) -> ChunkScene:
+        others = [other for other in traffic if other != number]
+        if not others:
+            return self._source.load(number)
+        key = (number, *others)
+        # Kept from pose to pose: it copies the Gaussians where actors are added.
+        if key not in self._extended:
+            scene = self._source.load(number)
+            for other in others:
+                scene = extend_traffic(scene, self._source.load(other))
+            self._extended = {k: v for k, v in self._extended.items() if k[0] != number} | {key: scene}
+        return self._extended[key]
 
 
 def render_rollout(
@@ -132,9 +142,10 @@ def render_rollout(
     Yields:
         The images of each pose.
     """
-    schedule = SceneSchedule(source, cut_at_borders(source) if handovers is None else handovers)
-    for index, frame in enumerate(path.frames):
-        yield _render_pose(schedule.find(float(frame)), path, index, rig, settings)
+    layout = lay_out_chunks(source)
+    schedule = SceneSchedule(source, layout, cut_at_borders(layout) if handovers is None else handovers)
+    for index, (place, frame) in enumerate(zip(layout.find_places(path), path.frames, strict=True)):
+        yield _render_pose(schedule.find(float(place), float(frame)), path, index, rig, settings)
 
 
 def _render_pose(

@@ -1,0 +1,118 @@
+"""The path of a rollout: planned or read, checked against what vehicles can do and against the traffic."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flows.simulation.path_file import read_path_file
+from flows.simulation.request import SimulationRequest
+from genre_tasks.config import SimulateConfig
+from genre_tasks.ego_paths.behaviours import plan_behaviour
+from genre_tasks.ego_paths.collisions import Collision, collect_world_actors, find_collisions
+from genre_tasks.ego_paths.ego_path import EgoPath
+from genre_tasks.ego_paths.kinematics import BoundViolation, compare_with_bounds, measure_kinematics
+from genre_tasks.errors import ConfigError
+from genre_tasks.scene.chunk import Chunk
+
+RECORDED = "recorded"
+"""The behaviour that drives as recorded."""
+_SHOWN_COLLISIONS = 3
+
+
+@dataclass(frozen=True)
+class CheckedPath:
+    """A path that is going to be rendered, and what was found about it.
+
+    Attributes:
+        path: P poses.
+        recorded: the recorded path.
+        violations: of kinematic bounds; empty unless they are allowed.
+        collisions: with actors; empty unless they are allowed.
+        maxima: largest amounts of the path's motion, by quantity and unit.
+    """
+
+    path: EgoPath
+    recorded: EgoPath
+    violations: tuple[BoundViolation, ...]
+    collisions: tuple[Collision, ...]
+    maxima: dict[str, float]
+
+
+def make_path(request: SimulationRequest, config: SimulateConfig, recorded: EgoPath) -> EgoPath:
+    """Plans or reads the path that a request asks for.
+
+    Args:
+        request: with a behaviour, a file with poses, or neither: the recorded path, moved to the side.
+        config: of the simulation.
+        recorded: the recorded path of the run.
+
+    Returns:
+        P poses.
+
+    Raises:
+        ConfigError: there is no such behaviour, or it does not go with the recorded path.
+        InputError: the file holds no path.
+    """
+    if request.path_file is not None:
+        return read_path_file(request.path_file, recorded)
+    if request.behaviour is None and not request.start_offset_m:
+        return recorded
+    offset_m = config.start_offset_m if request.start_offset_m is None else request.start_offset_m
+    return plan_behaviour(
+        request.behaviour or RECORDED,
+        recorded,
+        config,
+        start_offset_m=offset_m,
+        strength=request.strength,
+        delay_s=request.delay_s,
+        side=request.side,
+    )
+
+
+def check_path(
+    request: SimulationRequest, config: SimulateConfig, path: EgoPath, recorded: EgoPath, chunks: Sequence[Chunk]
+) -> CheckedPath:
+    """Checks a path against the kinematic bounds and the boxes of actors.
+
+    Args:
+        request: says what is allowed all the same.
+        config: bounds and margin.
+        path: to check.
+        recorded: the recorded path.
+        chunks: with the actors as they are simulated.
+
+    Returns:
+        The path with what was found.
+
+    Raises:
+        ConfigError: the path breaks a bound or meets an actor, and that is not allowed.
+    """
+    motion = measure_kinematics(path)
+    violations = compare_with_bounds(motion, config.bounds)
+    if violations and not request.allow_implausible:
+        found = "; ".join(str(violation) for violation in violations)
+        raise ConfigError(
+            f"no vehicle drives like this: {found}",
+            remedy="Choose a smaller --strength or --start-offset, or render it all the same by --allow-implausible.",
+        )
+    collisions = find_collisions(path, collect_world_actors(chunks), config.collision_margin_m)
+    if collisions and not request.allow_collision:
+        found = "; ".join(str(collision) for collision in collisions[:_SHOWN_COLLISIONS])
+        more = len(collisions) - _SHOWN_COLLISIONS
+        raise ConfigError(
+            f"the path meets other road users: {found}{f'; and {more} more' if more > 0 else ''}",
+            remedy="Choose another --start-offset, --side or --delay, or render it all the same by --allow-collision.",
+        )
+    maxima = {
+        "speed_m_s": motion.speed_m_s.max(),
+        "acceleration_m_s2": motion.acceleration_m_s2.max(),
+        "deceleration_m_s2": (-motion.acceleration_m_s2).max(),
+        "lateral_acceleration_m_s2": np.abs(motion.lateral_acceleration_m_s2).max(),
+        "jerk_m_s3": np.abs(motion.jerk_m_s3).max(),
+        "lateral_jerk_m_s3": np.abs(motion.lateral_jerk_m_s3).max(),
+        "curvature_1_m": np.abs(motion.curvature_1_m).max(),
+    }
+    return CheckedPath(path, recorded, violations, collisions, {name: float(value) for name, value in maxima.items()})

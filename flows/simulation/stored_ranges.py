@@ -1,0 +1,64 @@
+"""The reliable range of a run's scenes, computed once and then read from the run's folder in the store."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+
+from flows.simulation.run_scenes import RunScenes
+from genre_tasks.atomic_path import write_atomically
+from genre_tasks.config import RangeConfig
+from genre_tasks.effects.types import DEFAULT_PLAN
+from genre_tasks.progress import Progress
+from genre_tasks.reliability.reliable_range import estimate_reliable_range
+from storage.code_digest import code_digest
+from storage.keys import digest_value
+
+# Coarser than `genre range`: marks need the distance to half a metre, and every shift is rendered for all cameras.
+MARKS_CONFIG = RangeConfig(shifts_m=(1.0, 2.0, 3.0, 4.0), every=10)
+
+
+@dataclass(frozen=True)
+class SideRange:
+    """How far to the sides of the path a scene can be trusted.
+
+    Attributes:
+        left_m: metres to the left.
+        right_m: metres to the right.
+    """
+
+    left_m: float
+    right_m: float
+
+
+def find_side_ranges(scenes: RunScenes, progress: Progress) -> dict[int, SideRange]:
+    """Reads or computes the reliable range of each chunk's scene.
+
+    Args:
+        scenes: of a run, as they were reconstructed.
+        progress: called while a range is computed.
+
+    Returns:
+        The ranges by the chunk's number.
+
+    Raises:
+        InputError: an image of a chunk cannot be decoded.
+        OSError: the store cannot be written.
+    """
+    code = code_digest("genre_tasks.reliability.reliable_range")
+    folder = scenes.folder / "ranges"
+    ranges = {}
+    for number in scenes.chunk_numbers:
+        digests = {name: d for name, d in scenes.payload_digests().items() if name.startswith(f"chunk {number} ")}
+        parts = {"code": code, "configuration": MARKS_CONFIG.model_dump(mode="json"), "inputs": digests}
+        file = folder / f"chunk-{number}-{digest_value(parts)[:16]}.json"
+        if file.is_file():
+            values = json.loads(file.read_text(encoding="utf-8"))
+            ranges[number] = SideRange(values["left_m"], values["right_m"])
+            continue
+        loaded = scenes.load(number)
+        found = estimate_reliable_range(MARKS_CONFIG, loaded.chunk, loaded.scene, DEFAULT_PLAN, progress)
+        ranges[number] = SideRange(found.left_m, found.right_m)
+        text = json.dumps({"left_m": found.left_m, "right_m": found.right_m})
+        write_atomically(file, text.encode())
+    return ranges

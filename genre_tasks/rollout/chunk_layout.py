@@ -1,0 +1,100 @@
+"""How a run's chunks follow each other in the log, and at which place of the recorded path a pose is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from genre_tasks.ego_paths.ego_path import EgoPath
+from genre_tasks.logs.types import Float64
+from genre_tasks.scene_edits.chunk_scene import SceneSource
+
+# Recorded poses of a standing vehicle jitter by millimetres: of those the one of the pose's own moment is meant.
+_M_PER_FRAME = 0.002
+# An actor is posed by the nearest frame, and exposures move it by less than half a frame.
+_NEAREST_FRAME = 0.49
+
+
+@dataclass(frozen=True)
+class ChunkLayout:
+    """The chunks of a run in the order of the log.
+
+    Attributes:
+        numbers: of the N chunks.
+        first_frames: [N] first log frame of each chunk.
+        last_frames: [N] last log frame of each chunk.
+        frames: [F] all log frames.
+        positions: [F, 2] of the recorded vehicle in the ground plane of the log's world, metres.
+    """
+
+    numbers: tuple[int, ...]
+    first_frames: tuple[int, ...]
+    last_frames: tuple[int, ...]
+    frames: Float64
+    positions: Float64
+
+    def find_traffic(self, frame: float) -> tuple[int, ...]:
+        """Finds the chunks whose actors exist at a moment.
+
+        Args:
+            frame: log frame, or a moment between two.
+
+        Returns:
+            One number; two in the middle between the frames of two chunks.
+        """
+        found = []
+        for moment in (frame - _NEAREST_FRAME, frame + _NEAREST_FRAME):
+            # Of the last chunk that has begun by then.
+            index = max(int(np.searchsorted(self.first_frames, round(moment), side="right")) - 1, 0)
+            found.append(self.numbers[index])
+        return tuple(dict.fromkeys(found))
+
+    def find_places(self, path: EgoPath) -> Float64:
+        """Finds when the recorded vehicle was where a path is: a braking vehicle stays at places of earlier frames.
+
+        Args:
+            path: P poses.
+
+        Returns:
+            [P] log frames, or moments between two; of several the one nearest to the pose's own moment.
+        """
+        start = self.positions[:-1]
+        step = self.positions[1:] - start
+        if not len(step):
+            return np.full(len(path), self.frames[0])
+        squared_length = np.maximum((step**2).sum(1), 1e-12)
+        places = np.empty(len(path))
+        for index, pose in enumerate(path.world_SE3_ego):
+            offset = pose[:2, 3] - start
+            fraction = np.clip((offset * step).sum(1) / squared_length, 0, 1)
+            distance = np.linalg.norm(offset - fraction[:, None] * step, axis=1)
+            moments = self.frames[:-1] + fraction * np.diff(self.frames)
+            cost = distance + _M_PER_FRAME * np.abs(moments - path.frames[index])
+            places[index] = moments[cost.argmin()]
+        return places
+
+
+def lay_out_chunks(source: SceneSource) -> ChunkLayout:
+    """Reads where the chunks of a run are in the log.
+
+    Args:
+        source: the scenes of a run.
+
+    Returns:
+        The layout; no chunk stays in memory for it.
+    """
+    firsts = []
+    lasts = []
+    frames = []
+    positions = []
+    # Every chunk once, in order: a source keeps only the last few in memory.
+    for number in source.chunk_numbers:
+        chunk = source.load(number).chunk
+        firsts.append(chunk.frames[0])
+        lasts.append(chunk.frames[-1])
+        frames.append(np.asarray(chunk.frames, np.float64))
+        positions.append((chunk.world_SE3_chunk @ chunk.chunk_SE3_ego)[:, :2, 3])
+    return ChunkLayout(
+        tuple(source.chunk_numbers), tuple(firsts), tuple(lasts), np.concatenate(frames), np.concatenate(positions)
+    )
