@@ -14,6 +14,13 @@ from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.deformation import NODES, Deformation
 from genre_tasks.scene.gaussians import Gaussians, map_attributes
 from genre_tasks.scene.graph import FIRST_ACTOR, SH_COUNTS, SceneGraph
+from genre_tasks.scene.rotations import quats_to_matrices
+
+_MARGIN_M = 0.15
+"""Boxes are annotated to some centimetres, and mirrors stick out of them."""
+
+_REACH_SIGMAS = 2.0
+"""A Gaussian is visible up to about so many standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +49,8 @@ class PlacedActor:
         node: its box and its new path, in chunk coordinates.
         shape_frames: [F] the moment of its recording whose shape it has at each frame of ``node``.
         deformation: how its shape changes over its recording, as number 0; ``None``: it is rigid.
-        part: Gaussians that are added to the scene; ``None``: those that the scene has already, if any.
-        number: of the actor in the scene before the edit; ``None``: a new one.
+        part: Gaussians that are added to the scene; ``None``: the actor has those that the scene has already.
+        number: of the actor in the scene before the edit, whose Gaussians stay; ``None``: a new or changed one.
         keeps_shape: whether the deformation of the scene holds for it as it is.
     """
 
@@ -99,8 +106,8 @@ def select_deformation(deformation: Deformation | None, number: int) -> Deformat
 def assemble_edited_scene(scene: SceneGraph, placed: Sequence[PlacedActor]) -> SceneGraph:
     """Puts an edited scene together.
 
-    What stays keeps its order, and what is new comes last: Gaussians of the same depth are drawn in their order, so that
-    pixels without edited actors keep their bytes.
+    What stays keeps its order, and what is new comes last. Gaussians of the same depth are drawn in their order, so
+    that pixels without edited actors keep their bytes.
 
     Args:
         scene: before the edit.
@@ -129,6 +136,35 @@ def assemble_edited_scene(scene: SceneGraph, placed: Sequence[PlacedActor]) -> S
         actors=tuple(actor.node for actor in placed),
         deformation=_join_deformations(scene, placed),
         spherical_harmonics=_join_harmonics(scene, rows, parts),
+    )
+
+
+def trim_to_box(part: ActorPart, size_m: tuple[float, float, float]) -> ActorPart:
+    """Trims an actor's Gaussians to its box, since what is outside of it explains pixels of the background.
+
+    At its recorded place nothing shows that; where an actor is moved to, such Gaussians are smears around it.
+
+    Args:
+        part: the actor.
+        size_m: length, width and height of its box.
+
+    Returns:
+        The actor without Gaussians whose centre is outside, and with smaller ones where they reached outside.
+    """
+    gaussians = part.gaussians
+    half = torch.tensor(size_m, dtype=torch.float32) / 2 + _MARGIN_M
+    room = half - gaussians.means.abs()
+    # Widths along the axes of the box: the diagonal of R S Sᵀ Rᵀ.
+    rotation = quats_to_matrices(gaussians.quats) if len(part) else torch.zeros(0, 3, 3)
+    widths = _REACH_SIGMAS * (rotation * gaussians.log_scales.exp()[:, None]).square().sum(2).sqrt()
+    inside = torch.nonzero((room > 0).all(1))[:, 0]
+    shrink = (room / widths.clamp_min(1e-6)).amin(1).clamp(1e-3, 1.0).log()
+    gaussians = replace(gaussians, log_scales=gaussians.log_scales + shrink[:, None])
+    harmonics = part.spherical_harmonics
+    return ActorPart(
+        gaussians=map_attributes(lambda x: x.index_select(0, inside), gaussians),
+        spherical_harmonics=None if harmonics is None else harmonics.index_select(0, inside),
+        deformation=part.deformation,
     )
 
 

@@ -19,8 +19,10 @@ from genre_tasks.scene_edits.actor_parts import (
     ActorPart,
     PlacedActor,
     assemble_edited_scene,
+    extract_part,
     join_parts,
     select_deformation,
+    trim_to_box,
 )
 from genre_tasks.scene_edits.chunk_scene import ChunkScene, SceneSource
 from genre_tasks.scene_edits.contact_shadow import build_contact_shadow
@@ -156,8 +158,7 @@ class EditedScenes:
             node=_cut_node(node.track_id, node.label, node.size_m, trajectory, base),
             shape_frames=trajectory.shape_frames,
             deformation=deformation,
-            part=self._shadow(changed),
-            number=k,
+            part=self._with_shadow(changed, extract_part(base.scene, k)),
             keeps_shape=changed.change.keeps_motion,
         )
 
@@ -175,10 +176,8 @@ class EditedScenes:
                 self._adopted[track_id] = take_actor(self._source, self._survey, track_id)
             actor = self._adopted[track_id]
             part = apply_tone(actor.part, match_tone(actor.road_color, measure_road_color(base, self._survey.ground)))
-            shadow = self._shadow(changed)
-            part = join_parts(part, shadow.gaussians)
             node = _cut_node(track_id, actor.track.label, actor.track.size_m, trajectory, base)
-            out.append((_new_actor(node, trajectory, part), actor.points))
+            out.append((_new_actor(node, trajectory, self._with_shadow(changed, part)), actor.points))
         return out
 
     def _place_inserted(self, number: int, base: ChunkScene) -> list[tuple[PlacedActor, Points]]:
@@ -194,13 +193,16 @@ class EditedScenes:
             clearance = actor.clearance_m + float(inserted.change.up_m)
             shadow = build_contact_shadow(actor.track.size_m, clearance, self._config.contact_shadow)
             node = _cut_node(inserted.name, actor.track.label, actor.track.size_m, trajectory, base)
-            out.append((_new_actor(node, trajectory, join_parts(part, shadow)), actor.points))
+            out.append(
+                (_new_actor(node, trajectory, join_parts(trim_to_box(part, actor.track.size_m), shadow)), actor.points)
+            )
         return out
 
-    def _shadow(self, changed: _ChangedActor) -> ActorPart:
+    def _with_shadow(self, changed: _ChangedActor, part: ActorPart) -> ActorPart:
         track = self._survey.tracks[changed.track_id]
         clearance = measure_clearance(self._survey, track) + float(changed.change.up_m)
-        return ActorPart(build_contact_shadow(track.size_m, clearance, self._config.contact_shadow), None, None)
+        shadow = build_contact_shadow(track.size_m, clearance, self._config.contact_shadow)
+        return join_parts(trim_to_box(part, track.size_m), shadow)
 
     def _change(self, track_id: str, change: ActorChange) -> _ChangedActor:
         if change.removed:

@@ -71,7 +71,7 @@ def place_inserted(insert: Insert, actor: LibraryActor, recorded_frame_s: float,
 
 def _upright(yaw: Float64, normal: Float64) -> Float64:
     # Rotations [F, 3, 3] with the heading `yaw` that stand on ground with the normals [F, 3].
-    level = Rotation.from_euler("z", yaw).as_matrix()
+    level = Rotation.from_euler("z", yaw[:, None]).as_matrix()
     tilt = np.cross([0.0, 0.0, 1.0], normal)
     return np.asarray(Rotation.from_rotvec(tilt).as_matrix() @ level, np.float64)
 
