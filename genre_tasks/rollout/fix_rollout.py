@@ -1,0 +1,305 @@
+"""Runs FNet over a rollout: all of its images, or what removed actors hid alone."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from genre_tasks.checks import check_finite
+from genre_tasks.config import FnetConfig
+from genre_tasks.errors import InputError
+from genre_tasks.fixer.inference import draw_noise, fix, prefers_bfloat16
+from genre_tasks.fixer.inputs import FixerInputs, build_inputs
+from genre_tasks.fixer.network import Encoded, Fnet
+from genre_tasks.fixer.source_images import load_source_images
+from genre_tasks.fixer.view_surface import MIN_ALPHA, unproject_surface
+from genre_tasks.fixer.warping import SourceImage, sample_source
+from genre_tasks.render.surface import render_surfaces
+from genre_tasks.render.types import RenderSettings
+from genre_tasks.rollout.moment_actors import LAST_MOMENT, THIS_MOMENT, as_node, pose_actors
+from genre_tasks.rollout.removed_area import find_filled_area, hide_behind_boxes
+from genre_tasks.rollout.render_rollout import RolloutImages
+from genre_tasks.rollout.rig import RolloutView
+from genre_tasks.scene.actor_node import ActorNode
+from genre_tasks.scene.chunk import Actor, Chunk
+from genre_tasks.scene.graph import SceneGraph
+from genre_tasks.scene.lidar_map import build_lidar_scene
+from genre_tasks.scene.novel_poses import find_nearest_reference
+from genre_tasks.scene.novel_views import NovelView, NovelViews
+from genre_tasks.scene.transforms import invert_se3
+from genre_tasks.scene_edits.chunk_scene import SceneSource
+from genre_tasks.stages.fnet import load_configured_fnet
+from genre_tasks.threads import map_single_threaded
+
+DEFAULT_SETTINGS = RenderSettings()
+
+_CHUNKS_IN_MEMORY = 2
+"""A rollout needs the images on both sides of a border, and no more."""
+
+
+@dataclass(frozen=True)
+class FixedRolloutImages:
+    """What the fixer makes of the images of one pose.
+
+    Attributes:
+        color: [C, H, W, 3] sRGB in [0, 1].
+        filled: [C, H, W] true where a removed actor hid what no recorded image shows: FNet drew it.
+    """
+
+    color: Tensor
+    filled: Tensor
+
+
+@dataclass(frozen=True)
+class _ChunkImages:
+    """What the fixer reads of a chunk: recorded images, and the LiDAR map's scene.
+
+    Attributes:
+        chunk: as edited.
+        sources: recorded images; what lies behind removed actors is hidden from them.
+        recorded: actors as the images show them.
+        lidar_scene: coloured points as discs, as edited.
+        latents: of references by camera and frame, once encoded.
+    """
+
+    chunk: Chunk
+    sources: tuple[SourceImage, ...]
+    recorded: tuple[ActorNode, ...]
+    lidar_scene: SceneGraph
+    latents: dict[tuple[str, int], Tensor] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _LastImage:
+    """The fixed image of a camera at the pose before, with what hides points from it.
+
+    Attributes:
+        index: of the pose.
+        view: where the camera was.
+        world_SE3_camera: [4, 4]; the chunk may be another one by now.
+        image: [3, H, W].
+        depth: [H, W] metres, 0 where unknown.
+    """
+
+    index: int
+    view: RolloutView
+    world_SE3_camera: Tensor
+    image: Tensor
+    depth: Tensor
+
+
+class RolloutFixer:
+    """Repairs the images of a rollout, pose after pose.
+
+    A camera has the same noise at every pose, so that the noise does not flicker. With ``config.temporal`` the fixed
+    image of the pose before, warped by rendered depth, is one more looked-up image.
+
+    Args:
+        config: which network, and how it runs.
+        recorded: the scenes as recorded, without edits: recorded images show what was edited away.
+        lidar_max_points: points drawn in the LiDAR map.
+        network: at hand; ``None``: loaded as ``config`` says.
+        settings: of the renderer.
+
+    Raises:
+        InputError: the weights are missing or do not fit.
+    """
+
+    def __init__(
+        self,
+        config: FnetConfig,
+        recorded: SceneSource,
+        lidar_max_points: int,
+        network: Fnet | None = None,
+        settings: RenderSettings = DEFAULT_SETTINGS,
+    ) -> None:
+        self._config = config
+        self._recorded = recorded
+        self._lidar_max_points = lidar_max_points
+        self._network = load_configured_fnet(config) if network is None else network
+        self._settings = settings
+        self._chunks: OrderedDict[int, _ChunkImages] = OrderedDict()
+        self._last: dict[str, _LastImage] = {}
+
+    @torch.no_grad()
+    def fix(self, images: RolloutImages) -> FixedRolloutImages:
+        """Repairs all images of a pose.
+
+        Args:
+            images: of the pose; poses follow each other in order.
+
+        Returns:
+            The fixed images, and where they show what removed actors hid.
+
+        Raises:
+            NonFiniteError: a render is not finite.
+        """
+        chunk_images = self._load_chunk(images)
+        novel = self._render_inputs(images, chunk_images)
+        filled = self._find_filled(images, novel, chunk_images)
+        color = self._run_network(images, novel, chunk_images, range(len(images.views)))
+        for k, view in enumerate(images.views):
+            self._remember(images, k, view, color[k])
+        return FixedRolloutImages(color, filled)
+
+    @torch.no_grad()
+    def fill(self, images: RolloutImages) -> FixedRolloutImages:
+        """Fills what removed actors hid; all other pixels stay those of the render.
+
+        Args:
+            images: of the pose.
+
+        Returns:
+            The images, and the pixels that were filled.
+
+        Raises:
+            NonFiniteError: a render is not finite.
+        """
+        nothing = FixedRolloutImages(images.color, torch.zeros_like(images.alpha, dtype=torch.bool))
+        if not images.chunk_scene.removed:
+            return nothing
+        chunk_images = self._load_chunk(images)
+        novel = self._render_inputs(images, chunk_images)
+        filled = self._find_filled(images, novel, chunk_images)
+        rows = [k for k in range(len(images.views)) if bool(filled[k].any())]
+        if not rows:
+            return nothing
+        color = images.color.clone()
+        # The network repairs a view in one piece, and only the filled pixels of it are taken.
+        fixed = self._run_network(images, novel, chunk_images, rows)
+        color[rows] = torch.where(filled[rows][..., None], fixed, color[rows])
+        for k in rows:
+            self._remember(images, k, images.views[k], color[k])
+        return FixedRolloutImages(color, filled)
+
+    def _load_chunk(self, images: RolloutImages) -> _ChunkImages:
+        chunk = images.chunk_scene.chunk
+        known = self._chunks.get(chunk.index)
+        # An edit that changes along the path gives another chunk of the same index.
+        if known is None or known.chunk is not chunk:
+            recorded = self._recorded.load(chunk.index).chunk
+            sources = hide_behind_boxes(load_source_images(recorded), images.chunk_scene.removed)
+            if not sources:
+                raise InputError(
+                    "the chunk has no source image to fix views from",
+                    remedy="Reconstruct it from a log with images.",
+                    log=chunk.log,
+                    chunk=chunk.index,
+                )
+            lidar_scene = build_lidar_scene(chunk, self._lidar_max_points)
+            known = _ChunkImages(chunk, sources, tuple(as_node(a) for a in recorded.actors), lidar_scene)
+            self._chunks[chunk.index] = known
+        self._chunks.move_to_end(chunk.index)
+        while len(self._chunks) > _CHUNKS_IN_MEMORY:
+            self._chunks.popitem(last=False)
+        return known
+
+    def _render_inputs(self, images: RolloutImages, chunk_images: _ChunkImages) -> NovelViews:
+        """Renders the LiDAR map at the views, and puts it beside the render."""
+        lidar = render_surfaces(chunk_images.lidar_scene, images.views, self._settings)
+        check_finite(lidar.color, "LiDAR map", "fnet", chunk=chunk_images.chunk.index)
+        references = chunk_images.chunk.views_with_role("source")
+        views = []
+        for view in images.views:
+            nearest = find_nearest_reference(view.camera, view.chunk_SE3_camera, references)
+            reference = (nearest.camera, nearest.frame)
+            views.append(NovelView(view.camera, THIS_MOMENT, 0.0, view.chunk_SE3_camera, view.lens, reference))
+        return NovelViews(
+            views=tuple(views),
+            color=images.color,
+            alpha=images.alpha,
+            depth=images.depth,
+            lidar_color=lidar.color,
+            lidar_alpha=lidar.alpha,
+            lidar_depth=lidar.expected_depth(),
+        )
+
+    def _find_filled(self, images: RolloutImages, novel: NovelViews, chunk_images: _ChunkImages) -> Tensor:
+        rendered = torch.where(novel.alpha >= MIN_ALPHA, novel.depth, torch.zeros_like(novel.depth))
+        depth = torch.where(novel.lidar_alpha >= MIN_ALPHA, novel.lidar_depth, rendered)
+        return find_filled_area(images, depth, chunk_images.sources, chunk_images.recorded)
+
+    def _run_network(
+        self, images: RolloutImages, novel: NovelViews, chunk_images: _ChunkImages, rows: Sequence[int]
+    ) -> Tensor:
+        """[V, H, W, 3] fixed images of some of the views."""
+        rows = list(rows)
+        moving = self._pose_actors(images, chunk_images)
+        names = chunk_images.chunk.camera_names
+        half = prefers_bfloat16(novel.color.device) if self._config.half is None else self._config.half
+        latents = {k: self._encode_reference(novel.views[k].reference, chunk_images) for k in rows}
+        # The fixer finds actors' poses in a chunk: one whose actors are where they are at this moment.
+        chunk = replace(chunk_images.chunk, actors=moving)
+
+        def fix_batch(batch: Sequence[int]) -> Tensor:
+            inputs = build_inputs(chunk, novel, batch, chunk_images.sources)
+            inputs = self._look_up_last(images, novel, moving, batch, inputs)
+            # By camera and not by pose: noise that changes from pose to pose is seen as flicker.
+            seeds = [names.index(images.views[k].camera) for k in batch]
+            noise = draw_noise(self._network, self._config.seed, seeds, *novel.alpha.shape[1:])
+            return fix(self._network, inputs, noise, Encoded(torch.cat([latents[k] for k in batch]), ()), half)
+
+        size = self._config.batch_views
+        batches = [rows[first : first + size] for first in range(0, len(rows), size)]
+        return torch.cat(map_single_threaded(fix_batch, batches)).permute(0, 2, 3, 1)
+
+    def _pose_actors(self, images: RolloutImages, chunk_images: _ChunkImages) -> tuple[Actor, ...]:
+        moments = {THIS_MOMENT: images.views[0].frame}
+        # All cameras of a pose are of one moment.
+        moments |= {LAST_MOMENT: last.view.frame for last in self._last.values()}
+        recorded = {actor.track_id: actor for actor in chunk_images.recorded}
+        frames = sorted({source.frame for source in chunk_images.sources})
+        return pose_actors(images.chunk_scene.scene.actors, moments, recorded, frames)
+
+    def _encode_reference(self, reference: tuple[str, int], chunk_images: _ChunkImages) -> Tensor:
+        if reference not in chunk_images.latents:
+            image = next(s.image for s in chunk_images.sources if (s.camera, s.frame) == reference)
+            stride = self._network.stride
+            pad = (0, -image.shape[-1] % stride, 0, -image.shape[-2] % stride)
+            encoded = self._network.encode(F.pad(image[None], pad, mode="replicate"))
+            chunk_images.latents[reference] = encoded.latent
+        return chunk_images.latents[reference]
+
+    def _look_up_last(
+        self,
+        images: RolloutImages,
+        novel: NovelViews,
+        moving: Sequence[Actor],
+        rows: Sequence[int],
+        inputs: FixerInputs,
+    ) -> FixerInputs:
+        """Puts the last fixed image before the warped source images, where it shows a point."""
+        if not self._config.temporal:
+            return inputs
+        chunk_SE3_world = invert_se3(images.chunk_scene.chunk.world_SE3_chunk)
+        color = inputs.warped.clone()
+        mask = inputs.warp_mask.clone()
+        for j, k in enumerate(rows):
+            view = novel.views[k]
+            last = self._last.get(view.camera)
+            if last is None or last.index != images.index - 1:
+                continue
+            pose = chunk_SE3_world @ last.world_SE3_camera.numpy()
+            source = SourceImage(view.camera, LAST_MOMENT, pose, last.view.lens, last.image, last.depth)
+            surface = unproject_surface(
+                novel.depth[k], novel.alpha[k], view.chunk_SE3_camera, view.lens, moving, THIS_MOMENT
+            )
+            sampled, visible = sample_source(surface, source, moving, THIS_MOMENT)
+            color[j] = torch.where(visible, sampled, color[j])
+            mask[j] = torch.maximum(mask[j], visible[None].to(mask))
+        return replace(inputs, warped=color, warp_mask=mask)
+
+    def _remember(self, images: RolloutImages, k: int, view: RolloutView, color: Tensor) -> None:
+        opaque = images.alpha[k] >= MIN_ALPHA
+        self._last[view.camera] = _LastImage(
+            index=images.index,
+            view=view,
+            world_SE3_camera=torch.from_numpy(images.chunk_scene.chunk.world_SE3_chunk @ view.chunk_SE3_camera),
+            image=color.permute(2, 0, 1),
+            depth=torch.where(opaque, images.depth[k], torch.zeros_like(images.depth[k])),
+        )
