@@ -1,1 +1,1 @@
-"""LiDAR sweeps of a scene of Gaussians, and how they compare with recorded ones."""
+"""LiDAR sweeps of a scene: the sensor's own pattern of rays, cast through the Gaussians, compared with real sweeps."""

@@ -1,0 +1,110 @@
+"""Finds which Gaussians may matter to which rays, by azimuth and elevation about the rays' common origin."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from genre_tasks.logs.types import Float64
+
+ROW_RAD = np.radians(0.25)
+"""Height of a row of rays: within a row rays are sorted by azimuth, so that a Gaussian takes a range of them."""
+
+_MIN_DISTANCE_M = 0.2
+
+
+def find_ray_pairs(
+    means: Float64,
+    covariances: Float64,
+    sigmas: float,
+    origins: Float64,
+    directions: Float64,
+    max_pairs: int,
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Finds pairs of a ray and a Gaussian whose bounds it crosses.
+
+    Args:
+        means: [M, 3] metres.
+        covariances: [M, 3, 3].
+        sigmas: standard deviations to which a Gaussian reaches.
+        origins: [N, 3] metres, close together.
+        directions: [N, 3] unit vectors.
+        max_pairs: about so many come at a time.
+
+    Yields:
+        Indices of rays and of Gaussians [K].
+    """
+    azimuth = np.arctan2(directions[:, 1], directions[:, 0])
+    row = _to_row(np.arcsin(directions[:, 2].clip(-1, 1)))
+    # One key that sorts by row and then by azimuth: a range of azimuths in a row is a range of sorted rays.
+    key = row * 8.0 + azimuth
+    order = np.argsort(key)
+    key = key[order]
+    gaussian, center, half, low, high = _bound_gaussians(means, covariances, sigmas, origins)
+    low = np.maximum(_to_row(low), row.min())
+    high = np.minimum(_to_row(high), row.max())
+    row_count = (high - low + 1).clip(0)
+    for part in _split(row_count, max_pairs):
+        index = np.repeat(np.arange(len(row_count))[part], row_count[part])
+        first = np.cumsum(row_count[part]) - row_count[part]
+        at_row = low[index] + np.arange(len(index)) - np.repeat(first, row_count[part])
+        begin = np.searchsorted(key, at_row * 8.0 + np.maximum(center[index] - half[index], -np.pi))
+        end = np.searchsorted(key, at_row * 8.0 + np.minimum(center[index] + half[index], np.pi), side="right")
+        for some in _split(end - begin, max_pairs):
+            length = (end - begin)[some].clip(0)
+            owner = np.repeat(gaussian[index[some]], length)
+            ends = np.cumsum(length)
+            position = np.arange(len(owner)) + np.repeat(begin[some] - (ends - length), length)
+            yield order[position], owner
+
+
+def _bound_gaussians(
+    means: Float64, covariances: Float64, sigmas: float, origins: Float64
+) -> tuple[NDArray[np.int64], Float64, Float64, Float64, Float64]:
+    """Index, azimuth, half width in azimuth, lowest and highest elevation; one that crosses ±π comes twice."""
+    middle = origins.mean(0)
+    offset = means - middle
+    distance = np.linalg.norm(offset, axis=1).clip(_MIN_DISTANCE_M)
+    flat = np.linalg.norm(offset[:, :2], axis=1).clip(1e-6)
+    azimuth = np.arctan2(offset[:, 1], offset[:, 0])
+    elevation = np.arctan2(offset[:, 2], flat)
+    across = np.stack([-offset[:, 1] / flat, offset[:, 0] / flat, np.zeros(len(flat))], 1)
+    upward = np.cross(offset / distance[:, None], across)
+    # Origins apart from the middle see a Gaussian elsewhere: its bounds grow by that.
+    spread = np.linalg.norm(origins - middle, axis=1).max()
+    radius = sigmas * np.sqrt(np.linalg.eigvalsh(covariances)[:, -1]) + spread
+    # What lies at depth within the Gaussian is nearer than its middle, and so appears larger.
+    nearest = np.maximum(distance - radius, _MIN_DISTANCE_M)
+    sideways = sigmas * np.sqrt(np.einsum("ni,nij,nj->n", across, covariances, across)) + spread
+    vertical = sigmas * np.sqrt(np.einsum("ni,nij,nj->n", upward, covariances, upward)) + spread
+    half_elevation = np.arctan2(vertical, nearest)
+    steepest = np.minimum(np.abs(elevation) + half_elevation, np.pi / 2)
+    half_azimuth = np.arctan2(sideways, nearest * np.cos(steepest).clip(1e-3))
+    surrounds = distance <= radius
+    half_azimuth[surrounds] = np.pi
+    half_elevation[surrounds] = np.pi
+    index = np.arange(len(means))
+    copies = [(index, azimuth + turn) for turn in (-2 * np.pi, 0.0, 2 * np.pi)]
+    index = np.concatenate([i for i, _ in copies])
+    center = np.concatenate([a for _, a in copies])
+    half = half_azimuth[index]
+    crosses = np.abs(center) - half <= np.pi
+    index, center, half = index[crosses], center[crosses], half[crosses]
+    return index, center, half, (elevation - half_elevation)[index], (elevation + half_elevation)[index]
+
+
+def _to_row(elevation: Float64) -> NDArray[np.int64]:
+    return np.floor(elevation / ROW_RAD).astype(np.int64)
+
+
+def _split(counts: NDArray[np.int64], limit: int) -> Iterator[slice]:
+    """Parts whose counts sum up to about a limit."""
+    total = np.cumsum(counts.clip(0))
+    begin = 0
+    while begin < len(counts):
+        done = total[begin - 1] if begin else 0
+        end = max(int(np.searchsorted(total, done + limit)), begin + 1)
+        yield slice(begin, end)
+        begin = end
