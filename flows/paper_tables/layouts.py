@@ -226,7 +226,7 @@ _RE_SIMULATION = Layout(
     number=6,
     rows=(_row("3dgs", "3DGS"), _row("difix", "Difix3D"), _row("genre+", "GenRe+")),
     columns=behaviour_columns(),
-    extra_columns=(*behaviour_truth_columns(), _GAUSSIANS),
+    extra_columns=(*behaviour_truth_columns(), replace(_GAUSSIANS, label="Gaussians of all chunks")),
     evaluated=False,
     rollouts=TABLE_ROLLOUTS,
     notes=(

@@ -103,8 +103,9 @@ def compare_on_log(
 
     out = []
     for behaviour in BEHAVIOUR_LABELS:
-        sets = [[r.scores for r in _select(rows, m, behaviour) if r.scores is not None] for m in (method, other)]
-        found = compare_kernel_distances(*sets, real, bootstrap) if all(sets) else None
+        first = [r.scores for r in _select(rows, method, behaviour) if r.scores is not None]
+        second = [r.scores for r in _select(rows, other, behaviour) if r.scores is not None]
+        found = compare_kernel_distances(first, second, real, bootstrap) if first and second else None
         if found is not None:
             low = math.nan if found.low is None else found.low
             high = math.nan if found.high is None else found.high

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from flows.experiments.log_chunks import LogChunk
@@ -39,7 +39,7 @@ def measure_rollout_cell(
         The cell. Its seconds are sums over the chunks.
 
     Raises:
-        InputError: the log has no room for a behaviour.
+        ConfigError: the log has no room for a behaviour.
         GenreError: as the stages raise it.
     """
     # Imported here: what only predicts or prints a table should not load the renderer.
@@ -124,5 +124,5 @@ def count_missing_rollouts(basis: Basis, layout: Layout, method: Method, places:
     return sum(not measurement.is_stored(rollout) for rollout in layout.rollouts)
 
 
-def _sum_by_stage(parts: Sequence[dict[str, float]]) -> dict[str, float]:
+def _sum_by_stage(parts: Sequence[Mapping[str, float]]) -> dict[str, float]:
     return {name: math.fsum(part[name] for part in parts) for name in parts[0]}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from genre_tasks.config import SimulateConfig
-from genre_tasks.errors import InputError
+from genre_tasks.errors import ConfigError
 
 if TYPE_CHECKING:
     from genre_tasks.ego_paths.ego_path import EgoPath
@@ -78,7 +78,8 @@ def plan_rollout(rollout: TableRollout, recorded: EgoPath, config: SimulateConfi
         The path of the largest of ``STRENGTHS`` that is possible.
 
     Raises:
-        InputError: the log is too short for the least of them, or has no behaviour of that name.
+        ConfigError: the log is too short for the least of them, or there is no behaviour of that name.
+        InputError: the recorded path is none that a vehicle drives forwards.
     """
     # Imported here: a request is checked before anything numeric is loaded.
     from genre_tasks.ego_paths.behaviours import plan_behaviour
@@ -88,7 +89,7 @@ def plan_rollout(rollout: TableRollout, recorded: EgoPath, config: SimulateConfi
             path = plan_behaviour(
                 rollout.behaviour, recorded, config, start_offset_m=rollout.start_offset_m, strength=strength
             )
-        except InputError:
+        except ConfigError:
             # The last one's error says what is in the way, with its numbers.
             if strength == STRENGTHS[-1]:
                 raise

@@ -96,7 +96,7 @@ def measure_rollout_scores(
         A row for each rollout, in their order.
 
     Raises:
-        InputError: the log has no room for a behaviour.
+        ConfigError: the log has no room for a behaviour.
         GenreError: as the stages raise it.
     """
     refs = [run_stages(stages_until(end), job, runner) for job in jobs]
@@ -141,7 +141,7 @@ class LogMeasurement:
             true_views: views that are compared with the truth, where the log has one.
 
         Raises:
-            InputError: the log has no room for the behaviour.
+            ConfigError: the log has no room for the behaviour.
         """
         planned = plan_rollout(rollout, self._recorded, self._config.simulate)
         address = self._scores_address(planned, true_views)
@@ -166,7 +166,7 @@ class LogMeasurement:
             true_views: as for :meth:`measure`.
 
         Raises:
-            InputError: the log has no room for the behaviour.
+            ConfigError: the log has no room for the behaviour.
         """
         planned = plan_rollout(rollout, self._recorded, self._config.simulate)
         return self._store.find(self._scores_address(planned, true_views)) is not None
