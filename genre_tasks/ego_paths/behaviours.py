@@ -11,6 +11,7 @@ from typing import cast
 from genre_tasks.config.simulation_sections import SimulateConfig
 from genre_tasks.ego_paths.behaviour_request import BehaviourRequest, Side
 from genre_tasks.ego_paths.ego_path import EgoPath
+from genre_tasks.ego_paths.frenet import ConstantOffset, place_path
 from genre_tasks.ego_paths.plausibility import check_recorded_driving
 from genre_tasks.ego_paths.reference_path import fit_reference_path
 from genre_tasks.errors import ConfigError
@@ -98,7 +99,7 @@ def plan_behaviour(
     )
     if strength == 0:
         return _load_function(REPLAY)(request)
-    check_recorded_driving(request)
+    check_recorded_driving(request, place_path(reference, recorded, reference, ConstantOffset(start_offset_m)))
     return _load_function(behaviour.target)(request)
 
 

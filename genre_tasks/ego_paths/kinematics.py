@@ -8,15 +8,23 @@ import numpy as np
 
 from genre_tasks.config.simulation_sections import KinematicBounds
 from genre_tasks.ego_paths.ego_path import EgoPath
-from genre_tasks.ego_paths.reference_path import SMOOTHING_S
+from genre_tasks.ego_paths.reference_path import SMOOTHING_S, STRAIGHT_M, integrate_speed
 from genre_tasks.ego_paths.smoothing import fit_smooth_curve
 from genre_tasks.logs.types import Float64
 
+_SMOOTHING_M = 0.6
+"""Scale of the curve over arc length: half a car's turning radius comes through by 90 %, and a centimetre of jitter at
+10 Hz comes to a twentieth of a car's largest curvature."""
+
 _SAMPLES_PER_SMOOTHING = 6
 # A slower vehicle's direction of motion is that of its jitter.
-_CRAWLING_M_S = 1.0
-# Rounding: what is planned right at a bound does not break it.
-_TOLERANCE = 1e-6
+_CRAWLING_M_S = 0.5
+# Jitter of a standing vehicle looks as fast as this.
+_STANDING_M_S = 0.2
+# Who leaves so much of the smooth shape out on the way turns more sharply than it can follow.
+_SHORTENED = 0.7
+# As exact as the measurement is: a circle at the largest curvature does not break the bound.
+_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
@@ -67,9 +75,10 @@ class BoundViolation:
 def measure_kinematics(path: EgoPath) -> Kinematics:
     """Measures how a path moves.
 
-    Positions are finite samples, and recorded ones jitter. So the motion is that of the smooth curve next to them:
-    motion of a period below 0.9 s is taken for jitter, see ``fit_smooth_curve``. Below 1 m/s the curvature is the turn
-    rate over 1 m/s, since a standing vehicle has no direction of motion.
+    Positions are finite samples, and recorded ones jitter. So the motion is that of a smooth curve next to them, over
+    time: motion of a period below 0.9 s is taken for jitter, see ``fit_smooth_curve``. The curvature is that of a
+    smooth curve over arc length, since a slow vehicle's direction over time is that of its jitter; a standing one has
+    none.
 
     Args:
         path: of any number of poses; fewer than two stand.
@@ -95,6 +104,9 @@ def measure_kinematics(path: EgoPath) -> Kinematics:
     lateral = np.einsum("tk,tk->t", across, acceleration)
     # Of a vector in turning axes: the turn rate carries one component over to the other.
     turn_rate = lateral / np.maximum(speed, _CRAWLING_M_S)
+    curvature = _measure_curvature(times, path.world_SE3_ego[:, :2, 3], dense, speed)
+    lost_turns = np.isnan(curvature)
+    curvature[lost_turns] = (turn_rate / np.maximum(speed, _CRAWLING_M_S))[lost_turns]
     return Kinematics(
         times_s=dense,
         speed_m_s=speed,
@@ -102,8 +114,23 @@ def measure_kinematics(path: EgoPath) -> Kinematics:
         lateral_acceleration_m_s2=lateral,
         jerk_m_s3=np.einsum("tk,tk->t", along, jerk) + turn_rate * lateral,
         lateral_jerk_m_s3=np.einsum("tk,tk->t", across, jerk) - turn_rate * forward,
-        curvature_1_m=turn_rate / np.maximum(speed, _CRAWLING_M_S),
+        curvature_1_m=curvature,
     )
+
+
+def _measure_curvature(times: Float64, positions: Float64, dense: Float64, speed: Float64) -> Float64:
+    """[T] curvature over arc length; NaN where the vehicle turns more sharply than a smooth curve can follow."""
+    distances = integrate_speed(dense, speed)
+    if distances[-1] < STRAIGHT_M:
+        return np.zeros(len(dense))
+    curve = fit_smooth_curve(np.interp(times, dense, distances), positions, _SMOOTHING_M)
+    tangent = curve.evaluate(distances, 1)
+    change = curve.evaluate(distances, 2)
+    norm = np.linalg.norm(tangent, axis=1)
+    turning = tangent[:, 0] * change[:, 1] - tangent[:, 1] * change[:, 0]
+    curvature = turning / np.maximum(norm, _SHORTENED) ** 3
+    curvature[(norm < _SHORTENED) & (speed > _CRAWLING_M_S)] = np.nan
+    return np.where(speed > _STANDING_M_S, curvature, 0.0)
 
 
 def compare_with_bounds(motion: Kinematics, bounds: KinematicBounds) -> tuple[BoundViolation, ...]:

@@ -12,6 +12,7 @@ from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.ego_paths.frenet import measure_lateral_motion, place_path
 from genre_tasks.ego_paths.kinematics import find_bound_violations
 from genre_tasks.ego_paths.lateral_shape import LateralManoeuvre, LateralShape
+from genre_tasks.ego_paths.plausibility import describe_violations
 from genre_tasks.errors import ConfigError
 
 _LENGTH_COUNT = 12
@@ -78,8 +79,7 @@ def _measure_stretch(request: BehaviourRequest) -> tuple[float, float]:
     return start_m, request.reference.length_m - start_m
 
 
-def _measure_mean_speed(request: BehaviourRequest) -> float:
-    """While driving: standstill is no part of a manoeuvre."""
+def _measure_top_speed(request: BehaviourRequest) -> float:
     times = np.linspace(request.delay_s, request.reference.duration_s, 50)
     return float(request.reference.measure_speed(times).max())
 
@@ -88,7 +88,7 @@ def _estimate_length(request: BehaviourRequest, shape: LateralShape, strength: f
     """Metres that the manoeuvre takes on a straight road at the largest speed."""
     bounds: KinematicBounds = request.config.bounds
     amplitude_m = strength * request.config.lane_m
-    speed = _measure_mean_speed(request)
+    speed = _measure_top_speed(request)
     return max(
         math.sqrt(shape.peak_second * amplitude_m / bounds.max_curvature_1_m),
         speed * math.sqrt(shape.peak_second * amplitude_m / bounds.max_lateral_acceleration_m_s2),
@@ -97,13 +97,21 @@ def _estimate_length(request: BehaviourRequest, shape: LateralShape, strength: f
 
 
 def _explain_shortage(request: BehaviourRequest, shape: LateralShape) -> ConfigError:
-    _, available_m = _measure_stretch(request)
+    start_m, available_m = _measure_stretch(request)
     amplitude_m = request.strength * request.config.lane_m
+    needed_m = _estimate_length(request, shape, request.strength)
     problem = (
-        f"{request.name} of {amplitude_m:.2g} m takes about {_estimate_length(request, shape, request.strength):.1f} m "
-        f"of driving at {_measure_mean_speed(request):.1f} m/s; the recorded path has {available_m:.1f} m of it "
+        f"{request.name} of {amplitude_m:.2g} m takes about {needed_m:.1f} m of straight driving at "
+        f"{_measure_top_speed(request):.1f} m/s; the recorded path has {available_m:.1f} m of it "
         f"after {request.delay_s:.1f} s"
     )
+    if available_m >= _SHORTEST_M:
+        signed_m = request.signed_side * amplitude_m
+        longest = LateralManoeuvre(shape, request.start_offset_m, signed_m, start_m, available_m)
+        path = place_path(request.reference, request.recorded, request.reference, longest)
+        violations = find_bound_violations(path, request.config.bounds)
+        if violations:
+            problem += f", where it breaks the bounds: {describe_violations(violations)}"
     remedies = []
     possible = find_largest_strength(request, shape)
     if possible > 0:

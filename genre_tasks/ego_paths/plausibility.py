@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 from genre_tasks.ego_paths.behaviour_request import BehaviourRequest
 from genre_tasks.ego_paths.ego_path import EgoPath
-from genre_tasks.ego_paths.frenet import ConstantOffset, place_path
 from genre_tasks.ego_paths.kinematics import BoundViolation, find_bound_violations
 from genre_tasks.errors import ConfigError
 
@@ -24,26 +23,30 @@ def describe_violations(violations: Sequence[BoundViolation]) -> str:
     return ", ".join(str(violation) for violation in violations)
 
 
-def check_recorded_driving(request: BehaviourRequest) -> None:
+def check_recorded_driving(request: BehaviourRequest, path: EgoPath) -> EgoPath:
     """Refuses a behaviour where the recorded driving alone, at the start offset, breaks the bounds.
 
     Args:
         request: of any behaviour.
+        path: the recorded one, moved by the offset.
+
+    Returns:
+        The path.
 
     Raises:
         ConfigError: it does.
     """
-    path = place_path(request.reference, request.recorded, request.reference, ConstantOffset(request.start_offset_m))
     violations = find_bound_violations(path, request.config.bounds)
     if violations:
         offset = request.start_offset_m
-        moved = f", moved by {offset:g} m," if offset else ""
+        moved = f", moved by {offset:.3g} m," if offset else ""
         remedy = "Widen simulate.bounds in the configuration, or take other chunks."
         if offset:
-            remedy = f"Start nearer to the recorded path: `--start-offset {0.5 * offset:g}`. Or: {remedy}"
+            remedy = f"Start nearer to the recorded path: `--start-offset {0.5 * offset:.3g}`. Or: {remedy}"
         raise ConfigError(
             f"the recorded path itself{moved} breaks the bounds: {describe_violations(violations)}", remedy=remedy
         )
+    return path
 
 
 def check_planned_path(request: BehaviourRequest, path: EgoPath) -> EgoPath:
@@ -62,8 +65,8 @@ def check_planned_path(request: BehaviourRequest, path: EgoPath) -> EgoPath:
     violations = find_bound_violations(path, request.config.bounds)
     if violations:
         raise ConfigError(
-            f"{request.name} at strength {request.strength:g} breaks the bounds: {describe_violations(violations)}",
-            remedy=f"Ask for less: `--strength {0.5 * request.strength:g}`. Or widen simulate.bounds.",
+            f"{request.name} at strength {request.strength:.3g} breaks the bounds: {describe_violations(violations)}",
+            remedy=f"Ask for less: `--strength {0.5 * request.strength:.2g}`. Or widen simulate.bounds.",
         )
     return path
 
@@ -85,7 +88,7 @@ def check_rate(request: BehaviourRequest, rate_m_s2: float, bound_m_s2: float, q
     """
     rate = request.strength * rate_m_s2
     if rate > bound_m_s2:
-        problem = f"{request.name} at strength {request.strength:g} is a {quantity} of {rate:.3g} m/s²"
+        problem = f"{request.name} at strength {request.strength:.3g} is a {quantity} of {rate:.3g} m/s²"
         # Rounded down, so that the strength in the remedy is one that works.
         largest = math.floor(100 * bound_m_s2 / rate_m_s2) / 100
         raise ConfigError(

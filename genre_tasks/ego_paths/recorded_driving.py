@@ -6,7 +6,7 @@ import numpy as np
 
 from genre_tasks.ego_paths.behaviour_request import BehaviourRequest
 from genre_tasks.ego_paths.ego_path import EgoPath
-from genre_tasks.ego_paths.plausibility import check_planned_path
+from genre_tasks.ego_paths.plausibility import check_recorded_driving
 
 
 def plan_recorded_driving(request: BehaviourRequest) -> EgoPath:
@@ -26,4 +26,4 @@ def plan_recorded_driving(request: BehaviourRequest) -> EgoPath:
     # Level, as views beside the path are: a rolling vehicle would leave the ground.
     poses[:, :2, 3] += request.start_offset_m * lateral
     path = EgoPath(request.recorded.times_s, request.recorded.frames, poses)
-    return check_planned_path(request, path)
+    return check_recorded_driving(request, path)

@@ -17,10 +17,18 @@ SMOOTHING_S = 0.15
 """Motion of a shorter period than 2π times this (0.9 s) counts as jitter of the recording. A car's lateral motion is
 slower; centimetres of jitter at 10 Hz would otherwise be accelerations of several m/s²."""
 
-_SMOOTHING_M = 1.0
+_SMOOTHING_M = 1.5
+# A fast vehicle leaves few samples in a metre, and turns gently.
+_SMOOTHING_S_OF_SHAPE = 0.25
 # Below this speed a vehicle stands, and jitter of centimetres is no driving.
 _STANDING_M_S = 0.05
-_STANDING_M = 0.5
+STRAIGHT_M = 1.0
+"""A vehicle that drives less than this drives straight on: jitter of a centimetre alone would bend the path by more
+than a car can steer."""
+
+# Jitter alone comes to a good part of this.
+_STANDING_M = 0.25
+
 _DENSE_S = 0.02
 _TABLE_STEP_M = 0.1
 # Over so many seconds the curvature fades past the last recorded pose: at once would be an endless jerk.
@@ -176,12 +184,12 @@ def fit_reference_path(recorded: EgoPath) -> ReferencePath:
     times = recorded.times_s - recorded.times_s[0]
     poses = recorded.world_SE3_ego
     if len(recorded) == 1:
-        return _place_standing_reference(np.zeros(1), np.zeros(1), poses)
+        return _place_straight_reference(np.zeros(1), np.zeros(1), poses)
     dense, distances = _measure_distances(times, poses)
-    if distances[-1] < _STANDING_M:
-        return _place_standing_reference(dense, np.zeros_like(dense), poses)
+    if distances[-1] < STRAIGHT_M:
+        return _place_straight_reference(dense, distances * (distances[-1] > _STANDING_M), poses)
     driven = np.interp(times, dense, distances)
-    scale = max(_SMOOTHING_M, SMOOTHING_S * distances[-1] / times[-1])
+    scale = choose_smoothing_m(np.gradient(distances, dense))
     curve = fit_smooth_curve(driven, poses[:, :3, 3], scale)
     grid = np.linspace(0.0, distances[-1], max(8, round(distances[-1] / _TABLE_STEP_M)) + 1)
     velocity = curve.evaluate(grid, 1)
@@ -200,6 +208,35 @@ def fit_reference_path(recorded: EgoPath) -> ReferencePath:
     return ReferencePath(dense, distances, arc, table)
 
 
+def choose_smoothing_m(speed_m_s: Float64) -> float:
+    """Chooses how smooth the shape of a path is.
+
+    Args:
+        speed_m_s: [T] along it.
+
+    Returns:
+        The scale of ``fit_smooth_curve`` over arc length, metres.
+    """
+    return max(_SMOOTHING_M, _SMOOTHING_S_OF_SHAPE * float(speed_m_s.max()))
+
+
+def integrate_speed(times_s: Float64, speed_m_s: Float64) -> Float64:
+    """Integrates a smooth speed; what is slower than jitter counts as standing.
+
+    Args:
+        times_s: [T] dense.
+        speed_m_s: [T]; negative counts as 0.
+
+    Returns:
+        [T] metres driven by then.
+    """
+    # Fades out below the speed of standing, rather than ending there with a step.
+    driving = np.maximum(speed_m_s, 0.0)
+    driving = driving**3 / (driving**2 + _STANDING_M_S**2)
+    steps = 0.5 * (driving[1:] + driving[:-1]) * np.diff(times_s)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
 def _measure_distances(times: Float64, poses: Float64) -> tuple[Float64, Float64]:
     """Dense times and the metres driven by then."""
     curve = fit_smooth_curve(times, poses[:, :2, 3], SMOOTHING_S)
@@ -212,11 +249,7 @@ def _measure_distances(times: Float64, poses: Float64) -> tuple[Float64, Float64
     if backwards_m > _STANDING_M and backwards_m > np.trapezoid(np.maximum(speed, 0.0), dense):
         problem = f"the recorded vehicle drives backwards, {backwards_m:.1f} m"
         raise InputError(problem, remedy="Behaviours are for vehicles that drive forwards: take other chunks.")
-    # Fades out below the speed of standing, rather than ending there with a step.
-    driving = np.maximum(speed, 0.0)
-    driving *= driving**2 / (driving**2 + _STANDING_M_S**2)
-    steps = 0.5 * (driving[1:] + driving[:-1]) * np.diff(dense)
-    return dense, np.concatenate([[0.0], np.cumsum(steps)])
+    return dense, integrate_speed(dense, speed)
 
 
 def _turn_back(rotations: Float64, heading: Float64) -> Float64:
@@ -226,9 +259,9 @@ def _turn_back(rotations: Float64, heading: Float64) -> Float64:
     return np.asarray((Rotation.from_rotvec(about_z) * Rotation.from_matrix(rotations)).as_rotvec(), np.float64)
 
 
-def _place_standing_reference(times: Float64, distances: Float64, poses: Float64) -> ReferencePath:
-    """A straight line from where the vehicle stands."""
-    position = poses[:, :3, 3].mean(0)
+def _place_straight_reference(times: Float64, distances: Float64, poses: Float64) -> ReferencePath:
+    """A straight line from where the vehicle starts, to where it points."""
+    position = poses[0, :3, 3]
     forward = poses[:, :2, 0].mean(0)
     heading = float(np.arctan2(forward[1], forward[0]))
     rotation = _turn_back(poses[:, :3, :3], np.full(len(poses), heading)).mean(0)
