@@ -24,8 +24,8 @@ from flows.cli.range import range_command
 from flows.cli.render import render
 from flows.cli.run import run
 from flows.cli.show import show
-from flows.cli.simulate import simulate
 from flows.cli.signals import end_on_signals, exit_process
+from flows.cli.simulate import simulate
 from flows.cli.streams import prepare_streams
 from flows.cli.train import app as train_app
 from flows.cli.verify import verify

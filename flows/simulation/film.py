@@ -36,8 +36,8 @@ class FilmWriter:
         self._width_px = width_px // 2 * 2
         self._height_px = height_px // 2 * 2
         size = f"{self._width_px}x{self._height_px}"
-        # A file and no pipe, which could fill up and stop the encoder.
-        self._messages = tempfile.TemporaryFile()
+        # A file and no pipe, which could fill up and stop the encoder; it closes with this object.
+        self._messages = tempfile.TemporaryFile()  # noqa: SIM115
         self._process = subprocess.Popen(
             [
                 *(get_ffmpeg_exe(), "-v", "error", "-y"),

@@ -35,7 +35,10 @@ from genre_tasks.suggestions import did_you_mean
 POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 RELATIVE_COLUMNS = ("lateral_m", "ahead_m")
 TIME_COLUMNS = ("time_s", "frame")
-MARK_COLUMNS = ("reliable", "outside_recording")
+MARK_COLUMNS = (
+    *("index", "reliable", "outside_recording"),
+    *("chunk", "blended_chunk", "blend_weight", "collision"),
+)
 """What a rollout writes next to its poses; a path that is read has marks of its own."""
 
 _COLUMNS = (*TIME_COLUMNS, *POSE_COLUMNS, *RELATIVE_COLUMNS)

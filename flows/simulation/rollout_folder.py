@@ -88,9 +88,7 @@ def _replace(folder: Path, temporary: Path) -> None:
 
 
 def _read_manifest(folder: Path) -> Manifest:
-    foreign = InputError(
-        "--out holds files that are no rollout's", remedy="Name a new or empty folder.", file=folder
-    )
+    foreign = InputError("--out holds files that are no rollout's", remedy="Name a new or empty folder.", file=folder)
     path = folder / MANIFEST
     if not path.is_file():
         raise foreign

@@ -31,9 +31,7 @@ class RowMaker:
         self._path = rollout.checked.path
         self._marks = _mark_by_chunk(rollout)
         self._is_marked = bool(rollout.ranges)
-        self._collisions: dict[int, list[str]] = {}
-        for collision in rollout.checked.collisions:
-            self._collisions.setdefault(collision.index, []).append(collision.name)
+        self._colliding = rollout.checked.colliding
 
     def make_row(self, images: RolloutImages) -> PoseRow:
         """Makes the row of a pose.
@@ -43,7 +41,7 @@ class RowMaker:
         """
         index = images.index
         marks = self._marks[images.chunk]
-        names = self._collisions.get(index)
+        names = self._colliding.get(index)
         return PoseRow(
             index=index,
             **pose_values(self._path, index),

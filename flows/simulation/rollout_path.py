@@ -11,9 +11,10 @@ from flows.simulation.path_file import read_path_file
 from flows.simulation.request import SimulationRequest
 from genre_tasks.config import SimulateConfig
 from genre_tasks.ego_paths.behaviours import plan_behaviour
-from genre_tasks.ego_paths.collisions import Collision, collect_world_actors, find_collisions
+from genre_tasks.ego_paths.collisions import Collision, find_collisions
 from genre_tasks.ego_paths.ego_path import EgoPath
-from genre_tasks.ego_paths.kinematics import BoundViolation, compare_with_bounds, measure_kinematics
+from genre_tasks.ego_paths.kinematics import BoundViolation, Kinematics, compare_with_bounds, measure_kinematics
+from genre_tasks.ego_paths.world_actors import WorldActor, list_world_actors
 from genre_tasks.errors import ConfigError
 from genre_tasks.scene.chunk import Chunk
 
@@ -31,6 +32,7 @@ class CheckedPath:
         recorded: the recorded path.
         violations: of kinematic bounds; empty unless they are allowed.
         collisions: with actors; empty unless they are allowed.
+        colliding: by the index of a pose, the actors that it meets.
         maxima: largest amounts of the path's motion, by quantity and unit.
     """
 
@@ -38,6 +40,7 @@ class CheckedPath:
     recorded: EgoPath
     violations: tuple[BoundViolation, ...]
     collisions: tuple[Collision, ...]
+    colliding: dict[int, tuple[str, ...]]
     maxima: dict[str, float]
 
 
@@ -98,7 +101,8 @@ def check_path(
             f"no vehicle drives like this: {found}",
             remedy="Choose a smaller --strength or --start-offset, or render it all the same by --allow-implausible.",
         )
-    collisions = find_collisions(path, collect_world_actors(chunks), config.collision_margin_m)
+    actors = list_world_actors(chunks)
+    collisions = find_collisions(path, actors, config.collision_margin_m)
     if collisions and not request.allow_collision:
         found = "; ".join(str(collision) for collision in collisions[:_SHOWN_COLLISIONS])
         more = len(collisions) - _SHOWN_COLLISIONS
@@ -106,6 +110,27 @@ def check_path(
             f"the path meets other road users: {found}{f'; and {more} more' if more > 0 else ''}",
             remedy="Choose another --start-offset, --side or --delay, or render it all the same by --allow-collision.",
         )
+    met = {collision.actor_id for collision in collisions}
+    colliding = _find_colliding_poses(path, [a for a in actors if a.actor_id in met], config.collision_margin_m)
+    return CheckedPath(path, recorded, violations, collisions, colliding, _list_maxima(motion))
+
+
+def _find_colliding_poses(path: EgoPath, actors: Sequence[WorldActor], margin_m: float) -> dict[int, tuple[str, ...]]:
+    """The actors that each pose meets, by its index; poses that meet none are left out."""
+    if not actors:
+        return {}
+    colliding = {}
+    for index in range(len(path)):
+        here = slice(index, index + 1)
+        pose = EgoPath(path.times_s[here], path.frames[here], path.world_SE3_ego[here])
+        names = tuple(collision.actor_id for collision in find_collisions(pose, actors, margin_m))
+        if names:
+            colliding[index] = names
+    return colliding
+
+
+def _list_maxima(motion: Kinematics) -> dict[str, float]:
+    """Largest amounts of a motion, by quantity and unit."""
     maxima = {
         "speed_m_s": motion.speed_m_s.max(),
         "acceleration_m_s2": motion.acceleration_m_s2.max(),
@@ -115,4 +140,4 @@ def check_path(
         "lateral_jerk_m_s3": np.abs(motion.lateral_jerk_m_s3).max(),
         "curvature_1_m": np.abs(motion.curvature_1_m).max(),
     }
-    return CheckedPath(path, recorded, violations, collisions, {name: float(value) for name, value in maxima.items()})
+    return {name: float(value) for name, value in maxima.items()}

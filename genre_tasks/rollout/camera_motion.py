@@ -73,9 +73,7 @@ def place_rollout_views(
         shutter = None
         blur = None
         if camera.readout_s and motion.seconds:
-            shutter = RollingShutter(
-                camera.readout_s, velocity_m_s=velocity, turn_rad_s=turn, frame_s=motion.frame_s
-            )
+            shutter = RollingShutter(camera.readout_s, velocity_m_s=velocity, turn_rad_s=turn, frame_s=motion.frame_s)
         if camera.exposure_s and motion.seconds:
             blur = MotionBlur(camera.exposure_s, velocity_m_s=velocity, turn_rad_s=turn, frame_s=motion.frame_s)
         pose = chunk_SE3_ego @ camera.ego_SE3_camera

@@ -45,9 +45,7 @@ def extend_traffic(chunk_scene: ChunkScene, other: ChunkScene) -> ChunkScene:
     return ChunkScene(chunk, replace(scene, actors=nodes), removed)
 
 
-def _extend_tracks(
-    tracks: Sequence[Track], others: Sequence[Track], chunk_SE3_other: Float64
-) -> tuple[Track, ...]:
+def _extend_tracks(tracks: Sequence[Track], others: Sequence[Track], chunk_SE3_other: Float64) -> tuple[Track, ...]:
     """The tracks, longer by the frames of their namesakes, and after them those of new names."""
     other_by_name = {track.track_id: track for track in others}
     names = {track.track_id for track in tracks}
