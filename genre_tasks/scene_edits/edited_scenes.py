@@ -29,6 +29,7 @@ from genre_tasks.scene_edits.contact_shadow import build_contact_shadow
 from genre_tasks.scene_edits.edits import ActorChange, EditList, Insert, combine_changes
 from genre_tasks.scene_edits.insertion import place_inserted
 from genre_tasks.scene_edits.run_survey import survey_run
+from genre_tasks.scene_edits.symmetry import complete_by_symmetry
 from genre_tasks.scene_edits.tone import apply_tone, match_tone, measure_road_color
 from genre_tasks.scene_edits.trajectories import Trajectory, change_trajectory
 
@@ -158,7 +159,7 @@ class EditedScenes:
             node=_cut_node(node.track_id, node.label, node.size_m, trajectory, base),
             shape_frames=trajectory.shape_frames,
             deformation=deformation,
-            part=self._with_shadow(changed, extract_part(base.scene, k)),
+            part=self._with_shadow(changed, self._extract_recorded(base, k, changed.change)),
             keeps_shape=changed.change.keeps_motion,
         )
 
@@ -197,6 +198,12 @@ class EditedScenes:
                 (_new_actor(node, trajectory, join_parts(trim_to_box(part, actor.track.size_m), shadow)), actor.points)
             )
         return out
+
+    @staticmethod
+    def _extract_recorded(base: ChunkScene, k: int, change: ActorChange) -> ActorPart:
+        part = extract_part(base.scene, k)
+        # An actor that is not turned shows the side that it showed before.
+        return complete_by_symmetry(part, base.scene.actors[k], base.chunk.views) if change.turn_deg else part
 
     def _with_shadow(self, changed: _ChangedActor, part: ActorPart) -> ActorPart:
         track = self._survey.tracks[changed.track_id]
