@@ -21,11 +21,15 @@ from genre_tasks.fixer.view_surface import MIN_ALPHA, unproject_surface
 from genre_tasks.fixer.warping import SourceImage, sample_source
 from genre_tasks.render.surface import render_surfaces
 from genre_tasks.render.types import RenderSettings
-from genre_tasks.rollout.moment_actors import LAST_MOMENT, THIS_MOMENT, as_node, pose_actors
-from genre_tasks.rollout.removed_area import find_filled_area, hide_behind_boxes
+from genre_tasks.rollout.moment_actors import LAST_MOMENT, THIS_MOMENT, pose_actors
+from genre_tasks.rollout.removed_area import (
+    RemovedActors,
+    UncoveredArea,
+    find_uncovered_area,
+    separate_removed_actors,
+)
 from genre_tasks.rollout.render_rollout import RolloutImages
 from genre_tasks.rollout.rig import RolloutView
-from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.chunk import Actor, Chunk
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.lidar_map import build_lidar_scene
@@ -49,10 +53,13 @@ class FixedRolloutImages:
     Attributes:
         color: [C, H, W, 3] sRGB in [0, 1].
         filled: [C, H, W] true where a removed actor hid what no recorded image shows: FNet drew it.
+        restored: [C, H, W] true where a removed actor shaded what it did not hide: FNet drew it from recorded images
+            in which it is not in the shadow.
     """
 
     color: Tensor
     filled: Tensor
+    restored: Tensor
 
 
 @dataclass(frozen=True)
@@ -61,15 +68,13 @@ class _ChunkImages:
 
     Attributes:
         chunk: as edited.
-        sources: recorded images; what lies behind removed actors is hidden from them.
-        recorded: actors as the images show them.
+        removed: actors that were removed, and the recorded images without them.
         lidar_scene: coloured points as discs, as edited.
         latents: of references by camera and frame, once encoded.
     """
 
     chunk: Chunk
-    sources: tuple[SourceImage, ...]
-    recorded: tuple[ActorNode, ...]
+    removed: RemovedActors
     lidar_scene: SceneGraph
     latents: dict[tuple[str, int], Tensor] = field(default_factory=dict)
 
@@ -141,11 +146,11 @@ class RolloutFixer:
         """
         chunk_images = self._load_chunk(images)
         novel = self._render_inputs(images, chunk_images)
-        filled = self._find_filled(images, novel, chunk_images)
-        color = self._run_network(images, novel, chunk_images, range(len(images.views)))
+        area = self._find_area(images, novel, chunk_images)
+        color = self._run_network(images, _blank(novel, area), chunk_images, range(len(images.views)))
         for k, view in enumerate(images.views):
             self._remember(images, k, view, color[k])
-        return FixedRolloutImages(color, filled)
+        return FixedRolloutImages(color, area.filled, area.restored)
 
     @torch.no_grad()
     def fill(self, images: RolloutImages) -> FixedRolloutImages:
@@ -160,39 +165,45 @@ class RolloutFixer:
         Raises:
             NonFiniteError: a render is not finite.
         """
-        nothing = FixedRolloutImages(images.color, torch.zeros_like(images.alpha, dtype=torch.bool))
+        nowhere = torch.zeros_like(images.alpha, dtype=torch.bool)
         if not images.chunk_scene.removed:
-            return nothing
+            return FixedRolloutImages(images.color, nowhere, nowhere)
         chunk_images = self._load_chunk(images)
         novel = self._render_inputs(images, chunk_images)
-        filled = self._find_filled(images, novel, chunk_images)
-        rows = [k for k in range(len(images.views)) if bool(filled[k].any())]
-        if not rows:
-            return nothing
+        area = self._find_area(images, novel, chunk_images)
+        rows = [k for k in range(len(images.views)) if bool(area.both[k].any())]
         color = images.color.clone()
-        # The network repairs a view in one piece, and only the filled pixels of it are taken.
-        fixed = self._run_network(images, novel, chunk_images, rows)
-        color[rows] = torch.where(filled[rows][..., None], fixed, color[rows])
-        for k in rows:
-            self._remember(images, k, images.views[k], color[k])
-        return FixedRolloutImages(color, filled)
+        if rows:
+            # The network repairs a view in one piece, and only the pixels of the area are taken.
+            fixed = self._run_network(images, _blank(novel, area), chunk_images, rows)
+            color[rows] = torch.where(area.both[rows][..., None], fixed, color[rows])
+        for k, view in enumerate(images.views):
+            self._remember(images, k, view, color[k])
+        return FixedRolloutImages(color, area.filled, area.restored)
 
     def _load_chunk(self, images: RolloutImages) -> _ChunkImages:
         chunk = images.chunk_scene.chunk
         known = self._chunks.get(chunk.index)
         # An edit that changes along the path gives another chunk of the same index.
         if known is None or known.chunk is not chunk:
-            recorded = self._recorded.load(chunk.index).chunk
-            sources = hide_behind_boxes(load_source_images(recorded), images.chunk_scene.removed)
-            if not sources:
+            recorded = self._recorded.load(chunk.index)
+            views = recorded.chunk.views_with_role("source")
+            if not views:
                 raise InputError(
                     "the chunk has no source image to fix views from",
                     remedy="Reconstruct it from a log with images.",
                     log=chunk.log,
                     chunk=chunk.index,
                 )
-            lidar_scene = build_lidar_scene(chunk, self._lidar_max_points)
-            known = _ChunkImages(chunk, sources, tuple(as_node(a) for a in recorded.actors), lidar_scene)
+            removed = separate_removed_actors(
+                scene=recorded.scene,
+                removed=images.chunk_scene.removed,
+                sources=load_source_images(recorded.chunk),
+                # Depth has no motion blur, and without it each view is rendered once.
+                views=[replace(view, blur=None) for view in views],
+                settings=self._settings,
+            )
+            known = _ChunkImages(chunk, removed, build_lidar_scene(chunk, self._lidar_max_points))
             self._chunks[chunk.index] = known
         self._chunks.move_to_end(chunk.index)
         while len(self._chunks) > _CHUNKS_IN_MEMORY:
@@ -219,10 +230,13 @@ class RolloutFixer:
             lidar_depth=lidar.expected_depth(),
         )
 
-    def _find_filled(self, images: RolloutImages, novel: NovelViews, chunk_images: _ChunkImages) -> Tensor:
+    def _find_area(self, images: RolloutImages, novel: NovelViews, chunk_images: _ChunkImages) -> UncoveredArea:
+        if not images.chunk_scene.removed:
+            nowhere = torch.zeros_like(images.alpha, dtype=torch.bool)
+            return UncoveredArea(nowhere, nowhere)
         rendered = torch.where(novel.alpha >= MIN_ALPHA, novel.depth, torch.zeros_like(novel.depth))
         depth = torch.where(novel.lidar_alpha >= MIN_ALPHA, novel.lidar_depth, rendered)
-        return find_filled_area(images, depth, chunk_images.sources, chunk_images.recorded)
+        return find_uncovered_area(images, depth, chunk_images.removed, self._settings)
 
     def _run_network(
         self, images: RolloutImages, novel: NovelViews, chunk_images: _ChunkImages, rows: Sequence[int]
@@ -237,7 +251,7 @@ class RolloutFixer:
         chunk = replace(chunk_images.chunk, actors=moving)
 
         def fix_batch(batch: Sequence[int]) -> Tensor:
-            inputs = build_inputs(chunk, novel, batch, chunk_images.sources)
+            inputs = build_inputs(chunk, novel, batch, chunk_images.removed.unshaded)
             inputs = self._look_up_last(images, novel, moving, batch, inputs)
             # By camera and not by pose: noise that changes from pose to pose is seen as flicker.
             seeds = [names.index(images.views[k].camera) for k in batch]
@@ -252,13 +266,13 @@ class RolloutFixer:
         moments = {THIS_MOMENT: images.views[0].frame}
         # All cameras of a pose are of one moment.
         moments |= {LAST_MOMENT: last.view.frame for last in self._last.values()}
-        recorded = {actor.track_id: actor for actor in chunk_images.recorded}
-        frames = sorted({source.frame for source in chunk_images.sources})
+        recorded = {actor.track_id: actor for actor in chunk_images.removed.recorded}
+        frames = sorted({source.frame for source in chunk_images.removed.unshaded})
         return pose_actors(images.chunk_scene.scene.actors, moments, recorded, frames)
 
     def _encode_reference(self, reference: tuple[str, int], chunk_images: _ChunkImages) -> Tensor:
         if reference not in chunk_images.latents:
-            image = next(s.image for s in chunk_images.sources if (s.camera, s.frame) == reference)
+            image = next(s.image for s in chunk_images.removed.unshaded if (s.camera, s.frame) == reference)
             stride = self._network.stride
             pad = (0, -image.shape[-1] % stride, 0, -image.shape[-2] % stride)
             encoded = self._network.encode(F.pad(image[None], pad, mode="replicate"))
@@ -303,3 +317,9 @@ class RolloutFixer:
             image=color.permute(2, 0, 1),
             depth=torch.where(opaque, images.depth[k], torch.zeros_like(images.depth[k])),
         )
+
+
+def _blank(novel: NovelViews, area: UncoveredArea) -> NovelViews:
+    """The views without what the render shows in an area: the fixer fills it from LiDAR, images and surroundings."""
+    keep = (~area.both).to(novel.alpha)
+    return replace(novel, color=novel.color * keep[..., None], alpha=novel.alpha * keep, depth=novel.depth * keep)
