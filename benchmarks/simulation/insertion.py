@@ -213,7 +213,7 @@ def insertion_table(rows: Sequence[Row]) -> Iterator[str]:
     Args:
         rows: see :func:`measure_insertion`.
     """
-    yield "| log | inserted actor | pixels | PSNR to the truth at 180°, dB: copy at 180° | copy at 0° | moved and back |"
+    yield "| log | inserted actor | pixels | PSNR to the actor at 180°, dB: copy at 180° | copy at 0° | moved and back |"
     yield "|---|---|---|---|---|---|"
     for row in rows:
         trips = {trip["actor"]: trip for trip in row["round_trips"]}

@@ -19,9 +19,9 @@ from flows.simulation.rollout_path import check_path
 from genre_tasks.config import SimulateConfig
 from genre_tasks.ego_paths.behaviour_request import Side
 from genre_tasks.ego_paths.behaviours import BEHAVIOURS, plan_behaviour
-from genre_tasks.ego_paths.collisions import collect_world_actors
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.ego_paths.kinematics import find_bound_violations
+from genre_tasks.ego_paths.world_actors import list_world_actors
 from genre_tasks.errors import ConfigError, GenreError, InputError
 from genre_tasks.scene_edits.edits import Remove
 
@@ -108,7 +108,7 @@ def measure_refusals(case: SimulationCase) -> Row:
     scenes = open_scenes(case)
     recorded = scenes.recorded
     config = scenes.config.simulate
-    actor = collect_world_actors(scenes.chunks)[0]
+    actor = list_world_actors(scenes.chunks)[0]
     boxes = actor.place_boxes(recorded.frames)
     first = int(np.flatnonzero(boxes.exists)[0])
     # The whole path moved so that it starts where the actor is.
