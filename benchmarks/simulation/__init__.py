@@ -159,20 +159,26 @@ class SimulationBench:
 
     def table(self, rows: Mapping[str, Row]) -> Iterator[str]:
         """Gives a table for each section, and what was not measured."""
-        sections = (
-            ("Behaviours", behaviour_table(_select(rows, "behaviours"))),
-            ("Removed actors", removal_table(_select(rows, "removal"))),
-            ("Inserted actors", insertion_table(_select(rows, "insertion"))),
-            ("Flicker", flicker_table(_select(rows, "flicker"))),
-            ("Hand-over between chunks", handover_table(_select(rows, "hand-over"))),
-            ("Speed and memory", speed_table(_select(rows, "speed"), _select(rows, "memory"))),
-            ("Plausibility", plausibility_table(_select(rows, "plausibility"), _select(rows, "refusals"))),
-        )
-        for k, (title, lines) in enumerate(sections):
-            # A table first: the command's output begins with one.
-            if k:
-                yield f"\n{title}\n"
-            yield from lines
+        found = {kind: _select(rows, kind) for kind in {name.split()[0] for name in rows}}
+        speed = (found.get("speed", []), found.get("memory", []))
+        plausibility = (found.get("plausibility", []), found.get("refusals", []))
+        sections = [
+            ("Behaviours", behaviour_table, (found.get("behaviours", []),)),
+            ("Removed actors", removal_table, (found.get("removal", []),)),
+            ("Inserted actors", insertion_table, (found.get("insertion", []),)),
+            ("Flicker", flicker_table, (found.get("flicker", []),)),
+            ("Hand-over between chunks", handover_table, (found.get("hand-over", []),)),
+            ("Speed and memory", speed_table, speed),
+            ("Plausibility", plausibility_table, plausibility),
+        ]
+        first = True
+        for title, make_table, arguments in sections:
+            if any(arguments):
+                # A table first: the command's output begins with one.
+                if not first:
+                    yield f"\n{title}\n"
+                first = False
+                yield from make_table(*arguments)
         yield from list_not_measured(rows)
 
 

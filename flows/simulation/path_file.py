@@ -10,7 +10,8 @@ A file has a row for each pose. Its columns:
 ==================  ===================================================================================
 
 Instead of the last two lines, ``lateral_m`` and ``ahead_m`` place poses relative to the recorded path. JSON is a list
-of objects, one for each row, or an object whose ``poses`` are that list. The poses of a rollout are such a file.
+of objects, one for each row, or an object whose ``poses`` are that list. The ``poses.parquet`` of a rollout is such
+a file.
 """
 
 from __future__ import annotations
@@ -35,11 +36,8 @@ from genre_tasks.suggestions import did_you_mean
 POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 RELATIVE_COLUMNS = ("lateral_m", "ahead_m")
 TIME_COLUMNS = ("time_s", "frame")
-MARK_COLUMNS = (
-    *("index", "reliable", "outside_recording"),
-    *("chunk", "blended_chunk", "blend_weight", "collision"),
-)
-"""What a rollout writes next to its poses; a path that is read has marks of its own."""
+ROLLOUT_COLUMNS = ("index", "reliable", "outside_recording", "chunk", "blended_chunk", "blend_weight", "collision")
+"""What a rollout writes next to its poses; it is not read, since it is found again for any path."""
 
 _COLUMNS = (*TIME_COLUMNS, *POSE_COLUMNS, *RELATIVE_COLUMNS)
 _LEAST_STEP_S = 0.001
@@ -63,11 +61,11 @@ def read_path_file(path: Path, recorded: EgoPath) -> EgoPath:
         InputError: the file is unreadable or holds no path, with the row and the remedy.
     """
     if not len(recorded):
-        raise InputError("the recorded path has no frames", remedy="Take at least one chunk of the run.")
+        raise InputError("a path without frames: the recorded path has 0 poses", remedy="Take at least one chunk.")
     try:
         columns = _read_columns(path)
         if not columns or not len(next(iter(columns.values()))):
-            raise InputError("a path without frames: the file has no rows", remedy="Write a row for each pose.")
+            raise InputError("a path without frames: the file has 0 rows", remedy="Write a row for each pose.")
         _check_columns(columns)
         numbers = {name: _read_numbers(name, columns[name]) for name in _COLUMNS if name in columns}
         times, frames = _place_in_time(numbers, recorded)
@@ -128,7 +126,7 @@ def _read_columns(path: Path) -> Mapping[str, Sequence[Any]]:
 def _check_columns(columns: Mapping[str, Sequence[Any]]) -> None:
     """Refuses unknown and missing columns."""
     for name in columns:
-        if name not in _COLUMNS and name not in MARK_COLUMNS:
+        if name not in _COLUMNS and name not in ROLLOUT_COLUMNS:
             raise InputError(f"unknown column {name!r}", remedy=did_you_mean(name, _COLUMNS) + _REMEDY)
     if not set(TIME_COLUMNS) & set(columns):
         raise InputError("the path has neither time_s nor frame", remedy=_REMEDY)

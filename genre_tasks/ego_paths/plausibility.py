@@ -10,17 +10,22 @@ from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.ego_paths.kinematics import BoundViolation, find_bound_violations
 from genre_tasks.errors import ConfigError
 
+_NAMED_VIOLATIONS = 2
+
 
 def describe_violations(violations: Sequence[BoundViolation]) -> str:
-    """Writes violations for an error.
+    """Writes violations for an error, the worst ones first.
 
     Args:
         violations: at least one.
 
     Returns:
-        One clause.
+        One clause; of many violations it names two.
     """
-    return ", ".join(str(violation) for violation in violations)
+    worst = sorted(violations, key=lambda violation: violation.value / violation.bound, reverse=True)
+    named = ", ".join(str(violation) for violation in worst[:_NAMED_VIOLATIONS])
+    more = len(worst) - _NAMED_VIOLATIONS
+    return f"{named}, and {more} more" if more > 0 else named
 
 
 def check_recorded_driving(request: BehaviourRequest, path: EgoPath) -> EgoPath:

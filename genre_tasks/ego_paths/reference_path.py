@@ -180,7 +180,7 @@ def fit_reference_path(recorded: EgoPath) -> ReferencePath:
         InputError: a path without frames, or a vehicle that drives backwards.
     """
     if not len(recorded):
-        raise InputError("the recorded path has no frames", remedy="Take at least one chunk of the run.")
+        raise InputError("a path without frames: the recorded path has 0 poses", remedy="Take at least one chunk.")
     times = recorded.times_s - recorded.times_s[0]
     poses = recorded.world_SE3_ego
     if len(recorded) == 1:
