@@ -14,6 +14,7 @@ from flows.cli.bench import bench
 from flows.cli.check import check
 from flows.cli.cost import cost
 from flows.cli.doctor import doctor
+from flows.cli.edit import edit
 from flows.cli.effects import effects
 from flows.cli.figure import figure
 from flows.cli.last_resort import run_guarded
@@ -48,6 +49,7 @@ app.command(name="effects")(effects)
 app.command(name="render")(render)
 app.command(name="simulate")(simulate)
 app.command(name="range")(range_command)
+app.command(name="edit")(edit)
 app.command(name="show")(show)
 app.command(name="verify")(verify)
 app.command(name="doctor")(doctor)

@@ -20,10 +20,12 @@ def show(
     what: Annotated[
         str,
         typer.Argument(
-            help="runs for all finished runs, stages for all artifacts, config for a preset's configuration, the name "
-            "of a run, or the key of an artifact. The first characters of a name or a key are enough."
+            help="runs for all finished runs, stages for all artifacts, config for a preset's configuration, actors "
+            "for a run's actors, the name of a run, or the key of an artifact. The first characters of a name or a key "
+            "are enough."
         ),
     ] = "runs",
+    run: Annotated[str | None, typer.Argument(help="The run whose actors are shown.")] = None,
     store: StoreOption = DEFAULT_STORE,
     preset: PresetOption = DEFAULT_PRESET,
     picture: Annotated[
@@ -31,7 +33,8 @@ def show(
         typer.Option(
             parser=parse_path,
             metavar="PATH",
-            help="Write the artifact's picture to this PNG file, over an existing one. `what` must be a key.",
+            help="Write the artifact's picture to this PNG file, over an existing one, or the pictures of all actors. "
+            "`what` must be a key, or actors.",
         ),
     ] = None,
 ) -> None:
@@ -39,6 +42,7 @@ def show(
 
     Without an argument the command lists the finished runs. For an artifact it prints the manifest, the files with
     statistics of their columns, and the artifacts that it was made from. `--preset` counts for `genre show config`.
+    Names of actors are those that `genre edit` takes.
 
     Example:
 
@@ -48,6 +52,7 @@ def show(
         genre show config --preset fine
         genre show 4b1c
         genre show 9f02ab --picture artifact.png
+        genre show actors 4b1c --picture actors.png
     """
     from flows.cli.existing_store import open_existing_store
     from flows.cli.output_paths import check_output_file
@@ -58,13 +63,19 @@ def show(
         check_output_file(picture, "--picture", (".png",))
         if what in ("config", "runs", "stages"):
             raise _no_picture(f"a list of {what}" if what != "config" else "a configuration")
+    if run is not None and what != "actors":
+        raise _second_word(what, run)
     if what == "config":
         from flows.configuration import load_configuration
 
         print_fields(f"preset {preset}", load_configuration(preset).model_dump())
         return
     opened = open_existing_store(store)
-    if what == "runs":
+    if what == "actors":
+        from flows.cli.show_actors import show_actors
+
+        show_actors(store, run, picture)
+    elif what == "runs":
         from flows.reconstruction.run_records import list_runs
 
         print_rows("runs", [_run_row(record) for record in list_runs(store)])
@@ -99,6 +110,12 @@ def _show_run_or_artifact(name: str, opened: LocalStore, store: str, picture: Pa
     _print_artifact(opened, artifacts[0])
     if picture is not None:
         typer.echo(f"wrote {picture}")
+
+
+def _second_word(what: str, run: str) -> Exception:
+    from genre_tasks.errors import ConfigError
+
+    return ConfigError(f"'{run}' after '{what}' has no meaning", remedy="Only `genre show actors` takes a second word.")
 
 
 def _no_picture(what: str) -> Exception:

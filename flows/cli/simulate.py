@@ -41,6 +41,11 @@ StartOffsetOption = Annotated[
         "simulate.start_offset_m if not given."
     ),
 ]
+EditsOption = Annotated[
+    Path | None,
+    typer.Option(parser=parse_path, metavar="PATH", help="A YAML file with a list `edits` of the traffic."),
+]
+ListOption = list[str] | None
 
 
 def simulate(
@@ -59,6 +64,23 @@ def simulate(
     ] = None,
     chunks: ChunksOption = None,
     stage: SceneStageOption = None,
+    edits: EditsOption = None,
+    remove: Annotated[
+        ListOption, typer.Option(help="Remove an actor, such as car-12. May be given several times.")
+    ] = None,
+    insert: Annotated[
+        ListOption,
+        typer.Option(
+            help="Insert an actor of this run or another one: [NAME@][RUN:]ACTOR,ahead=12,left=-3,turn=180,speed=5."
+        ),
+    ] = None,
+    move: Annotated[ListOption, typer.Option(help="Move an actor, in metres: car-3,forward=2,left=-1.")] = None,
+    retime: Annotated[ListOption, typer.Option(help="Let an actor drive later, in seconds: car-3,delay=0.5.")] = None,
+    rotate: Annotated[ListOption, typer.Option(help="Turn an actor, in degrees: car-3,degrees=90.")] = None,
+    scale_speed: Annotated[ListOption, typer.Option(help="Scale an actor's speed: car-3,factor=0.5.")] = None,
+    fix: Annotated[
+        bool, typer.Option("--fix", help="Repair all images by FNet. What removed actors hid is filled by it anyway.")
+    ] = False,
     exr: Annotated[
         bool, typer.Option("--exr", help="Also write scene-linear images with opacity and depth: CAMERA/000012.exr.")
     ] = False,
@@ -93,18 +115,22 @@ def simulate(
     \b
         genre simulate 4b1c --behaviour brake --out braking
         genre simulate 4b1c --behaviour swerve --start-offset -1m --cameras front_camera --exr --out swerving
+        genre simulate 4b1c --remove car-3 --move car-5,left=1.5 --out edited
     """
     from flows.cli.existing_store import open_existing_store
     from flows.cli.outcome import add_facts
     from flows.cli.output_paths import check_output_folder
     from flows.cli.parsing import parse_numbers
     from flows.cli.terminal import TerminalReporter
+    from flows.simulation.edit_file import parse_edit_options, read_edit_file
     from flows.simulation.request import SimulationRequest
+    from genre_tasks.scene_edits.edits import EditList
 
     add_facts(run=run, store=store, out=str(out))
     check_output_folder(out, "--out")
     open_existing_store(store)
     numbers = parse_numbers(chunks, "--chunks")
+    listed = EditList() if edits is None else read_edit_file(edits)
     request = SimulationRequest(
         store=store,
         run=run,
@@ -118,6 +144,9 @@ def simulate(
         delay_s=delay,
         side=_parse_side(side),
         cameras=None if cameras is None else tuple(name.strip() for name in cameras.split(",")),
+        edits=listed
+        + parse_edit_options(remove or (), insert or (), move or (), retime or (), rotate or (), scale_speed or ()),
+        fix=fix,
         allow_collision=allow_collision,
         allow_implausible=allow_implausible,
         mark_range=not no_range,

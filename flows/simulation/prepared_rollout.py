@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flows.simulation.edited_runs import OpenedRun, open_edited_scenes
 from flows.simulation.request import SimulationRequest
 from flows.simulation.rollout_path import CheckedPath, check_path, make_path
 from flows.simulation.run_scenes import RunScenes
@@ -26,7 +27,8 @@ class PreparedRollout:
     """What is rendered, complete and checked.
 
     Attributes:
-        source: the scenes.
+        source: the scenes, with edited traffic.
+        recorded: the scenes as they were reconstructed.
         rig: the cameras.
         checked: the path.
         handovers: between chunks.
@@ -35,6 +37,7 @@ class PreparedRollout:
     """
 
     source: SceneSource
+    recorded: RunScenes
     rig: Sequence[RigCamera]
     checked: CheckedPath
     handovers: tuple[Handover, ...]
@@ -43,13 +46,13 @@ class PreparedRollout:
 
 
 def prepare_rollout(
-    request: SimulationRequest, scenes: RunScenes, config: PipelineConfig, progress: Progress
+    request: SimulationRequest, run: OpenedRun, config: PipelineConfig, progress: Progress
 ) -> PreparedRollout:
     """Plans and checks the path of a rollout, and looks where its scenes can be trusted.
 
     Args:
         request: what to simulate.
-        scenes: of the run.
+        run: the recorded run, and the edits that it has already.
         config: of the simulation.
         progress: called while scenes are measured.
 
@@ -60,18 +63,27 @@ def prepare_rollout(
         InputError: there is no such camera, or a file is unfit.
         ConfigError: the path is implausible or meets an actor.
     """
-    chunks = [scenes.load(number).chunk for number in scenes.chunk_numbers]
+    source = _edit_traffic(request, run, config)
+    chunks = [source.load(number).chunk for number in source.chunk_numbers]
     rig = select_cameras(estimate_rig(chunks), request.cameras)
     recorded = join_recorded_path(chunks)
     path = make_path(request, config.simulate, recorded)
     checked = check_path(request, config.simulate, path, recorded, chunks)
     # After the checks, which end most of the requests that are no good, and take no time.
-    ranges = find_side_ranges(scenes, progress) if request.mark_range else {}
+    ranges = find_side_ranges(run.recorded, progress) if request.mark_range else {}
     progress(0, len(path), "hand-over")
-    handovers = plan_handovers(scenes, path, rig, config.simulate.handover_frames)
+    handovers = plan_handovers(source, path, rig, config.simulate.handover_frames)
     steps = np.diff(path.times_s)
     pose_s = float(np.median(steps)) if len(steps) else DEFAULT_FRAME_S
-    return PreparedRollout(scenes, rig, checked, handovers, ranges, pose_s)
+    return PreparedRollout(source, run.recorded, rig, checked, handovers, ranges, pose_s)
+
+
+def _edit_traffic(request: SimulationRequest, run: OpenedRun, config: PipelineConfig) -> SceneSource:
+    if not len(run.edits + request.edits):
+        return run.recorded
+    return open_edited_scenes(
+        request.store, request.run, request.edits, config.simulate, stage=request.stage, chunks=request.chunks
+    )
 
 
 def select_cameras(rig: Sequence[RigCamera], names: Sequence[str] | None) -> tuple[RigCamera, ...]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from genre_tasks.ego_paths.behaviour_request import Side
 from genre_tasks.errors import ConfigError
+from genre_tasks.scene_edits.edits import EditList
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,8 @@ class SimulationRequest:
         delay_s: seconds of recorded driving before the behaviour starts.
         side: of a lane change or swerve; ``None``: the behaviour chooses.
         cameras: names; ``None``: all of the rig.
+        edits: of the traffic.
+        fix: whether FNet repairs all images; otherwise it fills what removed actors hid.
         allow_collision: whether a path through an actor is rendered all the same.
         allow_implausible: whether a path that no vehicle can drive is rendered all the same.
         mark_range: whether poses are marked that lie outside of the scenes' reliable range.
@@ -49,6 +52,8 @@ class SimulationRequest:
     delay_s: float = 0.0
     side: Side | None = None
     cameras: tuple[str, ...] | None = None
+    edits: EditList = field(default_factory=EditList)
+    fix: bool = False
     allow_collision: bool = False
     allow_implausible: bool = False
     mark_range: bool = True
@@ -75,7 +80,7 @@ class SimulationRequest:
         """Gives what of the request decides on the files, as JSON values.
 
         Returns:
-            All but the places that are read and written; file contents are digested elsewhere.
+            All but the places that are read and written; edits and files are digested elsewhere.
         """
         return {
             "behaviour": self.behaviour,
@@ -83,6 +88,7 @@ class SimulationRequest:
             "strength": self.strength,
             "delay_s": self.delay_s,
             "side": self.side,
+            "fix": self.fix,
             "cameras": None if self.cameras is None else list(self.cameras),
             # Whether a faulty path is refused changes no file: the files hold what was found.
             "mark_range": self.mark_range,

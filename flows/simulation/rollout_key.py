@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
+from flows.pipeline.definition import STAGE_BY_NAME, digest_stage_weights
+from flows.simulation.edited_runs import OpenedRun, digest_edits
 from flows.simulation.request import SimulationRequest
-from flows.simulation.run_scenes import RunScenes
 from genre_tasks.config import PipelineConfig
 from genre_tasks.ego_paths.behaviours import BEHAVIOURS
 from genre_tasks.errors import InputError
@@ -15,24 +15,21 @@ from storage.keys import digest_file, stage_key
 
 # Raised when the layout of the files changes, which no digest of code notices: writers lie outside of the closure.
 _LAYOUT = 1
-_MODULE = "genre_tasks.rollout.render_rollout"
-_FURTHER_MODULES = (
+_MODULES = (
+    "genre_tasks.ego_paths.behaviours",
     "genre_tasks.ego_paths.collisions",
     "genre_tasks.ego_paths.path_marks",
     "genre_tasks.reliability.reliable_range",
 )
 
 
-def compute_rollout_key(
-    request: SimulationRequest, scenes: RunScenes, config: PipelineConfig, modules: Sequence[str] = ()
-) -> str:
+def compute_rollout_key(request: SimulationRequest, run: OpenedRun, config: PipelineConfig) -> str:
     """Computes the key of a rollout without reading any scene.
 
     Args:
         request: what to simulate.
-        scenes: of the run.
+        run: the recorded run, and the edits that it has already.
         config: of the simulation.
-        modules: further modules whose code decides on the files.
 
     Returns:
         64 hex digits.
@@ -42,20 +39,30 @@ def compute_rollout_key(
     """
     import imageio_ffmpeg
 
-    inputs = dict(scenes.payload_digests())
+    inputs = dict(run.recorded.payload_digests())
+    edits = run.edits + request.edits
+    modules = list(_MODULES)
+    weights = None
+    if len(edits):
+        inputs["edits"] = digest_edits(request.store, edits, config.simulate)
+    if request.fix or len(edits):
+        # FNet fills what removed actors hid, so edits may need it as well.
+        modules.append("genre_tasks.rollout.fix_rollout")
+        weights = digest_stage_weights(STAGE_BY_NAME["fnet"], config)
     if request.path_file is not None:
         inputs["path file"] = _digest_file(request.path_file)
     configuration = {
         "simulate": config.simulate.model_dump(mode="json"),
         "request": request.key_values(),
+        "fnet": config.fnet.model_dump(mode="json"),
         "layout": _LAYOUT,
         # The encoder's version decides on the bytes of films.
         "ffmpeg": imageio_ffmpeg.__version__,
     }
     # Behaviours are named by strings, which a reader of imports does not see.
     planners = [behaviour.target.partition(":")[0] for behaviour in BEHAVIOURS.values()]
-    code = code_digest(_MODULE, (*_FURTHER_MODULES, "genre_tasks.ego_paths.behaviours", *planners, *modules))
-    return stage_key("rollout", code, configuration, inputs)
+    code = code_digest("genre_tasks.rollout.render_rollout", (*modules, *planners))
+    return stage_key("rollout", code, configuration, inputs, weights)
 
 
 def _digest_file(path: Path) -> str:

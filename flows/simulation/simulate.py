@@ -9,14 +9,15 @@ from typing import Any
 from flows.configuration.loading import apply_settings
 from flows.machine.facts import describe_environment
 from flows.machine.resource_usage import ResourceUsage, measure_usage
+from flows.simulation.edited_runs import open_run
 from flows.simulation.outputs import ExrImages, Films, PngImages, RolloutOutput, open_outputs
 from flows.simulation.poses_table import write_poses
 from flows.simulation.prepared_rollout import PreparedRollout, prepare_rollout
+from flows.simulation.repair import choose_repair
 from flows.simulation.request import SimulationRequest
 from flows.simulation.rollout_folder import KIND, find_rollout, write_rollout
 from flows.simulation.rollout_key import compute_rollout_key
 from flows.simulation.rollout_metrics import RowMaker, measure_rollout, write_metrics
-from flows.simulation.run_scenes import RunScenes
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import InputError
 from genre_tasks.progress import Progress, silent
@@ -42,13 +43,13 @@ def simulate_run(request: SimulationRequest, progress: Progress = silent) -> dic
         ResourceError: a film could not be written.
     """
     request.check()
-    scenes = RunScenes(request.store, request.run, request.stage, request.chunks)
-    config = apply_settings(PipelineConfig.model_validate(scenes.record["config"]), request.settings)
-    key = compute_rollout_key(request, scenes, config)
+    run = open_run(request.store, request.run, request.stage, request.chunks)
+    config = apply_settings(PipelineConfig.model_validate(run.recorded.record["config"]), request.settings)
+    key = compute_rollout_key(request, run, config)
     found = find_rollout(request.out, key, request.overwrite)
     if found is not None:
         return _describe(request.out, found, cached=True)
-    rollout = prepare_rollout(request, scenes, config, progress)
+    rollout = prepare_rollout(request, run, config, progress)
     usage = ResourceUsage()
     metrics: dict[str, Any] = {}
     chunk = rollout.source.load(rollout.source.chunk_numbers[0]).chunk
@@ -61,8 +62,13 @@ def simulate_run(request: SimulationRequest, progress: Progress = silent) -> dic
             chunk=chunk.index,
             stage=KIND,
             key=key,
-            inputs=scenes.payload_digests(),
-            configuration={"simulate": config.simulate.model_dump(mode="json"), "request": request.key_values()},
+            inputs=run.recorded.payload_digests(),
+            configuration={
+                "simulate": config.simulate.model_dump(mode="json"),
+                "fnet": config.fnet.model_dump(mode="json"),
+                "request": request.key_values(),
+                "edits": (run.edits + request.edits).model_dump(mode="json")["edits"],
+            },
             files=files,
             payload_digest=payload_digest(files),
             seconds=usage.seconds,
@@ -75,7 +81,7 @@ def simulate_run(request: SimulationRequest, progress: Progress = silent) -> dic
 
     with write_rollout(request.out, make_manifest) as folder:
         with measure_usage() as measured:
-            metrics.update(_render(request, rollout, folder, progress))
+            metrics.update(_render(request, config, rollout, folder, progress))
         usage.seconds = measured.seconds
         usage.peak_mib = measured.peak_mib
     written = find_rollout(request.out, key, overwrite=False)
@@ -84,7 +90,9 @@ def simulate_run(request: SimulationRequest, progress: Progress = silent) -> dic
     return _describe(request.out, written, cached=False)
 
 
-def _render(request: SimulationRequest, rollout: PreparedRollout, folder: Path, progress: Progress) -> dict[str, Any]:
+def _render(
+    request: SimulationRequest, config: PipelineConfig, rollout: PreparedRollout, folder: Path, progress: Progress
+) -> dict[str, Any]:
     outputs: list[RolloutOutput] = [Films(folder, rollout.rig, 1 / rollout.pose_s)]
     if request.exr:
         outputs.append(ExrImages(folder, rollout.rig))
@@ -92,11 +100,13 @@ def _render(request: SimulationRequest, rollout: PreparedRollout, folder: Path, 
         outputs.append(PngImages(folder, rollout.rig))
     path = rollout.checked.path
     row_maker = RowMaker(rollout)
+    repair = choose_repair(request, config, rollout, folder)
     rows = []
     with open_outputs(outputs):
         for images in render_rollout(rollout.source, path, rollout.rig, handovers=rollout.handovers):
+            repaired = repair(images)
             for output in outputs:
-                output.write(images)
+                output.write(repaired)
             rows.append(row_maker.make_row(images))
             progress(images.index + 1, len(path), f"{len(rollout.rig)} cameras")
     write_poses(folder, rows)

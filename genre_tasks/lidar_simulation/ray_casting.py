@@ -45,7 +45,7 @@ class RayHits:
     """What N rays meet.
 
     Attributes:
-        range_m: [N] where the surface is at which half of the light is blocked; NaN where less than half is.
+        range_m: [N] where the surface is at which half of the blocked light is blocked; NaN where too little is.
         mean_range_m: [N] blended over all that the ray passes, as an image's depth is; NaN where nothing is.
         alpha: [N] in [0, 1].
         color: [N, 3] sRGB of the surface at ``range_m``; NaN where there is none.
@@ -62,52 +62,125 @@ class RayHits:
 
 
 @dataclass(frozen=True)
-class _Discs:
-    """Gaussians by what a ray needs of them.
+class CastSettings:
+    """How rays are cast.
 
     Attributes:
-        means: [M, 3].
-        whitening: [M, 3, 3] takes chunk coordinates to standard deviations of the Gaussian.
+        min_alpha: a ray that less of its light is blocked on meets no surface.
+        surface_depth_m: what lies so near to the median surface along the ray is averaged with it.
+        surface_depth_fraction: the same as a fraction of the range; the larger of the two counts.
+    """
+
+    min_alpha: float = 0.5
+    surface_depth_m: float = 0.2
+    surface_depth_fraction: float = 0.005
+
+
+DEFAULT_CAST = CastSettings()
+
+
+@dataclass(frozen=True)
+class Discs:
+    """M Gaussians by what a ray needs of them.
+
+    Attributes:
+        means: [M, 3] metres, chunk coordinates.
+        whitening: [M, 3, 3] takes chunk axes to standard deviations of the Gaussian.
         normals: [M, 3] along the shortest axis.
+        scales: [M, 3] standard deviations, metres.
+        axes: [M, 3, 3] columns.
         opacities: [M].
-        colors: [M, 3].
-        nodes: [M].
-        covariances: [M, 3, 3].
+        colors: [M, 3] sRGB.
+        nodes: [M] of the scene graph.
     """
 
     means: Float64
     whitening: Float32
     normals: Float32
+    scales: Float64
+    axes: Float64
     opacities: Float32
     colors: Float32
     nodes: NDArray[np.int64]
-    covariances: Float64
+
+    def select(self, rows: NDArray[np.int64]) -> Discs:
+        """Copies some of the Gaussians."""
+        return Discs(**{name: values[rows] for name, values in vars(self).items()})
 
 
-@dataclass(frozen=True)
-class CastSettings:
-    """How rays are cast.
+def prepare_discs(
+    splats: Splats, nodes: NDArray[np.int64], center: Float64, *, widening: float = 1.0, beam_rad: float = 0.0005
+) -> Discs:
+    """Prepares Gaussians for rays.
 
-    Attributes:
-        beam_rad: standard deviation of a beam's width; discs are widened by it in their planes, as the images'
-            renderer widens them by a fraction of a pixel, so that no gaps are left between those far away.
-        surface_depth_m: what lies so near to the median surface along the ray is averaged with it.
-        surface_depth_fraction: the same as a fraction of the range; the larger of the two counts.
+    Args:
+        splats: of one moment, chunk coordinates.
+        nodes: [M] the node of each.
+        center: [3] about where the rays begin.
+        widening: factor on scales within the disc's plane.
+        beam_rad: standard deviation of a beam's width, by which discs are widened in their planes.
+
+    Returns:
+        The Gaussians that are opaque enough to matter.
     """
+    rows = np.flatnonzero(splats.opacities.numpy() >= ALPHA_MIN)
+    means = splats.means.numpy().astype(np.float64)[rows]
+    scales = splats.scales.numpy().astype(np.float64)[rows]
+    quats = splats.quats.numpy().astype(np.float64)[rows]
+    axes = quats_to_matrices_numpy(quats / np.linalg.norm(quats, axis=1, keepdims=True))
+    shortest = scales.argmin(1)
+    every = np.arange(len(rows))
+    beam = beam_rad * np.linalg.norm(means - center, axis=1)
+    widened = np.hypot(widening * scales, beam[:, None])
+    # The thickness stays: a thicker disc would answer before the ray meets its plane.
+    widened[every, shortest] = scales[every, shortest]
+    return Discs(
+        means=means,
+        whitening=(np.swapaxes(axes, 1, 2) / widened[:, :, None]).astype(np.float32),
+        normals=axes[every, :, shortest].astype(np.float32),
+        scales=widened,
+        axes=axes,
+        opacities=splats.opacities.numpy()[rows],
+        colors=splats.colors.numpy()[rows],
+        nodes=nodes[rows],
+    )
 
-    beam_rad: float = 0.001
-    surface_depth_m: float = 0.3
-    surface_depth_fraction: float = 0.01
+
+def select_discs_in_sector(discs: Discs, rays: Rays) -> Discs:
+    """Leaves out Gaussians that lie in directions in which no ray goes, by azimuth.
+
+    Args:
+        discs: all.
+        rays: of one part of a turn.
+
+    Returns:
+        Those that a ray may meet.
+    """
+    if not len(rays):
+        return discs
+    azimuth = np.arctan2(rays.directions[:, 1], rays.directions[:, 0])
+    middle = np.angle(np.exp(1j * azimuth).mean())
+    half = np.abs(_wrap(azimuth - middle)).max()
+    offset = discs.means - rays.origins.mean(0)
+    spread = np.linalg.norm(rays.origins - rays.origins.mean(0), axis=1).max()
+    reach = EXTENT_SIGMAS * discs.scales.max(1) + spread
+    flat = np.hypot(offset[:, 0], offset[:, 1])
+    widest = np.arcsin(np.minimum(reach / flat.clip(1e-6), 1.0))
+    apart = np.abs(_wrap(np.arctan2(offset[:, 1], offset[:, 0]) - middle))
+    return discs.select(np.flatnonzero((apart <= half + widest) | (flat <= reach)))
 
 
-def cast_rays(splats: Splats, nodes: NDArray[np.int64], rays: Rays, settings: CastSettings) -> RayHits:
+def _wrap(angle: Float64) -> Float64:
+    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
+
+
+def cast_rays(discs: Discs, rays: Rays, settings: CastSettings = DEFAULT_CAST) -> RayHits:
     """Casts rays through Gaussians.
 
     Args:
-        splats: M of them, chunk coordinates, as they are at the rays' moment.
-        nodes: [M] the node of each.
+        discs: as they are at the rays' moment.
         rays: N of them; origins lie close together, as those of one part of a sweep.
-        settings: widths.
+        settings: what counts as a surface.
 
     Returns:
         What they meet.
@@ -115,44 +188,16 @@ def cast_rays(splats: Splats, nodes: NDArray[np.int64], rays: Rays, settings: Ca
     if not len(rays):
         empty = np.zeros(0)
         return RayHits(empty, empty, empty, np.zeros((0, 3)), empty, np.zeros(0, np.int64))
-    discs = _prepare_discs(splats, nodes, rays.origins.mean(0), settings)
     ray, disc, range_m, alpha = _collect_responses(discs, rays)
     order = np.lexsort((range_m, ray))
     return _blend(discs, rays, ray[order], disc[order], range_m[order].astype(np.float64), alpha[order], settings)
 
 
-def _prepare_discs(splats: Splats, nodes: NDArray[np.int64], center: Float64, settings: CastSettings) -> _Discs:
-    used = splats.opacities.numpy() >= ALPHA_MIN
-    means = splats.means.numpy().astype(np.float64)[used]
-    scales = splats.scales.numpy().astype(np.float64)[used]
-    quats = splats.quats.numpy().astype(np.float64)[used]
-    axes = quats_to_matrices_numpy(quats / np.linalg.norm(quats, axis=1, keepdims=True))
-    shortest = scales.argmin(1)
-    widths = settings.beam_rad * np.linalg.norm(means - center, axis=1)
-    # The thickness stays: a thicker disc would answer before the ray meets its plane.
-    widened = np.hypot(scales, widths[:, None])
-    rows = np.arange(len(scales))
-    widened[rows, shortest] = scales[rows, shortest]
-    whitening = np.swapaxes(axes, 1, 2) / widened[:, :, None]
-    covariances = np.einsum("nij,nj,nkj->nik", axes, widened**2, axes)
-    return _Discs(
-        means=means,
-        whitening=whitening.astype(np.float32),
-        normals=axes[rows, :, shortest].astype(np.float32),
-        opacities=splats.opacities.numpy()[used],
-        colors=splats.colors.numpy()[used],
-        nodes=nodes[used],
-        covariances=covariances,
-    )
-
-
-def _collect_responses(
-    discs: _Discs, rays: Rays
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Float32, Float32]:
+def _collect_responses(discs: Discs, rays: Rays) -> tuple[NDArray[np.int64], NDArray[np.int64], Float32, Float32]:
     """Pairs of ray and disc that matter: ray, disc, range and alpha, [K] each."""
     parts: list[tuple[NDArray[np.int64], NDArray[np.int64], Float32, Float32]] = []
     for ray, disc in find_ray_pairs(
-        discs.means, discs.covariances, EXTENT_SIGMAS, rays.origins, rays.directions, _PAIRS_IN_MEMORY
+        discs.means, EXTENT_SIGMAS * discs.scales, discs.axes, rays.origins, rays.directions, _PAIRS_IN_MEMORY
     ):
         # Subtracted in float64, then small enough for float32.
         offset = (rays.origins[ray] - discs.means[disc]).astype(np.float32)
@@ -172,7 +217,7 @@ def _collect_responses(
 
 
 def _blend(
-    discs: _Discs,
+    discs: Discs,
     rays: Rays,
     ray: NDArray[np.int64],
     disc: NDArray[np.int64],
@@ -190,8 +235,10 @@ def _blend(
     total = np.bincount(ray, weight, count)
     with np.errstate(invalid="ignore"):
         mean_range = np.bincount(ray, weight * range_m, count) / np.where(total > 0, total, np.nan)
-    # The first pair after which less than half of the light is left.
-    crossing = np.flatnonzero((after < 0.5) & (before >= 0.5))
+    blocked = 1 - np.exp(passed[np.append(begin[1:], len(passed) - 1)] - passed[begin])
+    # The pair at which half of what is blocked has been blocked.
+    half = 1 - 0.5 * blocked[ray]
+    crossing = np.flatnonzero((after <= half) & (before > half) & (blocked[ray] >= settings.min_alpha))
     median = np.full(count, np.nan)
     median[ray[crossing]] = range_m[crossing]
     reach = np.maximum(settings.surface_depth_m, settings.surface_depth_fraction * median)
@@ -211,7 +258,7 @@ def _blend(
     return RayHits(
         range_m=average(range_m),
         mean_range_m=mean_range,
-        alpha=1 - np.exp(passed[np.append(begin[1:], len(passed) - 1)] - passed[begin]),
+        alpha=blocked,
         color=np.stack([average(discs.colors[disc, k].astype(np.float64)) for k in range(3)], 1),
         cosine=average(slant),
         node=node,

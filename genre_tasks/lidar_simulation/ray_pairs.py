@@ -17,8 +17,8 @@ _MIN_DISTANCE_M = 0.2
 
 def find_ray_pairs(
     means: Float64,
-    covariances: Float64,
-    sigmas: float,
+    extents: Float64,
+    axes: Float64,
     origins: Float64,
     directions: Float64,
     max_pairs: int,
@@ -27,8 +27,8 @@ def find_ray_pairs(
 
     Args:
         means: [M, 3] metres.
-        covariances: [M, 3, 3].
-        sigmas: standard deviations to which a Gaussian reaches.
+        extents: [M, 3] metres to which a Gaussian reaches along its axes.
+        axes: [M, 3, 3] columns.
         origins: [N, 3] metres, close together.
         directions: [N, 3] unit vectors.
         max_pairs: about so many come at a time.
@@ -42,7 +42,7 @@ def find_ray_pairs(
     key = row * 8.0 + azimuth
     order = np.argsort(key)
     key = key[order]
-    gaussian, center, half, low, high = _bound_gaussians(means, covariances, sigmas, origins)
+    gaussian, center, half, low, high = _bound_gaussians(means, extents, axes, origins)
     low = np.maximum(_to_row(low), row.min())
     high = np.minimum(_to_row(high), row.max())
     row_count = (high - low + 1).clip(0)
@@ -61,7 +61,7 @@ def find_ray_pairs(
 
 
 def _bound_gaussians(
-    means: Float64, covariances: Float64, sigmas: float, origins: Float64
+    means: Float64, extents: Float64, axes: Float64, origins: Float64
 ) -> tuple[NDArray[np.int64], Float64, Float64, Float64, Float64]:
     """Index, azimuth, half width in azimuth, lowest and highest elevation; one that crosses ±π comes twice."""
     middle = origins.mean(0)
@@ -74,11 +74,11 @@ def _bound_gaussians(
     upward = np.cross(offset / distance[:, None], across)
     # Origins apart from the middle see a Gaussian elsewhere: its bounds grow by that.
     spread = np.linalg.norm(origins - middle, axis=1).max()
-    radius = sigmas * np.sqrt(np.linalg.eigvalsh(covariances)[:, -1]) + spread
+    radius = extents.max(1) + spread
     # What lies at depth within the Gaussian is nearer than its middle, and so appears larger.
     nearest = np.maximum(distance - radius, _MIN_DISTANCE_M)
-    sideways = sigmas * np.sqrt(np.einsum("ni,nij,nj->n", across, covariances, across)) + spread
-    vertical = sigmas * np.sqrt(np.einsum("ni,nij,nj->n", upward, covariances, upward)) + spread
+    sideways = _reach_along(across, extents, axes) + spread
+    vertical = _reach_along(upward, extents, axes) + spread
     half_elevation = np.arctan2(vertical, nearest)
     steepest = np.minimum(np.abs(elevation) + half_elevation, np.pi / 2)
     half_azimuth = np.arctan2(sideways, nearest * np.cos(steepest).clip(1e-3))
@@ -93,6 +93,12 @@ def _bound_gaussians(
     crosses = np.abs(center) - half <= np.pi
     index, center, half = index[crosses], center[crosses], half[crosses]
     return index, center, half, (elevation - half_elevation)[index], (elevation + half_elevation)[index]
+
+
+def _reach_along(direction: Float64, extents: Float64, axes: Float64) -> Float64:
+    """Half extents [M] of the ellipsoids along directions [M, 3]."""
+    along = np.einsum("nij,ni->nj", axes, direction)
+    return np.asarray(np.sqrt(((along * extents) ** 2).sum(1)))
 
 
 def _to_row(elevation: Float64) -> NDArray[np.int64]:

@@ -31,7 +31,7 @@ CANDIDATE_OFFSETS = (0.0, -2.0, 2.0, -4.0, 4.0)
 
 @dataclass(frozen=True)
 class Handover:
-    """A fade from the scene of one chunk to that of the next.
+    """A fade from the background of one chunk to that of the next.
 
     Attributes:
         before: number of the chunk that is left.
@@ -65,9 +65,21 @@ class Handover:
         >>> [fade.weigh(place) for place in (16, 19.5, 23)]
         [0.0, 0.5, 1.0]
         """
-        if self.end_frame <= self.start_frame:
-            return float(place >= self.end_frame)
-        return min(max((place - self.start_frame) / (self.end_frame - self.start_frame), 0.0), 1.0)
+        return _ramp(place, self.start_frame, self.end_frame)
+
+    def weigh_traffic(self, frame: float) -> float:
+        """Gives how much the actors' looks of ``after`` count at a moment.
+
+        Their fade takes as long as that of the background, and is centred on the border.
+
+        Args:
+            frame: log frame, or a moment between two.
+
+        Returns:
+            0 to 1, linear in the moment.
+        """
+        half = (self.end_frame - self.start_frame) / 2
+        return _ramp(frame, self.border_frame - half, self.border_frame + half)
 
 
 def plan_handovers(
@@ -124,6 +136,12 @@ def cut_at_borders(layout: ChunkLayout) -> tuple[Handover, ...]:
         border = (last + first) / 2
         cuts.append(Handover(before, after, border_frame=border, start_frame=border, end_frame=border))
     return tuple(cuts)
+
+
+def _ramp(value: float, start: float, end: float) -> float:
+    if end <= start:
+        return float(value >= end)
+    return min(max((value - start) / (end - start), 0.0), 1.0)
 
 
 def _find_poses(places: Float64, middles: Sequence[float]) -> dict[float, int]:

@@ -12,10 +12,10 @@ from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.render import render_views
 from genre_tasks.render.types import RenderSettings
 from genre_tasks.rollout.camera_motion import place_rollout_views
-from genre_tasks.rollout.chunk_layout import ChunkLayout, lay_out_chunks
+from genre_tasks.rollout.chunk_layout import lay_out_chunks
 from genre_tasks.rollout.handover import Handover, cut_at_borders
 from genre_tasks.rollout.rig import RigCamera, RolloutView
-from genre_tasks.rollout.traffic import extend_traffic
+from genre_tasks.rollout.scene_schedule import SceneSchedule, ShownScene
 from genre_tasks.scene_edits.chunk_scene import ChunkScene, SceneSource
 
 __all__ = ["RolloutImages", "place_rollout_views", "render_rollout"]
@@ -30,14 +30,14 @@ class RolloutImages:
     Attributes:
         index: of the pose in the path.
         views: C of them, in coordinates of the chunk.
-        chunk_scene: the chunk and scene that were rendered, with the traffic of the moment; within a hand-over those
-            that count more.
+        chunk_scene: the chunk and scene that were rendered, with the traffic of the moment; of several scenes within
+            a hand-over the one that counts most.
         color: [C, H, W, 3] sRGB premultiplied by alpha, in [0, 1].
         alpha: [C, H, W].
         depth: [C, H, W] metres, 0 where nothing is; of ``chunk_scene`` alone.
-        chunk: number of that chunk.
-        blended_chunk: number of the chunk whose scene is mixed in by a hand-over; ``None``: there is none.
-        blend_weight: how much that scene counts in colour and alpha, 0 to 0.5.
+        chunk: number of the chunk whose background that is.
+        blended_chunk: number of the chunk whose background is mixed in by a hand-over; ``None``: there is none.
+        blend_weight: how much that background counts in colour and alpha.
     """
 
     index: int
@@ -49,76 +49,6 @@ class RolloutImages:
     chunk: int = 0
     blended_chunk: int | None = None
     blend_weight: float = 0.0
-
-
-@dataclass(frozen=True)
-class ShownScene:
-    """A scene and how much it counts at a moment.
-
-    Attributes:
-        chunk: its number.
-        chunk_scene: what is rendered.
-        weight: in [0, 1]; those of a moment add up to 1.
-    """
-
-    chunk: int
-    chunk_scene: ChunkScene
-    weight: float
-
-
-class SceneSchedule:
-    """Which scenes show a pose; the background of at most two chunks is in memory.
-
-    The background is that of the place where the vehicle is, and the traffic that of the log's moment: a vehicle that
-    brakes stays where an earlier chunk has recorded the street.
-
-    Args:
-        source: the scenes of a run.
-        layout: of its chunks.
-        handovers: between chunks that follow each other, in their order.
-    """
-
-    def __init__(self, source: SceneSource, layout: ChunkLayout, handovers: Sequence[Handover]) -> None:
-        self._source = source
-        self._layout = layout
-        self._handovers = handovers
-        # By the chunk that is shown and those whose traffic was added.
-        self._extended: dict[tuple[int, ...], ChunkScene] = {}
-
-    def find(self, place: float, frame: float) -> tuple[ShownScene, ...]:
-        """Finds the scenes of a pose.
-
-        Args:
-            place: log frame at which the recorded vehicle was there.
-            frame: log frame of the traffic.
-
-        Returns:
-            One scene, or two within a hand-over; the one that counts more comes first.
-        """
-        weights = {self._source.chunk_numbers[0]: 1.0}
-        for handover in self._handovers:
-            weight = handover.weigh(place)
-            if weight > 0:
-                weights = {handover.after: weight, handover.before: 1 - weight}
-        shown = sorted((number for number, weight in weights.items() if weight > 0), key=lambda n: -weights[n])
-        traffic = self._layout.find_traffic(frame)
-        scenes = {number: self._load(number, traffic) for number in shown}
-        # Those of the poses before are dropped.
-        self._extended = {key: scene for key, scene in self._extended.items() if key[0] in scenes}
-        return tuple(ShownScene(number, scene, weights[number]) for number, scene in scenes.items())
-
-    def _load(self, number: int, traffic: Sequence[int]) -> ChunkScene:
-        others = [other for other in traffic if other != number]
-        if not others:
-            return self._source.load(number)
-        key = (number, *others)
-        # Kept from pose to pose: it copies the Gaussians where actors are added.
-        if key not in self._extended:
-            scene = self._source.load(number)
-            for other in others:
-                scene = extend_traffic(scene, self._source.load(other))
-            self._extended = {k: v for k, v in self._extended.items() if k[0] != number} | {key: scene}
-        return self._extended[key]
 
 
 def render_rollout(
@@ -158,12 +88,13 @@ def _render_pose(
         # Without gradients the renderer keeps nothing for a backward pass, which takes memory.
         with torch.no_grad():
             renders.append(render_views(scene.chunk_scene.scene, views[-1], settings))
-    color = renders[0].color.clamp(0, 1)
-    alpha = renders[0].alpha
-    if len(shown) > 1:
+    color = renders[0].color.clamp(0, 1) * shown[0].weight
+    alpha = renders[0].alpha * shown[0].weight
+    for render, scene in zip(renders[1:], shown[1:], strict=True):
         # Over display colours: a fade that is linear there looks steady to the eye.
-        color = torch.lerp(color, renders[1].color.clamp(0, 1), shown[1].weight)
-        alpha = torch.lerp(alpha, renders[1].alpha, shown[1].weight)
+        color += render.color.clamp(0, 1) * scene.weight
+        alpha += render.alpha * scene.weight
+    others = [scene for scene in shown if scene.background != shown[0].background]
     return RolloutImages(
         index=index,
         views=views[0],
@@ -172,7 +103,7 @@ def _render_pose(
         alpha=alpha,
         # A mean of two depths would lie on neither surface.
         depth=renders[0].expected_depth(),
-        chunk=shown[0].chunk,
-        blended_chunk=shown[1].chunk if len(shown) > 1 else None,
-        blend_weight=shown[1].weight if len(shown) > 1 else 0.0,
+        chunk=shown[0].background,
+        blended_chunk=others[0].background if others else None,
+        blend_weight=sum(scene.weight for scene in others),
     )

@@ -1,4 +1,4 @@
-"""The traffic of two chunks in one scene, so that an actor drives on over the border between them."""
+"""The background of one chunk with the traffic of others, so that actors drive on over borders between chunks."""
 
 from __future__ import annotations
 
@@ -45,6 +45,38 @@ def extend_traffic(chunk_scene: ChunkScene, other: ChunkScene) -> ChunkScene:
     return ChunkScene(chunk, replace(scene, actors=nodes), removed)
 
 
+def compose_scene(background: ChunkScene, traffic: ChunkScene) -> ChunkScene:
+    """Puts the actors of one chunk in front of the background of another.
+
+    Args:
+        background: whose coordinates, static and distant Gaussians the result has; its actors are left out.
+        traffic: a chunk of the same log, whose actors the result has.
+
+    Returns:
+        A scene; whether it is rendered with anti-aliasing is as in ``background``.
+    """
+    still = torch.nonzero(background.scene.nodes < FIRST_ACTOR)[:, 0]
+    moving = torch.nonzero(traffic.scene.nodes >= FIRST_ACTOR)[:, 0]
+    gaussians = map_attributes(
+        lambda mine, theirs: torch.cat([mine[still], theirs[moving]]),
+        background.scene.gaussians,
+        traffic.scene.gaussians,
+    )
+    chunk_SE3_other = np.linalg.inv(background.chunk.world_SE3_chunk) @ traffic.chunk.world_SE3_chunk
+    scene = replace(
+        background.scene,
+        gaussians=gaussians,
+        nodes=torch.cat([background.scene.nodes[still], traffic.scene.nodes[moving]]),
+        actors=_extend_tracks((), traffic.scene.actors, chunk_SE3_other),
+        # In the boxes of actors, as their Gaussians and harmonics are: no move between chunks changes it.
+        deformation=traffic.scene.deformation,
+        spherical_harmonics=_join_spherical_harmonics(background.scene, still, traffic.scene, moving),
+    )
+    actors = _extend_tracks((), traffic.chunk.actors, chunk_SE3_other)
+    removed = _extend_tracks((), traffic.removed, chunk_SE3_other)
+    return ChunkScene(replace(background.chunk, actors=actors), scene, removed)
+
+
 def _extend_tracks(tracks: Sequence[Track], others: Sequence[Track], chunk_SE3_other: Float64) -> tuple[Track, ...]:
     """The tracks, longer by the frames of their namesakes, and after them those of new names."""
     other_by_name = {track.track_id: track for track in others}
@@ -88,23 +120,23 @@ def _add_actors(scene: SceneGraph, other: SceneGraph, added: Sequence[int]) -> S
         gaussians=gaussians,
         nodes=torch.cat([scene.nodes, table[other.nodes[rows]]]),
         deformation=_join_deformations(scene.deformation, other.deformation, number_of),
-        spherical_harmonics=_join_spherical_harmonics(scene, other, rows),
+        spherical_harmonics=_join_spherical_harmonics(scene, torch.arange(len(scene)), other, rows),
     )
 
 
-def _join_spherical_harmonics(scene: SceneGraph, other: SceneGraph, rows: Tensor) -> Tensor | None:
-    parts = (scene.spherical_harmonics, other.spherical_harmonics)
-    counts = [part.shape[1] for part in parts if part is not None]
+def _join_spherical_harmonics(scene: SceneGraph, rows: Tensor, other: SceneGraph, other_rows: Tensor) -> Tensor | None:
+    """Harmonics of some Gaussians of two scenes, one after the other; ``None`` where neither has any."""
+    harmonics = (scene.spherical_harmonics, other.spherical_harmonics)
+    counts = [values.shape[1] for values in harmonics if values is not None]
     if not counts:
         return None
     # Zeros for a scene without, or of a lower degree: they change no colour.
-    padded = []
-    for graph, part in zip((scene, other), parts, strict=True):
-        full = graph.gaussians.means.new_zeros(len(graph), max(counts), 3)
-        if part is not None:
-            full[:, : part.shape[1]] = part
-        padded.append(full)
-    return torch.cat([padded[0], padded[1][rows]])
+    joined = scene.gaussians.means.new_zeros(len(rows) + len(other_rows), max(counts), 3)
+    if scene.spherical_harmonics is not None:
+        joined[: len(rows), : scene.spherical_harmonics.shape[1]] = scene.spherical_harmonics[rows]
+    if other.spherical_harmonics is not None:
+        joined[len(rows) :, : other.spherical_harmonics.shape[1]] = other.spherical_harmonics[other_rows]
+    return joined
 
 
 def _join_deformations(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from typing import Protocol, runtime_checkable
 
 from genre_tasks.errors import InputError
 from genre_tasks.scene_edits.chunk_scene import SceneSource
@@ -13,15 +14,27 @@ _LISTED = 40
 """More names than this are not listed in an error."""
 
 
+@runtime_checkable
+class NamedSource(Protocol):
+    """Scenes that know the names of their actors: edited ones, whose actors keep the names of the recorded run."""
+
+    @property
+    def names(self) -> Mapping[str, str]:
+        """Readable name by track id."""
+        ...
+
+
 def name_actors(source: SceneSource) -> dict[str, str]:
     """Names all actors of a run, in the order of their first frame and then of their track id.
 
     Args:
-        source: the scenes of a run.
+        source: the scenes of a run. Edited ones keep the names of the recorded run.
 
     Returns:
         Name by track id, such as ``car-3``; no number is there twice.
     """
+    if isinstance(source, NamedSource):
+        return dict(source.names)
     tracks: dict[str, tuple[int, str]] = {}
     for number in source.chunk_numbers:
         for actor in source.load(number).scene.actors:

@@ -15,7 +15,7 @@ from genre_tasks.ego_paths.recorded_path import measure_frame_s
 from genre_tasks.logs.types import Float64
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.graph import FIRST_ACTOR
-from genre_tasks.scene_edits.actor_names import number_tracks
+from genre_tasks.scene_edits.actor_names import NamedSource, number_tracks
 from genre_tasks.scene_edits.chunk_scene import SceneSource
 from genre_tasks.scene_edits.ground import Ground, thin_ground_points
 
@@ -104,7 +104,10 @@ def survey_run(source: SceneSource) -> RunSurvey:
                 entry.poses.setdefault(int(frame), pose)
     tracks = {track_id: _make_track(track_id, entry) for track_id, entry in gathered.items()}
     path = _join_path(ego, float(np.median(steps)))
-    names = number_tracks((int(t.frames[0]), t.track_id, t.label) for t in tracks.values())
+    if isinstance(source, NamedSource):
+        names = {track_id: name for track_id, name in source.names.items() if track_id in tracks}
+    else:
+        names = number_tracks((int(t.frames[0]), t.track_id, t.label) for t in tracks.values())
     ground = Ground.from_points(np.concatenate(points), path, list(tracks.values()))
     return RunSurvey(tracks, names, path, float(np.median(steps)), frames, ground)
 

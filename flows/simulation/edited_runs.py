@@ -1,0 +1,216 @@
+"""Runs with edited traffic: opened for a rollout, or written into the store as runs of their own."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from flows.machine.facts import describe_environment
+from flows.machine.resource_usage import measure_usage
+from flows.pipeline.stage_runner import ArtifactRef
+from flows.reconstruction.run_records import (
+    FinishedRun,
+    find_last_stage,
+    read_stage_value,
+    summarise_run,
+    write_run_record,
+)
+from flows.simulation.run_scenes import RunScenes
+from genre_tasks.config import PipelineConfig
+from genre_tasks.config.simulation_sections import SimulateConfig
+from genre_tasks.scene.reconstruction import Reconstruction
+from genre_tasks.scene_edits.actor_library import ActorLibrary
+from genre_tasks.scene_edits.edited_scenes import EditedScenes
+from genre_tasks.scene_edits.edits import EditList, Insert
+from storage.address import Address
+from storage.code_digest import code_digest
+from storage.local import open_store
+from storage.store import Artifact, Provenance
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+_CODE = "genre_tasks.scene_edits.edited_scenes"
+
+
+@dataclass(frozen=True)
+class OpenedRun:
+    """A run whose scenes can be edited.
+
+    Attributes:
+        recorded: its scenes as they were reconstructed, before any edit.
+        edits: those that the run was made with, if it is an edited one.
+    """
+
+    recorded: RunScenes
+    edits: EditList
+
+
+def open_run(store: str, run: str, stage: str | None = None, chunks: Sequence[int] | None = None) -> OpenedRun:
+    """Opens a run; behind an edited run is the recorded one with the edits.
+
+    Args:
+        store: folder (or URI) of the store.
+        run: the run's name, or the start of it.
+        stage: initial, gnet or enet; ``None``: the last one.
+        chunks: numbers of the chunks to take; ``None``: all.
+
+    Returns:
+        The recorded run and the edits so far.
+
+    Raises:
+        InputError: there is no such run or chunk.
+    """
+    scenes = RunScenes(store, run, stage, chunks)
+    edited = scenes.record.get("edited")
+    if edited is None:
+        return OpenedRun(scenes, EditList())
+    return OpenedRun(RunScenes(store, edited["run"], stage, chunks), EditList.model_validate(edited["edits"]))
+
+
+def open_edited_scenes(
+    store: str,
+    run: str,
+    edits: EditList,
+    config: SimulateConfig,
+    *,
+    stage: str | None = None,
+    chunks: Sequence[int] | None = None,
+) -> EditedScenes:
+    """Opens the scenes of a run with edits, those of an edited run and new ones together.
+
+    Args:
+        store: folder (or URI) of the store.
+        run: the run's name, or the start of it.
+        edits: new ones; may be empty.
+        config: darkness of contact shadows.
+        stage: initial, gnet or enet; ``None``: the last one.
+        chunks: numbers of the chunks to take; ``None``: all.
+
+    Returns:
+        The edited scenes, whose chunks say which actors are removed or moved.
+
+    Raises:
+        InputError: there is no such run, chunk or actor.
+    """
+    opened = open_run(store, run, stage, chunks)
+    library = ActorLibrary(lambda name: open_shown_scenes(store, name))
+    return EditedScenes(opened.recorded, opened.edits + edits, library, config)
+
+
+def open_shown_scenes(store: str, run: str) -> RunScenes | EditedScenes:
+    """Opens the scenes of a run as it is: of an edited run the edited ones.
+
+    Args:
+        store: folder (or URI) of the store.
+        run: the run's name, or the start of it.
+
+    Raises:
+        InputError: there is no such run.
+    """
+    opened = open_run(store, run)
+    if not len(opened.edits):
+        return opened.recorded
+    return open_edited_scenes(store, run, EditList(), SimulateConfig())
+
+
+def digest_edits(store: str, edits: EditList, config: SimulateConfig) -> str:
+    """Computes what edits add to the key of all that is made with them.
+
+    Args:
+        store: folder (or URI) of the store.
+        edits: the list.
+        config: of re-simulation.
+
+    Returns:
+        64 hex digits over the edits, the scenes that actors are taken from, the settings and the code.
+
+    Raises:
+        InputError: a run that an actor is from does not exist.
+    """
+    runs = sorted({edit.from_run for edit in edits.edits if isinstance(edit, Insert) and edit.from_run is not None})
+    values = {
+        "edits": edits.model_dump(mode="json"),
+        "runs": {name: RunScenes(store, name).record["run"] for name in runs},
+        "contact_shadow": config.contact_shadow,
+        "code": code_digest(_CODE),
+    }
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+def write_edited_run(store: str, run: str, edits: EditList, config: SimulateConfig | None = None) -> dict[str, Any]:
+    """Writes the edited scenes of a run into the store, as a run that other commands know by its name.
+
+    Args:
+        store: folder (or URI) of the store.
+        run: the run's name, or the start of it.
+        edits: of its traffic.
+        config: of re-simulation; ``None``: the run's.
+
+    Returns:
+        The new run's record, with ``edited``: the recorded run and all edits.
+
+    Raises:
+        InputError: there is no such run or actor, or an artifact is gone.
+        OSError: the store cannot be written.
+    """
+    opened = open_run(store, run)
+    record = opened.recorded.record
+    settings = PipelineConfig.model_validate(record["config"]).simulate if config is None else config
+    scenes = open_edited_scenes(store, run, edits, settings)
+    digest = digest_edits(store, scenes.edits, settings)
+    chunks = {number: _write_chunk(store, record["run"], number, scenes, digest) for number in scenes.chunk_numbers}
+    finished = FinishedRun(
+        log=record["log"],
+        preset=record["preset"],
+        store=store,
+        config=record["config"],
+        differs={key: (before, after) for key, (before, after) in record["differs"].items()},
+        chunks=chunks,
+        notes=dict.fromkeys(chunks, f"the traffic of run {record['run']} is edited"),
+    )
+    edited = {"run": record["run"], "edits": scenes.edits.model_dump(mode="json")}
+    return write_run_record(finished, summarise_run(finished), {"edited": edited})
+
+
+def _write_chunk(store: str, run: str, number: int, scenes: EditedScenes, digest: str) -> dict[str, ArtifactRef]:
+    stage = find_last_stage(store, run, number)
+    keys = _stage_keys(store, run, number)
+    with measure_usage() as usage:
+        edited = scenes.load(number)
+    ingested = read_stage_value(store, run, number, "ingest")[1]
+    # The chunk as ingest left it, without the plan's effects: these are applied again by whoever reads it.
+    chunk = replace(ingested, actors=edited.chunk.actors)
+    values: Mapping[str, tuple[str, Any]] = {
+        "ingest": ("chunk", chunk),
+        stage: ("reconstruction", Reconstruction(edited.scene)),
+    }
+    opened = open_store(store)
+    refs = {"effects": _reference(next(iter(opened.artifacts(key=keys["effects"]))))}
+    for name, (kind, value) in values.items():
+        key = hashlib.sha256(f"{keys[name]}\n{digest}".encode()).hexdigest()
+        address = Address(ingested.dataset, ingested.log, number, name, key)
+        provenance = Provenance(
+            inputs={name: keys[name]},
+            configuration=scenes.edits.model_dump(mode="json"),
+            code_digest=code_digest(_CODE),
+            seconds=usage.seconds,
+            peak_mib=usage.peak_mib,
+            environment=describe_environment(),
+        )
+        refs[name] = _reference(opened.commit(address, kind, value, provenance))
+    return refs
+
+
+def _stage_keys(store: str, run: str, number: int) -> dict[str, str]:
+    record = RunScenes(store, run).record
+    stages = next(chunk["stages"] for chunk in record["chunks"] if chunk["chunk"] == number)
+    return {stage["stage"]: stage["key"] for stage in stages}
+
+
+def _reference(artifact: Artifact) -> ArtifactRef:
+    manifest = artifact.manifest
+    return ArtifactRef(manifest.stage, manifest.key, manifest.payload_digest, str(artifact.path), cached=False)
