@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from flows.cli.options import (
-    ChunkOption,
     LogArgument,
     MethodsOption,
     PresetOption,
@@ -20,12 +20,47 @@ from flows.cli.parsing import parse_path
 from flows.defaults import DEFAULT_STORE
 
 if TYPE_CHECKING:
+    from flows.experiments.stages import StageRunner
+    from flows.paper_tables.comparison_strips import ComparisonStrip
+    from flows.paper_tables.figure import Kind
+    from flows.paper_tables.request import CheckedRequest
     from flows.pipeline.stage_runner import ArtifactRef, Job
 
 
-CameraOption = Annotated[str | None, typer.Option(help="The camera to show. The first front camera if not given.")]
+FigureKindArgument = Annotated[
+    str,
+    typer.Argument(
+        help="What to compare: recon for the methods of table 1, fixers for those of table 3, swerve for those of "
+        "table 6 along a swerve, manipulation for one actor removed, inserted and moved."
+    ),
+]
+FigureChunkOption = Annotated[
+    int | None,
+    typer.Option(
+        help="The number of the chunk in the log, from 0. If not given, recon and fixers show chunk 0, and the others "
+        "use all chunks."
+    ),
+]
+CameraOption = Annotated[
+    str | None,
+    typer.Option(
+        help="The camera to show. If not given, the first front camera; manipulation shows every camera in which an "
+        "edit shows."
+    ),
+]
 FrameOption = Annotated[
-    int | None, typer.Option(help="The frame of the log to show, a source frame. The middle one if not given.")
+    int | None,
+    typer.Option(
+        help="The frame of the log to show; recon and fixers take source frames. If not given, the middle one; "
+        "manipulation takes the one that shows the actor best. A swerve has no single frame."
+    ),
+]
+ActorOption = Annotated[
+    str | None,
+    typer.Option(
+        help="The actor that manipulation edits: its readable name, its number or its track id. If not given, the one "
+        "that is largest in an image."
+    ),
 ]
 
 FigureFileOption = Annotated[
@@ -39,25 +74,26 @@ FigureFileOption = Annotated[
 
 
 def figure(
-    kind: Annotated[
-        str,
-        typer.Argument(help="The methods to compare: recon for those of table 1, fixers for those of table 3."),
-    ],
+    kind: FigureKindArgument,
     log: LogArgument,
     out: FigureFileOption,
     preset: PresetOption = "small",
-    chunk: ChunkOption = 0,
+    chunk: FigureChunkOption = None,
     camera: CameraOption = None,
     frame: FrameOption = None,
+    actor: ActorOption = None,
     settings: SettingsOption = None,
     methods: MethodsOption = None,
     weights: WeightsOption = None,
     store: StoreOption = DEFAULT_STORE,
 ) -> None:
-    """Draw a figure that compares methods beside the path.
+    """Draw a figure that compares methods beside the path, along a swerve, or a scene before and after edits.
 
-    The figure has a row for each method and a column for each distance to the left of the path. The last row is the
-    truth, where the log can tell it. Stages that are not in the store are computed.
+    recon and fixers have a row for each method and a column for each distance to the left of the path. swerve has
+    columns along its path. Their last row is the truth, where the log can tell it. manipulation has a row for each
+    camera and a column for each edit of GenRe+'s scene.
+
+    Stages that are not in the store are computed.
 
     Example:
 
@@ -66,7 +102,8 @@ def figure(
     """
     from flows.cli.output_paths import check_output_file
     from flows.cli.terminal import TerminalReporter
-    from flows.paper_tables.figure import TABLE, comparison_strips, draw_strips, parse_kind
+    from flows.paper_tables.comparison_strips import draw_strips
+    from flows.paper_tables.figure import SHIFTS_M, TABLE, parse_kind
     from flows.paper_tables.request import TableRequest
     from flows.pipeline.stage_runner import run_stage
     from genre_tasks.atomic_path import atomic_path
@@ -75,12 +112,13 @@ def figure(
     parsed_kind = parse_kind(kind)
     # Checked before any stage is computed, which may take minutes.
     check_output_file(out, "--out", (".png",))
+    chunks = (0,) if chunk is None and parsed_kind in SHIFTS_M else None if chunk is None else (chunk,)
     request = TableRequest(
         number=TABLE[parsed_kind],
         logs=(log,),
         preset=preset,
         store=store,
-        chunks=(chunk,),
+        chunks=chunks,
         settings=tuple(settings or ()),
         methods=tuple(str(file) for file in methods or ()),
         weights=tuple(weights or ()),
@@ -96,10 +134,30 @@ def figure(
         return ref
 
     with reporter:
-        strips = comparison_strips(parsed_kind, checked, run_reported, camera, frame)
-    title = " ".join([f"{log} chunk {chunk}, preset {preset}", *request.settings])
+        strips = _make_strips(parsed_kind, checked, run_reported, _Choice(camera, frame, actor))
+    shown = ", ".join(str(where.chunk) for where in checked.places)
+    title = " ".join([f"{log} chunk {shown}, preset {preset}", *request.settings])
     out.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(out) as part:
-        write_png(part, draw_strips(parsed_kind, strips, title))
+        write_png(part, draw_strips(strips, title))
     not_drawn = f"; not drawn: {', '.join(checked.missing)}" if checked.missing else ""
     typer.echo(f"wrote {out}: {', '.join(strip.label for strip in strips)}{not_drawn}")
+
+
+@dataclass(frozen=True)
+class _Choice:
+    # What of a log a figure shows; None leaves it to the figure.
+    camera: str | None
+    frame: int | None
+    actor: str | None
+
+
+def _make_strips(kind: Kind, checked: CheckedRequest, runner: StageRunner, choice: _Choice) -> list[ComparisonStrip]:
+    from flows.paper_tables.figure import comparison_strips
+    from flows.paper_tables.rollout_figures import manipulation_strips, swerve_strips
+
+    if kind == "swerve":
+        return swerve_strips(checked, runner, choice.camera)
+    if kind == "manipulation":
+        return manipulation_strips(checked, runner, choice.actor, choice.camera, choice.frame)
+    return comparison_strips(kind, checked, runner, choice.camera, choice.frame)

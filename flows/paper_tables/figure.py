@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, get_args
 
-import numpy as np
-from numpy.typing import NDArray
-
 from flows.experiments.stages import StageRunner, run_stages
+from flows.paper_tables.comparison_strips import ComparisonStrip, Pixels, to_pixels
 from flows.paper_tables.request import CheckedRequest
 from flows.pipeline.definition import stages_until
 from flows.pipeline.log_cache import cached_log
@@ -17,31 +14,14 @@ from flows.pipeline.stage_runner import read_artifact
 from genre_tasks.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from genre_tasks.scene.chunk import Chunk
     from genre_tasks.scene.novel_views import NovelView
 
-Kind = Literal["recon", "fixers"]
-TABLE: Mapping[str, int] = {"recon": 1, "fixers": 3}
+Kind = Literal["recon", "fixers", "swerve", "manipulation"]
+TABLE: Mapping[str, int] = {"recon": 1, "fixers": 3, "swerve": 6, "manipulation": 6}
 """The table whose methods a kind of figure shows."""
 SHIFTS_M: Mapping[str, tuple[float, ...]] = {"recon": (0.0, 1.0, 3.0, 5.0), "fixers": (1.0, 2.0, 3.0)}
-"""Metres to the left of the path, a column each."""
-
-Pixels = NDArray[np.uint8]  # [H, W, 3] sRGB
-
-
-@dataclass(frozen=True)
-class ComparisonStrip:
-    """A row of the picture.
-
-    Attributes:
-        label: the method's name, or what else the row shows.
-        images: one for each shift, [H, W, 3] sRGB.
-    """
-
-    label: str
-    images: tuple[Pixels, ...]
+"""Metres to the left of the path, a column each; of the kinds that compare shifts."""
 
 
 def parse_kind(name: str) -> Kind:
@@ -65,7 +45,7 @@ def comparison_strips(
     """Renders or fixes the same views with every method, on the request's first chunk.
 
     Args:
-        kind: which figure.
+        kind: which figure, a key of ``SHIFTS_M``.
         checked: the table's rows and chunks; rows that cannot be measured are left out.
         runner: runs one stage.
         camera: name of a camera; the first front one if ``None``.
@@ -79,6 +59,7 @@ def comparison_strips(
         InputError: the chunk has no source image of this camera and frame.
     """
     strips: list[ComparisonStrip] = []
+    captions = tuple(f"{shift:g} m" for shift in SHIFTS_M[kind])
     # Every method has the same ingest, so the last row's chunk and views serve the truth too.
     views: list[NovelView] = []
     # One chunk only: a picture of several would need a row for each method and chunk.
@@ -90,7 +71,7 @@ def comparison_strips(
         views = _select_views(chunk, SHIFTS_M[kind], camera, frame)
         if kind == "recon":
             scene = read_artifact(job, refs[row.method.end]).scene
-            strips.append(ComparisonStrip(row.label, _render(scene, views)))
+            strips.append(ComparisonStrip(row.label, _render(scene, views), captions))
             continue
         novel = read_artifact(job, refs["novel_views"])
         fixed = read_artifact(job, refs["fnet"])
@@ -99,53 +80,34 @@ def comparison_strips(
         chosen = [index[v.camera, v.frame, v.shift_m] for v in views]
         # All fixers get the same renders, so one strip of inputs stands for all.
         if not strips:
-            strips.append(ComparisonStrip("what they are given", _to_pixels(novel.color[chosen])))
-        strips.append(ComparisonStrip(row.label, _to_pixels(fixed.color[chosen])))
-    truth = _true_strip(where.log, chunk, views) if views else None
+            strips.append(ComparisonStrip("what they are given", to_pixels(novel.color[chosen]), captions))
+        strips.append(ComparisonStrip(row.label, to_pixels(fixed.color[chosen]), captions))
+    truth = _true_strip(where.log, chunk, views, captions) if views else None
     return strips if truth is None else [*strips, truth]
 
 
-def draw_strips(kind: Kind, strips: Sequence[ComparisonStrip], title: str) -> Pixels:
-    """Draws the picture.
-
-    Args:
-        kind: which figure.
-        strips: its rows, at least one.
-        title: above the rows.
-
-    Returns:
-        [H, W, 3] sRGB.
-    """
-    # Imported here, because the command line should start without matplotlib.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    height, width = strips[0].images[0].shape[:2]
-    columns = len(SHIFTS_M[kind])
-    dpi = 100
-    # One image pixel is about one pixel of the picture; labels take 24 pixels a row, the title 40.
-    size = ((columns * width + 40) / dpi, (len(strips) * (height + 24) + 40) / dpi)
-    figure = Figure(figsize=size, dpi=dpi, layout="constrained")
-    canvas = FigureCanvasAgg(figure)
-    figure.suptitle(title, fontsize=9)
-    panels = figure.subplots(len(strips), columns, squeeze=False)
-    for line, strip in zip(panels, strips, strict=True):
-        for axes, image, shift in zip(line, strip.images, SHIFTS_M[kind], strict=True):
-            # Smoothing would hide the very artefacts that the figure compares.
-            axes.imshow(image, interpolation="nearest")
-            axes.set_axis_off()
-            axes.set_title(f"{strip.label}, {shift:g} m", fontsize=8, pad=2)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
-
-
-def _true_strip(log: str, chunk: Chunk, views: Sequence[NovelView]) -> ComparisonStrip | None:
+def _true_strip(
+    log: str, chunk: Chunk, views: Sequence[NovelView], captions: tuple[str, ...]
+) -> ComparisonStrip | None:
     from genre_tasks.metrics.scoring import truth_image
 
     truth = cached_log(log).truth
     if truth is None:
         return None
-    return ComparisonStrip("the truth", tuple(truth_image(chunk, truth, v) for v in views))
+    return ComparisonStrip("the truth", tuple(truth_image(chunk, truth, v) for v in views), captions)
+
+
+def select_front_camera(names: Sequence[str]) -> str:
+    """Selects the camera that looks straight ahead.
+
+    Args:
+        names: of the rig, at least one.
+
+    >>> select_front_camera(["left_camera", "front_left_camera", "front_camera"])
+    'front_camera'
+    """
+    # Of several front cameras the shortest name is the one that looks straight ahead.
+    return min(names, key=lambda name: ("front" not in name, len(name)))
 
 
 def _select_views(chunk: Chunk, shifts_m: Sequence[float], camera: str | None, frame: int | None) -> list[NovelView]:
@@ -153,8 +115,7 @@ def _select_views(chunk: Chunk, shifts_m: Sequence[float], camera: str | None, f
 
     # Only source frames: the stage places novel views at these, so others have no fixed image.
     frames = sorted({v.frame for v in chunk.views_with_role("source")})
-    # Of several front cameras the shortest name is the one that looks straight ahead.
-    name = camera or min(chunk.camera_names, key=lambda c: ("front" not in c, len(c)))
+    name = camera or select_front_camera(chunk.camera_names)
     chosen = frames[len(frames) // 2] if frame is None else frame
     if name not in chunk.camera_names or chosen not in frames:
         raise InputError(
@@ -178,9 +139,4 @@ def _render(scene: object, views: Sequence[NovelView]) -> tuple[Pixels, ...]:
 
     # The scene's tensors may ask for gradients, whose buffers a picture does not need.
     with torch.no_grad():
-        return _to_pixels(render_views(scene, views).color)  # type: ignore[arg-type]  # read back from the store
-
-
-def _to_pixels(color: Tensor) -> tuple[Pixels, ...]:
-    # Rounded, because a plain cast truncates and darkens every image by half a level.
-    return tuple((color.clamp(0, 1) * 255).round().byte().cpu().numpy())
+        return to_pixels(render_views(scene, views).color)  # type: ignore[arg-type]  # read back from the store

@@ -77,7 +77,7 @@ def describe_rollouts(rows: Iterable[RolloutRow]) -> tuple[str, ...]:
     for row in rows:
         name = f"{row.rollout} on {row.log}"
         if row.strength < 1:
-            remarks.append(f"{name} at strength {row.strength:g}, as the log has no room for more")
+            remarks.append(f"{name} at strength {row.strength:g}, as there is no room for more")
         remarks += [f"{name}: {collision}" for collision in row.collisions]
     return tuple(remarks)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from genre_tasks.config import SimulateConfig
@@ -11,11 +11,12 @@ from genre_tasks.errors import ConfigError
 
 if TYPE_CHECKING:
     from genre_tasks.ego_paths.ego_path import EgoPath
+    from genre_tasks.ego_paths.world_actors import WorldActor
 
 BEHAVIOUR_LABELS = {"brake": "brake", "accelerate": "accelerate", "lane-change": "change lane", "swerve": "swerve"}
 """The behaviours in the paper's order, with the words of its table's heading."""
 STRENGTHS = (1.0, 0.75, 0.5, 0.25)
-"""Strengths in the order in which they are tried: a short log has no room for a strong behaviour."""
+"""Strengths in the order in which they are tried: a short log or other traffic may leave no room for a strong one."""
 START_OFFSET_M = 3.0
 """Paper Sec. IV-C: each rollout starts 3 m to the side of the recorded path."""
 
@@ -58,24 +59,33 @@ class PlannedRollout:
     Attributes:
         rollout: what was asked for.
         path: where the vehicle drives.
-        strength: of the behaviour, the largest of ``STRENGTHS`` that the log has room for.
+        strength: of the behaviour, one of ``STRENGTHS``.
+        collisions: overlaps with road users, a clause each; they are there only where no strength avoids them.
     """
 
     rollout: TableRollout
     path: EgoPath
     strength: float
+    collisions: tuple[str, ...] = ()
 
 
-def plan_rollout(rollout: TableRollout, recorded: EgoPath, config: SimulateConfig) -> PlannedRollout:
+def plan_rollout(
+    rollout: TableRollout, recorded: EgoPath, config: SimulateConfig, actors: Sequence[WorldActor] = ()
+) -> PlannedRollout:
     """Plans a behaviour as strong as the log has room for.
+
+    The paper's rollouts were vetted by hand for plausibility. Here a rule does it, which knows the path and the log
+    alone, so that every method drives the same.
 
     Args:
         rollout: what to drive.
         recorded: the recorded path.
         config: what a vehicle can do.
+        actors: road users that it should not meet.
 
     Returns:
-        The path of the largest of ``STRENGTHS`` that is possible.
+        The path of the largest of ``STRENGTHS`` that a vehicle can drive without meeting a road user; where there is
+        none, the largest that it can drive.
 
     Raises:
         ConfigError: the log is too short for the least of them, or there is no behaviour of that name.
@@ -83,25 +93,36 @@ def plan_rollout(rollout: TableRollout, recorded: EgoPath, config: SimulateConfi
     """
     # Imported here: a request is checked before anything numeric is loaded.
     from genre_tasks.ego_paths.behaviours import plan_behaviour
+    from genre_tasks.ego_paths.collisions import find_collisions
 
+    strongest: PlannedRollout | None = None
+    refusal: ConfigError | None = None
     for strength in STRENGTHS:
         try:
             path = plan_behaviour(
                 rollout.behaviour, recorded, config, start_offset_m=rollout.start_offset_m, strength=strength
             )
-        except ConfigError:
-            # The last one's error says what is in the way, with its numbers.
-            if strength == STRENGTHS[-1]:
-                raise
+        except ConfigError as error:
+            refusal = error
             continue
-        return PlannedRollout(rollout, path, strength)
-    raise AssertionError("STRENGTHS is not empty")
+        collisions = find_collisions(path, actors, config.collision_margin_m)
+        planned = PlannedRollout(rollout, path, strength, tuple(str(collision) for collision in collisions))
+        if not collisions:
+            return planned
+        strongest = strongest or planned
+    if strongest is not None:
+        return strongest
+    # The last one's error says what is in the way, with its numbers.
+    raise refusal or AssertionError("STRENGTHS is not empty")
 
 
-def join_names(names: Sequence[str]) -> str:
-    """Joins names for a sentence.
+def take_every(path: EgoPath, every: int) -> EgoPath:
+    """Takes every n-th pose of a path.
 
-    >>> join_names(["brake", "swerve", "accelerate"])
-    'brake, swerve and accelerate'
+    Args:
+        path: P poses.
+        every: 1 for all of them.
     """
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+    return replace(
+        path, times_s=path.times_s[::every], frames=path.frames[::every], world_SE3_ego=path.world_SE3_ego[::every]
+    )

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from flows.experiments.stages import StageRunner, run_reported_stage, run_stages
 from flows.paper_tables.methods import End
-from flows.paper_tables.rollouts import TABLE_ROLLOUTS, PlannedRollout, TableRollout, plan_rollout
+from flows.paper_tables.rollouts import TABLE_ROLLOUTS, PlannedRollout, TableRollout, plan_rollout, take_every
 from flows.pipeline.definition import stages_until
 from flows.pipeline.log_cache import cached_log
 from flows.pipeline.progress import get_reporter
@@ -18,6 +18,8 @@ from flows.training.training_scenes import get_or_make
 from genre_tasks.config import EvaluateConfig, PipelineConfig
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.ego_paths.recorded_path import join_recorded_path
+from genre_tasks.ego_paths.world_actors import list_parked_actors, list_world_actors
+from genre_tasks.rollout.handover import plan_handovers
 from genre_tasks.rollout.render_rollout import render_rollout
 from genre_tasks.rollout.rig import RigCamera, estimate_rig
 from genre_tasks.rollout.rollout_scores import (
@@ -36,12 +38,12 @@ from storage.files import digest_file
 from storage.keys import digest_bytes, digest_value
 from storage.local import open_store
 
-TRUE_VIEWS = 24
+TRUE_VIEWS = 12
 """Views of a rollout that are ray-cast, half a second each; spread evenly over poses and cameras."""
 SCORES = "rollout_scores"
 TRUTH = "rollout_truth"
 """Stages of the store where scores and true images of rollouts are."""
-_RENDERING = "genre_tasks.rollout.render_rollout"
+_RENDERING = ("genre_tasks.rollout.render_rollout", "genre_tasks.rollout.handover")
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class RolloutRow:
         chunks: numbers of the chunks that were driven through.
         rollout: behaviour and start.
         strength: of the behaviour, see :func:`flows.paper_tables.rollouts.plan_rollout`.
-        poses: number of poses of the path.
+        poses: number of poses that were rendered.
         metrics: ``psnr``, ``ssim`` and ``perceptual`` over views with a truth, ``kernel``, ``frechet`` and ``fid`` of
             all images; ``NAME/n`` images, and ``NAME/low``, ``NAME/high`` of 95 % intervals.
         collisions: overlaps with actors, a sentence each.
@@ -116,6 +118,11 @@ class LogMeasurement:
         refs: the artifacts of each job's stages, by stage.
         end: the stage whose scenes are rendered.
 
+    Attributes:
+        scenes: of the method.
+        recorded: the recorded path through all chunks.
+        rig: the cameras, with a global shutter.
+
     Raises:
         ArtifactCorruptError: an artifact is gone or damaged.
     """
@@ -125,11 +132,12 @@ class LogMeasurement:
         self._config = PipelineConfig.model_validate(jobs[0].config)
         self._log = cached_log(jobs[0].log)
         self._store = open_store(jobs[0].store)
-        self._scenes = StageScenes(jobs, refs, end)
-        chunks = [self._scenes.read_chunk(number) for number in self._scenes.chunk_numbers]
-        self._recorded = join_recorded_path(chunks)
-        self._rig = use_global_shutter(estimate_rig(chunks))
+        self.scenes = StageScenes(jobs, refs, end)
+        chunks = [self.scenes.read_chunk(number) for number in self.scenes.chunk_numbers]
+        self.recorded = join_recorded_path(chunks)
+        self.rig = use_global_shutter(estimate_rig(chunks))
         self._first = chunks[0]
+        self._actors = (*list_world_actors(chunks), *list_parked_actors(self._log.tracks(), chunks))
         self._scene_digests = [[found[s].payload_digest for s in ("ingest", "effects", end)] for found in refs]
 
     def measure(self, method: str, rollout: TableRollout, true_views: int = TRUE_VIEWS) -> RolloutRow:
@@ -143,7 +151,7 @@ class LogMeasurement:
         Raises:
             ConfigError: the log has no room for the behaviour.
         """
-        planned = plan_rollout(rollout, self._recorded, self._config.simulate)
+        planned = self.plan(rollout)
         address = self._scores_address(planned, true_views)
         scores = get_or_make(self._store, address, SCORES, lambda: self._score(planned, true_views))
         return RolloutRow(
@@ -152,11 +160,15 @@ class LogMeasurement:
             chunks=tuple(job.chunk for job in self._jobs),
             rollout=rollout,
             strength=planned.strength,
-            poses=len(planned.path),
+            poses=len(self._select_poses(planned)),
             metrics=_name_metrics(scores),
-            collisions=(),
+            collisions=planned.collisions,
             scores=scores,
         )
+
+    def plan(self, rollout: TableRollout) -> PlannedRollout:
+        """Plans a rollout on this log, see :func:`flows.paper_tables.rollouts.plan_rollout`."""
+        return plan_rollout(rollout, self.recorded, self._config.simulate, self._actors)
 
     def is_stored(self, rollout: TableRollout, true_views: int = TRUE_VIEWS) -> bool:
         """Says whether a rollout was measured before.
@@ -168,39 +180,48 @@ class LogMeasurement:
         Raises:
             ConfigError: the log has no room for the behaviour.
         """
-        planned = plan_rollout(rollout, self._recorded, self._config.simulate)
+        planned = self.plan(rollout)
         return self._store.find(self._scores_address(planned, true_views)) is not None
 
     def read_real_images(self) -> RealImages:
         """Gives what rollouts of this log are compared with as a set."""
-        chunks = [self._scenes.read_chunk(number, planned=False) for number in self._scenes.chunk_numbers]
+        chunks = [self.scenes.read_chunk(number, planned=False) for number in self.scenes.chunk_numbers]
         return collect_real_images(chunks, self._config.evaluate)
 
     def _score(self, planned: PlannedRollout, true_views: int) -> RolloutScores:
         true_images = self._cast_truth(planned, true_views)
-        rendered = render_rollout(self._scenes, planned.path, self._rig)
+        path = self._select_poses(planned)
+        # As `genre simulate` hands over from chunk to chunk, measured on all poses.
+        handovers = plan_handovers(self.scenes, planned.path, self.rig, self._config.simulate.handover_frames)
+        rendered = render_rollout(self.scenes, path, self.rig, handovers=handovers)
         return score_rollout(rendered, self._config.evaluate, self.read_real_images(), true_images)
+
+    def _select_poses(self, planned: PlannedRollout) -> EgoPath:
+        # Kernel distances are unbiased at any number of images, so that fewer poses only widen their interval.
+        return take_every(planned.path, self._config.evaluate.every)
 
     def _cast_truth(self, planned: PlannedRollout, count: int) -> FixedViews | None:
         """The true images of some views, from the store where another method asked for them before."""
         truth = self._log.truth
         if truth is None:
             return None
-        views = place_true_views(planned.path, self._rig, count, planned.rollout.start_offset_m)
+        path = self._select_poses(planned)
+        views = place_true_views(path, self.rig, count, planned.rollout.start_offset_m)
         images = [[v.camera, v.frame, v.lens.width_px, v.lens.height_px] for v in views]
         reader = code_digest(type(self._log).__module__)
-        fields = {"log": self._log.digest(), "code": reader, "views": images, "path": _digest_path(planned.path)}
-        key = digest_value(fields | {"rig": _digest_rig(self._rig)})
+        fields = {"log": self._log.digest(), "code": reader, "views": images, "path": _digest_path(path)}
+        key = digest_value(fields | {"rig": _digest_rig(self.rig)})
         return get_or_make(
             self._store, self._address(TRUTH, key), "fixed_views", lambda: cast_true_images(truth, views)
         )
 
     def _scores_address(self, planned: PlannedRollout, true_views: int) -> Address:
         fields = {
-            "code": code_digest("genre_tasks.rollout.rollout_scores", (_RENDERING, type(self._log).__module__)),
+            "code": code_digest("genre_tasks.rollout.rollout_scores", (*_RENDERING, type(self._log).__module__)),
             "scenes": self._scene_digests,
             "path": _digest_path(planned.path),
-            "rig": _digest_rig(self._rig),
+            "rig": _digest_rig(self.rig),
+            "handover_frames": self._config.simulate.handover_frames,
             "evaluate": _describe_evaluation(self._config.evaluate),
             # A log without a truth has the same scores whatever number of true views is asked for.
             "truth": None if self._log.truth is None else [self._log.digest(), true_views],
@@ -234,5 +255,9 @@ def _digest_rig(rig: Sequence[RigCamera]) -> str:
 def _describe_evaluation(config: EvaluateConfig) -> dict[str, object]:
     # Shifts and pictures are of the stage alone, so that they must not change the key of a rollout.
     networks = {name: getattr(config, name) for name in ("inception", "lpips")}
-    described: dict[str, object] = {"distributions": config.distributions, "bootstrap": config.bootstrap}
+    described: dict[str, object] = {
+        "distributions": config.distributions,
+        "bootstrap": config.bootstrap,
+        "every": config.every,
+    }
     return described | {name: None if file is None else digest_file(Path(file)) for name, file in networks.items()}

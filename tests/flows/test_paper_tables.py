@@ -18,7 +18,8 @@ from flows.configuration import load_configuration
 from flows.experiments.log_chunks import LogChunk
 from flows.paper_tables.builtin_methods import BUILT_IN
 from flows.paper_tables.columns import MeasuredCell, mean_over_cells
-from flows.paper_tables.figure import SHIFTS_M, TABLE, Kind, comparison_strips, draw_strips
+from flows.paper_tables.comparison_strips import draw_strips
+from flows.paper_tables.figure import SHIFTS_M, TABLE, Kind, comparison_strips
 from flows.paper_tables.flow import paper_table, write_results
 from flows.paper_tables.layouts import LAYOUTS, PROTOCOL, get_layout
 from flows.paper_tables.measure import Basis, list_stages, measure_cell
@@ -37,7 +38,7 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "docs/examples"
 
 
 def test_every_row_and_column_of_the_papers_tables_has_a_place() -> None:
-    assert set(LAYOUTS) == set(PAPER) == {1, 2, 3, 4, 5}
+    assert set(LAYOUTS) == set(PAPER) == {1, 2, 3, 4, 5, 6}
     for number, layout in LAYOUTS.items():
         rows = PAPER[number].rows
         assert [r.paper for r in layout.rows] == list(rows)
@@ -348,7 +349,7 @@ def test_a_figure_has_a_row_for_each_method_and_the_truth(kind: Kind, labels: li
         assert [i.shape for i in strip.images] == [(36, 64, 3)] * len(SHIFTS_M[kind])
         assert not np.array_equal(strip.images[0], strip.images[-1])
     assert not np.array_equal(found[0].images[0], found[1].images[0])
-    picture = draw_strips(kind, found, "a street")
+    picture = draw_strips(found, "a street")
     assert picture.dtype == np.uint8 and picture.shape[1] > 64 * len(SHIFTS_M[kind])
     with pytest.raises(InputError, match="no source image of camera back at frame"):
         comparison_strips(kind, planned, run_stage, camera="back")
