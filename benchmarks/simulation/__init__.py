@@ -8,7 +8,7 @@ takes minutes a log; ``genre table 6`` on the same logs and store leaves everyth
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 
 from benchmarks.common.bench import (
@@ -30,6 +30,8 @@ from benchmarks.simulation.behaviour_quality import (
     measure_behaviours,
 )
 from benchmarks.simulation.insertion import insertion_claims, insertion_table, measure_insertion
+from benchmarks.simulation.lidar import measure_lidar
+from benchmarks.simulation.lidar_report import lidar_claims, lidar_table
 from benchmarks.simulation.plausibility import (
     RANDOM_BEHAVIOURS,
     measure_plausibility,
@@ -59,6 +61,7 @@ _FLICKER_S = 60.0
 _HANDOVER_S = 45.0
 _PLAUSIBILITY_S = 30.0
 _REFUSALS_S = 8.0
+_LIDAR_S = 120.0
 _SPEED_S = 60.0
 _MEMORY_S = 90.0
 _ROUNDS = 3
@@ -80,6 +83,7 @@ class SimulationBench:
     code: tuple[str, ...] = (
         "benchmarks.simulation.behaviour_quality",
         "benchmarks.simulation.insertion",
+        "benchmarks.simulation.lidar",
         "benchmarks.simulation.plausibility",
         "benchmarks.simulation.removal",
         "benchmarks.simulation.speed",
@@ -135,6 +139,11 @@ class SimulationBench:
             Cell(f"hand-over {case.log}", _HANDOVER_S, partial(measure_handover, case), _describe_case(case))
             for case in real
         ]
+        for case in real:
+            for chunk in case.chunks:
+                measure = partial(measure_lidar, case.log, chunk, case.store, settings=settings)
+                name = f"lidar {case.log} chunk {chunk}"
+                cells.append(Cell(name, _LIDAR_S, measure, _describe_case(case)))
         # Of one log: what they measure is the machine and the code more than the street.
         for case in streets[:1]:
             parameters = _describe_case(case)
@@ -154,6 +163,7 @@ class SimulationBench:
         yield from insertion_claims(_select(rows, "insertion"))
         yield from flicker_claims(_select(rows, "flicker"))
         yield from handover_claims(_select(rows, "hand-over"))
+        yield from lidar_claims(_select(rows, "lidar"))
         yield from speed_claims(_select(rows, "speed"), _select(rows, "memory"))
         yield from plausibility_claims(_select(rows, "plausibility"), _select(rows, "refusals"))
 
@@ -162,12 +172,13 @@ class SimulationBench:
         found = {kind: _select(rows, kind) for kind in {name.split()[0] for name in rows}}
         speed = (found.get("speed", []), found.get("memory", []))
         plausibility = (found.get("plausibility", []), found.get("refusals", []))
-        sections = [
+        sections: list[tuple[str, Callable[..., Iterator[str]], tuple[list[Row], ...]]] = [
             ("Behaviours", behaviour_table, (found.get("behaviours", []),)),
             ("Removed actors", removal_table, (found.get("removal", []),)),
             ("Inserted actors", insertion_table, (found.get("insertion", []),)),
             ("Flicker", flicker_table, (found.get("flicker", []),)),
             ("Hand-over between chunks", handover_table, (found.get("hand-over", []),)),
+            ("LiDAR", lidar_table, (found.get("lidar", []),)),
             ("Speed and memory", speed_table, speed),
             ("Plausibility", plausibility_table, plausibility),
         ]
