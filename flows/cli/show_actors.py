@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from genre_tasks.scene_edits.chunk_scene import SceneSource
+    from genre_tasks.scene_edits.run_survey import RunSurvey
 
 _TRACK_CHARACTERS = 10
 
@@ -36,7 +41,7 @@ def show_actors(store: str, run: str | None, picture: Path | None) -> None:
         _write_sheet(scenes, survey.names, picture)
 
 
-def _actor_row(survey: Any, track_id: str, name: str) -> dict[str, Any]:
+def _actor_row(survey: RunSurvey, track_id: str, name: str) -> dict[str, Any]:
     from genre_tasks.scene_edits.trajectories import Trajectory, measure_speed
 
     track = survey.tracks[track_id]
@@ -54,13 +59,14 @@ def _actor_row(survey: Any, track_id: str, name: str) -> dict[str, Any]:
     }
 
 
-def _write_sheet(scenes: Any, names: dict[str, str], path: Path) -> None:
+def _write_sheet(scenes: SceneSource, names: Mapping[str, str], path: Path) -> None:
     from flows.plots.actor_pictures import draw_actors
+    from flows.simulation.run_scenes import RunScenes
     from genre_tasks.atomic_path import atomic_path
     from genre_tasks.errors import InputError
     from storage.codecs.png import write_png
 
-    image = draw_actors(scenes, names)
+    image = draw_actors(scenes, names, is_recorded=isinstance(scenes, RunScenes))
     if image is None:
         raise InputError("this run has no actors, so there is no picture", remedy="Leave out --picture.")
     path.parent.mkdir(parents=True, exist_ok=True)

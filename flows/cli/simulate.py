@@ -78,6 +78,13 @@ def simulate(
     retime: Annotated[ListOption, typer.Option(help="Let an actor drive later, in seconds: car-3,delay=0.5.")] = None,
     rotate: Annotated[ListOption, typer.Option(help="Turn an actor, in degrees: car-3,degrees=90.")] = None,
     scale_speed: Annotated[ListOption, typer.Option(help="Scale an actor's speed: car-3,factor=0.5.")] = None,
+    sensors: Annotated[
+        str,
+        typer.Option(
+            help="What is simulated, separated by commas: rgb, depth, masks (instances and classes), flow (optical, to "
+            "the next pose) and lidar (sweeps of the log's sensor)."
+        ),
+    ] = "rgb",
     fix: Annotated[
         bool, typer.Option("--fix", help="Repair all images by FNet. What removed actors hid is filled by it anyway.")
     ] = False,
@@ -146,6 +153,7 @@ def simulate(
         cameras=None if cameras is None else tuple(name.strip() for name in cameras.split(",")),
         edits=listed
         + parse_edit_options(remove or (), insert or (), move or (), retime or (), rotate or (), scale_speed or ()),
+        sensors=tuple(dict.fromkeys(name.strip() for name in sensors.split(","))),
         fix=fix,
         allow_collision=allow_collision,
         allow_implausible=allow_implausible,

@@ -1,9 +1,9 @@
-"""Pictures of a run's actors: each as the scene shows it, where it is largest in a recorded view."""
+"""Pictures of a run's actors: each where it is largest in a recorded view, cut out of the image or of a render."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from flows.plots.artifact_pictures import contact_sheet
 from genre_tasks.render import render_views
 from genre_tasks.scene.box_projection import project_box
 from genre_tasks.scene.chunk import Actor, View
+from genre_tasks.scene.image_decoding import decode_pixels, read_image_size
 from genre_tasks.scene_edits.chunk_scene import ChunkScene, SceneSource
 
 Image8 = NDArray[np.uint8]
@@ -33,12 +34,13 @@ class _BestView:
     area: int
 
 
-def draw_actors(source: SceneSource, names: Mapping[str, str]) -> Image8 | None:
+def draw_actors(source: SceneSource, names: Mapping[str, str], is_recorded: bool) -> Image8 | None:
     """Draws all actors of a run on one sheet, with their names.
 
     Args:
         source: the scenes of the run.
         names: readable name by track id, in the order of the sheet.
+        is_recorded: whether the recorded images show the actors; those of an edited run are rendered.
 
     Returns:
         sRGB [H, W, 3]; an actor that is in no recorded view is a dark tile. ``None`` for a run without actors.
@@ -52,7 +54,7 @@ def draw_actors(source: SceneSource, names: Mapping[str, str]) -> Image8 | None:
             found = _find_best_view(actor, number, chunk_scene)
             if found is not None and (actor.track_id not in best or found.area > best[actor.track_id].area):
                 best[actor.track_id] = found
-                tiles[actor.track_id] = _render_tile(chunk_scene, found)
+                tiles[actor.track_id] = _cut_tile(chunk_scene, found, is_recorded)
     blank = np.full((_TILE_PX[1], _TILE_PX[0], 3), _BACKGROUND, np.uint8)
     return contact_sheet([_write_name(tiles.get(t, blank), name) for t, name in names.items()], _COLUMNS)
 
@@ -70,24 +72,27 @@ def _find_best_view(actor: Actor, number: int, chunk_scene: ChunkScene) -> _Best
     return best
 
 
-def _render_tile(chunk_scene: ChunkScene, best: _BestView) -> Image8:
-    # The view's camera with a longer lens, so that far actors are rendered and not magnified pixels.
-    size = (best.high - best.low) * (1 + 2 * _MARGIN)
-    scale = float(min(_TILE_PX[0] / max(size[0], 1), _TILE_PX[1] / max(size[1], 1)))
-    middle = (best.low + best.high) / 2
+def _cut_tile(chunk_scene: ChunkScene, best: _BestView, is_recorded: bool) -> Image8:
     lens = best.view.lens
-    zoomed = replace(
-        lens,
-        fx_px=lens.fx_px * scale,
-        fy_px=lens.fy_px * scale,
-        cx_px=(lens.cx_px - middle[0]) * scale + _TILE_PX[0] / 2,
-        cy_px=(lens.cy_px - middle[1]) * scale + _TILE_PX[1] / 2,
-        width_px=_TILE_PX[0],
-        height_px=_TILE_PX[1],
+    if is_recorded:
+        width, height = read_image_size(best.view.image)
+        pixels = decode_pixels(best.view.image, width, height)
+    else:
+        with torch.no_grad():
+            color = render_views(chunk_scene.scene, [best.view]).color[0]
+        pixels = np.asarray((color.clamp(0, 1) * 255).round().byte().numpy(), np.uint8)
+    scale = pixels.shape[1] / lens.width_px
+    size = (best.high - best.low) * (1 + 2 * _MARGIN) * scale
+    # Widened to the tile's shape, so that nothing is stretched.
+    zoom = max(size[0] / _TILE_PX[0], size[1] / _TILE_PX[1], 1e-3)
+    half = np.array(_TILE_PX) * zoom / 2
+    middle = (best.low + best.high) / 2 * scale
+    box = (*(middle - half), *(middle + half))
+    # What is outside of the image is black.
+    tile = Image.fromarray(pixels).transform(
+        _TILE_PX, Image.Transform.EXTENT, tuple(float(v) for v in box), Image.Resampling.BILINEAR
     )
-    with torch.no_grad():
-        image = render_views(chunk_scene.scene, [replace(best.view, lens=zoomed, shutter=None, blur=None)]).color[0]
-    return np.asarray((image.clamp(0, 1) * 255).round().byte().numpy(), np.uint8)
+    return np.asarray(tile, np.uint8)
 
 
 def _write_name(tile: Image8, name: str) -> Image8:

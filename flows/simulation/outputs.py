@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from flows.simulation.film import FilmWriter
 from genre_tasks.rollout.render_rollout import RolloutImages
 from genre_tasks.rollout.rig import RigCamera
-from storage.codecs.exr import write_exr
+from storage.codecs.exr import write_channels, write_exr
 from storage.codecs.png import write_png
+
+DEPTH_FOLDER = "depth"
 
 
 class RolloutOutput(Protocol):
@@ -89,6 +91,31 @@ class ExrImages:
         for view, color, alpha, depth in zip(images.views, images.color, images.alpha, images.depth, strict=True):
             path = image_path(self._folder, view.camera, images.index, ".exr")
             write_exr(path, color.numpy(), alpha.numpy(), depth.numpy())
+
+    def close(self) -> None:
+        """Nothing is left to do: every file is complete."""
+
+    def abort(self) -> None:
+        """Nothing is under way between two poses."""
+
+
+class DepthImages:
+    """Depth alone, ``depth/CAMERA/000012.exr`` with a channel Z in metres, 0 where nothing is.
+
+    Args:
+        folder: of the rollout.
+        rig: the cameras.
+    """
+
+    def __init__(self, folder: Path, rig: Sequence[RigCamera]) -> None:
+        self._folder = folder / DEPTH_FOLDER
+        self._folder.mkdir()
+        make_camera_folders(self._folder, rig)
+
+    def write(self, images: RolloutImages) -> None:
+        """Writes a file for each camera."""
+        for view, depth in zip(images.views, images.depth, strict=True):
+            write_channels(image_path(self._folder, view.camera, images.index, ".exr"), {"Z": depth.numpy()})
 
     def close(self) -> None:
         """Nothing is left to do: every file is complete."""

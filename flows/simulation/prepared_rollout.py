@@ -8,12 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from flows.simulation.edited_runs import OpenedRun, open_edited_scenes
+from flows.simulation.parked_actors import list_parked
 from flows.simulation.request import SimulationRequest
 from flows.simulation.rollout_path import CheckedPath, check_path, make_path
 from flows.simulation.run_scenes import RunScenes
 from flows.simulation.stored_ranges import SideRange, find_side_ranges
 from genre_tasks.config import PipelineConfig
 from genre_tasks.ego_paths.recorded_path import DEFAULT_FRAME_S, join_recorded_path
+from genre_tasks.ego_paths.world_actors import list_world_actors
 from genre_tasks.errors import InputError
 from genre_tasks.progress import Progress
 from genre_tasks.rollout.handover import Handover, plan_handovers
@@ -68,7 +70,8 @@ def prepare_rollout(
     rig = select_cameras(estimate_rig(chunks), request.cameras)
     recorded = join_recorded_path(chunks)
     path = make_path(request, config.simulate, recorded)
-    checked = check_path(request, config.simulate, path, recorded, chunks)
+    actors = (*list_world_actors(chunks), *list_parked(run.recorded))
+    checked = check_path(request, config.simulate, path, recorded, actors)
     # After the checks, which end most of the requests that are no good, and take no time.
     ranges = find_side_ranges(run.recorded, progress) if request.mark_range else {}
     progress(0, len(path), "hand-over")

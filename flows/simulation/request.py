@@ -9,6 +9,10 @@ from typing import Any
 from genre_tasks.ego_paths.behaviour_request import Side
 from genre_tasks.errors import ConfigError
 from genre_tasks.scene_edits.edits import EditList
+from genre_tasks.suggestions import did_you_mean
+
+SENSORS = ("rgb", "depth", "masks", "flow", "lidar")
+"""What can be simulated: films, depth, instance and class masks, optical flow, LiDAR sweeps."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,7 @@ class SimulationRequest:
         side: of a lane change or swerve; ``None``: the behaviour chooses.
         cameras: names; ``None``: all of the rig.
         edits: of the traffic.
+        sensors: of ``SENSORS``.
         fix: whether FNet repairs all images; otherwise it fills what removed actors hid.
         allow_collision: whether a path through an actor is rendered all the same.
         allow_implausible: whether a path that no vehicle can drive is rendered all the same.
@@ -53,6 +58,7 @@ class SimulationRequest:
     side: Side | None = None
     cameras: tuple[str, ...] | None = None
     edits: EditList = field(default_factory=EditList)
+    sensors: tuple[str, ...] = ("rgb",)
     fix: bool = False
     allow_collision: bool = False
     allow_implausible: bool = False
@@ -66,8 +72,12 @@ class SimulationRequest:
         """Checks what needs no run to be read.
 
         Raises:
-            ConfigError: two values do not go together.
+            ConfigError: a sensor is unknown, or two values do not go together.
         """
+        for sensor in self.sensors:
+            if sensor not in SENSORS:
+                remedy = f"{did_you_mean(sensor, SENSORS)}Known: {', '.join(SENSORS)}."
+                raise ConfigError(f"no sensor is called '{sensor}'", remedy=remedy)
         if self.behaviour is not None and self.path_file is not None:
             raise ConfigError("--behaviour and --path both say how to drive", remedy="Give one of them.")
         if self.path_file is not None and self.start_offset_m is not None:
@@ -88,6 +98,7 @@ class SimulationRequest:
             "strength": self.strength,
             "delay_s": self.delay_s,
             "side": self.side,
+            "sensors": sorted(self.sensors),
             "fix": self.fix,
             "cameras": None if self.cameras is None else list(self.cameras),
             # Whether a faulty path is refused changes no file: the files hold what was found.

@@ -5,8 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from flows.pipeline.definition import STAGE_BY_NAME, digest_stage_weights
+from flows.pipeline.log_cache import cached_log
 from flows.simulation.edited_runs import OpenedRun, digest_edits
+from flows.simulation.parked_actors import find_log
 from flows.simulation.request import SimulationRequest
+from flows.simulation.sensors import MODULES as SENSOR_MODULES
 from genre_tasks.config import PipelineConfig
 from genre_tasks.ego_paths.behaviours import BEHAVIOURS
 from genre_tasks.errors import InputError
@@ -43,18 +46,26 @@ def compute_rollout_key(request: SimulationRequest, run: OpenedRun, config: Pipe
     edits = run.edits + request.edits
     modules = list(_MODULES)
     weights = None
+    for sensor in request.sensors:
+        modules += SENSOR_MODULES[sensor]
+    if "lidar" in request.sensors:
+        # Which rays the sensor sends is read from the log's sweeps.
+        inputs["log"] = cached_log(run.recorded.record["log"]).digest()
     if len(edits):
         inputs["edits"] = digest_edits(request.store, edits, config.simulate)
     if request.fix or len(edits):
         # FNet fills what removed actors hid, so edits may need it as well.
         modules.append("genre_tasks.rollout.fix_rollout")
         weights = digest_stage_weights(STAGE_BY_NAME["fnet"], config)
+    # Parked vehicles are known from the log alone: where it is gone, a path is not checked against them.
+    parked = find_log(run.recorded.record["log"]) is not None
     if request.path_file is not None:
         inputs["path file"] = _digest_file(request.path_file)
     configuration = {
         "simulate": config.simulate.model_dump(mode="json"),
         "request": request.key_values(),
         "fnet": config.fnet.model_dump(mode="json"),
+        "parked": parked,
         "layout": _LAYOUT,
         # The encoder's version decides on the bytes of films.
         "ffmpeg": imageio_ffmpeg.__version__,

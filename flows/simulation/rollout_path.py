@@ -14,9 +14,8 @@ from genre_tasks.ego_paths.behaviours import plan_behaviour
 from genre_tasks.ego_paths.collisions import Collision, find_collisions
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.ego_paths.kinematics import BoundViolation, Kinematics, compare_with_bounds, measure_kinematics
-from genre_tasks.ego_paths.world_actors import WorldActor, list_world_actors
+from genre_tasks.ego_paths.world_actors import WorldActor
 from genre_tasks.errors import ConfigError
-from genre_tasks.scene.chunk import Chunk
 
 RECORDED = "recorded"
 """The behaviour that drives as recorded."""
@@ -76,7 +75,7 @@ def make_path(request: SimulationRequest, config: SimulateConfig, recorded: EgoP
 
 
 def check_path(
-    request: SimulationRequest, config: SimulateConfig, path: EgoPath, recorded: EgoPath, chunks: Sequence[Chunk]
+    request: SimulationRequest, config: SimulateConfig, path: EgoPath, recorded: EgoPath, actors: Sequence[WorldActor]
 ) -> CheckedPath:
     """Checks a path against the kinematic bounds and the boxes of actors.
 
@@ -85,7 +84,7 @@ def check_path(
         config: bounds and margin.
         path: to check.
         recorded: the recorded path.
-        chunks: with the actors as they are simulated.
+        actors: as they are simulated, and parked ones.
 
     Returns:
         The path with what was found.
@@ -101,7 +100,6 @@ def check_path(
             f"no vehicle drives like this: {found}",
             remedy="Choose a smaller --strength or --start-offset, or render it all the same by --allow-implausible.",
         )
-    actors = list_world_actors(chunks)
     collisions = find_collisions(path, actors, config.collision_margin_m)
     if collisions and not request.allow_collision:
         found = "; ".join(str(collision) for collision in collisions[:_SHOWN_COLLISIONS])

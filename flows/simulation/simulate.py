@@ -10,7 +10,8 @@ from flows.configuration.loading import apply_settings
 from flows.machine.facts import describe_environment
 from flows.machine.resource_usage import ResourceUsage, measure_usage
 from flows.simulation.edited_runs import open_run
-from flows.simulation.outputs import ExrImages, Films, PngImages, RolloutOutput, open_outputs
+from flows.simulation.outputs import open_outputs
+from flows.simulation.parked_actors import find_log
 from flows.simulation.poses_table import write_poses
 from flows.simulation.prepared_rollout import PreparedRollout, prepare_rollout
 from flows.simulation.repair import choose_repair
@@ -18,6 +19,7 @@ from flows.simulation.request import SimulationRequest
 from flows.simulation.rollout_folder import KIND, find_rollout, write_rollout
 from flows.simulation.rollout_key import compute_rollout_key
 from flows.simulation.rollout_metrics import RowMaker, measure_rollout, write_metrics
+from flows.simulation.sensors import open_sensors
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import InputError
 from genre_tasks.progress import Progress, silent
@@ -93,16 +95,11 @@ def simulate_run(request: SimulationRequest, progress: Progress = silent) -> dic
 def _render(
     request: SimulationRequest, config: PipelineConfig, rollout: PreparedRollout, folder: Path, progress: Progress
 ) -> dict[str, Any]:
-    outputs: list[RolloutOutput] = [Films(folder, rollout.rig, 1 / rollout.pose_s)]
-    if request.exr:
-        outputs.append(ExrImages(folder, rollout.rig))
-    if request.png:
-        outputs.append(PngImages(folder, rollout.rig))
     path = rollout.checked.path
     row_maker = RowMaker(rollout)
     repair = choose_repair(request, config, rollout, folder)
     rows = []
-    with open_outputs(outputs):
+    with open_outputs(open_sensors(request, rollout, folder)) as outputs:
         for images in render_rollout(rollout.source, path, rollout.rig, handovers=rollout.handovers):
             repaired = repair(images)
             for output in outputs:
@@ -118,6 +115,8 @@ def _render(
 def _list_warnings(rollout: PreparedRollout, metrics: dict[str, Any]) -> tuple[str, ...]:
     warnings = [f"implausible: {violation}" for violation in rollout.checked.violations]
     warnings += [f"collision: {collision}" for collision in rollout.checked.collisions]
+    if find_log(rollout.recorded.record["log"]) is None:
+        warnings.append("the log is gone, so the path was not checked against parked vehicles")
     reliable = metrics.get("reliable_fraction")
     if reliable is not None and reliable < 1:
         warnings.append(f"{1 - reliable:.0%} of the poses are outside of the scenes' reliable range")

@@ -93,7 +93,7 @@ def check_rate(request: BehaviourRequest, rate_m_s2: float, bound_m_s2: float, q
     """
     rate = request.strength * rate_m_s2
     if rate > bound_m_s2:
-        problem = f"{request.name} at strength {request.strength:.3g} is a {quantity} of {rate:.3g} m/s²"
+        problem = f"{request.name} at strength {request.strength:.3g} has the {quantity} {rate:.3g} m/s²"
         # Rounded down, so that the strength in the remedy is one that works.
         largest = math.floor(100 * bound_m_s2 / rate_m_s2) / 100
         raise ConfigError(

@@ -89,15 +89,19 @@ def fit_smooth_curve(parameter: Float64, values: Float64, scale: float) -> Smoot
     # Banded by hand: sparse matrices of this size would take ten times as long to build.
     interval = np.minimum((x / step).astype(np.int64), intervals - 1)
     basis = np.vander(x / step - interval, _DEGREE + 1) @ _cardinal_basis()
-    banded = np.zeros((_DEGREE + 1, intervals + _DEGREE))
-    right = np.zeros((intervals + _DEGREE, y.shape[1]))
+    count = intervals + _DEGREE
     penalty = _penalise_third_derivative() * (scale / step) ** (2 * _ORDER - 1)
-    for a in range(_DEGREE + 1):
-        np.add.at(right, interval + a, (weights * basis[:, a])[:, None] * y)
-        for b in range(a, _DEGREE + 1):
-            np.add.at(banded[_DEGREE - b + a], interval + b, weights * basis[:, a] * basis[:, b])
-            banded[_DEGREE - b + a, b : b + intervals] += penalty[a, b]
-    coefficients = solveh_banded(banded, right)
+    # Pairs of splines that share an interval; the upper half of a symmetric matrix.
+    row, column = np.triu_indices(_DEGREE + 1)
+    every = np.arange(intervals)
+    index = np.concatenate([interval[:, None] + column, every[:, None] + column]) + count * (_DEGREE - column + row)
+    products = np.concatenate(
+        [(weights[:, None] * basis)[:, row] * basis[:, column], np.tile(penalty[row, column], (intervals, 1))]
+    )
+    banded = np.bincount(index.ravel(), products.ravel(), (_DEGREE + 1) * count).reshape(_DEGREE + 1, count)
+    index = (interval[:, None] + np.arange(_DEGREE + 1)).ravel()
+    right = [np.bincount(index, ((weights * values)[:, None] * basis).ravel(), count) for values in y.T]
+    coefficients = solveh_banded(banded, np.stack(right, axis=1))
     knots = step * np.arange(-_DEGREE, intervals + _DEGREE + 1)
     return SmoothCurve(BSpline(knots, coefficients, _DEGREE, extrapolate=True), origin, offset)
 

@@ -69,7 +69,9 @@ class ChunkLayout:
             offset = pose[:2, 3] - start
             fraction = np.clip((offset * step).sum(1) / squared_length, 0, 1)
             distance = np.linalg.norm(offset - fraction[:, None] * step, axis=1)
-            moments = self.frames[:-1] + fraction * np.diff(self.frames)
+            # The recorded poses too: while the vehicle stands, the way between two of them has no direction.
+            distance = np.append(distance, np.linalg.norm(pose[:2, 3] - self.positions, axis=1))
+            moments = np.append(self.frames[:-1] + fraction * np.diff(self.frames), self.frames)
             cost = distance + _M_PER_FRAME * np.abs(moments - path.frames[index])
             places[index] = moments[cost.argmin()]
         return places

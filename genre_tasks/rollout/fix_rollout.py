@@ -19,8 +19,9 @@ from genre_tasks.fixer.network import Encoded, Fnet
 from genre_tasks.fixer.source_images import load_source_images
 from genre_tasks.fixer.view_surface import MIN_ALPHA, unproject_surface
 from genre_tasks.fixer.warping import SourceImage, sample_source
+from genre_tasks.render import Render, RenderSettings, render_views
 from genre_tasks.render.surface import render_surfaces
-from genre_tasks.render.types import RenderSettings
+from genre_tasks.rollout.background_repair import repair_background
 from genre_tasks.rollout.moment_actors import LAST_MOMENT, THIS_MOMENT, pose_actors
 from genre_tasks.rollout.removed_area import (
     RemovedActors,
@@ -69,12 +70,14 @@ class _ChunkImages:
     Attributes:
         chunk: as edited.
         removed: actors that were removed, and the recorded images without them.
+        repaired: the edited scene, repaired where removed actors hid or shaded the background.
         lidar_scene: coloured points as discs, as edited.
         latents: of references by camera and frame, once encoded.
     """
 
     chunk: Chunk
     removed: RemovedActors
+    repaired: SceneGraph
     lidar_scene: SceneGraph
     latents: dict[tuple[str, int], Tensor] = field(default_factory=dict)
 
@@ -147,7 +150,9 @@ class RolloutFixer:
         chunk_images = self._load_chunk(images)
         novel = self._render_inputs(images, chunk_images)
         area = self._find_area(images, novel, chunk_images)
-        color = self._run_network(images, _blank(novel, area), chunk_images, range(len(images.views)))
+        if bool(area.both.any()):
+            novel = _paste(novel, area, render_views(chunk_images.repaired, images.views, self._settings))
+        color = self._run_network(images, novel, chunk_images, range(len(images.views)))
         for k, view in enumerate(images.views):
             self._remember(images, k, view, color[k])
         return FixedRolloutImages(color, area.filled, area.restored)
@@ -174,8 +179,9 @@ class RolloutFixer:
         rows = [k for k in range(len(images.views)) if bool(area.both[k].any())]
         color = images.color.clone()
         if rows:
+            novel = _paste(novel, area, render_views(chunk_images.repaired, images.views, self._settings))
             # The network repairs a view in one piece, and only the pixels of the area are taken.
-            fixed = self._run_network(images, _blank(novel, area), chunk_images, rows)
+            fixed = self._run_network(images, novel, chunk_images, rows)
             color[rows] = torch.where(area.both[rows][..., None], fixed, color[rows])
         for k, view in enumerate(images.views):
             self._remember(images, k, view, color[k])
@@ -203,7 +209,10 @@ class RolloutFixer:
                 views=[replace(view, blur=None) for view in views],
                 settings=self._settings,
             )
-            known = _ChunkImages(chunk, removed, build_lidar_scene(chunk, self._lidar_max_points))
+            scene = images.chunk_scene.scene
+            if images.chunk_scene.removed:
+                scene = repair_background(scene, chunk, images.chunk_scene.removed, removed)
+            known = _ChunkImages(chunk, removed, scene, build_lidar_scene(chunk, self._lidar_max_points))
             self._chunks[chunk.index] = known
         self._chunks.move_to_end(chunk.index)
         while len(self._chunks) > _CHUNKS_IN_MEMORY:
@@ -264,8 +273,10 @@ class RolloutFixer:
 
     def _pose_actors(self, images: RolloutImages, chunk_images: _ChunkImages) -> tuple[Actor, ...]:
         moments = {THIS_MOMENT: images.views[0].frame}
-        # All cameras of a pose are of one moment.
-        moments |= {LAST_MOMENT: last.view.frame for last in self._last.values()}
+        followed = [last for last in self._last.values() if last.index == images.index - 1]
+        if followed:
+            # All cameras of a pose are of one moment.
+            moments[LAST_MOMENT] = followed[0].view.frame
         recorded = {actor.track_id: actor for actor in chunk_images.removed.recorded}
         frames = sorted({source.frame for source in chunk_images.removed.unshaded})
         return pose_actors(images.chunk_scene.scene.actors, moments, recorded, frames)
@@ -287,7 +298,7 @@ class RolloutFixer:
         rows: Sequence[int],
         inputs: FixerInputs,
     ) -> FixerInputs:
-        """Puts the last fixed image before the warped source images, where it shows a point."""
+        """Puts the last fixed image behind the warped source images, where none of them shows a point."""
         if not self._config.temporal:
             return inputs
         chunk_SE3_world = invert_se3(images.chunk_scene.chunk.world_SE3_chunk)
@@ -304,7 +315,8 @@ class RolloutFixer:
                 novel.depth[k], novel.alpha[k], view.chunk_SE3_camera, view.lens, moving, THIS_MOMENT
             )
             sampled, visible = sample_source(surface, source, moving, THIS_MOMENT)
-            color[j] = torch.where(visible, sampled, color[j])
+            # Behind and not before them: an image that is resampled from pose to pose would blur ever more.
+            color[j] = torch.where(visible & (mask[j, 0] < 0.5), sampled, color[j])
             mask[j] = torch.maximum(mask[j], visible[None].to(mask))
         return replace(inputs, warped=color, warp_mask=mask)
 
@@ -319,7 +331,16 @@ class RolloutFixer:
         )
 
 
-def _blank(novel: NovelViews, area: UncoveredArea) -> NovelViews:
-    """The views without what the render shows in an area: the fixer fills it from LiDAR, images and surroundings."""
-    keep = (~area.both).to(novel.alpha)
-    return replace(novel, color=novel.color * keep[..., None], alpha=novel.alpha * keep, depth=novel.depth * keep)
+def _paste(novel: NovelViews, area: UncoveredArea, repaired: Render) -> NovelViews:
+    """The views with what another render shows in an area."""
+    both = area.both
+    color = repaired.color.clamp(0, 1)
+    # LiDAR points take their colours from images: where these show a shadow, so does the map.
+    lidar_color = color * novel.lidar_alpha[..., None]
+    return replace(
+        novel,
+        lidar_color=torch.where(both[..., None], lidar_color, novel.lidar_color),
+        color=torch.where(both[..., None], color, novel.color),
+        alpha=torch.where(both, repaired.alpha, novel.alpha),
+        depth=torch.where(both, repaired.expected_depth(), novel.depth),
+    )

@@ -119,7 +119,7 @@ def measure_clearance(survey: RunSurvey, track: Track) -> float:
     Returns:
         Metres, the median over its path, limited to half a metre; negative below the ground.
     """
-    bottom = track.world_SE3_box[:, :3, 3] - track.world_SE3_box[:, :3, 2] * (track.size_m[2] / 2)
+    bottom = track.bottoms
     # A few places suffice for a median.
     places = bottom[:: max(1, len(bottom) // 10)]
     height, _ = survey.ground.measure(places[:, :2])

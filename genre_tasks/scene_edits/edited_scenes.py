@@ -74,15 +74,16 @@ class EditedScenes:
     """
 
     def __init__(self, source: SceneSource, edits: EditList, library: ActorLibrary, config: SimulateConfig) -> None:
+        self.edits: EditList = edits
+        self._source: SceneSource = source
         if isinstance(source, EditedScenes):
-            edits = source.edits + edits
-            source = source._source
-        self.edits = edits
-        self._source = source
+            # Applied together: what was moved away and is moved back now is where it was, to the bit.
+            self.edits = source.edits + edits
+            self._source = source._source
         self._library = library
         self._config = config
-        self._survey = survey_run(source)
-        self._edit_numbers = {id(edit): k for k, edit in enumerate(edits.edits, start=1)}
+        self._survey = survey_run(self._source)
+        self._edit_numbers = {id(edit): k for k, edit in enumerate(self.edits.edits, start=1)}
         inserts = self._name_inserts()
         self.names = {**self._survey.names, **{name: name for name in inserts}}
         changes = self._combine()
@@ -131,9 +132,8 @@ class EditedScenes:
                 placed.append(actor)
                 recorded = base.chunk.actors[k]
                 # An actor that no edit names keeps its very arrays.
-                is_same = actor.node is node
-                pose = {"frames": actor.node.frames, "chunk_SE3_box": actor.node.chunk_SE3_box}
-                actors.append(recorded if is_same else replace(recorded, **pose))
+                changed = replace(recorded, frames=actor.node.frames, chunk_SE3_box=actor.node.chunk_SE3_box)
+                actors.append(recorded if actor.node is node else changed)
         for actor, points in new:
             placed.append(actor)
             node = actor.node

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -28,13 +27,6 @@ _PRIOR_WEIGHT = 0.02
 _MAX_SLOPE = 0.3
 
 
-class Footprint(Protocol):
-    """What stands on the ground: boxes of an actor."""
-
-    size_m: tuple[float, float, float]
-    world_SE3_box: Float64
-
-
 @dataclass(frozen=True)
 class Ground:
     """The ground of a run, in world coordinates.
@@ -48,17 +40,16 @@ class Ground:
     anchors: Float64
 
     @staticmethod
-    def from_points(points: Float64, path: EgoPath, tracks: Sequence[Footprint]) -> Ground:
+    def from_points(points: Float64, path: EgoPath, bottoms: Sequence[Float64]) -> Ground:
         """Gathers what is known of the ground.
 
         Args:
             points: [P, 3] points of the background in world coordinates.
             path: the recorded path of the ego vehicle.
-            tracks: with their boxes in world coordinates.
+            bottoms: for each actor the middles of its box's lower face [F, 3] in world coordinates.
         """
         cells = thin_ground_points(points)
         ego = path.world_SE3_ego[:, :3, 3]
-        bottoms = [t.world_SE3_box[:, :3, 3] - t.world_SE3_box[:, :3, 2] * (t.size_m[2] / 2) for t in tracks]
         under_ego = ego - [0.0, 0.0, _measure_ego_height(cells, ego, bottoms)]
         return Ground(cells, np.concatenate([under_ego, *bottoms]))
 

@@ -40,6 +40,13 @@ class Track:
     world_SE3_box: Float64
     gaussians: Mapping[int, int]
 
+    @property
+    def bottoms(self) -> Float64:
+        """[F, 3] the middle of the box's lower face."""
+        return np.asarray(
+            self.world_SE3_box[:, :3, 3] - self.world_SE3_box[:, :3, 2] * (self.size_m[2] / 2), np.float64
+        )
+
 
 @dataclass(frozen=True)
 class RunSurvey:
@@ -108,7 +115,7 @@ def survey_run(source: SceneSource) -> RunSurvey:
         names = {track_id: name for track_id, name in source.names.items() if track_id in tracks}
     else:
         names = number_tracks((int(t.frames[0]), t.track_id, t.label) for t in tracks.values())
-    ground = Ground.from_points(np.concatenate(points), path, list(tracks.values()))
+    ground = Ground.from_points(np.concatenate(points), path, [track.bottoms for track in tracks.values()])
     return RunSurvey(tracks, names, path, float(np.median(steps)), frames, ground)
 
 

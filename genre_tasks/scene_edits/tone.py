@@ -48,7 +48,7 @@ def measure_road_color(chunk_scene: ChunkScene, ground: Ground) -> Float64 | Non
     # In the ground plane alone: the ego vehicle's origin is on its roof.
     level = chunk_scene.chunk.chunk_SE3_ego.copy()
     level[:, 2, 3] = 0.0
-    rows = rows[distance_to_path(means * np.float32([1, 1, 0]), level) < _NEAR_PATH_M]
+    rows = rows[distance_to_path(means * np.array([1, 1, 0], np.float32), level) < _NEAR_PATH_M]
     # Evenly thinned: a median needs no more, and the ground is fitted at every place.
     rows = rows[:: max(1, len(rows) // _MAX_COUNT)]
     if not len(rows):

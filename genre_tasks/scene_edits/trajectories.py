@@ -79,7 +79,7 @@ def change_trajectory(
         reference = poses
         moments = recorded.shape_frames
     else:
-        moments = frames - delay
+        moments = np.asarray(frames - delay, np.float64)
         if change.speed_factor != 1:
             moments = _scale_progress(recorded, moments, float(change.speed_factor), frame_s)
         reference = np.stack(

@@ -1,0 +1,82 @@
+"""Marks: lateral distance, how far ahead, and what lies outside of the reliable range and the recording."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from genre_tasks.config.simulation_sections import SimulateConfig
+from genre_tasks.ego_paths.behaviours import plan_behaviour
+from genre_tasks.ego_paths.ego_path import EgoPath
+from genre_tasks.ego_paths.path_marks import mark_path
+from genre_tasks.ego_paths.relative_path import place_relative_path
+from genre_tasks.errors import InputError
+from tests.ego_paths.drives import drive, straight, yaw_of
+
+CONFIG = SimulateConfig()
+CURVE = drive(40, lambda t: np.full_like(t, 8.0), lambda s: np.full_like(s, 0.04), jitter_m=0.003)
+
+
+def test_the_recorded_path_is_on_itself() -> None:
+    marks = mark_path(CURVE, CURVE, 0.5, 0.5)
+    assert np.abs(marks.lateral_m).max() < 0.05
+    assert np.abs(marks.ahead_m).max() < 0.05
+    assert marks.reliable.all()
+    assert not marks.outside_recording.any()
+
+
+def test_a_lane_change_leaves_the_reliable_range_on_its_side() -> None:
+    path = plan_behaviour("lane-change", CURVE, CONFIG, start_offset_m=0.0)
+    marks = mark_path(path, CURVE, left_m=2.0, right_m=9.0)
+    assert marks.lateral_m[[0, -1]] == pytest.approx([0.0, 3.5], abs=0.01)
+    assert np.array_equal(marks.reliable, marks.lateral_m <= 2.0)
+    assert 0 < marks.reliable.sum() < 40
+    assert np.abs(marks.ahead_m).max() < 0.05
+    assert mark_path(path, CURVE, left_m=4.0, right_m=0.0).reliable[1:].all()
+
+
+def test_braking_falls_behind_and_accelerating_leaves_the_recording() -> None:
+    recorded = straight(40, 8.0)
+    behind = mark_path(plan_behaviour("brake", recorded, CONFIG, start_offset_m=-3.0), recorded, 2.0, 2.0)
+    assert behind.ahead_m[-1] == pytest.approx(-(8.0 * 3.9 - 8.0 * 8.0 / 8.0), abs=1.5)
+    assert not behind.outside_recording.any()
+    assert not behind.reliable.any()
+    ahead = mark_path(plan_behaviour("accelerate", recorded, CONFIG, start_offset_m=0.0), recorded, 2.0, 2.0)
+    assert ahead.ahead_m[-1] == pytest.approx(0.5 * 2.5 * 3.9**2, rel=0.05)
+    passed = ahead.ahead_m + 0.8 * np.arange(40) > 8.0 * 3.9 + 0.3
+    assert np.array_equal(ahead.outside_recording, passed)
+    assert ahead.outside_recording.sum() > 5
+
+
+def test_before_the_first_pose_is_outside_of_the_recording() -> None:
+    recorded = straight(20, 8.0)
+    early = EgoPath(recorded.times_s, recorded.frames, recorded.world_SE3_ego.copy())
+    early.world_SE3_ego[:, 0, 3] -= 2.0
+    marks = mark_path(early, recorded, 1.0, 1.0)
+    assert marks.ahead_m == pytest.approx(np.full(20, -2.0), abs=0.01)
+    assert np.array_equal(marks.outside_recording, recorded.world_SE3_ego[:, 0, 3] < 1.7)
+
+
+def test_a_relative_path_has_the_marks_that_it_was_stated_with() -> None:
+    frames = np.arange(5.0, 30.0, 0.5)
+    lateral = 2.0 * np.sin(frames / 8)
+    ahead = -0.1 * (frames - 5)
+    path = place_relative_path(CURVE, frames * 0.1, frames, lateral, ahead)
+    marks = mark_path(path, CURVE, 9.0, 9.0)
+    assert path.times_s[0] == 0.0
+    assert marks.lateral_m == pytest.approx(lateral, abs=0.01)
+    assert marks.ahead_m == pytest.approx(ahead, abs=0.02)
+    steps = np.diff(path.world_SE3_ego[:, :2, 3], axis=0)
+    driven = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+    yaw = yaw_of(path)
+    assert np.abs(driven - 0.5 * (yaw[1:] + yaw[:-1])).max() < 0.03
+
+
+@pytest.mark.parametrize(
+    ("lateral_m", "ahead_m", "problem"),
+    [(0.0, -6.0, r"pose 0 of the path is 6\.0 m before the first"), (26.0, 0.0, "past the centre of the curve")],
+)
+def test_relative_paths_that_have_no_place_are_refused(lateral_m: float, ahead_m: float, problem: str) -> None:
+    frames = np.arange(20.0)
+    with pytest.raises(InputError, match=problem):
+        place_relative_path(CURVE, 0.1 * frames, frames, np.full(20, lateral_m), np.full(20, ahead_m))

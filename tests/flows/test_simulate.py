@@ -1,0 +1,174 @@
+"""Simulations of a tiny run: the folder, its manifest, the cache, hand-over, and one clear error for each mistake."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from flows.simulation import simulate as simulate_module
+from flows.simulation.edit_file import parse_edit_options
+from flows.simulation.request import SimulationRequest
+from flows.simulation.rollout_metrics import METRICS_FILE
+from flows.simulation.run_scenes import RunScenes
+from flows.simulation.simulate import simulate_run
+from genre_tasks.ego_paths.recorded_path import join_recorded_path
+from genre_tasks.errors import ConfigError, GenreError, InputError
+from genre_tasks.rollout.handover import plan_handovers
+from genre_tasks.rollout.render_rollout import render_rollout
+from genre_tasks.rollout.rig import estimate_rig
+from genre_tasks.scene_edits.actor_names import name_actors
+from storage.files import digest_file
+from storage.manifest import MANIFEST, parse_manifest
+from tests.flows.small_simulation import make_run
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> SimulationRequest:
+    """The recorded path of a run of two chunks."""
+    folder = tmp_path_factory.mktemp("simulate")
+    return SimulationRequest(
+        store=str(folder), run=make_run(folder), out=folder / "unused", mark_range=False, allow_collision=True
+    )
+
+
+def test_a_simulation_is_complete_and_found_again(recorded: SimulationRequest, tmp_path: Path) -> None:
+    out = tmp_path / "rollouts" / "recorded"
+    request = replace(recorded, out=out, exr=True, png=True, sensors=("rgb", "depth"))
+    record = simulate_run(request)
+    assert not record["cached"] and record["metrics"]["poses"] == 12
+    manifest = parse_manifest((out / MANIFEST).read_bytes(), out / MANIFEST)
+    assert {entry.path: entry.sha256 for entry in manifest.files} == {
+        path.relative_to(out).as_posix(): digest_file(path)
+        for path in out.rglob("*")
+        if path.is_file() and path.name != MANIFEST
+    }
+    cameras = record["metrics"]["cameras"]
+    for camera in cameras:
+        film = imageio.imread(out / f"{camera}.mp4")
+        image = imageio.imread(out / camera / "000003.png")
+        assert film.shape == (12, 36, 64, 3)
+        # The film shows the image, as far as its quality allows; a shift of colours would be more.
+        assert np.abs(film[3].astype(float) - image).mean() < 4
+        assert (out / camera / "000011.exr").is_file() and (out / "depth" / camera / "000000.exr").is_file()
+    poses = pq.read_table(out / "poses.parquet").to_pydict()
+    assert poses["frame"] == list(range(12)) and poses["chunk"][0] == 0 and poses["chunk"][-1] == 1
+    assert np.allclose(poses["time_s"], np.arange(12) * 0.1, atol=1e-3) and poses["reliable"] == [None] * 12
+    assert json.loads((out / METRICS_FILE).read_text())["handovers"][0]["seam_psnr_db"] > 10
+    assert [path.name for path in out.parent.iterdir()] == ["recorded"]
+    # The same request is answered by the folder, a damaged one is not.
+    assert simulate_run(request) == {**record, "cached": True}
+    (out / f"{cameras[0]}.mp4").write_bytes(b"damaged")
+    with pytest.raises(ConfigError, match="damaged rollout"):
+        simulate_run(request)
+    again = simulate_run(replace(request, overwrite=True))
+    assert again["key"] == record["key"]
+    assert parse_manifest((out / MANIFEST).read_bytes(), out).payload_digest == manifest.payload_digest
+
+
+def test_the_poses_of_a_simulation_are_a_path(recorded: SimulationRequest, tmp_path: Path) -> None:
+    aside = replace(recorded, out=tmp_path / "a", behaviour="recorded", start_offset_m=1.0, cameras=("front_camera",))
+    simulate_run(aside)
+    first = pq.read_table(tmp_path / "a" / "poses.parquet")
+    read = replace(recorded, out=tmp_path / "b", path_file=tmp_path / "a" / "poses.parquet", cameras=("front_camera",))
+    simulate_run(read)
+    second = pq.read_table(tmp_path / "b" / "poses.parquet")
+    assert np.allclose(first["lateral_m"], 1.0, atol=0.1)
+    for name in ("x", "y", "qw", "qz", "time_s"):
+        assert np.allclose(first[name], second[name], atol=1e-6)
+
+
+def test_a_hand_over_spreads_the_seam(recorded: SimulationRequest) -> None:
+    scenes = RunScenes(recorded.store, recorded.run)
+    chunks = [scenes.load(number).chunk for number in scenes.chunk_numbers]
+    rig = estimate_rig(chunks)
+    path = join_recorded_path(chunks)
+    handovers = plan_handovers(scenes, path, rig, 4)
+    cut = plan_handovers(scenes, path, rig, 0)
+    assert handovers[0].end_frame - handovers[0].start_frame == 4
+    faded = list(render_rollout(scenes, path, rig, handovers=handovers))
+    jumped = list(render_rollout(scenes, path, rig, handovers=cut))
+    weights = {images.index: images.blend_weight for images in faded if images.blended_chunk is not None}
+    assert len(weights) == 4 and max(weights.values()) <= 0.5
+    assert all(images.blended_chunk is None for images in jumped)
+    # Outside of the fade nothing changes.
+    for index in set(range(12)) - set(weights) - {5, 6}:
+        assert np.array_equal(faded[index].color, jumped[index].color)
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "words"),
+    [
+        ({"behaviour": "brakes"}, ConfigError, "Did you mean 'brake'"),
+        ({"cameras": ("front_camra",)}, InputError, "Did you mean 'front_camera'"),
+        ({"run": "zzz"}, InputError, "0 runs"),
+        ({"chunks": (7,)}, InputError, "no chunk 7"),
+        ({"sensors": ("radar",)}, ConfigError, "no sensor is called 'radar'"),
+        ({"behaviour": "brake", "path_file": Path("x.json")}, ConfigError, "both say how to drive"),
+        ({"path_file": Path("nowhere.json")}, InputError, "no such file"),
+        ({"strength": 2.0}, ConfigError, "those of a behaviour"),
+        ({"settings": ("simulate.handover=2",)}, ConfigError, "handover"),
+    ],
+)
+def test_mistakes_are_named(
+    recorded: SimulationRequest, tmp_path: Path, change: dict[str, object], kind: type[GenreError], words: str
+) -> None:
+    with pytest.raises(kind, match=words):
+        simulate_run(replace(recorded, out=tmp_path / "out", **change))  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_path_without_poses_is_refused(recorded: SimulationRequest, tmp_path: Path) -> None:
+    file = tmp_path / "empty.json"
+    file.write_text("[]")
+    with pytest.raises(InputError, match="without frames"):
+        simulate_run(replace(recorded, out=tmp_path / "out", path_file=file))
+
+
+def test_foreign_files_are_never_replaced(recorded: SimulationRequest, tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("years of work")
+    with pytest.raises(InputError, match="no rollout's"):
+        simulate_run(replace(recorded, out=tmp_path, overwrite=True))
+    assert (tmp_path / "thesis.txt").read_text() == "years of work"
+
+
+def test_an_interrupted_simulation_leaves_nothing(
+    recorded: SimulationRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class StoppedError(BaseException):
+        pass
+
+    def stop(done: int, total: int, note: str = "") -> None:
+        if done == 3:
+            raise StoppedError
+
+    with pytest.raises(StoppedError):
+        simulate_run(replace(recorded, out=tmp_path / "out"), stop)
+    assert not list(tmp_path.iterdir())
+
+    def fail(*args: object) -> None:
+        raise OSError(28, "No space left on device", "metrics.json")
+
+    # The same at the very end, when films are complete already.
+    monkeypatch.setattr(simulate_module, "write_metrics", fail)
+    with pytest.raises(OSError, match="No space"):
+        simulate_run(replace(recorded, out=tmp_path / "out", cameras=("front_camera",)))
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_a_removed_actor_hid_is_in_the_output(recorded: SimulationRequest, tmp_path: Path) -> None:
+    name = name_actors(RunScenes(recorded.store, recorded.run))["car-0"]
+    edits = parse_edit_options(remove=[name])
+    out = tmp_path / "out"
+    record = simulate_run(replace(recorded, out=out, edits=edits, cameras=("front_camera",), chunks=(0,)))
+    masks = [imageio.imread(out / "filled" / "front_camera" / f"{index:06d}.png") for index in range(6)]
+    assert all(mask.shape == (36, 64) and set(np.unique(mask)) <= {0, 255} for mask in masks)
+    plain = simulate_run(replace(recorded, out=tmp_path / "plain", cameras=("front_camera",), chunks=(0,)))
+    assert plain["key"] != record["key"]
+    with pytest.raises(InputError, match="no actor"):
+        simulate_run(replace(recorded, out=tmp_path / "none", edits=parse_edit_options(remove=["car-99"])))

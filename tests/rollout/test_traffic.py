@@ -1,0 +1,117 @@
+"""Traffic over the border of two chunks: tracks go on, looks and coordinates stay right, no actor doubles."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from genre_tasks.ego_paths.ego_path import EgoPath
+from genre_tasks.rollout.chunk_layout import ChunkLayout
+from genre_tasks.rollout.handover import Handover
+from genre_tasks.rollout.traffic import compose_scene, extend_traffic
+from genre_tasks.scene.actor_node import ActorNode
+from genre_tasks.scene.chunk import Actor, Chunk, Points
+from genre_tasks.scene.deformation import NODES, Deformation
+from genre_tasks.scene.gaussians import Gaussians
+from genre_tasks.scene.graph import FIRST_ACTOR, SceneGraph
+from genre_tasks.scene_edits.chunk_scene import ChunkScene
+
+NO_POINTS = Points(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, bool), np.zeros(0, np.int16))
+
+
+def drive(frames: range, origin: float) -> np.ndarray:
+    """Boxes that are at x = frame in the world, in coordinates of a chunk."""
+    poses = np.tile(np.eye(4), (len(frames), 1, 1))
+    poses[:, 0, 3] = np.array(frames) - origin
+    return poses
+
+
+def chunk_scene(index: int, frames: range, origin: float, names: str, sh_count: int | None) -> ChunkScene:
+    """Two static Gaussians, one distant one, and one for each actor, whose red is the chunk's number."""
+    nodes = torch.tensor([0, 0, 1, *(FIRST_ACTOR + k for k in range(len(names)))])
+    packed = torch.zeros(len(nodes), 14)
+    packed[:, 6] = 1.0
+    packed[:, 11] = float(index)
+    tracks = [(name, np.array(frames), drive(frames, origin)) for name in names]
+    actors = tuple(ActorNode(name, "car", (4.0, 2.0, 1.5), f, p) for name, f, p in tracks)
+    world_SE3_chunk = np.eye(4)
+    world_SE3_chunk[0, 3] = origin
+    deformation = Deformation.zero(actors, (0,), tuple(frames))
+    deformation = deformation.with_offsets(torch.full((1, len(frames), NODES, 3), float(index + 1)))
+    chunk = Chunk(
+        dataset="test",
+        log="test",
+        index=index,
+        frames=tuple(frames),
+        camera_names=(),
+        width_px=64,
+        height_px=36,
+        world_SE3_chunk=world_SE3_chunk,
+        chunk_SE3_ego=drive(frames, origin),
+        views=(),
+        static=NO_POINTS,
+        actors=tuple(Actor(name, "car", (4.0, 2.0, 1.5), f, p, NO_POINTS) for name, f, p in tracks),
+        log_issues=(),
+    )
+    harmonics = None if sh_count is None else torch.full((len(nodes), sh_count, 3), float(index + 1))
+    return ChunkScene(chunk, SceneGraph(Gaussians.unpack(packed), nodes, actors, False, deformation, harmonics))
+
+
+BEFORE = chunk_scene(0, range(0, 4), 0.0, "ab", None)
+AFTER = chunk_scene(1, range(4, 8), 5.0, "cb", 3)
+
+
+def test_actors_drive_on_over_the_border() -> None:
+    extended = extend_traffic(BEFORE, AFTER)
+    scene = extended.scene
+    assert [actor.track_id for actor in scene.actors] == ["a", "b", "c"]
+    assert [actor.track_id for actor in extended.chunk.actors] == ["a", "b", "c"]
+    a, b, c = scene.actors
+    assert list(a.frames) == [0, 1, 2, 3] and list(b.frames) == list(range(8)) and list(c.frames) == [4, 5, 6, 7]
+    # In coordinates of the first chunk, without a step where the second one takes over.
+    assert np.allclose(b.chunk_SE3_box[:, 0, 3], np.arange(8)) and np.allclose(
+        c.chunk_SE3_box[:, 0, 3], np.arange(4, 8)
+    )
+    # The actor of both chunks is there once, as the first chunk shows it; the new one comes with its Gaussian.
+    assert scene.nodes.tolist() == [0, 0, 1, 2, 3, 4]
+    assert scene.gaussians.colors[:, 0].tolist() == [0, 0, 0, 0, 0, 1]
+    assert scene.spherical_harmonics is not None
+    assert scene.spherical_harmonics[:, 0, 0].tolist() == [0, 0, 0, 0, 0, 2]
+
+
+def test_a_deformation_goes_with_its_actor() -> None:
+    deformation = extend_traffic(BEFORE, AFTER).scene.deformation
+    assert deformation is not None and deformation.actors == (0, 2)
+    before, after = deformation.offsets_at([6.0])[0]
+    # Actor a keeps the last offsets that it has; c has those of its own chunk.
+    assert before.unique().tolist() == [1.0] and after.unique().tolist() == [2.0]
+
+
+def test_a_background_takes_the_actors_of_another_chunk() -> None:
+    composed = compose_scene(BEFORE, AFTER)
+    assert [actor.track_id for actor in composed.scene.actors] == ["c", "b"]
+    assert composed.scene.nodes.tolist() == [0, 0, 1, 2, 3]
+    assert composed.scene.gaussians.colors[:, 0].tolist() == [0, 0, 0, 1, 1]
+    assert np.allclose(composed.scene.actors[1].chunk_SE3_box[:, 0, 3], np.arange(4, 8))
+    assert composed.chunk.world_SE3_chunk[0, 3] == 0 and composed.chunk.frames == BEFORE.chunk.frames
+    posed = composed.scene.gaussians_at(5.0)
+    assert np.allclose(posed.means[4].numpy(), [5.0, 0.0, 0.0])
+
+
+def test_a_standing_vehicle_is_at_the_place_of_its_moment() -> None:
+    positions = np.array([[0.0, 0.0], [1.0, 0.0], [1.001, 0.0], [1.0, 0.0], [2.0, 0.0]])
+    layout = ChunkLayout((0, 1), (0, 3), (2, 4), np.arange(5.0), positions)
+    # A path beside the recorded one that stands at x = 1 all the time.
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, :2, 3] = (1.0, 3.0)
+    places = layout.find_places(EgoPath(np.arange(5.0) / 10, np.arange(5.0), poses))
+    assert np.allclose(places, [1, 1, 2, 3, 3], atol=0.05)
+    assert layout.find_traffic(2) == (0,) and layout.find_traffic(2.4) == (0, 1) and layout.find_traffic(3) == (1,)
+
+
+def test_fades_of_background_and_traffic() -> None:
+    fade = Handover(before=0, after=1, border_frame=3.5, start_frame=4.0, end_frame=6.0)
+    assert [fade.weigh(place) for place in (3, 4.5, 6)] == [0, 0.25, 1]
+    assert [fade.weigh_traffic(frame) for frame in (2, 3, 3.5, 5)] == [0, 0.25, 0.5, 1]
+    cut = Handover(before=0, after=1, border_frame=3.5, start_frame=3.5, end_frame=3.5)
+    assert [cut.weigh(place) for place in (3, 4)] == [0, 1]
