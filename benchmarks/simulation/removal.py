@@ -24,14 +24,18 @@ from benchmarks.simulation.scenes import (
     source_views,
     truth_view,
 )
+from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.logs.synthetic.edited_truth import EditedStreet, find_changed_pixels
 from genre_tasks.logs.synthetic.traffic_edits import build_street_layout, remove_actor
 from genre_tasks.logs.types import Float32
 from genre_tasks.render import render_views
+from genre_tasks.rollout.fix_rollout import RolloutFixer
+from genre_tasks.rollout.render_rollout import RolloutImages, render_rollout
 from genre_tasks.rollout.rig import RolloutView
 from genre_tasks.scene.graph import FIRST_ACTOR, SceneGraph
 from genre_tasks.scene_edits.chunk_scene import SceneSource
 from genre_tasks.scene_edits.edits import Remove
+from genre_tasks.stages.fnet import load_configured_fnet
 
 LEAST_ACTORS = 3
 MOST_ACTORS = 4
@@ -61,6 +65,25 @@ class ChosenView:
     area: float
 
 
+@dataclass(frozen=True)
+class _Removal:
+    """A removed actor.
+
+    Attributes:
+        name: its track id.
+        edited: the scenes without it.
+        before: the true street with it.
+        after: the true street without it.
+        fixer: fills what it hid.
+    """
+
+    name: str
+    edited: SceneSource
+    before: EditedStreet
+    after: EditedStreet
+    fixer: RolloutFixer
+
+
 def measure_removal(case: SimulationCase) -> Row:
     """Removes the actors of a street that cover most of the images, one at a time.
 
@@ -81,11 +104,16 @@ def measure_removal(case: SimulationCase) -> Row:
     chosen = choose_views(scenes, before)
     if len(chosen) < LEAST_ACTORS:
         raise NotMeasuredError(f"{len(chosen)} moving actors are large enough in the images, {LEAST_ACTORS} are needed")
+    config = scenes.config
+    network = load_configured_fnet(config.fnet)
     actors = []
     for name, views in chosen.items():
         after = EditedStreet(street, remove_actor(layout, name))
         edited = edit_scenes(scenes, Remove(actor=scenes.names[name]))
-        found = [_measure_view(scenes, edited, before, after, name, view) for view in views]
+        # One for each actor: it remembers what recorded images show without it.
+        fixer = RolloutFixer(config.fnet, scenes.source, config.novel_views.lidar_max_points, network)
+        removal = _Removal(name, edited, before, after, fixer)
+        found = [_measure_view(scenes, removal, view) for view in views]
         actors.append({"actor": name, "views": found})
     return {"log": case.log, "chunks": list(case.chunks), "actors": actors}
 
@@ -124,35 +152,47 @@ def _spread(views: Sequence[ChosenView]) -> list[ChosenView]:
     return out
 
 
-def _measure_view(
-    scenes: LogScenes, edited: SceneSource, before: EditedStreet, after: EditedStreet, name: str, chosen: ChosenView
-) -> Row:
+def _measure_view(scenes: LogScenes, removal: _Removal, chosen: ChosenView) -> Row:
     """Measures one view with and without an actor."""
     recorded = scenes.source.load(chosen.chunk)
     view = truth_view(recorded.chunk, chosen.view.frame, chosen.view.chunk_SE3_camera, chosen.view.lens)
     image_before = render_image(recorded.scene, chosen.view)
-    image_after = render_image(edited.load(chosen.chunk).scene, chosen.view)
-    truth = after.image(view).astype(np.float32) / np.float32(255)
-    covered = before.mask_actors(view, [name])
-    points, is_still = after.find_background(view)
-    was_recorded = before.find_recorded_points(points, source_views(recorded.chunk))
-    error = np.square(image_after - truth).mean(2)
-    change = np.abs(image_after - image_before).max(2) * 255
-    weight = render_actor_weight(recorded.scene, name, chosen.view)
-    shadow = find_changed_pixels(before, after, view)
+    images = _render_without(scenes, removal, chosen)
+    rendered = images.color[0].numpy()
+    filled = removal.fixer.fill(images).color[0].numpy()
+    truth = removal.after.image(view).astype(np.float32) / np.float32(255)
+    covered = removal.before.mask_actors(view, [removal.name])
+    points, is_still = removal.after.find_background(view)
+    was_recorded = removal.before.find_recorded_points(points, source_views(recorded.chunk))
+    weight = render_actor_weight(recorded.scene, removal.name, chosen.view)
+    shadow = find_changed_pixels(removal.before, removal.after, view)
     near = ndimage.binary_dilation(covered | shadow, iterations=_RIM_PX)
-    return {
-        "camera": chosen.view.camera,
-        "frame": chosen.view.frame,
-        "area": float(covered.mean()),
-        "recorded": _sum_errors(error, covered & is_still & was_recorded),
-        "never_recorded": _sum_errors(error, covered & is_still & ~was_recorded),
-        # Without it a lower number of the removal could be the scene's fault.
-        "around": _sum_errors(error, ndimage.binary_dilation(covered, iterations=10) & ~near),
-        "change_outside": float(change[~(covered | shadow | (weight > 0))].max(initial=0.0)),
-        "change_off_rim": float(change[~near].max(initial=0.0)),
-        "share_changed_off_rim": float((change[~near] > MOST_CHANGE).mean()),
+    outside = ~(covered | shadow | (weight > 0))
+    areas = {
+        "recorded": covered & is_still & was_recorded,
+        "never_recorded": covered & is_still & ~was_recorded,
+        # Without it a low number of the removal could be the scene's fault.
+        "around": ndimage.binary_dilation(covered, iterations=10) & ~near,
     }
+    row: Row = {"camera": chosen.view.camera, "frame": chosen.view.frame, "area": float(covered.mean())}
+    for version, image in (("filled", filled), ("rendered", rendered)):
+        error = np.square(image - truth).mean(2)
+        change = np.abs(image - image_before).max(2) * 255
+        row[version] = {name: _sum_errors(error, area) for name, area in areas.items()} | {
+            "change_outside": float(change[outside].max(initial=0.0)),
+            "share_changed_off_rim": float((change[~near] > MOST_CHANGE).mean()),
+        }
+    return row
+
+
+def _render_without(scenes: LogScenes, removal: _Removal, chosen: ChosenView) -> RolloutImages:
+    """The rollout's images of one camera at one recorded pose, without the actor."""
+    chunk = scenes.source.load(chosen.chunk).chunk
+    frame = int(chosen.view.frame)
+    pose = chunk.world_SE3_chunk @ chunk.chunk_SE3_ego[chunk.frames.index(frame)]
+    path = EgoPath(np.zeros(1), np.array([float(frame)]), pose[None])
+    rig = [camera for camera in scenes.rig if camera.name == chosen.view.camera]
+    return next(iter(render_rollout(removal.edited, path, rig)))
 
 
 def render_image(scene: SceneGraph, view: RolloutView) -> Float32:
@@ -214,6 +254,8 @@ def pool_psnr(parts: Sequence[Row]) -> float | None:
 def removal_claims(rows: Sequence[Row]) -> Iterator[Claim]:
     """Claims that removed actors leave what was behind them, and nothing else changes.
 
+    They are about images as ``genre simulate --remove`` makes them, with what was hidden filled by FNet.
+
     Args:
         rows: see :func:`measure_removal`.
     """
@@ -221,7 +263,7 @@ def removal_claims(rows: Sequence[Row]) -> Iterator[Claim]:
     views = [view for actor in actors for view in actor["views"]]
     streets = ", ".join(log_label(row) for row in rows) or "no street"
     data = f"{len(actors)} actors in {len(views)} views; {streets}"
-    found = [pool_psnr([view["recorded"] for view in actor["views"]]) for actor in actors]
+    found = [pool_psnr([view["filled"]["recorded"] for view in actor["views"]]) for actor in actors]
     values = [value for value in found if value is not None]
     quartiles = Quartiles.from_values(values) if values else None
     note = f"PSNR in an actor's pixels where another frame saw what is behind, the median actor; {data}"
@@ -230,7 +272,7 @@ def removal_claims(rows: Sequence[Row]) -> Iterator[Claim]:
     yield claim("simulation.removal_psnr", median, ">=", LEAST_PSNR, "dB", note, len(values), spread)
     note = f"the same, the worst actor; {data}"
     yield claim("simulation.removal_psnr_worst", min(values, default=None), ">=", LEAST_PSNR, "dB", note, len(values))
-    change = max((view["change_outside"] for view in views), default=None)
+    change = max((view["filled"]["change_outside"] for view in views), default=None)
     note = f"largest change of a pixel outside the actor's true and rendered pixels and its shadow; {data}"
     yield claim("simulation.removal_outside", change, "<=", MOST_CHANGE, "of 255", note, len(views))
 
@@ -242,29 +284,34 @@ def removal_table(rows: Sequence[Row]) -> Iterator[str]:
         rows: see :func:`measure_removal`.
     """
     yield (
-        "| log | removed actor | views | covers at most | PSNR where recorded, dB | pixels | where never recorded, dB "
-        "| pixels | around it, dB | change outside, of 255 | changed beyond the rim |"
+        "| log | removed actor | views | covers at most | images | PSNR where recorded, dB | pixels "
+        "| where never recorded, dB | pixels | around it, dB | change outside, of 255 | changed beyond the rim |"
     )
-    yield "|---|---|---|---|---|---|---|---|---|---|---|"
+    yield "|---|---|---|---|---|---|---|---|---|---|---|---|"
     for row in rows:
         for actor in row["actors"]:
-            views = actor["views"]
-            parts = {name: [view[name] for view in views] for name in ("recorded", "never_recorded", "around")}
-            pixels = {name: sum(part["pixels"] for part in found) for name, found in parts.items()}
-            columns = (
-                log_label(row),
-                actor["actor"],
-                str(len(views)),
-                f"{max(view['area'] for view in views):.1%}",
-                _format_db(pool_psnr(parts["recorded"])),
-                str(pixels["recorded"]),
-                _format_db(pool_psnr(parts["never_recorded"])),
-                str(pixels["never_recorded"]),
-                _format_db(pool_psnr(parts["around"])),
-                f"{max(view['change_outside'] for view in views):.2f}",
-                f"{max(view['share_changed_off_rim'] for view in views):.2%}",
-            )
-            yield f"| {' | '.join(columns)} |"
+            for version in ("filled", "rendered"):
+                yield f"| {' | '.join(_describe_actor(row, actor, version))} |"
+
+
+def _describe_actor(row: Row, actor: Row, version: str) -> tuple[str, ...]:
+    views = [view[version] for view in actor["views"]]
+    parts = {name: [view[name] for view in views] for name in ("recorded", "never_recorded", "around")}
+    pixels = {name: str(sum(part["pixels"] for part in found)) for name, found in parts.items()}
+    return (
+        log_label(row),
+        actor["actor"],
+        str(len(views)),
+        f"{max(view['area'] for view in actor['views']):.1%}",
+        version,
+        _format_db(pool_psnr(parts["recorded"])),
+        pixels["recorded"],
+        _format_db(pool_psnr(parts["never_recorded"])),
+        pixels["never_recorded"],
+        _format_db(pool_psnr(parts["around"])),
+        f"{max(view['change_outside'] for view in views):.2f}",
+        f"{max(view['share_changed_off_rim'] for view in views):.2%}",
+    )
 
 
 def _format_db(value: float | None) -> str:
