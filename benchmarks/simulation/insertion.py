@@ -40,7 +40,7 @@ from genre_tasks.scene_edits.edits import Edit, Insert, Move, Remove
 LEAST_ACTORS = 3
 MOST_ACTORS = 3
 _COPY = "copy"
-_AHEAD_M = 14.0
+_AHEAD_M = 20.0
 # Three views on the way towards it.
 _STEPS = (1, 6, 11)
 _LEAST_GAUSSIANS = 100
