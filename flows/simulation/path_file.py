@@ -36,8 +36,11 @@ from genre_tasks.suggestions import did_you_mean
 POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 RELATIVE_COLUMNS = ("lateral_m", "ahead_m")
 TIME_COLUMNS = ("time_s", "frame")
-ROLLOUT_COLUMNS = ("index", "reliable", "outside_recording", "chunk", "blended_chunk", "blend_weight", "collision")
-"""What a rollout writes next to its poses; it is not read, since it is found again for any path."""
+MARK_COLUMNS = (
+    *("index", "reliable", "outside_recording"),
+    *("chunk", "blended_chunk", "blend_weight", "collision"),
+)
+"""What a rollout writes next to its poses; a path that is read has marks of its own."""
 
 _COLUMNS = (*TIME_COLUMNS, *POSE_COLUMNS, *RELATIVE_COLUMNS)
 _LEAST_STEP_S = 0.001
@@ -126,7 +129,7 @@ def _read_columns(path: Path) -> Mapping[str, Sequence[Any]]:
 def _check_columns(columns: Mapping[str, Sequence[Any]]) -> None:
     """Refuses unknown and missing columns."""
     for name in columns:
-        if name not in _COLUMNS and name not in ROLLOUT_COLUMNS:
+        if name not in _COLUMNS and name not in MARK_COLUMNS:
             raise InputError(f"unknown column {name!r}", remedy=did_you_mean(name, _COLUMNS) + _REMEDY)
     if not set(TIME_COLUMNS) & set(columns):
         raise InputError("the path has neither time_s nor frame", remedy=_REMEDY)
@@ -201,7 +204,7 @@ def _read_poses(numbers: Mapping[str, Float64], recorded: EgoPath) -> Float64:
     offset = positions[:, None, :2] - recorded.world_SE3_ego[:, :2, 3]
     distance = np.sqrt(np.square(offset).sum(-1).min(axis=1))
     if distance.max() > _FARTHEST_M:
-        row = int(np.argmax(distance))
+        row = int(np.argmax(distance > _FARTHEST_M))
         raise InputError(
             f"row {row} (from 0) is {distance[row] / 1000:.1f} km away from the recorded path",
             remedy="Write positions in the log's world, as the poses of a rollout are.",

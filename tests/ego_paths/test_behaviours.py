@@ -136,7 +136,7 @@ def test_lateral_behaviours_keep_within_the_bounds_without_any_smoothing(
 
 def test_standstill_moves_nothing_sideways() -> None:
     recorded = drive(110, lambda t: np.clip(2 * np.abs(t - 4) - 4, 0, 4), jitter_m=0.003)
-    path = plan("lane-change", recorded, delay_s=1.0)
+    path = plan("lane-change", recorded, delay_s=0.3)
     still = (recorded.times_s > 2.4) & (recorded.times_s < 5.6)
     assert np.ptp(position_of(path)[still, 1]) < 0.02
     assert 0.3 < position_of(path)[still, 1].mean() < 3.2
@@ -243,9 +243,7 @@ def test_a_path_without_frames_is_refused() -> None:
 
 
 def test_bounds_of_the_configuration_make_manoeuvres_longer() -> None:
-    gentle = CONFIG.model_copy(
-        update={"bounds": KinematicBounds(max_lateral_acceleration_m_s2=2.0, max_jerk_m_s3=4.0)}
-    )
+    gentle = CONFIG.model_copy(update={"bounds": KinematicBounds(max_lateral_acceleration_m_s2=2.0, max_jerk_m_s3=4.0)})
     recorded = straight(60, 8.0)
     fast = position_of(plan("lane-change", recorded))[:, 1]
     slow_path = plan_behaviour("lane-change", recorded, gentle, start_offset_m=0.0)

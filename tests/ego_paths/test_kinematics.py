@@ -46,7 +46,7 @@ def test_braking_has_its_deceleration_and_jerk() -> None:
 
 
 @pytest.mark.parametrize("jitter_m", [0.0, 0.003, 0.01])
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(
     "speed", [lambda t: np.full_like(t, 8.0), lambda t: np.clip(4 - 2 * t, 0, None), np.zeros_like, lambda t: 0.9 + t]
 )
@@ -101,4 +101,6 @@ def test_bounds_are_those_of_the_configuration() -> None:
     path = straight(20, 8.0)
     (violation,) = find_bound_violations(path, BOUNDS.model_copy(update={"max_speed_m_s": 5.0}))
     assert violation.value == pytest.approx(8.0, abs=1e-3)
-    assert str(violation) == str(replace(violation, value=8.0)) == f"speed of 8 m/s at {violation.time_s:.1f} s (bound 5)"
+    assert (
+        str(violation) == str(replace(violation, value=8.0)) == f"speed of 8 m/s at {violation.time_s:.1f} s (bound 5)"
+    )

@@ -27,7 +27,9 @@ def write(path: Path, columns: dict[str, Any]) -> Path:
     if path.suffix == ".parquet":
         pq.write_table(pa.table(columns), path)
     else:
-        path.write_text(json.dumps([dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]))
+        path.write_text(
+            json.dumps([dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)])
+        )
     return path
 
 
@@ -90,8 +92,16 @@ def _changed(**changes: Any) -> dict[str, Any]:
         (_changed(time_s=(5, 0.4)), "time_s 0.4 in row 5 (from 0) follows 0.4", "rise"),
         (_changed(frame=(5, 3.0)), "frame 3 in row 5 (from 0) follows 4", "no frame fall"),
         (_changed(frame=(5, 4.0), time_s=None), "frame 4 in row 5 (from 0) follows 4", "state time_s"),
-        (_changed(frame=(39, 40.0)), "frame 40 in row 39 (from 0) is outside of the log's frames 0 to 39", "more chunks"),
-        (_changed(time_s=(39, 4.2), frame=None), "time_s 4.2 in row 39 (from 0) is outside of the log's 0 to 3.90 s", ""),
+        (
+            _changed(frame=(39, 40.0)),
+            "frame 40 in row 39 (from 0) is outside of the log's frames 0 to 39",
+            "more chunks",
+        ),
+        (
+            _changed(time_s=(39, 4.2), frame=None),
+            "time_s 4.2 in row 39 (from 0) is outside of the log's 0 to 3.90 s",
+            "",
+        ),
         (_changed(qw=[0.0] * 40, qz=[0.0] * 40), "the quaternion in row 0 (from 0) has the length 0", "unit"),
         (_changed(x=[5e6] * 40), "row 0 (from 0) is 4999.", "the log's world"),
     ],
