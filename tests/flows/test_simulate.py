@@ -10,7 +10,10 @@ import imageio.v3 as imageio
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import typer
 
+from flows.cli.main import app
+from flows.cli.simulate_options import read_request
 from flows.simulation import simulate as simulate_module
 from flows.simulation.edit_file import parse_edit_options
 from flows.simulation.request import SimulationRequest
@@ -172,3 +175,31 @@ def test_what_a_removed_actor_hid_is_in_the_output(recorded: SimulationRequest, 
     assert plain["key"] != record["key"]
     with pytest.raises(InputError, match="no actor"):
         simulate_run(replace(recorded, out=tmp_path / "none", edits=parse_edit_options(remove=["car-99"])))
+
+
+def test_poses_are_marked_by_the_reliable_range(recorded: SimulationRequest, tmp_path: Path) -> None:
+    request = replace(recorded, out=tmp_path / "marked", mark_range=True, cameras=("front_camera",))
+    ranges = simulate_run(request)["metrics"]["ranges"]
+    assert set(ranges) == {"0", "1"} and all(side["left_m"] >= 0 for side in ranges.values())
+    assert pq.read_table(tmp_path / "marked" / "poses.parquet")["reliable"].to_pylist() == [True] * 12
+    # Kept in the run's folder: the next simulation finds it.
+    files = list(RunScenes(recorded.store, recorded.run).folder.glob("ranges/*.json"))
+    assert len(files) == 2
+    files[0].write_text(json.dumps({"left_m": 7.0, "right_m": 7.0}))
+    again = simulate_run(replace(request, out=tmp_path / "again"))
+    assert 7.0 in [side["left_m"] for side in again["metrics"]["ranges"].values()]
+
+
+@pytest.mark.parametrize(
+    ("text", "metres"), [("3", 3.0), ("3m", 3.0), ("-3m", -3.0), ("+1.5 m", 1.5), (None, None), ("3 km", "km")]
+)
+def test_start_offsets_are_metres(text: str | None, metres: float | str | None) -> None:
+    command = typer.main.get_command(app).commands["simulate"]  # type: ignore[attr-defined]
+    words = ["abc", "--out", "x", "--behaviour", "brake", *([] if text is None else [f"--start-offset={text}"])]
+    options = command.make_context("simulate", words).params
+    if isinstance(metres, str):
+        with pytest.raises(ConfigError, match=metres):
+            read_request(options)
+    else:
+        request = read_request(options)
+        assert request.start_offset_m == metres and request.sensors == ("rgb",) and request.mark_range
