@@ -20,7 +20,8 @@ _SPACING_M = 0.45
 _SPREAD = 0.9
 _THICKNESS_M = 0.01
 _ABOVE_GROUND_M = 0.04
-_INSET = 0.9
+# A little wider than the box, since what is under it is seen from the side alone.
+_EXTENT = 1.1
 _MAX_COUNT = 400
 
 
@@ -43,8 +44,8 @@ def build_contact_shadow(size_m: tuple[float, float, float], clearance_m: float,
     spacing = _SPACING_M
     # A long vehicle gets larger Gaussians, not more of them.
     spacing *= max(1.0, math.sqrt(size_m[0] * size_m[1] / (_MAX_COUNT * spacing**2)))
-    counts = [max(2, round(_INSET * size / spacing)) for size in size_m[:2]]
-    steps = [_INSET * size / count for size, count in zip(size_m, counts, strict=False)]
+    counts = [max(2, round(_EXTENT * size / spacing)) for size in size_m[:2]]
+    steps = [_EXTENT * size / count for size, count in zip(size_m, counts, strict=False)]
     axes = [(torch.arange(n, dtype=torch.float32) - (n - 1) / 2) * step for n, step in zip(counts, steps, strict=True)]
     x, y = torch.meshgrid(*axes, indexing="ij")
     scales = [_SPREAD * step for step in steps]

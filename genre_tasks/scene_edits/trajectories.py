@@ -69,8 +69,9 @@ def change_trajectory(
         The new path; its frames are some of ``run_frames``.
     """
     delay = float(change.delay_s) / frame_s
-    first = min(recorded.frames[0], np.floor(recorded.frames[0] + delay))
-    last = max(recorded.frames[-1], np.ceil(recorded.frames[-1] + delay))
+    # Rounded, since the length of a frame is measured: four frames are not to be 4.000001.
+    first = min(recorded.frames[0], np.floor(recorded.frames[0] + delay + 1e-3))
+    last = max(recorded.frames[-1], np.ceil(recorded.frames[-1] + delay - 1e-3))
     frames = recorded.frames
     if change.delay_s:
         frames = run_frames[(run_frames >= first) & (run_frames <= last)]
@@ -206,6 +207,6 @@ def _scale_progress(recorded: Trajectory, moments: Float64, factor: float, frame
 
 
 def _smooth(values: Float64) -> Float64:
-    # A moving average [F, C] whose window shrinks at both ends.
-    half = _SMOOTH_FRAMES // 2
-    return np.stack([values[max(k - half, 0) : k + half + 1].mean(0) for k in range(len(values))])
+    # A moving average [F, C]. Its window shrinks at both ends and stays symmetric, as it would bend a ramp otherwise.
+    halves = [min(_SMOOTH_FRAMES // 2, k, len(values) - 1 - k) for k in range(len(values))]
+    return np.stack([values[k - half : k + half + 1].mean(0) for k, half in enumerate(halves)])
