@@ -14,14 +14,14 @@ from genre_tasks.checks import check_finite
 from genre_tasks.config import FnetConfig
 from genre_tasks.errors import InputError
 from genre_tasks.fixer.inference import draw_noise, fix, prefers_bfloat16
-from genre_tasks.fixer.inputs import FixerInputs, build_inputs
+from genre_tasks.fixer.inputs import build_inputs
 from genre_tasks.fixer.network import Encoded, Fnet
 from genre_tasks.fixer.source_images import load_source_images
-from genre_tasks.fixer.view_surface import MIN_ALPHA, unproject_surface
-from genre_tasks.fixer.warping import SourceImage, sample_source
+from genre_tasks.fixer.view_surface import MIN_ALPHA
 from genre_tasks.render import Render, RenderSettings, render_views
 from genre_tasks.render.surface import render_surfaces
 from genre_tasks.rollout.background_repair import repair_background
+from genre_tasks.rollout.last_images import LastImages
 from genre_tasks.rollout.moment_actors import LAST_MOMENT, THIS_MOMENT, pose_actors
 from genre_tasks.rollout.removed_area import (
     RemovedActors,
@@ -30,18 +30,19 @@ from genre_tasks.rollout.removed_area import (
     separate_removed_actors,
 )
 from genre_tasks.rollout.render_rollout import RolloutImages
-from genre_tasks.rollout.rig import RolloutView
 from genre_tasks.scene.chunk import Actor, Chunk
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.lidar_map import build_lidar_scene
 from genre_tasks.scene.novel_poses import find_nearest_reference
 from genre_tasks.scene.novel_views import NovelView, NovelViews
-from genre_tasks.scene.transforms import invert_se3
 from genre_tasks.scene_edits.chunk_scene import SceneSource
 from genre_tasks.stages.fnet import load_configured_fnet
 from genre_tasks.threads import map_single_threaded
 
 DEFAULT_SETTINGS = RenderSettings()
+
+SHADOW_CONTRAST = 0.04
+"""Ground that is darker by less than that is in no shadow."""
 
 _CHUNKS_IN_MEMORY = 2
 """A rollout needs the images on both sides of a border, and no more."""
@@ -82,25 +83,6 @@ class _ChunkImages:
     latents: dict[tuple[str, int], Tensor] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class _LastImage:
-    """The fixed image of a camera at the pose before, with what hides points from it.
-
-    Attributes:
-        index: of the pose.
-        view: where the camera was.
-        world_SE3_camera: [4, 4]; the chunk may be another one by now.
-        image: [3, H, W].
-        depth: [H, W] metres, 0 where unknown.
-    """
-
-    index: int
-    view: RolloutView
-    world_SE3_camera: Tensor
-    image: Tensor
-    depth: Tensor
-
-
 class RolloutFixer:
     """Repairs the images of a rollout, pose after pose.
 
@@ -132,7 +114,7 @@ class RolloutFixer:
         self._network = load_configured_fnet(config) if network is None else network
         self._settings = settings
         self._chunks: OrderedDict[int, _ChunkImages] = OrderedDict()
-        self._last: dict[str, _LastImage] = {}
+        self._last = LastImages()
 
     @torch.no_grad()
     def fix(self, images: RolloutImages) -> FixedRolloutImages:
@@ -149,12 +131,9 @@ class RolloutFixer:
         """
         chunk_images = self._load_chunk(images)
         novel = self._render_inputs(images, chunk_images)
-        area = self._find_area(images, novel, chunk_images)
-        if bool(area.both.any()):
-            novel = _paste(novel, area, render_views(chunk_images.repaired, images.views, self._settings))
+        novel, area = self._paste_repaired(images, novel, chunk_images)
         color = self._run_network(images, novel, chunk_images, range(len(images.views)))
-        for k, view in enumerate(images.views):
-            self._remember(images, k, view, color[k])
+        self._last.remember(images, color)
         return FixedRolloutImages(color, area.filled, area.restored)
 
     @torch.no_grad()
@@ -175,16 +154,14 @@ class RolloutFixer:
             return FixedRolloutImages(images.color, nowhere, nowhere)
         chunk_images = self._load_chunk(images)
         novel = self._render_inputs(images, chunk_images)
-        area = self._find_area(images, novel, chunk_images)
+        novel, area = self._paste_repaired(images, novel, chunk_images)
         rows = [k for k in range(len(images.views)) if bool(area.both[k].any())]
         color = images.color.clone()
         if rows:
-            novel = _paste(novel, area, render_views(chunk_images.repaired, images.views, self._settings))
             # The network repairs a view in one piece, and only the pixels of the area are taken.
             fixed = self._run_network(images, novel, chunk_images, rows)
             color[rows] = torch.where(area.both[rows][..., None], fixed, color[rows])
-        for k, view in enumerate(images.views):
-            self._remember(images, k, view, color[k])
+        self._last.remember(images, color)
         return FixedRolloutImages(color, area.filled, area.restored)
 
     def _load_chunk(self, images: RolloutImages) -> _ChunkImages:
@@ -242,10 +219,23 @@ class RolloutFixer:
     def _find_area(self, images: RolloutImages, novel: NovelViews, chunk_images: _ChunkImages) -> UncoveredArea:
         if not images.chunk_scene.removed:
             nowhere = torch.zeros_like(images.alpha, dtype=torch.bool)
-            return UncoveredArea(nowhere, nowhere)
+            return UncoveredArea(nowhere, nowhere, nowhere)
         rendered = torch.where(novel.alpha >= MIN_ALPHA, novel.depth, torch.zeros_like(novel.depth))
         depth = torch.where(novel.lidar_alpha >= MIN_ALPHA, novel.lidar_depth, rendered)
         return find_uncovered_area(images, depth, chunk_images.removed, self._settings)
+
+    def _paste_repaired(
+        self, images: RolloutImages, novel: NovelViews, chunk_images: _ChunkImages
+    ) -> tuple[NovelViews, UncoveredArea]:
+        """The views with what the repaired scene shows where removed actors were, and where that is."""
+        area = self._find_area(images, novel, chunk_images)
+        if not bool((area.both | area.near).any()):
+            return novel, area
+        repaired = render_views(chunk_images.repaired, images.views, self._settings)
+        # Without a shadow the ground is brighter; what is not was in the light all along, and stays.
+        brighter = (repaired.color - images.color).mean(-1) > SHADOW_CONTRAST
+        area = replace(area, restored=area.restored | (area.near & brighter))
+        return _paste(novel, area, repaired), area
 
     def _run_network(
         self, images: RolloutImages, novel: NovelViews, chunk_images: _ChunkImages, rows: Sequence[int]
@@ -261,7 +251,8 @@ class RolloutFixer:
 
         def fix_batch(batch: Sequence[int]) -> Tensor:
             inputs = build_inputs(chunk, novel, batch, chunk_images.removed.unshaded)
-            inputs = self._look_up_last(images, novel, moving, batch, inputs)
+            if self._config.temporal:
+                inputs = self._last.look_up(images, novel, batch, moving, inputs)
             # By camera and not by pose: noise that changes from pose to pose is seen as flicker.
             seeds = [names.index(images.views[k].camera) for k in batch]
             noise = draw_noise(self._network, self._config.seed, seeds, *novel.alpha.shape[1:])
@@ -273,10 +264,9 @@ class RolloutFixer:
 
     def _pose_actors(self, images: RolloutImages, chunk_images: _ChunkImages) -> tuple[Actor, ...]:
         moments = {THIS_MOMENT: images.views[0].frame}
-        followed = [last for last in self._last.values() if last.index == images.index - 1]
-        if followed:
-            # All cameras of a pose are of one moment.
-            moments[LAST_MOMENT] = followed[0].view.frame
+        last_frame = self._last.find_frame(images.index)
+        if last_frame is not None:
+            moments[LAST_MOMENT] = last_frame
         recorded = {actor.track_id: actor for actor in chunk_images.removed.recorded}
         frames = sorted({source.frame for source in chunk_images.removed.unshaded})
         return pose_actors(images.chunk_scene.scene.actors, moments, recorded, frames)
@@ -289,46 +279,6 @@ class RolloutFixer:
             encoded = self._network.encode(F.pad(image[None], pad, mode="replicate"))
             chunk_images.latents[reference] = encoded.latent
         return chunk_images.latents[reference]
-
-    def _look_up_last(
-        self,
-        images: RolloutImages,
-        novel: NovelViews,
-        moving: Sequence[Actor],
-        rows: Sequence[int],
-        inputs: FixerInputs,
-    ) -> FixerInputs:
-        """Puts the last fixed image behind the warped source images, where none of them shows a point."""
-        if not self._config.temporal:
-            return inputs
-        chunk_SE3_world = invert_se3(images.chunk_scene.chunk.world_SE3_chunk)
-        color = inputs.warped.clone()
-        mask = inputs.warp_mask.clone()
-        for j, k in enumerate(rows):
-            view = novel.views[k]
-            last = self._last.get(view.camera)
-            if last is None or last.index != images.index - 1:
-                continue
-            pose = chunk_SE3_world @ last.world_SE3_camera.numpy()
-            source = SourceImage(view.camera, LAST_MOMENT, pose, last.view.lens, last.image, last.depth)
-            surface = unproject_surface(
-                novel.depth[k], novel.alpha[k], view.chunk_SE3_camera, view.lens, moving, THIS_MOMENT
-            )
-            sampled, visible = sample_source(surface, source, moving, THIS_MOMENT)
-            # Behind and not before them: an image that is resampled from pose to pose would blur ever more.
-            color[j] = torch.where(visible & (mask[j, 0] < 0.5), sampled, color[j])
-            mask[j] = torch.maximum(mask[j], visible[None].to(mask))
-        return replace(inputs, warped=color, warp_mask=mask)
-
-    def _remember(self, images: RolloutImages, k: int, view: RolloutView, color: Tensor) -> None:
-        opaque = images.alpha[k] >= MIN_ALPHA
-        self._last[view.camera] = _LastImage(
-            index=images.index,
-            view=view,
-            world_SE3_camera=torch.from_numpy(images.chunk_scene.chunk.world_SE3_chunk @ view.chunk_SE3_camera),
-            image=color.permute(2, 0, 1),
-            depth=torch.where(opaque, images.depth[k], torch.zeros_like(images.depth[k])),
-        )
 
 
 def _paste(novel: NovelViews, area: UncoveredArea, repaired: Render) -> NovelViews:

@@ -33,6 +33,10 @@ SHADOW_MARGIN_M = 1.0
 _SHADOW_HALF_HEIGHT_M = 0.15
 
 
+# The slab is thin: a ray that goes on for longer has left it above the ground.
+_MAX_SHADOW_DEPTH = 1.5
+
+
 @dataclass(frozen=True)
 class UncoveredArea:
     """Pixels that removed actors covered and that the render shows wrongly.
@@ -40,14 +44,16 @@ class UncoveredArea:
     Attributes:
         filled: [C, H, W] true where no recorded image shows the background, other than in an actor's shadow.
         restored: [C, H, W] true where some recorded images show the background in shadow and others do not.
+        near: [C, H, W] true for ground of the latter kind that the actors did not cover, but may have shaded.
     """
 
     filled: Tensor
     restored: Tensor
+    near: Tensor
 
     @property
     def both(self) -> Tensor:
-        """[C, H, W] either of the two."""
+        """[C, H, W] filled or restored."""
         return self.filled | self.restored
 
 
@@ -137,7 +143,7 @@ def find_uncovered_area(
         settings: of the renderer.
 
     Returns:
-        The pixels. What the actors did not cover is in neither area.
+        The pixels. What the actors neither covered nor may have shaded is in no area.
     """
     drawn = render_views(removed.scene, images.views, settings)
     # What is nearer than the actor was never hidden by it.
@@ -147,13 +153,17 @@ def find_uncovered_area(
     by_track = {actor.track_id: actor for actor in removed.recorded}
     frames = sorted({source.frame for source in removed.sources})
     for k, view in enumerate(images.views):
-        if not bool(covered[k].any()):
+        shade = measure_depth_to_shadows(view.chunk_SE3_camera, view.lens, images.chunk_scene.removed, view.frame).to(
+            depth
+        )
+        asked = covered[k] | ((depth[k] > shade) & (depth[k] < shade * _MAX_SHADOW_DEPTH))
+        if not bool(asked.any()):
             continue
         posed = pose_actors(images.chunk_scene.scene.actors, {THIS_MOMENT: view.frame}, by_track, frames)
         known = (depth[k] > 0).to(depth)
         surface = unproject_surface(depth[k], known, view.chunk_SE3_camera, view.lens, posed, THIS_MOMENT)
-        # Few pixels were covered, so that all images can be asked about them.
-        points = Surface(*(t[covered[k]][None] for t in (surface.points, surface.known, surface.actor)))
+        # Few pixels are asked about, so that all images can answer.
+        points = Surface(*(t[asked][None] for t in (surface.points, surface.known, surface.actor)))
         lit = torch.zeros_like(points.known)
         shaded = torch.zeros_like(points.known)
         for source, unshaded in zip(removed.sources, removed.unshaded, strict=True):
@@ -161,9 +171,9 @@ def find_uncovered_area(
             visible_lit = sample_source(points, unshaded, posed, THIS_MOMENT)[1]
             lit |= visible_lit
             shaded |= visible & ~visible_lit
-        filled[k, covered[k]] = ~lit[0]
-        restored[k, covered[k]] = (lit & shaded)[0]
-    return UncoveredArea(filled, restored)
+        filled[k, asked] = ~lit[0]
+        restored[k, asked] = (lit & shaded)[0]
+    return UncoveredArea(filled & covered, restored & covered, restored & ~covered)
 
 
 def measure_depth_to_shadows(
