@@ -15,7 +15,7 @@ from genre_tasks.logs.types import DrivingLog, Sweep
 READER = "heldout-sweeps"
 
 
-class HeldOutSweepsLog:
+class HeldoutSweepsLog:
     """A ``DrivingLog`` without the sweeps of the frames that are held out.
 
     Args:
@@ -63,7 +63,7 @@ class HeldOutSweepsLog:
         return hashlib.sha256(f"{READER}:{self._every}:{self._log.digest()}".encode()).hexdigest()
 
 
-def open_heldout_sweeps(rest: str) -> HeldOutSweepsLog:
+def open_heldout_sweeps(rest: str) -> HeldoutSweepsLog:
     """Opens ``EVERY/READER:WHERE``.
 
     Args:
@@ -79,7 +79,7 @@ def open_heldout_sweeps(rest: str) -> HeldOutSweepsLog:
     if not (slash and every.isdigit()):
         remedy = f"Write {READER}:2/pandaset:PATH/002, for instance."
         raise InputError(f"'{rest}' does not say which sweeps stay", remedy=remedy, log=uri)
-    return HeldOutSweepsLog(open_log(uri), int(every))
+    return HeldoutSweepsLog(open_log(uri), int(every))
 
 
 register(READER, f"{__name__}:open_heldout_sweeps", "nothing", example=f"{READER}:2/pandaset:PATH/002")

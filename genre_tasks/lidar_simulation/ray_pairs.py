@@ -12,8 +12,6 @@ from genre_tasks.logs.types import Float64
 ROW_RAD = np.radians(0.25)
 """Height of a row of rays: within a row rays are sorted by azimuth, so that a Gaussian takes a range of them."""
 
-_MIN_DISTANCE_M = 0.2
-
 
 def find_ray_pairs(
     means: Float64,
@@ -66,25 +64,26 @@ def _bound_gaussians(
     """Index, azimuth, half width in azimuth, lowest and highest elevation; one that crosses ±π comes twice."""
     middle = origins.mean(0)
     offset = means - middle
-    distance = np.linalg.norm(offset, axis=1).clip(_MIN_DISTANCE_M)
-    flat = np.linalg.norm(offset[:, :2], axis=1).clip(1e-6)
-    azimuth = np.arctan2(offset[:, 1], offset[:, 0])
-    elevation = np.arctan2(offset[:, 2], flat)
-    across = np.stack([-offset[:, 1] / flat, offset[:, 0] / flat, np.zeros(len(flat))], 1)
-    upward = np.cross(offset / distance[:, None], across)
     # Origins apart from the middle see a Gaussian elsewhere: its bounds grow by that.
     spread = np.linalg.norm(origins - middle, axis=1).max()
-    radius = extents.max(1) + spread
-    # What lies at depth within the Gaussian is nearer than its middle, and so appears larger.
-    nearest = np.maximum(distance - radius, _MIN_DISTANCE_M)
+    flat = np.hypot(offset[:, 0], offset[:, 1]).clip(1e-6)
+    outward = np.stack([offset[:, 0] / flat, offset[:, 1] / flat, np.zeros(len(flat))], 1)
+    across = np.stack([-outward[:, 1], outward[:, 0], np.zeros(len(flat))], 1)
+    # A box around the ellipsoid: outward, to the side, and upward.
+    depth = _reach_along(outward, extents, axes) + spread
     sideways = _reach_along(across, extents, axes) + spread
-    vertical = _reach_along(upward, extents, axes) + spread
-    half_elevation = np.arctan2(vertical, nearest)
-    steepest = np.minimum(np.abs(elevation) + half_elevation, np.pi / 2)
-    half_azimuth = np.arctan2(sideways, nearest * np.cos(steepest).clip(1e-3))
-    surrounds = distance <= radius
-    half_azimuth[surrounds] = np.pi
-    half_elevation[surrounds] = np.pi
+    height = np.sqrt(((axes[:, 2] * extents) ** 2).sum(1)) + spread
+    nearest = flat - depth
+    surrounds = nearest <= 0
+    half_azimuth = np.where(surrounds, np.pi, np.arctan2(sideways, nearest))
+    farthest = np.hypot(flat + depth, sideways)
+    low = offset[:, 2] - height
+    high = offset[:, 2] + height
+    # The nearest corner of the box is seen steepest, up as well as down.
+    nearest = nearest.clip(0)
+    lowest = np.arctan2(low, np.where(low < 0, nearest, farthest))
+    highest = np.arctan2(high, np.where(high > 0, nearest, farthest))
+    azimuth = np.arctan2(offset[:, 1], offset[:, 0])
     index = np.arange(len(means))
     copies = [(index, azimuth + turn) for turn in (-2 * np.pi, 0.0, 2 * np.pi)]
     index = np.concatenate([i for i, _ in copies])
@@ -92,7 +91,7 @@ def _bound_gaussians(
     half = half_azimuth[index]
     crosses = np.abs(center) - half <= np.pi
     index, center, half = index[crosses], center[crosses], half[crosses]
-    return index, center, half, (elevation - half_elevation)[index], (elevation + half_elevation)[index]
+    return index, center, half, lowest[index], highest[index]
 
 
 def _reach_along(direction: Float64, extents: Float64, axes: Float64) -> Float64:

@@ -108,7 +108,8 @@ class LidarSimulator:
         if sweep is None:
             return None
         points = to_ego_axes(sweep, self._times_s, self._poses)
-        return build_pattern(points, sweep.timestamps_s - self._times_s[frame], sweep.intensity, self.sensor)
+        offsets = sweep.timestamps_s - self._times_s[frame]
+        return build_pattern(points, offsets, sweep.intensity.astype(np.float64), self.sensor)
 
     def _describe_no_sweep(self) -> InputError:
         problem = "the log has no LiDAR sweep, whose rays a simulated one could have"

@@ -40,7 +40,7 @@ class LidarModel:
         beam_rad: standard deviation of a beam's width.
     """
 
-    widenings: tuple[float, ...] = (0.6, 1.5)
+    widenings: tuple[float, ...] = (0.6, 1.5, 4.0)
     min_alpha: float = 0.3
     min_cosine: float = 0.01
     max_range_m: float = 120.0

@@ -73,7 +73,7 @@ def build_pattern(points: Float64, times_s: Float64, intensity: Float64, sensor:
         times_s=times_s[usable],
         ring=np.full(int(usable.sum()), NO_RING, np.int64),
         range_m=range_m[usable],
-        intensity=intensity[usable].astype(np.float64),
+        intensity=intensity[usable],
     )
     if not sensor.turn_rad_s or not len(directions):
         return returned

@@ -77,8 +77,8 @@ def _pixel_centers(lens: Lens) -> Float64:
 def _unproject(view: RolloutView, depth: NDArray[np.float32]) -> Float64:
     """[H, W, 3] metres in chunk coordinates."""
     centers = _pixel_centers(view.lens)
-    x = (centers[..., 0] - view.lens.cx_px) / view.lens.fx_px
-    y = (centers[..., 1] - view.lens.cy_px) / view.lens.fy_px
+    x: Float64 = (centers[..., 0] - view.lens.cx_px) / view.lens.fx_px
+    y: Float64 = (centers[..., 1] - view.lens.cy_px) / view.lens.fy_px
     if any(view.lens.distortion):
         x, y = pixels_to_rays(centers[..., 0], centers[..., 1], view.lens)
     points = np.stack([x, y, np.ones_like(x)], -1) * depth[..., None]
