@@ -37,8 +37,7 @@ FigureKindArgument = Annotated[
 FigureChunkOption = Annotated[
     int | None,
     typer.Option(
-        help="The number of the chunk in the log, from 0. If not given, recon and fixers show chunk 0, and the others "
-        "use all chunks."
+        help="The number of the chunk in the log, from 0. If not given, chunk 0; a swerve goes through all chunks."
     ),
 ]
 CameraOption = Annotated[
@@ -103,7 +102,7 @@ def figure(
     from flows.cli.output_paths import check_output_file
     from flows.cli.terminal import TerminalReporter
     from flows.paper_tables.comparison_strips import draw_strips
-    from flows.paper_tables.figure import SHIFTS_M, TABLE, parse_kind
+    from flows.paper_tables.figure import TABLE, parse_kind
     from flows.paper_tables.request import TableRequest
     from flows.pipeline.stage_runner import run_stage
     from genre_tasks.atomic_path import atomic_path
@@ -112,13 +111,14 @@ def figure(
     parsed_kind = parse_kind(kind)
     # Checked before any stage is computed, which may take minutes.
     check_output_file(out, "--out", (".png",))
-    chunks = (0,) if chunk is None and parsed_kind in SHIFTS_M else None if chunk is None else (chunk,)
+    # Edits are shown at one moment, and reading more chunks for it would take minutes.
+    default_chunks = None if parsed_kind == "swerve" else (0,)
     request = TableRequest(
         number=TABLE[parsed_kind],
         logs=(log,),
         preset=preset,
         store=store,
-        chunks=chunks,
+        chunks=default_chunks if chunk is None else (chunk,),
         settings=tuple(settings or ()),
         methods=tuple(str(file) for file in methods or ()),
         weights=tuple(weights or ()),
