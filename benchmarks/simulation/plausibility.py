@@ -108,8 +108,8 @@ def measure_refusals(case: SimulationCase) -> Row:
     scenes = open_scenes(case)
     recorded = scenes.recorded
     config = scenes.config.simulate
-    actor = list_world_actors(scenes.chunks)[0]
-    boxes = actor.place_boxes(recorded.frames)
+    actors = list_world_actors(scenes.chunks)
+    boxes = actors[0].place_boxes(recorded.frames)
     first = int(np.flatnonzero(boxes.exists)[0])
     # The whole path moved so that it starts where the actor is.
     shift = np.eye(4)
@@ -120,7 +120,7 @@ def measure_refusals(case: SimulationCase) -> Row:
     requests: dict[str, Callable[[], object]] = {
         "an unknown actor": lambda: edit_scenes(scenes, Remove(actor="car-99")),
         "a path without frames": lambda: plan_behaviour("brake", empty, config, start_offset_m=0.0),
-        "a start inside a car": lambda: check_path(request, config, inside, recorded, scenes.chunks),
+        "a start inside a car": lambda: check_path(request, config, inside, recorded, actors),
         "a swerve of 70 m": partial(plan_behaviour, "swerve", recorded, config, start_offset_m=0.0, strength=20.0),
         "a start 500 m aside": lambda: plan_behaviour("brake", recorded, config, start_offset_m=500.0),
         "an unknown behaviour": lambda: plan_behaviour("fly", recorded, config, start_offset_m=0.0),

@@ -11,7 +11,8 @@ import numpy as np
 from benchmarks.common.bench import NotMeasuredError, Row, split_option
 from benchmarks.common.run_stages import print_progress
 from flows.paper_tables.builtin_methods import BUILT_IN
-from flows.paper_tables.layouts import PROTOCOL
+from flows.paper_tables.layouts import SIMULATION_PROTOCOL
+from flows.paper_tables.rollouts import PlannedRollout, TableRollout, plan_rollout
 from flows.pipeline.definition import stages_until
 from flows.pipeline.log_cache import cached_log
 from flows.pipeline.stage_runner import ArtifactRef, Job, run_stage
@@ -19,6 +20,7 @@ from flows.simulation.stage_scenes import StageScenes
 from genre_tasks.config import PipelineConfig
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.ego_paths.recorded_path import join_recorded_path
+from genre_tasks.ego_paths.world_actors import list_world_actors
 from genre_tasks.logs.synthetic.edited_truth import TruthView
 from genre_tasks.logs.synthetic.log import SyntheticStreet
 from genre_tasks.logs.types import Float64, Lens
@@ -61,7 +63,7 @@ class SimulationCase:
         Args:
             method: a key of ``BUILT_IN``.
         """
-        config = BUILT_IN[method].configuration("small", (*PROTOCOL, *self.settings)).model_dump(mode="json")
+        config = BUILT_IN[method].configuration("small", (*SIMULATION_PROTOCOL, *self.settings)).model_dump(mode="json")
         return [Job(self.log, chunk, self.store, config) for chunk in self.chunks]
 
 
@@ -103,6 +105,17 @@ class LogScenes:
     def names(self) -> dict[str, str]:
         """What edits call the actors, by track id; a street's track ids look alike and mean others."""
         return name_actors(self.source)
+
+    def plan(self, rollout: TableRollout) -> PlannedRollout:
+        """Plans a rollout as table 6 does: as strong as a vehicle can drive it without meeting a road user.
+
+        Args:
+            rollout: what to drive.
+
+        Raises:
+            InputError: the log has no room for it.
+        """
+        return plan_rollout(rollout, self.recorded, self.config.simulate, list_world_actors(self.chunks))
 
     @property
     def street(self) -> SyntheticStreet:

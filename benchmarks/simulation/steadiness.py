@@ -15,7 +15,7 @@ from benchmarks.common.bench import Row
 from benchmarks.common.claims import Claim, claim
 from benchmarks.common.timing import Quartiles
 from benchmarks.simulation.scenes import LogScenes, SimulationCase, cut_path, log_label, open_scenes, truth_view
-from flows.paper_tables.rollouts import TableRollout, plan_rollout
+from flows.paper_tables.rollouts import TableRollout
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.logs.synthetic.edited_truth import EditedStreet
 from genre_tasks.logs.synthetic.traffic_edits import build_street_layout
@@ -51,7 +51,7 @@ def measure_flicker(case: SimulationCase, poses: int = TRUE_POSES, fixers: bool 
         street = EditedStreet(scenes.street, build_street_layout(scenes.street))
     found = []
     for rollout in STEADY_ROLLOUTS:
-        planned = plan_rollout(rollout, scenes.recorded, scenes.config.simulate)
+        planned = scenes.plan(rollout)
         first = max(0, (len(planned.path) - poses) // 2)
         path = cut_path(planned.path, first, poses)
         values = _measure_versions(scenes, path, street, fixers)
@@ -160,7 +160,7 @@ def measure_handover(case: SimulationCase) -> Row:
         return {"not_measured": "a single chunk has no border"}
     found = []
     for rollout in STEADY_ROLLOUTS:
-        planned = plan_rollout(rollout, scenes.recorded, scenes.config.simulate)
+        planned = scenes.plan(rollout)
         handovers = plan_handovers(scenes.source, planned.path, scenes.rig, scenes.config.simulate.handover_frames)
         faded = _measure_steps(scenes, planned.path, handovers)
         cut = _measure_steps(scenes, planned.path, None)
