@@ -53,14 +53,14 @@ from benchmarks.simulation.steadiness import (
 from flows.pipeline.definition import STAGE_BY_NAME, digest_stage_weights
 from genre_tasks.config import PipelineConfig
 
-# Measured on two cores, scenes and scores of table 6 not in the store.
-_BEHAVIOURS_S = 330.0
-_REMOVAL_S = 45.0
-_INSERTION_S = 40.0
+# Estimates for two quiet cores with all scenes in the store and no scores of table 6.
+_BEHAVIOURS_S = 170.0
+_REMOVAL_S = 60.0
+_INSERTION_S = 45.0
 _FLICKER_S = 60.0
-_HANDOVER_S = 45.0
+_HANDOVER_S = 35.0
 _PLAUSIBILITY_S = 30.0
-_REFUSALS_S = 8.0
+_REFUSALS_S = 4.0
 _LIDAR_S = 120.0
 _SPEED_S = 60.0
 _MEMORY_S = 90.0
