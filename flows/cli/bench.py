@@ -51,6 +51,9 @@ _BENCHES: dict[str, BenchEntry] = {
     "raster": BenchEntry(
         "benchmarks.raster:BENCH", "the renderer's speed against gsplat's torch reference and the machine's limits"
     ),
+    "simulation": BenchEntry(
+        "benchmarks.simulation:BENCH", "other behaviours and edited traffic against the truth; speed and hand-over"
+    ),
     "start_up": BenchEntry("benchmarks.start_up:BENCH", "seconds before anything is computed"),
 }
 

@@ -94,8 +94,9 @@ def thin_ground_points(points: Float64) -> Float64:
     if not len(points):
         return np.zeros((0, 3))
     keys = np.floor(points[:, :2] / CELL_M).astype(np.int64)
-    _, cell_of = np.unique(keys, axis=0, return_inverse=True)
-    cell_of = cell_of.reshape(-1)
+    keys -= keys.min(0)
+    # One number for each cell: rows of two would be sorted ten times as slowly.
+    _, cell_of = np.unique(keys[:, 0] * (keys[:, 1].max() + 1) + keys[:, 1], return_inverse=True)
     order = np.lexsort((points[:, 2], cell_of))
     counts = np.bincount(cell_of)
     starts = np.cumsum(counts) - counts
