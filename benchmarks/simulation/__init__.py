@@ -75,6 +75,7 @@ class SimulationBench:
     name = "simulation"
     options: Mapping[str, str] = {
         "seeds": "1001&frames=40,1002&frames=40,1003&frames=40,1004&frames=40,1005&frames=40",
+        "compared": "",
         "chunks": "0,1",
         "store": "genre-store",
         "pandaset": "../shared/data/pandaset/002",
@@ -101,7 +102,8 @@ class SimulationBench:
         "genre_tasks.logs.synthetic",
     )
     smallest = SmallestForm(
-        {"seeds": TINY_STREET, "chunks": "0", "pandaset": "", "settings": TINY_SETTINGS}, "plausibility"
+        {"seeds": TINY_STREET, "chunks": "0", "pandaset": "", "settings": TINY_SETTINGS},
+        "plausibility",
     )
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
@@ -122,7 +124,9 @@ class SimulationBench:
                 "plausibility", _PLAUSIBILITY_S, partial(measure_plausibility, logs, count), {"logs": logs, "n": count}
             )
         ]
-        for case in [*streets, *real]:
+        # Per-scene methods take minutes a chunk, so that they may be compared on fewer streets; empty: on all.
+        compared = cases_from_options({**options, "seeds": options["compared"] or options["seeds"]}, settings)
+        for case in [case for case in [*streets, *real] if case in compared]:
             parameters = _describe_case(case)
             driven = parameters | {"rollouts": [str(rollout) for rollout in rollouts]}
             seconds = _BEHAVIOURS_S * len(rollouts) / 8

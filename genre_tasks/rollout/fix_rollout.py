@@ -41,8 +41,6 @@ from genre_tasks.threads import map_single_threaded
 
 DEFAULT_SETTINGS = RenderSettings()
 
-SHADOW_CONTRAST = 0.04
-"""Ground that is darker by less than that is in no shadow."""
 
 _CHUNKS_IN_MEMORY = 2
 """A rollout needs the images on both sides of a border, and no more."""
@@ -55,8 +53,8 @@ class FixedRolloutImages:
     Attributes:
         color: [C, H, W, 3] sRGB in [0, 1].
         filled: [C, H, W] true where a removed actor hid what no recorded image shows: FNet drew it.
-        restored: [C, H, W] true where a removed actor shaded what it did not hide: FNet drew it from recorded images
-            in which it is not in the shadow.
+        restored: [C, H, W] true where a removed actor covered what some recorded images show in its shadow: FNet drew
+            it from images in which it is in the light.
     """
 
     color: Tensor
@@ -219,7 +217,7 @@ class RolloutFixer:
     def _find_area(self, images: RolloutImages, novel: NovelViews, chunk_images: _ChunkImages) -> UncoveredArea:
         if not images.chunk_scene.removed:
             nowhere = torch.zeros_like(images.alpha, dtype=torch.bool)
-            return UncoveredArea(nowhere, nowhere, nowhere)
+            return UncoveredArea(nowhere, nowhere)
         rendered = torch.where(novel.alpha >= MIN_ALPHA, novel.depth, torch.zeros_like(novel.depth))
         depth = torch.where(novel.lidar_alpha >= MIN_ALPHA, novel.lidar_depth, rendered)
         return find_uncovered_area(images, depth, chunk_images.removed, self._settings)
@@ -229,12 +227,9 @@ class RolloutFixer:
     ) -> tuple[NovelViews, UncoveredArea]:
         """The views with what the repaired scene shows where removed actors were, and where that is."""
         area = self._find_area(images, novel, chunk_images)
-        if not bool((area.both | area.near).any()):
+        if not bool(area.both.any()):
             return novel, area
         repaired = render_views(chunk_images.repaired, images.views, self._settings)
-        # Without a shadow the ground is brighter; what is not was in the light all along, and stays.
-        brighter = (repaired.color - images.color).mean(-1) > SHADOW_CONTRAST
-        area = replace(area, restored=area.restored | (area.near & brighter))
         return _paste(novel, area, repaired), area
 
     def _run_network(

@@ -33,10 +33,6 @@ SHADOW_MARGIN_M = 1.0
 _SHADOW_HALF_HEIGHT_M = 0.15
 
 
-# The slab is thin: a ray that goes on for longer has left it above the ground.
-_MAX_SHADOW_DEPTH = 1.5
-
-
 @dataclass(frozen=True)
 class UncoveredArea:
     """Pixels that removed actors covered and that the render shows wrongly.
@@ -44,12 +40,10 @@ class UncoveredArea:
     Attributes:
         filled: [C, H, W] true where no recorded image shows the background, other than in an actor's shadow.
         restored: [C, H, W] true where some recorded images show the background in shadow and others do not.
-        near: [C, H, W] true for ground of the latter kind that the actors did not cover, but may have shaded.
     """
 
     filled: Tensor
     restored: Tensor
-    near: Tensor
 
     @property
     def both(self) -> Tensor:
@@ -143,7 +137,7 @@ def find_uncovered_area(
         settings: of the renderer.
 
     Returns:
-        The pixels. What the actors neither covered nor may have shaded is in no area.
+        The pixels. What the actors did not cover is in no area.
     """
     drawn = render_views(removed.scene, images.views, settings)
     # What is nearer than the actor was never hidden by it.
@@ -153,10 +147,7 @@ def find_uncovered_area(
     by_track = {actor.track_id: actor for actor in removed.recorded}
     frames = sorted({source.frame for source in removed.sources})
     for k, view in enumerate(images.views):
-        shade = measure_depth_to_shadows(view.chunk_SE3_camera, view.lens, images.chunk_scene.removed, view.frame).to(
-            depth
-        )
-        asked = covered[k] | ((depth[k] > shade) & (depth[k] < shade * _MAX_SHADOW_DEPTH))
+        asked = covered[k]
         if not bool(asked.any()):
             continue
         posed = pose_actors(images.chunk_scene.scene.actors, {THIS_MOMENT: view.frame}, by_track, frames)
@@ -173,7 +164,7 @@ def find_uncovered_area(
             shaded |= visible & ~visible_lit
         filled[k, asked] = ~lit[0]
         restored[k, asked] = (lit & shaded)[0]
-    return UncoveredArea(filled & covered, restored & covered, restored & ~covered)
+    return UncoveredArea(filled, restored)
 
 
 def measure_depth_to_shadows(

@@ -1,0 +1,95 @@
+"""Tables of re-simulation for the documents, from the JSON file that ``genre bench simulation`` writes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+from docs.result_tables import number, provenance, result, table
+
+NAME = "simulation"
+BEHAVIOURS = ("brake", "accelerate", "lane_change", "swerve")
+METHODS = {"genre+": "GenRe+", "difix": "Difix3D-style", "3dgs": "3DGS"}
+METRICS = {
+    "psnr": "PSNR to the truth, dB ↑",
+    "perceptual": "perceptual distance to the truth ↓",
+    "kernel": "kernel distance to real images ↓",
+}
+COMPARISON = re.compile(r"simulation\.(psnr|perceptual|kernel)_(\w+)_vs_(\w+)")
+CLAIM_WORDS = {
+    "simulation.removal_psnr": "PSNR where a removed actor was and another frame saw what is behind, median actor",
+    "simulation.removal_psnr_worst": "the same, worst actor",
+    "simulation.removal_outside": "Largest change of a pixel outside of a removed actor and its shadow",
+    "simulation.insertion_turned": "PSNR that an inserted actor gains by being turned as the truth is, median actor",
+    "simulation.round_trip": "Fraction of actors that are the same bytes after a move there and back",
+    "simulation.flicker": "Flicker of ENet's scene over that of the truth, median rollout",
+    "simulation.handover_step": "Largest step between images at a hand-over, over that within chunks",
+    "simulation.speed_small": "Images a second, three cameras of 320×180, rendered and encoded",
+    "simulation.speed_large": "Images a second, three cameras of 1280×720, rendered and encoded",
+    "simulation.memory": "Growth of memory over 2,000 poses",
+    "simulation.lidar_range": "Median range error of LiDAR within 40 m, held-out sweeps",
+    "simulation.lidar_recall": "Fraction of recorded returns within 40 m whose ray hits something",
+    "simulation.plausible": "Fraction of 1,000 random behaviours that stay within the bounds, of those planned",
+    "simulation.clear_errors": "Fraction of impossible requests that give one clear error",
+}
+
+
+def behaviours() -> str:
+    """Every method along every behaviour: mean over logs, streets against the truth and the real log as a set."""
+    rows = [row for row in result(NAME)["rows"] if row["cell"].startswith("behaviours") and "rollouts" in row]
+    streets = [row for row in rows if "differences" not in row]
+    real = [row for row in rows if "differences" in row]
+    lines = []
+    for metric, words in METRICS.items():
+        for label in METHODS.values():
+            logs = real if metric == "kernel" else streets
+            means = [_mean(logs, behaviour.replace("_", "-"), label, metric) for behaviour in BEHAVIOURS]
+            lines.append([words, label, *means])
+    head = ["metric", "method", *(behaviour.replace("_", " ") for behaviour in BEHAVIOURS)]
+    return table(head, lines)
+
+
+def _mean(rows: Sequence[dict[str, Any]], behaviour: str, method: str, metric: str) -> str:
+    by_log = []
+    for row in rows:
+        values = [
+            entry["metrics"][metric]
+            for entry in row["rollouts"]
+            if entry["behaviour"] == behaviour and entry["method"] == method and metric in entry["metrics"]
+        ]
+        if values:
+            by_log.append(sum(values) / len(values))
+    if not by_log:
+        return "–"
+    mean = sum(by_log) / len(by_log)
+    return f"{mean:.2f}" if metric == "psnr" else f"{mean:.3f}"
+
+
+def comparison_claims() -> str:
+    """The claims that compare methods: the end of the paired interval that is nearest to 0, for each behaviour."""
+    claims = {claim["id"]: claim for claim in result(NAME)["claims"]}
+    lines = []
+    for metric, words in METRICS.items():
+        for other in ("3dgs", "difix"):
+            found = [claims[f"simulation.{metric}_{behaviour}_vs_{other}"] for behaviour in BEHAVIOURS]
+            bounds = ["not measured" if c["measured"] is None else f"{c['measured']:+.3f}" for c in found]
+            held = sum(c["holds"] for c in found)
+            verdict = "yes" if held == len(found) else f"**{held} of {len(found)}**"
+            lines.append([words, METHODS[other], *bounds, f"{found[0]['op']} 0", verdict])
+    head = ["metric", "GenRe+ less", *(behaviour.replace("_", " ") for behaviour in BEHAVIOURS), "target", "holds"]
+    return table(head, lines)
+
+
+def claims() -> str:
+    """The other claims: target, measured number, and whether it holds."""
+    lines = []
+    for claim in result(NAME)["claims"]:
+        if COMPARISON.fullmatch(claim["id"]):
+            continue
+        measured = "not measured" if claim["measured"] is None else number(claim["measured"])
+        unit = claim["unit"] if claim["unit"] in ("dB", "m", "images/s", "of 255") else ""
+        target = f"{claim['op']} {claim['target']:g} {unit}".strip()
+        verdict = "yes" if claim["holds"] else "**missed**"
+        lines.append([CLAIM_WORDS[claim["id"]], target, measured, str(claim["n"]), verdict])
+    return table(["claim", "target", "measured", "n", "holds"], lines) + "\n" + provenance(NAME)
