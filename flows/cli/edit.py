@@ -28,7 +28,9 @@ def edit(
     scale_speed: ScaleSpeedOption = None,
     store: StoreOption = DEFAULT_STORE,
 ) -> None:
-    """Edit the traffic of a finished run: remove, insert, move, delay, turn actors, or change their speed.
+    """Edit the traffic of a finished run.
+
+    Actors are removed, inserted, moved, delayed, turned, or get another speed.
 
     The edited scenes become a run with a name of its own, for `genre render`, `genre range` and `genre show`. The run
     that is edited stays as it is. `genre show actors RUN` shows the names of its actors.

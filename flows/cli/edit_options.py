@@ -32,8 +32,8 @@ InsertOption = Annotated[
     list[str] | None,
     typer.Option(
         metavar="ACTOR",
-        help="Insert an actor on the recorded path: [NAME@][RUN:]ACTOR[,ahead=M,left=M,turn=DEG,speed=M/S,start=S], "
-        "such as taxi@4b1c:7,ahead=12.",
+        help="Insert an actor on the recorded path: NAME@RUN:ACTOR,ahead=M,left=M,turn=DEG,speed=M/S,start=S, such as "
+        "taxi@4b1c:7,ahead=12. All but ACTOR may be left out.",
     ),
 ]
 MoveOption = Annotated[

@@ -60,7 +60,7 @@ RemoveOption = Annotated[
 InsertOption = Annotated[
     list[str] | None,
     typer.Option(
-        help="Insert an actor of this run or another one: [NAME@][RUN:]ACTOR,ahead=12,left=-3,turn=180,speed=5."
+        help="Insert an actor: NAME@RUN:ACTOR,ahead=12,left=-3,turn=180,speed=5. NAME@ and RUN: may be left out."
     ),
 ]
 MoveOption = Annotated[list[str] | None, typer.Option(help="Move an actor, in metres: car-3,forward=2,left=-1.")]

@@ -71,6 +71,7 @@ def pose_values(path: EgoPath, index: int) -> dict[str, float]:
     Returns:
         Values by column.
 
+    >>> import numpy as np
     >>> path = EgoPath(np.zeros(1), np.full(1, 4.0), np.eye(4)[None])
     >>> pose_values(path, 0)["qw"], pose_values(path, 0)["frame"]
     (1.0, 4.0)

@@ -37,7 +37,7 @@ def build_contact_shadow(size_m: tuple[float, float, float], clearance_m: float,
         Gaussians in the box; none where ``darkness`` is 0.
 
     >>> len(build_contact_shadow((4.5, 1.8, 1.5), 0.0, 0.5)), len(build_contact_shadow((4.5, 1.8, 1.5), 0.0, 0.0))
-    (40, 0)
+    (44, 0)
     """
     if not darkness:
         return Gaussians.unpack(torch.zeros(0, 14))

@@ -72,7 +72,7 @@ def match_tone(source_road: Float64 | None, target_road: Float64 | None) -> Floa
     Returns:
         [3] gains in linear light, 1 where either road is unknown.
 
-    >>> match_tone(np.array([0.1, 0.1, 0.1]), np.array([0.15, 0.1, 0.9])).tolist()
+    >>> match_tone(np.array([0.1, 0.1, 0.1]), np.array([0.15, 0.1, 0.9])).round(6).tolist()
     [1.5, 1.0, 2.0]
     """
     if source_road is None or target_road is None:
