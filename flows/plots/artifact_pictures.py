@@ -228,6 +228,13 @@ def _draw_effects(folder: Path) -> Image8 | None:
     return plot_effects_plan(read(folder))
 
 
+def _draw_rollout_scores(folder: Path) -> Image8 | None:
+    from flows.plots.rollout_scores_plot import plot_rollout_scores
+    from storage.codecs.rollout_scores import read
+
+    return plot_rollout_scores(read(folder))
+
+
 _DRAWING_FUNCTIONS: dict[str, Callable[[Path], Image8 | None]] = {
     "chunk": _draw_chunk,
     "reconstruction": _draw_reconstruction,
@@ -236,5 +243,6 @@ _DRAWING_FUNCTIONS: dict[str, Callable[[Path], Image8 | None]] = {
     "pairs": _draw_pairs,
     "evaluation": _draw_evaluation,
     "effects": _draw_effects,
+    "rollout_scores": _draw_rollout_scores,
 }
 """Kind of artifact → what draws it from its folder."""

@@ -13,6 +13,8 @@ from genre_tasks.fixer.inputs import FixerInputs
 from genre_tasks.fixer.pairs import INPUT_NAMES, Pairs
 from genre_tasks.logs.types import Lens, MotionBlur, RollingShutter
 from genre_tasks.metrics.results import Evaluation, Metric, ViewScore
+from genre_tasks.metrics.scoring import FeatureSet
+from genre_tasks.rollout.rollout_scores import RolloutScores
 from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.chunk import Actor, Chunk, LogIssue, Points, Role, View
 from genre_tasks.scene.gaussians import Gaussians
@@ -145,6 +147,15 @@ def evaluation(rng: np.random.Generator, count: int = 3) -> Evaluation:
     )
 
 
+def rollout_scores(rng: np.random.Generator, count: int = 3) -> RolloutScores:
+    features = torch.from_numpy(rng.normal(size=(count, 5)).astype(np.float32))
+    return RolloutScores(
+        (Metric("psnr", float(rng.random()), count), Metric("kernel", float(rng.random()), count, 0.1, 0.3)),
+        tuple(ViewScore("front_camera", k, 3.0, *rng.random(3).tolist()) for k in range(count)),
+        FeatureSet(features, tuple(range(count))),
+    )
+
+
 def effects(rng: np.random.Generator, count: int = 3) -> EffectsPlan:
     rows = [
         Decision(
@@ -186,6 +197,7 @@ MAKERS = {
     "pairs": pairs,
     "evaluation": evaluation,
     "effects": effects,
+    "rollout_scores": rollout_scores,
 }
 
 
