@@ -21,7 +21,7 @@ from tests.faults.small_run import LOG, SETTINGS
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (ROOT / "README.md", ROOT / "docs/quickstart.md", *sorted((ROOT / "docs/guides").glob("*.md")))
 TAKES_SETTINGS = ("run", "effects", "cost", "table", "figure")
-TAKES_STORE = ("run", "effects", "show", "render", "range", "verify", "cost", "table", "figure")
+TAKES_STORE = ("run", "effects", "show", "render", "range", "verify", "cost", "table", "figure", "simulate", "edit")
 
 
 def commands(page: Path) -> list[str]:
@@ -45,6 +45,8 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, 
 
     folder = tmp_path_factory.mktemp("commands")
     write_pandaset(open_log(LOG), folder / "pandaset/002")
+    guide = (ROOT / "docs/guides/simulation.md").read_text()
+    (folder / "edits.yaml").write_text(re.findall(r"```yaml\n(.*?)```", guide, flags=re.DOTALL)[0])
     with prefect_test_harness(server_startup_timeout=120):
         done = reconstruct_log(LOG, preset="demo", store=str(folder / "store"), settings=list(SETTINGS))
         yield folder, done["run"], f"pandaset:{folder}/pandaset/002"
@@ -58,6 +60,10 @@ def small(command: str, folder: Path, run: str, pandaset: str) -> list[str]:
     words = [pandaset if word == "pandaset:/data/pandaset/002" else word for word in words]
     if "--budget" in words:  # a budget chooses these settings itself, and is not given them
         return [*words, "--store", str(folder / "store"), "--dry-run"]
+    if words[0] == "simulate":
+        # A log of eight frames has no room to change lanes, and its street is full of cars.
+        words += ["--allow-collision", "--no-range"]
+        words += ["--strength", "0.005"] if {"lane-change", "swerve"} & set(words) else []
     more = ("gnet.per_scene.iterations=20",) if words[0] in ("table", "figure") else ()
     sets = [part for setting in (*SETTINGS, *more) for part in ("--set", setting)]
     sets = sets if words[0] in TAKES_SETTINGS else []
