@@ -85,7 +85,7 @@ def figure(
     weights: WeightsOption = None,
     store: StoreOption = DEFAULT_STORE,
 ) -> None:
-    """Draw a figure that compares methods, or a scene before edits and after.
+    """Draw a figure that compares methods, or edits of a scene.
 
     recon and fixers have a row for each method and a column for each distance to the left of the path. swerve has
     columns along its path. Their last row is the truth, where the log can tell it. manipulation has a row for each
