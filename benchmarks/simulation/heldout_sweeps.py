@@ -82,4 +82,6 @@ def open_heldout_sweeps(rest: str) -> HeldoutSweepsLog:
     return HeldoutSweepsLog(open_log(uri), int(every))
 
 
-register(READER, f"{__name__}:open_heldout_sweeps", "nothing", example=f"{READER}:2/pandaset:PATH/002")
+def register_reader() -> None:
+    """Lets ``open_log`` open logs with held-out sweeps; not on import, since users need no such reader."""
+    register(READER, f"{__name__}:open_heldout_sweeps", "nothing", example=f"{READER}:2/pandaset:PATH/002")

@@ -63,6 +63,7 @@ def measure_lidar(
     """
     require_log_folder(log)
     config = load_configuration("small", settings=list(settings)).model_dump(mode="json")
+    heldout_sweeps.register_reader()
     job = Job(f"{heldout_sweeps.READER}:{every}/{log}", chunk, store, config)
     refs = reconstruct(job, _STAGES[: _STAGES.index(stage) + 1])
     chunk_scene = ChunkScene(read_artifact(job, refs["ingest"]), read_artifact(job, refs[stage]).scene)

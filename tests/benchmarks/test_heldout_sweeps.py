@@ -4,10 +4,18 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.simulation.heldout_sweeps import HeldoutSweepsLog
+from benchmarks.simulation.heldout_sweeps import HeldoutSweepsLog, register_reader
 from genre_tasks.errors import InputError
+from genre_tasks.logs import registry
 from genre_tasks.logs.registry import open_log
 from tests.fakes import FakeLog
+
+
+@pytest.fixture(autouse=True)
+def readers(monkeypatch: pytest.MonkeyPatch) -> None:
+    # A copy: the users' registry lists no reader of a benchmark.
+    monkeypatch.setattr(registry, "_READERS", dict(registry._READERS))
+    register_reader()
 
 
 def test_sweeps_are_held_out_and_nothing_else():
