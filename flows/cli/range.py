@@ -65,7 +65,7 @@ def range_command(
     from flows.cli.printing import print_rows
     from flows.cli.terminal import TerminalReporter
     from flows.reconstruction.reliable_range import write_range
-    from flows.reconstruction.run_records import find_last_stage, read_next_scene, read_stage_scene, read_stage_value
+    from flows.reconstruction.stored_values import find_last_stage, read_next_scene, read_stage_scene, read_stage_value
     from genre_tasks.reliability.chunk_seam import measure_seam, median_psnr_by_distance
     from genre_tasks.reliability.reliable_range import estimate_reliable_range
 

@@ -12,9 +12,6 @@ from flows.cli.parsing import parse_path
 from flows.defaults import DEFAULT_STORE
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from genre_tasks.render import Render
     from genre_tasks.scene.chunk import Chunk
     from genre_tasks.scene.graph import SceneGraph
@@ -58,7 +55,7 @@ def render(
     from flows.cli.existing_store import open_existing_store
     from flows.cli.output_paths import check_output_file
     from flows.cli.parsing import check_number
-    from flows.reconstruction.run_records import find_last_stage, read_stage_scene, read_stage_value
+    from flows.reconstruction.stored_values import find_last_stage, read_stage_scene, read_stage_value
     from genre_tasks.errors import ConfigError, InputError
 
     # Checked first, because reading a scene takes seconds.
@@ -135,7 +132,9 @@ def _write_exr(path: Path, images: Render) -> None:
 def _write_pixels(path: Path, images: Render) -> None:
     import imageio.v3 as imageio
 
-    pixels: NDArray[np.uint8] = (images.color.clamp(0, 1) * 255).round().byte().numpy()
+    from storage.codecs.png import to_pixels
+
+    pixels = to_pixels(images.color)
     # Named here, as the library looks for suffixes in lower case alone.
     suffix = path.suffix.lower()
     if suffix == ".png":

@@ -7,6 +7,15 @@ from typing import Any
 
 import typer
 
+from flows.cli.edit_options import (
+    EditsOption,
+    InsertOption,
+    MoveOption,
+    RemoveOption,
+    RetimeOption,
+    RotateOption,
+    ScaleSpeedOption,
+)
 from flows.cli.options import ChunksOption, JsonOption, RunArgument, SceneStageOption, SettingsOption, StoreOption
 from flows.cli.simulate_options import (
     AllowCollisionOption,
@@ -14,20 +23,13 @@ from flows.cli.simulate_options import (
     BehaviourOption,
     CamerasOption,
     DelayOption,
-    EditsOption,
     ExrOption,
     FixOption,
-    InsertOption,
-    MoveOption,
     NoRangeOption,
     OutOption,
     OverwriteOption,
     PathFileOption,
     PngOption,
-    RemoveOption,
-    RetimeOption,
-    RotateOption,
-    ScaleSpeedOption,
     SensorsOption,
     SideOption,
     StartOffsetOption,

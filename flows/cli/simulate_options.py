@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 
+from flows.cli.edit_options import read_edits
 from flows.cli.parsing import parse_numbers, parse_path
 
 if TYPE_CHECKING:
@@ -42,10 +43,6 @@ StartOffsetOption = Annotated[
         "simulate.start_offset_m if not given."
     ),
 ]
-EditsOption = Annotated[
-    Path | None,
-    typer.Option(parser=parse_path, metavar="PATH", help="A YAML file with a list `edits` of the traffic."),
-]
 StrengthOption = Annotated[float, typer.Option(help="How strong the behaviour is; 1 is the configured strength.")]
 DelayOption = Annotated[float, typer.Option(help="Seconds of recorded driving before the behaviour starts.")]
 SideOption = Annotated[
@@ -54,19 +51,6 @@ SideOption = Annotated[
 CamerasOption = Annotated[
     str | None, typer.Option(help="Names of the cameras, separated by commas. All cameras if not given.")
 ]
-RemoveOption = Annotated[
-    list[str] | None, typer.Option(help="Remove an actor, such as car-12. May be given several times.")
-]
-InsertOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="Insert an actor: NAME@RUN:ACTOR,ahead=12,left=-3,turn=180,speed=5. NAME@ and RUN: may be left out."
-    ),
-]
-MoveOption = Annotated[list[str] | None, typer.Option(help="Move an actor, in metres: car-3,forward=2,left=-1.")]
-RetimeOption = Annotated[list[str] | None, typer.Option(help="Let an actor drive later, in seconds: car-3,delay=0.5.")]
-RotateOption = Annotated[list[str] | None, typer.Option(help="Turn an actor, in degrees: car-3,degrees=90.")]
-ScaleSpeedOption = Annotated[list[str] | None, typer.Option(help="Scale an actor's speed: car-3,factor=0.5.")]
 SensorsOption = Annotated[
     str,
     typer.Option(
@@ -110,12 +94,9 @@ def read_request(options: Mapping[str, Any]) -> SimulationRequest:
     Raises:
         ConfigError: an option cannot be read, or two of them do not go together.
     """
-    from flows.simulation.edit_file import parse_edit_options, read_edit_file
     from flows.simulation.request import SimulationRequest
-    from genre_tasks.scene_edits.edits import EditList
 
     numbers = parse_numbers(options["chunks"], "--chunks")
-    listed = EditList() if options["edits"] is None else read_edit_file(options["edits"])
     shorthands = ("remove", "insert", "move", "retime", "rotate", "scale_speed")
     # What has the same name and meaning in both.
     same = ("store", "run", "out", "stage", "behaviour", "strength", "fix", "exr", "png", "overwrite")
@@ -127,7 +108,7 @@ def read_request(options: Mapping[str, Any]) -> SimulationRequest:
         delay_s=options["delay"],
         side=_parse_side(options["side"]),
         cameras=None if options["cameras"] is None else _split(options["cameras"]),
-        edits=listed + parse_edit_options(**{name: options[name] or () for name in shorthands}),
+        edits=read_edits(options["edits"], **{name: options[name] for name in shorthands}),
         sensors=_split(options["sensors"]),
         mark_range=not options["no_range"],
         settings=tuple(options["settings"] or ()),

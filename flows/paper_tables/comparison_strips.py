@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from torch import Tensor
+    pass
 
 Pixels = NDArray[np.uint8]  # [H, W, 3] sRGB
 
@@ -61,16 +61,3 @@ def draw_strips(strips: Sequence[ComparisonStrip], title: str) -> Pixels:
             axes.set_title(f"{strip.label}, {caption}", fontsize=8, pad=2)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
-
-
-def to_pixels(color: Tensor) -> tuple[Pixels, ...]:
-    """Converts images to 8 bits.
-
-    Args:
-        color: [V, H, W, 3] sRGB.
-
-    Returns:
-        V images.
-    """
-    # Rounded, because a plain cast truncates and darkens every image by half a level.
-    return tuple((color.clamp(0, 1) * 255).round().byte().cpu().numpy())

@@ -6,12 +6,13 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Literal, get_args
 
 from flows.experiments.stages import StageRunner, run_stages
-from flows.paper_tables.comparison_strips import ComparisonStrip, Pixels, to_pixels
+from flows.paper_tables.comparison_strips import ComparisonStrip, Pixels
 from flows.paper_tables.request import CheckedRequest
 from flows.pipeline.definition import stages_until
 from flows.pipeline.log_cache import cached_log
 from flows.pipeline.stage_runner import read_artifact
 from genre_tasks.errors import ConfigError, InputError
+from storage.codecs.png import to_pixels
 
 if TYPE_CHECKING:
     from genre_tasks.scene.chunk import Chunk
@@ -80,8 +81,8 @@ def comparison_strips(
         chosen = [index[v.camera, v.frame, v.shift_m] for v in views]
         # All fixers get the same renders, so one strip of inputs stands for all.
         if not strips:
-            strips.append(ComparisonStrip("what they are given", to_pixels(novel.color[chosen]), captions))
-        strips.append(ComparisonStrip(row.label, to_pixels(fixed.color[chosen]), captions))
+            strips.append(ComparisonStrip("what they are given", tuple(to_pixels(novel.color[chosen])), captions))
+        strips.append(ComparisonStrip(row.label, tuple(to_pixels(fixed.color[chosen])), captions))
     truth = _true_strip(where.log, chunk, views, captions) if views else None
     return strips if truth is None else [*strips, truth]
 
@@ -139,4 +140,4 @@ def _render(scene: object, views: Sequence[NovelView]) -> tuple[Pixels, ...]:
 
     # The scene's tensors may ask for gradients, whose buffers a picture does not need.
     with torch.no_grad():
-        return to_pixels(render_views(scene, views).color)  # type: ignore[arg-type]  # read back from the store
+        return tuple(to_pixels(render_views(scene, views).color))  # type: ignore[arg-type]  # read back from the store

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from flows.experiments.stages import StageRunner, run_stages
-from flows.paper_tables.comparison_strips import ComparisonStrip, to_pixels
+from flows.paper_tables.comparison_strips import ComparisonStrip
 from flows.paper_tables.figure import select_front_camera
 from flows.paper_tables.layouts import Row
 from flows.paper_tables.request import CheckedRequest
@@ -35,6 +35,7 @@ from genre_tasks.scene_edits.actor_names import name_actors, resolve_actor
 from genre_tasks.scene_edits.chunk_scene import SceneSource
 from genre_tasks.scene_edits.edited_scenes import EditedScenes
 from genre_tasks.scene_edits.edits import Edit, EditList, Insert, Move, Remove
+from storage.codecs.png import to_pixels
 
 MOMENTS = 5
 """Columns of the figure of a swerve, spread evenly over its path."""
@@ -75,7 +76,7 @@ def swerve_strips(
         path = _select_moments(log.plan(TableRollout("swerve", start_offset_m)).path)
         rig = (_find_camera(log.rig, camera),)
         captions = _describe_moments(path, log.recorded)
-        images = [to_pixels(images.color)[0] for images in render_rollout(log.scenes, path, rig)]
+        images = [to_pixels(images.color[0]) for images in render_rollout(log.scenes, path, rig)]
         strips.append(ComparisonStrip(row.label, tuple(images), captions))
     # Every method drives the same path with the same rig, so the last one's serve the truth too.
     truth = cached_log(places[0].log).truth
@@ -125,8 +126,8 @@ def manipulation_strips(
         # A camera that looks elsewhere would fill a row with equal images.
         if camera is None and change < _LEAST_CHANGE:
             continue
-        recorded = to_pixels(decode_view_image(view)[None])[0]
-        images = (recorded, *(to_pixels(color[k : k + 1])[0] for color in columns.values()))
+        recorded = to_pixels(decode_view_image(view))
+        images = (recorded, *(to_pixels(color[k]) for color in columns.values()))
         captions = (f"frame {view.frame}, image", *(f"{names[best.track_id]} {name}" for name in columns))
         strips.append(ComparisonStrip(view.camera, images, captions))
     if not strips:

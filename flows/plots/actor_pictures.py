@@ -16,6 +16,7 @@ from genre_tasks.scene.box_projection import project_box
 from genre_tasks.scene.chunk import Actor, View
 from genre_tasks.scene.image_decoding import decode_pixels, read_image_size
 from genre_tasks.scene_edits.chunk_scene import ChunkScene, SceneSource
+from storage.codecs.png import to_pixels
 
 Image8 = NDArray[np.uint8]
 
@@ -80,7 +81,7 @@ def _cut_tile(chunk_scene: ChunkScene, best: _BestView, is_recorded: bool) -> Im
     else:
         with torch.no_grad():
             color = render_views(chunk_scene.scene, [best.view]).color[0]
-        pixels = np.asarray((color.clamp(0, 1) * 255).round().byte().numpy(), np.uint8)
+        pixels = to_pixels(color)
     scale = pixels.shape[1] / lens.width_px
     size = (best.high - best.low) * (1 + 2 * _MARGIN) * scale
     # Widened to the tile's shape, so that nothing is stretched.

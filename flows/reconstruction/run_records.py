@@ -1,4 +1,4 @@
-"""Finished runs: their summary, their record in the store, and how to read a stage's value again."""
+"""Finished runs: their summary, and their record in the store."""
 
 from __future__ import annotations
 
@@ -25,13 +25,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from genre_tasks.metrics.results import Evaluation
-    from genre_tasks.scene.chunk import Chunk
-    from genre_tasks.scene.graph import SceneGraph
     from storage.local import Artifact
 
 _FOLDER = "runs"
-SCENE_STAGES = ("initial", "gnet", "enet")
-"""The stages that make a scene, in their order."""
 
 
 @dataclass(frozen=True)
@@ -161,107 +157,6 @@ def list_runs(store: str, name: str = "") -> list[dict[str, Any]]:
     return [read_record(path) for path in sorted(paths, key=lambda path: path.stat().st_mtime)]
 
 
-def read_stage_value(store: str, run: str, chunk: int | None, stage: str) -> tuple[int, Any]:
-    """Reads the value of a stage of a finished run.
-
-    Args:
-        store: folder (or URI) of the store.
-        run: the run's name, or the start of it.
-        chunk: number of the chunk; ``None`` for the run's first one.
-        stage: the stage's name.
-
-    Returns:
-        The number of the chunk, and the stage's value.
-
-    Raises:
-        InputError: there is no such run, chunk or stage, or the artifact is gone.
-        ArtifactCorruptError: the artifact is damaged.
-    """
-    record = _find_record(store, run)
-    stages_by_chunk = {c["chunk"]: c["stages"] for c in record["chunks"]}
-    number = min(stages_by_chunk) if chunk is None else chunk
-    if number not in stages_by_chunk:
-        raise InputError(
-            f"the run has no chunk {number}", remedy=f"It has {sorted(stages_by_chunk)}.", log=record["log"]
-        )
-    keys = {s["stage"]: s["key"] for s in stages_by_chunk[number]}
-    if stage not in keys:
-        raise InputError(f"the run has no stage '{stage}'", remedy=f"It has {', '.join(keys)}.", stage=stage)
-    opened = open_store(store)
-    # A key is unique, so the first artifact is the one.
-    for artifact in opened.artifacts(key=keys[stage]):
-        return number, opened.read(artifact)
-    raise InputError("the artifact is gone", remedy="Run the log again.", log=record["log"], stage=stage)
-
-
-def read_stage_scene(store: str, run: str, chunk: int, stage: str) -> SceneGraph:
-    """Reads the scene that a stage of a finished run has made.
-
-    Args:
-        store: folder (or URI) of the store.
-        run: the run's name, or the start of it.
-        chunk: number of the chunk.
-        stage: initial, gnet or enet.
-
-    Returns:
-        The scene.
-
-    Raises:
-        InputError: the stage makes no scene, or as :func:`read_stage_value` raises it.
-        ArtifactCorruptError: the artifact is damaged.
-    """
-    if stage not in SCENE_STAGES:
-        raise InputError(
-            f"the stage {stage} makes no scene", remedy=f"Those do: {', '.join(SCENE_STAGES)}.", stage=stage
-        )
-    scene: SceneGraph = read_stage_value(store, run, chunk, stage)[1].scene
-    return scene
-
-
-def find_last_stage(store: str, run: str, chunk: int) -> str:
-    """Finds the stage whose scene is the result of a run's chunk.
-
-    Args:
-        store: folder (or URI) of the store.
-        run: the run's name, or the start of it.
-        chunk: number of the chunk.
-
-    Returns:
-        ``enet``, or an earlier stage where a budget ended the run before it.
-
-    Raises:
-        InputError: there is no such run.
-    """
-    record = _find_record(store, run)
-    stages = {s["stage"] for c in record["chunks"] if c["chunk"] == chunk for s in c["stages"]}
-    # A budget may have ended the run with an earlier scene.
-    return next(name for name in reversed(SCENE_STAGES) if name in stages)
-
-
-def read_next_scene(store: str, run: str, chunk: int, stage: str | None) -> tuple[Chunk, SceneGraph] | None:
-    """Reads the chunk that follows another one, and its scene.
-
-    Args:
-        store: folder (or URI) of the store.
-        run: the run's name, or the start of it.
-        chunk: number of the chunk before.
-        stage: the stage whose scene is read; ``None`` for the last one of that chunk.
-
-    Returns:
-        The next chunk and its scene, or ``None`` if the run does not have that chunk.
-
-    Raises:
-        InputError: as :func:`read_stage_value` raises it.
-        ArtifactCorruptError: an artifact is damaged.
-    """
-    following = chunk + 1
-    if following not in {c["chunk"] for c in _find_record(store, run)["chunks"]}:
-        return None
-    name = stage or find_last_stage(store, run, following)
-    _, ingested = read_stage_value(store, run, following, "ingest")
-    return ingested, read_stage_scene(store, run, following, name)
-
-
 def _stage_record(stage: StageSummary) -> dict[str, Any]:
     return {
         "stage": stage.stage,
@@ -330,7 +225,19 @@ def _find_by_path(store: str, ref: ArtifactRef) -> Artifact:
     return artifact
 
 
-def _find_record(store: str, run: str) -> dict[str, Any]:
+def find_run_record(store: str, run: str) -> dict[str, Any]:
+    """Reads the record of one finished run.
+
+    Args:
+        store: folder (or URI) of the store.
+        run: the run's name, or the start of it.
+
+    Returns:
+        The record, as plain values.
+
+    Raises:
+        InputError: no run, or more than one, begins so.
+    """
     found = list_runs(store, run)
     # Every name begins with an empty text, which an unset variable of a script's leaves.
     if len(found) != 1 or not run:

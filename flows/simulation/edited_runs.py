@@ -13,11 +13,10 @@ from flows.machine.resource_usage import measure_usage
 from flows.pipeline.stage_runner import ArtifactRef
 from flows.reconstruction.run_records import (
     FinishedRun,
-    find_last_stage,
-    read_stage_value,
     summarise_run,
     write_run_record,
 )
+from flows.reconstruction.stored_values import find_last_stage, read_stage_value
 from flows.simulation.run_scenes import RunScenes
 from genre_tasks.config import PipelineConfig
 from genre_tasks.config.simulation_sections import SimulateConfig
@@ -114,7 +113,8 @@ def open_shown_scenes(store: str, run: str) -> RunScenes | EditedScenes:
     opened = open_run(store, run)
     if not len(opened.edits):
         return opened.recorded
-    return open_edited_scenes(store, run, EditList(), SimulateConfig())
+    config = PipelineConfig.model_validate(opened.recorded.record["config"]).simulate
+    return open_edited_scenes(store, run, EditList(), config)
 
 
 def digest_edits(store: str, edits: EditList, config: SimulateConfig) -> str:

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Protocol
-
-import numpy as np
-from numpy.typing import NDArray
 
 from flows.simulation.film import FilmWriter
 from genre_tasks.rollout.render_rollout import RolloutImages
 from genre_tasks.rollout.rig import RigCamera
 from storage.codecs.exr import write_channels, write_exr
-from storage.codecs.png import write_png
+from storage.codecs.png import to_pixels, write_png
 
 DEPTH_FOLDER = "depth"
 
@@ -60,7 +57,7 @@ class Films:
 
     def write(self, images: RolloutImages) -> None:
         """Appends an image to each film."""
-        for writer, pixels in zip(self._writers, to_pixels(images), strict=True):
+        for writer, pixels in zip(self._writers, to_pixels(images.color), strict=True):
             writer.write(pixels)
 
     def close(self) -> None:
@@ -74,23 +71,32 @@ class Films:
             writer.abort()
 
 
-class ExrImages:
-    """Scene-linear images with opacity and depth, ``CAMERA/000012.exr``.
+class ImageFiles:
+    """A file for each image, ``CAMERA/000012.exr`` or ``.png``.
 
     Args:
-        folder: where to write.
+        folder: where to write; it is made if it does not exist.
         rig: the cameras.
+        suffix: of the files.
+        write_image: called with the path of a file, the images of a pose, and the index of the camera.
     """
 
-    def __init__(self, folder: Path, rig: Sequence[RigCamera]) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        rig: Sequence[RigCamera],
+        suffix: str,
+        write_image: Callable[[Path, RolloutImages, int], None],
+    ) -> None:
         self._folder = folder
+        self._suffix = suffix
+        self._write_image = write_image
         make_camera_folders(folder, rig)
 
     def write(self, images: RolloutImages) -> None:
         """Writes a file for each camera."""
-        for view, color, alpha, depth in zip(images.views, images.color, images.alpha, images.depth, strict=True):
-            path = image_path(self._folder, view.camera, images.index, ".exr")
-            write_exr(path, color.numpy(), alpha.numpy(), depth.numpy())
+        for c, view in enumerate(images.views):
+            self._write_image(image_path(self._folder, view.camera, images.index, self._suffix), images, c)
 
     def close(self) -> None:
         """Nothing is left to do: every file is complete."""
@@ -99,53 +105,37 @@ class ExrImages:
         """Nothing is under way between two poses."""
 
 
-class DepthImages:
-    """Depth alone, ``depth/CAMERA/000012.exr`` with a channel Z in metres, 0 where nothing is.
+def write_linear_image(path: Path, images: RolloutImages, camera: int) -> None:
+    """Writes one image as scene-linear EXR with opacity and depth.
 
     Args:
-        folder: of the rollout.
-        rig: the cameras.
+        path: the file.
+        images: of a pose.
+        camera: its index.
     """
-
-    def __init__(self, folder: Path, rig: Sequence[RigCamera]) -> None:
-        self._folder = folder / DEPTH_FOLDER
-        self._folder.mkdir()
-        make_camera_folders(self._folder, rig)
-
-    def write(self, images: RolloutImages) -> None:
-        """Writes a file for each camera."""
-        for view, depth in zip(images.views, images.depth, strict=True):
-            write_channels(image_path(self._folder, view.camera, images.index, ".exr"), {"Z": depth.numpy()})
-
-    def close(self) -> None:
-        """Nothing is left to do: every file is complete."""
-
-    def abort(self) -> None:
-        """Nothing is under way between two poses."""
+    write_exr(path, images.color[camera].numpy(), images.alpha[camera].numpy(), images.depth[camera].numpy())
 
 
-class PngImages:
-    """Display-referred images, ``CAMERA/000012.png``.
+def write_depth(path: Path, images: RolloutImages, camera: int) -> None:
+    """Writes the depth of one image as EXR with a channel Z in metres, 0 where nothing is.
 
     Args:
-        folder: where to write.
-        rig: the cameras.
+        path: the file.
+        images: of a pose.
+        camera: its index.
     """
+    write_channels(path, {"Z": images.depth[camera].numpy()})
 
-    def __init__(self, folder: Path, rig: Sequence[RigCamera]) -> None:
-        self._folder = folder
-        make_camera_folders(folder, rig)
 
-    def write(self, images: RolloutImages) -> None:
-        """Writes a file for each camera."""
-        for view, pixels in zip(images.views, to_pixels(images), strict=True):
-            write_png(image_path(self._folder, view.camera, images.index, ".png"), pixels)
+def write_display_image(path: Path, images: RolloutImages, camera: int) -> None:
+    """Writes one image as PNG.
 
-    def close(self) -> None:
-        """Nothing is left to do: every file is complete."""
-
-    def abort(self) -> None:
-        """Nothing is under way between two poses."""
+    Args:
+        path: the file.
+        images: of a pose.
+        camera: its index.
+    """
+    write_png(path, to_pixels(images.color[camera]))
 
 
 @contextmanager
@@ -178,7 +168,7 @@ def make_camera_folders(folder: Path, rig: Sequence[RigCamera]) -> None:
         rig: the cameras.
     """
     for camera in rig:
-        (folder / camera.name).mkdir(exist_ok=True)
+        (folder / camera.name).mkdir(parents=True, exist_ok=True)
 
 
 def image_path(folder: Path, camera: str, index: int, suffix: str) -> Path:
@@ -197,16 +187,3 @@ def image_path(folder: Path, camera: str, index: int, suffix: str) -> Path:
     'out/front_camera/000012.exr'
     """
     return folder / camera / f"{index:06d}{suffix}"
-
-
-def to_pixels(images: RolloutImages) -> NDArray[np.uint8]:
-    """Rounds colours to bytes.
-
-    Args:
-        images: of C cameras.
-
-    Returns:
-        [C, H, W, 3] sRGB.
-    """
-    pixels: NDArray[np.uint8] = (images.color * 255).round().byte().numpy()
-    return pixels

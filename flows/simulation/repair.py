@@ -22,7 +22,7 @@ FILLED_FOLDER = "filled"
 """Masks of what FNet drew in place of removed actors: ``filled/CAMERA/000012.png``, white where it did."""
 
 RESTORED_FOLDER = "restored"
-"""The same for what removed actors did not hide, but shaded."""
+"""The same for what they covered and some recorded images show in their shadow, others in the light."""
 
 Repair = Callable[[RolloutImages], RolloutImages]
 

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 
-from flows.reconstruction.run_records import find_last_stage, list_runs, read_stage_scene, read_stage_value
+from flows.reconstruction.run_records import find_run_record
+from flows.reconstruction.stored_values import find_last_stage, read_stage_scene, read_stage_value
 from genre_tasks.effects.apply_plan import apply_plan
 from genre_tasks.errors import InputError
-from genre_tasks.scene_edits.chunk_scene import ChunkScene
+from genre_tasks.scene_edits.chunk_scene import CHUNKS_IN_MEMORY, ChunkScene
 from storage.local import open_store
-
-_CHUNKS_IN_MEMORY = 2
-"""A rollout needs the scenes on both sides of a border, and no more."""
 
 
 class RunScenes:
@@ -30,11 +28,7 @@ class RunScenes:
     """
 
     def __init__(self, store: str, run: str, stage: str | None = None, chunks: Sequence[int] | None = None) -> None:
-        found = list_runs(store, run)
-        if len(found) != 1 or not run:
-            problem = f"{len(found)} runs of this store begin with '{run}'"
-            raise InputError(problem, remedy="`genre show runs` lists them.", file=store)
-        self.record = found[0]
+        self.record = find_run_record(store, run)
         available = sorted(entry["chunk"] for entry in self.record["chunks"])
         unknown = sorted(set(chunks or ()) - set(available))
         if unknown:
@@ -42,7 +36,7 @@ class RunScenes:
         self._numbers = [number for number in available if chunks is None or number in chunks]
         self._store = store
         self._stage = stage
-        self._loaded: OrderedDict[int, ChunkScene] = OrderedDict()
+        self._read = lru_cache(CHUNKS_IN_MEMORY)(self._read_chunk_scene)
         self._digests: dict[str, str] | None = None
 
     @property
@@ -92,17 +86,13 @@ class RunScenes:
             InputError: the run has no such chunk, or an artifact is gone.
             ArtifactCorruptError: an artifact is damaged.
         """
-        if number not in self._loaded:
-            run = self.record["run"]
-            stage = self.find_stage(number)
-            chunk = read_stage_value(self._store, run, number, "ingest")[1]
-            plan = read_stage_value(self._store, run, number, "effects")[1]
-            scene = read_stage_scene(self._store, run, number, stage)
-            self._loaded[number] = ChunkScene(apply_plan(chunk, plan), scene)
-        self._loaded.move_to_end(number)
-        while len(self._loaded) > _CHUNKS_IN_MEMORY:
-            self._loaded.popitem(last=False)
-        return self._loaded[number]
+        return self._read(number)
+
+    def _read_chunk_scene(self, number: int) -> ChunkScene:
+        run = self.record["run"]
+        chunk = read_stage_value(self._store, run, number, "ingest")[1]
+        plan = read_stage_value(self._store, run, number, "effects")[1]
+        return ChunkScene(apply_plan(chunk, plan), read_stage_scene(self._store, run, number, self.find_stage(number)))
 
     def _find_digests(self) -> dict[str, str]:
         name_of: dict[str, str] = {}

@@ -6,7 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from flows.pipeline.log_cache import cached_log
-from flows.simulation.outputs import DepthImages, ExrImages, Films, PngImages, RolloutOutput
+from flows.simulation.outputs import (
+    DEPTH_FOLDER,
+    Films,
+    ImageFiles,
+    RolloutOutput,
+    write_depth,
+    write_display_image,
+    write_linear_image,
+)
 from flows.simulation.prepared_rollout import PreparedRollout
 from flows.simulation.request import SimulationRequest
 
@@ -37,11 +45,11 @@ def open_sensors(request: SimulationRequest, rollout: PreparedRollout, folder: P
     outputs: list[RolloutOutput] = []
     # Films start encoders, so they are last: nothing after them can fail.
     if request.exr:
-        outputs.append(ExrImages(folder, rollout.rig))
+        outputs.append(ImageFiles(folder, rollout.rig, ".exr", write_linear_image))
     if request.png:
-        outputs.append(PngImages(folder, rollout.rig))
+        outputs.append(ImageFiles(folder, rollout.rig, ".png", write_display_image))
     if "depth" in request.sensors:
-        outputs.append(DepthImages(folder, rollout.rig))
+        outputs.append(ImageFiles(folder / DEPTH_FOLDER, rollout.rig, ".exr", write_depth))
     if {"masks", "flow"} & set(request.sensors):
         # Imported here, as most simulations have neither.
         from flows.simulation.sensor_images import FlowImages, MaskImages

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 
 from flows.pipeline.stage_runner import ArtifactRef, Job, read_artifact
 from genre_tasks.effects.apply_plan import apply_plan
 from genre_tasks.scene.chunk import Chunk
-from genre_tasks.scene_edits.chunk_scene import ChunkScene
-
-_CHUNKS_IN_MEMORY = 2
-"""A rollout needs the scenes on both sides of a border, and no more."""
+from genre_tasks.scene_edits.chunk_scene import CHUNKS_IN_MEMORY, ChunkScene
 
 
 class StageScenes:
@@ -26,7 +23,7 @@ class StageScenes:
     def __init__(self, jobs: Sequence[Job], refs: Sequence[Mapping[str, ArtifactRef]], end: str) -> None:
         self._parts = {job.chunk: (job, artifacts) for job, artifacts in zip(jobs, refs, strict=True)}
         self._end = end
-        self._loaded: OrderedDict[int, ChunkScene] = OrderedDict()
+        self._read = lru_cache(CHUNKS_IN_MEMORY)(self._read_chunk_scene)
 
     @property
     def chunk_numbers(self) -> Sequence[int]:
@@ -45,13 +42,7 @@ class StageScenes:
         Raises:
             ArtifactCorruptError: an artifact is gone or damaged.
         """
-        if number not in self._loaded:
-            job, artifacts = self._parts[number]
-            self._loaded[number] = ChunkScene(self.read_chunk(number), read_artifact(job, artifacts[self._end]).scene)
-        self._loaded.move_to_end(number)
-        while len(self._loaded) > _CHUNKS_IN_MEMORY:
-            self._loaded.popitem(last=False)
-        return self._loaded[number]
+        return self._read(number)
 
     def read_chunk(self, number: int, planned: bool = True) -> Chunk:
         """Reads one chunk without its scene.
@@ -66,3 +57,7 @@ class StageScenes:
         job, artifacts = self._parts[number]
         chunk: Chunk = read_artifact(job, artifacts["ingest"])
         return apply_plan(chunk, read_artifact(job, artifacts["effects"])) if planned else chunk
+
+    def _read_chunk_scene(self, number: int) -> ChunkScene:
+        job, artifacts = self._parts[number]
+        return ChunkScene(self.read_chunk(number), read_artifact(job, artifacts[self._end]).scene)

@@ -35,15 +35,11 @@ from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.lidar_map import build_lidar_scene
 from genre_tasks.scene.novel_poses import find_nearest_reference
 from genre_tasks.scene.novel_views import NovelView, NovelViews
-from genre_tasks.scene_edits.chunk_scene import SceneSource
+from genre_tasks.scene_edits.chunk_scene import CHUNKS_IN_MEMORY, SceneSource
 from genre_tasks.stages.fnet import load_configured_fnet
 from genre_tasks.threads import map_single_threaded
 
 DEFAULT_SETTINGS = RenderSettings()
-
-
-_CHUNKS_IN_MEMORY = 2
-"""A rollout needs the images on both sides of a border, and no more."""
 
 
 @dataclass(frozen=True)
@@ -190,7 +186,7 @@ class RolloutFixer:
             known = _ChunkImages(chunk, removed, scene, build_lidar_scene(chunk, self._lidar_max_points))
             self._chunks[chunk.index] = known
         self._chunks.move_to_end(chunk.index)
-        while len(self._chunks) > _CHUNKS_IN_MEMORY:
+        while len(self._chunks) > CHUNKS_IN_MEMORY:
             self._chunks.popitem(last=False)
         return known
 

@@ -10,6 +10,9 @@ from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.graph import SceneGraph
 
+CHUNKS_IN_MEMORY = 2
+"""Chunks that a source of scenes keeps: a rollout needs those on both sides of a border, and no more."""
+
 
 @dataclass(frozen=True)
 class ChunkScene:

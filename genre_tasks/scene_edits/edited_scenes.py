@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from genre_tasks.scene_edits.actor_parts import (
     select_deformation,
     trim_to_box,
 )
-from genre_tasks.scene_edits.chunk_scene import ChunkScene, SceneSource
+from genre_tasks.scene_edits.chunk_scene import CHUNKS_IN_MEMORY, ChunkScene, SceneSource
 from genre_tasks.scene_edits.contact_shadow import build_contact_shadow
 from genre_tasks.scene_edits.edits import ActorChange, EditList, Insert, combine_changes
 from genre_tasks.scene_edits.insertion import place_inserted
@@ -32,8 +32,6 @@ from genre_tasks.scene_edits.run_survey import survey_run
 from genre_tasks.scene_edits.symmetry import complete_by_symmetry
 from genre_tasks.scene_edits.tone import apply_tone, match_tone, measure_road_color
 from genre_tasks.scene_edits.trajectories import Trajectory, change_trajectory
-
-_CHUNKS_IN_MEMORY = 2
 
 
 @dataclass(frozen=True)
@@ -96,7 +94,7 @@ class EditedScenes:
             if track_id in self._survey.tracks and not change.is_identity
         }
         self._adopted: dict[str, LibraryActor] = {}
-        self._loaded: OrderedDict[int, ChunkScene] = OrderedDict()
+        self._edit = lru_cache(CHUNKS_IN_MEMORY)(self._edit_chunk)
 
     @property
     def chunk_numbers(self) -> Sequence[int]:
@@ -112,14 +110,10 @@ class EditedScenes:
         Returns:
             The edited chunk and scene; ``removed`` are the actors as they were recorded that are away or elsewhere.
         """
-        if number not in self._loaded:
-            self._loaded[number] = self._edit_chunk(number, self._source.load(number))
-        self._loaded.move_to_end(number)
-        while len(self._loaded) > _CHUNKS_IN_MEMORY:
-            self._loaded.popitem(last=False)
-        return self._loaded[number]
+        return self._edit(number)
 
-    def _edit_chunk(self, number: int, base: ChunkScene) -> ChunkScene:
+    def _edit_chunk(self, number: int) -> ChunkScene:
+        base = self._source.load(number)
         removed = [node for node in base.scene.actors if node.track_id in self._changed]
         new = [*self._adopt(number, base), *self._place_inserted(number, base)]
         if not removed and not new:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,9 @@ from numpy.typing import NDArray
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
 from storage.codecs.tables import REMEDY
 from storage.files import write_file
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def encode_png(image: NDArray[np.uint8]) -> bytes:
@@ -77,3 +81,21 @@ def read_png(path: Path) -> NDArray[np.uint8]:
         if isinstance(error, OSError) and error.errno is not None:
             raise
         raise ArtifactCorruptError(f"The picture does not decode ({error})", remedy=REMEDY, file=path) from error
+
+
+def to_pixels(color: Tensor) -> NDArray[np.uint8]:
+    """Rounds colours to bytes.
+
+    Args:
+        color: [..., 3] sRGB; what is outside of [0, 1] becomes the nearest end.
+
+    Returns:
+        [..., 3] sRGB.
+
+    >>> import torch
+    >>> to_pixels(torch.tensor([[-0.1, 0.5, 1.0]])).tolist()
+    [[0, 128, 255]]
+    """
+    # Rounded, because a plain cast truncates and darkens every image by half a level.
+    pixels: NDArray[np.uint8] = (color.clamp(0, 1) * 255).round().byte().cpu().numpy()
+    return pixels

@@ -15,7 +15,7 @@ from flows.pipeline import stage_task
 from flows.pipeline.definition import PIPELINE
 from flows.pipeline.log_cache import cached_log, expand_logs
 from flows.pipeline.stage_runner import Job
-from flows.reconstruction import flow, run_records
+from flows.reconstruction import flow, run_records, stored_values
 from flows.reconstruction.left_out import ChunksLeftOutError, LogsFailedError
 from genre_tasks.errors import ConfigError, InputError, ResourceError, TransientIOError
 from tests.faults.small_run import LOG, SETTINGS
@@ -179,8 +179,8 @@ def test_a_folder_of_sequences_is_expanded(tmp_path: Path) -> None:
 
 def test_a_stages_value_can_be_had_back(tmp_path: Path) -> None:
     summary = run(tmp_path)
-    number, chunk = run_records.read_stage_value(str(tmp_path), summary["run"][:6], None, "ingest")
+    number, chunk = stored_values.read_stage_value(str(tmp_path), summary["run"][:6], None, "ingest")
     assert number == 0 and chunk.log == cached_log(LOG).name
     shutil.rmtree(next(tmp_path.glob("synthetic/*/0000/initial")))
     with pytest.raises(InputError, match="gone"):
-        run_records.read_stage_value(str(tmp_path), summary["run"], 0, "initial")
+        stored_values.read_stage_value(str(tmp_path), summary["run"], 0, "initial")

@@ -20,11 +20,10 @@ from flows.pipeline.stage_runner import ArtifactRef, Job, run_stage
 from flows.reconstruction.reliable_range import write_range
 from flows.reconstruction.run_records import (
     FinishedRun,
-    find_last_stage,
-    read_stage_value,
     summarise_run,
     write_run_record,
 )
+from flows.reconstruction.stored_values import find_last_stage, read_stage_value
 from genre_tasks.config import RangeConfig
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.fixer.source_images import load_source_images
