@@ -10,10 +10,14 @@ import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from flows.cli.main import app
+from genre_tasks.config import SimulateConfig
+from genre_tasks.ego_paths.behaviours import plan_behaviour
+from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.logs.pandaset.writer import write_pandaset
 from genre_tasks.logs.registry import open_log
 from tests.faults.small_run import LOG, SETTINGS
@@ -81,6 +85,19 @@ def test_a_command_of_the_documents_runs(
     monkeypatch.setenv("PREFECT_HOME", str(workplace[0] / "prefect"))  # as the command itself sets it
     done = CliRunner().invoke(app, small(command, *workplace), catch_exceptions=False)
     assert done.exit_code == 0, done.output
+
+
+def test_the_documents_behaviours_fit_the_log_of_the_quickstart() -> None:
+    # The commands above run on eight frames, at a strength that fits them; these are the documents' own.
+    log = open_log("synthetic:street?seed=1000")
+    poses = np.stack([log.world_SE3_lidar(frame) for frame in range(log.frame_count)])
+    frames = np.arange(log.frame_count, dtype=np.float64)
+    recorded = EgoPath(0.1 * frames, frames, poses)
+    config = SimulateConfig()
+    found = {behaviour for page in PAGES for behaviour in re.findall(r"--behaviour ([\w-]+)", page.read_text())}
+    assert found >= {"brake", "lane-change"}
+    for behaviour in found:
+        assert len(plan_behaviour(behaviour, recorded, config, start_offset_m=config.start_offset_m)) == 20
 
 
 def test_the_readme_has_commands() -> None:
