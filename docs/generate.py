@@ -40,6 +40,7 @@ BLOCKS: Mapping[str, Callable[[], str]] = {
     "simulation-behaviours": simulation_tables.behaviours,
     "simulation-comparison": simulation_tables.comparison_claims,
     "simulation-claims": simulation_tables.claims,
+    "simulation-removal": simulation_tables.removal,
 }
 FILES: Mapping[str, Callable[[], str]] = {
     "docs/reference/cli.md": references.cli_reference,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
+import statistics
 from collections.abc import Sequence
 from typing import Any
 
@@ -64,6 +66,32 @@ def _mean(rows: Sequence[dict[str, Any]], behaviour: str, method: str, metric: s
         return "–"
     mean = sum(by_log) / len(by_log)
     return f"{mean:.2f}" if metric == "psnr" else f"{mean:.3f}"
+
+
+def removal() -> str:
+    """What removed actors hid, as rendered and as filled by FNet: PSNR of the median actor."""
+    actors = [
+        actor
+        for row in result(NAME)["rows"]
+        if row["cell"].startswith("removal") and "actors" in row
+        for actor in row["actors"]
+    ]
+    areas = {"recorded": "another frame saw it", "never_recorded": "no frame saw it"}
+    lines = []
+    for version, words in (("rendered", "the scene without the actor"), ("filled", "filled by FNet, as written")):
+        values = [_median_psnr(actors, version, area) for area in areas]
+        lines.append([words, *values])
+    return table(["PSNR of what a removed actor hid, dB ↑", *areas.values()], lines)
+
+
+def _median_psnr(actors: Sequence[dict[str, Any]], version: str, area: str) -> str:
+    values = []
+    for actor in actors:
+        error = sum(view[version][area]["squared_error"] for view in actor["views"])
+        pixels = sum(view[version][area]["pixels"] for view in actor["views"])
+        if pixels:
+            values.append(-10 * math.log10(error / pixels))
+    return f"{statistics.median(values):.1f}"
 
 
 def comparison_claims() -> str:
