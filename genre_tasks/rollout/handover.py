@@ -33,11 +33,12 @@ CANDIDATE_OFFSETS = (0.0, -2.0, 2.0, -4.0, 4.0)
 class Handover:
     """A fade from the background of one chunk to that of the next.
 
+    Places on the recorded path are named by the log frame at which the recorded vehicle was there.
+
     Attributes:
         before: number of the chunk that is left.
         after: number of the chunk that is entered.
-        border_frame: between the last log frame of the one and the first of the other. These three are places: where
-            the recorded vehicle was at that moment.
+        border_frame: the place between the last frame of ``before`` and the first of ``after``.
         start_frame: until there the scene of ``before`` is shown alone.
         end_frame: from there on that of ``after`` alone; equal to ``start_frame`` for a cut.
         psnr_db: how alike both scenes show the same views in the middle, without actors; NaN where not measured.
@@ -68,7 +69,7 @@ class Handover:
         return _ramp(place, self.start_frame, self.end_frame)
 
     def weigh_traffic(self, frame: float) -> float:
-        """Gives how much the actors' looks of ``after`` count at a moment.
+        """Gives how much the actors of ``after`` count at a moment, where both chunks have Gaussians of them.
 
         Their fade takes as long as that of the background, and is centred on the border.
 
@@ -95,8 +96,7 @@ def plan_handovers(
         source: the scenes of a run.
         path: P poses.
         rig: the cameras.
-        handover_frames: a fade goes from place to place as the recorded vehicle did in so many log frames; 0: a cut.
-            Short chunks have shorter fades.
+        handover_frames: length of a fade, in frames of the recorded drive; 0: a cut. Short chunks have shorter fades.
         settings: backend and threads.
 
     Returns:
