@@ -17,6 +17,7 @@ demo: $(READY)
 	$(GENRE) run 'synthetic:street?seed=1000' --preset demo
 
 test: $(READY)
+	@tests/install_browser.sh
 	$(VENV)/bin/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 test-all: $(READY)

@@ -69,7 +69,12 @@ def test_every_required_package_is_pinned() -> None:
         for line in (ROOT / "constraints.txt").read_text().splitlines()
         if "==" in line
     }
-    wanted = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
+    extras = project["optional-dependencies"]
+    wanted = [*project["dependencies"], *extras["dev"]]
+    # The tests' own extra names others of this project: their packages are installed with it.
+    for own in [w for w in wanted if w.startswith("genre[")]:
+        wanted.remove(own)
+        wanted += [w for name in re.split(r"[\[\],]", own)[1:-1] for w in extras[name]]
     names = {re.sub(r"[-_.]+", "-", re.split(r"[<>=\[ ]", w)[0]).lower() for w in wanted}
     assert names <= pinned, sorted(names - pinned)
 
