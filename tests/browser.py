@@ -12,9 +12,7 @@ from typing import Any
 import pytest
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-needs_browser = pytest.mark.skipif(
-    CHROMIUM is None, reason="there is no chromium; tests/install_browser.sh installs it"
-)
+needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium: run tests/install_browser.sh")
 
 _FLAGS = (
     "--no-sandbox",
