@@ -21,9 +21,6 @@ from storage.files import write_file
 FILLED_FOLDER = "filled"
 """Masks of what FNet drew in place of removed actors: ``filled/CAMERA/000012.png``, white where it did."""
 
-RESTORED_FOLDER = "restored"
-"""The same for what they covered and some recorded images show in their shadow, others in the light."""
-
 Repair = Callable[[RolloutImages], RolloutImages]
 
 
@@ -47,13 +44,12 @@ class FnetRepair:
         """Repairs the images of a pose; poses follow each other in order."""
         fixed = self._repair(images)
         if images.chunk_scene.removed:
-            for name, masks in ((FILLED_FOLDER, fixed.filled), (RESTORED_FOLDER, fixed.restored)):
-                folder = self._folder / name
-                folder.mkdir(exist_ok=True)
-                make_camera_folders(folder, self._rig)
-                for view, mask in zip(images.views, masks.numpy(), strict=True):
-                    path = image_path(folder, view.camera, images.index, ".png")
-                    write_file(path, encode_png(mask.astype(np.uint8) * 255))
+            folder = self._folder / FILLED_FOLDER
+            folder.mkdir(exist_ok=True)
+            make_camera_folders(folder, self._rig)
+            for view, mask in zip(images.views, fixed.filled.numpy(), strict=True):
+                path = image_path(folder, view.camera, images.index, ".png")
+                write_file(path, encode_png(mask.astype(np.uint8) * 255))
         return replace(images, color=fixed.color.clamp(0, 1))
 
 

@@ -1,4 +1,4 @@
-"""The background that removed actors hid or shaded: Gaussians that no image bears on take colours that images show."""
+"""The background that removed actors hid: Gaussians of the road that no image shows take the colours of the road."""
 
 from __future__ import annotations
 
@@ -41,11 +41,9 @@ _CLEARANCE_M = 0.2
 def repair_background(
     scene: SceneGraph, chunk: Chunk, nodes: Sequence[ActorNode], removed: RemovedActors
 ) -> SceneGraph:
-    """Repairs the static Gaussians that removed actors hid or shaded.
+    """Repairs the static Gaussians that removed actors hid.
 
-    * A Gaussian of the road that some images show in light and others near the actors takes the mean colour of the
-      former.
-    * One of the road that no image shows in light takes the median colour of the nearest that some do, and is opaque.
+    * A Gaussian of the road that no image shows takes the median colour of the nearest that some do, and is opaque.
     * One inside the space that the actors drove through is removed, because that space is empty.
 
     What stands behind the actors stays: its colours are better than those of its neighbours.
@@ -61,18 +59,13 @@ def repair_background(
     """
     rows = torch.nonzero(scene.nodes == STATIC)[:, 0]
     means = scene.gaussians.means[rows]
-    lit_color, lit = _average_colors(means, removed.unshaded)
-    shaded = torch.zeros_like(lit)
-    for source, unshaded in zip(removed.sources, removed.unshaded, strict=True):
-        shaded |= _sample(means, source)[1] & ~_sample(means, unshaded)[1]
+    visible = _find_visible(means, removed.sources)
     positions = means.double().numpy()
     height = measure_height_over_road(np.concatenate([chunk.static.positions, positions]), chunk.chunk_SE3_ego)
     on_road = torch.from_numpy(np.abs(height[len(chunk.static) :]) < ROAD_TOLERANCE_M)
     colors = scene.gaussians.colors[rows].clone()
-    relit = on_road & lit & shaded
-    colors[relit] = lit_color[relit]
-    unsupported = on_road & ~lit
-    known = on_road & lit
+    unsupported = on_road & ~visible
+    known = on_road & visible
     if bool(known.any()) and bool(unsupported.any()):
         asphalt = known & ((colors - colors[known].median(0).values).abs().amax(1) < MARKING_CONTRAST)
         # A road of many colours has no typical one.
@@ -82,12 +75,11 @@ def repair_background(
     opaque = torch.tensor(ROAD_OPACITY).logit().to(logits)
     logits = torch.where(unsupported, torch.maximum(logits, opaque), logits)
     logits[_find_driven_through(means, nodes)] = ABSENT_LOGIT
-    changed = relit | unsupported
     harmonics = scene.spherical_harmonics
     if harmonics is not None:
         harmonics = harmonics.clone()
-        # The new colour is a mean over directions.
-        harmonics[rows[changed]] = 0
+        # The new colour is a median over places and directions.
+        harmonics[rows[unsupported]] = 0
     gaussians = replace(
         scene.gaussians,
         colors=scene.gaussians.colors.index_copy(0, rows, colors),
@@ -96,23 +88,14 @@ def repair_background(
     return replace(scene, gaussians=gaussians, spherical_harmonics=harmonics)
 
 
-def _sample(means: Tensor, source: SourceImage) -> tuple[Tensor, Tensor]:
-    """Colours [3, N] that an image shows at static points, and [N] where it sees them."""
+def _find_visible(means: Tensor, sources: Sequence[SourceImage]) -> Tensor:
+    """[N] whether any image sees a static point."""
     everywhere = torch.ones(1, len(means), dtype=torch.bool)
     surface = Surface(means[None], everywhere, torch.full((1, len(means)), NO_ACTOR))
-    color, visible = sample_source(surface, source, (), source.frame)
-    return color[:, 0], visible[0]
-
-
-def _average_colors(means: Tensor, sources: Sequence[SourceImage]) -> tuple[Tensor, Tensor]:
-    """Mean colours [N, 3] of the images that see a point, and [N] whether any does."""
-    total = torch.zeros(len(means), 3)
-    count = torch.zeros(len(means))
+    visible = torch.zeros(len(means), dtype=torch.bool)
     for source in sources:
-        color, visible = _sample(means, source)
-        total += (color * visible).T
-        count += visible
-    return total / count.clamp_min(1)[:, None], count > 0
+        visible |= sample_source(surface, source, (), source.frame)[1][0]
+    return visible
 
 
 def _take_median_of_nearest(known: Tensor, colors: Tensor, places: Tensor) -> Tensor:

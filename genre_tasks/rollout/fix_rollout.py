@@ -25,7 +25,6 @@ from genre_tasks.rollout.last_images import LastImages
 from genre_tasks.rollout.moment_actors import LAST_MOMENT, THIS_MOMENT, pose_actors
 from genre_tasks.rollout.removed_area import (
     RemovedActors,
-    UncoveredArea,
     find_uncovered_area,
     separate_removed_actors,
 )
@@ -49,13 +48,10 @@ class FixedRolloutImages:
     Attributes:
         color: [C, H, W, 3] sRGB in [0, 1].
         filled: [C, H, W] true where a removed actor hid what no recorded image shows: FNet drew it.
-        restored: [C, H, W] true where a removed actor covered what some recorded images show in its shadow: FNet drew
-            it from images in which it is in the light.
     """
 
     color: Tensor
     filled: Tensor
-    restored: Tensor
 
 
 @dataclass(frozen=True)
@@ -65,7 +61,7 @@ class _ChunkImages:
     Attributes:
         chunk: as edited.
         removed: actors that were removed, and the recorded images without them.
-        repaired: the edited scene, repaired where removed actors hid or shaded the background.
+        repaired: the edited scene, repaired where removed actors hid the background.
         lidar_scene: coloured points as discs, as edited.
         latents: of references by camera and frame, once encoded.
     """
@@ -125,10 +121,10 @@ class RolloutFixer:
         """
         chunk_images = self._load_chunk(images)
         novel = self._render_inputs(images, chunk_images)
-        novel, area = self._paste_repaired(images, novel, chunk_images)
+        novel, filled = self._paste_repaired(images, novel, chunk_images)
         color = self._run_network(images, novel, chunk_images, range(len(images.views)))
         self._last.remember(images, color)
-        return FixedRolloutImages(color, area.filled, area.restored)
+        return FixedRolloutImages(color, filled)
 
     @torch.no_grad()
     def fill(self, images: RolloutImages) -> FixedRolloutImages:
@@ -145,18 +141,18 @@ class RolloutFixer:
         """
         nowhere = torch.zeros_like(images.alpha, dtype=torch.bool)
         if not images.chunk_scene.removed:
-            return FixedRolloutImages(images.color, nowhere, nowhere)
+            return FixedRolloutImages(images.color, nowhere)
         chunk_images = self._load_chunk(images)
         novel = self._render_inputs(images, chunk_images)
-        novel, area = self._paste_repaired(images, novel, chunk_images)
-        rows = [k for k in range(len(images.views)) if bool(area.both[k].any())]
+        novel, filled = self._paste_repaired(images, novel, chunk_images)
+        rows = [k for k in range(len(images.views)) if bool(filled[k].any())]
         color = images.color.clone()
         if rows:
-            # The network repairs a view in one piece, and only the pixels of the area are taken.
+            # The network repairs a view in one piece, and only the uncovered pixels are taken.
             fixed = self._run_network(images, novel, chunk_images, rows)
-            color[rows] = torch.where(area.both[rows][..., None], fixed, color[rows])
+            color[rows] = torch.where(filled[rows][..., None], fixed, color[rows])
         self._last.remember(images, color)
-        return FixedRolloutImages(color, area.filled, area.restored)
+        return FixedRolloutImages(color, filled)
 
     def _load_chunk(self, images: RolloutImages) -> _ChunkImages:
         chunk = images.chunk_scene.chunk
@@ -210,23 +206,22 @@ class RolloutFixer:
             lidar_depth=lidar.expected_depth(),
         )
 
-    def _find_area(self, images: RolloutImages, novel: NovelViews, chunk_images: _ChunkImages) -> UncoveredArea:
+    def _find_area(self, images: RolloutImages, novel: NovelViews, chunk_images: _ChunkImages) -> Tensor:
         if not images.chunk_scene.removed:
-            nowhere = torch.zeros_like(images.alpha, dtype=torch.bool)
-            return UncoveredArea(nowhere, nowhere)
+            return torch.zeros_like(images.alpha, dtype=torch.bool)
         rendered = torch.where(novel.alpha >= MIN_ALPHA, novel.depth, torch.zeros_like(novel.depth))
         depth = torch.where(novel.lidar_alpha >= MIN_ALPHA, novel.lidar_depth, rendered)
         return find_uncovered_area(images, depth, chunk_images.removed, self._settings)
 
     def _paste_repaired(
         self, images: RolloutImages, novel: NovelViews, chunk_images: _ChunkImages
-    ) -> tuple[NovelViews, UncoveredArea]:
+    ) -> tuple[NovelViews, Tensor]:
         """The views with what the repaired scene shows where removed actors were, and where that is."""
-        area = self._find_area(images, novel, chunk_images)
-        if not bool(area.both.any()):
-            return novel, area
+        uncovered = self._find_area(images, novel, chunk_images)
+        if not bool(uncovered.any()):
+            return novel, uncovered
         repaired = render_views(chunk_images.repaired, images.views, self._settings)
-        return _paste(novel, area, repaired), area
+        return _paste(novel, uncovered, repaired), uncovered
 
     def _run_network(
         self, images: RolloutImages, novel: NovelViews, chunk_images: _ChunkImages, rows: Sequence[int]
@@ -241,7 +236,7 @@ class RolloutFixer:
         chunk = replace(chunk_images.chunk, actors=moving)
 
         def fix_batch(batch: Sequence[int]) -> Tensor:
-            inputs = build_inputs(chunk, novel, batch, chunk_images.removed.unshaded)
+            inputs = build_inputs(chunk, novel, batch, chunk_images.removed.sources)
             if self._config.temporal:
                 inputs = self._last.look_up(images, novel, batch, moving, inputs)
             # By camera and not by pose: noise that changes from pose to pose is seen as flicker.
@@ -259,12 +254,12 @@ class RolloutFixer:
         if last_frame is not None:
             moments[LAST_MOMENT] = last_frame
         recorded = {actor.track_id: actor for actor in chunk_images.removed.recorded}
-        frames = sorted({source.frame for source in chunk_images.removed.unshaded})
+        frames = sorted({source.frame for source in chunk_images.removed.sources})
         return pose_actors(images.chunk_scene.scene.actors, moments, recorded, frames)
 
     def _encode_reference(self, reference: tuple[str, int], chunk_images: _ChunkImages) -> Tensor:
         if reference not in chunk_images.latents:
-            image = next(s.image for s in chunk_images.removed.unshaded if (s.camera, s.frame) == reference)
+            image = next(s.image for s in chunk_images.removed.sources if (s.camera, s.frame) == reference)
             stride = self._network.stride
             pad = (0, -image.shape[-1] % stride, 0, -image.shape[-2] % stride)
             encoded = self._network.encode(F.pad(image[None], pad, mode="replicate"))
@@ -272,16 +267,15 @@ class RolloutFixer:
         return chunk_images.latents[reference]
 
 
-def _paste(novel: NovelViews, area: UncoveredArea, repaired: Render) -> NovelViews:
-    """The views with what another render shows in an area."""
-    both = area.both
+def _paste(novel: NovelViews, area: Tensor, repaired: Render) -> NovelViews:
+    """The views with what another render shows in an area [V, H, W]."""
     color = repaired.color.clamp(0, 1)
-    # LiDAR points take their colours from images: where these show a shadow, so does the map.
+    # The LiDAR map has points there without a colour of any image.
     lidar_color = color * novel.lidar_alpha[..., None]
     return replace(
         novel,
-        lidar_color=torch.where(both[..., None], lidar_color, novel.lidar_color),
-        color=torch.where(both[..., None], color, novel.color),
-        alpha=torch.where(both, repaired.alpha, novel.alpha),
-        depth=torch.where(both, repaired.expected_depth(), novel.depth),
+        lidar_color=torch.where(area[..., None], lidar_color, novel.lidar_color),
+        color=torch.where(area[..., None], color, novel.color),
+        alpha=torch.where(area, repaired.alpha, novel.alpha),
+        depth=torch.where(area, repaired.expected_depth(), novel.depth),
     )

@@ -1,8 +1,8 @@
-"""The side of an actor that no camera saw, as a mirror image of the one that cameras saw.
+"""The faces of an actor that no camera saw, as mirror images of those that cameras saw.
 
-Vehicles are symmetric but for their writing. An actor that is turned around or inserted shows a side for which there is
-no evidence at all; what optimisation left there are Gaussians that no image constrained. Front and rear are no mirror
-images of one another: where only the rear was seen, the front stays as bad as it is.
+An actor that is turned around or inserted shows faces for which there is no evidence at all; what optimisation left
+there are Gaussians that no image constrained. Left and right sides of vehicles are mirror images but for their writing.
+Front and rear are not, but a mirrored rear has the right outline and paint, which unconstrained Gaussians have not.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.chunk import View
@@ -21,14 +20,18 @@ from genre_tasks.scene.transforms import invert_se3
 from genre_tasks.scene_edits.actor_parts import ActorPart
 
 UNSEEN_FRACTION = 0.1
-"""A side is mirrored where cameras saw it less than this, in proportion to the other side."""
+"""Cameras missed a face if they saw it less than this, in proportion to another one."""
 
-# Spherical harmonics that are odd in y, in the order of scene.spherical_harmonics.
-_ODD_IN_Y = (0, 3, 4, 8, 9, 10)
+# The front's share of a car's length that is hidden from behind: bonnet and windscreen.
+MIRRORED_LENGTH = 0.25
+"""Share of the length that is replaced at an end."""
+
+# Spherical harmonics that are odd in x and in y, in the order of scene.spherical_harmonics.
+_ODD_IN = ((2, 3, 6, 9, 12, 14), (0, 3, 4, 8, 9, 10))
 
 
 def complete_by_symmetry(part: ActorPart, node: ActorNode, views: Sequence[View]) -> ActorPart:
-    """Replaces the half of an actor that no camera saw by the mirrored other half.
+    """Replaces the faces of an actor that no camera saw by their mirrored opposites.
 
     Args:
         part: the actor. One that deforms is returned as it is: who walks is not symmetric.
@@ -36,32 +39,33 @@ def complete_by_symmetry(part: ActorPart, node: ActorNode, views: Sequence[View]
         views: recorded images of the chunk, in whose coordinates the path is.
 
     Returns:
-        The completed actor; the same object where both sides were seen, or neither.
+        The completed actor; the same object where nothing is replaced. An end is replaced only where neither side was
+        seen.
     """
-    left, right = measure_side_views(node, views)
-    if part.deformation is not None or min(left, right) >= UNSEEN_FRACTION * max(left, right):
+    if part.deformation is not None:
         return part
-    side = 1.0 if left > right else -1.0
-    rows = torch.nonzero(part.gaussians.means[:, 1] * side >= 0)[:, 0]
-    seen = map_attributes(lambda x: x.index_select(0, rows), part.gaussians)
-    harmonics = part.spherical_harmonics
-    if harmonics is not None:
-        seen_harmonics = harmonics.index_select(0, rows)
-        harmonics = torch.cat([seen_harmonics, _mirror_harmonics(seen_harmonics)])
-    gaussians = map_attributes(lambda a, b: torch.cat([a, b]), seen, _mirror(seen))
-    return replace(part, gaussians=gaussians, spherical_harmonics=harmonics)
+    front, rear = measure_face_views(node, views, axis=0)
+    left, right = measure_face_views(node, views, axis=1)
+    if min(left, right) < UNSEEN_FRACTION * max(left, right):
+        part = _replace_face(part, axis=1, side=1.0 if left > right else -1.0, from_m=0.0)
+    # A side shows both ends in profile: what images constrained there is better than a mirrored end.
+    if min(front, rear) + max(left, right) < UNSEEN_FRACTION * max(front, rear):
+        from_m = (0.5 - MIRRORED_LENGTH) * node.size_m[0]
+        part = _replace_face(part, axis=0, side=1.0 if front > rear else -1.0, from_m=from_m)
+    return part
 
 
-def measure_side_views(node: ActorNode, views: Sequence[View]) -> tuple[float, float]:
-    """Measures how much cameras saw of the two sides of an actor.
+def measure_face_views(node: ActorNode, views: Sequence[View], axis: int) -> tuple[float, float]:
+    """Measures how much cameras saw of two opposite faces of an actor.
 
     Args:
         node: its path.
         views: recorded images.
+        axis: of the box: 0 for front and rear, 1 for the left and the right side.
 
     Returns:
-        For the left and the right side the sum over images of the cosine at which the side is seen, divided by the
-        squared distance in metres.
+        For the face at the axis's positive end and for the other one the sum over images of the cosine at which the
+        face is seen, divided by the squared distance in metres.
     """
     sums = [0.0, 0.0]
     for view in views:
@@ -75,24 +79,45 @@ def measure_side_views(node: ActorNode, views: Sequence[View]) -> tuple[float, f
         if centre[2] <= 0 or not 0 <= u <= lens.width_px:
             continue
         position = box_SE3_camera[:3, 3]
-        # A side is seen from outside of its plane alone.
-        outside = abs(position[1]) - node.size_m[1] / 2
+        # A face is seen from outside of its plane alone.
+        outside = abs(position[axis]) - node.size_m[axis] / 2
         if outside > 0:
             distance = float(np.linalg.norm(position))
-            sums[0 if position[1] > 0 else 1] += float(outside) / distance**3
+            sums[0 if position[axis] > 0 else 1] += float(outside) / distance**3
     return sums[0], sums[1]
 
 
-def _mirror(gaussians: Gaussians) -> Gaussians:
-    # Across the plane y = 0 of the box: a rotation's axis is a pseudovector, so its other two components change sign.
+def _replace_face(part: ActorPart, axis: int, side: float, from_m: float) -> ActorPart:
+    """Replaces what lies beyond a distance from the middle on one side by the mirrored other side.
+
+    Args:
+        part: the actor.
+        axis: of the box.
+        side: +1 or −1, the end of the axis that was seen.
+        from_m: distance from the box's middle, metres.
+    """
+    position = part.gaussians.means[:, axis] * side
+    kept = torch.nonzero(position >= -from_m)[:, 0]
+    mirrored = torch.nonzero(position >= from_m)[:, 0]
+    parts = (
+        map_attributes(lambda x: x.index_select(0, kept), part.gaussians),
+        _mirror(map_attributes(lambda x: x.index_select(0, mirrored), part.gaussians), axis),
+    )
+    harmonics = part.spherical_harmonics
+    if harmonics is not None:
+        signs = torch.ones(harmonics.shape[1])
+        signs[[k for k in _ODD_IN[axis] if k < len(signs)]] = -1.0
+        harmonics = torch.cat([harmonics[kept], harmonics[mirrored] * signs[:, None]])
+    gaussians = map_attributes(lambda a, b: torch.cat([a, b]), *parts)
+    return replace(part, gaussians=gaussians, spherical_harmonics=harmonics)
+
+
+def _mirror(gaussians: Gaussians, axis: int) -> Gaussians:
+    flips = torch.ones(3)
+    flips[axis] = -1.0
+    # A rotation's axis is a pseudovector: the components along the mirror's plane change sign.
     return replace(
         gaussians,
-        means=gaussians.means * torch.tensor([1.0, -1.0, 1.0]),
-        quats=gaussians.quats * torch.tensor([1.0, -1.0, 1.0, -1.0]),
+        means=gaussians.means * flips,
+        quats=gaussians.quats * torch.cat([torch.ones(1), -flips]),
     )
-
-
-def _mirror_harmonics(harmonics: Tensor) -> Tensor:
-    signs = torch.ones(harmonics.shape[1])
-    signs[[k for k in _ODD_IN_Y if k < len(signs)]] = -1.0
-    return harmonics * signs[:, None]
