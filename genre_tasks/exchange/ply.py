@@ -182,8 +182,10 @@ def _pair_attributes(cloud: SplatCloud) -> Iterator[tuple[str, tuple[str, ...], 
 
 
 def _copy_columns(block: NDArray[np.void], names: tuple[str, ...], target: Float32) -> None:
-    for column, name in enumerate(names):
-        target[:, column] = block[name]
+    # What float32 does not hold becomes infinite, and is refused as such.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for column, name in enumerate(names):
+            target[:, column] = block[name]
 
 
 def _pack_rows(cloud: SplatCloud) -> NDArray[np.void]:
