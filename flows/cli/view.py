@@ -10,7 +10,6 @@ import typer
 
 from flows.cli.options import RunArgument, RunChunkOption, SceneStageOption, StoreOption
 from flows.cli.parsing import parse_path
-from flows.cli.simulate_options import NoRangeOption
 from flows.defaults import DEFAULT_STORE
 
 if TYPE_CHECKING:
@@ -53,7 +52,10 @@ def view(
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="The port, or 0 for a free one. A taken one leads to the next.")] = 8080,
     open_browser: Annotated[bool, typer.Option("--open", help="Open the viewer in this machine's browser.")] = False,
-    no_range: NoRangeOption = False,
+    no_range: Annotated[
+        bool,
+        typer.Option("--no-range", help="Do not draw the reliable range. It takes a minute once for each scene."),
+    ] = False,
     store: StoreOption = DEFAULT_STORE,
 ) -> None:
     """Look at a finished run's scene in a browser.
