@@ -23,39 +23,46 @@ _LEAST_SPLATS = 100
 _MOST_SPLATS = 5_000_000
 
 
+HtmlOption = Annotated[
+    Path | None,
+    typer.Option(
+        parser=parse_path,
+        metavar="PATH",
+        help="Write one HTML file x.html that plays the scene without a server or the network, over an existing one, "
+        "instead of starting a viewer.",
+    ),
+]
+MaxSplatsOption = Annotated[
+    int | None,
+    typer.Option(
+        help="Show no more Gaussians than this: those that fill most of the images along the path. "
+        f"{PAGE_SPLATS} with --html if not given, else all."
+    ),
+]
+HostOption = Annotated[
+    str,
+    typer.Option(
+        help="The address that the viewer listens at. Any other than that of this machine lets everyone in the "
+        "network look at the scene."
+    ),
+]
+PortOption = Annotated[int, typer.Option(help="The port, or 0 for a free one. A taken one leads to the next.")]
+OpenOption = Annotated[bool, typer.Option("--open", help="Open the viewer in this machine's browser.")]
+ViewNoRangeOption = Annotated[
+    bool, typer.Option("--no-range", help="Do not draw the reliable range. It takes a minute once for each scene.")
+]
+
+
 def view(
     run: RunArgument,
-    html: Annotated[
-        Path | None,
-        typer.Option(
-            parser=parse_path,
-            metavar="PATH",
-            help="Write one HTML file x.html that plays the scene without a server or the network, over an existing "
-            "one, instead of starting a viewer.",
-        ),
-    ] = None,
+    html: HtmlOption = None,
     stage: SceneStageOption = None,
     chunk: RunChunkOption = None,
-    max_splats: Annotated[
-        int | None,
-        typer.Option(
-            help="Show no more Gaussians than this: those that fill most of the images along the path. "
-            f"{PAGE_SPLATS} with --html if not given, else all."
-        ),
-    ] = None,
-    host: Annotated[
-        str,
-        typer.Option(
-            help="The address that the viewer listens at. Any other than that of this machine lets everyone in the "
-            "network look at the scene."
-        ),
-    ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="The port, or 0 for a free one. A taken one leads to the next.")] = 8080,
-    open_browser: Annotated[bool, typer.Option("--open", help="Open the viewer in this machine's browser.")] = False,
-    no_range: Annotated[
-        bool,
-        typer.Option("--no-range", help="Do not draw the reliable range. It takes a minute once for each scene."),
-    ] = False,
+    max_splats: MaxSplatsOption = None,
+    host: HostOption = "127.0.0.1",
+    port: PortOption = 8080,
+    open_browser: OpenOption = False,
+    no_range: ViewNoRangeOption = False,
     store: StoreOption = DEFAULT_STORE,
 ) -> None:
     """Look at a finished run's scene in a browser.

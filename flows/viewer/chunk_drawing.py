@@ -22,7 +22,7 @@ FRUSTUM_RGB = (40, 90, 200)
 
 Frusta = Literal["this frame", "all frames", "none"]
 
-_FRUSTUM_SCALE = 0.7
+_FRUSTUM_SCALE = 0.5
 _LINE_M = 0.06
 
 

@@ -19,6 +19,7 @@ from genre_tasks.scene.transforms import shift_laterally
 MAX_OFFSET_M = 6.0
 FRUSTA: tuple[Frusta, ...] = ("this frame", "all frames", "none")
 _LOOK_AHEAD_M = 10.0
+_RANGE_WAITS = "The reliable range is being computed, which takes a minute once."
 
 
 class ClientSession:
@@ -90,14 +91,23 @@ class ClientSession:
 
     def _replace(self, viewed: ViewedChunk) -> None:
         with self._lock:
+            before = self.drawing
+            before.remove()
+            self.drawing = ChunkDrawing.draw(self._client.scene, viewed)
             # Stages are compared from one place and in one moment, so all choices stay.
             controls = {name: control.value for name, control in self._controls().items()}
-            self.drawing.remove()
-            self.drawing = ChunkDrawing.draw(self._client.scene, viewed)
-            self._add_controls()
-            for name, control in self._controls().items():
-                if name in controls and _accepts(control, controls[name]):
-                    _set_value(control, controls[name])
+            if _needs_new_controls(before.viewed, viewed):
+                self._add_controls()
+                for name, control in self._controls().items():
+                    if name in controls and _accepts(control, controls[name]):
+                        _set_value(control, controls[name])
+            else:
+                self._heading.content = _describe_chunk(viewed)
+                self._range_note.content = _RANGE_WAITS if self._with_range else ""
+                for name, change in self._changes.items():
+                    change(self._switches[name].value)
+                self._show_frame()
+                self._change_drive()
         self.draw_range()
 
     def _controls(self) -> dict[str, Any]:
@@ -109,6 +119,7 @@ class ClientSession:
         viewed = self.drawing.viewed
         self._client.gui.reset()
         self._switches: dict[str, Any] = {}
+        self._changes: dict[str, Callable[[bool], None]] = {}
         self._add_choices(viewed)
         self._add_time(viewed)
         self._add_drive(viewed)
@@ -117,7 +128,7 @@ class ClientSession:
 
     def _add_choices(self, viewed: ViewedChunk) -> None:
         gui = self._client.gui
-        gui.add_markdown("  \n".join([f"**{viewed.log}**", *viewed.scene.losses]))
+        self._heading = gui.add_markdown(_describe_chunk(viewed))
         numbers = tuple(map(str, self._run.chunk_numbers))
         chunk = gui.add_dropdown("Chunk", numbers, initial_value=str(viewed.number), visible=len(numbers) > 1)
         stages = self._run.list_stages(viewed.number)
@@ -204,8 +215,7 @@ class ClientSession:
             self._add_switch("recorded path", lambda is_on: setattr(self.drawing.path, "visible", is_on))
             if self._with_range:
                 self._add_switch("reliable range", self._show_range)
-            waiting = "The reliable range is being computed, which takes a minute once."
-            self._range_note = gui.add_markdown(waiting if self._with_range else "")
+            self._range_note = gui.add_markdown(_RANGE_WAITS if self._with_range else "")
             for node in viewed.scene.nodes:
                 if node.motion is None:
                     self._add_node_switch(node.name)
@@ -225,6 +235,7 @@ class ClientSession:
     def _add_switch(self, name: str, change: Callable[[bool], None]) -> None:
         switch = self._client.gui.add_checkbox(name, True)
         self._switches[name] = switch
+        self._changes[name] = change
 
         def act() -> None:
             with self._lock:
@@ -239,6 +250,16 @@ class ClientSession:
                 action()
             except GenreError as error:
                 self._client.add_notification("This cannot be shown", str(error), color="red")
+
+
+def _describe_chunk(viewed: ViewedChunk) -> str:
+    # Two spaces end a line in Markdown.
+    return "  \n".join([f"**{viewed.log}**", *viewed.scene.losses])
+
+
+def _needs_new_controls(before: ViewedChunk, after: ViewedChunk) -> bool:
+    # Controls that stay keep their folders open, too.
+    return before.number != after.number or [n.name for n in before.scene.nodes] != [n.name for n in after.scene.nodes]
 
 
 def _accepts(control: Any, value: Any) -> bool:

@@ -16,8 +16,8 @@ PORTS_TRIED = 50
 """From a port that is taken the next ones are tried."""
 
 _FOV_RAD = 1.1
-_BEHIND_M = 9.0
-_ABOVE_M = 5.0
+_BEHIND_M = 5.5
+_ABOVE_M = 3.5
 _AHEAD_M = 20.0
 _NEAR_M = 0.1
 _FAR_M = 5000.0

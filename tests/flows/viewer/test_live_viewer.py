@@ -101,7 +101,9 @@ def check_driving(page: Any, session: ClientSession) -> None:
 def check_another_stage(page: Any, session: ClientSession, run: MadeUpRun) -> None:
     set_value(session._switches["car-1"], False)
     assert not session.drawing.splats["car-1"].visible
+    set_value(session._switches["recorded path"], False)
     session._choose(0, "initial")
+    assert not session.drawing.path.visible
     assert run.asked == [(0, "initial")]
     # The moment, the place and the switches stay.
     assert session.drawing.viewed.stage == "initial"
@@ -134,6 +136,20 @@ def test_time_runs_while_a_client_plays(viewer: tuple[LiveViewer, MadeUpRun]) ->
         # After the last frame it begins again.
         live.tick(0.5)
         assert session.drawing.row == 0
+        check_another_chunk(session)
+
+
+def check_another_chunk(session: ClientSession) -> None:
+    set_value(session.play, False)
+    set_value(session.frame, 5)
+    set_value(session._switches["car-1"], False)
+    before = session.frame
+    session._choose(1, None)
+    # The controls are new, since frames, cameras and actors may be others; what fits stays.
+    assert session.frame is not before
+    assert (session.drawing.viewed.number, session.drawing.row, session.frame.value) == (1, 5, 5)
+    assert not session.drawing.splats["car-1"].visible
+    assert session.drawing.range_lines is not None
 
 
 def test_a_taken_port_leads_to_the_next_and_a_foreign_address_is_refused() -> None:
