@@ -248,7 +248,7 @@ class ClientSession:
         def _(event: object) -> None:
             try:
                 action()
-            except GenreError as error:
+            except (GenreError, OSError) as error:
                 self._client.add_notification("This cannot be shown", str(error), color="red")
 
 

@@ -13,7 +13,9 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from flows.cli.main import app
 from flows.viewer.client_session import ClientSession
 from flows.viewer.live_viewer import LiveViewer
 from flows.viewer.local_server import find_free_port
@@ -23,8 +25,6 @@ from tests.browser import needs_browser, open_page
 from tests.flows.command_line import GENRE, environment
 from tests.flows.small_simulation import make_run
 from tests.flows.viewed_street import STEP_M, MadeUpRun, make_viewed
-
-pytest.importorskip("viser")
 
 # The corners of viser's splats have two coordinates, and three.js misses the third where it computes a bounding sphere
 # that nothing uses.
@@ -161,6 +161,28 @@ def test_a_taken_port_leads_to_the_next_and_a_foreign_address_is_refused() -> No
     # An address that is kept for documents.
     with pytest.raises(ConfigError, match=r"cannot listen at 192\.0\.2\.1"):
         find_free_port("192.0.2.1", 8080)
+
+
+def test_without_viser_the_command_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    done = CliRunner().invoke(app, ["view", "4b1c"])
+    assert isinstance(done.exception, ConfigError)
+    assert "pip install 'genre[viewer]'" in str(done.exception)
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (["--host", "my-machine"], "no address"),
+        (["--port", "70000"], "out of range"),
+        (["--max-splats", "3"], "out of range"),
+        (["--html", "scene.pdf"], "ends with '.pdf'"),
+    ],
+)
+def test_a_mistyped_option_is_refused_at_once(words: list[str], problem: str) -> None:
+    done = CliRunner().invoke(app, ["view", "4b1c", *words])
+    assert isinstance(done.exception, ConfigError | InputError)
+    assert problem in str(done.exception)
 
 
 @pytest.fixture(scope="module")

@@ -20,8 +20,6 @@ from genre_tasks.errors import InputError
 from tests.browser import needs_browser, open_page
 from tests.flows.viewed_street import SIDES, STEP_M, make_viewed
 
-pytest.importorskip("viser")
-
 RED = 0
 BLUE = 2
 
