@@ -30,6 +30,7 @@ from flows.cli.simulate import simulate
 from flows.cli.streams import prepare_streams
 from flows.cli.train import app as train_app
 from flows.cli.verify import verify
+from flows.cli.view import view
 from flows.machine.state_folder import find_state_folder
 
 app = typer.Typer(
@@ -47,6 +48,7 @@ app.command(name="run")(run)
 app.command(name="check")(check)
 app.command(name="effects")(effects)
 app.command(name="render")(render)
+app.command(name="view")(view)
 app.command(name="simulate")(simulate)
 app.command(name="range")(range_command)
 app.command(name="edit")(edit)
