@@ -26,6 +26,8 @@ IMPORTED = "imported"
 
 IMPORT_STAGE = "import"
 
+_TIME_DIGITS = 6
+
 
 class StoredScenes(Protocol):
     """The scenes of one name in a store, chunk by chunk."""
@@ -125,7 +127,8 @@ class _RunStoredScenes:
         chunk_scene = self.run_scenes.load(number)
         chunk = chunk_scene.chunk
         plan = read_stage_value(self._store, self._run, number, "effects")[1]
-        frame_s = measure_frame_s([chunk])
+        # Clocks of logs round their times, and a scene of ten frames a second is to have ten.
+        frame_s = round(measure_frame_s([chunk]), _TIME_DIGITS)
         return to_exchange_scene(
             chunk_scene.scene,
             chunk.frames,
