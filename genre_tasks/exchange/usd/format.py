@@ -66,7 +66,7 @@ class UsdFormat:
         # Beside the target: moving it there must not copy it to another disk.
         with temporary_folder(path.parent) as folder:
             layer = folder / f"{_LAYER_NAME}{'.usdc' if suffix == '.usdz' else suffix}"
-            write_stage(layer, scene)
+            write_stage(layer, scene, path)
             if suffix == ".usdz":
                 write_package(path, layer)
             else:

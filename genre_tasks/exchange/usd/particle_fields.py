@@ -9,14 +9,14 @@ import numpy as np
 from pxr import Usd, UsdGeom, UsdVol
 
 from genre_tasks.errors import InputError
+from genre_tasks.exchange.activations import colors_to_sh_dc, scales_to_logs
 from genre_tasks.exchange.checks import check_finite_cloud, check_finite_values
-from genre_tasks.exchange.types import SH_DC, SH_REST_COUNTS, SplatCloud
+from genre_tasks.exchange.types import SH_REST_COUNTS, SplatCloud
 from genre_tasks.exchange.usd.stage_writer import LARGEST_OPACITY
 from genre_tasks.logs.types import Float32
 
 _SMALLEST_OPACITY = 1e-30
-_SMALLEST_SCALE_M = 1e-12
-"""A scale of 0 becomes this one: its logarithm would be infinite."""
+"""Smaller ones become this one: the logit of 0 would be infinite."""
 
 _HALF_ROUNDING = 1e-3
 
@@ -132,13 +132,13 @@ def _read_display_color(reader: _ArrayReader, count: int) -> Float32:
     if len(values) not in (1, count):
         raise reader.damage(f"has {len(values)} colours for {count} positions")
     check_finite_values(reader.file, f"{reader.prim.GetPath()}.displayColor", values)
-    return np.broadcast_to(((values - 0.5) / SH_DC).astype(np.float32)[:, None], (count, 1, 3))
+    return np.broadcast_to(colors_to_sh_dc(values)[:, None], (count, 1, 3))
 
 
 def _read_log_scales(reader: _ArrayReader, scales: Float32) -> Float32:
     if (scales < 0).any():
         raise reader.damage("has negative scales, which look like logarithms; OpenUSD's scales are linear")
-    return np.asarray(np.log(np.maximum(scales, _SMALLEST_SCALE_M)), np.float32)
+    return scales_to_logs(reader.file, scales)
 
 
 def _read_logits(reader: _ArrayReader, opacities: Float32) -> Float32:

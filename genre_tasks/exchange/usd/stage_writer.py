@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdVol, Vt
 from scipy.spatial.transform import Rotation
 
+from genre_tasks.exchange.activations import logits_to_opacities, logs_to_scales
 from genre_tasks.exchange.types import ExchangeNode, ExchangeScene, NodeMotion, SplatCloud
 from genre_tasks.exchange.usd import names
 from genre_tasks.logs.types import Float32, Float64
@@ -27,14 +28,16 @@ _CODE_DIGITS = 6
 """Time codes are rounded to a millionth of a frame, so that frames at equal distances have whole numbers."""
 
 
-def write_stage(path: Path, scene: ExchangeScene) -> None:
+def write_stage(path: Path, scene: ExchangeScene, file: Path) -> None:
     """Writes a layer.
 
     Args:
         path: ending with ``.usdc`` or ``.usda``; it does not exist.
         scene: of which all values are finite.
+        file: that the layer is for, for errors.
 
     Raises:
+        InputError: a scale does not fit into float32.
         pxr.Tf.ErrorException: the layer cannot be written.
     """
     stage = Usd.Stage.CreateNew(str(path))
@@ -56,21 +59,8 @@ def write_stage(path: Path, scene: ExchangeScene) -> None:
         if node.motion is not None:
             _set_motion(xform, node.motion, codes)
         child = xform.GetPath().AppendChild(names.GAUSSIANS_PRIM)
-        _set_cloud(UsdVol.ParticleField3DGaussianSplat.Define(stage, child), node.cloud)
+        _set_cloud(UsdVol.ParticleField3DGaussianSplat.Define(stage, child), node.cloud, file)
     stage.GetRootLayer().Save()
-
-
-def activate_opacities(logits: Float32) -> Float32:
-    """Computes opacities that are below 1 also after they are rounded to float32.
-
-    Args:
-        logits: [N].
-
-    Returns:
-        [N] float32 in (0, 1).
-    """
-    wide = 1.0 / (1.0 + np.exp(-np.clip(logits.astype(np.float64), -80.0, 80.0)))
-    return np.minimum(wide, LARGEST_OPACITY).astype(np.float32)
 
 
 def _set_times(stage: Any, times_s: Float64) -> list[float]:
@@ -131,8 +121,8 @@ def _continue_signs(quats: NDArray[np.float64]) -> NDArray[np.float64]:
     return quats * np.cumprod(np.concatenate([[1.0], steps]))[:, None]
 
 
-def _set_cloud(field: Any, cloud: SplatCloud) -> None:
-    scales = np.exp(cloud.log_scales)
+def _set_cloud(field: Any, cloud: SplatCloud, file: Path) -> None:
+    scales = logs_to_scales(file, cloud.log_scales)
     quats = _normalize(cloud.quats)
     # In memory OpenUSD's quaternions have the real part last.
     imaginary_first = np.ascontiguousarray(np.roll(quats, -1, axis=1))
@@ -140,7 +130,8 @@ def _set_cloud(field: Any, cloud: SplatCloud) -> None:
     field.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(cloud.means)))
     field.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(scales)))
     field.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(imaginary_first))
-    field.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(activate_opacities(cloud.logit_opacities)))
+    opacities = np.minimum(logits_to_opacities(cloud.logit_opacities), LARGEST_OPACITY).astype(np.float32)
+    field.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(opacities))
     # Written always: a file that leaves it out has degree 3.
     field.CreateRadianceSphericalHarmonicsDegreeAttr(cloud.sh_degree)
     field.CreateRadianceSphericalHarmonicsCoefficientsAttr(Vt.Vec3fArray.FromNumpy(coefficients))
