@@ -65,9 +65,7 @@ class SceneExporter(Protocol):
         """
         ...
 
-    def export(
-        self, scenes: StoredScenes, request: ExportRequest, folder: Path, progress: Progress
-    ) -> dict[str, Any]:
+    def export(self, scenes: StoredScenes, request: ExportRequest, folder: Path, progress: Progress) -> dict[str, Any]:
         """Writes all files, ``scene.json`` among them.
 
         Args:

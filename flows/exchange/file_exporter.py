@@ -164,4 +164,3 @@ def _describe_layout(layout: Layout, entries: Sequence[ChunkEntry]) -> tuple[str
     if not moves or layout == "scenes":
         return ()
     return (_POSED_FILES if layout == "frames" else _RESTING_FILES,)
-

@@ -86,9 +86,7 @@ def _commit_scene(
         environment=describe_environment(),
         warnings=warnings,
     )
-    artifact = open_store(store).commit(
-        address, "reconstruction", Reconstruction(to_scene_graph(limited)), provenance
-    )
+    artifact = open_store(store).commit(address, "reconstruction", Reconstruction(to_scene_graph(limited)), provenance)
     return {
         "chunk": number,
         "key": artifact.manifest.key,
@@ -121,9 +119,7 @@ def _choose_name(path: Path) -> str:
 
 def _check_name(name: str) -> str:
     if not _NAME.fullmatch(name) or name.startswith("."):
-        raise ConfigError(
-            f"--name {name!r} cannot be used", remedy="Use letters, digits, and any of - _ = + . inside."
-        )
+        raise ConfigError(f"--name {name!r} cannot be used", remedy="Use letters, digits, and any of - _ = + . inside.")
     return name
 
 

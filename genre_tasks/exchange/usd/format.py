@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-
-from pxr import Tf, Usd, UsdUtils
 
 from genre_tasks.errors import InputError
 from genre_tasks.exchange.checks import check_finite_cloud, measure_file
 from genre_tasks.exchange.types import ExchangeScene
-from genre_tasks.exchange.usd.layer_checks import check_layers
 from genre_tasks.exchange.usd.package import extract_layers, write_package
-from genre_tasks.exchange.usd.stage_reader import read_stage
+from genre_tasks.exchange.usd.stage_process import run_stage_dump
+from genre_tasks.exchange.usd.stage_scene import make_scene
 from genre_tasks.exchange.usd.stage_writer import write_stage
 from genre_tasks.temporary_names import temporary_folder
 
@@ -42,10 +38,11 @@ class UsdFormat:
             InputError: the file is damaged, or it names other files.
         """
         measure_file(path)
-        with temporary_folder() as folder, _translated_errors(path):
-            layer = _copy_layers(path, folder)
-            check_layers(layer, path)
-            return read_stage(Usd.Stage.Open(str(layer)), path)
+        with temporary_folder() as folder:
+            layers = folder / "layers"
+            layers.mkdir()
+            layer = _copy_layers(path, layers)
+            return make_scene(*run_stage_dump(layer, folder, path), path)
 
     def write(self, path: Path, scene: ExchangeScene) -> None:
         """Writes a file: see :meth:`genre_tasks.exchange.types.ExchangeFormat.write`.
@@ -93,17 +90,3 @@ def _copy_layers(path: Path, folder: Path) -> Path:
     layer = folder / f"{_LAYER_NAME}{path.suffix.lower()}"
     shutil.copyfile(path, layer)
     return layer
-
-
-@contextmanager
-def _translated_errors(path: Path) -> Iterator[None]:
-    # OpenUSD prints what it finds wrong; the delegate keeps that to itself.
-    delegate = UsdUtils.CoalescingDiagnosticDelegate()
-    try:
-        yield
-    except (Tf.ErrorException, RuntimeError, ValueError) as error:
-        raise InputError(
-            "OpenUSD cannot read the file", remedy="Export the scene again; `usdchecker` says more.", file=path
-        ) from error
-    finally:
-        del delegate

@@ -15,12 +15,11 @@ _MAX_ARCS = 32
 _LIST_FIELDS = ("references", "payload", "inheritPaths", "specializes")
 
 
-def check_layers(root: Path, file: Path) -> None:
+def check_layers(root: Path) -> None:
     """Checks all layers of a folder before OpenUSD composes them.
 
     Args:
         root: the layer that is shown; layers in its folder may be named by it.
-        file: the file that the user named, for errors.
 
     Raises:
         InputError: a layer names a file outside of the package, has clips, or repeats its parts too often.
@@ -37,19 +36,18 @@ def check_layers(root: Path, file: Path) -> None:
         visited.add(path)
         layer = Sdf.Layer.FindOrOpen(str(path))
         if layer is None:
-            raise InputError("the file is no layer of OpenUSD", remedy="Export the scene again.", file=file)
-        named, arcs = _find_arcs(layer, file)
+            raise InputError("the file is no layer of OpenUSD", remedy="Export the scene again.")
+        named, arcs = _find_arcs(layer)
         arc_count += arcs
         if arc_count > _MAX_ARCS:
             raise InputError(
                 f"the file composes more than {_MAX_ARCS} parts",
                 remedy="Flatten it with `usdcat --flatten`, and give the result.",
-                file=file,
             )
-        todo.extend(_resolve(name, path, folder, file) for name in named)
+        todo.extend(_resolve(name, path, folder) for name in named)
 
 
-def _find_arcs(layer: Any, file: Path) -> tuple[list[str], int]:
+def _find_arcs(layer: Any) -> tuple[list[str], int]:
     """Names of other files that a layer composes, and the number of its arcs inside of the package."""
     named = [str(name) for name in layer.subLayerPaths]
     arcs = len(named)
@@ -64,7 +62,6 @@ def _find_arcs(layer: Any, file: Path) -> tuple[list[str], int]:
             raise InputError(
                 f"the prim {path} takes its values from other files (clips)",
                 remedy="Flatten the scene with `usdcat --flatten`, and give the result.",
-                file=file,
             )
         for field in _LIST_FIELDS:
             if spec.HasInfo(field):
@@ -76,7 +73,7 @@ def _find_arcs(layer: Any, file: Path) -> tuple[list[str], int]:
     return named, arcs
 
 
-def _resolve(name: str, layer: Path, folder: Path, file: Path) -> Path:
+def _resolve(name: str, layer: Path, folder: Path) -> Path:
     # By the rules of paths alone: OpenUSD's own search would also look elsewhere.
     target = (layer.parent / name).resolve()
     is_local = target.is_relative_to(folder.resolve()) and target.suffix.lower() in (".usdc", ".usda", ".usd")
@@ -84,6 +81,5 @@ def _resolve(name: str, layer: Path, folder: Path, file: Path) -> Path:
         raise InputError(
             f"the file names another one, '{name}', which is not read",
             remedy="Flatten the scene with `usdcat --flatten`, and give the result.",
-            file=file,
         )
     return target

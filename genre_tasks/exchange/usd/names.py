@@ -1,6 +1,14 @@
-"""What GenRe adds to a stage beyond OpenUSD's schema: names of entries in ``customData``."""
+"""Names of attributes, and of what GenRe adds to a stage in ``customData``."""
 
 from __future__ import annotations
+
+COEFFICIENTS = "radiance:sphericalHarmonicsCoefficients"
+DEGREE = "radiance:sphericalHarmonicsDegree"
+
+COLORS = "displayColor"
+MATRICES = "matrices"
+SHOWN = "shown"
+"""Names of arrays between the process that reads a stage and its caller, as is the one before."""
 
 VERSION = "genre:version"
 """Of these entries, on the scene's root prim; the others count only where it is there."""
@@ -18,6 +26,17 @@ SIZE_M = "genre:sizeM"
 MOVES = "genre:moves"
 ANTIALIASED = "genre:antialiased"
 """Only where it is known."""
+
+SCENE_ENTRIES: dict[str, type] = {TIMES_S: list, FRAMES: list, WORLD_SE3_SCENE: list, LOSSES: list}
+NODE_ENTRIES: dict[str, type] = {
+    NAME: str,
+    LABEL: str,
+    TRACK_ID: str,
+    SIZE_M: list,
+    MOVES: bool,
+    ANTIALIASED: bool,
+}
+"""Entries of ``customData`` and their kinds."""
 
 CURRENT_VERSION = 1
 

@@ -78,9 +78,6 @@ def _check_members(archive: zipfile.ZipFile, path: Path) -> list[zipfile.ZipInfo
     members = [member for member in archive.infolist() if not member.is_dir()]
     if len(members) > _MAX_MEMBERS:
         raise _damage(f"the package has {len(members)} members", path)
-    # Members that share their bytes are how a small archive becomes a large folder.
-    if sum(member.file_size for member in members) > path.stat().st_size:
-        raise _damage("the package's members claim more bytes than it has", path)
     for member in members:
         if member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1:
             problem = f"'{member.filename}' is compressed or encrypted, which a USDZ package does not allow"
@@ -89,6 +86,9 @@ def _check_members(archive: zipfile.ZipFile, path: Path) -> list[zipfile.ZipInfo
         is_inside = not name.is_absolute() and ".." not in name.parts
         if not is_inside or "\\" in member.filename or ":" in member.filename or not member.filename.isprintable():
             raise _damage(f"the member {member.filename!r} would lie outside of the package", path)
+    # Members that share their bytes are how a small archive becomes a large folder.
+    if sum(member.file_size for member in members) > path.stat().st_size:
+        raise _damage("the package's members claim more bytes than it has", path)
     layers = [member for member in members if member.filename.lower().endswith(LAYER_SUFFIXES)]
     if not layers or members[0] is not layers[0]:
         raise _damage("the package's first member is no layer", path)
