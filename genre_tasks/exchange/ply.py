@@ -156,7 +156,8 @@ def _read_cloud(path: Path, table: PlyTable, sh_names: tuple[str, ...], antialia
         sh_rest=np.empty((count, columns, 3), np.float32),
         antialiased=antialiased,
     )
-    # Not through a memory map: its pages would count to the process's memory beside the Gaussians.
+    # Not through a memory map: its pages would count to the process's memory, and a file that another program cuts off
+    # meanwhile would end the process.
     with path.open("rb") as stream:
         for start in range(0, count, _ROWS):
             rows = slice(start, min(start + _ROWS, count))
