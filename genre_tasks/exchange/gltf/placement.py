@@ -116,7 +116,10 @@ def scale_cloud(cloud: SplatCloud, factor: float) -> SplatCloud:
 
 
 def _stretch_cloud(cloud: SplatCloud, transform: Float64) -> SplatCloud:
-    """By any linear map: the axes of the stretched ellipsoids are the left singular vectors of map · rotation · scales."""
+    """Moves a cloud by any affine map.
+
+    Axes of the new ellipsoids are the left singular vectors of map · rotation · scales, and their sizes its values.
+    """
     linear = transform[:3, :3]
     quats = cloud.quats.astype(np.float64)
     identity = np.zeros((len(cloud), 3))

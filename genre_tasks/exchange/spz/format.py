@@ -62,8 +62,8 @@ class SpzFormat:
             scene: with one node that rests.
 
         Raises:
-            InputError: the scene has several nodes or motion, a Gaussian is too far away or too large, or a value is not
-                finite.
+            InputError: the scene has several nodes or motion, a Gaussian is too far away or too large, or a value is
+                not finite.
         """
         cloud = take_one_cloud(path, scene)
         check_finite_cloud(path, cloud)

@@ -48,14 +48,14 @@ class SpzHeader(NamedTuple):
 
     Attributes:
         version: 1 to 4.
-        count: number of Gaussians.
+        gaussian_count: number of Gaussians.
         sh_degree: 0 to 4.
         fractional_bits: of positions.
         flags: see ``ANTIALIASED_FLAG`` and ``EXTENSIONS_FLAG``.
     """
 
     version: int
-    count: int
+    gaussian_count: int
     sh_degree: int
     fractional_bits: int
     flags: int
@@ -87,9 +87,9 @@ def check_header(path: Path, header: SpzHeader, file_bytes: int) -> None:
     if header.fractional_bits >= 8 * POSITION_BYTES[HIGHEST_VERSION] // 3:
         problem = f"the file claims {header.fractional_bits} fractional bits of 24"
         raise InputError(problem, remedy=_REMEDY, file=path)
-    raw = header.count * sum(header.widths())
+    raw = header.gaussian_count * sum(header.widths())
     if raw > max(SMALL_BYTES, MOST_RATIO * file_bytes):
-        problem = f"the file claims {header.count} Gaussians, far more than its {file_bytes} bytes can hold"
+        problem = f"the file claims {header.gaussian_count} Gaussians, far more than its {file_bytes} bytes can hold"
         raise InputError(problem, remedy=_REMEDY, file=path)
 
 
@@ -104,7 +104,7 @@ def split_attributes(header: SpzHeader, streams: Sequence[bytes]) -> QuantizedCl
         Views into ``streams``.
     """
     arrays: list[Bytes] = [
-        np.frombuffer(stream, np.uint8).reshape(header.count, width)
+        np.frombuffer(stream, np.uint8).reshape(header.gaussian_count, width)
         for stream, width in zip(streams, header.widths(), strict=True)
     ]
     return QuantizedCloud(
