@@ -100,7 +100,7 @@ class SceneDocument(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    kind: Literal["genre-scene"] = KIND
+    kind: Literal["genre-scene"] = "genre-scene"
     version: int = VERSION
     format: str
     layout: Layout
