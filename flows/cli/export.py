@@ -12,7 +12,6 @@ from flows.cli.options import ChunksOption, JsonOption, SceneStageOption, StoreO
 from flows.cli.parsing import parse_path
 from flows.defaults import DEFAULT_STORE
 
-
 SceneArgument = Annotated[
     str,
     typer.Argument(
