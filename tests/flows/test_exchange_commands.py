@@ -18,6 +18,8 @@ from flows.exchange.export_request import ExportRequest
 from flows.exchange.export_scenes import export_scenes
 from flows.exchange.exporters import list_export_formats
 from flows.exchange.import_scene import import_scene
+from flows.simulation.edit_file import parse_edit_options
+from flows.simulation.edited_runs import write_edited_run
 from flows.simulation.run_scenes import RunScenes
 from genre_tasks.errors import ConfigError, GenreError, InputError
 from genre_tasks.exchange.conversion import to_scene_graph
@@ -26,9 +28,10 @@ from genre_tasks.exchange.registry import load_format
 from genre_tasks.exchange.scene_file import read_scene_file, read_scene_files
 from genre_tasks.exchange.scene_folder import SCENE_FILE, read_document
 from genre_tasks.exchange.types import SplatCloud
+from genre_tasks.exchange.usd.format import USDZ
 from genre_tasks.scene_edits.actor_names import name_actors
 from storage.files import digest_file, payload_files
-from tests.exchange.splat_clouds import make_cloud
+from tests.exchange.splat_clouds import make_cloud, make_driving_scene
 from tests.flows.small_simulation import make_run
 
 
@@ -214,6 +217,51 @@ def test_a_changed_file_is_read_and_named(run: ExportRequest, tmp_path: Path) ->
     assert "chunk-0/background.ply was changed after the export." in record["chunks"][0]["warnings"]
 
 
+def test_an_edited_run_is_exported_as_it_is(run: ExportRequest, tmp_path: Path) -> None:
+    names = name_actors(RunScenes(run.store, run.scene))
+    removed = names["car-0"]
+    edited = write_edited_run(run.store, run.scene, parse_edit_options(remove=[removed]))["run"]
+    export_scenes(replace(run, scene=edited, out=tmp_path / "out"))
+    found = {node.name for chunk in read_document(tmp_path / "out").chunks for node in chunk.nodes}
+    assert found == {"background", "distant", *names.values()} - {removed}
+
+
+def test_names_of_somebody_else_do_not_leave_the_folder(tmp_path: Path) -> None:
+    scene = make_driving_scene()
+    names = ("../../up", "/etc/x", "background", "Ünï cødé/..")
+    nodes = tuple(replace(node, name=name) for node, name in zip(scene.nodes, names, strict=True))
+    # Two actors with one track id, one of them called as the background is, and frames that do not rise.
+    nodes = tuple(replace(node, track_id="7") if node.motion is not None else node for node in nodes)
+    USDZ.write(tmp_path / "odd.usdz", replace(scene, nodes=nodes, frames=(3, 3, 2, 1, 0)))
+    store = str(tmp_path / "store")
+    record = import_scene(store, tmp_path / "odd.usdz")
+    assert record["chunks"][0]["gaussians"] == sum(len(node.cloud) for node in nodes)
+    out = tmp_path / "deep" / "out"
+    export_scenes(ExportRequest(store=store, scene="odd", format="ply", out=out))
+    # What rests is one background in a scene graph.
+    assert sorted(files_of(out)) == [
+        "chunk-0/background-moving.ply",
+        "chunk-0/background.ply",
+        "chunk-0/Ünï-cødé.ply",
+        SCENE_FILE,
+    ]
+    again = read_scene_file(out)
+    assert again.frames == (0, 1, 2, 3, 4) and len({node.track_id for node in again.nodes if node.motion}) == 2
+
+
+def test_an_actor_that_never_appears_is_kept(tmp_path: Path) -> None:
+    scene = make_driving_scene()
+    motion = scene.nodes[2].motion
+    assert motion is not None
+    absent = replace(motion, present=np.zeros(len(scene.times_s), bool))
+    USDZ.write(tmp_path / "a.usdz", replace(scene, nodes=(scene.nodes[0], replace(scene.nodes[2], motion=absent))))
+    store = str(tmp_path / "store")
+    import_scene(store, tmp_path / "a.usdz")
+    export_scenes(ExportRequest(store=store, scene="a", format="usdz", out=tmp_path / "out"))
+    found = read_scene_file(tmp_path / "out").nodes[1].motion
+    assert found is not None and not found.present.any()
+
+
 # --- the command
 
 
@@ -352,6 +400,8 @@ def damage(document: dict[str, Any], path: str, value: object) -> None:
         ("chunks", [], "no chunk"),
         ("chunks.0.times_s", [0.0, 0.0], "moments of chunk 0"),
         ("chunks.0.frames", [1], "moments of chunk 0"),
+        ("chunks.0.frames.0", 10**30, "frames"),
+        ("chunks.0.times_s.0", 1e999, "no number of JSON|cannot be read"),
         ("chunks.0.world_SE3_scene", [[1]], "world_SE3_scene"),
         ("chunks.0.nodes.0.file", "../secret.ply", "no file"),
         ("chunks.0.nodes.0.file", "/etc/hostname", "no file"),
