@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import tracemalloc
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -122,6 +123,11 @@ def test_big_endian_and_double(path: Path) -> None:
     wide = element.data.astype([(name, "<f8") for name in element.data.dtype.names])
     PlyData([PlyElement.describe(wide, "vertex")], byte_order="<").write(path)
     assert same_bits(read(path), cloud)
+    wide["rot_1"][3] = 1e300
+    PlyData([PlyElement.describe(wide, "vertex")], byte_order="<").write(path)
+    with warnings.catch_warnings(), pytest.raises(InputError, match="quats is not finite in 1"):
+        warnings.simplefilter("error")
+        read(path)
 
 
 def test_line_ends_and_comments_of_any_kind(path: Path) -> None:
