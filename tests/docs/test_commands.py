@@ -25,7 +25,10 @@ from tests.faults.small_run import LOG, SETTINGS
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (ROOT / "README.md", ROOT / "docs/quickstart.md", *sorted((ROOT / "docs/guides").glob("*.md")))
 TAKES_SETTINGS = ("run", "effects", "cost", "table", "figure")
-TAKES_STORE = (*TAKES_SETTINGS, "show", "render", "view", "range", "verify", "simulate", "edit")
+TAKES_STORE = (
+    *TAKES_SETTINGS,
+    *("show", "render", "view", "range", "verify", "simulate", "edit", "export", "import"),
+)
 
 
 def commands(page: Path) -> list[str]:
