@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import warnings
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -127,6 +129,15 @@ def test_the_range_is_that_of_simulations(served: tuple[str, str], monkeypatch: 
         *(True, True, False)
     ]
     assert not env.reset(options={"index": 9, "lateral_m": 0.8})[1]["reliable"]
+
+
+def test_the_guides_example_runs(served: tuple[str, str]) -> None:
+    guide = (Path(__file__).resolve().parents[3] / "docs/guides/simulators.md").read_text()
+    (example,) = re.findall(r"```python\n(.*?)```", guide, flags=re.DOTALL)
+    store, run = served
+    names: dict[str, Any] = {}
+    exec(example.replace("genre-store", store).replace('"RUN"', f'"{run}"'), names)
+    assert names["image"].shape == (36, 64, 3) and names["info"]["frame"] == 1
 
 
 def test_mistakes_are_named(env: GenreDrivingEnv, served: tuple[str, str]) -> None:
