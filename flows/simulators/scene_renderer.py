@@ -47,6 +47,11 @@ __all__ = [
 ]
 
 DEFAULT_LIMITS = RenderLimits()
+_MAX_PIXELS = 64_000_000
+"""Of all images of one call."""
+
+_CALL_PIXELS = 8_000_000
+"""That are rendered at once: each takes twenty bytes, and more within the renderer."""
 
 
 @dataclass(frozen=True)
@@ -208,6 +213,12 @@ class SceneRenderer:
             )
         for request in requests:
             self._check(request)
+        pixels = sum(request.lens.width_px * request.lens.height_px for request in requests)
+        if len(requests) > 1 and pixels > _MAX_PIXELS:
+            raise InputError(
+                f"{pixels / 1e6:.0f} megapixels in one request are too many",
+                remedy=f"Ask for {_MAX_PIXELS / 1e6:.0f} at a time.",
+            )
         if not requests:
             return []
         with self._queue.turn():
@@ -220,12 +231,15 @@ class SceneRenderer:
         for k, image in enumerate(placed):
             groups.setdefault(image.group, []).append(k)
         pixels: dict[int, NDArray[np.uint8]] = {}
-        for members in groups.values():
-            # Without gradients the renderer keeps nothing for a backward pass, which takes memory.
-            with torch.no_grad():
-                color = render_views(placed[members[0]].scene, [placed[k].view for k in members]).color
-            for k, image_pixels in zip(members, to_pixels(color), strict=True):
-                pixels[k] = image_pixels
+        for (_, width_px, height_px, _), group in groups.items():
+            # A call takes memory by its pixels, so a large group is rendered in parts.
+            size = max(1, _CALL_PIXELS // (width_px * height_px))
+            for begin in range(0, len(group), size):
+                members = group[begin : begin + size]
+                # Without gradients the renderer keeps nothing for a backward pass, which takes memory.
+                with torch.no_grad():
+                    color = render_views(placed[members[0]].scene, [placed[k].view for k in members]).color
+                pixels |= dict(zip(members, to_pixels(color), strict=True))
         return [pixels[k] for k in range(len(placed))]
 
     def _place(self, request: ImageRequest, scenes: dict[tuple[object, ...], SceneGraph]) -> _PlacedImage:
@@ -270,7 +284,7 @@ class SceneRenderer:
         check_request(request, self.limits, self._facts.world_SE3_ego[:, :3, 3])
         first_s, last_s = self.time_range_s
         slack_s = self.frame_s / 2
-        if not (first_s - slack_s <= request.start_s and request.end_s <= last_s + slack_s):
+        if not first_s - slack_s <= (request.start_s + request.end_s) / 2 <= last_s + slack_s:
             raise InputError(
                 f"{request.start_s:.6f} to {request.end_s:.6f} s is outside of the run",
                 remedy=f"It lasts from {first_s:.6f} to {last_s:.6f} s.",

@@ -177,6 +177,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "backwards": ({"end_s": 0.0}, "readout of -"),
     "camera": ({"camera": "front_camer"}, "Did you mean 'front_camera'"),
     "actor": ({"actors": (ActorPose("lorry", np.eye(4), np.eye(4)),)}, "no actor 'lorry'"),
+    "actor's number": ({"actors": (ActorPose("3", np.eye(4), np.eye(4)),)}, "no actor '3'"),
     "twice": ({"actors": (ActorPose("car-0", np.eye(4), np.eye(4)),) * 2}, "twice"),
     "actor's pose": ({"actors": (ActorPose("car-0", pose_with((1, 1), np.nan), np.eye(4)),)}, "'car-0' at the start"),
     "many actors": ({"actors": (ActorPose("car-0", np.eye(4), np.eye(4)),) * 1001}, "1001 actors"),
@@ -199,6 +200,9 @@ def test_a_camera_far_away_or_too_many_images(renderer: SceneRenderer, served: t
         renderer.render(replace(sound, start_world_SE3_camera=away, end_world_SE3_camera=away))
     with pytest.raises(InputError, match="33 images"):
         renderer.render_batch([sound] * 33)
+    large = replace(sound, lens=sound.lens.resized(1920, 1280))
+    with pytest.raises(InputError, match="79 megapixels"):
+        renderer.render_batch([large] * 32)
     with pytest.raises(InputError, match="no camera"):
         renderer.ego_mask("rear")
 
