@@ -26,6 +26,7 @@ from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.errors import InputError
 from genre_tasks.logs.types import Float64
 from genre_tasks.render import render_views
+from genre_tasks.render.types import RenderSettings
 from genre_tasks.rollout.camera_motion import place_rollout_views
 from genre_tasks.rollout.chunk_layout import lay_out_chunks
 from genre_tasks.rollout.handover import cut_at_borders
@@ -35,6 +36,7 @@ from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.transforms import interpolate_pose, invert_se3
 from genre_tasks.scene_edits.chunk_scene import ChunkScene
 from genre_tasks.suggestions import did_you_mean
+from genre_tasks.threads import torch_threads
 from storage.codecs.png import to_pixels
 
 __all__ = [
@@ -100,6 +102,7 @@ class SceneRenderer:
         self._layout = layout
         self._schedule = SceneSchedule(self._scenes, layout, cut_at_borders(layout))
         self._placer = ActorPlacer(self._scenes, self._facts.chunks_by_track, self._facts.names)
+        self._settings = RenderSettings(threads=torch.get_num_threads())
         self._queue = RenderQueue(limits.max_waiting)
         self.limits = limits
         self.name: str = str(self._scenes.record["run"])
@@ -221,7 +224,9 @@ class SceneRenderer:
             )
         if not requests:
             return []
-        with self._queue.turn():
+        # The renderer's kernel has threads of its own. Those of torch would spin next to them, and make a small image
+        # many times slower wherever OMP_WAIT_POLICY is not PASSIVE, as in a program of a user's own.
+        with self._queue.turn(), torch_threads(1):
             return self._render(requests)
 
     def _render(self, requests: Sequence[ImageRequest]) -> list[NDArray[np.uint8]]:
@@ -238,7 +243,9 @@ class SceneRenderer:
                 members = group[begin : begin + size]
                 # Without gradients the renderer keeps nothing for a backward pass, which takes memory.
                 with torch.no_grad():
-                    color = render_views(placed[members[0]].scene, [placed[k].view for k in members]).color
+                    color = render_views(
+                        placed[members[0]].scene, [placed[k].view for k in members], self._settings
+                    ).color
                 pixels |= dict(zip(members, to_pixels(color), strict=True))
         return [pixels[k] for k in range(len(placed))]
 
