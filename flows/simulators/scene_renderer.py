@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from flows.simulation.edited_runs import open_run, open_shown_scenes
 from flows.simulation.run_scenes import RunScenes
 from flows.simulators.image_request import (
     ActorDescription,
@@ -20,7 +21,7 @@ from flows.simulators.image_request import (
 )
 from flows.simulators.placed_actors import ActorPlacer, Readout, place_actors
 from flows.simulators.render_queue import RenderQueue
-from flows.simulators.request_checks import check_request
+from flows.simulators.request_checks import check_batch, check_request
 from flows.simulators.run_facts import read_run_facts
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.errors import InputError
@@ -34,6 +35,7 @@ from genre_tasks.rollout.rig import RigCamera, RolloutView
 from genre_tasks.rollout.scene_schedule import SceneSchedule
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.transforms import interpolate_pose, invert_se3
+from genre_tasks.scene_edits.actor_names import name_actors
 from genre_tasks.scene_edits.chunk_scene import ChunkScene
 from genre_tasks.suggestions import did_you_mean
 from genre_tasks.threads import torch_threads
@@ -49,17 +51,18 @@ __all__ = [
 ]
 
 DEFAULT_LIMITS = RenderLimits()
-_MAX_PIXELS = 64_000_000
-"""Of all images of one call."""
-
 _CALL_PIXELS = 8_000_000
 """That are rendered at once: each takes twenty bytes, and more within the renderer."""
 
 
 @dataclass(frozen=True)
 class _PlacedImage:
-    """An image, ready to be rendered: images of one ``group`` share a render."""
+    """An image, ready to be rendered: images of one ``group`` share a render.
 
+    Scenes are compared by their identity, so both stay alive for as long as the image waits.
+    """
+
+    chunk_scene: ChunkScene
     scene: SceneGraph
     view: RolloutView
 
@@ -97,7 +100,7 @@ class SceneRenderer:
         self, store: str, run: str, stage: str | None = None, *, limits: RenderLimits = DEFAULT_LIMITS
     ) -> None:
         self._scenes = RunScenes(store, run, stage)
-        self._facts = read_run_facts(self._scenes)
+        self._facts = read_run_facts(self._scenes, _find_edited_names(store, run, stage))
         layout = lay_out_chunks(self._scenes)
         self._layout = layout
         self._schedule = SceneSchedule(self._scenes, layout, cut_at_borders(layout))
@@ -210,18 +213,9 @@ class SceneRenderer:
         Raises:
             InputError, ResourceError: as :meth:`render`.
         """
-        if len(requests) > self.limits.max_batch:
-            raise InputError(
-                f"{len(requests)} images in one request are too many", remedy=f"Ask for {self.limits.max_batch}."
-            )
+        check_batch(requests, self.limits)
         for request in requests:
             self._check(request)
-        pixels = sum(request.lens.width_px * request.lens.height_px for request in requests)
-        if len(requests) > 1 and pixels > _MAX_PIXELS:
-            raise InputError(
-                f"{pixels / 1e6:.0f} megapixels in one request are too many",
-                remedy=f"Ask for {_MAX_PIXELS / 1e6:.0f} at a time.",
-            )
         if not requests:
             return []
         # The renderer's kernel has threads of its own. Those of torch would spin next to them, and make a small image
@@ -270,7 +264,7 @@ class SceneRenderer:
             if key not in scenes:
                 scenes[key] = place_actors(chunk_scene, wanted, readout)
             scene = scenes[key]
-        return _PlacedImage(scene, _place_view(request, middle, frames, chunk_scene))
+        return _PlacedImage(chunk_scene, scene, _place_view(request, middle, frames, chunk_scene))
 
     def _find_scene(self, request: ImageRequest, middle: Float64, frame: float, middle_s: float) -> ChunkScene:
         """The scene whose background is that of the place, and whose traffic is that of the moment."""
@@ -303,6 +297,13 @@ class SceneRenderer:
         if camera not in self.cameras:
             remedy = f"{did_you_mean(camera, self.cameras)}It has {', '.join(self.cameras)}."
             raise InputError(f"the run has no camera '{camera}'", remedy=remedy)
+
+
+def _find_edited_names(store: str, run: str, stage: str | None) -> Mapping[str, str] | None:
+    """Names of an edited run's actors, which keep those of the recorded run; ``None`` for a recorded one."""
+    if not len(open_run(store, run, stage).edits):
+        return None
+    return name_actors(open_shown_scenes(store, run))
 
 
 def _place_view(request: ImageRequest, middle: Float64, frames: Float64, chunk_scene: ChunkScene) -> RolloutView:
