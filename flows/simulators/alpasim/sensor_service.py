@@ -1,0 +1,245 @@
+"""What the sensor service answers: messages of the wire to messages of the wire, without any network."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.metadata import version
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.simulators.alpasim import common_pb2, sensorsim_pb2
+from flows.simulators.alpasim.image_bytes import check_format, encode_image
+from flows.simulators.alpasim.image_requests import read_image_request
+from flows.simulators.alpasim.local_frame import LocalFrame
+from flows.simulators.alpasim.wire_lenses import write_camera_spec
+from flows.simulators.alpasim.wire_poses import write_pose
+from flows.simulators.image_request import ImageRequest
+from flows.simulators.scene_renderer import SceneRenderer
+from genre_tasks.errors import ConfigError, InputError
+
+PROTOCOL_VERSION = (0, 54, 0)
+"""Of AlpaSim's messages, whose names and numbers the ``.proto`` files here have."""
+
+_MASK_COLOR = 0
+
+
+class SensorService:
+    """Answers the calls of ``SensorsimService`` for one run.
+
+    Args:
+        renderer: of the run.
+        frame: that poses on the wire are stated in; the bundle has the same.
+    """
+
+    def __init__(self, renderer: SceneRenderer, frame: LocalFrame) -> None:
+        self._renderer = renderer
+        self._frame = frame
+        self._track_ids = frozenset(actor.track_id for actor in renderer.actors())
+        masks = {name: renderer.ego_mask(name) for name in renderer.cameras}
+        self._masks = {name: mask for name, mask in masks.items() if mask is not None}
+
+    def get_version(self, _: common_pb2.Empty) -> common_pb2.VersionId:
+        """Gives the versions of GenRe and of the protocol."""
+        major, minor, patch = PROTOCOL_VERSION
+        api = common_pb2.VersionId.APIVersion(major=major, minor=minor, patch=patch)
+        return common_pb2.VersionId(version_id=f"genre {version('genre')}", grpc_api_version=api)
+
+    def get_available_scenes(self, _: common_pb2.Empty) -> common_pb2.AvailableScenesReturn:
+        """Names the one scene that is served."""
+        return common_pb2.AvailableScenesReturn(scene_ids=[self._renderer.name])
+
+    def get_loaded_scenes(self, _: common_pb2.Empty) -> sensorsim_pb2.LoadedScenesReturn:
+        """Names the scene as loaded: it is before the first call."""
+        entry = sensorsim_pb2.LoadedSceneEntry(
+            scene_id=self._renderer.name, loaded_instance_count=1, reusable_instance_count=1
+        )
+        return sensorsim_pb2.LoadedScenesReturn(scenes=[entry], loaded_instance_capacity=1)
+
+    def get_available_cameras(
+        self, request: sensorsim_pb2.AvailableCamerasRequest
+    ) -> sensorsim_pb2.AvailableCamerasReturn:
+        """Describes the cameras of the run's rig.
+
+        Args:
+            request: names the scene.
+
+        Returns:
+            Lens, name and place on the rig of each, named as in the bundle.
+
+        Raises:
+            InputError: no such scene is served.
+        """
+        self._check_scene(request.scene_id)
+        cameras = [
+            sensorsim_pb2.AvailableCamerasReturn.AvailableCamera(
+                intrinsics=write_camera_spec(camera),
+                rig_to_camera=write_pose(self._frame.to_rig(camera.rig_SE3_camera)),
+                logical_id=camera.name,
+            )
+            for camera in self._renderer.cameras.values()
+        ]
+        return sensorsim_pb2.AvailableCamerasReturn(available_cameras=cameras)
+
+    def get_available_trajectories(
+        self, request: sensorsim_pb2.AvailableTrajectoriesRequest
+    ) -> sensorsim_pb2.AvailableTrajectoriesReturn:
+        """Gives the recorded path of the rig.
+
+        Args:
+            request: names the scene.
+
+        Returns:
+            One path in the local frame, one pose for each log frame.
+
+        Raises:
+            InputError: no such scene is served.
+        """
+        self._check_scene(request.scene_id)
+        times_s, world_SE3_ego = self._renderer.ego_trajectory()
+        poses = [
+            common_pb2.PoseAtTime(pose=write_pose(pose), timestamp_us=to_microseconds(time_s))
+            for time_s, pose in zip(times_s, self._frame.place_rig(world_SE3_ego), strict=True)
+        ]
+        trajectory = sensorsim_pb2.AvailableTrajectoriesReturn.AvailableTrajectory(
+            trajectory=common_pb2.Trajectory(poses=poses)
+        )
+        return sensorsim_pb2.AvailableTrajectoriesReturn(available_trajectories=[trajectory])
+
+    def get_available_ego_masks(self, _: common_pb2.Empty) -> sensorsim_pb2.AvailableEgoMasksReturn:
+        """Names the cameras whose images show the recording vehicle itself."""
+        entries = [
+            sensorsim_pb2.AvailableEgoMasksReturn.EgoMaskMetadata(ego_mask_id=self._name_mask(name))
+            for name in self._masks
+        ]
+        return sensorsim_pb2.AvailableEgoMasksReturn(ego_mask_metadata=entries)
+
+    def render_rgb(self, request: sensorsim_pb2.RGBRenderRequest) -> sensorsim_pb2.RGBRenderReturn:
+        """Renders one image.
+
+        Args:
+            request: scene, camera, time and traffic.
+
+        Returns:
+            The encoded image.
+
+        Raises:
+            InputError: a value is missing or absurd, or no such scene is served.
+            ConfigError: GenRe does not render such a camera, or does not encode such images.
+            ResourceError: too many calls wait.
+        """
+        image = self._renderer.render(self._read(request))
+        return self._encode(request, image)
+
+    def batch_render_rgb(self, request: sensorsim_pb2.BatchRGBRenderRequest) -> sensorsim_pb2.BatchRGBRenderReturn:
+        """Renders several images, most often of all cameras at one moment.
+
+        Args:
+            request: the cameras' requests.
+
+        Returns:
+            An answer for each, in their order; one that cannot be rendered says so, and the others are rendered.
+
+        Raises:
+            InputError: there are more images than one call may have.
+            ResourceError: too many calls wait.
+        """
+        most = self._renderer.limits.max_batch
+        if len(request.items) > most:
+            raise InputError(f"{len(request.items)} images are too many for one call", remedy=f"Send at most {most}.")
+        answers = [sensorsim_pb2.BatchRGBRenderReturnItem(camera_name=item.camera_name) for item in request.items]
+        readable: dict[int, ImageRequest] = {}
+        for k, item in enumerate(request.items):
+            try:
+                readable[k] = self._read(item.request)
+            except (InputError, ConfigError) as error:
+                answers[k].error_message = str(error)
+        for k, image in self._render_all(readable).items():
+            if isinstance(image, InputError):
+                answers[k].error_message = str(image)
+            else:
+                answers[k].result.CopyFrom(self._encode(request.items[k].request, image))
+                answers[k].success = True
+        return sensorsim_pb2.BatchRGBRenderReturn(items=answers)
+
+    def render_lidar(self, _: sensorsim_pb2.LidarRenderRequest) -> sensorsim_pb2.LidarRenderReturn:
+        """Is not there: the protocol asks for sensors that no scene of GenRe has.
+
+        Raises:
+            ConfigError: always.
+        """
+        raise ConfigError(
+            "LiDAR sweeps of PANDAR128 and AT128 sensors are not simulated",
+            remedy="Simulate the log's own sensor: genre simulate RUN --sensors lidar.",
+        )
+
+    def render_aggregated(self, _: sensorsim_pb2.AggregatedRenderRequest) -> sensorsim_pb2.AggregatedRenderReturn:
+        """Is not there: clients that find it missing ask for images one by one.
+
+        Raises:
+            ConfigError: always.
+        """
+        raise ConfigError("render_aggregated is not served", remedy="Call batch_render_rgb.")
+
+    def _render_all(self, requests: Mapping[int, ImageRequest]) -> dict[int, NDArray[np.uint8] | InputError]:
+        """The images by number, or why one cannot be rendered."""
+        try:
+            return dict(zip(requests, self._renderer.render_batch(list(requests.values())), strict=True))
+        except InputError as error:
+            if len(requests) == 1:
+                return dict.fromkeys(requests, error)
+        # The renderer takes all or none: one by one, those that can be rendered are.
+        rendered: dict[int, NDArray[np.uint8] | InputError] = {}
+        for k, request in requests.items():
+            rendered |= self._render_all({k: request})
+        return rendered
+
+    def _read(self, request: sensorsim_pb2.RGBRenderRequest) -> ImageRequest:
+        self._check_scene(request.scene_id)
+        check_format(request.image_format, request.image_quality)
+        if request.insert_ego_mask:
+            self._find_mask(request.ego_mask_id)
+        return read_image_request(request, self._frame, self._renderer.cameras, self._track_ids)
+
+    def _encode(
+        self, request: sensorsim_pb2.RGBRenderRequest, pixels: NDArray[np.uint8]
+    ) -> sensorsim_pb2.RGBRenderReturn:
+        if request.insert_ego_mask:
+            mask = _resize_mask(self._find_mask(request.ego_mask_id), pixels.shape[0], pixels.shape[1])
+            pixels = np.where(mask[..., None], np.uint8(_MASK_COLOR), pixels)
+        encoded = encode_image(pixels, request.image_format, request.image_quality)
+        return sensorsim_pb2.RGBRenderReturn(image_bytes=encoded)
+
+    def _check_scene(self, scene_id: str) -> None:
+        if scene_id != self._renderer.name:
+            raise InputError(
+                f"no scene '{scene_id[:80]}' is served", remedy=f"Ask for '{self._renderer.name}', the only one."
+            )
+
+    def _name_mask(self, camera: str) -> sensorsim_pb2.EgoMaskId:
+        return sensorsim_pb2.EgoMaskId(camera_logical_id=camera, rig_config_id=self._renderer.name)
+
+    def _find_mask(self, mask_id: sensorsim_pb2.EgoMaskId) -> NDArray[np.bool_]:
+        mask = self._masks.get(mask_id.camera_logical_id)
+        if mask is None or mask_id.rig_config_id != self._renderer.name:
+            raise InputError(
+                f"there is no ego mask '{mask_id.camera_logical_id[:80]}' of '{mask_id.rig_config_id[:80]}'",
+                remedy="Send one that get_available_ego_masks names, or insert none.",
+            )
+        return mask
+
+
+def to_microseconds(time_s: float) -> int:
+    """Rounds absolute seconds to the microseconds of the wire.
+
+    >>> to_microseconds(1.5)
+    1500000
+    """
+    return round(time_s * 1e6)
+
+
+def _resize_mask(mask: NDArray[np.bool_], height: int, width: int) -> NDArray[np.bool_]:
+    # The nearest pixel: a mask has no values in between.
+    rows = (np.arange(height) + 0.5) * mask.shape[0] / height
+    columns = (np.arange(width) + 0.5) * mask.shape[1] / width
+    return np.asarray(mask[rows.astype(np.int64)[:, None], columns.astype(np.int64)])

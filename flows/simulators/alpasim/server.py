@@ -1,0 +1,205 @@
+"""The gRPC server of the sensor service: bytes in, bytes out, and every error as a status code."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+from google.protobuf.message import DecodeError, Message
+
+from flows.simulators.alpasim import common_pb2, sensorsim_pb2
+from genre_tasks.errors import ConfigError, GenreError, InputError, NonFiniteError, ResourceError
+
+if TYPE_CHECKING:
+    import grpc
+
+    from flows.simulators.alpasim.sensor_service import SensorService
+
+SERVICE = "nre.grpc.protos.sensorsim.SensorsimService"
+
+MAX_REQUEST_BYTES = 16 << 20
+MAX_ANSWER_BYTES = 64 << 20
+"""What AlpaSim's client takes; a batch of PNG images is far smaller."""
+
+REQUEST_TYPES: dict[str, type[Message]] = {
+    "render_rgb": sensorsim_pb2.RGBRenderRequest,
+    "render_lidar": sensorsim_pb2.LidarRenderRequest,
+    "render_aggregated": sensorsim_pb2.AggregatedRenderRequest,
+    "batch_render_rgb": sensorsim_pb2.BatchRGBRenderRequest,
+    "get_version": common_pb2.Empty,
+    "get_available_scenes": common_pb2.Empty,
+    "get_loaded_scenes": common_pb2.Empty,
+    "get_available_cameras": sensorsim_pb2.AvailableCamerasRequest,
+    "get_available_trajectories": sensorsim_pb2.AvailableTrajectoriesRequest,
+    "get_available_ego_masks": common_pb2.Empty,
+}
+"""What each method of the service is called with."""
+
+_STATUS_NAMES: tuple[tuple[type[Exception], str], ...] = (
+    (DecodeError, "INVALID_ARGUMENT"),
+    (InputError, "INVALID_ARGUMENT"),
+    (ConfigError, "UNIMPLEMENTED"),
+    (ResourceError, "RESOURCE_EXHAUSTED"),
+    (NonFiniteError, "OUT_OF_RANGE"),
+    (GenreError, "FAILED_PRECONDITION"),
+    (Exception, "INTERNAL"),
+)
+
+_log = logging.getLogger(__name__)
+
+
+def find_status_name(error: Exception) -> str:
+    """Finds the gRPC status code of an error.
+
+    Args:
+        error: that answering a call raised.
+
+    Returns:
+        The code's name.
+
+    >>> find_status_name(ConfigError("no such lens", remedy="Send another."))
+    'UNIMPLEMENTED'
+    """
+    return next(name for kind, name in _STATUS_NAMES if isinstance(error, kind))
+
+
+class SensorServer:
+    """Serves a scene on a port, until :meth:`stop`.
+
+    Args:
+        service: what answers the calls.
+        host: an address of this machine; the default is reached from this machine alone.
+        port: to listen on; 0: any free one.
+        max_waiting: calls that may wait while another one is rendered.
+        on_call: is called with method and status name after each call, for counters; ``None``: nothing counts.
+
+    Raises:
+        ConfigError: the port is taken, or the package for gRPC is not installed.
+
+    Example::
+
+        with SensorServer(service) as server:
+            print(server.address)
+            server.wait()
+    """
+
+    def __init__(
+        self,
+        service: SensorService,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        max_waiting: int = 16,
+        on_call: Callable[[str, str], None] | None = None,
+    ) -> None:
+        self._grpc = _import_grpc()
+        self._service = service
+        self._on_call = on_call
+        # Calls that only ask for facts are answered while all others wait for the renderer.
+        workers = max_waiting + 4
+        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="sensorsim")
+        self._server = self._grpc.server(
+            self._pool,
+            options=(
+                ("grpc.max_receive_message_length", MAX_REQUEST_BYTES),
+                ("grpc.max_send_message_length", MAX_ANSWER_BYTES),
+                # Two servers on one port would each get some of the calls.
+                ("grpc.so_reuseport", 0),
+            ),
+            maximum_concurrent_rpcs=2 * workers,
+        )
+        handlers = {name: self._make_handler(name) for name in REQUEST_TYPES}
+        generic = self._grpc.method_handlers_generic_handler(SERVICE, handlers)
+        self._server.add_generic_rpc_handlers((generic,))
+        self._host = host
+        try:
+            self._port = self._server.add_insecure_port(f"{host}:{port}")
+        except RuntimeError as error:
+            raise ConfigError(f"cannot listen on {host}:{port}", remedy="Choose another --port or --host.") from error
+        self._server.start()
+
+    @property
+    def address(self) -> str:
+        """``host:port`` that clients connect to."""
+        return f"{self._host}:{self._port}"
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Waits until the server has ended.
+
+        Args:
+            timeout_s: at most so long; ``None``: without end.
+
+        Returns:
+            Whether it has.
+        """
+        return not self._server.wait_for_termination(timeout_s)
+
+    def stop(self, grace_s: float = 5.0) -> None:
+        """Ends the server: new calls are refused at once, those under way get time to be answered.
+
+        Args:
+            grace_s: how much.
+        """
+        self._server.stop(grace_s).wait()
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def __enter__(self) -> SensorServer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def _make_handler(self, method: str) -> Any:
+        # Without deserializer: a request that cannot be read gets a status that says so, instead of INTERNAL.
+        return self._grpc.unary_unary_rpc_method_handler(lambda payload, context: self._answer(method, payload, context))
+
+    def _answer(self, method: str, payload: bytes, context: grpc.ServicerContext) -> bytes:
+        try:
+            answer = answer_call(self._service, method, payload)
+        except Exception as error:
+            name = find_status_name(error)
+            if name == "INTERNAL":
+                # A fault of the program: the client learns that there was one, the log learns where.
+                _log.exception("%s failed", method)
+            self._count(method, name)
+            details = "the service failed; see its log" if name == "INTERNAL" else str(error)
+            context.set_code(self._grpc.StatusCode[name])
+            context.set_details(details)
+            return b""
+        self._count(method, "OK")
+        return answer
+
+    def _count(self, method: str, status: str) -> None:
+        if self._on_call is not None:
+            self._on_call(method, status)
+
+
+def answer_call(service: SensorService, method: str, payload: bytes) -> bytes:
+    """Answers one call.
+
+    Args:
+        service: that has the method.
+        method: a key of ``REQUEST_TYPES``.
+        payload: the request as it came over the wire.
+
+    Returns:
+        The answer's bytes.
+
+    Raises:
+        DecodeError: the payload is no message.
+        GenreError: the service refuses the request.
+    """
+    request = REQUEST_TYPES[method].FromString(payload)
+    answer: Message = getattr(service, method)(request)
+    return answer.SerializeToString()
+
+
+def _import_grpc() -> Any:
+    try:
+        import grpc
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            "the service needs the package grpcio", remedy="Install it: pip install 'genre[simulators]'."
+        ) from error
+    return grpc
