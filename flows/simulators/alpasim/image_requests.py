@@ -85,7 +85,8 @@ def _read_size(request: sensorsim_pb2.RGBRenderRequest) -> tuple[int, int]:
     height_px = request.resolution_h or request.camera_intrinsics.resolution_h
     if not (1 <= width_px <= MAX_SIDE_PX and 1 <= height_px <= MAX_SIDE_PX):
         raise InputError(
-            f"an image of {width_px} × {height_px} pixels cannot be rendered", remedy="Send resolution_w and resolution_h."
+            f"an image of {width_px} × {height_px} pixels cannot be rendered",
+            remedy="Send resolution_w and resolution_h.",
         )
     return width_px, height_px
 

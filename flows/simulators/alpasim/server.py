@@ -152,7 +152,9 @@ class SensorServer:
 
     def _make_handler(self, method: str) -> Any:
         # Without deserializer: a request that cannot be read gets a status that says so, instead of INTERNAL.
-        return self._grpc.unary_unary_rpc_method_handler(lambda payload, context: self._answer(method, payload, context))
+        return self._grpc.unary_unary_rpc_method_handler(
+            lambda payload, context: self._answer(method, payload, context)
+        )
 
     def _answer(self, method: str, payload: bytes, context: grpc.ServicerContext) -> bytes:
         try:
