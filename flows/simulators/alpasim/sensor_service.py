@@ -12,6 +12,7 @@ from flows.simulators.alpasim import common_pb2, sensorsim_pb2
 from flows.simulators.alpasim.image_bytes import check_format, encode_image
 from flows.simulators.alpasim.image_requests import read_image_request
 from flows.simulators.alpasim.local_frame import LocalFrame
+from flows.simulators.alpasim.timestamps import to_microseconds
 from flows.simulators.alpasim.wire_lenses import write_camera_spec
 from flows.simulators.alpasim.wire_poses import write_pose
 from flows.simulators.image_request import ImageRequest
@@ -227,15 +228,6 @@ class SensorService:
                 remedy="Send one that get_available_ego_masks names, or insert none.",
             )
         return mask
-
-
-def to_microseconds(time_s: float) -> int:
-    """Rounds absolute seconds to the microseconds of the wire.
-
-    >>> to_microseconds(1.5)
-    1500000
-    """
-    return round(time_s * 1e6)
 
 
 def _resize_mask(mask: NDArray[np.bool_], height: int, width: int) -> NDArray[np.bool_]:
