@@ -1,0 +1,127 @@
+"""The server: several clients at once, bounds, faults, and its end."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from flows.simulators.alpasim import common_pb2
+from flows.simulators.alpasim.server import SensorServer
+from genre_tasks.errors import ConfigError, ResourceError
+from tests.flows.simulators.alpasim.wire_client import ServedRun, WireClient
+
+
+class FakeService:
+    """Answers every call with what a function does."""
+
+    def __init__(self, answer: Callable[[], None]) -> None:
+        self._answer = answer
+
+    def get_version(self, _: Any) -> common_pb2.VersionId:
+        self._answer()
+        return common_pb2.VersionId(version_id="fake")
+
+
+@contextmanager
+def serve(answer: Callable[[], None], **options: Any) -> Iterator[tuple[SensorServer, WireClient]]:
+    pytest.importorskip("grpc")
+    with SensorServer(FakeService(answer), **options) as server, WireClient(server.address) as client:  # type: ignore[arg-type]
+        yield server, client
+
+
+def test_two_clients_get_their_own_images(client: WireClient, served: ServedRun) -> None:
+    requests = [client.image_request(k % 2, step) for k, step in enumerate(range(8))]
+    expected = [client.call("render_rgb", request).image_bytes for request in requests]
+    with SensorServer(served.service) as server, WireClient(server.address) as one, WireClient(server.address) as two:
+
+        def drive(simulator: WireClient) -> list[bytes]:
+            return [simulator.call("render_rgb", request).image_bytes for request in requests]
+
+        with ThreadPoolExecutor(2) as pool:
+            assert list(pool.map(drive, [one, two])) == [expected, expected]
+
+
+def test_calls_are_counted_by_method_and_status() -> None:
+    counts: Counter[tuple[str, str]] = Counter()
+    with serve(lambda: None, on_call=lambda *call: counts.update([call])) as (_, client):
+        client.call("get_version")
+        client.status("get_version", b"\xff")
+        client.status("get_version", b"")
+    assert counts == {("get_version", "OK"): 2, ("get_version", "INVALID_ARGUMENT"): 1}
+
+
+def test_more_calls_than_may_wait_are_refused() -> None:
+    release = threading.Event()
+    with serve(lambda: release.wait(30) and None, max_waiting=0) as (_, client):
+        with ThreadPoolExecutor(20) as pool:
+            calls = [pool.submit(client.status, "get_version", b"") for _ in range(20)]
+            deadline = time.monotonic() + 30
+            while sum(call.done() for call in calls) < 12 and time.monotonic() < deadline:
+                time.sleep(0.01)
+            refused = [call.result()[0] for call in calls if call.done()]
+            release.set()
+        codes = Counter(call.result()[0] for call in calls)
+        assert refused == ["RESOURCE_EXHAUSTED"] * 12
+        assert codes == {"RESOURCE_EXHAUSTED": 12, "OK": 8}
+        assert client.status("get_version", b"")[0] == "OK"
+
+
+def test_a_fault_of_the_program_says_nothing_of_itself_to_clients(caplog: pytest.LogCaptureFixture) -> None:
+    def fail() -> None:
+        raise ZeroDivisionError("a secret")
+
+    with serve(fail) as (_, client):
+        code, details = client.status("get_version", b"")
+    assert code == "INTERNAL"
+    assert "secret" not in details
+    assert "a secret" in caplog.text
+
+
+def test_a_busy_renderer_asks_to_come_back() -> None:
+    def refuse() -> None:
+        raise ResourceError("the renderer is busy", remedy="Ask again later.")
+
+    with serve(refuse) as (_, client):
+        assert client.status("get_version", b"") == ("RESOURCE_EXHAUSTED", "the renderer is busy. Ask again later.")
+
+
+def test_the_end_lets_calls_under_way_finish() -> None:
+    started = threading.Event()
+    release = threading.Event()
+
+    def answer() -> None:
+        started.set()
+        release.wait(30)
+
+    with serve(answer) as (server, client), ThreadPoolExecutor(2) as pool:
+        call = pool.submit(client.status, "get_version", b"")
+        assert started.wait(30)
+        end = pool.submit(server.stop, 30.0)
+        assert not server.wait(0.05)
+        release.set()
+        end.result(30)
+        assert call.result(30)[0] == "OK"
+        assert server.wait(5.0)
+        assert client.status("get_version", b"")[0] == "UNAVAILABLE"
+        # The port is free again.
+        host, _, port = server.address.rpartition(":")
+        SensorServer(FakeService(lambda: None), host, int(port)).stop()  # type: ignore[arg-type]
+
+
+def test_a_taken_port_is_named() -> None:
+    with serve(lambda: None) as (server, _):
+        host, _, port = server.address.rpartition(":")
+        with pytest.raises(ConfigError, match=f"cannot listen on {server.address}"):
+            SensorServer(FakeService(lambda: None), host, int(port))  # type: ignore[arg-type]
+
+
+def test_only_this_machine_reaches_the_default_address() -> None:
+    with serve(lambda: None) as (server, _):
+        assert server.address.startswith("127.0.0.1:")
