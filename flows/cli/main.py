@@ -24,6 +24,7 @@ from flows.cli.parsing import check_words
 from flows.cli.range import range_command
 from flows.cli.render import render
 from flows.cli.run import run
+from flows.cli.serve import serve
 from flows.cli.show import show
 from flows.cli.signals import end_on_signals, exit_process
 from flows.cli.simulate import simulate
@@ -48,6 +49,7 @@ app.command(name="check")(check)
 app.command(name="effects")(effects)
 app.command(name="render")(render)
 app.command(name="simulate")(simulate)
+app.command(name="serve")(serve)
 app.command(name="range")(range_command)
 app.command(name="edit")(edit)
 app.command(name="show")(show)

@@ -60,28 +60,28 @@ class ActorPlacer:
         # The latest scenes with actors of other chunks, because joining copies Gaussians.
         self._extended: list[tuple[ChunkScene, tuple[int, ...], ChunkScene]] = []
 
-    def resolve(self, actors: Sequence[ActorPose]) -> dict[str, ActorPose]:
+    def resolve(self, words: Sequence[str]) -> tuple[str, ...]:
         """Finds which actors are meant.
 
         Args:
-            actors: of a client.
+            words: the log's track ids, or readable names.
 
         Returns:
-            The poses by the log's track id.
+            The track id of each.
 
         Raises:
             InputError: an actor is not known, or is there twice.
         """
-        found: dict[str, ActorPose] = {}
-        for actor in actors:
-            # The log's own id first: another actor's number may look the same.
-            track_id = actor.track_id if actor.track_id in self._names else resolve_actor(actor.track_id, self._names)
+        found: list[str] = []
+        for word in words:
+            # The log's own id first: the readable name of another actor may look the same.
+            track_id = word if word in self._names else resolve_actor(word, self._names)
             if track_id in found:
                 raise InputError(
-                    f"actor {self._names[track_id]} ({track_id!r}) is there twice", remedy="Give one pose for each."
+                    f"actor {self._names[track_id]} ({track_id!r}) is there twice", remedy="Name each actor once."
                 )
-            found[track_id] = actor
-        return found
+            found.append(track_id)
+        return tuple(found)
 
     def gather(self, chunk_scene: ChunkScene, track_ids: Sequence[str]) -> ChunkScene:
         """Gives a scene the Gaussians of actors that only other chunks have.

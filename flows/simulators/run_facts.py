@@ -98,7 +98,7 @@ def _without_measurements(chunk: Chunk) -> Chunk:
 
 
 def _join_ego_poses(chunks: Sequence[Chunk], clock: RunClock) -> Float64:
-    poses = {}
+    poses: dict[int, Float64] = {}
     for chunk in chunks:
         for frame, pose in zip(chunk.frames, chunk.world_SE3_chunk @ chunk.chunk_SE3_ego, strict=True):
             poses.setdefault(frame, pose)

@@ -139,6 +139,17 @@ class SceneRenderer:
         mask = self._facts.ego_masks.get(camera)
         return None if mask is None else mask.copy()
 
+    def check_actors(self, track_ids: Sequence[str]) -> None:
+        """Checks that the run has actors.
+
+        Args:
+            track_ids: the log's ids, or readable names.
+
+        Raises:
+            InputError: an actor is not known, or is there twice.
+        """
+        self._placer.resolve(track_ids)
+
     def render(self, request: ImageRequest) -> NDArray[np.uint8]:
         """Renders one image.
 
@@ -206,7 +217,8 @@ class SceneRenderer:
         else:
             readout = Readout(round(frame), readout_s)
             frames = readout.frames
-            wanted = self._placer.resolve(request.actors)
+            ids = self._placer.resolve([actor.track_id for actor in request.actors])
+            wanted = dict(zip(ids, request.actors, strict=True))
             chunk_scene = self._placer.gather(chunk_scene, list(wanted))
             # Images of one moment with equal actors share a scene, and so a render.
             key = (id(chunk_scene), readout, *(_describe_pose(track_id, pose) for track_id, pose in wanted.items()))
@@ -240,7 +252,7 @@ class SceneRenderer:
                 remedy=f"It lasts from {first_s:.6f} to {last_s:.6f} s.",
             )
         if request.actors is not None:
-            self._placer.resolve(request.actors)
+            self.check_actors([actor.track_id for actor in request.actors])
 
     def _check_camera(self, camera: str) -> None:
         if camera not in self.cameras:

@@ -1,0 +1,233 @@
+"""NeuroNCAP's renderer protocol over HTTP: alive, start_time, get_actors, update_actors and render_image."""
+
+from __future__ import annotations
+
+import io
+import threading
+import time
+from collections.abc import Awaitable, Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
+
+from flows.simulators.http_thread import HttpThread
+from flows.simulators.image_request import ImageRequest
+from flows.simulators.neuroncap_messages import (
+    MICROSECONDS,
+    ImageMessage,
+    Trajectory,
+    describe_recorded,
+    parse_image,
+    parse_trajectories,
+    write_trajectories,
+)
+from flows.simulators.scene_renderer import SceneRenderer
+from flows.simulators.service import RunningService, ServiceRequest
+from flows.simulators.service_metrics import ServiceMetrics
+from genre_tasks.errors import ConfigError, GenreError, InputError, ResourceError
+from genre_tasks.suggestions import did_you_mean
+from storage.codecs.png import encode_png
+
+MAX_BODY_BYTES = 16 * 2**20
+"""Of one request: a thousand actors over twenty seconds take less."""
+
+_JPEG_QUALITY = 95
+_REFUSED_FORMAT = 406
+_TOO_LARGE = 413
+_UNFIT = 422
+_FAULT = 500
+_BUSY = 503
+
+Handler = Callable[[Request], Awaitable[Response]]
+
+
+class _BodyTooLargeError(Exception):
+    """A request has more bytes than are read."""
+
+
+class ActorState:
+    """The actors of a service: the recorded ones, until a client sets others."""
+
+    def __init__(self, renderer: SceneRenderer) -> None:
+        self._renderer = renderer
+        self._lock = threading.Lock()
+        self._trajectories = describe_recorded(renderer.actors())
+        self._is_recorded = True
+
+    @property
+    def trajectories(self) -> tuple[Trajectory, ...]:
+        """Those that images show at present."""
+        with self._lock:
+            return self._trajectories
+
+    def replace_all(self, trajectories: tuple[Trajectory, ...]) -> None:
+        """Sets all actors; one that is not among them is absent from now on.
+
+        Args:
+            trajectories: of a client.
+
+        Raises:
+            InputError: an actor is not known, or is there twice.
+        """
+        self._renderer.check_actors([trajectory.track_id for trajectory in trajectories])
+        with self._lock:
+            self._trajectories = trajectories
+            self._is_recorded = False
+
+    def request_image(self, message: ImageMessage) -> ImageRequest:
+        """Turns a message into a request of the renderer.
+
+        Args:
+            message: of a client.
+
+        Raises:
+            InputError: the run has no such camera.
+        """
+        cameras = self._renderer.cameras
+        if message.camera_name not in cameras:
+            remedy = f"{did_you_mean(message.camera_name, cameras)}It has {', '.join(cameras)}."
+            raise InputError(f"the run has no camera '{message.camera_name}'", remedy=remedy)
+        pose = np.array(message.pose, np.float64)
+        time_s = message.timestamp / MICROSECONDS
+        with self._lock:
+            placed = None if self._is_recorded else [t.pose_at(message.timestamp) for t in self._trajectories]
+        # One pose and one time: this protocol's cameras have a global shutter.
+        return ImageRequest(
+            lens=cameras[message.camera_name].lens,
+            start_world_SE3_camera=pose,
+            end_world_SE3_camera=pose,
+            start_s=time_s,
+            end_s=time_s,
+            actors=None if placed is None else tuple(actor for actor in placed if actor is not None),
+            camera=message.camera_name,
+        )
+
+
+class NeuroncapApp:
+    """Answers the protocol's five requests.
+
+    Args:
+        renderer: of the run.
+        metrics: where requests are counted.
+    """
+
+    def __init__(self, renderer: SceneRenderer, metrics: ServiceMetrics) -> None:
+        self._renderer = renderer
+        self._metrics = metrics
+        self._state = ActorState(renderer)
+
+    def build(self) -> Starlette:
+        """Makes the application that a server runs."""
+        return Starlette(
+            routes=[
+                self._route("/alive", "GET", self._alive),
+                self._route("/start_time", "GET", self._start_time),
+                self._route("/get_actors", "GET", self._get_actors),
+                self._route("/update_actors", "POST", self._update_actors),
+                self._route("/render_image", "POST", self._render_image),
+            ]
+        )
+
+    def _route(self, path: str, method: str, handler: Handler) -> Route:
+        async def answer(request: Request) -> Response:
+            started = time.perf_counter()
+            response = await _guard(handler, request)
+            self._metrics.count_request(path[1:], str(response.status_code), time.perf_counter() - started)
+            return response
+
+        return Route(path, answer, methods=[method])
+
+    async def _alive(self, request: Request) -> Response:
+        return JSONResponse(True)
+
+    async def _start_time(self, request: Request) -> Response:
+        return JSONResponse(round(self._renderer.time_range_s[0] * MICROSECONDS))
+
+    async def _get_actors(self, request: Request) -> Response:
+        return JSONResponse(await run_in_threadpool(write_trajectories, self._state.trajectories))
+
+    async def _update_actors(self, request: Request) -> Response:
+        body = await _read_body(request)
+
+        def update() -> None:
+            self._state.replace_all(parse_trajectories(body))
+
+        await run_in_threadpool(update)
+        return JSONResponse(None)
+
+    async def _render_image(self, request: Request) -> Response:
+        body = await _read_body(request)
+        return await run_in_threadpool(self._answer_image, body)
+
+    def _answer_image(self, body: bytes) -> Response:
+        message = parse_image(body)
+        if message.image_format == "raw":
+            detail = "the format raw, this protocol's default, is a pickle, which could run code: ask for png or jpg"
+            return _refuse(_REFUSED_FORMAT, detail)
+        pixels = self._renderer.render(self._state.request_image(message))
+        self._metrics.count_images(1)
+        if message.image_format == "png":
+            return Response(encode_png(pixels), media_type="image/png")
+        return Response(_encode_jpeg(pixels), media_type="image/jpeg")
+
+
+def start_neuroncap(request: ServiceRequest) -> RunningService:
+    """Starts the service; a ``StartService``.
+
+    Args:
+        request: with the renderer of one run.
+
+    Raises:
+        ConfigError: there are several runs, or the address cannot be listened at.
+    """
+    if len(request.renderers) != 1:
+        raise ConfigError(
+            f"the protocol neuroncap has no names of scenes, and {len(request.renderers)} runs are to be served",
+            remedy="Name one run, and start a service for each at a --port of its own.",
+        )
+    (renderer,) = request.renderers.values()
+    return HttpThread(NeuroncapApp(renderer, request.metrics).build(), request.host, request.port)
+
+
+async def _guard(handler: Handler, request: Request) -> Response:
+    """Answers a request, and every mistake in it with a status and a sentence."""
+    try:
+        return await handler(request)
+    except _BodyTooLargeError:
+        return _refuse(_TOO_LARGE, f"a request has at most {MAX_BODY_BYTES} bytes")
+    except ClientDisconnect:
+        return _refuse(_UNFIT, "the client went away")
+    except InputError as error:
+        return _refuse(_UNFIT, str(error))
+    except ResourceError as error:
+        response = _refuse(_BUSY, str(error))
+        response.headers["Retry-After"] = "1"
+        return response
+    except GenreError as error:
+        return _refuse(_FAULT, str(error))
+
+
+def _refuse(status: int, detail: str) -> Response:
+    return JSONResponse({"detail": detail}, status_code=status)
+
+
+async def _read_body(request: Request) -> bytes:
+    """The body of a request, read no further than it may be long."""
+    parts = bytearray()
+    async for part in request.stream():
+        parts += part
+        if len(parts) > MAX_BODY_BYTES:
+            raise _BodyTooLargeError
+    return bytes(parts)
+
+
+def _encode_jpeg(pixels: NDArray[np.uint8]) -> bytes:
+    sink = io.BytesIO()
+    Image.fromarray(pixels).save(sink, "JPEG", quality=_JPEG_QUALITY)
+    return sink.getvalue()
