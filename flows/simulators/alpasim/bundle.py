@@ -77,8 +77,7 @@ def write_alpasim_bundle(store: str, run: str, out: Path, stage: str | None = No
         OSError: the file cannot be written.
     """
     scenes = RunScenes(store, run, stage)
-    run_name = str(scenes.record["run"])
-    source = BundleSource(run_name, read_run_facts(scenes), read_local_frame(store, run_name))
+    source = BundleSource(str(scenes.record["run"]), read_run_facts(scenes), read_local_frame(scenes))
     if len(source.facts.clock.times_s) < MIN_POSES:
         raise InputError("the run has one frame, and a simulator drives along several", remedy="Choose another run.")
     survey = survey_run(scenes)

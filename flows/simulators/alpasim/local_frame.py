@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from flows.simulation.run_scenes import RunScenes
 from genre_tasks.ego_paths.collisions import EGO_SIZE_M
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.logs.types import Float64
 from genre_tasks.scene.transforms import compose_se3, invert_se3
+from genre_tasks.scene_edits.chunk_scene import ChunkScene, SceneSource
 from genre_tasks.scene_edits.ground import Ground
 from genre_tasks.scene_edits.run_survey import survey_run
 
@@ -73,23 +74,35 @@ class LocalFrame:
         return self.to_local(world_SE3_ego @ self.ego_SE3_rig)
 
 
-def read_local_frame(store: str, run: str) -> LocalFrame:
+def read_local_frame(source: SceneSource) -> LocalFrame:
     """Reads where a run's local frame is, from its first chunk.
 
     Args:
-        store: folder (or URI) of the store.
-        run: the run's name, or the start of it.
+        source: the scenes of the run.
 
     Returns:
         The frame; the same for the bundle and for the service.
 
     Raises:
-        InputError: there is no such run, or an artifact is gone.
+        InputError: an artifact is gone.
     """
-    first = RunScenes(store, run).chunk_numbers[0]
     # One chunk: the others would only be read to measure the same height again.
-    survey = survey_run(RunScenes(store, run, chunks=[first]))
+    survey = survey_run(_FirstChunk(source))
     return LocalFrame.from_path(survey.path, survey.ground)
+
+
+class _FirstChunk:
+    """The first chunk of a run; a ``SceneSource``."""
+
+    def __init__(self, source: SceneSource) -> None:
+        self._source = source
+
+    @property
+    def chunk_numbers(self) -> Sequence[int]:
+        return self._source.chunk_numbers[:1]
+
+    def load(self, number: int) -> ChunkScene:
+        return self._source.load(number)
 
 
 def describe_ego_box() -> dict[str, list[float]]:

@@ -17,28 +17,50 @@ from flows.simulators.alpasim.wire_lenses import write_camera_spec
 from flows.simulators.alpasim.wire_poses import write_pose
 from flows.simulators.image_request import ImageRequest
 from flows.simulators.scene_renderer import SceneRenderer
+from flows.simulators.service_metrics import ServiceMetrics, SilentMetrics
 from genre_tasks.errors import ConfigError, InputError
 
 PROTOCOL_VERSION = (0, 54, 0)
 """Of AlpaSim's messages, whose names and numbers the ``.proto`` files here have."""
 
+SILENT = SilentMetrics()
+
 _MASK_COLOR = 0
 
 
-class SensorService:
-    """Answers the calls of ``SensorsimService`` for one run.
+class ServedScene:
+    """A run as the service knows it.
 
     Args:
         renderer: of the run.
         frame: that poses on the wire are stated in; the bundle has the same.
+
+    Attributes:
+        renderer: of the run.
+        frame: that poses on the wire are stated in.
+        track_ids: of all moving actors.
+        masks: [H, W] true on the recording vehicle itself, by camera.
     """
 
     def __init__(self, renderer: SceneRenderer, frame: LocalFrame) -> None:
-        self._renderer = renderer
-        self._frame = frame
-        self._track_ids = frozenset(actor.track_id for actor in renderer.actors())
+        self.renderer = renderer
+        self.frame = frame
+        self.track_ids = frozenset(actor.track_id for actor in renderer.actors())
         masks = {name: renderer.ego_mask(name) for name in renderer.cameras}
-        self._masks = {name: mask for name, mask in masks.items() if mask is not None}
+        self.masks = {name: mask for name, mask in masks.items() if mask is not None}
+
+
+class SensorService:
+    """Answers the calls of ``SensorsimService``.
+
+    Args:
+        scenes: of one or more runs, by the scene's name.
+        metrics: where images are counted.
+    """
+
+    def __init__(self, scenes: Mapping[str, ServedScene], metrics: ServiceMetrics = SILENT) -> None:
+        self._scenes = scenes
+        self._metrics = metrics
 
     def get_version(self, _: common_pb2.Empty) -> common_pb2.VersionId:
         """Gives the versions of GenRe and of the protocol."""
@@ -47,20 +69,21 @@ class SensorService:
         return common_pb2.VersionId(version_id=f"genre {version('genre')}", grpc_api_version=api)
 
     def get_available_scenes(self, _: common_pb2.Empty) -> common_pb2.AvailableScenesReturn:
-        """Names the one scene that is served."""
-        return common_pb2.AvailableScenesReturn(scene_ids=[self._renderer.name])
+        """Names the scenes that are served."""
+        return common_pb2.AvailableScenesReturn(scene_ids=list(self._scenes))
 
     def get_loaded_scenes(self, _: common_pb2.Empty) -> sensorsim_pb2.LoadedScenesReturn:
-        """Names the scene as loaded: it is before the first call."""
-        entry = sensorsim_pb2.LoadedSceneEntry(
-            scene_id=self._renderer.name, loaded_instance_count=1, reusable_instance_count=1
-        )
-        return sensorsim_pb2.LoadedScenesReturn(scenes=[entry], loaded_instance_capacity=1)
+        """Names the same scenes as loaded: all are before the first call."""
+        entries = [
+            sensorsim_pb2.LoadedSceneEntry(scene_id=name, loaded_instance_count=1, reusable_instance_count=1)
+            for name in self._scenes
+        ]
+        return sensorsim_pb2.LoadedScenesReturn(scenes=entries, loaded_instance_capacity=len(entries))
 
     def get_available_cameras(
         self, request: sensorsim_pb2.AvailableCamerasRequest
     ) -> sensorsim_pb2.AvailableCamerasReturn:
-        """Describes the cameras of the run's rig.
+        """Describes the cameras of a run's rig.
 
         Args:
             request: names the scene.
@@ -71,14 +94,14 @@ class SensorService:
         Raises:
             InputError: no such scene is served.
         """
-        self._check_scene(request.scene_id)
+        scene = self._find_scene(request.scene_id)
         cameras = [
             sensorsim_pb2.AvailableCamerasReturn.AvailableCamera(
                 intrinsics=write_camera_spec(camera),
-                rig_to_camera=write_pose(self._frame.to_rig(camera.rig_SE3_camera)),
+                rig_to_camera=write_pose(scene.frame.to_rig(camera.rig_SE3_camera)),
                 logical_id=camera.name,
             )
-            for camera in self._renderer.cameras.values()
+            for camera in scene.renderer.cameras.values()
         ]
         return sensorsim_pb2.AvailableCamerasReturn(available_cameras=cameras)
 
@@ -96,11 +119,11 @@ class SensorService:
         Raises:
             InputError: no such scene is served.
         """
-        self._check_scene(request.scene_id)
-        times_s, world_SE3_ego = self._renderer.ego_trajectory()
+        scene = self._find_scene(request.scene_id)
+        times_s, world_SE3_ego = scene.renderer.ego_trajectory()
         poses = [
             common_pb2.PoseAtTime(pose=write_pose(pose), timestamp_us=to_microseconds(time_s))
-            for time_s, pose in zip(times_s, self._frame.place_rig(world_SE3_ego), strict=True)
+            for time_s, pose in zip(times_s, scene.frame.place_rig(world_SE3_ego), strict=True)
         ]
         trajectory = sensorsim_pb2.AvailableTrajectoriesReturn.AvailableTrajectory(
             trajectory=common_pb2.Trajectory(poses=poses)
@@ -108,10 +131,13 @@ class SensorService:
         return sensorsim_pb2.AvailableTrajectoriesReturn(available_trajectories=[trajectory])
 
     def get_available_ego_masks(self, _: common_pb2.Empty) -> sensorsim_pb2.AvailableEgoMasksReturn:
-        """Names the cameras whose images show the recording vehicle itself."""
+        """Names the cameras whose images show the recording vehicle itself; a scene's name stands for its rig."""
         entries = [
-            sensorsim_pb2.AvailableEgoMasksReturn.EgoMaskMetadata(ego_mask_id=self._name_mask(name))
-            for name in self._masks
+            sensorsim_pb2.AvailableEgoMasksReturn.EgoMaskMetadata(
+                ego_mask_id=sensorsim_pb2.EgoMaskId(camera_logical_id=camera, rig_config_id=name)
+            )
+            for name, scene in self._scenes.items()
+            for camera in scene.masks
         ]
         return sensorsim_pb2.AvailableEgoMasksReturn(ego_mask_metadata=entries)
 
@@ -129,7 +155,8 @@ class SensorService:
             ConfigError: GenRe does not render such a camera, or does not encode such images.
             ResourceError: too many calls wait.
         """
-        image = self._renderer.render(self._read(request))
+        image = self._find_scene(request.scene_id).renderer.render(self._read(request))
+        self._metrics.count_images(1)
         return self._encode(request, image)
 
     def batch_render_rgb(self, request: sensorsim_pb2.BatchRGBRenderRequest) -> sensorsim_pb2.BatchRGBRenderReturn:
@@ -145,22 +172,26 @@ class SensorService:
             InputError: there are more images than one call may have.
             ResourceError: too many calls wait.
         """
-        most = self._renderer.limits.max_batch
+        most = min(scene.renderer.limits.max_batch for scene in self._scenes.values())
         if len(request.items) > most:
             raise InputError(f"{len(request.items)} images are too many for one call", remedy=f"Send at most {most}.")
         answers = [sensorsim_pb2.BatchRGBRenderReturnItem(camera_name=item.camera_name) for item in request.items]
-        readable: dict[int, ImageRequest] = {}
+        readable: dict[str, dict[int, ImageRequest]] = {}
         for k, item in enumerate(request.items):
             try:
-                readable[k] = self._read(item.request)
+                readable.setdefault(item.request.scene_id, {})[k] = self._read(item.request)
             except (InputError, ConfigError) as error:
                 answers[k].error_message = str(error)
-        for k, image in self._render_all(readable).items():
-            if isinstance(image, InputError):
-                answers[k].error_message = str(image)
-            else:
+        for scene_id, requests in readable.items():
+            if not requests:
+                continue
+            for k, image in _render_all(self._find_scene(scene_id).renderer, requests).items():
+                if isinstance(image, InputError):
+                    answers[k].error_message = str(image)
+                    continue
                 answers[k].result.CopyFrom(self._encode(request.items[k].request, image))
                 answers[k].success = True
+        self._metrics.count_images(sum(answer.success for answer in answers))
         return sensorsim_pb2.BatchRGBRenderReturn(items=answers)
 
     def render_lidar(self, _: sensorsim_pb2.LidarRenderRequest) -> sensorsim_pb2.LidarRenderReturn:
@@ -175,59 +206,60 @@ class SensorService:
         )
 
     def render_aggregated(self, _: sensorsim_pb2.AggregatedRenderRequest) -> sensorsim_pb2.AggregatedRenderReturn:
-        """Is not there: clients that find it missing ask for images one by one.
+        """Is not there: the protocol has calls for images alone.
 
         Raises:
             ConfigError: always.
         """
         raise ConfigError("render_aggregated is not served", remedy="Call batch_render_rgb.")
 
-    def _render_all(self, requests: Mapping[int, ImageRequest]) -> dict[int, NDArray[np.uint8] | InputError]:
-        """The images by number, or why one cannot be rendered."""
-        try:
-            return dict(zip(requests, self._renderer.render_batch(list(requests.values())), strict=True))
-        except InputError as error:
-            if len(requests) == 1:
-                return dict.fromkeys(requests, error)
-        # The renderer takes all or none: one by one, those that can be rendered are.
-        rendered: dict[int, NDArray[np.uint8] | InputError] = {}
-        for k, request in requests.items():
-            rendered |= self._render_all({k: request})
-        return rendered
+    def _find_scene(self, scene_id: str) -> ServedScene:
+        scene = self._scenes.get(scene_id)
+        if scene is None:
+            raise InputError(f"no scene '{scene_id[:80]}' is served", remedy=f"Known: {', '.join(self._scenes)}.")
+        return scene
 
     def _read(self, request: sensorsim_pb2.RGBRenderRequest) -> ImageRequest:
-        self._check_scene(request.scene_id)
+        scene = self._find_scene(request.scene_id)
         check_format(request.image_format, request.image_quality)
         if request.insert_ego_mask:
-            self._find_mask(request.ego_mask_id)
-        return read_image_request(request, self._frame, self._renderer.cameras, self._track_ids)
+            self._find_mask(request)
+        return read_image_request(request, scene.frame, scene.renderer.cameras, scene.track_ids)
 
     def _encode(
         self, request: sensorsim_pb2.RGBRenderRequest, pixels: NDArray[np.uint8]
     ) -> sensorsim_pb2.RGBRenderReturn:
         if request.insert_ego_mask:
-            mask = _resize_mask(self._find_mask(request.ego_mask_id), pixels.shape[0], pixels.shape[1])
+            mask = _resize_mask(self._find_mask(request), pixels.shape[0], pixels.shape[1])
             pixels = np.where(mask[..., None], np.uint8(_MASK_COLOR), pixels)
         encoded = encode_image(pixels, request.image_format, request.image_quality)
         return sensorsim_pb2.RGBRenderReturn(image_bytes=encoded)
 
-    def _check_scene(self, scene_id: str) -> None:
-        if scene_id != self._renderer.name:
-            raise InputError(
-                f"no scene '{scene_id[:80]}' is served", remedy=f"Ask for '{self._renderer.name}', the only one."
-            )
-
-    def _name_mask(self, camera: str) -> sensorsim_pb2.EgoMaskId:
-        return sensorsim_pb2.EgoMaskId(camera_logical_id=camera, rig_config_id=self._renderer.name)
-
-    def _find_mask(self, mask_id: sensorsim_pb2.EgoMaskId) -> NDArray[np.bool_]:
-        mask = self._masks.get(mask_id.camera_logical_id)
-        if mask is None or mask_id.rig_config_id != self._renderer.name:
+    def _find_mask(self, request: sensorsim_pb2.RGBRenderRequest) -> NDArray[np.bool_]:
+        mask_id = request.ego_mask_id
+        mask = self._find_scene(request.scene_id).masks.get(mask_id.camera_logical_id)
+        if mask is None or mask_id.rig_config_id != request.scene_id:
             raise InputError(
                 f"there is no ego mask '{mask_id.camera_logical_id[:80]}' of '{mask_id.rig_config_id[:80]}'",
                 remedy="Send one that get_available_ego_masks names, or insert none.",
             )
         return mask
+
+
+def _render_all(
+    renderer: SceneRenderer, requests: Mapping[int, ImageRequest]
+) -> dict[int, NDArray[np.uint8] | InputError]:
+    """The images by number, or why one cannot be rendered."""
+    try:
+        return dict(zip(requests, renderer.render_batch(list(requests.values())), strict=True))
+    except InputError as error:
+        if len(requests) == 1:
+            return dict.fromkeys(requests, error)
+    # The renderer takes all or none: one by one, those that can be rendered are.
+    rendered: dict[int, NDArray[np.uint8] | InputError] = {}
+    for k, request in requests.items():
+        rendered |= _render_all(renderer, {k: request})
+    return rendered
 
 
 def _resize_mask(mask: NDArray[np.bool_], height: int, width: int) -> NDArray[np.bool_]:

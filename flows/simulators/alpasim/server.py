@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
+import grpc
 from google.protobuf.message import DecodeError, Message
 
 from flows.simulators.alpasim import common_pb2, sensorsim_pb2
+from flows.simulators.service_metrics import ServiceMetrics, SilentMetrics
 from genre_tasks.errors import ConfigError, GenreError, InputError, NonFiniteError, ResourceError
 
 if TYPE_CHECKING:
-    import grpc
-
     from flows.simulators.alpasim.sensor_service import SensorService
 
 SERVICE = "nre.grpc.protos.sensorsim.SensorsimService"
@@ -47,6 +47,8 @@ _STATUS_NAMES: tuple[tuple[type[Exception], str], ...] = (
     (Exception, "INTERNAL"),
 )
 
+SILENT = SilentMetrics()
+
 _log = logging.getLogger(__name__)
 
 
@@ -66,17 +68,17 @@ def find_status_name(error: Exception) -> str:
 
 
 class SensorServer:
-    """Serves a scene on a port, until :meth:`stop`.
+    """Serves a scene on a port, until :meth:`close`; a ``RunningService``.
 
     Args:
         service: what answers the calls.
         host: an address of this machine; the default is reached from this machine alone.
         port: to listen on; 0: any free one.
         max_waiting: calls that may wait while another one is rendered.
-        on_call: is called with method and status name after each call, for counters; ``None``: nothing counts.
+        metrics: where calls are counted.
 
     Raises:
-        ConfigError: the port is taken, or the package for gRPC is not installed.
+        ConfigError: the port is taken, or the address is no one's.
 
     Example::
 
@@ -91,15 +93,14 @@ class SensorServer:
         host: str = "127.0.0.1",
         port: int = 0,
         max_waiting: int = 16,
-        on_call: Callable[[str, str], None] | None = None,
+        metrics: ServiceMetrics = SILENT,
     ) -> None:
-        self._grpc = _import_grpc()
         self._service = service
-        self._on_call = on_call
+        self._metrics = metrics
         # Calls that only ask for facts are answered while all others wait for the renderer.
         workers = max_waiting + 4
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="sensorsim")
-        self._server = self._grpc.server(
+        self._server = grpc.server(
             self._pool,
             options=(
                 ("grpc.max_receive_message_length", MAX_REQUEST_BYTES),
@@ -110,7 +111,7 @@ class SensorServer:
             maximum_concurrent_rpcs=2 * workers,
         )
         handlers = {name: self._make_handler(name) for name in REQUEST_TYPES}
-        generic = self._grpc.method_handlers_generic_handler(SERVICE, handlers)
+        generic = grpc.method_handlers_generic_handler(SERVICE, handlers)
         self._server.add_generic_rpc_handlers((generic,))
         self._host = host
         try:
@@ -124,18 +125,15 @@ class SensorServer:
         """``host:port`` that clients connect to."""
         return f"{self._host}:{self._port}"
 
-    def wait(self, timeout_s: float | None = None) -> bool:
-        """Waits until the server has ended.
+    def wait(self, timeout_s: float | None = None) -> None:
+        """Waits until the server has ended; a signal ends the wait.
 
         Args:
             timeout_s: at most so long; ``None``: without end.
-
-        Returns:
-            Whether it has.
         """
-        return not self._server.wait_for_termination(timeout_s)
+        self._server.wait_for_termination(timeout_s)
 
-    def stop(self, grace_s: float = 5.0) -> None:
+    def close(self, grace_s: float = 5.0) -> None:
         """Ends the server: new calls are refused at once, those under way get time to be answered.
 
         Args:
@@ -148,33 +146,29 @@ class SensorServer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.stop()
+        self.close()
 
     def _make_handler(self, method: str) -> Any:
         # Without deserializer: a request that cannot be read gets a status that says so, instead of INTERNAL.
-        return self._grpc.unary_unary_rpc_method_handler(
-            lambda payload, context: self._answer(method, payload, context)
-        )
+        return grpc.unary_unary_rpc_method_handler(lambda payload, context: self._answer(method, payload, context))
 
     def _answer(self, method: str, payload: bytes, context: grpc.ServicerContext) -> bytes:
+        start = time.perf_counter()
+        name = "OK"
+        answer = b""
         try:
             answer = answer_call(self._service, method, payload)
         except Exception as error:
             name = find_status_name(error)
+            details = str(error)
             if name == "INTERNAL":
                 # A fault of the program: the client learns that there was one, the log learns where.
                 _log.exception("%s failed", method)
-            self._count(method, name)
-            details = "the service failed; see its log" if name == "INTERNAL" else str(error)
-            context.set_code(self._grpc.StatusCode[name])
+                details = "the service failed; see its log"
+            context.set_code(grpc.StatusCode[name])
             context.set_details(details)
-            return b""
-        self._count(method, "OK")
+        self._metrics.count_request(method, name, time.perf_counter() - start)
         return answer
-
-    def _count(self, method: str, status: str) -> None:
-        if self._on_call is not None:
-            self._on_call(method, status)
 
 
 def answer_call(service: SensorService, method: str, payload: bytes) -> bytes:
@@ -195,13 +189,3 @@ def answer_call(service: SensorService, method: str, payload: bytes) -> bytes:
     request = REQUEST_TYPES[method].FromString(payload)
     answer: Message = getattr(service, method)(request)
     return answer.SerializeToString()
-
-
-def _import_grpc() -> Any:
-    try:
-        import grpc
-    except ModuleNotFoundError as error:
-        raise ConfigError(
-            "the service needs the package grpcio", remedy="Install it: pip install 'genre[simulators]'."
-        ) from error
-    return grpc

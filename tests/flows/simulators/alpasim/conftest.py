@@ -21,5 +21,3 @@ def client(served: ServedRun) -> Iterator[WireClient]:
 
     with SensorServer(served.service) as server, WireClient(server.address) as client:
         yield client
-
-

@@ -125,7 +125,8 @@ CASES = {
     "trajectories": (
         f"{PACKAGE}.AvailableTrajectoriesReturn",
         block(1, block(2, block(1, block(1, START) + fixed64(2, 7)))),
-        "available_trajectories { trajectory { poses { pose { vec { x: 1.5 y: -2 } quat { w: 1 } } timestamp_us: 7 } } }",
+        "available_trajectories { trajectory { "
+        "poses { pose { vec { x: 1.5 y: -2 } quat { w: 1 } } timestamp_us: 7 } } }",
     ),
     "ego masks": (
         f"{PACKAGE}.AvailableEgoMasksReturn",

@@ -12,8 +12,11 @@ from typing import Any
 
 import pytest
 
-from flows.simulators.alpasim import common_pb2
+from flows.simulators.alpasim import common_pb2, sensorsim_pb2
 from flows.simulators.alpasim.server import SensorServer
+from flows.simulators.alpasim.start import start_alpasim
+from flows.simulators.protocols import load_protocol
+from flows.simulators.service import ServiceRequest
 from genre_tasks.errors import ConfigError, ResourceError
 from tests.flows.simulators.alpasim.wire_client import ServedRun, WireClient
 
@@ -48,13 +51,47 @@ def test_two_clients_get_their_own_images(client: WireClient, served: ServedRun)
             assert list(pool.map(drive, [one, two])) == [expected, expected]
 
 
+class CountingMetrics:
+    """Counts calls by method and status; a ``ServiceMetrics``."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[tuple[str, str]] = Counter()
+        self.images = 0
+
+    def count_request(self, method: str, status: str, seconds: float) -> None:
+        assert seconds > 0
+        self.counts[method, status] += 1
+
+    def count_images(self, count: int) -> None:
+        self.images += count
+
+
 def test_calls_are_counted_by_method_and_status() -> None:
-    counts: Counter[tuple[str, str]] = Counter()
-    with serve(lambda: None, on_call=lambda *call: counts.update([call])) as (_, client):
+    metrics = CountingMetrics()
+    with serve(lambda: None, metrics=metrics) as (_, client):
         client.call("get_version")
         client.status("get_version", b"\xff")
         client.status("get_version", b"")
-    assert counts == {("get_version", "OK"): 2, ("get_version", "INVALID_ARGUMENT"): 1}
+    assert metrics.counts == {("get_version", "OK"): 2, ("get_version", "INVALID_ARGUMENT"): 1}
+
+
+def test_a_service_of_runs_is_started_and_counts_images(served: ServedRun) -> None:
+    metrics = CountingMetrics()
+    renderers = {served.renderer.name: served.renderer}
+    service = start_alpasim(ServiceRequest(renderers, "127.0.0.1", 0, metrics))
+    with WireClient(service.address) as client:
+        client.render(client.image_request())
+        batch = sensorsim_pb2.BatchRGBRenderRequest()
+        for k in range(2):
+            batch.items.add(camera_name=str(k), request=client.image_request(k))
+        client.call("batch_render_rgb", batch)
+    service.close()
+    assert metrics.images == 3
+    assert metrics.counts["batch_render_rgb", "OK"] == 1
+
+
+def test_genre_serve_knows_the_protocol() -> None:
+    assert load_protocol("alpasim") is start_alpasim
 
 
 def test_more_calls_than_may_wait_are_refused() -> None:
@@ -103,16 +140,16 @@ def test_the_end_lets_calls_under_way_finish() -> None:
     with serve(answer) as (server, client), ThreadPoolExecutor(2) as pool:
         call = pool.submit(client.status, "get_version", b"")
         assert started.wait(30)
-        end = pool.submit(server.stop, 30.0)
-        assert not server.wait(0.05)
+        end = pool.submit(server.close, 30.0)
+        time.sleep(0.05)
+        assert not end.done()
         release.set()
         end.result(30)
         assert call.result(30)[0] == "OK"
-        assert server.wait(5.0)
         assert client.status("get_version", b"")[0] == "UNAVAILABLE"
         # The port is free again.
         host, _, port = server.address.rpartition(":")
-        SensorServer(FakeService(lambda: None), host, int(port)).stop()  # type: ignore[arg-type]
+        SensorServer(FakeService(lambda: None), host, int(port)).close()  # type: ignore[arg-type]
 
 
 def test_a_taken_port_is_named() -> None:

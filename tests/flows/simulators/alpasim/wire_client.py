@@ -15,7 +15,7 @@ from PIL import Image
 from flows.simulation.run_scenes import RunScenes
 from flows.simulators.alpasim import common_pb2, sensorsim_pb2
 from flows.simulators.alpasim.local_frame import LocalFrame, read_local_frame
-from flows.simulators.alpasim.sensor_service import SensorService
+from flows.simulators.alpasim.sensor_service import SensorService, ServedScene
 from flows.simulators.alpasim.wire_poses import read_pose, write_pose
 from flows.simulators.scene_renderer import SceneRenderer
 from genre_tasks.logs.types import Float64
@@ -46,11 +46,12 @@ class ServedRun:
     @staticmethod
     def open(folder: Path) -> ServedRun:
         run = make_run(folder)
-        return ServedRun(str(folder), run, SceneRenderer(str(folder), run), read_local_frame(str(folder), run))
+        renderer = SceneRenderer(str(folder), run)
+        return ServedRun(str(folder), run, renderer, read_local_frame(renderer.scenes))
 
     @cached_property
     def service(self) -> SensorService:
-        return SensorService(self.renderer, self.frame)
+        return SensorService({self.renderer.name: ServedScene(self.renderer, self.frame)})
 
     @cached_property
     def scenes(self) -> RunScenes:
