@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from genre_tasks.temporary_names import describe_owner, remove_abandoned
+from genre_tasks.temporary_names import describe_owner, remove_abandoned, remove_path
 
 
 @contextmanager
@@ -51,3 +52,27 @@ def write_atomically(path: Path, data: bytes) -> None:
         file.flush()
         # A rename can reach the disk before the data does: without this, a crash could leave an empty file.
         os.fsync(file.fileno())
+
+
+def replace_folder(folder: Path, complete: Path) -> None:
+    """Puts a complete folder in the place of another one, which goes only when the new one is there.
+
+    Args:
+        folder: the place; there may be nothing, an empty folder or a full one.
+        complete: the new folder, on the same file system.
+
+    Raises:
+        OSError: it cannot be renamed; what was at the place is there again.
+    """
+    if not folder.exists() or not any(folder.iterdir()):
+        # A rename takes the place of an empty folder.
+        complete.rename(folder)
+        return
+    old = folder.with_name(f".{folder.name}-{describe_owner()}-{uuid.uuid4().hex[:8]}")
+    folder.rename(old)
+    try:
+        complete.rename(folder)
+    except BaseException:
+        old.rename(folder)
+        raise
+    remove_path(old)

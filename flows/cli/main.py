@@ -16,7 +16,9 @@ from flows.cli.cost import cost
 from flows.cli.doctor import doctor
 from flows.cli.edit import edit
 from flows.cli.effects import effects
+from flows.cli.export import export
 from flows.cli.figure import figure
+from flows.cli.import_command import import_command
 from flows.cli.last_resort import run_guarded
 from flows.cli.outcome import start_outcome, wants_json
 from flows.cli.paper_table import table
@@ -52,6 +54,8 @@ app.command(name="simulate")(simulate)
 app.command(name="serve")(serve)
 app.command(name="range")(range_command)
 app.command(name="edit")(edit)
+app.command(name="export")(export)
+app.command(name="import")(import_command)
 app.command(name="show")(show)
 app.command(name="verify")(verify)
 app.command(name="doctor")(doctor)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from genre_tasks.atomic_path import replace_folder
 from genre_tasks.errors import ArtifactCorruptError, ConfigError, InputError
-from genre_tasks.temporary_names import describe_owner, remove_path, temporary_folder
+from genre_tasks.temporary_names import temporary_folder
 from storage.files import make_folders, payload_files, sync
 from storage.manifest import MANIFEST, FileEntry, Manifest, parse_manifest
 from storage.manifest_writer import find_damage, write_manifest
@@ -68,23 +68,8 @@ def write_rollout(folder: Path, make_manifest: Callable[[tuple[FileEntry, ...]],
         yield temporary
         temporary.chmod(_FOLDER_MODE)
         write_manifest(temporary, make_manifest)
-        _replace(folder, temporary)
+        replace_folder(folder, temporary)
         sync(folder.parent)
-
-
-def _replace(folder: Path, temporary: Path) -> None:
-    if not folder.exists() or not any(folder.iterdir()):
-        # A rename takes the place of an empty folder.
-        temporary.rename(folder)
-        return
-    old = folder.with_name(f".{folder.name}-{describe_owner()}-{uuid.uuid4().hex[:8]}")
-    folder.rename(old)
-    try:
-        temporary.rename(folder)
-    except BaseException:
-        old.rename(folder)
-        raise
-    remove_path(old)
 
 
 def _read_manifest(folder: Path) -> Manifest:

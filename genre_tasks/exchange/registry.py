@@ -34,7 +34,7 @@ _FORMATS: dict[str, FormatEntry] = {
     "spz": FormatEntry("genre_tasks.exchange.spz.format:SPZ", (".spz",)),
     "glb": FormatEntry("genre_tasks.exchange.gltf.format:GLB", (".glb",)),
     "usdz": FormatEntry(
-        "genre_tasks.exchange.usd.format:USDZ", (".usdz", ".usdc", ".usda"), "pip install 'genre[usd]'"
+        "genre_tasks.exchange.usd.format:USDZ", (".usdz", ".usdc", ".usda", ".usd"), "pip install 'genre[usd]'"
     ),
 }
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from genre_tasks.errors import ArtifactCorruptError, ConfigError, GenreError
@@ -51,12 +53,22 @@ GAUSSIANS = schema(
         column("node", pa.int64(), "0 static, 1 distant (chunk coordinates), 2 + k actor k (box coordinates)"),
     ],
 )
-_SH_COUNT = SH_COUNTS[DEFAULT_SH_DEGREE]
-_SH_COLUMNS = tuple(f"{channel}_{k}" for k in range(1, _SH_COUNT + 1) for channel in ("red", "green", "blue"))
-SPHERICAL_HARMONICS = schema(
-    f"harmonics/{DEFAULT_SH_DEGREE}",
-    [column(n, pa.float32(), "of 3DGS's real spherical harmonic of that number") for n in _SH_COLUMNS],
-)
+SH_COLUMNS = {
+    degree: tuple(f"{channel}_{k}" for k in range(1, count + 1) for channel in ("red", "green", "blue"))
+    for degree, count in SH_COUNTS.items()
+}
+"""Columns of a table of spherical harmonics, by its degree."""
+
+SPHERICAL_HARMONICS = {
+    degree: schema(
+        f"harmonics/{degree}",
+        [column(name, pa.float32(), "of 3DGS's real spherical harmonic of that number") for name in names],
+    )
+    for degree, names in SH_COLUMNS.items()
+}
+"""Tables of spherical harmonics, by their degree; reconstructions have ``DEFAULT_SH_DEGREE``, imports any."""
+
+_DEGREES = {count: degree for degree, count in SH_COUNTS.items()}
 
 
 def write_scene(path: Path, scene: SceneGraph) -> None:
@@ -79,11 +91,15 @@ def write_scene(path: Path, scene: SceneGraph) -> None:
     write_table(path, GAUSSIANS, {**columns, "node": nodes})
     if scene.spherical_harmonics is not None:
         coefficients = scene.spherical_harmonics.detach().cpu().numpy()
-        check_array(coefficients, f"harmonics of {path.name}", np.float32, (len(packed), _SH_COUNT, 3))
+        # A number that fits no degree is an error against the one of reconstructions.
+        degree = _DEGREES.get(coefficients.shape[1] if coefficients.ndim == 3 else 0, DEFAULT_SH_DEGREE)
+        expected = (len(packed), SH_COUNTS[degree], 3)
+        check_array(coefficients, f"harmonics of {path.name}", np.float32, expected)
         sh_path = _sh_path(path)
         sh_path.parent.mkdir(exist_ok=True)
-        flat = coefficients.reshape(len(coefficients), -1)
-        write_table(sh_path, SPHERICAL_HARMONICS, {name: flat[:, i] for i, name in enumerate(_SH_COLUMNS)})
+        flat = coefficients.reshape(len(coefficients), len(SH_COLUMNS[degree]))
+        sh_columns = {name: flat[:, i] for i, name in enumerate(SH_COLUMNS[degree])}
+        write_table(sh_path, SPHERICAL_HARMONICS[degree], sh_columns)
 
 
 def read_scene(path: Path, actors: tuple[ActorNode, ...], antialiased: bool, deformation_path: Path) -> SceneGraph:
@@ -137,14 +153,23 @@ def _read_spherical_harmonics(path: Path, count: int) -> Tensor | None:
     # The folder decides: with it, a table that is missing is damage.
     if not path.parent.is_dir():
         return None
-    table = read_table(path, SPHERICAL_HARMONICS)[0]
+    degree = _find_degree(path)
+    table = read_table(path, SPHERICAL_HARMONICS[degree])[0]
     # Two tables that do not fit would shift colours from one Gaussian to another.
     if table.num_rows != count:
         raise ArtifactCorruptError(
             f"The table has {table.num_rows} rows for {count} Gaussians", remedy=REMEDY, file=path
         )
-    flat = np.stack([column_array(table, n) for n in _SH_COLUMNS], 1)
-    return torch.from_numpy(flat.reshape(count, _SH_COUNT, 3))
+    flat = np.stack([column_array(table, n) for n in SH_COLUMNS[degree]], 1)
+    return torch.from_numpy(flat.reshape(count, SH_COUNTS[degree], 3))
+
+
+def _find_degree(path: Path) -> int:
+    """Degree of a table of harmonics by its number of columns; that of reconstructions where none fits."""
+    # What is wrong with the file says the strict reader, which names file and column.
+    with suppress(pa.ArrowException, OSError, ValueError):
+        return _DEGREES.get(len(pq.read_schema(path).names) // 3, DEFAULT_SH_DEGREE)
+    return DEFAULT_SH_DEGREE
 
 
 def _check_nodes(nodes: NDArray[np.int64], actor_count: int, make_error: Callable[[str], GenreError]) -> None:

@@ -154,13 +154,19 @@ def test_harmonics_lie_beside_the_gaussians_and_old_artifacts_have_none(tmp_path
     names = pq.read_schema(tmp_path / "new" / "harmonics" / "gaussians.parquet").names
     assert names[:4] == ["red_1", "green_1", "blue_1", "red_2"]
     (tmp_path / "bad").mkdir()
-    with pytest.raises(ConfigError, match=r"harmonics of gaussians.parquet is float32 \[13, 15, 3\]"):
-        codec.write(
-            tmp_path / "bad", replace(value, scene=value.scene.with_spherical_harmonics(torch.zeros(13, 15, 3)))
-        )
+    with pytest.raises(ConfigError, match=r"harmonics of gaussians.parquet is float32 \[13, 5, 3\]"):
+        codec.write(tmp_path / "bad", replace(value, scene=value.scene.with_spherical_harmonics(torch.zeros(13, 5, 3))))
     (tmp_path / "new" / "harmonics" / "iteration_0008.parquet").unlink()
     with pytest.raises(ArtifactCorruptError, match="A table is missing"):
         codec.read(tmp_path / "new")
+
+
+@pytest.mark.parametrize("degree", SH_COUNTS)
+def test_scenes_from_files_keep_the_degree_of_their_harmonics(tmp_path: Path, degree: int) -> None:
+    value, codec = values.make("reconstruction"), get_codec("reconstruction")
+    waves = torch.randn(13, SH_COUNTS[degree], 3, generator=torch.Generator().manual_seed(degree))
+    codec.write(tmp_path, replace(value, scene=value.scene.with_spherical_harmonics(waves), snapshots={}))
+    assert torch.equal(codec.read(tmp_path).scene.spherical_harmonics, waves)
 
 
 def test_images_of_a_chunk_lie_uncompressed_as_they_came(tmp_path: Path) -> None:

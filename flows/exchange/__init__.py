@@ -1,0 +1,1 @@
+"""Scenes out of a store into files of other people's tools, and from such files into a store."""

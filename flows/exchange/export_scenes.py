@@ -1,0 +1,70 @@
+"""Exports scenes of a store into a folder, which appears complete or not at all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from flows.exchange.export_request import ExportRequest
+from flows.exchange.exporters import load_exporter
+from flows.exchange.stored_scenes import open_stored_scenes
+from genre_tasks.atomic_path import replace_folder
+from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.exchange.scene_folder import SCENE_FILE, read_document
+from genre_tasks.progress import Progress, silent
+from genre_tasks.temporary_names import temporary_folder
+from storage.files import make_folders, payload_files, sync
+
+_FOLDER_MODE = 0o755
+
+
+def export_scenes(request: ExportRequest, progress: Progress = silent) -> dict[str, Any]:
+    """Writes the scenes of a run, or imported ones, into files of other people's tools.
+
+    The same request on the same store gives the same bytes.
+
+    Args:
+        request: what to write, and where.
+        progress: called before each file.
+
+    Returns:
+        JSON values: ``out``, ``format``, where the scenes are from, numbers of what was written, and ``losses``.
+
+    Raises:
+        ConfigError: the format is unknown, or ``out`` holds an export that may not be replaced.
+        InputError: there is no such scene, chunk or frame, or ``out`` holds other files.
+        OSError: a file cannot be written.
+    """
+    exporter = load_exporter(request.format)
+    exporter.check(request)
+    _check_folder(request.out, request.overwrite)
+    scenes = open_stored_scenes(request.store, request.scene, request.stage, request.chunks)
+    make_folders(request.out.parent)
+    # In the same folder, because a rename is atomic only within one file system.
+    with temporary_folder(request.out.parent) as folder:
+        written = exporter.export(scenes, request, folder, progress)
+        folder.chmod(_FOLDER_MODE)
+        for _, path in payload_files(folder):
+            sync(path)
+        replace_folder(request.out, folder)
+        sync(request.out.parent)
+    return {"out": str(request.out), "format": request.format, "source": scenes.describe(), **written}
+
+
+def _check_folder(folder: Path, overwrite: bool) -> None:
+    if not folder.exists() or not any(folder.iterdir()):
+        return
+    # Never replaced, not even by --overwrite: a user's files may be the only copy.
+    foreign = InputError("--out holds files that are no export's", remedy="Name a new or empty folder.", file=folder)
+    if not (folder / SCENE_FILE).is_file():
+        raise foreign
+    try:
+        listed = {entry.path for entry in read_document(folder).files} | {SCENE_FILE}
+    except InputError as error:
+        raise foreign from error
+    if any(name not in listed for name, _ in payload_files(folder)):
+        raise foreign
+    if not overwrite:
+        raise ConfigError(
+            "--out holds an export already", remedy="Name another folder, or replace it by --overwrite.", file=folder
+        )

@@ -1,0 +1,166 @@
+"""Exports into files of Gaussians: a file for each node, chunk or frame, by what the format can hold."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from flows.exchange.export_request import ExportRequest
+from flows.exchange.stored_scenes import StoredScenes
+from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.exchange.conversion import pose_scene
+from genre_tasks.exchange.one_cloud import make_resting_scene
+from genre_tasks.exchange.scene_folder import (
+    ChunkEntry,
+    Layout,
+    PosedFile,
+    SceneDocument,
+    describe_chunk,
+    digest_files,
+    write_document,
+)
+from genre_tasks.exchange.types import ExchangeFormat, ExchangeScene
+from genre_tasks.progress import Progress
+
+_RESTING_FILES = "The files themselves rest: where actors are at which time is in scene.json."
+_POSED_FILES = "Each file is the scene at one frame: nothing in it moves."
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What one file holds.
+
+    Attributes:
+        name: of the file without its suffix, relative to the folder.
+        scene: its contents.
+        node: name of the node, where the file holds one alone.
+        frame: log frame, where the file holds the scene at one.
+    """
+
+    name: str
+    scene: ExchangeScene
+    node: str | None = None
+    frame: int | None = None
+
+
+class FileExporter:
+    """An exporter for any format of files.
+
+    Args:
+        exchange_format: that can write.
+    """
+
+    def __init__(self, exchange_format: ExchangeFormat) -> None:
+        self._format = exchange_format
+
+    def check(self, request: ExportRequest) -> None:
+        """Checks that the format is written: see :meth:`flows.exchange.export_request.SceneExporter.check`.
+
+        Raises:
+            ConfigError: it is only read.
+        """
+        if not self._format.can_write:
+            raise ConfigError(f"the format {self._format.name} is only read", remedy="Choose another --format.")
+
+    def export(self, scenes: StoredScenes, request: ExportRequest, folder: Path, progress: Progress) -> dict[str, Any]:
+        """Writes the files: see :meth:`flows.exchange.export_request.SceneExporter.export`.
+
+        Returns:
+            Numbers of chunks, nodes, Gaussians, files and bytes, and the losses.
+
+        Raises:
+            InputError: no chunk has the frame, or there is no actor to write.
+        """
+        layout = _choose_layout(request, self._format.carries_nodes)
+        numbers = list(scenes.chunk_numbers)
+        entries: list[ChunkEntry] = []
+        # A dictionary keeps sentences once, in the order in which they come up.
+        losses: dict[str, None] = {}
+        for k, number in enumerate(numbers):
+            scene = scenes.load(number)
+            if request.frame is not None and request.frame not in scene.frames:
+                continue
+            if request.per_actor:
+                scene = replace(scene, nodes=tuple(node for node in scene.nodes if node.motion is not None))
+            entry = describe_chunk(number, scene, scenes.describe_chunk(number))
+            losses.update(dict.fromkeys(scene.losses))
+            for part in _split_scene(number, scene, layout, request.frame):
+                progress(k, len(numbers), part.name)
+                losses.update(dict.fromkeys(self._format.describe_losses(part.scene)))
+                entry = self._write_part(folder, entry, part)
+            entries.append(entry)
+        _check_found(entries, request, numbers)
+        losses.update(dict.fromkeys(_describe_layout(layout, entries)))
+        files = digest_files(folder)
+        document = SceneDocument(
+            format=self._format.name,
+            layout=layout,
+            source=scenes.describe(),
+            chunks=tuple(entries),
+            losses=tuple(losses),
+            files=files,
+        )
+        write_document(folder, document)
+        return {
+            "chunks": [entry.chunk for entry in entries],
+            "nodes": sum(len(entry.nodes) for entry in entries),
+            "gaussians": sum(node.gaussians for entry in entries for node in entry.nodes),
+            "files": [file.path for file in files],
+            "bytes": sum(file.size for file in files),
+            "losses": list(losses),
+        }
+
+    def _write_part(self, folder: Path, entry: ChunkEntry, part: _Part) -> ChunkEntry:
+        """Writes one file; the chunk's entry with that file in it."""
+        file = f"{part.name}{self._format.suffixes[0]}"
+        path = folder / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._format.write(path, part.scene)
+        if part.frame is not None:
+            return entry.model_copy(update={"posed": (*entry.posed, PosedFile(frame=part.frame, file=file))})
+        if part.node is None:
+            return entry.model_copy(update={"file": file})
+        nodes = tuple(n.model_copy(update={"file": file}) if n.name == part.node else n for n in entry.nodes)
+        return entry.model_copy(update={"nodes": nodes})
+
+
+def _choose_layout(request: ExportRequest, carries_nodes: bool) -> Layout:
+    if request.frame is not None or request.all_frames:
+        return "frames"
+    return "scenes" if carries_nodes and not request.per_actor else "nodes"
+
+
+def _split_scene(number: int, scene: ExchangeScene, layout: Layout, frame: int | None) -> Iterator[_Part]:
+    """The files of a chunk, made one after the other: posed scenes are as large as the scene itself."""
+    if layout == "scenes":
+        yield _Part(f"chunk-{number}", scene)
+    elif layout == "nodes":
+        for node in scene.nodes:
+            yield _Part(f"chunk-{number}/{node.name}", make_resting_scene(node.cloud), node=node.name)
+    else:
+        for index, at in enumerate(scene.frames):
+            if frame is None or frame == at:
+                posed = make_resting_scene(pose_scene(scene, index))
+                yield _Part(f"chunk-{number}/frame-{at:06d}", posed, frame=at)
+
+
+def _check_found(entries: Sequence[ChunkEntry], request: ExportRequest, numbers: Sequence[int]) -> None:
+    if not entries:
+        raise InputError(
+            f"none of the chunks {', '.join(map(str, numbers))} has frame {request.frame}",
+            remedy="Give another --frame, or leave out --chunks.",
+            frame=request.frame,
+        )
+    if request.per_actor and not any(entry.nodes for entry in entries):
+        raise InputError("the scene has no actors", remedy="Leave out --per-actor.")
+    if request.all_frames and not any(entry.posed for entry in entries):
+        raise InputError("the scene has no frames: nothing in it moves", remedy="Leave out --all-frames.")
+
+
+def _describe_layout(layout: Layout, entries: Sequence[ChunkEntry]) -> tuple[str, ...]:
+    moves = any(node.motion is not None for entry in entries for node in entry.nodes)
+    if not moves or layout == "scenes":
+        return ()
+    return (_POSED_FILES if layout == "frames" else _RESTING_FILES,)

@@ -1,0 +1,1 @@
+"""OpenUSD: scenes of ``ParticleField3DGaussianSplat`` prims, in packages (``.usdz``) and layers."""
