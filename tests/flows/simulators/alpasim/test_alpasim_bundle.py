@@ -14,9 +14,12 @@ import yaml
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
+from flows.exchange.export_request import ExportRequest
+from flows.exchange.export_scenes import export_scenes
 from flows.simulators.alpasim.bundle import write_alpasim_bundle
 from flows.simulators.alpasim.wire_poses import read_pose
-from genre_tasks.errors import InputError
+from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.exchange.scene_folder import find_changes, read_document
 from tests.flows.simulators.alpasim.wire_client import ServedRun, WireClient
 
 
@@ -132,4 +135,22 @@ def test_the_same_run_gives_the_same_bytes(bundle: Path, served: ServedRun, tmp_
 def test_an_unknown_run_writes_nothing(served: ServedRun, tmp_path: Path) -> None:
     with pytest.raises(InputError):
         write_alpasim_bundle(served.store, "ffff", tmp_path / "scene.usdz")
+    assert not list(tmp_path.iterdir())
+
+
+def test_genre_export_writes_the_bundle(bundle: Path, served: ServedRun, tmp_path: Path) -> None:
+    out = tmp_path / "exported"
+    record = export_scenes(ExportRequest(served.store, served.run[:6], "alpasim", out))
+    assert record["files"] == [f"{served.run}.usdz"]
+    assert (out / record["files"][0]).read_bytes() == bundle.read_bytes()
+    document = read_document(out)
+    assert [entry.chunk for entry in document.chunks] == [0, 1]
+    assert any("genre serve" in loss for loss in document.losses)
+    assert find_changes(out) == ()
+
+
+@pytest.mark.parametrize("part", [{"frame": 2}, {"all_frames": True}, {"per_actor": True}, {"chunks": (0,)}])
+def test_a_bundle_is_of_a_whole_run(served: ServedRun, tmp_path: Path, part: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match="whole run"):
+        export_scenes(ExportRequest(served.store, served.run, "alpasim", tmp_path / "part", **part))
     assert not list(tmp_path.iterdir())
