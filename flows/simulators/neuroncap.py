@@ -31,7 +31,6 @@ from flows.simulators.scene_renderer import SceneRenderer
 from flows.simulators.service import RunningService, ServiceRequest
 from flows.simulators.service_metrics import ServiceMetrics
 from genre_tasks.errors import ConfigError, GenreError, InputError, ResourceError
-from genre_tasks.suggestions import did_you_mean
 from storage.codecs.png import encode_png
 
 MAX_BODY_BYTES = 16 * 2**20
@@ -89,17 +88,14 @@ class ActorState:
         Raises:
             InputError: the run has no such camera.
         """
-        cameras = self._renderer.cameras
-        if message.camera_name not in cameras:
-            remedy = f"{did_you_mean(message.camera_name, cameras)}It has {', '.join(cameras)}."
-            raise InputError(f"the run has no camera '{message.camera_name}'", remedy=remedy)
+        camera = self._renderer.select_cameras([message.camera_name])[message.camera_name]
         pose = np.array(message.pose, np.float64)
         time_s = message.timestamp / MICROSECONDS
         with self._lock:
             placed = None if self._is_recorded else [t.pose_at(message.timestamp) for t in self._trajectories]
         # One pose and one time: this protocol's cameras have a global shutter.
         return ImageRequest(
-            lens=cameras[message.camera_name].lens,
+            lens=camera.lens,
             start_world_SE3_camera=pose,
             end_world_SE3_camera=pose,
             start_s=time_s,

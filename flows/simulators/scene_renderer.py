@@ -116,6 +116,30 @@ class SceneRenderer:
         """Seconds of a log frame."""
         return self._facts.clock.frame_s
 
+    def find_time(self, frame: float) -> float:
+        """Gives the absolute seconds of a log frame, or of a moment between two.
+
+        Args:
+            frame: log frame of the run.
+        """
+        return self._facts.clock.find_time(frame)
+
+    def select_cameras(self, names: Sequence[str] | None) -> dict[str, CameraDescription]:
+        """Takes some cameras of the rig.
+
+        Args:
+            names: of the cameras; ``None``: all.
+
+        Returns:
+            The cameras by name, in the order of ``names``.
+
+        Raises:
+            InputError: the run has no such camera.
+        """
+        for name in names or ():
+            self._check_camera(name)
+        return {name: self.cameras[name] for name in (self.cameras if names is None else names)}
+
     def ego_trajectory(self) -> tuple[Float64, Float64]:
         """Gives where the recorded vehicle was.
 
