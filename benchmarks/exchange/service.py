@@ -19,7 +19,8 @@ from benchmarks.common.context import THREADS
 from benchmarks.exchange.simulator_client import CAMERAS, Simulator, ask, make_plain_request
 from flows.simulators.alpasim import sensorsim_pb2
 from flows.simulators.alpasim.local_frame import LocalFrame, read_local_frame
-from flows.simulators.alpasim.sensor_service import SensorService, ServedScene
+from flows.simulators.alpasim.sensor_service import SensorService
+from flows.simulators.alpasim.served_scene import ServedScene
 from flows.simulators.alpasim.server import SensorServer
 from flows.simulators.alpasim.timestamps import to_microseconds
 from flows.simulators.alpasim.wire_poses import read_pose, write_pose

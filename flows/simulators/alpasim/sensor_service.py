@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from flows.simulators.alpasim import common_pb2, sensorsim_pb2
 from flows.simulators.alpasim.image_bytes import check_format, encode_image
-from flows.simulators.alpasim.image_requests import read_image_request
-from flows.simulators.alpasim.local_frame import LocalFrame
+from flows.simulators.alpasim.image_requests import ReadImage, read_image_request
+from flows.simulators.alpasim.served_scene import ServedScene
 from flows.simulators.alpasim.timestamps import to_microseconds
 from flows.simulators.alpasim.wire_lenses import write_camera_spec
 from flows.simulators.alpasim.wire_poses import write_pose
-from flows.simulators.image_request import ImageRequest
 from flows.simulators.scene_renderer import SceneRenderer
 from flows.simulators.service_metrics import ServiceMetrics, SilentMetrics
 from genre_tasks.errors import ConfigError, InputError
@@ -26,28 +25,6 @@ PROTOCOL_VERSION = (0, 54, 0)
 SILENT = SilentMetrics()
 
 _MASK_COLOR = 0
-
-
-class ServedScene:
-    """A run as the service knows it.
-
-    Args:
-        renderer: of the run.
-        frame: that poses on the wire are stated in; the bundle has the same.
-
-    Attributes:
-        renderer: of the run.
-        frame: that poses on the wire are stated in.
-        track_ids: of all moving actors.
-        masks: [H, W] true on the recording vehicle itself, by camera.
-    """
-
-    def __init__(self, renderer: SceneRenderer, frame: LocalFrame) -> None:
-        self.renderer = renderer
-        self.frame = frame
-        self.track_ids = frozenset(actor.track_id for actor in renderer.actors())
-        masks = {name: renderer.ego_mask(name) for name in renderer.cameras}
-        self.masks = {name: mask for name, mask in masks.items() if mask is not None}
 
 
 class SensorService:
@@ -155,9 +132,10 @@ class SensorService:
             ConfigError: GenRe does not render such a camera, or does not encode such images.
             ResourceError: too many calls wait.
         """
-        image = self._find_scene(request.scene_id).renderer.render(self._read(request))
+        read = self._read(request)
+        images = self._find_scene(request.scene_id).renderer.render_batch(read.requests)
         self._metrics.count_images(1)
-        return self._encode(request, image)
+        return self._encode(request, read.finish(images))
 
     def batch_render_rgb(self, request: sensorsim_pb2.BatchRGBRenderRequest) -> sensorsim_pb2.BatchRGBRenderReturn:
         """Renders several images, most often of all cameras at one moment.
@@ -176,7 +154,7 @@ class SensorService:
         if len(request.items) > most:
             raise InputError(f"{len(request.items)} images are too many for one call", remedy=f"Send at most {most}.")
         answers = [sensorsim_pb2.BatchRGBRenderReturnItem(camera_name=item.camera_name) for item in request.items]
-        readable: dict[str, dict[int, ImageRequest]] = {}
+        readable: dict[str, dict[int, ReadImage]] = {}
         for k, item in enumerate(request.items):
             try:
                 readable.setdefault(item.request.scene_id, {})[k] = self._read(item.request)
@@ -185,11 +163,11 @@ class SensorService:
         for scene_id, requests in readable.items():
             if not requests:
                 continue
-            for k, image in _render_all(self._find_scene(scene_id).renderer, requests).items():
-                if isinstance(image, InputError):
-                    answers[k].error_message = str(image)
+            for k, pixels in _render_all(self._find_scene(scene_id).renderer, requests).items():
+                if isinstance(pixels, InputError):
+                    answers[k].error_message = str(pixels)
                     continue
-                answers[k].result.CopyFrom(self._encode(request.items[k].request, image))
+                answers[k].result.CopyFrom(self._encode(request.items[k].request, pixels))
                 answers[k].success = True
         self._metrics.count_images(sum(answer.success for answer in answers))
         return sensorsim_pb2.BatchRGBRenderReturn(items=answers)
@@ -219,12 +197,12 @@ class SensorService:
             raise InputError(f"no scene '{scene_id[:80]}' is served", remedy=f"Known: {', '.join(self._scenes)}.")
         return scene
 
-    def _read(self, request: sensorsim_pb2.RGBRenderRequest) -> ImageRequest:
+    def _read(self, request: sensorsim_pb2.RGBRenderRequest) -> ReadImage:
         scene = self._find_scene(request.scene_id)
         check_format(request.image_format, request.image_quality)
         if request.insert_ego_mask:
             self._find_mask(request)
-        return read_image_request(request, scene.frame, scene.renderer.cameras, scene.track_ids)
+        return read_image_request(request, scene)
 
     def _encode(
         self, request: sensorsim_pb2.RGBRenderRequest, pixels: NDArray[np.uint8]
@@ -246,20 +224,19 @@ class SensorService:
         return mask
 
 
-def _render_all(
-    renderer: SceneRenderer, requests: Mapping[int, ImageRequest]
-) -> dict[int, NDArray[np.uint8] | InputError]:
+def _render_all(renderer: SceneRenderer, wanted: Mapping[int, ReadImage]) -> dict[int, NDArray[np.uint8] | InputError]:
     """The images by number, or why one cannot be rendered."""
     try:
-        return dict(zip(requests, renderer.render_batch(list(requests.values())), strict=True))
+        images = iter(renderer.render_batch([request for read in wanted.values() for request in read.requests]))
     except InputError as error:
-        if len(requests) == 1:
-            return dict.fromkeys(requests, error)
-    # The renderer takes all or none: one by one, those that can be rendered are.
-    rendered: dict[int, NDArray[np.uint8] | InputError] = {}
-    for k, request in requests.items():
-        rendered |= _render_all(renderer, {k: request})
-    return rendered
+        if len(wanted) == 1:
+            return dict.fromkeys(wanted, error)
+        # The renderer takes all or none: one by one, those that can be rendered are.
+        rendered: dict[int, NDArray[np.uint8] | InputError] = {}
+        for k, read in wanted.items():
+            rendered |= _render_all(renderer, {k: read})
+        return rendered
+    return {k: read.finish([next(images) for _ in read.requests]) for k, read in wanted.items()}
 
 
 def _resize_mask(mask: NDArray[np.bool_], height: int, width: int) -> NDArray[np.bool_]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from flows.simulators.alpasim.local_frame import read_local_frame
-from flows.simulators.alpasim.sensor_service import SensorService, ServedScene
+from flows.simulators.alpasim.sensor_service import SensorService
+from flows.simulators.alpasim.served_scene import ServedScene
 from flows.simulators.alpasim.server import SensorServer
 from flows.simulators.service import RunningService, ServiceRequest
 

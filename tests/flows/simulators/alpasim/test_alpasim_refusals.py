@@ -40,8 +40,15 @@ def clear(name: str) -> Callable[[Request], None]:
     return lambda request: request.ClearField(name)
 
 
-def choose_fisheye(request: Request) -> None:
-    request.camera_intrinsics.opencv_fisheye_param.focal_length_x = 100.0
+def choose_fisheye(request: Request, focal_px: float) -> None:
+    fisheye = request.camera_intrinsics.opencv_fisheye_param
+    fisheye.focal_length_x = fisheye.focal_length_y = focal_px
+    fisheye.principal_point_x = 32.0
+    fisheye.principal_point_y = 18.0
+
+
+def choose_ftheta(request: Request, *coefficients: float) -> None:
+    request.camera_intrinsics.ftheta_param.angle_to_pixeldist_poly[:] = coefficients
 
 
 def add_windshield(request: Request) -> None:
@@ -67,7 +74,12 @@ REFUSED = {
     "another scene": (change("scene_id", "another"), "INVALID_ARGUMENT", "no scene 'another'"),
     "no scene": (clear("scene_id"), "INVALID_ARGUMENT", "no scene"),
     "no camera": (clear("camera_intrinsics"), "INVALID_ARGUMENT", "camera model"),
-    "fisheye": (choose_fisheye, "UNIMPLEMENTED", "opencv_fisheye_param"),
+    "looks backwards": (partial(choose_fisheye, focal_px=12.0), "UNIMPLEMENTED", "from its axis"),
+    "flat fisheye": (partial(choose_fisheye, focal_px=0.0), "INVALID_ARGUMENT", "onto a line"),
+    "endless fisheye": (partial(choose_fisheye, focal_px=inf), "INVALID_ARGUMENT", "scales"),
+    "no polynomial": (choose_ftheta, "INVALID_ARGUMENT", "no polynomial"),
+    "falling": (lambda request: choose_ftheta(request, 0.0, -30.0), "INVALID_ARGUMENT", "does not rise"),
+    "too sharp": (lambda request: choose_ftheta(request, 0.0, 1e5), "INVALID_ARGUMENT", ""),
     "windshield": (add_windshield, "UNIMPLEMENTED", "windshield"),
     "rational": (change(f"{PINHOLE}.radial_coeffs", [0, 0, 0, 0.1]), "UNIMPLEMENTED", "k4"),
     "thin prism": (change(f"{PINHOLE}.thin_prism_coeffs", [0.1]), "UNIMPLEMENTED", "thin prism"),
@@ -79,7 +91,7 @@ REFUSED = {
     "endless focal length": (change(f"{PINHOLE}.focal_length_y", inf), "INVALID_ARGUMENT", "focal"),
     "absurd center": (change(f"{PINHOLE}.principal_point_x", 1e30), "INVALID_ARGUMENT", "principal point"),
     "absurd lens": (change("camera_intrinsics.resolution_w", 4_000_000_000), "INVALID_ARGUMENT", "absurd"),
-    "huge image": (change("resolution_h", 4_000_000_000), "INVALID_ARGUMENT", "pixels"),
+    "huge image": (change("resolution_h", 4_000_000_000), "INVALID_ARGUMENT", "out of bounds"),
     "large image": (change("resolution_w", 16_000), "INVALID_ARGUMENT", "out of bounds"),
     "no pose": (clear("sensor_pose"), "INVALID_ARGUMENT", "sensor pose"),
     "no number": (change("sensor_pose.start_pose.vec.x", nan), "INVALID_ARGUMENT", "not finite"),

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from flows.simulators.alpasim import sensorsim_pb2
+from flows.simulators.alpasim.image_requests import read_image_request
+from flows.simulators.alpasim.served_scene import ServedScene
 from flows.simulators.alpasim.wire_poses import read_pose, write_pose
 from genre_tasks.logs.types import RollingShutter
 from genre_tasks.render import render_views
@@ -146,6 +148,67 @@ def test_a_lens_is_scaled_to_the_image(client: WireClient) -> None:
     assert np.abs(halved - small).mean() < 4
 
 
+def test_a_wide_lens_sees_what_a_pinhole_sees_and_more(client: WireClient) -> None:
+    request = client.image_request()
+    request.resolution_w = 128
+    request.resolution_h = 72
+    narrow = client.render(request)
+    pinhole = request.camera_intrinsics.opencv_pinhole_param
+    wide = client.image_request()
+    wide.resolution_w = 384
+    wide.resolution_h = 72
+    # Pixels as large at the axis as those of the pinhole; 90° to each side.
+    focal = pinhole.focal_length_x
+    ftheta = wide.camera_intrinsics.ftheta_param
+    ftheta.principal_point_x = 96.0
+    ftheta.principal_point_y = pinhole.principal_point_y
+    ftheta.reference_poly = sensorsim_pb2.FthetaCameraParam.PIXELDIST_TO_ANGLE
+    ftheta.pixeldist_to_angle_poly[:] = [0.0, 1 / focal]
+    wide.camera_intrinsics.resolution_w = 192
+    image = client.render(wide)
+    assert image.shape == (72, 384, 3)
+    # Around the axis both lenses are the same: half of a pixel's angle of 10° is lost.
+    around = narrow[26:46, 56:74].astype(int)
+    axis = round(2 * pinhole.principal_point_x)
+    same = image[26:46, 192 + 56 - axis : 192 + 74 - axis]
+    assert np.abs(around - same).mean() < 6
+    # And the scene goes on at its sides, to 90° on the left and the right.
+    assert (image.max((0, 2)) > 60).all()
+    assert image[:, :60].std() > 5
+    assert image[:, -60:].std() > 5
+
+
+def test_pinholes_of_a_wide_lens_have_their_part_of_the_readout(client: WireClient, served: ServedRun) -> None:
+    wide = client.image_request()
+    fisheye = wide.camera_intrinsics.opencv_fisheye_param
+    fisheye.focal_length_x = fisheye.focal_length_y = 18.0
+    fisheye.principal_point_x = 32.0
+    fisheye.principal_point_y = 18.0
+    wide.camera_intrinsics.shutter_type = sensorsim_pb2.ROLLING_TOP_TO_BOTTOM
+    pose = read_pose(wide.sensor_pose.start_pose, "the camera")
+    wide.sensor_pose.end_pose.CopyFrom(write_pose(turn(pose, 0.3)))
+    wide.dynamic_objects.add(track_id="car-0", pose_pair=wide.sensor_pose)
+    read = read_image_request(wide, ServedScene(served.renderer, served.frame))
+    assert read.cover is not None
+    assert len(read.requests) == len(read.cover.tiles) == 5
+    start_s = wide.frame_start_us / 1e6
+    for request, tile in zip(read.requests, read.cover.tiles, strict=True):
+        assert request.start_s - start_s == pytest.approx(0.01 * tile.first_row, abs=1e-6)
+        assert request.end_s - start_s == pytest.approx(0.01 * tile.last_row, abs=1e-6)
+        poses = (request.start_world_SE3_camera, request.end_world_SE3_camera)
+        for matrix, part in zip(poses, (tile.first_row, tile.last_row), strict=True):
+            expected = turn(pose, 0.3 * part)[:3, :3] @ tile.lens_R_tile
+            assert matrix[:3, :3] == pytest.approx(expected, abs=1e-5)
+        (actor,) = request.actors or ()
+        moved = served.frame.to_local(actor.end_world_SE3_box)
+        assert moved == pytest.approx(turn(pose, 0.3 * tile.last_row), abs=1e-5)
+    # The pinholes that look up and down see the upper and the lower rows alone.
+    spans = [(round(tile.first_row, 2), round(tile.last_row, 2)) for tile in read.cover.tiles]
+    assert spans[0] == (0.11, 0.89)
+    assert spans[3][0] == 0.0 and spans[3][1] < 0.4
+    assert spans[4][0] > 0.6 and spans[4][1] == 1.0
+
+
 def test_jpeg_has_the_quality_that_is_asked_for(client: WireClient) -> None:
     request = client.image_request()
     png = client.render(request)
@@ -190,7 +253,7 @@ def test_a_batch_has_an_answer_for_each_camera(client: WireClient) -> None:
     answer = client.call("batch_render_rgb", batch)
     assert [item.camera_name for item in answer.items] == [item.camera_name for item in batch.items]
     assert [item.success for item in answer.items] == [True, True, False, False]
-    assert "ftheta" in answer.items[2].error_message
+    assert "f-theta" in answer.items[2].error_message
     assert "outside of the run" in answer.items[3].error_message
     for k in range(2):
         assert distance(decode(answer.items[k].result.image_bytes), client.render(client.image_request(k))) == 0

@@ -15,7 +15,8 @@ from PIL import Image
 from flows.simulation.run_scenes import RunScenes
 from flows.simulators.alpasim import common_pb2, sensorsim_pb2
 from flows.simulators.alpasim.local_frame import LocalFrame, read_local_frame
-from flows.simulators.alpasim.sensor_service import SensorService, ServedScene
+from flows.simulators.alpasim.sensor_service import SensorService
+from flows.simulators.alpasim.served_scene import ServedScene
 from flows.simulators.alpasim.wire_poses import read_pose, write_pose
 from flows.simulators.scene_renderer import SceneRenderer
 from genre_tasks.logs.types import Float64
