@@ -110,15 +110,15 @@ def make_request(client: FuzzClient, random: np.random.Generator) -> tuple[str, 
     Returns:
         Method and message.
     """
-    method = str(random.choice(list(client.samples)))
-    samples = client.samples[method]
-    message = samples[int(random.integers(len(samples)))]
+    # By message, so that methods with more kinds of messages are asked more often.
+    messages = [(method, message) for method, samples in client.samples.items() for message in samples]
+    method, message = messages[int(random.integers(len(messages)))]
     kind = random.random()
     if kind < 0.15:
         return method, random.bytes(int(random.integers(_MAX_NOISE_BYTES)))
     if kind < 0.4:
         return method, damage_bytes(message, random)
-    if kind < 0.95:
+    if kind < 0.9:
         return method, client.mutate_fields(message, random)
     return method, message
 

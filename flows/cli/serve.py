@@ -41,7 +41,7 @@ def serve(
 ) -> None:
     """Render images for a simulator that asks over the network.
 
-    The service answers until Ctrl-C or SIGTERM. It has no password, so whoever reaches its address can ask it.
+    The service answers until Ctrl-C or SIGTERM. It has no password: all that reach its address can ask it.
 
     Example:
 
@@ -70,7 +70,12 @@ def serve(
         service = start_service(ServiceRequest(renderers, host, chosen_port, metrics))
         stack.callback(service.close)
         _announce(service, renderers, protocol, shared=not is_loopback(host))
-        service.wait()
+        _wait(service)
+
+
+def _wait(service: RunningService) -> None:
+    """Waits for a signal, which raises in the main thread."""
+    service.wait()
 
 
 def _open_runs(store: str, runs: list[str], stage: str | None, limits: RenderLimits) -> dict[str, SceneRenderer]:

@@ -130,7 +130,8 @@ class BicycleModel:
         rate = _clip(steer_rate_rad_s, -MAX_STEER_RATE_RAD_S, MAX_STEER_RATE_RAD_S)
         steer = _clip(state.steer_rad + rate * step_s, -self.max_steer_rad, self.max_steer_rad)
         before = self.find_curvature(state.steer_rad)
-        squared = max(speed_m_s**2, 1e-6)
+        # The larger speed of the two, so that a bound holds within the step too.
+        squared = max(speed_m_s, state.speed_m_s, 1e-3) ** 2
         # The lateral jerk of a path is v² κ̇ + 3 v a κ: the vehicle speeds up along a direction that turns.
         drift = 3 * speed_m_s * acceleration_m_s2 * before
         lowest = before + (-bounds.max_jerk_m_s3 - drift) / squared * step_s

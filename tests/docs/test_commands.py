@@ -25,7 +25,20 @@ from tests.faults.small_run import LOG, SETTINGS
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (ROOT / "README.md", ROOT / "docs/quickstart.md", *sorted((ROOT / "docs/guides").glob("*.md")))
 TAKES_SETTINGS = ("run", "effects", "cost", "table", "figure")
-TAKES_STORE = ("run", "effects", "show", "render", "range", "verify", "cost", "table", "figure", "simulate", "edit")
+TAKES_STORE = (
+    "run",
+    "effects",
+    "show",
+    "render",
+    "range",
+    "verify",
+    "cost",
+    "table",
+    "figure",
+    "simulate",
+    "edit",
+    "serve",
+)
 
 
 def commands(page: Path) -> list[str]:
@@ -68,6 +81,9 @@ def small(command: str, folder: Path, run: str, pandaset: str) -> list[str]:
         # A log of eight frames has no room to change lanes, and its street is full of cars.
         words += ["--allow-collision", "--no-range"]
         words += ["--strength", "0.005"] if {"lane-change", "swerve"} & set(words) else []
+    if words[0] == "serve":
+        # Whatever else runs here may have taken the page's ports.
+        words += ["--port", "0", "--metrics-port", "0"]
     more = ("gnet.per_scene.iterations=20",) if words[0] in ("table", "figure") else ()
     sets = [part for setting in (*SETTINGS, *more) for part in ("--set", setting)]
     sets = sets if words[0] in TAKES_SETTINGS else []
@@ -83,6 +99,8 @@ def test_a_command_of_the_documents_runs(
         pytest.skip("the detector is a file that the user brings")
     monkeypatch.chdir(workplace[0])
     monkeypatch.setenv("PREFECT_HOME", str(workplace[0] / "prefect"))  # as the command itself sets it
+    # A service would answer until a signal.
+    monkeypatch.setattr("flows.cli.serve._wait", lambda service: None)
     done = CliRunner().invoke(app, small(command, *workplace), catch_exceptions=False)
     assert done.exit_code == 0, done.output
 

@@ -1,0 +1,107 @@
+"""``genre serve``: the command with its address, counters and end, and one clear error for each mistake."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from flows.cli.main import app
+from flows.simulators import protocols
+from flows.simulators.protocols import ProtocolEntry, load_protocol
+from flows.simulators.service import bind_socket, is_loopback
+from flows.simulators.service_metrics import PrometheusMetrics
+from genre_tasks.errors import ConfigError, GenreError, InputError
+from tests.flows.command_line import GENRE, environment
+
+
+def read(address: str) -> str:
+    with urllib.request.urlopen(address, timeout=60) as answer:
+        text: str = answer.read().decode()
+        return text
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_service_answers_until_a_signal(number: signal.Signals, served: tuple[str, str], tmp_path: Path) -> None:
+    store, run = served
+    command = [*GENRE, "serve", run[:6], "--store", store, "--port", "0", "--metrics-port", "0"]
+    process = subprocess.Popen(
+        command, cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout is not None and process.stderr is not None
+        counters = process.stdout.readline().split()[-1]
+        assert process.stdout.readline().startswith(f"scene {run}: 2 cameras, 7 actors, ")
+        last = process.stdout.readline()
+        assert last.startswith("serving neuroncap at http://127.0.0.1:") and last.endswith(" until Ctrl-C\n")
+        address = last.split()[3]
+        assert json.loads(read(f"{address}/alive")) is True
+        assert 'genre_requests_total{method="alive",status="200"} 1.0' in read(counters)
+        process.send_signal(number)
+        assert process.wait(30) == 128 + number
+        assert process.stderr.read() == "stopped\n"
+    finally:
+        process.kill()
+        process.communicate()
+    with pytest.raises(OSError, match="refused"):
+        read(f"{address}/alive")
+
+
+def refusal(*words: str) -> GenreError:
+    error = CliRunner().invoke(app, ["serve", *words]).exception
+    assert isinstance(error, GenreError)
+    return error
+
+
+def test_mistakes_are_named(served: tuple[str, str]) -> None:
+    store, run = served
+    assert "Did you mean 'neuroncap'" in str(refusal(run, "--store", store, "--protocol", "neuroncp"))
+    assert "--port 70000 is out of range" in str(refusal(run, "--store", store, "--port", "70000"))
+    assert "--max-width 0 is out of range" in str(refusal(run, "--store", store, "--max-width", "0"))
+    assert isinstance(refusal("nosuchrun", "--store", store, "--port", "0"), InputError)
+    assert isinstance(refusal(run, "--store", store, "--port", "0", "--stage", "enet"), InputError)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        assert "cannot listen at 127.0.0.1" in str(refusal(run, "--store", store, "--port", port))
+        words = (run, "--store", store, "--port", "0", "--metrics-port", port)
+        assert "another --metrics-port" in str(refusal(*words))
+    assert "no.such.host" in str(refusal(run, "--store", store, "--port", "0", "--host", "no.such.host.invalid"))
+
+
+def test_an_address_is_taken_at_once() -> None:
+    with bind_socket("127.0.0.1", 0) as one, pytest.raises(ConfigError, match="--port"):
+        bind_socket("127.0.0.1", one.getsockname()[1])
+    assert [is_loopback(host) for host in ("localhost", "::1", "127.9.9.9", "::", "example.org")] == [
+        *(True, True, True, False, False)
+    ]
+
+
+def test_counters() -> None:
+    metrics = PrometheusMetrics("127.0.0.1", 0, lambda: 3)
+    metrics.count_request("render", "ok", 0.03)
+    metrics.count_images(6)
+    text = read(f"http://127.0.0.1:{metrics.port}/metrics")
+    for line in (
+        'genre_requests_total{method="render",status="ok"} 1.0',
+        'genre_request_seconds_bucket{le="0.05",method="render"} 1.0',
+        "genre_images_total 6.0",
+        "genre_queue 3.0",
+    ):
+        assert line in text
+    metrics.close()
+
+
+def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "prometheus_client", None)
+    with pytest.raises(ConfigError, match="prometheus_client"):
+        PrometheusMetrics("127.0.0.1", 0, lambda: 0)
+    monkeypatch.setitem(protocols._PROTOCOLS, "other", ProtocolEntry("no_such_package.service:start", 1))
+    with pytest.raises(ConfigError, match="no_such_package"):
+        load_protocol("other")
