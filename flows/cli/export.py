@@ -23,7 +23,7 @@ def export(
         ),
     ],
     file_format: Annotated[
-        str, typer.Option("--format", help="The format of the files: ply, splat, spz, glb, usdz or alpasim.")
+        str, typer.Option("--format", help="The format of the files: ply, splat, spz, glb or usdz.")
     ],
     out: Annotated[
         Path, typer.Option(parser=parse_path, metavar="FOLDER", help="The folder to write. It is made if missing.")
@@ -51,9 +51,6 @@ def export(
     each node: the background, the distant shell and each actor in its own coordinates. In both cases scene.json says
     what the files do not: names, sizes, motions, times, the place in the world, and what was lost.
 
-    The format alpasim is not of Gaussians: it is the bundle that tells the simulator AlpaSim of the run, while
-    `genre serve --protocol alpasim` renders its images.
-
     Example:
 
     \b
@@ -61,7 +58,6 @@ def export(
         genre export 4b1c --format ply --out nodes
         genre export 4b1c --format ply --frame 12 --out moment
         genre export 4b1c --format spz --per-actor --out cars
-        genre export 4b1c --format alpasim --out bundle
     """
     from flows.cli.existing_store import open_existing_store
     from flows.cli.outcome import add_facts

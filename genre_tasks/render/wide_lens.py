@@ -95,10 +95,10 @@ class WideLens:
         with np.errstate(over="ignore", invalid="ignore"):
             if self.radius_to_angle:
                 radii = np.linspace(0.0, max(float(radius.max()), _SMALLEST), _SAMPLES)
-                angles = polyval(radii, self.radius_to_angle)
+                angles = np.asarray(polyval(radii, self.radius_to_angle), np.float64)
             else:
                 angles = np.linspace(0.0, limit, _SAMPLES)
-                radii = polyval(angles, self.angle_to_radius)
+                radii = np.asarray(polyval(angles, self.angle_to_radius), np.float64)
             # Past the first place where a polynomial turns back no ray of the lens is.
             rising = (np.diff(angles) > 0) & (np.diff(radii) > 0)
         count = _SAMPLES if rising.all() else int(np.argmin(rising)) + 1
