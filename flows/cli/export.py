@@ -12,36 +12,40 @@ from flows.cli.options import ChunksOption, JsonOption, SceneStageOption, StoreO
 from flows.cli.parsing import parse_path
 from flows.defaults import DEFAULT_STORE
 
+SceneArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="RUN",
+        help="The name of a finished run or of an imported scene, or its first characters. `genre show runs` lists "
+        "runs.",
+    ),
+]
+FormatOption = Annotated[
+    str, typer.Option("--format", help="The format of the files: ply, splat, spz, glb, usdz or alpasim.")
+]
+FolderOption = Annotated[
+    Path, typer.Option(parser=parse_path, metavar="FOLDER", help="The folder to write. It is made if missing.")
+]
+FrameOption = Annotated[int | None, typer.Option(help="Write one file: the scene as it is at this frame of the log.")]
+AllFramesOption = Annotated[
+    bool, typer.Option("--all-frames", help="Write a file for each frame, with the scene as it is then.")
+]
+PerActorOption = Annotated[
+    bool, typer.Option("--per-actor", help="Write the actors alone, each in a file and in its own coordinates.")
+]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an export that is in the folder already.")]
+
 
 def export(
-    scene: Annotated[
-        str,
-        typer.Argument(
-            metavar="RUN",
-            help="The name of a finished run or of an imported scene, or its first characters. `genre show runs` lists "
-            "runs.",
-        ),
-    ],
-    file_format: Annotated[
-        str, typer.Option("--format", help="The format of the files: ply, splat, spz, glb or usdz.")
-    ],
-    out: Annotated[
-        Path, typer.Option(parser=parse_path, metavar="FOLDER", help="The folder to write. It is made if missing.")
-    ],
+    scene: SceneArgument,
+    file_format: FormatOption,
+    out: FolderOption,
     stage: SceneStageOption = None,
     chunks: ChunksOption = None,
-    frame: Annotated[
-        int | None, typer.Option(help="Write one file: the scene as it is at this frame of the log.")
-    ] = None,
-    all_frames: Annotated[
-        bool, typer.Option("--all-frames", help="Write a file for each frame, with the scene as it is then.")
-    ] = False,
-    per_actor: Annotated[
-        bool, typer.Option("--per-actor", help="Write the actors alone, each in a file and in its own coordinates.")
-    ] = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace an export that is in the folder already.")
-    ] = False,
+    frame: FrameOption = None,
+    all_frames: AllFramesOption = False,
+    per_actor: PerActorOption = False,
+    overwrite: OverwriteOption = False,
     store: StoreOption = DEFAULT_STORE,
     as_json: JsonOption = False,
 ) -> None:
@@ -58,6 +62,7 @@ def export(
         genre export 4b1c --format ply --out nodes
         genre export 4b1c --format ply --frame 12 --out moment
         genre export 4b1c --format spz --per-actor --out cars
+        genre export 4b1c --format alpasim --out bundle
     """
     from flows.cli.existing_store import open_existing_store
     from flows.cli.outcome import add_facts

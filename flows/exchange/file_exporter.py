@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 from flows.exchange.export_request import ExportRequest
 from flows.exchange.stored_scenes import StoredScenes
 from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.exchange.clouds import merge_clouds
 from genre_tasks.exchange.conversion import pose_scene
 from genre_tasks.exchange.one_cloud import make_resting_scene
 from genre_tasks.exchange.scene_folder import (
@@ -23,6 +25,8 @@ from genre_tasks.exchange.scene_folder import (
 )
 from genre_tasks.exchange.types import ExchangeFormat, ExchangeScene
 from genre_tasks.progress import Progress
+
+_STEM_CHARACTERS = 60
 
 _RESTING_FILES = "The files themselves rest: where actors are at which time is in scene.json."
 _POSED_FILES = "Each file is the scene at one frame: nothing in it moves."
@@ -76,8 +80,7 @@ class FileExporter:
         layout = _choose_layout(request, self._format.carries_nodes)
         numbers = list(scenes.chunk_numbers)
         entries: list[ChunkEntry] = []
-        # A dictionary keeps sentences once, in the order in which they come up.
-        losses: dict[str, None] = {}
+        chunks_by_loss: dict[str, list[int]] = {}
         for k, number in enumerate(numbers):
             scene = scenes.load(number)
             if request.frame is not None and request.frame not in scene.frames:
@@ -85,21 +88,21 @@ class FileExporter:
             if request.per_actor:
                 scene = replace(scene, nodes=tuple(node for node in scene.nodes if node.motion is not None))
             entry = describe_chunk(number, scene, scenes.describe_chunk(number))
-            losses.update(dict.fromkeys(scene.losses))
+            for loss in dict.fromkeys(self._list_losses(scene, layout)):
+                chunks_by_loss.setdefault(loss, []).append(number)
             for part in _split_scene(number, scene, layout, request.frame):
                 progress(k, len(numbers), part.name)
-                losses.update(dict.fromkeys(self._format.describe_losses(part.scene)))
                 entry = self._write_part(folder, entry, part)
             entries.append(entry)
         _check_found(entries, request, numbers)
-        losses.update(dict.fromkeys(_describe_layout(layout, entries)))
+        losses = _name_chunks(chunks_by_loss, len(entries)) + _describe_layout(layout, entries)
         files = digest_files(folder)
         document = SceneDocument(
             format=self._format.name,
             layout=layout,
             source=scenes.describe(),
             chunks=tuple(entries),
-            losses=tuple(losses),
+            losses=losses,
             files=files,
         )
         write_document(folder, document)
@@ -111,6 +114,14 @@ class FileExporter:
             "bytes": sum(file.size for file in files),
             "losses": list(losses),
         }
+
+    def _list_losses(self, scene: ExchangeScene, layout: Layout) -> tuple[str, ...]:
+        """Sentences on a chunk: what the scene has lost before, and what the format cannot carry."""
+        written = scene
+        if layout != "scenes":
+            # As one part: that files rest and are several is said once, for all chunks.
+            written = make_resting_scene(merge_clouds([node.cloud for node in scene.nodes]))
+        return (*scene.losses, *self._format.describe_losses(written))
 
     def _write_part(self, folder: Path, entry: ChunkEntry, part: _Part) -> ChunkEntry:
         """Writes one file; the chunk's entry with that file in it."""
@@ -137,13 +148,31 @@ def _split_scene(number: int, scene: ExchangeScene, layout: Layout, frame: int |
     if layout == "scenes":
         yield _Part(f"chunk-{number}", scene)
     elif layout == "nodes":
-        for node in scene.nodes:
-            yield _Part(f"chunk-{number}/{node.name}", make_resting_scene(node.cloud), node=node.name)
+        stems = _choose_stems([node.name for node in scene.nodes])
+        for node, stem in zip(scene.nodes, stems, strict=True):
+            yield _Part(f"chunk-{number}/{stem}", make_resting_scene(node.cloud), node=node.name)
     else:
         for index, at in enumerate(scene.frames):
             if frame is None or frame == at:
                 posed = make_resting_scene(pose_scene(scene, index))
                 yield _Part(f"chunk-{number}/frame-{at:06d}", posed, frame=at)
+
+
+def _choose_stems(names: Sequence[str]) -> list[str]:
+    """Names of files for nodes: those of imported scenes are whatever somebody else's file says."""
+    stems: list[str] = []
+    taken: set[str] = set()
+    for name in names:
+        base = re.sub(r"[^\w+=-]+", "-", name).strip("-")[:_STEM_CHARACTERS] or "node"
+        stem = base
+        number = 2
+        # File systems may take names for one that differ in case alone.
+        while stem.casefold() in taken:
+            stem = f"{base}-{number}"
+            number += 1
+        taken.add(stem.casefold())
+        stems.append(stem)
+    return stems
 
 
 def _check_found(entries: Sequence[ChunkEntry], request: ExportRequest, numbers: Sequence[int]) -> None:
@@ -157,6 +186,14 @@ def _check_found(entries: Sequence[ChunkEntry], request: ExportRequest, numbers:
         raise InputError("the scene has no actors", remedy="Leave out --per-actor.")
     if request.all_frames and not any(entry.posed for entry in entries):
         raise InputError("the scene has no frames: nothing in it moves", remedy="Leave out --all-frames.")
+
+
+def _name_chunks(chunks_by_loss: Mapping[str, Sequence[int]], chunk_count: int) -> tuple[str, ...]:
+    """Sentences that hold for all chunks as they are, and others with the chunks that they hold for."""
+    return tuple(
+        loss if len(chunks) == chunk_count else f"Chunk {', '.join(map(str, chunks))}: {loss}"
+        for loss, chunks in chunks_by_loss.items()
+    )
 
 
 def _describe_layout(layout: Layout, entries: Sequence[ChunkEntry]) -> tuple[str, ...]:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import re
-from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from flows.exchange.stored_scenes import IMPORT_STAGE, IMPORTED
 from flows.machine.facts import describe_environment
+from flows.machine.resource_usage import ResourceUsage, measure_usage
 from genre_tasks.errors import ConfigError
-from genre_tasks.exchange.conversion import limit_sh_degree, to_scene_graph
+from genre_tasks.exchange.conversion import BACKGROUND_NAME, DISTANT_NAME, limit_sh_degree, to_scene_graph
 from genre_tasks.exchange.registry import find_format, load_format
 from genre_tasks.exchange.scene_file import read_scene_files
 from genre_tasks.exchange.scene_folder import SCENE_FILE, find_changes, read_document
@@ -51,42 +52,75 @@ def import_scene(store: str, path: Path, name: str | None = None, progress: Prog
     """
     path = path.parent if path.name == SCENE_FILE else path
     called = _choose_name(path) if name is None else _check_name(name)
-    scenes = read_scene_files(path)
-    source = {"file": path.name, "digest": _digest_source(path), "module": _find_module(path)}
+    with measure_usage() as usage:
+        scenes = read_scene_files(path)
     changed = find_changes(path) if path.is_dir() else ()
+    source = _Source(
+        store=store,
+        name=called,
+        file=path.absolute().name,
+        digest=_digest_source(path),
+        module=_find_module(path),
+        warnings=tuple(f"{file} was changed after the export." for file in changed),
+        usage=usage,
+    )
     chunks = []
     for k, (number, scene) in enumerate(sorted(scenes.items())):
         progress(k, len(scenes), f"chunk {number}")
-        warnings = (*(f"{file} was changed after the export." for file in changed), *find_scene_warnings(scene))
-        chunks.append(_commit_scene(store, called, number, scene, source, warnings))
+        chunks.append(_commit_scene(source, number, scene))
     progress(len(scenes), len(scenes), "done")
     return {"name": called, "file": str(path), "chunks": chunks}
 
 
-def _commit_scene(
-    store: str, name: str, number: int, scene: ExchangeScene, source: Mapping[str, str], warnings: tuple[str, ...]
-) -> dict[str, Any]:
-    limited = _with_distinct_tracks(limit_sh_degree(scene))
+@dataclass(frozen=True)
+class _Source:
+    """What all chunks of an import share.
+
+    Attributes:
+        store: folder (or URI) of the store.
+        name: of the scene in the store.
+        file: name of the file or folder.
+        digest: of its bytes.
+        module: that reads it, as its format is named in a registry alone.
+        warnings: on the file as it is.
+        usage: what reading it took.
+    """
+
+    store: str
+    name: str
+    file: str
+    digest: str
+    module: str
+    warnings: tuple[str, ...]
+    usage: ResourceUsage
+
+
+def _commit_scene(source: _Source, number: int, scene: ExchangeScene) -> dict[str, Any]:
+    limited = _make_distinct(limit_sh_degree(scene))
+    warnings = (*source.warnings, *find_scene_warnings(limited))
     # What a scene graph does not hold, and an export of the imported scene states again.
     facts = {
-        "file": source["file"],
-        "names": {node.track_id or node.name: node.name for node in limited.nodes if node.motion is not None},
+        "file": source.file,
+        "names": {node.track_id: node.name for node in limited.nodes if node.motion is not None},
         "times_s": limited.times_s.tolist(),
         "frames": list(limited.frames or range(len(limited.times_s))),
         "world_SE3_scene": limited.world_SE3_scene.tolist(),
         "losses": list(limited.losses),
     }
-    code = code_digest(_CODE, (source["module"],))
-    key = stage_key(IMPORT_STAGE, code, facts, {"file": source["digest"]})
-    address = Address(IMPORTED, name, number, IMPORT_STAGE, key)
+    code = code_digest(_CODE, (source.module,))
+    key = stage_key(IMPORT_STAGE, code, facts, {"file": source.digest})
+    address = Address(IMPORTED, source.name, number, IMPORT_STAGE, key)
     provenance = Provenance(
-        inputs={"file": source["digest"]},
+        inputs={"file": source.digest},
         configuration=facts,
         code_digest=code,
+        seconds=source.usage.seconds,
+        peak_mib=source.usage.peak_mib,
         environment=describe_environment(),
         warnings=warnings,
     )
-    artifact = open_store(store).commit(address, "reconstruction", Reconstruction(to_scene_graph(limited)), provenance)
+    value = Reconstruction(to_scene_graph(limited))
+    artifact = open_store(source.store).commit(address, "reconstruction", value, provenance)
     return {
         "chunk": number,
         "key": artifact.manifest.key,
@@ -98,21 +132,34 @@ def _commit_scene(
     }
 
 
-def _with_distinct_tracks(scene: ExchangeScene) -> ExchangeScene:
-    """Actors of a scene graph are told apart by their track ids, which a file may repeat or leave out."""
-    taken: set[str] = set()
+def _make_distinct(scene: ExchangeScene) -> ExchangeScene:
+    """Gives actors track ids and names of their own, and moments rising frames: a scene graph tells them apart by it.
+
+    Files may repeat track ids or leave them out, and a moving part may be called as the background is.
+    """
+    tracks: set[str] = set()
+    names = {BACKGROUND_NAME, DISTANT_NAME, *(node.name for node in scene.nodes)}
     nodes: list[ExchangeNode] = []
     for node in scene.nodes:
-        track = node.track_id or node.name
-        if node.motion is not None:
-            track = track if track not in taken else node.name
-            taken.add(track)
-        nodes.append(replace(node, track_id=track) if node.motion is not None else node)
-    return replace(scene, nodes=tuple(nodes))
+        if node.motion is None:
+            nodes.append(node)
+            continue
+        name = node.name
+        while node.name in (BACKGROUND_NAME, DISTANT_NAME) and name in names:
+            name += "-moving"
+        track = node.track_id if node.track_id and node.track_id not in tracks else name
+        while track in tracks:
+            track += "-"
+        names.add(name)
+        tracks.add(track)
+        nodes.append(replace(node, name=name, track_id=track))
+    is_rising = all(before < after for before, after in itertools.pairwise(scene.frames))
+    return replace(scene, nodes=tuple(nodes), frames=scene.frames if is_rising else ())
 
 
 def _choose_name(path: Path) -> str:
-    stem = path.name if path.is_dir() else path.name.partition(".")[0]
+    called = path.absolute().name
+    stem = called if path.is_dir() else called.partition(".")[0]
     slug = re.sub(r"[^\w+=-]+", "-", stem).strip("-.")
     return slug[:100] or "scene"
 

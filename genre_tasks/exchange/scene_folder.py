@@ -12,8 +12,6 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from genre_tasks.errors import InputError
-from genre_tasks.exchange.conversion import pose_scene
-from genre_tasks.exchange.one_cloud import make_resting_scene
 from genre_tasks.exchange.registry import find_format, load_format
 from genre_tasks.exchange.types import ExchangeNode, ExchangeScene, NodeMotion
 from genre_tasks.json_files import read_json_object
@@ -30,6 +28,7 @@ _BLOCK_BYTES = 1 << 20
 _REMEDY = "Export the scene again, or give one of its files."
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+Frame = Annotated[int, Field(ge=-(2**31), lt=2**31)]
 Row = tuple[Finite, Finite, Finite, Finite]
 Matrix = tuple[Row, Row, Row, Row]
 Layout = Literal["nodes", "scenes", "frames"]
@@ -65,7 +64,7 @@ class PosedFile(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    frame: int
+    frame: Frame
     file: str
 
 
@@ -74,11 +73,11 @@ class ChunkEntry(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    chunk: int = Field(ge=0)
+    chunk: int = Field(ge=0, lt=10_000)
     source: dict[str, Any] = {}
     world_SE3_scene: Matrix
     times_s: tuple[Finite, ...]
-    frames: tuple[int, ...]
+    frames: tuple[Frame, ...]
     losses: tuple[str, ...] = ()
     nodes: tuple[NodeEntry, ...]
     file: str | None = None
@@ -100,7 +99,7 @@ class SceneDocument(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    kind: Literal["genre-scene"] = KIND
+    kind: Literal["genre-scene"] = "genre-scene"
     version: int = VERSION
     format: str
     layout: Layout
@@ -227,16 +226,6 @@ def find_changes(folder: Path) -> tuple[str, ...]:
     return tuple(
         entry.path for entry in read_document(folder).files if _digest(_inside(folder, entry.path)) != entry.sha256
     )
-
-
-def make_posed_scene(scene: ExchangeScene, index: int) -> ExchangeScene:
-    """Poses a scene at one moment, as one cloud that rests.
-
-    Args:
-        scene: with F moments.
-        index: of the moment.
-    """
-    return make_resting_scene(pose_scene(scene, index))
 
 
 def _read_chunk_file(folder: Path, _format: str, entry: ChunkEntry) -> ExchangeScene:

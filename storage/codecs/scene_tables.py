@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -53,22 +52,23 @@ GAUSSIANS = schema(
         column("node", pa.int64(), "0 static, 1 distant (chunk coordinates), 2 + k actor k (box coordinates)"),
     ],
 )
-SH_COLUMNS = {
-    degree: tuple(f"{channel}_{k}" for k in range(1, count + 1) for channel in ("red", "green", "blue"))
-    for degree, count in SH_COUNTS.items()
-}
-"""Columns of a table of spherical harmonics, by its degree."""
 
+
+def _list_sh_columns(degree: int) -> tuple[str, ...]:
+    return tuple(f"{c}_{k}" for k in range(1, SH_COUNTS[degree] + 1) for c in ("red", "green", "blue"))
+
+
+# A degree each: reconstructions have the default one, scenes of other programs any.
 SPHERICAL_HARMONICS = {
     degree: schema(
         f"harmonics/{degree}",
-        [column(name, pa.float32(), "of 3DGS's real spherical harmonic of that number") for name in names],
+        [
+            column(name, pa.float32(), "of 3DGS's real spherical harmonic of that number")
+            for name in _list_sh_columns(degree)
+        ],
     )
-    for degree, names in SH_COLUMNS.items()
+    for degree in SH_COUNTS
 }
-"""Tables of spherical harmonics, by their degree; reconstructions have ``DEFAULT_SH_DEGREE``, imports any."""
-
-_DEGREES = {count: degree for degree, count in SH_COUNTS.items()}
 
 
 def write_scene(path: Path, scene: SceneGraph) -> None:
@@ -91,15 +91,14 @@ def write_scene(path: Path, scene: SceneGraph) -> None:
     write_table(path, GAUSSIANS, {**columns, "node": nodes})
     if scene.spherical_harmonics is not None:
         coefficients = scene.spherical_harmonics.detach().cpu().numpy()
-        # A number that fits no degree is an error against the one of reconstructions.
-        degree = _DEGREES.get(coefficients.shape[1] if coefficients.ndim == 3 else 0, DEFAULT_SH_DEGREE)
-        expected = (len(packed), SH_COUNTS[degree], 3)
-        check_array(coefficients, f"harmonics of {path.name}", np.float32, expected)
+        degrees = {count: degree for degree, count in SH_COUNTS.items()}
+        degree = degrees.get(coefficients.shape[1] if coefficients.ndim == 3 else 0, DEFAULT_SH_DEGREE)
+        check_array(coefficients, f"harmonics of {path.name}", np.float32, (len(packed), SH_COUNTS[degree], 3))
         sh_path = _sh_path(path)
         sh_path.parent.mkdir(exist_ok=True)
-        flat = coefficients.reshape(len(coefficients), len(SH_COLUMNS[degree]))
-        sh_columns = {name: flat[:, i] for i, name in enumerate(SH_COLUMNS[degree])}
-        write_table(sh_path, SPHERICAL_HARMONICS[degree], sh_columns)
+        flat = coefficients.reshape(len(coefficients), -1)
+        columns = {name: flat[:, i] for i, name in enumerate(_list_sh_columns(degree))}
+        write_table(sh_path, SPHERICAL_HARMONICS[degree], columns)
 
 
 def read_scene(path: Path, actors: tuple[ActorNode, ...], antialiased: bool, deformation_path: Path) -> SceneGraph:
@@ -153,23 +152,25 @@ def _read_spherical_harmonics(path: Path, count: int) -> Tensor | None:
     # The folder decides: with it, a table that is missing is damage.
     if not path.parent.is_dir():
         return None
-    degree = _find_degree(path)
+    degree = _find_sh_degree(path)
     table = read_table(path, SPHERICAL_HARMONICS[degree])[0]
     # Two tables that do not fit would shift colours from one Gaussian to another.
     if table.num_rows != count:
         raise ArtifactCorruptError(
             f"The table has {table.num_rows} rows for {count} Gaussians", remedy=REMEDY, file=path
         )
-    flat = np.stack([column_array(table, n) for n in SH_COLUMNS[degree]], 1)
+    flat = np.stack([column_array(table, n) for n in _list_sh_columns(degree)], 1)
     return torch.from_numpy(flat.reshape(count, SH_COUNTS[degree], 3))
 
 
-def _find_degree(path: Path) -> int:
-    """Degree of a table of harmonics by its number of columns; that of reconstructions where none fits."""
-    # What is wrong with the file says the strict reader, which names file and column.
-    with suppress(pa.ArrowException, OSError, ValueError):
-        return _DEGREES.get(len(pq.read_schema(path).names) // 3, DEFAULT_SH_DEGREE)
-    return DEFAULT_SH_DEGREE
+def _find_sh_degree(path: Path) -> int:
+    """The degree that a table's number of columns is of; the default one where the table is damaged or none."""
+    try:
+        columns = len(pq.read_schema(path).names)
+    except (pa.ArrowException, OSError, ValueError):
+        # Reading it raises the error that names what is wrong.
+        return DEFAULT_SH_DEGREE
+    return next((degree for degree, count in SH_COUNTS.items() if 3 * count == columns), DEFAULT_SH_DEGREE)
 
 
 def _check_nodes(nodes: NDArray[np.int64], actor_count: int, make_error: Callable[[str], GenreError]) -> None:

@@ -26,18 +26,8 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGES = (ROOT / "README.md", ROOT / "docs/quickstart.md", *sorted((ROOT / "docs/guides").glob("*.md")))
 TAKES_SETTINGS = ("run", "effects", "cost", "table", "figure")
 TAKES_STORE = (
-    "run",
-    "effects",
-    "show",
-    "render",
-    "range",
-    "verify",
-    "cost",
-    "table",
-    "figure",
-    "simulate",
-    "edit",
-    "serve",
+    *("run", "effects", "show", "render", "range", "verify", "cost", "table", "figure", "simulate", "edit", "serve"),
+    *("export", "import"),
 )
 
 

@@ -410,7 +410,7 @@ def test_the_process_reads_and_passes_errors_on(package: Path, tmp_path: Path) -
 
 def test_the_memory_of_the_process_is_limited() -> None:
     module = "genre_tasks.exchange.usd.stage_dump"
-    code = f"import numpy as np; from {module} import limit_memory; limit_memory({{}}); np.ones(2**28)"
+    code = f"import numpy as np; from {module} import limit_memory; limit_memory({{}}); np.empty(2**28)"
     # Two gigabytes: more than a small file may take, and less than a large one.
     results = [
         subprocess.run([sys.executable, "-c", code.format(size)], capture_output=True, text=True, check=False)

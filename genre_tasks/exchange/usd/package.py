@@ -40,10 +40,13 @@ def write_package(path: Path, layer: Path) -> None:
     before = _LOCAL_HEADER_BYTES + len(layer.name) + _EXTRA_HEADER_BYTES
     padding = -before % _ALIGNMENT_BYTES
     entry.extra = struct.pack("<HH", _PADDING_ID, padding) + bytes(padding)
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
-        with archive.open(entry, "w") as member, layer.open("rb") as file:
-            while block := file.read(_BLOCK_BYTES):
-                member.write(block)
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive,
+        archive.open(entry, "w") as member,
+        layer.open("rb") as file,
+    ):
+        while block := file.read(_BLOCK_BYTES):
+            member.write(block)
 
 
 def extract_layers(path: Path, folder: Path) -> Path:

@@ -97,7 +97,7 @@ class FieldArrays:
         if len(values) not in (1, count):
             raise self._damage(f"has {len(values)} colours for {count} positions")
         check_finite_values(self._file, f"{self._path}.{names.COLORS}", values)
-        return np.broadcast_to(colors_to_sh_dc(values)[:, None], (count, 1, 3))
+        return np.broadcast_to(colors_to_sh_dc(values.astype(np.float64))[:, None], (count, 1, 3))
 
     def _to_logits(self, opacities: Float32) -> Float32:
         if ((opacities < -_HALF_ROUNDING) | (opacities > 1 + _HALF_ROUNDING)).any():

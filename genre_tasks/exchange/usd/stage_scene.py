@@ -15,7 +15,7 @@ from genre_tasks.exchange.checks import check_finite_cloud
 from genre_tasks.exchange.types import ExchangeNode, ExchangeScene, NodeMotion, SplatCloud
 from genre_tasks.exchange.usd import names
 from genre_tasks.exchange.usd.particle_fields import FieldArrays
-from genre_tasks.exchange.usd.placement import place_cloud, scale_cloud, split_similarity
+from genre_tasks.exchange.usd.similarity import place_cloud, scale_cloud, split_similarity
 from genre_tasks.logs.types import Float64
 
 _Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])

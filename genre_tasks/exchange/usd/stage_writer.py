@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdVol, Vt
+from pxr import Gf, Tf, Usd, UsdGeom, UsdVol, Vt
 from scipy.spatial.transform import Rotation
 
 from genre_tasks.exchange.activations import logits_to_opacities, logs_to_scales
