@@ -113,9 +113,10 @@ class SensorServer:
         handlers = {name: self._make_handler(name) for name in REQUEST_TYPES}
         generic = grpc.method_handlers_generic_handler(SERVICE, handlers)
         self._server.add_generic_rpc_handlers((generic,))
-        self._host = host
+        # An address of IPv6 has colons of its own.
+        self._host = f"[{host}]" if ":" in host else host
         try:
-            self._port = self._server.add_insecure_port(f"{host}:{port}")
+            self._port = self._server.add_insecure_port(f"{self._host}:{port}")
         except RuntimeError as error:
             raise ConfigError(f"cannot listen on {host}:{port}", remedy="Choose another --port or --host.") from error
         self._server.start()

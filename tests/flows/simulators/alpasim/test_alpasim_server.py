@@ -159,6 +159,20 @@ def test_a_taken_port_is_named() -> None:
             SensorServer(FakeService(lambda: None), host, int(port))  # type: ignore[arg-type]
 
 
+def test_an_address_of_ipv6_is_served() -> None:
+    try:
+        with serve(lambda: None, host="::1") as (server, client):
+            assert server.address.startswith("[::1]:")
+            assert client.call("get_version").version_id == "fake"
+    except ConfigError:
+        pytest.skip("this machine has no IPv6")
+
+
+def test_an_address_of_no_one_is_named() -> None:
+    with pytest.raises(ConfigError, match="cannot listen on"):
+        SensorServer(FakeService(lambda: None), "192.0.2.1", 0)  # type: ignore[arg-type]
+
+
 def test_only_this_machine_reaches_the_default_address() -> None:
     with serve(lambda: None) as (server, _):
         assert server.address.startswith("127.0.0.1:")
