@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flows.simulation.run_scenes import RunScenes
-from flows.simulators.alpasim.ground_mesh import build_ground_mesh, encode_mesh
+from flows.simulators.alpasim.ground_mesh import NOWHERE, build_ground_mesh, encode_mesh
 from flows.simulators.alpasim.local_frame import LocalFrame, describe_ego_box, read_local_frame
 from flows.simulators.alpasim.timestamps import to_microseconds
 from flows.simulators.image_request import ActorDescription, CameraDescription
@@ -81,7 +81,8 @@ def write_alpasim_bundle(store: str, run: str, out: Path, stage: str | None = No
     if len(source.facts.clock.times_s) < MIN_POSES:
         raise InputError("the run has one frame, and a simulator drives along several", remedy="Choose another run.")
     survey = survey_run(scenes)
-    mesh = build_ground_mesh(survey.ground, survey.path.world_SE3_ego[:, :2, 3])
+    tracks = [track.world_SE3_box[:, :2, 3] for track in survey.tracks.values()]
+    mesh = build_ground_mesh(survey.ground, survey.path.world_SE3_ego[:, :2, 3], np.concatenate([NOWHERE, *tracks]))
     # Only now: near the log's origin float32 would be too coarse.
     local = mesh._replace(vertices=mesh.vertices - source.frame.world_SE3_local[:3, 3])
     ply = encode_mesh(local)

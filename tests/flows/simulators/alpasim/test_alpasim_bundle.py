@@ -126,6 +126,16 @@ def test_the_ground_carries_the_path(bundle: Path, client: WireClient) -> None:
         assert vertices[nearest, 2].mean() == pytest.approx(position[2], abs=0.15)
 
 
+def test_the_ground_reaches_under_all_traffic(bundle: Path) -> None:
+    with zipfile.ZipFile(bundle) as archive:
+        ply = PlyData.read(io.BytesIO(archive.read("mesh_ground.ply")))
+    vertices = np.stack([ply["vertex"][name] for name in "xy"], 1).astype(np.float64)
+    (sequence,) = load(bundle, "sequence_tracks.json").values()
+    for rows in sequence["tracks_data"]["tracks_poses"]:
+        for x, y, *_ in rows:
+            assert np.linalg.norm(vertices - (x, y), axis=1).min() < 1.0
+
+
 def test_the_same_run_gives_the_same_bytes(bundle: Path, served: ServedRun, tmp_path: Path) -> None:
     again = tmp_path / "deep" / "again.usdz"
     write_alpasim_bundle(served.store, served.run, again)
