@@ -5,13 +5,16 @@ from __future__ import annotations
 import io
 import itertools
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
 from PIL import Image
+from typer.testing import CliRunner
 
+from flows.cli.main import app
 from flows.simulators.alpasim import sensorsim_pb2
 from flows.simulators.alpasim.image_requests import read_image_request
 from flows.simulators.alpasim.served_scene import ServedScene
@@ -76,6 +79,21 @@ def test_images_are_those_of_the_library(client: WireClient, served: ServedRun, 
         request.sensor_pose.CopyFrom(pose_pair(write_pose(pose)))
         request.frame_start_us = request.frame_end_us = round(view.timestamp_s * 1e6)
         assert distance(client.render(request), expected) <= 1
+
+
+def test_images_are_those_of_genre_render(client: WireClient, served: ServedRun, tmp_path: Path) -> None:
+    camera = client.cameras[1].logical_id
+    frame = 8
+    place = ["--chunk", "1", "--frame", str(frame), "--camera", camera, "--store", served.store]
+    done = CliRunner().invoke(app, ["render", served.run, "--out", str(tmp_path / "image.png"), *place])
+    assert done.exit_code == 0, done.output
+    chunk = served.scenes.load(1).chunk
+    (view,) = [view for view in chunk.views if (view.camera, view.frame) == (camera, frame)]
+    request = client.image_request(1)
+    pose = served.frame.to_local(chunk.world_SE3_chunk @ view.chunk_SE3_camera)
+    request.sensor_pose.CopyFrom(pose_pair(write_pose(pose)))
+    request.frame_start_us = request.frame_end_us = round(view.timestamp_s * 1e6)
+    assert distance(client.render(request), decode((tmp_path / "image.png").read_bytes())) <= 1
 
 
 def test_a_rolling_shutter_reads_rows_on_the_way_from_start_to_end(client: WireClient, served: ServedRun) -> None:
