@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,7 +145,9 @@ def _check_shutter(request: sensorsim_pb2.RGBRenderRequest) -> bool:
 def _cover(lens: Lens | WideLens, width_px: int, height_px: int, scene: ServedScene) -> LensCover | None:
     if isinstance(lens, Lens):
         return None
-    cover = _cover_lens(lens, width_px, height_px)
+    # One at a time: finding the rays of a large image takes a quarter of a gigabyte for a moment.
+    with _cover_lock:
+        cover = _cover_lens(lens, width_px, height_px)
     limits = scene.renderer.limits
     wide = max(tile.lens.width_px for tile in cover.tiles)
     high = max(tile.lens.height_px for tile in cover.tiles)
@@ -156,8 +159,10 @@ def _cover(lens: Lens | WideLens, width_px: int, height_px: int, scene: ServedSc
     return cover
 
 
+_cover_lock = Lock()
+
 # A rig has a few wide cameras, and takes images of each all along.
-_cover_lens = lru_cache(maxsize=8)(cover_lens)
+_cover_lens = lru_cache(maxsize=6)(cover_lens)
 
 
 def _read_size(request: sensorsim_pb2.RGBRenderRequest, scene: ServedScene) -> tuple[int, int]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 import grpc
@@ -19,7 +21,12 @@ if TYPE_CHECKING:
 
 SERVICE = "nre.grpc.protos.sensorsim.SensorsimService"
 
-MAX_REQUEST_BYTES = 16 << 20
+MAX_REQUEST_BYTES = 4 << 20
+"""A batch of 32 images with 1000 objects each has 3 MB."""
+
+LARGE_REQUEST_BYTES = 256 << 10
+"""A message takes up to 30 times its size in memory, so larger requests are answered one at a time."""
+
 MAX_ANSWER_BYTES = 64 << 20
 """What AlpaSim's client takes; a batch of PNG images is far smaller."""
 
@@ -97,6 +104,7 @@ class SensorServer:
     ) -> None:
         self._service = service
         self._metrics = metrics
+        self._large_requests = threading.Lock()
         # Calls that only ask for facts are answered while all others wait for the renderer.
         workers = max_waiting + 4
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="sensorsim")
@@ -158,7 +166,8 @@ class SensorServer:
         name = "OK"
         answer = b""
         try:
-            answer = answer_call(self._service, method, payload)
+            with self._large_requests if len(payload) > LARGE_REQUEST_BYTES else nullcontext():
+                answer = answer_call(self._service, method, payload)
         except Exception as error:
             name = find_status_name(error)
             details = str(error)

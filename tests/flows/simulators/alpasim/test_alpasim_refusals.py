@@ -142,6 +142,13 @@ def test_lidar_and_all_sensors_at_once_are_not_there(client: WireClient) -> None
     assert client.status("no_such_method", b"")[0] == "UNIMPLEMENTED"
 
 
+def test_a_large_message_is_read_and_refused_for_what_is_in_it(client: WireClient) -> None:
+    # A million objects without a name, in as few bytes as that takes.
+    payload = client.image_request().SerializeToString() + block(8, b"") * 1_000_000
+    code, details = client.status("render_rgb", payload)
+    assert (code, "1000000 objects are too many" in details) == ("INVALID_ARGUMENT", True)
+
+
 def test_an_oversized_message_is_refused(client: WireClient) -> None:
     payload = block(1, bytes(MAX_REQUEST_BYTES))
     assert client.status("render_rgb", payload)[0] == "RESOURCE_EXHAUSTED"
