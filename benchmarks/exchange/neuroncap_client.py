@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
+from benchmarks.common.bench import NotMeasuredError
 from benchmarks.exchange.service_fuzz import Answer
 from flows.simulators.neuroncap_messages import describe_recorded, write_trajectories
 from flows.simulators.scene_renderer import SceneRenderer
@@ -82,6 +83,23 @@ class NeuroncapClient:
         detail = content[:500].decode("utf-8", "replace") if is_refusal else ""
         is_fault = status >= _FIRST_FAULT and status != _BUSY
         return Answer(str(status), is_fault, detail, is_refusal)
+
+    def fetch_image(self, message: bytes) -> bytes:
+        """Asks for an image.
+
+        Args:
+            message: a valid request.
+
+        Returns:
+            The encoded image.
+
+        Raises:
+            NotMeasuredError: the service refuses it.
+        """
+        status, content = self._request("POST", "/render_image", message)
+        if status >= _FIRST_REFUSAL:
+            raise NotMeasuredError(f"the service answers {status}: {content[:200]!r}")
+        return content
 
     def mutate_fields(self, message: bytes, random: np.random.Generator) -> bytes:
         """See ``FuzzClient``.

@@ -14,7 +14,8 @@ from genre_tasks.errors import ResourceError
 # A command has to end within seconds of a signal.
 _SECONDS_TO_END = 3
 _SECONDS_TO_START = 30.0
-_MAX_CONNECTIONS = 256
+# A request of the largest size may be read at each of them.
+_MAX_CONNECTIONS = 64
 
 
 class HttpThread:

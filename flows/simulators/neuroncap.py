@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import io
 import threading
 import time
 from collections.abc import Awaitable, Callable
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
-from PIL import Image
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
+from flows.simulators.encoded_images import encode_image
 from flows.simulators.http_thread import HttpThread
 from flows.simulators.image_request import ImageRequest
 from flows.simulators.neuroncap_messages import (
@@ -31,12 +30,10 @@ from flows.simulators.scene_renderer import SceneRenderer
 from flows.simulators.service import RunningService, ServiceRequest
 from flows.simulators.service_metrics import ServiceMetrics
 from genre_tasks.errors import ConfigError, GenreError, InputError, ResourceError
-from storage.codecs.png import encode_png
 
 MAX_BODY_BYTES = 16 * 2**20
 """Of one request: a thousand actors over twenty seconds take less."""
 
-_JPEG_QUALITY = 95
 _REFUSED_FORMAT = 406
 _TOO_LARGE = 413
 _UNFIT = 422
@@ -168,9 +165,8 @@ class NeuroncapApp:
             return _refuse(_REFUSED_FORMAT, detail)
         pixels = self._renderer.render(self._state.request_image(message))
         self._metrics.count_images(1)
-        if message.image_format == "png":
-            return Response(encode_png(pixels), media_type="image/png")
-        return Response(_encode_jpeg(pixels), media_type="image/jpeg")
+        image_format: Literal["png", "jpeg"] = "png" if message.image_format == "png" else "jpeg"
+        return Response(encode_image(pixels, image_format), media_type=f"image/{image_format}")
 
 
 def start_neuroncap(request: ServiceRequest) -> RunningService:
@@ -221,9 +217,3 @@ async def _read_body(request: Request) -> bytes:
         if len(parts) > MAX_BODY_BYTES:
             raise _BodyTooLargeError
     return bytes(parts)
-
-
-def _encode_jpeg(pixels: NDArray[np.uint8]) -> bytes:
-    sink = io.BytesIO()
-    Image.fromarray(pixels).save(sink, "JPEG", quality=_JPEG_QUALITY)
-    return sink.getvalue()

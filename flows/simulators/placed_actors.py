@@ -14,10 +14,12 @@ from genre_tasks.rollout.traffic import extend_traffic
 from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.transforms import interpolate_pose, invert_se3
-from genre_tasks.scene_edits.actor_names import resolve_actor
 from genre_tasks.scene_edits.chunk_scene import ChunkScene, SceneSource
+from genre_tasks.suggestions import did_you_mean
 
 _SCENES_IN_MEMORY = 2
+# Actors, and letters of a name, that an error repeats.
+_LISTED = 40
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,7 @@ class ActorPlacer:
         self._source = source
         self._chunks_by_track = chunks_by_track
         self._names = names
+        self._track_by_name = {name: track_id for track_id, name in names.items()}
         # The latest scenes with actors of other chunks, because joining copies Gaussians.
         self._extended: list[tuple[ChunkScene, tuple[int, ...], ChunkScene]] = []
 
@@ -74,14 +77,26 @@ class ActorPlacer:
         """
         found: list[str] = []
         for word in words:
-            # The log's own id first: the readable name of another actor may look the same.
-            track_id = word if word in self._names else resolve_actor(word, self._names)
+            track_id = self._find(word)
             if track_id in found:
                 raise InputError(
                     f"actor {self._names[track_id]} ({track_id!r}) is there twice", remedy="Name each actor once."
                 )
             found.append(track_id)
         return tuple(found)
+
+    def _find(self, word: str) -> str:
+        # The log's own id first: the readable name of another actor may look the same. Nothing shorter counts, as an
+        # actor of the simulator's own would else be taken for one of the log.
+        if word in self._names:
+            return word
+        if word in self._track_by_name:
+            return self._track_by_name[word]
+        known = [*self._track_by_name, *self._names]
+        shown = ", ".join(list(self._track_by_name)[:_LISTED]) or "none"
+        raise InputError(
+            f"the run has no actor {word[:_LISTED]!r}", remedy=f"{did_you_mean(word[:_LISTED], known)}It has {shown}."
+        )
 
     def gather(self, chunk_scene: ChunkScene, track_ids: Sequence[str]) -> ChunkScene:
         """Gives a scene the Gaussians of actors that only other chunks have.

@@ -16,6 +16,9 @@ from genre_tasks.scene.transforms import is_rigid_transform
 MAX_READOUT_S = 1.0
 """Slower than this no camera reads an image out."""
 
+MAX_PIXELS = 64_000_000
+"""Of all images of one call; a single image is bounded by its sides."""
+
 MAX_ACTORS = 1000
 """Actors of one image."""
 
@@ -28,6 +31,26 @@ _MAX_MOVE_M = 100.0
 _MAX_DISTANCE_M = 10_000.0
 # Poses from JSON may be those of a simulator that computes in single precision.
 _ROTATION_TOLERANCE = 1e-3
+
+
+def check_batch(requests: Sequence[ImageRequest], limits: RenderLimits) -> None:
+    """Checks that a call asks for no more than memory has room for.
+
+    Args:
+        requests: of a client.
+        limits: of one call.
+
+    Raises:
+        InputError: there are too many images, or too many pixels in them.
+    """
+    if len(requests) > limits.max_batch:
+        raise InputError(f"{len(requests)} images in one request are too many", remedy=f"Ask for {limits.max_batch}.")
+    pixels = sum(request.lens.width_px * request.lens.height_px for request in requests)
+    if len(requests) > 1 and pixels > MAX_PIXELS:
+        raise InputError(
+            f"{pixels / 1e6:.0f} megapixels in one request are too many",
+            remedy=f"Ask for {MAX_PIXELS / 1e6:.0f} at a time.",
+        )
 
 
 def check_request(request: ImageRequest, limits: RenderLimits, positions: Float64) -> None:

@@ -42,11 +42,12 @@ class RunFacts:
     ego_masks: Mapping[str, NDArray[np.bool_]]
 
 
-def read_run_facts(source: SceneSource) -> RunFacts:
+def read_run_facts(source: SceneSource, names: Mapping[str, str] | None = None) -> RunFacts:
     """Reads what simulators have to know.
 
     Args:
         source: the scenes of a run.
+        names: readable name of each actor, by track id; ``None``: numbered as those of a recorded run.
 
     Returns:
         The facts; no scene, image or point stays in memory for them.
@@ -63,7 +64,9 @@ def read_run_facts(source: SceneSource) -> RunFacts:
         for actor in loaded.scene.actors:
             chunks_by_track[actor.track_id] = (*chunks_by_track.get(actor.track_id, ()), number)
     clock = read_clock(chunks)
-    names = name_actors(source)
+    names = name_actors(source) if names is None else names
+    # An edited run has names of actors that are gone.
+    names = {track_id: name for track_id, name in names.items() if track_id in chunks_by_track}
     ego = _join_ego_poses(chunks, clock)
     actors = []
     for tracked in list_world_actors(chunks):

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from flows.simulation.edited_runs import open_run, open_shown_scenes
 from flows.simulation.run_scenes import RunScenes
 from flows.simulators.image_request import (
     ActorDescription,
@@ -20,12 +21,13 @@ from flows.simulators.image_request import (
 )
 from flows.simulators.placed_actors import ActorPlacer, Readout, place_actors
 from flows.simulators.render_queue import RenderQueue
-from flows.simulators.request_checks import check_request
+from flows.simulators.request_checks import check_batch, check_request
 from flows.simulators.run_facts import read_run_facts
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.errors import InputError
 from genre_tasks.logs.types import Float64
 from genre_tasks.render import render_views
+from genre_tasks.render.types import RenderSettings
 from genre_tasks.rollout.camera_motion import place_rollout_views
 from genre_tasks.rollout.chunk_layout import lay_out_chunks
 from genre_tasks.rollout.handover import cut_at_borders
@@ -33,8 +35,10 @@ from genre_tasks.rollout.rig import RigCamera, RolloutView
 from genre_tasks.rollout.scene_schedule import SceneSchedule
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.transforms import interpolate_pose, invert_se3
+from genre_tasks.scene_edits.actor_names import name_actors
 from genre_tasks.scene_edits.chunk_scene import ChunkScene
 from genre_tasks.suggestions import did_you_mean
+from genre_tasks.threads import torch_threads
 from storage.codecs.png import to_pixels
 
 __all__ = [
@@ -47,12 +51,18 @@ __all__ = [
 ]
 
 DEFAULT_LIMITS = RenderLimits()
+_CALL_PIXELS = 8_000_000
+"""That are rendered at once: each takes twenty bytes, and more within the renderer."""
 
 
 @dataclass(frozen=True)
 class _PlacedImage:
-    """An image, ready to be rendered: images of one ``group`` share a render."""
+    """An image, ready to be rendered: images of one ``group`` share a render.
 
+    Scenes are compared by their identity, so both stay alive for as long as the image waits.
+    """
+
+    chunk_scene: ChunkScene
     scene: SceneGraph
     view: RolloutView
 
@@ -90,11 +100,12 @@ class SceneRenderer:
         self, store: str, run: str, stage: str | None = None, *, limits: RenderLimits = DEFAULT_LIMITS
     ) -> None:
         self._scenes = RunScenes(store, run, stage)
-        self._facts = read_run_facts(self._scenes)
+        self._facts = read_run_facts(self._scenes, _find_edited_names(store, run, stage))
         layout = lay_out_chunks(self._scenes)
         self._layout = layout
         self._schedule = SceneSchedule(self._scenes, layout, cut_at_borders(layout))
         self._placer = ActorPlacer(self._scenes, self._facts.chunks_by_track, self._facts.names)
+        self._settings = RenderSettings(threads=torch.get_num_threads())
         self._queue = RenderQueue(limits.max_waiting)
         self.limits = limits
         self.name: str = str(self._scenes.record["run"])
@@ -207,15 +218,14 @@ class SceneRenderer:
         Raises:
             InputError, ResourceError: as :meth:`render`.
         """
-        if len(requests) > self.limits.max_batch:
-            raise InputError(
-                f"{len(requests)} images in one request are too many", remedy=f"Ask for {self.limits.max_batch}."
-            )
+        check_batch(requests, self.limits)
         for request in requests:
             self._check(request)
         if not requests:
             return []
-        with self._queue.turn():
+        # The renderer's kernel has threads of its own. Those of torch would spin next to them, and make a small image
+        # many times slower wherever OMP_WAIT_POLICY is not PASSIVE, as in a program of a user's own.
+        with self._queue.turn(), torch_threads(1):
             return self._render(requests)
 
     def _render(self, requests: Sequence[ImageRequest]) -> list[NDArray[np.uint8]]:
@@ -225,12 +235,17 @@ class SceneRenderer:
         for k, image in enumerate(placed):
             groups.setdefault(image.group, []).append(k)
         pixels: dict[int, NDArray[np.uint8]] = {}
-        for members in groups.values():
-            # Without gradients the renderer keeps nothing for a backward pass, which takes memory.
-            with torch.no_grad():
-                color = render_views(placed[members[0]].scene, [placed[k].view for k in members]).color
-            for k, image_pixels in zip(members, to_pixels(color), strict=True):
-                pixels[k] = image_pixels
+        for (_, width_px, height_px, _), group in groups.items():
+            # A call takes memory by its pixels, so a large group is rendered in parts.
+            size = max(1, _CALL_PIXELS // (width_px * height_px))
+            for begin in range(0, len(group), size):
+                members = group[begin : begin + size]
+                # Without gradients the renderer keeps nothing for a backward pass, which takes memory.
+                with torch.no_grad():
+                    color = render_views(
+                        placed[members[0]].scene, [placed[k].view for k in members], self._settings
+                    ).color
+                pixels |= dict(zip(members, to_pixels(color), strict=True))
         return [pixels[k] for k in range(len(placed))]
 
     def _place(self, request: ImageRequest, scenes: dict[tuple[object, ...], SceneGraph]) -> _PlacedImage:
@@ -254,7 +269,7 @@ class SceneRenderer:
             if key not in scenes:
                 scenes[key] = place_actors(chunk_scene, wanted, readout)
             scene = scenes[key]
-        return _PlacedImage(scene, _place_view(request, middle, frames, chunk_scene))
+        return _PlacedImage(chunk_scene, scene, _place_view(request, middle, frames, chunk_scene))
 
     def _find_scene(self, request: ImageRequest, middle: Float64, frame: float, middle_s: float) -> ChunkScene:
         """The scene whose background is that of the place, and whose traffic is that of the moment."""
@@ -275,7 +290,7 @@ class SceneRenderer:
         check_request(request, self.limits, self._facts.world_SE3_ego[:, :3, 3])
         first_s, last_s = self.time_range_s
         slack_s = self.frame_s / 2
-        if not (first_s - slack_s <= request.start_s and request.end_s <= last_s + slack_s):
+        if not first_s - slack_s <= (request.start_s + request.end_s) / 2 <= last_s + slack_s:
             raise InputError(
                 f"{request.start_s:.6f} to {request.end_s:.6f} s is outside of the run",
                 remedy=f"It lasts from {first_s:.6f} to {last_s:.6f} s.",
@@ -287,6 +302,13 @@ class SceneRenderer:
         if camera not in self.cameras:
             remedy = f"{did_you_mean(camera, self.cameras)}It has {', '.join(self.cameras)}."
             raise InputError(f"the run has no camera '{camera}'", remedy=remedy)
+
+
+def _find_edited_names(store: str, run: str, stage: str | None) -> Mapping[str, str] | None:
+    """Names of an edited run's actors, which keep those of the recorded run; ``None`` for a recorded one."""
+    if not len(open_run(store, run, stage).edits):
+        return None
+    return name_actors(open_shown_scenes(store, run))
 
 
 def _place_view(request: ImageRequest, middle: Float64, frames: Float64, chunk_scene: ChunkScene) -> RolloutView:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from flows.simulation.edited_runs import write_edited_run
 from flows.simulation.run_scenes import RunScenes
 from flows.simulators.image_request import ActorPose, ImageRequest, RenderLimits
 from flows.simulators.render_queue import RenderQueue
@@ -22,6 +23,7 @@ from genre_tasks.rollout.rig import RolloutView
 from genre_tasks.scene.chunk import View
 from genre_tasks.scene.novel_poses import place_novel_views
 from genre_tasks.scene_edits.chunk_scene import ChunkScene
+from genre_tasks.scene_edits.edits import EditList, Move, Remove
 from storage.codecs.png import to_pixels
 
 Image = np.ndarray[Any, np.dtype[np.uint8]]
@@ -177,6 +179,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "backwards": ({"end_s": 0.0}, "readout of -"),
     "camera": ({"camera": "front_camer"}, "Did you mean 'front_camera'"),
     "actor": ({"actors": (ActorPose("lorry", np.eye(4), np.eye(4)),)}, "no actor 'lorry'"),
+    "actor's number": ({"actors": (ActorPose("3", np.eye(4), np.eye(4)),)}, "no actor '3'"),
     "twice": ({"actors": (ActorPose("car-0", np.eye(4), np.eye(4)),) * 2}, "twice"),
     "actor's pose": ({"actors": (ActorPose("car-0", pose_with((1, 1), np.nan), np.eye(4)),)}, "'car-0' at the start"),
     "many actors": ({"actors": (ActorPose("car-0", np.eye(4), np.eye(4)),) * 1001}, "1001 actors"),
@@ -199,6 +202,9 @@ def test_a_camera_far_away_or_too_many_images(renderer: SceneRenderer, served: t
         renderer.render(replace(sound, start_world_SE3_camera=away, end_world_SE3_camera=away))
     with pytest.raises(InputError, match="33 images"):
         renderer.render_batch([sound] * 33)
+    large = replace(sound, lens=sound.lens.resized(1920, 1280))
+    with pytest.raises(InputError, match="79 megapixels"):
+        renderer.render_batch([large] * 32)
     with pytest.raises(InputError, match="no camera"):
         renderer.ego_mask("rear")
 
@@ -255,3 +261,17 @@ def test_limits_are_the_services(served: tuple[str, str]) -> None:
     narrow = SceneRenderer(*served, limits=RenderLimits(max_width_px=32))
     with pytest.raises(InputError, match="1 × 1 to 32 ×"):
         narrow.render(request_at(narrow, served, 0, "front_camera"))
+
+
+def test_an_edited_run_keeps_the_names_of_the_recorded_one(served: tuple[str, str]) -> None:
+    store, run = served
+    edits = EditList(edits=(Remove(actor="car-1"), Move(actor="car-3", left_m=1.0)))
+    edited = SceneRenderer(store, write_edited_run(store, run, edits)["run"])
+    names = {actor.track_id: actor.name for actor in edited.actors()}
+    assert "car-1" not in names.values() and names["car-1"] == "car-2" and names["car-2"] == "car-3"
+    request = request_at(edited, served, 2, "front_camera")
+    box = request.start_world_SE3_camera @ pose_with((2, 3), 8.0)
+    edited.render(replace(request, actors=(ActorPose("car-3", box, box),)))
+    # The log's own car-0 is the removed car-1.
+    with pytest.raises(InputError, match="no actor 'car-0'"):
+        edited.render(replace(request, actors=(ActorPose("car-0", box, box),)))
