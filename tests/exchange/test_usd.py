@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from genre_tasks.errors import InputError
 from genre_tasks.exchange.activations import logits_to_opacities
 from genre_tasks.exchange.cloud_errors import CloudErrors, compare_clouds
+from genre_tasks.exchange.types import NodeMotion
 from genre_tasks.exchange.usd.format import USDZ
 from genre_tasks.exchange.usd.stage_dump import ARRAYS_FILE, STAGE_FILE, dump_stage
 from tests.exchange.format_suite import FormatSuite
@@ -145,6 +146,26 @@ def test_the_degree_is_written_also_where_it_is_0(tmp_path: Path) -> None:
     path = tmp_path / "plain.usda"
     USDZ.write(path, make_driving_scene(0))
     assert path.read_text().count("sphericalHarmonicsDegree = 0") == 4
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_moments_at_any_distance_keep_their_poses(tmp_path: Path, seed: int) -> None:
+    scene = make_driving_scene(moments=40)
+    random = np.random.default_rng(seed)
+    times = np.cumsum(random.uniform(0.01, 0.3, 40))
+    times -= times[0]
+    motions = [node.motion for node in scene.nodes]
+    assert motions[3] is not None
+    present = random.random(40) < 0.5
+    poses = np.where(present[:, None, None], motions[3].scene_SE3_node, np.eye(4))
+    walker = replace(scene.nodes[3], motion=NodeMotion(poses, present))
+    USDZ.write(tmp_path / "scene.usda", replace(scene, nodes=(*scene.nodes[:3], walker), times_s=times))
+    found = USDZ.read(tmp_path / "scene.usda")
+    np.testing.assert_array_equal(found.times_s, times)
+    for node, before in zip(found.nodes[2:], (motions[2], walker.motion), strict=True):
+        assert node.motion is not None and before is not None
+        np.testing.assert_array_equal(node.motion.present, before.present)
+        np.testing.assert_allclose(node.motion.scene_SE3_node[present], before.scene_SE3_node[present], atol=1e-9)
 
 
 def test_names_that_are_no_identifiers_are_kept_apart(tmp_path: Path) -> None:
@@ -418,3 +439,18 @@ def test_the_memory_of_the_process_is_limited() -> None:
     ]
     assert results[0].returncode == 1 and "MemoryError" in results[0].stderr
     assert results[1].returncode == 0
+
+
+def test_without_openusd_the_error_says_what_to_install() -> None:
+    code = """
+import sys
+from genre_tasks.errors import ConfigError
+from genre_tasks.exchange.registry import load_format
+sys.modules["pxr"] = None
+try:
+    load_format("usdz")
+except ConfigError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "needs the package pxr" in done.stdout and "pip install 'genre[usd]'" in done.stdout

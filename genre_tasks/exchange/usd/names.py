@@ -1,4 +1,4 @@
-"""Names of attributes, and of what GenRe adds to a stage in ``customData``."""
+"""Names of attributes and of what GenRe adds to a stage in ``customData``, and the stage's time codes."""
 
 from __future__ import annotations
 
@@ -42,3 +42,22 @@ CURRENT_VERSION = 1
 
 ROOT_PRIM = "Scene"
 GAUSSIANS_PRIM = "gaussians"
+
+_CODE_DIGITS = 9
+
+
+def to_time_code(time_s: float, rate: float) -> float:
+    """Gives the time code of a moment: the same one when a stage is written and when it is read.
+
+    Args:
+        time_s: seconds.
+        rate: time codes a second.
+
+    Returns:
+        Rounded to a billionth of a frame, so that frames at equal distances have whole numbers.
+
+    >>> to_time_code(0.1 + 0.2, 10.0)
+    3.0
+    """
+    # Visibility is held from one sample to the next: a code just before its sample would show the one before.
+    return round(time_s * rate, _CODE_DIGITS)

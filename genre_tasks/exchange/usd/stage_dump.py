@@ -33,7 +33,7 @@ _MAX_POSES = 2_000_000
 """Fields times moments: a file may state a moment for one field that all others get a place for."""
 
 _BASE_BYTES = 1 << 30
-_BYTES_PER_BYTE = 64
+_BYTES_PER_BYTE = 24
 """Text takes much more memory than its bytes while it is parsed."""
 
 
@@ -68,7 +68,8 @@ def dump_stage(layer: Path, folder: Path, file_bytes: int) -> None:
     is_ours = bool(root) and root.GetCustomDataByKey(names.VERSION) is not None
     ours = _read_data(root, names.SCENE_ENTRIES) if is_ours else {}
     rate = float(stage.GetTimeCodesPerSecond())
-    codes = [float(time) * rate for time in ours[names.TIMES_S]] if ours.get(names.TIMES_S) else _find_codes(prims)
+    times_s = ours.get(names.TIMES_S)
+    codes = [names.to_time_code(float(time), rate) for time in times_s] if times_s else _find_codes(prims)
     if len(prims) * len(codes) > _MAX_POSES:
         raise _damage(f"the file moves {len(prims)} nodes at {len(codes)} moments")
     budget = ReadBudget(file_bytes)

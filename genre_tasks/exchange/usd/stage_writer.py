@@ -24,8 +24,7 @@ _EXTENT_SIGMAS = 3.0
 _DEFAULT_RATE = 24.0
 """Time codes a second where nothing moves: OpenUSD's own default."""
 
-_CODE_DIGITS = 6
-"""Time codes are rounded to a millionth of a frame, so that frames at equal distances have whole numbers."""
+_RATE_DIGITS = 6
 
 
 def write_stage(path: Path, scene: ExchangeScene, file: Path) -> None:
@@ -67,8 +66,8 @@ def _set_times(stage: Any, times_s: Float64) -> list[float]:
     """Sets the stage's clock; the time code of each moment."""
     rate = _DEFAULT_RATE
     if len(times_s) > 1:
-        rate = round(float(1.0 / np.median(np.diff(times_s))), _CODE_DIGITS)
-    codes = [round(float(time) * rate, _CODE_DIGITS) for time in times_s]
+        rate = round(float(1.0 / np.median(np.diff(times_s))), _RATE_DIGITS)
+    codes = [names.to_time_code(float(time), rate) for time in times_s]
     stage.SetTimeCodesPerSecond(rate)
     stage.SetFramesPerSecond(rate)
     if codes:
