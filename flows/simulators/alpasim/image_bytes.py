@@ -1,18 +1,13 @@
-"""Encodes images as a request asks for it."""
+"""Image formats of the wire."""
 
 from __future__ import annotations
-
-import io
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flows.simulators.alpasim import sensorsim_pb2
+from flows.simulators.encoded_images import JPEG_QUALITY, encode_image
 from genre_tasks.errors import ConfigError, InputError
-from storage.codecs.png import encode_png
-
-DEFAULT_QUALITY = 95
-"""Of JPEG, where a request states none."""
 
 
 def check_format(image_format: int, quality: float) -> None:
@@ -35,25 +30,20 @@ def check_format(image_format: int, quality: float) -> None:
         raise InputError(f"the image quality {quality:g} is out of range", remedy="Send 1 to 100.")
 
 
-def encode_image(pixels: NDArray[np.uint8], image_format: int, quality: float) -> bytes:
-    """Encodes an image.
+def encode_pixels(pixels: NDArray[np.uint8], image_format: int, quality: float) -> bytes:
+    """Encodes an image as a request asks for it.
 
     Args:
         pixels: [H, W, 3] sRGB.
         image_format: a value that :func:`check_format` accepts.
-        quality: of JPEG, up to 100; 0: ``DEFAULT_QUALITY``.
+        quality: of JPEG, up to 100; 0: ``JPEG_QUALITY``.
 
     Returns:
         The bytes of a PNG or JPEG file.
 
-    >>> encode_image(np.zeros((2, 3, 3), np.uint8), sensorsim_pb2.JPEG, 0.0)[:3].hex()
+    >>> encode_pixels(np.zeros((2, 3, 3), np.uint8), sensorsim_pb2.JPEG, 0.0)[:3].hex()
     'ffd8ff'
     """
     if image_format == sensorsim_pb2.PNG:
-        return encode_png(pixels)
-    from PIL import Image
-
-    sink = io.BytesIO()
-    level = max(1, round(quality)) if quality else DEFAULT_QUALITY
-    Image.fromarray(np.ascontiguousarray(pixels)).save(sink, "JPEG", quality=level)
-    return sink.getvalue()
+        return encode_image(pixels, "png")
+    return encode_image(pixels, "jpeg", max(1, round(quality)) if quality else JPEG_QUALITY)

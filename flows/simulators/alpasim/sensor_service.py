@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.simulators.alpasim import common_pb2, sensorsim_pb2
-from flows.simulators.alpasim.image_bytes import check_format, encode_image
+from flows.simulators.alpasim.image_bytes import check_format, encode_pixels
 from flows.simulators.alpasim.image_requests import ReadImage, read_image_request
 from flows.simulators.alpasim.served_scene import ServedScene
 from flows.simulators.alpasim.timestamps import to_microseconds
@@ -210,7 +210,7 @@ class SensorService:
         if request.insert_ego_mask:
             mask = _resize_mask(self._find_mask(request), pixels.shape[0], pixels.shape[1])
             pixels = np.where(mask[..., None], np.uint8(_MASK_COLOR), pixels)
-        encoded = encode_image(pixels, request.image_format, request.image_quality)
+        encoded = encode_pixels(pixels, request.image_format, request.image_quality)
         return sensorsim_pb2.RGBRenderReturn(image_bytes=encoded)
 
     def _find_mask(self, request: sensorsim_pb2.RGBRenderRequest) -> NDArray[np.bool_]:
