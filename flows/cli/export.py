@@ -101,8 +101,9 @@ def _print_record(record: Mapping[str, Any], as_json: bool) -> None:
         print_outcome("done", record)
         return
     count = len(record["files"])
+    files = f"{count} {record['format']} {'file' if count == 1 else 'files'}"
     size = f"{record['bytes'] / 2**20:.1f} MiB"
-    typer.echo(f"wrote {record['out']}: {record['gaussians']} Gaussians, {count} {record['format']} files, {size}")
+    typer.echo(f"wrote {record['out']}: {record['gaussians']} Gaussians, {files}, {size}")
     if record["losses"]:
         typer.echo("not in the files:")
     for loss in record["losses"]:
