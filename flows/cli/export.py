@@ -20,7 +20,9 @@ SceneArgument = Annotated[
         "runs.",
     ),
 ]
-FormatOption = Annotated[str, typer.Option("--format", help="The format of the files: ply, splat, spz, glb or usdz.")]
+FormatOption = Annotated[
+    str, typer.Option("--format", help="The format of the files: ply, splat, spz, glb, usdz or alpasim.")
+]
 FolderOption = Annotated[
     Path, typer.Option(parser=parse_path, metavar="FOLDER", help="The folder to write. It is made if missing.")
 ]
@@ -60,6 +62,7 @@ def export(
         genre export 4b1c --format ply --out nodes
         genre export 4b1c --format ply --frame 12 --out moment
         genre export 4b1c --format spz --per-actor --out cars
+        genre export 4b1c --format alpasim --out bundle
     """
     from flows.cli.existing_store import open_existing_store
     from flows.cli.outcome import add_facts

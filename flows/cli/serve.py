@@ -23,7 +23,7 @@ _MAX_PORT = 65535
 
 def serve(
     runs: Annotated[list[str], typer.Argument(metavar="RUN", help="Names of finished runs, or the starts of them.")],
-    protocol: Annotated[str, typer.Option(help="How the simulator asks: neuroncap.")] = "neuroncap",
+    protocol: Annotated[str, typer.Option(help="How the simulator asks: neuroncap or alpasim.")] = "neuroncap",
     host: Annotated[
         str, typer.Option(help="Address to listen at. By default only this machine reaches it.")
     ] = "127.0.0.1",

@@ -12,7 +12,9 @@ from genre_tasks.exchange.registry import known_formats, load_format
 from genre_tasks.suggestions import did_you_mean
 
 # Name of a format → "module:constant", a ``SceneExporter``. Formats of single files need no line here.
-_FOLDER_EXPORTERS: dict[str, str] = {}
+_FOLDER_EXPORTERS: dict[str, str] = {
+    "alpasim": "flows.simulators.alpasim.exporter:ALPASIM",
+}
 
 _READ_ONLY = ("compressed.ply",)
 

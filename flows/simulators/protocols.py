@@ -23,6 +23,7 @@ class ProtocolEntry(NamedTuple):
 
 
 _PROTOCOLS: dict[str, ProtocolEntry] = {
+    "alpasim": ProtocolEntry("flows.simulators.alpasim.start:start_alpasim", 50051),
     "neuroncap": ProtocolEntry("flows.simulators.neuroncap:start_neuroncap", 8000),
 }
 

@@ -113,6 +113,11 @@ class SceneRenderer:
         self.time_range_s: tuple[float, float] = self._facts.clock.range_s
 
     @property
+    def scenes(self) -> RunScenes:
+        """The scenes of the run, for what else a protocol has to know of it."""
+        return self._scenes
+
+    @property
     def queue_length(self) -> int:
         """Calls that are rendered or wait."""
         return self._queue.length
