@@ -1,0 +1,79 @@
+"""Writes the report of a run: one HTML file with its pictures in it, readable without torch and without Prefect."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from flows.reconstruction.report.chunk_section import STAGE_LABELS, ChunkPage, build_chunk_page
+from flows.reconstruction.report.metric_table import SCORED_STAGES
+from flows.reconstruction.run_summary import RunSummary
+from genre_tasks.atomic_path import atomic_path
+
+SCENE_FILE = "scene.html"
+"""The scene for a browser; the report links to it where it lies in the same folder."""
+
+
+def write_report(path: Path, run: RunSummary) -> Path:
+    """Writes the report of a run as one HTML file that appears whole or not at all.
+
+    Args:
+        path: the file to write; its folder is made if it does not exist.
+        run: what the report shows.
+
+    Returns:
+        ``path``.
+
+    Raises:
+        OSError: the file cannot be written.
+
+    Example::
+
+        write_report(Path("report.html"), summarise_run(run))
+    """
+    pages = [build_chunk_page(chunk) for chunk in run.chunks]
+    html = render_page(
+        "report.html.jinja",
+        run=run,
+        chunks=pages,
+        columns=[STAGE_LABELS[stage] for stage in SCORED_STAGES],
+        scene_file=SCENE_FILE if (path.parent / SCENE_FILE).is_file() else "",
+        scale=_error_scale(pages),
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as part:
+        part.write_text(html, encoding="utf-8")
+    return path
+
+
+def render_page(template: str, **values: object) -> str:
+    """Fills a template of this folder; everything is in the one page, so that it can be mailed.
+
+    Args:
+        template: the file's name.
+        values: what it shows.
+
+    Returns:
+        The page.
+    """
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        # The templates are in this folder, also in an installed package.
+        loader=FileSystemLoader(Path(__file__).parent),
+        # Names of logs and messages may hold any character.
+        autoescape=True,
+        # A field that was renamed here and not in the template fails, instead of showing nothing.
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(**values)
+
+
+def _error_scale(pages: list[ChunkPage]) -> str:
+    """The colours of the maps as stops of a gradient; empty where no picture has a truth."""
+    if not any(page.has_errors for page in pages):
+        return ""
+    from flows.reconstruction.report.error_maps import describe_scale
+
+    return describe_scale()
