@@ -285,3 +285,20 @@ def find_run_record(store: str, run: str) -> dict[str, Any]:
         problem = f"{len(found)} runs of this store begin with '{run}'"
         raise InputError(problem, remedy="`genre show runs` lists them.", file=store)
     return found[0]
+
+
+def find_run_folder(store: str, run: str) -> Path:
+    """Finds the folder of a finished run's record and report.
+
+    Args:
+        store: folder (or URI) of the store.
+        run: the run's name, or the start of it.
+
+    Returns:
+        The folder.
+
+    Raises:
+        InputError: no run, or more than one, begins so.
+    """
+    name: str = find_run_record(store, run)["run"]
+    return open_store(store).root / _FOLDER / name

@@ -77,7 +77,8 @@ class ChunkPage:
 
     Attributes:
         number: number of the chunk.
-        facts: (name, value) of what was reconstructed.
+        log_facts: (name, value) of what was reconstructed.
+        scene_facts: the same of the last scene.
         warnings: sentences for the user.
         headline: (label, value, comparison) of the few numbers that come first.
         viewpoints: pictures, with errors where there is a truth.
@@ -97,7 +98,8 @@ class ChunkPage:
     """
 
     number: int
-    facts: list[tuple[str, str]]
+    log_facts: list[tuple[str, str]]
+    scene_facts: list[tuple[str, str]]
     warnings: tuple[str, ...]
     headline: list[tuple[str, str, str]]
     viewpoints: list[Viewpoint]
@@ -142,7 +144,8 @@ def build_chunk_page(chunk: ChunkSummary) -> ChunkPage:
     found = chunk.reliable_range
     return ChunkPage(
         number=chunk.chunk,
-        facts=_list_facts(chunk),
+        log_facts=_format_facts(_contents(chunk, "ingest")),
+        scene_facts=_list_scene_facts(chunk),
         warnings=(*chunk.warnings, *stage_warnings),
         headline=build_headline(chunk),
         viewpoints=build_viewpoints(chunk),
@@ -166,16 +169,15 @@ def _stage_label(stage: StageSummary) -> str:
     return STAGE_LABELS.get(stage.stage, stage.stage)
 
 
-def _list_facts(chunk: ChunkSummary) -> list[tuple[str, str]]:
-    """What went in, and what came out of the last stage that made a scene."""
-    facts = _format_facts(_contents(chunk, "ingest"))
+def _list_scene_facts(chunk: ChunkSummary) -> list[tuple[str, str]]:
+    """Of the last stage that made a scene."""
     last = next((name for name in _SCENE_STAGES if _contents(chunk, name)), None)
     if last is None:
-        return facts
+        return []
     scene = _contents(chunk, last)
     shown = {f"{name} after {STAGE_LABELS[last]}" if name == "Gaussians" else name: v for name, v in scene.items()}
-    # The scene has the actors of the log, which were counted already.
-    return facts + _format_facts({n: v for n, v in shown.items() if n not in ("actors", "iterations", "snapshots")})
+    # The scene has the actors of the log, which are among the log's facts; the other two are of the stage.
+    return _format_facts({n: v for n, v in shown.items() if n not in ("actors", "iterations", "snapshots")})
 
 
 def _contents(chunk: ChunkSummary, name: str) -> Mapping[str, Any]:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-MAX_ERROR = 0.25
+MAX_ERROR = 0.2
 """End of the scale, as a fraction of full brightness. It is the same for all maps, so that they can be compared."""
 
 _LEVELS = 64

@@ -88,7 +88,7 @@ def plot_range_curve(found: RangeSummary) -> RangePlot | None:
         points=points,
         band=(place_x(found.left_m), place_x(-found.right_m)),
         limit_y=place_y(found.limit_db),
-        x=tuple((place_x(shift), f"{shift:g}") for shift in ticks_x),
+        x=tuple((place_x(shift), f"{shift:g}".replace("-", "−")) for shift in ticks_x),
         y=tuple((place_y(db), f"{db:g}") for db in ticks_y),
     )
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from flows.reconstruction.report.chunk_section import STAGE_LABELS, ChunkPage, build_chunk_page
+from flows.reconstruction.report.error_maps import MAX_ERROR
 from flows.reconstruction.report.metric_table import SCORED_STAGES
 from flows.reconstruction.run_summary import RunSummary
 from genre_tasks.atomic_path import atomic_path
@@ -37,7 +39,9 @@ def write_report(path: Path, run: RunSummary) -> Path:
         chunks=pages,
         columns=[STAGE_LABELS[stage] for stage in SCORED_STAGES],
         scene_file=SCENE_FILE if (path.parent / SCENE_FILE).is_file() else "",
+        environment=describe_environment(run.environment),
         scale=_error_scale(pages),
+        max_error=f"{MAX_ERROR:g}",
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as part:
@@ -68,6 +72,22 @@ def render_page(template: str, **values: object) -> str:
         lstrip_blocks=True,
     )
     return environment.get_template(template).render(**values)
+
+
+def describe_environment(environment: Mapping[str, str]) -> str:
+    """Writes versions and machine on one line.
+
+    Args:
+        environment: as manifests have it.
+
+    Returns:
+        Versions and machine, separated by commas; empty where nothing is known.
+
+    >>> describe_environment({"genre": "0.2.0", "platform": "Linux", "threads": "2"})
+    'genre 0.2.0, Linux, threads 2'
+    """
+    # A platform says what it is by itself.
+    return ", ".join(value if name == "platform" else f"{name} {value}" for name, value in environment.items())
 
 
 def _error_scale(pages: list[ChunkPage]) -> str:
