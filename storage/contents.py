@@ -1,4 +1,4 @@
-"""What an artifact holds, in a few counts that a reader wants first; only tables' headers and short columns are read."""
+"""What an artifact holds, in a few counts that a reader wants first; of tables only short columns are read."""
 
 from __future__ import annotations
 

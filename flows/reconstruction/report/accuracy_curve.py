@@ -115,5 +115,7 @@ def _describe(lines: list[tuple[str, list[tuple[float, float]]]]) -> str:
     parts = []
     for name, line in lines:
         (start_s, start_db), (end_s, end_db) = line[0], line[-1]
-        parts.append(f"{LABELS[name]} from {start_db:.2f} dB after {start_s:.1f} s to {end_db:.2f} dB after {end_s:.1f} s")
+        parts.append(
+            f"{LABELS[name]} from {start_db:.2f} dB after {start_s:.1f} s to {end_db:.2f} dB after {end_s:.1f} s"
+        )
     return "Held-out PSNR against seconds of iterations: " + "; ".join(parts)

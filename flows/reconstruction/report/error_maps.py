@@ -71,13 +71,23 @@ def compare_pixels(pixels: NDArray[np.uint8], other: NDArray[np.uint8]) -> Error
     Returns:
         The map of the mean absolute difference of the channels.
     """
-    import numpy as np
-
-    difference = np.abs(pixels.astype(np.float64) - other.astype(np.float64)) / 255
+    difference = _difference(pixels, other)
     mean_square = float((difference**2).mean())
     psnr = math.inf if mean_square == 0 else -10 * math.log10(mean_square)
-    levels = np.clip(difference.mean(2) / MAX_ERROR * (_LEVELS - 1), 0, _LEVELS - 1).round().astype(np.uint8)
-    return ErrorMap(embed_map(levels, error_palette()), float(difference.mean()), psnr)
+    return ErrorMap(embed_map(_choose_levels(difference), error_palette()), float(difference.mean()), psnr)
+
+
+def color_errors(pixels: NDArray[np.uint8], other: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Draws the same map as an image.
+
+    Args:
+        pixels: [H, W, 3] sRGB.
+        other: [H, W, 3] sRGB.
+
+    Returns:
+        [H, W, 3] sRGB in the colours of the scale.
+    """
+    return error_palette()[_choose_levels(_difference(pixels, other))]
 
 
 @cache
@@ -108,3 +118,17 @@ def describe_scale(stops: int = 9) -> str:
     palette = error_palette()
     rows = [round(k * (len(palette) - 1) / (stops - 1)) for k in range(stops)]
     return ", ".join("#" + bytes(palette[row]).hex() for row in rows)
+
+
+def _difference(pixels: NDArray[np.uint8], other: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """[H, W, 3] in [0, 1]."""
+    import numpy as np
+
+    return np.abs(pixels.astype(np.float64) - other.astype(np.float64)) / 255
+
+
+def _choose_levels(difference: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """[H, W] row of the palette."""
+    import numpy as np
+
+    return np.clip(difference.mean(2) / MAX_ERROR * (_LEVELS - 1), 0, _LEVELS - 1).round().astype(np.uint8)

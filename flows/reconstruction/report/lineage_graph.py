@@ -108,7 +108,12 @@ def draw_lineage(stages: Sequence[StageSummary]) -> LineageGraph | None:
     rows = {name: int(name.startswith(_EVALUATE)) for name in known}
     corners = {n: (_MARGIN + columns[n] * _STEP_X, _MARGIN + rows[n] * _STEP_Y) for n in known}
     boxes = tuple(
-        (*corners[name], *_BOX, name.removeprefix(_EVALUATE) if not rows[name] else "evaluation", f"{name} {s.key[:12]}")
+        (
+            *corners[name],
+            *_BOX,
+            name.removeprefix(_EVALUATE) if not rows[name] else "evaluation",
+            f"{name} {s.key[:12]}",
+        )
         for name, s in known.items()
     )
     edges = tuple(_draw_edge(corners[i], corners[name]) for name in known for i in nearest[name])

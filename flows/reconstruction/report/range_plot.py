@@ -79,7 +79,12 @@ def plot_range_curve(found: RangeSummary) -> RangePlot | None:
         return round(_BOTTOM - (db - ticks_y[0]) / (ticks_y[-1] - ticks_y[0]) * (_BOTTOM - _TOP), 1)
 
     points = tuple(
-        (place_x(shift), place_y(db), f"{_name_shift(shift)}: {db:.1f} dB, {'holds' if holds else 'does not hold'}", holds)
+        (
+            place_x(shift),
+            place_y(db),
+            f"{_name_shift(shift)}: {db:.1f} dB, {'holds' if holds else 'does not hold'}",
+            holds,
+        )
         for shift, db, holds in found.points
     )
     return RangePlot(
