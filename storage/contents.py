@@ -12,10 +12,12 @@ from genre_tasks.errors import ArtifactCorruptError
 from storage.codecs.tables import REMEDY
 
 if TYPE_CHECKING:
+    import pyarrow as pa
     from numpy.typing import NDArray
 
     from storage.store import Artifact
 
+_SHORT_TABLES = {"evaluation": "metrics.parquet", "effects": "effects.parquet", "rollout_scores": "metrics.parquet"}
 _STATIC = 0
 _DISTANT = 1
 
@@ -34,6 +36,25 @@ def summarise_contents(artifact: Artifact) -> dict[str, Any]:
     """
     count = _COUNTING_FUNCTIONS.get(artifact.manifest.kind)
     return {} if count is None else count(artifact.path)
+
+
+def read_short_table(artifact: Artifact) -> list[dict[str, Any]]:
+    """Reads the table that is the result itself: metrics of an evaluation, decisions of a plan.
+
+    Args:
+        artifact: of any kind; its files are not verified.
+
+    Returns:
+        Its rows, with empty texts for what is not there; none for a kind whose tables are long.
+
+    Raises:
+        ArtifactCorruptError: the table is missing or damaged.
+    """
+    name = _SHORT_TABLES.get(artifact.manifest.kind)
+    if name is None:
+        return []
+    table = _read_table(artifact.path / name)
+    return [{key: "" if value is None else value for key, value in row.items()} for row in table.to_pylist()]
 
 
 def count_nodes(nodes: NDArray[np.int64]) -> dict[str, int]:
@@ -80,14 +101,23 @@ def read_columns(path: Path, names: list[str]) -> dict[str, NDArray[Any]]:
     Raises:
         ArtifactCorruptError: the file is missing or damaged, or lacks a column.
     """
+    table = _read_table(path, names)
+    return {name: table.column(name).to_numpy() for name in names}
+
+
+def _read_table(path: Path, names: list[str] | None = None) -> pa.Table:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
         table = pq.read_table(path, columns=names, use_threads=False)
-        return {name: table.column(name).to_numpy() for name in names}
-    except (OSError, KeyError, pa.ArrowException) as error:
+    except (OSError, pa.ArrowException) as error:
         raise ArtifactCorruptError(f"The table does not decode ({error})", remedy=REMEDY, file=path) from error
+    for name in names or ():
+        # Arrow leaves out a column that the file does not have.
+        if name not in table.column_names:
+            raise ArtifactCorruptError(f"Column {name!r} is missing", remedy=REMEDY, file=path)
+    return table
 
 
 def _count_rows(path: Path) -> int:

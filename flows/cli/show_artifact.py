@@ -21,7 +21,7 @@ def print_artifact(store: LocalStore, artifact: Artifact) -> None:
         ArtifactCorruptError: a file is missing or damaged.
     """
     from flows.cli.printing import print_fields, print_rows
-    from storage.contents import summarise_contents
+    from storage.contents import read_short_table, summarise_contents
     from storage.lineage import find_ancestors, summarise_files
 
     # Before anything is printed: tables of a damaged artifact would show the damage as if it were the result.
@@ -30,6 +30,9 @@ def print_artifact(store: LocalStore, artifact: Artifact) -> None:
     contents = summarise_contents(artifact)
     if contents:
         print_fields("contents", contents)
+    rows = read_short_table(artifact)
+    if rows:
+        print_rows(artifact.manifest.kind, rows)
     print_rows("files", [file.model_dump() for file in artifact.manifest.files])
     for table in tables:
         print_rows(table.name, _leave_out_empty(table.rows))

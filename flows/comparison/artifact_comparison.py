@@ -89,7 +89,7 @@ def _add_contents(comparison: Comparison, a: Artifact, b: Artifact) -> None:
     if a.manifest.log != b.manifest.log or a.manifest.chunk != b.manifest.chunk:
         comparison.notes.append("The artifacts are of different chunks, so no images are compared.")
         return
-    comparison.pairs += pair_pictures(a, b, prefix="")
+    comparison.pairs += pair_pictures(a, b)
 
 
 def _name(artifact: Artifact) -> str:

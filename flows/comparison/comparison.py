@@ -17,7 +17,7 @@ class PicturePair:
     """The same viewpoint in both.
 
     Attributes:
-        name: fit for a file's name, such as ``chunk-0-enet-3m_left_front_camera_04``.
+        name: fit for a file's name, such as ``chunk-0-after-enet-3m_left_front_camera_04``.
         label: what it shows, for readers.
         a: [H, W, 3] sRGB uint8 of the first.
         b: [H, W, 3] of the second.

@@ -107,7 +107,7 @@ def _build_view(pair: PicturePair) -> _View:
         layers.append(_Layer("Truth", _embed(pair.truth)))
         layers.append(_error_layer("Error of A", pair.a, pair.truth))
         layers.append(_error_layer("Error of B", pair.b, pair.truth))
-    return _View(f"{pair.name.partition('m_')[0].rpartition('-')[0] or 'images'} · {pair.label}", layers)
+    return _View(pair.label[:1].upper() + pair.label[1:], layers)
 
 
 def _error_layer(label: str, one: NDArray[np.uint8], other: NDArray[np.uint8]) -> _Layer:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,13 +21,13 @@ MOST_PAIRS = 12
 """Of many views so many are compared, at equal distances."""
 
 
-def pair_pictures(a: Artifact, b: Artifact, prefix: str) -> list[PicturePair]:
+def pair_pictures(a: Artifact, b: Artifact, heading: str = "") -> list[PicturePair]:
     """Pairs the images of two artifacts of one kind by viewpoint.
 
     Args:
         a: an evaluation, novel views or fixed views.
         b: the same kind; its payload is verified, as is that of ``a``.
-        prefix: how the names of the pairs begin.
+        heading: how the labels of the pairs begin, such as ``chunk 0 after enet``; their names begin so, too.
 
     Returns:
         The pairs of equal size, at most :data:`MOST_PAIRS`; empty for kinds without images.
@@ -36,10 +37,16 @@ def pair_pictures(a: Artifact, b: Artifact, prefix: str) -> list[PicturePair]:
     """
     list_pairs = {"evaluation": _pair_evaluation, "novel_views": _pair_views, "fixed_views": _pair_views}
     pairs = list_pairs.get(a.manifest.kind)
-    return [] if pairs is None else [pair for pair in pairs(a, b, prefix) if pair.a.shape == pair.b.shape]
+    if pairs is None:
+        return []
+    found = [pair for pair in pairs(a, b) if pair.a.shape == pair.b.shape]
+    if not heading:
+        return found
+    slug = heading.replace(" ", "-")
+    return [replace(pair, name=f"{slug}-{pair.name}", label=f"{heading} · {pair.label}") for pair in found]
 
 
-def _pair_evaluation(a: Artifact, b: Artifact, prefix: str) -> Iterator[PicturePair]:
+def _pair_evaluation(a: Artifact, b: Artifact) -> Iterator[PicturePair]:
     from storage.codecs.png import read_png
 
     folders = (a.path / "pictures", b.path / "pictures")
@@ -47,7 +54,7 @@ def _pair_evaluation(a: Artifact, b: Artifact, prefix: str) -> Iterator[PictureP
     for name in sorted(name for name in names[0] & names[1] if not name.endswith(_TRUTH))[:MOST_PAIRS]:
         truth = folders[0] / f"{name}{_TRUTH}.png"
         yield PicturePair(
-            name=f"{prefix}{name}",
+            name=name,
             label=describe_viewpoint(name),
             a=read_png(folders[0] / f"{name}.png"),
             b=read_png(folders[1] / f"{name}.png"),
@@ -55,7 +62,7 @@ def _pair_evaluation(a: Artifact, b: Artifact, prefix: str) -> Iterator[PictureP
         )
 
 
-def _pair_views(a: Artifact, b: Artifact, prefix: str) -> Iterator[PicturePair]:
+def _pair_views(a: Artifact, b: Artifact) -> Iterator[PicturePair]:
     from flows.plots.artifact_pictures import spread_indices
 
     files_a = _view_files(a)
@@ -64,7 +71,7 @@ def _pair_views(a: Artifact, b: Artifact, prefix: str) -> Iterator[PicturePair]:
     for index in spread_indices(len(common), MOST_PAIRS):
         camera, frame, shift_m = common[index]
         yield PicturePair(
-            name=f"{prefix}{camera}_{frame:04d}_{shift_m:+.2f}m",
+            name=f"{camera}_{frame:04d}_{shift_m:+.2f}m",
             label=f"{abs(shift_m):g} m to the {'left' if shift_m > 0 else 'right'} · {camera.replace('_', ' ')}"
             f" · frame {frame}",
             a=_read_view(a, *files_a[common[index]]),

@@ -129,9 +129,15 @@ def _add_means(comparison: Comparison, a: RunSide, b: RunSide, chunks: Sequence[
 def _add_chunk(comparison: Comparison, a: RunSide, b: RunSide, number: int) -> None:
     stages = dict.fromkeys([*a.stages(number), *b.stages(number)])
     comparison.add_table(f"chunk {number} stages", [_stage_row(a, b, number, stage) for stage in stages])
+    equal = []
     for stage in stages:
-        rows = compare_scores(_find_scores(a, number, stage), _find_scores(b, number, stage))
-        comparison.add_table(f"chunk {number} metrics after {stage}", rows)
+        scores = (_find_scores(a, number, stage), _find_scores(b, number, stage))
+        if scores[0] == scores[1]:
+            equal += [stage] if scores[0] else []
+            continue
+        comparison.add_table(f"chunk {number} metrics after {stage}", compare_scores(*scores))
+    if equal:
+        comparison.notes.append(f"Chunk {number} has the same metrics in both after {', '.join(equal)}.")
     scenes = [(stage, a.find(number, stage), b.find(number, stage)) for stage in SCENE_STAGES]
     for stage, one, other in reversed(scenes):
         if one is not None and other is not None:
@@ -145,8 +151,7 @@ def _add_chunk(comparison: Comparison, a: RunSide, b: RunSide, number: int) -> N
         if one is None or other is None or one.manifest.payload_digest == other.manifest.payload_digest:
             continue
         _verify((a, one), (b, other))
-        name = stage.removeprefix(_EVALUATE)
-        comparison.pairs += pair_pictures(one, other, prefix=f"chunk-{number}-{name}-")
+        comparison.pairs += pair_pictures(one, other, f"chunk {number} after {stage.removeprefix(_EVALUATE)}")
 
 
 def _verify(*found: tuple[RunSide, Artifact]) -> None:

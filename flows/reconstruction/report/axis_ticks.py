@@ -16,7 +16,7 @@ def round_ticks(low: float, high: float) -> list[float]:
         Ascending numbers at equal distances, the first at most ``low`` and the last at least ``high``.
 
     >>> round_ticks(17.1, 24.1)
-    [16.0, 18.0, 20.0, 22.0, 24.0, 26.0]
+    [16, 18, 20, 22, 24, 26]
     """
     # A flat curve would otherwise have ticks at a distance of 0.
     span = max(high - low, 1e-3)
