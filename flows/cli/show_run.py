@@ -86,7 +86,7 @@ def _print_overview(chunks: Sequence[Mapping[str, Any]]) -> None:
         {"stage": name, "metrics": _mean_metrics([_find_metrics(chunk, name) for chunk in chunks])}
         for name in dict.fromkeys(stage["stage"] for chunk in chunks for stage in chunk["stages"])
     ]
-    print_rows(f"metrics, means over {len(chunks)} chunks", tabulate_metrics(means))
+    print_rows(f"means of {len(chunks)} chunks", tabulate_metrics(means))
     print_rows("chunks", [_chunk_row(chunk) for chunk in chunks])
 
 

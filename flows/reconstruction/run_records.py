@@ -27,7 +27,6 @@ from flows.reconstruction.run_summary import (
 from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import InputError
 from storage.address import Address
-from storage.contents import summarise_contents
 from storage.local import open_store
 
 if TYPE_CHECKING:
@@ -208,6 +207,9 @@ def _summarise_chunk(run: FinishedRun, chunk: int, refs: dict[str, ArtifactRef])
 
 
 def _summarise_stage(artifact: Artifact, cached: bool, evaluation: Evaluation | None) -> StageSummary:
+    # Here, as it imports NumPy and Arrow, which reading a record does not need.
+    from storage.contents import summarise_contents
+
     manifest = artifact.manifest
     summary = StageSummary(
         stage=manifest.stage,
