@@ -14,6 +14,7 @@ from flows.defaults import DEFAULT_STORE
 
 if TYPE_CHECKING:
     from genre_tasks.config import RangeConfig
+    from genre_tasks.reliability.detector import Detector
     from genre_tasks.reliability.reliable_range import CurvePoint
 
 DetectorOption = Annotated[
@@ -77,12 +78,7 @@ def range_command(
     config = _range_config(max_drop_db, every)
     check_number(max_drop_db, "--max-drop-db", 0, 100)
     open_existing_store(store)
-    # Without a detector the other guards decide alone.
-    network = None
-    if detector is not None:
-        from genre_tasks.reliability.detector import Detector
-
-        network = Detector.load(detector)
+    network = _load_detector(detector)
     number, ingested = read_stage_value(store, run, chunk, "ingest")
     scene_stage = find_last_stage(store, run, number) if stage is None else stage
     _, plan = read_stage_value(store, run, number, "effects")
@@ -102,6 +98,15 @@ def range_command(
         psnr_by_distance = median_psnr_by_distance(measure_seam((ingested, scene), following))
         values = ", ".join(f"{db:.1f} dB at {distance:g} m" for distance, db in psnr_by_distance.items())
         typer.echo(f"seam to chunk {number + 1}, the same view from both scenes without actors: {values}")
+
+
+def _load_detector(path: Path | None) -> Detector | None:
+    # Without a detector the other guards decide alone.
+    if path is None:
+        return None
+    from genre_tasks.reliability.detector import Detector
+
+    return Detector.load(path)
 
 
 def _rewrite_report(store: str, run: str) -> list[str]:

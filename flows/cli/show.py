@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,33 +15,33 @@ from flows.defaults import DEFAULT_PRESET, DEFAULT_STORE
 if TYPE_CHECKING:
     from storage.local import LocalStore
 
+WhatArgument = Annotated[
+    str,
+    typer.Argument(
+        help="runs for all finished runs, stages for all artifacts, config for a preset's configuration, actors for a "
+        "run's actors, the name of a run, the key of an artifact, or the path of a folder that `genre simulate` wrote. "
+        "The first characters of a name or a key are enough."
+    ),
+]
+PictureOption = Annotated[
+    Path | None,
+    typer.Option(
+        parser=parse_path,
+        metavar="PATH",
+        help="Write the artifact's picture to this PNG file, over an existing one, or the pictures of all actors. "
+        "`what` must be a key, or actors.",
+    ),
+]
 _LISTS = ("runs", "stages", "config", "actors")
 
 
 def show(
-    what: Annotated[
-        str,
-        typer.Argument(
-            help="runs for all finished runs, stages for all artifacts, config for a preset's configuration, actors "
-            "for a run's actors, the name of a run, the key of an artifact, or a folder that `genre simulate` wrote. "
-            "The first characters of a name or a key are enough."
-        ),
-    ] = "runs",
+    what: WhatArgument = "runs",
     run: Annotated[str | None, typer.Argument(help="The run whose actors are shown.")] = None,
     store: StoreOption = DEFAULT_STORE,
     preset: PresetOption = DEFAULT_PRESET,
-    chunk: Annotated[
-        int | None, typer.Option(help="The chunk of a run that is shown. All chunks if not given.")
-    ] = None,
-    picture: Annotated[
-        Path | None,
-        typer.Option(
-            parser=parse_path,
-            metavar="PATH",
-            help="Write the artifact's picture to this PNG file, over an existing one, or the pictures of all actors. "
-            "`what` must be a key, or actors.",
-        ),
-    ] = None,
+    chunk: Annotated[int | None, typer.Option(help="The chunk of a run. All chunks if not given.")] = None,
+    picture: PictureOption = None,
 ) -> None:
     """Show what a store holds: runs, stages, one run or one artifact.
 
@@ -62,7 +63,7 @@ def show(
     from flows.cli.printing import print_fields, print_rows
 
     _check_options(what, run, picture)
-    if Path(what).is_dir() and what not in _LISTS:
+    if _is_folder(what):
         _show_folder(Path(what), picture)
         return
     if what == "config":
@@ -116,6 +117,13 @@ def _show_run_or_artifact(name: str, opened: LocalStore, chunk: int | None, pict
     print_artifact(opened, found)
     if picture is not None:
         typer.echo(f"wrote {picture}")
+
+
+def _is_folder(what: str) -> bool:
+    """A folder with a manifest, or any other that is written as a path: a key may be a folder's name, too."""
+    # Not by Path, which raises an error for a name that is too long for the file system.
+    has_manifest = bool(what) and what not in _LISTS and os.path.isfile(os.path.join(what, "manifest.json"))
+    return has_manifest or ("/" in what and os.path.isdir(what))
 
 
 def _show_folder(folder: Path, picture: Path | None) -> None:
