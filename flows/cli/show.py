@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -121,9 +121,11 @@ def _show_run_or_artifact(name: str, opened: LocalStore, chunk: int | None, pict
 
 def _is_folder(what: str) -> bool:
     """A folder with a manifest, or any other that is written as a path: a key may be a folder's name, too."""
-    # Not by Path, which raises an error for a name that is too long for the file system.
-    has_manifest = bool(what) and what not in _LISTS and os.path.isfile(os.path.join(what, "manifest.json"))
-    return has_manifest or ("/" in what and os.path.isdir(what))
+    # A name may be too long for the file system, which is then no folder.
+    with contextlib.suppress(OSError):
+        has_manifest = bool(what) and what not in _LISTS and (Path(what) / "manifest.json").is_file()
+        return has_manifest or ("/" in what and Path(what).is_dir())
+    return False
 
 
 def _show_folder(folder: Path, picture: Path | None) -> None:
