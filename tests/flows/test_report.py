@@ -111,6 +111,7 @@ def test_writes_one_self_contained_page(tmp_path: Path) -> None:
         "a/store",
         "0123456789ab",
         "Chunk 3",
+        "Chunk 3 24.00 dB 23.80 dB",
         "gnet.iterations = 8",
         "frame 28 <has> no sweep & none follows",
         "4 of 12",

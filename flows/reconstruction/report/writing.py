@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from flows.reconstruction.report.chunk_section import STAGE_LABELS, ChunkPage, build_chunk_page
@@ -39,6 +39,7 @@ def write_report(path: Path, run: RunSummary) -> Path:
         chunks=pages,
         columns=[STAGE_LABELS[stage] for stage in SCORED_STAGES],
         scene_file=SCENE_FILE if (path.parent / SCENE_FILE).is_file() else "",
+        overview=build_overview(pages),
         environment=describe_environment(run.environment),
         scale=_error_scale(pages),
         max_error=f"{MAX_ERROR:g}",
@@ -72,6 +73,23 @@ def render_page(template: str, **values: object) -> str:
         lstrip_blocks=True,
     )
     return environment.get_template(template).render(**values)
+
+
+def build_overview(pages: Sequence[ChunkPage]) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Arranges the headline numbers of all chunks in one table.
+
+    Args:
+        pages: of the chunks.
+
+    Returns:
+        The headings, and for each chunk its number and a value for each heading; empty where it was not measured.
+    """
+    headings = list(dict.fromkeys(label for page in pages for label, _, _ in page.headline))
+    rows = []
+    for page in pages:
+        values = {label: value for label, value, _ in page.headline}
+        rows.append((page.number, [values.get(heading, "") for heading in headings]))
+    return headings, rows
 
 
 def describe_environment(environment: Mapping[str, str]) -> str:
