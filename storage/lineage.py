@@ -13,7 +13,10 @@ from numpy.typing import NDArray
 
 from genre_tasks.errors import ArtifactCorruptError
 from storage.codecs.tables import REMEDY
+from storage.histograms import draw_histogram
 from storage.store import Artifact, Store
+
+_PIXELS_PER_IMAGE = 4096
 
 
 @dataclass(frozen=True)
@@ -86,7 +89,8 @@ def _summarise_table(folder: Path, path: Path) -> TableSummary:
     for field in table.schema:
         note = (field.metadata or {}).get(b"note", b"").decode()
         values = table.column(field.name)
-        row = {"column": field.name, "type": str(field.type), "min": "", "mean": "", "max": "", "note": note}
+        row = {"column": field.name, "type": str(field.type), "min": "", "mean": "", "max": "", "histogram": ""}
+        row["note"] = note
         rows.append(row | _column_statistics(field.type, values))
     return TableSummary(f"{path.relative_to(folder).as_posix()}: {table.num_rows} rows", rows)
 
@@ -111,11 +115,13 @@ def _statistics(values: NDArray[Any]) -> dict[str, Any]:
     # In double precision, since the mean of a million float32 values would lose digits.
     wide = values.astype(np.float64)
     out = {"min": float(wide.min()), "mean": float(wide.mean()), "max": float(wide.max())}
-    return {k: int(v) if values.dtype.kind in "iu" and k != "mean" and math.isfinite(v) else v for k, v in out.items()}
+    out = {k: int(v) if values.dtype.kind in "iu" and k != "mean" and math.isfinite(v) else v for k, v in out.items()}
+    return {**out, "histogram": draw_histogram(wide)}
 
 
 def _summarise_exr(folder: Path, paths: list[Path]) -> TableSummary:
     by_channel: dict[str, dict[str, Any]] = {}
+    samples: dict[str, list[NDArray[np.float64]]] = {}
     for path in paths:
         for name, pixels in _read_channels(path):
             row = by_channel.setdefault(
@@ -126,6 +132,7 @@ def _summarise_exr(folder: Path, paths: list[Path]) -> TableSummary:
                     "min": math.inf,
                     "mean": 0.0,
                     "max": -math.inf,
+                    "histogram": "",
                     "note": "metres" if name.endswith("Z") else "linear",
                 },
             )
@@ -133,6 +140,11 @@ def _summarise_exr(folder: Path, paths: list[Path]) -> TableSummary:
             row["min"] = min(row["min"], float(wide.min()))
             row["max"] = max(row["max"], float(wide.max()))
             row["mean"] += float(wide.mean()) / len(paths)
+            # Every image gives so many pixels at equal distances, as all of them together may not fit into memory.
+            flat = pixels.ravel()
+            samples.setdefault(name, []).append(flat[:: max(1, len(flat) // _PIXELS_PER_IMAGE)].astype(np.float64))
+    for name, row in by_channel.items():
+        row["histogram"] = draw_histogram(np.concatenate(samples[name]))
     heading = f"{paths[0].parent.relative_to(folder).as_posix()}/*.exr: {len(paths)} images"
     return TableSummary(heading, [*by_channel.values()])
 
@@ -153,5 +165,14 @@ def _summarise_png(folder: Path, paths: list[Path]) -> TableSummary:
     rows = []
     for path in paths:
         image = read_png(path)
-        rows.append({"picture": path.stem, "size": f"{image.shape[1]}x{image.shape[0]}", "mean": float(image.mean())})
+        rows.append(
+            {
+                "picture": path.stem,
+                "size": f"{image.shape[1]}x{image.shape[0]}",
+                "min": int(image.min()),
+                "mean": float(image.mean()),
+                "max": int(image.max()),
+                "histogram": draw_histogram(image.ravel().astype(np.float64)),
+            }
+        )
     return TableSummary(f"{paths[0].parent.relative_to(folder).as_posix()}/*.png: {len(paths)} pictures", rows)

@@ -172,6 +172,7 @@ class LocalStore:
         stage: str | None = None,
         key: str | None = None,
         kind: str | None = None,
+        key_start: str = "",
     ) -> Iterator[Artifact]:
         """Lists the artifacts that fit, in the order of their paths.
 
@@ -186,6 +187,9 @@ class LocalStore:
             base = base / part
         wanted = {"dataset": dataset, "log": log, "chunk": chunk, "stage": stage, "key": key, "kind": kind}
         for folder in find_artifact_folders(base):
+            # A folder is named by its key, so that the manifests of all others need not be read.
+            if not folder.name.startswith(key or key_start):
+                continue
             # A damaged artifact must not hide the sound ones after it; `verify_all` reports it.
             with suppress(ArtifactCorruptError, ConfigError):
                 manifest = load_manifest(folder)

@@ -136,6 +136,7 @@ class Store(Protocol):
         stage: str | None = None,
         key: str | None = None,
         kind: str | None = None,
+        key_start: str = "",
     ) -> Iterator[Artifact]:
         """Lists artifacts in the order of their paths; what has no readable manifest is left out.
 
@@ -146,6 +147,7 @@ class Store(Protocol):
             stage: only of this stage.
             key: only with this key.
             kind: only of this kind.
+            key_start: only with a key that begins so.
 
         Yields:
             The artifacts that fit.

@@ -13,6 +13,7 @@ import typer
 from flows.cli.bench import bench
 from flows.cli.check import check
 from flows.cli.cost import cost
+from flows.cli.diff import diff
 from flows.cli.doctor import doctor
 from flows.cli.edit import edit
 from flows.cli.effects import effects
@@ -59,6 +60,7 @@ app.command(name="edit")(edit)
 app.command(name="export")(export)
 app.command(name="import")(import_command)
 app.command(name="show")(show)
+app.command(name="diff")(diff)
 app.command(name="verify")(verify)
 app.command(name="doctor")(doctor)
 app.command(name="cost")(cost)

@@ -14,6 +14,7 @@ from flows.defaults import DEFAULT_STORE
 
 if TYPE_CHECKING:
     from genre_tasks.config import RangeConfig
+    from genre_tasks.reliability.detector import Detector
     from genre_tasks.reliability.reliable_range import CurvePoint
 
 DetectorOption = Annotated[
@@ -52,6 +53,8 @@ def range_command(
     Views beside the path have no true image to compare with, so guards stand in its place: agreement with the recorded
     images, surfaces that no image shows, holes, floating Gaussians, and actors that a detector no longer finds.
 
+    The run's report gets the range and its curve, too.
+
     Where the run has the next chunk too, the same views are rendered from both scenes and compared.
 
     Example:
@@ -64,7 +67,9 @@ def range_command(
     from flows.cli.parsing import check_number
     from flows.cli.printing import print_rows
     from flows.cli.terminal import TerminalReporter
+    from flows.reconstruction.range_record import write_range_record
     from flows.reconstruction.reliable_range import write_range
+    from flows.reconstruction.run_records import find_run_folder
     from flows.reconstruction.stored_values import find_last_stage, read_next_scene, read_stage_scene, read_stage_value
     from genre_tasks.reliability.chunk_seam import measure_seam, median_psnr_by_distance
     from genre_tasks.reliability.reliable_range import estimate_reliable_range
@@ -73,12 +78,7 @@ def range_command(
     config = _range_config(max_drop_db, every)
     check_number(max_drop_db, "--max-drop-db", 0, 100)
     open_existing_store(store)
-    # Without a detector the other guards decide alone.
-    network = None
-    if detector is not None:
-        from genre_tasks.reliability.detector import Detector
-
-        network = Detector.load(detector)
+    network = _load_detector(detector)
     number, ingested = read_stage_value(store, run, chunk, "ingest")
     scene_stage = find_last_stage(store, run, number) if stage is None else stage
     _, plan = read_stage_value(store, run, number, "effects")
@@ -89,6 +89,8 @@ def range_command(
     following = read_next_scene(store, run, number, stage)
     facts = {"log": ingested.log, "chunk": str(number), "stage": scene_stage, "run": run}
     files = write_range(out, reliable_range, facts)
+    write_range_record(find_run_folder(store, run), number, scene_stage, reliable_range)
+    files += _rewrite_report(store, run)
     rows = [_point_row(point) for point in reliable_range.points]
     print_rows(f"{ingested.log}, chunk {number}, after {scene_stage}", rows)
     typer.echo(f"{reliable_range}; wrote {', '.join(files)}")
@@ -96,6 +98,28 @@ def range_command(
         psnr_by_distance = median_psnr_by_distance(measure_seam((ingested, scene), following))
         values = ", ".join(f"{db:.1f} dB at {distance:g} m" for distance, db in psnr_by_distance.items())
         typer.echo(f"seam to chunk {number + 1}, the same view from both scenes without actors: {values}")
+
+
+def _load_detector(path: Path | None) -> Detector | None:
+    # Without a detector the other guards decide alone.
+    if path is None:
+        return None
+    from genre_tasks.reliability.detector import Detector
+
+    return Detector.load(path)
+
+
+def _rewrite_report(store: str, run: str) -> list[str]:
+    """The report's path in a list; an empty one where the report cannot be made any more, which is told."""
+    from flows.reconstruction.rewritten_report import rewrite_report
+    from genre_tasks.errors import ArtifactCorruptError, InputError
+
+    try:
+        return [str(rewrite_report(store, run))]
+    except (InputError, ArtifactCorruptError) as error:
+        # The range itself is there, and took minutes.
+        typer.echo(f"note: the run's report stays as it was: {error}", err=True)
+        return []
 
 
 def _range_config(max_drop_db: float, every: int) -> RangeConfig:

@@ -6,10 +6,11 @@ import base64
 import logging
 import time
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from prefect import flow
-from prefect.artifacts import create_image_artifact, create_table_artifact
+from prefect.artifacts import create_image_artifact, create_link_artifact, create_table_artifact
 
 from flows.budget.budget import Budget
 from flows.budget.chooser import Chooser
@@ -94,7 +95,7 @@ def reconstruct_log(
     summary = summarise_run(run)
     record = write_run_record(run, summary, {} if budget is None else {"budget": budget.as_record()})
     # After the record is written: if Prefect's server fails now, the run is complete nevertheless.
-    _publish_to_prefect(summary)
+    _publish_to_prefect(summary, Path(record["report"]))
     if failures:
         raise ChunksLeftOutError(log, len(selected), failures, record)
     return record
@@ -239,8 +240,15 @@ def _run_stage_task(spec: StageSpec, job: Job, refs: dict[str, ArtifactRef]) -> 
     return ref
 
 
-def _publish_to_prefect(summary: RunSummary) -> None:
-    """Shows tables and a few pictures in Prefect's UI; the report has all of them."""
+def _publish_to_prefect(summary: RunSummary, report: Path) -> None:
+    """Shows a link to the report, tables and a few pictures in Prefect's UI; the report has all of them."""
+    # A worker may be on another machine than the reader: the path is then one of the worker's.
+    create_link_artifact(
+        link=report.absolute().as_uri(),
+        link_text=f"report of run {summary.run}",
+        key="report",
+        description=f"{summary.log}, preset {summary.preset}",
+    )
     for chunk in summary.chunks:
         rows = [
             {"stage": s.stage, "served": "cache" if s.cached else "computed", "seconds": round(s.seconds, 2)}

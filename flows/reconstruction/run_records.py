@@ -11,10 +11,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flows.error_record import describe_record
-from flows.pipeline.definition import PIPELINE
+from flows.pipeline.definition import PIPELINE, RECONSTRUCTION_STAGES
 from flows.pipeline.stage_runner import ArtifactRef
+from flows.reconstruction.range_record import read_range_record
 from flows.reconstruction.record_files import read_record
-from flows.reconstruction.run_summary import ChunkSummary, RunSummary, StageSummary, add_counts, place_over_seconds
+from flows.reconstruction.run_summary import (
+    ChunkSummary,
+    Origin,
+    RangeSummary,
+    RunSummary,
+    StageSummary,
+    add_counts,
+    place_over_seconds,
+)
 from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import InputError
 from storage.address import Address
@@ -82,7 +91,7 @@ def write_run_record(run: FinishedRun, summary: RunSummary, extra: Mapping[str, 
     Raises:
         OSError: the folder cannot be written.
     """
-    from flows.reconstruction.report import write_report
+    from flows.reconstruction.report.writing import write_report
 
     run.folder.mkdir(parents=True, exist_ok=True)
     report = write_report(run.folder / "report.html", summary)
@@ -134,6 +143,7 @@ def summarise_run(run: FinishedRun) -> RunSummary:
         chunks=chunks,
         differs=run.differs,
         left_out=tuple(f"chunk {entry['chunk']} is left out: {describe_record(entry)}" for entry in run.left_out),
+        environment=_last_environment(run),
     )
 
 
@@ -178,13 +188,28 @@ def _summarise_chunk(run: FinishedRun, chunk: int, refs: dict[str, ArtifactRef])
         evaluated = artifacts.get(f"evaluate/{spec.name}")
         evaluation = None if evaluated is None else store.read(evaluated)
         stages.append(_summarise_stage(artifacts[spec.name], refs[spec.name].cached, evaluation))
-    notes = (run.notes[chunk],) if chunk in run.notes else ()
+    warnings = [run.notes[chunk]] if chunk in run.notes else []
     # What the log lacks was found once, when the chunk was ingested.
-    issues = artifacts["ingest"].manifest.measurements.get("marks", ())
-    return ChunkSummary(chunk=chunk, stages=tuple(stages), warnings=(*notes, *(str(issue) for issue in issues)))
+    warnings += [str(issue) for issue in artifacts["ingest"].manifest.measurements.get("marks", ())]
+    reliable_range: RangeSummary | None = None
+    try:
+        reliable_range = read_range_record(run.folder, chunk)
+    except InputError as error:
+        # The run itself is sound: the report says what is wrong with the range, and shows all else.
+        warnings.append(str(error))
+    return ChunkSummary(
+        chunk=chunk,
+        stages=tuple(stages),
+        warnings=tuple(warnings),
+        effects=store.read(artifacts["effects"]).decisions if "effects" in artifacts else (),
+        reliable_range=reliable_range,
+    )
 
 
 def _summarise_stage(artifact: Artifact, cached: bool, evaluation: Evaluation | None) -> StageSummary:
+    # Here, as it imports NumPy and Arrow, which reading a record does not need.
+    from storage.contents import summarise_contents
+
     manifest = artifact.manifest
     summary = StageSummary(
         stage=manifest.stage,
@@ -193,6 +218,15 @@ def _summarise_stage(artifact: Artifact, cached: bool, evaluation: Evaluation | 
         seconds=manifest.seconds,
         peak_mib=manifest.peak_mib,
         warnings=manifest.warnings,
+        origin=Origin(
+            inputs=manifest.inputs,
+            payload_digest=manifest.payload_digest,
+            size_bytes=sum(file.size for file in manifest.files),
+            made_at=manifest.created_at,
+            code_digest=manifest.code_digest,
+            weights_digest=manifest.weights_digest,
+        ),
+        contents=summarise_contents(artifact),
     )
     # Stages that make no image, such as ingest, are not evaluated.
     if evaluation is None:
@@ -204,6 +238,15 @@ def _summarise_stage(artifact: Artifact, cached: bool, evaluation: Evaluation | 
         curve=place_over_seconds(evaluation.curve, manifest.measurements.get("seconds_per_iteration", ())),
         intervals={m.name: (m.low, m.high) for m in evaluation.metrics if m.low is not None and m.high is not None},
     )
+
+
+def _last_environment(run: FinishedRun) -> Mapping[str, str]:
+    for refs in run.chunks.values():
+        # Of the first chunk: the others were made by the same command, if not by an earlier one.
+        last = [stage for stage in RECONSTRUCTION_STAGES if stage in refs][-1:]
+        for stage in last:
+            return _find_by_path(run.store, refs[stage]).manifest.environment
+    return {}
 
 
 def _encode_png(image: NDArray[np.uint8]) -> bytes:
@@ -244,3 +287,20 @@ def find_run_record(store: str, run: str) -> dict[str, Any]:
         problem = f"{len(found)} runs of this store begin with '{run}'"
         raise InputError(problem, remedy="`genre show runs` lists them.", file=store)
     return found[0]
+
+
+def find_run_folder(store: str, run: str) -> Path:
+    """Finds the folder of a finished run's record and report.
+
+    Args:
+        store: folder (or URI) of the store.
+        run: the run's name, or the start of it.
+
+    Returns:
+        The folder.
+
+    Raises:
+        InputError: no run, or more than one, begins so.
+    """
+    name: str = find_run_record(store, run)["run"]
+    return open_store(store).root / _FOLDER / name

@@ -8,7 +8,50 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from genre_tasks.effects.types import Decision
     from genre_tasks.metrics.results import Metric
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where an artifact came from.
+
+    Attributes:
+        inputs: name → key of each input artifact (or digest of the log).
+        payload_digest: digest of its files.
+        size_bytes: of all its files.
+        made_at: time of the commit, ISO 8601.
+        code_digest: digest of the stage's code.
+        weights_digest: digest of the network's weights; ``None`` without a network.
+    """
+
+    inputs: Mapping[str, str]
+    payload_digest: str
+    size_bytes: int
+    made_at: str
+    code_digest: str
+    weights_digest: str | None = None
+
+
+@dataclass(frozen=True)
+class RangeSummary:
+    """How far to the sides of the path a chunk's scene can be trusted.
+
+    Attributes:
+        stage: the stage that made the scene.
+        left_m: metres to the left.
+        right_m: metres to the right.
+        farthest_m: the largest shift that was looked at; a range of so many metres may be larger.
+        limit_db: the estimate below which a shift does not hold, dB; ``None`` where only the metres are known.
+        points: (metres to the left, estimated PSNR in dB, whether all guards hold), from the right to the left.
+    """
+
+    stage: str
+    left_m: float
+    right_m: float
+    farthest_m: float
+    limit_db: float | None = None
+    points: tuple[tuple[float, float, bool], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -26,6 +69,8 @@ class StageSummary:
         curve: (seconds of iterations so far in this stage, held-out PSNR in dB).
         warnings: sentences for the user.
         intervals: 95 % interval of some metrics, by their name.
+        origin: where the artifact came from; ``None`` where it is not known.
+        contents: counts of what the artifact holds, by name.
     """
 
     stage: str
@@ -38,6 +83,8 @@ class StageSummary:
     curve: tuple[tuple[float, float], ...] = ()
     warnings: tuple[str, ...] = ()
     intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    origin: Origin | None = None
+    contents: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -48,11 +95,15 @@ class ChunkSummary:
         chunk: number of the chunk.
         stages: its stages, in the order in which they ran.
         warnings: what its log lacks, and what it was made with if that is not what the user asked for.
+        effects: the decisions of the effects' plan.
+        reliable_range: of the last scene; ``None`` where it was not measured.
     """
 
     chunk: int
     stages: tuple[StageSummary, ...]
     warnings: tuple[str, ...] = ()
+    effects: tuple[Decision, ...] = ()
+    reliable_range: RangeSummary | None = None
 
     def stage(self, name: str) -> StageSummary | None:
         """Finds a stage by its name.
@@ -81,6 +132,7 @@ class RunSummary:
         chunks: the chunks that were reconstructed.
         differs: (the preset's value, the value used) of each ``section.key`` that was set otherwise.
         left_out: a sentence for each chunk that could not be reconstructed.
+        environment: versions and machine that the last scene was made with.
     """
 
     run: str
@@ -90,6 +142,7 @@ class RunSummary:
     chunks: tuple[ChunkSummary, ...]
     differs: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
     left_out: tuple[str, ...] = ()
+    environment: Mapping[str, str] = field(default_factory=dict)
 
 
 def add_counts(metrics: Sequence[Metric]) -> dict[str, float]:

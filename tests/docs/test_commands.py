@@ -5,6 +5,7 @@ A command is what stands in a ``bash`` block. Names of logs and runs are replace
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from collections.abc import Iterator
@@ -25,10 +26,8 @@ from tests.faults.small_run import LOG, SETTINGS
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (ROOT / "README.md", ROOT / "docs/quickstart.md", *sorted((ROOT / "docs/guides").glob("*.md")))
 TAKES_SETTINGS = ("run", "effects", "cost", "table", "figure")
-TAKES_STORE = (
-    *TAKES_SETTINGS,
-    *("show", "render", "view", "range", "verify", "simulate", "edit", "export", "import", "serve"),
-)
+READS_STORE = ("show", "diff", "render", "view", "range", "verify", "simulate", "edit", "export", "import", "serve")
+TAKES_STORE = (*TAKES_SETTINGS, *READS_STORE)
 
 
 def commands(page: Path) -> list[str]:
@@ -59,11 +58,18 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, 
         yield folder, done["run"], f"pandaset:{folder}/pandaset/002"
 
 
+def scene_key(folder: Path, run: str) -> str:
+    """The key of the last scene of a run."""
+    record = json.loads((folder / "store/runs" / run / "run.json").read_text())
+    return next(stage["key"] for stage in record["chunks"][0]["stages"] if stage["stage"] == "enet")
+
+
 def small(command: str, folder: Path, run: str, pandaset: str) -> list[str]:
     """The command's arguments, with the test's log, run, store and settings in place of the page's."""
     words = shlex.split(command.split("   #")[0])[1:]
     words = [re.sub(r"^synthetic:street\?seed=\d+$", LOG, word) for word in words]
-    words = [run if word == "RUN" else word for word in words]
+    words = [run if word in ("RUN", "OTHER") else word for word in words]
+    words = [scene_key(folder, run) if word == "KEY" else word for word in words]
     words = [pandaset if word == "pandaset:/data/pandaset/002" else word for word in words]
     if "--budget" in words:  # a budget chooses these settings itself, and is not given them
         return [*words, "--store", str(folder / "store"), "--dry-run"]

@@ -52,6 +52,9 @@ def test_a_second_run_is_cached_and_says_so(tmp_path: Path) -> None:
     assert (served(first), served(second)) == ([False] * 3, [True] * 3)
     assert first["run"] == second["run"]
     assert Path(second["report"]).read_text().startswith("<!doctype html>")
+    # Prefect's page links to it.
+    link = Artifact.get("report")
+    assert link is not None and Path(second["report"]).as_uri() in str(link.data) and LOG in str(link.description)
 
 
 def test_a_hit_ends_in_a_state_named_cached(tmp_path: Path) -> None:

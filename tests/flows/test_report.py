@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import re
 import subprocess
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
-from flows.reconstruction.report import write_report
-from flows.reconstruction.report_curve import accuracy_curve
-from flows.reconstruction.report_metrics import SCORED_STAGES, build_headline, build_metric_rows
-from flows.reconstruction.report_pictures import build_picture_rows
-from flows.reconstruction.run_summary import ChunkSummary, RunSummary, StageSummary
+from flows.reconstruction.report.accuracy_curve import accuracy_curve
+from flows.reconstruction.report.error_maps import error_palette, make_error_map
+from flows.reconstruction.report.lineage_graph import build_lineage_rows, draw_lineage
+from flows.reconstruction.report.metric_table import SCORED_STAGES, build_headline, build_metric_rows
+from flows.reconstruction.report.range_plot import plot_range_curve
+from flows.reconstruction.report.viewpoints import build_viewpoints
+from flows.reconstruction.report.writing import write_report
+from flows.reconstruction.run_summary import ChunkSummary, Origin, RangeSummary, RunSummary, StageSummary
+from genre_tasks.effects.types import Decision
+from storage.codecs.png import encode_png
 
 PNG = bytes.fromhex(
     "89504e470d0a1a0a0000000d4948445200000001000000010802000000907753de0000000c4944415408d763f8cfc000000301010018dd8db0"
@@ -50,7 +59,7 @@ class Reader(HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data: str) -> None:
-        if not self.open or self.open[-1] not in ("style", "title"):
+        if not self.open or self.open[-1] not in ("style", "title", "script"):
             self.text.append(data.strip())
 
 
@@ -91,9 +100,10 @@ def test_writes_one_self_contained_page(tmp_path: Path) -> None:
     assert path == tmp_path / "deep" / "report.html" and list(path.parent.iterdir()) == [path]
     html = path.read_text(encoding="utf-8")
     page = Reader(html)
-    assert all(a.startswith(("data:image/png;base64,", "#chunk-")) for a in page.addresses)
-    assert not re.search(r"https?://|@import|url\(", html)
-    assert "script" not in page.tags
+    assert all(a.startswith(("data:image/", "#chunk-")) for a in page.addresses)
+    assert not re.search(r"https?://|@import|url\((?!#)", html)
+    # The page's script is the only one: that of the log's name is text.
+    assert page.tags.count("script") == 1 and "alert(" not in html.partition("<script>")[2]
     text = " ".join(page.text)
     for expected in (
         'x=<script>alert("1")</script>',
@@ -101,6 +111,7 @@ def test_writes_one_self_contained_page(tmp_path: Path) -> None:
         "a/store",
         "0123456789ab",
         "Chunk 3",
+        "Chunk 3 24.00 dB 23.80 dB",
         "gnet.iterations = 8",
         "frame 28 <has> no sweep & none follows",
         "4 of 12",
@@ -113,7 +124,8 @@ def test_writes_one_self_contained_page(tmp_path: Path) -> None:
         "the fixer works beside the path",
     ):
         assert expected in text, expected
-    assert page.tags.count("img") == 2 * 5 and page.tags.count("svg") == 2
+    # Five pictures, the errors of those with a truth, and the two layers of each slider.
+    assert page.tags.count("img") == 2 * (5 + 3 + 2 * 2) and page.tags.count("svg") == 2
 
 
 def test_the_same_run_writes_the_same_bytes(tmp_path: Path) -> None:
@@ -146,15 +158,72 @@ def test_stages_measured_on_fewer_images_and_ties_win_nothing() -> None:
 
 
 def test_pictures_say_what_is_missing() -> None:
-    ((first, on_path), (second, beside)) = build_picture_rows(chunk())
-    assert first == "On the path · front camera · frame 5" and second.startswith("3 m to the left")
-    assert [p.label for p in on_path] == ["Truth", "GNet", "Fixed", "ENet"]
-    assert [bool(p.url) for p in on_path] == [True, True, False, False]
-    assert [bool(p.url) for p in beside] == [True, True, True, False]
+    on_path, beside = build_viewpoints(chunk())
+    assert on_path.label == "On the path · front camera · frame 5" and beside.label.startswith("3 m to the left")
+    assert [p.label for p in on_path.pictures] == ["Truth", "Initial", "GNet", "Fixed", "ENet"]
+    assert [bool(p.image) for p in on_path.pictures] == [True, False, True, False, False]
+    assert [bool(p.image) for p in beside.pictures] == [True, False, True, True, False]
+    assert (beside.before, beside.after) == ("GNet", "Fixed") and (on_path.before, on_path.after) == ("GNet", "Truth")
     real = ChunkSummary(0, (StageSummary("gnet", "g", False, 1, 1, {}, {"3m_right_left_camera_10": PNG}),))
-    ((label, pictures),) = build_picture_rows(real)
-    assert label == "3 m to the right · left camera · frame 10"
-    assert not pictures[0].url and "no true image" in pictures[0].why
+    (view,) = build_viewpoints(real)
+    assert view.label == "3 m to the right · left camera · frame 10"
+    assert view.pictures[0].image is None and "no true image" in view.pictures[0].why
+    assert not any(picture.error for picture in view.pictures)
+
+
+def test_an_error_map_shows_where_and_how_much() -> None:
+    truth = np.full((4, 6, 3), 100, np.uint8)
+    render = truth.copy()
+    render[:, 3:] += 51  # a fifth of full brightness: the end of the scale
+    error = make_error_map(encode_png(render), encode_png(truth))
+    assert error is not None and abs(error.mean - 0.1) < 1e-9 and abs(error.psnr + 10 * np.log10(0.02)) < 1e-9
+    with Image.open(io.BytesIO(base64.b64decode(error.image.url.partition(",")[2]))) as image:
+        colors = np.asarray(image.convert("RGB"))
+    assert (colors[:, :3] == error_palette()[0]).all() and (colors[:, 3:] == error_palette()[-1]).all()
+    same = make_error_map(encode_png(truth), encode_png(truth))
+    assert same is not None and same.words == "no difference"
+    assert make_error_map(encode_png(truth), encode_png(truth[:2])) is None
+
+
+def test_lineage_names_all_inputs_and_draws_the_nearest() -> None:
+    inputs = {"ingest": {"log": "l"}, "initial": {"ingest": "i"}, "gnet": {"ingest": "i", "initial": "n"}}
+    stages = [
+        StageSummary(name, name, False, 1, 1, origin=Origin(of, f"{name}-payload", 2**21, "2026-01-02T03:04:05", "c"))
+        for name, of in inputs.items()
+    ]
+    rows = build_lineage_rows(stages)
+    assert [row.made_from for row in rows] == [("log",), ("ingest",), ("ingest", "initial")]
+    assert (rows[0].size, rows[0].made_at) == ("2 MiB", "2026-01-02 03:04:05")
+    graph = draw_lineage(stages)
+    assert graph is not None and graph.words == "initial from ingest; gnet from initial" and len(graph.edges) == 2
+    assert [box[4] for box in graph.boxes] == list(inputs)
+    assert draw_lineage([StageSummary("gnet", "k", False, 1, 1)]) is None
+
+
+def test_a_range_has_its_left_on_the_left() -> None:
+    found = RangeSummary("enet", 1.9, 1.5, 2.0, 20.0, ((-2.0, 18.0, False), (0.0, 24.0, True), (2.0, 21.0, False)))
+    plot = plot_range_curve(found)
+    assert plot is not None and plot.band[0] < plot.points[1][0] < plot.band[1]
+    assert plot.points[0][0] > plot.points[2][0] and plot.points[1][1] < plot.limit_y < plot.points[0][1]
+    assert plot_range_curve(RangeSummary("enet", 1.9, 1.5, 2.0)) is None
+
+
+def test_effects_range_lineage_and_scene_are_in_the_page(tmp_path: Path) -> None:
+    decision = Decision("rolling_shutter", "p", 4.5, "px", 1.0, "on", "mark", "because <it> moves", "a pose a row")
+    origin = Origin({"log": "l"}, "d" * 64, 4096, "2026-01-02T03:04:05+00:00", "c" * 64)
+    stages = (StageSummary("ingest", "i" * 64, True, 1, 1, origin=origin, contents={"frames": 1200, "image": "4 × 3"}),)
+    full = ChunkSummary(0, stages, effects=(decision,), reliable_range=RangeSummary("enet", 1.9, 5.0, 5.0))
+    (tmp_path / "scene.html").write_text("a scene")
+    page = Reader(write_report(tmp_path / "r.html", run(full)).read_text())
+    text = " ".join(page.text)
+    for expected in ("rolling shutter", "reported only", "set by hand", "4.5 px (threshold 1)", "because <it> moves"):
+        assert expected in text, expected
+    assert "1.9 m to the left, 5.0 m or more to the right" in text and "1,200" in text and "d" * 12 in text
+    assert "scene.html" in page.addresses
+    (tmp_path / "scene.html").unlink()
+    assert "scene.html" not in Reader(write_report(tmp_path / "r.html", run(full)).read_text()).addresses
+    bare = ChunkSummary(0, stages)
+    assert "genre range 0123456789ab --chunk 0" in write_report(tmp_path / "r.html", run(bare)).read_text()
 
 
 def test_curve_continues_where_gnet_ended() -> None:
@@ -183,7 +252,7 @@ def test_a_run_with_nothing_to_show_still_has_a_report(tmp_path: Path, stages: t
 
 def test_needs_neither_torch_nor_prefect() -> None:
     code = (
-        "import sys, pathlib, tempfile; from flows.reconstruction.report import write_report; "
+        "import sys, pathlib, tempfile; from flows.reconstruction.report.writing import write_report; "
         "from flows.reconstruction.run_summary import *;"
         "run = RunSummary('r', 'l', 'p', 's', (ChunkSummary(0, ()),));"
         "write_report(pathlib.Path(tempfile.mkdtemp()) / 'r.html', run);"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from flows.reconstruction.report.axis_ticks import round_ticks
 from flows.reconstruction.run_summary import ChunkSummary
 
 LABELS = {"gnet": "GNet", "enet": "ENet"}
@@ -48,11 +49,13 @@ class Curve:
         lines: one line for each stage.
         x: (coordinate, label) of the ticks on the horizontal axis, seconds.
         y: (coordinate, label) of the ticks on the vertical axis, dB.
+        words: the curve in a sentence, for who cannot see it.
     """
 
     lines: tuple[Line, ...]
     x: tuple[tuple[float, str], ...]
     y: tuple[tuple[float, str], ...]
+    words: str = ""
 
 
 def accuracy_curve(chunk: ChunkSummary) -> Curve | None:
@@ -69,8 +72,8 @@ def accuracy_curve(chunk: ChunkSummary) -> Curve | None:
     # A single point makes no line.
     if len(points) < 2:
         return None
-    ticks_x = _round_ticks(0.0, max(seconds for seconds, _ in points))
-    ticks_y = _round_ticks(min(psnr for _, psnr in points), max(psnr for _, psnr in points))
+    ticks_x = round_ticks(0.0, max(seconds for seconds, _ in points))
+    ticks_y = round_ticks(min(psnr for _, psnr in points), max(psnr for _, psnr in points))
 
     def to_svg(seconds: float, psnr: float) -> tuple[float, float]:
         across = (seconds - ticks_x[0]) / (ticks_x[-1] - ticks_x[0])
@@ -85,7 +88,7 @@ def accuracy_curve(chunk: ChunkSummary) -> Curve | None:
         svg_lines.append(Line(name, label, svg_points))
     labels_x = tuple((to_svg(seconds, ticks_y[0])[0], f"{seconds:g}") for seconds in ticks_x)
     labels_y = tuple((to_svg(ticks_x[0], psnr)[1], f"{psnr:g}") for psnr in ticks_y)
-    return Curve(tuple(svg_lines), labels_x, labels_y)
+    return Curve(tuple(svg_lines), labels_x, labels_y, _describe(lines))
 
 
 def _cumulative_lines(chunk: ChunkSummary) -> list[tuple[str, list[tuple[float, float]]]]:
@@ -108,14 +111,11 @@ def _cumulative_lines(chunk: ChunkSummary) -> list[tuple[str, list[tuple[float, 
     return lines
 
 
-def _round_ticks(low: float, high: float) -> list[float]:
-    """About five round numbers that enclose [low, high]."""
-    # A flat curve would otherwise have ticks at a distance of 0.
-    span = max(high - low, 1e-3)
-    wanted_step = span / 4
-    unit = 10 ** math.floor(math.log10(wanted_step))
-    # The tolerances keep a step that fits exactly from being skipped for the error of its last bit.
-    step = next(m * unit for m in (1, 2, 2.5, 5, 10) if m * unit >= wanted_step * 0.999)
-    first = math.floor(low / step + 1e-9)
-    last = math.ceil(high / step - 1e-9)
-    return [round(k * step, 10) for k in range(first, max(last, first + 1) + 1)]
+def _describe(lines: list[tuple[str, list[tuple[float, float]]]]) -> str:
+    parts = []
+    for name, line in lines:
+        (start_s, start_db), (end_s, end_db) = line[0], line[-1]
+        parts.append(
+            f"{LABELS[name]} from {start_db:.2f} dB after {start_s:.1f} s to {end_db:.2f} dB after {end_s:.1f} s"
+        )
+    return "Held-out PSNR against seconds of iterations: " + "; ".join(parts)
