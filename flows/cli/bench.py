@@ -36,6 +36,9 @@ _BENCHES: dict[str, BenchEntry] = {
     "evaluation": BenchEntry(
         "benchmarks.evaluation:EVALUATION", "whether runs keep their budget, and how well guards predict quality"
     ),
+    "exchange": BenchEntry(
+        "benchmarks.exchange:BENCH", "formats, foreign scenes enhanced, pages in a browser, and simulators' requests"
+    ),
     "facades": BenchEntry(
         "benchmarks.optimiser.ablation:FACADES", "what completing façades above the LiDAR's view gains"
     ),

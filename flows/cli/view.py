@@ -29,7 +29,7 @@ HtmlOption = Annotated[
         parser=parse_path,
         metavar="PATH",
         help="Write one HTML file x.html that plays the scene without a server or the network, over an existing one, "
-        "instead of starting a viewer.",
+        "instead of starting a viewer. As scene.html in the run's folder it is linked from the run's report.",
     ),
 ]
 MaxSplatsOption = Annotated[
@@ -101,7 +101,7 @@ def view(
     for loss in viewed.scene.losses:
         typer.echo(loss)
     if html is not None:
-        _write_page(html, viewed_run, viewed, with_range=not no_range)
+        _write_page(html, viewed_run, viewed, store, with_range=not no_range)
         return
     from flows.viewer.live_viewer import LiveViewer
 
@@ -112,7 +112,7 @@ def view(
         viewer.run_forever()
 
 
-def _write_page(path: Path, run: ViewedRun, viewed: ViewedChunk, with_range: bool) -> None:
+def _write_page(path: Path, run: ViewedRun, viewed: ViewedChunk, store: str, with_range: bool) -> None:
     from flows.cli.terminal import TerminalReporter
     from flows.viewer.offline_page import write_offline_page
 
@@ -125,6 +125,16 @@ def _write_page(path: Path, run: ViewedRun, viewed: ViewedChunk, with_range: boo
     count = f"{len(viewed.scene):,} Gaussians, {len(viewed.actor_names)} actors"
     seconds = f"{viewed.times_s[-1]:.1f} s of driving"
     typer.echo(f"wrote {path}: {count}, {seconds}, {size / 1e6:.1f} MB")
+    _link_from_report(path, run, store)
+
+
+def _link_from_report(path: Path, run: ViewedRun, store: str) -> None:
+    """Writes the run's report again where the page lies beside it."""
+    from flows.reconstruction.report.writing import SCENE_FILE
+    from flows.reconstruction.rewritten_report import rewrite_report
+
+    if path.resolve() == (run.folder / SCENE_FILE).resolve() and (run.folder / "report.html").is_file():
+        typer.echo(f"wrote {rewrite_report(store, run.name)}, which links to it")
 
 
 def _check_host(host: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -95,6 +96,11 @@ class ViewedRun:
     def log(self) -> str:
         """The log's URI."""
         return str(self._scenes.record["log"])
+
+    @property
+    def folder(self) -> Path:
+        """The run's folder in the store, with its report."""
+        return self._scenes.folder
 
     @property
     def chunk_numbers(self) -> tuple[int, ...]:
