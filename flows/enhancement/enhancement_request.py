@@ -109,16 +109,14 @@ def prepare_enhancement(inputs: EnhancementInputs, ingest: IngestConfig) -> Enha
     explanation.append(f"depth is {depth}")
     # Written with the numbers that were found, so that the log stays the same when finding changes.
     uri = format_uri(inputs.cameras, inputs.images, log.up.vector, scale)
-    return EnhancementRequest(uri, _make_settings(inputs, log, scale, ingest), tuple(explanation))
+    # Opened again, because its numbers are those of the URI: scene and images must be placed by the same ones.
+    placed: PosedImagesLog = open_log(uri)  # type: ignore[assignment]
+    return EnhancementRequest(uri, _make_settings(inputs, placed, ingest), tuple(explanation))
 
 
-def _make_settings(
-    inputs: EnhancementInputs, log: PosedImagesLog, scale: float, ingest: IngestConfig
-) -> tuple[str, ...]:
-    from genre_tasks.logs.posed_images.world_axes import turn_up_to_z
-
+def _make_settings(inputs: EnhancementInputs, log: PosedImagesLog, ingest: IngestConfig) -> tuple[str, ...]:
     chunk_frames = ingest.chunk_frames if inputs.chunk_frames is None else inputs.chunk_frames
-    placement = f"{{scale: {scale!r}, quat: {_find_quat(turn_up_to_z(log.up.vector))}}}"
+    placement = f"{{scale: {log.metres_per_unit!r}, quat: {_find_quat(log.world_R_source)}}}"
     points = f"ingest.points={inputs.lidar}" if inputs.lidar else f"ingest.scene={inputs.scene}"
     width, height = _choose_size(log, ingest)
     frames = min(chunk_frames, log.frame_count)
