@@ -55,11 +55,11 @@ def measure_enhancement(log: str, store: str, depths: Sequence[str] = ("scene",)
         The row: for the scene as it was given and for each enhanced one, held-out PSNR, and PSNR and perceptual
         distance at 3 m.
     """
-    folder, chunk = make_given_scene(log, store)
+    folder, chunk = make_base_scene(log, store)
     return {"log": log, "iterations": ITERATIONS, **score_enhancement(log, folder, chunk, store, depths, settings)}
 
 
-def make_given_scene(log: str, store: str) -> tuple[Path, Chunk]:
+def make_base_scene(log: str, store: str) -> tuple[Path, Chunk]:
     """Makes a scene of chunk 0 by per-scene 3DGS, and writes it with images, poses and points.
 
     Args:
@@ -85,7 +85,7 @@ def score_enhancement(
 
     Args:
         log: URI of the street, which has the truth.
-        folder: from :func:`make_given_scene`.
+        folder: from :func:`make_base_scene`.
         chunk: of the street.
         store: folder of the artifacts.
         depths: some of :data:`DEPTHS`.

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from genre_tasks.errors import ArtifactCorruptError, ConfigError, GenreError
@@ -51,12 +52,23 @@ GAUSSIANS = schema(
         column("node", pa.int64(), "0 static, 1 distant (chunk coordinates), 2 + k actor k (box coordinates)"),
     ],
 )
-_SH_COUNT = SH_COUNTS[DEFAULT_SH_DEGREE]
-_SH_COLUMNS = tuple(f"{channel}_{k}" for k in range(1, _SH_COUNT + 1) for channel in ("red", "green", "blue"))
-SPHERICAL_HARMONICS = schema(
-    f"harmonics/{DEFAULT_SH_DEGREE}",
-    [column(n, pa.float32(), "of 3DGS's real spherical harmonic of that number") for n in _SH_COLUMNS],
-)
+
+
+def _list_sh_columns(degree: int) -> tuple[str, ...]:
+    return tuple(f"{c}_{k}" for k in range(1, SH_COUNTS[degree] + 1) for c in ("red", "green", "blue"))
+
+
+# A degree each: reconstructions have the default one, scenes of other programs any.
+SPHERICAL_HARMONICS = {
+    degree: schema(
+        f"harmonics/{degree}",
+        [
+            column(name, pa.float32(), "of 3DGS's real spherical harmonic of that number")
+            for name in _list_sh_columns(degree)
+        ],
+    )
+    for degree in SH_COUNTS
+}
 
 
 def write_scene(path: Path, scene: SceneGraph) -> None:
@@ -79,11 +91,14 @@ def write_scene(path: Path, scene: SceneGraph) -> None:
     write_table(path, GAUSSIANS, {**columns, "node": nodes})
     if scene.spherical_harmonics is not None:
         coefficients = scene.spherical_harmonics.detach().cpu().numpy()
-        check_array(coefficients, f"harmonics of {path.name}", np.float32, (len(packed), _SH_COUNT, 3))
+        degrees = {count: degree for degree, count in SH_COUNTS.items()}
+        degree = degrees.get(coefficients.shape[1] if coefficients.ndim == 3 else 0, DEFAULT_SH_DEGREE)
+        check_array(coefficients, f"harmonics of {path.name}", np.float32, (len(packed), SH_COUNTS[degree], 3))
         sh_path = _sh_path(path)
         sh_path.parent.mkdir(exist_ok=True)
         flat = coefficients.reshape(len(coefficients), -1)
-        write_table(sh_path, SPHERICAL_HARMONICS, {name: flat[:, i] for i, name in enumerate(_SH_COLUMNS)})
+        columns = {name: flat[:, i] for i, name in enumerate(_list_sh_columns(degree))}
+        write_table(sh_path, SPHERICAL_HARMONICS[degree], columns)
 
 
 def read_scene(path: Path, actors: tuple[ActorNode, ...], antialiased: bool, deformation_path: Path) -> SceneGraph:
@@ -137,14 +152,25 @@ def _read_spherical_harmonics(path: Path, count: int) -> Tensor | None:
     # The folder decides: with it, a table that is missing is damage.
     if not path.parent.is_dir():
         return None
-    table = read_table(path, SPHERICAL_HARMONICS)[0]
+    degree = _find_sh_degree(path)
+    table = read_table(path, SPHERICAL_HARMONICS[degree])[0]
     # Two tables that do not fit would shift colours from one Gaussian to another.
     if table.num_rows != count:
         raise ArtifactCorruptError(
             f"The table has {table.num_rows} rows for {count} Gaussians", remedy=REMEDY, file=path
         )
-    flat = np.stack([column_array(table, n) for n in _SH_COLUMNS], 1)
-    return torch.from_numpy(flat.reshape(count, _SH_COUNT, 3))
+    flat = np.stack([column_array(table, n) for n in _list_sh_columns(degree)], 1)
+    return torch.from_numpy(flat.reshape(count, SH_COUNTS[degree], 3))
+
+
+def _find_sh_degree(path: Path) -> int:
+    """The degree that a table's number of columns is of; the default one where the table is damaged or none."""
+    try:
+        columns = len(pq.read_schema(path).names)
+    except (pa.ArrowException, OSError, ValueError):
+        # Reading it raises the error that names what is wrong.
+        return DEFAULT_SH_DEGREE
+    return next((degree for degree, count in SH_COUNTS.items() if 3 * count == columns), DEFAULT_SH_DEGREE)
 
 
 def _check_nodes(nodes: NDArray[np.int64], actor_count: int, make_error: Callable[[str], GenreError]) -> None:

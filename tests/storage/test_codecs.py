@@ -154,10 +154,17 @@ def test_harmonics_lie_beside_the_gaussians_and_old_artifacts_have_none(tmp_path
     names = pq.read_schema(tmp_path / "new" / "harmonics" / "gaussians.parquet").names
     assert names[:4] == ["red_1", "green_1", "blue_1", "red_2"]
     (tmp_path / "bad").mkdir()
-    with pytest.raises(ConfigError, match=r"harmonics of gaussians.parquet is float32 \[13, 15, 3\]"):
+    with pytest.raises(ConfigError, match=r"harmonics of gaussians.parquet is float32 \[13, 5, 3\]"):
         codec.write(
-            tmp_path / "bad", replace(value, scene=value.scene.with_spherical_harmonics(torch.zeros(13, 15, 3)))
+            tmp_path / "bad", replace(value, scene=value.scene.with_spherical_harmonics(torch.zeros(13, 5, 3)))
         )
+    for degree, count in SH_COUNTS.items():
+        # A scene of another program has the degree of its file.
+        folder = tmp_path / f"degree {degree}"
+        folder.mkdir()
+        coefficients = torch.randn(13, count, 3, generator=torch.Generator().manual_seed(degree))
+        codec.write(folder, replace(value, scene=value.scene.with_spherical_harmonics(coefficients), snapshots={}))
+        assert torch.equal(codec.read(folder).scene.spherical_harmonics, coefficients)
     (tmp_path / "new" / "harmonics" / "iteration_0008.parquet").unlink()
     with pytest.raises(ArtifactCorruptError, match="A table is missing"):
         codec.read(tmp_path / "new")
