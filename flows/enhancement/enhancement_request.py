@@ -78,7 +78,7 @@ def prepare_enhancement(inputs: EnhancementInputs, ingest: IngestConfig) -> Enha
         InputError: a file is missing or unsound, or nothing tells the scale.
         ConfigError: up or scale is none.
     """
-    from genre_tasks.logs.posed_images.image_log import format_uri, parse_direction, parse_scale
+    from genre_tasks.logs.posed_images.poses_address import format_uri, parse_direction, parse_scale
     from genre_tasks.logs.registry import open_log
 
     for file in (inputs.scene, inputs.lidar):

@@ -155,9 +155,7 @@ def test_harmonics_lie_beside_the_gaussians_and_old_artifacts_have_none(tmp_path
     assert names[:4] == ["red_1", "green_1", "blue_1", "red_2"]
     (tmp_path / "bad").mkdir()
     with pytest.raises(ConfigError, match=r"harmonics of gaussians.parquet is float32 \[13, 5, 3\]"):
-        codec.write(
-            tmp_path / "bad", replace(value, scene=value.scene.with_spherical_harmonics(torch.zeros(13, 5, 3)))
-        )
+        codec.write(tmp_path / "bad", replace(value, scene=value.scene.with_spherical_harmonics(torch.zeros(13, 5, 3))))
     for degree, count in SH_COUNTS.items():
         # A scene of another program has the degree of its file.
         folder = tmp_path / f"degree {degree}"

@@ -3,27 +3,26 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import re
 from functools import cached_property
 from pathlib import Path
-from urllib.parse import parse_qsl, quote
+from urllib.parse import parse_qsl, unquote
 
 import numpy as np
 
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.pandaset.log_digest import digest_files
-from genre_tasks.logs.posed_images.colmap_model import find_colmap_model, read_colmap_model
+from genre_tasks.logs.posed_images.colmap_model import read_colmap_model
 from genre_tasks.logs.posed_images.frame_grouping import FrameGroups, group_frames
 from genre_tasks.logs.posed_images.image_files import ImageFolder, fit_lens
+from genre_tasks.logs.posed_images.poses_address import find_poses, parse_direction, parse_scale
 from genre_tasks.logs.posed_images.rig_poses import RigPoses, fill_rig_poses
 from genre_tasks.logs.posed_images.transforms_json import read_transforms
 from genre_tasks.logs.posed_images.world_axes import UpDirection, find_up, turn_up_to_z
 from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Sweep, Truth
 from genre_tasks.suggestions import did_you_mean
 
-_REMEDY = "Give a transforms.json, a folder that holds one, or the folder of a COLMAP model."
 _OPTIONS = ("images", "up", "scale")
 # What a file without times is taken for; frames must neither stand on one moment nor be minutes apart.
 _ASSUMED_SPEED_M_S = 10.0
@@ -55,115 +54,11 @@ def open_posed_images(rest: str) -> PosedImagesLog:
             raise ConfigError(f"images with poses have no option '{name}'", remedy=hint)
     return PosedImagesLog(
         uri=f"posed_images:{rest}",
-        poses=find_poses(Path(_unquote(path)).expanduser()),
+        poses=find_poses(Path(unquote(path)).expanduser()),
         images=Path(options["images"]).expanduser() if options.get("images") else None,
         up=parse_direction(options["up"]) if options.get("up") else None,
         scale=parse_scale(options.get("scale", "1")),
     )
-
-
-def format_uri(poses: Path, images: Path | None, up: Float64 | None, scale: float | None) -> str:
-    """Writes the URI of a log that :func:`open_posed_images` opens.
-
-    Args:
-        poses: transforms.json, or a folder.
-        images: folder of the images; ``None``: near the poses.
-        up: [3] direction in the axes of the poses; ``None``: found.
-        scale: metres a unit; ``None``: 1.
-
-    Returns:
-        The URI.
-
-    >>> format_uri(Path("a b/transforms.json"), None, np.array([0.0, 0.0, 1.0]), 0.5)
-    'posed_images:a%20b/transforms.json?up=0,0,1&scale=0.5'
-    """
-    options = []
-    if images is not None:
-        options.append(f"images={quote(str(images))}")
-    if up is not None:
-        # Six digits are a ten-thousandth of a degree, and the negative zero says nothing.
-        options.append("up=" + ",".join(f"{value + 0.0:.6g}" for value in up))
-    if scale is not None:
-        options.append(f"scale={scale:.6g}")
-    return f"posed_images:{quote(str(poses))}" + ("?" + "&".join(options) if options else "")
-
-
-def parse_direction(text: str) -> Float64:
-    """Reads a direction.
-
-    Args:
-        text: three numbers with commas.
-
-    Returns:
-        [3] unit vector.
-
-    Raises:
-        ConfigError: it is no direction.
-
-    >>> parse_direction("0,-2,0").tolist()
-    [0.0, -1.0, 0.0]
-    """
-    try:
-        vector = np.array([float(word) for word in text.split(",")])
-    except ValueError:
-        vector = np.zeros(0)
-    length = float(np.linalg.norm(vector))
-    if vector.shape != (3,) or not math.isfinite(length) or length == 0:
-        raise ConfigError(f"'{text}' is no direction", remedy="Write three numbers, such as 0,0,1, or auto.")
-    # Adding 0 makes a negative zero a plain one.
-    unit: Float64 = vector / length + 0.0
-    return unit
-
-
-def parse_scale(text: str) -> float:
-    """Reads metres a unit.
-
-    Args:
-        text: a number above 0.
-
-    Raises:
-        ConfigError: it is none, or beyond 1e-6 to 1e6.
-
-    >>> parse_scale("2.5")
-    2.5
-    """
-    try:
-        scale = float(text)
-    except ValueError:
-        scale = math.nan
-    if not 1e-6 <= scale <= 1e6:
-        raise ConfigError(
-            f"'{text}' is no scale", remedy="Write metres a unit of the poses, such as 1 or 0.25, or auto."
-        )
-    return scale
-
-
-def find_poses(path: Path) -> Path:
-    """Finds the file of poses, or the folder of the COLMAP model.
-
-    Args:
-        path: that the user names.
-
-    Returns:
-        A transforms.json, or a folder with cameras and images of COLMAP.
-
-    Raises:
-        InputError: there is neither.
-    """
-    if path.is_file():
-        return path
-    if (path / "transforms.json").is_file():
-        return path / "transforms.json"
-    model = find_colmap_model(path)
-    if model is None:
-        raise InputError("there are no camera poses", remedy=_REMEDY, file=path)
-    return model
-
-
-def _unquote(text: str) -> str:
-    from urllib.parse import unquote
-
-    return unquote(text)
 
 
 class PosedImagesLog:
