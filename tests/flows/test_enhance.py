@@ -1,4 +1,4 @@
-"""``genre enhance``: a file of Gaussians in its own axes and unit goes through all stages and lands where it belongs."""
+"""``genre enhance``: a file of Gaussians in its own axes goes through all stages, and lands where it belongs."""
 
 from __future__ import annotations
 
