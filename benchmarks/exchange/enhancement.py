@@ -128,7 +128,7 @@ def make_enhancement_job(folder: Path, store: str, depth: str, settings: Sequenc
         lidar=folder / "points.ply" if depth == "lidar" else None,
         scale="1",
     )
-    prepared = prepare_enhancement(inputs, load_configuration(PRESET).ingest)
+    prepared = prepare_enhancement(inputs, load_configuration(PRESET))
     config = load_configuration(PRESET, settings=[*prepared.settings, "enet.snapshots=0", *settings])
     return Job(prepared.log, 0, store, config.model_dump(mode="json"))
 

@@ -90,7 +90,7 @@ def enhance(
 
     add_facts(scene=str(scene), preset=preset, store=store, run=None, report=None, chunks=[], left_out=[])
     inputs = EnhancementInputs(scene, cameras, images, lidar, up, scale, chunk_frames)
-    prepared = prepare_enhancement(inputs, load_configuration(preset).ingest)
+    prepared = prepare_enhancement(inputs, load_configuration(preset))
     add_facts(log=prepared.log)
     for line in prepared.explanation:
         # On stderr: with --json, stdout is the object alone.

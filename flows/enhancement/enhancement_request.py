@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from genre_tasks.config import IngestConfig
+from genre_tasks.config import IngestConfig, PipelineConfig
 from genre_tasks.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
@@ -64,12 +64,12 @@ class EnhancementRequest:
     explanation: tuple[str, ...]
 
 
-def prepare_enhancement(inputs: EnhancementInputs, ingest: IngestConfig) -> EnhancementRequest:
+def prepare_enhancement(inputs: EnhancementInputs, config: PipelineConfig) -> EnhancementRequest:
     """Finds out which way is up and how long a metre is, and asks for a run that starts from the scene.
 
     Args:
         inputs: what the user gives.
-        ingest: the preset's section.
+        config: the preset's.
 
     Returns:
         The run.
@@ -111,10 +111,24 @@ def prepare_enhancement(inputs: EnhancementInputs, ingest: IngestConfig) -> Enha
     uri = format_uri(inputs.cameras, inputs.images, log.up.vector, scale)
     # Opened again, because its numbers are those of the URI: scene and images must be placed by the same ones.
     placed: PosedImagesLog = open_log(uri)  # type: ignore[assignment]
-    return EnhancementRequest(uri, _make_settings(inputs, placed, ingest), tuple(explanation))
+    settings = _make_settings(inputs, placed, config.ingest)
+    count = _count_gaussians(inputs.scene)
+    expected = config.initial.max_points + config.initial.distant_count
+    if count > expected and config.enet.split_fraction > 0:
+        settings.append("enet.split_fraction=0")
+        explanation.append(
+            f"ENet splits none of the {count} Gaussians: the preset is made for {expected} before a split"
+        )
+    return EnhancementRequest(uri, tuple(settings), tuple(explanation))
 
 
-def _make_settings(inputs: EnhancementInputs, log: PosedImagesLog, ingest: IngestConfig) -> tuple[str, ...]:
+def _count_gaussians(scene: Path) -> int:
+    from genre_tasks.exchange.registry import find_format
+
+    return sum(len(node.cloud) for node in find_format(scene).read(scene).nodes)
+
+
+def _make_settings(inputs: EnhancementInputs, log: PosedImagesLog, ingest: IngestConfig) -> list[str]:
     chunk_frames = ingest.chunk_frames if inputs.chunk_frames is None else inputs.chunk_frames
     placement = f"{{scale: {log.metres_per_unit!r}, quat: {_find_quat(log.world_R_source)}}}"
     points = f"ingest.points={inputs.lidar}" if inputs.lidar else f"ingest.scene={inputs.scene}"
@@ -134,7 +148,7 @@ def _make_settings(inputs: EnhancementInputs, log: PosedImagesLog, ingest: Inges
     # A handful of images would have one source frame, and nothing between two of them to compare with.
     if frames <= 2 * ingest.source_every:
         settings.append(f"ingest.source_every={_SHORT_CHUNK_SOURCE_EVERY if frames > 2 else 1}")
-    return tuple(settings)
+    return settings
 
 
 def _find_quat(rotation: NDArray[np.float64]) -> list[float]:

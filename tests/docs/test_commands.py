@@ -31,7 +31,20 @@ from tests.logs.posed_images_folder import write_transforms
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (ROOT / "README.md", ROOT / "docs/quickstart.md", *sorted((ROOT / "docs/guides").glob("*.md")))
 TAKES_SETTINGS = ("run", "enhance", "effects", "cost", "table", "figure")
-TAKES_STORE = ("run", "enhance", "effects", "show", "render", "range", "verify", "cost", "table", "figure", "simulate", "edit")
+TAKES_STORE = (
+    "run",
+    "enhance",
+    "effects",
+    "show",
+    "render",
+    "range",
+    "verify",
+    "cost",
+    "table",
+    "figure",
+    "simulate",
+    "edit",
+)
 
 
 def commands(page: Path) -> list[str]:

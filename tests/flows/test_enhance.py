@@ -17,7 +17,7 @@ from flows.configuration import load_configuration
 from flows.enhancement.enhancement_request import EnhancementInputs, prepare_enhancement
 from flows.pipeline.definition import PIPELINE, STAGE_BY_NAME
 from flows.pipeline.stage_runner import ArtifactRef, Job, compute_key, read_artifact, run_stage
-from genre_tasks.config import FilePlacement, IngestConfig, InitialConfig
+from genre_tasks.config import FilePlacement, InitialConfig, PipelineConfig
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.exchange.clouds import transform_cloud
 from genre_tasks.exchange.conversion import pose_scene, to_exchange_scene
@@ -81,7 +81,7 @@ def inputs(folder: Path) -> EnhancementInputs:
 def test_a_scene_goes_through_every_stage_and_the_command_finds_it(
     inputs: EnhancementInputs, folder: Path, street: tuple[Chunk, SceneGraph], tmp_path: Path
 ) -> None:
-    prepared = prepare_enhancement(inputs, load_configuration("demo").ingest)
+    prepared = prepare_enhancement(inputs, load_configuration("demo"))
     config = load_configuration("demo", settings=[*prepared.settings, *TINY])
     job = Job(prepared.log, 0, str(tmp_path), config.model_dump(mode="json"))
     refs: dict[str, ArtifactRef] = {}
@@ -115,7 +115,7 @@ def test_a_scene_goes_through_every_stage_and_the_command_finds_it(
 
 def test_points_of_lidar_are_placed_as_the_scene_is(inputs: EnhancementInputs, folder: Path, street: tuple) -> None:
     inputs = replace(inputs, lidar=folder / "points.ply")
-    prepared = prepare_enhancement(inputs, load_configuration("demo").ingest)
+    prepared = prepare_enhancement(inputs, load_configuration("demo"))
     config = load_configuration("demo", settings=[*prepared.settings, *SIZE])
     chunk = ingest(config.ingest, open_log(prepared.log), 0)
     true_chunk, _ = street
@@ -129,7 +129,7 @@ def test_points_of_lidar_are_placed_as_the_scene_is(inputs: EnhancementInputs, f
 def test_the_depth_of_the_scene_lies_on_the_street(inputs: EnhancementInputs, street: tuple) -> None:
     from scipy.spatial import cKDTree
 
-    prepared = prepare_enhancement(inputs, load_configuration("demo").ingest)
+    prepared = prepare_enhancement(inputs, load_configuration("demo"))
     config = load_configuration("demo", settings=[*prepared.settings, *SIZE])
     log = open_log(prepared.log)
     chunk = ingest(config.ingest, log, 0)
@@ -145,9 +145,9 @@ def test_the_depth_of_the_scene_lies_on_the_street(inputs: EnhancementInputs, st
 
 
 def test_the_scale_is_found_from_the_height_over_the_ground(inputs: EnhancementInputs, folder: Path) -> None:
-    ingest_config = load_configuration("demo").ingest
+    preset = load_configuration("demo")
     for lidar in (None, folder / "points.ply"):
-        prepared = prepare_enhancement(replace(inputs, scale="auto", lidar=lidar), ingest_config)
+        prepared = prepare_enhancement(replace(inputs, scale="auto", lidar=lidar), preset)
         scale = float(prepared.log.rpartition("scale=")[2])
         log = open_log(LOG)
         true_height = log.world_SE3_camera("front_camera", 0)[2, 3] - log.world_SE3_lidar(0)[2, 3]
@@ -157,7 +157,7 @@ def test_the_scale_is_found_from_the_height_over_the_ground(inputs: EnhancementI
 
 def test_a_scale_has_to_come_from_somewhere(inputs: EnhancementInputs) -> None:
     with pytest.raises(ConfigError, match="how long a metre is"):
-        prepare_enhancement(replace(inputs, scale=None), IngestConfig())
+        prepare_enhancement(replace(inputs, scale=None), PipelineConfig())
 
 
 def test_errors_of_the_command(folder: Path, tmp_path: Path) -> None:
@@ -176,14 +176,14 @@ def test_errors_of_the_command(folder: Path, tmp_path: Path) -> None:
 
 
 def test_a_scene_elsewhere_is_an_error(inputs: EnhancementInputs) -> None:
-    prepared = prepare_enhancement(replace(inputs, up="0,0,1"), load_configuration("demo").ingest)
+    prepared = prepare_enhancement(replace(inputs, up="0,0,1"), load_configuration("demo"))
     config = load_configuration("demo", settings=[*prepared.settings, *SIZE, "ingest.placement={scale: 1000.0}"])
     with pytest.raises(InputError, match="next to nothing of the scene"):
         ingest(config.ingest, open_log(prepared.log), 0)
 
 
 def test_keys_depend_on_the_file_and_not_on_its_place(inputs: EnhancementInputs, folder: Path, tmp_path: Path) -> None:
-    prepared = prepare_enhancement(inputs, IngestConfig())
+    prepared = prepare_enhancement(inputs, PipelineConfig())
 
     def key(scene: Path) -> str:
         settings = [*prepared.settings, f"ingest.scene={scene}"]
@@ -195,6 +195,13 @@ def test_keys_depend_on_the_file_and_not_on_its_place(inputs: EnhancementInputs,
     assert key(copy) == key(folder / "scene.ply")
     copy.write_bytes(copy.read_bytes()[:-4] + b"\0\0\0\0")
     assert key(copy) != key(folder / "scene.ply")
+
+
+def test_dense_scenes_are_not_split(inputs: EnhancementInputs) -> None:
+    dense = prepare_enhancement(inputs, load_configuration("small", settings=["initial.max_points=100"]))
+    assert "enet.split_fraction=0" in dense.settings
+    sparse = prepare_enhancement(inputs, load_configuration("small"))
+    assert not any(setting.startswith("enet.") for setting in sparse.settings)
 
 
 # --- the file
