@@ -135,7 +135,9 @@ class PosedImagesLog:
         path = self._rig.world_SE3_ego[:, :3, 3]
         steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
         step = float(np.median(steps)) if len(steps) else 0.0
-        return np.arange(self.frame_count) * float(np.clip(step / _ASSUMED_SPEED_M_S, *_PERIOD_RANGE_S))
+        period_s = float(np.clip(step / _ASSUMED_SPEED_M_S, *_PERIOD_RANGE_S))
+        times: Float64 = period_s * np.arange(self.frame_count, dtype=np.float64)
+        return times
 
     def frame_timestamp_s(self, frame: int) -> float:
         """The time of a frame; assumed where the file has no times."""

@@ -45,13 +45,13 @@ def fill_rig_poses(groups: FrameGroups, world_R_source: Float64, scale: float) -
             poses[name][index, :3, 3] = scale * (world_R_source @ image.source_SE3_camera[:3, 3])
     # The camera with most images is the rig's origin: every other one is placed by it.
     anchor = max(groups.cameras, key=lambda name: int(known[name].sum()))
-    for index in np.flatnonzero(~known[anchor]):
+    for index in np.flatnonzero(~known[anchor]).tolist():
         other = next(iter(groups.frames[index]))
-        poses[anchor][index] = poses[other][index] @ _find_mount(poses, known, (other, anchor), int(index))
+        poses[anchor][index] = poses[other][index] @ _find_mount(poses, known, (other, anchor), index)
     for name in groups.cameras:
-        for index in np.flatnonzero(~known[name]):
+        for index in np.flatnonzero(~known[name]).tolist():
             if name != anchor:
-                mount = _find_mount(poses, known, (anchor, name), int(index))
+                mount = _find_mount(poses, known, (anchor, name), index)
                 poses[name][index] = poses[anchor][index] @ mount
     ordered = [poses[name] for name in groups.cameras]
     motion = ordered[0][-1, :3, 3] - ordered[0][0, :3, 3]
