@@ -198,7 +198,9 @@ def test_keys_depend_on_the_file_and_not_on_its_place(inputs: EnhancementInputs,
 
 
 def test_dense_scenes_are_not_split(inputs: EnhancementInputs) -> None:
-    dense = prepare_enhancement(inputs, load_configuration("small", settings=["initial.max_points=100"]))
+    dense = prepare_enhancement(
+        inputs, load_configuration("small", settings=["initial.max_points=100", "initial.distant_count=0"])
+    )
     assert "enet.split_fraction=0" in dense.settings
     sparse = prepare_enhancement(inputs, load_configuration("small"))
     assert not any(setting.startswith("enet.") for setting in sparse.settings)
