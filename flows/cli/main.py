@@ -17,6 +17,7 @@ from flows.cli.diff import diff
 from flows.cli.doctor import doctor
 from flows.cli.edit import edit
 from flows.cli.effects import effects
+from flows.cli.enhance import enhance
 from flows.cli.export import export
 from flows.cli.figure import figure
 from flows.cli.import_command import import_command
@@ -49,6 +50,7 @@ app = typer.Typer(
 )
 # The order here is the order in `genre --help`: from a first run to looking at it, then measuring and training.
 app.command(name="run")(run)
+app.command(name="enhance")(enhance)
 app.command(name="check")(check)
 app.command(name="effects")(effects)
 app.command(name="render")(render)

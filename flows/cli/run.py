@@ -53,8 +53,19 @@ TableOption = Annotated[
 
 
 @dataclass(frozen=True)
-class _RunRequest:
-    """What the user asks for, read and checked."""
+class RunRequest:
+    """What the user asks for, read and checked.
+
+    Attributes:
+        log: the log's URI.
+        preset: name of the preset.
+        store: folder (or URI) of the store.
+        chunks: numbers of chunks; ``None`` for all.
+        config: the effective configuration.
+        budget_s: seconds that the run may take; ``None`` for no limit.
+        start_time: when the command began, seconds since the epoch.
+        table: what a budget chooses from; ``None`` for the preset's table.
+    """
 
     log: str
     preset: str
@@ -104,7 +115,7 @@ def run(
     add_facts(log=log, preset=preset, store=store, run=None, report=None, chunks=[], left_out=[])
     # Over the settings, as --strict is the more explicit wish.
     strict_settings = ["ingest.strict=true"] if strict else []
-    request = _RunRequest(
+    request = RunRequest(
         log=log,
         preset=preset,
         store=store,
@@ -115,15 +126,22 @@ def run(
         start_time=psutil.Process().create_time(),
         table=None if table is None else str(table),
     )
-    _check_request(request)
+    check_request(request)
     if dry_run:
-        _print_dry_run(request, as_json)
+        print_dry_run(request, as_json)
     else:
-        _reconstruct(request, as_json)
+        reconstruct(request, as_json)
 
 
-def _check_request(request: _RunRequest) -> None:
-    """Checks all that the run needs: a mistake shows here, before Prefect's server takes seconds to start."""
+def check_request(request: RunRequest) -> None:
+    """Checks all that the run needs: a mistake shows here, before Prefect's server takes seconds to start.
+
+    Args:
+        request: what the user asks for.
+
+    Raises:
+        GenreError: as :func:`flows.preflight.requirements.check_requirements` raises it.
+    """
     from flows.preflight.requirements import check_requirements
     from genre_tasks.errors import ConfigError
 
@@ -137,7 +155,16 @@ def _check_request(request: _RunRequest) -> None:
         raise ConfigError("--table is what --budget chooses from", remedy="Give a --budget, too, or leave it out.")
 
 
-def _reconstruct(request: _RunRequest, as_json: bool) -> None:
+def reconstruct(request: RunRequest, as_json: bool) -> None:
+    """Runs what was asked for, and prints the result.
+
+    Args:
+        request: what the user asks for.
+        as_json: one JSON object instead of tables.
+
+    Raises:
+        GenreError: as the flow raises it.
+    """
     from flows.cli.outcome import add_facts
     from flows.cli.terminal import report_on_terminal
     from flows.reconstruction.left_out import ChunksLeftOutError
@@ -169,7 +196,7 @@ def _reconstruct(request: _RunRequest, as_json: bool) -> None:
     _print_result(record, as_json)
 
 
-def _find_stored_record(request: _RunRequest) -> dict[str, Any] | None:
+def _find_stored_record(request: RunRequest) -> dict[str, Any] | None:
     """The record of a run that finds every stage in the store, without Prefect; ``None`` for any other."""
     from flows.cli.terminal import TerminalReporter
     from flows.prefect_api.settings_sources import API_URL, find_source
@@ -202,7 +229,16 @@ def _print_result(record: dict[str, Any], as_json: bool, error: ChunksLeftOutErr
         print_run(record)
 
 
-def _print_dry_run(request: _RunRequest, as_json: bool) -> None:
+def print_dry_run(request: RunRequest, as_json: bool) -> None:
+    """Prints what the run would compute.
+
+    Args:
+        request: what the user asks for.
+        as_json: one JSON object instead of tables.
+
+    Raises:
+        GenreError: what the run needs is missing.
+    """
     from flows.cli.outcome import print_outcome
     from flows.cli.run_tables import print_prediction
     from flows.configuration import diff_from_preset
@@ -226,7 +262,7 @@ def _print_dry_run(request: _RunRequest, as_json: bool) -> None:
         print_prediction(prediction)
 
 
-def _first_choice(request: _RunRequest, budget_s: float) -> tuple[PipelineConfig, str]:
+def _first_choice(request: RunRequest, budget_s: float) -> tuple[PipelineConfig, str]:
     """What the first chunk would begin with and the stage where that ends; printed to stderr, too."""
     from flows.budget.budget import Budget
     from flows.pipeline.log_cache import select_chunks

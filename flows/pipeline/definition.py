@@ -123,8 +123,11 @@ PIPELINE: tuple[StageSpec, ...] = (
 
 STAGE_BY_NAME: Mapping[str, StageSpec] = {spec.name: spec for spec in PIPELINE}
 
-_FILE_SETTINGS = {"ingest": ("points",), "evaluate": ("inception", "lpips")}
+_FILE_SETTINGS = {"ingest": ("points", "scene"), "initial": ("scene",), "evaluate": ("inception", "lpips")}
 """Settings that name files, by section."""
+
+_SCENE_MODULES = {"ingest": f"{_STAGES}.scene_points", "initial": f"{_STAGES}.scene_file"}
+"""What the stages run in addition where they read a file of Gaussians."""
 
 _WEIGHTS_SETTINGS = {"weights": True, "refine": {"weights"}}
 """Settings that name weights: their digest is part of the key, so where they lie is not."""
@@ -241,12 +244,37 @@ def _digest_weights_file(file: Path) -> str:
     return digest_file(file)
 
 
+def find_scene_modules(spec: StageSpec, config: PipelineConfig) -> tuple[str, ...]:
+    """Names the code that a stage runs only where it reads a file of Gaussians: the file's format, and its own.
+
+    Args:
+        spec: the stage.
+        config: the configuration of the whole pipeline.
+
+    Returns:
+        Modules; none for a stage that reads no such file.
+
+    Raises:
+        InputError: the file's name has no known suffix.
+        ConfigError: the format's package is not installed.
+
+    >>> find_scene_modules(STAGE_BY_NAME["initial"], PipelineConfig())
+    ()
+    """
+    file = getattr(config_section(spec, config), "scene", None)
+    if file is None:
+        return ()
+    from genre_tasks.exchange.registry import find_format
+
+    return (_SCENE_MODULES[spec.name], type(find_format(Path(file))).__module__)
+
+
 def stage_key(
     spec: StageSpec,
     config: PipelineConfig,
     inputs: Mapping[str, str],
     weights: str | None,
-    reader: tuple[str, ...] = (),
+    more_modules: tuple[str, ...] = (),
 ) -> str:
     """Computes the key of a stage's artifact: equal keys mean that a stored artifact can be used again.
 
@@ -255,7 +283,8 @@ def stage_key(
         config: the configuration of the whole pipeline; only the stage's section counts.
         inputs: name → payload digest of each input, and for ``log`` the log's digest and the chunk.
         weights: digest of the stage's weights, from :func:`digest_stage_weights`.
-        reader: the module that reads the log. No import of the stage names it, but it is part of the stage's code.
+        more_modules: what reads the log and files of Gaussians. No import of the stage names it, but it is part of the
+            stage's code.
 
     Returns:
         64 hex digits of sha256.
@@ -269,5 +298,5 @@ def stage_key(
         # A file that a setting names is an input: its bytes count, not its name alone.
         if configuration[key] and Path(configuration[key]).is_file():
             configuration[key] = digest_file(Path(configuration[key]))
-    code = code_digest(spec.module, lazy_modules=(*spec.lazy_modules, *reader))
+    code = code_digest(spec.module, lazy_modules=(*spec.lazy_modules, *more_modules))
     return keys.stage_key(spec.name, code, configuration, inputs, weights)

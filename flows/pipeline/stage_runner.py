@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from flows.machine.facts import describe_environment
 from flows.machine.resource_usage import measure_usage
-from flows.pipeline.definition import STAGE_BY_NAME, StageSpec, config_section, digest_stage_weights, stage_key
+from flows.pipeline.definition import (
+    STAGE_BY_NAME,
+    StageSpec,
+    config_section,
+    digest_stage_weights,
+    find_scene_modules,
+    stage_key,
+)
 from flows.pipeline.log_cache import cached_log
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ArtifactCorruptError
@@ -99,20 +106,21 @@ def compute_key(spec: StageSpec, job: Job, inputs: Mapping[str, ArtifactRef]) ->
         digests["log"] = cached_log(job.log).digest()
         digests["chunk"] = str(job.chunk)
     weights = digest_stage_weights(spec, config)
-    return stage_key(spec, config, digests, weights, reader_modules(spec, job)), weights
+    return stage_key(spec, config, digests, weights, reading_modules(spec, job)), weights
 
 
-def reader_modules(spec: StageSpec, job: Job) -> tuple[str, ...]:
-    """Names the module that reads the log, whose code is part of the stage's code.
+def reading_modules(spec: StageSpec, job: Job) -> tuple[str, ...]:
+    """Names the modules that read the log and files of Gaussians, whose code is part of the stage's code.
 
     Args:
         spec: the stage.
-        job: says which log is read.
+        job: says which log and files are read.
 
     Returns:
-        One module name, or nothing for a stage that does not read the log.
+        Module names; nothing for a stage that reads neither.
     """
-    return (type(cached_log(job.log)).__module__,) if spec.needs_log else ()
+    reader = (type(cached_log(job.log)).__module__,) if spec.needs_log else ()
+    return (*reader, *find_scene_modules(spec, PipelineConfig.model_validate(job.config)))
 
 
 def artifact_address(stage: str, job: Job, key: str) -> Address:
@@ -211,7 +219,7 @@ def run_stage(
         inputs={name: inputs[name].key for name in spec.inputs},
         # As configured, not with the smaller batch of a retry, which is no part of the result.
         configuration=configured.model_dump(mode="json"),
-        code_digest=code_digest(spec.module, lazy_modules=(*spec.lazy_modules, *reader_modules(spec, job))),
+        code_digest=code_digest(spec.module, lazy_modules=(*spec.lazy_modules, *reading_modules(spec, job))),
         weights_digest=digest_stage_weights(spec, PipelineConfig.model_validate(job.config)),
         seconds=usage.seconds,
         peak_mib=usage.peak_mib,

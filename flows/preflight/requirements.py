@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flows.pipeline.definition import PIPELINE, StageSpec, find_weights_file
+from flows.pipeline.definition import PIPELINE, StageSpec, find_scene_modules, find_weights_file
 from flows.pipeline.log_cache import cached_log, select_chunks
 from flows.pipeline.stage_runner import Job
 from flows.preflight.machine_checks import assess_disk, assess_memory, estimate_disk_mib
@@ -181,6 +181,8 @@ def check_files(config: PipelineConfig, stages: Iterable[str] = ALL_STAGES) -> l
     _check_packages(spec for spec in PIPELINE if spec.name in wanted)
     lines = []
     for spec in PIPELINE:
+        if spec.name in wanted:
+            lines += _check_scene(spec, config)
         if spec.name in wanted and spec.weights is not None:
             lines += [f"weights of {spec.name}: {path}" for path in _check_weights(spec, config)]
     if any(name.startswith("evaluate/") for name in wanted):
@@ -221,6 +223,8 @@ def _check_points(config: PipelineConfig, log: DrivingLog, chunks: Sequence[int]
         from genre_tasks.scene.ply_reader import check_ply_header
 
         return f"points: {check_ply_header(config.ingest.points)} in {config.ingest.points}"
+    if config.ingest.scene is not None:
+        return f"points: the depth of {config.ingest.scene}"
     # A street that is ray-cast draws its sweeps when they are asked for, which takes as long as a stage.
     if log.truth is not None:
         return "points: LiDAR of the synthetic street"
@@ -259,6 +263,17 @@ def _check_packages(specs: Iterable[StageSpec]) -> None:
                     remedy="Run `make setup`, or `pip install genre` again; `genre doctor` lists all packages.",
                     stage=spec.name,
                 )
+
+
+def _check_scene(spec: StageSpec, config: PipelineConfig) -> list[str]:
+    """Checks that the file of Gaussians is there that a stage reads, and that its format can be read."""
+    file = getattr(getattr(config, spec.section), "scene", None)
+    if file is None:
+        return []
+    if not Path(file).is_file():
+        raise InputError("there is no such file of Gaussians", remedy="Correct the path of the scene.", file=file)
+    find_scene_modules(spec, config)
+    return [f"scene of {spec.name}: {file}"]
 
 
 def _check_weights(spec: StageSpec, config: PipelineConfig) -> list[Path]:

@@ -18,7 +18,7 @@ from genre_tasks.config.optimisation_sections import (
     PerSceneConfig,
     RefineConfig,
 )
-from genre_tasks.config.section import LearningRate, LearningRates, LearningRateTuple, Section
+from genre_tasks.config.section import FilePlacement, LearningRate, LearningRates, LearningRateTuple, Section
 from genre_tasks.config.simulation_sections import KinematicBounds, SimulateConfig
 from genre_tasks.config.stage_sections import (
     EvaluateConfig,
@@ -35,6 +35,7 @@ __all__ = [
     "EffectSetting",
     "EffectsConfig",
     "EvaluateConfig",
+    "FilePlacement",
     "FnetConfig",
     "GnetConfig",
     "IngestConfig",

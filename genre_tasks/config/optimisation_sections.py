@@ -188,10 +188,11 @@ class GnetConfig(OptimiserConfig):
     """GNet, or in its place a baseline that reconstructs from source views too (``configs/baselines.yaml``)."""
 
     # mypy takes more choices than the base class has for a conflict.
-    method: Literal["learned", "adam", "standard_3dgs", "street_gs", "g3r"] = Field(  # type: ignore[assignment]
+    method: Literal["learned", "adam", "standard_3dgs", "street_gs", "g3r", "none"] = Field(  # type: ignore[assignment]
         "learned",
         description="learned: GNet; adam: the baseline tuned for each attribute; standard_3dgs, street_gs: per-scene "
-        "3DGS without and with actors; g3r: learned from recorded views alone, with weights of its own.",
+        "3DGS without and with actors; g3r: learned from recorded views alone, with weights of its own; none: the "
+        "initial scene stays as it is.",
     )
     per_scene: PerSceneConfig = Field(
         PerSceneConfig(), description="Settings of the methods standard_3dgs and street_gs."

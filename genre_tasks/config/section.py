@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import unicodedata
 from collections.abc import Sequence
-from typing import Annotated, TypeVar
+from typing import Annotated, Self, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 Item = TypeVar("Item")
 
@@ -73,6 +73,26 @@ class Section(BaseModel):
     # A mistyped key must not be ignored, and a stage must not change what its key was computed from. Without strict,
     # true would be the number 1 and "3" the number 3. JSON has no number for infinity or NaN, and no stage can use one.
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class FilePlacement(Section):
+    """How coordinates of a file become the log's world: turned, then scaled, about the origin that both share.
+
+    >>> FilePlacement().quat
+    (1.0, 0.0, 0.0, 0.0)
+    """
+
+    scale: float = Field(1.0, ge=1e-6, le=1e6, description="Metres a unit of the file.")
+    quat: Annotated[tuple[float, float, float, float], Field(strict=False)] = Field(
+        (1.0, 0.0, 0.0, 0.0), description="Rotation from the file's axes to the world's as w, x, y, z."
+    )
+
+    @model_validator(mode="after")
+    def _require_rotation(self) -> Self:
+        # No length to divide by, or one that overflows.
+        if not 1e-6 < sum(value * value for value in self.quat) < 1e6:
+            raise ValueError("quat is no rotation")
+        return self
 
 
 class LearningRates(Section):

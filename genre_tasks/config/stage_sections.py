@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from genre_tasks.config.section import Distances, FilePath, Section, Seed, Shifts, Text, TextList
+from genre_tasks.config.section import Distances, FilePath, FilePlacement, Section, Seed, Shifts, Text, TextList
 
 
 class IngestConfig(Section):
@@ -26,6 +26,12 @@ class IngestConfig(Section):
     points: FilePath | None = Field(
         None, description="Path of a PLY file with coloured points, for a log without LiDAR."
     )
+    scene: FilePath | None = Field(
+        None,
+        description="Path of a file of Gaussians whose own depth stands in for LiDAR where there is none, as "
+        "`genre enhance` sets it; points take precedence.",
+    )
+    placement: FilePlacement = Field(FilePlacement(), description="From the axes of points and scene to the world.")
     complete_facades: bool = Field(
         True, description="Complete façades above the LiDAR's field of view, as far as images support it."
     )
@@ -54,7 +60,14 @@ class IngestConfig(Section):
 
 
 class InitialConfig(Section):
-    """Gaussians on LiDAR points, and a fixed number of them far away (paper Sec. III-A)."""
+    """Gaussians on LiDAR points, and a fixed number of them far away (paper Sec. III-A); or those of a file."""
+
+    scene: FilePath | None = Field(
+        None,
+        description="Path of a file of Gaussians to start from, in any format that `genre export` writes; null: they "
+        "are placed on LiDAR points.",
+    )
+    placement: FilePlacement = Field(FilePlacement(), description="From the axes of scene to the world.")
 
     max_points: int = Field(
         400_000,

@@ -37,6 +37,11 @@ _READERS: dict[str, ReaderEntry] = {
         "pandaset:PATH/002",
         "pip install genre (pillow is part of it)",
     ),
+    "posed_images": ReaderEntry(
+        "genre_tasks.logs.posed_images.image_log:open_posed_images",
+        "posed_images:PATH/transforms.json?images=DIR",
+        "pip install genre (scipy and pillow are part of it)",
+    ),
     "synthetic": ReaderEntry(
         "genre_tasks.logs.synthetic:open_synthetic",
         "synthetic:street?seed=1000",
@@ -75,7 +80,7 @@ def known_readers() -> tuple[str, ...]:
         The names, sorted.
 
     >>> known_readers()
-    ('pandaset', 'synthetic')
+    ('pandaset', 'posed_images', 'synthetic')
     """
     return tuple(sorted(_READERS))
 

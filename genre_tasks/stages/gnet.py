@@ -37,6 +37,9 @@ def gnet(
         InputError: the chunk has no source view, an image is unreadable, or weights are missing or do not fit.
         NonFiniteError: the optimisation has diverged.
     """
+    # A scene of another program is enhanced as it is.
+    if config.method == "none":
+        return Reconstruction(initial.scene)
     start = _prepare_start(config, initial.scene, plan)
     return optimise("gnet", drop_unplanned_losses(config, plan), apply_plan(chunk, plan), start, None, progress)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from importlib import import_module
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ from genre_tasks.stages.ingest_views import read_views, require_source_frames
 __all__ = ["STANDSTILL_M", "chunk_count", "ingest"]
 
 _NOTED_WITH_IMAGES = frozenset(LEFT_OUT)
+SCENE_POINTS_MODULE = "genre_tasks.stages.scene_points"
 STANDSTILL_M = 0.1
 """An ego vehicle that travels less than this in a chunk stands still: there is no parallax."""
 
@@ -48,7 +50,7 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
         The chunk, in coordinates of its own.
 
     Raises:
-        InputError: fewer than two source frames have images, or there is neither LiDAR nor ``points``.
+        InputError: fewer than two source frames have images, or there is neither LiDAR nor ``points`` nor ``scene``.
         ConfigError: the chunk or a camera is unknown.
     """
     frames = select_frames(config, log, chunk_index)
@@ -68,6 +70,9 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
     require_source_frames(reading, sources)
     if config.points is not None:
         found = read_points_from_file(reading, config.points)
+    elif config.scene is not None:
+        # By name, as in the stage ``initial``: the renderer is part of this stage only where a scene is rendered.
+        found = import_module(SCENE_POINTS_MODULE).read_points_from_scene(reading, config.scene, sources)
     else:
         found = read_points_from_sweeps(reading, sources)
     # Sweeps and cuboids have been read by now.

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from genre_tasks.config import FilePlacement
 from genre_tasks.errors import InputError
 from genre_tasks.logs.types import CuboidTrack, Float32, Float64
 from genre_tasks.scene.actor_track import ActorTrack
@@ -16,6 +17,7 @@ from genre_tasks.scene.facade_completion import complete_facades
 from genre_tasks.scene.moving_actors import MovingActors, find_points_in_box, select_moving_actors
 from genre_tasks.scene.ply_reader import read_ply
 from genre_tasks.scene.road_completion import complete_road
+from genre_tasks.scene.rotations import quats_to_matrices_numpy
 from genre_tasks.scene.visibility import PointCloud
 from genre_tasks.stages.chunk_reading import ChunkReading
 from genre_tasks.stages.ingest_views import REMEDY
@@ -51,7 +53,7 @@ def read_points_from_file(reading: ChunkReading, file: str) -> ChunkPoints:
 
     Args:
         reading: the chunk; actors, which a file has no points for, are noted in its issues.
-        file: PLY in world coordinates.
+        file: PLY in the coordinates that ``placement`` takes to the world.
 
     Returns:
         A background without actors.
@@ -60,11 +62,31 @@ def read_points_from_file(reading: ChunkReading, file: str) -> ChunkPoints:
         InputError: the file cannot be read.
     """
     positions, colors = read_ply(file)
+    positions = place_points(positions, reading.config.placement)
     # Subtracted in float64, as sweeps are.
     local = (positions - reading.world_SE3_chunk[:3, 3]).astype(np.float32)
     for track in _select_actors(reading).tracks:
         reading.add_issue("actor_few_points", f"track {track.track_id}: points come from a file")
     return ChunkPoints(PointCloud(local, np.full(len(local), NO_SWEEP, np.int16)), [], colors)
+
+
+def place_points(positions: Float64, placement: FilePlacement) -> Float64:
+    """Takes points of a file to the log's world.
+
+    Args:
+        positions: [P, 3] in the file's axes and unit.
+        placement: where they belong.
+
+    Returns:
+        [P, 3] metres; the same bits where the placement changes nothing.
+
+    >>> place_points(np.array([[0.0, 0.0, 1.0]]), FilePlacement(scale=2.0)).tolist()
+    [[0.0, 0.0, 2.0]]
+    """
+    if placement == FilePlacement():
+        return positions
+    rotation = quats_to_matrices_numpy(np.array(placement.quat))
+    return placement.scale * (positions @ rotation.T)
 
 
 def read_points_from_sweeps(reading: ChunkReading, sources: Sequence[View]) -> ChunkPoints:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib import import_module
 
 from genre_tasks.checks import check_finite
 from genre_tasks.config import InitialConfig
@@ -13,11 +14,14 @@ from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.initial_gaussians import build_initial_scene
 from genre_tasks.scene.reconstruction import Reconstruction
 
+SCENE_FILE_MODULE = "genre_tasks.stages.scene_file"
+"""By name: the code of formats is part of the stage only where a file is read, as the keys of artifacts say."""
+
 
 def initial(
     config: InitialConfig, chunk: Chunk, plan: EffectsPlan = DEFAULT_PLAN, progress: Progress = silent
 ) -> Reconstruction:
-    """Places Gaussians on the chunk's LiDAR points and far away.
+    """Places Gaussians on the chunk's LiDAR points and far away, or takes those of a file.
 
     Args:
         config: how many, and how large.
@@ -29,10 +33,15 @@ def initial(
         The initial scene, without losses.
 
     Raises:
-        InputError: no point is near the path.
+        InputError: no point is near the path, or the file cannot be read.
         NonFiniteError: an attribute of a Gaussian is not finite.
     """
     progress(0, 1, "initial scene")
+    if config.scene is not None:
+        scene = import_module(SCENE_FILE_MODULE).load_initial_scene(config, chunk)
+        check_finite(scene.gaussians.pack(), "gaussians", "initial", log=chunk.log, chunk=chunk.index)
+        progress(1, 1, "initial scene")
+        return Reconstruction(scene)
     chunk = apply_plan(chunk, plan)
     # The plan overrides the configuration: where LiDAR reaches everything, a shell has nothing to show.
     if not plan.is_on("distant_region"):

@@ -16,16 +16,22 @@ import pytest
 from typer.testing import CliRunner
 
 from flows.cli.main import app
+from flows.reconstruction.stored_values import read_stage_scene, read_stage_value
 from genre_tasks.config import SimulateConfig
 from genre_tasks.ego_paths.behaviours import plan_behaviour
 from genre_tasks.ego_paths.ego_path import EgoPath
+from genre_tasks.exchange.clouds import transform_cloud
+from genre_tasks.exchange.conversion import pose_scene, to_exchange_scene
+from genre_tasks.exchange.one_cloud import make_resting_scene
+from genre_tasks.exchange.ply import PLY
 from genre_tasks.logs.pandaset.writer import write_pandaset
 from genre_tasks.logs.registry import open_log
 from tests.faults.small_run import LOG, SETTINGS
+from tests.logs.posed_images_folder import write_transforms
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (ROOT / "README.md", ROOT / "docs/quickstart.md", *sorted((ROOT / "docs/guides").glob("*.md")))
-TAKES_SETTINGS = ("run", "effects", "cost", "table", "figure")
+TAKES_SETTINGS = ("run", "enhance", "effects", "cost", "table", "figure")
 READS_STORE = ("show", "diff", "render", "view", "range", "verify", "simulate", "edit", "export", "import", "serve")
 TAKES_STORE = (*TAKES_SETTINGS, *READS_STORE)
 
@@ -55,6 +61,7 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, 
     (folder / "edits.yaml").write_text(re.findall(r"```yaml\n(.*?)```", guide, flags=re.DOTALL)[0])
     with prefect_test_harness(server_startup_timeout=120):
         done = reconstruct_log(LOG, preset="demo", store=str(folder / "store"), settings=list(SETTINGS))
+        write_scene_files(folder, done["run"])
         yield folder, done["run"], f"pandaset:{folder}/pandaset/002"
 
 
@@ -62,6 +69,19 @@ def scene_key(folder: Path, run: str) -> str:
     """The key of the last scene of a run."""
     record = json.loads((folder / "store/runs" / run / "run.json").read_text())
     return next(stage["key"] for stage in record["chunks"][0]["stages"] if stage["stage"] == "enet")
+
+
+def write_scene_files(folder: Path, run: str) -> None:
+    """What ``genre enhance`` takes: a scene, its images and poses, and points."""
+    _, chunk = read_stage_value(str(folder / "store"), run, 0, "ingest")
+    scene = read_stage_scene(str(folder / "store"), run, 0, "initial")
+    cloud = pose_scene(to_exchange_scene(scene, (), (), chunk.world_SE3_chunk, names={}), None)
+    PLY.write(folder / "scene.ply", make_resting_scene(transform_cloud(cloud, chunk.world_SE3_chunk)))
+    write_transforms(folder, street=LOG)
+    points = chunk.static.positions + chunk.world_SE3_chunk[:3, 3]
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n"
+    header += "property double x\nproperty double y\nproperty double z\nend_header\n"
+    (folder / "points.ply").write_text(header + "\n".join(" ".join(map(repr, row)) for row in points.tolist()))
 
 
 def small(command: str, folder: Path, run: str, pandaset: str) -> list[str]:

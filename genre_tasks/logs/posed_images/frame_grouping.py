@@ -1,0 +1,119 @@
+"""Which images were taken together: by labels and times of the file, or by folders with equal file names."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from genre_tasks.errors import InputError
+from genre_tasks.logs.posed_images.posed_image import PosedImage
+
+ONE_CAMERA = "camera"
+_REMEDY = (
+    "Keep the images of each camera in a folder of its own, with equal file names for images of one moment, or write "
+    "`camera` and `time` into every frame of transforms.json."
+)
+_LENS_REMEDY = "Give each camera a folder of its own; COLMAP then needs --ImageReader.single_camera_per_folder 1."
+# Of the frames of the camera that has fewer, so many must have a partner; else the names say nothing.
+_MIN_SHARED = 0.5
+
+
+@dataclass(frozen=True)
+class FrameGroups:
+    """Images of a log by frame and camera.
+
+    Attributes:
+        cameras: names, in order.
+        frames: for each frame the images by camera; a camera may lack some.
+        times_s: of each frame, ``None`` where the file has no times.
+    """
+
+    cameras: tuple[str, ...]
+    frames: tuple[dict[str, PosedImage], ...]
+    times_s: tuple[float, ...] | None
+
+
+def group_frames(images: Sequence[PosedImage], file: Path) -> FrameGroups:
+    """Groups images into frames of a rig.
+
+    Args:
+        images: at least one.
+        file: that they are from, for errors.
+
+    Returns:
+        Frames in the order of their times, or of their names without times.
+
+    Raises:
+        InputError: names of several folders do not agree, two images claim one place, or a camera has two lenses.
+    """
+    has_times = all(image.time_s is not None for image in images)
+    cameras = _name_cameras(images)
+    names = sorted(set(cameras), key=_natural_key)
+    frames: dict[float | str, dict[str, PosedImage]] = {}
+    for image, camera in zip(images, cameras, strict=True):
+        key = float(image.time_s or 0.0) if has_times else PurePosixPath(image.name).stem
+        frame = frames.setdefault(key, {})
+        if camera in frame:
+            problem = f"{image.name} and {frame[camera].name} are of one camera and one moment"
+            raise InputError(problem, remedy=_REMEDY, file=file)
+        frame[camera] = image
+    if len(names) > 1:
+        _require_shared_frames(frames.values(), names, file)
+    order = sorted(frames) if has_times else sorted(map(str, frames), key=_natural_key)
+    _require_one_lens(images, cameras, file)
+    groups = tuple(frames[key] for key in order)
+    return FrameGroups(tuple(names), groups, tuple(map(float, order)) if has_times else None)
+
+
+def _name_cameras(images: Sequence[PosedImage]) -> list[str]:
+    """The camera of each image: by its label, or by its folder where labels do not say what was taken together."""
+    folders = [PurePosixPath(image.name).parent.as_posix() for image in images]
+    labelled = all(image.camera is not None for image in images)
+    # A model's number of a camera alone does not say which images were taken together; folders do.
+    if labelled and (len(set(folders)) == 1 or all(image.time_s is not None for image in images)):
+        labels = [str(image.camera) for image in images]
+        # COLMAP numbers a camera for every image unless it is asked not to.
+        is_one = len({image.lens for image in images}) == 1 and all(image.time_s is None for image in images)
+        return [ONE_CAMERA] * len(images) if is_one or len(set(labels)) == 1 else labels
+    if len(set(folders)) == 1:
+        return [ONE_CAMERA] * len(images)
+    # The part that all share, such as ``images/``, names no camera.
+    shared = len(_shared_parts(folders))
+    return ["_".join(PurePosixPath(folder).parts[shared:]) or ONE_CAMERA for folder in folders]
+
+
+def _shared_parts(folders: Sequence[str]) -> tuple[str, ...]:
+    parts = [PurePosixPath(folder).parts for folder in set(folders)]
+    shared = 0
+    while all(len(p) > shared and p[shared] == parts[0][shared] for p in parts):
+        shared += 1
+    return parts[0][:shared]
+
+
+def _require_shared_frames(frames: Collection[Mapping[str, PosedImage]], names: Sequence[str], file: Path) -> None:
+    counts = Counter(name for frame in frames for name in frame)
+    together = Counter(name for frame in frames if len(frame) > 1 for name in frame)
+    for name in names:
+        if together[name] < _MIN_SHARED * counts[name]:
+            raise InputError(
+                f"{counts[name] - together[name]} of {counts[name]} images of {name} have no partner of the same name "
+                "in the folders of other cameras",
+                remedy=_REMEDY,
+                file=file,
+            )
+
+
+def _require_one_lens(images: Sequence[PosedImage], cameras: Sequence[str], file: Path) -> None:
+    lenses = {camera: image.lens for image, camera in zip(images, cameras, strict=True)}
+    for image, camera in zip(images, cameras, strict=True):
+        if image.lens != lenses[camera]:
+            problem = f"the images of {camera} have more than one set of intrinsics, {image.name} another than the last"
+            raise InputError(problem, remedy=_LENS_REMEDY, file=file)
+
+
+def _natural_key(name: str) -> list[tuple[int, str]]:
+    """Numbers within names count as numbers, so that 10 comes after 9."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]

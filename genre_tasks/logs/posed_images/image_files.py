@@ -1,0 +1,93 @@
+"""Where the images of a file of poses lie, whatever folders its names begin with, and what size they have."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+from genre_tasks.errors import InputError
+from genre_tasks.logs.types import Lens
+
+# instant-ngp's names may lack the suffix.
+_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
+_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
+# Rounding of both sides of a resampled image changes its shape by so many pixels at most.
+_ROUNDING_PX = 2.0
+
+
+class ImageFolder:
+    """A folder of images that are asked for by the names of a file of poses.
+
+    Args:
+        folder: that exists.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._dropped_parts = 0
+
+    def find(self, name: str) -> Path | None:
+        """Finds an image. Leading folders of a name that are not in this folder are left out.
+
+        Args:
+            name: as the file of poses writes it.
+
+        Returns:
+            The file; ``None`` if there is none.
+        """
+        # Without a root and steps upwards, so that no name leads out of the folder.
+        parts = [part for part in PurePosixPath(name).parts if part not in ("/", "..", ".")]
+        # What fitted the last name fits most likely again.
+        order = sorted(range(len(parts)), key=lambda dropped: dropped != self._dropped_parts)
+        for dropped in order:
+            for suffix in _SUFFIXES if PurePosixPath(name).suffix == "" else ("",):
+                path = self._folder.joinpath(*parts[dropped:-1], parts[-1] + suffix)
+                if path.is_file():
+                    self._dropped_parts = dropped
+                    return path
+        return None
+
+
+def fit_lens(lens: Lens, camera: str, files: Sequence[Path]) -> Lens:
+    """Scales a lens to the images that there are.
+
+    Args:
+        lens: at the size that the file of poses states.
+        camera: name of the camera, for errors.
+        files: its images; the first readable one counts.
+
+    Returns:
+        The lens at the images' size.
+
+    Raises:
+        InputError: the images have another shape, or none can be read.
+    """
+    for file in files:
+        size = _read_size(file)
+        if size is None:
+            continue
+        width, height = size
+        # Half-size images of odd sides are rounded.
+        if abs(lens.height_px * width / lens.width_px - height) > _ROUNDING_PX:
+            problem = f"images of {camera} are {width}×{height}, the intrinsics are for "
+            problem += f"{lens.width_px}×{lens.height_px}"
+            raise InputError(problem, remedy="Give the images that the poses were made from.", file=file, camera=camera)
+        return lens if size == (lens.width_px, lens.height_px) else lens.resized(width, height)
+    raise InputError(
+        f"no image of {camera} can be read", remedy="Give images as PNG or JPEG.", file=files[0], camera=camera
+    )
+
+
+def _read_size(file: Path) -> tuple[int, int] | None:
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            # Ingest judges whether an image is too large.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(file, formats=_FORMATS) as image:
+                return image.size
+    # Damaged headers raise whatever the decoder of their format stumbles over.
+    except Exception:
+        return None
