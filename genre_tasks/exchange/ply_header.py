@@ -29,12 +29,14 @@ class PlyTable:
     """Where an element's rows are in a file, and what a row holds.
 
     Attributes:
+        path: of the file.
         name: of the element.
         row: numpy's type of one row.
         count: of rows.
         offset: bytes before the first row.
     """
 
+    path: Path
     name: str
     row: np.dtype[np.void]
     count: int
@@ -47,9 +49,18 @@ class PlyTable:
             stream: the file, open for reading.
             start: first row.
             stop: row after the last one.
+
+        Returns:
+            ``stop - start`` rows.
+
+        Raises:
+            InputError: the file has become shorter since its header was read.
         """
         stream.seek(self.offset + start * self.row.itemsize)
-        return np.fromfile(stream, self.row, stop - start)
+        rows = np.fromfile(stream, self.row, stop - start)
+        if len(rows) < stop - start:
+            raise InputError("the file has become shorter while it was read", remedy=_REMEDY, file=self.path)
+        return rows
 
 
 @dataclass(frozen=True)
@@ -99,7 +110,7 @@ def read_ply_header(path: Path) -> PlyHeader:
     for element, count in zip(parsed.elements, counts, strict=True):
         row = np.dtype(element.dtype(parsed.byte_order))
         check_claimed_size(path, offset + count * row.itemsize, size, f"{count} rows of {element.name}")
-        tables[element.name] = PlyTable(element.name, row, count, offset)
+        tables[element.name] = PlyTable(path, element.name, row, count, offset)
         offset += count * row.itemsize
     comments = (*parsed.comments, *(comment for element in parsed.elements for comment in element.comments))
     return PlyHeader(tables, comments)
