@@ -99,7 +99,7 @@ class AntimatterSplatFormat:
             total = sum(len(cloud) for cloud in clouds)
             losses.append(f"The colours of {outside} of {total} Gaussians are cut to the range from 0 to 1.")
         if any(cloud.antialiased for cloud in clouds):
-            losses.append("That the scene was made with anti-aliasing is left out.")
+            losses.append("That the scene was made with anti-aliasing is left out: without it thin parts look thicker.")
         return tuple(losses)
 
 

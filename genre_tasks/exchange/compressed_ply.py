@@ -62,15 +62,16 @@ class CompressedPlyFormat:
         # Each Gaussian's chunk.
         owner = np.arange(vertices.count) // CHUNK_SIZE
         rgba = _unpack_rgba(packed["packed_color"])
-        cloud = SplatCloud(
-            means=_unpack_in_ranges(packed["packed_position"], ranges, owner, ""),
-            log_scales=_unpack_in_ranges(packed["packed_scale"], ranges, owner, "scale_"),
-            quats=unpack_smallest_three(packed["packed_rotation"]),
-            logit_opacities=opacities_to_logits(rgba[:, 3]),
-            sh_dc=colors_to_sh_dc(_scale_colors(rgba[:, :3], ranges, owner)),
-            sh_rest=_read_sh(path, header, vertices.count),
-        )
-        # Ranges that are finite may still be too wide for float32.
+        # Ranges that are finite may still be too wide for float32: what becomes infinite is refused below.
+        with np.errstate(over="ignore"):
+            cloud = SplatCloud(
+                means=_unpack_in_ranges(packed["packed_position"], ranges, owner, ""),
+                log_scales=_unpack_in_ranges(packed["packed_scale"], ranges, owner, "scale_"),
+                quats=unpack_smallest_three(packed["packed_rotation"]),
+                logit_opacities=opacities_to_logits(rgba[:, 3]),
+                sh_dc=colors_to_sh_dc(_scale_colors(rgba[:, :3], ranges, owner)),
+                sh_rest=_read_sh(path, header, vertices.count),
+            )
         check_finite_cloud(path, cloud)
         return make_resting_scene(cloud, (_LOSS,))
 

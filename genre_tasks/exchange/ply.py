@@ -84,9 +84,14 @@ class PlyFormat:
             # Readers know one of these each.
             mode = "mip" if cloud.antialiased else "default"
             comments = [f"SplatRenderMode: {mode}", f"antialiased {int(cloud.antialiased)}"]
-        element = PlyElement.describe(_pack_rows(cloud), "vertex")
+        row = _describe_row(cloud.sh_rest.shape[1])
+        # One row stands for all: a header needs their type and number alone.
+        rows = np.broadcast_to(np.zeros(1, row), len(cloud))
+        header = PlyData([PlyElement.describe(rows, "vertex")], byte_order="<", comments=comments).header
         with path.open("wb") as stream:
-            PlyData([element], byte_order="<", comments=comments).write(stream)
+            stream.write(f"{header}\n".encode("ascii"))
+            for start in range(0, len(cloud), _ROWS):
+                stream.write(_pack_rows(cloud.select(slice(start, start + _ROWS))).tobytes())
 
     def describe_losses(self, scene: ExchangeScene) -> tuple[str, ...]:
         """Lists what of a scene the format cannot carry: parts, motion and the place in the world.
@@ -182,23 +187,24 @@ def _pair_attributes(cloud: SplatCloud) -> Iterator[tuple[str, tuple[str, ...], 
 
 
 def _copy_columns(block: NDArray[np.void], names: tuple[str, ...], target: Float32) -> None:
-    for column, name in enumerate(names):
-        target[:, column] = block[name]
+    # What float32 does not hold becomes infinite, and is refused as such.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for column, name in enumerate(names):
+            target[:, column] = block[name]
 
 
-def _pack_rows(cloud: SplatCloud) -> NDArray[np.void]:
-    sh_names = tuple(f"f_rest_{k}" for k in range(3 * cloud.sh_rest.shape[1]))
+def _describe_row(columns: int) -> np.dtype[np.void]:
+    sh_names = (f"f_rest_{k}" for k in range(3 * columns))
     names = (*_MEANS, *_SH_DC, *sh_names, _OPACITY, *_LOG_SCALES, *_QUATS)
-    values = np.empty((len(cloud), len(names)), "<f4")
-    stop = 6 + len(sh_names)
-    values[:, :3] = cloud.means
-    values[:, 3:6] = cloud.sh_dc
+    return np.dtype([(name, "<f4") for name in names])
+
+
+def _pack_rows(cloud: SplatCloud) -> NDArray[np.float32]:
+    """[N, properties] in the order of :func:`_describe_row`."""
     # All reds come first, then all greens, then all blues.
-    values[:, 6:stop] = cloud.sh_rest.transpose(0, 2, 1).reshape(len(cloud), len(sh_names))
-    values[:, stop] = cloud.logit_opacities
-    values[:, stop + 1 : stop + 4] = cloud.log_scales
-    values[:, stop + 4 :] = cloud.quats
-    return values.view([(name, "<f4") for name in names]).reshape(len(cloud))
+    harmonics = cloud.sh_rest.transpose(0, 2, 1).reshape(len(cloud), 3 * cloud.sh_rest.shape[1])
+    parts = (cloud.means, cloud.sh_dc, harmonics, cloud.logit_opacities[:, None], cloud.log_scales, cloud.quats)
+    return np.concatenate(parts, axis=1, dtype="<f4")
 
 
 PLY = PlyFormat()

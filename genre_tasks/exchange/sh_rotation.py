@@ -139,12 +139,18 @@ def rotate_sh(sh_rest: _Real, rotation: Float64) -> _Real:
     """
     matrices = compute_sh_rotations(rotation, SH_REST_COUNTS.index(sh_rest.shape[1]))
     out = np.empty_like(sh_rest)
-    # In blocks, so that no copy of all coefficients in float64 is made.
-    for start in range(0, len(sh_rest), _ROWS):
-        rows = slice(start, start + _ROWS)
-        for band, matrix in enumerate(matrices, start=1):
-            block = sh_rest[rows, _columns(band)].astype(np.float64)
-            out[rows, _columns(band)] = np.einsum("ij,njc->nic", matrix, block, optimize=True)
+    for band, matrix in enumerate(matrices, start=1):
+        columns = _columns(band)
+        diagonal = np.diag(matrix)
+        # Flipped axes change signs alone, which most formats need and no product is needed for.
+        if np.array_equal(matrix, np.diag(diagonal)):
+            np.multiply(sh_rest[:, columns], diagonal[:, None], out=out[:, columns], casting="same_kind")
+            continue
+        # In blocks, so that no copy of all coefficients in float64 is made.
+        for start in range(0, len(sh_rest), _ROWS):
+            rows = slice(start, start + _ROWS)
+            block = sh_rest[rows, columns].astype(np.float64)
+            out[rows, columns] = np.einsum("ij,njc->nic", matrix, block, optimize=True)
     return out
 
 

@@ -47,7 +47,9 @@ def make_garden(source: Path = GARDEN, sh_degree: int = 3, seed: int = 0) -> For
     means = data["means3d"].astype(np.float32)
     random = np.random.default_rng(seed)
     distances = cKDTree(means).query(means, k=4)[0][:, 1:]
-    spacing = np.sqrt(np.square(distances).mean(1)).clip(1e-4)
+    spacing = np.sqrt(np.square(distances).mean(1))
+    # Lone points would hide the garden behind blots.
+    spacing = spacing.clip(1e-4, 3 * np.median(spacing))
     cloud = SplatCloud(
         means=means,
         log_scales=np.log(spacing[:, None] * random.uniform(0.6, 1.1, (len(means), 3))).astype(np.float32),

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import tempfile
 import tracemalloc
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
 from genre_tasks.errors import InputError
@@ -119,6 +123,11 @@ def test_big_endian_and_double(path: Path) -> None:
     wide = element.data.astype([(name, "<f8") for name in element.data.dtype.names])
     PlyData([PlyElement.describe(wide, "vertex")], byte_order="<").write(path)
     assert same_bits(read(path), cloud)
+    wide["rot_1"][3] = 1e300
+    PlyData([PlyElement.describe(wide, "vertex")], byte_order="<").write(path)
+    with warnings.catch_warnings(), pytest.raises(InputError, match="quats is not finite in 1"):
+        warnings.simplefilter("error")
+        read(path)
 
 
 def test_line_ends_and_comments_of_any_kind(path: Path) -> None:
@@ -210,6 +219,38 @@ def test_hostile_files(path: Path, name: str) -> None:
     assert caught.value.file == str(path)
     assert caught.value.remedy.endswith(".")
     assert peak < MOST_BYTES
+
+
+def test_headers_with_lines_in_disorder() -> None:
+    # Structured damage gets further than flipped bytes: each header here still looks like one.
+    words = st.sampled_from(["0", "-1", "21", "99999999999", "float", "uchar", "list", "vertex", "x", "end_header"])
+    changes = st.lists(st.tuples(st.integers(0, 40), st.sampled_from(["drop", "repeat", "swap", "word"]), words))
+
+    @settings(max_examples=60, deadline=None)
+    @given(changes=changes)
+    def search(changes: list[tuple[int, str, str]]) -> None:
+        lines = header.split(b"\n")
+        for place, kind, word in changes:
+            k = place % len(lines)
+            if kind == "drop" and len(lines) > 1:
+                del lines[k]
+            elif kind == "repeat":
+                lines.insert(k, lines[k])
+            elif kind == "swap":
+                lines[k], lines[k - 1] = lines[k - 1], lines[k]
+            elif kind == "word":
+                lines[k] = b" ".join([*lines[k].split()[:-1], word.encode()])
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "scene.ply"
+            path.write_bytes(b"\n".join(lines) + body)
+            TestPly().read_or_refuse(path)
+
+    with tempfile.TemporaryDirectory() as folder:
+        text = write(Path(folder) / "scene.ply", make_cloud(20, 1))
+    end = text.index(b"end_header\n") + len(b"end_header\n")
+    header = text[:end]
+    body = text[end:]
+    search()
 
 
 @pytest.mark.parametrize(
