@@ -19,8 +19,8 @@ from genre_tasks.stages.chunk_reading import ChunkReading
 from genre_tasks.stages.ingest_points import ChunkPoints
 from genre_tasks.stages.scene_file import read_placed_scene
 
-MAX_POINTS = 400_000
-"""About what the sweeps of a chunk have where LiDAR is sparse; each keeps the image's full width of detail."""
+MAX_POINTS = 1_500_000
+"""About as many as the sweeps of a chunk have; views are looked at more coarsely where they have more pixels."""
 
 MAX_DEPTH_M = 100.0
 """Farther than LiDAR reaches, a render's depth says little."""
