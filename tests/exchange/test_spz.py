@@ -169,7 +169,7 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_quaternion_without_direction_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="Gaussian 2 .*no direction"):
+    with pytest.raises(InputError, match=r"Gaussian 2 .*no direction"):
         write(tmp_path / "scene.spz", change_one(make_cloud(4), "quats", 0.0, row=2))
 
 
