@@ -11,6 +11,7 @@ import subprocess
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -124,7 +125,7 @@ def _run(folder: Path, *command: str) -> str:
 def _convert(folder: Path, *names: str) -> Path:
     """Through the files of these names, one after the other."""
     tool = "node_modules/@playcanvas/splat-transform/bin/cli.mjs"
-    for source, target in zip(names, names[1:], strict=False):
+    for source, target in pairwise(names):
         _run(folder, "node", tool, "-q", "-w", "-g", "cpu", source, target)
     return folder / names[-1]
 
