@@ -29,6 +29,7 @@ from benchmarks.common.claims import Claim
 from benchmarks.exchange.answer_time import answer_time_claims, answer_time_table, measure_answer_time
 from benchmarks.exchange.enhancement import enhancement_claims, enhancement_table, measure_enhancement
 from benchmarks.exchange.import_speed import import_speed_claims, import_speed_table, measure_import_speed
+from benchmarks.exchange.interop import interop_claims, interop_table, measure_interop
 from benchmarks.exchange.measured_run import RunCase
 from benchmarks.exchange.pages import measure_page, pages_claims, pages_table, seek_end, seek_start
 from benchmarks.exchange.round_trips import (
@@ -38,6 +39,8 @@ from benchmarks.exchange.round_trips import (
     round_trip_table,
 )
 from benchmarks.exchange.service_fuzz import REQUESTS, service_fuzz_claims, service_fuzz_table
+from flows.reconstruction.stored_values import find_last_stage, read_stage_scene, read_stage_value
+from genre_tasks.exchange.conversion import to_exchange_scene
 
 _FORMATS = ("ply", "splat", "spz", "glb", "usdz")
 _HARMONIC_FORMATS = ("ply", "spz", "glb", "usdz")
@@ -49,6 +52,7 @@ _QUICK_REQUESTS = 500
 _RUN_S = 200.0
 _FORMAT_S = 6.0
 _SPEED_S = 20.0
+_TOOLS_S = 120.0
 _PAGE_S = 120.0
 _ANSWER_S = 45.0
 _SERVICE_S = 60.0
@@ -71,6 +75,7 @@ class ExchangeBench:
         "benchmarks.exchange.answer_time",
         "benchmarks.exchange.enhancement",
         "benchmarks.exchange.import_speed",
+        "benchmarks.exchange.interop",
         "benchmarks.exchange.pages",
         "benchmarks.exchange.round_trips",
         "benchmarks.exchange.service",
@@ -94,7 +99,8 @@ class ExchangeBench:
         "genre_tasks.ego_paths.bicycle",
     )
     smallest = SmallestForm(
-        {"log": f"synthetic:street?seed={TINY_STREET}", "seeds": "", "settings": TINY_SETTINGS}, "round trip ply"
+        {"log": f"synthetic:street?seed={TINY_STREET}", "seeds": "", "settings": TINY_SETTINGS},
+        "round trip ply degree 0",
     )
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
@@ -115,6 +121,7 @@ class ExchangeBench:
         ]
         cells += [
             Cell("import speed", _SPEED_S, partial(measure_import_speed, 3 if quick else _ROUNDS)),
+            Cell("other tools", _TOOLS_S, partial(_measure_tools, case), parameters),
             Cell("page viewer", _PAGE_S, partial(_measure_viewer, case), parameters),
             Cell("page report", _PAGE_S, partial(_measure_report, case), parameters),
             Cell("answers", _ANSWER_S, partial(measure_answer_time, 3 if quick else _ROUNDS)),
@@ -135,6 +142,7 @@ class ExchangeBench:
     def claims(self, rows: Mapping[str, Row]) -> Iterator[Claim]:
         """Makes the claims, section by section."""
         yield from round_trip_claims(_select(rows, "round"))
+        yield from interop_claims(_select(rows, "other tools"))
         yield from import_speed_claims(_select(rows, "import"))
         yield from enhancement_claims(_select(rows, "enhancement"))
         yield from pages_claims(_select(rows, "page"))
@@ -146,6 +154,7 @@ class ExchangeBench:
         """Gives a table for each section, and what was not measured."""
         sections: list[tuple[str, Callable[..., Iterator[str]], tuple[list[Row], ...]]] = [
             ("Formats", round_trip_table, (_select(rows, "round"),)),
+            ("Tools of others", interop_table, (_select(rows, "other tools"),)),
             ("Import", import_speed_table, (_select(rows, "import"),)),
             ("Enhanced scenes", enhancement_table, (_select(rows, "enhancement"),)),
             ("Pages", pages_table, (_select(rows, "page"),)),
@@ -172,6 +181,16 @@ def _select(rows: Mapping[str, Row], kind: str) -> list[Row]:
 
 def _measure_trip(case: RunCase, name: str, degree: int) -> Row:
     return measure_round_trip(name, RoundTripCase(case.store, case.make()), degree)
+
+
+def _measure_tools(case: RunCase) -> Row:
+    """The last scene of a run in tools of others."""
+    run = case.make()
+    _, chunk = read_stage_value(case.store, run, 0, "ingest")
+    scene = read_stage_scene(case.store, run, 0, find_last_stage(case.store, run, 0))
+    times_s = [(frame - chunk.frames[0]) / 10.0 for frame in chunk.frames]
+    names = {actor.track_id: f"actor-{k}" for k, actor in enumerate(scene.actors)}
+    return measure_interop(to_exchange_scene(scene, chunk.frames, times_s, chunk.world_SE3_chunk, names=names))
 
 
 def _measure_viewer(case: RunCase) -> Row:

@@ -39,10 +39,10 @@ def diff(
 ) -> None:
     """Compare two runs or two artifacts.
 
-    For runs it prints the settings that differ, which stages have the same payload, metrics side by side with their
-    differences and intervals, and how the Gaussians of the last scenes differ. For artifacts of one kind it prints
-    settings, files, statistics of columns, and what the kind has. Runs of different logs share settings and mean
-    metrics only.
+    For runs it prints the settings that differ, and which stages have the same payload. Metrics stand side by side with
+    their differences and intervals. It also says how the Gaussians of the last scenes differ. For artifacts
+    of one kind it prints settings, files, statistics of columns, and what the kind has. Runs of different logs share
+    settings and mean metrics only.
 
     Where the number of Gaussians of a node is the same in both, they are compared in their order.
 

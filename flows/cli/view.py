@@ -67,9 +67,9 @@ def view(
 ) -> None:
     """Look at a finished run's scene in a browser.
 
-    The viewer has a slider for the time, the run's stages and chunks, a camera that drives along the recorded path or
-    beside it, switches for actors, the recorded images at their cameras, and the reliable range on the ground. It runs
-    until Ctrl-C. With --html the scene becomes one file that plays by itself.
+    The viewer has a slider for the time, and shows any chunk after any stage. Its camera drives along the recorded path
+    or beside it. Actors can be switched off. Recorded images stand at their cameras, and the reliable range is drawn on
+    the ground. It runs until Ctrl-C. With --html the scene becomes one file that plays by itself.
 
     Example:
 

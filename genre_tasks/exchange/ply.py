@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
 from genre_tasks.errors import InputError
+from genre_tasks.exchange.activations import opacities_to_logits
 from genre_tasks.exchange.checks import check_finite_cloud, check_finite_values
 from genre_tasks.exchange.one_cloud import describe_one_cloud_losses, make_resting_scene, take_one_cloud
 from genre_tasks.exchange.ply_header import PlyTable, read_ply_header
 from genre_tasks.exchange.types import SH_REST_COUNTS, ExchangeScene, SplatCloud
 from genre_tasks.logs.types import Float32
+from genre_tasks.scene.gaussians import OPACITY_CLAMP
 
 # Rows that are read at once: a few megabytes, whatever the file's size.
 _ROWS = 1 << 14
@@ -64,8 +66,11 @@ class PlyFormat:
             raise InputError("the PLY file has no vertices", remedy=_REMEDY, file=path)
         antialiased = _parse_antialiasing(path, header.comments)
         sh_names = _check_properties(path, table)
-        cloud = _read_cloud(path, table, sh_names, antialiased)
-        return make_resting_scene(cloud, _describe_unread(header.tables, sh_names))
+        cloud, bounded = _read_cloud(path, table, sh_names, antialiased)
+        losses = _describe_unread(header.tables, sh_names)
+        if bounded:
+            losses += (f"Infinite opacities of {bounded} Gaussians become those of 1 and 0, less {OPACITY_CLAMP:g}.",)
+        return make_resting_scene(cloud, losses)
 
     def write(self, path: Path, scene: ExchangeScene) -> None:
         """Writes a binary little-endian PLY file without normals.
@@ -149,7 +154,10 @@ def _describe_unread(tables: dict[str, PlyTable], sh_names: tuple[str, ...]) -> 
     return (f"The file also has {', '.join(unread[:_LISTED])}{more}, which is not read.",)
 
 
-def _read_cloud(path: Path, table: PlyTable, sh_names: tuple[str, ...], antialiased: bool | None) -> SplatCloud:
+def _read_cloud(
+    path: Path, table: PlyTable, sh_names: tuple[str, ...], antialiased: bool | None
+) -> tuple[SplatCloud, int]:
+    """The Gaussians, and how many infinite opacities were made finite."""
     count = table.count
     columns = len(sh_names) // 3
     cloud = SplatCloud(
@@ -161,6 +169,7 @@ def _read_cloud(path: Path, table: PlyTable, sh_names: tuple[str, ...], antialia
         sh_rest=np.empty((count, columns, 3), np.float32),
         antialiased=antialiased,
     )
+    bounded = 0
     # Not through a memory map: its pages would count to the process's memory, and a file that another program cuts off
     # meanwhile would end the process.
     with path.open("rb") as stream:
@@ -169,13 +178,23 @@ def _read_cloud(path: Path, table: PlyTable, sh_names: tuple[str, ...], antialia
             block = table.read_rows(stream, rows.start, rows.stop)
             for attribute, names, target in _pair_attributes(cloud):
                 _copy_columns(block, names, target[rows])
+                if names == (_OPACITY,):
+                    bounded += _bound_opacities(target[rows])
                 check_finite_values(path, attribute, target[rows], start)
             # All reds come first, then all greens, then all blues.
             for channel in range(3):
                 names = sh_names[channel * columns : (channel + 1) * columns]
                 _copy_columns(block, names, cloud.sh_rest[rows, :, channel])
             check_finite_values(path, "sh_rest", cloud.sh_rest[rows], start)
-    return cloud
+    return cloud, bounded
+
+
+def _bound_opacities(logits: Float32) -> int:
+    """Makes infinite logits finite, in place; how many there were."""
+    # Writers that take opacities of 0 and 1 from eight bits to logits leave these; NaN means nothing.
+    infinite = np.isinf(logits)
+    logits[infinite] = np.sign(logits[infinite]) * opacities_to_logits(np.array([1 - OPACITY_CLAMP]))
+    return int(infinite.sum())
 
 
 def _pair_attributes(cloud: SplatCloud) -> Iterator[tuple[str, tuple[str, ...], Float32]]:

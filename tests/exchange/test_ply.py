@@ -260,7 +260,6 @@ def test_headers_with_lines_in_disorder() -> None:
         (5, "sh_dc"),
         (6, "sh_rest"),
         (14, "sh_rest"),
-        (15, "logit_opacities"),
         (18, "log_scales"),
         (22, "quats"),
     ],
@@ -274,6 +273,21 @@ def test_values_that_are_not_finite_are_named(path: Path, column: int, attribute
     values[[17_001, 17_500], column] = value
     path.write_bytes(text[:start] + values.tobytes())
     with pytest.raises(InputError, match=f"{attribute} is not finite in 2 Gaussians, the first is number 17001 "):
+        PLY.read(path)
+
+
+def test_opacities_of_zero_and_one_are_bounded_and_nan_is_refused(path: Path) -> None:
+    text = write(path, make_cloud(5))
+    start = text.index(b"end_header\n") + len(b"end_header\n")
+    values = np.frombuffer(bytearray(text[start:]), "<f4").reshape(5, 14).copy()
+    values[1:3, 6] = (np.inf, -np.inf)
+    path.write_bytes(text[:start] + values.tobytes())
+    scene = PLY.read(path)
+    assert scene.losses == ("Infinite opacities of 2 Gaussians become those of 1 and 0, less 1e-06.",)
+    assert scene.nodes[0].cloud.logit_opacities[1:3] == pytest.approx([13.8155, -13.8155], abs=1e-3)
+    values[4, 6] = np.nan
+    path.write_bytes(text[:start] + values.tobytes())
+    with pytest.raises(InputError, match="logit_opacities is not finite in 1 Gaussians"):
         PLY.read(path)
 
 

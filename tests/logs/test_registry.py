@@ -24,7 +24,7 @@ def open_fake(rest: str) -> FakeLog:
 
 
 def test_known_readers() -> None:
-    assert known_readers() == ("pandaset", "synthetic")
+    assert known_readers() == ("pandaset", "posed_images", "synthetic")
 
 
 def test_a_reader_is_one_line() -> None:
@@ -40,7 +40,10 @@ def test_a_reader_is_one_line() -> None:
     [
         ("pandset:x/002", "unknown reader 'pandset'.*Did you mean 'pandaset'"),
         ("PandaSet:x/002", "unknown reader 'PandaSet'.*Did you mean 'pandaset'"),
-        ("nuscenes:x", r"unknown reader 'nuscenes'.*Known: pandaset:PATH/002, synthetic:street\?seed=1000"),
+        (
+            "nuscenes:x",
+            r"unknown reader 'nuscenes'.*Known: pandaset:PATH/002, posed_images:\S+, synthetic:street\?seed=1000",
+        ),
         ("../data/002", "names no reader.*Known: pandaset:PATH/002"),
         ("", "names no reader"),
     ],

@@ -213,7 +213,15 @@ def test_a_run_is_read_by_chunk_and_stage(store: tuple[Path, str]) -> None:
 def test_the_command_serves_until_ctrl_c(store: tuple[Path, str]) -> None:
     folder, name = store
     command = [*GENRE, "view", name, "--store", str(folder), "--port", "0", "--no-range"]
-    process = subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command,
+        env=environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # A shell that runs the tests in the background has them ignore Ctrl-C.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     try:
         assert process.stdout is not None
         line = process.stdout.readline()
