@@ -59,8 +59,6 @@ def export(
 
     \b
         genre export 4b1c --format usdz --out street
-        genre export 4b1c --format ply --out nodes
-        genre export 4b1c --format ply --frame 12 --out moment
         genre export 4b1c --format spz --per-actor --out cars
         genre export 4b1c --format alpasim --out bundle
     """
