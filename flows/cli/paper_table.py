@@ -10,14 +10,24 @@ import typer
 from flows.cli.options import (
     ChunksOption,
     DryRunOption,
-    LogsArgument,
     MethodsOption,
+    OptionalLogsArgument,
     PresetOption,
     SettingsOption,
     StoreOption,
     WeightsOption,
 )
 from flows.cli.parsing import parse_path
+from flows.cli.scene_options import (
+    ChunkFramesOption,
+    ImagesOption,
+    LidarOption,
+    ScaleOption,
+    SceneCamerasOption,
+    SceneOption,
+    UpOption,
+    make_scene_inputs,
+)
 from flows.defaults import DEFAULT_STORE
 
 if TYPE_CHECKING:
@@ -58,7 +68,7 @@ StoredOption = Annotated[
 
 def table(
     number: TableNumberArgument,
-    logs: LogsArgument,
+    logs: OptionalLogsArgument = None,
     preset: PresetOption = "small",
     chunks: ChunksOption = None,
     settings: SettingsOption = None,
@@ -69,6 +79,13 @@ def table(
     into: PageOption = None,
     remarks: RemarksOption = None,
     stored: StoredOption = False,
+    scene: SceneOption = None,
+    cameras: SceneCamerasOption = None,
+    images: ImagesOption = None,
+    lidar: LidarOption = None,
+    up: UpOption = "auto",
+    scale: ScaleOption = None,
+    chunk_frames: ChunkFramesOption = None,
     dry_run: DryRunOption = False,
 ) -> None:
     """Measure a table of the paper, with the paper's numbers beside.
@@ -77,10 +94,13 @@ def table(
 
     Finished stages come from the store, so a table that was stopped goes on where it was, and tables share stages.
 
+    Table 2 also takes a 3D Gaussian scene of any program in the place of logs, and compares it before and after.
+
     Example:
 
     \b
         genre table 4 'synthetic:street?seed=1000' --chunks 0 --out tables
+        genre table 2 --scene point_cloud.ply --cameras transforms.json --scale 1
     """
     from flows.cli.output_paths import check_output_file, check_output_folder
     from flows.cli.parsing import parse_numbers
@@ -93,7 +113,7 @@ def table(
     chunk_numbers = parse_numbers(chunks, "--chunks")
     request = TableRequest(
         number=number,
-        logs=tuple(logs),
+        logs=tuple(logs or ()),
         preset=preset,
         store=store,
         chunks=None if chunk_numbers is None else tuple(chunk_numbers),
@@ -104,9 +124,20 @@ def table(
         into=None if into is None else str(into),
         remarks=tuple(remarks or ()),
         stored=stored,
+        scene=make_scene_inputs(
+            scene=scene,
+            cameras=cameras,
+            images=images,
+            lidar=lidar,
+            up=up,
+            scale=scale,
+            chunk_frames=chunk_frames,
+        ),
     )
     # Mistakes in the request show here, before Prefect's server takes seconds to start.
     checked = request.check()
+    for line in checked.explanation:
+        typer.echo(line, err=True)
     if dry_run:
         rows = predict_table(checked)
         print_rows(f"{len(rows)} cells, {sum(row['seconds'] for row in rows) / 60:.0f} minutes", rows)
@@ -134,5 +165,6 @@ def _measure_table(request: TableRequest) -> dict[str, Any]:
             into=request.into,
             remarks=list(request.remarks),
             stored=request.stored,
+            scene=None if request.scene is None else request.scene.to_values(),
         )
     return done
