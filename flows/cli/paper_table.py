@@ -31,7 +31,7 @@ from flows.cli.scene_options import (
 from flows.defaults import DEFAULT_STORE
 
 if TYPE_CHECKING:
-    from flows.paper_tables.request import TableRequest
+    from flows.paper_tables.request import CheckedRequest, TableRequest
 
 TableNumberArgument = Annotated[
     int,
@@ -104,8 +104,7 @@ def table(
     """
     from flows.cli.output_paths import check_output_file, check_output_folder
     from flows.cli.parsing import parse_numbers
-    from flows.cli.printing import print_rows
-    from flows.paper_tables.request import TableRequest, predict_table
+    from flows.paper_tables.request import TableRequest
 
     check_output_folder(out, "--out")
     if into is not None:
@@ -124,29 +123,27 @@ def table(
         into=None if into is None else str(into),
         remarks=tuple(remarks or ()),
         stored=stored,
-        scene=make_scene_inputs(
-            scene=scene,
-            cameras=cameras,
-            images=images,
-            lidar=lidar,
-            up=up,
-            scale=scale,
-            chunk_frames=chunk_frames,
-        ),
+        scene=make_scene_inputs(scene, cameras, images, lidar, up=up, scale=scale, chunk_frames=chunk_frames),
     )
     # Mistakes in the request show here, before Prefect's server takes seconds to start.
     checked = request.check()
     for line in checked.explanation:
         typer.echo(line, err=True)
     if dry_run:
-        rows = predict_table(checked)
-        print_rows(f"{len(rows)} cells, {sum(row['seconds'] for row in rows) / 60:.0f} minutes", rows)
-        return
-    done = _measure_table(request)
-    typer.echo(f"{done['cells']} cells, {len(done['failed'])} left out; wrote {', '.join(done['files'])}")
+        _print_prediction(checked)
+    else:
+        _measure_table(request)
 
 
-def _measure_table(request: TableRequest) -> dict[str, Any]:
+def _print_prediction(checked: CheckedRequest) -> None:
+    from flows.cli.printing import print_rows
+    from flows.paper_tables.request import predict_table
+
+    rows = predict_table(checked)
+    print_rows(f"{len(rows)} cells, {sum(row['seconds'] for row in rows) / 60:.0f} minutes", rows)
+
+
+def _measure_table(request: TableRequest) -> None:
     from flows.cli.terminal import report_on_terminal
     from flows.paper_tables.flow import paper_table
 
@@ -167,4 +164,4 @@ def _measure_table(request: TableRequest) -> dict[str, Any]:
             stored=request.stored,
             scene=None if request.scene is None else request.scene.to_values(),
         )
-    return done
+    typer.echo(f"{done['cells']} cells, {len(done['failed'])} left out; wrote {', '.join(done['files'])}")

@@ -61,11 +61,11 @@ ChunkFramesOption = Annotated[
 
 
 def make_scene_inputs(
-    *,
     scene: Path | None,
     cameras: Path | None,
     images: Path | None,
     lidar: Path | None,
+    *,
     up: str,
     scale: str | None,
     chunk_frames: int | None,

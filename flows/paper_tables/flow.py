@@ -96,6 +96,11 @@ def paper_table(
         checked = replace(checked, missing=find_unstored_methods(checked) | checked.missing)
     open_store(store).clean_temporaries()
     _warm_up_if_timed(checked)
+    return _measure(request, checked)
+
+
+def _measure(request: TableRequest, checked: CheckedRequest) -> dict[str, Any]:
+    """Runs what can be measured, and writes the table of it; gives what the flow returns."""
     cells, failed = _run_cells(checked)
     complete = [c for c in cells if c.method not in failed]
     if not complete and failed:

@@ -14,10 +14,11 @@ from typer.testing import CliRunner
 from flows.cli.main import app
 from flows.configuration import load_configuration
 from flows.enhancement.enhancement_request import EnhancementInputs
+from flows.experiments.stage_prediction import StagePredictor
 from flows.paper_tables.layouts import SCENE_LAYOUTS
 from flows.paper_tables.measure import warm_up
 from flows.paper_tables.published_numbers import PAPER
-from flows.paper_tables.request import TableRequest, predict_table
+from flows.paper_tables.request import TableRequest
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ConfigError, GenreError, InputError
 from tests.faults.small_run import LOG, SETTINGS
@@ -99,17 +100,14 @@ def test_the_scene_goes_before_the_users_settings_and_methods(folder: Path, tmp_
     assert "--lidar" in request.command and "--scale 2.5" in request.command
 
 
-def test_passing_a_scene_on_costs_nothing(folder: Path, tmp_path: Path) -> None:
-    checked = make_request(folder, tmp_path / "store").check()
-    file = tmp_path / "own.yaml"
-    file.write_text("name: learned\nsettings: [gnet.method=learned, gnet.iterations=3]\nend: gnet\n")
-    request = make_request(folder, tmp_path / "store")
-    learned = TableRequest(**{**vars(request), "methods": (str(file),)}).check()
-    seconds = {row["cell"].partition(" · ")[0]: row["seconds"] for row in predict_table(learned)}
-    # It shares everything with the first row but GNet's stage and the evaluation of its scene.
-    alone = predict_table(checked)[0]["seconds"]
-    assert seconds["Scene as given"] == alone > 0
-    assert seconds["learned"] > 0
+def test_passing_a_scene_on_is_predicted_to_cost_nothing(folder: Path, tmp_path: Path) -> None:
+    job, stages = make_request(folder, tmp_path / "store").check().list_jobs()[0]
+    config = PipelineConfig.model_validate(job.config)
+    predicted = [
+        StagePredictor(job.store).predict("scene", job, config, names)["seconds"]
+        for names in (stages, [name for name in stages if name != "gnet"])
+    ]
+    assert predicted[0] == predicted[1] > 0
 
 
 def test_the_warm_up_is_without_the_scene(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
