@@ -109,13 +109,13 @@ def table(
     check_output_folder(out, "--out")
     if into is not None:
         check_output_file(into, "--into")
-    chunk_numbers = parse_numbers(chunks, "--chunks")
+    numbers = parse_numbers(chunks, "--chunks")
     request = TableRequest(
         number=number,
         logs=tuple(logs or ()),
         preset=preset,
         store=store,
-        chunks=None if chunk_numbers is None else tuple(chunk_numbers),
+        chunks=None if numbers is None else tuple(numbers),
         settings=tuple(settings or ()),
         methods=tuple(str(file) for file in methods or ()),
         weights=tuple(weights or ()),
@@ -126,13 +126,19 @@ def table(
         scene=make_scene_inputs(scene, cameras, images, lidar, up=up, scale=scale, chunk_frames=chunk_frames),
     )
     # Mistakes in the request show here, before Prefect's server takes seconds to start.
-    checked = request.check()
-    for line in checked.explanation:
-        typer.echo(line, err=True)
+    checked = _check(request)
     if dry_run:
         _print_prediction(checked)
     else:
         _measure_table(request)
+
+
+def _check(request: TableRequest) -> CheckedRequest:
+    """Checks a request, and prints what was found or assumed about a scene."""
+    checked = request.check()
+    for line in checked.explanation:
+        typer.echo(line, err=True)
+    return checked
 
 
 def _print_prediction(checked: CheckedRequest) -> None:
