@@ -2,53 +2,20 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
-
 import typer
 
 from flows.cli.options import ChunksOption, DryRunOption, JsonOption, PresetOption, SettingsOption, StoreOption
-from flows.cli.parsing import parse_path
 from flows.cli.run import RunRequest, check_request, print_dry_run, reconstruct
+from flows.cli.scene_options import (
+    CamerasOption,
+    ChunkFramesOption,
+    ImagesOption,
+    LidarOption,
+    ScaleOption,
+    SceneFileArgument,
+    UpOption,
+)
 from flows.defaults import DEFAULT_STORE
-
-SceneFileArgument = Annotated[
-    Path, typer.Argument(parser=parse_path, metavar="SCENE", help="The file of Gaussians, such as a 3DGS PLY.")
-]
-CamerasOption = Annotated[
-    Path,
-    typer.Option(
-        parser=parse_path,
-        metavar="PATH",
-        help="Camera poses in the scene's coordinates: a transforms.json of nerfstudio or instant-ngp, or the folder "
-        "of a COLMAP model.",
-    ),
-]
-ImagesOption = Annotated[
-    Path | None,
-    typer.Option(parser=parse_path, metavar="PATH", help="The folder of the images. Near the poses if not given."),
-]
-LidarOption = Annotated[
-    Path | None,
-    typer.Option(
-        parser=parse_path,
-        metavar="PATH",
-        help="A PLY file with LiDAR points in the scene's coordinates. The scene's own depth if not given.",
-    ),
-]
-UpOption = Annotated[
-    str, typer.Option(help="Which way is up in the scene's axes, such as 0,0,1; auto finds it from the cameras.")
-]
-ScaleOption = Annotated[
-    str | None,
-    typer.Option(
-        help="Metres a unit of the scene, such as 1; auto assumes that the cameras are 1.6 m above the ground. Must be "
-        "given where there is no LiDAR."
-    ),
-]
-ChunkFramesOption = Annotated[
-    int | None, typer.Option(help="Frames of a chunk, each of which is enhanced by itself. The preset's if not given.")
-]
 
 
 def enhance(

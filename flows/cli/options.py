@@ -18,13 +18,12 @@ LogArgument = Annotated[
         "synthetic:street?seed=1000 for a made-up street."
     ),
 ]
-LogsArgument = Annotated[
-    list[str],
-    typer.Argument(
-        help="One or more driving logs, such as pandaset:data/002 or synthetic:street?seed=1000. 'pandaset:data/*' "
-        "stands for every sequence in a folder."
-    ),
-]
+_LOGS = typer.Argument(
+    help="One or more driving logs, such as pandaset:data/002 or synthetic:street?seed=1000. 'pandaset:data/*' "
+    "stands for every sequence in a folder."
+)
+LogsArgument = Annotated[list[str], _LOGS]
+OptionalLogsArgument = Annotated[list[str] | None, _LOGS]
 PresetOption = Annotated[
     str, typer.Option(help="The named configuration to start from: demo, small, fine, long or paper.")
 ]

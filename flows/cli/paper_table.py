@@ -10,18 +10,28 @@ import typer
 from flows.cli.options import (
     ChunksOption,
     DryRunOption,
-    LogsArgument,
     MethodsOption,
+    OptionalLogsArgument,
     PresetOption,
     SettingsOption,
     StoreOption,
     WeightsOption,
 )
 from flows.cli.parsing import parse_path
+from flows.cli.scene_options import (
+    ChunkFramesOption,
+    ImagesOption,
+    LidarOption,
+    ScaleOption,
+    SceneCamerasOption,
+    SceneOption,
+    UpOption,
+    make_scene_inputs,
+)
 from flows.defaults import DEFAULT_STORE
 
 if TYPE_CHECKING:
-    from flows.paper_tables.request import TableRequest
+    from flows.paper_tables.request import CheckedRequest, TableRequest
 
 TableNumberArgument = Annotated[
     int,
@@ -58,7 +68,7 @@ StoredOption = Annotated[
 
 def table(
     number: TableNumberArgument,
-    logs: LogsArgument,
+    logs: OptionalLogsArgument = None,
     preset: PresetOption = "small",
     chunks: ChunksOption = None,
     settings: SettingsOption = None,
@@ -69,6 +79,13 @@ def table(
     into: PageOption = None,
     remarks: RemarksOption = None,
     stored: StoredOption = False,
+    scene: SceneOption = None,
+    cameras: SceneCamerasOption = None,
+    images: ImagesOption = None,
+    lidar: LidarOption = None,
+    up: UpOption = "auto",
+    scale: ScaleOption = None,
+    chunk_frames: ChunkFramesOption = None,
     dry_run: DryRunOption = False,
 ) -> None:
     """Measure a table of the paper, with the paper's numbers beside.
@@ -77,26 +94,28 @@ def table(
 
     Finished stages come from the store, so a table that was stopped goes on where it was, and tables share stages.
 
+    Table 2 also takes a 3D Gaussian scene of any program in the place of logs, and compares it before and after.
+
     Example:
 
     \b
         genre table 4 'synthetic:street?seed=1000' --chunks 0 --out tables
+        genre table 2 --scene point_cloud.ply --cameras transforms.json --scale 1
     """
     from flows.cli.output_paths import check_output_file, check_output_folder
     from flows.cli.parsing import parse_numbers
-    from flows.cli.printing import print_rows
-    from flows.paper_tables.request import TableRequest, predict_table
+    from flows.paper_tables.request import TableRequest
 
     check_output_folder(out, "--out")
     if into is not None:
         check_output_file(into, "--into")
-    chunk_numbers = parse_numbers(chunks, "--chunks")
+    numbers = parse_numbers(chunks, "--chunks")
     request = TableRequest(
         number=number,
-        logs=tuple(logs),
+        logs=tuple(logs or ()),
         preset=preset,
         store=store,
-        chunks=None if chunk_numbers is None else tuple(chunk_numbers),
+        chunks=None if numbers is None else tuple(numbers),
         settings=tuple(settings or ()),
         methods=tuple(str(file) for file in methods or ()),
         weights=tuple(weights or ()),
@@ -104,18 +123,33 @@ def table(
         into=None if into is None else str(into),
         remarks=tuple(remarks or ()),
         stored=stored,
+        scene=make_scene_inputs(scene, cameras, images, lidar, up=up, scale=scale, chunk_frames=chunk_frames),
     )
     # Mistakes in the request show here, before Prefect's server takes seconds to start.
-    checked = request.check()
+    checked = _check(request)
     if dry_run:
-        rows = predict_table(checked)
-        print_rows(f"{len(rows)} cells, {sum(row['seconds'] for row in rows) / 60:.0f} minutes", rows)
-        return
-    done = _measure_table(request)
-    typer.echo(f"{done['cells']} cells, {len(done['failed'])} left out; wrote {', '.join(done['files'])}")
+        _print_prediction(checked)
+    else:
+        _measure_table(request)
 
 
-def _measure_table(request: TableRequest) -> dict[str, Any]:
+def _check(request: TableRequest) -> CheckedRequest:
+    """Checks a request, and prints what was found or assumed about a scene."""
+    checked = request.check()
+    for line in checked.explanation:
+        typer.echo(line, err=True)
+    return checked
+
+
+def _print_prediction(checked: CheckedRequest) -> None:
+    from flows.cli.printing import print_rows
+    from flows.paper_tables.request import predict_table
+
+    rows = predict_table(checked)
+    print_rows(f"{len(rows)} cells, {sum(row['seconds'] for row in rows) / 60:.0f} minutes", rows)
+
+
+def _measure_table(request: TableRequest) -> None:
     from flows.cli.terminal import report_on_terminal
     from flows.paper_tables.flow import paper_table
 
@@ -134,5 +168,6 @@ def _measure_table(request: TableRequest) -> dict[str, Any]:
             into=request.into,
             remarks=list(request.remarks),
             stored=request.stored,
+            scene=None if request.scene is None else request.scene.to_values(),
         )
-    return done
+    typer.echo(f"{done['cells']} cells, {len(done['failed'])} left out; wrote {', '.join(done['files'])}")

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from genre_tasks.config import IngestConfig, PipelineConfig
 from genre_tasks.errors import ConfigError, InputError
@@ -47,6 +47,34 @@ class EnhancementInputs:
     up: str = AUTO
     scale: str | None = None
     chunk_frames: int | None = None
+
+    def to_values(self) -> dict[str, Any]:
+        """Gives plain values, such as a flow's parameters have to be."""
+        return {name: str(value) if isinstance(value, Path) else value for name, value in asdict(self).items()}
+
+    @classmethod
+    def from_values(cls, values: Mapping[str, Any]) -> EnhancementInputs:
+        """Makes inputs of what :meth:`to_values` gave.
+
+        >>> inputs = EnhancementInputs(Path("scene.ply"), Path("transforms.json"), scale="1")
+        >>> EnhancementInputs.from_values(inputs.to_values()) == inputs
+        True
+        """
+        files = {name: Path(values[name]) for name in ("scene", "cameras", "images", "lidar") if values.get(name)}
+        return cls(**{**values, **files})
+
+    def list_options(self) -> list[str]:
+        """Lists the options of a command line that stand for these inputs.
+
+        >>> EnhancementInputs(Path("scene.ply"), Path("transforms.json"), chunk_frames=20).list_options()
+        ['--scene', 'scene.ply', '--cameras', 'transforms.json', '--chunk-frames', '20']
+        """
+        words: list[str] = []
+        for name, value in self.to_values().items():
+            # What is as by default says nothing.
+            if value is not None and (name, value) != ("up", AUTO):
+                words += [f"--{name.replace('_', '-')}", str(value)]
+        return words
 
 
 @dataclass(frozen=True)

@@ -80,6 +80,9 @@ class StagePredictor:
         # Stored medians of this stage are of the learned method, which is far quicker.
         if isinstance(section, GnetConfig) and section.method in PER_SCENE_METHODS:
             return section.per_scene.iterations * PER_SCENE_ITERATION_S * _pixels(config) / _PER_SCENE_PIXELS
+        # A scene of another program is passed on as it is.
+        if isinstance(section, GnetConfig) and section.method == "none":
+            return 0.0
         # Stages are dominated by rasterising, whose time grows with the pixels.
         seconds = self._stage_seconds[name.partition("/")[0]] * (_pixels(config) / _pixels(base))
         # An iteration's cost is that of rendering its views, so their number is what scales.

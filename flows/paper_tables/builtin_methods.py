@@ -23,6 +23,8 @@ _DISTILLED = (
 # Written out, so that a user's settings for all methods cannot turn the learned ones into others.
 _LEARNED = ("gnet.method=learned", "enet.method=learned")
 _STREET_GS = ("gnet.method=street_gs", *_AS_PUBLISHED)
+# The scene is another program's work, and starts ENet as it is.
+_AS_GIVEN = ("gnet.method=none",)
 _ONE_SHOT = "Distilled by Adam, 480 iterations of 3 + 3 views; once, at 3 m, not progressively."
 
 BUILT_IN: Mapping[str, Method] = {
@@ -89,6 +91,21 @@ BUILT_IN: Mapping[str, Method] = {
         "enet",
         slot="enet-g3r",
         needs_weights=True,
+    ),
+    "scene": Method("Scene as given", _AS_GIVEN, "gnet", "Rendered as it is, nothing optimised."),
+    "scene+genre": Method(
+        "Scene + GenRe",
+        (*_LEARNED, *_AS_GIVEN),
+        "enet",
+        "The shipped ENet, which was trained on scenes of GNet and of tuned Adam, not on scenes of other programs.",
+    ),
+    "scene+difix": Method(
+        "Scene + Difix3D-style",
+        (*_AS_GIVEN, *_DISTILLED),
+        "enet",
+        f"The scene → novel views → fixer → per-scene distillation. {_ONE_SHOT}",
+        slot="difix",
+        stand_in="No fixer with Difix3D's inputs (render + reference) is shipped: FNet with all inputs stands in.",
     ),
     "gnet-gnet": Method(
         "GNet → FNet → GNet",

@@ -11,6 +11,7 @@ from typing import Any
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
+from flows.enhancement.enhancement_request import EnhancementInputs
 from flows.experiments.log_chunks import LogChunk
 from flows.experiments.result_files import machine_facts, write_text
 from flows.experiments.stages import run_reported_stage
@@ -47,6 +48,7 @@ def paper_table(
     into: str | None = None,
     remarks: list[str] | None = None,
     stored: bool = False,
+    scene: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Measures a table of the paper, and writes it with the paper's numbers beside the measured ones.
 
@@ -55,7 +57,7 @@ def paper_table(
 
     Args:
         number: of the table, 1 to 6.
-        logs: URIs, all of one dataset; ``pandaset:PATH/*`` stands for every sequence in a folder.
+        logs: URIs, all of one dataset; ``pandaset:PATH/*`` stands for every sequence in a folder. None with a scene.
         preset: name of the preset.
         store: folder of the store.
         chunks: of each log; all if ``None``.
@@ -66,6 +68,7 @@ def paper_table(
         into: a Markdown page whose section of this table is replaced.
         remarks: what else the reader should know.
         stored: compute nothing, and leave out the methods that the store has not completely.
+        scene: a scene of another program in the place of logs, see :meth:`EnhancementInputs.to_values`.
 
     Returns:
         ``cells``, their number; ``failed``, labels of methods that failed; ``files`` that were written.
@@ -86,12 +89,18 @@ def paper_table(
         into=into,
         remarks=tuple(remarks or ()),
         stored=stored,
+        scene=None if scene is None else EnhancementInputs.from_values(scene),
     )
     checked = request.check()
     if stored:
         checked = replace(checked, missing=find_unstored_methods(checked) | checked.missing)
     open_store(store).clean_temporaries()
     _warm_up_if_timed(checked)
+    return _measure(request, checked)
+
+
+def _measure(request: TableRequest, checked: CheckedRequest) -> dict[str, Any]:
+    """Runs what can be measured, and writes the table of it; gives what the flow returns."""
     cells, failed = _run_cells(checked)
     complete = [c for c in cells if c.method not in failed]
     if not complete and failed:
@@ -206,6 +215,8 @@ def collect_facts(request: TableRequest, checked: CheckedRequest, cells: Sequenc
         counts = sorted({int(c.metrics[f"{group}/n"]) for c in cells if f"{group}/n" in c.metrics})
         if counts:
             facts[name] = ", ".join(map(str, counts))
+    if checked.explanation:
+        facts["scene"] = "; ".join(checked.explanation)
     # Every method drives the same rollouts, so a remark on one is written once.
     remarks = list(dict.fromkeys(text for cell in cells for text in cell.remarks))
     if remarks:

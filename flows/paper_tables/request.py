@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from flows.configuration import load_configuration
+from flows.enhancement.enhancement_request import EnhancementInputs, prepare_enhancement
 from flows.experiments.log_chunks import LogChunk, select_log_chunks
 from flows.experiments.stage_prediction import StagePredictor, find_stored_stages
 from flows.paper_tables.layouts import Layout, Row, get_layout
@@ -24,12 +25,20 @@ from genre_tasks.errors import ConfigError
 
 
 @dataclass(frozen=True)
+class _Inputs:
+    # What is measured: logs, the settings over the protocol, and what was found or assumed about a scene.
+    logs: tuple[str, ...]
+    settings: tuple[str, ...]
+    explanation: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class TableRequest:
     """What a user asks for; its files are read by :meth:`check`.
 
     Attributes:
         number: of the table, 1 to 6.
-        logs: URIs; ``pandaset:PATH/*`` stands for every sequence in a folder.
+        logs: URIs; ``pandaset:PATH/*`` stands for every sequence in a folder; none where there is a scene.
         preset: name of the preset.
         store: folder of the store.
         chunks: of each log; all if ``None``.
@@ -40,6 +49,7 @@ class TableRequest:
         into: a Markdown page whose section of this table is replaced.
         remarks: what else the reader should know.
         stored: whether methods that the store has not completely are left out.
+        scene: a scene of another program, with its cameras and images, in the place of logs.
     """
 
     number: int
@@ -54,6 +64,7 @@ class TableRequest:
     into: str | None = None
     remarks: tuple[str, ...] = ()
     stored: bool = False
+    scene: EnhancementInputs | None = None
 
     def check(self) -> CheckedRequest:
         """Reads the files, finds the table's rows and chunks, and checks that all stages can run.
@@ -63,14 +74,16 @@ class TableRequest:
                 datasets.
             InputError: a log, chunk or file of weights does not exist, or the store cannot be written to.
         """
-        basis = Basis(self.preset, self.settings, self.store)
+        of_scene = self.scene is not None
+        inputs = self._find_inputs(get_layout(self.number, of_scene=of_scene).protocol)
+        basis = Basis(self.preset, inputs.settings, self.store)
         # Files are read once, as they could change while the table is measured.
-        user_methods = [read_method(Path(f), self.preset, self.settings) for f in self.methods]
-        layout = get_layout(self.number, user_methods)
+        user_methods = [read_method(Path(f), self.preset, inputs.settings) for f in self.methods]
+        layout = get_layout(self.number, user_methods, of_scene=of_scene)
         weights = read_weights(self.weights)
-        config = load_configuration(self.preset, settings=(*layout.protocol, *self.settings))
+        config = load_configuration(self.preset, settings=(*layout.protocol, *inputs.settings))
         chunks = None if self.chunks is None else list(self.chunks)
-        places = select_log_chunks(self.logs, chunks, config)
+        places = select_log_chunks(inputs.logs, chunks, config)
         datasets = sorted({cached_log(where.log).dataset for where in places})
         # Image sizes and difficulty differ so much that a mean would depend on the mix alone.
         if len(datasets) > 1:
@@ -85,11 +98,27 @@ class TableRequest:
         }
         # Weights change the notes too, so the layout itself is rebuilt.
         rows = tuple(replace(row, method=row.method.with_weights(weights)) for row in layout.rows)
-        checked = CheckedRequest(basis, replace(layout, rows=rows), tuple(places), missing, "".join(datasets))
+        checked = CheckedRequest(
+            basis, replace(layout, rows=rows), tuple(places), missing, "".join(datasets), inputs.explanation
+        )
         # What is only read from the store needs neither weights nor a store that can be written to.
         if not self.stored:
             check_jobs(checked.list_jobs())
         return checked
+
+    def _find_inputs(self, protocol: tuple[str, ...]) -> _Inputs:
+        """Finds the logs, and what a scene asks for before the user's settings."""
+        if self.scene is None:
+            if not self.logs:
+                raise ConfigError("there is nothing to measure", remedy="Give a log, or for table 2 --scene FILE.")
+            return _Inputs(self.logs, self.settings)
+        if self.logs:
+            raise ConfigError(
+                f"there are both a scene and a log ({self.logs[0]})",
+                remedy="Leave out one of them: a scene comes with its images and cameras in the place of a log.",
+            )
+        prepared = prepare_enhancement(self.scene, load_configuration(self.preset, settings=protocol))
+        return _Inputs((prepared.log,), (*prepared.settings, *self.settings), prepared.explanation)
 
     @property
     def command(self) -> str:
@@ -99,7 +128,8 @@ class TableRequest:
         'genre table 4 synthetic:street --preset small --chunks 0'
         """
         # Neither --out nor --stored: they do not change what the numbers mean.
-        parts = ["genre", "table", str(self.number), *self.logs, "--preset", self.preset]
+        scene = [] if self.scene is None else self.scene.list_options()
+        parts = ["genre", "table", str(self.number), *self.logs, *scene, "--preset", self.preset]
         if self.chunks is not None:
             parts += ["--chunks", ",".join(map(str, self.chunks))]
         for option, values in (("--set", self.settings), ("--method", self.methods), ("--weights", self.weights)):
@@ -120,6 +150,7 @@ class CheckedRequest:
         places: the chunks to measure.
         missing: label of a row → why it cannot be measured.
         dataset: of all logs.
+        explanation: a line for each thing that was found or assumed about a scene.
     """
 
     basis: Basis
@@ -127,6 +158,7 @@ class CheckedRequest:
     places: tuple[LogChunk, ...]
     missing: dict[str, str]
     dataset: str
+    explanation: tuple[str, ...] = ()
 
     @property
     def config(self) -> PipelineConfig:

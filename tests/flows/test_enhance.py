@@ -19,8 +19,6 @@ from flows.pipeline.definition import PIPELINE, STAGE_BY_NAME
 from flows.pipeline.stage_runner import ArtifactRef, Job, compute_key, read_artifact, run_stage
 from genre_tasks.config import FilePlacement, InitialConfig, PipelineConfig
 from genre_tasks.errors import ConfigError, InputError
-from genre_tasks.exchange.clouds import transform_cloud
-from genre_tasks.exchange.conversion import pose_scene, to_exchange_scene
 from genre_tasks.exchange.one_cloud import make_resting_scene
 from genre_tasks.exchange.ply import PLY
 from genre_tasks.exchange.types import SplatCloud
@@ -30,46 +28,27 @@ from genre_tasks.render import render_views
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.novel_views import NovelView
-from genre_tasks.scene.transforms import compose_se3, invert_se3
+from genre_tasks.scene.transforms import invert_se3
 from genre_tasks.stages.ingest import ingest
 from genre_tasks.stages.initial import initial
 from genre_tasks.stages.scene_file import read_placed_scene
 from tests.faults.small_run import LOG, SETTINGS
-from tests.logs.posed_images_folder import Y_DOWN, write_transforms
+from tests.flows.street_scene_files import SIZE, in_source_axes, make_resting_street, write_street
 
 pytest.importorskip("embreex", reason="the synthetic street is ray-cast with Embree")
 
-SIZE = ("ingest.width_px=64", "ingest.height_px=36")
 TINY = tuple(setting for setting in SETTINGS if not setting.startswith("gnet."))
 
 
-def in_source_axes(cloud: SplatCloud) -> SplatCloud:
-    """The street's Gaussians as the file of poses has the world: turned, and in units of 2.5 m."""
-    turned = transform_cloud(cloud, compose_se3(Y_DOWN.rotation, np.zeros(3)))
-    unit = np.float32(Y_DOWN.metres_per_unit)
-    return replace(turned, means=turned.means / unit, log_scales=turned.log_scales - np.log(unit))
+@pytest.fixture(scope="module")
+def street() -> tuple[Chunk, SceneGraph]:
+    return make_resting_street()
 
 
 @pytest.fixture(scope="module")
-def street(tmp_path_factory: pytest.TempPathFactory) -> tuple[Chunk, SceneGraph]:
-    config = load_configuration("demo", settings=[*SIZE, "initial.max_points=3000", "initial.distant_count=300"])
-    chunk = ingest(config.ingest, open_log(LOG), 0)
-    scene = initial(config.initial, chunk).scene
-    return chunk, replace(scene, actors=(), nodes=torch.zeros_like(scene.nodes))
-
-
-@pytest.fixture(scope="module")
-def folder(street: tuple[Chunk, SceneGraph], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """``scene.ply``, ``points.ply``, ``transforms.json`` and images."""
-    chunk, scene = street
-    folder = write_transforms(tmp_path_factory.mktemp("street"), Y_DOWN, LOG)
-    cloud = pose_scene(to_exchange_scene(scene, (), (), chunk.world_SE3_chunk, names={}), None)
-    world = transform_cloud(cloud, chunk.world_SE3_chunk)
-    PLY.write(folder / "scene.ply", make_resting_scene(in_source_axes(world)))
-    points = (chunk.static.positions + chunk.world_SE3_chunk[:3, 3]) @ Y_DOWN.rotation.T / Y_DOWN.metres_per_unit
-    header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n"
-    header += "property double x\nproperty double y\nproperty double z\nend_header\n"
-    (folder / "points.ply").write_text(header + "\n".join(" ".join(map(repr, row)) for row in points.tolist()))
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("street")
+    write_street(folder)
     return folder
 
 
