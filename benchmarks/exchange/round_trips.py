@@ -193,12 +193,14 @@ def round_trip_claims(rows: Sequence[Row]) -> Iterator[Claim]:
     worst = max((_largest_error(row) for row in ply), default=None)
     yield claim("exchange.ply_error", worst, "<=", 0.0, "largest error", "a reconstructed street", len(ply))
     difference = _take(plain, "splat", "difference")
-    yield claim("exchange.splat_difference", difference, "<=", SPLAT_DIFFERENCE, "steps of 256", note)
+    yield claim("exchange.splat_difference", difference, "<=", SPLAT_DIFFERENCE, "of 256", note)
     quality = _take(plain, "splat", "psnr_db")
     outside = f"; {plain['splat']['out_of_range']:.0%} of its colours are out of range" if "splat" in plain else ""
     yield claim("exchange.splat_psnr", quality, ">=", SPLAT_PSNR_DB, "dB", f"{note}{outside}")
     quality = _take(plain, "splat", "psnr_in_range_db")
     yield claim("exchange.splat_psnr_in_range", quality, ">=", SPLAT_PSNR_DB, "dB", f"{note}, colours cut to 0 to 1")
+    yield claim("exchange.spz_difference", _take(plain, "spz", "difference"), "<=", SPLAT_DIFFERENCE, "of 256", note)
+    yield claim("exchange.spz_psnr", _take(plain, "spz", "psnr_db"), ">=", SPLAT_PSNR_DB, "dB", note)
     size = _take(plain, "spz", "bytes_per_gaussian")
     yield claim("exchange.spz_bytes", size, "<=", SPZ_BYTES, "bytes a Gaussian", note)
     for name in _NODE_FORMATS:
