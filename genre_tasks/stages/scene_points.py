@@ -29,8 +29,8 @@ from genre_tasks.stages.chunk_reading import ChunkReading
 from genre_tasks.stages.ingest_points import NO_SWEEP, ChunkPoints
 from genre_tasks.stages.scene_file import read_placed_scene
 
-MAX_POINTS = 1_500_000
-"""About as many as the sweeps of a chunk have; views are looked at more coarsely where they have more pixels."""
+MAX_PIXELS = 4_000_000
+"""Of all views, about a third of which become points; views are looked at more coarsely where they have more."""
 
 MAX_DEPTH_M = 100.0
 """Farther than LiDAR reaches, a render's depth says little."""
@@ -44,7 +44,10 @@ OPACITY_CONTRAST = 4.0
 ROAD_FRAMES = 3
 """Road is completed from surfaces that so many moments agree on: a lone point under the road would tilt it."""
 
-_DEPTH_TOLERANCE = 0.05
+_DEPTH_TOLERANCE = 0.1
+# Depths take the median of their neighbours where it is this near: noise goes, and outlines stay.
+_MEDIAN_PX = 7
+_MEDIAN_TOLERANCE = 0.15
 _AGREEMENT_CELL_M = 0.25
 _MIN_POINTS = 100
 
@@ -68,7 +71,7 @@ def read_points_from_scene(reading: ChunkReading, file: str, views: Sequence[Vie
     scene = read_placed_scene(file, reading.config.placement, reading.world_SE3_chunk)
     opaque = _sharpen_opacities(scene)
     renders = [render_surfaces(opaque, [view]) for view in views]
-    depths = [render.expected_depth()[0] for render in renders]
+    depths = [_smooth_depth(render.expected_depth()[0]) for render in renders]
     alphas = [render.alpha[0] for render in renders]
     stride = _choose_stride(views)
     parts = []
@@ -106,10 +109,22 @@ def _sharpen_opacities(scene: SceneGraph) -> SceneGraph:
     return replace(scene, gaussians=replace(scene.gaussians, logit_opacities=sharpened))
 
 
+def _smooth_depth(depth: Tensor) -> Tensor:
+    """Replaces depths [H, W] by the median of those around, but for outlines."""
+    from scipy.ndimage import median_filter
+
+    known = torch.isfinite(depth) & (depth > 0)
+    # What has no depth counts as far away.
+    filled = torch.where(known, depth, torch.full_like(depth, 1e9))
+    median = torch.from_numpy(median_filter(filled.numpy(), size=_MEDIAN_PX))
+    is_noise = known & ((median / filled - 1).abs() < _MEDIAN_TOLERANCE)
+    return torch.where(is_noise, median, depth)
+
+
 def _choose_stride(views: Sequence[View]) -> int:
-    """Every so many pixels of a row and of a column, so that points stay within ``MAX_POINTS``."""
+    """Every so many pixels of a row and of a column, so that pixels stay within ``MAX_PIXELS``."""
     pixels = sum(view.lens.width_px * view.lens.height_px for view in views)
-    return max(1, int(np.ceil(np.sqrt(pixels / MAX_POINTS))))
+    return max(1, int(np.ceil(np.sqrt(pixels / MAX_PIXELS))))
 
 
 def _unproject(view: View, depth: Tensor, alpha: Tensor, stride: int) -> Float32:
