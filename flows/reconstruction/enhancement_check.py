@@ -30,6 +30,5 @@ def find_harm(config: Mapping[str, Any], stages: Sequence[StageSummary]) -> str 
         return None
     return (
         f"ENet made the scene worse: on held-out images PSNR fell from {psnr['gnet']:.1f} to {psnr['enet']:.1f} dB. "
-        f"Keep the scene as it was, or set more of enet.iterations (now {config['enet']['iterations']}) "
-        "and a tenth of enet.learning_rates"
+        f"Use the scene as it was given, or set more of enet.iterations (now {config['enet']['iterations']})"
     )

@@ -67,7 +67,8 @@ def smooth_road(positions: Float32, reliable: Float32, chunk_SE3_ego: Float64) -
 def _find_cells(points: Float32, low: Float64, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Cells [P, 2] of the grid around the path, and whether a point is inside [P]."""
     cells = np.floor((points[:, :2] - low) / CELL_M).astype(np.int64)
-    return cells, ((cells >= 0) & (cells < shape)).all(1)
+    inside: np.ndarray = ((cells >= 0) & (cells < shape)).all(1)
+    return cells, inside
 
 
 def _take_medians(groups: np.ndarray, values: Float64) -> tuple[np.ndarray, Float64]:

@@ -140,9 +140,7 @@ def test_claims_that_do_not_fit(tmp_path: Path, change: Change, problem: str) ->
 
 
 def build_new_file(count: int, streams: list[bytes], raw_sizes: list[int]) -> bytes:
-    table = b"".join(
-        struct.pack("<QQ", len(part), size) for part, size in zip(streams, raw_sizes, strict=True)
-    )
+    table = b"".join(struct.pack("<QQ", len(part), size) for part, size in zip(streams, raw_sizes, strict=True))
     return struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, 0, 12, 0, 5, 32) + table + b"".join(streams)
 
 

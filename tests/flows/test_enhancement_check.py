@@ -28,7 +28,7 @@ def test_a_loss_is_warned_of(before: float, after: float, warned: bool) -> None:
     warning = find_harm(config, stages)
     assert (warning is not None) == warned
     if warning is not None:
-        assert "from 41.4 to 20.3 dB" in warning and "enet.learning_rates" in warning
+        assert "from 41.4 to 20.3 dB" in warning and "enet.iterations (now " in warning
 
 
 def test_only_scenes_of_a_file_are_compared() -> None:
