@@ -67,7 +67,7 @@ def smooth_road(positions: Float32, reliable: Float32, chunk_SE3_ego: Float64) -
 def _find_cells(points: Float32, low: Float64, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Cells [P, 2] of the grid around the path, and whether a point is inside [P]."""
     cells = np.floor((points[:, :2] - low) / CELL_M).astype(np.int64)
-    inside: np.ndarray = ((cells >= 0) & (cells < shape)).all(1)
+    inside = np.all((cells >= 0) & (cells < shape), axis=1)
     return cells, inside
 
 

@@ -32,6 +32,9 @@ from genre_tasks.stages.scene_file import read_placed_scene
 MAX_PIXELS = 4_000_000
 """Of all views, about a third of which become points; views are looked at more coarsely where they have more."""
 
+MAX_PROJECTIONS = 250_000_000
+"""Of pixels into all other views, which takes about half a minute: a long chunk of many cameras has fewer points."""
+
 MAX_DEPTH_M = 100.0
 """Farther than LiDAR reaches, a render's depth says little."""
 
@@ -122,9 +125,10 @@ def _smooth_depth(depth: Tensor) -> Tensor:
 
 
 def _choose_stride(views: Sequence[View]) -> int:
-    """Every so many pixels of a row and of a column, so that pixels stay within ``MAX_PIXELS``."""
+    """Every so many pixels of a row and of a column, so that pixels and projections stay within their bounds."""
     pixels = sum(view.lens.width_px * view.lens.height_px for view in views)
-    return max(1, int(np.ceil(np.sqrt(pixels / MAX_PIXELS))))
+    bound = min(MAX_PIXELS, MAX_PROJECTIONS / max(len(views), 1))
+    return max(1, int(np.ceil(np.sqrt(pixels / bound))))
 
 
 def _unproject(view: View, depth: Tensor, alpha: Tensor, stride: int) -> Float32:
