@@ -133,7 +133,7 @@ def prepare_enhancement(inputs: EnhancementInputs, config: PipelineConfig) -> En
     else:
         scale = parse_scale(inputs.scale)
         explanation.append(f"a unit is {scale:g} m, as asked for")
-    depth = "the LiDAR's" if inputs.lidar else "the scene's own, where source views agree: there is no LiDAR"
+    depth = "the LiDAR's" if inputs.lidar else "the scene's own, where views agree: there is no LiDAR"
     explanation.append(f"depth is {depth}")
     # Written with the numbers that were found, so that the log stays the same when finding changes.
     uri = format_uri(inputs.cameras, inputs.images, log.up.vector, scale)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from flows.error_record import describe_record
 from flows.pipeline.definition import PIPELINE, RECONSTRUCTION_STAGES
 from flows.pipeline.stage_runner import ArtifactRef
+from flows.reconstruction.enhancement_check import find_harm
 from flows.reconstruction.range_record import read_range_record
 from flows.reconstruction.record_files import read_record
 from flows.reconstruction.run_summary import (
@@ -191,6 +192,10 @@ def _summarise_chunk(run: FinishedRun, chunk: int, refs: dict[str, ArtifactRef])
     warnings = [run.notes[chunk]] if chunk in run.notes else []
     # What the log lacks was found once, when the chunk was ingested.
     warnings += [str(issue) for issue in artifacts["ingest"].manifest.measurements.get("marks", ())]
+    harm = find_harm(run.config, stages)
+    # A run that is read from its record has the warning among its notes.
+    if harm is not None and harm not in warnings:
+        warnings.append(harm)
     reliable_range: RangeSummary | None = None
     try:
         reliable_range = read_range_record(run.folder, chunk)

@@ -72,7 +72,7 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
         found = read_points_from_file(reading, config.points)
     elif config.scene is not None:
         # By name, as in the stage ``initial``: the renderer is part of this stage only where a scene is rendered.
-        found = import_module(SCENE_POINTS_MODULE).read_points_from_scene(reading, config.scene, sources)
+        found = import_module(SCENE_POINTS_MODULE).read_points_from_scene(reading, config.scene, views)
     else:
         found = read_points_from_sweeps(reading, sources)
     # Sweeps and cuboids have been read by now.

@@ -1,8 +1,15 @@
-"""Points of a log without LiDAR, from the depth that a scene of Gaussians shows in the source views."""
+"""Points of a log without LiDAR, from the surfaces that a scene of Gaussians shows at the poses of the images.
+
+A render's depth is an average of the centres of Gaussians along a ray. On a road at a grazing angle, centres lie metres
+before and behind the surface, and a haze of faint Gaussians draws the average towards the camera. So depth is where
+rays meet the planes of flat Gaussians, and faint Gaussians are left out of it. Poses suffice for that: no image that
+is held out is looked at.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -11,16 +18,22 @@ from torch import Tensor
 
 from genre_tasks.fixer.view_surface import unproject_surface
 from genre_tasks.logs.types import Float32
-from genre_tasks.render import render_views
+from genre_tasks.render.surface import render_surfaces
 from genre_tasks.scene.chunk import View
+from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.projection import project
+from genre_tasks.scene.road_completion import complete_road
+from genre_tasks.scene.road_smoothing import smooth_road
 from genre_tasks.scene.visibility import PointCloud
 from genre_tasks.stages.chunk_reading import ChunkReading
-from genre_tasks.stages.ingest_points import ChunkPoints
+from genre_tasks.stages.ingest_points import NO_SWEEP, ChunkPoints
 from genre_tasks.stages.scene_file import read_placed_scene
 
-MAX_POINTS = 1_500_000
-"""About as many as the sweeps of a chunk have; views are looked at more coarsely where they have more pixels."""
+MAX_PIXELS = 4_000_000
+"""Of all views, about a third of which become points; views are looked at more coarsely where they have more."""
+
+MAX_PROJECTIONS = 250_000_000
+"""Of pixels into all other views, which takes about half a minute: a long chunk of many cameras has fewer points."""
 
 MAX_DEPTH_M = 100.0
 """Farther than LiDAR reaches, a render's depth says little."""
@@ -28,36 +41,46 @@ MAX_DEPTH_M = 100.0
 MIN_ALPHA = 0.8
 """A pixel's depth counts where at least so much of its light is accounted for."""
 
-_DEPTH_TOLERANCE = 0.05
+OPACITY_CONTRAST = 4.0
+"""Added to the logits of opacities above one half and taken from the others: a ray then ends at its first surface."""
+
+ROAD_FRAMES = 3
+"""Road is completed from surfaces that so many moments agree on: a lone point under the road would tilt it."""
+
+_DEPTH_TOLERANCE = 0.1
+# Depths take the median of their neighbours where it is this near: noise goes, and outlines stay.
+_MEDIAN_PX = 7
+_MEDIAN_TOLERANCE = 0.15
+_AGREEMENT_CELL_M = 0.25
 _MIN_POINTS = 100
 
 
-def read_points_from_scene(reading: ChunkReading, file: str, sources: Sequence[View]) -> ChunkPoints:
-    """Makes points of a scene's depth: where source views see it, and views of other frames agree.
+def read_points_from_scene(reading: ChunkReading, file: str, views: Sequence[View]) -> ChunkPoints:
+    """Makes points of a scene's depth: where views see it, and views of other frames agree.
 
     A floater before one camera is no surface for the others, so that it gives no points.
 
     Args:
         reading: the chunk; what stands in for LiDAR is noted in its issues.
         file: of Gaussians, in the coordinates that ``placement`` takes to the world.
-        sources: the source views.
+        views: source views and held-out ones, whose poses alone are used.
 
     Returns:
-        A background without actors; a point's frame is that of its view.
+        A background without actors; a point's frame is that of its view, and points that complete the road have none.
 
     Raises:
-        InputError: the file cannot be read, or the source views see next to nothing of it.
+        InputError: the file cannot be read, or the views see next to nothing of it.
     """
     scene = read_placed_scene(file, reading.config.placement, reading.world_SE3_chunk)
-    with torch.no_grad():
-        renders = [render_views(scene, [view]) for view in sources]
-    depths = [render.expected_depth()[0] for render in renders]
+    opaque = _sharpen_opacities(scene)
+    renders = [render_surfaces(opaque, [view]) for view in views]
+    depths = [_smooth_depth(render.expected_depth()[0]) for render in renders]
     alphas = [render.alpha[0] for render in renders]
-    stride = _choose_stride(sources)
+    stride = _choose_stride(views)
     parts = []
-    for index, view in enumerate(sources):
+    for index, view in enumerate(views):
         points = _unproject(view, depths[index], alphas[index], stride)
-        others = [(sources[k], depths[k]) for k in range(len(sources)) if sources[k].frame != view.frame]
+        others = [(views[k], depths[k]) for k in range(len(views)) if views[k].frame != view.frame]
         parts.append(points[_is_confirmed(points, others)])
     positions = np.concatenate(parts)
     if len(positions) < _MIN_POINTS:
@@ -65,16 +88,47 @@ def read_points_from_scene(reading: ChunkReading, file: str, sources: Sequence[V
             "the images see next to nothing of the scene",
             "Check that scene and camera poses share their coordinates, and that --up and --scale fit.",
         )
-    frames = np.repeat(np.array([view.frame for view in sources], np.int16), [len(part) for part in parts])
+    frames = np.repeat(np.array([view.frame for view in views], np.int16), [len(part) for part in parts])
     detail = f"there is no LiDAR: {len(positions)} points are of the depth of the scene that is to be enhanced"
     reading.add_issue("depth_of_scene", detail)
-    return ChunkPoints(PointCloud(positions, frames), [])
+    positions = smooth_road(positions, _select_agreed(positions, frames), reading.chunk_SE3_ego)
+    road = complete_road(_select_agreed(positions, frames), reading.chunk_SE3_ego)
+    frames = np.concatenate([frames, np.full(len(road), NO_SWEEP, np.int16)])
+    return ChunkPoints(PointCloud(np.concatenate([positions, road]), frames), [])
 
 
-def _choose_stride(sources: Sequence[View]) -> int:
-    """Every so many pixels of a row and of a column, so that points stay within ``MAX_POINTS``."""
-    pixels = sum(view.lens.width_px * view.lens.height_px for view in sources)
-    return max(1, int(np.ceil(np.sqrt(pixels / MAX_POINTS))))
+def _select_agreed(positions: Float32, frames: NDArray[np.int16]) -> Float32:
+    """The points in cells that ``ROAD_FRAMES`` frames have points in."""
+    cells = np.floor(positions / _AGREEMENT_CELL_M).astype(np.int64)
+    cell_of_point = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
+    pairs = np.unique(np.stack([cell_of_point, frames], 1), axis=0)
+    return positions[np.bincount(pairs[:, 0])[cell_of_point] >= ROAD_FRAMES]
+
+
+def _sharpen_opacities(scene: SceneGraph) -> SceneGraph:
+    """The scene with its Gaussians nearly opaque or nearly clear."""
+    logits = scene.gaussians.logit_opacities
+    sharpened = logits + torch.where(logits > 0, OPACITY_CONTRAST, -OPACITY_CONTRAST)
+    return replace(scene, gaussians=replace(scene.gaussians, logit_opacities=sharpened))
+
+
+def _smooth_depth(depth: Tensor) -> Tensor:
+    """Replaces depths [H, W] by the median of those around, but for outlines."""
+    from scipy.ndimage import median_filter
+
+    known = torch.isfinite(depth) & (depth > 0)
+    # What has no depth counts as far away.
+    filled = torch.where(known, depth, torch.full_like(depth, 1e9))
+    median = torch.from_numpy(median_filter(filled.numpy(), size=_MEDIAN_PX))
+    is_noise = known & ((median / filled - 1).abs() < _MEDIAN_TOLERANCE)
+    return torch.where(is_noise, median, depth)
+
+
+def _choose_stride(views: Sequence[View]) -> int:
+    """Every so many pixels of a row and of a column, so that pixels and projections stay within their bounds."""
+    pixels = sum(view.lens.width_px * view.lens.height_px for view in views)
+    bound = min(MAX_PIXELS, MAX_PROJECTIONS / max(len(views), 1))
+    return max(1, int(np.ceil(np.sqrt(pixels / bound))))
 
 
 def _unproject(view: View, depth: Tensor, alpha: Tensor, stride: int) -> Float32:

@@ -17,6 +17,7 @@ from flows.configuration import load_configuration
 from flows.enhancement.enhancement_request import EnhancementInputs, prepare_enhancement
 from flows.pipeline.definition import PIPELINE, STAGE_BY_NAME
 from flows.pipeline.stage_runner import ArtifactRef, Job, compute_key, read_artifact, run_stage
+from flows.reconstruction.enhancement_check import MOST_LOSS_DB
 from genre_tasks.config import FilePlacement, InitialConfig, PipelineConfig
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.exchange.one_cloud import make_resting_scene
@@ -30,6 +31,7 @@ from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.novel_views import NovelView
 from genre_tasks.scene.transforms import invert_se3
 from genre_tasks.stages.ingest import ingest
+from genre_tasks.stages.ingest_points import NO_SWEEP
 from genre_tasks.stages.initial import initial
 from genre_tasks.stages.scene_file import read_placed_scene
 from tests.faults.small_run import LOG, SETTINGS
@@ -37,7 +39,13 @@ from tests.flows.street_scene_files import SIZE, in_source_axes, make_resting_st
 
 pytest.importorskip("embreex", reason="the synthetic street is ray-cast with Embree")
 
+<<<<<<< HEAD
 TINY = tuple(setting for setting in SETTINGS if not setting.startswith("gnet."))
+=======
+SIZE = ("ingest.width_px=64", "ingest.height_px=36")
+# Distances between sets of images take most of a run's time, and say nothing of the scene's place.
+TINY = (*(setting for setting in SETTINGS if not setting.startswith("gnet.")), "evaluate.distributions=false")
+>>>>>>> depth
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +96,11 @@ def test_a_scene_goes_through_every_stage_and_the_command_finds_it(
     record = json.loads(done.stdout)
     assert record["status"] == "done" and record["log"] == prepared.log
     assert {s["stage"]: s["cached"] for s in record["chunks"][0]["stages"]} == {spec.name: True for spec in PIPELINE}
-    assert any("depth of scene" in warning for warning in record["chunks"][0]["warnings"])
+    warnings = record["chunks"][0]["warnings"]
+    assert any("depth of scene" in warning for warning in warnings)
+    psnr = {s["stage"]: s["metrics"].get("interpolation/psnr") for s in record["chunks"][0]["stages"]}
+    is_worse = psnr["gnet"] - psnr["enet"] > MOST_LOSS_DB
+    assert any("ENet made the scene worse" in warning for warning in warnings) == is_worse
     assert "a unit is 2.5 m" in done.stderr
 
 
@@ -120,7 +132,8 @@ def test_the_depth_of_the_scene_lies_on_the_street(inputs: EnhancementInputs, st
     # Few and large Gaussians at 64 pixels: within what counts as agreement of two views.
     depth = np.linalg.norm(points - true_chunk.views[0].chunk_SE3_camera[:3, 3], axis=1)
     assert np.median(distance / depth) < 0.05
-    assert set(np.unique(chunk.static.frames)) == {view.frame for view in chunk.views_with_role("source")}
+    # Held-out views show surfaces too, and the road that no view shows is of no frame.
+    assert set(np.unique(chunk.static.frames)) == {NO_SWEEP, *(view.frame for view in chunk.views)}
 
 
 def test_the_scale_is_found_from_the_height_over_the_ground(inputs: EnhancementInputs, folder: Path) -> None:
