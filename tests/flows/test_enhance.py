@@ -39,7 +39,6 @@ from tests.flows.street_scene_files import SIZE, in_source_axes, make_resting_st
 
 pytest.importorskip("embreex", reason="the synthetic street is ray-cast with Embree")
 
-SIZE = ("ingest.width_px=64", "ingest.height_px=36")
 # Distances between sets of images take most of a run's time, and say nothing of the scene's place.
 TINY = (*(setting for setting in SETTINGS if not setting.startswith("gnet.")), "evaluate.distributions=false")
 
