@@ -22,7 +22,7 @@ CLAIM_WORDS = {
     "exchange.import_s": "Import of a PLY file of a million Gaussians with harmonics of degree 3",
     "exchange.import_memory": "Growth of memory for that, as a multiple of the file",
     "exchange.enhance_psnr_3m": "PSNR that `genre enhance` gains at 3 m, mean over streets",
-    "exchange.enhance_perceptual_3m": "Part by which it lowers the perceptual distance at 3 m",
+    "exchange.enhance_perceptual_3m": "Fraction by which it lowers the perceptual distance at 3 m, without LiDAR",
     "exchange.enhance_heldout": "Loss of held-out PSNR by it",
     "exchange.page_bytes": "Size of the largest page, bytes",
     "exchange.page_problems": "Console errors and failed requests of pages without the network",
@@ -31,7 +31,7 @@ CLAIM_WORDS = {
     "exchange.answer_run": "`genre show RUN`, a run of 100 chunks",
     "exchange.answer_artifact": "`genre show KEY` in its store",
     "exchange.service_failed": "Failed calls of a rollout of 200 steps by AlpaSim's protocol",
-    "exchange.service_p95": "Time of an image of 512×320, the slowest of 20",
+    "exchange.service_p95": "Time of an image of 512×320, 95th percentile",
     "exchange.service_difference": "Largest difference to the library's image",
     "exchange.http_overhead": "Time that HTTP adds to an image",
     "exchange.http_difference": "Largest difference to the library's image, by HTTP",
@@ -47,12 +47,19 @@ def claims() -> str:
     """Every claim: target, measured number, and whether it holds."""
     lines = []
     for claim in result(NAME)["claims"]:
-        measured = "not measured" if claim["measured"] is None else number(claim["measured"])
+        measured = "not measured" if claim["measured"] is None else _format(claim["measured"])
         unit = claim["unit"] if claim["unit"] in UNITS else ""
         target = f"{claim['op']} {claim['target']:g} {unit}".strip()
         verdict = "yes" if claim["holds"] else "**missed**"
         lines.append([CLAIM_WORDS[claim["id"]], target, measured, verdict])
     return table(["claim", "target", "measured", "holds"], lines) + "\n" + provenance(NAME)
+
+
+def _format(value: float) -> str:
+    # Rounded to three digits, a number just below its target would look like it.
+    if 0 < abs(value) < 0.1:
+        return f"{value:.3g}"
+    return f"{value:,.0f}" if abs(value) >= 1e5 else number(value)
 
 
 def formats() -> str:
