@@ -44,9 +44,14 @@ def wait_for_color(page: Any, channel: int, least_px: float = 0.0, most_px: floa
 
 
 def go_to(page: Any, seconds: str) -> None:
-    """Sets the time line, which also pauses it."""
-    page.locator("input").first.fill(seconds)
-    page.wait_for_timeout(300)
+    """Sets the time line, which also pauses it; until the recording is loaded, it plays on all the same."""
+    time_field = page.locator("input").first
+    for _ in range(60):
+        time_field.fill(seconds)
+        page.wait_for_timeout(300)
+        if float(time_field.input_value()) == pytest.approx(float(seconds), abs=0.02):
+            return
+    raise AssertionError(f"the time line is at {time_field.input_value()}, not at {seconds}")
 
 
 @needs_browser
@@ -57,6 +62,8 @@ def test_the_time_line_moves_an_actor_and_the_console_is_empty(tmp_path: Path) -
     with open_page(file, 800, 500) as opened:
         page = opened.page
         page.locator("input").first.wait_for()
+        # A time that is set before the recording is loaded is forgotten.
+        wait_for_color(page, RED)
         # The red block drives from the left to the right, and is gone at the last frame, where a blue one is there.
         go_to(page, "0.05")
         start = wait_for_color(page, RED, most_px=390)
