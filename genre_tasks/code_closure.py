@@ -19,7 +19,7 @@ class ImportClosure:
     """All code that a module can run.
 
     Attributes:
-        modules: module of the package → its file.
+        modules: module of the followed packages → its file.
         cpp_files: C++ files that these modules name, and what those include.
         packages: names of the other top-level packages that are imported.
     """
@@ -31,6 +31,8 @@ class ImportClosure:
 
 def import_closure(module: str, lazy_modules: Sequence[str], root: Path) -> ImportClosure:
     """Finds everything that modules import, directly and through others, and the C++ files that they name.
+
+    Imports of ``genre_tasks`` and of the packages that the named modules are in are followed, others are not.
 
     Args:
         module: the module to start from.
@@ -49,6 +51,8 @@ def import_closure(module: str, lazy_modules: Sequence[str], root: Path) -> Impo
                 f"There is no module {name!r}", remedy="Name a module inside the package, as genre_tasks.stages.gnet."
             )
     todo = [part for name in (module, *lazy_modules) for part in _with_packages(name)]
+    # A stage imports its own package alone; a benchmark imports the product's code by way of others.
+    followed = {PACKAGE, *(name.partition(".")[0] for name in (module, *lazy_modules))}
     modules: dict[str, Path] = {}
     packages: set[str] = set()
     cpp_files: list[Path] = []
@@ -63,7 +67,7 @@ def import_closure(module: str, lazy_modules: Sequence[str], root: Path) -> Impo
         cpp_files += [path.parent / cpp_name for cpp_name in source.cpp_names]
         for imported in source.imports:
             package = imported.partition(".")[0]
-            if package == PACKAGE:
+            if package in followed:
                 # The last part of "from a.b import c" may be a name and no module.
                 todo += _with_packages(imported)
             else:

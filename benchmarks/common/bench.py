@@ -73,7 +73,8 @@ class Bench(Protocol):
     Attributes:
         name: as in ``genre bench NAME``.
         options: what ``--set`` may change, with defaults.
-        code: names of modules; a cell's cached row is valid as long as they and their imports stay the same.
+        code: names of modules; a cell's cached row is valid as long as they, and what they import of the benchmarks and
+            of ``genre_tasks``, stay the same. What only flows import has to be named.
         smallest: options of the shortest run.
     """
 

@@ -39,8 +39,7 @@ from benchmarks.exchange.round_trips import (
     round_trip_table,
 )
 from benchmarks.exchange.service_fuzz import REQUESTS, service_fuzz_claims, service_fuzz_table
-from flows.reconstruction.stored_values import find_last_stage, read_stage_scene, read_stage_value
-from genre_tasks.exchange.conversion import to_exchange_scene
+from flows.exchange.stored_scenes import open_stored_scenes
 
 _FORMATS = ("ply", "splat", "spz", "glb", "usdz")
 _HARMONIC_FORMATS = ("ply", "spz", "glb", "usdz")
@@ -185,12 +184,7 @@ def _measure_trip(case: RunCase, name: str, degree: int) -> Row:
 
 def _measure_tools(case: RunCase) -> Row:
     """The last scene of a run in tools of others."""
-    run = case.make()
-    _, chunk = read_stage_value(case.store, run, 0, "ingest")
-    scene = read_stage_scene(case.store, run, 0, find_last_stage(case.store, run, 0))
-    times_s = [(frame - chunk.frames[0]) / 10.0 for frame in chunk.frames]
-    names = {actor.track_id: f"actor-{k}" for k, actor in enumerate(scene.actors)}
-    return measure_interop(to_exchange_scene(scene, chunk.frames, times_s, chunk.world_SE3_chunk, names=names))
+    return measure_interop(open_stored_scenes(case.store, case.make()).load(0))
 
 
 def _measure_viewer(case: RunCase) -> Row:

@@ -156,6 +156,19 @@ def test_every_package_that_stages_import_is_known() -> None:
     assert packages - {"pydantic", "safetensors", "huggingface_hub", "psutil"} <= set(module.NUMERIC_PACKAGES)
 
 
+def test_a_benchmark_follows_its_own_package_too_and_a_stage_does_not(tmp_path: Path) -> None:
+    root = write_package(tmp_path, {})
+    (root / "benchmarks").mkdir()
+    (root / "benchmarks/__init__.py").touch()
+    (root / "benchmarks/speed.py").write_text("from benchmarks.scenes import X\n")
+    (root / "benchmarks/scenes.py").write_text("from genre_tasks.scene.graph import LIMIT as X\n")
+    (root / "genre_tasks/render/api.py").write_text("import benchmarks.scenes\n")
+    followed = import_closure("benchmarks.speed", (), root).modules
+    assert {"benchmarks.scenes", "genre_tasks.scene.graph"} <= followed.keys()
+    of_stage = import_closure("genre_tasks.render.api", (), root)
+    assert "benchmarks.scenes" not in of_stage.modules and "benchmarks" in of_stage.packages
+
+
 LITTER = (
     ".DS_Store",
     "._gnet.py",
