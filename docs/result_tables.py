@@ -96,9 +96,17 @@ def number(value: float) -> str:
 def provenance(name: str) -> str:
     """One line that says what a table was measured on, and how to measure it again."""
     loaded = result(name)
+    rows = loaded["rows"]
+    # A row that was measured elsewhere, or before, carries its own machine and commit.
+    earlier = sum("commit" in row or "machine" in row for row in rows)
+    part = (
+        f" {earlier} of {len(rows)} rows are of earlier commits or other machines, which the file names."
+        if earlier
+        else ""
+    )
     return (
         f"Measured on {loaded['machine']} at commit `{loaded['commit'][:12]}` by "
-        f"`genre bench {name} --json docs/results/data/{name}.json`.\n"
+        f"`genre bench {name} --json docs/results/data/{name}.json`.{part}\n"
     )
 
 
