@@ -71,6 +71,7 @@ def summarise_files(store: Store, artifact: Artifact) -> list[TableSummary]:
         ArtifactCorruptError: a file is missing, unexpected or altered.
     """
     store.verify(artifact)
+    store.fetch(artifact)
     files = [artifact.path / entry.path for entry in artifact.manifest.files]
     summaries = [_summarise_table(artifact.path, p) for p in files if p.suffix == ".parquet"]
     for folder in sorted({p.parent for p in files if p.suffix == ".exr"}):

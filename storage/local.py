@@ -7,14 +7,14 @@ import shutil
 import time
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import asdict, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, urlparse
 
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
+from genre_tasks.progress import Progress, silent
 from genre_tasks.temporary_names import describe_owner, is_abandoned, remove_path
 from genre_tasks.user_paths import expand_user_path
 from storage.address import Address
@@ -28,13 +28,15 @@ from storage.artifact_folders import (
     move_to_trash,
 )
 from storage.codecs import get_codec
-from storage.files import make_folders, payload_files, sync
+from storage.file_lease import hold_file_lease
+from storage.files import make_folders, payload_files, sync, write_file
 from storage.io_errors import as_genre_error
 from storage.manifest import MANIFEST, FileEntry, Manifest, parse_manifest, payload_digest
 from storage.manifest_writer import find_damage, write_manifest
+from storage.records import LocalRecordFolders
 from storage.store import Artifact, Provenance
 
-__all__ = ["Artifact", "LocalStore", "Provenance", "open_store"]
+__all__ = ["Artifact", "LocalStore", "Provenance"]
 
 _RECOMPUTE = "Run again: it is computed anew (or delete the folder by hand)."
 
@@ -53,6 +55,26 @@ class LocalStore:
 
     def __init__(self, root: Path) -> None:
         self.root = expand_user_path(root).absolute()
+        self.records = LocalRecordFolders(self.root)
+
+    @property
+    def uri(self) -> str:
+        """The folder's path."""
+        return str(self.root)
+
+    def check_writable(self) -> None:
+        """Writes and removes a small file: see :meth:`storage.store.Store.check_writable`."""
+        probe = self.root / f"{TEMPORARY_PREFIX}probe-{describe_owner()}-{uuid.uuid4().hex}"
+        try:
+            make_folders(self.root)
+            write_file(probe, b"\0")
+            probe.unlink()
+        except OSError as error:
+            raise as_genre_error(error, self.root) from error
+
+    def exists(self) -> bool:
+        """Tells whether the folder is there: see :meth:`storage.store.Store.exists`."""
+        return self.root.is_dir()
 
     def commit(self, address: Address, kind: str, value: Any, provenance: Provenance | None = None) -> Artifact:
         """Writes a value to a temporary folder and renames it into place: see :meth:`storage.store.Store.commit`.
@@ -148,6 +170,22 @@ class LocalStore:
         with _os_errors_translated(artifact.path, artifact.address):
             return codec.read(artifact.path, artifact.manifest.measurements)
 
+    def fetch(self, artifact: Artifact, suffix: str = "") -> Path:
+        """Gives the folder of an artifact's files: see :meth:`storage.store.Store.fetch`.
+
+        Returns:
+            The artifact's folder in the store.
+        """
+        return artifact.path
+
+    def lease(self, address: Address, progress: Progress = silent) -> AbstractContextManager[None]:
+        """Keeps others from computing an artifact: see :meth:`storage.store.Store.lease`.
+
+        Returns:
+            The context in which this process alone computes it.
+        """
+        return hold_file_lease(self.root, address, progress)
+
     def discard(self, target: Artifact | Address) -> None:
         """Removes an artifact, renamed away first so that nobody sees half of it.
 
@@ -198,22 +236,23 @@ class LocalStore:
                 if fits and folder == self.root / address.relative_path:
                     yield Artifact(address, folder, manifest)
 
-    def verify_all(self) -> Iterator[tuple[Path, ArtifactCorruptError | None]]:
-        """Checks every artifact of the store, also those whose manifest cannot be read.
+    def verify_all(self) -> Iterator[tuple[str, ArtifactCorruptError | None]]:
+        """Checks every artifact of the store: see :meth:`storage.store.Store.verify_all`.
 
         Yields:
-            (folder, what is wrong with it or ``None``), in the order of their paths.
+            (relative path, what is wrong with it or ``None``).
         """
         for folder in find_artifact_folders(self.root):
+            name = folder.relative_to(self.root).as_posix()
             try:
                 manifest = load_manifest(folder)
                 artifact = Artifact(manifest.address, folder, manifest)
                 if folder != self.root / artifact.address.relative_path:
                     raise _corruption_error(artifact, MANIFEST, f"The manifest belongs to {artifact.address}")
                 self.verify(artifact)
-                yield folder, None
+                yield name, None
             except ArtifactCorruptError as error:
-                yield folder, error
+                yield name, error
 
     def clean_temporaries(self, older_than_s: float = 3600.0) -> int:
         """Removes what killed processes left behind.
@@ -272,29 +311,6 @@ class LocalStore:
             return True
         except ArtifactCorruptError:
             return False
-
-
-def open_store(uri: str) -> LocalStore:
-    """Opens the store at a path or URI.
-
-    Args:
-        uri: a path, or ``file:///…``.
-
-    Returns:
-        The store; its folder need not exist yet.
-
-    Raises:
-        ConfigError: the URI has another scheme.
-
-    >>> print(open_store("file:///data/a%20store").root)
-    /data/a store
-    """
-    parsed = urlparse(uri)
-    if parsed.scheme == "" and uri:
-        return LocalStore(Path(uri))
-    if parsed.scheme == "file" and parsed.netloc in ("", "localhost") and parsed.path:
-        return LocalStore(Path(unquote(parsed.path)))
-    raise ConfigError(f"The store {uri!r} is of no known kind", remedy="Give a folder: a path, or file:///path.")
 
 
 def _corruption_error(artifact: Artifact, name: str, problem: str) -> ArtifactCorruptError:

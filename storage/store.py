@@ -1,14 +1,18 @@
-"""What any store can do. The local folder is one; an object store comes behind the same protocol."""
+"""What any store can do, whether it is a folder of this machine or a bucket of an object store."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+from genre_tasks.errors import ArtifactCorruptError
+from genre_tasks.progress import Progress, silent
 from storage.address import Address
 from storage.manifest import Manifest
+from storage.records import RecordFolders
 
 
 @dataclass(frozen=True)
@@ -17,7 +21,7 @@ class Artifact:
 
     Attributes:
         address: where it belongs.
-        path: its folder.
+        path: where its files are on this machine, which for a remote store is true only after :meth:`Store.fetch`.
         manifest: what it says of itself.
     """
 
@@ -57,6 +61,34 @@ class Provenance:
 
 class Store(Protocol):
     """A place for artifacts: commits are atomic, the first writer wins, reads are verified."""
+
+    @property
+    def uri(self) -> str:
+        """Where the store is: a path or a URI, without credentials."""
+        ...
+
+    @property
+    def records(self) -> RecordFolders:
+        """The records of runs and datasets."""
+        ...
+
+    def check_writable(self) -> None:
+        """Writes and removes a small file.
+
+        Raises:
+            InputError: this user may not write there.
+            ResourceError: the disk is full.
+            TransientIOError: the store does not answer.
+        """
+        ...
+
+    def exists(self) -> bool:
+        """Tells whether anything was ever written to the store.
+
+        Raises:
+            TransientIOError: the store does not answer.
+        """
+        ...
 
     def commit(self, address: Address, kind: str, value: Any, provenance: Provenance | None = None) -> Artifact:
         """Writes a value completely or not at all.
@@ -117,6 +149,43 @@ class Store(Protocol):
         """
         ...
 
+    def fetch(self, artifact: Artifact, suffix: str = "") -> Path:
+        """Brings an artifact's files to this machine, for a reader of single files.
+
+        Files that come over the network are verified; a local store's are used as they are.
+
+        Args:
+            artifact: the artifact.
+            suffix: how the names of the files end that are needed; by default all.
+
+        Returns:
+            The folder with its files, for reading only. It is ``artifact.path``.
+
+        Raises:
+            ArtifactCorruptError: a file that was brought is missing or altered.
+            TransientIOError: the store does not answer.
+        """
+        ...
+
+    def lease(self, address: Address, progress: Progress = silent) -> AbstractContextManager[None]:
+        """Gives the exclusive right to compute an artifact, and waits for it while another process has it.
+
+        A process that dies loses its lease. Commits are safe without one: a lease only saves doubled work.
+        A process that had to wait looks the artifact up again.
+
+        Args:
+            address: of the artifact.
+            progress: called while another process has the lease.
+
+        Returns:
+            The context in which this process alone computes the artifact.
+
+        Raises:
+            InputError: the store cannot be written.
+            TransientIOError: the store does not answer.
+        """
+        ...
+
     def discard(self, target: Artifact | Address) -> None:
         """Removes an artifact, sound or not; nothing happens where there is none.
 
@@ -151,5 +220,24 @@ class Store(Protocol):
 
         Yields:
             The artifacts that fit.
+        """
+        ...
+
+    def verify_all(self) -> Iterator[tuple[str, ArtifactCorruptError | None]]:
+        """Checks every byte of every artifact, also of those whose manifest cannot be read.
+
+        Yields:
+            (the artifact's path relative to the store, what is wrong with it or ``None``), in the order of the paths.
+        """
+        ...
+
+    def clean_temporaries(self, older_than_s: float = 3600.0) -> int:
+        """Removes what killed processes left behind.
+
+        Args:
+            older_than_s: what cannot be attributed to a process goes when it was not touched for so many seconds.
+
+        Returns:
+            How many files and folders were removed.
         """
         ...

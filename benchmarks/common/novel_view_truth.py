@@ -14,7 +14,7 @@ from genre_tasks.scene.novel_views import FixedViews, NovelView
 from storage.address import Address
 from storage.code_digest import code_digest
 from storage.keys import digest_value
-from storage.local import open_store
+from storage.opening import open_store
 
 TRUE_VIEWS = 12
 """Number of views at a shift that are ray-cast, half a second each; spread evenly over sides, frames and cameras."""

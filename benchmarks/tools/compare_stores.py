@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from genre_tasks.scene.novel_views import FixedViews, NovelViews
-from storage.local import open_store
+from storage.opening import open_store
 from storage.store import Artifact, Store
 
 LEVELS = 255.0

@@ -13,7 +13,7 @@ from flows.defaults import DEFAULT_STORE
 
 if TYPE_CHECKING:
     from flows.comparison.comparison import Comparison
-    from storage.local import LocalStore
+    from storage.store import Store
 
 
 def diff(
@@ -71,7 +71,7 @@ def diff(
     _write_files(comparison, html, out)
 
 
-def _compare(stores: tuple[LocalStore, LocalStore], names: tuple[str, str], chunk: int | None) -> Comparison:
+def _compare(stores: tuple[Store, Store], names: tuple[str, str], chunk: int | None) -> Comparison:
     from flows.comparison.artifact_comparison import compare_artifacts
     from flows.comparison.run_comparison import compare_runs, open_side
     from flows.reconstruction.named_results import NamedRun, find_named

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from storage.local import LocalStore
+    from storage.store import Store
 
 
-def open_existing_store(uri: str) -> LocalStore:
+def open_existing_store(uri: str) -> Store:
     """Opens a store that must be there.
 
     Args:
@@ -22,10 +22,10 @@ def open_existing_store(uri: str) -> LocalStore:
         InputError: there is no such folder.
     """
     from genre_tasks.errors import InputError
-    from storage.local import open_store
+    from storage.opening import open_store
 
     opened = open_store(uri)
-    if not opened.root.is_dir():
+    if not opened.exists():
         remedy = "Give the folder of one by --store; `genre run` makes one."
-        raise InputError("there is no store", remedy=remedy, file=opened.root)
+        raise InputError("there is no store", remedy=remedy, file=opened.uri)
     return opened

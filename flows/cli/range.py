@@ -69,7 +69,7 @@ def range_command(
     from flows.cli.terminal import TerminalReporter
     from flows.reconstruction.range_record import write_range_record
     from flows.reconstruction.reliable_range import write_range
-    from flows.reconstruction.run_records import find_run_folder
+    from flows.reconstruction.run_records import find_run_folder, name_run_folder
     from flows.reconstruction.stored_values import find_last_stage, read_next_scene, read_stage_scene, read_stage_value
     from genre_tasks.reliability.chunk_seam import measure_seam, median_psnr_by_distance
     from genre_tasks.reliability.reliable_range import estimate_reliable_range
@@ -77,7 +77,7 @@ def range_command(
     check_output_folder(out, "--out", ("range.parquet", "range.png"))
     config = _range_config(max_drop_db, every)
     check_number(max_drop_db, "--max-drop-db", 0, 100)
-    open_existing_store(store)
+    opened = open_existing_store(store)
     network = _load_detector(detector)
     number, ingested = read_stage_value(store, run, chunk, "ingest")
     scene_stage = find_last_stage(store, run, number) if stage is None else stage
@@ -89,7 +89,9 @@ def range_command(
     following = read_next_scene(store, run, number, stage)
     facts = {"log": ingested.log, "chunk": str(number), "stage": scene_stage, "run": run}
     files = write_range(out, reliable_range, facts)
-    write_range_record(find_run_folder(store, run), number, scene_stage, reliable_range)
+    folder = find_run_folder(store, run)
+    write_range_record(folder, number, scene_stage, reliable_range)
+    opened.records.push(name_run_folder(folder.name))
     files += _rewrite_report(store, run)
     rows = [_point_row(point) for point in reliable_range.points]
     print_rows(f"{ingested.log}, chunk {number}, after {scene_stage}", rows)

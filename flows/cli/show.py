@@ -13,7 +13,7 @@ from flows.cli.parsing import parse_path
 from flows.defaults import DEFAULT_PRESET, DEFAULT_STORE
 
 if TYPE_CHECKING:
-    from storage.local import LocalStore
+    from storage.store import Store
 
 WhatArgument = Annotated[
     str,
@@ -100,7 +100,7 @@ def _check_options(what: str, run: str | None, picture: Path | None) -> None:
         raise _second_word(what, run)
 
 
-def _show_run_or_artifact(name: str, opened: LocalStore, chunk: int | None, picture: Path | None) -> None:
+def _show_run_or_artifact(name: str, opened: Store, chunk: int | None, picture: Path | None) -> None:
     from flows.cli.show_artifact import print_artifact, write_picture
     from flows.cli.show_run import print_run_record
     from flows.reconstruction.named_results import NamedRun, find_named

@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from storage.local import LocalStore
-    from storage.store import Artifact
+    from storage.store import Artifact, Store
 
 
-def print_artifact(store: LocalStore, artifact: Artifact) -> None:
+def print_artifact(store: Store, artifact: Artifact) -> None:
     """Prints the manifest, what the artifact holds, its files with statistics of their columns, and its ancestors.
 
     Args:
@@ -26,6 +25,7 @@ def print_artifact(store: LocalStore, artifact: Artifact) -> None:
 
     # Before anything is printed: tables of a damaged artifact would show the damage as if it were the result.
     tables = summarise_files(store, artifact)
+    store.fetch(artifact)
     print_fields("manifest", artifact.manifest.model_dump(exclude={"files"}))
     contents = summarise_contents(artifact)
     if contents:
@@ -64,7 +64,7 @@ def read_folder_artifact(folder: Path) -> Artifact:
     return Artifact(manifest.address, folder, manifest)
 
 
-def write_picture(store: LocalStore, artifact: Artifact, path: Path) -> None:
+def write_picture(store: Store, artifact: Artifact, path: Path) -> None:
     """Draws an artifact into a PNG file.
 
     Args:

@@ -13,13 +13,12 @@ from genre_tasks.errors import InputError
 from storage.lineage import summarise_files
 
 if TYPE_CHECKING:
-    from storage.local import LocalStore
-    from storage.store import Artifact
+    from storage.store import Artifact, Store
 
 _STATISTICS = ("min", "mean", "max")
 
 
-def compare_artifacts(stores: tuple[LocalStore, LocalStore], a: Artifact, b: Artifact) -> Comparison:
+def compare_artifacts(stores: tuple[Store, Store], a: Artifact, b: Artifact) -> Comparison:
     """Compares two artifacts: where they are from, settings, files, statistics, and what their kind has.
 
     Args:
@@ -41,6 +40,7 @@ def compare_artifacts(stores: tuple[LocalStore, LocalStore], a: Artifact, b: Art
         )
     for store, artifact in zip(stores, (a, b), strict=True):
         store.verify(artifact)
+        store.fetch(artifact)
     comparison = Comparison(a=_name(a), b=_name(b))
     if a.manifest.payload_digest == b.manifest.payload_digest:
         comparison.notes.append("The payloads are the same, byte by byte.")
@@ -143,7 +143,7 @@ def _compare_files(a: Artifact, b: Artifact) -> list[dict[str, Any]]:
     return rows
 
 
-def _compare_statistics(stores: tuple[LocalStore, LocalStore], a: Artifact, b: Artifact) -> list[dict[str, Any]]:
+def _compare_statistics(stores: tuple[Store, Store], a: Artifact, b: Artifact) -> list[dict[str, Any]]:
     """A row for each column of each table of both whose statistics differ."""
     found = [_read_statistics(store, artifact) for store, artifact in zip(stores, (a, b), strict=True)]
     rows = []
@@ -159,7 +159,7 @@ def _compare_statistics(stores: tuple[LocalStore, LocalStore], a: Artifact, b: A
     return rows
 
 
-def _read_statistics(store: LocalStore, artifact: Artifact) -> dict[tuple[str, str], dict[str, Any]]:
+def _read_statistics(store: Store, artifact: Artifact) -> dict[tuple[str, str], dict[str, Any]]:
     return {
         # Without the number of rows, which stands behind the table's name and may differ.
         (table.name.partition(":")[0], row.get("column", row.get("picture", ""))): row

@@ -16,8 +16,7 @@ from flows.reconstruction.stored_values import SCENE_STAGES
 from genre_tasks.errors import InputError
 
 if TYPE_CHECKING:
-    from storage.local import LocalStore
-    from storage.store import Artifact
+    from storage.store import Artifact, Store
 
 _EVALUATE = "evaluate/"
 MOST_CHUNKS = 4
@@ -35,7 +34,7 @@ class RunSide:
     """
 
     record: Mapping[str, Any]
-    store: LocalStore
+    store: Store
     artifacts: Mapping[str, Artifact]
 
     def stages(self, chunk: int) -> dict[str, Mapping[str, Any]]:
@@ -53,7 +52,7 @@ class RunSide:
         return [chunk["chunk"] for chunk in self.record["chunks"]]
 
 
-def open_side(store: LocalStore, record: Mapping[str, Any]) -> RunSide:
+def open_side(store: Store, record: Mapping[str, Any]) -> RunSide:
     """Finds the artifacts of a run.
 
     Args:
@@ -157,6 +156,7 @@ def _add_chunk(comparison: Comparison, a: RunSide, b: RunSide, number: int) -> N
 def _verify(*found: tuple[RunSide, Artifact]) -> None:
     for side, artifact in found:
         side.store.verify(artifact)
+        side.store.fetch(artifact)
 
 
 def _stage_row(a: RunSide, b: RunSide, number: int, stage: str) -> dict[str, Any]:

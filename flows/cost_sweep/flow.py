@@ -24,7 +24,7 @@ from flows.pipeline.progress import get_reporter
 from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import GenreError
 from storage.codecs.png import write_png
-from storage.local import open_store
+from storage.opening import open_store
 
 
 @flow(name="cost-of-accuracy", persist_result=False, validate_parameters=False)

@@ -25,7 +25,7 @@ from storage.address import Address
 from storage.code_digest import code_digest
 from storage.files import digest_file, payload_files
 from storage.keys import stage_key
-from storage.local import open_store
+from storage.opening import open_store
 from storage.store import Provenance
 
 _CODE = "genre_tasks.exchange.scene_file"

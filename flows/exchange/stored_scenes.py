@@ -18,7 +18,7 @@ from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.exchange.conversion import to_exchange_scene
 from genre_tasks.exchange.types import ExchangeScene
 from genre_tasks.scene_edits.actor_names import name_actors
-from storage.local import open_store
+from storage.opening import open_store
 from storage.store import Artifact
 
 IMPORTED = "imported"

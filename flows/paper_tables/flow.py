@@ -31,7 +31,7 @@ from flows.paper_tables.rollout_cells import measure_rollout_cell
 from flows.pipeline.progress import get_reporter
 from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import GenreError
-from storage.local import open_store
+from storage.opening import open_store
 
 
 @flow(name="paper-table", flow_run_name="table {number}", persist_result=False, validate_parameters=False)

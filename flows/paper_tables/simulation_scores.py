@@ -36,7 +36,7 @@ from storage.address import Address
 from storage.code_digest import code_digest
 from storage.files import digest_file
 from storage.keys import digest_bytes, digest_value
-from storage.local import open_store
+from storage.opening import open_store
 
 TRUE_VIEWS = 12
 """Views of a rollout that are ray-cast, half a second each; spread evenly over poses and cameras."""

@@ -10,7 +10,7 @@ from flows.pipeline.definition import PIPELINE, RECONSTRUCTION_STAGES, StageSpec
 from flows.pipeline.log_cache import cached_log, select_chunks
 from flows.pipeline.stage_runner import ArtifactRef, Job, find_artifact
 from genre_tasks.config import PipelineConfig
-from storage.local import open_store
+from storage.opening import open_store
 
 # Measured on two cores at 320×180 with six cameras and 44k Gaussians (preset small), for one chunk.
 # Used where the store holds no finished stage to learn from; scaled with the number of pixels.

@@ -23,7 +23,7 @@ from genre_tasks.errors import ArtifactCorruptError
 from genre_tasks.progress import Progress, silent
 from storage.address import Address
 from storage.code_digest import code_digest
-from storage.local import open_store
+from storage.opening import open_store
 from storage.store import Artifact, Provenance, Store
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ class ArtifactRef:
         stage: the stage that made the artifact.
         key: the artifact's key.
         payload_digest: digest of its files; later keys depend on it.
-        path: its folder in the store.
+        address: where it is in the store.
         cached: whether it was in the store already.
         note: a warning for the user, such as that a damaged artifact was computed again; empty without one.
     """
@@ -63,7 +63,7 @@ class ArtifactRef:
     stage: str
     key: str
     payload_digest: str
-    path: str
+    address: Address
     cached: bool
     note: str = ""
 
@@ -205,6 +205,25 @@ def run_stage(
     if ref is not None:
         return ref
     store = open_store(job.store)
+    with store.lease(address, progress):
+        # The process that had the lease before has probably committed the artifact.
+        _, ref, _ = find_artifact(spec, job, inputs)
+        if ref is not None:
+            return ref
+        artifact = _compute_artifact(spec, job, inputs, store, address, note, attempt, progress)
+    return _reference(artifact, cached=False, note=note)
+
+
+def _compute_artifact(
+    spec: StageSpec,
+    job: Job,
+    inputs: Mapping[str, ArtifactRef],
+    store: Store,
+    address: Address,
+    note: str,
+    attempt: int,
+    progress: Progress,
+) -> Artifact:
     # Read here and not before the look-up: a hit reads the manifests alone.
     values = {name: store.read(_find_input(store, inputs[name], job)) for name in spec.inputs}
     values |= _special_arguments(spec, job)
@@ -228,8 +247,7 @@ def run_stage(
         warnings=(note,) if note else (),
     )
     # The first writer wins: if another process has committed this key meanwhile, its artifact is the result.
-    artifact = store.commit(address, spec.kind, value, provenance)
-    return _reference(artifact, cached=False, note=note)
+    return store.commit(address, spec.kind, value, provenance)
 
 
 def open_artifact(job: Job, ref: ArtifactRef) -> Artifact:
@@ -302,11 +320,11 @@ def _find_input(store: Store, ref: ArtifactRef, job: Job) -> Artifact:
         raise ArtifactCorruptError(
             f"the artifact of {ref.stage} vanished while the run was going on",
             remedy="Run again: it is computed again.",
-            file=ref.path,
+            file=str(ref.address),
         )
     return artifact
 
 
 def _reference(artifact: Artifact, cached: bool, note: str = "") -> ArtifactRef:
     manifest = artifact.manifest
-    return ArtifactRef(manifest.stage, manifest.key, manifest.payload_digest, str(artifact.path), cached, note)
+    return ArtifactRef(manifest.stage, manifest.key, manifest.payload_digest, artifact.address, cached, note)

@@ -152,7 +152,7 @@ def draw_artifact(store: Store, artifact: Artifact) -> NDArray[np.uint8] | None:
     # A picture of a damaged artifact would show the damage as if it were the result.
     store.verify(artifact)
     draw = _DRAWING_FUNCTIONS.get(artifact.manifest.kind)
-    return None if draw is None else draw(artifact.path)
+    return None if draw is None else draw(store.fetch(artifact))
 
 
 def _draw_chunk(folder: Path) -> Image8 | None:

@@ -97,14 +97,15 @@ def check_requirements(
     inputs = check_inputs(log, chunks, config)
     files = check_files(config, stages)
     root = check_store(store, (inputs.log.dataset, inputs.log.name))
+    where = store if root is None else root
     needed_mib = estimate_disk_mib(inputs.log, inputs.cameras, config, len(inputs.chunks))
     checked = (
         *inputs.lines,
         *files,
-        f"store {root}: can be written to",
+        f"store {where}: can be written to",
         f"disk: about {needed_mib:.0f} MiB for a run from nothing",
     )
-    found = (assess_disk(root, needed_mib), assess_memory(config))
+    found = (None if root is None else assess_disk(root, needed_mib), assess_memory(config))
     return RequirementReport(checked, tuple(warning for warning in found if warning is not None))
 
 

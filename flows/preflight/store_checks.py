@@ -8,7 +8,8 @@ from pathlib import Path
 
 from genre_tasks.errors import ConfigError, InputError, ResourceError
 from storage.io_errors import as_genre_error
-from storage.local import open_store
+from storage.local import LocalStore
+from storage.opening import open_store
 
 MIN_FREE_MIB = 100
 """A run is refused with less free space: the first stages alone would fill it."""
@@ -17,7 +18,7 @@ _REMEDY = "Give by --store a folder that this user can write to."
 _PROBE_BYTES = 4096
 
 
-def check_store(store: str, parts: tuple[str, ...] = ()) -> Path:
+def check_store(store: str, parts: tuple[str, ...] = ()) -> Path | None:
     """Checks that artifacts can be written to a store, and leaves no trace of that.
 
     Args:
@@ -25,14 +26,22 @@ def check_store(store: str, parts: tuple[str, ...] = ()) -> Path:
         parts: names of the folders in it that artifacts will go to, such as dataset and log.
 
     Returns:
-        The store's folder.
+        The store's folder; ``None`` for a store that is no folder of this machine.
 
     Raises:
-        ConfigError: it is no folder of this machine.
+        ConfigError: the URI is of no known kind.
         InputError: a part of its path is a file, or it cannot be written to.
         ResourceError: there is almost no free space.
+        TransientIOError: a remote store does not answer.
     """
-    root = _open_root(store)
+    # A flow's parameters may hold anything; a character that ends a C string would fail in every call.
+    if not isinstance(store, str) or "\0" in store:
+        raise ConfigError(f"the store is no path: {store!r}", remedy=_REMEDY)
+    opened = open_store(store)
+    if not isinstance(opened, LocalStore):
+        opened.check_writable()
+        return None
+    root = opened.root
     # Reports of runs go into the store as well, beside the artifacts.
     for folder in (root.joinpath(*parts), root / "runs"):
         _probe(folder)
@@ -60,13 +69,6 @@ def free_space_mib(folder: Path) -> float:
     """
     status = os.statvfs(_nearest_existing(folder))
     return status.f_bavail * status.f_frsize / 2**20
-
-
-def _open_root(store: object) -> Path:
-    # A flow's parameters may hold anything; a character that ends a C string would fail in every call.
-    if not isinstance(store, str) or "\0" in store:
-        raise ConfigError(f"the store is no path: {store!r}", remedy=_REMEDY)
-    return open_store(store).root
 
 
 def _probe(folder: Path) -> None:

@@ -27,7 +27,7 @@ from flows.reconstruction.run_records import FinishedRun, summarise_run, write_r
 from flows.reconstruction.run_summary import RunSummary
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ConfigError, GenreError
-from storage.local import open_store
+from storage.opening import open_store
 
 _log = logging.getLogger("genre")
 

@@ -9,8 +9,7 @@ from flows.reconstruction.run_records import list_runs
 from genre_tasks.errors import InputError
 
 if TYPE_CHECKING:
-    from storage.local import LocalStore
-    from storage.store import Artifact
+    from storage.store import Artifact, Store
 
 
 @dataclass(frozen=True)
@@ -24,7 +23,7 @@ class NamedRun:
     record: dict[str, Any]
 
 
-def find_named(store: LocalStore, name: str) -> NamedRun | Artifact:
+def find_named(store: Store, name: str) -> NamedRun | Artifact:
     """Finds the one run or artifact whose name or key begins so.
 
     Args:
@@ -38,7 +37,7 @@ def find_named(store: LocalStore, name: str) -> NamedRun | Artifact:
         InputError: none begins so, or several do.
     """
     # An empty text, which an unset variable of a script's leaves, would fit to everything.
-    runs = list_runs(str(store.root), name) if name else []
+    runs = list_runs(store.uri, name) if name else []
     # Runs are fewer and asked for more often.
     if len(runs) == 1:
         return NamedRun(runs[0])
@@ -48,6 +47,6 @@ def find_named(store: LocalStore, name: str) -> NamedRun | Artifact:
         raise InputError(
             f"{len(runs) + len(artifacts)} runs or artifacts begin with '{name}'",
             remedy="`genre show runs` and `genre show stages` list them; give more of the name.",
-            file=store.root,
+            file=store.uri,
         )
     return artifacts[0]

@@ -7,9 +7,9 @@ from typing import Any
 
 from flows.pipeline.stage_runner import ArtifactRef
 from flows.reconstruction.report.writing import write_report
-from flows.reconstruction.run_records import FinishedRun, find_run_record, summarise_run
+from flows.reconstruction.run_records import FinishedRun, find_run_record, name_run_folder, summarise_run
 from genre_tasks.errors import InputError
-from storage.local import open_store
+from storage.opening import open_store
 from storage.store import Artifact
 
 
@@ -29,7 +29,9 @@ def rewrite_report(store: str, run: str) -> Path:
         OSError: the report cannot be written.
     """
     finished = read_finished_run(store, find_run_record(store, run))
-    return write_report(finished.folder / "report.html", summarise_run(finished))
+    report = write_report(finished.folder / "report.html", summarise_run(finished))
+    open_store(store).records.push(name_run_folder(finished.name))
+    return report
 
 
 def read_finished_run(store: str, record: dict[str, Any]) -> FinishedRun:
@@ -79,6 +81,6 @@ def _make_ref(stage: dict[str, Any], artifact: Artifact | None, record: dict[str
         stage=stage["stage"],
         key=stage["key"],
         payload_digest=artifact.manifest.payload_digest,
-        path=str(artifact.path),
+        address=artifact.address,
         cached=stage["cached"],
     )

@@ -27,15 +27,14 @@ from flows.reconstruction.run_summary import (
 )
 from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import InputError
-from storage.address import Address
-from storage.local import open_store
+from storage.opening import open_store
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from genre_tasks.metrics.results import Evaluation
-    from storage.local import Artifact
+    from storage.store import Artifact, Store
 
 _FOLDER = "runs"
 
@@ -74,8 +73,8 @@ class FinishedRun:
 
     @property
     def folder(self) -> Path:
-        """The folder of the run's record and report."""
-        return open_store(self.store).root / _FOLDER / self.name
+        """The folder of the run's record and report on this machine."""
+        return open_store(self.store).records.pull(name_run_folder(self.name))
 
 
 def write_run_record(run: FinishedRun, summary: RunSummary, extra: Mapping[str, Any]) -> dict[str, Any]:
@@ -94,8 +93,9 @@ def write_run_record(run: FinishedRun, summary: RunSummary, extra: Mapping[str, 
     """
     from flows.reconstruction.report.writing import write_report
 
-    run.folder.mkdir(parents=True, exist_ok=True)
-    report = write_report(run.folder / "report.html", summary)
+    folder = run.folder
+    folder.mkdir(parents=True, exist_ok=True)
+    report = write_report(folder / "report.html", summary)
     record = {
         "status": "partly_done" if run.left_out else "done",
         "log": run.log,
@@ -117,8 +117,9 @@ def write_run_record(run: FinishedRun, summary: RunSummary, extra: Mapping[str, 
         **extra,
     }
     # Written last: a folder without run.json belongs to a run that did not end.
-    with atomic_path(run.folder / "run.json") as part:
+    with atomic_path(folder / "run.json") as part:
         part.write_text(json.dumps(record, indent=1), encoding="utf-8")
+    open_store(run.store).records.push(name_run_folder(run.name))
     return record
 
 
@@ -161,11 +162,8 @@ def list_runs(store: str, name: str = "") -> list[dict[str, Any]]:
     Raises:
         InputError: a record is damaged.
     """
-    paths = [
-        path for path in (open_store(store).root / _FOLDER).glob("*/run.json") if path.parent.name.startswith(name)
-    ]
-    # The time of the file is when the run ended; the record itself holds no time.
-    return [read_record(path) for path in sorted(paths, key=lambda path: path.stat().st_mtime)]
+    # By the time of the file, which is when the run ended; the record itself holds no time.
+    return [read_record(path) for path in open_store(store).records.find(_FOLDER, "run.json", name)]
 
 
 def _stage_record(stage: StageSummary) -> dict[str, Any]:
@@ -181,13 +179,15 @@ def _stage_record(stage: StageSummary) -> dict[str, Any]:
 
 def _summarise_chunk(run: FinishedRun, chunk: int, refs: dict[str, ArtifactRef]) -> ChunkSummary:
     store = open_store(run.store)
-    artifacts = {name: _find_by_path(run.store, ref) for name, ref in refs.items()}
+    artifacts = {name: _find_artifact(store, ref) for name, ref in refs.items()}
     stages = []
     for spec in PIPELINE:
         if spec.name not in artifacts:
             continue
         evaluated = artifacts.get(f"evaluate/{spec.name}")
         evaluation = None if evaluated is None else store.read(evaluated)
+        # What counts an artifact's contents reads tables alone.
+        store.fetch(artifacts[spec.name], ".parquet")
         stages.append(_summarise_stage(artifacts[spec.name], refs[spec.name].cached, evaluation))
     warnings = [run.notes[chunk]] if chunk in run.notes else []
     # What the log lacks was found once, when the chunk was ingested.
@@ -250,7 +250,7 @@ def _last_environment(run: FinishedRun) -> Mapping[str, str]:
         # Of the first chunk: the others were made by the same command, if not by an earlier one.
         last = [stage for stage in RECONSTRUCTION_STAGES if stage in refs][-1:]
         for stage in last:
-            return _find_by_path(run.store, refs[stage]).manifest.environment
+            return _find_artifact(open_store(run.store), refs[stage]).manifest.environment
     return {}
 
 
@@ -262,14 +262,15 @@ def _encode_png(image: NDArray[np.uint8]) -> bytes:
     return encoded.getvalue()
 
 
-def _find_by_path(store: str, ref: ArtifactRef) -> Artifact:
-    opened = open_store(store)
-    # dataset / log / chunk / stage (which may hold a slash) / key, as storage.address lays folders out.
-    parts = Path(ref.path).relative_to(opened.root).parts
-    address = Address(parts[0], parts[1], int(parts[2]), "/".join(parts[3:-1]), parts[-1])
-    artifact = opened.find(address)
+def _find_artifact(store: Store, ref: ArtifactRef) -> Artifact:
+    artifact = store.find(ref.address)
     if artifact is None:
-        raise InputError("an artifact of this run is gone", remedy="Run the log again.", file=ref.path, stage=ref.stage)
+        raise InputError(
+            "an artifact of this run is gone",
+            remedy="Run the log again.",
+            file=f"{store.uri}/{ref.address}",
+            stage=ref.stage,
+        )
     return artifact
 
 
@@ -308,4 +309,19 @@ def find_run_folder(store: str, run: str) -> Path:
         InputError: no run, or more than one, begins so.
     """
     name: str = find_run_record(store, run)["run"]
-    return open_store(store).root / _FOLDER / name
+    return open_store(store).records.pull(name_run_folder(name))
+
+
+def name_run_folder(run: str) -> str:
+    """Names the record folder of a run in a store.
+
+    Args:
+        run: the run's full name.
+
+    Returns:
+        The name that :class:`storage.records.RecordFolders` takes.
+
+    >>> name_run_folder("5f41c0de9a1b")
+    'runs/5f41c0de9a1b'
+    """
+    return f"{_FOLDER}/{run}"

@@ -8,7 +8,7 @@ from flows.pipeline.log_cache import select_chunks
 from flows.pipeline.stage_runner import ArtifactRef, Job, find_artifact
 from flows.reconstruction.run_records import FinishedRun
 from genre_tasks.config import PipelineConfig
-from storage.local import open_store
+from storage.opening import open_store
 
 
 def find_stored_run(

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from flows.reconstruction.run_records import find_run_record
 from genre_tasks.errors import InputError
-from storage.local import open_store
+from storage.opening import open_store
 
 if TYPE_CHECKING:
     from genre_tasks.scene.chunk import Chunk

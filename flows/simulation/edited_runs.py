@@ -26,7 +26,7 @@ from genre_tasks.scene_edits.edited_scenes import EditedScenes
 from genre_tasks.scene_edits.edits import EditList, Insert
 from storage.address import Address
 from storage.code_digest import code_digest
-from storage.local import open_store
+from storage.opening import open_store
 from storage.store import Artifact, Provenance
 
 if TYPE_CHECKING:
@@ -213,4 +213,4 @@ def _stage_keys(store: str, run: str, number: int) -> dict[str, str]:
 
 def _reference(artifact: Artifact) -> ArtifactRef:
     manifest = artifact.manifest
-    return ArtifactRef(manifest.stage, manifest.key, manifest.payload_digest, str(artifact.path), cached=False)
+    return ArtifactRef(manifest.stage, manifest.key, manifest.payload_digest, artifact.address, cached=False)

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
-from flows.reconstruction.run_records import find_run_record
+from flows.reconstruction.run_records import find_run_record, name_run_folder
 from flows.reconstruction.stored_values import find_last_stage, read_stage_scene, read_stage_value
 from genre_tasks.effects.apply_plan import apply_plan
 from genre_tasks.errors import InputError
 from genre_tasks.scene_edits.chunk_scene import CHUNKS_IN_MEMORY, ChunkScene
-from storage.local import open_store
+from storage.opening import open_store
 
 
 class RunScenes:
@@ -46,8 +46,12 @@ class RunScenes:
 
     @property
     def folder(self) -> Path:
-        """The run's folder in the store."""
-        return open_store(self._store).root / "runs" / str(self.record["run"])
+        """The run's folder on this machine."""
+        return open_store(self._store).records.pull(name_run_folder(str(self.record["run"])))
+
+    def push_folder(self) -> None:
+        """Makes what was written into :attr:`folder` visible to everyone who uses the store."""
+        open_store(self._store).records.push(name_run_folder(str(self.record["run"])))
 
     def find_stage(self, number: int) -> str:
         """Finds the stage whose scene is read.

@@ -61,4 +61,5 @@ def find_side_ranges(scenes: RunScenes, progress: Progress) -> dict[int, SideRan
         ranges[number] = SideRange(found.left_m, found.right_m)
         text = json.dumps({"left_m": found.left_m, "right_m": found.right_m})
         write_atomically(file, text.encode())
+        scenes.push_folder()
     return ranges

@@ -23,7 +23,7 @@ from genre_tasks.stages.novel_views import novel_views
 from genre_tasks.weights import resolve_weights
 from storage.address import Address
 from storage.keys import digest_value
-from storage.local import LocalStore
+from storage.store import Store
 
 STAND_IN_TRUTH = 0.6
 """Fraction of the blurred truth in a stand-in image; the rest is the render."""
@@ -63,7 +63,7 @@ def fixed_images_key(recipe: SceneRecipe, start: SceneStart, stage_weights: Stag
 
 
 def get_fixed_views(
-    store: LocalStore,
+    store: Store,
     scene: PreparedScene,
     start: SceneStart,
     started: Reconstruction,

@@ -35,7 +35,7 @@ from genre_tasks.scene.reconstruction import Reconstruction
 from genre_tasks.weights import resolve_weights
 from storage.address import Address
 from storage.keys import digest_value
-from storage.local import LocalStore
+from storage.store import Store
 
 if TYPE_CHECKING:
     from genre_tasks.fixer.pairs import Pairs
@@ -155,7 +155,7 @@ def list_validation_scenes(seeds: Sequence[int] = (900, 901, 902)) -> list[Scene
     ]
 
 
-def get_pairs(store: LocalStore, scene: SceneRecipe, recipe: PairRecipe | None = None) -> Pairs:
+def get_pairs(store: Store, scene: SceneRecipe, recipe: PairRecipe | None = None) -> Pairs:
     """Reads the pairs of one scene from the store, or makes and stores them.
 
     Args:

@@ -25,7 +25,7 @@ from genre_tasks.scene.reconstruction import Reconstruction
 from genre_tasks.stages.gnet import gnet
 from storage.address import Address
 from storage.keys import digest_value
-from storage.local import LocalStore
+from storage.store import Store
 
 LOSS = LossConfig(perceptual=0.0)
 """The loss that tuned Adam and GNet descend when they make starts."""
@@ -127,9 +127,7 @@ def scene_start_key(recipe: SceneRecipe, start: SceneStart, stage_weights: Stage
     return digest_value({"recipe": recipe.key_fields(), "begin": [type(start).__name__, fields]})
 
 
-def get_start(
-    store: LocalStore, scene: PreparedScene, start: SceneStart, stage_weights: StageWeights
-) -> Reconstruction:
+def get_start(store: Store, scene: PreparedScene, start: SceneStart, stage_weights: StageWeights) -> Reconstruction:
     """Reads the scene at its start from the store, or makes and stores it.
 
     Args:
@@ -154,9 +152,7 @@ def get_start(
     return value
 
 
-def make_starts(
-    store: LocalStore, scene: PreparedScene, starts: Sequence[SceneStart], stage_weights: StageWeights
-) -> int:
+def make_starts(store: Store, scene: PreparedScene, starts: Sequence[SceneStart], stage_weights: StageWeights) -> int:
     """Makes what the store lacks of several starts of one scene.
 
     Args:

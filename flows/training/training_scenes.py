@@ -28,7 +28,7 @@ from genre_tasks.stages.ingest import ingest
 from genre_tasks.stages.initial import initial
 from storage.address import Address
 from storage.keys import digest_value
-from storage.local import LocalStore
+from storage.store import Store
 
 TRAINING_SEEDS = range(0, 900)
 """Seeds of the synthetic street (configs/seeds.yaml): no other may be used to train."""
@@ -147,7 +147,7 @@ def check_for_training(recipe: SceneRecipe) -> None:
         raise ConfigError(f"chunk {recipe.chunk} of {recipe.uri} is not for training", remedy="Use chunk 0.")
 
 
-def prepare_scene(store: LocalStore, recipe: SceneRecipe) -> PreparedScene:
+def prepare_scene(store: Store, recipe: SceneRecipe) -> PreparedScene:
     """Reads the parts of a training scene from the store; what it lacks is made and stored.
 
     Keys are the recipe's alone, not the code's: after a change of how scenes are made, take an empty store.
@@ -185,7 +185,7 @@ def prepare_scene(store: LocalStore, recipe: SceneRecipe) -> PreparedScene:
     return PreparedScene(recipe, apply_plan(chunk, plan), start, truth)
 
 
-def get_or_make(store: LocalStore, address: Address, kind: str, make: Callable[[], Any]) -> Any:
+def get_or_make(store: Store, address: Address, kind: str, make: Callable[[], Any]) -> Any:
     """Reads a value from the store; made and stored where the store has nothing, or nothing sound.
 
     Args:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -178,3 +179,59 @@ class StoreSuite:
         with pytest.raises(ConfigError, match="negative"):
             Address("d", "l", -1, "s", "k")
         assert MANIFEST not in str(address())
+
+    def test_two_never_compute_one_artifact_at_once(self, store: Store, second: Store) -> None:
+        running: list[str] = []
+        most = []
+        start = threading.Barrier(4)
+
+        def work(k: int) -> None:
+            start.wait()
+            with (store, second)[k % 2].lease(address()):
+                running.append("x")
+                most.append(len(running))
+                time.sleep(0.05)
+                running.pop()
+
+        threads = [threading.Thread(target=work, args=(k,)) for k in range(4)]
+        for t in threads:
+            t.start()
+        for t in threads:
+            t.join()
+        assert most == [1, 1, 1, 1]
+
+    def test_a_lease_ends_with_an_error_and_is_of_one_artifact(self, store: Store, second: Store) -> None:
+        with pytest.raises(KeyError), store.lease(address()):
+            raise KeyError
+        with second.lease(address()), store.lease(address(key=OTHER)):
+            pass
+
+    def test_records_are_seen_by_others(self, store: Store, second: Store) -> None:
+        for name in ("aa", "ab"):
+            folder = store.records.pull(f"runs/{name}")
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / "run.json").write_text(name)
+            store.records.push(f"runs/{name}")
+        assert (second.records.pull("runs/ab") / "run.json").read_text() == "ab"
+        assert [path.read_text() for path in second.records.find("runs", "run.json")] == ["aa", "ab"]
+        assert [path.parent.name for path in second.records.find("runs", "run.json", "ab")] == ["ab"]
+        assert list(store.artifacts()) == []
+
+    @pytest.mark.parametrize("name", ["../out", "runs/..", "/runs", "runs//a", "runs/.hidden", ""])
+    def test_records_stay_in_the_store(self, store: Store, name: str) -> None:
+        with pytest.raises(ConfigError, match="record's folder"):
+            store.records.pull(name)
+
+    def test_a_store_exists_once_something_was_written(self, store: Store) -> None:
+        assert not store.exists()
+        store.check_writable()
+        self.commit(store, "evaluation")
+        assert store.exists()
+        assert [damage for _, damage in store.verify_all()] == [None]
+
+    def test_single_files_are_fetched(self, store: Store, second: Store) -> None:
+        self.commit(store, "evaluation")
+        found = second.find(address())
+        assert found is not None
+        assert (second.fetch(found, ".parquet") / "metrics.parquet").is_file()
+        assert second.fetch(found) == found.path

@@ -11,7 +11,7 @@ from flows.cli.main import app
 from flows.configuration import load_configuration
 from flows.pipeline.definition import STAGE_BY_NAME
 from flows.pipeline.stage_runner import ArtifactRef, Job, run_stage
-from storage.local import open_store
+from storage.opening import open_store
 from tests.faults.small_run import LOG, SETTINGS
 
 

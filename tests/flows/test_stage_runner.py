@@ -113,7 +113,7 @@ def test_the_key_follows_the_logs_content_and_the_chunk(store: Path) -> None:
 
 def test_deleting_an_artifact_computes_it_again_and_nothing_else(store: Path) -> None:
     refs = run(job(store), *EARLY)
-    shutil.rmtree(refs["ingest"].path)
+    shutil.rmtree(store / str(refs["ingest"].address))
     again = run(job(store), *EARLY)
     assert cached(again) == {"ingest": False, "effects": True, "initial": True}
     assert again["ingest"].payload_digest == refs["ingest"].payload_digest
@@ -122,7 +122,7 @@ def test_deleting_an_artifact_computes_it_again_and_nothing_else(store: Path) ->
 @pytest.mark.parametrize("damage", ["flip", "truncate", "remove", "add"])
 def test_a_damaged_file_is_found_named_and_computed_again(store: Path, damage: str) -> None:
     refs = run(job(store), *EARLY)
-    file = sorted(Path(refs["initial"].path).glob("*.parquet"))[0]
+    file = sorted((store / str(refs["initial"].address)).glob("*.parquet"))[0]
     data = bytearray(file.read_bytes())
     if damage == "flip":
         data[len(data) // 2] ^= 4

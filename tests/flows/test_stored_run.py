@@ -33,7 +33,7 @@ def test_a_run_that_the_store_answers_starts_no_prefect(tmp_path: Path) -> None:
     for spec in PIPELINE:
         refs[spec.name] = run_stage(spec.name, job, refs)
     # What a killed process left; another one's, which still runs, is beside it.
-    chunk = Path(refs["gnet"].path).parent
+    chunk = (store / str(refs["gnet"].address)).parent
     machine, process, _ = describe_owner().split("-")
     (chunk / f".tmp-abc-{machine}-{process}-1-dead").mkdir()
     (chunk / f".tmp-abc-{describe_owner()}-alive").mkdir()
@@ -49,5 +49,5 @@ def test_a_run_that_the_store_answers_starts_no_prefect(tmp_path: Path) -> None:
     # A single missing stage is a reason to compute.
     found = find_stored_run(LOG, "demo", str(store), None, config)
     assert found is not None and found.name == record["run"]
-    shutil.rmtree(refs["enet"].path)
+    shutil.rmtree(store / str(refs["enet"].address))
     assert find_stored_run(LOG, "demo", str(store), None, config) is None

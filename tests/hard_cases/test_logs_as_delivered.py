@@ -22,7 +22,7 @@ from genre_tasks.logs.registry import open_log
 from genre_tasks.metrics.results import Evaluation
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.reconstruction import Reconstruction
-from storage.local import open_store
+from storage.opening import open_store
 from tests.faults.small_run import SETTINGS
 
 pytestmark = pytest.mark.slow

@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
-from storage.local import LocalStore, Provenance, open_store
+from storage.local import LocalStore, Provenance
 from storage.manifest import MANIFEST, NewerSchemaError
+from storage.opening import open_local_store
 from tests.contracts.store_suite import KEY, StoreSuite, address
 from tests.storage.artifact_values import COLORS, MAKERS, assert_same, make
 
@@ -25,7 +26,7 @@ class TestLocalStore(StoreSuite):
 
     @pytest.fixture
     def second(self, store: LocalStore) -> LocalStore:
-        return open_store(store.root.as_uri())
+        return open_local_store(store.root.as_uri())
 
 
 def test_layout_can_be_walked(tmp_path: Path) -> None:
@@ -60,7 +61,7 @@ def test_an_artifact_moved_to_another_key_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ArtifactCorruptError, match="belongs to"):
         store.find(elsewhere)
     assert [a.address for a in store.artifacts()] == [artifact.address]
-    assert {path.name: error is None for path, error in store.verify_all()} == {KEY: True, "f" * 64: False}
+    assert {Path(name).name: error is None for name, error in store.verify_all()} == {KEY: True, "f" * 64: False}
 
 
 def test_no_manifest_no_artifact(tmp_path: Path) -> None:
@@ -187,9 +188,9 @@ def test_two_processes_on_one_key(tmp_path: Path) -> None:
 @pytest.mark.parametrize("uri", ["s3://bucket/x", "http://host/x", "file://elsewhere/x", "", "file://"])
 def test_unknown_schemes_are_refused(uri: str) -> None:
     with pytest.raises(ConfigError, match="no known kind"):
-        open_store(uri)
+        open_local_store(uri)
 
 
 def test_paths_and_file_uris_open(tmp_path: Path) -> None:
     odd = tmp_path / "a b#c"
-    assert open_store(str(odd)).root == odd == open_store(odd.as_uri()).root
+    assert open_local_store(str(odd)).root == odd == open_local_store(odd.as_uri()).root

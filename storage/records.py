@@ -1,0 +1,108 @@
+"""Folders of records beside the artifacts: runs and datasets, their reports, and what was measured of them later."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+from genre_tasks.errors import ConfigError
+
+
+class RecordFolders(Protocol):
+    """Folders such as ``runs/5f41c0de9a1b``, whose files are read and written on this machine.
+
+    Example::
+
+        folder = store.records.pull("runs/5f41c0de9a1b")
+        (folder / "run.json").write_text(text)
+        store.records.push("runs/5f41c0de9a1b")
+    """
+
+    def pull(self, name: str) -> Path:
+        """Brings a folder with its files to this machine.
+
+        Args:
+            name: the folder's name, with "/" between its parts.
+
+        Returns:
+            The folder on this machine. It need not exist where the store has none of this name.
+
+        Raises:
+            ConfigError: the name leads out of the store.
+            TransientIOError: the store does not answer.
+        """
+        ...
+
+    def push(self, name: str) -> None:
+        """Makes what was written into a pulled folder visible to everyone who uses the store.
+
+        Args:
+            name: the folder's name.
+
+        Raises:
+            ConfigError: the name leads out of the store.
+            TransientIOError: the store does not answer.
+        """
+        ...
+
+    def find(self, parent: str, file: str, start: str = "") -> list[Path]:
+        """Finds a file of many folders, such as every run's ``run.json``.
+
+        Args:
+            parent: the folder above them, such as ``runs``.
+            file: the file's name.
+            start: how the names of the folders begin.
+
+        Returns:
+            The files on this machine, the one that was written first at the front.
+
+        Raises:
+            TransientIOError: the store does not answer.
+        """
+        ...
+
+
+class LocalRecordFolders:
+    """Record folders of a store that is itself a folder of this machine.
+
+    Args:
+        root: the store's folder.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+
+    def pull(self, name: str) -> Path:
+        """Gives the folder where it is: see :meth:`RecordFolders.pull`."""
+        return self._root.joinpath(*split_record_name(name))
+
+    def push(self, name: str) -> None:
+        """Does nothing, as files are written in place."""
+        split_record_name(name)
+
+    def find(self, parent: str, file: str, start: str = "") -> list[Path]:
+        """Finds a file of many folders: see :meth:`RecordFolders.find`."""
+        folder = self._root.joinpath(*split_record_name(parent))
+        found = [path for path in folder.glob(f"*/{file}") if path.parent.name.startswith(start)]
+        return sorted(found, key=lambda path: path.stat().st_mtime)
+
+
+def split_record_name(name: str) -> tuple[str, ...]:
+    """Checks the name of a record folder, which may come from a record that somebody edited.
+
+    Args:
+        name: such as ``runs/5f41c0de9a1b``.
+
+    Returns:
+        Its parts.
+
+    Raises:
+        ConfigError: a part is empty or hidden, or leads upwards.
+
+    >>> split_record_name("runs/5f41c0de9a1b")
+    ('runs', '5f41c0de9a1b')
+    """
+    parts = tuple(name.split("/"))
+    if any(not part or part.startswith(".") or "\\" in part or "\0" in part for part in parts):
+        raise ConfigError(f"{name!r} cannot be the name of a record's folder", remedy="Give a name such as runs/5f41.")
+    return parts
