@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from flows.machine.facts import describe_environment
 from flows.machine.resource_usage import measure_usage
+from flows.observability.stage_observation import count_bytes_read, count_bytes_written, note_key, observed
 from flows.pipeline.definition import (
     STAGE_BY_NAME,
     StageSpec,
@@ -168,6 +169,7 @@ def find_artifact(spec: StageSpec, job: Job, inputs: Mapping[str, ArtifactRef], 
     return FoundArtifact(address, None if artifact is None else _reference(artifact, cached=True), "")
 
 
+@observed
 def run_stage(
     stage: str,
     job: Job,
@@ -202,6 +204,7 @@ def run_stage(
     """
     spec = STAGE_BY_NAME[stage]
     address, ref, note = find_artifact(spec, job, inputs)
+    note_key(address.key)
     if ref is not None:
         return ref
     store = open_store(job.store)
@@ -304,9 +307,17 @@ def _find_input(store: Store, ref: ArtifactRef, job: Job) -> Artifact:
             remedy="Run again: it is computed again.",
             file=ref.path,
         )
+    count_bytes_read(_measure_size(artifact))
     return artifact
+
+
+def _measure_size(artifact: Artifact) -> int:
+    """Bytes of all files of an artifact."""
+    return sum(file.size for file in artifact.manifest.files)
 
 
 def _reference(artifact: Artifact, cached: bool, note: str = "") -> ArtifactRef:
     manifest = artifact.manifest
+    if not cached:
+        count_bytes_written(_measure_size(artifact))
     return ArtifactRef(manifest.stage, manifest.key, manifest.payload_digest, str(artifact.path), cached, note)
