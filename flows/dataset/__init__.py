@@ -1,0 +1,1 @@
+"""A dataset of many logs: its flow, its table and its report."""
