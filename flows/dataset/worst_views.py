@@ -8,13 +8,15 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from flows.pipeline.log_cache import cached_log
 from genre_tasks.errors import GenreError
+from storage.address import Address
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from storage.store import Store
+    from storage.store import Artifact, Store
 
 COUNT = 12
 """How many views there are at most, one a log, so that the report of a thousand logs stays small."""
@@ -23,6 +25,7 @@ WIDTH_PX = 640
 """Wider pictures are scaled down."""
 
 _SCENE_STAGES = ("initial", "gnet", "enet")
+_ATTEMPTS = 2
 _ACCURACY = "interpolation/psnr"
 _TRUTH = ".truth"
 
@@ -82,7 +85,8 @@ def find_worst_views(store: Store, records: Iterable[Mapping[str, Any]], count: 
         for candidate in _list_candidates(record):
             by_log[candidate.log] = min(candidate, by_log.get(candidate.log, candidate))
     views = []
-    for candidate in sorted(by_log.values()):
+    # Where the evaluations are gone, those of all other logs probably are, too.
+    for candidate in sorted(by_log.values())[: _ATTEMPTS * count]:
         if len(views) == count:
             break
         view = _read_worst_view(store, candidate)
@@ -106,8 +110,7 @@ def _list_candidates(record: Mapping[str, Any]) -> list[_Candidate]:
 
 def _read_worst_view(store: Store, candidate: _Candidate) -> WorstView | None:
     try:
-        stage = f"evaluate/{candidate.stage}"
-        artifact = next(store.artifacts(chunk=candidate.chunk, stage=stage, key=candidate.key), None)
+        artifact = _find_evaluation(store, candidate)
         pictures = {} if artifact is None else store.read(artifact).pictures
     except GenreError:
         # The log's metrics are in the table all the same; `genre verify` says what is damaged.
@@ -130,6 +133,16 @@ def _read_worst_view(store: Store, candidate: _Candidate) -> WorstView | None:
         picture=_encode_png(pictures[name]),
         truth=_encode_png(pictures[name + _TRUTH]),
     )
+
+
+def _find_evaluation(store: Store, candidate: _Candidate) -> Artifact | None:
+    stage = f"evaluate/{candidate.stage}"
+    try:
+        log = cached_log(candidate.log)
+    except GenreError:
+        # The log is on the machines of the workers alone: the store is searched, which takes longer.
+        return next(store.artifacts(chunk=candidate.chunk, stage=stage, key=candidate.key), None)
+    return store.find(Address(log.dataset, log.name, candidate.chunk, stage, candidate.key))
 
 
 def _measure_psnr(pixels: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
