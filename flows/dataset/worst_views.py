@@ -84,7 +84,7 @@ def find_worst_views(store: Store, records: Iterable[Mapping[str, Any]], count: 
     for record in records:
         for candidate in _list_candidates(record):
             by_log[candidate.log] = min(candidate, by_log.get(candidate.log, candidate))
-    views = []
+    views: list[WorstView] = []
     # Where the evaluations are gone, those of all other logs probably are, too.
     for candidate in sorted(by_log.values())[: _ATTEMPTS * count]:
         if len(views) == count:

@@ -31,7 +31,7 @@ class JsonFormatter(logging.Formatter):
 
     Every line has ``time`` (ISO 8601, UTC), ``level``, ``logger``, ``message``, ``host`` and ``pid``. Lines of a stage
     have ``log``, ``chunk``, ``stage`` and ``key`` as well, and the line of its end has ``seconds``. Lines of a flow run
-    have its id as ``run``.
+    have its id as ``run``, and those of Prefect's tasks the task's name as ``task``.
 
     Args:
         arguments: of ``logging.Formatter``; none of them is used.
@@ -54,12 +54,17 @@ class JsonFormatter(logging.Formatter):
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname,
             "logger": record.name,
-            "message": record.getMessage(),
+            # Records that were made before `prepare_logs` was called are not redacted yet.
+            "message": redact(record.getMessage()),
         }
         line |= getattr(record, _CONTEXT, {})
         run = _find_run(record)
         if run:
             line["run"] = run
+        task = getattr(record, "task_run_name", None)
+        # Prefect's records of a task's start and end are made outside of the stage.
+        if task:
+            line["task"] = task
         line |= {"host": self._host, "pid": record.process}
         if hasattr(record, _SECONDS):
             line["seconds"] = round(getattr(record, _SECONDS), 6)

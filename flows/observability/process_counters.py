@@ -28,6 +28,8 @@ class ProcessCounters:
         self._folder = folder
         self._lock = threading.Lock()
         self._has_failed = False
+        # What the file holds; None before it is written.
+        self._saved: dict[Sample, float] | None = None
         self._start_file(Counts())
         try:
             folder.fold_if_many()
@@ -85,7 +87,7 @@ class ProcessCounters:
         self._process = os.getpid()
         self._path = self._folder.name_file()
         self._counts = counts
-        self._saved: dict[Sample, float] | None = None
+        self._saved = None
 
     def _report(self, error: OSError) -> None:
         if not self._has_failed:

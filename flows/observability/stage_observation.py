@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -26,6 +26,13 @@ class _Reference(Protocol):
 
     @property
     def cached(self) -> bool: ...
+
+
+class _File(Protocol):
+    """What is read of a file in a manifest."""
+
+    @property
+    def size(self) -> int: ...
 
 
 _Parameters = ParamSpec("_Parameters")
@@ -130,26 +137,26 @@ def note_key(key: str) -> None:
         observation.context.key = key
 
 
-def count_bytes_read(size: int) -> None:
-    """Adds to the bytes that the running stage has read.
+def count_read(files: Iterable[_File]) -> None:
+    """Adds files to what the running stage has read.
 
     Args:
-        size: bytes.
+        files: such as those that a manifest lists.
     """
     observation = _observation.get()
     if observation is not None:
-        observation.bytes_read += size
+        observation.bytes_read += sum(file.size for file in files)
 
 
-def count_bytes_written(size: int) -> None:
-    """Adds to the bytes that the running stage has written.
+def count_written(files: Iterable[_File]) -> None:
+    """Adds files to what the running stage has written.
 
     Args:
-        size: bytes.
+        files: such as those that a manifest lists.
     """
     observation = _observation.get()
     if observation is not None:
-        observation.bytes_written += size
+        observation.bytes_written += sum(file.size for file in files)
 
 
 def measure_lease_wait(progress: Progress) -> Progress:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from flows.machine.facts import describe_environment
 from flows.machine.resource_usage import measure_usage
-from flows.observability.stage_observation import count_bytes_read, count_bytes_written, note_key, observed
+from flows.observability.stage_observation import count_read, count_written, note_key, observed
 from flows.pipeline.definition import (
     STAGE_BY_NAME,
     StageSpec,
@@ -307,17 +307,12 @@ def _find_input(store: Store, ref: ArtifactRef, job: Job) -> Artifact:
             remedy="Run again: it is computed again.",
             file=ref.path,
         )
-    count_bytes_read(_measure_size(artifact))
+    count_read(artifact.manifest.files)
     return artifact
-
-
-def _measure_size(artifact: Artifact) -> int:
-    """Bytes of all files of an artifact."""
-    return sum(file.size for file in artifact.manifest.files)
 
 
 def _reference(artifact: Artifact, cached: bool, note: str = "") -> ArtifactRef:
     manifest = artifact.manifest
     if not cached:
-        count_bytes_written(_measure_size(artifact))
+        count_written(manifest.files)
     return ArtifactRef(manifest.stage, manifest.key, manifest.payload_digest, str(artifact.path), cached, note)

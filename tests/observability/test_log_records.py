@@ -115,10 +115,11 @@ def test_a_message_with_lines_stays_one_line(records: list[str]) -> None:
 
 def test_a_record_names_the_flow_run(records: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     log = logging.getLogger("prefect.observability_test")
-    log.info("of Prefect", extra={"flow_run_id": "run-1"})
+    log.info("of Prefect", extra={"flow_run_id": "run-1", "task_run_name": "gnet · chunk 0"})
     monkeypatch.setenv("PREFECT__FLOW_RUN_ID", "run-2")
     log.info("of the process")
     assert [json.loads(line)["run"] for line in records] == ["run-1", "run-2"]
+    assert json.loads(records[0])["task"] == "gnet · chunk 0"
 
 
 def test_a_task_runs_in_the_context_of_its_stage() -> None:

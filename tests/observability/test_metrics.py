@@ -25,13 +25,14 @@ from flows.observability.exporter import (
 )
 from flows.observability.process_counters import METRICS_FOLDER, ProcessCounters, get_counters
 from flows.observability.stage_observation import (
-    count_bytes_read,
-    count_bytes_written,
+    count_read,
+    count_written,
     measure_lease_wait,
     observe_stage,
 )
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.progress import silent
+from storage.manifest import FileEntry
 from tests.faults.small_run import ROOT
 
 STAGE = "genre_stages_total"
@@ -49,6 +50,10 @@ def parse(text: str) -> dict[tuple[str, ...], float]:
         for family in text_string_to_metric_families(text)
         for sample in family.samples
     }
+
+
+def entry(size: int) -> FileEntry:
+    return FileEntry(path="metrics.parquet", size=size, sha256="0" * 64)
 
 
 def count_in_process(folder: Path, code: str) -> subprocess.Popen[str]:
@@ -93,9 +98,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_stage_is_counted_by_its_outcome(folder: Path) -> None:
     with observe_stage("log", 0, "gnet", attempt=1) as observation:
         assert samples(folder)[("genre_running_stages", "gnet")] == 1
-        count_bytes_read(1000)
-        count_bytes_read(24)
-        count_bytes_written(2048)
+        count_read([entry(1000), entry(20)])
+        count_read([entry(4)])
+        count_written([entry(2048)])
         measure_lease_wait(silent)(0, 1, "another process computes this artifact")
     with observe_stage("log", 0, "gnet") as observation:
         observation.is_cached = True
@@ -132,7 +137,7 @@ def test_without_the_variable_nothing_is_counted(tmp_path: Path, monkeypatch: py
     monkeypatch.delenv(METRICS_FOLDER, raising=False)
     monkeypatch.chdir(tmp_path)
     with observe_stage("log", 0, "gnet"):
-        count_bytes_read(1)
+        count_read([entry(1)])
     assert get_counters() is None
     assert not list(tmp_path.iterdir())
 
@@ -147,7 +152,7 @@ def test_counting_needs_no_package_of_prometheus(folder: Path) -> None:
 
 
 def test_a_killed_process_loses_and_doubles_nothing(folder: Path) -> None:
-    finished = "with observe_stage('log', 0, 'gnet'): count_bytes_written(10)"
+    finished = "with observe_stage('log', 0, 'gnet') as o: o.bytes_written = 10"
     running = "entered = observe_stage('log', 0, 'enet')\nentered.__enter__()"
     process = count_in_process(folder, f"{finished}\n{running}")
     found = samples(folder)

@@ -68,13 +68,13 @@ def draw_histogram(title: str, values: Sequence[float], decimals: int) -> Histog
         decimals: digits after the point.
 
     Returns:
-        The drawing, or ``None`` where fewer than two values are finite.
+        The drawing, or ``None`` where all finite values are equal, or there are none.
 
     >>> draw_histogram("PSNR, dB", [20.0, 21.0, 30.0], 1).summary
     '20.0 … 21.0 … 30.0'
     """
     finite = sorted(value for value in values if math.isfinite(value))
-    if len(finite) < 2:
+    if not finite or finite[0] == finite[-1]:
         return None
     ends = round_ticks(finite[0], finite[-1])
     low = ends[0]
@@ -98,7 +98,8 @@ def draw_histogram(title: str, values: Sequence[float], decimals: int) -> Histog
         title=title,
         summary=shown.replace("-", "−"),
         bars=tuple(bars),
-        ticks=tuple((_place(end, low, high), f"{end:g}".replace("-", "−")) for end in ends),
+        # More labels than three would run into each other on a phone.
+        ticks=tuple((_place(end, low, high), f"{end:g}".replace("-", "−")) for end in (low, (low + high) / 2, high)),
         median_x=_place(middle, low, high),
     )
 

@@ -144,7 +144,7 @@ def _metric_column(name: str, title: str, metric: str) -> Column:
 
 
 def _stage_column(name: str) -> Column:
-    return Column(name.replace("_", " "), 1, lambda log: log.stage_seconds.get(name))
+    return Column(name.replace("_", " "), 2, lambda log: log.stage_seconds.get(name))
 
 
 def _shift_of(name: str) -> float:
