@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 from pathlib import Path
 from typing import Protocol
 
@@ -83,7 +84,8 @@ class LocalRecordFolders:
     def find(self, parent: str, file: str, start: str = "") -> list[Path]:
         """Finds a file of many folders: see :meth:`RecordFolders.find`."""
         folder = self._root.joinpath(*split_record_name(parent))
-        found = [path for path in folder.glob(f"*/{file}") if path.parent.name.startswith(start)]
+        # Only folders that fit are looked into: a dataset asks for one of its thousand runs after the other.
+        found = folder.glob(f"{glob.escape(start)}*/{file}")
         return sorted(found, key=lambda path: path.stat().st_mtime)
 
 

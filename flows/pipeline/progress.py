@@ -6,12 +6,15 @@ import logging
 import time
 from typing import Protocol
 
+from flows.observability.log_records import prepare_logs
 from flows.pipeline.stage_runner import ArtifactRef
 
 _log = logging.getLogger("genre")
 # A worker's root logger stands at WARNING and would drop what a run reports.
 if _log.level == logging.NOTSET:
     _log.setLevel(logging.INFO)
+# Here, as every process that runs stages imports this, and a worker's process offers no earlier door.
+prepare_logs()
 
 
 class Reporter(Protocol):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from flows.machine.facts import describe_environment
 from flows.machine.resource_usage import measure_usage
+from flows.observability.stage_observation import count_read, count_written, measure_lease_wait, note_key, observed
 from flows.pipeline.definition import (
     STAGE_BY_NAME,
     StageSpec,
@@ -168,6 +169,7 @@ def find_artifact(spec: StageSpec, job: Job, inputs: Mapping[str, ArtifactRef], 
     return FoundArtifact(address, None if artifact is None else _reference(artifact, cached=True), "")
 
 
+@observed
 def run_stage(
     stage: str,
     job: Job,
@@ -202,10 +204,11 @@ def run_stage(
     """
     spec = STAGE_BY_NAME[stage]
     address, ref, note = find_artifact(spec, job, inputs)
+    note_key(address.key)
     if ref is not None:
         return ref
     store = open_store(job.store)
-    with store.lease(address, progress):
+    with store.lease(address, measure_lease_wait(progress)):
         # The process that had the lease before has probably committed the artifact.
         _, ref, _ = find_artifact(spec, job, inputs)
         if ref is not None:
@@ -322,9 +325,12 @@ def _find_input(store: Store, ref: ArtifactRef, job: Job) -> Artifact:
             remedy="Run again: it is computed again.",
             file=str(ref.address),
         )
+    count_read(artifact.manifest.files)
     return artifact
 
 
 def _reference(artifact: Artifact, cached: bool, note: str = "") -> ArtifactRef:
     manifest = artifact.manifest
+    if not cached:
+        count_written(manifest.files)
     return ArtifactRef(manifest.stage, manifest.key, manifest.payload_digest, artifact.address, cached, note)

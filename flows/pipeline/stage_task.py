@@ -15,6 +15,7 @@ from prefect.context import TaskRunContext
 from prefect.states import Completed
 from prefect.tasks import Task, exponential_backoff
 
+from flows.observability.stage_context import with_stage_context
 from flows.pipeline.progress import get_reporter
 from flows.pipeline.stage_runner import ArtifactRef, Job, run_stage
 from genre_tasks.errors import ResourceError, TransientIOError
@@ -45,6 +46,7 @@ async def _can_retry(task: Task[..., Any], run: TaskRun, state: State[Any]) -> b
     persist_result=False,
     cache_policy=NO_CACHE,
 )
+@with_stage_context
 def stage_task(stage: str, chunk: int, job: Job, inputs: dict[str, ArtifactRef]) -> Any:
     """Makes a stage's artifact, or finds it in the store.
 
