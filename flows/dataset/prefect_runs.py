@@ -114,21 +114,8 @@ class PrefectRuns:
 
     def read_heartbeats(self, ids: Sequence[str]) -> Mapping[str, str]:
         """Reads when runs have last shown that they are alive."""
-        found: dict[str, str] = {}
-        now = datetime.now(timezone.utc)
-        # A day both ways: the clocks of workers and of this machine may differ.
-        day = timedelta(days=1)
-        for some in _split(ids, _IDS_PER_EVENT_REQUEST):
-            wanted = EventFilter(
-                event=EventNameFilter(name=[HEARTBEAT_EVENT]),
-                resource=EventResourceFilter(id=[f"prefect.flow-run.{id_}" for id_ in some]),
-                occurred=EventOccurredFilter(since=now - day, until=now + day),
-                order=EventOrder.DESC,
-            )
-            page = call_server(self._client.read_events, wanted, limit=_EVENTS_PER_REQUEST)
-            for event in page.events:
-                found.setdefault(event.resource.id.rpartition(".")[2], str(event.id))
-        return found
+        # A day: the clocks of workers and of this machine may differ.
+        return read_last_heartbeats(self._client, ids, since_s=86400.0)
 
     def read_stages(self, ids: Sequence[str]) -> Mapping[str, str]:
         """Reads which stage runs are in."""
@@ -211,6 +198,33 @@ def dataset_tag(dataset: str) -> str:
     'genre-dataset:0b2a'
     """
     return f"genre-dataset:{dataset}"
+
+
+def read_last_heartbeats(client: SyncPrefectClient, ids: Sequence[str], since_s: float) -> dict[str, str]:
+    """Reads the last heartbeats of flow runs.
+
+    Args:
+        client: of the server.
+        ids: of the runs.
+        since_s: how many seconds ago the oldest one may be that counts.
+
+    Returns:
+        By id of the run, the id of its last heartbeat; nothing for a run without any.
+    """
+    found: dict[str, str] = {}
+    now = datetime.now(timezone.utc)
+    for some in _split(ids, _IDS_PER_EVENT_REQUEST):
+        wanted = EventFilter(
+            event=EventNameFilter(name=[HEARTBEAT_EVENT]),
+            resource=EventResourceFilter(id=[f"prefect.flow-run.{id_}" for id_ in some]),
+            # A worker's clock may be ahead.
+            occurred=EventOccurredFilter(since=now - timedelta(seconds=since_s), until=now + timedelta(days=1)),
+            order=EventOrder.DESC,
+        )
+        page = call_server(client.read_events, wanted, limit=_EVENTS_PER_REQUEST)
+        for event in page.events:
+            found.setdefault(event.resource.id.rpartition(".")[2], str(event.id))
+    return found
 
 
 def _split(ids: Sequence[str], size: int) -> Iterator[Sequence[str]]:

@@ -150,13 +150,13 @@ class Supervisor:
         self._update_row(run)
 
     def _poll(self) -> None:
+        found = self._runs.read(list(self._state.watches))
+        # After the call, which waits as long as the server is away.
         now = self._clock()
-        ids = list(self._state.watches)
         if now - self._last_poll_s > self._limits.silent_s / 3:
             # The server was away, and heartbeats with it: what is dead shows itself from here on.
             for watch in self._state.watches.values():
                 watch.since_s = now
-        found = self._runs.read(ids)
         for watch in list(self._state.watches.values()):
             run = found.get(watch.run.id)
             if run is None:

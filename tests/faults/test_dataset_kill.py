@@ -1,0 +1,144 @@
+"""A dataset on a real server with process workers: a log that fails, a worker killed with its children, a resumed parent."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.faults import small_run
+
+pytestmark = [pytest.mark.slow, pytest.mark.fault]
+PREFECT = str(Path(sys.executable).parent / "prefect")
+GOOD = [small_run.LOG, small_run.LOG.replace("seed=900", "seed=902")]
+
+
+class Cluster:
+    """A server's address, and workers that tests may kill with all their processes."""
+
+    def __init__(self, folder: Path, url: str) -> None:
+        self.folder = folder
+        self.env = small_run.environment(
+            folder,
+            PREFECT_API_URL=url,
+            DO_NOT_TRACK="1",
+            PREFECT_WORKER_QUERY_SECONDS="1",
+        )
+        self.workers: list[subprocess.Popen[bytes]] = []
+
+    def prefect(self, *args: str) -> None:
+        done = subprocess.run(
+            [PREFECT, *args], env=self.env, cwd=small_run.ROOT, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+
+    def start_worker(self, pool: str) -> subprocess.Popen[bytes]:
+        log = (self.folder / f"worker-{pool}-{len(self.workers)}.log").open("wb")
+        command = [PREFECT, "worker", "start", "--pool", pool]
+        worker = subprocess.Popen(command, env=self.env, cwd=small_run.ROOT, stdout=log, stderr=log)
+        self.workers.append(worker)
+        return worker
+
+    def kill(self, worker: subprocess.Popen[bytes]) -> None:
+        with suppress(psutil.NoSuchProcess):
+            for child in psutil.Process(worker.pid).children(recursive=True):
+                with suppress(psutil.NoSuchProcess):
+                    os.kill(child.pid, signal.SIGKILL)
+        worker.kill()
+        worker.wait()
+
+    def dataset(self, *args: str) -> list[str]:
+        sets = [part for setting in small_run.SETTINGS for part in ("--set", setting)]
+        common = ["--preset", "demo", *sets, "--store", str(self.folder / "store"), "--json"]
+        return [small_run.GENRE, "dataset", *args, *common, "--pool", "logs"]
+
+
+@contextmanager
+def _cluster(folder: Path) -> Iterator[Cluster]:
+    with small_run.prefect_server(folder) as url:
+        cluster = Cluster(folder, url)
+        for pool in ("genre", "logs"):
+            cluster.prefect("work-pool", "create", pool, "--type", "process")
+        cluster.prefect("--no-prompt", "deploy", "--all")
+        try:
+            yield cluster
+        finally:
+            for worker in cluster.workers:
+                cluster.kill(worker)
+
+
+def _wait_for(path: Path, pattern: str, seconds: float) -> None:
+    start_s = time.monotonic()
+    while not list(path.glob(pattern)):
+        assert time.monotonic() - start_s < seconds, f"no {pattern} within {seconds} s"
+        time.sleep(0.2)
+
+
+def _worker_online(cluster: Cluster) -> None:
+    """Waits until the command takes the pools for ready."""
+    for _ in range(60):
+        listed = subprocess.run(
+            [PREFECT, "work-pool", "ls"], env=cluster.env, capture_output=True, text=True, check=False
+        ).stdout
+        if listed.count("READY") >= 2:
+            return
+        time.sleep(1)
+    raise AssertionError(listed)
+
+
+def test_a_failing_log_does_not_stop_the_others(tmp_path: Path) -> None:
+    with _cluster(tmp_path) as cluster:
+        refused = subprocess.run(
+            cluster.dataset(*GOOD), env=cluster.env, cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+        assert refused.returncode == 2 and "no worker of the work pool 'logs'" in refused.stderr, refused.stderr
+        cluster.start_worker("genre")
+        cluster.start_worker("logs")
+        _worker_online(cluster)
+        for _ in range(2):
+            start_s = time.monotonic()
+            done = subprocess.run(
+                cluster.dataset("synthetic:nothing", *GOOD, "--follow"),
+                env=cluster.env,
+                cwd=tmp_path,
+                capture_output=True,
+                text=True,
+                timeout=400,
+                check=False,
+            )
+            print(f"{time.monotonic() - start_s:.1f} s", done.stderr[-1500:])
+            assert done.returncode == 1, done.stderr[-3000:]
+            rows = json.loads(done.stdout)["logs"]
+            assert [row["status"] for row in rows] == ["failed", "done", "done"], rows
+            assert "no synthetic log 'nothing'" in rows[0]["why"] and rows[0]["attempts"] == 1
+            assert all(row["where"] for row in rows)
+        (record,) = (tmp_path / "store").glob("datasets/*/dataset.json")
+        assert json.loads(record.read_text())["logs"] == rows
+
+
+def test_a_worker_killed_with_its_children_costs_no_log(tmp_path: Path) -> None:
+    with _cluster(tmp_path) as cluster:
+        cluster.start_worker("genre")
+        victim = cluster.start_worker("logs")
+        _worker_online(cluster)
+        log = (tmp_path / "command.log").open("wb")
+        command = subprocess.Popen(
+            cluster.dataset(*GOOD, "--follow"), env=cluster.env, cwd=tmp_path, stdout=subprocess.PIPE, stderr=log
+        )
+        _wait_for(tmp_path / "store", "synthetic/*/0000/ingest/*/manifest.json", 120)
+        cluster.kill(victim)
+        cluster.start_worker("logs")
+        printed, _ = command.communicate(timeout=500)
+        assert command.returncode == 0, (tmp_path / "command.log").read_text()[-3000:]
+        rows = json.loads(printed)["logs"]
+    assert [row["status"] for row in rows] == ["done", "done"]
+    assert max(row["attempts"] for row in rows) == 2
