@@ -6,7 +6,7 @@ import json
 import logging
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 from uuid import UUID
 
 from prefect.artifacts import create_progress_artifact, create_table_artifact, update_progress_artifact
@@ -85,13 +85,16 @@ class LiveTable:
         ended = sum(row["status"] in FINAL_STATUSES for row in rows)
         percent = 100.0 * ended / max(len(rows), 1)
         if self._table is None:
-            self._table = create_table_artifact(table=self._last_rows, key=TABLE_KEY, description=description)
+            created = create_table_artifact(table=self._last_rows, key=TABLE_KEY, description=description)
+            # Prefect's types allow for a caller in an event loop, which this is not.
+            self._table = cast(UUID, created)
         else:
             # Updated in place: a new version every few seconds would fill the server's database.
             update = ArtifactUpdate(data=json.dumps(self._last_rows), description=description)
             with get_client(sync_client=True) as client:
                 client.update_artifact(self._table, update)
         if self._progress is None:
-            self._progress = create_progress_artifact(percent, key=PROGRESS_KEY, description=description)
+            created = create_progress_artifact(percent, key=PROGRESS_KEY, description=description)
+            self._progress = cast(UUID, created)
         else:
             update_progress_artifact(self._progress, percent, description=description)

@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timedelta, timezone
+from datetime import UTC, datetime, timedelta
 from typing import Any
 from uuid import UUID
 
@@ -212,7 +212,7 @@ def read_last_heartbeats(client: SyncPrefectClient, ids: Sequence[str], since_s:
         By id of the run, the id of its last heartbeat; nothing for a run without any.
     """
     found: dict[str, str] = {}
-    now = datetime.now(timezone.utc)
+    now = datetime.now(UTC)
     for some in _split(ids, _IDS_PER_EVENT_REQUEST):
         wanted = EventFilter(
             event=EventNameFilter(name=[HEARTBEAT_EVENT]),

@@ -1,4 +1,4 @@
-"""A dataset on a real server with process workers: a log that fails, a worker killed with its children, a resumed parent."""
+"""A dataset on a real server with process workers: a failing log, a killed worker, a killed parent."""
 
 from __future__ import annotations
 
