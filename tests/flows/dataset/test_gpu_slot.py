@@ -67,7 +67,8 @@ def test_a_retried_stage_returns_its_slot_and_takes_it_again(tmp_path: Path, mon
         other = threading.Thread(target=hold_slot, args=(is_held,))
         other.start()
         assert is_held.wait(30)
-        assert one_stage().key == "key"
+        ref: ArtifactRef = one_stage(return_state=True).result()
+        assert ref.key == "key"
         other.join()
         # One slot in use at both tries, by this stage alone, and none afterwards.
         assert taken == [1, 1]
