@@ -97,6 +97,10 @@ def follow_dataset(
     with get_client(sync_client=True) as client:
         while True:
             run = call_server(client.read_flow_run, run_id)
+            if run.state is not None and run.state.type is StateType.RUNNING and not _is_alive(client, run):
+                # Nobody else notices that the parent's worker died with all its processes.
+                crash_run(client, run.id)
+                continue
             rows = _read_table(client, run_id)
             show(rows)
             if run.state is not None and run.state.is_final():
@@ -133,8 +137,18 @@ def _find_running(client: SyncPrefectClient, name: str) -> FlowRun | None:
     for run in client.read_flow_runs(flow_run_filter=wanted):
         if run.state is None or run.state.type is not StateType.RUNNING or _is_alive(client, run):
             return run
-        client.set_flow_run_state(run.id, Crashed(message="no heartbeat"), force=True)
+        crash_run(client, run.id)
     return None
+
+
+def crash_run(client: SyncPrefectClient, run_id: UUID) -> None:
+    """Sets a parent without a sign of life to Crashed, so that the dataset can be started again.
+
+    Args:
+        client: of the server.
+        run_id: of the flow run.
+    """
+    call_server(client.set_flow_run_state, run_id, Crashed(message="no heartbeat"), force=True)
 
 
 def _is_alive(client: SyncPrefectClient, run: FlowRun) -> bool:

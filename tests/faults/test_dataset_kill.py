@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
@@ -12,10 +13,14 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from uuid import UUID
 
 import psutil
 import pytest
+from prefect.client.orchestration import get_client
+from prefect.settings import PREFECT_API_URL, temporary_settings
 
+from flows.dataset.submission import crash_run
 from tests.faults import small_run
 
 pytestmark = [pytest.mark.slow, pytest.mark.fault]
@@ -145,3 +150,41 @@ def test_a_worker_killed_with_its_children_costs_no_log(tmp_path: Path) -> None:
         rows = json.loads(printed)["logs"]
     assert [row["status"] for row in rows] == ["done", "done"]
     assert max(row["attempts"] for row in rows) == 2
+
+
+def test_a_killed_parent_is_resumed_by_the_same_command(tmp_path: Path) -> None:
+    """The second parent takes over active child runs; Crashed is what the automation of heartbeats would set."""
+    with _cluster(tmp_path) as cluster:
+        coordinator = cluster.start_worker("genre")
+        cluster.start_worker("logs")
+        _worker_online(cluster)
+        started = subprocess.run(
+            cluster.dataset(*GOOD), env=cluster.env, cwd=tmp_path, capture_output=True, text=True, check=True
+        )
+        first = json.loads(started.stdout)["flow_run"]
+        _wait_for(tmp_path / "store", "synthetic/*/0000/ingest/*/manifest.json", 120)
+        cluster.kill(coordinator)
+        with temporary_settings({PREFECT_API_URL: cluster.env["PREFECT_API_URL"]}):
+            with get_client(sync_client=True) as client:
+                crash_run(client, UUID(first))
+            cluster.start_worker("genre")
+            done = subprocess.run(
+                cluster.dataset(*GOOD, "--follow"),
+                env=cluster.env,
+                cwd=tmp_path,
+                capture_output=True,
+                text=True,
+                timeout=400,
+                check=False,
+            )
+            assert done.returncode == 0, done.stderr[-3000:]
+            result = json.loads(done.stdout)
+            assert [row["status"] for row in result["logs"]] == ["done", "done"]
+            with get_client(sync_client=True) as client:
+                runs = client.read_flow_runs(limit=50)
+    children = [run for run in runs if any(tag.startswith("genre-log:") for tag in run.tags)]
+    # None crashed, and no two runs of one log at a time.
+    assert {run.state.type.value for run in children if run.state} == {"COMPLETED"}
+    for log in GOOD:
+        times = sorted((run.start_time, run.end_time) for run in children if f"genre-log:{log}" in run.tags)
+        assert times and all(before[1] <= after[0] for before, after in itertools.pairwise(times))
