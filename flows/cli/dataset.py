@@ -44,9 +44,9 @@ def dataset(
     settings: SettingsOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Reconstruct many driving logs; one that fails does not stop the others.
+    """Reconstruct many driving logs, here or on many workers.
 
-    With --pool the dataset is a flow run on a Prefect server, and every log is a run on a worker of the pool. A log
+    A log that fails does not stop the others. With --pool every log is a run on a worker of a Prefect work pool. A log
     whose worker dies is submitted again. The same command run again goes on where the dataset was.
 
     The record is written to STORE/datasets/DATASET/dataset.json.
