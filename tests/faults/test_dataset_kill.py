@@ -186,5 +186,9 @@ def test_a_killed_parent_is_resumed_by_the_same_command(tmp_path: Path) -> None:
     # None crashed, and no two runs of one log at a time.
     assert {run.state.type.value for run in children if run.state} == {"COMPLETED"}
     for log in GOOD:
-        times = sorted((run.start_time, run.end_time) for run in children if f"genre-log:{log}" in run.tags)
+        times = sorted(
+            (run.start_time.timestamp(), run.end_time.timestamp())
+            for run in children
+            if f"genre-log:{log}" in run.tags and run.start_time and run.end_time
+        )
         assert times and all(before[1] <= after[0] for before, after in itertools.pairwise(times))
