@@ -13,6 +13,7 @@ import typer
 from flows.cli.bench import bench
 from flows.cli.check import check
 from flows.cli.cost import cost
+from flows.cli.dataset import dataset
 from flows.cli.diff import diff
 from flows.cli.doctor import doctor
 from flows.cli.edit import edit
@@ -50,6 +51,7 @@ app = typer.Typer(
 )
 # The order here is the order in `genre --help`: from a first run to looking at it, then measuring and training.
 app.command(name="run")(run)
+app.command(name="dataset")(dataset)
 app.command(name="enhance")(enhance)
 app.command(name="check")(check)
 app.command(name="effects")(effects)

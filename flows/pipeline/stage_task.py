@@ -16,6 +16,7 @@ from prefect.states import Completed
 from prefect.tasks import Task, exponential_backoff
 
 from flows.observability.stage_context import with_stage_context
+from flows.pipeline.gpu_slot import gpu_slot
 from flows.pipeline.progress import get_reporter
 from flows.pipeline.stage_runner import ArtifactRef, Job, run_stage
 from genre_tasks.errors import ResourceError, TransientIOError
@@ -67,7 +68,8 @@ def stage_task(stage: str, chunk: int, job: Job, inputs: dict[str, ArtifactRef])
     attempt = context.task_run.run_count - 1 if context else 0
     reporter = get_reporter()
     reporter.stage_started(stage, chunk)
-    ref = run_stage(stage, job, inputs, attempt=max(attempt, 0), progress=reporter.progress)
+    with gpu_slot(stage):
+        ref = run_stage(stage, job, inputs, attempt=max(attempt, 0), progress=reporter.progress)
     reporter.stage_ended(stage, chunk, ref)
     # The name of the state is what Prefect's UI shows.
     if ref.cached:

@@ -1,9 +1,8 @@
-"""The flows: one log through GNet → novel views → FNet → ENet, and a dataset of logs."""
+"""The flow of one log: GNet → novel views → FNet → ENet."""
 
 from __future__ import annotations
 
 import base64
-import logging
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -17,19 +16,19 @@ from flows.budget.chooser import Chooser
 from flows.configuration import diff_from_preset, load_configuration, validate_config
 from flows.defaults import DEFAULT_PRESET, DEFAULT_STORE
 from flows.pipeline.definition import PIPELINE, RECONSTRUCTION_STAGES, STAGE_BY_NAME, StageSpec
-from flows.pipeline.log_cache import expand_logs, select_chunks
+from flows.pipeline.log_cache import select_chunks
 from flows.pipeline.progress import get_reporter
 from flows.pipeline.stage_runner import ArtifactRef, Job
 from flows.pipeline.stage_task import stage_task
 from flows.preflight.requirements import check_requirements
-from flows.reconstruction.left_out import ChunksLeftOutError, LogsFailedError, describe_log, record_failures
+from flows.reconstruction.left_out import ChunksLeftOutError, record_failures
+from flows.reconstruction.outcome_artifact import is_child_run, publish_outcome
 from flows.reconstruction.run_records import FinishedRun, summarise_run, write_run_record
 from flows.reconstruction.run_summary import RunSummary
+from flows.reconstruction.stored_run import find_stored_run
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ConfigError, GenreError
 from storage.opening import open_store
-
-_log = logging.getLogger("genre")
 
 
 # Parameters are not validated by Prefect: the configuration's own models do it, and their errors say what to do.
@@ -74,11 +73,34 @@ def reconstruct_log(
 
         print(reconstruct_log("synthetic:street?seed=1000", preset="demo", store="genre-store")["report"])
     """
-    effective = _effective_config(preset, config, settings)
+    try:
+        effective = _effective_config(preset, config, settings)
+        record = _take_from_store(log, preset, store, chunks, effective) if budget_s is None else None
+        if record is None:
+            budget = None if budget_s is None else Budget(budget_s, start_time, table, preset, effective)
+            record = _compute(log, preset, store, chunks, effective, budget)
+    except Exception as error:
+        publish_outcome(log, getattr(error, "record", None), error)
+        raise
+    publish_outcome(log, record, None)
+    return record
+
+
+def _take_from_store(
+    log: str, preset: str, store: str, chunks: list[int] | None, config: PipelineConfig
+) -> dict[str, Any] | None:
+    """The record of a child run that finds every stage in the store; ``None`` for any other."""
+    # Without tasks and the artifacts of stages: of a thousand logs, most may be done already.
+    run = find_stored_run(log, preset, store, chunks, config) if is_child_run() else None
+    return None if run is None else write_run_record(run, summarise_run(run), {})
+
+
+def _compute(
+    log: str, preset: str, store: str, chunks: list[int] | None, effective: PipelineConfig, budget: Budget | None
+) -> dict[str, Any]:
     selected = _check_needs(log, store, chunks, effective)
     # A killed run may have left half-written folders behind; no artifact is among them.
     open_store(store).clean_temporaries()
-    budget = None if budget_s is None else Budget(budget_s, start_time, table, preset, effective)
     values = effective.model_dump(mode="json")
     done, failures = _reconstruct_chunks(log, store, values, selected, budget)
     notes = {} if budget is None else {chunk: budget.choosers[chunk].describe() for chunk in done}
@@ -99,59 +121,6 @@ def reconstruct_log(
     if failures:
         raise ChunksLeftOutError(log, len(selected), failures, record)
     return record
-
-
-@flow(name="reconstruct-dataset", persist_result=False, validate_parameters=False)
-def reconstruct_dataset(
-    logs: list[str],
-    preset: str = DEFAULT_PRESET,
-    store: str = DEFAULT_STORE,
-    settings: list[str] | None = None,
-) -> list[dict[str, Any]]:
-    """Reconstructs many logs, each in a child flow run; a log that fails does not stop the others.
-
-    At the end a line for each log says how it ended and why; Prefect shows the same as a table.
-
-    Args:
-        logs: URIs of logs; ``pandaset:PATH/*`` stands for every sequence in a folder.
-        preset: demo, small, fine, long or paper.
-        store: folder (or URI) of the store.
-        settings: ``section.key=value`` strings over the preset.
-
-    Returns:
-        The record of each log, in order.
-
-    Raises:
-        InputError: a star matches no folder.
-        LogsFailedError: some logs are not complete, raised once all were tried; its ``outcomes`` has all of them.
-
-    Example::
-
-        try:
-            records = reconstruct_dataset(["pandaset:data/*"], preset="small")
-        except LogsFailedError as error:
-            failed = [outcome["log"] for outcome in error.outcomes if outcome["status"] == "failed"]
-    """
-    records: list[dict[str, Any]] = []
-    outcomes: list[dict[str, Any]] = []
-    for log in expand_logs(logs):
-        try:
-            record = reconstruct_log(log, preset=preset, store=store, settings=settings)
-        except Exception as error:
-            # A fault of ours with one log is no reason to leave the others either.
-            if not isinstance(error, GenreError):
-                _log.exception("%s failed by a fault of ours", log)
-            outcomes.append(describe_log(log, getattr(error, "record", None), error))
-        else:
-            records.append(record)
-            outcomes.append(describe_log(log, record, None))
-    for outcome in outcomes:
-        get_reporter().message("  ".join(f"{name} {value}" for name, value in outcome.items() if value not in ("", 0)))
-    # After the lines: if Prefect's server fails now, they are there nevertheless.
-    create_table_artifact(table=outcomes, key="logs", description=f"{len(records)} of {len(outcomes)} logs are done")
-    if len(records) < len(outcomes):
-        raise LogsFailedError(outcomes)
-    return records
 
 
 def _effective_config(preset: str, config: dict[str, Any] | None, settings: list[str] | None) -> PipelineConfig:

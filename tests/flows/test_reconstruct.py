@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from prefect.artifacts import Artifact
 
+from flows.dataset.flow import reconstruct_dataset
 from flows.pipeline import stage_task
 from flows.pipeline.definition import PIPELINE
 from flows.pipeline.log_cache import cached_log, expand_logs
@@ -142,7 +143,7 @@ def test_a_dataset_ends_with_a_table_of_all_logs(tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr(stage_task, "run_stage", faulty)
     with pytest.raises(LogsFailedError, match="3 of 4 logs are not complete") as caught:
-        flow.reconstruct_dataset(logs, preset="demo", store=str(tmp_path), settings=settings)
+        reconstruct_dataset(logs, preset="demo", store=str(tmp_path), settings=settings)
     rows = caught.value.outcomes
     assert [row["log"] for row in rows] == logs
     assert [row["status"] for row in rows] == ["failed", "done", "partly_done", "failed"]
@@ -158,7 +159,7 @@ def test_a_dataset_ends_with_a_table_of_all_logs(tmp_path: Path, monkeypatch: py
 
 
 def test_a_dataset_that_is_done_gives_its_records(tmp_path: Path) -> None:
-    records = flow.reconstruct_dataset([LOG, OTHER_LOG], preset="demo", store=str(tmp_path), settings=list(SETTINGS))
+    records = reconstruct_dataset([LOG, OTHER_LOG], preset="demo", store=str(tmp_path), settings=list(SETTINGS))
     assert [record["log"] for record in records] == [LOG, OTHER_LOG]
     assert {record["status"] for record in records} == {"done"}
 

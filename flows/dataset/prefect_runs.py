@@ -1,0 +1,232 @@
+"""Child runs on a Prefect server: flow runs of the deployment ``reconstruct-log/log``, found again by their tags."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Any
+from uuid import UUID
+
+from prefect.client.orchestration import SyncPrefectClient, get_client
+from prefect.client.schemas.filters import (
+    ArtifactFilter,
+    ArtifactFilterFlowRunId,
+    ArtifactFilterKey,
+    FlowRunFilter,
+    FlowRunFilterId,
+    FlowRunFilterTags,
+    TaskRunFilter,
+    TaskRunFilterFlowRunId,
+    TaskRunFilterState,
+    TaskRunFilterStateType,
+)
+from prefect.client.schemas.objects import FlowRun, StateType
+from prefect.client.schemas.sorting import FlowRunSort
+from prefect.events.filters import EventFilter, EventNameFilter, EventOccurredFilter, EventOrder, EventResourceFilter
+from prefect.states import Crashed
+
+from flows.dataset.child_runs import ACTIVE_STATES, ChildRun
+from flows.dataset.server_calls import call_server
+from flows.dataset.supervisor import HEARTBEAT_S
+from flows.dataset.work_units import WorkUnit, read_unit
+from flows.pipeline.gpu_slot import GPU_LIMIT_VARIABLE
+from flows.reconstruction.outcome_artifact import DATASET_VARIABLE, OUTCOME_KEY
+
+DEPLOYMENT = "reconstruct-log/log"
+"""What a child run is a run of."""
+HEARTBEAT_EVENT = "prefect.flow-run.heartbeat"
+# The server gives no more runs in one answer, and no more than fifty events.
+_RUNS_PER_REQUEST = 200
+_EVENTS_PER_REQUEST = 50
+_IDS_PER_EVENT_REQUEST = 10
+
+
+@dataclass(frozen=True)
+class ChildRequest:
+    """What all child runs of a dataset have in common.
+
+    Attributes:
+        dataset: the dataset's name.
+        parent: id of the parent's flow run.
+        pool: the work pool that runs them.
+        parameters: of ``reconstruct-log``, apart from log and chunks.
+        gpu_limit: name of the concurrency limit that a stage on a GPU waits for; ``None`` for none.
+    """
+
+    dataset: str
+    parent: str
+    pool: str
+    parameters: Mapping[str, Any]
+    gpu_limit: str | None = None
+
+
+class PrefectRuns:
+    """Implements :class:`flows.dataset.child_runs.ChildRuns` by Prefect's API.
+
+    Args:
+        request: what the child runs have in common.
+        client: of the server; the one of the settings if not given.
+    """
+
+    def __init__(self, request: ChildRequest, client: SyncPrefectClient | None = None) -> None:
+        self._request = request
+        self._client = client or get_client(sync_client=True)
+        self._deployment = call_server(self._client.read_deployment_by_name, DEPLOYMENT)
+
+    def find(self) -> list[ChildRun]:
+        """Finds runs of an earlier life of this parent, and active ones of any parent of the same dataset."""
+        tags = FlowRunFilter(tags=FlowRunFilterTags(all_=[dataset_tag(self._request.dataset)]))
+        runs = [self._read(run) for run in self._page(tags) if read_unit(run.tags) is not None]
+        return [run for run in runs if run.is_ours or run.state in ACTIVE_STATES]
+
+    def submit(self, unit: WorkUnit, attempt: int) -> ChildRun:
+        """Submits a run; the same unit and attempt give the same run."""
+        chunks = None if unit.chunk is None else [unit.chunk]
+        environment = {DATASET_VARIABLE: self._request.dataset, "PREFECT_FLOWS_HEARTBEAT_FREQUENCY": str(HEARTBEAT_S)}
+        if self._request.gpu_limit is not None:
+            environment[GPU_LIMIT_VARIABLE] = self._request.gpu_limit
+        key = [self._request.dataset, *unit, self._request.parent, attempt]
+        body = {
+            "name": unit.log if unit.chunk is None else f"{unit.log} · chunk {unit.chunk}",
+            "flow_id": str(self._deployment.flow_id),
+            "deployment_id": str(self._deployment.id),
+            "parameters": {**self._request.parameters, "log": unit.log, "chunks": chunks},
+            "tags": [dataset_tag(self._request.dataset), self._parent_tag, *unit.tags()],
+            "idempotency_key": hashlib.sha256(json.dumps(key).encode()).hexdigest(),
+            # The deployment may be of another pool: Prefect's client could only choose the queue.
+            "work_pool_name": self._request.pool,
+            "job_variables": {**(self._deployment.job_variables or {}), "env": environment},
+            "state": {"type": "SCHEDULED", "name": "Scheduled"},
+        }
+        response = call_server(self._client.request, "POST", "/flow_runs/", json=body)
+        return self._read(FlowRun.model_validate(response.json()))
+
+    def read(self, ids: Sequence[str]) -> Mapping[str, ChildRun]:
+        """Reads the state of runs."""
+        found: dict[str, ChildRun] = {}
+        for some in _split(ids, _RUNS_PER_REQUEST):
+            for run in self._page(FlowRunFilter(id=FlowRunFilterId(any_=[UUID(id_) for id_ in some]))):
+                found[str(run.id)] = self._read(run)
+        return found
+
+    def read_heartbeats(self, ids: Sequence[str]) -> Mapping[str, str]:
+        """Reads when runs have last shown that they are alive."""
+        # A day: the clocks of workers and of this machine may differ.
+        return read_last_heartbeats(self._client, ids, since_s=86400.0)
+
+    def read_stages(self, ids: Sequence[str]) -> Mapping[str, str]:
+        """Reads which stage runs are in."""
+        found: dict[str, str] = {}
+        running = TaskRunFilterState(type=TaskRunFilterStateType(any_=[StateType.RUNNING]))
+        for some in _split(ids, _RUNS_PER_REQUEST):
+            wanted = TaskRunFilter(
+                flow_run_id=TaskRunFilterFlowRunId(any_=[UUID(id_) for id_ in some]),
+                state=running,
+            )
+            for task in call_server(self._client.read_task_runs, task_run_filter=wanted, limit=_RUNS_PER_REQUEST):
+                found[str(task.flow_run_id)] = task.name
+        return found
+
+    def crash(self, run: ChildRun, reason: str) -> None:
+        """Sets a run to Crashed, so that its slots are free; a run that has ended meanwhile is left as it is."""
+        newest = call_server(self._client.read_flow_run, UUID(run.id))
+        if newest.state is not None and newest.state.type.value == run.state:
+            # Forced: the rules of states would let a run that is being cancelled stay as it is.
+            call_server(self._client.set_flow_run_state, UUID(run.id), Crashed(message=reason), force=True)
+
+    def read_outcome(self, run: ChildRun) -> dict[str, Any] | None:
+        """Reads how a run ended, as the run itself has left it."""
+        wanted = ArtifactFilter(
+            flow_run_id=ArtifactFilterFlowRunId(any_=[UUID(run.id)]),
+            key=ArtifactFilterKey(any_=[OUTCOME_KEY]),
+        )
+        artifacts = call_server(self._client.read_artifacts, artifact_filter=wanted)
+        if not artifacts:
+            return None
+        newest = max(artifacts, key=lambda artifact: str(artifact.created))
+        row: dict[str, Any] = json.loads(str(newest.data))[0]
+        return row
+
+    @property
+    def _parent_tag(self) -> str:
+        return f"genre-parent:{self._request.parent}"
+
+    def _page(self, wanted: FlowRunFilter) -> Iterator[FlowRun]:
+        offset = 0
+        while True:
+            runs = call_server(
+                self._client.read_flow_runs,
+                flow_run_filter=wanted,
+                sort=FlowRunSort.EXPECTED_START_TIME_ASC,
+                limit=_RUNS_PER_REQUEST,
+                offset=offset,
+            )
+            yield from runs
+            if len(runs) < _RUNS_PER_REQUEST:
+                return
+            offset += len(runs)
+
+    def _read(self, run: FlowRun) -> ChildRun:
+        unit = read_unit(run.tags)
+        # Only runs that were found by their tags come here.
+        assert unit is not None
+        seconds = run.total_run_time if run.state is not None and run.state.is_final() else run.estimated_run_time
+        return ChildRun(
+            id=str(run.id),
+            unit=unit,
+            state="SCHEDULED" if run.state is None else run.state.type.value,
+            message="" if run.state is None else run.state.message or "",
+            where=run.infrastructure_pid or "",
+            seconds=seconds.total_seconds(),
+            is_ours=self._parent_tag in run.tags,
+        )
+
+
+def dataset_tag(dataset: str) -> str:
+    """Writes the tag of the flow runs of a dataset.
+
+    Args:
+        dataset: the dataset's name.
+
+    Returns:
+        The tag.
+
+    >>> dataset_tag("0b2a")
+    'genre-dataset:0b2a'
+    """
+    return f"genre-dataset:{dataset}"
+
+
+def read_last_heartbeats(client: SyncPrefectClient, ids: Sequence[str], since_s: float) -> dict[str, str]:
+    """Reads the last heartbeats of flow runs.
+
+    Args:
+        client: of the server.
+        ids: of the runs.
+        since_s: how many seconds ago the oldest one may be that counts.
+
+    Returns:
+        By id of the run, the id of its last heartbeat; nothing for a run without any.
+    """
+    found: dict[str, str] = {}
+    now = datetime.now(UTC)
+    for some in _split(ids, _IDS_PER_EVENT_REQUEST):
+        wanted = EventFilter(
+            event=EventNameFilter(name=[HEARTBEAT_EVENT]),
+            resource=EventResourceFilter(id=[f"prefect.flow-run.{id_}" for id_ in some]),
+            # A worker's clock may be ahead.
+            occurred=EventOccurredFilter(since=now - timedelta(seconds=since_s), until=now + timedelta(days=1)),
+            order=EventOrder.DESC,
+        )
+        page = call_server(client.read_events, wanted, limit=_EVENTS_PER_REQUEST)
+        for event in page.events:
+            found.setdefault(event.resource.id.rpartition(".")[2], str(event.id))
+    return found
+
+
+def _split(ids: Sequence[str], size: int) -> Iterator[Sequence[str]]:
+    for start in range(0, len(ids), size):
+        yield ids[start : start + size]

@@ -1,0 +1,184 @@
+"""Starts a dataset on a Prefect server, finds one that is running, and follows it to its end."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+from uuid import UUID
+
+from prefect.client.orchestration import SyncPrefectClient, get_client
+from prefect.client.schemas.filters import (
+    ArtifactFilter,
+    ArtifactFilterFlowRunId,
+    ArtifactFilterKey,
+    FlowRunFilter,
+    FlowRunFilterState,
+    FlowRunFilterStateType,
+    FlowRunFilterTags,
+)
+from prefect.client.schemas.objects import FlowRun, StateType
+from prefect.client.schemas.responses import DeploymentResponse
+from prefect.exceptions import ObjectNotFound
+from prefect.states import Crashed
+
+from flows.dataset.live_table import TABLE_KEY
+from flows.dataset.prefect_runs import DEPLOYMENT, dataset_tag, read_last_heartbeats
+from flows.dataset.server_calls import call_server
+from flows.dataset.supervisor import HEARTBEAT_S
+from genre_tasks.errors import ConfigError
+
+PARENT_DEPLOYMENT = "reconstruct-dataset/dataset"
+"""What the parent of a dataset is a run of."""
+PARENT_TAG = "genre-dataset-parent"
+"""Tag of the flow runs of parents; their child runs do not have it."""
+_ACTIVE = [StateType.SCHEDULED, StateType.PENDING, StateType.RUNNING, StateType.PAUSED]
+
+
+@dataclass(frozen=True)
+class Submission:
+    """A dataset's flow run on the server.
+
+    Attributes:
+        id: of the flow run.
+        is_new: whether it was started now; otherwise it was running already.
+    """
+
+    id: UUID
+    is_new: bool
+
+
+def submit_dataset(name: str, parameters: Mapping[str, Any]) -> Submission:
+    """Starts a dataset's flow, unless it is running already.
+
+    Args:
+        name: the dataset's name.
+        parameters: of :func:`flows.dataset.flow.reconstruct_dataset`, with ``pool``.
+
+    Returns:
+        The flow run.
+
+    Raises:
+        ConfigError: a deployment, the pool or a worker is missing.
+    """
+    with get_client(sync_client=True) as client:
+        parent = _find_deployment(client, PARENT_DEPLOYMENT)
+        _find_deployment(client, DEPLOYMENT)
+        _check_pool(client, str(parameters["pool"]))
+        _check_pool(client, parent.work_pool_name or "")
+        running = _find_running(client, name)
+        if running is not None:
+            return Submission(running.id, is_new=False)
+        run = client.create_flow_run_from_deployment(
+            parent.id,
+            parameters=dict(parameters),
+            name=f"dataset {name}",
+            tags=[dataset_tag(name), PARENT_TAG],
+            job_variables={"env": {"PREFECT_FLOWS_HEARTBEAT_FREQUENCY": str(HEARTBEAT_S)}},
+        )
+        return Submission(run.id, is_new=True)
+
+
+def mark_as_parent(run_id: str, name: str) -> None:
+    """Gives a running parent the tags by which it is found, as one that Prefect's own command started has none.
+
+    Args:
+        run_id: of the parent's flow run.
+        name: the dataset's name.
+    """
+    with get_client(sync_client=True) as client:
+        run = call_server(client.read_flow_run, UUID(run_id))
+        tags = {*run.tags, dataset_tag(name), PARENT_TAG}
+        if tags != set(run.tags):
+            call_server(client.update_flow_run, UUID(run_id), tags=sorted(tags))
+
+
+def follow_dataset(
+    run_id: UUID, show: Callable[[Sequence[Mapping[str, Any]]], None], poll_s: float = 2.0
+) -> tuple[str, list[dict[str, Any]]]:
+    """Shows the table of a dataset until its flow run ends.
+
+    Args:
+        run_id: of the flow run.
+        show: called with the rows of the table whenever they are read.
+        poll_s: seconds between two reads.
+
+    Returns:
+        The type of the run's last state with its message, and the final rows.
+    """
+    with get_client(sync_client=True) as client:
+        while True:
+            run = call_server(client.read_flow_run, run_id)
+            if run.state is not None and run.state.type is StateType.RUNNING and not _is_alive(client, run):
+                # Nobody else notices that the parent's worker died with all its processes.
+                crash_run(client, run.id)
+                continue
+            rows = _read_table(client, run_id)
+            show(rows)
+            if run.state is not None and run.state.is_final():
+                return f"{run.state.type.value}: {run.state.message or ''}", _read_table(client, run_id)
+            time.sleep(poll_s)
+
+
+def _find_deployment(client: SyncPrefectClient, name: str) -> DeploymentResponse:
+    try:
+        return client.read_deployment_by_name(name)
+    except ObjectNotFound as error:
+        remedy = "Deploy it in the folder of prefect.yaml: prefect --no-prompt deploy --all."
+        raise ConfigError(f"the Prefect server has no deployment '{name}'", remedy=remedy) from error
+
+
+def _check_pool(client: SyncPrefectClient, pool: str) -> None:
+    try:
+        client.read_work_pool(pool)
+    except ObjectNotFound as error:
+        remedy = f"Create it: prefect work-pool create {pool} --type process."
+        raise ConfigError(f"the Prefect server has no work pool '{pool}'", remedy=remedy) from error
+    workers = client.read_workers_for_work_pool(pool)
+    if not any(worker.status is not None and str(worker.status.value) == "ONLINE" for worker in workers):
+        remedy = f"Start one: prefect worker start --pool {pool}."
+        raise ConfigError(f"no worker of the work pool '{pool}' is online", remedy=remedy)
+
+
+def _find_running(client: SyncPrefectClient, name: str) -> FlowRun | None:
+    """The parent that is running this dataset; one without a sign of life is set to Crashed."""
+    wanted = FlowRunFilter(
+        tags=FlowRunFilterTags(all_=[dataset_tag(name), PARENT_TAG]),
+        state=FlowRunFilterState(type=FlowRunFilterStateType(any_=_ACTIVE)),
+    )
+    for run in client.read_flow_runs(flow_run_filter=wanted):
+        if run.state is None or run.state.type is not StateType.RUNNING or _is_alive(client, run):
+            return run
+        crash_run(client, run.id)
+    return None
+
+
+def crash_run(client: SyncPrefectClient, run_id: UUID) -> None:
+    """Sets a parent without a sign of life to Crashed, so that the dataset can be started again.
+
+    Args:
+        client: of the server.
+        run_id: of the flow run.
+    """
+    call_server(client.set_flow_run_state, run_id, Crashed(message="no heartbeat"), force=True)
+
+
+def _is_alive(client: SyncPrefectClient, run: FlowRun) -> bool:
+    silent_s = 3.0 * HEARTBEAT_S
+    if run.estimated_run_time.total_seconds() < silent_s:
+        return True
+    return bool(read_last_heartbeats(client, [str(run.id)], since_s=silent_s))
+
+
+def _read_table(client: SyncPrefectClient, run_id: UUID) -> list[dict[str, Any]]:
+    wanted = ArtifactFilter(
+        flow_run_id=ArtifactFilterFlowRunId(any_=[run_id]),
+        key=ArtifactFilterKey(any_=[TABLE_KEY]),
+    )
+    artifacts = call_server(client.read_artifacts, artifact_filter=wanted)
+    # A parent that was started again has a table of each of its lives.
+    newest = max(artifacts, key=lambda artifact: str(artifact.created), default=None)
+    rows: list[dict[str, Any]] = [] if newest is None else json.loads(str(newest.data))
+    return rows

@@ -1,0 +1,258 @@
+"""Supervises child runs: bounded in flight, freed and submitted again when they are dead, adopted after a restart."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from flows.dataset.child_runs import ACTIVE_STATES, ChildRun, ChildRuns
+from flows.dataset.work_units import WorkUnit
+
+HEARTBEAT_S = 30
+"""Seconds between two heartbeats of a child run."""
+Rows = list[dict[str, Any]]
+_STATUS_BY_STATE = {"SCHEDULED": "waiting", "PENDING": "starting", "RUNNING": "running"}
+
+
+@dataclass(frozen=True)
+class SupervisionLimits:
+    """How many runs at once, how often, and when a run counts as dead.
+
+    Attributes:
+        in_flight: runs that are submitted and have not ended, at most.
+        attempts: how often a unit is submitted, at most.
+        poll_s: seconds between two looks at the server.
+        pending_s: seconds that a worker may take to start a run.
+        silent_s: seconds that a run may be without a heartbeat.
+    """
+
+    in_flight: int = 8
+    attempts: int = 3
+    poll_s: float = 2.0
+    pending_s: float = 180.0
+    silent_s: float = 3.0 * HEARTBEAT_S
+
+
+@dataclass
+class _Watch:
+    """When a run that is in flight last changed, by the clock of this process.
+
+    Attributes:
+        run: as last read.
+        since_s: when its state or heartbeat changed.
+        heartbeat: the last one.
+    """
+
+    run: ChildRun
+    since_s: float
+    heartbeat: str = ""
+
+
+@dataclass
+class _Supervision:
+    """What the supervisor knows of its units.
+
+    Attributes:
+        rows: the table's rows by unit.
+        waiting: units to submit.
+        watches: runs in flight, by id.
+        attempts: how often a unit was submitted.
+    """
+
+    rows: dict[WorkUnit, dict[str, Any]]
+    waiting: deque[WorkUnit] = field(default_factory=deque)
+    watches: dict[str, _Watch] = field(default_factory=dict)
+    attempts: dict[WorkUnit, int] = field(default_factory=dict)
+
+
+class Supervisor:
+    """Runs every unit to its end through child runs; the failure of one does not stop the others.
+
+    Args:
+        units: what to run, without doubles.
+        runs: the child runs.
+        limits: bounds and times.
+        on_change: called with the rows of the table after every poll.
+        clock: seconds of a clock that never jumps.
+        sleep: waits for seconds.
+    """
+
+    def __init__(
+        self,
+        units: Sequence[WorkUnit],
+        runs: ChildRuns,
+        limits: SupervisionLimits,
+        on_change: Callable[[Rows], None] = lambda rows: None,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._runs = runs
+        self._limits = limits
+        self._on_change = on_change
+        self._clock = clock
+        self._sleep = sleep
+        self._last_poll_s = clock()
+        self._state = _Supervision({unit: _new_row(unit) for unit in units})
+
+    @property
+    def rows(self) -> Rows:
+        """The table as it stands, one row for each unit."""
+        return [dict(row) for row in self._state.rows.values()]
+
+    def run(self) -> Rows:
+        """Submits, polls and submits again until every unit has ended.
+
+        Returns:
+            The final rows.
+        """
+        self._adopt()
+        while self._state.waiting or self._state.watches:
+            self._submit()
+            self._on_change(self.rows)
+            self._sleep(self._limits.poll_s)
+            self._poll()
+        self._on_change(self.rows)
+        return self.rows
+
+    def _adopt(self) -> None:
+        """Takes over the runs that an earlier life of this parent, or an earlier parent, has left."""
+        newest: dict[WorkUnit, ChildRun] = {}
+        for run in self._runs.find():
+            if run.unit not in self._state.rows:
+                continue
+            if run.is_ours:
+                self._state.attempts[run.unit] = self._state.attempts.get(run.unit, 0) + 1
+            # An active run wins over an ended one, as its unit must not be run twice at a time.
+            before = newest.get(run.unit)
+            if before is None or before.state not in ACTIVE_STATES:
+                newest[run.unit] = run
+        for unit in self._state.rows:
+            run_found = newest.get(unit)
+            if run_found is None:
+                self._state.waiting.append(unit)
+            else:
+                self._watch(run_found)
+        for watch in list(self._state.watches.values()):
+            self._judge(watch)
+
+    def _submit(self) -> None:
+        while self._state.waiting and len(self._state.watches) < self._limits.in_flight:
+            unit = self._state.waiting.popleft()
+            attempt = self._state.attempts.get(unit, 0)
+            self._state.attempts[unit] = attempt + 1
+            self._watch(self._runs.submit(unit, attempt))
+
+    def _watch(self, run: ChildRun) -> None:
+        self._state.watches[run.id] = _Watch(run, self._clock())
+        self._update_row(run)
+
+    def _poll(self) -> None:
+        found = self._runs.read(list(self._state.watches))
+        # After the call, which waits as long as the server is away.
+        now = self._clock()
+        if now - self._last_poll_s > self._limits.silent_s / 3:
+            # The server was away, and heartbeats with it: what is dead shows itself from here on.
+            for watch in self._state.watches.values():
+                watch.since_s = now
+        for watch in list(self._state.watches.values()):
+            run = found.get(watch.run.id)
+            if run is None:
+                self._end_attempt(watch, "the flow run was deleted")
+                continue
+            if run.state != watch.run.state:
+                watch.since_s = now
+            watch.run = run
+            self._update_row(run)
+            self._judge(watch)
+        self._read_signs_of_life()
+        self._last_poll_s = self._clock()
+
+    def _read_signs_of_life(self) -> None:
+        running = {id_: watch for id_, watch in self._state.watches.items() if watch.run.state == "RUNNING"}
+        if not running:
+            return
+        for id_, stage in self._runs.read_stages(list(running)).items():
+            self._state.rows[running[id_].run.unit]["stage"] = stage
+        # Asked only for runs that may be late: most polls ask for none.
+        late = [id_ for id_, watch in running.items() if self._age(watch) > self._limits.silent_s / 3]
+        if not late:
+            return
+        for id_, heartbeat in self._runs.read_heartbeats(late).items():
+            if heartbeat != running[id_].heartbeat:
+                running[id_].heartbeat = heartbeat
+                running[id_].since_s = self._clock()
+
+    def _judge(self, watch: _Watch) -> None:
+        """Ends the watch of a run that has ended, or is dead."""
+        run = watch.run
+        if run.state == "PENDING" and self._age(watch) > self._limits.pending_s:
+            self._free(watch, f"not started within {self._limits.pending_s:.0f} s")
+        elif run.state == "RUNNING" and self._age(watch) > self._limits.silent_s:
+            self._free(watch, f"no heartbeat for {self._limits.silent_s:.0f} s")
+        elif run.state not in ACTIVE_STATES:
+            self._end(watch)
+
+    def _age(self, watch: _Watch) -> float:
+        return self._clock() - watch.since_s
+
+    def _free(self, watch: _Watch, reason: str) -> None:
+        self._runs.crash(watch.run, reason)
+        # It may have ended just before: then that is how it ended.
+        run = self._runs.read([watch.run.id]).get(watch.run.id)
+        if run is None or run.state in ACTIVE_STATES:
+            # The server does not take the state yet; the next poll tries again.
+            return
+        watch.run = run
+        self._end(watch)
+
+    def _end(self, watch: _Watch) -> None:
+        outcome = self._runs.read_outcome(watch.run)
+        if watch.run.state == "CANCELLED":
+            self._finish(watch, {"status": "failed", "why": "cancelled"})
+        elif watch.run.state == "CRASHED" or outcome is None or outcome["is_passing"]:
+            # A run that says nothing was ended from outside, or by an error of its surroundings.
+            self._end_attempt(watch, outcome["why"] if outcome else watch.run.message or watch.run.state.lower())
+        else:
+            self._finish(watch, {name: value for name, value in outcome.items() if name != "is_passing"})
+
+    def _end_attempt(self, watch: _Watch, why: str) -> None:
+        unit = watch.run.unit
+        if self._state.attempts.get(unit, 0) >= self._limits.attempts:
+            self._finish(watch, {"status": "failed", "why": f"{why} (attempt {self._state.attempts[unit]})"})
+            return
+        del self._state.watches[watch.run.id]
+        self._state.rows[unit] |= {"status": "waiting", "why": why}
+        self._state.waiting.append(unit)
+
+    def _finish(self, watch: _Watch, outcome: dict[str, Any]) -> None:
+        del self._state.watches[watch.run.id]
+        # The log's URI and chunk stay as this flow names them.
+        self._state.rows[watch.run.unit] |= {k: v for k, v in outcome.items() if k not in ("log", "chunk")}
+
+    def _update_row(self, run: ChildRun) -> None:
+        self._state.rows[run.unit] |= {
+            "status": _STATUS_BY_STATE.get(run.state, run.state.lower()),
+            "seconds": round(run.seconds, 1),
+            "where": run.where,
+            "attempts": self._state.attempts.get(run.unit, 0),
+        }
+
+
+def _new_row(unit: WorkUnit) -> dict[str, Any]:
+    return {
+        "log": unit.log,
+        "chunk": "" if unit.chunk is None else unit.chunk,
+        "stage": "",
+        "status": "waiting",
+        "seconds": 0.0,
+        "where": "",
+        "attempts": 0,
+        "chunks": 0,
+        "left_out": 0,
+        "run": "",
+        "report": "",
+        "why": "",
+    }

@@ -1,0 +1,44 @@
+"""How a child run hands its outcome to the dataset's flow: a table of one row among Prefect's artifacts.
+
+A record in the store is found by its run's name alone, and an error leaves none; the state's message has no remedy.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+from prefect.artifacts import create_table_artifact
+
+from flows.reconstruction.left_out import describe_log
+from genre_tasks.errors import GenreError, ResourceError, TransientIOError
+
+DATASET_VARIABLE = "GENRE_DATASET"
+"""The environment variable that names the dataset of a child run."""
+OUTCOME_KEY = "outcome"
+"""Key of the artifact."""
+
+
+def is_child_run() -> bool:
+    """Says whether this process runs a log for a dataset's flow.
+
+    Returns:
+        Whether the variable ``GENRE_DATASET`` is set, as the dataset's flow sets it for its child runs.
+    """
+    return bool(os.environ.get(DATASET_VARIABLE))
+
+
+def publish_outcome(log: str, record: Mapping[str, Any] | None, error: Exception | None) -> None:
+    """Writes how the run of a log ended, if it is a child run.
+
+    Args:
+        log: the log's URI.
+        record: the record of its run; ``None`` where there is none.
+        error: what is wrong, if anything is.
+    """
+    if not is_child_run():
+        return
+    is_final = isinstance(error, GenreError) and not isinstance(error, TransientIOError | ResourceError)
+    row = describe_log(log, record, error) | {"is_passing": error is not None and not is_final}
+    create_table_artifact(table=[row], key=OUTCOME_KEY, description="read by the dataset's flow")

@@ -1,0 +1,158 @@
+"""Child runs under supervision, by a fake server whose clock the test moves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from flows.dataset.child_runs import ACTIVE_STATES, ChildRun
+from flows.dataset.supervisor import SupervisionLimits, Supervisor
+from flows.dataset.work_units import WorkUnit
+
+A = WorkUnit("synthetic:a")
+B = WorkUnit("synthetic:b")
+DONE = {"status": "done", "run": "5f41", "why": "", "is_passing": False}
+LIMITS = SupervisionLimits(in_flight=2, attempts=3, poll_s=1.0, pending_s=5.0, silent_s=9.0)
+
+
+class FakeRuns:
+    """Runs that follow a script of states, one a poll; the last state stays."""
+
+    def __init__(self, scripts: Mapping[WorkUnit, Sequence[Sequence[str]]]) -> None:
+        self.scripts = scripts
+        self.runs: dict[str, ChildRun] = {}
+        self.polls: dict[str, int] = {}
+        self.outcomes: dict[str, dict[str, Any]] = {}
+        self.beating: set[str] = set()
+        self.submitted: list[tuple[WorkUnit, int]] = []
+        self.crashed: list[str] = []
+        self.most_active = 0
+        self.now_s = 0.0
+
+    def find(self) -> list[ChildRun]:
+        return list(self.runs.values())
+
+    def submit(self, unit: WorkUnit, attempt: int) -> ChildRun:
+        id_ = f"{unit.log}/{attempt}"
+        assert not [run for run in self.runs.values() if run.unit == unit and run.state in ACTIVE_STATES]
+        self.submitted.append((unit, attempt))
+        self.runs[id_] = ChildRun(id_, unit, "SCHEDULED")
+        active = sum(run.state in ACTIVE_STATES for run in self.runs.values())
+        self.most_active = max(self.most_active, active)
+        return self.runs[id_]
+
+    def read(self, ids: Sequence[str]) -> Mapping[str, ChildRun]:
+        return {id_: self._step(id_) for id_ in ids if id_ in self.runs}
+
+    def _step(self, id_: str) -> ChildRun:
+        run = self.runs[id_]
+        if id_ not in self.crashed:
+            script = self.scripts[run.unit][int(id_.rpartition("/")[2])]
+            position = min(self.polls.get(id_, 0), len(script) - 1)
+            self.polls[id_] = position + 1
+            self.runs[id_] = replace(run, state=script[position])
+        return self.runs[id_]
+
+    def read_heartbeats(self, ids: Sequence[str]) -> Mapping[str, str]:
+        return {id_: str(self.now_s) for id_ in ids if id_ in self.beating}
+
+    def read_stages(self, ids: Sequence[str]) -> Mapping[str, str]:
+        return dict.fromkeys(ids, "gnet · chunk 0")
+
+    def crash(self, run: ChildRun, reason: str) -> None:
+        self.crashed.append(run.id)
+        self.runs[run.id] = replace(run, state="CRASHED", message=reason)
+
+    def read_outcome(self, run: ChildRun) -> dict[str, Any] | None:
+        return self.outcomes.get(run.id, DONE if run.state == "COMPLETED" else None)
+
+
+def supervise(runs: FakeRuns, units: Sequence[WorkUnit], limits: SupervisionLimits = LIMITS) -> list[dict[str, Any]]:
+    def sleep(seconds: float) -> None:
+        runs.now_s += seconds
+        assert runs.now_s < 500, "the supervisor does not come to its end"
+
+    return Supervisor(units, runs, limits, clock=lambda: runs.now_s, sleep=sleep).run()
+
+
+def test_runs_are_bounded_in_flight_and_all_end() -> None:
+    units = [WorkUnit(f"synthetic:{n}") for n in range(7)]
+    runs = FakeRuns({unit: [["PENDING", "RUNNING", "COMPLETED"]] for unit in units})
+    rows = supervise(runs, units)
+    assert [row["log"] for row in rows] == [unit.log for unit in units]
+    assert {row["status"] for row in rows} == {"done"} and runs.most_active == LIMITS.in_flight
+    assert {row["stage"] for row in rows} == {"gnet · chunk 0"}
+
+
+@pytest.mark.parametrize("states", [["RUNNING"], ["PENDING"]])
+def test_a_silent_run_is_freed_and_submitted_again(states: list[str]) -> None:
+    runs = FakeRuns({A: [states, ["RUNNING", "COMPLETED"]]})
+    (row,) = supervise(runs, [A])
+    assert (row["status"], row["attempts"]) == ("done", 2)
+    assert runs.crashed == ["synthetic:a/0"] and runs.submitted == [(A, 0), (A, 1)]
+
+
+def test_heartbeats_keep_a_long_run_alive() -> None:
+    runs = FakeRuns({A: [["RUNNING"] * 60 + ["COMPLETED"]]})
+    runs.beating.add("synthetic:a/0")
+    (row,) = supervise(runs, [A])
+    assert row["status"] == "done" and not runs.crashed
+
+
+def test_a_run_in_the_queue_is_never_freed() -> None:
+    runs = FakeRuns({A: [["SCHEDULED"] * 100 + ["COMPLETED"]]})
+    assert supervise(runs, [A])[0]["status"] == "done" and not runs.crashed
+
+
+def test_attempts_are_bounded() -> None:
+    runs = FakeRuns({A: [["CRASHED"]] * 3, B: [["COMPLETED"]]})
+    rows = supervise(runs, [A, B])
+    assert [row["status"] for row in rows] == ["failed", "done"]
+    assert [attempt for unit, attempt in runs.submitted if unit == A] == [0, 1, 2]
+    assert "attempt 3" in rows[0]["why"]
+
+
+def test_an_error_of_the_log_is_final_and_the_others_go_on() -> None:
+    runs = FakeRuns({A: [["FAILED"]], B: [["RUNNING", "COMPLETED"]]})
+    runs.outcomes["synthetic:a/0"] = {"status": "failed", "why": "no image. Copy it.", "is_passing": False}
+    rows = supervise(runs, [A, B])
+    assert [(row["status"], row["why"]) for row in rows] == [("failed", "no image. Copy it."), ("done", "")]
+    assert runs.submitted == [(A, 0), (B, 0)]
+
+
+def test_an_error_that_may_pass_is_tried_again() -> None:
+    runs = FakeRuns({A: [["FAILED"], ["COMPLETED"]]})
+    runs.outcomes["synthetic:a/0"] = {"status": "failed", "why": "the store is away", "is_passing": True}
+    (row,) = supervise(runs, [A])
+    assert (row["status"], row["why"], row["attempts"]) == ("done", "", 2)
+
+
+def test_active_and_ended_runs_are_adopted() -> None:
+    runs = FakeRuns({A: [["RUNNING", "COMPLETED"]], B: [["COMPLETED"]]})
+    runs.runs["synthetic:a/0"] = ChildRun("synthetic:a/0", A, "RUNNING", is_ours=False)
+    runs.runs["synthetic:b/0"] = ChildRun("synthetic:b/0", B, "COMPLETED")
+    rows = supervise(runs, [A, B])
+    assert {row["status"] for row in rows} == {"done"} and not runs.submitted
+
+
+def test_an_adopted_run_that_crashed_counts_as_an_attempt() -> None:
+    runs = FakeRuns({A: [["CRASHED"], ["COMPLETED"]]})
+    runs.runs["synthetic:a/0"] = ChildRun("synthetic:a/0", A, "CRASHED", message="killed")
+    (row,) = supervise(runs, [A])
+    assert row["status"] == "done" and runs.submitted == [(A, 1)]
+
+
+def test_an_outage_of_the_server_does_not_make_runs_stale() -> None:
+    runs = FakeRuns({A: [["RUNNING"] * 6 + ["COMPLETED"]]})
+    real = runs.read
+
+    def away_for_a_minute(ids: Sequence[str]) -> Mapping[str, ChildRun]:
+        if runs.now_s == 3.0:
+            runs.now_s += 60.0
+        return real(ids)
+
+    runs.read = away_for_a_minute  # type: ignore[method-assign]
+    assert supervise(runs, [A])[0]["status"] == "done" and not runs.crashed
