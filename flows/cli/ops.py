@@ -137,9 +137,9 @@ def deploy(
 
 def _print_services(rows: list[dict[str, object]], as_json: bool) -> None:
     if as_json:
-        from flows.cli.outcome import _print
+        from flows.cli.outcome import print_outcome
 
-        _print({"services": rows})
+        print_outcome("done", {"services": rows})
         return
     from flows.cli.printing import print_rows
 
