@@ -16,7 +16,7 @@ from typing import Any
 from flows.operations.deployments import COORDINATOR_QUEUE, RUN_QUEUE, deploy_flows
 from flows.operations.object_server import ObjectServer
 from flows.operations.postgres_server import PostgresServer
-from flows.operations.prefect_services import PrefectServer, Worker
+from flows.operations.prefect_services import HEARTBEAT_SECONDS, PrefectServer, Worker
 from flows.operations.service import Service
 from flows.operations.state_file import ServiceRecord, locked, read_records, read_start_ticks, write_records
 from genre_tasks.errors import ConfigError
@@ -74,7 +74,9 @@ class Stack:
             deploy_flows(server.url, env["PREFECT_API_AUTH_STRING"], self.pool, store, self.folder)
             for worker in self._workers(env):
                 self._ensure(worker)
-            self._write_env({**env, "GENRE_STORE": store})
+            # A run with slower heartbeats than the automation expects would be marked as crashed while it lives.
+            heartbeat = {"PREFECT_FLOWS_HEARTBEAT_FREQUENCY": str(HEARTBEAT_SECONDS)}
+            self._write_env({**env, **heartbeat, "GENRE_STORE": store})
             return list(read_records(self.folder).values())
 
     def _workers(self, env: dict[str, str]) -> Iterator[Worker]:
