@@ -13,7 +13,9 @@ _PERIODS = 3
 def install_heartbeat_automation(
     api_url: str, auth_string: str | None = None, heartbeat_seconds: int = HEARTBEAT_SECONDS
 ) -> str:
-    """Makes the server mark a flow run as Crashed when its heartbeats stop; a second call changes nothing.
+    """Asks the server to mark a flow run as Crashed when its heartbeats stop; a second call changes nothing.
+
+    Not verified: a run killed with its children stayed Running past the bound, so callers must check for it themselves.
 
     Any event of the run within three periods counts, not only a heartbeat: a run that has just finished sends
     its last state instead.
