@@ -21,6 +21,7 @@ test: $(READY)
 	$(VENV)/bin/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 test-all: $(READY)
+	@tests/install_services.sh
 	$(VENV)/bin/python -m pytest -m "" --timeout 3600
 
 lint: $(READY)

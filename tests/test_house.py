@@ -41,10 +41,15 @@ def test_compose_file_follows_the_specification() -> None:
     schema = json.loads((ROOT / "tests/data/compose_spec.json").read_text())
     compose = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
     jsonschema.Draft201909Validator(schema).validate(compose)
-    assert set(compose["services"]) == {"database", "server", "worker"}
-    for service in compose["services"].values():
-        for name in service.get("depends_on", {}):
-            assert "healthcheck" in compose["services"][name]
+    services = compose["services"]
+    once = {name for name, service in services.items() if service.get("restart") == "no"}
+    assert once == {"setup", "bucket"}
+    assert set(services) - once == {"database", "server", "objects", "coordinator", "worker", "gpu-worker"}
+    for name, service in services.items():
+        assert name in once or "healthcheck" in service, name
+        for needed, how in service.get("depends_on", {}).items():
+            finished = how["condition"] == "service_completed_successfully"
+            assert finished == (needed in once)
     named = {
         v.split(":")[0] for s in compose["services"].values() for v in s.get("volumes", []) if "/" not in v[:1] + v[:2]
     }

@@ -23,6 +23,7 @@ from flows.cli.export import export
 from flows.cli.figure import figure
 from flows.cli.import_command import import_command
 from flows.cli.last_resort import run_guarded
+from flows.cli.ops import app as ops_app
 from flows.cli.outcome import start_outcome, wants_json
 from flows.cli.paper_table import table
 from flows.cli.parsing import check_words
@@ -67,6 +68,7 @@ app.command(name="show")(show)
 app.command(name="diff")(diff)
 app.command(name="verify")(verify)
 app.command(name="doctor")(doctor)
+app.add_typer(ops_app, name="ops")
 app.command(name="cost")(cost)
 app.command(name="table")(table)
 app.command(name="figure")(figure)

@@ -1,0 +1,146 @@
+"""``genre ops``: the services of a deployment on this machine, without containers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flows.cli.options import JsonOption
+from flows.cli.parsing import parse_path
+
+app = typer.Typer(
+    help="""Start, show and stop the services of a deployment on this machine.
+
+    Example:
+
+    \b
+        genre ops up --workers 2
+        eval "$(genre ops status --env)"
+        genre ops down
+    """,
+    no_args_is_help=True,
+)
+
+FolderOption = Annotated[
+    Path | None,
+    typer.Option(
+        parser=parse_path,
+        metavar="PATH",
+        help="The folder for data, logs and passwords. `operations` in the state folder if not given.",
+    ),
+]
+
+
+def _find_folder(folder: Path | None) -> Path:
+    from flows.machine.state_folder import find_state_folder
+
+    return (find_state_folder() / "operations" if folder is None else folder).absolute()
+
+
+@app.command(name="up")
+def up(
+    folder: FolderOption = None,
+    workers: Annotated[int, typer.Option(min=0, help="How many workers take logs, one log each at a time.")] = 2,
+    pool: Annotated[str, typer.Option(help="The name of the work pool.")] = "genre",
+    store_server: Annotated[
+        bool, typer.Option("--store-server/--no-store-server", help="Start an S3 server for the store.")
+    ] = True,
+    database: Annotated[str, typer.Option(help="The Prefect server's database: postgres or sqlite.")] = "postgres",
+) -> None:
+    """Start the services that do not run yet, and deploy the flows.
+
+    Example:
+
+    \b
+        genre ops up --workers 2 --database sqlite --no-store-server
+    """
+    from flows.operations.stack import Stack, describe_services
+
+    state = _find_folder(folder)
+    Stack(state, workers, pool, store_server, database).start()
+    _print_services(describe_services(state), as_json=False)
+    typer.echo('For clients: eval "$(genre ops status --env)"')
+
+
+@app.command(name="status")
+def status(
+    folder: FolderOption = None,
+    env: Annotated[
+        bool, typer.Option("--env", help="Print the variables for clients, passwords included, for eval.")
+    ] = False,
+    json: JsonOption = False,
+) -> None:
+    """Show the services, or what clients of them must export.
+
+    Example:
+
+    \b
+        genre ops status --json
+    """
+    from flows.operations.stack import describe_services
+    from genre_tasks.errors import InputError
+
+    state = _find_folder(folder)
+    if not env:
+        _print_services(describe_services(state), as_json=json)
+        return
+    file = state / "env"
+    if not file.exists():
+        raise InputError("no services were started", remedy="Start them by `genre ops up`.", file=file)
+    typer.echo(file.read_text(), nl=False)
+
+
+@app.command(name="down")
+def down(
+    folder: FolderOption = None,
+    delete: Annotated[bool, typer.Option("--delete", help="Remove data, logs and passwords too.")] = False,
+) -> None:
+    """Stop all services, workers first.
+
+    Example:
+
+    \b
+        genre ops down
+    """
+    from flows.operations.stack import stop_stack
+
+    stopped = stop_stack(_find_folder(folder), delete)
+    typer.echo(f"Stopped: {', '.join(stopped)}" if stopped else "Nothing ran.")
+
+
+@app.command(name="deploy")
+def deploy(
+    pool: Annotated[str, typer.Option(help="The name of the work pool.")] = "genre",
+    store: Annotated[str, typer.Option(help="The default store of the deployments.")] = "genre-store",
+) -> None:
+    """Make pool, deployments and the heartbeat automation at the server of PREFECT_API_URL.
+
+    Example:
+
+    \b
+        genre ops deploy --store s3://bucket/store
+    """
+    import os
+
+    from flows.operations.deployments import deploy_flows
+    from genre_tasks.errors import ConfigError
+
+    url = os.environ.get("PREFECT_API_URL")
+    if not url:
+        raise ConfigError("PREFECT_API_URL is not set", remedy="Set it to the address of the Prefect API.")
+    address = store if "://" in store else str(Path(store).absolute())
+    for name in deploy_flows(url, os.environ.get("PREFECT_API_AUTH_STRING"), pool, address, Path.cwd()):
+        typer.echo(name)
+
+
+def _print_services(rows: list[dict[str, object]], as_json: bool) -> None:
+    if as_json:
+        from flows.cli.outcome import print_outcome
+
+        print_outcome("done", {"services": rows})
+        return
+    from flows.cli.printing import print_rows
+
+    print_rows("services", rows)

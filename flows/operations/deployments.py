@@ -1,0 +1,105 @@
+"""The work pool, its queues and GenRe's deployments, made through Prefect's API."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from flows.operations.heartbeat_automation import install_heartbeat_automation
+
+COORDINATOR_QUEUE = "datasets"
+RUN_QUEUE = "default"
+
+
+@dataclass(frozen=True)
+class FlowDeployment:
+    """A deployment as prefect.yaml names it, which an installed package does not carry."""
+
+    name: str
+    entrypoint: str
+    queue: str = RUN_QUEUE
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+
+DEPLOYMENTS = (
+    FlowDeployment(
+        "log",
+        "flows/reconstruction/flow.py:reconstruct_log",
+        parameters={"log": "synthetic:street?seed=1000", "preset": "demo"},
+    ),
+    FlowDeployment(
+        "dataset",
+        "flows/dataset/flow.py:reconstruct_dataset",
+        # Not the runs' queue: a parent must not take the slot that its children wait for.
+        queue=COORDINATOR_QUEUE,
+        parameters={"logs": ["synthetic:street?seed=1000"], "preset": "demo"},
+    ),
+    FlowDeployment(
+        "training-scenes",
+        "flows/training/optimiser_flow.py:train_scenes",
+        parameters={"folder": "training", "recipe": "shipped"},
+    ),
+    FlowDeployment(
+        "training",
+        "flows/training/optimiser_flow.py:train_network",
+        parameters={"network": "gnet", "folder": "training", "recipe": "shipped"},
+    ),
+)
+
+
+def deploy_flows(api_url: str, auth_string: str | None, pool: str, store: str, folder: Path) -> list[str]:
+    """Makes pool, queues, deployments and the heartbeat automation; what exists is brought up to date.
+
+    Args:
+        api_url: the address of the Prefect API.
+        auth_string: its password; ``None``: the environment's.
+        pool: the work pool, of type process.
+        store: the default store of the deployments; a path must be absolute.
+        folder: the folder of trainings.
+
+    Returns:
+        The deployments' names, such as ``reconstruct-log/log``.
+    """
+    from prefect.client.orchestration import get_client
+    from prefect.client.schemas.actions import WorkPoolCreate
+    from prefect.exceptions import ObjectAlreadyExists
+    from prefect.flows import load_flow_from_entrypoint
+    from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
+    from prefect.utilities.callables import parameter_schema
+
+    import flows as package
+
+    root = Path(package.__file__).resolve().parents[1]
+    settings = {PREFECT_API_URL: api_url}
+    if auth_string is not None:
+        settings[PREFECT_API_AUTH_STRING] = auth_string
+    names = []
+    with temporary_settings(settings), get_client(sync_client=True) as client:
+        if pool not in {found.name for found in client.read_work_pools()}:
+            client.create_work_pool(WorkPoolCreate(name=pool, type="process"))
+        with suppress(ObjectAlreadyExists):
+            client.create_work_queue(name=COORDINATOR_QUEUE, work_pool_name=pool)
+        for deployment in DEPLOYMENTS:
+            path, _, function = deployment.entrypoint.partition(":")
+            loaded: Any = load_flow_from_entrypoint(f"{root / path}:{function}")
+            parameters = dict(deployment.parameters)
+            if "folder" in parameters:
+                parameters["folder"] = str(folder / "training")
+            else:
+                parameters["store"] = store
+            client.create_deployment(
+                flow_id=client.create_flow_from_name(loaded.name),
+                name=deployment.name,
+                entrypoint=deployment.entrypoint,
+                pull_steps=[{"prefect.deployments.steps.set_working_directory": {"directory": str(root)}}],
+                parameters=parameters,
+                parameter_openapi_schema=parameter_schema(loaded).model_dump_for_openapi(),
+                work_pool_name=pool,
+                work_queue_name=deployment.queue,
+                enforce_parameter_schema=False,
+            )
+            names.append(f"{loaded.name}/{deployment.name}")
+    install_heartbeat_automation(api_url, auth_string)
+    return names

@@ -1,0 +1,94 @@
+"""The record of the services that run detached: who they are, so that a reused process id is not mistaken."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from genre_tasks.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class ServiceRecord:
+    """A started service.
+
+    Args:
+        name: the service's name.
+        pid: its process, which leads a session.
+        start_ticks: the process's start, in clock ticks since the machine's; tells it from a later one of this id.
+        since: when it was started, ISO 8601 in UTC.
+        url: where it listens, without credentials; may be empty.
+        log: the path of its log.
+    """
+
+    name: str
+    pid: int
+    start_ticks: int
+    since: str
+    url: str
+    log: str
+
+    @property
+    def alive(self) -> bool:
+        """Whether this very process still runs."""
+        return read_start_ticks(self.pid) == self.start_ticks
+
+
+def read_start_ticks(pid: int) -> int | None:
+    """Returns when a process started, in clock ticks; ``None`` where it does not run or has ended unreaped."""
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return None
+    # The name in parentheses may hold spaces and parentheses.
+    fields = text.rpartition(")")[2].split()
+    return None if fields[0] in "ZX" else int(fields[19])
+
+
+def read_records(folder: Path) -> dict[str, ServiceRecord]:
+    """Returns the records of a state folder by name, empty where there are none.
+
+    Raises:
+        ConfigError: the file is not one of records.
+    """
+    file = folder / "services.json"
+    if not file.exists():
+        return {}
+    try:
+        return {name: ServiceRecord(**fields) for name, fields in json.loads(file.read_text()).items()}
+    except (ValueError, TypeError, AttributeError) as error:
+        raise ConfigError("not a record of services", remedy="Remove it after ending them.", file=file) from error
+
+
+def write_records(folder: Path, records: Mapping[str, ServiceRecord]) -> None:
+    """Replaces the records of a state folder in one step."""
+    handle, name = tempfile.mkstemp(dir=folder, prefix=".services-")
+    with os.fdopen(handle, "w") as stream:
+        json.dump({key: asdict(record) for key, record in records.items()}, stream, indent=1)
+    Path(name).replace(folder / "services.json")
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keeps a second command out of the state folder until the first has ended.
+
+    Raises:
+        ConfigError: the folder cannot be written.
+    """
+    import fcntl
+
+    try:
+        # Enterable, so that PostgreSQL's user reaches its data; the files with secrets have mode 600.
+        folder.mkdir(mode=0o711, parents=True, exist_ok=True)
+        stream = (folder / "lock").open("w")
+    except OSError as error:
+        remedy = "Name another with --folder."
+        raise ConfigError(f"the state folder cannot be written: {error}", remedy=remedy, file=folder) from error
+    with stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        yield

@@ -1,0 +1,181 @@
+"""The services: their commands, secrets, records and errors; one slow test starts all of them for a dataset run."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from flows.operations import PostgresServer, PrefectServer, Service, Worker
+from flows.operations import postgres_server as postgres_module
+from flows.operations.deployments import DEPLOYMENTS, RUN_QUEUE
+from flows.operations.service import find_free_port, keep_port, keep_secret
+from flows.operations.stack import Stack, describe_services, stop_stack
+from flows.operations.state_file import ServiceRecord, read_records, read_start_ticks, write_records
+from genre_tasks.errors import ConfigError, ResourceError
+from tests.faults import small_run
+
+
+class _Sleeper(Service):
+    def __init__(self, folder: Path, script: str) -> None:
+        super().__init__(folder, "sleeper", start_seconds=5.0, stop_seconds=2.0)
+        self.script = script
+
+    def command(self) -> list[str]:
+        return ["sh", "-c", self.script]
+
+
+def _record(pid: int, ticks: int) -> ServiceRecord:
+    return ServiceRecord("server", pid, ticks, "2026-01-01T00:00:00+00:00", "http://127.0.0.1:1", "log")
+
+
+def test_a_service_that_ends_at_its_start_shows_its_log(tmp_path: Path) -> None:
+    service = _Sleeper(tmp_path, "echo the-reason >&2; exit 3")
+    service.is_healthy = lambda: False  # type: ignore[method-assign]
+    with pytest.raises(ResourceError, match="the-reason"):
+        service.start()
+
+
+def test_kill_ends_the_children_too(tmp_path: Path) -> None:
+    service = _Sleeper(tmp_path, "sleep 60 & echo $! > child; wait")
+    service.spawn_options = lambda: {"cwd": tmp_path}  # type: ignore[method-assign]
+    service.start()
+    child = tmp_path / "child"
+    while not child.exists() or not child.read_text().strip():
+        time.sleep(0.02)
+    service.kill()
+    deadline = time.monotonic() + 5
+    while read_start_ticks(int(child.read_text())) is not None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert read_start_ticks(int(child.read_text())) is None
+    assert not service.is_alive()
+
+
+def test_secrets_stay_and_only_their_user_reads_them(tmp_path: Path) -> None:
+    secret = keep_secret(tmp_path / "password")
+    assert keep_secret(tmp_path / "password") == secret
+    assert stat.S_IMODE((tmp_path / "password").stat().st_mode) == 0o600
+    assert len(secret) >= 32
+
+
+def test_a_port_stays_and_a_taken_one_is_an_error(tmp_path: Path) -> None:
+    import socket
+
+    port = keep_port(tmp_path / "port")
+    assert keep_port(tmp_path / "port") == port
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", port))
+        other.listen()
+        with pytest.raises(ConfigError, match=f"port {port} is taken"):
+            keep_port(tmp_path / "port")
+
+
+def test_commands_hold_no_secret(tmp_path: Path) -> None:
+    server = PrefectServer(tmp_path / "server", "postgresql+asyncpg://u:database-secret@127.0.0.1/p", services=False)
+    server.folder.mkdir()
+    server.prepare()
+    secret = server.env()["PREFECT_API_AUTH_STRING"]
+    words = server.command() + Worker(tmp_path, server.env(), queue="datasets", limit=1).command()
+    assert "--no-services" in words
+    assert words[-4:] == ["--work-queue", "datasets", "--limit", "1"]
+    assert not any(secret in word or "database-secret" in word for word in words)
+    assert Worker(tmp_path, server.env()).environment()["PREFECT_FLOWS_HEARTBEAT_FREQUENCY"] == "30"
+
+
+def test_a_reused_process_id_is_not_taken_for_the_service(tmp_path: Path) -> None:
+    ticks = read_start_ticks(os.getpid())
+    assert ticks is not None
+    assert _record(os.getpid(), ticks).alive
+    assert not _record(os.getpid(), ticks - 1).alive
+    write_records(tmp_path, {"server": _record(os.getpid(), ticks - 1)})
+    assert [row["state"] for row in describe_services(tmp_path)] == ["dead"]
+    # This process would have ended otherwise.
+    assert stop_stack(tmp_path) == []
+    assert read_records(tmp_path) == {}
+
+
+def test_a_damaged_record_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "services.json").write_text('{"server": {"pid": 1}}')
+    with pytest.raises(ConfigError, match="not a record of services"):
+        read_records(tmp_path)
+
+
+def test_without_postgres_the_error_names_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(postgres_module.shutil, "which", lambda name: None)
+    monkeypatch.setattr(postgres_module.Path, "glob", lambda self, pattern: iter(()))
+    with pytest.raises(ConfigError, match="package postgresql, or use --database sqlite"):
+        PostgresServer(tmp_path).start()
+
+
+def test_an_unknown_database_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="unknown database oracle"):
+        Stack(tmp_path, database="oracle").start()
+
+
+def test_deployments_are_those_of_prefect_yaml() -> None:
+    listed = yaml.safe_load((small_run.ROOT / "prefect.yaml").read_text())["deployments"]
+    named = {(d["name"], d["entrypoint"], d["work_pool"].get("work_queue_name", RUN_QUEUE)) for d in listed}
+    assert named == {(d.name, d.entrypoint, d.queue) for d in DEPLOYMENTS}
+
+
+def test_the_slurm_script_starts_a_worker_per_task(tmp_path: Path) -> None:
+    script = small_run.ROOT / "docs/examples/slurm/workers.sbatch"
+    subprocess.run(["bash", "-n", str(script)], check=True)
+    for name, line in (("srun", 'while [ "${1#--}" != "$1" ]; do shift; done; exec "$@"'), ("prefect", 'echo "$@"')):
+        program = tmp_path / name
+        program.write_text(f"#!/bin/bash\n{line}\n")
+        program.chmod(0o755)
+    env = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}", "PREFECT_API_URL": "http://127.0.0.1:1/api"}
+    env |= {"SLURM_JOB_ID": "7", "SLURM_PROCID": "0", "PREFECT_API_AUTH_STRING": "genre:x"}
+    done = subprocess.run(["bash", str(script)], env=env, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "worker start --pool genre --work-queue default --limit 1 --name slurm-7-0"
+
+
+@pytest.fixture
+def state() -> Iterator[Path]:
+    # Not `tmp_path`, whose parents PostgreSQL's user may not enter.
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        folder.chmod(0o711)
+        yield folder
+        stop_stack(folder)
+
+
+@pytest.mark.slow
+def test_up_twice_then_a_dataset_then_down(state: Path) -> None:
+    def genre(*words: str) -> str:
+        command = [sys.executable, "-m", "flows.cli.main", "ops", *words, "--folder", str(state)]
+        done = subprocess.run(command, env=small_run.environment(state), capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    def services() -> dict[str, Any]:
+        return {row["service"]: row for row in json.loads(genre("status", "--json"))["services"]}
+
+    genre("up", "--workers", "1")
+    first = services()
+    assert set(first) == {"store-server", "postgres", "server", "coordinator", "worker-0"}
+    genre("up", "--workers", "1")
+    assert services() == first
+
+    env = dict(line.removeprefix("export ").split("=", 1) for line in genre("status", "--env").splitlines())
+    clients = small_run.environment(state, **{name: value.strip("'") for name, value in env.items()})
+    values = {"logs": [small_run.LOG], "settings": list(small_run.SETTINGS), "store": str(state / "store")}
+    command = [sys.executable, "-m", "prefect", "deployment", "run", "reconstruct-dataset/dataset", "--watch"]
+    command += ["--params", json.dumps(values)]
+    done = subprocess.run(command, env=clients, capture_output=True, text=True, timeout=180, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+    genre("down")
+    assert not any(read_start_ticks(row["pid"]) for row in first.values())
+    assert find_free_port()
