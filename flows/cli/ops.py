@@ -115,7 +115,7 @@ def deploy(
     pool: Annotated[str, typer.Option(help="The name of the work pool.")] = "genre",
     store: Annotated[str, typer.Option(help="The default store of the deployments.")] = "genre-store",
 ) -> None:
-    """Make pool, deployments and the heartbeat automation at the server of PREFECT_API_URL.
+    """Deploy the flows at the Prefect server of PREFECT_API_URL.
 
     Example:
 
