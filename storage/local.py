@@ -305,4 +305,3 @@ class LocalStore:
             return True
         except ArtifactCorruptError:
             return False
-

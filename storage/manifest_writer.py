@@ -34,18 +34,33 @@ def write_artifact(folder: Path, address: Address, kind: str, value: Any, proven
     """
     codec = get_codec(kind)
     codec.write(folder, value)
+    # Only now, once all files are known, so that the manifest can list them.
+    files = list_payload(folder)
+    known = {f.name: getattr(provenance, f.name) for f in fields(provenance)}
+    known["created_at"] = provenance.created_at or datetime.now(UTC).isoformat(timespec="seconds")
+    known["measurements"] = {**codec.measurements(value), **provenance.measurements}
+    manifest = Manifest(kind=kind, files=files, payload_digest=payload_digest(files), **asdict(address), **known)
+    write_manifest(folder, manifest)
+    return manifest
+
+
+def list_payload(folder: Path) -> tuple[FileEntry, ...]:
+    """Digests the files of a folder and pushes them to the disk.
+
+    Args:
+        folder: with complete files and no manifest yet.
+
+    Returns:
+        What a manifest says of the files.
+
+    Raises:
+        OSError: a file cannot be read.
+    """
     entries = []
     for name, path in payload_files(folder):
         sync(path)
         entries.append(FileEntry(path=name, sha256=digest_file(path), size=path.stat().st_size))
-    known = {f.name: getattr(provenance, f.name) for f in fields(provenance)}
-    known["created_at"] = provenance.created_at or datetime.now(UTC).isoformat(timespec="seconds")
-    known["measurements"] = {**codec.measurements(value), **provenance.measurements}
-    files = tuple(entries)
-    # Only now, once all files are known, so that the manifest can list them.
-    manifest = Manifest(kind=kind, files=files, payload_digest=payload_digest(files), **asdict(address), **known)
-    write_manifest(folder, manifest)
-    return manifest
+    return tuple(entries)
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
