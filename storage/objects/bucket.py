@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
-import logging
-import os
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
-from genre_tasks.errors import InputError, TransientIOError
-from storage.objects.client import check_uri, open_client, read_retry_seconds
-from storage.objects.client_errors import translate_error
+from storage.objects.client import check_uri, open_client
+from storage.objects.download import Download
+from storage.objects.retries import AbsentError, call_with_retries
 
-_MAX_PAUSE_S = 5.0
 _PART_BYTES = 8 << 20
 _PARTS_AT_ONCE = 4
 _LIST_SIZE = 1000
-_log = logging.getLogger("genre")
 T = TypeVar("T")
 
 
@@ -42,20 +36,29 @@ class ObjectInfo:
 
 
 @dataclass(frozen=True)
+class ObjectVersion:
+    """Names one content that an object has or had.
+
+    Attributes:
+        e_tag: changes with the content; S3 and Azure compare it.
+        generation: counts the writes, where the server does; Google Cloud Storage compares it and no ETag.
+    """
+
+    e_tag: str
+    generation: str | None = None
+
+
+@dataclass(frozen=True)
 class ObjectContent:
     """An object's content.
 
     Attributes:
         data: the bytes.
-        e_tag: changes with the content.
+        version: of this content.
     """
 
     data: bytes
-    e_tag: str
-
-
-class _AbsentError(Exception):
-    """There is no such object."""
+    version: ObjectVersion
 
 
 class Bucket:
@@ -66,13 +69,15 @@ class Bucket:
 
     Args:
         uri: without credentials.
+        retry_s: for how long a request is tried again; by default as the environment says.
 
     Raises:
         ConfigError: the URI names no bucket, or holds credentials or parameters.
     """
 
-    def __init__(self, uri: str) -> None:
+    def __init__(self, uri: str, retry_s: float | None = None) -> None:
         self.uri = check_uri(uri)
+        self._retry_s = retry_s
 
     def read(self, name: str) -> ObjectContent | None:
         """Reads a small object.
@@ -91,14 +96,14 @@ class Bucket:
 
         def call() -> ObjectContent:
             result = obstore.get(self._client(), name)
-            return ObjectContent(bytes(result.bytes()), result.meta["e_tag"] or "")
+            return ObjectContent(bytes(result.bytes()), _version_of(result.meta))
 
         try:
             return self._call(name, call)
-        except _AbsentError:
+        except AbsentError:
             return None
 
-    def write(self, name: str, data: bytes) -> str:
+    def write(self, name: str, data: bytes) -> ObjectVersion:
         """Writes an object over any that is there.
 
         Args:
@@ -106,7 +111,7 @@ class Bucket:
             data: its content.
 
         Returns:
-            The new ETag.
+            The new version.
 
         Raises:
             InputError: it must not be written, or the bucket is missing.
@@ -114,10 +119,9 @@ class Bucket:
         """
         import obstore
 
-        result = self._call(name, lambda: obstore.put(self._client(), name, data))
-        return result["e_tag"] or ""
+        return _version_of(self._call(name, lambda: obstore.put(self._client(), name, data)))
 
-    def create(self, name: str, data: bytes) -> str | None:
+    def create(self, name: str, data: bytes) -> ObjectVersion | None:
         """Writes an object where there is none; of two writers one succeeds.
 
         Args:
@@ -125,7 +129,7 @@ class Bucket:
             data: its content. An object of the very same content counts as written by this call.
 
         Returns:
-            The new ETag; ``None`` where another is there.
+            The new version; ``None`` where another is there.
 
         Raises:
             InputError: it must not be written, or the bucket is missing.
@@ -133,43 +137,45 @@ class Bucket:
         """
         return self._put_if(name, data, "create")
 
-    def replace(self, name: str, data: bytes, e_tag: str) -> str | None:
+    def replace(self, name: str, data: bytes, version: ObjectVersion) -> ObjectVersion | None:
         """Writes an object over the one that was read; of two writers one succeeds.
 
         Args:
             name: below the prefix.
             data: its content. It must differ from what any other writer would write.
-            e_tag: of the object that was read.
+            version: of the object that was read.
 
         Returns:
-            The new ETag; ``None`` where the object has changed or is gone.
+            The new version; ``None`` where the object has changed or is gone.
 
         Raises:
             InputError: it must not be written, or the bucket is missing.
             TransientIOError: the store does not answer.
         """
-        return self._put_if(name, data, {"e_tag": e_tag})
+        # Both, where the server has both: each cloud compares another one. The client takes no None.
+        named = {"e_tag": version.e_tag, "version": version.generation}
+        return self._put_if(name, data, {key: value for key, value in named.items() if value})
 
-    def _put_if(self, name: str, data: bytes, mode: Any) -> str | None:
+    def _put_if(self, name: str, data: bytes, mode: Any) -> ObjectVersion | None:
         import obstore
         from obstore.exceptions import AlreadyExistsError, PreconditionError
 
-        def call() -> str | None:
+        def call() -> ObjectVersion | None:
             try:
-                return obstore.put(self._client(), name, data, mode=mode)["e_tag"] or ""
+                return _version_of(obstore.put(self._client(), name, data, mode=mode))
             except (AlreadyExistsError, PreconditionError):
                 return None
 
         try:
-            e_tag = self._call(name, call)
-        except _AbsentError:
+            version = self._call(name, call)
+        except AbsentError:
             # To be replaced, and gone.
             return None
-        if e_tag is None:
+        if version is None:
             # The refusal may be the answer to a second try, after the first succeeded and its answer was lost.
             found = self.read(name)
-            e_tag = found.e_tag if found is not None and found.data == data else None
-        return e_tag
+            version = found.version if found is not None and found.data == data else None
+        return version
 
     def upload(self, name: str, path: Path) -> str:
         """Writes a file as an object, in parts where it is large.
@@ -210,22 +216,17 @@ class Bucket:
             InputError: the object must not be read, or the bucket is missing.
             TransientIOError: the store does not answer, or breaks off every time.
         """
-        import obstore
-
-        def call() -> tuple[str, int]:
-            digest = hashlib.sha256()
-            size = 0
-            with open(os.devnull if path is None else path, "wb") as out:  # noqa: PTH123
-                for piece in obstore.get(self._client(), name).stream(min_chunk_size=_PART_BYTES):
-                    digest.update(piece)
-                    out.write(piece)
-                    size += len(piece)
-            return digest.hexdigest(), size
-
+        out = None if path is None else path.open("wb")
+        download = Download(self.uri, name, out)
         try:
-            return self._call(name, call)
-        except _AbsentError as error:
+            digest = self._call(name, download.run, lambda: download.size)
+        except AbsentError as error:
             raise FileNotFoundError(name) from error
+        finally:
+            # What was not written yet may find the disk full, which is an error too.
+            if out is not None:
+                out.close()
+        return digest, download.size
 
     def list(self, folder: str = "", start: str = "") -> Iterator[ObjectInfo]:
         """Lists the objects of a folder and of all folders below it.
@@ -289,7 +290,7 @@ class Bucket:
             return
         try:
             self._call(names[0], lambda: obstore.delete(self._client(), list(names)))
-        except _AbsentError:
+        except AbsentError:
             # Some servers report a missing one, and may have stopped at it.
             for name in names if len(names) > 1 else ():
                 self.delete([name])
@@ -297,33 +298,9 @@ class Bucket:
     def _client(self) -> Any:
         return open_client(self.uri)
 
-    def _call(self, name: str, function: Callable[[], T]) -> T:
-        """Calls a function of the client; what takes longer than the client's few tries is logged and tried again."""
-        from obstore.exceptions import BaseError, GenericError, NotFoundError
+    def _call(self, name: str, function: Callable[[], T], measure_progress: Callable[[], int] = lambda: 0) -> T:
+        return call_with_retries(function, name, self.uri, self._retry_s, measure_progress)
 
-        start_s = time.monotonic()
-        pause_s = 0.2
-        while True:
-            try:
-                return function()
-            except GenericError as error:
-                problem = translate_error(error, f"{self.uri}/{name}")
-                left_s = start_s + read_retry_seconds() - time.monotonic()
-                if not isinstance(problem, TransientIOError) or pause_s > left_s:
-                    raise problem from error
-                _log.warning("%s; trying again for %.0f s", problem.problem, left_s)
-            except (NotFoundError, FileNotFoundError) as error:
-                # One of a file on this machine has a number.
-                if isinstance(error, OSError) and error.errno is not None:
-                    raise
-                if "NoSuchBucket" in str(error):
-                    raise InputError(
-                        "there is no such bucket", remedy="Make it, or correct --store.", file=self.uri
-                    ) from error
-                raise _AbsentError(name) from error
-            except (BaseError, PermissionError) as error:
-                if isinstance(error, OSError) and error.errno is not None:
-                    raise
-                raise translate_error(error, f"{self.uri}/{name}") from error
-            time.sleep(pause_s)
-            pause_s = min(2 * pause_s, _MAX_PAUSE_S)
+
+def _version_of(meta: Any) -> ObjectVersion:
+    return ObjectVersion(meta["e_tag"] or "", meta["version"])

@@ -19,6 +19,7 @@ RETRY_VARIABLE = "GENRE_STORE_RETRY_SECONDS"
 _RETRY_S = 180.0
 _REQUEST_S = 60.0
 _CLOUD_VARIABLES = ("AWS_", "AZURE_", "GOOGLE_", RETRY_VARIABLE)
+_client_process: dict[str, int] = {}
 _ENDPOINT_VARIABLES = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT")
 
 
@@ -37,16 +38,21 @@ def check_uri(uri: str) -> str:
     >>> check_uri("s3://bucket/genre/")
     's3://bucket/genre'
     """
-    parts = urlsplit(uri)
-    # The URI may be in logs and manifests. It is not repeated in this error either.
-    if parts.username is not None or parts.password is not None or parts.query or parts.fragment:
+    # The URI may be in logs and manifests. It is not repeated in this error either. A secret may hold a "/", behind
+    # which no parser takes the "@" for the end of credentials.
+    if any(character in uri for character in "@?#"):
         raise ConfigError(
             "the store's URI holds credentials or parameters",
             remedy="Give scheme, bucket and path alone; credentials belong into the environment.",
         )
+    try:
+        parts = urlsplit(uri)
+    except ValueError as error:
+        raise ConfigError("the store's URI is none", remedy="Give one such as s3://bucket/path.") from error
     path = parts.path.strip("/")
+    is_bucket = re.fullmatch(r"[\w.-]+", parts.netloc) is not None
     is_sound = all(re.fullmatch(r"[\w.=+ -]+", part) and part not in (".", "..") for part in path.split("/") if path)
-    if parts.scheme not in SCHEMES or not parts.netloc or not is_sound:
+    if parts.scheme not in SCHEMES or not is_bucket or not is_sound:
         known = ", ".join(f"{scheme}://bucket/path" for scheme in SCHEMES[:3])
         raise ConfigError(f"the store {uri!r} is of no known kind", remedy=f"Give a folder, or one of {known}.")
     return f"{parts.scheme}://{parts.netloc}" + (f"/{path}" if path else "")
@@ -64,26 +70,27 @@ def read_retry_seconds() -> float:
     return read_seconds(RETRY_VARIABLE, _RETRY_S)
 
 
-def read_seconds(variable: str, default: float) -> float:
+def read_seconds(variable: str, default: float, least: float = 0.0) -> float:
     """Reads a number of seconds from the environment.
 
     Args:
         variable: the environment variable's name.
         default: where it is not set.
+        least: the smallest number that is allowed.
 
     Returns:
         The number.
 
     Raises:
-        ConfigError: it is no number from 0 on.
+        ConfigError: it is no number from ``least`` on.
     """
     text = os.environ.get(variable)
     try:
         value = default if not text else float(text)
     except ValueError:
         value = -1.0
-    if not 0 <= value < float("inf"):
-        raise ConfigError(f"{variable} is {text!r}", remedy="Give a number of seconds, such as 60.")
+    if not least <= value < float("inf"):
+        raise ConfigError(f"{variable} is {text!r}", remedy=f"Give {least:.0f} seconds or more, such as 60.")
     return value
 
 
@@ -97,8 +104,15 @@ def open_client(uri: str) -> Any:
         A store of the package obstore.
 
     Raises:
-        ConfigError: a variable of the environment is wrong or missing.
+        ConfigError: a variable of the environment is wrong or missing, or a parent process used a client.
     """
+    # A fork copies no threads: a request of the child would wait for those of the client for ever.
+    if os.getpid() != _client_process.setdefault("pid", os.getpid()):
+        raise ConfigError(
+            "this process was forked from one that used the store",
+            remedy="Start processes by spawn, or open the store in the child alone.",
+            file=uri,
+        )
     # By the environment too, as a notebook may change it.
     variables = tuple(sorted((k, v) for k, v in os.environ.items() if k.startswith(_CLOUD_VARIABLES)))
     return _open_client(uri, variables)

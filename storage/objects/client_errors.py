@@ -11,6 +11,9 @@ _DENIED = (401, 403)
 _REFUSED = 400
 _PASSING = (408, 409, 425, 429)
 _FAILED = 500
+_UNSUPPORTED = 501
+# Where a machine of a cloud gets its credentials: asked only where the environment has none.
+_METADATA_HOSTS = ("169.254.169.254", "169.254.170.2", "metadata.google.internal")
 
 
 def translate_error(error: Exception, file: str) -> GenreError:
@@ -28,6 +31,9 @@ def translate_error(error: Exception, file: str) -> GenreError:
     text = str(error).partition("\n")[0]
     # Listings report a refusal as an error of no kind.
     status = int(found[1]) if (found := re.search(r"status code: (\d{3})", text)) else 0
+    special = _translate_special(str(error), status, file)
+    if special is not None:
+        return special
     is_denied = isinstance(error, PermissionDeniedError | UnauthenticatedError | PermissionError)
     if is_denied or status in _DENIED:
         return InputError(
@@ -44,3 +50,31 @@ def translate_error(error: Exception, file: str) -> GenreError:
         remedy="Check the server, and AWS_ENDPOINT_URL or its like; then run again, finished stages are kept.",
         file=file,
     )
+
+
+def _translate_special(text: str, status: int, file: str) -> GenreError | None:
+    """What a status or a class of error alone would report with the wrong remedy."""
+    # It comes as a refusal of the credentials, and passes once the clock is set.
+    if "RequestTimeTooSkewed" in text:
+        return TransientIOError(
+            "this machine's clock differs from the store's", remedy="Set it, for instance by NTP; run again.", file=file
+        )
+    if any(host in text.partition("\n")[0] for host in _METADATA_HOSTS):
+        return InputError(
+            "there are no credentials for the store",
+            remedy="Set the cloud's variables in the environment, such as AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY.",
+            file=file,
+        )
+    if "redirect without LOCATION" in text:
+        return InputError(
+            "the bucket is in another region, or the endpoint is of another server",
+            remedy="Check AWS_REGION and AWS_ENDPOINT_URL.",
+            file=file,
+        )
+    if status == _UNSUPPORTED:
+        return InputError(
+            "the server lacks a function that the store needs",
+            remedy="Take one that supports conditional writes (If-None-Match and If-Match).",
+            file=file,
+        )
+    return None

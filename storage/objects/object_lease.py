@@ -14,7 +14,7 @@ from genre_tasks.errors import GenreError
 from genre_tasks.progress import Progress
 from genre_tasks.temporary_names import describe_owner
 from storage.address import Address
-from storage.objects.bucket import Bucket
+from storage.objects.bucket import Bucket, ObjectVersion
 from storage.objects.client import read_seconds
 
 LEASES_FOLDER = ".leases"
@@ -25,6 +25,8 @@ _LEASE_S = 60.0
 _RENEWALS_PER_LEASE = 3
 _FIRST_POLL_S = 0.2
 _MAX_POLL_S = 2.0
+_SLOW_ANSWER_S = 1.0
+_SHORTEST_LEASE_S = 1.0
 _log = logging.getLogger("genre")
 
 
@@ -33,7 +35,7 @@ def hold_object_lease(bucket: Bucket, address: Address, progress: Progress) -> I
     """Waits until nobody else computes an artifact, and keeps others from it while the block runs.
 
     A thread renews the lease. One that was not renewed for ``GENRE_LEASE_SECONDS`` is taken over. The time is that of
-    the waiting process's monotonic clock, so that no jump of a clock matters.
+    the waiting process's monotonic clock, so that no jump of a clock matters, and stands still while the store is away.
 
     Args:
         bucket: of the store.
@@ -44,11 +46,13 @@ def hold_object_lease(bucket: Bucket, address: Address, progress: Progress) -> I
         Nothing.
 
     Raises:
-        ConfigError: ``GENRE_LEASE_SECONDS`` is no number.
+        ConfigError: ``GENRE_LEASE_SECONDS`` is no number, or less than a second.
         InputError: the store cannot be written.
         TransientIOError: the store does not answer.
     """
-    lease = _Lease(bucket, f"{LEASES_FOLDER}/{address.key}.json", read_seconds(LEASE_VARIABLE, _LEASE_S))
+    lease = _Lease(
+        bucket, f"{LEASES_FOLDER}/{address.key}.json", read_seconds(LEASE_VARIABLE, _LEASE_S, _SHORTEST_LEASE_S)
+    )
     lease.acquire(progress)
     stopped = threading.Event()
     renewal = threading.Thread(target=lease.renew_until, args=(stopped,), name="genre-lease", daemon=True)
@@ -66,59 +70,80 @@ class _Lease:
         self._bucket = bucket
         self._name = name
         self._seconds = seconds
+        # Short: a renewal that fails is followed by the next one, and the end of a stage must not wait for long.
+        self._renewing_bucket = Bucket(bucket.uri, retry_s=seconds / _RENEWALS_PER_LEASE)
         self._token = uuid.uuid4().hex
         self._renewals = 0
-        self._e_tag: str | None = None
+        self._version: ObjectVersion | None = None
 
     def acquire(self, progress: Progress) -> None:
         pause_s = _FIRST_POLL_S
-        # The ETag of the other's lease, and when it was first read.
-        last_e_tag = ""
-        since_s = time.monotonic()
-        while True:
-            self._e_tag = self._bucket.create(self._name, self._body())
-            if self._e_tag is not None:
-                return
+        # The other's lease, and for how long it was watched without a change.
+        last_version: ObjectVersion | None = None
+        unchanged_s = 0.0
+        read_s = time.monotonic()
+        self._version = self._bucket.create(self._name, self._body())
+        while self._version is None:
             found = self._bucket.read(self._name)
+            # A store that was away did not let the holder renew either: such a wait does not count.
+            waited_s = min(time.monotonic() - read_s, pause_s + _SLOW_ANSWER_S)
+            read_s = time.monotonic()
             if found is None:
-                continue
-            if found.e_tag != last_e_tag:
-                last_e_tag = found.e_tag
-                since_s = time.monotonic()
-            elif time.monotonic() - since_s > self._seconds:
-                self._e_tag = self._bucket.replace(self._name, self._body(), found.e_tag)
-                if self._e_tag is not None:
-                    _log.warning("took over the lease %s, which was not renewed for %.0f s", self._name, self._seconds)
-                    return
-            progress(0, 1, "another process computes this artifact")
-            time.sleep(pause_s)
-            pause_s = min(1.5 * pause_s, _MAX_POLL_S, max(self._seconds / _RENEWALS_PER_LEASE, _FIRST_POLL_S))
+                self._version = self._bucket.create(self._name, self._body())
+            elif found.version != last_version:
+                last_version = found.version
+                unchanged_s = 0.0
+            else:
+                unchanged_s += waited_s
+                if unchanged_s > self._seconds:
+                    self._version = self._bucket.replace(self._name, self._body(), found.version)
+                    if self._version is not None:
+                        text = "took over the lease %s, which was not renewed for %.0f s"
+                        _log.warning(text, self._name, self._seconds)
+            if self._version is None:
+                progress(0, 1, "another process computes this artifact")
+                time.sleep(pause_s)
+                pause_s = min(1.5 * pause_s, _MAX_POLL_S, self._seconds / _RENEWALS_PER_LEASE)
 
     def renew_until(self, stopped: threading.Event) -> None:
-        while not stopped.wait(self._seconds / _RENEWALS_PER_LEASE):
-            if self._e_tag is None:
-                return
-            self._renewals += 1
+        interval_s = self._seconds / _RENEWALS_PER_LEASE
+        pause_s = interval_s
+        while self._version is not None and not stopped.wait(pause_s):
             try:
-                self._e_tag = self._bucket.replace(self._name, self._body(), self._e_tag)
+                self._renew()
+                pause_s = interval_s
             except GenreError as error:
                 # The store is away for everyone. The next renewal finds out whether the lease is still ours.
                 _log.warning("a lease could not be renewed: %s", error)
-                continue
-            if self._e_tag is None:
+                pause_s = min(interval_s, _MAX_POLL_S)
+            if self._version is None:
                 # The commit is safe without: of two writers one wins.
                 _log.warning("the lease %s was taken over by another process", self._name)
 
     def release(self) -> None:
-        if self._e_tag is None:
-            return
         try:
-            # Only if it is ours. Between the two calls nobody takes it over, as it was renewed just now.
-            found = self._bucket.read(self._name)
-            if found is not None and found.e_tag == self._e_tag:
-                self._bucket.delete([self._name])
+            if self._version is not None:
+                # Renewed before it is removed, so that nobody takes it over between the two.
+                self._renew()
+            if self._version is not None:
+                self._renewing_bucket.delete([self._name])
         except GenreError as error:
             _log.warning("a lease could not be released, and ends by itself: %s", error)
+
+    def _renew(self) -> None:
+        if self._version is None:
+            return
+        version = self._renewing_bucket.replace(self._name, self._next_body(), self._version)
+        if version is None:
+            # An earlier renewal may have arrived although its answer was lost.
+            found = self._renewing_bucket.read(self._name)
+            if found is not None and self._token.encode() in found.data:
+                version = self._renewing_bucket.replace(self._name, self._next_body(), found.version)
+        self._version = version
+
+    def _next_body(self) -> bytes:
+        self._renewals += 1
+        return self._body()
 
     def _body(self) -> bytes:
         # The token and the counter make every body another, and so every ETag.

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 
 from genre_tasks.atomic_path import atomic_path
+from genre_tasks.errors import ConfigError
 from storage.files import digest_file
 from storage.objects.bucket import Bucket, ObjectInfo
 from storage.records import split_record_name
@@ -34,7 +36,9 @@ class ObjectRecordFolders:
         parts = split_record_name(name)
         folder = self._folder.joinpath(*parts)
         known = _read_sync(folder)
-        found = {info.name[len(name) + 1 :]: info for info in self._bucket.list(name)}
+        listed = {info.name[len(name) + 1 :]: info for info in self._bucket.list(name)}
+        # Somebody may have uploaded a folder with hidden files.
+        found = {file: info for file, info in listed.items() if _is_record_name(file)}
         for file, info in found.items():
             self._bring(folder, file, info, known)
         # What was in the bucket once and is not any more. Files that were never pushed stay.
@@ -62,7 +66,7 @@ class ObjectRecordFolders:
         found: list[tuple[datetime, str, Path]] = []
         for info in self._bucket.list(parent, start):
             name, _, rest = info.name[len(parent) + 1 :].partition("/")
-            if rest != file or not name.startswith(start):
+            if rest != file or not name.startswith(start) or not _is_record_name(name):
                 continue
             folder = self._folder.joinpath(*split_record_name(f"{parent}/{name}"))
             known = _read_sync(folder)
@@ -73,7 +77,6 @@ class ObjectRecordFolders:
 
     def _bring(self, folder: Path, file: str, info: ObjectInfo, known: dict[str, dict[str, str]]) -> bool:
         """Downloads a file if it changed; whether it did."""
-        split_record_name(file)
         target = folder / file
         if known.get(file, {}).get("e_tag") == info.e_tag and target.is_file():
             return False
@@ -84,6 +87,12 @@ class ObjectRecordFolders:
         os.utime(target, (info.modified.timestamp(), info.modified.timestamp()))
         known[file] = {"sha256": digest, "e_tag": info.e_tag}
         return True
+
+
+def _is_record_name(name: str) -> bool:
+    with suppress(ConfigError):
+        return bool(split_record_name(name))
+    return False
 
 
 def _list_files(folder: Path) -> Iterator[tuple[str, Path]]:

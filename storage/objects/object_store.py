@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import uuid
-from collections.abc import Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, suppress
-from datetime import UTC, datetime
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from genre_tasks.errors import ArtifactCorruptError, ConfigError, TransientIOError
@@ -19,16 +17,16 @@ from storage.codecs import get_codec
 from storage.io_errors import make_corruption_error, os_errors_translated
 from storage.manifest import MANIFEST, Manifest, NewerSchemaError, parse_manifest
 from storage.manifest_writer import find_damage, write_artifact
-from storage.objects.bucket import Bucket, ObjectInfo
-from storage.objects.object_lease import LEASES_FOLDER, hold_object_lease
+from storage.objects.abandoned import PROBE_START, find_abandoned
+from storage.objects.bucket import Bucket, ObjectVersion
+from storage.objects.manifest_listing import ManifestListing
+from storage.objects.object_lease import hold_object_lease
 from storage.objects.object_records import ObjectRecordFolders
-from storage.objects.payloads import ETAGS_START, PAYLOAD_START, Payloads, is_payload
+from storage.objects.payloads import Payloads
 from storage.objects.read_cache import ReadCache, find_cache_folder, read_limit_bytes
 from storage.store import Artifact, Provenance
 
-_PROBE = ".probe-"
 _PUBLISH_ATTEMPTS = 5
-_MANIFESTS_AT_ONCE = 16
 
 
 class ObjectStore:
@@ -50,6 +48,7 @@ class ObjectStore:
         folder = find_cache_folder() / name
         self._cache = ReadCache(folder, read_limit_bytes())
         self._payloads = Payloads(self._bucket, self._cache)
+        self._manifests = ManifestListing(self._bucket, self._cache)
         self.records = ObjectRecordFolders(self._bucket, folder / "records")
 
     @property
@@ -59,9 +58,7 @@ class ObjectStore:
 
     def check_writable(self) -> None:
         """Writes and removes a small object: see :meth:`storage.store.Store.check_writable`."""
-        name = f"{_PROBE}{describe_owner()}-{uuid.uuid4().hex}"
-        self._bucket.write(name, b"\0")
-        self._bucket.delete([name])
+        self._bucket.delete([self._write_probe()])
 
     def exists(self) -> bool:
         """Tells whether anything was ever written: see :meth:`storage.store.Store.exists`."""
@@ -121,9 +118,9 @@ class ObjectStore:
         codec = get_codec(artifact.manifest.kind)
         with os_errors_translated(artifact.path, artifact.address):
             for _ in range(_PUBLISH_ATTEMPTS):
-                self._payloads.bring(artifact, artifact.manifest.files, trusts_cache=False)
                 # Another process may make room just now.
                 with suppress(FileNotFoundError):
+                    self._payloads.bring(artifact, artifact.manifest.files, trusts_cache=False)
                     return codec.read(artifact.path, artifact.manifest.measurements)
             raise make_corruption_error(artifact.address, artifact.path, "The cache loses the artifact's files")
 
@@ -153,15 +150,21 @@ class ObjectStore:
             NewerSchemaError: as :meth:`storage.store.Store.discard` says.
         """
         address = target.address if isinstance(target, Artifact) else target
-        # Only for the error: a newer version's artifact is not ours to remove.
+        # Before the manifest goes: a writer that comes then must not lose its files.
+        names = [info.name for info in self._bucket.list(str(address))]
         try:
-            self.find(address)
+            found = self.find(address)
+            if isinstance(target, Artifact) and found is not None and found.manifest != target.manifest:
+                # Another process has replaced it already.
+                return
         except NewerSchemaError:
+            # It is not ours to remove.
             raise
         except ArtifactCorruptError:
             pass
-        self._bucket.delete([f"{address}/{MANIFEST}"])
-        self._bucket.delete([info.name for info in self._bucket.list(str(address))])
+        manifest = f"{address}/{MANIFEST}"
+        self._bucket.delete([manifest])
+        self._bucket.delete([name for name in names if name != manifest])
 
     def artifacts(
         self,
@@ -185,9 +188,8 @@ class ObjectStore:
                 break
             parts.append(part)
         wanted = {"dataset": dataset, "log": log, "chunk": chunk, "stage": stage, "key": key, "kind": kind}
-        start = key or key_start
-        infos = (info for info in self._list_manifests("/".join(parts)) if _key_of(info).startswith(start))
-        for info, data in self._read_manifests(infos):
+        infos = self._manifests.find("/".join(parts), key or key_start)
+        for info, data in self._manifests.read_all(infos):
             # A damaged artifact must not hide the sound ones after it; `verify_all` reports it.
             with suppress(ArtifactCorruptError, ConfigError):
                 artifact = self._make_artifact(None, data, info.name)
@@ -200,7 +202,7 @@ class ObjectStore:
         Yields:
             (relative path, what is wrong with it or ``None``).
         """
-        for info, data in self._read_manifests(self._list_manifests("")):
+        for info, data in self._manifests.read_all(self._manifests.find()):
             name = info.name.removesuffix(f"/{MANIFEST}")
             try:
                 artifact = self._make_artifact(None, data, info.name)
@@ -218,28 +220,18 @@ class ObjectStore:
         Returns:
             How many objects and folders were removed.
         """
-        payloads: dict[str, list[ObjectInfo]] = {}
-        abandoned: list[ObjectInfo] = []
-        for info in self._bucket.list():
-            if info.name.startswith((f"{LEASES_FOLDER}/", _PROBE)):
-                abandoned.append(info)
-            elif is_payload(info.name):
-                folder = info.name.partition(f"/{PAYLOAD_START}")[0].partition(f"/{ETAGS_START}")[0]
-                payloads.setdefault(folder, []).append(info)
-        for folder, infos in payloads.items():
-            found = self._bucket.read(f"{folder}/{MANIFEST}")
-            digest = ""
-            if found is not None:
-                try:
-                    digest = parse_manifest(found.data, Path(folder, MANIFEST)).payload_digest[:12]
-                except ArtifactCorruptError:
-                    # It may be a newer version's, whose files are not known here.
-                    continue
-            abandoned += [info for info in infos if not digest or digest not in info.name[len(folder) :]]
-        now = datetime.now(UTC)
-        old = [info.name for info in abandoned if (now - info.modified).total_seconds() >= older_than_s]
-        self._bucket.delete(old)
+        probe = self._write_probe()
+        try:
+            old = find_abandoned(self._bucket, probe, older_than_s)
+            self._bucket.delete(old)
+        finally:
+            self._bucket.delete([probe])
         return len(old) + self._cache.clean_temporaries()
+
+    def _write_probe(self) -> str:
+        name = f"{PROBE_START}{describe_owner()}-{uuid.uuid4().hex}"
+        self._bucket.write(name, b"\0")
+        return name
 
     def _publish(self, folder: Path, manifest: Manifest) -> Artifact:
         """Uploads a folder's files and puts the manifest, where the first sound artifact stays."""
@@ -247,9 +239,11 @@ class ObjectStore:
         problem: ArtifactCorruptError | None = None
         # A loop, because another writer may come or go between any two of these calls.
         for _ in range(_PUBLISH_ATTEMPTS):
-            found = self._find_sound(address)
+            found, damaged = self._find_sound(address)
             if found is not None:
                 return found
+            if damaged is not None:
+                self._payloads.remove_unlisted(manifest)
             self._payloads.upload(folder, manifest)
             artifact = self._make_artifact(address, manifest.to_json())
             try:
@@ -258,11 +252,11 @@ class ObjectStore:
                 # A truncated upload must never become an artifact.
                 problem = error
                 continue
-            if self._bucket.create(f"{address}/{MANIFEST}", manifest.to_json()) is None:
-                winner = self._find_sound(address)
+            if not self._put_manifest(manifest, damaged):
+                winner, _ = self._find_sound(address)
                 if winner is not None and winner.manifest.payload_digest != manifest.payload_digest:
                     self._payloads.delete(manifest)
-        found = self._find_sound(address)
+        found, _ = self._find_sound(address)
         if found is None:
             raise TransientIOError(
                 f"the store does not keep what is written: {problem or 'the artifact vanishes'}",
@@ -271,18 +265,26 @@ class ObjectStore:
             ) from problem
         return found
 
-    def _find_sound(self, address: Address) -> Artifact | None:
-        """The artifact at an address; a damaged one is removed."""
+    def _put_manifest(self, manifest: Manifest, damaged: ObjectVersion | None) -> bool:
+        """Puts a manifest where there is none, or only this damaged one: another writer's is never replaced."""
+        name = f"{manifest.address}/{MANIFEST}"
+        if damaged is None:
+            return self._bucket.create(name, manifest.to_json()) is not None
+        return self._bucket.replace(name, manifest.to_json(), damaged) is not None
+
+    def _find_sound(self, address: Address) -> tuple[Artifact | None, ObjectVersion | None]:
+        """The artifact at an address, or the version of a damaged one's manifest."""
+        content = self._bucket.read(f"{address}/{MANIFEST}")
+        if content is None:
+            return None, None
         try:
-            found = self.find(address)
-            if found is not None:
-                self.verify(found)
-            return found
+            artifact = self._make_artifact(address, content.data)
+            self.verify(artifact)
+            return artifact, None
         except NewerSchemaError:
             raise
         except ArtifactCorruptError:
-            self.discard(address)
-            return None
+            return None, content.version
 
     def _make_artifact(self, address: Address | None, data: bytes, name: str = "") -> Artifact:
         """Parses a manifest that must be of the address, or of the object's name."""
@@ -294,47 +296,3 @@ class ObjectStore:
             )
         path = self._cache.find_folder(manifest.address, manifest.payload_digest)
         return Artifact(manifest.address, path, manifest)
-
-    def _list_manifests(self, folder: str) -> Iterator[ObjectInfo]:
-        for info in self._bucket.list(folder):
-            parts = PurePosixPath(info.name).parts
-            # A file of a payload may have the name, too. Hidden folders and records are no artifacts.
-            is_manifest = parts[-1] == MANIFEST and not is_payload(info.name) and not info.name.startswith(".")
-            if is_manifest and len(parts) > _FEWEST_PARTS:
-                yield info
-
-    def _read_manifests(self, infos: Iterable[ObjectInfo]) -> Iterator[tuple[ObjectInfo, bytes]]:
-        """Reads manifests, in the order of their artifacts' paths; those that have not changed come from the cache."""
-        # A listing is in the order of bytes, in which "-" comes before "/".
-        ordered = sorted(infos, key=lambda info: PurePosixPath(info.name).parts)
-        with ThreadPoolExecutor(_MANIFESTS_AT_ONCE) as pool:
-            for start in range(0, len(ordered), 4 * _MANIFESTS_AT_ONCE):
-                some = ordered[start : start + 4 * _MANIFESTS_AT_ONCE]
-                for info, data in zip(some, pool.map(self._read_manifest, some), strict=True):
-                    # One that is gone was discarded after the listing.
-                    if data is not None:
-                        yield info, data
-
-    def _read_manifest(self, info: ObjectInfo) -> bytes | None:
-        tag = hashlib.sha256(f"{info.name} {info.e_tag}".encode()).hexdigest()
-        cached = self._cache.folder / "manifests" / tag[:2] / tag
-        with suppress(OSError):
-            return cached.read_bytes()
-        found = self._bucket.read(info.name)
-        if found is None:
-            return None
-        # Only as it was listed: the name of the file says so.
-        if found.e_tag == info.e_tag:
-            with suppress(OSError), self._cache.temporary() as temporary:
-                (temporary / "manifest").write_bytes(found.data)
-                cached.parent.mkdir(parents=True, exist_ok=True)
-                (temporary / "manifest").replace(cached)
-        return found.data
-
-
-# Dataset, log, chunk, stage, key and the manifest's name: less is a record.
-_FEWEST_PARTS = 5
-
-
-def _key_of(info: ObjectInfo) -> str:
-    return info.name.split("/")[-2]

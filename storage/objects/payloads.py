@@ -60,6 +60,20 @@ class Payloads:
         body = {entry.path: e_tag for entry, e_tag in zip(manifest.files, e_tags, strict=True)}
         self._bucket.write(_etags_name(manifest), json.dumps(body).encode())
 
+    def remove_unlisted(self, manifest: Manifest) -> None:
+        """Removes what is among the files of an artifact and not in its manifest.
+
+        Args:
+            manifest: names the files.
+
+        Raises:
+            InputError: the store must not be written.
+            TransientIOError: the store does not answer.
+        """
+        base = _payload_folder(manifest)
+        listed = {f"{base}/{entry.path}" for entry in manifest.files}
+        self._bucket.delete([info.name for info in self._bucket.list(base) if info.name not in listed])
+
     def delete(self, manifest: Manifest) -> None:
         """Removes the files of an artifact that never came to be.
 
@@ -112,6 +126,8 @@ class Payloads:
         missing = [entry for entry in entries if not _is_cached(folder, entry, trusts_cache)]
         if missing:
             folder.mkdir(parents=True, exist_ok=True)
+            # At first, so that no other process makes room here while the files come.
+            self._cache.mark_used(folder)
             with ThreadPoolExecutor(_THREADS) as pool:
                 list(pool.map(lambda entry: self._bring_file(artifact, entry), missing))
             if not (folder / MANIFEST).exists():
@@ -123,12 +139,15 @@ class Payloads:
     def _find_damage(self, entry: FileEntry, info: ObjectInfo | None, e_tag: str) -> str | None:
         if info is None:
             return "A file is missing"
-        if info.size != entry.size:
-            return f"A file has {info.size} bytes, expected {entry.size}"
         is_unaltered = bool(e_tag) and info.e_tag == e_tag
-        if is_unaltered or self._bucket.download(info.name)[0] == entry.sha256:
-            return None
-        return "A file does not have the sha256 of the manifest"
+        if is_unaltered or info.size != entry.size:
+            return _describe_damage(entry, entry.sha256, info.size)
+        try:
+            digest, size = self._bucket.download(info.name)
+        except FileNotFoundError:
+            # It was removed after the listing.
+            return "A file is missing"
+        return _describe_damage(entry, digest, size)
 
     def _read_etags(self, manifest: Manifest) -> dict[str, str]:
         found = self._bucket.read(_etags_name(manifest))
@@ -141,17 +160,19 @@ class Payloads:
 
     def _bring_file(self, artifact: Artifact, entry: FileEntry) -> None:
         target = artifact.path / entry.path
-        target.parent.mkdir(parents=True, exist_ok=True)
         with self._cache.temporary() as temporary:
             part = temporary / "file"
             try:
-                self._bucket.download(f"{_payload_folder(artifact.manifest)}/{entry.path}", part)
+                digest, size = self._bucket.download(f"{_payload_folder(artifact.manifest)}/{entry.path}", part)
             except FileNotFoundError as error:
                 raise self._corruption_error(artifact, entry.path, "A file is missing") from error
-            problem = find_damage(part, entry)
+            problem = _describe_damage(entry, digest, size)
             if problem:
                 raise self._corruption_error(artifact, entry.path, problem)
+            # Only now, as the folder may have gone while a large file came.
+            target.parent.mkdir(parents=True, exist_ok=True)
             part.replace(target)
+            self._cache.mark_used(artifact.path)
 
     def _corruption_error(self, artifact: Artifact, name: str, problem: str) -> Exception:
         # As people find it in the bucket, not in this machine's cache.
@@ -180,6 +201,12 @@ def _payload_folder(manifest: Manifest) -> str:
 
 def _etags_name(manifest: Manifest) -> str:
     return f"{manifest.address}/{ETAGS_START}{manifest.payload_digest[:12]}.json"
+
+
+def _describe_damage(entry: FileEntry, digest: str, size: int) -> str | None:
+    if size != entry.size:
+        return f"A file has {size} bytes, expected {entry.size}"
+    return None if digest == entry.sha256 else "A file does not have the sha256 of the manifest"
 
 
 def _is_cached(folder: Path, entry: FileEntry, trusts_cache: bool) -> bool:

@@ -83,6 +83,8 @@ class ReadCache:
             OSError: it cannot be moved.
         """
         size = sum(path.stat().st_size for path in temporary.rglob("*") if path.is_file())
+        # Before the move: without it a process that dies now would leave a folder that never goes.
+        self.mark_used(temporary)
         target.parent.mkdir(parents=True, exist_ok=True)
         # A process that was faster has the same bytes there.
         with suppress(OSError):
@@ -120,6 +122,9 @@ class ReadCache:
             trash = self.folder / f"tmp-{describe_owner()}-{uuid.uuid4().hex}"
             # Another process may do the same.
             with suppress(OSError):
+                # Somebody may have begun to use it since it was measured.
+                if (folder / _USED).stat().st_mtime > used:
+                    continue
                 folder.rename(trash)
                 shutil.rmtree(trash, ignore_errors=True)
             total -= size
@@ -148,6 +153,9 @@ def find_cache_folder() -> Path:
     Returns:
         ``$GENRE_CACHE_DIR``, or ``genre`` in the user's folder of caches, or among the temporary files where this
         user has none.
+
+    Raises:
+        ConfigError: the folder among the temporary files belongs to another user.
     """
     stated = os.environ.get(FOLDER_VARIABLE)
     if stated:
@@ -159,7 +167,12 @@ def find_cache_folder() -> Path:
             folder.mkdir(parents=True, exist_ok=True)
         if os.access(folder, os.W_OK | os.X_OK):
             return folder
-    return Path(tempfile.gettempdir()).absolute() / f"genre-cache-{os.getuid()}"
+    folder = Path(tempfile.gettempdir()).absolute() / f"genre-cache-{os.getuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    # Everybody may write there: another user could have put files into it that would be read as artifacts.
+    if folder.is_symlink() or folder.stat().st_uid != os.getuid():
+        raise ConfigError(f"{folder} belongs to another user", remedy=f"Set {FOLDER_VARIABLE} to a folder of yours.")
+    return folder
 
 
 def read_limit_bytes() -> int:

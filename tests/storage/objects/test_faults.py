@@ -12,7 +12,7 @@ import pytest
 
 from genre_tasks.errors import ArtifactCorruptError, ConfigError, InputError, TransientIOError
 from storage.manifest import MANIFEST
-from storage.objects.bucket import Bucket
+from storage.objects.bucket import Bucket, ObjectVersion
 from storage.objects.object_lease import LEASES_FOLDER
 from storage.objects.object_store import ObjectStore
 from storage.opening import open_store
@@ -40,10 +40,10 @@ def test_a_killed_process_loses_its_lease(store: ObjectStore, monkeypatch: pytes
         assert holder.stdout is not None and holder.stdout.readline() == b"held\n"
         waited: list[str] = []
         # While it lives it renews: the lease outlasts its time.
-        with pytest.raises(TimeoutError), store.lease(address(), lambda done, total, words: _wait(waited, 3.0)):
+        with pytest.raises(TimeoutError), store.lease(address(), lambda done, total, note="": _wait(waited, 3.0)):
             pass
         holder.kill()
-    with store.lease(address(), lambda done, total, words: waited.append(words)):
+    with store.lease(address(), lambda done, total, note="": waited.append(note)):
         assert [info.name for info in store._bucket.list(LEASES_FOLDER)] == [f"{LEASES_FOLDER}/{KEY}.json"]
     assert waited and list(store._bucket.list(LEASES_FOLDER)) == []
 
@@ -59,14 +59,14 @@ def test_a_holder_that_lost_its_lease_leaves_the_new_one_alone(store: ObjectStor
         name = f"{LEASES_FOLDER}/{KEY}.json"
         found = store._bucket.read(name)
         assert found is not None
-        assert store._bucket.replace(name, b"of another", found.e_tag) is not None
+        assert store._bucket.replace(name, b"of another", found.version) is not None
     assert (left := store._bucket.read(name)) is not None and left.data == b"of another"
 
 
 def test_of_two_that_write_one_succeeds(store: ObjectStore) -> None:
     bucket = store._bucket
     start = threading.Barrier(8)
-    results: list[str | None] = []
+    results: list[ObjectVersion | None] = []
 
     def create(k: int) -> None:
         start.wait()
@@ -77,11 +77,12 @@ def test_of_two_that_write_one_succeeds(store: ObjectStore) -> None:
         thread.start()
     for thread in threads:
         thread.join()
-    assert sum(e_tag is not None for e_tag in results) == 1
+    assert sum(version is not None for version in results) == 1
     # The same content counts as written: the answer to the first try may have been lost.
     found = bucket.read("one")
-    assert found is not None and bucket.create("one", found.data) == found.e_tag
-    assert bucket.replace("one", b"new", "wrong") is None and bucket.replace("none", b"new", found.e_tag) is None
+    assert found is not None and bucket.create("one", found.data) == found.version
+    assert bucket.replace("one", b"new", ObjectVersion("wrong")) is None
+    assert bucket.replace("none", b"new", found.version) is None
 
 
 def test_a_truncated_upload_is_written_again(store: ObjectStore, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,7 +93,7 @@ def test_a_truncated_upload_is_written_again(store: ObjectStore, monkeypatch: py
         if truncated:
             return upload(self, name, path)
         truncated.append(name)
-        return self.write(name, path.read_bytes()[:-1])
+        return self.write(name, path.read_bytes()[:-1]).e_tag
 
     monkeypatch.setattr(Bucket, "upload", truncate_once)
     made = store.commit(address(), "evaluation", make("evaluation"))
@@ -102,7 +103,7 @@ def test_a_truncated_upload_is_written_again(store: ObjectStore, monkeypatch: py
 
 
 def test_a_server_that_keeps_nothing_is_named(store: ObjectStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Bucket, "upload", lambda self, name, path: self.write(name, b""))
+    monkeypatch.setattr(Bucket, "upload", lambda self, name, path: self.write(name, b"").e_tag)
     with pytest.raises(TransientIOError, match="does not keep what is written"):
         store.commit(address(), "evaluation", make("evaluation"))
     assert store.find(address()) is None

@@ -27,6 +27,7 @@ class TestObjectStore(StoreSuite):
         bucket = self._bucket
         (info,) = [i for i in bucket.list(str(artifact.address)) if i.name.endswith(f"/{name}")]
         found = bucket.read(info.name)
+        assert found is not None
         data = bytearray(found.data)
         data[len(data) // 2] ^= 4
         bucket.write(info.name, bytes(data))
