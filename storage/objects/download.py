@@ -7,7 +7,8 @@ from typing import BinaryIO
 
 from storage.objects.client import open_client
 
-_PIECE_BYTES = 8 << 20
+# What of a piece has arrived is lost when the line breaks.
+_PIECE_BYTES = 1 << 20
 
 
 class Download:

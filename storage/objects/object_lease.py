@@ -25,7 +25,7 @@ _LEASE_S = 60.0
 _RENEWALS_PER_LEASE = 3
 _FIRST_POLL_S = 0.2
 _MAX_POLL_S = 2.0
-_SLOW_ANSWER_S = 1.0
+_SLOW_ANSWER_FRACTION = 0.1
 _SHORTEST_LEASE_S = 1.0
 _log = logging.getLogger("genre")
 
@@ -86,7 +86,7 @@ class _Lease:
         while self._version is None:
             found = self._bucket.read(self._name)
             # A store that was away did not let the holder renew either: such a wait does not count.
-            waited_s = min(time.monotonic() - read_s, pause_s + _SLOW_ANSWER_S)
+            waited_s = min(time.monotonic() - read_s, pause_s + _SLOW_ANSWER_FRACTION * self._seconds)
             read_s = time.monotonic()
             if found is None:
                 self._version = self._bucket.create(self._name, self._body())
