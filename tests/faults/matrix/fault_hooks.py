@@ -83,7 +83,8 @@ def suffer(folder: Path, stage: str) -> None:
         raise TransientIOError("an armed fault", remedy="It is tried again.")
 
 
-def _hook_stage_runner(folder: Path, module: ModuleType) -> None:
+def hook_stage_runner(folder: Path, module: ModuleType) -> None:
+    """Changes ``flows.pipeline.stage_runner``: computations are noted, and suffer what is armed."""
     compute: Callable[..., Any] = module._compute_artifact
     measure: Callable[[], AbstractContextManager[Any]] = module.measure_usage
 
@@ -110,7 +111,8 @@ def _hook_stage_runner(folder: Path, module: ModuleType) -> None:
     module.measure_usage = measure_and_suffer  # type: ignore[attr-defined]
 
 
-def _hook_flow_engine(folder: Path, module: ModuleType) -> None:
+def hook_flow_engine(folder: Path, module: ModuleType) -> None:
+    """Changes ``prefect.flow_engine``: a run may be stopped before it sends its first heartbeat."""
     base = module.BaseFlowRunEngine
     emit: Callable[..., None] = base._emit_flow_run_heartbeat
 
@@ -123,7 +125,7 @@ def _hook_flow_engine(folder: Path, module: ModuleType) -> None:
     base._emit_flow_run_heartbeat = hold_and_emit
 
 
-_HOOKS = {"flows.pipeline.stage_runner": _hook_stage_runner, "prefect.flow_engine": _hook_flow_engine}
+_HOOKS = {"flows.pipeline.stage_runner": hook_stage_runner, "prefect.flow_engine": hook_flow_engine}
 
 
 class HookFinder(importlib.abc.MetaPathFinder):

@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 
 from flows.dataset.child_runs import ACTIVE_STATES, ChildRun
-from flows.dataset.supervisor import SupervisionLimits, Supervisor
+from flows.dataset.supervisor import SupervisionLimits, Supervisor, read_limits
 from flows.dataset.work_units import WorkUnit
+from genre_tasks.errors import ConfigError
 
 A = WorkUnit("synthetic:a")
 B = WorkUnit("synthetic:b")
@@ -156,3 +157,25 @@ def test_an_outage_of_the_server_does_not_make_runs_stale() -> None:
 
     runs.read = away_for_a_minute  # type: ignore[method-assign]
     assert supervise(runs, [A])[0]["status"] == "done" and not runs.crashed
+
+
+def test_the_environment_changes_when_a_run_counts_as_dead() -> None:
+    assert read_limits(8, 3, {}) == SupervisionLimits(in_flight=8, attempts=3)
+    changed = read_limits(4, 2, {"GENRE_PENDING_SECONDS": "600", "GENRE_SILENT_SECONDS": "75.5"})
+    assert changed == SupervisionLimits(in_flight=4, attempts=2, pending_s=600.0, silent_s=75.5)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("GENRE_PENDING_SECONDS", "soon"),
+        ("GENRE_PENDING_SECONDS", "0"),
+        ("GENRE_PENDING_SECONDS", "inf"),
+        # Less than two heartbeats would end runs that live.
+        ("GENRE_SILENT_SECONDS", "59"),
+        ("GENRE_SILENT_SECONDS", "nan"),
+    ],
+)
+def test_a_wrong_time_in_the_environment_is_an_error(name: str, value: str) -> None:
+    with pytest.raises(ConfigError, match=name):
+        read_limits(8, 3, {name: value})
