@@ -25,7 +25,7 @@ from prefect.exceptions import ObjectNotFound
 from prefect.states import Crashed
 
 from flows.dataset.live_table import TABLE_KEY
-from flows.dataset.prefect_runs import DEPLOYMENT, dataset_tag, read_last_heartbeats
+from flows.dataset.prefect_runs import DEPLOYMENT, dataset_tag, has_heartbeat
 from flows.dataset.server_calls import call_server
 from flows.dataset.supervisor import HEARTBEAT_S
 from genre_tasks.errors import ConfigError
@@ -169,7 +169,7 @@ def _is_alive(client: SyncPrefectClient, run: FlowRun) -> bool:
     silent_s = 3.0 * HEARTBEAT_S
     if run.estimated_run_time.total_seconds() < silent_s:
         return True
-    return bool(read_last_heartbeats(client, [str(run.id)], since_s=silent_s))
+    return has_heartbeat(client, str(run.id), since_s=silent_s)
 
 
 def _read_table(client: SyncPrefectClient, run_id: UUID) -> list[dict[str, Any]]:
