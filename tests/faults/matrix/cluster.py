@@ -18,7 +18,7 @@ from typing import Any
 
 import psutil
 from prefect.client.orchestration import SyncPrefectClient, get_client
-from prefect.client.schemas.actions import GlobalConcurrencyLimitCreate
+from prefect.client.schemas.actions import GlobalConcurrencyLimitCreate, GlobalConcurrencyLimitUpdate
 from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterState, FlowRunFilterStateType
 from prefect.client.schemas.objects import FlowRun, StateType
 from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
@@ -32,7 +32,8 @@ from tests.faults.matrix.compute_log import Note, read_notes
 
 POOL = "genre"
 GPU_LIMIT = "gpu"
-GPU_SLOTS = 2
+# Of two workers: runs that are killed do not hold up the others until their slots are taken back.
+GPU_SLOTS = 8
 WORKERS = 2
 ATTEMPTS = 12
 PENDING_S = 45
@@ -52,6 +53,9 @@ class Cluster:
         workers: those of logs, one log at a time each.
         faults: folder of the hooks.
         objects: the S3 server, once it was needed.
+        commands: of all datasets.
+        orphaned_groups: process groups of workers that were killed.
+        store_env: what processes need to reach the store.
     """
 
     folder: Path
@@ -63,6 +67,7 @@ class Cluster:
     objects: ObjectServer | None = None
     commands: list[subprocess.Popen[bytes]] = field(default_factory=list)
     orphaned_groups: list[int] = field(default_factory=list)
+    store_env: dict[str, str] = field(default_factory=dict)
 
     @contextmanager
     def client(self) -> Iterator[SyncPrefectClient]:
@@ -74,7 +79,7 @@ class Cluster:
 
     def client_env(self, **more: str) -> dict[str, str]:
         """The environment of a command that talks to this server."""
-        return small_run.environment(self.folder, **self.server.env(), **more)
+        return small_run.environment(self.folder, **{**self.server.env(), **self.store_env, **more})
 
     def start_dataset(self, logs: Sequence[str], store: str, *more: str, **env: str) -> subprocess.Popen[bytes]:
         """Starts ``genre dataset LOGS --pool … --follow``; its output goes to files by the number of the command."""
@@ -135,6 +140,11 @@ class Cluster:
         with self.client() as client:
             return client.read_flow_runs(flow_run_filter=wanted)
 
+    def set_slots(self, slots: int) -> None:
+        """Changes how many stages may use a GPU at a time."""
+        with self.client() as client:
+            client.update_global_concurrency_limit(GPU_LIMIT, GlobalConcurrencyLimitUpdate(limit=slots))
+
     def count_slots(self) -> int:
         """Slots that are taken of all global concurrency limits."""
         with self.client() as client:
@@ -151,8 +161,9 @@ class Cluster:
         services = [self.coordinator, *self.workers]
         for service in services:
             service.kill()
-        self.coordinator = make_coordinator(self.folder, self.server, env)
-        self.workers = [make_worker(self.folder, self.server, self.faults, n, env) for n in range(WORKERS)]
+        more = {**self.store_env, **env}
+        self.coordinator = make_coordinator(self.folder, self.server, more)
+        self.workers = [make_worker(self.folder, self.server, self.faults, n, more) for n in range(WORKERS)]
         for service in [self.coordinator, *self.workers]:
             service.start()
 

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from flows.pipeline.gpu_slot import GPU_STAGES
-from tests.faults.matrix.cluster import Cluster
+from tests.faults.matrix.cluster import GPU_SLOTS, Cluster
 from tests.faults.matrix.fault_hooks import ARMED, TAKEN
 from tests.faults.matrix.scenario import LOGS, Fault, Injection
 from tests.faults.matrix.worker_faults import find_logs, find_runs
@@ -102,8 +102,16 @@ class RetryUnderLimit(Fault):
     """A stage with a slot of a concurrency limit fails once."""
 
     name = "retry under a concurrency limit"
-    how = "TransientIOError in a stage that has a slot of the limit; two workers, two slots"
+    how = "TransientIOError in a stage that has the only slot of the limit, for which two workers wait"
     pause_s = (0.0, 2.0)
+
+    @contextmanager
+    def surround(self, cluster: Cluster) -> Iterator[None]:
+        cluster.set_slots(1)
+        try:
+            yield
+        finally:
+            cluster.set_slots(GPU_SLOTS)
 
     def inject(self, cluster: Cluster, rng: random.Random) -> Injection | None:
         return arm(cluster, f"transient@{rng.choice(sorted(GPU_STAGES))}")

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import pytest
 
 from flows.machine.facts import git_commit
-from tests.faults.matrix import machine_faults, service_faults, worker_faults
+from tests.faults.matrix import machine_faults, service_faults, store_faults, worker_faults
 from tests.faults.matrix.cluster import Cluster, start_cluster
 from tests.faults.matrix.fault_table import TABLE, find_faults, merge_row
 from tests.faults.matrix.scenario import Fault, run_fault, run_quietly
@@ -33,6 +33,10 @@ FAULTS: tuple[type[Fault], ...] = (
     service_faults.ServerKilled,
     service_faults.DatabaseRestarted,
     machine_faults.ClockJumps,
+    store_faults.StoreUnreachable,
+    store_faults.StoreFails,
+    store_faults.StoreSlow,
+    store_faults.UploadTruncated,
 )
 
 

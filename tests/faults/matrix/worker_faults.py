@@ -14,11 +14,14 @@ from prefect.client.schemas.objects import StateType
 from flows.dataset.prefect_runs import has_heartbeat
 from flows.operations import Worker
 from tests.faults.matrix.cluster import Cluster
+from tests.faults.matrix.compute_log import read_notes
 from tests.faults.matrix.fault_hooks import ARMED, TAKEN
 from tests.faults.matrix.scenario import Fault, Injection
 
 _RUN_VARIABLE = "PREFECT__FLOW_RUN_ID"
 _WAIT_S = 60.0
+_STAGE_FRACTION = 2 / 3
+_STAGE_S = 15.0
 
 
 def find_runs(cluster: Cluster, worker: Worker) -> dict[str, psutil.Process]:
@@ -38,6 +41,21 @@ def find_logs(cluster: Cluster, run_ids: list[str]) -> set[str]:
         return {str(client.read_flow_run(run_id).parameters["log"]) for run_id in run_ids}  # type: ignore[arg-type]
 
 
+def choose_worker(cluster: Cluster, rng: random.Random) -> Worker:
+    """A worker at a random moment: mostly inside a stage, as the start of a run takes longer than all its stages."""
+    worker = rng.choice(cluster.workers)
+    if rng.random() < _STAGE_FRACTION:
+        deadline = time.monotonic() + _STAGE_S
+        while time.monotonic() < deadline:
+            pids = {process.pid for process in find_runs(cluster, worker).values()}
+            last = next((note for note in reversed(read_notes(cluster.faults)) if note.pid in pids), None)
+            if last is not None and last.event == "start":
+                break
+            time.sleep(0.05)
+        time.sleep(rng.uniform(0.0, 0.3))
+    return worker
+
+
 class WorkerKilledAlone(Fault):
     """The worker dies; its children lose the pipes of their output."""
 
@@ -45,7 +63,7 @@ class WorkerKilledAlone(Fault):
     how = "kill −9 of the worker's process alone, then a new worker"
 
     def inject(self, cluster: Cluster, rng: random.Random) -> Injection | None:
-        worker = rng.choice(cluster.workers)
+        worker = choose_worker(cluster, rng)
         runs = find_runs(cluster, worker)
         if not runs:
             return None
@@ -64,7 +82,7 @@ class WorkerKilledWithChildren(Fault):
     pause_s = (1.0, 8.0)
 
     def inject(self, cluster: Cluster, rng: random.Random) -> Injection | None:
-        worker = rng.choice(cluster.workers)
+        worker = choose_worker(cluster, rng)
         runs = find_runs(cluster, worker)
         if not runs:
             return None
@@ -82,7 +100,7 @@ class RunKilled(Fault):
     how = "kill −9 of the run's process alone"
 
     def inject(self, cluster: Cluster, rng: random.Random) -> Injection | None:
-        runs = find_runs(cluster, rng.choice(cluster.workers))
+        runs = find_runs(cluster, choose_worker(cluster, rng))
         if not runs:
             return None
         logs = find_logs(cluster, list(runs))
