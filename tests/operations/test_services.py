@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import importlib
 import json
 import os
 import stat
@@ -10,8 +12,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import pytest
 import yaml
@@ -90,6 +94,19 @@ def test_commands_hold_no_secret(tmp_path: Path) -> None:
     assert words[-4:] == ["--work-queue", "datasets", "--limit", "1"]
     assert not any(secret in word or "database-secret" in word for word in words)
     assert Worker(tmp_path, server.env()).environment()["PREFECT_FLOWS_HEARTBEAT_FREQUENCY"] == "30"
+
+
+def test_a_killed_server_remembers_who_has_slots(tmp_path: Path) -> None:
+    name = "PREFECT_SERVER_CONCURRENCY_LEASE_STORAGE"
+    module = PrefectServer(tmp_path).environment()[name]
+    storage = importlib.import_module(module).ConcurrencyLeaseStorage(tmp_path / "leases")
+    lease = asyncio.run(storage.create_lease([uuid4()], timedelta(minutes=1)))
+    again = importlib.import_module(module).ConcurrencyLeaseStorage(tmp_path / "leases")
+    assert asyncio.run(again.read_lease(lease.id)) == lease
+    server = yaml.safe_load((small_run.ROOT / "docker-compose.yml").read_text())["services"]["server"]
+    assert server["environment"][name] == module
+    # Files outside of a volume would be lost with the container.
+    assert f"server:{server['environment']['PREFECT_HOME']}" in server["volumes"]
 
 
 def test_a_reused_process_id_is_not_taken_for_the_service(tmp_path: Path) -> None:
