@@ -17,7 +17,8 @@ from tests.faults.matrix.fault_hooks import ARMED, TAKEN
 from tests.faults.matrix.scenario import LOGS, Fault, Injection
 from tests.faults.matrix.worker_faults import find_logs, find_runs
 
-FAKETIME = Path("/usr/lib/x86_64-linux-gnu/faketime/libfaketimeMT.so.1")
+# For processes with threads.
+FAKETIME = next(Path("/usr/lib").glob("*/faketime/libfaketimeMT.so.1"), None)
 _DISK_BYTES = 256 << 20
 _BLOCK_BYTES = 64 << 10
 _JUMP_S = 3600
