@@ -31,20 +31,31 @@ def find_damage(uri: str) -> list[str]:
 
 
 def list_leases(store: Store) -> list[str]:
-    """Leases that are left; a killed process's file goes when another one has computed the stage."""
+    """Leases that are left; a killed process's lease goes when another one has computed the stage."""
     if not isinstance(store, LocalStore):
-        raise TypeError(f"no list of leases of {store.uri}")
+        return [name for name in list_objects(store) if name.startswith(f"{LEASES_FOLDER}/")]
     folder = store.root / LEASES_FOLDER
     return sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
 
 
 def list_temporaries(store: Store) -> list[str]:
     """What is left of half-written artifacts after ``clean_temporaries``."""
-    store.clean_temporaries()
-    if not isinstance(store, LocalStore):
-        raise TypeError(f"no list of temporaries of {store.uri}")
-    prefixes = (TEMPORARY_PREFIX, TRASH_PREFIX)
-    return sorted(str(path) for path in store.root.rglob(".*") if path.name.startswith(prefixes))
+    if isinstance(store, LocalStore):
+        store.clean_temporaries()
+        prefixes = (TEMPORARY_PREFIX, TRASH_PREFIX)
+        return sorted(str(path) for path in store.root.rglob(".*") if path.name.startswith(prefixes))
+    # Of an object, nobody can say whether its writer lives: its age decides, and here all writers have ended.
+    store.clean_temporaries(older_than_s=0.0)
+    folders = tuple(f"{artifact.address}/" for artifact in store.artifacts())
+    records = ("runs/", "datasets/", f"{LEASES_FOLDER}/")
+    return [name for name in list_objects(store) if not name.startswith((*folders, *records))]
+
+
+def list_objects(store: Store) -> list[str]:
+    """Names of all objects of a store in a bucket."""
+    from storage.objects.bucket import Bucket
+
+    return sorted(info.name for info in Bucket(store.uri).list())
 
 
 def wait_for_zero(count: Callable[[], int], seconds: float) -> int:

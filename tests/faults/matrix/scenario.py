@@ -202,8 +202,9 @@ def _check(
     runs = checks.wait_for_zero(lambda: len(cluster.read_active_runs()), _RUNS_S)
     slots = checks.wait_for_zero(cluster.count_slots, _SLOTS_S)
     opened = open_store(store)
-    temporaries = checks.list_temporaries(opened)
+    # Before the cleaning, which removes those of a bucket.
     leases = checks.list_leases(opened)
+    temporaries = checks.list_temporaries(opened)
     problems += [*damaged, *temporaries, *leases, *computations.doubled]
     problems += sorted({note.why for note in notes if note.event == "failed"})
     return Round(

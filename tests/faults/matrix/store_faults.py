@@ -10,7 +10,9 @@ from contextlib import contextmanager
 
 from tests.faults.matrix.cluster import Cluster
 from tests.faults.matrix.faulty_proxy import FaultyProxy, Mode
+from tests.faults.matrix.machine_faults import ClockJumps, TwoWorkersOneArtifact
 from tests.faults.matrix.scenario import Fault, Injection
+from tests.faults.matrix.worker_faults import WorkerKilledWithChildren
 
 _WAIT_S = 60.0
 
@@ -105,3 +107,26 @@ class UploadTruncated(StoreFault):
                 return None
             time.sleep(0.02)
         return Injection(time.monotonic())
+
+
+class WorkerKilledWithLease(WorkerKilledWithChildren, StoreFault):
+    """A dead worker's lease is an object, which no system frees."""
+
+    name = "worker killed with its run, S3"
+
+
+class TwoWorkersOneObject(TwoWorkersOneArtifact, StoreFault):
+    """Two workers that know of each other only by the objects of the store."""
+
+    name = "two workers on one artifact, S3"
+
+
+class ClockJumpsWithLeases(ClockJumps, StoreFault):
+    """Leases in a bucket end by time, and the clocks of their holders jump."""
+
+    name = "clock jump, S3"
+
+    @contextmanager
+    def surround(self, cluster: Cluster) -> Iterator[None]:
+        with StoreFault.surround(self, cluster), ClockJumps.surround(self, cluster):
+            yield
