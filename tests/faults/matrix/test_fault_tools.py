@@ -48,7 +48,7 @@ class _Echo(http.server.BaseHTTPRequestHandler):
 def proxy() -> Iterator[FaultyProxy]:
     _Echo.received = []
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), _Echo)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
+    threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
     with FaultyProxy(server.server_address[1], delay_s=0.3).run() as running:
         yield running
     server.shutdown()
