@@ -50,8 +50,9 @@ def test_a_service_that_ends_at_its_start_shows_its_log(tmp_path: Path) -> None:
         service.start()
 
 
-def test_kill_ends_the_children_too(tmp_path: Path) -> None:
-    service = _Sleeper(tmp_path, "sleep 60 & echo $! > child; wait")
+@pytest.mark.parametrize("session", ["", "setsid "], ids=["same session", "session of its own"])
+def test_kill_ends_the_children_too(session: str, tmp_path: Path) -> None:
+    service = _Sleeper(tmp_path, f"{session}sleep 60 & echo $! > child; wait")
     service.spawn_options = lambda: {"cwd": tmp_path}  # type: ignore[method-assign]
     service.start()
     child = tmp_path / "child"

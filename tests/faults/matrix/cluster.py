@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -54,7 +53,7 @@ class Cluster:
         faults: folder of the hooks.
         objects: the S3 server, once it was needed.
         commands: of all datasets.
-        orphaned_groups: process groups of workers that were killed.
+        orphans: runs whose worker was killed alone.
         store_env: what processes need to reach the store.
     """
 
@@ -66,7 +65,7 @@ class Cluster:
     workers: list[Worker]
     objects: ObjectServer | None = None
     commands: list[subprocess.Popen[bytes]] = field(default_factory=list)
-    orphaned_groups: list[int] = field(default_factory=list)
+    orphans: list[psutil.Process] = field(default_factory=list)
     store_env: dict[str, str] = field(default_factory=dict)
 
     @contextmanager
@@ -122,8 +121,8 @@ class Cluster:
 
     def kill_worker(self, worker: Worker, children: bool) -> None:
         """Kills a worker; a child that lives on is ended with the cluster at the latest."""
-        if worker.pid is not None:
-            self.orphaned_groups.append(worker.pid)
+        if not children:
+            self.orphans += self.find_children(worker)
         worker.kill(children=children)
 
     def find_children(self, worker: Worker) -> list[psutil.Process]:
@@ -169,11 +168,10 @@ class Cluster:
 
     def kill_orphans(self) -> None:
         """Ends runs whose worker was killed alone, if there are any left."""
-        for group in self.orphaned_groups:
-            # The number stays this group's while one of its processes lives.
-            with suppress(ProcessLookupError, PermissionError):
-                os.killpg(group, signal.SIGKILL)
-        self.orphaned_groups.clear()
+        for process in self.orphans:
+            with suppress(psutil.Error):
+                process.kill()
+        self.orphans.clear()
 
     def stop_runs(self) -> None:
         """Ends what a failed fault has left, so that the next one starts from nothing."""
