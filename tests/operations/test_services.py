@@ -20,7 +20,7 @@ from uuid import uuid4
 import pytest
 import yaml
 
-from flows.operations import PostgresServer, PrefectServer, Service, Worker
+from flows.operations import ObjectServer, PostgresServer, PrefectServer, Service, Worker
 from flows.operations import postgres_server as postgres_module
 from flows.operations.deployments import DEPLOYMENTS, RUN_QUEUE
 from flows.operations.service import find_free_port, keep_port, keep_secret
@@ -167,6 +167,12 @@ def state() -> Iterator[Path]:
         folder.chmod(0o711)
         yield folder
         stop_stack(folder)
+
+
+@pytest.mark.slow
+def test_two_object_servers_run_on_one_machine(tmp_path: Path) -> None:
+    with ObjectServer(tmp_path / "one") as one, ObjectServer(tmp_path / "two") as two:
+        assert one.is_healthy() and two.is_healthy()
 
 
 @pytest.mark.slow
