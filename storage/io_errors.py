@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from genre_tasks.errors import GenreError, InputError, ResourceError, TransientIOError
+from genre_tasks.errors import ArtifactCorruptError, GenreError, InputError, ResourceError, TransientIOError
 from storage.address import Address
 
 
@@ -83,3 +85,44 @@ def as_genre_error(error: OSError, path: Path, address: Address | None = None) -
     translation = next((t for t in _TRANSLATIONS if error.errno in t.codes), _OTHER)
     problem = translation.problem.format(name=name, text=error.strerror or error)
     return translation.kind(problem, remedy=translation.remedy, **where)  # type: ignore[arg-type]
+
+
+@contextmanager
+def os_errors_translated(path: Path, address: Address) -> Iterator[None]:
+    """Turns an ``OSError`` inside the block into one of the project's errors.
+
+    Args:
+        path: the file or folder, for an error that names none.
+        address: the artifact that is read or written.
+
+    Yields:
+        Nothing.
+
+    Raises:
+        GenreError: as :func:`as_genre_error` makes it.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise as_genre_error(error, path, address) from error
+
+
+def make_corruption_error(address: Address, file: Path | str, problem: str) -> ArtifactCorruptError:
+    """Makes the error for an artifact that cannot be trusted.
+
+    Args:
+        address: of the artifact.
+        file: the damaged file, or the artifact's folder.
+        problem: what is wrong with it.
+
+    Returns:
+        The error, to be raised.
+    """
+    return ArtifactCorruptError(
+        problem,
+        remedy="Run again: it is computed once more (or delete the folder by hand).",
+        file=file,
+        log=address.log,
+        chunk=address.chunk,
+        stage=address.stage,
+    )

@@ -6,10 +6,8 @@ import os
 import shutil
 import time
 import uuid
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import asdict, fields
-from datetime import UTC, datetime
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -29,16 +27,14 @@ from storage.artifact_folders import (
 )
 from storage.codecs import get_codec
 from storage.file_lease import hold_file_lease
-from storage.files import make_folders, payload_files, sync, write_file
-from storage.io_errors import as_genre_error
-from storage.manifest import MANIFEST, FileEntry, Manifest, parse_manifest, payload_digest
-from storage.manifest_writer import find_damage, write_manifest
+from storage.files import make_folders, sync, write_file
+from storage.io_errors import as_genre_error, make_corruption_error, os_errors_translated
+from storage.manifest import MANIFEST, Manifest, parse_manifest
+from storage.manifest_writer import find_damaged_file, write_artifact, write_manifest
 from storage.records import LocalRecordFolders
 from storage.store import Artifact, Provenance
 
 __all__ = ["Artifact", "LocalStore", "Provenance"]
-
-_RECOMPUTE = "Run again: it is computed anew (or delete the folder by hand)."
 
 # Every further attempt needs another writer that leaves a damaged artifact at the same moment.
 _PUBLISH_ATTEMPTS = 20
@@ -82,36 +78,49 @@ class LocalStore:
         Returns:
             The artifact that is now at ``address``.
         """
-        codec = get_codec(kind)
-        provenance = provenance or Provenance()
+        known = provenance or Provenance()
+        return self._publish_folder(address, lambda folder: write_artifact(folder, address, kind, value, known))
+
+    def adopt(self, manifest: Manifest, folder: Path) -> Artifact:
+        """Takes in an artifact's files as another store has them: see :meth:`storage.store.Store.adopt`.
+
+        Returns:
+            The artifact that is now at the manifest's address.
+        """
+
+        def copy(temporary: Path) -> Manifest:
+            for entry in manifest.files:
+                target = temporary / entry.path
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(folder / entry.path, target)
+                sync(target)
+            write_manifest(temporary, manifest)
+            damage = find_damaged_file(temporary, manifest)
+            if damage is not None:
+                raise make_corruption_error(manifest.address, folder / damage[0], damage[1])
+            return manifest
+
+        return self._publish_folder(manifest.address, copy)
+
+    def _publish_folder(self, address: Address, write: Callable[[Path], Manifest]) -> Artifact:
+        """Has a temporary folder written and renames it into place."""
         target = self.root / address.relative_path
         # Beside the target, because a rename is atomic only within one file system. The owner tells whether a folder
         # is still in use, the random part keeps two writers of one process apart.
         name = f"{TEMPORARY_PREFIX}{address.key[:12]}-{describe_owner()}-{uuid.uuid4().hex}"
         temporary = target.parent / name
-
-        def make_manifest(files: tuple[FileEntry, ...]) -> Manifest:
-            # Called by the writer once all files are known, so that the manifest can list them.
-            known = {f.name: getattr(provenance, f.name) for f in fields(provenance)}
-            known["created_at"] = provenance.created_at or datetime.now(UTC).isoformat(timespec="seconds")
-            known["measurements"] = {**codec.measurements(value), **provenance.measurements}
-            digest = payload_digest(files)
-            return Manifest(kind=kind, files=files, payload_digest=digest, **asdict(address), **known)
-
-        with _os_errors_translated(target, address):
+        with os_errors_translated(target, address):
             try:
                 make_folders(target.parent)
                 temporary.mkdir()
-                codec.write(temporary, value)
-                write_manifest(temporary, make_manifest)
+                write(temporary)
                 self._publish(temporary, target, address)
             finally:
                 # After the rename nothing is left here; after an error nothing may stay.
                 shutil.rmtree(temporary, ignore_errors=True)
             artifact = self.find(address)
         if artifact is None:
-            vanished = Artifact(address, target, make_manifest(()))
-            raise _corruption_error(vanished, "", "The artifact vanished while it was committed")
+            raise make_corruption_error(address, target, "The artifact vanished while it was committed")
         return artifact
 
     def find(self, address: Address) -> Artifact | None:
@@ -121,7 +130,7 @@ class LocalStore:
             The artifact, or ``None``.
         """
         path = self.root / address.relative_path
-        with _os_errors_translated(path, address):
+        with os_errors_translated(path, address):
             try:
                 data = (path / MANIFEST).read_bytes()
             except (FileNotFoundError, NotADirectoryError):
@@ -129,14 +138,7 @@ class LocalStore:
         manifest = parse_manifest(data, path / MANIFEST)
         # A folder that someone moved or copied by hand would otherwise pass for another artifact.
         if manifest.address != address:
-            raise ArtifactCorruptError(
-                f"The manifest belongs to {manifest.address}",
-                remedy=_RECOMPUTE,
-                file=path / MANIFEST,
-                log=address.log,
-                chunk=address.chunk,
-                stage=address.stage,
-            )
+            raise make_corruption_error(address, path / MANIFEST, f"The manifest belongs to {manifest.address}")
         return Artifact(address, path, manifest)
 
     def verify(self, artifact: Artifact) -> None:
@@ -145,18 +147,10 @@ class LocalStore:
         Raises:
             ArtifactCorruptError: as :meth:`storage.store.Store.verify` says.
         """
-        with _os_errors_translated(artifact.path, artifact.address):
-            # In the order of the manifest, so that the same damage is always named by the same file.
-            listed = {entry.path: entry for entry in artifact.manifest.files}
-            present = dict(payload_files(artifact.path))
-            present.pop(MANIFEST, None)
-            for name, entry in listed.items():
-                problem = find_damage(present.get(name), entry)
-                if problem:
-                    raise _corruption_error(artifact, name, problem)
-            for name in present:
-                if name not in listed:
-                    raise _corruption_error(artifact, name, "A file is not in the manifest")
+        with os_errors_translated(artifact.path, artifact.address):
+            damage = find_damaged_file(artifact.path, artifact.manifest)
+        if damage is not None:
+            raise make_corruption_error(artifact.address, artifact.path / damage[0], damage[1])
 
     def read(self, artifact: Artifact) -> Any:
         """Reads an artifact's value: digests first, then the codec with its strict checks.
@@ -167,7 +161,7 @@ class LocalStore:
         self.verify(artifact)
         # After the digests, so that decoders never see bytes that the codec did not write.
         codec = get_codec(artifact.manifest.kind)
-        with _os_errors_translated(artifact.path, artifact.address):
+        with os_errors_translated(artifact.path, artifact.address):
             return codec.read(artifact.path, artifact.manifest.measurements)
 
     def fetch(self, artifact: Artifact, suffix: str = "") -> Path:
@@ -194,7 +188,7 @@ class LocalStore:
         """
         address = target.address if isinstance(target, Artifact) else target
         folder = self.root / address.relative_path
-        with _os_errors_translated(folder, address):
+        with os_errors_translated(folder, address):
             # Only for the error: a newer version's artifact is not ours to remove.
             find_sound_manifest(folder)
             trash = move_to_trash(folder)
@@ -248,7 +242,7 @@ class LocalStore:
                 manifest = load_manifest(folder)
                 artifact = Artifact(manifest.address, folder, manifest)
                 if folder != self.root / artifact.address.relative_path:
-                    raise _corruption_error(artifact, MANIFEST, f"The manifest belongs to {artifact.address}")
+                    raise make_corruption_error(artifact.address, folder, f"The manifest belongs to {artifact.address}")
                 self.verify(artifact)
                 yield name, None
             except ArtifactCorruptError as error:
@@ -311,23 +305,3 @@ class LocalStore:
             return True
         except ArtifactCorruptError:
             return False
-
-
-def _corruption_error(artifact: Artifact, name: str, problem: str) -> ArtifactCorruptError:
-    return ArtifactCorruptError(
-        problem,
-        remedy=_RECOMPUTE,
-        file=artifact.path / name,
-        log=artifact.address.log,
-        chunk=artifact.address.chunk,
-        stage=artifact.address.stage,
-    )
-
-
-@contextmanager
-def _os_errors_translated(path: Path, address: Address) -> Iterator[None]:
-    """Turns an ``OSError`` inside the block into one of the project's errors."""
-    try:
-        yield
-    except OSError as error:
-        raise as_genre_error(error, path, address) from error

@@ -32,18 +32,24 @@ def open_store(uri: str) -> Store:
     """Opens the store at a path or URI.
 
     Args:
-        uri: a path, or ``file:///…``.
+        uri: a path, ``file:///…``, ``s3://bucket/path``, ``gs://bucket/path`` or ``az://container/path``. Credentials
+            come from the environment.
 
     Returns:
         The store; it need not exist yet.
 
     Raises:
-        ConfigError: the URI has another scheme.
+        ConfigError: the URI has another scheme, or holds credentials.
 
     >>> print(open_store("file:///data/a%20store").uri)
     /data/a store
     """
-    return open_local_store(uri)
+    if not is_remote(uri):
+        return open_local_store(uri)
+    # Only here: the package of its client is not needed for folders.
+    from storage.objects.object_store import ObjectStore
+
+    return ObjectStore(uri)
 
 
 def open_local_store(uri: str) -> LocalStore:

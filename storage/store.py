@@ -109,6 +109,24 @@ class Store(Protocol):
         """
         ...
 
+    def adopt(self, manifest: Manifest, folder: Path) -> Artifact:
+        """Takes in an artifact's files as another store has them, completely or not at all.
+
+        Args:
+            manifest: what the artifact says of itself; it is written unchanged.
+            folder: has the payload's files, which are copied and checked.
+
+        Returns:
+            The artifact that is now at the manifest's address, also where another was there before.
+
+        Raises:
+            ArtifactCorruptError: a file is missing or altered.
+            InputError: the store cannot be written.
+            ResourceError: the disk is full.
+            TransientIOError: the store does not answer.
+        """
+        ...
+
     def find(self, address: Address) -> Artifact | None:
         """Looks an artifact up without reading its payload.
 

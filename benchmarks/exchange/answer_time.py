@@ -22,7 +22,7 @@ from flows.pipeline.definition import PIPELINE, StageSpec
 from storage.address import Address
 from storage.codecs import get_codec
 from storage.manifest import FileEntry, Manifest, payload_digest
-from storage.manifest_writer import write_manifest
+from storage.manifest_writer import list_payload, write_manifest
 
 CHUNKS = 100
 MOST_HELP_S = 1.0
@@ -163,7 +163,7 @@ def _write_artifact(store: Path, address: Address) -> None:
             **asdict(address),
         )
 
-    write_manifest(folder, make_manifest)
+    write_manifest(folder, make_manifest(list_payload(folder)))
 
 
 def _stage_record(spec: StageSpec, key: str) -> dict[str, Any]:

@@ -85,6 +85,8 @@ class ObjectServer(Service):
         words += ["-s3.port.iceberg=0", "-s3.port.lance=0"]
         # Small volumes: little disk is taken before there is data.
         words += [f"-s3.port.grpc={self._ports['s3.grpc']}", "-master.volumeSizeLimitMB=64", "-volume.max=0"]
+        # Two servers on a machine would both want the standard ports of what is not needed here.
+        words += ["-s3.port.iceberg=0", "-s3.port.lance=0"]
         return [*words, "-master.volumePreallocate=false", "-master.telemetry=false"]
 
     def is_healthy(self) -> bool:

@@ -11,7 +11,7 @@ from genre_tasks.errors import ArtifactCorruptError, ConfigError, InputError
 from genre_tasks.temporary_names import temporary_folder
 from storage.files import make_folders, payload_files, sync
 from storage.manifest import MANIFEST, FileEntry, Manifest, parse_manifest
-from storage.manifest_writer import find_damage, write_manifest
+from storage.manifest_writer import find_damage, list_payload, write_manifest
 
 KIND = "rollout"
 """Kind of artifact in the manifest."""
@@ -67,7 +67,7 @@ def write_rollout(folder: Path, make_manifest: Callable[[tuple[FileEntry, ...]],
     with temporary_folder(folder.parent) as temporary:
         yield temporary
         temporary.chmod(_FOLDER_MODE)
-        write_manifest(temporary, make_manifest)
+        write_manifest(temporary, make_manifest(list_payload(temporary)))
         replace_folder(folder, temporary)
         sync(folder.parent)
 

@@ -11,6 +11,7 @@ import pytest
 
 from genre_tasks.errors import ArtifactCorruptError, ConfigError, NonFiniteError
 from storage.address import Address
+from storage.local import LocalStore
 from storage.manifest import MANIFEST
 from storage.store import Provenance, Store
 from tests.storage.artifact_values import COLORS, MAKERS, assert_same, make
@@ -235,3 +236,24 @@ class StoreSuite:
         assert found is not None
         assert (second.fetch(found, ".parquet") / "metrics.parquet").is_file()
         assert second.fetch(found) == found.path
+
+    @pytest.mark.parametrize("kind", ["evaluation", "novel_views"])
+    def test_an_artifact_of_another_store_is_adopted_as_it_is(self, store: Store, tmp_path: Path, kind: str) -> None:
+        other = LocalStore(tmp_path / "other")
+        given = self.commit(other, kind, warnings=("careful",))
+        adopted = store.adopt(given.manifest, other.fetch(given))
+        assert adopted.manifest == given.manifest
+        store.verify(adopted)
+        assert_same(make(kind), store.read(adopted), kind, COLORS)
+        # The first one stays.
+        self.commit(other, kind, address(key=OTHER), seed=1)
+        assert store.adopt(given.manifest, other.fetch(given)).manifest == given.manifest
+        assert len(list(store.artifacts())) == 1
+
+    def test_a_damaged_artifact_is_not_adopted(self, store: Store, tmp_path: Path) -> None:
+        other = LocalStore(tmp_path / "other")
+        given = self.commit(other, "evaluation")
+        (given.path / "metrics.parquet").write_bytes(b"else")
+        with pytest.raises(ArtifactCorruptError, match=r"metrics\.parquet"):
+            store.adopt(given.manifest, given.path)
+        assert store.find(address()) is None

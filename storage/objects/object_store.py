@@ -1,0 +1,340 @@
+"""The store in a bucket: a manifest that is put if absent is the commit."""
+
+from __future__ import annotations
+
+import hashlib
+import uuid
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, suppress
+from datetime import UTC, datetime
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from genre_tasks.errors import ArtifactCorruptError, ConfigError, TransientIOError
+from genre_tasks.progress import Progress, silent
+from genre_tasks.temporary_names import describe_owner
+from storage.address import Address
+from storage.codecs import get_codec
+from storage.io_errors import make_corruption_error, os_errors_translated
+from storage.manifest import MANIFEST, Manifest, NewerSchemaError, parse_manifest
+from storage.manifest_writer import find_damage, write_artifact
+from storage.objects.bucket import Bucket, ObjectInfo
+from storage.objects.object_lease import LEASES_FOLDER, hold_object_lease
+from storage.objects.object_records import ObjectRecordFolders
+from storage.objects.payloads import ETAGS_START, PAYLOAD_START, Payloads, is_payload
+from storage.objects.read_cache import ReadCache, find_cache_folder, read_limit_bytes
+from storage.store import Artifact, Provenance
+
+_PROBE = ".probe-"
+_PUBLISH_ATTEMPTS = 5
+_MANIFESTS_AT_ONCE = 16
+
+
+class ObjectStore:
+    """A store in a bucket; implements :class:`storage.store.Store`.
+
+    An artifact is ``ADDRESS/manifest.json``, ``ADDRESS/payload-DIGEST/FILE`` and ``ADDRESS/etags-DIGEST.json``. Writers
+    of other bytes write to another payload folder, and so never mix.
+
+    Args:
+        uri: such as ``s3://bucket/prefix``.
+
+    Raises:
+        ConfigError: the URI names no bucket, or holds credentials; or a variable of the environment is wrong.
+    """
+
+    def __init__(self, uri: str) -> None:
+        self._bucket = Bucket(uri)
+        name = hashlib.sha256(self._bucket.uri.encode()).hexdigest()[:12]
+        folder = find_cache_folder() / name
+        self._cache = ReadCache(folder, read_limit_bytes())
+        self._payloads = Payloads(self._bucket, self._cache)
+        self.records = ObjectRecordFolders(self._bucket, folder / "records")
+
+    @property
+    def uri(self) -> str:
+        """The URI, without credentials."""
+        return self._bucket.uri
+
+    def check_writable(self) -> None:
+        """Writes and removes a small object: see :meth:`storage.store.Store.check_writable`."""
+        name = f"{_PROBE}{describe_owner()}-{uuid.uuid4().hex}"
+        self._bucket.write(name, b"\0")
+        self._bucket.delete([name])
+
+    def exists(self) -> bool:
+        """Tells whether anything was ever written: see :meth:`storage.store.Store.exists`."""
+        return next(self._bucket.list(), None) is not None
+
+    def commit(self, address: Address, kind: str, value: Any, provenance: Provenance | None = None) -> Artifact:
+        """Uploads a value's files, then puts the manifest if there is none: see :meth:`storage.store.Store.commit`.
+
+        Returns:
+            The artifact that is now at ``address``.
+        """
+        with os_errors_translated(self._cache.folder, address), self._cache.temporary() as temporary:
+            manifest = write_artifact(temporary, address, kind, value, provenance or Provenance())
+            artifact = self._publish(temporary, manifest)
+            if artifact.manifest == manifest:
+                # The next stage reads it on this machine: it need not come back over the network.
+                self._cache.keep(temporary, artifact.path)
+            return artifact
+
+    def adopt(self, manifest: Manifest, folder: Path) -> Artifact:
+        """Takes in an artifact's files as another store has them: see :meth:`storage.store.Store.adopt`.
+
+        Returns:
+            The artifact that is now at the manifest's address.
+        """
+        with os_errors_translated(folder, manifest.address):
+            for entry in manifest.files:
+                problem = find_damage(folder / entry.path, entry)
+                if problem:
+                    raise make_corruption_error(manifest.address, folder / entry.path, problem)
+            return self._publish(folder, manifest)
+
+    def find(self, address: Address) -> Artifact | None:
+        """Looks an artifact up by its manifest: see :meth:`storage.store.Store.find`.
+
+        Returns:
+            The artifact, or ``None``.
+        """
+        name = f"{address}/{MANIFEST}"
+        found = self._bucket.read(name)
+        return None if found is None else self._make_artifact(address, found.data)
+
+    def verify(self, artifact: Artifact) -> None:
+        """Checks an artifact by a listing, and by its bytes where these may be altered: see :meth:`Store.verify`.
+
+        Raises:
+            ArtifactCorruptError: as :meth:`storage.store.Store.verify` says.
+        """
+        self._payloads.verify(artifact)
+
+    def read(self, artifact: Artifact) -> Any:
+        """Brings an artifact's files to this machine, digests them and decodes them: see :meth:`Store.read`.
+
+        Returns:
+            The value: see :meth:`storage.store.Store.read`.
+        """
+        codec = get_codec(artifact.manifest.kind)
+        with os_errors_translated(artifact.path, artifact.address):
+            for _ in range(_PUBLISH_ATTEMPTS):
+                self._payloads.bring(artifact, artifact.manifest.files, trusts_cache=False)
+                # Another process may make room just now.
+                with suppress(FileNotFoundError):
+                    return codec.read(artifact.path, artifact.manifest.measurements)
+            raise make_corruption_error(artifact.address, artifact.path, "The cache loses the artifact's files")
+
+    def fetch(self, artifact: Artifact, suffix: str = "") -> Path:
+        """Brings files of an artifact to this machine: see :meth:`storage.store.Store.fetch`.
+
+        Returns:
+            Their folder in the cache.
+        """
+        wanted = [entry for entry in artifact.manifest.files if entry.path.endswith(suffix)]
+        with os_errors_translated(artifact.path, artifact.address):
+            self._payloads.bring(artifact, wanted, trusts_cache=True)
+        return artifact.path
+
+    def lease(self, address: Address, progress: Progress = silent) -> AbstractContextManager[None]:
+        """Keeps others from computing an artifact: see :meth:`storage.store.Store.lease`.
+
+        Returns:
+            The context in which this process alone computes it.
+        """
+        return hold_object_lease(self._bucket, address, progress)
+
+    def discard(self, target: Artifact | Address) -> None:
+        """Removes an artifact, its manifest first so that nobody sees half of it.
+
+        Raises:
+            NewerSchemaError: as :meth:`storage.store.Store.discard` says.
+        """
+        address = target.address if isinstance(target, Artifact) else target
+        # Only for the error: a newer version's artifact is not ours to remove.
+        try:
+            self.find(address)
+        except NewerSchemaError:
+            raise
+        except ArtifactCorruptError:
+            pass
+        self._bucket.delete([f"{address}/{MANIFEST}"])
+        self._bucket.delete([info.name for info in self._bucket.list(str(address))])
+
+    def artifacts(
+        self,
+        dataset: str | None = None,
+        log: str | None = None,
+        chunk: int | None = None,
+        stage: str | None = None,
+        key: str | None = None,
+        kind: str | None = None,
+        key_start: str = "",
+    ) -> Iterator[Artifact]:
+        """Lists the artifacts that fit, in the order of their paths.
+
+        Yields:
+            Artifacts with a sound manifest: see :meth:`storage.store.Store.artifacts`.
+        """
+        parts = []
+        # The known start of the path narrows the search; the rest is compared below.
+        for part in (dataset, log, None if chunk is None else f"{chunk:04d}", stage):
+            if part is None:
+                break
+            parts.append(part)
+        wanted = {"dataset": dataset, "log": log, "chunk": chunk, "stage": stage, "key": key, "kind": kind}
+        start = key or key_start
+        infos = (info for info in self._list_manifests("/".join(parts)) if _key_of(info).startswith(start))
+        for info, data in self._read_manifests(infos):
+            # A damaged artifact must not hide the sound ones after it; `verify_all` reports it.
+            with suppress(ArtifactCorruptError, ConfigError):
+                artifact = self._make_artifact(None, data, info.name)
+                if all(v is None or v == getattr(artifact.manifest, name) for name, v in wanted.items()):
+                    yield artifact
+
+    def verify_all(self) -> Iterator[tuple[str, ArtifactCorruptError | None]]:
+        """Reads every byte of every artifact: see :meth:`storage.store.Store.verify_all`.
+
+        Yields:
+            (relative path, what is wrong with it or ``None``).
+        """
+        for info, data in self._read_manifests(self._list_manifests("")):
+            name = info.name.removesuffix(f"/{MANIFEST}")
+            try:
+                artifact = self._make_artifact(None, data, info.name)
+                self._payloads.verify(artifact, reads_all=True)
+                yield name, None
+            except ArtifactCorruptError as error:
+                yield name, error
+
+    def clean_temporaries(self, older_than_s: float = 3600.0) -> int:
+        """Removes payloads without a manifest, leases that nobody renews, and this machine's temporary folders.
+
+        Args:
+            older_than_s: objects go when they were written so many seconds ago or earlier.
+
+        Returns:
+            How many objects and folders were removed.
+        """
+        payloads: dict[str, list[ObjectInfo]] = {}
+        abandoned: list[ObjectInfo] = []
+        for info in self._bucket.list():
+            if info.name.startswith((f"{LEASES_FOLDER}/", _PROBE)):
+                abandoned.append(info)
+            elif is_payload(info.name):
+                folder = info.name.partition(f"/{PAYLOAD_START}")[0].partition(f"/{ETAGS_START}")[0]
+                payloads.setdefault(folder, []).append(info)
+        for folder, infos in payloads.items():
+            found = self._bucket.read(f"{folder}/{MANIFEST}")
+            digest = ""
+            if found is not None:
+                try:
+                    digest = parse_manifest(found.data, Path(folder, MANIFEST)).payload_digest[:12]
+                except ArtifactCorruptError:
+                    # It may be a newer version's, whose files are not known here.
+                    continue
+            abandoned += [info for info in infos if not digest or digest not in info.name[len(folder) :]]
+        now = datetime.now(UTC)
+        old = [info.name for info in abandoned if (now - info.modified).total_seconds() >= older_than_s]
+        self._bucket.delete(old)
+        return len(old) + self._cache.clean_temporaries()
+
+    def _publish(self, folder: Path, manifest: Manifest) -> Artifact:
+        """Uploads a folder's files and puts the manifest, where the first sound artifact stays."""
+        address = manifest.address
+        problem: ArtifactCorruptError | None = None
+        # A loop, because another writer may come or go between any two of these calls.
+        for _ in range(_PUBLISH_ATTEMPTS):
+            found = self._find_sound(address)
+            if found is not None:
+                return found
+            self._payloads.upload(folder, manifest)
+            artifact = self._make_artifact(address, manifest.to_json())
+            try:
+                self._payloads.verify(artifact)
+            except ArtifactCorruptError as error:
+                # A truncated upload must never become an artifact.
+                problem = error
+                continue
+            if self._bucket.create(f"{address}/{MANIFEST}", manifest.to_json()) is None:
+                winner = self._find_sound(address)
+                if winner is not None and winner.manifest.payload_digest != manifest.payload_digest:
+                    self._payloads.delete(manifest)
+        found = self._find_sound(address)
+        if found is None:
+            raise TransientIOError(
+                f"the store does not keep what is written: {problem or 'the artifact vanishes'}",
+                remedy="Check the server's disk and log; then run again.",
+                file=f"{self.uri}/{address}",
+            ) from problem
+        return found
+
+    def _find_sound(self, address: Address) -> Artifact | None:
+        """The artifact at an address; a damaged one is removed."""
+        try:
+            found = self.find(address)
+            if found is not None:
+                self.verify(found)
+            return found
+        except NewerSchemaError:
+            raise
+        except ArtifactCorruptError:
+            self.discard(address)
+            return None
+
+    def _make_artifact(self, address: Address | None, data: bytes, name: str = "") -> Artifact:
+        """Parses a manifest that must be of the address, or of the object's name."""
+        place = str(address) if address is not None else name.removesuffix(f"/{MANIFEST}")
+        manifest = parse_manifest(data, Path(place) / MANIFEST)
+        if str(manifest.address) != place:
+            raise make_corruption_error(
+                manifest.address, f"{self.uri}/{place}/{MANIFEST}", f"The manifest belongs to {manifest.address}"
+            )
+        path = self._cache.find_folder(manifest.address, manifest.payload_digest)
+        return Artifact(manifest.address, path, manifest)
+
+    def _list_manifests(self, folder: str) -> Iterator[ObjectInfo]:
+        for info in self._bucket.list(folder):
+            parts = PurePosixPath(info.name).parts
+            # A file of a payload may have the name, too. Hidden folders and records are no artifacts.
+            is_manifest = parts[-1] == MANIFEST and not is_payload(info.name) and not info.name.startswith(".")
+            if is_manifest and len(parts) > _FEWEST_PARTS:
+                yield info
+
+    def _read_manifests(self, infos: Iterable[ObjectInfo]) -> Iterator[tuple[ObjectInfo, bytes]]:
+        """Reads manifests, in the order of their artifacts' paths; those that have not changed come from the cache."""
+        # A listing is in the order of bytes, in which "-" comes before "/".
+        ordered = sorted(infos, key=lambda info: PurePosixPath(info.name).parts)
+        with ThreadPoolExecutor(_MANIFESTS_AT_ONCE) as pool:
+            for start in range(0, len(ordered), 4 * _MANIFESTS_AT_ONCE):
+                some = ordered[start : start + 4 * _MANIFESTS_AT_ONCE]
+                for info, data in zip(some, pool.map(self._read_manifest, some), strict=True):
+                    # One that is gone was discarded after the listing.
+                    if data is not None:
+                        yield info, data
+
+    def _read_manifest(self, info: ObjectInfo) -> bytes | None:
+        tag = hashlib.sha256(f"{info.name} {info.e_tag}".encode()).hexdigest()
+        cached = self._cache.folder / "manifests" / tag[:2] / tag
+        with suppress(OSError):
+            return cached.read_bytes()
+        found = self._bucket.read(info.name)
+        if found is None:
+            return None
+        # Only as it was listed: the name of the file says so.
+        if found.e_tag == info.e_tag:
+            with suppress(OSError), self._cache.temporary() as temporary:
+                (temporary / "manifest").write_bytes(found.data)
+                cached.parent.mkdir(parents=True, exist_ok=True)
+                (temporary / "manifest").replace(cached)
+        return found.data
+
+
+# Dataset, log, chunk, stage, key and the manifest's name: less is a record.
+_FEWEST_PARTS = 5
+
+
+def _key_of(info: ObjectInfo) -> str:
+    return info.name.split("/")[-2]

@@ -1,0 +1,192 @@
+"""The files of artifacts in a bucket: uploaded, checked against a listing, and brought into the read cache."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+
+from storage.files import write_file
+from storage.io_errors import make_corruption_error
+from storage.manifest import MANIFEST, FileEntry, Manifest
+from storage.manifest_writer import find_damage
+from storage.objects.bucket import Bucket, ObjectInfo
+from storage.objects.read_cache import ReadCache
+from storage.store import Artifact
+
+PAYLOAD_START = "payload-"
+"""How the folder of an artifact's files begins; the digest of the payload follows."""
+ETAGS_START = "etags-"
+"""How the object begins that remembers the ETags of an artifact's files."""
+# More threads gain little, and a server that is slow already gets slower by them.
+_THREADS = 4
+
+
+class Payloads:
+    """The files of a store's artifacts.
+
+    The server's ETags are remembered at the upload. A listing then shows whether a file was altered since.
+
+    Args:
+        bucket: of the store.
+        cache: of what was read on this machine.
+    """
+
+    def __init__(self, bucket: Bucket, cache: ReadCache) -> None:
+        self._bucket = bucket
+        self._cache = cache
+
+    def upload(self, folder: Path, manifest: Manifest) -> None:
+        """Uploads the files of an artifact, several at a time.
+
+        Args:
+            folder: has the files.
+            manifest: names them.
+
+        Raises:
+            OSError: a file cannot be read.
+            InputError: the store must not be written.
+            TransientIOError: the store does not answer.
+        """
+        base = _payload_folder(manifest)
+
+        def upload(entry: FileEntry) -> str:
+            return self._bucket.upload(f"{base}/{entry.path}", folder / entry.path)
+
+        with ThreadPoolExecutor(_THREADS) as pool:
+            e_tags = list(pool.map(upload, manifest.files))
+        body = {entry.path: e_tag for entry, e_tag in zip(manifest.files, e_tags, strict=True)}
+        self._bucket.write(_etags_name(manifest), json.dumps(body).encode())
+
+    def delete(self, manifest: Manifest) -> None:
+        """Removes the files of an artifact that never came to be.
+
+        Args:
+            manifest: names them.
+
+        Raises:
+            InputError: the store must not be written.
+            TransientIOError: the store does not answer.
+        """
+        names = [info.name for info in self._bucket.list(_payload_folder(manifest))]
+        self._bucket.delete([*names, _etags_name(manifest)])
+
+    def verify(self, artifact: Artifact, reads_all: bool = False) -> None:
+        """Compares a listing with the manifest, and reads the files that it does not show to be unaltered.
+
+        Args:
+            artifact: the artifact.
+            reads_all: whether every file is read, whatever its ETag is.
+
+        Raises:
+            ArtifactCorruptError: a file is missing, altered or not listed.
+            TransientIOError: the store does not answer.
+        """
+        base = _payload_folder(artifact.manifest)
+        listed = {info.name[len(base) + 1 :]: info for info in self._bucket.list(base)}
+        e_tags = {} if reads_all else self._read_etags(artifact.manifest)
+        # In the order of the manifest, so that the same damage is always named by the same file.
+        for entry in artifact.manifest.files:
+            problem = self._find_damage(entry, listed.pop(entry.path, None), e_tags.get(entry.path, ""))
+            if problem:
+                raise self._corruption_error(artifact, entry.path, problem)
+        for name in listed:
+            raise self._corruption_error(artifact, name, "A file is not in the manifest")
+
+    def bring(self, artifact: Artifact, entries: Iterable[FileEntry], trusts_cache: bool) -> None:
+        """Downloads the files that the cache lacks; each is digested on its way.
+
+        Args:
+            artifact: the artifact; its files come into ``artifact.path``.
+            entries: of the files that are needed.
+            trusts_cache: whether a file of the right size counts as present, as it was digested when it came.
+
+        Raises:
+            ArtifactCorruptError: a file is missing or altered.
+            OSError: the cache cannot be written.
+            TransientIOError: the store does not answer.
+        """
+        folder = artifact.path
+        missing = [entry for entry in entries if not _is_cached(folder, entry, trusts_cache)]
+        if missing:
+            folder.mkdir(parents=True, exist_ok=True)
+            with ThreadPoolExecutor(_THREADS) as pool:
+                list(pool.map(lambda entry: self._bring_file(artifact, entry), missing))
+            if not (folder / MANIFEST).exists():
+                with suppress(FileExistsError):
+                    write_file(folder / MANIFEST, artifact.manifest.to_json())
+        self._cache.mark_used(folder)
+        self._cache.make_room(sum(entry.size for entry in missing))
+
+    def _find_damage(self, entry: FileEntry, info: ObjectInfo | None, e_tag: str) -> str | None:
+        if info is None:
+            return "A file is missing"
+        if info.size != entry.size:
+            return f"A file has {info.size} bytes, expected {entry.size}"
+        is_unaltered = bool(e_tag) and info.e_tag == e_tag
+        if is_unaltered or self._bucket.download(info.name)[0] == entry.sha256:
+            return None
+        return "A file does not have the sha256 of the manifest"
+
+    def _read_etags(self, manifest: Manifest) -> dict[str, str]:
+        found = self._bucket.read(_etags_name(manifest))
+        try:
+            known: dict[str, str] = {} if found is None else json.loads(found.data)
+            return known
+        except ValueError:
+            # Then the files are read, and their digests decide.
+            return {}
+
+    def _bring_file(self, artifact: Artifact, entry: FileEntry) -> None:
+        target = artifact.path / entry.path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with self._cache.temporary() as temporary:
+            part = temporary / "file"
+            try:
+                self._bucket.download(f"{_payload_folder(artifact.manifest)}/{entry.path}", part)
+            except FileNotFoundError as error:
+                raise self._corruption_error(artifact, entry.path, "A file is missing") from error
+            problem = find_damage(part, entry)
+            if problem:
+                raise self._corruption_error(artifact, entry.path, problem)
+            part.replace(target)
+
+    def _corruption_error(self, artifact: Artifact, name: str, problem: str) -> Exception:
+        # As people find it in the bucket, not in this machine's cache.
+        file = f"{self._bucket.uri}/{_payload_folder(artifact.manifest)}/{name}"
+        return make_corruption_error(artifact.address, file, problem)
+
+
+def is_payload(name: str) -> bool:
+    """Tells whether an object belongs to the files of an artifact, and is no manifest of one.
+
+    Args:
+        name: below the store's prefix.
+
+    Returns:
+        Whether it is a file or the list of their ETags.
+
+    >>> is_payload("d/l/0000/gnet/5f41/payload-0a1b/manifest.json"), is_payload("d/l/0000/gnet/5f41/manifest.json")
+    (True, False)
+    """
+    return f"/{PAYLOAD_START}" in name or name.rpartition("/")[2].startswith(ETAGS_START)
+
+
+def _payload_folder(manifest: Manifest) -> str:
+    return f"{manifest.address}/{PAYLOAD_START}{manifest.payload_digest[:12]}"
+
+
+def _etags_name(manifest: Manifest) -> str:
+    return f"{manifest.address}/{ETAGS_START}{manifest.payload_digest[:12]}.json"
+
+
+def _is_cached(folder: Path, entry: FileEntry, trusts_cache: bool) -> bool:
+    path = folder / entry.path
+    if not trusts_cache:
+        return find_damage(path, entry) is None
+    try:
+        return path.stat().st_size == entry.size
+    except FileNotFoundError:
+        return False

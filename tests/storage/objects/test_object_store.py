@@ -1,0 +1,36 @@
+"""The store in a bucket of a real S3 server: the contract, and what is its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from storage.objects.object_store import ObjectStore
+from storage.opening import open_store
+from tests.contracts.store_suite import StoreSuite
+
+
+class TestObjectStore(StoreSuite):
+    @pytest.fixture
+    def store(self, bucket_uri: str) -> ObjectStore:
+        return ObjectStore(bucket_uri)
+
+    @pytest.fixture
+    def second(self, store: ObjectStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+        """As another machine opens it: with another cache."""
+        monkeypatch.setenv("GENRE_CACHE_DIR", str(tmp_path / "other-cache"))
+        return open_store(store.uri)
+
+    def damage(self, artifact: Any, name: str) -> None:
+        bucket = self._bucket
+        (info,) = [i for i in bucket.list(str(artifact.address)) if i.name.endswith(f"/{name}")]
+        found = bucket.read(info.name)
+        data = bytearray(found.data)
+        data[len(data) // 2] ^= 4
+        bucket.write(info.name, bytes(data))
+
+    @pytest.fixture(autouse=True)
+    def reach_bucket(self, store: ObjectStore) -> None:
+        self._bucket = store._bucket
