@@ -75,16 +75,21 @@ class _Lease:
         # The ETag of the other's lease, and when it was first read.
         last_e_tag = ""
         since_s = time.monotonic()
+        last_read_s = since_s
         while True:
             self._e_tag = self._bucket.create(self._name, self._body())
             if self._e_tag is not None:
                 return
             found = self._bucket.read(self._name)
+            now_s = time.monotonic()
+            # A store that was away was so for the holder too, who could not renew, and lives.
+            was_away = now_s - last_read_s > self._seconds / _RENEWALS_PER_LEASE
+            last_read_s = now_s
             if found is None:
                 continue
-            if found.e_tag != last_e_tag:
+            if found.e_tag != last_e_tag or was_away:
                 last_e_tag = found.e_tag
-                since_s = time.monotonic()
+                since_s = now_s
             elif time.monotonic() - since_s > self._seconds:
                 self._e_tag = self._bucket.replace(self._name, self._body(), found.e_tag)
                 if self._e_tag is not None:

@@ -28,7 +28,8 @@ class StoreFault(Fault):
         objects = cluster.start_objects()
         before = dict(os.environ)
         with FaultyProxy(objects.port).run() as self.proxy:
-            cluster.store_env = {**objects.env(), "AWS_ENDPOINT_URL": self.proxy.url}
+            cache = str(cluster.folder / "cache")
+            cluster.store_env = {**objects.env(), "AWS_ENDPOINT_URL": self.proxy.url, "GENRE_CACHE_DIR": cache}
             # The checks of this process read the store, too.
             os.environ.update(cluster.store_env)
             cluster.restart_workers()
