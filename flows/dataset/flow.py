@@ -14,7 +14,7 @@ from flows.configuration import load_configuration
 from flows.dataset.dataset_record import name_dataset, write_dataset_record
 from flows.dataset.live_table import FINAL_STATUSES, LiveTable
 from flows.dataset.prefect_runs import ChildRequest, PrefectRuns
-from flows.dataset.server_calls import call_server
+from flows.dataset.server_calls import call_server, read_last_outage
 from flows.dataset.submission import mark_as_parent
 from flows.dataset.supervisor import Supervisor, read_limits
 from flows.dataset.work_units import Unit, list_units
@@ -86,7 +86,7 @@ def reconstruct_dataset(
         mark_as_parent(str(flow_run.id), name)
         request = ChildRequest(name, str(flow_run.id), pool, parameters, gpu_limit)
         limits = read_limits(in_flight, attempts)
-        outcomes = Supervisor(units, PrefectRuns(request), limits, table.show).run()
+        outcomes = Supervisor(units, PrefectRuns(request), limits, table.show, last_outage=read_last_outage).run()
     _report(outcomes)
     report = write_dataset_record(store, name, preset, outcomes)
     get_reporter().message(f"report {report}")

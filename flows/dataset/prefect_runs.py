@@ -115,7 +115,7 @@ class PrefectRuns:
     def read_heartbeats(self, ids: Sequence[str]) -> Mapping[str, str]:
         """Reads when runs have last shown that they are alive."""
         # By their number and not by their times, which jump with the worker's clock.
-        counts = {id_: _count_heartbeats(self._client, id_) for id_ in ids}
+        counts = {id_: count_heartbeats(self._client, id_) for id_ in ids}
         return {id_: str(count) for id_, count in counts.items() if count}
 
     def read_stages(self, ids: Sequence[str]) -> Mapping[str, str]:
@@ -218,7 +218,16 @@ def has_heartbeat(client: SyncPrefectClient, run_id: str, since_s: float) -> boo
     return any(event.received >= earliest for event in page.events)
 
 
-def _count_heartbeats(client: SyncPrefectClient, run_id: str) -> int:
+def count_heartbeats(client: SyncPrefectClient, run_id: str) -> int:
+    """Counts the heartbeats of a flow run that the server has received.
+
+    Args:
+        client: of the server.
+        run_id: of the run.
+
+    Returns:
+        Their number.
+    """
     return int(call_server(client.read_events, _heartbeats_of(run_id), limit=1).total)
 
 

@@ -126,6 +126,7 @@ class Supervisor:
         on_change: called with the rows of the table after every poll.
         clock: seconds of a clock that never jumps.
         sleep: waits for seconds.
+        last_outage: when the server was last found away, by the same clock.
     """
 
     def __init__(
@@ -136,12 +137,14 @@ class Supervisor:
         on_change: Callable[[Rows], None] = lambda rows: None,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
+        last_outage: Callable[[], float] = lambda: float("-inf"),
     ) -> None:
         self._runs = runs
         self._limits = limits
         self._on_change = on_change
         self._clock = clock
         self._sleep = sleep
+        self._last_outage = last_outage
         self._last_poll_s = clock()
         self._state = _Supervision({unit: _new_row(unit) for unit in units})
 
@@ -201,7 +204,7 @@ class Supervisor:
         found = self._runs.read(list(self._state.watches))
         # After the call, which waits as long as the server is away.
         now = self._clock()
-        if now - self._last_poll_s > self._limits.silent_s / 3:
+        if now - self._last_poll_s > self._limits.silent_s / 3 or self._last_outage() >= self._last_poll_s:
             # The server was away, and heartbeats with it: what is dead shows itself from here on.
             for watch in self._state.watches.values():
                 watch.since_s = now

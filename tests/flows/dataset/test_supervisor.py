@@ -71,12 +71,18 @@ class FakeRuns:
         return self.outcomes.get(run.id, DONE if run.state == "COMPLETED" else None)
 
 
-def supervise(runs: FakeRuns, units: Sequence[WorkUnit], limits: SupervisionLimits = LIMITS) -> list[dict[str, Any]]:
+def supervise(
+    runs: FakeRuns, units: Sequence[WorkUnit], limits: SupervisionLimits = LIMITS, outages_end_s: float = -1.0
+) -> list[dict[str, Any]]:
     def sleep(seconds: float) -> None:
         runs.now_s += seconds
         assert runs.now_s < 500, "the supervisor does not come to its end"
 
-    return Supervisor(units, runs, limits, clock=lambda: runs.now_s, sleep=sleep).run()
+    def last_outage() -> float:
+        # The server is away for a moment in every poll until then.
+        return min(runs.now_s, outages_end_s)
+
+    return Supervisor(units, runs, limits, clock=lambda: runs.now_s, sleep=sleep, last_outage=last_outage).run()
 
 
 def test_runs_are_bounded_in_flight_and_all_end() -> None:
@@ -101,6 +107,16 @@ def test_heartbeats_keep_a_long_run_alive() -> None:
     runs.beating.add("synthetic:a/0")
     (row,) = supervise(runs, [A])
     assert row["status"] == "done" and not runs.crashed
+
+
+def test_heartbeats_that_were_lost_with_the_server_make_no_run_dead() -> None:
+    runs = FakeRuns({A: [["RUNNING"] * 60 + ["COMPLETED"]]})
+    (row,) = supervise(runs, [A], outages_end_s=55.0)
+    assert row["status"] == "done" and not runs.crashed
+    # Dead all the same, once the server is there to stay.
+    dead = FakeRuns({A: [["RUNNING"], ["COMPLETED"]]})
+    (row,) = supervise(dead, [A], outages_end_s=55.0)
+    assert row["status"] == "done" and row["attempts"] == 2 and dead.crashed
 
 
 def test_a_run_in_the_queue_is_never_freed() -> None:
