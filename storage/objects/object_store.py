@@ -7,7 +7,6 @@ import uuid
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, suppress
-from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -19,14 +18,14 @@ from storage.codecs import get_codec
 from storage.io_errors import make_corruption_error, os_errors_translated
 from storage.manifest import MANIFEST, Manifest, NewerSchemaError, parse_manifest
 from storage.manifest_writer import find_damage, write_artifact
+from storage.objects.abandoned import PROBE_START, remove_abandoned_objects
 from storage.objects.bucket import Bucket, ObjectInfo
-from storage.objects.object_lease import LEASES_FOLDER, hold_object_lease
+from storage.objects.object_lease import hold_object_lease
 from storage.objects.object_records import ObjectRecordFolders
-from storage.objects.payloads import ETAGS_START, PAYLOAD_START, Payloads, is_payload
+from storage.objects.payloads import Payloads, is_payload
 from storage.objects.read_cache import ReadCache, find_cache_folder, read_limit_bytes
 from storage.store import Artifact, Provenance
 
-_PROBE = ".probe-"
 _PUBLISH_ATTEMPTS = 5
 _MANIFESTS_AT_ONCE = 16
 
@@ -59,7 +58,7 @@ class ObjectStore:
 
     def check_writable(self) -> None:
         """Writes and removes a small object: see :meth:`storage.store.Store.check_writable`."""
-        name = f"{_PROBE}{describe_owner()}-{uuid.uuid4().hex}"
+        name = f"{PROBE_START}{describe_owner()}-{uuid.uuid4().hex}"
         self._bucket.write(name, b"\0")
         self._bucket.delete([name])
 
@@ -209,37 +208,18 @@ class ObjectStore:
             except ArtifactCorruptError as error:
                 yield name, error
 
-    def clean_temporaries(self, older_than_s: float = 3600.0) -> int:
-        """Removes payloads without a manifest, leases that nobody renews, and this machine's temporary folders.
+    def clean_temporaries(self, older_than_s: float = 3600.0, everywhere: bool = False) -> int:
+        """Removes this machine's temporary folders, payloads without a manifest, and leases that nobody renews.
 
         Args:
             older_than_s: objects go when they were written so many seconds ago or earlier.
+            everywhere: whether objects go too. The whole bucket is then listed.
 
         Returns:
             How many objects and folders were removed.
         """
-        payloads: dict[str, list[ObjectInfo]] = {}
-        abandoned: list[ObjectInfo] = []
-        for info in self._bucket.list():
-            if info.name.startswith((f"{LEASES_FOLDER}/", _PROBE)):
-                abandoned.append(info)
-            elif is_payload(info.name):
-                folder = info.name.partition(f"/{PAYLOAD_START}")[0].partition(f"/{ETAGS_START}")[0]
-                payloads.setdefault(folder, []).append(info)
-        for folder, infos in payloads.items():
-            found = self._bucket.read(f"{folder}/{MANIFEST}")
-            digest = ""
-            if found is not None:
-                try:
-                    digest = parse_manifest(found.data, Path(folder, MANIFEST)).payload_digest[:12]
-                except ArtifactCorruptError:
-                    # It may be a newer version's, whose files are not known here.
-                    continue
-            abandoned += [info for info in infos if not digest or digest not in info.name[len(folder) :]]
-        now = datetime.now(UTC)
-        old = [info.name for info in abandoned if (now - info.modified).total_seconds() >= older_than_s]
-        self._bucket.delete(old)
-        return len(old) + self._cache.clean_temporaries()
+        removed = self._cache.clean_temporaries()
+        return removed + (remove_abandoned_objects(self._bucket, older_than_s) if everywhere else 0)
 
     def _publish(self, folder: Path, manifest: Manifest) -> Artifact:
         """Uploads a folder's files and puts the manifest, where the first sound artifact stays."""
