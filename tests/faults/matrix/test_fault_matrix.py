@@ -63,8 +63,6 @@ def services(request: pytest.FixtureRequest) -> Iterator[Services]:
 def test_nothing_is_lost(kind: type[Fault], services: Services, request: pytest.FixtureRequest) -> None:
     if kind is machine_faults.DiskFull and shutil.which("mount") is None:
         pytest.skip("a small disk cannot be mounted")
-    if issubclass(kind, machine_faults.ClockJumps) and machine_faults.FAKETIME is None:
-        pytest.skip("the package libfaketime is not installed")
     times = request.config.getoption("fault_times")
     try:
         row, problems = run_fault(services.cluster, kind(), times, services.quiet)

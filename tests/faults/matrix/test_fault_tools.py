@@ -5,6 +5,9 @@ from __future__ import annotations
 import http.client
 import http.server
 import json
+import os
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -23,6 +26,7 @@ from tests.faults.matrix.compute_log import Note, count_computations, find_runni
 from tests.faults.matrix.fault_hooks import ARMED, TAKEN, hook_stage_runner
 from tests.faults.matrix.fault_table import FaultRow, find_faults, merge_row
 from tests.faults.matrix.faulty_proxy import FaultyProxy
+from tests.faults.matrix.machine_faults import build_clock_shift, write_shift
 from tests.storage.artifact_values import make
 
 BODY = b"0123456789" * 1000
@@ -131,6 +135,25 @@ def test_hooks_note_computations_and_an_armed_fault_hits_once(tmp_path: Path) ->
     assert [note.stage for note in notes] == ["ingest"] * 5 + ["gnet"] * 5
     assert {path.name for path in (tmp_path / TAKEN).iterdir()} == {"memory.1", "transient@gnet.2"}
     assert not list((tmp_path / ARMED).iterdir())
+
+
+def test_a_shifted_clock_jumps_and_waits_do_not(tmp_path: Path) -> None:
+    shift = tmp_path / "shift"
+    write_shift(shift, 0)
+    script = (
+        "import os, struct, sys, threading, time, datetime\n"
+        "handle = os.open(sys.argv[1], os.O_WRONLY)\n"
+        "before = time.time()\n"
+        "monotonic = time.monotonic()\n"
+        "os.pwrite(handle, struct.pack('=q', -3600), 0)\n"
+        "assert -3601 < time.time() - before < -3590\n"
+        "assert -3601 < datetime.datetime.now().timestamp() - before < -3590\n"
+        "time.sleep(0.01)\n"
+        "assert not threading.Event().wait(0.01)\n"
+        "assert 0 < time.monotonic() - monotonic < 60\n"
+    )
+    env = os.environ | {"LD_PRELOAD": str(build_clock_shift(tmp_path)), "GENRE_CLOCK_SHIFT": str(shift)}
+    subprocess.run([sys.executable, "-c", script, str(shift)], env=env, check=True)
 
 
 def test_computations_are_counted_by_key() -> None:
