@@ -17,7 +17,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from docs import exchange_tables, references, result_tables, simulation_tables  # after the path is set
+from docs import exchange_tables, fault_tables, references, result_tables, simulation_tables  # after the path is set
 
 BLOCK = re.compile(r"<!-- generated: ([\w-]+) -->\n(.*?)<!-- end -->", re.DOTALL)
 
@@ -37,6 +37,8 @@ BLOCKS: Mapping[str, Callable[[], str]] = {
     "evaluation-claims": lambda: result_tables.claims("evaluation"),
     "log-faults": result_tables.log_faults,
     "log-faults-claims": lambda: result_tables.claims("log_faults"),
+    "faults": fault_tables.matrix,
+    "fault-injections": fault_tables.injections,
     "exchange-claims": exchange_tables.claims,
     "exchange-formats": exchange_tables.formats,
     "exchange-enhancement": exchange_tables.enhancement,

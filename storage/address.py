@@ -10,6 +10,9 @@ from genre_tasks.errors import ConfigError
 
 _FOLDER_NAME = re.compile(r"[^\x00-\x1f\x7f/\\]{1,200}")
 
+# Dataset, log, chunk, stage and key; a stage may have more.
+_FEWEST_PARTS = 5
+
 
 @dataclass(frozen=True, order=True)
 class Address:
@@ -50,6 +53,27 @@ class Address:
                 f"The {name} {part!r} cannot be a folder's name",
                 remedy="Use letters, digits, and any of - _ = + . inside; not empty and with no dot in front.",
             )
+
+    @classmethod
+    def parse(cls, text: str) -> Address:
+        """Reads an address as :meth:`__str__` writes it.
+
+        Args:
+            text: such as ``pandaset/002/0000/gnet/5f41af0e``.
+
+        Returns:
+            The address.
+
+        Raises:
+            ConfigError: the text is no address.
+
+        >>> Address.parse("pandaset/002/0000/evaluate/gnet/5f41af0e").stage
+        'evaluate/gnet'
+        """
+        parts = text.split("/")
+        if len(parts) < _FEWEST_PARTS or not parts[2].isdecimal():
+            raise ConfigError(f"{text!r} is no address", remedy="Write it as dataset/log/chunk/stage/key.")
+        return cls(parts[0], parts[1], int(parts[2]), "/".join(parts[3:-1]), parts[-1])
 
     @property
     def relative_path(self) -> PurePosixPath:

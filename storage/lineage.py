@@ -57,6 +57,29 @@ def find_ancestors(store: Store, artifact: Artifact) -> list[Artifact]:
     return list(found.values())
 
 
+def find_descendants(store: Store, artifact: Artifact) -> list[Artifact]:
+    """Finds all artifacts that were made from an artifact, directly or through others.
+
+    Args:
+        store: the store that the artifact is in.
+        artifact: the artifact.
+
+    Returns:
+        The descendants of the same chunk, nearest first, each once.
+    """
+    address = artifact.address
+    others = list(store.artifacts(dataset=address.dataset, log=address.log, chunk=address.chunk))
+    found: dict[str, Artifact] = {}
+    todo = [address.key]
+    while todo:
+        key = todo.pop(0)
+        for other in others:
+            if key in other.manifest.inputs.values() and other.address.key not in found:
+                found[other.address.key] = other
+                todo.append(other.address.key)
+    return list(found.values())
+
+
 def summarise_files(store: Store, artifact: Artifact) -> list[TableSummary]:
     """Summarises every file of an artifact: schema, rows and statistics.
 

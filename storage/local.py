@@ -248,12 +248,13 @@ class LocalStore:
             except ArtifactCorruptError as error:
                 yield name, error
 
-    def clean_temporaries(self, older_than_s: float = 3600.0) -> int:
+    def clean_temporaries(self, older_than_s: float = 3600.0, everywhere: bool = False) -> int:
         """Removes what killed processes left behind.
 
         Args:
             older_than_s: folders of other machines, whose processes cannot be asked for, go when nothing in them was
                 touched for so many seconds.
+            everywhere: makes no difference for a folder.
 
         Returns:
             How many files and folders were removed.

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import glob
+import shutil
 from pathlib import Path
 from typing import Protocol
 
 from genre_tasks.errors import ConfigError
+from storage.io_errors import as_genre_error
 
 
 class RecordFolders(Protocol):
@@ -46,6 +48,19 @@ class RecordFolders(Protocol):
         """
         ...
 
+    def remove(self, name: str) -> None:
+        """Removes a folder; nothing happens where there is none.
+
+        Args:
+            name: the folder's name.
+
+        Raises:
+            ConfigError: the name leads out of the store.
+            InputError: the store cannot be written.
+            TransientIOError: the store does not answer.
+        """
+        ...
+
     def find(self, parent: str, file: str, start: str = "") -> list[Path]:
         """Finds a file of many folders, such as every run's ``run.json``.
 
@@ -80,6 +95,16 @@ class LocalRecordFolders:
     def push(self, name: str) -> None:
         """Does nothing, as files are written in place."""
         split_record_name(name)
+
+    def remove(self, name: str) -> None:
+        """Removes a folder: see :meth:`RecordFolders.remove`."""
+        folder = self.pull(name)
+        try:
+            shutil.rmtree(folder)
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            raise as_genre_error(error, folder) from error
 
     def find(self, parent: str, file: str, start: str = "") -> list[Path]:
         """Finds a file of many folders: see :meth:`RecordFolders.find`."""

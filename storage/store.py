@@ -249,11 +249,12 @@ class Store(Protocol):
         """
         ...
 
-    def clean_temporaries(self, older_than_s: float = 3600.0) -> int:
+    def clean_temporaries(self, older_than_s: float = 3600.0, everywhere: bool = False) -> int:
         """Removes what killed processes left behind.
 
         Args:
             older_than_s: what cannot be attributed to a process goes when it was not touched for so many seconds.
+            everywhere: whether a bucket is listed as well, which takes long for a large one.
 
         Returns:
             How many files and folders were removed.

@@ -4,9 +4,19 @@ from __future__ import annotations
 
 import os
 
+import pytest
+
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("DO_NOT_TRACK", "1")
 os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
 
 # Doctests are collected from every module, and several conftest.py of one name cannot be imported as modules.
 collect_ignore_glob = ["conftest.py", "*/conftest.py"]
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Options of the fault matrix, here because pytest reads them before it knows of deeper folders."""
+    group = parser.getgroup("fault matrix")
+    group.addoption("--write-fault-table", action="store_true", help="Write rows into docs/results/data/faults.json.")
+    group.addoption("--fault-times", type=int, default=5, help="How often every fault is injected.")
+    group.addoption("--keep-fault-folder", action="store_true", help="Leave logs and stores of the faults on the disk.")

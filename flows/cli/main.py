@@ -21,12 +21,15 @@ from flows.cli.effects import effects
 from flows.cli.enhance import enhance
 from flows.cli.export import export
 from flows.cli.figure import figure
+from flows.cli.gc import gc
 from flows.cli.import_command import import_command
 from flows.cli.last_resort import run_guarded
+from flows.cli.lineage import lineage
 from flows.cli.ops import app as ops_app
 from flows.cli.outcome import start_outcome, wants_json
 from flows.cli.paper_table import table
 from flows.cli.parsing import check_words
+from flows.cli.pin import pin, unpin
 from flows.cli.range import range_command
 from flows.cli.render import render
 from flows.cli.run import run
@@ -34,6 +37,7 @@ from flows.cli.serve import serve
 from flows.cli.show import show
 from flows.cli.signals import end_on_signals, exit_process
 from flows.cli.simulate import simulate
+from flows.cli.store import app as store_app
 from flows.cli.streams import prepare_streams
 from flows.cli.train import app as train_app
 from flows.cli.verify import verify
@@ -66,7 +70,12 @@ app.command(name="export")(export)
 app.command(name="import")(import_command)
 app.command(name="show")(show)
 app.command(name="diff")(diff)
+app.command(name="lineage")(lineage)
 app.command(name="verify")(verify)
+app.command(name="gc")(gc)
+app.command(name="pin")(pin)
+app.command(name="unpin")(unpin)
+app.add_typer(store_app, name="store")
 app.command(name="doctor")(doctor)
 app.add_typer(ops_app, name="ops")
 app.command(name="cost")(cost)

@@ -2,36 +2,76 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Annotated, Any
+
 import typer
 
 from flows.cli.options import StoreOption
 from flows.defaults import DEFAULT_STORE
 
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
-def verify(store: StoreOption = DEFAULT_STORE) -> None:
+    from genre_tasks.errors import ArtifactCorruptError
+    from storage.store import Store
+
+
+def verify(
+    store: StoreOption = DEFAULT_STORE,
+    repair: Annotated[
+        bool, typer.Option("--repair", help="Remove damaged artifacts, and compute those of runs again.")
+    ] = False,
+) -> None:
     """Check every artifact of a store against its manifest.
 
     Every file is read and compared with the size and the sha256 that its manifest lists. Damaged artifacts are named;
-    nothing is changed. The exit status is 1 if any artifact is damaged.
+    without --repair nothing is changed. The exit status is 1 if any artifact is damaged and was not repaired.
 
     Example:
 
     \b
         genre verify --store genre-store
+        genre verify --store genre-store --repair
     """
     from flows.cli.existing_store import open_existing_store
 
     opened = open_existing_store(store)
     sound = 0
-    damaged = 0
-    for _, error in opened.verify_all():
+    damaged: dict[str, ArtifactCorruptError] = {}
+    for name, error in opened.verify_all():
         if error is None:
             sound += 1
         else:
-            damaged += 1
+            damaged[name] = error
             # All of them are listed, not the first alone: a failing disk seldom damages one file.
             typer.echo(f"damaged: {error}")
-    typer.echo(f"{sound} artifacts are sound, {damaged} damaged")
-    if damaged:
-        typer.echo("Run the log again: damaged artifacts are computed again, nothing else is.")
+    typer.echo(f"{sound} artifacts are sound, {len(damaged)} damaged")
+    if not damaged:
+        return
+    if not repair:
+        typer.echo("Add --repair, or run the log again: damaged artifacts are computed again, nothing else is.")
         raise typer.Exit(1)
+    if not _repair(opened, damaged):
+        raise typer.Exit(1)
+
+
+def _repair(store: Store, damaged: Mapping[str, ArtifactCorruptError]) -> bool:
+    """Repairs artifacts and prints what became of each; whether all were repaired."""
+    from flows.cli.terminal import report_on_terminal
+    from flows.upkeep.repair import repair_artifacts
+
+    def run_again(record: Mapping[str, Any]) -> None:
+        # All chunks, so that the run keeps its name: the sound ones are served from the store.
+        chunks = [chunk["chunk"] for chunk in record["chunks"]]
+        with report_on_terminal():
+            from flows.reconstruction.flow import reconstruct_log
+
+            reconstruct_log(
+                record["log"], preset=record["preset"], store=store.uri, chunks=chunks, config=record["config"]
+            )
+
+    is_complete = True
+    for done in repair_artifacts(store, damaged, run_again):
+        is_complete &= done.outcome == "repaired"
+        typer.echo(f"{done.outcome}: {done.name}{': ' if done.why else ''}{done.why}")
+    return is_complete

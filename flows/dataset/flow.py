@@ -14,9 +14,9 @@ from flows.configuration import load_configuration
 from flows.dataset.dataset_record import name_dataset, write_dataset_record
 from flows.dataset.live_table import FINAL_STATUSES, LiveTable
 from flows.dataset.prefect_runs import ChildRequest, PrefectRuns
-from flows.dataset.server_calls import call_server
+from flows.dataset.server_calls import call_server, read_last_outage
 from flows.dataset.submission import mark_as_parent
-from flows.dataset.supervisor import SupervisionLimits, Supervisor
+from flows.dataset.supervisor import Supervisor, read_limits
 from flows.dataset.work_units import Unit, list_units
 from flows.defaults import DEFAULT_PRESET, DEFAULT_STORE
 from flows.pipeline.log_cache import expand_logs
@@ -64,7 +64,7 @@ def reconstruct_dataset(
 
     Raises:
         InputError: a star matches no folder.
-        ConfigError: a setting or parameter is wrong.
+        ConfigError: a setting, a parameter or a variable of the environment is wrong.
         LogsFailedError: some logs are not complete, raised once all were tried; its ``outcomes`` has all of them.
 
     Example::
@@ -85,8 +85,8 @@ def reconstruct_dataset(
         parameters = {"preset": preset, "store": store, "settings": settings}
         mark_as_parent(str(flow_run.id), name)
         request = ChildRequest(name, str(flow_run.id), pool, parameters, gpu_limit)
-        limits = SupervisionLimits(in_flight=in_flight, attempts=attempts)
-        outcomes = Supervisor(units, PrefectRuns(request), limits, table.show).run()
+        limits = read_limits(in_flight, attempts)
+        outcomes = Supervisor(units, PrefectRuns(request), limits, table.show, last_outage=read_last_outage).run()
     _report(outcomes)
     report = write_dataset_record(store, name, preset, outcomes)
     get_reporter().message(f"report {report}")

@@ -41,7 +41,7 @@ HEARTBEAT_EVENT = "prefect.flow-run.heartbeat"
 # The server gives no more runs in one answer, and no more than fifty events.
 _RUNS_PER_REQUEST = 200
 _EVENTS_PER_REQUEST = 50
-_IDS_PER_EVENT_REQUEST = 10
+_DAYS = 7
 
 
 @dataclass(frozen=True)
@@ -114,8 +114,9 @@ class PrefectRuns:
 
     def read_heartbeats(self, ids: Sequence[str]) -> Mapping[str, str]:
         """Reads when runs have last shown that they are alive."""
-        # A day: the clocks of workers and of this machine may differ.
-        return read_last_heartbeats(self._client, ids, since_s=86400.0)
+        # By their number and not by their times, which jump with the worker's clock.
+        counts = {id_: count_heartbeats(self._client, id_) for id_ in ids}
+        return {id_: str(count) for id_, count in counts.items() if count}
 
     def read_stages(self, ids: Sequence[str]) -> Mapping[str, str]:
         """Reads which stage runs are in."""
@@ -200,31 +201,45 @@ def dataset_tag(dataset: str) -> str:
     return f"genre-dataset:{dataset}"
 
 
-def read_last_heartbeats(client: SyncPrefectClient, ids: Sequence[str], since_s: float) -> dict[str, str]:
-    """Reads the last heartbeats of flow runs.
+def has_heartbeat(client: SyncPrefectClient, run_id: str, since_s: float) -> bool:
+    """Says whether the server has received a heartbeat of a flow run lately.
 
     Args:
         client: of the server.
-        ids: of the runs.
-        since_s: how many seconds ago the oldest one may be that counts.
+        run_id: of the run.
+        since_s: how many seconds ago the heartbeat may have been received, by the server's clock.
 
     Returns:
-        By id of the run, the id of its last heartbeat; nothing for a run without any.
+        Whether there is one.
     """
-    found: dict[str, str] = {}
+    earliest = datetime.now(UTC) - timedelta(seconds=since_s)
+    page = call_server(client.read_events, _heartbeats_of(run_id), limit=_EVENTS_PER_REQUEST)
+    # The time of the event itself is the worker's, whose clock may be wrong.
+    return any(event.received >= earliest for event in page.events)
+
+
+def count_heartbeats(client: SyncPrefectClient, run_id: str) -> int:
+    """Counts the heartbeats of a flow run that the server has received.
+
+    Args:
+        client: of the server.
+        run_id: of the run.
+
+    Returns:
+        Their number.
+    """
+    return int(call_server(client.read_events, _heartbeats_of(run_id), limit=1).total)
+
+
+def _heartbeats_of(run_id: str) -> EventFilter:
     now = datetime.now(UTC)
-    for some in _split(ids, _IDS_PER_EVENT_REQUEST):
-        wanted = EventFilter(
-            event=EventNameFilter(name=[HEARTBEAT_EVENT]),
-            resource=EventResourceFilter(id=[f"prefect.flow-run.{id_}" for id_ in some]),
-            # A worker's clock may be ahead.
-            occurred=EventOccurredFilter(since=now - timedelta(seconds=since_s), until=now + timedelta(days=1)),
-            order=EventOrder.DESC,
-        )
-        page = call_server(client.read_events, wanted, limit=_EVENTS_PER_REQUEST)
-        for event in page.events:
-            found.setdefault(event.resource.id.rpartition(".")[2], str(event.id))
-    return found
+    return EventFilter(
+        event=EventNameFilter(name=[HEARTBEAT_EVENT]),
+        resource=EventResourceFilter(id=[f"prefect.flow-run.{run_id}"]),
+        # Far enough for any worker's clock.
+        occurred=EventOccurredFilter(since=now - timedelta(days=_DAYS), until=now + timedelta(days=_DAYS)),
+        order=EventOrder.DESC,
+    )
 
 
 def _split(ids: Sequence[str], size: int) -> Iterator[Sequence[str]]:

@@ -16,6 +16,7 @@ R = TypeVar("R")
 _PATIENCE_S = 900.0
 _MAX_PAUSE_S = 10.0
 _FIRST_SERVER_ERROR = 500
+_last_outage_s = float("-inf")
 
 
 def call_server(
@@ -42,11 +43,28 @@ def call_server(
         try:
             return function(*args, **kwargs)
         except Exception as error:
-            if not is_server_away(error) or time.monotonic() - start_s > _PATIENCE_S:
+            if not is_server_away(error):
+                raise
+            _note_outage()
+            if time.monotonic() - start_s > _PATIENCE_S:
                 raise
             _log.warning("Prefect's server does not answer (%s): trying again in %.1f s", error, pause_s)
         time.sleep(pause_s)
         pause_s = min(2 * pause_s, _MAX_PAUSE_S)
+
+
+def read_last_outage() -> float:
+    """Reads when a call of this process last found the server away, as heartbeats are lost at such times.
+
+    Returns:
+        Seconds of ``time.monotonic``; minus infinity if it never did.
+    """
+    return _last_outage_s
+
+
+def _note_outage() -> None:
+    global _last_outage_s
+    _last_outage_s = time.monotonic()
 
 
 def is_server_away(error: Exception) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,15 +26,18 @@ from prefect.exceptions import ObjectNotFound
 from prefect.states import Crashed
 
 from flows.dataset.live_table import TABLE_KEY
-from flows.dataset.prefect_runs import DEPLOYMENT, dataset_tag, read_last_heartbeats
-from flows.dataset.server_calls import call_server
+from flows.dataset.prefect_runs import DEPLOYMENT, count_heartbeats, dataset_tag, has_heartbeat
+from flows.dataset.server_calls import call_server, read_last_outage
 from flows.dataset.supervisor import HEARTBEAT_S
 from genre_tasks.errors import ConfigError
 
+_log = logging.getLogger("genre")
 PARENT_DEPLOYMENT = "reconstruct-dataset/dataset"
 """What the parent of a dataset is a run of."""
 PARENT_TAG = "genre-dataset-parent"
 """Tag of the flow runs of parents; their child runs do not have it."""
+_SILENT_S = 3.0 * HEARTBEAT_S
+_HEARTBEAT_POLL_S = 5.0
 _ACTIVE = [StateType.SCHEDULED, StateType.PENDING, StateType.RUNNING, StateType.PAUSED]
 
 
@@ -109,9 +113,10 @@ def follow_dataset(
         The type of the run's last state with its message, and the final rows.
     """
     with get_client(sync_client=True) as client:
+        watch = HeartbeatWatch(client, run_id)
         while True:
             run = call_server(client.read_flow_run, run_id)
-            if run.state is not None and run.state.type is StateType.RUNNING and not _is_alive(client, run):
+            if run.state is not None and run.state.type is StateType.RUNNING and watch.is_silent():
                 # Nobody else notices that the parent's worker died with all its processes.
                 crash_run(client, run.id)
                 continue
@@ -149,7 +154,7 @@ def _find_running(client: SyncPrefectClient, name: str) -> FlowRun | None:
         state=FlowRunFilterState(type=FlowRunFilterStateType(any_=_ACTIVE)),
     )
     for run in client.read_flow_runs(flow_run_filter=wanted):
-        if run.state is None or run.state.type is not StateType.RUNNING or _is_alive(client, run):
+        if run.state is None or run.state.type is not StateType.RUNNING or _shows_life(client, run):
             return run
         crash_run(client, run.id)
     return None
@@ -165,11 +170,55 @@ def crash_run(client: SyncPrefectClient, run_id: UUID) -> None:
     call_server(client.set_flow_run_state, run_id, Crashed(message="no heartbeat"), force=True)
 
 
-def _is_alive(client: SyncPrefectClient, run: FlowRun) -> bool:
-    silent_s = 3.0 * HEARTBEAT_S
-    if run.estimated_run_time.total_seconds() < silent_s:
+class HeartbeatWatch:
+    """Watches by this process's clock whether a running parent sends heartbeats.
+
+    Heartbeats are lost while the server is away, so that time does not count.
+
+    Args:
+        client: of the server.
+        run_id: of the parent's flow run.
+        clock: seconds of a clock that never jumps.
+    """
+
+    def __init__(self, client: SyncPrefectClient, run_id: UUID, clock: Callable[[], float] = time.monotonic) -> None:
+        self._client = client
+        self._run_id = str(run_id)
+        self._clock = clock
+        self._count = -1
+        self._since_s = clock()
+        self._next_s = self._since_s
+
+    def is_silent(self) -> bool:
+        """Says whether no heartbeat has come for three periods in which the server was there; asks now and then."""
+        now_s = self._clock()
+        self._since_s = max(self._since_s, read_last_outage())
+        if now_s < self._next_s:
+            return False
+        self._next_s = now_s + _HEARTBEAT_POLL_S
+        count = count_heartbeats(self._client, self._run_id)
+        if count != self._count:
+            self._count = count
+            self._since_s = now_s
+        return now_s - self._since_s > _SILENT_S
+
+    def waits_for_life(self, sleep: Callable[[float], None] = time.sleep) -> bool:
+        """Waits for a heartbeat; returns False if none comes for three periods."""
+        self.is_silent()
+        first = self._count
+        while self._count == first:
+            if self.is_silent():
+                return False
+            sleep(1.0)
         return True
-    return bool(read_last_heartbeats(client, [str(run.id)], since_s=silent_s))
+
+
+def _shows_life(client: SyncPrefectClient, run: FlowRun) -> bool:
+    if run.estimated_run_time.total_seconds() < _SILENT_S or has_heartbeat(client, str(run.id), since_s=_SILENT_S):
+        return True
+    # Its heartbeats may have been lost with the server: one that lives sends another.
+    _log.warning("the dataset's flow run sends no heartbeat: waiting for one before it is given up")
+    return HeartbeatWatch(client, run.id).waits_for_life()
 
 
 def _read_table(client: SyncPrefectClient, run_id: UUID) -> list[dict[str, Any]]:

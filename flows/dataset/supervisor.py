@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from flows.dataset.child_runs import ACTIVE_STATES, ChildRun, ChildRuns
 from flows.dataset.work_units import WorkUnit
+from genre_tasks.errors import ConfigError
 
+PENDING_VARIABLE = "GENRE_PENDING_SECONDS"
+"""The variable of the environment for :attr:`SupervisionLimits.pending_s`."""
+SILENT_VARIABLE = "GENRE_SILENT_SECONDS"
+"""The variable of the environment for :attr:`SupervisionLimits.silent_s`."""
 HEARTBEAT_S = 30
 """Seconds between two heartbeats of a child run."""
 Rows = list[dict[str, Any]]
@@ -34,6 +40,48 @@ class SupervisionLimits:
     poll_s: float = 2.0
     pending_s: float = 180.0
     silent_s: float = 3.0 * HEARTBEAT_S
+
+
+def read_limits(in_flight: int, attempts: int, environment: Mapping[str, str] = os.environ) -> SupervisionLimits:
+    """Makes limits whose times the environment of the coordinator's worker may change.
+
+    Args:
+        in_flight: runs that are submitted and have not ended, at most.
+        attempts: how often a unit is submitted, at most.
+        environment: ``GENRE_PENDING_SECONDS`` for machines that are slow to start a run, ``GENRE_SILENT_SECONDS`` for
+            how long a run may be without a heartbeat, which comes every thirty seconds.
+
+    Returns:
+        The limits.
+
+    Raises:
+        ConfigError: a variable is no number, or too small.
+
+    >>> read_limits(8, 3, {"GENRE_PENDING_SECONDS": "600"}).pending_s
+    600.0
+    """
+    defaults = SupervisionLimits(in_flight=in_flight, attempts=attempts)
+    return SupervisionLimits(
+        in_flight=in_flight,
+        attempts=attempts,
+        pending_s=_read_seconds(environment, PENDING_VARIABLE, defaults.pending_s, 1.0),
+        # A living run must be able to miss one heartbeat.
+        silent_s=_read_seconds(environment, SILENT_VARIABLE, defaults.silent_s, 2.0 * HEARTBEAT_S),
+    )
+
+
+def _read_seconds(environment: Mapping[str, str], name: str, default: float, least: float) -> float:
+    text = environment.get(name)
+    if not text:
+        return default
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = float("nan")
+    # Also false for NaN.
+    if not least <= seconds < float("inf"):
+        raise ConfigError(f"{name} is {text!r}", remedy=f"Give seconds, {least:.0f} or more, or unset it.")
+    return seconds
 
 
 @dataclass
@@ -78,6 +126,7 @@ class Supervisor:
         on_change: called with the rows of the table after every poll.
         clock: seconds of a clock that never jumps.
         sleep: waits for seconds.
+        last_outage: when the server was last found away, by the same clock.
     """
 
     def __init__(
@@ -88,12 +137,14 @@ class Supervisor:
         on_change: Callable[[Rows], None] = lambda rows: None,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
+        last_outage: Callable[[], float] = lambda: float("-inf"),
     ) -> None:
         self._runs = runs
         self._limits = limits
         self._on_change = on_change
         self._clock = clock
         self._sleep = sleep
+        self._last_outage = last_outage
         self._last_poll_s = clock()
         self._state = _Supervision({unit: _new_row(unit) for unit in units})
 
@@ -153,7 +204,7 @@ class Supervisor:
         found = self._runs.read(list(self._state.watches))
         # After the call, which waits as long as the server is away.
         now = self._clock()
-        if now - self._last_poll_s > self._limits.silent_s / 3:
+        if now - self._last_poll_s > self._limits.silent_s / 3 or self._last_outage() >= self._last_poll_s:
             # The server was away, and heartbeats with it: what is dead shows itself from here on.
             for watch in self._state.watches.values():
                 watch.since_s = now

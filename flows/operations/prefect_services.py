@@ -13,6 +13,8 @@ from flows.operations.service import HOST, Service, keep_port, keep_secret
 
 HEARTBEAT_SECONDS = 30
 _QUIET = {"DO_NOT_TRACK": "1", "PREFECT_SERVER_ANALYTICS_ENABLED": "false"}
+LEASE_STORAGE = "prefect.server.concurrency.lease_storage.filesystem"
+"""Where a server remembers who has slots of concurrency limits: files, as memory is lost with the process."""
 _PREFECT = [sys.executable, "-m", "prefect"]
 
 
@@ -63,6 +65,8 @@ class PrefectServer(Service):
     def environment(self) -> dict[str, str]:
         """Returns database, secret and home of the server."""
         variables = {**_QUIET, "PREFECT_HOME": str(self.folder / "home"), "PREFECT_API_URL": self.url}
+        # The database counts the slots: without their leases, a server that was killed would never take them back.
+        variables["PREFECT_SERVER_CONCURRENCY_LEASE_STORAGE"] = LEASE_STORAGE
         if self.database_url:
             variables["PREFECT_API_DATABASE_CONNECTION_URL"] = self.database_url
         if self.authentication:

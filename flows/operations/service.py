@@ -159,12 +159,13 @@ class Service:
         """
         if self.process is None:
             return
-        with suppress(ProcessLookupError, PermissionError):
-            if children:
-                # The group outlives its leader while a child lives, and its number is not reused until then.
-                os.killpg(self.process.pid, signal.SIGKILL)
-            elif self.process.poll() is None:
-                self.process.kill()
+        is_alive = self.process.poll() is None
+        if is_alive and children:
+            kill_tree(self.process.pid)
+        elif is_alive:
+            self.process.kill()
+        elif children:
+            kill_group(self.process.pid)
         self.process.wait()
 
     def __enter__(self) -> Self:
@@ -174,6 +175,37 @@ class Service:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.stop()
+
+
+def kill_tree(pid: int) -> None:
+    """Kills a running process that leads a session, its group, and its descendants in sessions of their own (SIGKILL).
+
+    Args:
+        pid: the process. The caller makes sure that it runs, as its number may be another's later.
+    """
+    import psutil
+
+    descendants: list[psutil.Process] = []
+    with suppress(psutil.Error):
+        leader = psutil.Process(pid)
+        # Stopped first, so that it starts no more. A worker of Prefect starts every run in a session of its own.
+        leader.suspend()
+        descendants = leader.children(recursive=True)
+    kill_group(pid)
+    for process in descendants:
+        with suppress(psutil.Error):
+            process.kill()
+
+
+def kill_group(pid: int) -> None:
+    """Kills what is left of the group of a process that leads a session (SIGKILL).
+
+    Args:
+        pid: the process, which may have ended.
+    """
+    with suppress(ProcessLookupError, PermissionError):
+        # The group outlives its leader while a child lives, and its number is not reused until then.
+        os.killpg(pid, signal.SIGKILL)
 
 
 def find_free_port() -> int:

@@ -17,7 +17,7 @@ from flows.operations.deployments import COORDINATOR_QUEUE, RUN_QUEUE, deploy_fl
 from flows.operations.object_server import ObjectServer
 from flows.operations.postgres_server import PostgresServer
 from flows.operations.prefect_services import HEARTBEAT_SECONDS, PrefectServer, Worker
-from flows.operations.service import Service
+from flows.operations.service import Service, kill_group, kill_tree
 from flows.operations.state_file import ServiceRecord, locked, read_records, read_start_ticks, write_records
 from genre_tasks.errors import ConfigError
 
@@ -144,8 +144,10 @@ def _stop(record: ServiceRecord) -> None:
     deadline = time.monotonic() + _STOP_SECONDS
     while record.alive and time.monotonic() < deadline:
         time.sleep(0.1)
-    with suppress(ProcessLookupError, PermissionError):
-        os.killpg(record.pid, signal.SIGKILL)
+    if record.alive:
+        kill_tree(record.pid)
+    else:
+        kill_group(record.pid)
 
 
 def describe_services(folder: Path) -> list[dict[str, Any]]:

@@ -79,6 +79,17 @@ class Bucket:
         self.uri = check_uri(uri)
         self._retry_s = retry_s
 
+    def with_retry_seconds(self, retry_s: float) -> Bucket:
+        """Makes another access to the same objects.
+
+        Args:
+            retry_s: for how long a request is tried again.
+
+        Returns:
+            The access.
+        """
+        return Bucket(self.uri, retry_s)
+
     def read(self, name: str) -> ObjectContent | None:
         """Reads a small object.
 

@@ -71,7 +71,7 @@ class _Lease:
         self._name = name
         self._seconds = seconds
         # Short: a renewal that fails is followed by the next one, and the end of a stage must not wait for long.
-        self._renewing_bucket = Bucket(bucket.uri, retry_s=seconds / _RENEWALS_PER_LEASE)
+        self._renewing_bucket = bucket.with_retry_seconds(seconds / _RENEWALS_PER_LEASE)
         self._token = uuid.uuid4().hex
         self._renewals = 0
         self._version: ObjectVersion | None = None
@@ -85,9 +85,11 @@ class _Lease:
         self._version = self._bucket.create(self._name, self._body())
         while self._version is None:
             found = self._bucket.read(self._name)
-            # A store that was away did not let the holder renew either: such a wait does not count.
-            waited_s = min(time.monotonic() - read_s, pause_s + _SLOW_ANSWER_FRACTION * self._seconds)
-            read_s = time.monotonic()
+            waited_s = time.monotonic() - read_s
+            read_s += waited_s
+            # A store that was away did not let the holder renew either: only the pause counts then.
+            if waited_s > pause_s + _SLOW_ANSWER_FRACTION * self._seconds:
+                waited_s = pause_s
             if found is None:
                 self._version = self._bucket.create(self._name, self._body())
             elif found.version != last_version:

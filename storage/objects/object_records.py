@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import suppress
 from datetime import datetime
@@ -59,6 +60,12 @@ class ObjectRecordFolders:
                 continue
             known[file] = {"sha256": digest, "e_tag": self._bucket.upload(f"{name}/{file}", path)}
         _write_sync(folder, known)
+
+    def remove(self, name: str) -> None:
+        """Removes a folder: see :meth:`storage.records.RecordFolders.remove`."""
+        folder = self._folder.joinpath(*split_record_name(name))
+        self._bucket.delete([info.name for info in self._bucket.list(name)])
+        shutil.rmtree(folder, ignore_errors=True)
 
     def find(self, parent: str, file: str, start: str = "") -> list[Path]:
         """Finds a file of many folders: see :meth:`storage.records.RecordFolders.find`."""

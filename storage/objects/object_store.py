@@ -211,22 +211,26 @@ class ObjectStore:
             except ArtifactCorruptError as error:
                 yield name, error
 
-    def clean_temporaries(self, older_than_s: float = 3600.0) -> int:
-        """Removes payloads without a manifest, leases that nobody renews, and this machine's temporary folders.
+    def clean_temporaries(self, older_than_s: float = 3600.0, everywhere: bool = False) -> int:
+        """Removes this machine's temporary folders, payloads without a manifest, and leases that nobody renews.
 
         Args:
             older_than_s: objects go when they were written so many seconds ago or earlier.
+            everywhere: whether objects go too. The whole bucket is then listed.
 
         Returns:
             How many objects and folders were removed.
         """
+        removed = self._cache.clean_temporaries()
+        if not everywhere:
+            return removed
         probe = self._write_probe()
         try:
             old = find_abandoned(self._bucket, probe, older_than_s)
             self._bucket.delete(old)
         finally:
             self._bucket.delete([probe])
-        return len(old) + self._cache.clean_temporaries()
+        return removed + len(old)
 
     def _write_probe(self) -> str:
         name = f"{PROBE_START}{describe_owner()}-{uuid.uuid4().hex}"

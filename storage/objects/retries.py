@@ -35,7 +35,7 @@ def call_with_retries(
         name: of the object, for errors.
         uri: of the store.
         retry_s: for how long it is tried again after the first failure; by default as the environment says.
-        measure_progress: how far the function came; the time starts anew once that has changed.
+        measure_progress: how far the function came; the time starts again once that has changed.
 
     Returns:
         What the function returns.

@@ -216,6 +216,9 @@ class StoreSuite:
         assert (second.records.pull("runs/ab") / "run.json").read_text() == "ab"
         assert [path.read_text() for path in second.records.find("runs", "run.json")] == ["aa", "ab"]
         assert [path.parent.name for path in second.records.find("runs", "run.json", "ab")] == ["ab"]
+        store.records.remove("runs/aa")
+        store.records.remove("runs/none")
+        assert [path.read_text() for path in second.records.find("runs", "run.json")] == ["ab"]
         assert list(store.artifacts()) == []
 
     @pytest.mark.parametrize("name", ["../out", "runs/..", "/runs", "runs//a", "runs/.hidden", ""])

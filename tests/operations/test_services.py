@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import importlib
 import json
 import os
 import stat
@@ -10,13 +12,15 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import pytest
 import yaml
 
-from flows.operations import PostgresServer, PrefectServer, Service, Worker
+from flows.operations import ObjectServer, PostgresServer, PrefectServer, Service, Worker
 from flows.operations import postgres_server as postgres_module
 from flows.operations.deployments import DEPLOYMENTS, RUN_QUEUE
 from flows.operations.service import find_free_port, keep_port, keep_secret
@@ -46,8 +50,9 @@ def test_a_service_that_ends_at_its_start_shows_its_log(tmp_path: Path) -> None:
         service.start()
 
 
-def test_kill_ends_the_children_too(tmp_path: Path) -> None:
-    service = _Sleeper(tmp_path, "sleep 60 & echo $! > child; wait")
+@pytest.mark.parametrize("session", ["", "setsid "], ids=["same session", "session of its own"])
+def test_kill_ends_the_children_too(session: str, tmp_path: Path) -> None:
+    service = _Sleeper(tmp_path, f"{session}sleep 60 & echo $! > child; wait")
     service.spawn_options = lambda: {"cwd": tmp_path}  # type: ignore[method-assign]
     service.start()
     child = tmp_path / "child"
@@ -90,6 +95,19 @@ def test_commands_hold_no_secret(tmp_path: Path) -> None:
     assert words[-4:] == ["--work-queue", "datasets", "--limit", "1"]
     assert not any(secret in word or "database-secret" in word for word in words)
     assert Worker(tmp_path, server.env()).environment()["PREFECT_FLOWS_HEARTBEAT_FREQUENCY"] == "30"
+
+
+def test_a_killed_server_remembers_who_has_slots(tmp_path: Path) -> None:
+    name = "PREFECT_SERVER_CONCURRENCY_LEASE_STORAGE"
+    module = PrefectServer(tmp_path).environment()[name]
+    storage = importlib.import_module(module).ConcurrencyLeaseStorage(tmp_path / "leases")
+    lease = asyncio.run(storage.create_lease([uuid4()], timedelta(minutes=1)))
+    again = importlib.import_module(module).ConcurrencyLeaseStorage(tmp_path / "leases")
+    assert asyncio.run(again.read_lease(lease.id)) == lease
+    server = yaml.safe_load((small_run.ROOT / "docker-compose.yml").read_text())["services"]["server"]
+    assert server["environment"][name] == module
+    # Files outside of a volume would be lost with the container.
+    assert f"server:{server['environment']['PREFECT_HOME']}" in server["volumes"]
 
 
 def test_a_reused_process_id_is_not_taken_for_the_service(tmp_path: Path) -> None:
@@ -149,6 +167,12 @@ def state() -> Iterator[Path]:
         folder.chmod(0o711)
         yield folder
         stop_stack(folder)
+
+
+@pytest.mark.slow
+def test_two_object_servers_run_on_one_machine(tmp_path: Path) -> None:
+    with ObjectServer(tmp_path / "one") as one, ObjectServer(tmp_path / "two") as two:
+        assert one.is_healthy() and two.is_healthy()
 
 
 @pytest.mark.slow

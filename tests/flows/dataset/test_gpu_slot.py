@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import httpx
 import pytest
 from prefect import flow
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.actions import GlobalConcurrencyLimitCreate
+from prefect.concurrency.asyncio import ConcurrencySlotAcquisitionError
 from prefect.settings import PREFECT_API_URL, temporary_settings
 
 from flows.pipeline import stage_task
@@ -35,6 +40,47 @@ def test_a_stage_without_a_limit_needs_no_server(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setenv(GPU_LIMIT_VARIABLE, LIMIT)
     with gpu_slot("ingest"):
         pass
+
+
+def _refuse(status: int) -> httpx.HTTPStatusError:
+    request = httpx.Request("POST", "http://127.0.0.1:9/api")
+    return httpx.HTTPStatusError("refused", request=request, response=httpx.Response(status, request=request))
+
+
+@pytest.mark.parametrize(
+    ("causes", "error", "tries"),
+    [
+        # The server was killed and is started again: the stage waits.
+        ([httpx.ConnectError("refused"), _refuse(503)], None, 3),
+        # Without a cause, the server says that there is no such limit.
+        ([None], ConfigError, 1),
+        ([_refuse(422)], ConfigError, 1),
+        ([httpx.ConnectError("refused")] * 100, TransientIOError, 35),
+    ],
+)
+def test_a_server_that_is_away_is_no_missing_limit(
+    causes: list[Exception | None], error: type[Exception] | None, tries: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = list(causes)
+    now_s = [0.0]
+
+    @contextmanager
+    def concurrency(name: str, **options: Any) -> Iterator[None]:
+        if left:
+            raise ConcurrencySlotAcquisitionError("no slot") from left.pop(0)
+        yield
+
+    def sleep(seconds: float) -> None:
+        now_s[0] += seconds
+
+    monkeypatch.setenv(GPU_LIMIT_VARIABLE, LIMIT)
+    monkeypatch.setattr("prefect.concurrency.sync.concurrency", concurrency)
+    monkeypatch.setattr("flows.pipeline.gpu_slot.time", SimpleNamespace(monotonic=lambda: now_s[0], sleep=sleep))
+    entered = []
+    with nullcontext() if error is None else pytest.raises(error), gpu_slot("gnet"):
+        entered.append(True)
+    assert entered == ([True] if error is None else [])
+    assert len(causes) - len(left) + (error is None) == tries
 
 
 @pytest.mark.slow

@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 
 from flows.dataset.child_runs import ACTIVE_STATES, ChildRun
-from flows.dataset.supervisor import SupervisionLimits, Supervisor
+from flows.dataset.supervisor import SupervisionLimits, Supervisor, read_limits
 from flows.dataset.work_units import WorkUnit
+from genre_tasks.errors import ConfigError
 
 A = WorkUnit("synthetic:a")
 B = WorkUnit("synthetic:b")
@@ -70,12 +71,18 @@ class FakeRuns:
         return self.outcomes.get(run.id, DONE if run.state == "COMPLETED" else None)
 
 
-def supervise(runs: FakeRuns, units: Sequence[WorkUnit], limits: SupervisionLimits = LIMITS) -> list[dict[str, Any]]:
+def supervise(
+    runs: FakeRuns, units: Sequence[WorkUnit], limits: SupervisionLimits = LIMITS, outages_end_s: float = -1.0
+) -> list[dict[str, Any]]:
     def sleep(seconds: float) -> None:
         runs.now_s += seconds
         assert runs.now_s < 500, "the supervisor does not come to its end"
 
-    return Supervisor(units, runs, limits, clock=lambda: runs.now_s, sleep=sleep).run()
+    def last_outage() -> float:
+        # The server is away for a moment in every poll until then.
+        return min(runs.now_s, outages_end_s)
+
+    return Supervisor(units, runs, limits, clock=lambda: runs.now_s, sleep=sleep, last_outage=last_outage).run()
 
 
 def test_runs_are_bounded_in_flight_and_all_end() -> None:
@@ -100,6 +107,16 @@ def test_heartbeats_keep_a_long_run_alive() -> None:
     runs.beating.add("synthetic:a/0")
     (row,) = supervise(runs, [A])
     assert row["status"] == "done" and not runs.crashed
+
+
+def test_heartbeats_that_were_lost_with_the_server_make_no_run_dead() -> None:
+    runs = FakeRuns({A: [["RUNNING"] * 60 + ["COMPLETED"]]})
+    (row,) = supervise(runs, [A], outages_end_s=55.0)
+    assert row["status"] == "done" and not runs.crashed
+    # Dead all the same, once the server is there to stay.
+    dead = FakeRuns({A: [["RUNNING"], ["COMPLETED"]]})
+    (row,) = supervise(dead, [A], outages_end_s=55.0)
+    assert row["status"] == "done" and row["attempts"] == 2 and dead.crashed
 
 
 def test_a_run_in_the_queue_is_never_freed() -> None:
@@ -156,3 +173,25 @@ def test_an_outage_of_the_server_does_not_make_runs_stale() -> None:
 
     runs.read = away_for_a_minute  # type: ignore[method-assign]
     assert supervise(runs, [A])[0]["status"] == "done" and not runs.crashed
+
+
+def test_the_environment_changes_when_a_run_counts_as_dead() -> None:
+    assert read_limits(8, 3, {}) == SupervisionLimits(in_flight=8, attempts=3)
+    changed = read_limits(4, 2, {"GENRE_PENDING_SECONDS": "600", "GENRE_SILENT_SECONDS": "75.5"})
+    assert changed == SupervisionLimits(in_flight=4, attempts=2, pending_s=600.0, silent_s=75.5)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("GENRE_PENDING_SECONDS", "soon"),
+        ("GENRE_PENDING_SECONDS", "0"),
+        ("GENRE_PENDING_SECONDS", "inf"),
+        # Less than two heartbeats would end runs that live.
+        ("GENRE_SILENT_SECONDS", "59"),
+        ("GENRE_SILENT_SECONDS", "nan"),
+    ],
+)
+def test_a_wrong_time_in_the_environment_is_an_error(name: str, value: str) -> None:
+    with pytest.raises(ConfigError, match=name):
+        read_limits(8, 3, {name: value})

@@ -121,7 +121,7 @@ def test_leases_and_uploads_at_work_are_no_leftovers(store: ObjectStore) -> None
     store._bucket.delete([f"{address()}/{MANIFEST}"])
     with store.lease(address(key=OTHER)):
         before = {info.name for info in store._bucket.list()}
-        store.clean_temporaries(older_than_s=60.0)
+        store.clean_temporaries(older_than_s=60.0, everywhere=True)
         assert {info.name for info in store._bucket.list()} == before
 
 

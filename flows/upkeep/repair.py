@@ -1,0 +1,88 @@
+"""Damaged artifacts of a store: removed, and computed again by the runs that they are of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from flows.reconstruction.run_records import list_runs
+from flows.upkeep.pins import list_run_keys
+from genre_tasks.errors import ArtifactCorruptError, GenreError
+from storage.address import Address
+from storage.manifest import NewerSchemaError
+from storage.store import Store
+
+
+@dataclass(frozen=True)
+class Repair:
+    """What became of a damaged artifact.
+
+    Attributes:
+        name: its path in the store.
+        problem: what was wrong with it.
+        outcome: ``repaired``, ``removed`` or ``left``.
+        why: the reason, where it was not repaired.
+    """
+
+    name: str
+    problem: str
+    outcome: str
+    why: str = ""
+
+
+def repair_artifacts(
+    store: Store,
+    damaged: Mapping[str, ArtifactCorruptError],
+    run_again: Callable[[Mapping[str, Any]], None],
+) -> Iterator[Repair]:
+    """Removes damaged artifacts, and has the runs that they are of computed again.
+
+    Args:
+        store: that has them.
+        damaged: by path, as :meth:`storage.store.Store.verify_all` names them.
+        run_again: runs the log of a record again; called with the record.
+
+    Yields:
+        What became of each artifact.
+
+    Raises:
+        InputError: a run's record is damaged, or the store cannot be written.
+    """
+    records = list_runs(store.uri)
+    addresses: dict[str, Address] = {}
+    for name, error in damaged.items():
+        try:
+            if isinstance(error, NewerSchemaError):
+                raise error
+            addresses[name] = Address.parse(name)
+            store.discard(addresses[name])
+        except GenreError as reason:
+            yield Repair(name, error.problem, "left", f"{reason.problem}. {reason.remedy}")
+    failures: dict[str, str] = {}
+    for record in records:
+        keys = set(list_run_keys(record))
+        wanted = [name for name, address in addresses.items() if address.key in keys]
+        missing = [name for name in wanted if store.find(addresses[name]) is None]
+        # An edited run is made from another one by its edits, not from a log.
+        if not missing or "edited" in record:
+            continue
+        try:
+            run_again(record)
+        except GenreError as error:
+            failures |= {name: str(error) for name in missing}
+    for name, address in addresses.items():
+        if store.find(address) is not None:
+            yield Repair(name, damaged[name].problem, "repaired")
+        else:
+            why = failures.get(name, _explain(address, records))
+            yield Repair(name, damaged[name].problem, "removed", why)
+
+
+def _explain(address: Address, records: list[dict[str, Any]]) -> str:
+    found = [record for record in records if address.key in list_run_keys(record)]
+    if not found:
+        return "no run refers to it"
+    if all("edited" in record for record in found):
+        return f"`genre edit` makes it again for run {found[0]['run']}"
+    return "the code, the weights or the log have changed since: run the log again"

@@ -1,0 +1,125 @@
+"""Copies of a store, or of some of its runs, to another one: the same bytes, and resumed where a copy was stopped."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from flows.dataset.dataset_record import DATASETS
+from flows.reconstruction.run_records import find_run_record, name_run_folder
+from flows.upkeep.garbage import add_ancestors, measure_bytes
+from flows.upkeep.pins import PINS, list_pins, list_run_keys
+from genre_tasks.atomic_path import atomic_path
+from storage.io_errors import as_genre_error
+from storage.store import Artifact, Store
+
+_RECORDS = (("runs", "run.json"), (DATASETS, "dataset.json"), (PINS, "pin.json"))
+
+
+@dataclass(frozen=True)
+class CopyResult:
+    """What a copy did.
+
+    Attributes:
+        copied: artifacts that the target did not have.
+        skipped: artifacts that it had.
+        bytes_copied: of the copied artifacts' files.
+        records: folders of records that were copied.
+    """
+
+    copied: int
+    skipped: int
+    bytes_copied: int
+    records: int
+
+
+def copy_store(
+    source: Store,
+    target: Store,
+    runs: Sequence[str] = (),
+    pinned: bool = False,
+    report: Callable[[int, int, int], None] = lambda done, total, bytes_copied: None,
+) -> CopyResult:
+    """Copies artifacts with all that they were made from, and the records of runs, datasets and pins.
+
+    Args:
+        source: to copy from; nothing in it is changed.
+        target: to copy to; what it has stays.
+        runs: names of runs, or their first characters: only these are copied, and not the rest of the store.
+        pinned: whether only pinned runs and artifacts are copied, beside those of ``runs``.
+        report: called with how many artifacts are done, how many there are, and the bytes copied.
+
+    Returns:
+        What was done.
+
+    Raises:
+        InputError: no run, or several, begin so; or the target cannot be written.
+        ArtifactCorruptError: an artifact of the source is damaged.
+        TransientIOError: a store does not answer.
+    """
+    artifacts = list(source.artifacts())
+    records = _list_records(source)
+    if runs or pinned:
+        by_key = {artifact.address.key: artifact for artifact in artifacts}
+        found = [find_run_record(source.uri, run) for run in runs]
+        pins = list_pins(source) if pinned else []
+        wanted = [key for record in found for key in list_run_keys(record)] + [key for pin in pins for key in pin.keys]
+        kept = add_ancestors(wanted, by_key)
+        artifacts = [artifact for artifact in artifacts if artifact.address.key in kept]
+        names = {name_run_folder(str(record["run"])) for record in found}
+        names |= {f"{PINS}/{pin.name}" for pin in pins} | {name_run_folder(pin.name) for pin in pins}
+        records = [name for name in records if name in names]
+    copied = _copy_artifacts(source, target, artifacts, report)
+    # After the artifacts: a record must not refer to what is not there yet.
+    for name in records:
+        _copy_record(source, target, name)
+    return CopyResult(len(copied), len(artifacts) - len(copied), measure_bytes(copied), len(records))
+
+
+def _copy_artifacts(
+    source: Store, target: Store, artifacts: Sequence[Artifact], report: Callable[[int, int, int], None]
+) -> list[Artifact]:
+    copied: list[Artifact] = []
+    for done, artifact in enumerate(artifacts):
+        report(done, len(artifacts), measure_bytes(copied))
+        present = target.find(artifact.address)
+        # Payloads may differ between machines; then the target's artifact is as right as the source's.
+        if present is None:
+            target.adopt(artifact.manifest, source.fetch(artifact))
+            copied.append(artifact)
+    report(len(artifacts), len(artifacts), measure_bytes(copied))
+    return copied
+
+
+def _list_records(store: Store) -> list[str]:
+    return [f"{parent}/{path.parent.name}" for parent, file in _RECORDS for path in store.records.find(parent, file)]
+
+
+def _copy_record(source: Store, target: Store, name: str) -> None:
+    folder = source.records.pull(name)
+    goal = target.records.pull(name)
+    try:
+        for path in _list_files(folder):
+            place = goal / path.relative_to(folder)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_path(place) as part:
+                shutil.copyfile(path, part)
+        record = goal / "run.json"
+        if record.is_file():
+            values = json.loads(record.read_bytes())
+            # Where the record is now; all else is as it was.
+            values |= {"store": target.uri, "report": str(goal / "report.html")}
+            with atomic_path(record) as part:
+                part.write_text(json.dumps(values, indent=1), encoding="utf-8")
+    except OSError as error:
+        raise as_genre_error(error, goal) from error
+    target.records.push(name)
+
+
+def _list_files(folder: Path) -> Iterable[Path]:
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts):
+            yield path

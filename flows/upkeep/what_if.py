@@ -1,0 +1,103 @@
+"""Which stages of a run would be computed again if a setting, code, weights, a package or the log changed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flows.configuration.loading import apply_settings
+from flows.configuration.validation import validate_config
+from flows.pipeline.definition import PIPELINE, StageSpec, digest_stage_weights, stage_key
+from flows.pipeline.stage_runner import Job, reading_modules
+from genre_tasks.code_closure import import_closure
+from genre_tasks.config import PipelineConfig
+from genre_tasks.errors import ConfigError
+
+_ROOT = Path(__file__).resolve().parents[2]
+_FORMS = (
+    "Write a setting as gnet.iterations=96, a module as code:genre_tasks.stages.gnet, weights as weights:fnet, a "
+    "package as package:torch, or log."
+)
+
+
+@dataclass(frozen=True)
+class Recomputation:
+    """A stage that would be computed again.
+
+    Attributes:
+        chunk: number of the chunk.
+        stage: the stage's name.
+        seconds: what it took the last time.
+        reason: its own change, or the stages that it reads.
+    """
+
+    chunk: int
+    stage: str
+    seconds: float
+    reason: str
+
+
+def find_recomputations(record: Mapping[str, Any], change: str) -> list[Recomputation]:
+    """Finds what of a run would be computed again after a change, by the same keys that decide about the cache.
+
+    A stage that reads a changed one counts, although it would be served from the store if the changed one came out the
+    same to the byte.
+
+    Args:
+        record: of the run, as ``run.json`` holds it.
+        change: ``section.key=value``, ``code:MODULE``, ``weights:NETWORK``, ``package:NAME`` or ``log``.
+
+    Returns:
+        The stages in the order of the pipeline, chunk by chunk.
+
+    Raises:
+        ConfigError: the change is none of these, or its setting is wrong.
+        InputError: the log or the weights are gone.
+    """
+    config = validate_config(record["config"], f"the record of run {record['run']}")
+    found: list[Recomputation] = []
+    # All chunks share the configuration and the code: what changes in one changes in all.
+    job = Job(record["log"], 0, record["store"], record["config"])
+    reasons = {spec.name: _explain(spec, job, config, change) for spec in PIPELINE}
+    if not any(reasons.values()) and not _is_sound(change):
+        raise ConfigError(f"{change!r} is no change that keys know", remedy=_FORMS)
+    for chunk in record["chunks"]:
+        seconds = {stage["stage"]: float(stage["seconds"]) for stage in chunk["stages"]}
+        changed: set[str] = set()
+        for spec in PIPELINE:
+            read = [name for name in spec.inputs if name in changed]
+            reason = reasons[spec.name] or (f"reads {', '.join(read)}" if read else "")
+            if reason and spec.name in seconds:
+                changed.add(spec.name)
+                found.append(Recomputation(int(chunk["chunk"]), spec.name, seconds[spec.name], reason))
+    return found
+
+
+def _explain(spec: StageSpec, job: Job, config: PipelineConfig, change: str) -> str:
+    """Why the stage itself is concerned; empty if it is not."""
+    kind, _, name = change.partition(":")
+    if change == "log":
+        return "reads the log" if spec.needs_log else ""
+    if "=" in change and kind not in ("code", "weights", "package"):
+        other = apply_settings(config, [change])
+        keys = [
+            stage_key(spec, c, {}, digest_stage_weights(spec, c), reading_modules(spec, job)) for c in (config, other)
+        ]
+        return "" if keys[0] == keys[1] else "its setting"
+    if kind == "weights":
+        refinement = getattr(getattr(config, spec.section), "refinement", None)
+        is_loaded = digest_stage_weights(spec, config) is not None and spec.weights == name
+        return "its weights" if is_loaded or (refinement is not None and name == "gnet") else ""
+    if kind in ("code", "package"):
+        modules = (*spec.lazy_modules, *reading_modules(spec, job))
+        closure = import_closure(spec.module, modules, _ROOT)
+        found = closure.modules if kind == "code" else closure.packages
+        return f"its {'code' if kind == 'code' else 'packages'}" if name in found else ""
+    return ""
+
+
+def _is_sound(change: str) -> bool:
+    kind, _, name = change.partition(":")
+    return change == "log" or "=" in change or (kind in ("code", "weights", "package") and bool(name))

@@ -1,0 +1,84 @@
+"""Heartbeats are noticed and judged by the server's clock: a worker's clock may be wrong, and may jump."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
+from typing import Any
+from uuid import uuid4
+
+import pytest
+
+from flows.dataset import submission
+from flows.dataset.prefect_runs import ChildRequest, PrefectRuns, has_heartbeat
+from flows.dataset.submission import HeartbeatWatch
+
+NOW = datetime.now(UTC)
+
+
+class FakeClient:
+    """Answers with the newest events by their own times, as the server does."""
+
+    def __init__(self) -> None:
+        self.events: list[SimpleNamespace] = []
+
+    def read_deployment_by_name(self, name: str) -> SimpleNamespace:
+        return SimpleNamespace(name=name)
+
+    def read_events(self, wanted: Any, limit: int) -> SimpleNamespace:
+        newest = sorted(self.events, key=lambda event: event.occurred, reverse=True)
+        return SimpleNamespace(events=newest[:limit], total=len(newest))
+
+    def send(self, age_s: float, shift_s: float = 0.0) -> None:
+        received = NOW - timedelta(seconds=age_s)
+        self.events.append(SimpleNamespace(occurred=received + timedelta(seconds=shift_s), received=received))
+
+
+def test_every_heartbeat_is_noticed_also_when_the_clock_jumps_back() -> None:
+    client = FakeClient()
+    runs = PrefectRuns(ChildRequest("d", "p", "pool", {}), client)  # type: ignore[arg-type]
+    assert runs.read_heartbeats(["a"]) == {}
+    found = []
+    for shift_s in (0.0, 3600.0, 0.0, -3600.0, -3600.0):
+        client.send(60.0, shift_s)
+        found.append(runs.read_heartbeats(["a"])["a"])
+    assert len(set(found)) == len(found)
+
+
+def test_a_run_is_alive_by_the_time_of_receipt() -> None:
+    client = FakeClient()
+    assert not has_heartbeat(client, "a", since_s=90.0)  # type: ignore[arg-type]
+    # The worker's clock is ahead, and its process has died.
+    client.send(600.0, shift_s=3600.0)
+    assert not has_heartbeat(client, "a", since_s=90.0)  # type: ignore[arg-type]
+    # A clock that is behind.
+    client.send(10.0, shift_s=-3600.0)
+    assert has_heartbeat(client, "a", since_s=90.0)  # type: ignore[arg-type]
+
+
+def _silent_after(heartbeats_s: list[float], outages_s: list[float], monkeypatch: pytest.MonkeyPatch) -> float | None:
+    """When a watch calls a parent silent, which sends heartbeats at some times, while the server is away at others."""
+    client = FakeClient()
+    now_s = 0.0
+    watch = HeartbeatWatch(client, uuid4(), clock=lambda: now_s)  # type: ignore[arg-type]
+    while now_s < 300.0:
+        now_s += 2.0
+        known = [outage_s for outage_s in outages_s if outage_s <= now_s]
+        monkeypatch.setattr(submission, "read_last_outage", lambda known=known: max(known, default=float("-inf")))
+        client.events = []
+        for heartbeat_s in heartbeats_s:
+            if heartbeat_s <= now_s:
+                client.send(0.0)
+        if watch.is_silent():
+            return now_s
+    return None
+
+
+def test_a_dead_parent_is_noticed_and_one_whose_heartbeats_were_lost_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    dead_s = _silent_after([10.0], [], monkeypatch)
+    assert dead_s is not None and 100.0 < dead_s < 115.0
+    assert _silent_after([10.0, 40.0, 70.0, 100.0, 130.0, 160.0, 190.0, 220.0, 250.0, 280.0], [], monkeypatch) is None
+    # The server was killed again and again, and with it four heartbeats were lost.
+    assert _silent_after([10.0, 160.0, 190.0, 220.0, 250.0, 280.0], [38.0, 68.0, 99.0, 128.0], monkeypatch) is None
+    late_s = _silent_after([10.0], [60.0], monkeypatch)
+    assert late_s is not None and late_s > 150.0

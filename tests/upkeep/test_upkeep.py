@@ -1,0 +1,210 @@
+"""Care for stores: garbage, pins, repairs, copies, lineage and what a change would compute again."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from flows.cli.main import app
+from flows.configuration import load_configuration
+from flows.pipeline.definition import PIPELINE
+from flows.pipeline.stage_runner import ArtifactRef, Job, run_stage
+from flows.reconstruction.run_records import FinishedRun, list_runs, summarise_run, write_run_record
+from flows.upkeep.garbage import find_garbage
+from flows.upkeep.pins import add_pin, list_pins, remove_pin
+from flows.upkeep.store_copy import copy_store
+from flows.upkeep.what_if import find_recomputations
+from genre_tasks.errors import ArtifactCorruptError, ConfigError, GenreError, InputError
+from storage.local import LocalStore
+from tests.contracts.store_suite import address
+from tests.faults.small_run import LOG, SETTINGS
+from tests.storage.artifact_values import make
+
+LATER = datetime.now(UTC) + timedelta(days=2)
+
+
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store with one run of one chunk, and its record."""
+    store = tmp_path_factory.mktemp("filled") / "store"
+    config = load_configuration("demo", settings=SETTINGS).model_dump(mode="json")
+    refs: dict[str, ArtifactRef] = {}
+    for spec in PIPELINE:
+        refs[spec.name] = run_stage(spec.name, Job(LOG, 0, str(store), config), refs)
+    run = FinishedRun(log=LOG, preset="demo", store=str(store), config=config, differs={}, chunks={0: refs})
+    write_run_record(run, summarise_run(run), {})
+    return store
+
+
+@pytest.fixture
+def store(filled: Path, tmp_path: Path) -> LocalStore:
+    return LocalStore(shutil.copytree(filled, tmp_path / "store"))
+
+
+@pytest.fixture
+def genre(store: LocalStore) -> Callable[..., tuple[int, str]]:
+    """The command; its exit status and its output."""
+
+    def call(*words: str) -> tuple[int, str]:
+        done = CliRunner().invoke(app, [*words, "--store", store.uri])
+        if isinstance(done.exception, GenreError):
+            return 2, str(done.exception)
+        assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+        return done.exit_code, done.stdout
+
+    return call
+
+
+def record_of(store: LocalStore) -> dict[str, object]:
+    (record,) = list_runs(store.uri)
+    return {**record, "store": store.uri}
+
+
+def test_what_a_run_refers_to_is_no_garbage(store: LocalStore) -> None:
+    stray = store.commit(address(), "evaluation", make("evaluation"))
+    imported = address()
+    imported = type(imported)("imported", "scene", 0, "import", "c" * 64)
+    store.commit(imported, "evaluation", make("evaluation"))
+    found = find_garbage(store, now=LATER)
+    assert [artifact.address for artifact in found.artifacts] == [stray.address]
+    assert found.kept == len(PIPELINE) + 1 and found.young == 0
+    # A run that goes on has no record yet.
+    assert find_garbage(store).artifacts == () and find_garbage(store).young == 1
+
+
+def test_a_pin_keeps_what_its_artifact_was_made_from(store: LocalStore) -> None:
+    store.records.remove(f"runs/{record_of(store)['run']}")
+    (fnet,) = store.artifacts(stage="fnet")
+    pin = add_pin(store, fnet.address.key[:10], "kept")
+    assert [p.note for p in list_pins(store)] == ["kept"] and pin.keys == (fnet.address.key,)
+    gone = {artifact.address.stage for artifact in find_garbage(store, now=LATER).artifacts}
+    assert gone == {"enet", "evaluate/initial", "evaluate/gnet", "evaluate/enet", "evaluate/fnet"}
+    remove_pin(store, pin.name[:6])
+    assert len(find_garbage(store, now=LATER).artifacts) == len(PIPELINE)
+    with pytest.raises(InputError, match="0 pins"):
+        remove_pin(store, pin.name)
+
+
+def test_a_damaged_record_keeps_everything(store: LocalStore, genre: Callable[..., tuple[int, str]]) -> None:
+    (store.root / "runs" / str(record_of(store)["run"]) / "run.json").write_text("{")
+    code, text = genre("gc", "--delete", "--older-than", "0")
+    assert code == 2 and "run.json" in text and len(list(store.artifacts())) == len(PIPELINE)
+
+
+def test_gc_changes_nothing_unless_asked(store: LocalStore, genre: Callable[..., tuple[int, str]]) -> None:
+    store.commit(address(), "evaluation", make("evaluation"))
+    code, text = genre("gc", "--older-than", "0")
+    assert code == 0 and "Nothing was changed" in text and store.find(address()) is not None
+    code, text = genre("gc", "--older-than", "0", "--delete", "--json")
+    assert code == 0 and json.loads(text)["artifacts"] == [str(address())]
+    assert store.find(address()) is None and len(list(store.artifacts())) == len(PIPELINE)
+
+
+def test_pins_by_command(store: LocalStore, genre: Callable[..., tuple[int, str]]) -> None:
+    run = str(record_of(store)["run"])
+    assert genre("pin", run[:5], "--note", "why")[0] == 0
+    assert "why" in genre("pin", "--list")[1]
+    assert genre("pin")[0] == 2 and genre("unpin", run[:5])[0] == 0 and list_pins(store) == []
+
+
+def test_damage_is_repaired_to_the_byte(store: LocalStore, genre: Callable[..., tuple[int, str]]) -> None:
+    before = {artifact.address: artifact.manifest.payload_digest for artifact in store.artifacts()}
+    run = record_of(store)["run"]
+    (gnet,) = store.artifacts(stage="gnet")
+    (effects,) = store.artifacts(stage="effects")
+    stray = store.commit(address(), "evaluation", make("evaluation"))
+    for file in (next(gnet.path.glob("*.parquet")), effects.path / "manifest.json", stray.path / "metrics.parquet"):
+        data = bytearray(file.read_bytes())
+        data[len(data) // 2] ^= 4
+        file.write_bytes(data)
+    assert genre("verify")[0] == 1
+    code, text = genre("verify", "--repair")
+    assert code == 1 and text.count("repaired: ") == 2 and "no run refers to it" in text
+    assert {artifact.address: artifact.manifest.payload_digest for artifact in store.artifacts()} == before
+    assert record_of(store)["run"] == run
+    assert genre("verify")[0] == 0
+
+
+def test_a_copy_has_the_same_bytes_and_is_resumed(store: LocalStore, tmp_path: Path) -> None:
+    target = LocalStore(tmp_path / "target")
+    first = next(store.artifacts())
+    target.adopt(first.manifest, first.path)
+    result = copy_store(store, target)
+    assert (result.copied, result.skipped, result.records) == (len(PIPELINE) - 1, 1, 1)
+    assert [a.manifest for a in target.artifacts()] == [a.manifest for a in store.artifacts()]
+    assert [damage for _, damage in target.verify_all()] == [None] * len(PIPELINE)
+    (record,) = list_runs(target.uri)
+    assert record["store"] == target.uri and Path(record["report"]).is_file() and target.uri in record["report"]
+    again = copy_store(store, target)
+    assert (again.copied, again.skipped) == (0, len(PIPELINE))
+
+
+def test_one_run_is_copied_without_the_rest(store: LocalStore, tmp_path: Path) -> None:
+    store.commit(address(), "evaluation", make("evaluation"))
+    target = LocalStore(tmp_path / "target")
+    assert copy_store(store, target, runs=[str(record_of(store)["run"])[:6]]).copied == len(PIPELINE)
+    assert target.find(address()) is None
+
+
+def test_damage_is_not_copied(store: LocalStore, tmp_path: Path) -> None:
+    (gnet,) = store.artifacts(stage="gnet")
+    next(gnet.path.glob("*.parquet")).write_bytes(b"else")
+    target = LocalStore(tmp_path / "target")
+    with pytest.raises(ArtifactCorruptError, match="parquet"):
+        copy_store(store, target)
+    assert target.find(gnet.address) is None and list_runs(target.uri) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "own", "reading"),
+    [
+        ("gnet.iterations=5", {"gnet"}, {"novel_views", "fnet", "enet", "evaluate/gnet"}),
+        ("code:genre_tasks.stages.fnet", {"fnet"}, {"enet", "evaluate/fnet", "evaluate/enet"}),
+        ("weights:fnet", {"fnet"}, {"enet", "evaluate/fnet", "evaluate/enet"}),
+        ("log", {"ingest", "effects"}, {"initial", "gnet", "enet"}),
+        ("package:torch", {"gnet", "fnet", "enet"}, set()),
+        ("gnet.iterations=2", set(), set()),
+    ],
+)
+def test_a_change_says_what_it_computes_again(store: LocalStore, change: str, own: set[str], reading: set[str]) -> None:
+    record = record_of(store)
+    if not own:
+        change = f"gnet.iterations={record['config']['gnet']['iterations']}"  # type: ignore[index]
+    found = find_recomputations(record, change)
+    reasons = {entry.stage: entry.reason for entry in found}
+    assert own <= {stage for stage, reason in reasons.items() if not reason.startswith("reads ") or change == "log"}
+    assert reading <= set(reasons)
+    assert bool(found) == bool(own)
+
+
+def test_a_setting_says_what_a_run_computes(store: LocalStore) -> None:
+    """What is foretold is what the pipeline then does."""
+    record = record_of(store)
+    foretold = {entry.stage for entry in find_recomputations(record, "evaluate.every=3")}
+    config = load_configuration("demo", settings=[*SETTINGS, "evaluate.every=3"]).model_dump(mode="json")
+    refs: dict[str, ArtifactRef] = {}
+    for spec in PIPELINE:
+        refs[spec.name] = run_stage(spec.name, Job(LOG, 0, store.uri, config), refs)
+    assert {name for name, ref in refs.items() if not ref.cached} == foretold
+
+
+def test_changes_that_keys_do_not_know_are_refused(store: LocalStore) -> None:
+    for change in ("nothing", "code:", "gnet"):
+        with pytest.raises(ConfigError, match="no change that keys know"):
+            find_recomputations(record_of(store), change)
+
+
+def test_lineage_goes_both_ways(store: LocalStore, genre: Callable[..., tuple[int, str]]) -> None:
+    (gnet,) = store.artifacts(stage="gnet")
+    values = json.loads(genre("lineage", gnet.address.key[:12], "--json")[1])
+    assert {row["stage"] for row in values["made_from"]} == {"ingest", "effects", "initial"}
+    assert {row["stage"] for row in values["went_into"]} >= {"novel_views", "fnet", "enet", "evaluate/gnet"}
+    code, text = genre("lineage", str(record_of(store)["run"]), "--if", "weights:fnet")
+    assert code == 0 and "its weights" in text
+    assert genre("lineage", "zz")[0] == 2
