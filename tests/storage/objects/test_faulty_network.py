@@ -19,7 +19,7 @@ from storage.objects.object_lease import LEASES_FOLDER
 from storage.objects.object_store import ObjectStore
 from tests.contracts.store_suite import KEY, address
 from tests.storage.artifact_values import COLORS, assert_same, make
-from tests.storage.objects.faulty_proxy import SOUND, Fault, FaultyProxy
+from tests.storage.objects.network_proxy import SOUND, Fault, FaultyProxy
 
 LEASE = f"{LEASES_FOLDER}/{KEY}.json"
 _MIB = 1 << 20
