@@ -23,12 +23,12 @@ _HEAD = (
 
 def matrix() -> str:
     """Every fault: how often, what became of the datasets, and what was left behind."""
-    return table(_HEAD, [_row(row) for row in result("faults")["rows"]]) + "\n" + _provenance()
+    return table(_HEAD, [_row(row) for row in result("tests/faults")["rows"]]) + "\n" + _provenance()
 
 
 def injections() -> str:
     """How every fault is injected."""
-    rows = result("faults")["rows"]
+    rows = result("tests/faults")["rows"]
     return table(("fault", "store", "how it is injected"), [(row["fault"], row["store"], row["how"]) for row in rows])
 
 
@@ -48,7 +48,7 @@ def _row(row: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _provenance() -> str:
-    rows = result("faults")["rows"]
+    rows = result("tests/faults")["rows"]
     machines = " and ".join(sorted({row["machine"] for row in rows}))
     commits = ", ".join(f"`{commit[:12]}`" for commit in sorted({row["commit"] for row in rows}))
     return (

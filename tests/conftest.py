@@ -17,6 +17,6 @@ collect_ignore_glob = ["conftest.py", "*/conftest.py"]
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Options of the fault matrix, here because pytest reads them before it knows of deeper folders."""
     group = parser.getgroup("fault matrix")
-    group.addoption("--write-fault-table", action="store_true", help="Write rows into docs/results/data/faults.json.")
+    group.addoption("--write-fault-table", action="store_true", help="Write rows into the table of faults.")
     group.addoption("--fault-times", type=int, default=5, help="How often every fault is injected.")
     group.addoption("--keep-fault-folder", action="store_true", help="Leave logs and stores of the faults on the disk.")

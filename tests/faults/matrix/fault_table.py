@@ -9,7 +9,7 @@ from pathlib import Path
 from flows.machine.facts import describe_machine
 from genre_tasks.atomic_path import atomic_path
 
-TABLE = Path(__file__).resolve().parents[3] / "docs/results/data/faults.json"
+TABLE = Path(__file__).resolve().parents[3] / "docs/results/data/tests/faults.json"
 
 
 @dataclass(frozen=True)
