@@ -10,7 +10,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from genre_tasks.errors import ArtifactCorruptError
+from genre_tasks.errors import ArtifactCorruptError, ConfigError
 from storage.address import Address
 from storage.keys import digest_bytes, digest_value
 
@@ -186,9 +186,15 @@ def parse_manifest(data: bytes, file: Path) -> Manifest:
         raise ArtifactCorruptError("The manifest does not fit its schema", remedy=_RECOMPUTE, file=file) from error
     if manifest.payload_digest != payload_digest(manifest.files):
         raise ArtifactCorruptError("The payload digest is not of the files listed", remedy=_RECOMPUTE, file=file)
-    # Stores are exchanged: a path from somebody else's manifest must not lead out of the folder.
+    # Stores are exchanged: an address or a path from somebody else's manifest must not lead out of its folder.
+    try:
+        _ = manifest.address
+    except ConfigError as error:
+        raise ArtifactCorruptError(error.problem, remedy=_RECOMPUTE, file=file) from error
     for entry in manifest.files:
         path = PurePosixPath(entry.path)
-        if path.is_absolute() or ".." in path.parts or not path.parts or entry.path == MANIFEST:
+        is_outside = path.is_absolute() or ".." in path.parts or not path.parts
+        # A NUL would fail in every call of the system, by an error that names nothing.
+        if is_outside or entry.path == MANIFEST or "\0" in entry.path:
             raise ArtifactCorruptError(f"The path {entry.path!r} is not allowed", remedy=_RECOMPUTE, file=file)
     return manifest

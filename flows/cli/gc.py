@@ -22,8 +22,8 @@ def gc(
 ) -> None:
     """Remove what no run and no pin of a store refers to.
 
-    It lists what would go; --delete removes it. What a run, a pin or an imported scene was made from stays. Let no run
-    of this store be under way that is older than --older-than: it has no record yet.
+    It lists what would go; --delete removes it. What a run, a pin or an imported scene was made from stays. Best
+    let no run of this store be under way: it has no record yet, and may read what it found in the store.
 
     Example:
 

@@ -11,9 +11,10 @@ from flows.configuration.loading import apply_settings
 from flows.configuration.validation import validate_config
 from flows.pipeline.definition import PIPELINE, StageSpec, digest_stage_weights, stage_key
 from flows.pipeline.stage_runner import Job, reading_modules
-from genre_tasks.code_closure import import_closure
+from genre_tasks.code_closure import find_module_file, import_closure
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ConfigError
+from storage.code_digest import NUMERIC_PACKAGES
 
 _ROOT = Path(__file__).resolve().parents[2]
 _FORMS = (
@@ -56,13 +57,12 @@ def find_recomputations(record: Mapping[str, Any], change: str) -> list[Recomput
         ConfigError: the change is none of these, or its setting is wrong.
         InputError: the log or the weights are gone.
     """
+    _check_change(change)
     config = validate_config(record["config"], f"the record of run {record['run']}")
     found: list[Recomputation] = []
     # All chunks share the configuration and the code: what changes in one changes in all.
     job = Job(record["log"], 0, record["store"], record["config"])
     reasons = {spec.name: _explain(spec, job, config, change) for spec in PIPELINE}
-    if not any(reasons.values()) and not _is_sound(change):
-        raise ConfigError(f"{change!r} is no change that keys know", remedy=_FORMS)
     for chunk in record["chunks"]:
         seconds = {stage["stage"]: float(stage["seconds"]) for stage in chunk["stages"]}
         changed: set[str] = set()
@@ -98,6 +98,18 @@ def _explain(spec: StageSpec, job: Job, config: PipelineConfig, change: str) -> 
     return ""
 
 
-def _is_sound(change: str) -> bool:
+def _check_change(change: str) -> None:
+    """Refuses what no key depends on: a typing error must not look like a change without consequences."""
     kind, _, name = change.partition(":")
-    return change == "log" or "=" in change or (kind in ("code", "weights", "package") and bool(name))
+    is_known = {
+        "code": lambda: find_module_file(name, _ROOT) is not None,
+        "weights": lambda: name in {spec.weights for spec in PIPELINE if spec.weights},
+        # The versions of others are no part of a key.
+        "package": lambda: name in NUMERIC_PACKAGES,
+    }
+    if kind in is_known and name:
+        is_sound = is_known[kind]()
+    else:
+        is_sound = change == "log" or ("=" in change and "." in change.partition("=")[0])
+    if not is_sound:
+        raise ConfigError(f"{change!r} is no change that keys know", remedy=_FORMS)

@@ -60,11 +60,17 @@ def test_payload_digest_does_not_depend_on_order_and_must_fit() -> None:
         parse_manifest(example(payload_digest="0" * 64).to_json(), FILE)
 
 
-@pytest.mark.parametrize("path", ["../x", "/etc/x", "manifest.json", "a/../../x"])
+@pytest.mark.parametrize("path", ["../x", "/etc/x", "manifest.json", "a/../../x", "a\0b"])
 def test_paths_that_lead_out_are_refused(path: str) -> None:
     files = (FileEntry(path=path, sha256="1" * 64, size=3),)
     with pytest.raises(ArtifactCorruptError, match="not allowed"):
         parse_manifest(example(files=files, payload_digest=payload_digest(files)).to_json(), FILE)
+
+
+@pytest.mark.parametrize("change", [{"dataset": ".."}, {"log": "a/b"}, {"stage": "../s"}, {"key": ""}])
+def test_addresses_that_lead_out_are_refused(change: dict[str, str]) -> None:
+    with pytest.raises(ArtifactCorruptError, match=r"cannot be a folder's name.*manifest\.json"):
+        parse_manifest(example(**change).to_json(), FILE)
 
 
 @pytest.mark.parametrize(

@@ -195,7 +195,15 @@ def test_a_setting_says_what_a_run_computes(store: LocalStore) -> None:
 
 
 def test_changes_that_keys_do_not_know_are_refused(store: LocalStore) -> None:
-    for change in ("nothing", "code:", "gnet"):
+    for change in (
+        "nothing",
+        "code:",
+        "gnet",
+        "code:genre_tasks.none",
+        "weights:fnett",
+        "package:yaml",
+        "iterations=3",
+    ):
         with pytest.raises(ConfigError, match="no change that keys know"):
             find_recomputations(record_of(store), change)
 
