@@ -13,8 +13,6 @@ from flows.dataset import submission
 from flows.dataset.prefect_runs import ChildRequest, PrefectRuns, has_heartbeat
 from flows.dataset.submission import HeartbeatWatch
 
-NOW = datetime.now(UTC)
-
 
 class FakeClient:
     """Answers with the newest events by their own times, as the server does."""
@@ -30,7 +28,7 @@ class FakeClient:
         return SimpleNamespace(events=newest[:limit], total=len(newest))
 
     def send(self, age_s: float, shift_s: float = 0.0) -> None:
-        received = NOW - timedelta(seconds=age_s)
+        received = datetime.now(UTC) - timedelta(seconds=age_s)
         self.events.append(SimpleNamespace(occurred=received + timedelta(seconds=shift_s), received=received))
 
 
