@@ -22,6 +22,8 @@ test: $(READY)
 
 test-all: $(READY)
 	@tests/install_services.sh
+	$(VENV)/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[audit]'
+	mkdir -p build && $(VENV)/bin/cyclonedx-py environment --output-file build/sbom.json $(VENV)/bin/python
 	$(VENV)/bin/python -m pytest -m "" --timeout 3600
 
 lint: $(READY)
