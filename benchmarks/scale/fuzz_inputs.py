@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from random import Random
 
-from benchmarks.scale.fuzz_formats import FuzzTarget, list_targets
+from benchmarks.scale.fuzz_formats import list_targets
 from benchmarks.scale.fuzz_mutations import keep
+from benchmarks.scale.fuzz_target import FuzzTarget
 
 UNCHANGED_EVERY = 40
 """One input in so many of a target is a valid file, which must be read."""
@@ -42,7 +43,9 @@ class FuzzInputs:
             start: the first index.
             stop: the index after the last one.
         """
-        for target in {self.target(index).reader + self.target(index).file: self.target(index) for index in range(start, stop)}.values():
+        for target in {
+            self.target(index).reader + self.target(index).file: self.target(index) for index in range(start, stop)
+        }.values():
             folder = self._target_folder(target)
             path = folder / target.file
             for content in self._samples(target):

@@ -1,4 +1,4 @@
-"""Damages that any file can have: flipped bits, cuts, splices, wrong numbers, wrong types, nesting and hostile names."""
+"""Damages that any file can have: flipped bits, cuts, splices, wrong numbers and types, nesting, hostile names."""
 
 from __future__ import annotations
 
@@ -12,30 +12,92 @@ from typing import Any
 Mutation = Callable[[Random, bytes, Sequence[bytes]], bytes]
 """Makes a damaged file from a generator, a valid file and other valid files of the format."""
 
-INTEGERS = (0, 1, 2, 127, 128, 255, 32767, 65535, 10**6, 10**9, 2**31 - 1, 2**31, 2**32 - 1, 2**62, 2**63 - 1, 2**64 - 1)
+INTEGERS = (
+    0,
+    1,
+    2,
+    127,
+    128,
+    255,
+    32767,
+    65535,
+    10**6,
+    10**9,
+    2**31 - 1,
+    2**31,
+    2**32 - 1,
+    2**62,
+    2**63 - 1,
+    2**64 - 1,
+)
 """Integers at which sizes overflow or become absurd."""
 
 MAGICS = (
-    *(b"\xff\xd8\xff\xe0", b"\x89PNG\r\n\x1a\n", b"PAR1", b"\x76\x2f\x31\x01", b"ply\nformat ascii 1.0\n", b"PK\x03\x04"),
-    *(b"\x1f\x8b\x08\x00", b"BZh9", b"\xfd7zXZ\x00", b"\x80\x04\x95", b"glTF", b"GIF89a", b"%!PS-Adobe-3.0", b"II*\x00"),
+    *(
+        b"\xff\xd8\xff\xe0",
+        b"\x89PNG\r\n\x1a\n",
+        b"PAR1",
+        b"\x76\x2f\x31\x01",
+        b"ply\nformat ascii 1.0\n",
+        b"PK\x03\x04",
+    ),
+    *(
+        b"\x1f\x8b\x08\x00",
+        b"BZh9",
+        b"\xfd7zXZ\x00",
+        b"\x80\x04\x95",
+        b"glTF",
+        b"GIF89a",
+        b"%!PS-Adobe-3.0",
+        b"II*\x00",
+    ),
     *(b"RIFF\x00\x00\x00\x00WEBP", b"#usda 1.0\n", b"PXR-USDC", b"<?xml version='1.0'?>", b"\xef\xbb\xbf", b"\xff\xfe"),
 )
 """First bytes of other formats."""
 
 HOSTILE_TEXTS = (
     *("", "\0", "../../../../etc/passwd", "/etc/passwd", "..\\..\\windows", "file:///etc/passwd", "~root/x", "CON"),
-    *("http://169.254.169.254/latest/meta-data", "s3://127.0.0.1:1/x", "$(touch x)", "`touch x`", "%s%n", "{0.__class__}"),
+    *(
+        "http://169.254.169.254/latest/meta-data",
+        "s3://127.0.0.1:1/x",
+        "$(touch x)",
+        "`touch x`",
+        "%s%n",
+        "{0.__class__}",
+    ),
     *("\ud7ff\U0001f697", "\u202e", "a" * 5000, "e\u0301" * 50, "__proto__", "NaN", "-inf", "1e999", "'; DROP TABLE x"),
 )
 """Names that lead out of a folder, to an address, or into a shell."""
 
 _FAR = 256
 _NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
-_NUMBER_TEXTS = (b"NaN", b"Infinity", b"-Infinity", b"1e999", b"-1", b"0", b"1" * 400, b"1" * 5000, b"0x7fffffff", b"1e-400")
-_MORE_NUMBERS = (b"99999999999", b"2147483648", b"18446744073709551616", b"null", b'"x"', b"[]", b"{}", b"true", b"-0", b"01")
+_NUMBER_TEXTS = (
+    b"NaN",
+    b"Infinity",
+    b"-Infinity",
+    b"1e999",
+    b"-1",
+    b"0",
+    b"1" * 400,
+    b"1" * 5000,
+    b"0x7fffffff",
+    b"1e-400",
+)
+_MORE_NUMBERS = (
+    b"99999999999",
+    b"2147483648",
+    b"18446744073709551616",
+    b"null",
+    b'"x"',
+    b"[]",
+    b"{}",
+    b"true",
+    b"-0",
+    b"01",
+)
 
 
-def _pick_offset(rng: Random, data: bytes) -> int:
+def _pick_offset(rng: Random, data: bytes | bytearray) -> int:
     # Headers decide most, so that half of the changes fall into the first bytes.
     return rng.randrange(max(1, min(len(data), _FAR) if rng.random() < 0.5 else len(data)))
 
@@ -67,7 +129,9 @@ def splice(rng: Random, data: bytes, others: Sequence[bytes]) -> bytes:
     if kind == 0:
         return data[:start] + other[rng.randrange(len(other) + 1) :]
     end = min(len(data), start + rng.choice((1, 4, 16, 100, 1000)))
-    return data[:end] + data[start:end] * rng.choice((1, 2, 50)) + data[end:] if kind == 1 else data[:start] + data[end:]
+    return (
+        data[:end] + data[start:end] * rng.choice((1, 2, 50)) + data[end:] if kind == 1 else data[:start] + data[end:]
+    )
 
 
 def write_integer(rng: Random, data: bytes, others: Sequence[bytes]) -> bytes:
@@ -143,7 +207,9 @@ def nest(rng: Random, data: bytes, others: Sequence[bytes]) -> bytes:
     """Nests brackets or mappings thousands deep, around the file or instead of it."""
     depth = rng.choice((40, 900, 5000, 100_000))
     opening = rng.choice((b"[", b'{"a":', b"[[", b'{"a":[', b"- ", b"? "))
-    closing = opening.replace(b'"a":', b"").translate(bytes.maketrans(b"[{", b"]}"))[::-1] if opening[0] in b"[{" else b""
+    closing = (
+        opening.replace(b'"a":', b"").translate(bytes.maketrans(b"[{", b"]}"))[::-1] if opening[0] in b"[{" else b""
+    )
     return opening * depth + (data if rng.random() < 0.3 else b"1") + closing * depth
 
 
@@ -157,7 +223,7 @@ def make_value(rng: Random) -> Any:
     nested: Any = 1
     for _ in range(depth):
         nested = [nested] if rng.random() < 0.5 else {"a": nested}
-    choices = (
+    choices: tuple[Any, ...] = (
         *(None, True, False, -1, 0, 1, 2.5, -0.0, 1e308, 10**18, 10**30, 10**400, 2**31, 2**63, float("nan")),
         *(float("inf"), float("-inf"), [], {}, "", [[]], [None], ["x"], {"x": 1}, [1e999], list(range(300)), nested),
     )

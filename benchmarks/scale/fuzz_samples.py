@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +27,18 @@ def encode_pictures(format: str) -> list[bytes]:
     from PIL import Image
 
     image = Image.fromarray(make_picture())
-    grey = Image.fromarray((make_picture()[:, :, 0].astype(np.uint16) << 7))
+    grey = Image.fromarray(make_picture()[:, :, 0].astype(np.uint16) << 7)
     variants: list[tuple[Any, dict[str, Any]]]
     if format == "JPEG":
         variants = [(image, {}), (image, {"progressive": True}), (image.convert("L"), {}), (image.convert("CMYK"), {})]
     else:
-        variants = [(image, {}), (image.convert("P"), {}), (image.convert("RGBA"), {}), (grey, {}), (image.convert("1"), {})]
+        variants = [
+            (image, {}),
+            (image.convert("P"), {}),
+            (image.convert("RGBA"), {}),
+            (grey, {}),
+            (image.convert("1"), {}),
+        ]
     files = []
     for picture, options in variants:
         sink = io.BytesIO()
@@ -50,7 +57,7 @@ def pickle_tables() -> list[bytes]:
     words = np.array([f"box-{k}" for k in range(count)], dtype=object)
     names = ("yaw", "position.x", "position.y", "position.z", "dimensions.x", "dimensions.y", "dimensions.z")
     boxes: dict[str, Any] = {"uuid": words, "label": np.array(["Car", None] * 3, dtype=object)}
-    boxes |= {"stationary": np.arange(count) % 2 == 0} | {name: numbers + 5 for name in names}
+    boxes |= {"stationary": np.arange(count) % 2 == 0} | dict.fromkeys(names, numbers + 5)
     return [pickle_table(sweep), pickle_table(boxes)]
 
 
@@ -159,6 +166,26 @@ def make_sequence_poses() -> list[dict[str, Any]]:
     """Makes a ``poses.json`` of a PandaSet camera."""
     pose = {"position": {"x": 1.0, "y": 2.0, "z": 0.5}, "heading": {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}}
     return [pose, pose]
+
+
+def write_colmap_model(file: str, folder: Path) -> list[bytes]:
+    """Writes a sparse model of one camera and two images, in bytes or text.
+
+    Returns:
+        The bytes of ``file``.
+    """
+    cameras = struct.pack("<QiiQQ4d", 1, 1, 1, 48, 32, 40.0, 40.0, 24.0, 16.0)
+    images = struct.pack("<Q", 2)
+    for number in (1, 2):
+        images += struct.pack("<i7di", number, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, float(number), 1) + b"%d.png\0" % number
+        images += struct.pack("<Q2dq", 1, 3.0, 4.0, -1)
+    if file.endswith(".bin"):
+        (folder / "cameras.bin").write_bytes(cameras)
+        (folder / "images.bin").write_bytes(images)
+    else:
+        (folder / "cameras.txt").write_text("# cameras\n1 PINHOLE 48 32 40 40 24 16\n")
+        (folder / "images.txt").write_text("1 1 0 0 0 0 0 1 1 1.png\n3 4 -1\n2 1 0 0 0 0 0 2 1 2.png\n\n")
+    return [(folder / file).read_bytes()]
 
 
 def write_optimiser(folder: Path) -> Path:

@@ -100,7 +100,9 @@ def _read_all(inputs: int, seed: int) -> Iterator[dict[str, Any]]:
         yield from rows
         if died_at is None:
             if status or len(rows) < inputs - start:
-                raise RuntimeError(f"the process of inputs ended with {status} before it read input {start + len(rows)}")
+                raise RuntimeError(
+                    f"the process of inputs ended with {status} before it read input {start + len(rows)}"
+                )
             return
         outcome = "hang" if status == -signal.SIGALRM else "crash"
         yield {"index": died_at, "outcome": outcome, "detail": f"the process ended with {status}"}

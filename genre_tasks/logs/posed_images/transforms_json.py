@@ -98,16 +98,30 @@ def _read_lens(values: Mapping[str, Any], path: Path) -> Lens:
 
 
 def _read_number(values: Mapping[str, Any], key: str, path: Path) -> float:
-    value = values.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    number = _as_number(values.get(key))
+    if number is None:
         raise InputError(f"the intrinsics lack a number for {key}", remedy=_REMEDY, file=path)
-    return float(value)
+    return number
 
 
 def _read_time(frame: Mapping[str, Any], name: str, path: Path) -> float | None:
     value = frame.get("time", frame.get("timestamp"))
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    number = _as_number(value)
+    if number is None:
         raise InputError(f"the time of {name} is no number", remedy="Write seconds, or no time at all.", file=path)
-    return float(value)
+    return number
+
+
+def _as_number(value: object) -> float | None:
+    """A finite number of JSON, or ``None``."""
+    # A bool is an int of Python.
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        # Integers of JSON have any number of digits.
+        return None
+    return number if math.isfinite(number) else None
