@@ -194,12 +194,17 @@ def write_optimiser(folder: Path) -> Path:
     Returns:
         The file of the tensors.
     """
+    import torch
+
     from genre_tasks.learned.learned_optimiser import LearnedOptimiser
     from genre_tasks.learned.network import NetworkConfig
     from genre_tasks.learned.weights import save_optimiser
 
     path = folder / "gnet.safetensors"
-    save_optimiser(LearnedOptimiser(NetworkConfig(hidden=4, channels=(4, 4))), path)
+    # The same weights in every process: an input follows from its index.
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        save_optimiser(LearnedOptimiser(NetworkConfig(hidden=4, channels=(4, 4))), path)
     return path
 
 
