@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.scale import fuzz_attacks, fuzz_samples, fuzz_table_attacks
 from benchmarks.scale.fuzz_mutations import BYTES, JSON, TEXT, change_json
-from benchmarks.scale.fuzz_target import FuzzTarget, give_samples, require_sound
+from benchmarks.scale.fuzz_target import LARGE_TABLE_MEMORY_MIB, FuzzTarget, give_samples, require_sound
 
 
 def _prepare_artifact(kind: str, file: str, folder: Path) -> list[bytes]:
@@ -53,7 +53,8 @@ def table_targets() -> Iterator[FuzzTarget]:
     prepare = partial(_prepare_artifact, "reconstruction", "gaussians.parquet")
     bombs = (fuzz_table_attacks.make_large_table,)
     read = partial(_read_artifact, "reconstruction", 0)
-    yield FuzzTarget("Parquet", "codec, large tables", "gaussians.parquet", prepare, read, bombs, 1, 512)
+    bound = LARGE_TABLE_MEMORY_MIB
+    yield FuzzTarget("Parquet", "codec, large tables", "gaussians.parquet", prepare, read, bombs, 1, bound)
     views = partial(_prepare_artifact, "chunk", "views.parquet")
     columns = ["camera", "role"]
     yield FuzzTarget(

@@ -14,7 +14,7 @@ def make_large_table(rng: Random, data: bytes, others: Sequence[bytes]) -> bytes
     import pyarrow.parquet as pq
 
     table = pq.read_table(io.BytesIO(data))
-    count = rng.choice((100_000, 1_000_000, 8_000_000))
+    count = rng.choice((100_000, 1_000_000, 3_000_000, 8_000_000))
     if not table.num_rows:
         return data
     columns = []

@@ -11,6 +11,9 @@ from benchmarks.scale.fuzz_mutations import Mutation
 MEMORY_MIB = 256
 """Reading a small file may add so much to the process's memory at most."""
 
+LARGE_TABLE_MEMORY_MIB = 768
+"""Tables may take 256 MiB, and are copied when they become the arrays of a scene."""
+
 IMAGE_MEMORY_MIB = 1024
 """Images of up to 100 million pixels are read."""
 

@@ -16,23 +16,24 @@ class MemoryBound:
     """What a table may take in memory.
 
     Attributes:
-        most_bytes: of the table; it may take four times its file in any case.
+        most_bytes: of the table, whatever its file's size.
+        file_ratio: so many times its file's size a table may take in any case.
         value_bytes: what a value takes at least.
         row_bytes: what a row takes besides its values.
     """
 
     most_bytes: int
+    file_ratio: int
     value_bytes: int
     row_bytes: int
 
 
-FOR_COLUMNS = MemoryBound(2 << 30, value_bytes=1, row_bytes=0)
-"""For tables that are read as arrays: eight million Gaussians with harmonics of degree three."""
+FOR_COLUMNS = MemoryBound(256 << 20, file_ratio=64, value_bytes=1, row_bytes=0)
+"""For tables that are read as arrays. Harmonics of a million Gaussians may all be zero, which takes no file."""
 
-FOR_ROWS = MemoryBound(64 << 20, value_bytes=8, row_bytes=200)
+FOR_ROWS = MemoryBound(64 << 20, file_ratio=4, value_bytes=8, row_bytes=200)
 """For tables whose rows become dictionaries of Python."""
 
-_BYTES_PER_FILE_BYTE = 4
 _WIDTHS = {"INT32": 4, "INT64": 8, "INT96": 12, "FLOAT": 4, "DOUBLE": 8, "BOOLEAN": 1}
 # An offset in Arrow, or a reference in Python.
 _TEXT_BYTES = 8
@@ -58,7 +59,7 @@ def read_bounded_table(path: Path, bound: MemoryBound, columns: Sequence[str] | 
         TableTooLargeError: the table would take more.
         pyarrow.ArrowException: the file is no Parquet table, or is damaged; also ``OSError`` and ``ValueError``.
     """
-    most_bytes = max(bound.most_bytes, _BYTES_PER_FILE_BYTE * path.stat().st_size)
+    most_bytes = max(bound.most_bytes, bound.file_ratio * path.stat().st_size)
     with pq.ParquetFile(path, page_checksum_verification=True) as file:
         expected = file.schema_arrow
         size, repeated = _measure_metadata(file.metadata, bound, columns)

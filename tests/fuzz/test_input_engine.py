@@ -30,7 +30,9 @@ def test_an_input_follows_from_seed_and_index(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         made.append([make_input(50, SEED, index, tmp_path / name) for index in range(0, 50, 7)])
     assert [path.read_bytes() for path in made[0]] == [path.read_bytes() for path in made[1]]
-    assert [path.relative_to(tmp_path / "a") for path in made[0]] == [path.relative_to(tmp_path / "b") for path in made[1]]
+    assert [path.relative_to(tmp_path / "a") for path in made[0]] == [
+        path.relative_to(tmp_path / "b") for path in made[1]
+    ]
 
 
 def test_few_inputs_of_all_formats() -> None:

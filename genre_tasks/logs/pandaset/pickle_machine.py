@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-MAX_OPCODES = 4_000_000
+MAX_OPCODES = 2_000_000
 """A table has a few for every column and for every cell that is text; more would take minutes and gigabytes."""
 
 
