@@ -167,6 +167,7 @@ def change_png(rng: Random, data: bytes, others: Sequence[bytes]) -> bytes:
         chunks.append((data[position + 4 : position + 8], data[position + 8 : position + 8 + length]))
         position += length + 12
     header = bytearray(chunks[0][1])
+    # Checksums are computed again below, so that decoders get to see the change.
     kind = rng.randrange(5)
     if kind == 0:
         struct.pack_into(">II", header, 0, rng.choice(_SIDES), rng.choice(_SIDES))
@@ -194,6 +195,7 @@ def change_jpeg(rng: Random, data: bytes, others: Sequence[bytes]) -> bytes:
     frame = max(data.find(b"\xff\xc0"), data.find(b"\xff\xc2"))
     scan = data.rfind(b"\xff\xda")
     kind = rng.randrange(4)
+    # Baseline and progressive frames begin alike: length, depth, height, width.
     if kind == 0 and frame > 0:
         sides = struct.pack(">HH", *(min(rng.choice(_SIDES), 65_535) for _ in range(2)))
         return data[: frame + 5] + sides + data[frame + 9 :]
@@ -210,6 +212,7 @@ def change_jpeg(rng: Random, data: bytes, others: Sequence[bytes]) -> bytes:
 
 def change_safetensors(rng: Random, data: bytes, others: Sequence[bytes]) -> bytes:
     """Changes the JSON header or its length."""
+    # A length of eight bytes, then JSON of that length, then the tensors.
     (length,) = struct.unpack_from("<Q", data)
     header = json.loads(data[8 : 8 + length])
     body = data[8 + length :]
@@ -232,6 +235,7 @@ def change_glb(rng: Random, data: bytes, others: Sequence[bytes]) -> bytes:
     for _ in range(rng.choice((1, 2))):
         value = change_value(rng, value)
     text = dump_json(value)
+    # Parts of the file begin at multiples of four.
     text += b" " * (-len(text) % 4)
     body = data[20 + length :]
     header = struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(body), len(text), 0x4E4F534A)

@@ -113,6 +113,8 @@ def image_targets() -> Iterator[FuzzTarget]:
         samples = give_samples(*fuzz_samples.encode_pictures(kind))
         damages = (*BYTES, *(change,) * 5)
         yield FuzzTarget(kind, "decode_with_facts", name, samples, read, damages, 70, IMAGE_MEMORY_MIB)
+    others = give_samples(*fuzz_samples.encode_other_pictures())
+    yield FuzzTarget("other pictures", "decode_with_facts", "0.jpg", others, read, BYTES, 30, IMAGE_MEMORY_MIB)
     picture = give_samples(fuzz_samples.encode_pictures("PNG")[0])
     damages = (*BYTES, *(fuzz_attacks.change_png,) * 5)
     yield FuzzTarget("PNG", "read_png", "0.png", picture, read_png, damages, 20, IMAGE_MEMORY_MIB)

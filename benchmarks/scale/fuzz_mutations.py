@@ -118,6 +118,7 @@ def flip_bits(rng: Random, data: bytes, others: Sequence[bytes]) -> bytes:
 def cut(rng: Random, data: bytes, others: Sequence[bytes]) -> bytes:
     """Cuts the end off, or leaves zeros where it was."""
     end = rng.randrange(len(data) + 1)
+    # A download that stopped leaves zeros where the file was reserved at its size.
     return data[:end] + (bytes(len(data) - end) if rng.random() < 0.3 else b"")
 
 
@@ -154,6 +155,7 @@ def write_float(rng: Random, data: bytes, others: Sequence[bytes]) -> bytes:
 def swap_magic(rng: Random, data: bytes, others: Sequence[bytes]) -> bytes:
     """Begins the file as another format does."""
     magic = rng.choice(MAGICS)
+    # In place of the bytes that were there, or before them.
     return magic + (data[len(magic) :] if rng.random() < 0.5 else data)
 
 
@@ -174,6 +176,7 @@ BYTES: tuple[Mutation, ...] = (
 
 def replace_number(rng: Random, data: bytes, others: Sequence[bytes]) -> bytes:
     """Replaces a number in a text by an absurd one or by a value of another type."""
+    # Headers of texts are short, and the numbers after them are many.
     found = list(_NUMBER.finditer(data[: 1 << 16]))
     if not found:
         return data

@@ -47,6 +47,20 @@ def encode_pictures(format: str) -> list[bytes]:
     return files
 
 
+def encode_other_pictures() -> list[bytes]:
+    """Encodes the picture in the other formats that logs may have."""
+    from PIL import Image
+
+    image = Image.fromarray(make_picture())
+    files = []
+    for name in ("WEBP", "TIFF", "BMP", "GIF", "JPEG2000", "PPM"):
+        for options in ({}, {"compression": "tiff_lzw"}, {"compression": "jpeg"}) if name == "TIFF" else ({},):
+            sink = io.BytesIO()
+            image.save(sink, name, **options)
+            files.append(sink.getvalue())
+    return files
+
+
 def pickle_tables() -> list[bytes]:
     """Pickles a sweep and a table of cuboids."""
     from genre_tasks.logs.pandaset.pickle_writer import pickle_table
@@ -133,6 +147,19 @@ def make_cloud() -> Any:
 
     cloud = SplatCloud(numbers(8, 3), numbers(8, 3), numbers(8, 4), numbers(8), numbers(8, 3), numbers(8, 3, 3))
     return make_resting_scene(cloud, ())
+
+
+def make_compressed_ply() -> bytes:
+    """Writes eight Gaussians as SuperSplat compresses them: one chunk of bounds, and four numbers for each."""
+    bounds = [f"{end}_{axis}" for end in ("min", "max") for axis in "xyz"]
+    bounds += [f"{end}_scale_{axis}" for end in ("min", "max") for axis in "xyz"]
+    header = ["ply", "format binary_little_endian 1.0", "element chunk 1", *(f"property float {b}" for b in bounds)]
+    header += ["element vertex 8"]
+    header += [f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color")]
+    values = [-1.0, -1.0, -1.0, 1.0, 1.0, 1.0, -3.0, -3.0, -3.0, 0.0, 0.0, 0.0]
+    # Any bits are a packed Gaussian.
+    packed = np.arange(32, dtype="<u4") * np.uint32(99_999_989)
+    return "\n".join([*header, "end_header", ""]).encode() + struct.pack("<12f", *values) + packed.tobytes()
 
 
 def make_manifests() -> list[bytes]:

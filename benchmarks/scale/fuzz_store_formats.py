@@ -127,6 +127,8 @@ def splat_targets() -> Iterator[FuzzTarget]:
     yield FuzzTarget(
         "USD", "format usdz", "0.usdz", partial(prepare, "usdz"), _read_splats, BYTES, 8, starts_process=True
     )
+    packed = give_samples(fuzz_samples.make_compressed_ply())
+    yield FuzzTarget("PLY", "format compressed.ply", "0.compressed.ply", packed, _read_splats, TEXT, 20)
     ascii_ply = b"ply\nformat ascii 1.0\nelement vertex 2\n"
     ascii_ply += b"".join(b"property float %c\n" % c for c in b"xyz")
     ascii_ply += b"".join(b"property uchar %s\n" % c for c in (b"red", b"green", b"blue"))

@@ -26,6 +26,7 @@ def make_large_table(rng: Random, data: bytes, others: Sequence[bytes]) -> bytes
         )
     rows = pa.Table.from_arrays([column.cast(column.type.value_type) for column in columns], schema=table.schema)
     sink = io.BytesIO()
+    # Dictionaries and zstd make a few bytes of every group of rows.
     with pq.ParquetWriter(sink, table.schema, compression="ZSTD") as writer:
         block = pa.concat_tables([rows] * 100)
         for _ in range(count // len(block)):

@@ -55,6 +55,7 @@ def measure_input_fuzz(inputs: int, seed: int) -> dict[str, Any]:
     findings = []
     for row in _read_all(inputs, seed):
         target = targets[row["index"]]
+        # A valid file that is refused would hide that nothing behind the refusal is tested.
         if row.get("damage") == "keep" and row["outcome"] == REFUSED:
             row |= {"outcome": "wrong error", "detail": "a valid file is refused"}
         formats[target.format][row["outcome"]] += 1
@@ -95,6 +96,7 @@ def make_input(inputs: int, seed: int, index: int, folder: Path) -> Path:
 def _read_all(inputs: int, seed: int) -> Iterator[dict[str, Any]]:
     """A row for every input; a new process goes on after one that died."""
     start = 0
+    # One process reads as long as it lives: imports take longer than hundreds of inputs.
     while start < inputs:
         rows, died_at, status = _run_worker(seed, start, inputs)
         yield from rows
@@ -118,6 +120,7 @@ def _run_worker(seed: int, start: int, inputs: int) -> tuple[list[dict[str, Any]
         text=True,
         check=False,
     )
+    # The last line may be cut off where the process died while it wrote.
     lines = [json.loads(line) for line in done.stdout.splitlines() if line.endswith("}")]
     rows = [line for line in lines if "outcome" in line]
     last = lines[-1] if lines else {}
