@@ -64,6 +64,14 @@ def test_times_of_hundreds_of_digits_are_no_times(tmp_path: Path) -> None:
         read_transforms(tmp_path / "transforms.json")
 
 
+def test_matrices_of_hundreds_of_digits_are_no_poses(tmp_path: Path) -> None:
+    values = fuzz_samples.make_transforms()
+    values["frames"][1]["transform_matrix"][0][0] = 10**400
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    with pytest.raises(InputError, match="transform_matrix of 4 × 4 numbers"):
+        read_transforms(tmp_path / "transforms.json")
+
+
 def test_infinite_schema_versions_are_no_manifest() -> None:
     data = fuzz_samples.make_manifests()[0].replace(b'"schema_version": 1', b'"schema_version": 1e999')
     with pytest.raises(ArtifactCorruptError, match="not readable"):

@@ -64,7 +64,7 @@ def _read_frame(shared: Mapping[str, Any], frame: Any, index: int, path: Path) -
 def _read_matrix(frame: Mapping[str, Any], name: str, path: Path) -> Float64:
     try:
         matrix = np.array(frame.get("transform_matrix"), dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape not in ((4, 4), (3, 4)):
         raise InputError(f"{name} has no transform_matrix of 4 × 4 numbers", remedy=_REMEDY, file=path)
