@@ -20,7 +20,7 @@ from benchmarks.scale.fuzz_attacks import CANARY
 from benchmarks.scale.fuzz_inputs import FuzzInputs
 from benchmarks.scale.fuzz_target import FuzzTarget, WrongReadError
 
-SECONDS = 20
+SECONDS = 30
 """An input that takes longer hangs."""
 
 ADDRESS_SPACE_MIB = 3072

@@ -48,7 +48,8 @@ def measure_input_fuzz(inputs: int, seed: int) -> dict[str, Any]:
 
     begin_s = time.perf_counter()
     with tempfile.TemporaryDirectory() as name:
-        targets = [FuzzInputs(seed, inputs, Path(name)).target(index) for index in range(inputs)]
+        made = FuzzInputs(seed, inputs, Path(name))
+        targets = [made.target(index) for index in range(inputs)]
     formats: dict[str, Counter[str]] = {target.format: Counter() for target in targets}
     longest = dict.fromkeys(formats, 0.0)
     largest = dict.fromkeys(formats, 0.0)
