@@ -30,7 +30,7 @@ def test_damaged_files_are_read_or_refused(target: FuzzTarget, folder: Path) -> 
     samples = target.prepare(room)
     path = room / target.file
 
-    @settings(max_examples=12, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), database=None)
+    @settings(max_examples=8, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), database=None)
     @given(random=st.randoms(use_true_random=False), damages=st.lists(st.sampled_from(BYTES), min_size=1, max_size=2))
     def read(random: Random, damages: list) -> None:
         data = samples[0]
