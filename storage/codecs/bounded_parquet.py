@@ -93,15 +93,17 @@ def _measure_metadata(
         row_group = metadata.row_group(group)
         for index in range(row_group.num_columns):
             chunk = row_group.column(index)
-            name = chunk.path_in_schema
+            described = metadata.schema.column(index)
+            # Of the schema, by which Arrow reads; the name beside the column's bytes may be another one.
+            name = described.path
             if columns is not None and name.partition(".")[0] not in columns:
                 continue
-            described = metadata.schema.column(index)
+            is_flat = described.max_repetition_level == 0 and "." not in name
             width = _WIDTHS.get(chunk.physical_type) or described.length
             has_dictionary = bool(_DICTIONARIES & set(chunk.encodings))
             if width:
                 size += chunk.num_values * max(width, bound.value_bytes)
-            elif not has_dictionary or described.max_repetition_level == 0:
+            elif is_flat or not has_dictionary:
                 size += chunk.num_values * _TEXT_BYTES + chunk.total_uncompressed_size
                 repeated |= {name} if has_dictionary else set()
             else:

@@ -272,6 +272,19 @@ def test_bounded_tables_are_those_of_arrow(tmp_path: Path) -> None:
     assert read_bounded_table(path, generous, ["text"]).equals(pq.read_table(path, columns=["text"]))
 
 
+def test_columns_that_are_named_twice_are_measured_by_the_name_that_counts(tmp_path: Path) -> None:
+    path = tmp_path / "t.parquet"
+    write_table(path, TABLE, {"x": np.arange(5), "text": ["a", "a", "", "b", "a"]})
+    data = path.read_bytes()
+    footer = data.find(b"genre.table")
+    places = [k for k in range(footer) if data.startswith(b"\x04text", k)]
+    # The schema says "text", and what lies beside the column's bytes says "next".
+    assert len(places) == 2
+    path.write_bytes(data[: places[1]] + b"\x04next" + data[places[1] + 5 :])
+    assert pq.read_metadata(path).row_group(0).column(1).path_in_schema == "next"
+    assert read_bounded_table(path, FOR_COLUMNS).column("text").to_pylist() == ["a", "a", "", "b", "a"]
+
+
 @pytest.mark.parametrize("place", ["value", "metadata"])
 def test_texts_of_tables_are_utf8(tmp_path: Path, place: str) -> None:
     texts = pa.array([b"\xff" if place == "value" else b"x"]).view(pa.string())
