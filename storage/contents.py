@@ -107,11 +107,12 @@ def read_columns(path: Path, names: list[str]) -> dict[str, NDArray[Any]]:
 
 def _read_table(path: Path, names: list[str] | None = None) -> pa.Table:
     import pyarrow as pa
-    import pyarrow.parquet as pq
+
+    from storage.codecs.bounded_parquet import FOR_COLUMNS, FOR_ROWS, read_bounded_table
 
     try:
-        table = pq.read_table(path, columns=names, use_threads=False)
-    except (OSError, pa.ArrowException) as error:
+        table = read_bounded_table(path, FOR_COLUMNS if names else FOR_ROWS, names)
+    except (OSError, ValueError, pa.ArrowException) as error:
         raise ArtifactCorruptError(f"The table does not decode ({error})", remedy=REMEDY, file=path) from error
     for name in names or ():
         # Arrow leaves out a column that the file does not have.
@@ -126,7 +127,7 @@ def _count_rows(path: Path) -> int:
 
     try:
         return int(pq.read_metadata(path).num_rows)
-    except (OSError, pa.ArrowException) as error:
+    except (OSError, ValueError, pa.ArrowException) as error:
         raise ArtifactCorruptError(f"The table does not decode ({error})", remedy=REMEDY, file=path) from error
 
 

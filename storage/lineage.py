@@ -105,10 +105,9 @@ def summarise_files(store: Store, artifact: Artifact) -> list[TableSummary]:
 
 
 def _summarise_table(folder: Path, path: Path) -> TableSummary:
-    import pyarrow.parquet as pq
+    from storage.codecs.bounded_parquet import FOR_COLUMNS, read_bounded_table
 
-    with pq.ParquetFile(path, page_checksum_verification=True) as file:
-        table = file.read(use_threads=False)
+    table = read_bounded_table(path, FOR_COLUMNS)
     rows = []
     for field in table.schema:
         note = (field.metadata or {}).get(b"note", b"").decode()
@@ -176,6 +175,11 @@ def _summarise_exr(folder: Path, paths: list[Path]) -> TableSummary:
 def _read_channels(path: Path) -> Iterator[tuple[str, NDArray[Any]]]:
     import OpenEXR
 
+    from storage.codecs.exr import find_size_problems
+
+    with OpenEXR.File(str(path), header_only=True) as file:
+        for problem in find_size_problems(file):
+            raise ArtifactCorruptError(problem, remedy=REMEDY, file=path)
     with OpenEXR.File(str(path), separate_channels=True) as file:
         if len(file.parts) != 1:
             raise ArtifactCorruptError("The image does not decode", remedy=REMEDY, file=path)

@@ -169,7 +169,7 @@ def parse_manifest(data: bytes, file: Path) -> Manifest:
         version = int(body["schema_version"])
         seal = body.pop(_SEAL, None)
         computed_seal = digest_value(body)
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, RecursionError, OverflowError) as error:
         raise ArtifactCorruptError("The manifest is not readable", remedy=_RECOMPUTE, file=file) from error
     # A newer version may seal its manifests in another way: a missing seal is then no damage.
     if seal != computed_seal and not (seal is None and version > SCHEMA_VERSION):

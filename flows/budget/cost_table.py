@@ -113,9 +113,11 @@ def load_cost_table(path: Path, preset: str, user_keys: Iterable[str] = ()) -> C
     summaries, facts = read_settings(path)
     if facts.get("base") != preset:
         raise ConfigError(f"this table is of the preset {facts.get('base')}", remedy=remedy, file=path)
+    if not summaries:
+        raise ConfigError("this table has no setting", remedy=remedy, file=path)
     # Without the speed of its machine, a table's seconds say nothing about this one.
-    if "calibration_s" not in facts:
-        raise ConfigError("this table does not say how fast its machine was", remedy=remedy, file=path)
+    if missing := [name for name in ("calibration_s", "judged", "cold_seconds", "machine") if name not in facts]:
+        raise ConfigError(f"this table does not say how fast its machine was ({missing[0]})", remedy=remedy, file=path)
     measure = next((m for m in MEASURES if m.name == facts["judged"]), PSNR)
     # Accuracy is better when larger; of distances it is the opposite.
     sign = 1.0 if measure.more_is_better else -1.0
@@ -131,13 +133,18 @@ def load_cost_table(path: Path, preset: str, user_keys: Iterable[str] = ()) -> C
         raise ConfigError(
             f"{', '.join(both)} is what a budget decides", remedy="Leave out either --budget or that setting."
         )
+    try:
+        calibration_s = float(facts["calibration_s"])
+        first_call_s = {str(stage): float(seconds) for stage, seconds in json.loads(facts["cold_seconds"]).items()}
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise ConfigError(f"this table's facts are damaged ({error})", remedy=remedy, file=path) from error
     return CostTable(
         preset=preset,
         accuracy_label=measure.label,
         points=points,
         images=summaries[0].source_images,
-        calibration_s=float(facts["calibration_s"]),
-        first_call_s=json.loads(facts["cold_seconds"]),
+        calibration_s=calibration_s,
+        first_call_s=first_call_s,
         machine=facts["machine"],
     )
 

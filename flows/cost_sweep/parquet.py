@@ -11,7 +11,9 @@ from typing import Any
 import pyarrow as pa
 
 from flows.cost_sweep.summary import COSTS, MEASURES, Measure, SettingSummary, Spread
-from storage.codecs.tables import column, read_table, schema, write_table
+from genre_tasks.errors import ArtifactCorruptError
+from storage.codecs.bounded_parquet import FOR_ROWS
+from storage.codecs.tables import REMEDY, column, read_table, schema, write_table
 
 # The order is that of the columns: changing it needs a new version of the schema.
 _MEASURES = (*COSTS, *MEASURES)
@@ -115,8 +117,11 @@ def read_settings(path: Path) -> tuple[list[SettingSummary], dict[str, str]]:
     Raises:
         ArtifactCorruptError: the file is no such table.
     """
-    table, facts = read_table(path, LINES)
-    return [_summary(row) for row in table.to_pylist()], facts
+    table, facts = read_table(path, LINES, FOR_ROWS)
+    try:
+        return [_summary(row) for row in table.to_pylist()], facts
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise ArtifactCorruptError(f"A setting does not decode ({error})", remedy=REMEDY, file=path) from error
 
 
 def _summary(row: Mapping[str, Any]) -> SettingSummary:
@@ -127,10 +132,10 @@ def _summary(row: Mapping[str, Any]) -> SettingSummary:
         n=row["n"],
         values={m.name: _read_spread(row, _value_columns(m)) for m in _MEASURES},
         gains={m.name: _read_spread(row, _gain_columns(m)) for m in _MEASURES},
-        stage_seconds=json.loads(row["stage_seconds"]),
+        stage_seconds={str(stage): float(seconds) for stage, seconds in json.loads(row["stage_seconds"]).items()},
         # The file has no such column, and zero would be a claim.
         images_at_3m=math.nan,
-        changes=tuple(json.loads(row["changes"])),
+        changes=tuple(str(change) for change in json.loads(row["changes"])),
         end=row["end"],
         threads=row["threads"],
         source_images=row["images"],

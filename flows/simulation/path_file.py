@@ -24,7 +24,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
 from genre_tasks.ego_paths.ego_path import EgoPath
@@ -32,6 +31,7 @@ from genre_tasks.ego_paths.relative_path import place_relative_path
 from genre_tasks.errors import InputError
 from genre_tasks.logs.types import Float64
 from genre_tasks.suggestions import did_you_mean
+from storage.codecs.bounded_parquet import FOR_ROWS, read_bounded_table
 
 POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 RELATIVE_COLUMNS = ("lateral_m", "ahead_m")
@@ -105,8 +105,7 @@ def _read_columns(path: Path) -> Mapping[str, Sequence[Any]]:
         raise InputError("a path is a .parquet or a .json file", remedy="Give the file one of these endings.")
     try:
         if kind == ".parquet":
-            with pq.ParquetFile(path) as file:
-                table = file.read(use_threads=False)
+            table = read_bounded_table(path, FOR_ROWS)
             return {name: table.column(name).to_pylist() for name in table.column_names}
         rows = json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError, pa.ArrowException) as error:

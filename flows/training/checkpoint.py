@@ -85,7 +85,7 @@ def describe(path: Path) -> dict[str, Any]:
             description: dict[str, Any] = json.loads((file.metadata() or {})["training"])
         # Older checkpoints lack settings that have since been added; they mean the defaults.
         description["network"] = NetworkConfig(**description["network"]).model_dump(mode="json")
-    except (SafetensorError, OSError, KeyError, ValueError) as error:
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise InputError(
             f"The checkpoint cannot be read: {error}", remedy="Delete it to train the stage anew.", file=path
         ) from error

@@ -109,7 +109,7 @@ def list_pins(store: Store) -> list[Pin]:
             values = json.loads(path.read_bytes())
             keys = tuple(str(key) for key in values["keys"])
             pins.append(Pin(str(values["name"]), keys, str(values["note"]), str(values["pinned_at"])))
-        except (ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             # To ignore it would let what it keeps be removed.
             raise InputError("the pin is damaged", remedy="Remove the folder, and pin again.", file=path) from error
     return pins

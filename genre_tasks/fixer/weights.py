@@ -20,6 +20,19 @@ from genre_tasks.fixer.weight_files import REMEDY, read_fixer_document
 from genre_tasks.weight_checks import require_weights_fit
 from genre_tasks.weights import find_tensors_file
 
+# A network also has a few numbers that no file holds.
+_MAX_SIZE_RATIO = 2
+_MAX_LAYERS = 16
+# What diffusers raises where an architecture's numbers do not go together.
+_CONSTRUCTION_ERRORS = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    LookupError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
 # Files are in half precision; weights of other tools are in any of these, and all are used in float32.
 _FILE_DTYPES = (torch.float16, torch.bfloat16, torch.float32)
 
@@ -73,6 +86,8 @@ def load_fnet(path: Path, model: str = "small") -> Fnet:
         tensors = load_file(path)
     except (OSError, SafetensorError) as error:
         raise InputError(f"the weights cannot be read: {error}", remedy=REMEDY, file=path, stage="fnet") from error
+    if model == "small":
+        _require_plausible_size(document, sum(value.numel() for value in tensors.values()), path)
     fnet = _build_described(document, path)
     # Checked before loading, because torch's own error names neither the file nor a remedy.
     expected = fnet.state_dict() if model == "small" else trainable_state(fnet)
@@ -102,10 +117,40 @@ def _build_described(document: dict[str, Any], path: Path) -> Fnet:
         local = path.parent / document["base"]
         source = str(local) if local.exists() else document["base"]
         return load_sd_turbo(source, document["timestep"], document["rank"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"the configuration of the weights does not describe a fixer: {error}",
-            remedy=REMEDY,
-            file=path.with_suffix(".json"),
-            stage="fnet",
-        ) from error
+    except _CONSTRUCTION_ERRORS as error:
+        raise _describe_no_fixer(error, path) from error
+
+
+def _require_plausible_size(document: dict[str, Any], weight_count: int, path: Path) -> None:
+    """Refuses a description of a network that is much larger than the file, before memory is taken for it."""
+    from diffusers import AutoencoderKL, UNet2DConditionModel
+
+    try:
+        architecture = FnetArchitecture(**document["architecture"])
+        _check_depth(architecture.vae)
+        _check_depth(architecture.unet)
+        with torch.device("meta"):
+            networks: tuple[Any, ...] = (AutoencoderKL(**architecture.vae), UNet2DConditionModel(**architecture.unet))
+    except _CONSTRUCTION_ERRORS as error:
+        raise _describe_no_fixer(error, path) from error
+    described = sum(parameter.numel() for network in networks for parameter in network.parameters())
+    if described > _MAX_SIZE_RATIO * weight_count:
+        raise _describe_no_fixer(f"it has {described} weights, and the file {weight_count}", path)
+
+
+def _check_depth(arguments: dict[str, Any]) -> None:
+    """Raises ``ValueError`` for a network of so many layers that building it would take for ever."""
+    for name, value in arguments.items():
+        counts = value if isinstance(value, list) else [value]
+        has_many = "layers" in name and any(isinstance(count, int) and count > _MAX_LAYERS for count in counts)
+        if has_many or len(counts) > _MAX_LAYERS:
+            raise ValueError(f"{name} has more than {_MAX_LAYERS} layers or levels")
+
+
+def _describe_no_fixer(reason: object, path: Path) -> InputError:
+    return InputError(
+        f"the configuration of the weights does not describe a fixer: {reason}",
+        remedy=REMEDY,
+        file=path.with_suffix(".json"),
+        stage="fnet",
+    )

@@ -11,6 +11,8 @@ between 0 and 2.
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import torch
 import torch.nn.functional as F
 from pydantic import BaseModel, ConfigDict, Field
@@ -31,8 +33,8 @@ class NetworkConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     hidden: int = Field(default=64, ge=4, le=512, description="Width of the head for each Gaussian.")
-    channels: tuple[int, ...] = Field(
-        default=(16, 32, 48), min_length=1, description="Channels of the UNet's levels, finest first."
+    channels: tuple[Annotated[int, Field(ge=1, le=512)], ...] = Field(
+        default=(16, 32, 48), min_length=1, max_length=8, description="Channels of the UNet's levels, finest first."
     )
     voxel_m: float = Field(default=1.0, gt=0, description="Width of a static voxel near the cameras, metres.")
     residuals: bool = Field(

@@ -173,7 +173,7 @@ def inspect_image(data: bytes) -> ImageFacts:
     except DECODE_ERRORS as error:
         raise describe_decode_error(error) from error
     image, header = _load(data, (max(image.width // 8, _BLANK_GRID[0]), max(image.height // 8, _BLANK_GRID[1])))
-    rgb, findings = convert_to_srgb(image, header)
+    rgb, findings = _convert(image, header)
     return _facts(header, findings, _is_blank(rgb))
 
 
@@ -208,11 +208,19 @@ def _load(data: bytes, draft_size: tuple[int, int]) -> tuple[Image.Image, ImageH
     return image, header
 
 
+def _convert(image: Image.Image, header: ImageHeader) -> tuple[Image.Image, tuple[Finding, ...]]:
+    try:
+        return convert_to_srgb(image, header)
+    # Pixels may name colours that a palette does not have, which shows only here.
+    except DECODE_ERRORS as error:
+        raise describe_decode_error(error) from error
+
+
 def _decode_resized(data: bytes, width_px: int, height_px: int) -> tuple[Image.Image, ImageHeader, tuple[Finding, ...]]:
     # JPEG decodes faster at a fraction of its size, an average over blocks of the DCT. At twice the size of the result
     # at least two of its pixels are left per pixel, so the average stays one.
     image, header = _load(data, (2 * width_px, 2 * height_px))
-    rgb, findings = convert_to_srgb(image, header)
+    rgb, findings = _convert(image, header)
     # A box filter averages over areas, which only makes sense where there is more than a pixel in each.
     reduces = rgb.width >= width_px and rgb.height >= height_px
     if rgb.size != (width_px, height_px):

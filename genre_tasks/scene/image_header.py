@@ -58,6 +58,9 @@ _TIFF_WHITE_IS_ZERO = 0
 # Unsigned, or not stated.
 _TIFF_UNSIGNED = {1, 4}
 _JPEG_END = b"\xff\xd9"
+_JPEG_SCAN = b"\xff\xda"
+# Encoders make about ten; thumbnails and further pictures of the file have a few more.
+_MAX_SCANS = 100
 # A download that was cut off leaves zeros where the file was reserved at its final size.
 _ZERO_TAIL_BYTES = 16
 
@@ -127,6 +130,7 @@ def open_image(data: bytes) -> tuple[Image.Image, ImageHeader]:
         raise InputError(problem, remedy="Reduce it, with its intrinsics, or fetch it again.")
     chunks = _read_png_chunks(data) if image.format == "PNG" else {}
     _refuse_cut_off(image, data)
+    _refuse_many_scans(image, data)
     _refuse_turned(image, chunks.get(b"eXIf"))
     _refuse_wide_color(_read_color_code(image, data, chunks))
     tags = dict(image.tag_v2) if image.format == "TIFF" and hasattr(image, "tag_v2") else {}
@@ -174,6 +178,13 @@ def _refuse_cut_off(image: Image.Image, data: bytes) -> None:
         return
     if not data.rstrip(b"\0").endswith(_JPEG_END):
         raise InputError("cannot decode the image: its end is zeros", remedy=_DAMAGED_REMEDY)
+
+
+def _refuse_many_scans(image: Image.Image, data: bytes) -> None:
+    """Raises where a JPEG repeats scans, of which every one goes over all pixels: minutes for a small file."""
+    # Within compressed data these two bytes cannot follow each other.
+    if image.format in ("JPEG", "MPO") and data.count(_JPEG_SCAN) > _MAX_SCANS:
+        raise InputError("cannot decode the image: it has too many scans", remedy=_FORMAT_REMEDY)
 
 
 def _refuse_turned(image: Image.Image, trailing_exif: bytes | None) -> None:

@@ -38,6 +38,7 @@ _TYPES = {
 _COLORS = ("red", "green", "blue")
 # Comments may be long, but no program writes more of them.
 _MAX_HEADER_BYTES = 1 << 18
+_MAX_COUNT_DIGITS = 18
 _REMEDY = "Give ingest.points a PLY file (ascii or binary_little_endian) with x, y, z and red, green, blue per vertex."
 
 
@@ -134,8 +135,11 @@ def _read_header(data: bytes, file: Path) -> _Header:
                 if element != "vertex" and count < 0:
                     raise InputError(f"line {number}: vertices must be the first element", remedy=_REMEDY, file=file)
                 if element == "vertex":
-                    if not n.isdigit():
-                        raise InputError(f"line {number}: {n!r} is no vertex count", remedy=_REMEDY, file=file)
+                    # Python refuses to read thousands of digits, by an error of its own.
+                    if not n.isdigit() or len(n) > _MAX_COUNT_DIGITS:
+                        raise InputError(
+                            f"line {number}: {n[:_MAX_COUNT_DIGITS]!r} is no vertex count", remedy=_REMEDY, file=file
+                        )
                     count = int(n)
             case ["property", kind, name] if element == "vertex" and kind in _TYPES:
                 columns[name] = _TYPES[kind]

@@ -97,6 +97,6 @@ def _find_base(configuration: Path) -> Path | None:
     try:
         base = configuration.parent / json.loads(configuration.read_bytes())["base"]
     # Weights without a base have no such key; what cannot be read is an error when they are loaded.
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
     return base if base.is_dir() else None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,9 @@ from storage.srgb import to_linear_half
 
 # More threads do not pay for images of this size, and stages run beside each other.
 EXR_THREADS = 2
+
+MAX_PIXELS = 100_000_000
+"""Of all channels together; images of more are refused before they are decoded."""
 
 
 @lru_cache(maxsize=1)
@@ -87,6 +90,10 @@ def read_channels(path: Path, dtypes: Mapping[str, Any], shape: tuple[int, int])
         raise corrupt("An image is missing")
     # OpenEXR does not raise for a truncated or altered file: it has no parts, or channels without pixels.
     try:
+        # The header first: a file of zeros can be unpacked to a thousand times its size.
+        with OpenEXR.File(str(path), header_only=True) as file:
+            for problem in find_size_problems(file, shape):
+                raise corrupt(problem)
         with OpenEXR.File(str(path), separate_channels=True) as file:
             if len(file.parts) != 1:
                 raise corrupt(f"The image has {len(file.parts)} parts, expected 1")
@@ -103,6 +110,25 @@ def read_channels(path: Path, dtypes: Mapping[str, Any], shape: tuple[int, int])
                 f"Channel {name} is {found[name].dtype} {found[name].shape}, expected {np.dtype(dtype)} {shape}"
             )
     return found
+
+
+def find_size_problems(file: Any, shape: tuple[int, int] | None = None) -> Iterator[str]:
+    """Finds what of an image's header would make reading it take other memory than expected.
+
+    Args:
+        file: of OpenEXR, opened for its header alone.
+        shape: (height, width) in pixels; ``None``: any of at most ``MAX_PIXELS``.
+
+    Yields:
+        Problems, one sentence each.
+    """
+    for part in file.parts:
+        low, high = (corner.tolist() for corner in part.header["dataWindow"])
+        width, height = (high[axis] - low[axis] + 1 for axis in (0, 1))
+        if shape is not None and (height, width) != shape:
+            yield f"The image has (height, width) {(height, width)}, expected {shape}"
+        if height * width * len(part.header["channels"]) > MAX_PIXELS:
+            yield f"The image has {len(part.header['channels'])} channels of {height} × {width} pixels"
 
 
 def write_exr(

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from genre_tasks.errors import ArtifactCorruptError
 from genre_tasks.fixer.inputs import FixerInputs
 from genre_tasks.fixer.pairs import INPUT_NAMES, Pairs
-from storage.codecs.png import encode_png
+from storage.codecs.png import decode_png, encode_png
 from storage.codecs.tables import REMEDY, check_array, column, column_array, read_table, schema, write_table
 
 IMAGES: dict[str, tuple[str, ...]] = {
@@ -108,15 +107,11 @@ def _encode(image: Tensor) -> bytes:
 
 def _decode_column(table: pa.Table, name: str, path: Path) -> Tensor:
     """The pictures of a column, [N, C, H, W] uint8."""
-    from PIL import Image
-
-    images: list[NDArray[np.uint8]] = []
-    try:
-        for data in table.column(name).to_pylist():
-            # Only this format: other decoders need not see bytes that claim to be a PNG.
-            with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
-                images.append(np.array(image))
-        stacked = np.stack(images)
-    except (OSError, SyntaxError, ValueError) as error:
-        raise ArtifactCorruptError(f"{name} does not decode ({error})", remedy=REMEDY, file=path) from error
+    pictures = table.column(name).to_pylist()
+    images = [decode_png(io.BytesIO(data), path, name) for data in pictures]
+    # A grey picture has no axis of channels, and pictures of several sizes cannot be stacked.
+    if not images or len({image.shape for image in images}) > 1 or images[0].ndim != 3:
+        problem = f"{name} holds {len(images)} pictures of sizes {sorted({image.shape for image in images})}"
+        raise ArtifactCorruptError(problem, remedy=REMEDY, file=path)
+    stacked = np.stack(images)
     return torch.from_numpy(np.ascontiguousarray(stacked.transpose(0, 3, 1, 2)))

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import warnings
+from collections.abc import Collection
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +17,9 @@ from storage.files import write_file
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+MAX_PIXELS = 100_000_000
+"""Larger pictures are refused before they are decoded."""
 
 
 def encode_png(image: NDArray[np.uint8]) -> bytes:
@@ -67,20 +72,48 @@ def read_png(path: Path) -> NDArray[np.uint8]:
     Raises:
         ArtifactCorruptError: the file is no RGB PNG, or does not decode.
     """
+    # Converting a grey or palette image would succeed, and hide that another program wrote it.
+    return decode_png(path, path, "The picture", modes=("RGB",))
+
+
+def decode_png(
+    source: Path | BinaryIO, file: Path, name: str, modes: Collection[str] = ("L", "RGB", "RGBA")
+) -> NDArray[np.uint8]:
+    """Decodes a picture of at most ``MAX_PIXELS``.
+
+    Args:
+        source: the file, or the bytes of one.
+        file: that errors name.
+        name: that errors call the picture.
+        modes: Pillow's names of the channels that it may have.
+
+    Returns:
+        [H, W] or [H, W, C] uint8.
+
+    Raises:
+        ArtifactCorruptError: it is no such PNG, is too large, or does not decode.
+    """
     from PIL import Image
 
     try:
-        # Only this format: other decoders need not see a file that claims to be a PNG.
-        with Image.open(path, formats=["PNG"]) as image:
-            # Converting a grey or palette image would succeed, and hide that another program wrote it.
-            if image.mode != "RGB":
-                raise ArtifactCorruptError(f"The picture has mode {image.mode}, expected RGB", remedy=REMEDY, file=path)
-            return np.array(image)
-    except (OSError, SyntaxError, ValueError) as error:
+        with warnings.catch_warnings():
+            # The size is checked below.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            # Only this format: other decoders need not see a file that claims to be a PNG.
+            with Image.open(source, formats=["PNG"]) as image:
+                if image.mode not in modes:
+                    problem = f"{name} has mode {image.mode}, expected {' or '.join(modes)}"
+                    raise ArtifactCorruptError(problem, remedy=REMEDY, file=file)
+                # A few kilobytes of zeros can be unpacked to gigabytes.
+                if image.width * image.height > MAX_PIXELS:
+                    problem = f"{name} has {image.width} × {image.height} pixels"
+                    raise ArtifactCorruptError(problem, remedy=REMEDY, file=file)
+                return np.array(image)
+    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
         # Pillow raises OSError without a number for damage; one with a number is the operating system's.
         if isinstance(error, OSError) and error.errno is not None:
             raise
-        raise ArtifactCorruptError(f"The picture does not decode ({error})", remedy=REMEDY, file=path) from error
+        raise ArtifactCorruptError(f"{name} does not decode ({error})", remedy=REMEDY, file=file) from error
 
 
 def to_pixels(color: Tensor) -> NDArray[np.uint8]:

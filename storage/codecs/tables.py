@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from genre_tasks.errors import ArtifactCorruptError, ConfigError, NonFiniteError
+from storage.codecs.bounded_parquet import FOR_COLUMNS, FOR_ROWS, MemoryBound, read_bounded_table
 from storage.files import write_file
 
 Record = TypeVar("Record")
@@ -116,39 +117,38 @@ def write_records(
     write_table(path, declared, {name: [getattr(row, name) for row in rows] for name in declared.names}, extra)
 
 
-def read_table(path: Path, declared: pa.Schema) -> tuple[pa.Table, dict[str, str]]:
+def read_table(path: Path, declared: pa.Schema, bound: MemoryBound = FOR_COLUMNS) -> tuple[pa.Table, dict[str, str]]:
     """Reads a table, with page checksums verified.
 
     Args:
         path: the file.
         declared: the schema that it must have.
+        bound: what it may take in memory, see :func:`storage.codecs.bounded_parquet.read_bounded_table`.
 
     Returns:
         (table, extra metadata).
 
     Raises:
-        ArtifactCorruptError: the file is missing or does not decode, or a column is missing, unexpected, of another
-            type or holds nulls where none are allowed; file and column are named.
+        ArtifactCorruptError: the file is missing, too large or does not decode, or a column is missing, unexpected, of
+            another type or holds nulls where none are allowed; file and column are named.
     """
     if not path.is_file():
         raise ArtifactCorruptError("A table is missing", remedy=REMEDY, file=path)
     try:
-        with pq.ParquetFile(path, page_checksum_verification=True) as file:
-            # One thread: tables are small, and threads of Arrow would run beside those of the stage.
-            table = file.read(use_threads=False)
+        table = read_bounded_table(path, bound)
+        metadata = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
     except (pa.ArrowException, OSError, ValueError) as error:
         # Arrow raises OSError without a number for damage; one with a number is the operating system's.
         if isinstance(error, OSError) and error.errno is not None:
             raise
         raise ArtifactCorruptError(f"The table does not decode ({error})", remedy=REMEDY, file=path) from error
-    metadata = dict(table.schema.metadata or {})
-    name = metadata.pop(_TABLE, b"").decode()
+    name = metadata.pop(_TABLE.decode(), "")
     wanted = declared.metadata[_TABLE].decode()
     # The name holds the version, so an old layout is refused before its columns are misread.
     if name != wanted:
         raise ArtifactCorruptError(f"The table is {name or 'unnamed'!r}, expected {wanted!r}", remedy=REMEDY, file=path)
     _check_columns(path, table, declared)
-    return table, {k.decode(): v.decode() for k, v in metadata.items()}
+    return table, metadata
 
 
 def read_rows(path: Path, declared: pa.Schema) -> list[dict[str, Any]]:
@@ -164,7 +164,8 @@ def read_rows(path: Path, declared: pa.Schema) -> list[dict[str, Any]]:
     Raises:
         ArtifactCorruptError: as :func:`read_table`.
     """
-    return read_table(path, declared)[0].to_pylist()
+    rows: list[dict[str, Any]] = read_table(path, declared, FOR_ROWS)[0].to_pylist()
+    return rows
 
 
 def read_records(path: Path, declared: pa.Schema, record: Callable[..., Record]) -> tuple[Record, ...]:

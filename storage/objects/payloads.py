@@ -152,9 +152,9 @@ class Payloads:
     def _read_etags(self, manifest: Manifest) -> dict[str, str]:
         found = self._bucket.read(_etags_name(manifest))
         try:
-            known: dict[str, str] = {} if found is None else json.loads(found.data)
-            return known
-        except ValueError:
+            known = {} if found is None else json.loads(found.data)
+            return {str(name): str(e_tag) for name, e_tag in known.items()}
+        except (ValueError, AttributeError, RecursionError):
             # Then the files are read, and their digests decide.
             return {}
 

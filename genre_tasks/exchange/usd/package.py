@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import struct
 import zipfile
 from pathlib import Path, PurePosixPath
@@ -73,6 +74,11 @@ def extract_layers(path: Path, folder: Path) -> Path:
                     while block := source.read(_BLOCK_BYTES):
                         file.write(block)
     except (zipfile.BadZipFile, EOFError, NotImplementedError, struct.error, ValueError, OverflowError) as error:
+        raise _damage("the package cannot be read", path) from error
+    except OSError as error:
+        # A member that begins before the file does is sought there.
+        if error.errno != errno.EINVAL:
+            raise
         raise _damage("the package cannot be read", path) from error
     return folder / members[0].filename
 

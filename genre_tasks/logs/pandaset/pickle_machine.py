@@ -14,6 +14,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+MAX_OPCODES = 2_000_000
+"""A table has a few for every column and for every cell that is text; more would take minutes and gigabytes."""
+
 
 class PickleRefusedError(Exception):
     """The pickle asks for something that is not allowed.
@@ -210,7 +213,9 @@ def read_pickle_tree(data: bytes, allowed: Mapping[tuple[str, str], str]) -> obj
     """
     machine = _StackMachine(allowed)
     try:
-        for opcode, argument, _ in pickletools.genops(data):
+        for number, (opcode, argument, _) in enumerate(pickletools.genops(data)):
+            if number >= MAX_OPCODES:
+                raise PickleRefusedError(f"more than {MAX_OPCODES} opcodes")
             if opcode.name == "STOP":
                 return machine.pop()
             machine.execute(opcode.name, argument)

@@ -64,7 +64,7 @@ def _read_frame(shared: Mapping[str, Any], frame: Any, index: int, path: Path) -
 def _read_matrix(frame: Mapping[str, Any], name: str, path: Path) -> Float64:
     try:
         matrix = np.array(frame.get("transform_matrix"), dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape not in ((4, 4), (3, 4)):
         raise InputError(f"{name} has no transform_matrix of 4 × 4 numbers", remedy=_REMEDY, file=path)
@@ -98,16 +98,30 @@ def _read_lens(values: Mapping[str, Any], path: Path) -> Lens:
 
 
 def _read_number(values: Mapping[str, Any], key: str, path: Path) -> float:
-    value = values.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    number = _as_number(values.get(key))
+    if number is None:
         raise InputError(f"the intrinsics lack a number for {key}", remedy=_REMEDY, file=path)
-    return float(value)
+    return number
 
 
 def _read_time(frame: Mapping[str, Any], name: str, path: Path) -> float | None:
     value = frame.get("time", frame.get("timestamp"))
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    number = _as_number(value)
+    if number is None:
         raise InputError(f"the time of {name} is no number", remedy="Write seconds, or no time at all.", file=path)
-    return float(value)
+    return number
+
+
+def _as_number(value: object) -> float | None:
+    """A finite number of JSON, or ``None``."""
+    # A bool is an int of Python.
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        # Integers of JSON have any number of digits.
+        return None
+    return number if math.isfinite(number) else None

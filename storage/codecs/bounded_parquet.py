@@ -1,0 +1,128 @@
+"""Reads Parquet tables within a bound of memory: a few bytes of a file can repeat a row a billion times."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+
+@dataclass(frozen=True)
+class MemoryBound:
+    """What a table may take in memory.
+
+    Attributes:
+        most_bytes: of the table, whatever its file's size.
+        file_ratio: so many times its file's size a table may take in any case.
+        value_bytes: what a value takes at least.
+        row_bytes: what a row takes besides its values.
+    """
+
+    most_bytes: int
+    file_ratio: int
+    value_bytes: int
+    row_bytes: int
+
+
+FOR_COLUMNS = MemoryBound(256 << 20, file_ratio=64, value_bytes=1, row_bytes=0)
+"""For tables that are read as arrays. Harmonics of a million Gaussians may all be zero, which takes no file."""
+
+FOR_ROWS = MemoryBound(64 << 20, file_ratio=4, value_bytes=8, row_bytes=200)
+"""For tables whose rows become dictionaries of Python."""
+
+_WIDTHS = {"INT32": 4, "INT64": 8, "INT96": 12, "FLOAT": 4, "DOUBLE": 8, "BOOLEAN": 1}
+# An offset in Arrow, or a reference in Python.
+_TEXT_BYTES = 8
+_DICTIONARIES = {"RLE_DICTIONARY", "PLAIN_DICTIONARY"}
+
+
+class TableTooLargeError(ValueError):
+    """A table would take more memory than its reader allows."""
+
+
+def read_bounded_table(path: Path, bound: MemoryBound, columns: Sequence[str] | None = None) -> pa.Table:
+    """Reads a table with page checksums verified, unless it would take too much memory.
+
+    Args:
+        path: the file.
+        bound: what the table may take in memory.
+        columns: names of those to read; ``None``: all.
+
+    Returns:
+        The table, as Arrow itself reads it.
+
+    Raises:
+        TableTooLargeError: the table would take more.
+        pyarrow.ArrowException: the file is no Parquet table, or is damaged; also ``OSError`` and ``ValueError``.
+    """
+    most_bytes = max(bound.most_bytes, bound.file_ratio * path.stat().st_size)
+    with pq.ParquetFile(path, page_checksum_verification=True) as file:
+        expected = file.schema_arrow
+        size, repeated = _measure_metadata(file.metadata, bound, columns)
+        _require_within(size, most_bytes)
+        if not repeated:
+            # One thread: tables are small, and threads of Arrow would run beside those of a stage.
+            return _validate(file.read(columns=columns, use_threads=False))
+    # Repeated texts stay references to one text until their length is known.
+    with pq.ParquetFile(path, page_checksum_verification=True, read_dictionary=repeated) as file:
+        table = file.read(columns=columns, use_threads=False)
+    _require_within(table.nbytes + sum(_measure_texts(table.column(name)) for name in repeated), most_bytes)
+    fields = [expected.field(name) for name in table.column_names]
+    return _validate(table.cast(pa.schema(fields, expected.metadata)))
+
+
+def _validate(table: pa.Table) -> pa.Table:
+    """The table, whose texts and names are UTF-8."""
+    # Arrow believes a file that says so, and would raise when a text becomes one of Python.
+    table.validate(full=True)
+    _ = table.column_names
+    return table
+
+
+def _measure_metadata(
+    metadata: pq.FileMetaData, bound: MemoryBound, columns: Sequence[str] | None
+) -> tuple[int, list[str]]:
+    """Bytes by what the file says of itself, and the columns whose texts are stored once and referred to."""
+    size = metadata.num_rows * bound.row_bytes
+    repeated = set()
+    for group in range(metadata.num_row_groups):
+        row_group = metadata.row_group(group)
+        for index in range(row_group.num_columns):
+            chunk = row_group.column(index)
+            described = metadata.schema.column(index)
+            # Of the schema, by which Arrow reads; the name beside the column's bytes may be another one.
+            name = described.path
+            if columns is not None and name.partition(".")[0] not in columns:
+                continue
+            is_flat = described.max_repetition_level == 0 and "." not in name
+            width = _WIDTHS.get(chunk.physical_type) or described.length
+            has_dictionary = bool(_DICTIONARIES & set(chunk.encodings))
+            if width:
+                size += chunk.num_values * max(width, bound.value_bytes)
+            elif is_flat or not has_dictionary:
+                size += chunk.num_values * _TEXT_BYTES + chunk.total_uncompressed_size
+                repeated |= {name} if has_dictionary else set()
+            else:
+                # Of a list of texts it is not known how long they are: every one may be the longest.
+                size += chunk.num_values * max(chunk.total_uncompressed_size, _TEXT_BYTES)
+    return size, sorted(repeated)
+
+
+def _require_within(size: int, most_bytes: int) -> None:
+    if size > most_bytes:
+        raise TableTooLargeError(f"it would take {size >> 20} MiB of memory, and {most_bytes >> 20} are allowed")
+
+
+def _measure_texts(column: pa.ChunkedArray) -> int:
+    """Bytes of a column's texts when every row has its text."""
+    size = 0
+    for chunk in column.chunks:
+        if not isinstance(chunk, pa.DictionaryArray):
+            continue
+        lengths = pc.cast(pc.binary_length(chunk.dictionary), pa.int64())
+        size += pc.sum(lengths.take(chunk.indices)).as_py() or 0
+    return size
