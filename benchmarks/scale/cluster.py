@@ -1,0 +1,132 @@
+"""A dataset on a simulated cluster: real servers, real supervisor and store, workers whose stages sleep.
+
+Run as ``python -m benchmarks.scale.cluster --logs 20 --workers 5 --scale 0.1 --json FILE``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+from benchmarks.scale.cluster_services import POOL, ClusterServices, start_services
+from benchmarks.scale.request_meter import RequestMeter, metered_clients
+from benchmarks.scale.server_load import (
+    LoadSampler,
+    read_database,
+    subtract_counters,
+)
+from benchmarks.scale.simulated_stages import read_stage_seconds
+from benchmarks.scale.summary import ClusterRun, summarise_cluster
+from flows.dataset.live_table import LiveTable
+from flows.dataset.prefect_runs import ChildRequest, PrefectRuns
+from flows.dataset.supervisor import SupervisionLimits, Supervisor
+from flows.dataset.work_units import WorkUnit
+
+_IDLE_S = 40.0
+_DRAIN_S = 120.0
+# More than the workers: a worker that ends a log finds the next one waiting.
+_IN_FLIGHT_PER_WORKER = 1.25
+Row = dict[str, Any]
+
+
+def measure_cluster(logs: int, workers: int, seed: int, seconds_scale: float, keep_logs: Path | None = None) -> Row:
+    """Runs a dataset of simulated logs on simulated workers, and measures what it costs the servers.
+
+    PostgreSQL, Prefect's server, the S3 server, the supervisor of the dataset and the store are real. So is the part
+    of Prefect's worker that polls and proposes states. Only the process of a flow run is simulated: it sends the
+    requests and events of a real one, and sleeps where a stage computes.
+
+    Args:
+        logs: of the dataset.
+        workers: that run one log at a time each.
+        seed: of the artifacts' keys, and of when the workers start.
+        seconds_scale: by what the stages' measured seconds, the workers' polling and the heartbeats are multiplied.
+            A cluster at a tenth of the time loads its servers as one of ten times as many workers does.
+        keep_logs: folder for the servers' logs.
+
+    Returns:
+        JSON values: ``wall_s``, ``logs_per_minute``, ``per_log``, ``idle``, ``cores``, ``latencies``, ``stages`` and
+        more, as :func:`benchmarks.scale.summary.summarise_cluster` says.
+
+    Raises:
+        ConfigError: PostgreSQL or the S3 server is not installed.
+        ResourceError: a server did not start.
+    """
+    seconds = read_stage_seconds()
+    meter = RequestMeter()
+    with start_services(keep_logs) as services, metered_clients(meter):
+        services.start_workers(workers, seed, seconds_scale, seconds)
+        sampler = LoadSampler(services.pids())
+        idle_start = sampler.sample()
+        time.sleep(_IDLE_S * max(seconds_scale, 0.25))
+        idle_end = sampler.sample()
+        before = read_database(services.postgres.url)
+        meter.api.clear()
+        sampler.start()
+        start = sampler.sample()
+        rows = _run_dataset(logs, workers, seconds_scale)
+        end = sampler.sample()
+        connections = read_database(services.postgres.url)["connections"]
+        drain_s = _wait_for_records(services, before["task_runs"] + logs * len(seconds))
+        after = read_database(services.postgres.url)
+        sampler.stop()
+        found = services.stop_workers()
+    database = subtract_counters(after, before)
+    run = ClusterRun(
+        logs=logs,
+        workers=workers,
+        scale=seconds_scale,
+        seconds=seconds,
+        outcomes=rows,
+        processes=found,
+        parent=meter,
+        samples=[start, *(sample for sample in sampler.samples if start.time_s < sample.time_s < end.time_s), end],
+        idle=(idle_start, idle_end),
+        database=database | {"connections": connections},
+        drain_s=drain_s,
+    )
+    return summarise_cluster(run) | {"seed": seed}
+
+
+def _run_dataset(logs: int, workers: int, scale: float) -> list[Row]:
+    """The dataset's flow without its process: its supervisor, child runs and table are the real ones."""
+    units = [WorkUnit(f"log-{number:04d}") for number in range(logs)]
+    request = ChildRequest(f"simulated-{uuid4().hex[:8]}", str(uuid4()), POOL, {"preset": "small"})
+    limits = SupervisionLimits(in_flight=max(2, round(_IN_FLIGHT_PER_WORKER * workers)), attempts=3)
+    return Supervisor(units, PrefectRuns(request), limits, LiveTable().show).run()
+
+
+def _wait_for_records(services: ClusterServices, wanted: int) -> float:
+    """Seconds until the server has recorded the task runs, whose events it may still work through."""
+    start_s = time.monotonic()
+    while time.monotonic() - start_s < _DRAIN_S:
+        if read_database(services.postgres.url)["task_runs"] >= wanted:
+            break
+        time.sleep(1.0)
+    return time.monotonic() - start_s
+
+
+def main() -> None:
+    """Measures one or several clusters, and adds each to a file of JSON."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--logs", type=int, nargs="+", required=True, help="logs of each cluster")
+    parser.add_argument("--workers", type=int, nargs="+", required=True, help="workers of each cluster")
+    parser.add_argument("--scale", type=float, default=1.0, help="by what all times are multiplied")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path, required=True, help="file that a row is added to for each cluster")
+    parser.add_argument("--keep-logs", type=Path, default=None, help="folder for the servers' logs")
+    args = parser.parse_args()
+    for logs, workers in zip(args.logs, args.workers, strict=True):
+        row = measure_cluster(logs, workers, args.seed, args.scale, args.keep_logs)
+        rows = json.loads(args.json.read_text()) if args.json.exists() else []
+        args.json.write_text(json.dumps([*rows, row], indent=1))
+        sys.stdout.write(json.dumps(row, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
