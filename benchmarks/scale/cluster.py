@@ -27,6 +27,7 @@ from flows.dataset.prefect_runs import ChildRequest, PrefectRuns
 from flows.dataset.supervisor import SupervisionLimits, Supervisor
 from flows.dataset.work_units import WorkUnit
 
+_BASE_S = 10.0
 _IDLE_S = 40.0
 _DRAIN_S = 120.0
 # More than the workers: a worker that ends a log finds the next one waiting.
@@ -60,6 +61,9 @@ def measure_cluster(logs: int, workers: int, seed: int, seconds_scale: float, ke
     seconds = read_stage_seconds()
     meter = RequestMeter()
     with start_services(keep_logs) as services, metered_clients(meter):
+        base_start = LoadSampler(services.pids()).sample()
+        time.sleep(_BASE_S)
+        base = (base_start, LoadSampler(services.pids()).sample())
         services.start_workers(workers, seed, seconds_scale, seconds)
         sampler = LoadSampler(services.pids())
         idle_start = sampler.sample()
@@ -86,6 +90,7 @@ def measure_cluster(logs: int, workers: int, seed: int, seconds_scale: float, ke
         processes=found,
         parent=meter,
         samples=[start, *(sample for sample in sampler.samples if start.time_s < sample.time_s < end.time_s), end],
+        base=base,
         idle=(idle_start, idle_end),
         database=database | {"connections": connections},
         drain_s=drain_s,

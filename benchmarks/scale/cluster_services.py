@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.scale.simulated_worker import WorkersPlan
+from benchmarks.scale.summary import POLL_S
 from flows.operations import ObjectServer, PostgresServer, PrefectServer
 from flows.operations.deployments import RUN_QUEUE, deploy_flows
 from genre_tasks.errors import ResourceError
 
 POOL = "genre"
-_POLL_S = 10.0
 _WORKERS_PER_PROCESS = 50
 _ONLINE_S = 120.0
 _STOP_S = 60.0
@@ -61,11 +61,12 @@ class ClusterServices:
         """Returns the first processes of what is measured.
 
         Returns:
-            Process ids by the service's name; ``parent`` is this process.
+            Process ids by the service's name; ``workers-N`` are those of workers, ``parent`` is this process.
         """
         servers = {"prefect": self.server.pid, "postgres": self.postgres.pid, "objects": self.objects.pid}
         found = {name: [] if pid is None else [pid] for name, pid in servers.items()}
-        return {**found, "workers": [process.pid for process in self.processes], "parent": [os.getpid()]}
+        workers = {f"workers-{number}": [process.pid] for number, process in enumerate(self.processes)}
+        return {**found, **workers, "parent": [os.getpid()]}
 
     def start_workers(self, workers: int, seed: int, scale: float, seconds: Mapping[str, float]) -> None:
         """Starts the processes of workers and waits until all workers are online.
@@ -80,7 +81,7 @@ class ClusterServices:
             ResourceError: a process ended, or not all workers are online in time.
         """
         names = [f"worker-{number}" for number in range(workers)]
-        env = {**os.environ, **self.env(), "PREFECT_WORKER_QUERY_SECONDS": str(_POLL_S * scale)}
+        env = {**os.environ, **self.env(), "PREFECT_WORKER_QUERY_SECONDS": str(POLL_S * scale)}
         # Whole seconds, of which the server waits for three times as many before a worker counts as offline.
         env["PREFECT_WORKER_HEARTBEAT_SECONDS"] = str(max(3, round(30 * scale)))
         for number, start in enumerate(range(0, workers, _WORKERS_PER_PROCESS)):
@@ -94,7 +95,7 @@ class ClusterServices:
                 seed=seed,
                 scale=scale,
                 seconds=dict(seconds),
-                poll_s=_POLL_S * scale,
+                poll_s=POLL_S * scale,
                 stop_file=str(self.folder / "stop"),
                 result_file=str(result),
             )

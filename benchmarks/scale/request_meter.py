@@ -97,7 +97,7 @@ def metered_clients(meter: RequestMeter) -> Iterator[None]:
     Yields:
         Nothing.
     """
-    methods = [(PrefectHttpxAsyncClient, "send"), (PrefectHttpxSyncClient, "send")]
+    methods: list[tuple[type[Any], str]] = [(PrefectHttpxAsyncClient, "send"), (PrefectHttpxSyncClient, "send")]
     methods += [(Bucket, name) for name in (*_BUCKET_CALLS, "list")]
     before = [(owner, name, getattr(owner, name)) for owner, name in methods]
     meter.install()
@@ -146,8 +146,8 @@ def _install_api(requests: list[Request]) -> None:
         note(request, start_s, response)
         return response
 
-    PrefectHttpxAsyncClient.send = timed_async  # type: ignore[method-assign]
-    PrefectHttpxSyncClient.send = timed_sync  # type: ignore[method-assign]
+    PrefectHttpxAsyncClient.send = timed_async  # type: ignore[method-assign, assignment]
+    PrefectHttpxSyncClient.send = timed_sync  # type: ignore[method-assign, assignment]
 
 
 def _count_bytes(args: tuple[Any, ...]) -> int:

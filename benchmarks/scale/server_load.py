@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -89,7 +90,7 @@ def read_cpu_seconds(pid: int) -> float:
     """Reads the processor seconds of a process and of its children, also of those that have ended.
 
     Args:
-        pid: of the process.
+        pid: of the process. This process is read without its children, which are the services.
 
     Returns:
         Seconds; 0 for a process that is gone.
@@ -97,8 +98,11 @@ def read_cpu_seconds(pid: int) -> float:
     with suppress(psutil.Error):
         process = psutil.Process(pid)
         times = process.cpu_times()
-        total = times.user + times.system + times.children_user + times.children_system
-        return float(total + sum(read_cpu_seconds(child.pid) for child in process.children()))
+        total = float(times.user + times.system)
+        if pid == os.getpid():
+            return total
+        ended = float(times.children_user + times.children_system)
+        return total + ended + sum(read_cpu_seconds(child.pid) for child in process.children())
     return 0.0
 
 
@@ -116,11 +120,13 @@ def measure_usage(start: LoadSample, end: LoadSample) -> dict[str, float]:
         end: the last one.
 
     Returns:
-        Busy processors by the service's name; ``machine_idle`` for those that were idle.
+        Busy processors by the service's name; ``machine_idle`` for those that were idle, ``others`` for the rest.
     """
     seconds = max(end.time_s - start.time_s, 1e-9)
     cores = {name: round((used - start.cpu_s[name]) / seconds, 3) for name, used in end.cpu_s.items()}
-    return {**cores, "machine_idle": round((end.idle_s - start.idle_s) / seconds, 3)}
+    idle = (end.idle_s - start.idle_s) / seconds
+    others = max((psutil.cpu_count() or 1) - idle - sum(cores.values()), 0.0)
+    return {**cores, "others": round(others, 3), "machine_idle": round(idle, 3)}
 
 
 def find_quantiles(values: Sequence[float]) -> dict[str, float]:
@@ -168,9 +174,8 @@ async def _read_database(url: str) -> dict[str, Any]:
         found["connections"] = int(
             await connection.fetchval("select count(*) from pg_stat_activity where backend_type = 'client backend'")
         )
-        found["task_runs"] = int(
-            await connection.fetchval("select count(*) from task_run where state_type = 'COMPLETED'")
-        )
+        done = "select count(*) from task_run where state_type = 'COMPLETED'"
+        found["task_runs"] = int(await connection.fetchval(done))
         tables = await connection.fetch("select relname, n_tup_ins from pg_stat_user_tables where n_tup_ins > 0")
         found["inserted"] = {table["relname"]: int(table["n_tup_ins"]) for table in tables}
     finally:

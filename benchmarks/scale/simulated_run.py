@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import json
 import os
 from collections.abc import Callable, Coroutine
 from concurrent.futures import Executor
@@ -29,7 +30,7 @@ from flows.reconstruction.outcome_artifact import OUTCOME_KEY
 
 # Of a small log: a picture of each of four stages, and lines in the log of the run.
 _PICTURES = 4
-_PICTURE_BYTES = 40_000
+_PICTURE_BYTES = 75_000
 _LINES_PER_STAGE = 3
 
 
@@ -41,11 +42,13 @@ class RunPlan:
         seconds: of the stages, by name, as they were measured.
         scale: by what all times are multiplied.
         compute: runs a stage of a log in a thread: log, stage, seconds. Returns whether it was computed.
+        write_record: writes the record of a log's run into the store.
     """
 
     seconds: dict[str, float]
     scale: float
     compute: Callable[[str, str, float], bool]
+    write_record: Callable[[str], None]
 
 
 @dataclass
@@ -103,6 +106,7 @@ async def run_log(flow_run: FlowRun, plan: RunPlan, counts: RunCounts, threads: 
 
             if await process.run_task(stage, compute):
                 counts.computed.append(f"{log} {stage}")
+        await loop.run_in_executor(threads, plan.write_record, log)
         await process.publish_results(log)
         await client.set_flow_run_state(run.id, Completed())
         await process.write_lines(["Finished in state Completed()"])
@@ -178,8 +182,6 @@ class _RunProcess:
         await self._publish(OUTCOME_KEY, "table", [outcome | {"is_passing": False}])
 
     async def _publish(self, key: str, kind: str, data: Any) -> None:
-        import json
-
         text = data if isinstance(data, str) else json.dumps(data)
         await self._client.create_artifact(ArtifactCreate(key=key, type=kind, data=text, flow_run_id=self._run.id))
 

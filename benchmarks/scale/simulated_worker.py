@@ -24,7 +24,7 @@ from prefect.workers.base import BaseJobConfiguration, BaseVariables, BaseWorker
 
 from benchmarks.scale.request_meter import RequestMeter
 from benchmarks.scale.simulated_run import RunCounts, RunPlan, run_log
-from benchmarks.scale.simulated_stages import run_simulated_stage
+from benchmarks.scale.simulated_stages import run_simulated_stage, write_simulated_record
 from storage.opening import open_store
 
 _LAG_EVERY_S = 0.2
@@ -123,7 +123,7 @@ async def run_workers(plan: WorkersPlan, meter: RequestMeter) -> dict[str, Any]:
     def compute(log: str, stage: str, seconds: float) -> bool:
         return run_simulated_stage(store, log, stage, plan.seed, seconds)
 
-    run_plan = RunPlan(plan.seconds, plan.scale, compute)
+    run_plan = RunPlan(plan.seconds, plan.scale, compute, partial(write_simulated_record, store))
     lags: list[float] = []
     with ThreadPoolExecutor(len(plan.names)) as threads:
         tasks = [asyncio.create_task(_measure_lag(lags))]

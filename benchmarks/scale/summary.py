@@ -11,6 +11,8 @@ from benchmarks.scale.request_meter import Request, RequestMeter
 from benchmarks.scale.server_load import LoadSample, find_quantiles, measure_usage
 from benchmarks.scale.simulated_stages import count_artifacts
 
+POLL_S = 10.0
+"""Seconds between two polls of a worker, as Prefect's default has it."""
 _PARTS = 6
 # A process of Python runs on one core; at nine tenths of it, requests wait.
 _BUSY_CORE = 0.85
@@ -31,6 +33,7 @@ class ClusterRun:
         processes: what each process of workers did.
         parent: requests of the dataset's supervisor.
         samples: of the load, from the dataset's start to its end.
+        base: two samples before there were workers.
         idle: two samples while all workers were polling and there was no log.
         database: what PostgreSQL counted during the dataset.
         drain_s: seconds from the dataset's end until its task runs were recorded.
@@ -44,6 +47,7 @@ class ClusterRun:
     processes: Sequence[Mapping[str, Any]]
     parent: RequestMeter
     samples: Sequence[LoadSample]
+    base: tuple[LoadSample, LoadSample]
     idle: tuple[LoadSample, LoadSample]
     database: Mapping[str, Any]
     drain_s: float
@@ -84,9 +88,10 @@ def summarise_cluster(run: ClusterRun) -> Row:
         "attempts": sum(int(row["attempts"]) for row in run.outcomes),
         "stages": _count_stages(run),
         "cores": cores,
-        "first_limit": find_limit(cores, _cores_of_process(run)),
+        "first_limit": find_limit(cores),
         "per_log": _divide(run, busy_api, store),
         "idle": _measure_idle(run, api),
+        "capacity": _predict_capacity(run),
         "latencies": _measure_latencies(busy_api, store, first, last),
         "parts": _split_in_parts(run, busy_api, store),
         "client": _describe_client(run),
@@ -99,20 +104,19 @@ def summarise_cluster(run: ClusterRun) -> Row:
     }
 
 
-def find_limit(cores: Mapping[str, float], client_cores: Sequence[float]) -> str:
+def find_limit(cores: Mapping[str, float]) -> str:
     """Says which part of the cluster has no more room.
 
     Args:
         cores: processors that the services kept busy, with ``machine_idle``.
-        client_cores: the same of each process of workers.
 
     Returns:
         A sentence.
 
-    >>> find_limit({"prefect": 0.95, "machine_idle": 0.5}, [0.2])
+    >>> find_limit({"prefect": 0.95, "workers-0": 0.2, "machine_idle": 0.5})
     "Prefect's server keeps one processor busy."
     """
-    if any(used > _BUSY_CORE for used in client_cores):
+    if any(used > _BUSY_CORE for name, used in cores.items() if name.startswith("workers") or name == "parent"):
         return "The simulated workers keep one processor busy: the servers may carry more."
     if cores["prefect"] > _BUSY_CORE:
         return "Prefect's server keeps one processor busy."
@@ -172,7 +176,25 @@ def _measure_idle(run: ClusterRun, api: Sequence[Request]) -> Row:
         "requests_per_worker_second": round(per_second, 4),
         "prefect_cores": cores["prefect"],
         "postgres_cores": cores["postgres"],
-        "prefect_cpu_ms_per_worker_second": round(1000 * cores["prefect"] / run.workers * run.scale, 3),
+    }
+
+
+def _predict_capacity(run: ClusterRun) -> Row:
+    """How many workers keep one processor of Prefect's server busy, at the stages' measured seconds."""
+    base = measure_usage(*run.base)["prefect"]
+    idle = measure_usage(*run.idle)["prefect"]
+    busy = measure_usage(run.samples[0], run.samples[-1])["prefect"]
+    polling = max(idle - base, 0.0) / run.workers * run.scale
+    per_log = max(busy - idle, 0.0) * run.wall_s / run.logs
+    # A worker that ends a log waits for half of its pause between two polls.
+    log_s = sum(run.seconds.values()) + POLL_S / 2
+    workers = (1.0 - base) / (polling + per_log / log_s)
+    return {
+        "prefect_base_cores": base,
+        "prefect_cpu_s_per_log": round(per_log, 3),
+        "prefect_cpu_ms_per_worker_second": round(1000 * polling, 3),
+        "workers_per_server_core": round(workers),
+        "logs_per_minute_per_server_core": round(60 * workers / log_s, 1),
     }
 
 
@@ -211,16 +233,10 @@ def _split_in_parts(run: ClusterRun, api: Sequence[Request], store: Sequence[Req
     return parts
 
 
-def _cores_of_process(run: ClusterRun) -> list[float]:
-    # Of the processes' time, the dataset's is the main part.
-    return [process["cpu_s"] / max(run.wall_s, 1e-9) for process in run.processes]
-
-
 def _describe_client(run: ClusterRun) -> Row:
     lags = [lag for process in run.processes for lag in process["lags"]]
     return {
         "processes": len(run.processes),
-        "cores_per_process": [round(used, 3) for used in _cores_of_process(run)],
         "event_loop_lag": find_quantiles(lags),
         "failed_workers": [error for process in run.processes for error in process["failed_workers"]],
     }
