@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from prefect.client.base import PrefectHttpxAsyncClient, PrefectHttpxSyncClient
+import httpx
 
 from storage.manifest import MANIFEST
 from storage.objects.bucket import Bucket
@@ -97,7 +97,7 @@ def metered_clients(meter: RequestMeter) -> Iterator[None]:
     Yields:
         Nothing.
     """
-    methods: list[tuple[type[Any], str]] = [(PrefectHttpxAsyncClient, "send"), (PrefectHttpxSyncClient, "send")]
+    methods: list[tuple[type[Any], str]] = [(httpx.AsyncClient, "send"), (httpx.Client, "send")]
     methods += [(Bucket, name) for name in (*_BUCKET_CALLS, "list")]
     before = [(owner, name, getattr(owner, name)) for owner, name in methods]
     meter.install()
@@ -125,8 +125,9 @@ def name_route(method: str, path: str) -> str:
 
 
 def _install_api(requests: list[Request]) -> None:
-    send_async = PrefectHttpxAsyncClient.send
-    send_sync = PrefectHttpxSyncClient.send
+    # Below Prefect's clients: what they try again, and their tokens against forged requests, count too.
+    send_async = httpx.AsyncClient.send
+    send_sync = httpx.Client.send
 
     def note(request: Any, start_s: float, response: Any) -> None:
         now_s = time.monotonic()
@@ -146,8 +147,8 @@ def _install_api(requests: list[Request]) -> None:
         note(request, start_s, response)
         return response
 
-    PrefectHttpxAsyncClient.send = timed_async  # type: ignore[method-assign, assignment]
-    PrefectHttpxSyncClient.send = timed_sync  # type: ignore[method-assign, assignment]
+    httpx.AsyncClient.send = timed_async  # type: ignore[method-assign, assignment]
+    httpx.Client.send = timed_sync  # type: ignore[method-assign, assignment]
 
 
 def _count_bytes(args: tuple[Any, ...]) -> int:

@@ -88,8 +88,13 @@ async def run_log(flow_run: FlowRun, plan: RunPlan, counts: RunCounts, threads: 
         await client.read_deployment(deployment_id)
         await stack.enter_async_context(PrefectEventsClient())
         await stack.enter_async_context(FlowRunCancellingObserver(on_cancelling=lambda run_id: None))
+        # The command, the engine and the task runner of a process ask each.
+        for route in ("/admin/version", "/admin/version", "/admin/version", "/admin/storage", "/admin/storage"):
+            await client.request("GET", route)
         await client.update_flow_run(run.id, flow_version="simulated")
         await client.read_flow_run(run.id)
+        await client.read_flow_run(run.id)
+        await client.update_flow_run(run.id, name=run.name)
         await client.set_flow_run_state(run.id, Running())
         await client.read_flow_run(run.id)
         related = await _read_related(client, run, deployment_id)
