@@ -28,7 +28,7 @@ from flows.dataset.supervisor import SupervisionLimits, Supervisor
 from flows.dataset.work_units import WorkUnit
 
 _BASE_S = 10.0
-_IDLE_S = 40.0
+_IDLE_S = 20.0
 _DRAIN_S = 120.0
 # More than the workers: a worker that ends a log finds the next one waiting.
 _IN_FLIGHT_PER_WORKER = 1.25
@@ -46,8 +46,8 @@ def measure_cluster(logs: int, workers: int, seed: int, seconds_scale: float, ke
         logs: of the dataset.
         workers: that run one log at a time each.
         seed: of the artifacts' keys, and of when the workers start.
-        seconds_scale: by what the stages' measured seconds, the workers' polling and the heartbeats are multiplied.
-            A cluster at a tenth of the time loads its servers as one of ten times as many workers does.
+        seconds_scale: by what the stages' measured seconds and the time between two heartbeats of a run are multiplied.
+            Workers poll as often as real ones do.
         keep_logs: folder for the servers' logs.
 
     Returns:
@@ -67,7 +67,7 @@ def measure_cluster(logs: int, workers: int, seed: int, seconds_scale: float, ke
         services.start_workers(workers, seed, seconds_scale, seconds)
         sampler = LoadSampler(services.pids())
         idle_start = sampler.sample()
-        time.sleep(_IDLE_S * max(seconds_scale, 0.25))
+        time.sleep(_IDLE_S)
         idle_end = sampler.sample()
         before = read_database(services.postgres.url)
         meter.api.clear()
@@ -121,7 +121,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--logs", type=int, nargs="+", required=True, help="logs of each cluster")
     parser.add_argument("--workers", type=int, nargs="+", required=True, help="workers of each cluster")
-    parser.add_argument("--scale", type=float, default=1.0, help="by what all times are multiplied")
+    parser.add_argument("--scale", type=float, default=1.0, help="by what the seconds of stages are multiplied")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, required=True, help="file that a row is added to for each cluster")
     parser.add_argument("--keep-logs", type=Path, default=None, help="folder for the servers' logs")

@@ -74,16 +74,14 @@ class ClusterServices:
         Args:
             workers: how many.
             seed: of the artifacts' keys.
-            scale: by what all times are multiplied.
+            scale: by what the seconds of stages are multiplied.
             seconds: of the stages.
 
         Raises:
             ResourceError: a process ended, or not all workers are online in time.
         """
         names = [f"worker-{number}" for number in range(workers)]
-        env = {**os.environ, **self.env(), "PREFECT_WORKER_QUERY_SECONDS": str(POLL_S * scale)}
-        # Whole seconds, of which the server waits for three times as many before a worker counts as offline.
-        env["PREFECT_WORKER_HEARTBEAT_SECONDS"] = str(max(3, round(30 * scale)))
+        env = {**os.environ, **self.env(), "PREFECT_WORKER_QUERY_SECONDS": str(POLL_S)}
         for number, start in enumerate(range(0, workers, _WORKERS_PER_PROCESS)):
             result = self.folder / f"workers-{number}.result.json"
             some = names[start : start + _WORKERS_PER_PROCESS]
@@ -95,7 +93,7 @@ class ClusterServices:
                 seed=seed,
                 scale=scale,
                 seconds=dict(seconds),
-                poll_s=POLL_S * scale,
+                poll_s=POLL_S,
                 stop_file=str(self.folder / "stop"),
                 result_file=str(result),
             )

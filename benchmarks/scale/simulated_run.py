@@ -40,7 +40,7 @@ class RunPlan:
 
     Attributes:
         seconds: of the stages, by name, as they were measured.
-        scale: by what all times are multiplied.
+        scale: by what the seconds of stages, and between two heartbeats, are multiplied.
         compute: runs a stage of a log in a thread: log, stage, seconds. Returns whether it was computed.
         write_record: writes the record of a log's run into the store.
     """

@@ -40,7 +40,7 @@ class WorkersPlan:
         queue: the work queue.
         store: URI of the store.
         seed: of the artifacts' keys, and of when the workers start.
-        scale: by what all times are multiplied.
+        scale: by what the seconds of stages are multiplied.
         seconds: of the stages, by name.
         poll_s: seconds between two polls of a worker.
         stop_file: the workers stop when it is there.

@@ -27,7 +27,7 @@ class ClusterRun:
     Attributes:
         logs: of the dataset.
         workers: of the cluster.
-        scale: by what all times were multiplied.
+        scale: by what the seconds of stages were multiplied.
         seconds: of the stages as they were measured, by name.
         outcomes: rows of the dataset's table.
         processes: what each process of workers did.
@@ -82,7 +82,7 @@ def summarise_cluster(run: ClusterRun) -> Row:
         "log_seconds": round(sum(run.seconds.values()), 1),
         "wall_s": round(run.wall_s, 1),
         "logs_per_minute": round(60 * run.logs / run.wall_s, 2),
-        "offered_logs_per_minute": round(60 * run.workers / (sum(run.seconds.values()) * run.scale), 2),
+        "offered_logs_per_minute": round(60 * run.workers / (sum(run.seconds.values()) * run.scale + POLL_S / 2), 2),
         "logs_done": statuses["done"],
         "statuses": dict(statuses),
         "attempts": sum(int(row["attempts"]) for row in run.outcomes),
@@ -169,8 +169,7 @@ def _measure_idle(run: ClusterRun, api: Sequence[Request]) -> Row:
     seconds = end.time_s - start.time_s
     asked = [request for request in api if start.time_s <= request.time_s <= end.time_s]
     cores = measure_usage(start, end)
-    # In a cluster at a tenth of the time, a worker asks ten times as often.
-    per_second = len(asked) / seconds / run.workers * run.scale
+    per_second = len(asked) / seconds / run.workers
     return {
         "seconds": round(seconds, 1),
         "requests_per_worker_second": round(per_second, 4),
@@ -184,7 +183,7 @@ def _predict_capacity(run: ClusterRun) -> Row:
     base = measure_usage(*run.base)["prefect"]
     idle = measure_usage(*run.idle)["prefect"]
     busy = measure_usage(run.samples[0], run.samples[-1])["prefect"]
-    polling = max(idle - base, 0.0) / run.workers * run.scale
+    polling = max(idle - base, 0.0) / run.workers
     per_log = max(busy - idle, 0.0) * run.wall_s / run.logs
     # A worker that ends a log waits for half of its pause between two polls.
     log_s = sum(run.seconds.values()) + POLL_S / 2
