@@ -9,6 +9,7 @@ import argparse
 import json
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -18,6 +19,7 @@ from benchmarks.scale.request_meter import RequestMeter, metered_clients
 from benchmarks.scale.server_load import (
     LoadSampler,
     read_database,
+    read_event_delay,
     subtract_counters,
 )
 from benchmarks.scale.simulated_stages import read_stage_seconds
@@ -28,6 +30,7 @@ from flows.dataset.supervisor import SupervisionLimits, Supervisor
 from flows.dataset.work_units import WorkUnit
 
 _BASE_S = 10.0
+_DELAY_EVERY_S = 10.0
 _IDLE_S = 20.0
 _DRAIN_S = 120.0
 # More than the workers: a worker that ends a log finds the next one waiting.
@@ -35,7 +38,14 @@ _IN_FLIGHT_PER_WORKER = 1.25
 Row = dict[str, Any]
 
 
-def measure_cluster(logs: int, workers: int, seed: int, seconds_scale: float, keep_logs: Path | None = None) -> Row:
+def measure_cluster(
+    logs: int,
+    workers: int,
+    seed: int,
+    seconds_scale: float,
+    keep_logs: Path | None = None,
+    limit_s: float = float("inf"),
+) -> Row:
     """Runs a dataset of simulated logs on simulated workers, and measures what it costs the servers.
 
     PostgreSQL, Prefect's server, the S3 server, the supervisor of the dataset and the store are real. So is the part
@@ -49,6 +59,7 @@ def measure_cluster(logs: int, workers: int, seed: int, seconds_scale: float, ke
         seconds_scale: by what the stages' measured seconds and the time between two heartbeats of a run are multiplied.
             Workers poll as often as real ones do.
         keep_logs: folder for the servers' logs.
+        limit_s: seconds after which the dataset is given up; the numbers are then those of a part of it.
 
     Returns:
         JSON values: ``wall_s``, ``logs_per_minute``, ``per_log``, ``idle``, ``cores``, ``latencies``, ``stages`` and
@@ -73,10 +84,12 @@ def measure_cluster(logs: int, workers: int, seed: int, seconds_scale: float, ke
         meter.api.clear()
         sampler.start()
         start = sampler.sample()
-        rows = _run_dataset(logs, workers, seconds_scale)
+        watch = _DatasetWatch(services.postgres.url, start.time_s + limit_s)
+        rows = _run_dataset(logs, workers, watch)
         end = sampler.sample()
         connections = read_database(services.postgres.url)["connections"]
-        drain_s = _wait_for_records(services, before["task_runs"] + logs * len(seconds))
+        done = sum(row["status"] == "done" for row in rows)
+        drain_s = _wait_for_records(services, before["task_runs"] + done * len(seconds))
         after = read_database(services.postgres.url)
         sampler.stop()
         found = services.stop_workers()
@@ -94,16 +107,44 @@ def measure_cluster(logs: int, workers: int, seed: int, seconds_scale: float, ke
         idle=(idle_start, idle_end),
         database=database | {"connections": connections},
         drain_s=drain_s,
+        event_delays=watch.delays,
     )
     return summarise_cluster(run) | {"seed": seed}
 
 
-def _run_dataset(logs: int, workers: int, scale: float) -> list[Row]:
+class _TimeOverError(Exception):
+    """The dataset takes longer than it may."""
+
+
+class _DatasetWatch:
+    """Shows the live table as the dataset's flow does, and measures how far the server is behind with events."""
+
+    def __init__(self, database: str, end_s: float) -> None:
+        self.delays: list[float] = []
+        self._database = database
+        self._end_s = end_s
+        self._table = LiveTable()
+        self._next_s = time.monotonic()
+
+    def on_change(self, rows: list[Row]) -> None:
+        now_s = time.monotonic()
+        if now_s > self._end_s:
+            raise _TimeOverError
+        self._table.show(rows)
+        if now_s >= self._next_s:
+            self._next_s = now_s + _DELAY_EVERY_S
+            self.delays.append(read_event_delay(self._database))
+
+
+def _run_dataset(logs: int, workers: int, watch: _DatasetWatch) -> list[Row]:
     """The dataset's flow without its process: its supervisor, child runs and table are the real ones."""
     units = [WorkUnit(f"log-{number:04d}") for number in range(logs)]
     request = ChildRequest(f"simulated-{uuid4().hex[:8]}", str(uuid4()), POOL, {"preset": "small"})
     limits = SupervisionLimits(in_flight=max(2, round(_IN_FLIGHT_PER_WORKER * workers)), attempts=3)
-    return Supervisor(units, PrefectRuns(request), limits, LiveTable().show).run()
+    supervisor = Supervisor(units, PrefectRuns(request), limits, watch.on_change)
+    with suppress(_TimeOverError):
+        supervisor.run()
+    return supervisor.rows
 
 
 def _wait_for_records(services: ClusterServices, wanted: int) -> float:
@@ -124,10 +165,11 @@ def main() -> None:
     parser.add_argument("--scale", type=float, default=1.0, help="by what the seconds of stages are multiplied")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, required=True, help="file that a row is added to for each cluster")
+    parser.add_argument("--limit-s", type=float, default=float("inf"), help="seconds after which a dataset is given up")
     parser.add_argument("--keep-logs", type=Path, default=None, help="folder for the servers' logs")
     args = parser.parse_args()
     for logs, workers in zip(args.logs, args.workers, strict=True):
-        row = measure_cluster(logs, workers, args.seed, args.scale, args.keep_logs)
+        row = measure_cluster(logs, workers, args.seed, args.scale, args.keep_logs, args.limit_s)
         rows = json.loads(args.json.read_text()) if args.json.exists() else []
         args.json.write_text(json.dumps([*rows, row], indent=1))
         sys.stdout.write(json.dumps(row, indent=1) + "\n")

@@ -183,6 +183,28 @@ async def _read_database(url: str) -> dict[str, Any]:
     return found
 
 
+def read_event_delay(url: str) -> float:
+    """Reads how long ago the newest event came that the server has worked through.
+
+    Args:
+        url: as Prefect's server has it.
+
+    Returns:
+        Seconds; 0 where there is no event.
+    """
+    return asyncio.run(_read_event_delay(url.replace("postgresql+asyncpg://", "postgresql://")))
+
+
+async def _read_event_delay(url: str) -> float:
+    import asyncpg
+
+    connection = await asyncpg.connect(url)
+    try:
+        return float(await connection.fetchval("select extract(epoch from now() - max(received)) from events") or 0.0)
+    finally:
+        await connection.close()
+
+
 def subtract_counters(end: Mapping[str, Any], start: Mapping[str, Any]) -> dict[str, Any]:
     """Subtracts two readings of the database.
 

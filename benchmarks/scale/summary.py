@@ -37,6 +37,7 @@ class ClusterRun:
         idle: two samples while all workers were polling and there was no log.
         database: what PostgreSQL counted during the dataset.
         drain_s: seconds from the dataset's end until its task runs were recorded.
+        event_delays: how far the server was behind with events, in seconds, every ten seconds.
     """
 
     logs: int
@@ -51,6 +52,7 @@ class ClusterRun:
     idle: tuple[LoadSample, LoadSample]
     database: Mapping[str, Any]
     drain_s: float
+    event_delays: Sequence[float] = ()
 
     @property
     def wall_s(self) -> float:
@@ -81,7 +83,7 @@ def summarise_cluster(run: ClusterRun) -> Row:
         "seconds_scale": run.scale,
         "log_seconds": round(sum(run.seconds.values()), 1),
         "wall_s": round(run.wall_s, 1),
-        "logs_per_minute": round(60 * run.logs / run.wall_s, 2),
+        "logs_per_minute": round(60 * statuses["done"] / run.wall_s, 2),
         "offered_logs_per_minute": round(60 * run.workers / (sum(run.seconds.values()) * run.scale + POLL_S / 2), 2),
         "logs_done": statuses["done"],
         "statuses": dict(statuses),
@@ -100,6 +102,7 @@ def summarise_cluster(run: ClusterRun) -> Row:
         "postgres_connections": run.database["connections"],
         "task_runs_recorded": run.database["task_runs"],
         "drain_s": round(run.drain_s, 1),
+        "event_delay_s": [round(delay, 1) for delay in run.event_delays],
         "api_errors": sum(request.is_error for request in busy_api),
     }
 
@@ -128,7 +131,9 @@ def find_limit(cores: Mapping[str, float]) -> str:
 def _count_stages(run: ClusterRun) -> Row:
     commits = Counter(name for process in run.processes for name in process["commits"])
     computed = Counter(stage for process in run.processes for stage in process["computed"])
-    counts = count_artifacts(commits, run.logs)
+    # Of a dataset that was given up, only the logs that were done must be complete.
+    done = {row["log"] for row in run.outcomes if row["status"] == "done"}
+    counts = count_artifacts({name: n for name, n in commits.items() if name.split("/")[1] in done}, len(done))
     return {
         **counts,
         "computed": computed.total(),
@@ -139,7 +144,7 @@ def _count_stages(run: ClusterRun) -> Row:
 
 
 def _divide(run: ClusterRun, api: Sequence[Request], store: Sequence[Request]) -> Row:
-    logs = run.logs
+    logs = _count_done(run)
     used = {name: run.samples[-1].cpu_s[name] - run.samples[0].cpu_s[name] for name in run.samples[0].cpu_s}
     groups = Counter(request.group for request in api)
     parent = Counter(request.group for request in run.parent.api)
@@ -178,13 +183,17 @@ def _measure_idle(run: ClusterRun, api: Sequence[Request]) -> Row:
     }
 
 
+def _count_done(run: ClusterRun) -> int:
+    return max(1, sum(row["status"] == "done" for row in run.outcomes))
+
+
 def _predict_capacity(run: ClusterRun) -> Row:
     """How many workers keep one processor of Prefect's server busy, at the stages' measured seconds."""
     base = measure_usage(*run.base)["prefect"]
     idle = measure_usage(*run.idle)["prefect"]
     busy = measure_usage(run.samples[0], run.samples[-1])["prefect"]
     polling = max(idle - base, 0.0) / run.workers
-    per_log = max(busy - idle, 0.0) * run.wall_s / run.logs
+    per_log = max(busy - idle, 0.0) * run.wall_s / _count_done(run)
     # A worker that ends a log waits for half of its pause between two polls.
     log_s = sum(run.seconds.values()) + POLL_S / 2
     workers = (1.0 - base) / (polling + per_log / log_s)

@@ -79,6 +79,15 @@ class ChildRuns(Protocol):
         """
         ...
 
+    def read_event_delay(self) -> float:
+        """Measures how far the server is behind with the events that it has received, heartbeats among them.
+
+        Returns:
+            Seconds since the newest event that can be read, by the server's clock. The parent itself sends a heartbeat
+            every thirty seconds, so that a server that keeps up is less than that behind.
+        """
+        ...
+
     def read_stages(self, ids: Sequence[str]) -> Mapping[str, str]:
         """Reads which stage runs are in.
 

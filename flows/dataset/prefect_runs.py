@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from email.utils import parsedate_to_datetime
 from typing import Any
 from uuid import UUID
 
@@ -129,11 +130,25 @@ class PrefectRuns:
         for some in _split(ids, _RUNS_PER_REQUEST):
             body = {"filter": _heartbeats_of(some).model_dump(mode="json", exclude_unset=True)}
             # Prefect's client has no function for it.
-            path = "/events/count-by/{countable}"
-            response = call_server(self._client.request, "POST", path, path_params={"countable": "resource"}, json=body)
+            response = call_server(
+                self._client.request,
+                "POST",
+                "/events/count-by/{countable}",
+                path_params={"countable": "resource"},
+                json=body,
+            )
             for entry in response.json():
                 found[entry["value"].removeprefix(_RUN_RESOURCE)] = str(entry["count"])
         return found
+
+    def read_event_delay(self) -> float:
+        """Measures how far the server is behind with the events that it has received."""
+        body = {"filter": _any_event().model_dump(mode="json", exclude_unset=True), "limit": _EVENTS_PER_REQUEST}
+        response = call_server(self._client.request, "POST", "/events/filter", json=body)
+        # Both times are the server's: its answers name the time in their header.
+        now = parsedate_to_datetime(response.headers["date"])
+        received = [datetime.fromisoformat(event["received"]) for event in response.json()["events"]]
+        return (now - max(received)).total_seconds() if received else 0.0
 
     def read_stages(self, ids: Sequence[str]) -> Mapping[str, str]:
         """Reads which stage runs are in."""
@@ -257,6 +272,12 @@ def _heartbeats_of(run_ids: Sequence[str]) -> EventFilter:
         occurred=EventOccurredFilter(since=now - timedelta(days=_DAYS), until=now + timedelta(days=_DAYS)),
         order=EventOrder.DESC,
     )
+
+
+def _any_event() -> EventFilter:
+    now = datetime.now(UTC)
+    occurred = EventOccurredFilter(since=now - timedelta(days=_DAYS), until=now + timedelta(days=_DAYS))
+    return EventFilter(occurred=occurred, order=EventOrder.DESC)
 
 
 def _split(ids: Sequence[str], size: int) -> Iterator[Sequence[str]]:

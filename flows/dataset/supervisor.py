@@ -19,6 +19,8 @@ SILENT_VARIABLE = "GENRE_SILENT_SECONDS"
 """The variable of the environment for :attr:`SupervisionLimits.silent_s`."""
 HEARTBEAT_S = 30
 """Seconds between two heartbeats of a child run."""
+# As a multiple of the seconds that a run may be silent.
+_MOST_DELAY = 10.0
 Rows = list[dict[str, Any]]
 _STATUS_BY_STATE = {"SCHEDULED": "waiting", "PENDING": "starting", "RUNNING": "running"}
 
@@ -245,7 +247,7 @@ class Supervisor:
             run = watch.run
             if run.state == "PENDING" and self._age(watch) > self._limits.pending_s:
                 is_ended = self._free(watch, f"not started within {self._limits.pending_s:.0f} s")
-            elif run.state == "RUNNING" and self._age(watch) > self._limits.silent_s:
+            elif run.state == "RUNNING" and self._is_silent(watch):
                 is_ended = self._free(watch, f"no heartbeat for {self._limits.silent_s:.0f} s")
             else:
                 is_ended = run.state not in ACTIVE_STATES
@@ -255,6 +257,15 @@ class Supervisor:
         outcomes = self._runs.read_outcomes([watch.run.id for watch in ended]) if ended else {}
         for watch in ended:
             self._end(watch, outcomes.get(watch.run.id))
+
+    def _is_silent(self, watch: _Watch) -> bool:
+        age_s = self._age(watch)
+        if age_s <= self._limits.silent_s:
+            return False
+        # A busy server is minutes behind with heartbeats that it has received: their runs are alive.
+        delay_s = self._runs.read_event_delay() - HEARTBEAT_S
+        # Bounded, as a parent whose own heartbeats are lost would wait for ever.
+        return age_s > self._limits.silent_s + min(max(delay_s, 0.0), _MOST_DELAY * self._limits.silent_s)
 
     def _age(self, watch: _Watch) -> float:
         return self._clock() - watch.since_s

@@ -76,6 +76,9 @@ class _Runs:
     def read_heartbeats(self, ids: Sequence[str]) -> Mapping[str, str]:
         return {}
 
+    def read_event_delay(self) -> float:
+        return 0.0
+
     def read_stages(self, ids: Sequence[str]) -> Mapping[str, str]:
         return {}
 
@@ -180,7 +183,8 @@ def test_a_missing_and_a_doubled_stage_are_counted() -> None:
 
 def test_the_numbers_are_those_of_the_samples(meter: RequestMeter) -> None:
     meter.api += [Request(110.0, "POST logs", 0.01), Request(150.0, "POST logs", 0.03), Request(25.0, "GET poll", 0.01)]
-    row = summarise_cluster(_cluster_run([], RunCounts(), meter))
+    rows = [{"log": f"log-{number}", "status": "done", "attempts": 1} for number in range(LOGS)]
+    row = summarise_cluster(_cluster_run(rows, RunCounts(), meter))
     assert row["wall_s"] == 60.0
     assert row["cores"]["prefect"] == 0.5
     assert row["per_log"]["cpu_s"]["prefect"] == 5.0

@@ -59,6 +59,20 @@ def test_heartbeats_of_many_runs_are_read_by_one_request() -> None:
     assert client.count_requests == 1
 
 
+def test_the_delay_of_events_is_by_the_servers_clock() -> None:
+    client = FakeClient()
+    runs = PrefectRuns(ChildRequest("d", "p", "pool", {}), client)  # type: ignore[arg-type]
+    events = [{"received": "2020-01-01T00:00:10Z"}, {"received": "2020-01-01T00:00:00Z"}]
+    answer = SimpleNamespace(
+        headers={"date": "Wed, 01 Jan 2020 00:01:40 GMT"},
+        json=lambda: {"events": events},
+    )
+    client.request = lambda *args, **kwargs: answer  # type: ignore[method-assign]
+    assert runs.read_event_delay() == 90.0
+    events.clear()
+    assert runs.read_event_delay() == 0.0
+
+
 def test_a_run_is_alive_by_the_time_of_receipt() -> None:
     client = FakeClient()
     assert not has_heartbeat(client, "a", since_s=90.0)  # type: ignore[arg-type]

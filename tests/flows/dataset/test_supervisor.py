@@ -32,6 +32,7 @@ class FakeRuns:
         self.crashed: list[str] = []
         self.most_active = 0
         self.outcome_requests = 0
+        self.event_delay_s = 5.0
         self.now_s = 0.0
 
     def find(self) -> list[ChildRun]:
@@ -63,6 +64,9 @@ class FakeRuns:
 
     def read_heartbeats(self, ids: Sequence[str]) -> Mapping[str, str]:
         return {id_: str(self.now_s) for id_ in ids if id_ in self.beating}
+
+    def read_event_delay(self) -> float:
+        return self.event_delay_s
 
     def read_stages(self, ids: Sequence[str]) -> Mapping[str, str]:
         return dict.fromkeys(ids, "gnet · chunk 0")
@@ -209,3 +213,22 @@ def test_runs_that_end_together_are_read_by_one_request() -> None:
     rows = supervise(runs, units, replace(LIMITS, in_flight=40))
     assert {row["status"] for row in rows} == {"done"}
     assert runs.outcome_requests == 1
+
+
+@pytest.mark.parametrize(("delay_s", "crashes"), [(5.0, 1), (300.0, 0)])
+def test_a_server_that_is_behind_with_heartbeats_is_no_dead_run(delay_s: float, crashes: int) -> None:
+    unit = WorkUnit("log-0")
+    polls = round((LIMITS.silent_s + 60) / LIMITS.poll_s)
+    runs = FakeRuns({unit: [["RUNNING"] * polls + ["COMPLETED"], ["COMPLETED"]]})
+    runs.event_delay_s = delay_s
+    assert supervise(runs, [unit])[0]["status"] == "done"
+    assert len(runs.crashed) == crashes
+
+
+def test_a_delay_does_not_keep_a_dead_run_for_ever() -> None:
+    unit = WorkUnit("log-0")
+    limits = replace(LIMITS, silent_s=20.0)
+    runs = FakeRuns({unit: [["RUNNING"], ["COMPLETED"]]})
+    runs.event_delay_s = 1e6
+    assert supervise(runs, [unit], limits)[0]["status"] == "done"
+    assert len(runs.crashed) == 1
