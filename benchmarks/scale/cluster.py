@@ -17,6 +17,7 @@ from uuid import uuid4
 from benchmarks.scale.cluster_services import POOL, ClusterServices, start_services
 from benchmarks.scale.request_meter import RequestMeter, metered_clients
 from benchmarks.scale.server_load import (
+    LoadSample,
     LoadSampler,
     read_database,
     read_event_delay,
@@ -72,14 +73,10 @@ def measure_cluster(
     seconds = read_stage_seconds()
     meter = RequestMeter()
     with start_services(keep_logs) as services, metered_clients(meter):
-        base_start = LoadSampler(services.pids()).sample()
-        time.sleep(_BASE_S)
-        base = (base_start, LoadSampler(services.pids()).sample())
+        base = _sample_during(services, _BASE_S)
         services.start_workers(workers, seed, seconds_scale, seconds)
+        idle = _sample_during(services, _IDLE_S)
         sampler = LoadSampler(services.pids())
-        idle_start = sampler.sample()
-        time.sleep(_IDLE_S)
-        idle_end = sampler.sample()
         before = read_database(services.postgres.url)
         meter.api.clear()
         sampler.start()
@@ -93,7 +90,6 @@ def measure_cluster(
         after = read_database(services.postgres.url)
         sampler.stop()
         found = services.stop_workers()
-    database = subtract_counters(after, before)
     run = ClusterRun(
         logs=logs,
         workers=workers,
@@ -104,12 +100,19 @@ def measure_cluster(
         parent=meter,
         samples=[start, *(sample for sample in sampler.samples if start.time_s < sample.time_s < end.time_s), end],
         base=base,
-        idle=(idle_start, idle_end),
-        database=database | {"connections": connections},
+        idle=idle,
+        database=subtract_counters(after, before) | {"connections": connections},
         drain_s=drain_s,
         event_delays=watch.delays,
     )
     return summarise_cluster(run) | {"seed": seed}
+
+
+def _sample_during(services: ClusterServices, seconds: float) -> tuple[LoadSample, LoadSample]:
+    sampler = LoadSampler(services.pids())
+    start = sampler.sample()
+    time.sleep(seconds)
+    return start, sampler.sample()
 
 
 class _TimeOverError(Exception):
