@@ -70,6 +70,13 @@ def measure_cluster(
         ConfigError: PostgreSQL or the S3 server is not installed.
         ResourceError: a server did not start.
     """
+    run = _run_cluster(logs, workers, seed, seconds_scale, keep_logs, limit_s)
+    return summarise_cluster(run) | {"seed": seed}
+
+
+def _run_cluster(
+    logs: int, workers: int, seed: int, seconds_scale: float, keep_logs: Path | None, limit_s: float
+) -> ClusterRun:
     seconds = read_stage_seconds()
     meter = RequestMeter()
     with start_services(keep_logs) as services, metered_clients(meter):
@@ -90,7 +97,7 @@ def measure_cluster(
         after = read_database(services.postgres.url)
         sampler.stop()
         found = services.stop_workers()
-    run = ClusterRun(
+    return ClusterRun(
         logs=logs,
         workers=workers,
         scale=seconds_scale,
@@ -105,7 +112,6 @@ def measure_cluster(
         drain_s=drain_s,
         event_delays=watch.delays,
     )
-    return summarise_cluster(run) | {"seed": seed}
 
 
 def _sample_during(services: ClusterServices, seconds: float) -> tuple[LoadSample, LoadSample]:
