@@ -71,18 +71,19 @@ def dataset(
     load_configuration(preset, settings=settings or ())
     expanded = expand_logs(logs)
     name = name_dataset(expanded, preset, settings)
-    add_facts(dataset=name, preset=preset, store=store, logs=[])
+    facts = {"dataset": name, "preset": preset, "store": store}
+    add_facts(**facts, logs=[])
     parameters = {"logs": expanded, "preset": preset, "store": store, "settings": settings}
     if pool is None:
-        _run_here(parameters, as_json)
+        _run_here(parameters, facts, as_json)
         return
     on_pool = {"pool": pool, "in_flight": in_flight, "unit": unit, "attempts": attempts, "gpu_limit": gpu_limit}
     run_id = _submit(name, {**parameters, **on_pool}, follow, as_json)
     if follow:
-        _follow(run_id, as_json)
+        _follow(run_id, facts, as_json)
 
 
-def _run_here(parameters: Mapping[str, Any], as_json: bool) -> None:
+def _run_here(parameters: Mapping[str, Any], facts: Mapping[str, Any], as_json: bool) -> None:
     from flows.cli.terminal import report_on_terminal
     from flows.reconstruction.left_out import LogsFailedError
 
@@ -92,9 +93,9 @@ def _run_here(parameters: Mapping[str, Any], as_json: bool) -> None:
         try:
             outcomes = reconstruct_dataset(**parameters)
         except LogsFailedError as error:
-            _print_outcomes(error.outcomes, as_json, error)
+            _print_outcomes(error.outcomes, facts, as_json, error)
             raise
-    _print_outcomes(outcomes, as_json)
+    _print_outcomes(outcomes, facts, as_json)
 
 
 def _submit(name: str, parameters: Mapping[str, Any], follow: bool, as_json: bool) -> UUID:
@@ -122,7 +123,7 @@ def _submit(name: str, parameters: Mapping[str, Any], follow: bool, as_json: boo
     return submission.id
 
 
-def _follow(run_id: UUID, as_json: bool) -> None:
+def _follow(run_id: UUID, facts: Mapping[str, Any], as_json: bool) -> None:
     from flows.cli.signals import Interrupted
     from flows.dataset.submission import follow_dataset
     from flows.reconstruction.left_out import LogsFailedError
@@ -135,12 +136,12 @@ def _follow(run_id: UUID, as_json: bool) -> None:
         typer.echo("no longer following; the dataset goes on: the same command follows it again", err=True)
         raise typer.Exit(error.exit_status) from error
     if state.startswith("COMPLETED"):
-        _print_outcomes(rows, as_json)
+        _print_outcomes(rows, facts, as_json)
         return
     if not rows or all(row["status"] == "done" for row in rows):
         raise ResourceError(f"the dataset's flow run ended as {state}", remedy="Run the same command again.")
     failure = LogsFailedError(rows)
-    _print_outcomes(rows, as_json, failure)
+    _print_outcomes(rows, facts, as_json, failure)
     raise failure
 
 
@@ -199,12 +200,14 @@ def _build_table(rows: Sequence[Mapping[str, Any]]) -> Any:
     return table
 
 
-def _print_outcomes(rows: Sequence[Mapping[str, Any]], as_json: bool, error: Any = None) -> None:
+def _print_outcomes(
+    rows: Sequence[Mapping[str, Any]], facts: Mapping[str, Any], as_json: bool, error: Any = None
+) -> None:
     from flows.cli.outcome import print_outcome
     from flows.cli.printing import print_rows
 
     if as_json:
-        print_outcome("done" if error is None else error.status, {"logs": [dict(row) for row in rows]}, error)
+        print_outcome("done" if error is None else error.status, {**facts, "logs": [dict(row) for row in rows]}, error)
         return
     names = ("log", "chunk", "status", "run", "seconds", "where")
     print_rows("logs", [{name: row.get(name, "") for name in names} for row in rows])

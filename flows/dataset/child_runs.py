@@ -8,7 +8,9 @@ from typing import Any, Protocol
 
 from flows.dataset.work_units import WorkUnit
 
-ACTIVE_STATES = frozenset({"SCHEDULED", "PENDING", "RUNNING", "PAUSED", "CANCELLING"})
+SILENT = "SILENT"
+"""The server missed heartbeats of a run and calls it Crashed; by its heartbeats it may live nevertheless."""
+ACTIVE_STATES = frozenset({"SCHEDULED", "PENDING", "RUNNING", "PAUSED", "CANCELLING", SILENT})
 """Types of states in which a run may still do something."""
 
 
@@ -19,7 +21,7 @@ class ChildRun:
     Attributes:
         id: the flow run's id.
         unit: what it is about.
-        state: type of its state, as Prefect names it, such as ``RUNNING``.
+        state: type of its state, as Prefect names it, such as ``RUNNING``; or :data:`SILENT`.
         message: of its state.
         where: host and process, once a worker has started it.
         seconds: how long it has been running.

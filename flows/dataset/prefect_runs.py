@@ -30,10 +30,11 @@ from prefect.client.schemas.sorting import FlowRunSort
 from prefect.events.filters import EventFilter, EventNameFilter, EventOccurredFilter, EventOrder, EventResourceFilter
 from prefect.states import Crashed
 
-from flows.dataset.child_runs import ACTIVE_STATES, ChildRun
+from flows.dataset.child_runs import ACTIVE_STATES, SILENT, ChildRun
 from flows.dataset.server_calls import call_server
 from flows.dataset.supervisor import HEARTBEAT_S
 from flows.dataset.work_units import WorkUnit, read_unit
+from flows.operations.heartbeat_automation import SILENT_STATE_NAME
 from flows.pipeline.gpu_slot import GPU_LIMIT_VARIABLE
 from flows.reconstruction.outcome_artifact import DATASET_VARIABLE, OUTCOME_KEY
 
@@ -166,7 +167,7 @@ class PrefectRuns:
     def crash(self, run: ChildRun, reason: str) -> None:
         """Sets a run to Crashed, so that its slots are free; a run that has ended meanwhile is left as it is."""
         newest = call_server(self._client.read_flow_run, UUID(run.id))
-        if newest.state is not None and newest.state.type.value == run.state:
+        if newest.state is not None and _name_state(newest) == run.state:
             # Forced: the rules of states would let a run that is being cancelled stay as it is.
             call_server(self._client.set_flow_run_state, UUID(run.id), Crashed(message=reason), force=True)
 
@@ -210,12 +211,30 @@ class PrefectRuns:
         return ChildRun(
             id=str(run.id),
             unit=unit,
-            state="SCHEDULED" if run.state is None else run.state.type.value,
+            state=_name_state(run),
             message="" if run.state is None else run.state.message or "",
             where=run.infrastructure_pid or "",
             seconds=seconds.total_seconds(),
             is_ours=self._parent_tag in run.tags,
         )
+
+
+def is_called_silent(run: FlowRun) -> bool:
+    """Says whether a run is Crashed only because the server missed its heartbeats.
+
+    Args:
+        run: as the server has it.
+
+    Returns:
+        Whether its state is the one of the heartbeat automation.
+    """
+    return run.state is not None and run.state.type is StateType.CRASHED and run.state.name == SILENT_STATE_NAME
+
+
+def _name_state(run: FlowRun) -> str:
+    if is_called_silent(run):
+        return SILENT
+    return "SCHEDULED" if run.state is None else run.state.type.value
 
 
 def dataset_tag(dataset: str) -> str:

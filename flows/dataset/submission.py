@@ -17,6 +17,7 @@ from prefect.client.schemas.filters import (
     ArtifactFilterKey,
     FlowRunFilter,
     FlowRunFilterState,
+    FlowRunFilterStateName,
     FlowRunFilterStateType,
     FlowRunFilterTags,
 )
@@ -26,9 +27,10 @@ from prefect.exceptions import ObjectNotFound
 from prefect.states import Crashed
 
 from flows.dataset.live_table import TABLE_KEY
-from flows.dataset.prefect_runs import DEPLOYMENT, count_heartbeats, dataset_tag, has_heartbeat
+from flows.dataset.prefect_runs import DEPLOYMENT, count_heartbeats, dataset_tag, has_heartbeat, is_called_silent
 from flows.dataset.server_calls import call_server, read_last_outage
 from flows.dataset.supervisor import HEARTBEAT_S
+from flows.operations.heartbeat_automation import SILENT_STATE_NAME
 from genre_tasks.errors import ConfigError
 
 _log = logging.getLogger("genre")
@@ -116,13 +118,15 @@ def follow_dataset(
         watch = HeartbeatWatch(client, run_id)
         while True:
             run = call_server(client.read_flow_run, run_id)
-            if run.state is not None and run.state.type is StateType.RUNNING and watch.is_silent():
+            is_silent = watch.is_silent()
+            if run.state is not None and run.state.type is StateType.RUNNING and is_silent:
                 # Nobody else notices that the parent's worker died with all its processes.
                 crash_run(client, run.id)
                 continue
             rows = _read_table(client, run_id)
             show(rows)
-            if run.state is not None and run.state.is_final():
+            lives = is_called_silent(run) and not is_silent
+            if run.state is not None and run.state.is_final() and not lives:
                 return f"{run.state.type.value}: {run.state.message or ''}", _read_table(client, run_id)
             time.sleep(poll_s)
 
@@ -153,11 +157,23 @@ def _find_running(client: SyncPrefectClient, name: str) -> FlowRun | None:
         tags=FlowRunFilterTags(all_=[dataset_tag(name), PARENT_TAG]),
         state=FlowRunFilterState(type=FlowRunFilterStateType(any_=_ACTIVE)),
     )
+    for run in _find_called_silent(client, name):
+        # Without waiting for one more heartbeat: it may have ended long ago.
+        if has_heartbeat(client, str(run.id), since_s=_SILENT_S):
+            return run
     for run in client.read_flow_runs(flow_run_filter=wanted):
         if run.state is None or run.state.type is not StateType.RUNNING or _shows_life(client, run):
             return run
         crash_run(client, run.id)
     return None
+
+
+def _find_called_silent(client: SyncPrefectClient, name: str) -> list[FlowRun]:
+    wanted = FlowRunFilter(
+        tags=FlowRunFilterTags(all_=[dataset_tag(name), PARENT_TAG]),
+        state=FlowRunFilterState(name=FlowRunFilterStateName(any_=[SILENT_STATE_NAME])),
+    )
+    return client.read_flow_runs(flow_run_filter=wanted)
 
 
 def crash_run(client: SyncPrefectClient, run_id: UUID) -> None:

