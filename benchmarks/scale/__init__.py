@@ -1,0 +1,1 @@
+"""Measurements of many logs on many workers."""

@@ -48,15 +48,14 @@ class ChildRuns(Protocol):
         """
         ...
 
-    def submit(self, unit: WorkUnit, attempt: int) -> ChildRun:
-        """Submits a run; the same unit and attempt give the same run.
+    def submit(self, requests: Sequence[tuple[WorkUnit, int]]) -> Sequence[ChildRun]:
+        """Submits runs, several at a time; the same unit and attempt give the same run.
 
         Args:
-            unit: what it is about.
-            attempt: how often the unit has been submitted before.
+            requests: what each run is about, and how often the unit has been submitted before.
 
         Returns:
-            The run.
+            The runs, in the order of the requests.
         """
         ...
 
@@ -82,6 +81,15 @@ class ChildRuns(Protocol):
         """
         ...
 
+    def read_event_delay(self) -> float:
+        """Measures how far the server is behind with the events that it has received, heartbeats among them.
+
+        Returns:
+            Seconds since the newest event that can be read, by the server's clock. The parent itself sends a heartbeat
+            every thirty seconds, so that a server that keeps up is less than that behind.
+        """
+        ...
+
     def read_stages(self, ids: Sequence[str]) -> Mapping[str, str]:
         """Reads which stage runs are in.
 
@@ -102,13 +110,14 @@ class ChildRuns(Protocol):
         """
         ...
 
-    def read_outcome(self, run: ChildRun) -> dict[str, Any] | None:
-        """Reads how a run ended, as the run itself has left it.
+    def read_outcomes(self, ids: Sequence[str]) -> Mapping[str, dict[str, Any]]:
+        """Reads how runs ended, as the runs themselves have left it.
 
         Args:
-            run: the run.
+            ids: of the runs.
 
         Returns:
-            What :func:`flows.reconstruction.outcome_artifact.publish_outcome` wrote; ``None`` if it wrote nothing.
+            By id, what :func:`flows.reconstruction.outcome_artifact.publish_outcome` wrote; nothing for a run that
+            wrote nothing.
         """
         ...

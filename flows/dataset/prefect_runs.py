@@ -5,8 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from email.utils import parsedate_to_datetime
 from typing import Any
 from uuid import UUID
 
@@ -23,7 +25,7 @@ from prefect.client.schemas.filters import (
     TaskRunFilterState,
     TaskRunFilterStateType,
 )
-from prefect.client.schemas.objects import FlowRun, StateType
+from prefect.client.schemas.objects import Artifact, FlowRun, StateType
 from prefect.client.schemas.sorting import FlowRunSort
 from prefect.events.filters import EventFilter, EventNameFilter, EventOccurredFilter, EventOrder, EventResourceFilter
 from prefect.states import Crashed
@@ -43,6 +45,10 @@ HEARTBEAT_EVENT = "prefect.flow-run.heartbeat"
 _RUNS_PER_REQUEST = 200
 _EVENTS_PER_REQUEST = 50
 _DAYS = 7
+# A run that was tried again within itself has left several.
+_OUTCOMES_PER_REQUEST = 50
+_SUBMITTED_AT_ONCE = 8
+_RUN_RESOURCE = "prefect.flow-run."
 
 
 @dataclass(frozen=True)
@@ -83,8 +89,13 @@ class PrefectRuns:
         runs = [self._read(run) for run in self._page(tags) if read_unit(run.tags) is not None]
         return [run for run in runs if run.is_ours or run.state in ACTIVE_STATES]
 
-    def submit(self, unit: WorkUnit, attempt: int) -> ChildRun:
-        """Submits a run; the same unit and attempt give the same run."""
+    def submit(self, requests: Sequence[tuple[WorkUnit, int]]) -> Sequence[ChildRun]:
+        """Submits runs, several at a time; the same unit and attempt give the same run."""
+        # One after another, a busy server that takes a second for a request would leave a hundred workers idle.
+        with ThreadPoolExecutor(_SUBMITTED_AT_ONCE) as threads:
+            return list(threads.map(self._submit, *zip(*requests, strict=True)))
+
+    def _submit(self, unit: WorkUnit, attempt: int) -> ChildRun:
         chunks = None if unit.chunk is None else [unit.chunk]
         environment = {DATASET_VARIABLE: self._request.dataset, "PREFECT_FLOWS_HEARTBEAT_FREQUENCY": str(HEARTBEAT_S)}
         if self._request.gpu_limit is not None:
@@ -116,8 +127,29 @@ class PrefectRuns:
     def read_heartbeats(self, ids: Sequence[str]) -> Mapping[str, str]:
         """Reads when runs have last shown that they are alive."""
         # By their number and not by their times, which jump with the worker's clock.
-        counts = {id_: count_heartbeats(self._client, id_) for id_ in ids}
-        return {id_: str(count) for id_, count in counts.items() if count}
+        found: dict[str, str] = {}
+        for some in _split(ids, _RUNS_PER_REQUEST):
+            body = {"filter": _heartbeats_of(some).model_dump(mode="json", exclude_unset=True)}
+            # Prefect's client has no function for it.
+            response = call_server(
+                self._client.request,
+                "POST",
+                "/events/count-by/{countable}",
+                path_params={"countable": "resource"},
+                json=body,
+            )
+            for entry in response.json():
+                found[entry["value"].removeprefix(_RUN_RESOURCE)] = str(entry["count"])
+        return found
+
+    def read_event_delay(self) -> float:
+        """Measures how far the server is behind with the events that it has received."""
+        body = {"filter": _any_event().model_dump(mode="json", exclude_unset=True), "limit": _EVENTS_PER_REQUEST}
+        response = call_server(self._client.request, "POST", "/events/filter", json=body)
+        # Both times are the server's: its answers name the time in their header.
+        now = parsedate_to_datetime(response.headers["date"])
+        received = [datetime.fromisoformat(event["received"]) for event in response.json()["events"]]
+        return (now - max(received)).total_seconds() if received else 0.0
 
     def read_stages(self, ids: Sequence[str]) -> Mapping[str, str]:
         """Reads which stage runs are in."""
@@ -139,18 +171,18 @@ class PrefectRuns:
             # Forced: the rules of states would let a run that is being cancelled stay as it is.
             call_server(self._client.set_flow_run_state, UUID(run.id), Crashed(message=reason), force=True)
 
-    def read_outcome(self, run: ChildRun) -> dict[str, Any] | None:
-        """Reads how a run ended, as the run itself has left it."""
-        wanted = ArtifactFilter(
-            flow_run_id=ArtifactFilterFlowRunId(any_=[UUID(run.id)]),
-            key=ArtifactFilterKey(any_=[OUTCOME_KEY]),
-        )
-        artifacts = call_server(self._client.read_artifacts, artifact_filter=wanted)
-        if not artifacts:
-            return None
-        newest = max(artifacts, key=lambda artifact: str(artifact.created))
-        row: dict[str, Any] = json.loads(str(newest.data))[0]
-        return row
+    def read_outcomes(self, ids: Sequence[str]) -> Mapping[str, dict[str, Any]]:
+        """Reads how runs ended, as the runs themselves have left it."""
+        newest: dict[str, Artifact] = {}
+        for some in _split(ids, _OUTCOMES_PER_REQUEST):
+            wanted = ArtifactFilter(
+                flow_run_id=ArtifactFilterFlowRunId(any_=[UUID(id_) for id_ in some]),
+                key=ArtifactFilterKey(any_=[OUTCOME_KEY]),
+            )
+            artifacts = call_server(self._client.read_artifacts, artifact_filter=wanted, limit=_RUNS_PER_REQUEST)
+            for artifact in sorted(artifacts, key=lambda artifact: str(artifact.created)):
+                newest[str(artifact.flow_run_id)] = artifact
+        return {id_: json.loads(str(artifact.data))[0] for id_, artifact in newest.items()}
 
     @property
     def _parent_tag(self) -> str:
@@ -232,7 +264,7 @@ def has_heartbeat(client: SyncPrefectClient, run_id: str, since_s: float) -> boo
         Whether there is one.
     """
     earliest = datetime.now(UTC) - timedelta(seconds=since_s)
-    page = call_server(client.read_events, _heartbeats_of(run_id), limit=_EVENTS_PER_REQUEST)
+    page = call_server(client.read_events, _heartbeats_of([run_id]), limit=_EVENTS_PER_REQUEST)
     # The time of the event itself is the worker's, whose clock may be wrong.
     return any(event.received >= earliest for event in page.events)
 
@@ -247,18 +279,24 @@ def count_heartbeats(client: SyncPrefectClient, run_id: str) -> int:
     Returns:
         Their number.
     """
-    return int(call_server(client.read_events, _heartbeats_of(run_id), limit=1).total)
+    return int(call_server(client.read_events, _heartbeats_of([run_id]), limit=1).total)
 
 
-def _heartbeats_of(run_id: str) -> EventFilter:
+def _heartbeats_of(run_ids: Sequence[str]) -> EventFilter:
     now = datetime.now(UTC)
     return EventFilter(
         event=EventNameFilter(name=[HEARTBEAT_EVENT]),
-        resource=EventResourceFilter(id=[f"prefect.flow-run.{run_id}"]),
+        resource=EventResourceFilter(id=[f"{_RUN_RESOURCE}{run_id}" for run_id in run_ids]),
         # Far enough for any worker's clock.
         occurred=EventOccurredFilter(since=now - timedelta(days=_DAYS), until=now + timedelta(days=_DAYS)),
         order=EventOrder.DESC,
     )
+
+
+def _any_event() -> EventFilter:
+    now = datetime.now(UTC)
+    occurred = EventOccurredFilter(since=now - timedelta(days=_DAYS), until=now + timedelta(days=_DAYS))
+    return EventFilter(occurred=occurred, order=EventOrder.DESC)
 
 
 def _split(ids: Sequence[str], size: int) -> Iterator[Sequence[str]]:

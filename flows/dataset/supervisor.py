@@ -19,6 +19,8 @@ SILENT_VARIABLE = "GENRE_SILENT_SECONDS"
 """The variable of the environment for :attr:`SupervisionLimits.silent_s`."""
 HEARTBEAT_S = 30
 """Seconds between two heartbeats of a child run."""
+# As a multiple of the seconds that a run may be silent.
+_MOST_DELAY = 10.0
 Rows = list[dict[str, Any]]
 _STATUS_BY_STATE = {"SCHEDULED": "waiting", "PENDING": "starting", "RUNNING": "running", SILENT: "running"}
 # States in which a living run sends heartbeats.
@@ -188,15 +190,17 @@ class Supervisor:
                 self._state.waiting.append(unit)
             else:
                 self._watch(run_found)
-        for watch in list(self._state.watches.values()):
-            self._judge(watch)
+        self._judge(list(self._state.watches.values()))
 
     def _submit(self) -> None:
-        while self._state.waiting and len(self._state.watches) < self._limits.in_flight:
+        requests: list[tuple[WorkUnit, int]] = []
+        while self._state.waiting and len(self._state.watches) + len(requests) < self._limits.in_flight:
             unit = self._state.waiting.popleft()
-            attempt = self._state.attempts.get(unit, 0)
-            self._state.attempts[unit] = attempt + 1
-            self._watch(self._runs.submit(unit, attempt))
+            requests.append((unit, self._state.attempts.get(unit, 0)))
+            self._state.attempts[unit] = requests[-1][1] + 1
+        if requests:
+            for run in self._runs.submit(requests):
+                self._watch(run)
 
     def _watch(self, run: ChildRun) -> None:
         self._state.watches[run.id] = _Watch(run, self._clock())
@@ -220,7 +224,7 @@ class Supervisor:
                 watch.since_s = now
             watch.run = run
             self._update_row(run)
-            self._judge(watch)
+        self._judge(list(self._state.watches.values()))
         self._read_signs_of_life()
         self._last_poll_s = self._clock()
 
@@ -239,31 +243,48 @@ class Supervisor:
                 running[id_].heartbeat = heartbeat
                 running[id_].since_s = self._clock()
 
-    def _judge(self, watch: _Watch) -> None:
-        """Ends the watch of a run that has ended, or is dead."""
-        run = watch.run
-        if run.state == "PENDING" and self._age(watch) > self._limits.pending_s:
-            self._free(watch, f"not started within {self._limits.pending_s:.0f} s")
-        elif run.state in _SENDING and self._age(watch) > self._limits.silent_s:
-            self._free(watch, f"no heartbeat for {self._limits.silent_s:.0f} s")
-        elif run.state not in ACTIVE_STATES:
-            self._end(watch)
+    def _judge(self, watches: Sequence[_Watch]) -> None:
+        """Ends the watches of runs that have ended, or are dead."""
+        ended: list[_Watch] = []
+        for watch in watches:
+            run = watch.run
+            if run.state == "PENDING" and self._age(watch) > self._limits.pending_s:
+                is_ended = self._free(watch, f"not started within {self._limits.pending_s:.0f} s")
+            elif run.state in _SENDING and self._is_silent(watch):
+                is_ended = self._free(watch, f"no heartbeat for {self._limits.silent_s:.0f} s")
+            else:
+                is_ended = run.state not in ACTIVE_STATES
+            if is_ended:
+                ended.append(watch)
+        # All at once: a hundred workers may end their logs at the same moment.
+        outcomes = self._runs.read_outcomes([watch.run.id for watch in ended]) if ended else {}
+        for watch in ended:
+            self._end(watch, outcomes.get(watch.run.id))
+
+    def _is_silent(self, watch: _Watch) -> bool:
+        age_s = self._age(watch)
+        if age_s <= self._limits.silent_s:
+            return False
+        # A busy server is minutes behind with heartbeats that it has received: their runs are alive.
+        delay_s = self._runs.read_event_delay() - HEARTBEAT_S
+        # Bounded, as a parent whose own heartbeats are lost would wait for ever.
+        return age_s > self._limits.silent_s + min(max(delay_s, 0.0), _MOST_DELAY * self._limits.silent_s)
 
     def _age(self, watch: _Watch) -> float:
         return self._clock() - watch.since_s
 
-    def _free(self, watch: _Watch, reason: str) -> None:
+    def _free(self, watch: _Watch, reason: str) -> bool:
+        """Sets a dead run to Crashed; whether it has ended."""
         self._runs.crash(watch.run, reason)
         # It may have ended just before: then that is how it ended.
         run = self._runs.read([watch.run.id]).get(watch.run.id)
         if run is None or run.state in ACTIVE_STATES:
             # The server does not take the state yet; the next poll tries again.
-            return
+            return False
         watch.run = run
-        self._end(watch)
+        return True
 
-    def _end(self, watch: _Watch) -> None:
-        outcome = self._runs.read_outcome(watch.run)
+    def _end(self, watch: _Watch, outcome: dict[str, Any] | None) -> None:
         if watch.run.state == "CANCELLED":
             self._finish(watch, {"status": "failed", "why": "cancelled"})
         elif watch.run.state == "CRASHED" or outcome is None or outcome["is_passing"]:

@@ -15,6 +15,14 @@ HEARTBEAT_SECONDS = 30
 _QUIET = {"DO_NOT_TRACK": "1", "PREFECT_SERVER_ANALYTICS_ENABLED": "false"}
 LEASE_STORAGE = "prefect.server.concurrency.lease_storage.filesystem"
 """Where a server remembers who has slots of concurrency limits: files, as memory is lost with the process."""
+EVENT_SETTINGS = {
+    "PREFECT_SERVER_SERVICES_TASK_RUN_RECORDER_BATCH_SIZE": "100",
+    "PREFECT_SERVER_SERVICES_TASK_RUN_RECORDER_FLUSH_INTERVAL": "1",
+    "PREFECT_SERVER_SERVICES_EVENT_PERSISTER_BATCH_SIZE": "200",
+    "PREFECT_SERVER_SERVICES_EVENT_PERSISTER_FLUSH_INTERVAL": "1",
+}
+"""How many events a server writes at once. By default it writes each state of a task in a transaction of its own, and
+falls minutes behind with fifty workers."""
 _PREFECT = [sys.executable, "-m", "prefect"]
 
 
@@ -64,7 +72,7 @@ class PrefectServer(Service):
 
     def environment(self) -> dict[str, str]:
         """Returns database, secret and home of the server."""
-        variables = {**_QUIET, "PREFECT_HOME": str(self.folder / "home"), "PREFECT_API_URL": self.url}
+        variables = {**_QUIET, **EVENT_SETTINGS, "PREFECT_HOME": str(self.folder / "home"), "PREFECT_API_URL": self.url}
         # The database counts the slots: without their leases, a server that was killed would never take them back.
         variables["PREFECT_SERVER_CONCURRENCY_LEASE_STORAGE"] = LEASE_STORAGE
         if self.database_url:

@@ -19,10 +19,12 @@ from uuid import uuid4
 
 import pytest
 import yaml
+from prefect.settings.models.server.services import ServerServicesSettings
 
 from flows.operations import ObjectServer, PostgresServer, PrefectServer, Service, Worker
 from flows.operations import postgres_server as postgres_module
 from flows.operations.deployments import DEPLOYMENTS, RUN_QUEUE
+from flows.operations.prefect_services import EVENT_SETTINGS
 from flows.operations.service import find_free_port, keep_port, keep_secret
 from flows.operations.stack import Stack, describe_services, stop_stack
 from flows.operations.state_file import ServiceRecord, read_records, read_start_ticks, write_records
@@ -108,6 +110,18 @@ def test_a_killed_server_remembers_who_has_slots(tmp_path: Path) -> None:
     assert server["environment"][name] == module
     # Files outside of a volume would be lost with the container.
     assert f"server:{server['environment']['PREFECT_HOME']}" in server["volumes"]
+
+
+def test_every_server_writes_events_in_batches(tmp_path: Path) -> None:
+    environment = PrefectServer(tmp_path).environment()
+    server = yaml.safe_load((small_run.ROOT / "docker-compose.yml").read_text())["services"]["server"]["environment"]
+    assert EVENT_SETTINGS.items() <= environment.items()
+    assert EVENT_SETTINGS.items() <= server.items()
+    # Names that Prefect does not know would change nothing.
+    services = ServerServicesSettings().model_dump()
+    for name in EVENT_SETTINGS:
+        group = "task_run_recorder" if "TASK_RUN_RECORDER" in name else "event_persister"
+        assert name.removeprefix(f"PREFECT_SERVER_SERVICES_{group.upper()}_").lower() in services[group]
 
 
 def test_a_reused_process_id_is_not_taken_for_the_service(tmp_path: Path) -> None:

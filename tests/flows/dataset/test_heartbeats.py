@@ -19,6 +19,7 @@ class FakeClient:
 
     def __init__(self) -> None:
         self.events: list[SimpleNamespace] = []
+        self.count_requests = 0
 
     def read_deployment_by_name(self, name: str) -> SimpleNamespace:
         return SimpleNamespace(name=name)
@@ -26,6 +27,12 @@ class FakeClient:
     def read_events(self, wanted: Any, limit: int) -> SimpleNamespace:
         newest = sorted(self.events, key=lambda event: event.occurred, reverse=True)
         return SimpleNamespace(events=newest[:limit], total=len(newest))
+
+    def request(self, method: str, path: str, path_params: dict[str, str], json: dict[str, Any]) -> SimpleNamespace:
+        assert path.format(**path_params) == "/events/count-by/resource"
+        self.count_requests += 1
+        counts = [{"value": id_, "count": len(self.events)} for id_ in json["filter"]["resource"]["id"]]
+        return SimpleNamespace(json=lambda: counts if self.events else [])
 
     def send(self, age_s: float, shift_s: float = 0.0) -> None:
         received = datetime.now(UTC) - timedelta(seconds=age_s)
@@ -41,6 +48,29 @@ def test_every_heartbeat_is_noticed_also_when_the_clock_jumps_back() -> None:
         client.send(60.0, shift_s)
         found.append(runs.read_heartbeats(["a"])["a"])
     assert len(set(found)) == len(found)
+
+
+def test_heartbeats_of_many_runs_are_read_by_one_request() -> None:
+    client = FakeClient()
+    client.send(60.0)
+    runs = PrefectRuns(ChildRequest("d", "p", "pool", {}), client)  # type: ignore[arg-type]
+    ids = [str(uuid4()) for _ in range(150)]
+    assert runs.read_heartbeats(ids) == dict.fromkeys(ids, "1")
+    assert client.count_requests == 1
+
+
+def test_the_delay_of_events_is_by_the_servers_clock() -> None:
+    client = FakeClient()
+    runs = PrefectRuns(ChildRequest("d", "p", "pool", {}), client)  # type: ignore[arg-type]
+    events = [{"received": "2020-01-01T00:00:10Z"}, {"received": "2020-01-01T00:00:00Z"}]
+    answer = SimpleNamespace(
+        headers={"date": "Wed, 01 Jan 2020 00:01:40 GMT"},
+        json=lambda: {"events": events},
+    )
+    client.request = lambda *args, **kwargs: answer  # type: ignore[method-assign]
+    assert runs.read_event_delay() == 90.0
+    events.clear()
+    assert runs.read_event_delay() == 0.0
 
 
 def test_a_run_is_alive_by_the_time_of_receipt() -> None:

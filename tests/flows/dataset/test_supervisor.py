@@ -31,12 +31,17 @@ class FakeRuns:
         self.submitted: list[tuple[WorkUnit, int]] = []
         self.crashed: list[str] = []
         self.most_active = 0
+        self.outcome_requests = 0
+        self.event_delay_s = 5.0
         self.now_s = 0.0
 
     def find(self) -> list[ChildRun]:
         return list(self.runs.values())
 
-    def submit(self, unit: WorkUnit, attempt: int) -> ChildRun:
+    def submit(self, requests: Sequence[tuple[WorkUnit, int]]) -> Sequence[ChildRun]:
+        return [self._submit(unit, attempt) for unit, attempt in requests]
+
+    def _submit(self, unit: WorkUnit, attempt: int) -> ChildRun:
         id_ = f"{unit.log}/{attempt}"
         assert not [run for run in self.runs.values() if run.unit == unit and run.state in ACTIVE_STATES]
         self.submitted.append((unit, attempt))
@@ -60,6 +65,9 @@ class FakeRuns:
     def read_heartbeats(self, ids: Sequence[str]) -> Mapping[str, str]:
         return {id_: str(self.now_s) for id_ in ids if id_ in self.beating}
 
+    def read_event_delay(self) -> float:
+        return self.event_delay_s
+
     def read_stages(self, ids: Sequence[str]) -> Mapping[str, str]:
         return dict.fromkeys(ids, "gnet · chunk 0")
 
@@ -67,8 +75,10 @@ class FakeRuns:
         self.crashed.append(run.id)
         self.runs[run.id] = replace(run, state="CRASHED", message=reason)
 
-    def read_outcome(self, run: ChildRun) -> dict[str, Any] | None:
-        return self.outcomes.get(run.id, DONE if run.state == "COMPLETED" else None)
+    def read_outcomes(self, ids: Sequence[str]) -> Mapping[str, dict[str, Any]]:
+        self.outcome_requests += 1
+        found = {id_: self.outcomes.get(id_, DONE if self.runs[id_].state == "COMPLETED" else None) for id_ in ids}
+        return {id_: outcome for id_, outcome in found.items() if outcome is not None}
 
 
 def supervise(
@@ -205,3 +215,30 @@ def test_the_environment_changes_when_a_run_counts_as_dead() -> None:
 def test_a_wrong_time_in_the_environment_is_an_error(name: str, value: str) -> None:
     with pytest.raises(ConfigError, match=name):
         read_limits(8, 3, {name: value})
+
+
+def test_runs_that_end_together_are_read_by_one_request() -> None:
+    units = [WorkUnit(f"log-{number}") for number in range(40)]
+    runs = FakeRuns({unit: [["PENDING", "RUNNING", "COMPLETED"]] for unit in units})
+    rows = supervise(runs, units, replace(LIMITS, in_flight=40))
+    assert {row["status"] for row in rows} == {"done"}
+    assert runs.outcome_requests == 1
+
+
+@pytest.mark.parametrize(("delay_s", "crashes"), [(5.0, 1), (300.0, 0)])
+def test_a_server_that_is_behind_with_heartbeats_is_no_dead_run(delay_s: float, crashes: int) -> None:
+    unit = WorkUnit("log-0")
+    polls = round((LIMITS.silent_s + 60) / LIMITS.poll_s)
+    runs = FakeRuns({unit: [["RUNNING"] * polls + ["COMPLETED"], ["COMPLETED"]]})
+    runs.event_delay_s = delay_s
+    assert supervise(runs, [unit])[0]["status"] == "done"
+    assert len(runs.crashed) == crashes
+
+
+def test_a_delay_does_not_keep_a_dead_run_for_ever() -> None:
+    unit = WorkUnit("log-0")
+    limits = replace(LIMITS, silent_s=20.0)
+    runs = FakeRuns({unit: [["RUNNING"], ["COMPLETED"]]})
+    runs.event_delay_s = 1e6
+    assert supervise(runs, [unit], limits)[0]["status"] == "done"
+    assert len(runs.crashed) == 1
