@@ -8,6 +8,8 @@ import pytest
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("DO_NOT_TRACK", "1")
+# A server of gRPC in this process would break programs that tests start, such as the encoder of films.
+os.environ.setdefault("GRPC_ENABLE_FORK_SUPPORT", "false")
 os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
 
 # Doctests are collected from every module, and several conftest.py of one name cannot be imported as modules.

@@ -30,9 +30,12 @@ from flows.dataset.prefect_runs import ChildRequest, PrefectRuns
 from flows.dataset.supervisor import SupervisionLimits, Supervisor
 from flows.dataset.work_units import WorkUnit
 
+# The servers without workers, whose load every later number includes.
 _BASE_S = 10.0
 _DELAY_EVERY_S = 10.0
+# Two polls of every worker.
 _IDLE_S = 20.0
+# The server records task runs after the dataset has ended, as far as it is behind.
 _DRAIN_S = 120.0
 # More than the workers: a worker that ends a log finds the next one waiting.
 _IN_FLIGHT_PER_WORKER = 1.25
@@ -85,6 +88,7 @@ def _run_cluster(
         idle = _sample_during(services, _IDLE_S)
         sampler = LoadSampler(services.pids())
         before = read_database(services.postgres.url)
+        # The requests of the start belong to no log.
         meter.api.clear()
         sampler.start()
         start = sampler.sample()

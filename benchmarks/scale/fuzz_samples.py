@@ -17,6 +17,7 @@ KEY = "5f41c0de"
 
 def make_picture(width: int = 48, height: int = 32) -> np.ndarray[Any, np.dtype[np.uint8]]:
     """Makes an image [H, W, 3] with edges and slopes."""
+    # No plain colour: decoders have short cuts for it, and damage would hit nothing.
     rows, columns = np.mgrid[0:height, 0:width]
     image = np.stack([rows * 5 % 256, columns * 3 % 256, (rows * columns) % 256], axis=2)
     return image.astype(np.uint8)

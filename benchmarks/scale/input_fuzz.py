@@ -49,6 +49,7 @@ def measure_input_fuzz(inputs: int, seed: int) -> dict[str, Any]:
     begin_s = time.perf_counter()
     with tempfile.TemporaryDirectory() as name:
         made = FuzzInputs(seed, inputs, Path(name))
+        # Worked out here, as a process that dies cannot say what it was reading.
         targets = [made.target(index) for index in range(inputs)]
     formats: dict[str, Counter[str]] = {target.format: Counter() for target in targets}
     longest = dict.fromkeys(formats, 0.0)

@@ -61,6 +61,7 @@ class LoadSampler:
 
     def start(self) -> None:
         """Starts to sample."""
+        # A daemon: a benchmark that fails must not wait for it.
         self._thread = threading.Thread(target=self._run, name="load", daemon=True)
         self._thread.start()
 

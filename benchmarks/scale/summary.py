@@ -13,8 +13,9 @@ from benchmarks.scale.simulated_stages import count_artifacts
 
 POLL_S = 10.0
 """Seconds between two polls of a worker, as Prefect's default has it."""
+# Latencies over time: enough parts to see them grow, and enough requests in each.
 _PARTS = 6
-# A process of Python runs on one core; at nine tenths of it, requests wait.
+# A process of Python runs on one core; well before it is full, requests wait.
 _BUSY_CORE = 0.85
 _FREE_CORE = 0.15
 Row = dict[str, Any]

@@ -54,6 +54,9 @@ _BENCHES: dict[str, BenchEntry] = {
     "raster": BenchEntry(
         "benchmarks.raster:BENCH", "the renderer's speed against gsplat's torch reference and the machine's limits"
     ),
+    "scale": BenchEntry(
+        "benchmarks.scale:BENCH", "workers, orchestration, the store on S3, a simulated cluster, and damaged files"
+    ),
     "simulation": BenchEntry(
         "benchmarks.simulation:BENCH", "other behaviours and edited traffic against the truth; speed and hand-over"
     ),

@@ -167,6 +167,8 @@ class Worker(Service):
             "PREFECT_LOGGING_TO_API_ENABLED": "true",
             "PREFECT_LOGGING_LEVEL": "INFO",
             "OMP_WAIT_POLICY": "PASSIVE",
+            # A worker of one run at a time asks for the next one only so often.
+            "PREFECT_WORKER_QUERY_SECONDS": "2",
             **self.client_env,
         }
 
