@@ -115,7 +115,8 @@ class Scale:
         cluster = wanted.get("cluster", {}).get("stages", {})
         # Counted in the store: a stage that two workers computed has two manifests, or one that was refused.
         for name in ("lost", "doubled"):
-            yield claim(f"scale.cluster_{name}", _as_float(cluster.get(name)), "<=", 0.0, "stages", "logs on a simulated cluster")
+            measured = _as_float(cluster.get(name))
+            yield claim(f"scale.cluster_{name}", measured, "<=", 0.0, "stages", "logs on a simulated cluster")
         findings = None if "fuzz" not in wanted else float(len(wanted["fuzz"]["findings"]))
         yield claim("scale.fuzz_findings", findings, "<=", 0.0, "inputs", "damaged and harmful files of all formats")
 
