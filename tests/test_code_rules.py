@@ -15,7 +15,7 @@ MAY_IMPORT_PICKLE = {
     # Its names of opcodes: the writer of PandaSet's layout emits them, and loads nothing.
     "genre_tasks/logs/pandaset/pickle_writer.py",
     # It writes pickles that would run code, for the readers to refuse.
-    "benchmarks/scale/fuzz_attacks.py",
+    "benchmarks/fuzz/fuzz_attacks.py",
 }
 MAY_LOAD_TORCH_SCRIPT = {
     # FID's and LPIPS's networks exist as TorchScript alone; it is a language without files and processes.

@@ -21,6 +21,7 @@ from benchmarks.common.bench import (
     split_option,
 )
 from benchmarks.common.claims import Claim, claim
+from benchmarks.fuzz.input_fuzz import FINDINGS, measure_input_fuzz
 from benchmarks.scale.cluster import measure_cluster
 from benchmarks.scale.datasets import (
     measure_cached_logs,
@@ -28,7 +29,6 @@ from benchmarks.scale.datasets import (
     measure_orchestration,
     measure_throughput,
 )
-from benchmarks.scale.input_fuzz import FINDINGS, measure_input_fuzz
 
 _TINY_STREET = "&width=64&height=36&samples=1&frames=8&cameras=1&lidar_beams=32&lidar_azimuths=300"
 
@@ -49,6 +49,7 @@ class Scale:
     }
     code: tuple[str, ...] = (
         "benchmarks.scale",
+        "benchmarks.fuzz.fuzz_worker",
         "flows.dataset.flow",
         "flows.reconstruction.flow",
         "flows.operations",

@@ -8,10 +8,10 @@ import sys
 import time
 from pathlib import Path
 
-from benchmarks.scale import fuzz_inputs, fuzz_worker
-from benchmarks.scale.fuzz_attacks import CANARY
-from benchmarks.scale.fuzz_mutations import keep
-from benchmarks.scale.fuzz_target import FuzzTarget, WrongReadError, give_samples
+from benchmarks.fuzz import fuzz_inputs, fuzz_worker
+from benchmarks.fuzz.fuzz_attacks import CANARY
+from benchmarks.fuzz.fuzz_mutations import keep
+from benchmarks.fuzz.fuzz_target import FuzzTarget, WrongReadError, give_samples
 from genre_tasks.errors import InputError
 
 SECONDS = 2

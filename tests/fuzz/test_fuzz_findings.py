@@ -20,8 +20,8 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from benchmarks.scale import fuzz_samples
-from benchmarks.scale.fuzz_samples import make_picture
+from benchmarks.fuzz import fuzz_samples
+from benchmarks.fuzz.fuzz_samples import make_picture
 from flows.budget.cost_table import find_shipped_table, load_cost_table
 from flows.simulation.path_file import read_path_file
 from flows.training.checkpoint import describe

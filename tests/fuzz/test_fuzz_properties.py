@@ -9,9 +9,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from benchmarks.scale.fuzz_formats import list_targets
-from benchmarks.scale.fuzz_mutations import BYTES
-from benchmarks.scale.fuzz_target import FuzzTarget
+from benchmarks.fuzz.fuzz_formats import list_targets
+from benchmarks.fuzz.fuzz_mutations import BYTES
+from benchmarks.fuzz.fuzz_target import FuzzTarget
 from genre_tasks.errors import GenreError
 
 # Processes of their own and bombs are left to the engine, which bounds time and memory.

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.scale import fuzz_inputs, input_fuzz
-from benchmarks.scale.input_fuzz import FINDINGS, OUTCOMES, make_input, measure_input_fuzz
+from benchmarks.fuzz import fuzz_inputs, input_fuzz
+from benchmarks.fuzz.input_fuzz import FINDINGS, OUTCOMES, make_input, measure_input_fuzz
 from tests.fuzz import planted_worker
 
 INPUTS = 10_000

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.scale.fuzz_mutations import Mutation
+from benchmarks.fuzz.fuzz_mutations import Mutation
 
 MEMORY_MIB = 256
 """Reading a small file may add so much to the process's memory at most."""

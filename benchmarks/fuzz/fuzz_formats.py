@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from benchmarks.scale import fuzz_log_formats, fuzz_store_formats
-from benchmarks.scale.fuzz_target import FuzzTarget
+from benchmarks.fuzz import fuzz_log_formats, fuzz_store_formats
+from benchmarks.fuzz.fuzz_target import FuzzTarget
 
 _GROUPS = (
     fuzz_log_formats.json_targets,

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from random import Random
 from typing import Any
 
-from benchmarks.scale.fuzz_mutations import INTEGERS, change_value, dump_json
+from benchmarks.fuzz.fuzz_mutations import INTEGERS, change_value, dump_json
 
 CANARY = "fuzz_canary"
 """Name of the file that code in an input would write into the current folder."""

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.scale import fuzz_attacks, fuzz_samples
-from benchmarks.scale.fuzz_mutations import BYTES, JSON, TEXT
-from benchmarks.scale.fuzz_target import IMAGE_MEMORY_MIB, FuzzTarget, give_samples, require_sound
+from benchmarks.fuzz import fuzz_attacks, fuzz_samples
+from benchmarks.fuzz.fuzz_mutations import BYTES, JSON, TEXT
+from benchmarks.fuzz.fuzz_target import IMAGE_MEMORY_MIB, FuzzTarget, give_samples, require_sound
 
 
 def json_targets() -> Iterator[FuzzTarget]:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from random import Random
 
-from benchmarks.scale.fuzz_formats import list_targets
-from benchmarks.scale.fuzz_mutations import keep
-from benchmarks.scale.fuzz_target import FuzzTarget
+from benchmarks.fuzz.fuzz_formats import list_targets
+from benchmarks.fuzz.fuzz_mutations import keep
+from benchmarks.fuzz.fuzz_target import FuzzTarget
 
 UNCHANGED_EVERY = 40
 """One input in so many of a target is a valid file, which must be read."""

@@ -1,6 +1,6 @@
 """The process that reads damaged files: it reports every input, so that its death or silence says which one it was.
 
-python -m benchmarks.scale.fuzz_worker SEED START STOP COUNT writes a line of JSON before and after each input.
+python -m benchmarks.fuzz.fuzz_worker SEED START STOP COUNT writes a line of JSON before and after each input.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from benchmarks.scale.fuzz_attacks import CANARY
-from benchmarks.scale.fuzz_inputs import FuzzInputs
-from benchmarks.scale.fuzz_target import FuzzTarget, WrongReadError
+from benchmarks.fuzz.fuzz_attacks import CANARY
+from benchmarks.fuzz.fuzz_inputs import FuzzInputs
+from benchmarks.fuzz.fuzz_target import FuzzTarget, WrongReadError
 
 SECONDS = 30
 """An input that takes longer hangs."""

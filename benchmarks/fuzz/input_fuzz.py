@@ -26,7 +26,7 @@ OUTCOMES = (READ, REFUSED, *FINDINGS)
 """All that can become of an input."""
 
 _ROOT = Path(__file__).resolve().parents[2]
-_MODULE = "benchmarks.scale.fuzz_worker"
+_MODULE = "benchmarks.fuzz.fuzz_worker"
 
 
 def measure_input_fuzz(inputs: int, seed: int) -> dict[str, Any]:
@@ -44,7 +44,7 @@ def measure_input_fuzz(inputs: int, seed: int) -> dict[str, Any]:
         ``memory_mib`` of an input, by format); ``findings`` (rows with ``index``, ``format``, ``reader``, ``damage``,
         ``outcome`` and ``detail``). :func:`make_input` writes the file of an index again.
     """
-    from benchmarks.scale.fuzz_inputs import FuzzInputs
+    from benchmarks.fuzz.fuzz_inputs import FuzzInputs
 
     begin_s = time.perf_counter()
     with tempfile.TemporaryDirectory() as name:
@@ -90,7 +90,7 @@ def make_input(inputs: int, seed: int, index: int, folder: Path) -> Path:
     Returns:
         The damaged file.
     """
-    from benchmarks.scale.fuzz_inputs import FuzzInputs
+    from benchmarks.fuzz.fuzz_inputs import FuzzInputs
 
     return FuzzInputs(seed, inputs, folder).write(index)[1]
 

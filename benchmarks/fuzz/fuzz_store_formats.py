@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.scale import fuzz_attacks, fuzz_samples, fuzz_table_attacks
-from benchmarks.scale.fuzz_mutations import BYTES, JSON, TEXT, change_json
-from benchmarks.scale.fuzz_target import LARGE_TABLE_MEMORY_MIB, FuzzTarget, give_samples, require_sound
+from benchmarks.fuzz import fuzz_attacks, fuzz_samples, fuzz_table_attacks
+from benchmarks.fuzz.fuzz_mutations import BYTES, JSON, TEXT, change_json
+from benchmarks.fuzz.fuzz_target import LARGE_TABLE_MEMORY_MIB, FuzzTarget, give_samples, require_sound
 
 
 def _prepare_artifact(kind: str, file: str, folder: Path) -> list[bytes]:

@@ -1,0 +1,1 @@
+"""Damaged and harmful files of every format, fed to the readers of the project."""
