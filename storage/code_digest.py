@@ -13,6 +13,7 @@ from pathlib import Path
 
 from genre_tasks.code_closure import import_closure
 from genre_tasks.source_code import read_source
+from storage.known_sources import remembered_sources
 
 NUMERIC_PACKAGES = {
     "torch": "torch",
@@ -58,12 +59,13 @@ def code_digest(module: str, lazy_modules: Sequence[str] = (), root: Path | None
 @lru_cache(maxsize=256)
 def _digest_closure(module: str, lazy_modules: tuple[str, ...], root: Path | None) -> str:
     base = (root or Path(__file__).resolve().parents[1]).absolute()
-    closure = import_closure(module, lazy_modules, base)
     digest = hashlib.sha256()
-    for name in sorted(closure.modules):
-        _update(digest, name, read_source(closure.modules[name], name).digest)
-    for path in closure.cpp_files:
-        _update(digest, path.relative_to(base).as_posix(), read_source(path).digest)
+    with remembered_sources():
+        closure = import_closure(module, lazy_modules, base)
+        for name in sorted(closure.modules):
+            _update(digest, name, read_source(closure.modules[name], name).digest)
+        for path in closure.cpp_files:
+            _update(digest, path.relative_to(base).as_posix(), read_source(path).digest)
     for name in sorted(closure.packages & set(NUMERIC_PACKAGES)):
         _update(digest, f"version of {NUMERIC_PACKAGES[name]}", _installed_version(NUMERIC_PACKAGES[name]))
     return digest.hexdigest()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import pytest
 
@@ -11,6 +12,8 @@ os.environ.setdefault("DO_NOT_TRACK", "1")
 # A server of gRPC in this process would break programs that tests start, such as the encoder of films.
 os.environ.setdefault("GRPC_ENABLE_FORK_SUPPORT", "false")
 os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
+# The user's own caches are none of the tests' business.
+os.environ.setdefault("GENRE_CACHE_DIR", str(Path(__file__).resolve().parents[1] / "build/tests/cache"))
 
 # Doctests are collected from every module, and several conftest.py of one name cannot be imported as modules.
 collect_ignore_glob = ["conftest.py", "*/conftest.py"]

@@ -12,11 +12,11 @@ from benchmarks.common.bench import Row
 from benchmarks.common.command import run_genre
 from benchmarks.common.timing import Quartiles, ratio
 from benchmarks.scale.deployment import (
-    Deployment,
     options_from_settings,
     read_compute_seconds,
     start_deployment,
 )
+from benchmarks.scale.worker_time import WorkerClock
 
 
 def measure_throughput(logs: Sequence[str], preset: str, settings: Sequence[str]) -> Row:
@@ -57,15 +57,16 @@ def measure_orchestration(log: str, preset: str, settings: Sequence[str]) -> Row
         settings: over it.
 
     Returns:
-        ``worker_s``, from the worker's taking the run to its end; ``compute_s``, of all stages; ``share``, of the
-        difference in the computation.
+        ``worker_s``, from the worker's taking the run to the end of its process; ``compute_s``, of all stages;
+        ``share``, of the difference in the computation.
     """
     options = options_from_settings(preset, settings)
     with start_deployment(workers=1) as deployment:
         store = deployment.folder / "store"
-        dataset = deployment.run_dataset([log], str(store), options)["dataset"]
+        with WorkerClock(deployment) as clock:
+            dataset = deployment.run_dataset([log], str(store), options)["dataset"]
         # A second run would mean that the first one died, and its time would be another one's.
-        (worker_s,) = _read_worker_seconds(deployment, dataset)
+        (worker_s,) = clock.read_seconds(dataset)
         compute_s = read_compute_seconds(store)
     return {"worker_s": worker_s, "compute_s": compute_s, "share": (worker_s - compute_s) / compute_s}
 
@@ -86,10 +87,11 @@ def measure_cached_logs(logs: Sequence[str], preset: str, settings: Sequence[str
     with start_deployment(workers=1) as deployment:
         store = str(deployment.folder / "store")
         dataset = deployment.run_dataset(logs, store, options)["dataset"]
-        for _ in range(rounds):
-            deployment.run_dataset(logs, store, options)
-        # The first runs computed; all later ones found every stage.
-        seconds = _read_worker_seconds(deployment, dataset)[len(logs) :]
+        # The first runs computed; all later ones find every stage.
+        with WorkerClock(deployment) as clock:
+            for _ in range(rounds):
+                deployment.run_dataset(logs, store, options)
+        seconds = clock.read_seconds(dataset)
     return {"seconds": Quartiles.from_values(seconds).as_row()}
 
 
@@ -123,16 +125,3 @@ def measure_object_store(log: str, preset: str, settings: Sequence[str], rounds:
         "s3_s": Quartiles.from_values(objects).as_row(),
         "ratio": ratio(objects, local).as_row(),
     }
-
-
-def _read_worker_seconds(deployment: Deployment, dataset: str) -> list[float]:
-    """From a worker's taking of a run until its end, for every run of a dataset's logs."""
-    found = []
-    with deployment.client() as client:
-        for run in deployment.read_child_runs(dataset):
-            states = client.read_flow_run_states(run.id)
-            # By the server's clock: a worker's slot is taken from its proposal of Pending on.
-            taken = min(state.timestamp for state in states if state.type.value == "PENDING")
-            ended = max(state.timestamp for state in states if state.type.value == "COMPLETED")
-            found.append((ended - taken).total_seconds())
-    return found

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +13,8 @@ from flows.operations.heartbeat_automation import install_heartbeat_automation
 
 COORDINATOR_QUEUE = "datasets"
 RUN_QUEUE = "default"
+_COMMAND = shlex.join([sys.executable, "-m", "prefect.engine"])
+"""What a worker starts. Without it, a worker starts Prefect twice, first to prepare a folder that no flow needs."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +86,9 @@ def deploy_flows(api_url: str, auth_string: str | None, pool: str, store: str, f
         with suppress(ObjectAlreadyExists):
             client.create_work_queue(name=COORDINATOR_QUEUE, work_pool_name=pool)
         for deployment in DEPLOYMENTS:
-            path, _, function = deployment.entrypoint.partition(":")
-            loaded: Any = load_flow_from_entrypoint(f"{root / path}:{function}")
+            # By its module, a run imports the flow where it starts; by its file, Prefect asks for steps to fetch it.
+            entrypoint = deployment.entrypoint.replace(".py:", ".").replace("/", ".")
+            loaded: Any = load_flow_from_entrypoint(entrypoint)
             parameters = dict(deployment.parameters)
             if "folder" in parameters:
                 parameters["folder"] = str(folder / "training")
@@ -92,12 +97,12 @@ def deploy_flows(api_url: str, auth_string: str | None, pool: str, store: str, f
             client.create_deployment(
                 flow_id=client.create_flow_from_name(loaded.name),
                 name=deployment.name,
-                entrypoint=deployment.entrypoint,
-                pull_steps=[{"prefect.deployments.steps.set_working_directory": {"directory": str(root)}}],
+                entrypoint=entrypoint,
                 parameters=parameters,
                 parameter_openapi_schema=parameter_schema(loaded).model_dump_for_openapi(),
                 work_pool_name=pool,
                 work_queue_name=deployment.queue,
+                job_variables={"command": _COMMAND, "working_dir": str(root)},
                 enforce_parameter_schema=False,
             )
             names.append(f"{loaded.name}/{deployment.name}")

@@ -6,13 +6,11 @@ import base64
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from prefect import flow
 from prefect.artifacts import create_image_artifact, create_link_artifact, create_table_artifact
 
-from flows.budget.budget import Budget
-from flows.budget.chooser import Chooser
 from flows.configuration import diff_from_preset, load_configuration, validate_config
 from flows.defaults import DEFAULT_PRESET, DEFAULT_STORE
 from flows.pipeline.definition import PIPELINE, RECONSTRUCTION_STAGES, STAGE_BY_NAME, StageSpec
@@ -29,6 +27,10 @@ from flows.reconstruction.stored_run import find_stored_run
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ConfigError, GenreError
 from storage.opening import open_store
+
+if TYPE_CHECKING:
+    from flows.budget.budget import Budget
+    from flows.budget.chooser import Chooser
 
 
 # Parameters are not validated by Prefect: the configuration's own models do it, and their errors say what to do.
@@ -77,13 +79,22 @@ def reconstruct_log(
         effective = _effective_config(preset, config, settings)
         record = _take_from_store(log, preset, store, chunks, effective) if budget_s is None else None
         if record is None:
-            budget = None if budget_s is None else Budget(budget_s, start_time, table, preset, effective)
+            budget = None if budget_s is None else _open_budget(budget_s, start_time, table, preset, effective)
             record = _compute(log, preset, store, chunks, effective, budget)
     except Exception as error:
         publish_outcome(log, getattr(error, "record", None), error)
         raise
     publish_outcome(log, record, None)
     return record
+
+
+def _open_budget(
+    budget_s: float, start_time: float | None, table: str | None, preset: str, config: PipelineConfig
+) -> Budget:
+    # Tables of costs take a tenth of the time of a run that is in the store, and few runs have a budget.
+    from flows.budget.budget import Budget
+
+    return Budget(budget_s, start_time, table, preset, config)
 
 
 def _take_from_store(

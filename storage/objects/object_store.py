@@ -13,6 +13,7 @@ from genre_tasks.errors import ArtifactCorruptError, ConfigError, TransientIOErr
 from genre_tasks.progress import Progress, silent
 from genre_tasks.temporary_names import describe_owner
 from storage.address import Address
+from storage.cache_folder import find_cache_folder
 from storage.codecs import get_codec
 from storage.io_errors import make_corruption_error, os_errors_translated
 from storage.manifest import MANIFEST, Manifest, NewerSchemaError, parse_manifest
@@ -23,7 +24,7 @@ from storage.objects.manifest_listing import ManifestListing
 from storage.objects.object_lease import hold_object_lease
 from storage.objects.object_records import ObjectRecordFolders
 from storage.objects.payloads import Payloads
-from storage.objects.read_cache import ReadCache, find_cache_folder, read_limit_bytes
+from storage.objects.read_cache import ReadCache, read_limit_bytes
 from storage.store import Artifact, Provenance
 
 _PUBLISH_ATTEMPTS = 5

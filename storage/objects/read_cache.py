@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import tempfile
 import time
 import uuid
 from collections.abc import Iterator
@@ -15,8 +14,6 @@ from genre_tasks.errors import ConfigError
 from genre_tasks.temporary_names import describe_owner, remove_abandoned
 from storage.address import Address
 
-FOLDER_VARIABLE = "GENRE_CACHE_DIR"
-"""The environment variable for the folder."""
 LIMIT_VARIABLE = "GENRE_CACHE_GB"
 """The environment variable for the bound, in gigabytes (10⁹ bytes)."""
 _LIMIT_GB = 20.0
@@ -145,34 +142,6 @@ class ReadCache:
             with suppress(OSError):
                 size = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
                 yield (path / _USED).stat().st_mtime, size, path
-
-
-def find_cache_folder() -> Path:
-    """Finds the folder of all caches of this user.
-
-    Returns:
-        ``$GENRE_CACHE_DIR``, or ``genre`` in the user's folder of caches, or among the temporary files where this
-        user has none.
-
-    Raises:
-        ConfigError: the folder among the temporary files belongs to another user.
-    """
-    stated = os.environ.get(FOLDER_VARIABLE)
-    if stated:
-        return Path(stated).expanduser().absolute()
-    base = os.environ.get("XDG_CACHE_HOME", "")
-    with suppress(RuntimeError):
-        folder = (Path(base) if os.path.isabs(base) else Path.home() / ".cache") / "genre"  # noqa: PTH117
-        with suppress(OSError):
-            folder.mkdir(parents=True, exist_ok=True)
-        if os.access(folder, os.W_OK | os.X_OK):
-            return folder
-    folder = Path(tempfile.gettempdir()).absolute() / f"genre-cache-{os.getuid()}"
-    folder.mkdir(mode=0o700, exist_ok=True)
-    # Everybody may write there: another user could have put files into it that would be read as artifacts.
-    if folder.is_symlink() or folder.stat().st_uid != os.getuid():
-        raise ConfigError(f"{folder} belongs to another user", remedy=f"Set {FOLDER_VARIABLE} to a folder of yours.")
-    return folder
 
 
 def read_limit_bytes() -> int:

@@ -51,7 +51,8 @@ print(hashlib.sha256("".join(digests).encode()).hexdigest())
 
 @cache
 def run_python(interpreter: str | Path, code: str, option: str = "-B") -> str:
-    environment = {"PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"}
+    # Without a cache, in which one interpreter would find what another one has read.
+    environment = {"PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1", "GENRE_CACHE_DIR": "/dev/null"}
     command = [interpreter, option, "-c", code]
     run = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
     # A launcher of another version manager may be there without its interpreter.
