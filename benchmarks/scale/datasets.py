@@ -57,8 +57,8 @@ def measure_orchestration(log: str, preset: str, settings: Sequence[str]) -> Row
         settings: over it.
 
     Returns:
-        ``worker_s``, from the worker's taking the run to the end of its process; ``compute_s``, of all stages;
-        ``share``, of the difference in the computation.
+        ``worker_s``, from the worker's taking the run to the end of its process; ``compute_s``, of all stages, each
+        of them in ``stages_s``; ``share``, of the difference in the computation.
     """
     options = options_from_settings(preset, settings)
     with start_deployment(workers=1) as deployment:
@@ -67,8 +67,10 @@ def measure_orchestration(log: str, preset: str, settings: Sequence[str]) -> Row
             dataset = deployment.run_dataset([log], str(store), options)["dataset"]
         # A second run would mean that the first one died, and its time would be another one's.
         (worker_s,) = clock.read_seconds(dataset)
-        compute_s = read_compute_seconds(store)
-    return {"worker_s": worker_s, "compute_s": compute_s, "share": (worker_s - compute_s) / compute_s}
+        stages_s = read_compute_seconds(store)
+    compute_s = sum(stages_s.values())
+    share = (worker_s - compute_s) / compute_s
+    return {"worker_s": worker_s, "compute_s": compute_s, "share": share, "stages_s": stages_s}
 
 
 def measure_cached_logs(logs: Sequence[str], preset: str, settings: Sequence[str], rounds: int) -> Row:

@@ -180,17 +180,18 @@ def options_from_settings(preset: str, settings: Sequence[str]) -> list[str]:
     return options
 
 
-def read_compute_seconds(store: Path) -> float:
-    """Adds up the seconds of computation in a store of this machine.
+def read_compute_seconds(store: Path) -> dict[str, float]:
+    """Reads how long the stages in a store of this machine computed.
 
     Args:
         store: its folder.
 
     Returns:
-        Wall seconds of the functions of all stages, from the manifests.
+        Wall seconds of each stage's function, from the manifests, summed over logs and chunks.
     """
-    total = 0.0
-    for path in store.glob("*/*/*/**/manifest.json"):
+    seconds: dict[str, float] = {}
+    for path in sorted(store.glob("*/*/*/**/manifest.json")):
         with suppress(FileNotFoundError):
-            total += float(json.loads(path.read_text(encoding="utf-8"))["seconds"])
-    return total
+            manifest = json.loads(path.read_text(encoding="utf-8"))
+            seconds[manifest["stage"]] = seconds.get(manifest["stage"], 0.0) + float(manifest["seconds"])
+    return seconds
