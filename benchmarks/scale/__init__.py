@@ -39,12 +39,13 @@ class Scale:
     name = "scale"
     options: Mapping[str, str] = {
         "seeds": ",".join(str(seed) for seed in range(900, 916)),
-        "street": "&cameras=1",
+        "street": "&cameras=1&frames=8",
         "preset": "small",
+        "throughput_preset": "demo",
         "settings": "",
         "cached_street": _TINY_STREET,
         "cluster": "1000x100",
-        "seconds_scale": "0.2",
+        "seconds_scale": "0.4",
         "inputs": "10000",
     }
     code: tuple[str, ...] = (
@@ -62,7 +63,8 @@ class Scale:
         """Lists the measurements.
 
         Args:
-            options: ``seeds`` and ``street``, the parameters of the streets; ``preset`` and ``settings``;
+            options: ``seeds`` and ``street``, the parameters of the streets; ``preset``, and ``throughput_preset`` of the
+                many logs, and ``settings``;
                 ``cached_street``, of the streets that come from the store; ``cluster``, logs x workers, and
                 ``seconds_scale`` of its stages; ``inputs`` of the fuzzers.
             quick: fewer rounds.
@@ -76,15 +78,17 @@ class Scale:
         settings = settings_from_options(options)
         tiny = tuple(TINY_SETTINGS.split())
         # Of a log that comes from the store, the size of its images plays no part.
-        preset = options["preset"]
-        rounds = 1 if quick else 4
+        preset, small = options["preset"], options["throughput_preset"]
+        rounds = 1 if quick else 3
         cluster_logs, _, workers = options["cluster"].partition("x")
         log = f"synthetic:street?seed={seeds[0]}"
         return [
-            Cell("throughput", 1200.0, partial(measure_throughput, logs, preset, settings), _parameters(options)),
+            Cell("throughput", 1200.0, partial(measure_throughput, logs, small, settings), _parameters(options)),
             Cell("orchestration", 200.0, partial(measure_orchestration, log, preset, settings), _parameters(options)),
             Cell("cached", 300.0, partial(measure_cached_logs, cached, "demo", tiny, rounds), _parameters(options)),
-            Cell("object_store", 600.0, partial(measure_object_store, log, preset, settings, rounds), {"n": rounds}),
+            Cell(
+                "object_store", 600.0, partial(measure_object_store, logs[0], preset, settings, rounds), {"n": rounds}
+            ),
             Cell(
                 "cluster",
                 1800.0,
@@ -105,7 +109,7 @@ class Scale:
         """
         wanted = {name: row for name, row in rows.items() if "not_measured" not in row}
         throughput = wanted.get("throughput", {}).get("ratio")
-        data = "16 logs, the seconds of the command with one worker over those with two, one thread each"
+        data = "16 logs of 8 frames, the seconds with one worker over those with two, one thread each"
         yield claim("scale.two_workers", throughput, ">=", 1.7, "ratio", data)
         share = wanted.get("orchestration", {}).get("share")
         data = "a worker's time without computation over the computation, one log of the preset small, one thread"
