@@ -63,9 +63,8 @@ class Scale:
         """Lists the measurements.
 
         Args:
-            options: ``seeds`` and ``street``, the parameters of the streets; ``preset``, and ``throughput_preset`` of the
-                many logs, and ``settings``;
-                ``cached_street``, of the streets that come from the store; ``cluster``, logs x workers, and
+            options: ``seeds`` and ``street``, the parameters of the streets; ``preset``, ``throughput_preset`` of the
+                many logs, and ``settings``; ``cached_street``, of the streets that come from the store; ``cluster``, logs x workers, and
                 ``seconds_scale`` of its stages; ``inputs`` of the fuzzers.
             quick: fewer rounds.
 
@@ -80,6 +79,7 @@ class Scale:
         # Of a log that comes from the store, the size of its images plays no part.
         preset, small = options["preset"], options["throughput_preset"]
         rounds = 1 if quick else 3
+        counts = {"n": rounds}
         cluster_logs, _, workers = options["cluster"].partition("x")
         log = f"synthetic:street?seed={seeds[0]}"
         return [
