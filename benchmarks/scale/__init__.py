@@ -64,8 +64,8 @@ class Scale:
 
         Args:
             options: ``seeds`` and ``street``, the parameters of the streets; ``preset``, ``throughput_preset`` of the
-                many logs, and ``settings``; ``cached_street``, of the streets that come from the store; ``cluster``, logs x workers, and
-                ``seconds_scale`` of its stages; ``inputs`` of the fuzzers.
+                many logs, and ``settings``; ``cached_street``, of the streets that come from the store; ``cluster``,
+                logs x workers, and ``seconds_scale`` of its stages; ``inputs`` of the fuzzers.
             quick: fewer rounds.
 
         Returns:
@@ -79,7 +79,6 @@ class Scale:
         # Of a log that comes from the store, the size of its images plays no part.
         preset, small = options["preset"], options["throughput_preset"]
         rounds = 1 if quick else 3
-        counts = {"n": rounds}
         cluster_logs, _, workers = options["cluster"].partition("x")
         log = f"synthetic:street?seed={seeds[0]}"
         return [
