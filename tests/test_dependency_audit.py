@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
+import sysconfig
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 pytestmark = pytest.mark.slow
+AUDIT = Path(__file__).resolve().parents[1] / "build/audit/bin/pip-audit"
 
 
 def list_vulnerable(report: dict[str, Any]) -> list[str]:
@@ -29,7 +31,9 @@ def test_a_vulnerable_package_is_listed() -> None:
 
 
 def test_no_package_has_a_known_vulnerability() -> None:
-    command = [sys.executable, "-m", "pip_audit", "--format", "json", "--progress-spinner", "off"]
+    if not AUDIT.is_file():
+        pytest.skip("not checked: make test-all installs pip-audit")
+    command = [AUDIT, "--path", sysconfig.get_path("purelib"), "--format", "json", "--progress-spinner", "off"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
     try:
         report = json.loads(done.stdout)

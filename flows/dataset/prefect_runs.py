@@ -49,6 +49,7 @@ _DAYS = 7
 _OUTCOMES_PER_REQUEST = 50
 _SUBMITTED_AT_ONCE = 8
 _RUN_RESOURCE = "prefect.flow-run."
+_WORKER_LABEL = "prefect.worker.name"
 
 
 @dataclass(frozen=True)
@@ -213,7 +214,8 @@ class PrefectRuns:
             unit=unit,
             state=_name_state(run),
             message="" if run.state is None else run.state.message or "",
-            where=run.infrastructure_pid or "",
+            # A number of a process says nothing on many machines.
+            where=str(run.labels.get(_WORKER_LABEL) or run.infrastructure_pid or ""),
             seconds=seconds.total_seconds(),
             is_ours=self._parent_tag in run.tags,
         )

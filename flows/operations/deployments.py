@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,8 +11,9 @@ from flows.operations.heartbeat_automation import install_heartbeat_automation
 
 COORDINATOR_QUEUE = "datasets"
 RUN_QUEUE = "default"
-_COMMAND = shlex.join([sys.executable, "-m", "prefect.engine"])
-"""What a worker starts. Without it, a worker starts Prefect twice, first to prepare a folder that no flow needs."""
+_COMMAND = "python -m prefect.engine"
+"""What a worker starts. Without it, a worker starts Prefect twice, first to prepare a folder that no flow needs. By its
+name, since the interpreter of another machine may lie at another path."""
 
 
 @dataclass(frozen=True)
@@ -73,9 +72,6 @@ def deploy_flows(api_url: str, auth_string: str | None, pool: str, store: str, f
     from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
     from prefect.utilities.callables import parameter_schema
 
-    import flows as package
-
-    root = Path(package.__file__).resolve().parents[1]
     settings = {PREFECT_API_URL: api_url}
     if auth_string is not None:
         settings[PREFECT_API_AUTH_STRING] = auth_string
@@ -102,7 +98,7 @@ def deploy_flows(api_url: str, auth_string: str | None, pool: str, store: str, f
                 parameter_openapi_schema=parameter_schema(loaded).model_dump_for_openapi(),
                 work_pool_name=pool,
                 work_queue_name=deployment.queue,
-                job_variables={"command": _COMMAND, "working_dir": str(root)},
+                job_variables={"command": _COMMAND},
                 enforce_parameter_schema=False,
             )
             names.append(f"{loaded.name}/{deployment.name}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import urllib.error
 import urllib.request
@@ -170,6 +171,8 @@ class Worker(Service):
             # A worker of one run at a time asks for the next one only so often.
             "PREFECT_WORKER_QUERY_SECONDS": "2",
             **self.client_env,
+            # Runs are started by the name python, which must be this interpreter.
+            "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)]),
         }
 
     def env(self) -> dict[str, str]:

@@ -134,8 +134,9 @@ def load_sd_turbo(source: str, timestep: int = 200, rank: int = 16) -> Fnet:
     from diffusers import AutoencoderKL, UNet2DConditionModel
 
     try:
-        vae = AutoencoderKL.from_pretrained(source, subfolder="vae")
-        unet = UNet2DConditionModel.from_pretrained(source, subfolder="unet")
+        # Other weights are pickles, which may run code.
+        vae = AutoencoderKL.from_pretrained(source, subfolder="vae", use_safetensors=True)
+        unet = UNet2DConditionModel.from_pretrained(source, subfolder="unet", use_safetensors=True)
     except (OSError, ValueError) as error:
         raise InputError(
             f"SD-Turbo cannot be loaded: {str(error).splitlines()[0]}",
