@@ -118,7 +118,7 @@ def _read_array(column: pa.ChunkedArray) -> NDArray[Any]:
 def _read_table(path: Path, names: list[str] | None = None) -> pa.Table:
     import pyarrow as pa
 
-    from storage.codecs.bounded_parquet import FOR_COLUMNS, FOR_ROWS, read_bounded_table
+    from genre_tasks.bounded_parquet import FOR_COLUMNS, FOR_ROWS, read_bounded_table
 
     try:
         table = read_bounded_table(path, FOR_COLUMNS if names else FOR_ROWS, names)

@@ -105,7 +105,7 @@ def summarise_files(store: Store, artifact: Artifact) -> list[TableSummary]:
 
 
 def _summarise_table(folder: Path, path: Path) -> TableSummary:
-    from storage.codecs.bounded_parquet import FOR_COLUMNS, read_bounded_table
+    from genre_tasks.bounded_parquet import FOR_COLUMNS, read_bounded_table
 
     table = read_bounded_table(path, FOR_COLUMNS)
     rows = []

@@ -21,7 +21,7 @@ def json_targets() -> Iterator[FuzzTarget]:
     from flows.simulation.path_file import read_path_file
     from genre_tasks.ego_paths.ego_path import EgoPath
     from genre_tasks.json_files import read_json_object
-    from genre_tasks.logs.pandaset.file_reading import read_entries, read_times
+    from genre_tasks.logs.file_reading import read_entries, read_times
     from genre_tasks.logs.pandaset.layout import parse_pose
     from genre_tasks.logs.posed_images.transforms_json import read_transforms
 
@@ -93,7 +93,7 @@ def pickle_targets() -> Iterator[FuzzTarget]:
 
 def image_targets() -> Iterator[FuzzTarget]:
     """Lists the readers of JPEG and PNG."""
-    from genre_tasks.logs.pandaset.image_sizes import measure_images
+    from genre_tasks.logs.image_sizes import measure_images
     from genre_tasks.scene.image_decoding import decode_with_facts, inspect_image, read_image_size
     from storage.codecs.png import read_png
 

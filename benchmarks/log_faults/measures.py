@@ -13,7 +13,6 @@ from benchmarks.common.bench import NotMeasuredError, Row
 from benchmarks.common.task import require_log_folder
 from benchmarks.log_faults.changed_log import ChangedLog
 from benchmarks.log_faults.faults import Fault
-from benchmarks.log_faults.kitti import KittiLog
 from genre_tasks.log_checks.calibration import measure_agreement
 from genre_tasks.log_checks.log_sample import LogSample
 from genre_tasks.log_checks.plausibility import assess_plausibility
@@ -100,7 +99,7 @@ def _open_chunk_log(uri: str) -> _OpenLog:
     if not Path(rest).is_dir():
         raise NotMeasuredError(f"there is no folder {rest}; give it with --set kitti=PATH")
     folder = tempfile.TemporaryDirectory(prefix="genre-kitti-")
-    written = write_pandaset(KittiLog(Path(rest)), Path(folder.name) / "0009")
+    written = write_pandaset(open_log(uri), Path(folder.name) / "0009")
     log = open_log(f"pandaset:{written}")
     return _OpenLog(log, _CachedSweeps(log), folder)
 

@@ -12,6 +12,7 @@ import typer
 
 from flows.cli.bench import bench
 from flows.cli.check import check
+from flows.cli.convert import convert
 from flows.cli.cost import cost
 from flows.cli.dataset import dataset
 from flows.cli.diff import diff
@@ -59,6 +60,7 @@ app.command(name="run")(run)
 app.command(name="dataset")(dataset)
 app.command(name="enhance")(enhance)
 app.command(name="check")(check)
+app.command(name="convert")(convert)
 app.command(name="effects")(effects)
 app.command(name="render")(render)
 app.command(name="view")(view)

@@ -11,8 +11,8 @@ from typing import Any
 import pyarrow as pa
 
 from flows.cost_sweep.summary import COSTS, MEASURES, Measure, SettingSummary, Spread
+from genre_tasks.bounded_parquet import FOR_ROWS
 from genre_tasks.errors import ArtifactCorruptError
-from storage.codecs.bounded_parquet import FOR_ROWS
 from storage.codecs.tables import REMEDY, column, read_table, schema, write_table
 
 # The order is that of the columns: changing it needs a new version of the schema.

@@ -26,12 +26,12 @@ import numpy as np
 import pyarrow as pa
 from scipy.spatial.transform import Rotation
 
+from genre_tasks.bounded_parquet import FOR_ROWS, read_bounded_table
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.ego_paths.relative_path import place_relative_path
 from genre_tasks.errors import InputError
 from genre_tasks.logs.types import Float64
 from genre_tasks.suggestions import did_you_mean
-from storage.codecs.bounded_parquet import FOR_ROWS, read_bounded_table
 
 POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 RELATIVE_COLUMNS = ("lateral_m", "ahead_m")

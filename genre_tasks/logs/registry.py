@@ -32,6 +32,16 @@ class ReaderEntry:
 # Targets are text, not functions: importing every reader would need the packages of all, and would slow down each
 # command.
 _READERS: dict[str, ReaderEntry] = {
+    "genre": ReaderEntry(
+        "genre_tasks.logs.genre_layout.reader:open_genre_layout",
+        "genre:PATH/my-log",
+        "pip install genre (pyarrow is part of it)",
+    ),
+    "kitti": ReaderEntry(
+        "genre_tasks.logs.kitti.reader:open_kitti",
+        "kitti:PATH/2011_09_26/2011_09_26_drive_0009_sync",
+        "pip install genre (scipy and pillow are part of it)",
+    ),
     "pandaset": ReaderEntry(
         "genre_tasks.logs.pandaset.reader:open_pandaset",
         "pandaset:PATH/002",
@@ -80,7 +90,7 @@ def known_readers() -> tuple[str, ...]:
         The names, sorted.
 
     >>> known_readers()
-    ('pandaset', 'posed_images', 'synthetic')
+    ('genre', 'kitti', 'pandaset', 'posed_images', 'synthetic')
     """
     return tuple(sorted(_READERS))
 

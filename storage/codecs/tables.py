@@ -12,8 +12,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from genre_tasks.bounded_parquet import FOR_COLUMNS, FOR_ROWS, MemoryBound, read_bounded_table
 from genre_tasks.errors import ArtifactCorruptError, ConfigError, NonFiniteError
-from storage.codecs.bounded_parquet import FOR_COLUMNS, FOR_ROWS, MemoryBound, read_bounded_table
 from storage.files import write_file
 
 Record = TypeVar("Record")
@@ -123,7 +123,7 @@ def read_table(path: Path, declared: pa.Schema, bound: MemoryBound = FOR_COLUMNS
     Args:
         path: the file.
         declared: the schema that it must have.
-        bound: what it may take in memory, see :func:`storage.codecs.bounded_parquet.read_bounded_table`.
+        bound: what it may take in memory, see :func:`genre_tasks.bounded_parquet.read_bounded_table`.
 
     Returns:
         (table, extra metadata).

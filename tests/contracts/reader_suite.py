@@ -29,7 +29,8 @@ def assert_rigid(pose: Float64) -> None:
 def inside(points_world: Float64, world_SE3_box: Float64, size_m: tuple[float, float, float]) -> int:
     """How many points [N, 3] lie in a box."""
     local = (points_world - world_SE3_box[:3, 3]) @ world_SE3_box[:3, :3]
-    return int((np.abs(local) <= np.asarray(size_m) / 2).all(axis=1).sum())
+    # Points lie on the faces, and files round them.
+    return int((np.abs(local) <= np.asarray(size_m) / 2 + 1e-3).all(axis=1).sum())
 
 
 class ReaderSuite(ABC):
@@ -37,6 +38,7 @@ class ReaderSuite(ABC):
 
     missing_images: frozenset[tuple[str, int]] = frozenset()
     missing_sweeps: frozenset[int] = frozenset()
+    front_camera = "front"
     has_tracks = True
     has_sweeps = True
 
@@ -193,7 +195,7 @@ class ReaderSuite(ABC):
             assert left.sum() < 5 or (u[left] < front.lens.cx_px).mean() > 0.95
 
     def _front(self, log: DrivingLog) -> Camera:
-        return next(c for c in log.cameras if c.name.removesuffix("_camera") == "front")
+        return next(c for c in log.cameras if c.name.removesuffix("_camera") == self.front_camera)
 
     # --- tracks
 

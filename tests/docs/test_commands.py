@@ -27,6 +27,7 @@ from genre_tasks.exchange.ply import PLY
 from genre_tasks.logs.pandaset.writer import write_pandaset
 from genre_tasks.logs.registry import open_log
 from tests.faults.small_run import LOG, SETTINGS
+from tests.logs.kitti_folder import DRIVE, write_kitti, write_tracking_labels
 from tests.logs.posed_images_folder import write_transforms
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -57,6 +58,8 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, 
 
     folder = tmp_path_factory.mktemp("commands")
     write_pandaset(open_log(LOG), folder / "pandaset/002")
+    write_kitti(open_log(LOG), folder / "kitti", camera_count=1)
+    write_tracking_labels(open_log(LOG), folder / "kitti/labels.txt")
     guide = (ROOT / "docs/guides/simulation.md").read_text()
     (folder / "edits.yaml").write_text(re.findall(r"```yaml\n(.*?)```", guide, flags=re.DOTALL)[0])
     with prefect_test_harness(server_startup_timeout=120):
@@ -91,6 +94,8 @@ def small(command: str, folder: Path, run: str, pandaset: str) -> list[str]:
     words = [run if word in ("RUN", "OTHER") else word for word in words]
     words = [scene_key(folder, run) if word == "KEY" else word for word in words]
     words = [pandaset if word == "pandaset:/data/pandaset/002" else word for word in words]
+    words = [word.replace("/data/kitti/label_02/0001.txt", f"{folder}/kitti/labels.txt") for word in words]
+    words = [re.sub(r"/data/kitti/\w+/\w+", f"{folder}/kitti/{DRIVE}", word) for word in words]
     if "--budget" in words:  # a budget chooses these settings itself, and is not given them
         return [*words, "--store", str(folder / "store"), "--dry-run"]
     if words[0] == "simulate":

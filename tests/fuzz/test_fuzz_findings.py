@@ -26,6 +26,7 @@ from flows.budget.cost_table import find_shipped_table, load_cost_table
 from flows.simulation.path_file import read_path_file
 from flows.training.checkpoint import describe
 from flows.upkeep.pins import PINS, list_pins
+from genre_tasks.bounded_parquet import FOR_COLUMNS, FOR_ROWS, MemoryBound, TableTooLargeError, read_bounded_table
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.errors import ArtifactCorruptError, ConfigError, InputError
 from genre_tasks.exchange.usd.package import extract_layers
@@ -37,7 +38,6 @@ from genre_tasks.scene.image_decoding import decode_pixels, read_image_size
 from genre_tasks.scene.ply_reader import read_ply
 from genre_tasks.weights import list_weights_files
 from storage.codecs import get_codec
-from storage.codecs.bounded_parquet import FOR_COLUMNS, FOR_ROWS, MemoryBound, TableTooLargeError, read_bounded_table
 from storage.codecs.exr import read_channels, write_channels
 from storage.codecs.png import read_png
 from storage.codecs.tables import column, read_table, schema, write_table

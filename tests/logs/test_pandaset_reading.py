@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from genre_tasks.errors import InputError
-from genre_tasks.logs.pandaset.file_reading import convert_to_seconds
+from genre_tasks.logs.file_reading import convert_to_seconds
 from genre_tasks.logs.pandaset.layout import parse_pose, to_flu_axes, to_panda_axes
 from genre_tasks.logs.pandaset.pickle_reader import read_table
 from genre_tasks.logs.pandaset.reader import PandaSetLog, open_pandaset

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from genre_tasks.errors import InputError
-from genre_tasks.logs.pandaset.file_reading import describe_value, read_number
+from genre_tasks.logs.file_reading import describe_value, read_number
 from genre_tasks.logs.types import Float64
 
 RIG_ORDER = ("front_camera", "front_left_camera", "front_right_camera", "left_camera", "right_camera", "back_camera")

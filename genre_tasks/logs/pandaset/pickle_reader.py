@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from genre_tasks.errors import InputError
 from genre_tasks.logs.file_kinds import describe_non_pickle
-from genre_tasks.logs.pandaset.file_reading import describe_os_error
+from genre_tasks.logs.file_reading import describe_os_error
 from genre_tasks.logs.pandaset.pickle_arrays import expect_call, read_array, require
 from genre_tasks.logs.pandaset.pickle_machine import (
     Call,

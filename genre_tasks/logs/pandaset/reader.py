@@ -11,10 +11,8 @@ from typing import Any
 import numpy as np
 
 from genre_tasks.errors import InputError
-from genre_tasks.logs.findings import Finding
-from genre_tasks.logs.lens_validity import with_distortion
-from genre_tasks.logs.pandaset.cuboids import FrameBoxes, build_tracks, read_boxes
-from genre_tasks.logs.pandaset.file_reading import (
+from genre_tasks.logs.file_digest import digest_files
+from genre_tasks.logs.file_reading import (
     describe_value,
     read_entries,
     read_file,
@@ -22,10 +20,12 @@ from genre_tasks.logs.pandaset.file_reading import (
     read_number,
     read_times,
 )
+from genre_tasks.logs.findings import Finding
+from genre_tasks.logs.image_sizes import ImageSizes, choose_lens, measure_images, report_problems
+from genre_tasks.logs.lens_validity import with_distortion
+from genre_tasks.logs.pandaset.cuboids import FrameBoxes, build_tracks, read_boxes
 from genre_tasks.logs.pandaset.folder_index import LIDAR_FILES, SequenceIndex, index_sequence
-from genre_tasks.logs.pandaset.image_sizes import ImageSizes, choose_lens, measure_images, report_problems
 from genre_tasks.logs.pandaset.layout import PIXEL_CENTRE, READOUT_S, RIG_ORDER, parse_pose, to_flu_axes
-from genre_tasks.logs.pandaset.log_digest import digest_files
 from genre_tasks.logs.pandaset.pickle_reader import read_table
 from genre_tasks.logs.pandaset.sweeps import build_sweep
 from genre_tasks.logs.pandaset.unread_files import find_unread_files

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from genre_tasks.errors import InputError
+from genre_tasks.logs.file_reading import convert_to_seconds
 from genre_tasks.logs.findings import Finding
-from genre_tasks.logs.pandaset.file_reading import convert_to_seconds
 from genre_tasks.logs.pandaset.layout import INTENSITY_SCALE, SPINNING_SENSOR
 from genre_tasks.logs.pandaset.pickle_reader import Table
 from genre_tasks.logs.types import Float64, Sweep

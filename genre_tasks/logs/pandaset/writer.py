@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import gzip
 import json
-import re
-import shutil
-import uuid
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from genre_tasks.errors import InputError, ResourceError
+from genre_tasks.logs.image_suffixes import find_image_suffix
+from genre_tasks.logs.new_log_folder import new_log_folder
 from genre_tasks.logs.pandaset.layout import (
     BOX_HEADING,
     INTENSITY_SCALE,
@@ -28,15 +26,7 @@ from genre_tasks.logs.pandaset.layout import (
 from genre_tasks.logs.pandaset.pickle_writer import pickle_table
 from genre_tasks.logs.types import Camera, CuboidTrack, DrivingLog, Float64, Sweep
 from genre_tasks.progress import Progress, silent
-from genre_tasks.temporary_names import describe_owner, remove_abandoned
 
-_SUFFIX_OF_SIGNATURE = {
-    rb"\xff\xd8\xff": ".jpg",
-    rb"\x89PNG\r\n\x1a\n": ".png",
-    rb"RIFF....WEBP": ".webp",
-    rb"II\*\0|MM\0\*": ".tif",
-    rb"BM": ".bmp",
-}
 # Coordinates are noise in their low bits: higher levels take three times as long for 2 %.
 _GZIP_LEVEL = 4
 # Cuboids.sensor_id of a box that was annotated once, without a sibling.
@@ -67,27 +57,10 @@ def write_pandaset(log: DrivingLog, folder: Path, progress: Progress = silent) -
         write_pandaset(open_log("synthetic:street?seed=7"), Path("sequences/007"))
         log = open_log("pandaset:sequences/007")
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        remedy = "Give a folder that does not exist yet, or remove this one first."
-        raise InputError("the folder to write holds something already", remedy=remedy, file=folder, log=log.uri)
-    # Beside the target, since only a rename within one file system is atomic.
-    remove_abandoned(folder.parent)
-    partial = folder.parent / f".{folder.name}.{describe_owner()}-{uuid.uuid4().hex[:8]}.partial"
-    try:
-        partial.mkdir(parents=True)
-        _write_cameras(log, partial, progress)
-        _write_lidar(log, partial, progress)
-        _write_cuboids(log, partial)
-        # An empty folder would stop the rename on some systems.
-        if folder.exists():
-            folder.rmdir()
-        partial.replace(folder)
-    except OSError as error:
-        problem = f"the sequence could not be written ({error})"
-        raise ResourceError(problem, remedy="Free space, or give another folder.", file=folder, log=log.uri) from error
-    finally:
-        # After a success there is nothing left to remove.
-        shutil.rmtree(partial, ignore_errors=True)
+    with new_log_folder(folder, log.uri) as root:
+        _write_cameras(log, root, progress)
+        _write_lidar(log, root, progress)
+        _write_cuboids(log, root)
     return folder
 
 
@@ -117,7 +90,7 @@ def _write_cameras(log: DrivingLog, root: Path, progress: Progress) -> None:
         for frame in frames:
             image = log.image_bytes(name, frame)
             if image is not None:
-                suffix = _find_suffix(image, log, name, frame)
+                suffix = find_image_suffix(image, log=log.uri, camera=name, frame=frame)
                 (folder / f"{frame_stem(frame)}{suffix}").write_bytes(image)
             progress(index * log.frame_count + frame + 1, _count_steps(log), f"{name} {frame}")
 
@@ -135,17 +108,6 @@ def _format_intrinsics(camera: Camera) -> dict[str, Any]:
     if lens.distortion:
         intrinsics["distortion"] = list(lens.distortion)
     return intrinsics
-
-
-def _find_suffix(image: bytes, log: DrivingLog, camera: str, frame: int) -> str:
-    """The file name's suffix, by the first bytes of an encoded image."""
-    for signature, suffix in _SUFFIX_OF_SIGNATURE.items():
-        if re.match(signature, image, re.DOTALL):
-            return suffix
-    remedy = "Encode the image as JPEG or PNG, or remove it: a missing image is survived."
-    raise InputError(
-        "the image is neither JPEG, PNG, WebP, TIFF nor BMP", remedy=remedy, log=log.uri, camera=camera, frame=frame
-    )
 
 
 def _write_lidar(log: DrivingLog, root: Path, progress: Progress) -> None:

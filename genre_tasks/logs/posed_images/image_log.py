@@ -11,8 +11,8 @@ from urllib.parse import parse_qsl, unquote
 import numpy as np
 
 from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.logs.file_digest import digest_files
 from genre_tasks.logs.findings import Finding
-from genre_tasks.logs.pandaset.log_digest import digest_files
 from genre_tasks.logs.posed_images.colmap_model import read_colmap_model
 from genre_tasks.logs.posed_images.frame_grouping import FrameGroups, group_frames
 from genre_tasks.logs.posed_images.image_files import ImageFolder, fit_lens

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from genre_tasks.logs.file_kinds import describe_non_image
+from genre_tasks.logs.file_reading import describe_os_error
 from genre_tasks.logs.findings import Finding, format_frames
-from genre_tasks.logs.pandaset.file_reading import describe_os_error
 from genre_tasks.logs.types import Lens
 
 Size = tuple[int, int]

@@ -1,0 +1,173 @@
+"""The names and numbers of the layout, as its reader and its writer share them.
+
+``log.json``::
+
+    {"format": "genre-log", "version": 1,
+     "cameras": {"front": {"fx_px": …, "fy_px": …, "cx_px": …, "cy_px": …, "width_px": …, "height_px": …}},
+     "frames": [{"time_s": …, "lidar_pose": POSE, "sweep": "lidar/000000.npz",
+                 "images": {"front": {"file": "images/front/000000.jpg", "pose": POSE, "time_s": …}}}]}
+
+POSE is a 4×4 matrix, row by row, that takes the sensor's axes to the world's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from genre_tasks.errors import InputError
+from genre_tasks.logs.types import Float64
+
+LOG_FILE = "log.json"
+FORMAT = "genre-log"
+VERSION = 1
+BOXES_FILE = "boxes.parquet"
+LENS_KEYS = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
+POINT_COLUMNS = ("x", "y", "z", "intensity", "time_s")
+BOX_COLUMNS = (
+    "track_id",
+    "label",
+    "frame",
+    "moving",
+    "x",
+    "y",
+    "z",
+    "qw",
+    "qx",
+    "qy",
+    "qz",
+    "length",
+    "width",
+    "height",
+)
+
+_ROTATION_TOLERANCE = 1e-3
+# The Earth is 4e7 m around.
+_MAX_POSITION_M = 1e12
+
+
+class EntryError(ValueError):
+    """A value of ``log.json`` is not what the layout has there."""
+
+
+def parse_pose(value: object, what: str) -> Float64:
+    """Reads a pose.
+
+    Args:
+        value: 4×4 numbers, row by row.
+        what: it is, for the error.
+
+    Returns:
+        [4, 4] float64, as it stands in the file where its rotation is one to nine digits.
+
+    Raises:
+        EntryError: it is no matrix of a rotation and a position.
+    """
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        matrix = np.zeros(0)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise EntryError(f"{what} is no matrix of 4×4 finite numbers")
+    # A scale or a shear would bend everything that is placed by it.
+    rotation = matrix[:3, :3]
+    error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    if not (matrix[3] == [0, 0, 0, 1]).all() or error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        raise EntryError(f"{what} is no rotation with a position: its last row must be 0, 0, 0, 1")
+    if np.abs(matrix[:3, 3]).max() > _MAX_POSITION_M:
+        raise EntryError(f"the position of {what} is beyond the Earth")
+    # Files of others are rounded to a few digits; what this project wrote is left as it is.
+    if error > 1e-9:
+        u, _, v = np.linalg.svd(rotation)
+        matrix[:3, :3] = u @ v
+    return matrix
+
+
+def parse_number(values: Mapping[str, Any], key: str, what: str, default: float | None = None) -> float:
+    """Reads a finite number.
+
+    Args:
+        values: that the key is in.
+        key: of the number.
+        what: the values are, for the error.
+        default: for a missing key; ``None``: it must be there.
+
+    Returns:
+        The number.
+
+    Raises:
+        EntryError: it is missing, or no finite number.
+
+    >>> parse_number({"a": 2}, "a", "x"), parse_number({}, "a", "x", 0.5)
+    (2.0, 0.5)
+    """
+    value = values.get(key, default)
+    # A bool is an int of Python.
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    try:
+        number = float(value) if is_number and value is not None else math.nan
+    except OverflowError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise EntryError(f"{what} has no finite number {key}")
+    return number
+
+
+def parse_mapping(value: object, what: str) -> Mapping[str, Any]:
+    """Checks that a value is an object of JSON.
+
+    Args:
+        value: to check.
+        what: it is, for the error.
+
+    Returns:
+        The object.
+
+    Raises:
+        EntryError: it is none.
+    """
+    if not isinstance(value, dict):
+        raise EntryError(f"{what} is no object")
+    return value
+
+
+def resolve_file(folder: Path, name: object, what: str) -> Path:
+    """Finds a file of the log.
+
+    Args:
+        folder: of the log.
+        name: relative to it, with ``/``.
+        what: it is, for the error.
+
+    Returns:
+        The path, whether it exists or not.
+
+    Raises:
+        EntryError: it is no name, or leads out of the folder.
+    """
+    if not isinstance(name, str) or not name:
+        raise EntryError(f"{what} names no file")
+    # A log may come from anyone, and must not read files of others.
+    path = PurePosixPath(name)
+    if path.is_absolute() or ".." in path.parts or "\0" in name:
+        raise EntryError(f"{what} leads out of the log's folder: {name!r}")
+    return folder / path
+
+
+def describe_entry_error(error: EntryError, file: Path, log: str) -> InputError:
+    """Makes the error that a user reads.
+
+    Args:
+        error: of an entry.
+        file: that it stands in.
+        log: URI of the log.
+
+    Returns:
+        The error, which names the file and what the layout has.
+    """
+    remedy = "Correct the file; the guide of the genre layout lists every key."
+    return InputError(str(error), remedy=remedy, file=file, log=log)

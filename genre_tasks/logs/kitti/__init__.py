@@ -1,0 +1,1 @@
+"""KITTI's raw recordings, with the boxes of its tracklets or of its tracking benchmark."""
