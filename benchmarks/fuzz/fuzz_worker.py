@@ -24,7 +24,7 @@ SECONDS = 30
 """An input that takes longer hangs."""
 
 ADDRESS_SPACE_MIB = 3072
-"""So much more address space than at its start the process may take."""
+"""So much more address space than before it the process may take while it reads an input."""
 
 _FORBIDDEN_EVENTS = frozenset(
     {"os.system", "os.exec", "os.posix_spawn", "os.fork", "os.spawn", "subprocess.Popen", "pickle.find_class"}
@@ -89,13 +89,12 @@ def main(arguments: list[str]) -> None:
         tempfile.tempdir = name
         code_folder = Path.cwd()
         watch = EventWatch(folder)
-        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (used + (ADDRESS_SPACE_MIB << 20), resource.RLIM_INFINITY))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         for index in range(start, stop):
             target, path, damage = inputs.write(index)
             _report(report, {"started": index})
             os.chdir(folder)
+            _limit_address_space()
             row = _observe(target, path, watch)
             canaries = list(folder.rglob(CANARY))
             os.chdir(code_folder)
@@ -103,6 +102,12 @@ def main(arguments: list[str]) -> None:
                 row |= {"outcome": "code run", "detail": "the canary was written"}
                 canaries[0].unlink()
             _report(report, {"index": index, "damage": damage, **row})
+
+
+def _limit_address_space() -> None:
+    # Before every input: allocators keep address space that they do not use, and thousands of inputs add up.
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + (ADDRESS_SPACE_MIB << 20), resource.RLIM_INFINITY))
 
 
 def _report(stream: Any, row: dict[str, Any]) -> None:
