@@ -32,6 +32,11 @@ class ReaderEntry:
 # Targets are text, not functions: importing every reader would need the packages of all, and would slow down each
 # command.
 _READERS: dict[str, ReaderEntry] = {
+    "argoverse2": ReaderEntry(
+        "genre_tasks.logs.argoverse2.reader:open_argoverse2",
+        "argoverse2:PATH/7fab2350-7eaf-3b7e-a39d-6937a4c1bede",
+        "pip install genre (pyarrow is part of it)",
+    ),
     "genre": ReaderEntry(
         "genre_tasks.logs.genre_layout.reader:open_genre_layout",
         "genre:PATH/my-log",
@@ -90,7 +95,7 @@ def known_readers() -> tuple[str, ...]:
         The names, sorted.
 
     >>> known_readers()
-    ('genre', 'kitti', 'pandaset', 'posed_images', 'synthetic')
+    ('argoverse2', 'genre', 'kitti', 'pandaset', 'posed_images', 'synthetic')
     """
     return tuple(sorted(_READERS))
 

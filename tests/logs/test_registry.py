@@ -24,7 +24,7 @@ def open_fake(rest: str) -> FakeLog:
 
 
 def test_known_readers() -> None:
-    assert known_readers() == ("genre", "kitti", "pandaset", "posed_images", "synthetic")
+    assert known_readers() == ("argoverse2", "genre", "kitti", "pandaset", "posed_images", "synthetic")
 
 
 def test_a_reader_is_one_line() -> None:
@@ -42,7 +42,7 @@ def test_a_reader_is_one_line() -> None:
         ("PandaSet:x/002", "unknown reader 'PandaSet'.*Did you mean 'pandaset'"),
         (
             "nuscenes:x",
-            r"unknown reader 'nuscenes'.*Known: genre:\S+, kitti:\S+, pandaset:PATH/002, posed_images:\S+, synthetic",
+            r"unknown reader 'nuscenes'.*Known: .*kitti:\S+, pandaset:PATH/002, posed_images:\S+, synthetic",
         ),
         ("../data/002", "names no reader.*Known: .*pandaset:PATH/002"),
         ("", "names no reader"),

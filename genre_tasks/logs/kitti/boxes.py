@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree
@@ -13,7 +12,8 @@ import numpy as np
 from genre_tasks.errors import InputError
 from genre_tasks.logs.file_reading import read_file
 from genre_tasks.logs.kitti.drive_files import parse_numbers, read_text
-from genre_tasks.logs.types import CuboidTrack, Float64
+from genre_tasks.logs.labelled_boxes import LabelledBox
+from genre_tasks.logs.types import Float64
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -22,29 +22,8 @@ if TYPE_CHECKING:
 _MAX_XML_BYTES = 1 << 27
 _REMEDY = "Copy the labels of this drive again."
 _NOT_LABELLED = "DontCare"
-# The poses of a standing car wander by less over twenty frames.
-_MOVES_M = 1.0
 # Box axes in the camera's: the box's x forward, y left, z up; the camera's x right, y down, z forward.
 _CAMERA_R_BOX = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-
-
-@dataclass(frozen=True)
-class LabelledBox:
-    """A box in one frame.
-
-    Attributes:
-        frame: log frame.
-        track_id: of its object.
-        label: class, in the file's words.
-        sensor_SE3_box: [4, 4] centre and axes (x forward, y left, z up) in the axes of the labels' sensor.
-        size_m: length, width, height.
-    """
-
-    frame: int
-    track_id: str
-    label: str
-    sensor_SE3_box: Float64
-    size_m: tuple[float, float, float]
 
 
 def read_tracklets(path: Path, log: str) -> list[LabelledBox]:
@@ -131,46 +110,6 @@ def read_tracking_labels(path: Path, log: str) -> list[LabelledBox]:
         centre = np.array(lower) - np.array([0.0, height / 2, 0.0])
         boxes.append(LabelledBox(frame, str(track), words[2], _compose(axes, centre), (length, width, height)))
     return boxes
-
-
-def build_tracks(
-    boxes: list[LabelledBox], world_SE3_sensor: Callable[[int], Float64], frame_count: int
-) -> tuple[CuboidTrack, ...]:
-    """Joins the boxes of each object.
-
-    Args:
-        boxes: of all frames.
-        world_SE3_sensor: frame → [4, 4] pose of the labels' sensor.
-        frame_count: boxes of later frames are left out.
-
-    Returns:
-        Tracks by their ids. KITTI does not say what moves: an object whose boxes are a metre apart does.
-    """
-    by_track: dict[str, dict[int, LabelledBox]] = {}
-    for box in boxes:
-        if 0 <= box.frame < frame_count:
-            by_track.setdefault(box.track_id, {})[box.frame] = box
-    poses = {frame: world_SE3_sensor(frame) for frame in {box.frame for box in boxes} if 0 <= frame < frame_count}
-    tracks = []
-    # As numbers are sorted, though they are text.
-    for track_id in sorted(by_track, key=lambda name: (len(name), name)):
-        frames = sorted(by_track[track_id])
-        rows = [by_track[track_id][frame] for frame in frames]
-        world = np.stack([poses[frame] @ box.sensor_SE3_box for frame, box in zip(frames, rows, strict=True)])
-        # The benchmark's sizes are one for all frames; tracklets of others may differ.
-        sizes = np.median([box.size_m for box in rows], axis=0)
-        distances = np.linalg.norm(world[:, :3, 3] - world[0, :3, 3], axis=1)
-        tracks.append(
-            CuboidTrack(
-                track_id=track_id,
-                label=rows[0].label,
-                frames=np.array(frames, dtype=np.int64),
-                world_SE3_box=world,
-                size_m=(float(sizes[0]), float(sizes[1]), float(sizes[2])),
-                moving=bool(distances.max() > _MOVES_M),
-            )
-        )
-    return tuple(tracks)
 
 
 def _rotate(axis: str, angle_rad: float) -> Float64:

@@ -14,7 +14,7 @@ from genre_tasks.logs.file_digest import digest_files
 from genre_tasks.logs.file_reading import read_file
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.image_sizes import choose_lens, measure_images, report_problems
-from genre_tasks.logs.kitti.boxes import build_tracks, read_tracking_labels, read_tracklets
+from genre_tasks.logs.kitti.boxes import read_tracking_labels, read_tracklets
 from genre_tasks.logs.kitti.drive_files import (
     CALIBRATION_FILES,
     TRACKLETS_FILE,
@@ -24,7 +24,9 @@ from genre_tasks.logs.kitti.drive_files import (
     read_text,
     read_times,
 )
-from genre_tasks.logs.kitti.drive_poses import DrivePoses
+from genre_tasks.logs.kitti.drive_poses import project_records
+from genre_tasks.logs.labelled_boxes import build_tracks
+from genre_tasks.logs.timed_poses import TimedPoses
 from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Lens, Sweep, Truth
 from genre_tasks.suggestions import did_you_mean
 from genre_tasks.user_paths import expand_user_path
@@ -99,7 +101,7 @@ class KittiLog:
         self._read_calibration()
         self._findings: dict[str, Finding] = {}
 
-    def _read_poses(self) -> DrivePoses:
+    def _read_poses(self) -> TimedPoses:
         times = read_times(self._files.times_file("oxts"), self.uri)
         # A drive may lack records; poses between those that there are serve all sensors.
         frames = [frame for frame in sorted(self._files.poses) if frame < len(times) and np.isfinite(times[frame])]
@@ -113,7 +115,7 @@ class KittiLog:
         if not (np.diff(times[frames]) > 0).all():
             file = self._files.times_file("oxts")
             raise InputError("the times of the poses do not increase", remedy=_COPY_REMEDY, file=file, log=self.uri)
-        return DrivePoses(times[frames], np.stack(records))
+        return project_records(times[frames], np.stack(records))
 
     def _read_camera_times(self, camera: str) -> Float64:
         path = self._files.times_file(camera)

@@ -1,0 +1,279 @@
+"""Reader of the Argoverse 2 sensor dataset: ``argoverse2:PATH/LOG``."""
+
+from __future__ import annotations
+
+import re
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from genre_tasks.errors import InputError
+from genre_tasks.logs.argoverse2.feather_tables import POSITION, QUATERNION, compose_poses, read_columns
+from genre_tasks.logs.file_digest import digest_files
+from genre_tasks.logs.file_reading import read_file
+from genre_tasks.logs.findings import Finding
+from genre_tasks.logs.image_sizes import choose_lens, measure_images, report_problems
+from genre_tasks.logs.labelled_boxes import LabelledBox, build_tracks
+from genre_tasks.logs.timed_poses import TimedPoses
+from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Lens, Sweep, Truth
+from genre_tasks.suggestions import did_you_mean
+from genre_tasks.user_paths import expand_user_path
+
+_POSES = "city_SE3_egovehicle.feather"
+_MOUNTS = "calibration/egovehicle_SE3_sensor.feather"
+_LENSES = "calibration/intrinsics.feather"
+_BOXES = "annotations.feather"
+_TIMED_FILE = re.compile(r"([0-9]{1,18})\.(?:jpg|png|feather)")
+_REMEDY = "Give the folder of one log, as in argoverse2:PATH/7fab2350-7eaf-3b7e-a39d-6937a4c1bede."
+_LENS_COLUMNS = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
+_SIZE_COLUMNS = ("length_m", "width_m", "height_m")
+# The grey stereo pair looks where the front camera of the ring does.
+_RING = "ring_"
+_INTENSITY_SCALE = 255.0
+_NS = 1e-9
+# Without a neighbour, what a sweep's frame lasts: ten sweeps a second.
+_PERIOD_S = 0.1
+
+
+def open_argoverse2(rest: str) -> Argoverse2Log:
+    """Opens the folder of one log.
+
+    Args:
+        rest: path of the folder; ``~`` is the home folder.
+
+    Returns:
+        The log.
+
+    Raises:
+        InputError: no such log, or its poses or calibration cannot be read.
+    """
+    folder = expand_user_path(rest)
+    uri = f"argoverse2:{rest}"
+    if not rest or not (folder / _POSES).is_file():
+        logs = sorted(path.parent.name for path in folder.glob(f"*/{_POSES}")) if rest else []
+        hint = f" Logs in it: {', '.join(logs[:10])}." if logs else ""
+        raise InputError(f"there is no {_POSES}", remedy=f"{_REMEDY}{hint}", file=folder, log=uri)
+    return Argoverse2Log(uri, folder.resolve())
+
+
+class Argoverse2Log:
+    """A ``DrivingLog`` over a log of Argoverse 2; see ``DrivingLog`` for methods, units and axes.
+
+    A frame is a sweep; each camera gives its image that is nearest in time, with the pose of that time. Images are
+    undistorted already, and all rows are taken at once. The world is the city's, moved to where the log begins.
+
+    Args:
+        uri: what the user wrote.
+        folder: of the log.
+
+    Raises:
+        InputError: poses or calibration cannot be read, or there are no sweeps.
+    """
+
+    dataset = "argoverse2"
+    truth: Truth | None = None
+
+    def __init__(self, uri: str, folder: Path) -> None:
+        self.uri = uri
+        self.folder = folder
+        self.name = re.sub(r"[^\w.=,+-]", "_", folder.name, flags=re.ASCII)
+        self._sweeps = _list_timed_files(folder / "sensors/lidar")
+        self._sweep_times_ns = np.array(sorted(self._sweeps), dtype=np.int64)
+        self.frame_count = len(self._sweep_times_ns)
+        if not self.frame_count:
+            raise InputError("there are no sweeps", remedy=_REMEDY, file=folder / "sensors/lidar", log=uri)
+        self._poses = self._read_poses()
+        self._mounts = self._read_mounts()
+        self._lenses = self._read_lenses()
+        self._images = {name: _list_timed_files(folder / "sensors/cameras" / name) for name in self._lenses}
+        self._findings: dict[str, Finding] = {}
+
+    def _read_poses(self) -> TimedPoses:
+        path = self.folder / _POSES
+        columns = read_columns(path, ("timestamp_ns", *QUATERNION, *POSITION), self.uri)
+        # Several sensors may share a time.
+        times_ns, rows = np.unique(columns["timestamp_ns"].astype(np.int64), return_index=True)
+        if len(times_ns) < 2:
+            raise InputError(f"{len(times_ns)} poses; two are needed", remedy=_REMEDY, file=path, log=self.uri)
+        rotations, positions = compose_poses({name: values[rows] for name, values in columns.items()}, path, self.uri)
+        # A city's origin may be kilometres away.
+        return TimedPoses(times_ns * _NS, rotations, positions - positions[0])
+
+    def _read_mounts(self) -> dict[str, Float64]:
+        """Sensor → [4, 4] vehicle_SE3_sensor."""
+        path = self.folder / _MOUNTS
+        columns = read_columns(path, (*QUATERNION, *POSITION), self.uri, texts=("sensor_name",))
+        rotations, positions = compose_poses(columns, path, self.uri)
+        poses = np.tile(np.eye(4), (len(positions), 1, 1))
+        poses[:, :3, :3] = rotations.as_matrix()
+        poses[:, :3, 3] = positions
+        return dict(zip(columns["sensor_name"], poses, strict=True))
+
+    def _read_lenses(self) -> dict[str, Lens]:
+        """Camera → lens, of the ring's cameras that have a mount."""
+        path = self.folder / _LENSES
+        columns = read_columns(path, _LENS_COLUMNS, self.uri, texts=("sensor_name",))
+        rows = np.stack([columns[name].astype(np.float64) for name in _LENS_COLUMNS], axis=1)
+        lenses = {}
+        for name, row in zip(columns["sensor_name"], rows.tolist(), strict=True):
+            if not name.startswith(_RING):
+                continue
+            fx_px, fy_px, cx_px, cy_px, width_px, height_px = row
+            if name not in self._mounts or not (fx_px > 0 and fy_px > 0 and width_px >= 1 and height_px >= 1):
+                problem = f"{name} has no place on the vehicle, or no positive focal length and size"
+                raise InputError(problem, remedy="Download the log again.", file=path, log=self.uri, camera=name)
+            # Taken to count from the centre of the first pixel, as OpenCV's calibration does.
+            lenses[name] = Lens(fx_px, fy_px, cx_px + 0.5, cy_px + 0.5, int(width_px), int(height_px))
+        return lenses
+
+    @cached_property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The ring's cameras that have images, in the order of the calibration."""
+        cameras = []
+        for name, lens in self._lenses.items():
+            files = self._images[name]
+            if not files:
+                continue
+            measured = measure_images(dict(enumerate(files.values())))
+            self._report(*report_problems(measured, name))
+            lens, findings = choose_lens(lens, measured, name)
+            self._report(*findings)
+            cameras.append(Camera(name, lens))
+        return tuple(cameras)
+
+    @cached_property
+    def _nearest(self) -> dict[str, list[int | None]]:
+        """Camera → for each frame the time of its image, in ns."""
+        return {name: self._find_nearest(sorted(files)) for name, files in self._images.items()}
+
+    def _find_nearest(self, times_ns: list[int]) -> list[int | None]:
+        steps = np.diff(self._sweep_times_ns)
+        period_ns = float(np.median(steps)) if len(steps) else _PERIOD_S / _NS
+        found: list[int | None] = []
+        times = np.array(times_ns, dtype=np.int64)
+        for frame_ns in self._sweep_times_ns:
+            nearest = int(times[np.argmin(np.abs(times - frame_ns))]) if len(times) else None
+            # Of another frame, where images are missing.
+            is_near = nearest is not None and abs(nearest - int(frame_ns)) <= period_ns / 2
+            found.append(nearest if is_near else None)
+        return found
+
+    def frame_timestamp_s(self, frame: int) -> float:
+        """See ``DrivingLog``."""
+        return float(self._sweep_times_ns[self._check_frame(frame)] * _NS)
+
+    def world_SE3_lidar(self, frame: int) -> Float64:
+        """See ``DrivingLog``: the vehicle's own frame, in whose axes sweeps and boxes are."""
+        return self._poses.matrix_at(self.frame_timestamp_s(frame))
+
+    def world_SE3_camera(self, camera: str, frame: int) -> Float64:
+        """See ``DrivingLog``."""
+        time_s = self.camera_timestamp_s(camera, frame)
+        pose: Float64 = self._poses.matrix_at(time_s) @ self._mounts[camera]
+        return pose
+
+    def camera_timestamp_s(self, camera: str, frame: int) -> float:
+        """See ``DrivingLog``; the sweep's time where a frame has no image."""
+        self._check_camera(camera, frame)
+        time_ns = self._nearest[camera][self._check_frame(frame)]
+        return self.frame_timestamp_s(frame) if time_ns is None else time_ns * _NS
+
+    def image_bytes(self, camera: str, frame: int) -> bytes | None:
+        """See ``DrivingLog``."""
+        self._check_camera(camera, frame)
+        time_ns = self._nearest[camera][self._check_frame(frame)]
+        if time_ns is None:
+            return None
+        return read_file(self._images[camera][time_ns], log=self.uri, camera=camera, frame=frame)
+
+    def sweep(self, frame: int) -> Sweep | None:
+        """See ``DrivingLog``; both LiDARs, whose points the dataset has moved to the sweep's time already."""
+        time_ns = int(self._sweep_times_ns[self._check_frame(frame)])
+        path = self._sweeps[time_ns]
+        try:
+            columns = read_columns(path, ("x", "y", "z", "intensity", "offset_ns"), self.uri)
+        except InputError as error:
+            error.frame = frame
+            raise
+        local = np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=1)
+        pose = self.world_SE3_lidar(frame)
+        intensity = columns["intensity"].astype(np.float32) / np.float32(_INTENSITY_SCALE)
+        return Sweep(
+            points_world=local @ pose[:3, :3].T + pose[:3, 3],
+            intensity=np.clip(intensity, 0.0, 1.0),
+            timestamps_s=(time_ns + columns["offset_ns"].astype(np.int64)) * _NS,
+        )
+
+    def tracks(self) -> tuple[CuboidTrack, ...]:
+        """See ``DrivingLog``.
+
+        Raises:
+            InputError: there are boxes, and they cannot be read.
+        """
+        return self._tracks
+
+    @cached_property
+    def _tracks(self) -> tuple[CuboidTrack, ...]:
+        path = self.folder / _BOXES
+        # Logs of the test split have none.
+        if not path.is_file():
+            return ()
+        numbers = ("timestamp_ns", *QUATERNION, *POSITION, *_SIZE_COLUMNS)
+        columns = read_columns(path, numbers, self.uri, texts=("track_uuid", "category"))
+        sizes = np.stack([columns[name] for name in _SIZE_COLUMNS], axis=1)
+        if (sizes <= 0).any():
+            raise InputError("a box has no size", remedy="Download the log again.", file=path, log=self.uri)
+        return build_tracks(self._read_boxes(columns, sizes, path), self.world_SE3_lidar, self.frame_count)
+
+    def _read_boxes(self, columns: dict[str, Any], sizes: Float64, path: Path) -> list[LabelledBox]:
+        rotations, positions = compose_poses(columns, path, self.uri)
+        matrices = rotations.as_matrix()
+        frames = {int(time_ns): frame for frame, time_ns in enumerate(self._sweep_times_ns)}
+        boxes = []
+        for row, time_ns in enumerate(columns["timestamp_ns"].astype(np.int64).tolist()):
+            # A part of a log may lack the sweeps of most boxes.
+            if time_ns not in frames:
+                continue
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = matrices[row], positions[row]
+            length, width, height = sizes[row].tolist()
+            track, label = columns["track_uuid"][row], columns["category"][row]
+            boxes.append(LabelledBox(frames[time_ns], track, label, pose, (length, width, height)))
+        return boxes
+
+    def findings(self) -> tuple[Finding, ...]:
+        """What was left out, for ``genre check``."""
+        return tuple(self._findings.values()) if self.cameras else ()
+
+    def digest(self) -> str:
+        """Identifies all files that are read."""
+        tables = [self.folder / name for name in (_POSES, _MOUNTS, _LENSES, _BOXES)]
+        files = [path for path in tables if path.is_file()]
+        for timed in (*self._images.values(), self._sweeps):
+            files += timed.values()
+        return digest_files(self.folder, files, ())
+
+    def _report(self, *findings: Finding) -> None:
+        self._findings |= {finding.message: finding for finding in findings}
+
+    def _check_frame(self, frame: int) -> int:
+        if not 0 <= frame < self.frame_count:
+            remedy = f"The log has frames 0 to {self.frame_count - 1}."
+            raise InputError("no such frame", remedy=remedy, log=self.uri, frame=frame)
+        return frame
+
+    def _check_camera(self, camera: str, frame: int) -> None:
+        if camera not in self._lenses:
+            hint = did_you_mean(camera, self._lenses)
+            remedy = f"{hint}The log has {', '.join(self._lenses)}."
+            raise InputError("no such camera", remedy=remedy, log=self.uri, camera=camera, frame=frame)
+
+
+def _list_timed_files(folder: Path) -> dict[int, Path]:
+    """Time in ns → file."""
+    if not folder.is_dir():
+        return {}
+    matches = ((_TIMED_FILE.fullmatch(path.name), path) for path in sorted(folder.iterdir()))
+    return {int(match[1]): path for match, path in matches if match is not None}

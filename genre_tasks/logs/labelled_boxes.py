@@ -1,0 +1,72 @@
+"""Boxes that labels state frame by frame in the axes of a sensor, joined to tracks in the world."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from genre_tasks.logs.types import CuboidTrack, Float64
+
+# The boxes of a standing car wander by less over twenty frames.
+_MOVES_M = 1.0
+
+
+@dataclass(frozen=True)
+class LabelledBox:
+    """A box in one frame.
+
+    Attributes:
+        frame: log frame.
+        track_id: of its object.
+        label: class, in the file's words.
+        sensor_SE3_box: [4, 4] centre and axes (x forward, y left, z up) in the axes of the labels' sensor.
+        size_m: length, width, height.
+    """
+
+    frame: int
+    track_id: str
+    label: str
+    sensor_SE3_box: Float64
+    size_m: tuple[float, float, float]
+
+
+def build_tracks(
+    boxes: list[LabelledBox], world_SE3_sensor: Callable[[int], Float64], frame_count: int
+) -> tuple[CuboidTrack, ...]:
+    """Joins the boxes of each object.
+
+    Args:
+        boxes: of all frames.
+        world_SE3_sensor: frame → [4, 4] pose of the labels' sensor.
+        frame_count: boxes of later frames are left out.
+
+    Returns:
+        Tracks by their ids. Where labels do not say what moves, an object whose boxes are a metre apart does.
+    """
+    by_track: dict[str, dict[int, LabelledBox]] = {}
+    for box in boxes:
+        if 0 <= box.frame < frame_count:
+            by_track.setdefault(box.track_id, {})[box.frame] = box
+    poses = {frame: world_SE3_sensor(frame) for frame in {box.frame for box in boxes} if 0 <= frame < frame_count}
+    tracks = []
+    # As numbers are sorted, though they are text.
+    for track_id in sorted(by_track, key=lambda name: (len(name), name)):
+        frames = sorted(by_track[track_id])
+        rows = [by_track[track_id][frame] for frame in frames]
+        world = np.stack([poses[frame] @ box.sensor_SE3_box for frame, box in zip(frames, rows, strict=True)])
+        # The benchmark's sizes are one for all frames; tracklets of others may differ.
+        sizes = np.median([box.size_m for box in rows], axis=0)
+        distances = np.linalg.norm(world[:, :3, 3] - world[0, :3, 3], axis=1)
+        tracks.append(
+            CuboidTrack(
+                track_id=track_id,
+                label=rows[0].label,
+                frames=np.array(frames, dtype=np.int64),
+                world_SE3_box=world,
+                size_m=(float(sizes[0]), float(sizes[1]), float(sizes[2])),
+                moving=bool(distances.max() > _MOVES_M),
+            )
+        )
+    return tuple(tracks)
