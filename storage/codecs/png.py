@@ -100,7 +100,9 @@ def decode_png(
             # The size is checked below.
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             # Only this format: other decoders need not see a file that claims to be a PNG.
-            with Image.open(source, formats=["PNG"]) as image:
+            # From memory: of a file, Pillow asks for as many bytes at once as a damaged chunk claims to have left.
+            data = io.BytesIO(source.read_bytes()) if isinstance(source, Path) else source
+            with Image.open(data, formats=["PNG"]) as image:
                 if image.mode not in modes:
                     problem = f"{name} has mode {image.mode}, expected {' or '.join(modes)}"
                     raise ArtifactCorruptError(problem, remedy=REMEDY, file=file)

@@ -7,6 +7,8 @@ import io
 import json
 import resource
 import struct
+import subprocess
+import sys
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -39,7 +41,7 @@ from genre_tasks.scene.ply_reader import read_ply
 from genre_tasks.weights import list_weights_files
 from storage.codecs import get_codec
 from storage.codecs.exr import read_channels, write_channels
-from storage.codecs.png import read_png
+from storage.codecs.png import encode_png, read_png
 from storage.codecs.tables import column, read_table, schema, write_table
 from storage.local import LocalStore
 from storage.manifest import parse_manifest
@@ -167,6 +169,27 @@ def test_networks_larger_than_any_are_refused(tmp_path: Path, channels: list[int
     config.write_text(json.dumps(json.loads(config.read_text()) | {"channels": channels}))
     with pytest.raises(ConfigError, match="channels"):
         load_optimiser(weights)
+
+
+_READ_WITHIN_A_GIGABYTE = """
+import resource, sys
+from pathlib import Path
+from storage.codecs.png import encode_png, read_png
+used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 30), resource.RLIM_INFINITY))
+print(read_png(Path(sys.argv[1])).shape)
+"""
+
+
+def test_a_chunk_that_claims_gigabytes_takes_none(tmp_path: Path) -> None:
+    path = tmp_path / "p.png"
+    data = bytearray(encode_png(make_picture()))
+    length = data.index(b"IDAT") - 4
+    data[length] = 0xE8
+    path.write_bytes(data)
+    command = [sys.executable, "-c", _READ_WITHIN_A_GIGABYTE, str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert done.stdout.strip() == str(make_picture().shape), done.stderr
 
 
 def test_networks_larger_than_their_file_take_no_memory(tmp_path: Path) -> None:
