@@ -17,7 +17,14 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from docs import exchange_tables, fault_tables, references, result_tables, simulation_tables  # after the path is set
+from docs import (
+    exchange_tables,
+    fault_tables,
+    references,
+    result_tables,
+    scale_tables,
+    simulation_tables,
+)  # after the path is set
 
 BLOCK = re.compile(r"<!-- generated: ([\w-]+) -->\n(.*?)<!-- end -->", re.DOTALL)
 
@@ -39,6 +46,11 @@ BLOCKS: Mapping[str, Callable[[], str]] = {
     "log-faults-claims": lambda: result_tables.claims("log_faults"),
     "faults": fault_tables.matrix,
     "fault-injections": fault_tables.injections,
+    "scale-claims": lambda: result_tables.claims("scale"),
+    "scale-workers": scale_tables.workers,
+    "scale-cluster": scale_tables.cluster,
+    "scale-cluster-run": scale_tables.cluster_runs,
+    "fuzz-formats": scale_tables.fuzz,
     "exchange-claims": exchange_tables.claims,
     "exchange-formats": exchange_tables.formats,
     "exchange-enhancement": exchange_tables.enhancement,

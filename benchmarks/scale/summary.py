@@ -78,6 +78,7 @@ def summarise_cluster(run: ClusterRun) -> Row:
     busy_api = [request for request in api if first <= request.time_s <= last]
     statuses = Counter(str(row["status"]) for row in run.outcomes)
     cores = measure_usage(run.samples[0], run.samples[-1])
+    parts = _split_in_parts(run, busy_api, store)
     return {
         "logs": run.logs,
         "workers": run.workers,
@@ -91,12 +92,13 @@ def summarise_cluster(run: ClusterRun) -> Row:
         "attempts": sum(int(row["attempts"]) for row in run.outcomes),
         "stages": _count_stages(run),
         "cores": cores,
-        "first_limit": find_limit(cores),
+        # Of the busiest part: at the start and the end there is less to do.
+        "first_limit": find_limit(max([cores, *(p["cores"] for p in parts if p["cores"])], key=_busy_prefect)),
         "per_log": _divide(run, busy_api, store),
         "idle": _measure_idle(run, api),
         "capacity": _predict_capacity(run),
         "latencies": _measure_latencies(busy_api, store, first, last),
-        "parts": _split_in_parts(run, busy_api, store),
+        "parts": parts,
         "client": _describe_client(run),
         "server_peak_mib": round(max(sample.rss_mib["prefect"] for sample in run.samples), 1),
         "server_rss_growth_mib": round(run.samples[-1].rss_mib["prefect"] - run.samples[0].rss_mib["prefect"], 1),
@@ -106,6 +108,10 @@ def summarise_cluster(run: ClusterRun) -> Row:
         "event_delay_s": [round(delay, 1) for delay in run.event_delays],
         "api_errors": sum(request.is_error for request in busy_api),
     }
+
+
+def _busy_prefect(cores: Mapping[str, float]) -> float:
+    return cores["prefect"]
 
 
 def find_limit(cores: Mapping[str, float]) -> str:
