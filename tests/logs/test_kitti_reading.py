@@ -119,6 +119,11 @@ BROKEN = {
     "no images": (_remove("image_02"), "no images", "0001_sync"),
     "times of words": (_write("image_02/timestamps.txt", "yesterday\n" * 6), "no time", "timestamps.txt"),
     "a thirteenth month": (_write("oxts/timestamps.txt", "2011-13-01 00:00:00.0\n" * 6), "no time", "timestamps.txt"),
+    "times that stand": (
+        _write("velodyne_points/timestamps.txt", "2011-09-26 13:08:24.9\n" * 6),
+        "do not increase",
+        "timestamps.txt",
+    ),
     "few times": (_write("image_02/timestamps.txt", "2011-09-26 13:08:24.9\n"), "1 times for 6", "timestamps.txt"),
 }
 
@@ -165,6 +170,20 @@ def test_points_that_are_not_finite_are_left_out(drive: Path) -> None:
     log = open_log(f"kitti:{drive}")
     assert len(log.sweep(1).points_world) == len(rows) - 1
     assert "1 points of sweep 1" in "".join(finding.message for finding in log.findings())
+
+
+def test_a_missing_sweep_without_a_time_keeps_its_frame(drive: Path) -> None:
+    expected = [open_log(f"kitti:{drive}").frame_timestamp_s(frame) for frame in range(FAKE.frame_count)]
+    path = drive / "velodyne_points/timestamps.txt"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:2], "", *lines[3:]]) + "\n")
+    (drive / "velodyne_points/data/0000000002.bin").unlink()
+
+    log = open_log(f"kitti:{drive}")
+    found = [log.frame_timestamp_s(frame) for frame in range(log.frame_count)]
+    assert found == pytest.approx(expected, abs=1e-6)
+    assert log.sweep(2) is None
+    assert log.sweep(3) is not None
 
 
 def test_a_drive_without_boxes_says_so(drive: Path) -> None:

@@ -90,16 +90,23 @@ class KittiLog:
         if labels is not None and not labels.is_file():
             raise InputError("there is no such file of labels", remedy="Correct labels=FILE.", file=labels, log=uri)
         self._labels = labels
-        self._times = read_times(self._files.times_file("velodyne_points"), uri)
+        self._times = self._read_lidar_times()
         self.frame_count = len(self._times)
-        if not self.frame_count or not np.isfinite(self._times).all():
-            problem = "the times of the LiDAR are empty, or one is missing"
-            file = self._files.times_file("velodyne_points")
-            raise InputError(problem, remedy=_COPY_REMEDY, file=file, log=uri)
         self._poses = self._read_poses()
         self._camera_times = {name: self._read_camera_times(name) for name in self._files.cameras}
         self._read_calibration()
         self._findings: dict[str, Finding] = {}
+
+    def _read_lidar_times(self) -> Float64:
+        path = self._files.times_file("velodyne_points")
+        times = read_times(path, self.uri)
+        known = np.flatnonzero(np.isfinite(times))
+        # A sweep that is missing has no time, as in whole drives of KITTI; turns follow one another evenly.
+        filled = np.interp(np.arange(len(times)), known, times[known]) if len(known) else times
+        if not len(known) or not (np.diff(filled) > 0).all():
+            problem = "the times of the LiDAR are empty, or do not increase"
+            raise InputError(problem, remedy=_COPY_REMEDY, file=path, log=self.uri)
+        return filled
 
     def _read_poses(self) -> TimedPoses:
         times = read_times(self._files.times_file("oxts"), self.uri)
@@ -245,6 +252,8 @@ class KittiLog:
         if self._turns is None:
             return np.full(len(rows), self.frame_timestamp_s(frame))
         begin, end = (float(times[frame]) for times in self._turns)
+        if not np.isfinite(end - begin):
+            return np.full(len(rows), self.frame_timestamp_s(frame))
         # A turn begins behind the vehicle, and runs clockwise as seen from above.
         part = 0.5 - np.arctan2(rows[:, 1], rows[:, 0]).astype(np.float64) / (2 * np.pi)
         return begin + part * (end - begin)
