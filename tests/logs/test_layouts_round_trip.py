@@ -13,7 +13,7 @@ from genre_tasks.logs.registry import open_log
 from tests.fakes import FakeCar, FakeLog
 from tests.logs.kitti_folder import shifted_world, write_kitti
 
-# Two hundred logs in each layout; the seeds are those of the project's tuning.
+# Two hundred logs in each layout. They are drawn by the tests' own fake, and are no streets.
 SEEDS = range(200)
 _RIGS = (("front",), ("front", "left"), ("left", "front", "right"), ("back", "front"))
 
