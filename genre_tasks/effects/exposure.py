@@ -10,6 +10,7 @@ import numpy as np
 
 from genre_tasks.effects.measurements import ChunkMeasurements
 from genre_tasks.effects.types import Effect, EffectParameters, Measurement
+from genre_tasks.logs.types import Float64
 from genre_tasks.scene.chunk import Gain, View
 
 
@@ -38,7 +39,8 @@ def fit(measurements: ChunkMeasurements) -> EffectParameters:
         measurements: the chunk's colours of points.
 
     Returns:
-        The gains that were measured of source views; other views take theirs from their camera's neighbours in time.
+        The gains that were measured of source views. Other views take theirs from their camera's neighbours in time,
+        along the line through the two nearest ones before the first and after the last source view.
     """
     # Held-out views are not measured: their images are what the scene is judged by.
     known: dict[str, list[tuple[float, Gain]]] = {}
@@ -57,11 +59,22 @@ def fit(measurements: ChunkMeasurements) -> EffectParameters:
 
 def _interpolate_gain(view: View, known: list[tuple[float, Gain]]) -> Gain:
     ordered = sorted(known)
-    times = [time for time, _ in ordered]
+    times = np.array([time for time, _ in ordered])
     gains = np.array([gain for _, gain in ordered])
-    # Before the first and after the last source view the nearest gain holds: gains are never extrapolated.
+    if len(times) > 1:
+        times, gains = _extend_linearly(times, gains)
     red, green, blue = (float(np.interp(view.timestamp_s, times, gains[:, k])) for k in range(3))
     return red, green, blue
+
+
+def _extend_linearly(times: Float64, gains: Float64) -> tuple[Float64, Float64]:
+    # An exposure that swings goes on swinging after the last source image. One interval further is as far as the
+    # neighbours can tell: beyond it the gain is held, or a long gap would drive it away.
+    before = 2 * gains[0] - gains[1]
+    after = 2 * gains[-1] - gains[-2]
+    steps = np.diff(times)
+    times = np.concatenate([[times[0] - steps[0]], times, [times[-1] + steps[-1]]])
+    return times, np.concatenate([before[None], gains, after[None]])
 
 
 EFFECT = Effect(

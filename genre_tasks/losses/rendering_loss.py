@@ -26,6 +26,9 @@ from genre_tasks.threads import map_single_threaded
 CROP_PX = 128
 """Side of the perceptual term's crop: the network's stride is 32, its features see about a hundred pixels."""
 
+CLIPPED = 254.0 / 255
+"""Pixels of an image from here on are taken to be clipped: resizing leaves few of them at exactly 1."""
+
 ImageDistance = Callable[[Tensor, Tensor], Tensor]
 """A perceptual distance: two batches of images [B, H, W, 3] in [0, 1] → [B]."""
 
@@ -155,7 +158,7 @@ def image_gradients(
     gains = _stack_gains(targets, color)
     if gains is not None:
         # The render gets the gain, rather than the image losing it: what is clipped in an image cannot be restored.
-        color = apply_gain(color, gains)
+        color, beyond_clipped = _clip_where_images_are(apply_gain(color, gains), targets)
     compute = image_loss if is_supported(color, depth, targets) else torch_image_loss
     result = compute(config, color, depth, targets, terms.weights)
     # In float64 and in the order of the views, whatever number of threads computed them.
@@ -171,7 +174,7 @@ def image_gradients(
             depth_gradient[i][target.ego_mask] = 0.0
     if gains is not None:
         # The chain rule: gradients are with respect to the render without the gain.
-        color_gradient = color_gradient * gain_factor(gains)
+        color_gradient = torch.where(beyond_clipped, 0.0, color_gradient * gain_factor(gains))
     return loss, color_gradient, depth_gradient
 
 
@@ -186,7 +189,7 @@ def residual_image(color: Tensor, targets: Sequence[Target]) -> Tensor:
         [V, H, W, 3] image minus render, 0 on the ego vehicle.
     """
     gains = _stack_gains(targets, color)
-    exposed = color if gains is None else apply_gain(color, gains)
+    exposed = color if gains is None else _clip_where_images_are(apply_gain(color, gains), targets)[0]
     residual = torch.empty_like(color)
     for i, target in enumerate(targets):
         _subtract(target.image.pixels, exposed[i], residual[i])
@@ -263,6 +266,17 @@ def _stack_gains(targets: Sequence[Target], like: Tensor) -> Tensor | None:
     if all(target.log_gain is None for target in targets):
         return None
     return like.new_tensor([target.log_gain or (0.0, 0.0, 0.0) for target in targets])[:, None, None]
+
+
+def _clip_where_images_are(color: Tensor, targets: Sequence[Target]) -> tuple[Tensor, Tensor]:
+    """Takes renders [V, H, W, 3] that are brighter than a clipped image to agree with it, and says where.
+
+    A clipped pixel tells that the scene is at least so bright. Pulled down to 1 by a bright image, a sky would be too
+    dark in the images of a shorter exposure.
+    """
+    images = torch.stack([target.image.pixels for target in targets])
+    beyond = (images >= CLIPPED) & (color > images)
+    return torch.where(beyond, images, color), beyond
 
 
 def _random_below(limit: int, generator: torch.Generator) -> int:
