@@ -33,6 +33,9 @@ class EffectsConfig(Section):
     distant_region: EffectSetting = Field(
         "auto", description="Gaussians for what LiDAR does not reach and parallax does not move."
     )
+    multi_view_stereo: EffectSetting = Field(
+        "auto", description="Surfaces that LiDAR does not reach get points from several images of them."
+    )
     rolling_shutter: EffectSetting = Field(
         "auto", description="Rows of an image are read out one after another while the camera moves."
     )

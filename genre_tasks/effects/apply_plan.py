@@ -5,6 +5,7 @@ This module imports no effect: a plan's artifact holds all that is needed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,9 @@ _POINT_ATTRIBUTES = ("positions", "colors", "colored", "frames")
 
 
 def apply_plan(chunk: Chunk, plan: EffectsPlan) -> Chunk:
-    """Gives each view its gain, ego mask, shutter and blur, and makes actors static where they are not modelled.
+    """Gives each view its gain, ego mask, shutter and blur, and the background what effects add to it.
+
+    That is points of multi-view stereo, and actors where they are not modelled.
 
     Args:
         chunk: as ``ingest`` made it.
@@ -28,6 +31,9 @@ def apply_plan(chunk: Chunk, plan: EffectsPlan) -> Chunk:
     if chunk.actors and not plan.is_on("rigid_actors"):
         # Without nodes of their own, actors are smeared along their way, as in any static reconstruction.
         chunk = replace(chunk, static=_merge_actors_into_background(chunk), actors=())
+    stereo_points = plan.parameters.stereo_points
+    if stereo_points is not None:
+        chunk = replace(chunk, static=_join_points([chunk.static, stereo_points]))
     # The default plan decides nothing, so that lenses stay as they are.
     undistort = bool(plan.decisions) and not plan.is_on("lens_distortion")
     views = tuple(_apply_to_view(view, plan, undistort) for view in chunk.views)
@@ -55,7 +61,10 @@ def _apply_to_view(view: View, plan: EffectsPlan, undistort: bool) -> View:
 
 def _merge_actors_into_background(chunk: Chunk) -> Points:
     """Adds every actor's points to the background, where the point's own sweep saw them."""
-    parts = [chunk.static, *(_points_in_chunk(actor) for actor in chunk.actors)]
+    return _join_points([chunk.static, *(_points_in_chunk(actor) for actor in chunk.actors)])
+
+
+def _join_points(parts: Sequence[Points]) -> Points:
     return Points(*(np.concatenate([getattr(part, name) for part in parts]) for name in _POINT_ATTRIBUTES))
 
 

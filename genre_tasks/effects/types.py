@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from genre_tasks.logs.types import MotionBlur, RollingShutter
+from genre_tasks.scene.chunk import Points
 
 if TYPE_CHECKING:
     from genre_tasks.effects.measurements import ChunkMeasurements
@@ -51,12 +52,14 @@ class EffectParameters:
         ego_masks: by camera, [H, W], true where the recording vehicle itself is in the image.
         shutters: how the camera moves while the rows of an image are read out.
         blurs: how the camera moves while an image is exposed.
+        stereo_points: of the background, where LiDAR has none; ``None``: there are none.
     """
 
     gains: Mapping[ImageKey, tuple[float, float, float]] = field(default_factory=dict)
     ego_masks: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
     shutters: Mapping[ImageKey, RollingShutter] = field(default_factory=dict)
     blurs: Mapping[ImageKey, MotionBlur] = field(default_factory=dict)
+    stereo_points: Points | None = None
 
     def merge(self, other: EffectParameters) -> EffectParameters:
         """Combines the parameters of two effects.
@@ -78,6 +81,7 @@ class EffectParameters:
             ego_masks={**self.ego_masks, **other.ego_masks},
             shutters={**self.shutters, **other.shutters},
             blurs={**self.blurs, **other.blurs},
+            stereo_points=self.stereo_points if other.stereo_points is None else other.stereo_points,
         )
 
 

@@ -12,12 +12,12 @@ import pyarrow as pa
 from genre_tasks.errors import ArtifactCorruptError
 from genre_tasks.scene.chunk import Actor, Chunk, LogIssue, Points, View
 from storage.codecs.actors import read_actors, write_actors
+from storage.codecs.point_table import read_points, write_points
 from storage.codecs.tables import (
     POSE,
     REMEDY,
     check_array,
     column,
-    column_array,
     poses_from_rows,
     poses_to_column,
     read_records,
@@ -66,21 +66,6 @@ VIEWS = schema(
         column("image", pa.large_binary(), "encoded image, the bytes of the log"),
     ],
 )
-# One table for all nodes, because a chunk may have a hundred actors with a few points each.
-POINTS = schema(
-    "points/1",
-    [
-        column("node", pa.int64(), "0 static (chunk coordinates), 2 + k actor k (box coordinates)"),
-        column("x", pa.float32(), "metres"),
-        column("y", pa.float32(), "metres"),
-        column("z", pa.float32(), "metres"),
-        column("red", pa.uint8(), "sRGB"),
-        column("green", pa.uint8(), "sRGB"),
-        column("blue", pa.uint8(), "sRGB"),
-        column("colored", pa.bool_(), "an image saw it unoccluded"),
-        column("frame", pa.int16(), "frame of the log of its sweep"),
-    ],
-)
 LOG_ISSUES = schema(
     "marks/1",
     [
@@ -118,7 +103,8 @@ def write(folder: Path, value: Chunk) -> None:
     frames = {"frame": list(value.frames), "chunk_SE3_ego": poses_to_column(ego, "chunk_SE3_ego")}
     write_table(folder / "frames.parquet", FRAMES, frames)
     _write_views(folder, value.views)
-    _write_points(folder, [(STATIC, value.static)] + [(FIRST_ACTOR + k, a.points) for k, a in enumerate(value.actors)])
+    nodes = [(STATIC, value.static)] + [(FIRST_ACTOR + k, a.points) for k, a in enumerate(value.actors)]
+    write_points(folder / "points.parquet", nodes)
     write_actors(folder / "actors.parquet", value.actors)
     write_records(folder / "marks.parquet", LOG_ISSUES, value.log_issues)
 
@@ -144,7 +130,7 @@ def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> Chunk:
         )
     (head,) = rows
     frames = read_table(folder / "frames.parquet", FRAMES)[0]
-    points = _read_points(folder)
+    points = read_points(folder / "points.parquet")
     actors = read_actors(folder / "actors.parquet")
     stray = set(points) - {STATIC, *(FIRST_ACTOR + k for k in range(len(actors)))}
     # Points of an unknown node would be dropped silently, and the scene would lack them without any sign.
@@ -203,43 +189,6 @@ def _read_views(folder: Path) -> tuple[View, ...]:
         pose, lens = pose_and_lens(row)
         views.append(View(row["camera"], row["frame"], row["role"], row["timestamp_s"], pose, lens, row["image"]))
     return tuple(views)
-
-
-def _write_points(folder: Path, nodes: list[tuple[int, Points]]) -> None:
-    # All nodes are checked before anything is joined, so that the error can name the node.
-    for node, p in nodes:
-        check_array(p.positions, f"positions of node {node}", np.float32, (None, 3))
-        check_array(p.colors, f"colors of node {node}", np.uint8, (len(p), 3))
-        check_array(p.colored, f"colored of node {node}", np.bool_, (len(p),))
-        check_array(p.frames, f"frames of node {node}", np.int16, (len(p),))
-    positions = np.concatenate([p.positions for _, p in nodes])
-    colors = np.concatenate([p.colors for _, p in nodes])
-    columns = {
-        "node": np.concatenate([np.full(len(p), node, np.int64) for node, p in nodes]),
-        **{axis: positions[:, i] for i, axis in enumerate("xyz")},
-        **{name: colors[:, i] for i, name in enumerate(("red", "green", "blue"))},
-        "colored": np.concatenate([p.colored for _, p in nodes]),
-        "frame": np.concatenate([p.frames for _, p in nodes]),
-    }
-    write_table(folder / "points.parquet", POINTS, columns)
-
-
-def _read_points(folder: Path) -> dict[int, Points]:
-    table = read_table(folder / "points.parquet", POINTS)[0]
-    node = column_array(table, "node")
-    # Sorted nodes make each one a slice, found by bisection.
-    if np.any(np.diff(node) < 0):
-        raise ArtifactCorruptError("Column 'node' is not sorted", remedy=REMEDY, file=folder / "points.parquet")
-    positions = np.stack([column_array(table, c) for c in ("x", "y", "z")], 1)
-    colors = np.stack([column_array(table, c) for c in ("red", "green", "blue")], 1)
-    colored = column_array(table, "colored")
-    frame = column_array(table, "frame")
-    points = {}
-    for n in np.unique(node).tolist():
-        rows = slice(*np.searchsorted(node, [n, n + 1]).tolist())
-        # Copied, because a slice would keep the points of all nodes in memory.
-        points[n] = Points(positions[rows].copy(), colors[rows].copy(), colored[rows].copy(), frame[rows].copy())
-    return points
 
 
 def _no_points() -> Points:

@@ -1,6 +1,7 @@
 """Plan of effects ↔ ``effects.parquet``, a row an effect, and what those that are on need to be applied.
 
-That is ``gains.parquet``, ``shutters.parquet``, ``blurs.parquet`` and ``own/CAMERA.png``.
+That is ``gains.parquet``, ``shutters.parquet``, ``blurs.parquet``, ``own/CAMERA.png`` and, where stereo found points,
+``points.parquet``.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import pyarrow as pa
 from genre_tasks.effects.types import Decision, EffectParameters, EffectsPlan
 from genre_tasks.logs.types import MotionBlur, RollingShutter
 from storage.codecs.png import read_png, write_png
+from storage.codecs.point_table import read_points, write_points
 from storage.codecs.tables import column, read_records, read_rows, schema, write_records, write_table
 from storage.codecs.view_columns import CAMERA_AND_FRAME, image_columns
 
@@ -82,6 +84,9 @@ def write(folder: Path, value: EffectsPlan) -> None:
     for camera, mask in value.parameters.ego_masks.items():
         # Three equal channels, because that is the one PNG format of the store, and any viewer shows it.
         write_png(folder / "own" / f"{camera}.png", np.repeat(np.uint8(255) * mask[..., None], 3, 2))
+    # Only where there are any, as masks: plans without the effect keep their bytes.
+    if value.parameters.stereo_points is not None:
+        write_points(folder / "points.parquet", [(0, value.parameters.stereo_points)])
 
 
 def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> EffectsPlan:
@@ -104,7 +109,9 @@ def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> Effects
     shutters = _read_motions(folder / "shutters.parquet", SHUTTERS, RollingShutter, "readout_s")
     blurs = _read_motions(folder / "blurs.parquet", BLURS, MotionBlur, "exposure_s")
     decisions = read_records(folder / "effects.parquet", EFFECTS, Decision)
-    return EffectsPlan(decisions, EffectParameters(gains, masks, shutters, blurs))
+    points_path = folder / "points.parquet"
+    stereo_points = read_points(points_path).get(0) if points_path.is_file() else None
+    return EffectsPlan(decisions, EffectParameters(gains, masks, shutters, blurs, stereo_points))
 
 
 def measurements(value: EffectsPlan) -> dict[str, Any]:

@@ -186,7 +186,8 @@ def effects(rng: np.random.Generator, count: int = 3) -> EffectsPlan:
         )
         for k, x in enumerate(numbers)
     }
-    return EffectsPlan(tuple(rows), EffectParameters(gains, own, shutters, blurs))
+    stereo_points = points(rng, 7 * count) if count else None
+    return EffectsPlan(tuple(rows), EffectParameters(gains, own, shutters, blurs, stereo_points))
 
 
 MAKERS = {
