@@ -27,6 +27,7 @@ from genre_tasks.logs.synthetic.ego_vehicle import FRAME_S, build_rig, draw_driv
 from genre_tasks.logs.synthetic.lidar import scan_sweep
 from genre_tasks.logs.synthetic.noise import rotate
 from genre_tasks.logs.synthetic.parameters import parse_parameters
+from genre_tasks.logs.synthetic.pose_errors import PoseErrors
 from genre_tasks.logs.synthetic.raycast import RayCaster
 from genre_tasks.logs.synthetic.recent_values import RecentValues
 from genre_tasks.logs.synthetic.road import Road, make_generator
@@ -80,6 +81,7 @@ class SyntheticStreet:
     Attributes:
         parameters: what the query asked for.
         camera_effects: how the cameras record the street.
+        pose_errors: by how much recorded camera poses err.
         offset_m: [3] added to the street's coordinates to get the world's.
 
     Raises:
@@ -93,6 +95,7 @@ class SyntheticStreet:
         self._road = Road(self.parameters.seed)
         self._ego = draw_drive(self.parameters, self._road)
         self.camera_effects = CameraEffects(self.parameters, self._ego)
+        self.pose_errors = PoseErrors(self.parameters)
         # A random offset, so that a method which forgets a translation fails on this log too.
         rng = make_generator(self.parameters.seed, "origin")
         self.offset_m = np.add(rng.uniform([-40, -40, -10], [40, 40, 10]), [self.parameters.origin_m, 0.0, 0.0])
@@ -158,13 +161,33 @@ class SyntheticStreet:
         return world_SE3_ego
 
     def world_SE3_camera(self, camera: str, frame: int) -> Float64:
-        """See ``DrivingLog``.
+        """See ``DrivingLog``; with the errors that the parameters ask for.
 
         Returns:
             [4, 4]; axes x right, y down, z forward.
         """
         self._find_lens(camera)
-        return self.world_SE3_lidar(frame) @ ego_SE3_camera(camera)
+        if self.pose_errors.is_exact:
+            return self.world_SE3_lidar(frame) @ ego_SE3_camera(camera)
+        world_SE3_rig = self.world_SE3_lidar(frame) @ self.pose_errors.ego_SE3_recorded_ego(frame * FRAME_S)
+        pose: Float64 = world_SE3_rig @ ego_SE3_camera(camera) @ self.pose_errors.camera_SE3_recorded_camera(camera)
+        return pose
+
+    def true_world_SE3_camera(self, camera: str, frame: int) -> Float64:
+        """Poses a camera where it is when it takes an image; other logs do not know it.
+
+        Args:
+            camera: name of the camera.
+            frame: log frame.
+
+        Returns:
+            [4, 4]; axes x right, y down, z forward.
+        """
+        self._find_lens(camera)
+        self._check_frame(frame)
+        pose = self.camera_effects.street_SE3_camera(camera, frame * FRAME_S + self.parameters.camera_delay_s)
+        pose[:3, 3] += self.offset_m
+        return pose
 
     def image_bytes(self, camera: str, frame: int) -> bytes:
         """See ``DrivingLog``.
@@ -176,9 +199,10 @@ class SyntheticStreet:
         self._check_frame(frame)
 
         def encode() -> bytes:
-            if self.camera_effects.is_ideal:
+            if self.camera_effects.is_ideal and self.pose_errors.is_exact:
                 return _encode_png(self._truth.image(frame, self.world_SE3_camera(camera, frame), lens))
-            return _encode_png(self.camera_effects.record_image(self._renderer, camera, frame * FRAME_S, lens))
+            taken_s = frame * FRAME_S + self.parameters.camera_delay_s
+            return _encode_png(self.camera_effects.record_image(self._renderer, camera, taken_s, lens))
 
         return self._png_images.get((camera, frame), encode)
 

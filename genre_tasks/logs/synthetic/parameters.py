@@ -55,6 +55,9 @@ class StreetParameters:
         white_balance_jitter: the same for what differs between red, green and blue.
         bonnet: share of the front and back images that the vehicle itself covers.
         distortion: the lens's k1; below −0.08 the widest lens would fold.
+        pose_noise_deg: standard deviation of the angle by which recorded camera poses err.
+        pose_noise_m: the same for their position, metres.
+        camera_delay_s: images are taken so many seconds later than the log says.
         gloss: strength of a sheen, sun and sky as a rough surface mirrors them, in images and truth alike.
     """
 
@@ -83,6 +86,9 @@ class StreetParameters:
     bonnet: float = _number(0.0, 0.0, 0.5)
     distortion: float = _number(0.0, -0.08, 0.5)
     gloss: float = _number(0.0, 0.0, 1.0)
+    pose_noise_deg: float = _number(0.0, 0.0, 5.0)
+    pose_noise_m: float = _number(0.0, 0.0, 1.0)
+    camera_delay_s: float = _number(0.0, -0.1, 0.1)
 
     def query(self, *, all_keys: bool = False, separator: str = "&") -> str:
         """Formats the parameters as a query, which names the street.
