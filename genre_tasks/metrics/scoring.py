@@ -15,8 +15,9 @@ from torch import Tensor
 from genre_tasks.checks import check_finite
 from genre_tasks.logs.types import Truth
 from genre_tasks.metrics.distribution_distances import frechet_distance, kernel_distance
-from genre_tasks.metrics.fid_lpips import Inception, Lpips, fid
+from genre_tasks.metrics.fid_lpips import Inception, fid
 from genre_tasks.metrics.image_quality import psnr, ssim
+from genre_tasks.metrics.lpips import Lpips
 from genre_tasks.metrics.perceptual import POOLED_DIMENSIONS, perceptual_distance
 from genre_tasks.metrics.results import Metric, ViewScore
 from genre_tasks.scene.chunk import Chunk, View
@@ -143,7 +144,7 @@ class ScoreCollector:
         distributions: whether features for the distribution distances are computed.
         prefix: goes before a metric's last word: ``render_`` makes ``shift_3m/render_psnr``.
         inception: the network for FID proper, where the user gave it.
-        lpips: the network for LPIPS proper, where the user gave it.
+        lpips: the network for LPIPS proper, where the user named it.
         scores: of the images with a truth, in the order in which they came.
     """
 
@@ -196,7 +197,7 @@ class ScoreCollector:
             group: first part of the metrics' names.
 
         Returns:
-            ``group/psnr``, ``group/ssim``, ``group/perceptual``, and ``group/lpips`` where its network is given;
+            ``group/psnr``, ``group/ssim``, ``group/perceptual``, and ``group/lpips…`` where its network is named;
             nothing without images that have a truth.
         """
         n = len(self.scores)
@@ -204,8 +205,8 @@ class ScoreCollector:
         for name in ("psnr", "ssim", "perceptual") if n else ():
             # Every image counts alike, whatever its camera.
             metrics.append(Metric(self._name(group, name), sum(getattr(s, name) for s in self.scores) / n, n))
-        if self._lpips:
-            metrics.append(Metric(self._name(group, "lpips"), sum(self._lpips) / n, n))
+        if self.lpips is not None and self._lpips:
+            metrics.append(Metric(self._name(group, self.lpips.metric), sum(self._lpips) / n, n))
         return metrics
 
     def fid_metrics(self, group: str, chunk: Chunk) -> list[Metric]:
