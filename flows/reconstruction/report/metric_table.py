@@ -29,6 +29,7 @@ class MetricFormat:
 
 METRIC_FORMATS = {
     "psnr": MetricFormat("PSNR, dB", higher_is_better=True, decimals=2),
+    "cc_psnr": MetricFormat("PSNR, colours fitted, dB", higher_is_better=True, decimals=2),
     "ssim": MetricFormat("SSIM", higher_is_better=True, decimals=4),
     "perceptual": MetricFormat("Perceptual", higher_is_better=False, decimals=4),
     "lpips_alex": MetricFormat("LPIPS, AlexNet", higher_is_better=False, decimals=4),
