@@ -29,7 +29,7 @@ def check_evaluation_networks(config: EvaluateConfig) -> list[Path]:
     for name, file in found.items():
         check_network_file(file, NETWORK_ARGUMENTS[name], f"evaluate.{name}")
     files = list(found.values())
-    if config.lpips in LPIPS_FILES:
+    if config.lpips is not None and config.lpips in LPIPS_FILES:
         files.append(check_lpips_weights(config.lpips))
     return files
 
