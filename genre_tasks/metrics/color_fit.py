@@ -21,6 +21,12 @@ ITERATIONS = 5
 _SATURATED = 0.5 / 255
 """Colours nearer to 0 or 1 than this are cut off, and tell nothing of the light."""
 
+_TERMS = 10
+"""Terms of the polynomial: six products of two channels, three channels, and 1."""
+
+_BLOCK = 8192
+"""Pixels at once: their terms fit into the processor's cache, which takes a fifth of the time."""
+
 # The published fit is in float32, whose directions below the rounding of the largest one count as absent. Here they are
 # eigenvalues of a product of the design with itself, hence the square.
 _RELATIVE_TOLERANCE = float(np.finfo(np.float32).eps) ** 2
@@ -78,37 +84,39 @@ def fit_colors(
     # In float64, where the product of the design with itself keeps the digits that the published fit has.
     image64, truth64 = widen_pair(image, truth, mask)
     selected = np.ones(image.shape[:2], np.bool_) if mask is None else mask
-    colors = torch.from_numpy(image64[selected])
-    true_colors = torch.from_numpy(truth64[selected])
+    # Channels first, so that sums over pixels read memory in order.
+    colors = torch.from_numpy(image64[selected].T.copy())
+    true_colors = torch.from_numpy(truth64[selected].T.copy())
     usable = _is_unsaturated(colors) & _is_unsaturated(true_colors)
     for _ in range(ITERATIONS):
         colors = _fit_once(colors, true_colors, usable & _is_unsaturated(colors))
     fitted = image64.copy()
-    fitted[selected] = colors.numpy()
+    fitted[selected] = colors.T.numpy()
     return fitted
 
 
 def _fit_once(colors: Tensor, true_colors: Tensor, usable: Tensor) -> Tensor:
-    """Colours [N, 3] after one fit to [N, 3] on the usable ones [N, 3]."""
-    design = _quadratic_terms(colors)
-    channels = []
-    for channel in range(3):
-        rows = design[usable[:, channel]]
-        # Nothing to fit: weights of 0 would turn a white image with a white truth black.
-        if not len(rows):
-            channels.append(colors[:, channel])
-            continue
-        # The normal equations: ten unknowns, and a pixel is read once.
-        inverse = torch.linalg.pinv(rows.T @ rows, rtol=_RELATIVE_TOLERANCE, hermitian=True)
-        weights = inverse @ (rows.T @ true_colors[usable[:, channel], channel])
-        channels.append((design @ weights).clamp(0, 1))
-    return torch.stack(channels, 1)
+    """Colours [3, N] after one fit to [3, N] on the usable ones [3, N]."""
+    products = torch.zeros((3, _TERMS, _TERMS), dtype=colors.dtype)
+    goals = torch.zeros((3, _TERMS), dtype=colors.dtype)
+    # The normal equations, block by block.
+    for block, goal, counts in zip(*(x.split(_BLOCK, 1) for x in (colors, true_colors, usable)), strict=True):
+        terms = _quadratic_terms(block)
+        for channel in range(3):
+            counted = terms * counts[channel]
+            products[channel] += counted @ terms.T
+            goals[channel] += counted @ goal[channel]
+    inverses = torch.linalg.pinv(products, rtol=_RELATIVE_TOLERANCE, hermitian=True)
+    weights = (inverses @ goals[..., None])[..., 0]
+    fitted = torch.cat([weights @ _quadratic_terms(block) for block in colors.split(_BLOCK, 1)], 1).clamp(0, 1)
+    # Nothing to fit gives weights of 0, which would turn a white image with a white truth black.
+    return torch.where(usable.any(1, keepdim=True), fitted, colors)
 
 
 def _quadratic_terms(colors: Tensor) -> Tensor:
-    """[N, 10] products of two channels, channels, and 1."""
-    products = [colors[:, c : c + 1] * colors[:, c:] for c in range(3)]
-    return torch.cat([*products, colors, torch.ones_like(colors[:, :1])], 1)
+    """[10, N] terms of colours [3, N]."""
+    products = [colors[c : c + 1] * colors[c:] for c in range(3)]
+    return torch.cat([*products, colors, torch.ones_like(colors[:1])])
 
 
 def _is_unsaturated(colors: Tensor) -> Tensor:
