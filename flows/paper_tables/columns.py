@@ -16,6 +16,11 @@ PREPARATION = ("ingest", "effects")
 """Stages that read the log; the paper's times do not include them, so they have a column of their own."""
 ALL_PHASES = (*RECONSTRUCTION, *FIXER, *DISTILLATION)
 
+LPIPS_NAMES = (("lpips", "LPIPS"), ("lpips_alex", "LPIPS Alex"), ("lpips_vgg", "LPIPS VGG"))
+"""Metric and heading of LPIPS: by a network of the user's, and by those with a name."""
+
+_LPIPS = tuple((name, label, 3) for name, label in LPIPS_NAMES)
+
 
 @dataclass(frozen=True)
 class MeasuredCell:
@@ -145,7 +150,7 @@ def truth_columns(shifts_m: Sequence[int]) -> tuple[Column, ...]:
     columns = [
         Column(f"psnr_{n}m", f"PSNR @{n}m", read_metric(f"shift_{n}m/psnr"), 2, more_is_better=True) for n in shifts_m
     ]
-    for name, label, digits in (("perceptual", "perceptual", 3), ("lpips", "LPIPS", 3), ("frechet", "Fréchet", 2)):
+    for name, label, digits in (("perceptual", "perceptual", 3), *_LPIPS, ("frechet", "Fréchet", 2)):
         columns += [
             Column(f"{name}_{n}m", f"{label} @{n}m", read_metric(f"shift_{n}m/{name}"), digits) for n in shifts_m
         ]
@@ -175,7 +180,7 @@ def behaviour_truth_columns() -> tuple[Column, ...]:
         ("psnr", "PSNR", 2),
         ("perceptual", "perceptual", 3),
         ("ssim", "SSIM", 3),
-        ("lpips", "LPIPS", 3),
+        *_LPIPS,
         ("frechet", "Fréchet", 2),
     ):
         better = name in ("psnr", "ssim")

@@ -10,6 +10,7 @@ from flows.paper_tables.columns import (
     ALL_PHASES,
     DISTILLATION,
     FIXER,
+    LPIPS_NAMES,
     PREPARATION,
     RECONSTRUCTION,
     Column,
@@ -127,12 +128,14 @@ def _row(key: str, paper: str = "") -> Row:
 _PSNR = Column("psnr", "PSNR, dB", read_metric("interpolation/psnr"), 2, paper="psnr", more_is_better=True)
 _SSIM = Column("ssim", "SSIM", read_metric("interpolation/ssim"), 3, paper="ssim", more_is_better=True)
 _PERCEPTUAL_HELD_OUT = Column("perceptual", "perceptual held out", read_metric("interpolation/perceptual"), 3)
-_LPIPS_HELD_OUT = Column("lpips", "LPIPS held out", read_metric("interpolation/lpips"), 3)
+_LPIPS_HELD_OUT = tuple(
+    Column(name, f"{label} held out", read_metric(f"interpolation/{name}"), 3) for name, label in LPIPS_NAMES
+)
 _HELD_OUT = (
     Column("psnr", "PSNR held out, dB", read_metric("interpolation/psnr"), 2, more_is_better=True),
     Column("ssim", "SSIM held out", read_metric("interpolation/ssim"), 3, more_is_better=True),
     _PERCEPTUAL_HELD_OUT,
-    _LPIPS_HELD_OUT,
+    *_LPIPS_HELD_OUT,
 )
 _GAUSSIANS = Column("gaussians", "Gaussians", lambda cell: cell.gaussians, 0)
 _SECONDS = Column("seconds", "seconds", sum_seconds(ALL_PHASES), 1)
@@ -155,7 +158,7 @@ _COMPARISON = Layout(
     columns=(_PSNR, _SSIM, *kernel_columns((1, 2, 3, 4, 5)), _MINUTES),
     extra_columns=(
         _PERCEPTUAL_HELD_OUT,
-        _LPIPS_HELD_OUT,
+        *_LPIPS_HELD_OUT,
         *truth_columns((1, 3, 5)),
         _CPU_SECONDS,
         _GAUSSIANS,

@@ -17,8 +17,8 @@ PUBLISHED_SIZE_PX = (1920, 1080)
 KERNEL = (
     "the paper's distances are FID, on features of InceptionV3; measured are kernel distances (unbiased at any number "
     "of images) on features of EfficientNet-Lite0: they may be compared in their order alone, not in their size. FID "
-    "and LPIPS are not measured: weights of neither ship with this project. Given by path (`--set "
-    "evaluate.inception=PATH`, `--set evaluate.lpips=PATH`), FID takes these columns"
+    "is not measured: its weights do not ship with this project. Given by path (`--set evaluate.inception=PATH`), FID "
+    "takes these columns; LPIPS is measured by `--set evaluate.lpips=vgg`"
 )
 FID = "FID is biased by the number of images, which the paper does not state and which is a chunk's here"
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from flows.experiments.stages import StageRunner, run_reported_stage, run_stages
 from flows.paper_tables.methods import End
@@ -19,6 +18,7 @@ from genre_tasks.config import EvaluateConfig, PipelineConfig
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.ego_paths.recorded_path import join_recorded_path
 from genre_tasks.ego_paths.world_actors import list_parked_actors, list_world_actors
+from genre_tasks.metrics.network_files import NETWORK_ARGUMENTS, find_network_files
 from genre_tasks.rollout.handover import plan_handovers
 from genre_tasks.rollout.render_rollout import render_rollout
 from genre_tasks.rollout.rig import RigCamera, estimate_rig
@@ -254,10 +254,13 @@ def _digest_rig(rig: Sequence[RigCamera]) -> str:
 
 def _describe_evaluation(config: EvaluateConfig) -> dict[str, object]:
     # Shifts and pictures are of the stage alone, so that they must not change the key of a rollout.
-    networks = {name: getattr(config, name) for name in ("inception", "lpips")}
     described: dict[str, object] = {
         "distributions": config.distributions,
         "bootstrap": config.bootstrap,
         "every": config.every,
     }
-    return described | {name: None if file is None else digest_file(Path(file)) for name, file in networks.items()}
+    files = find_network_files(config)
+    for name in NETWORK_ARGUMENTS:
+        # A file counts by its bytes, a network of a package by its name.
+        described[name] = digest_file(files[name]) if name in files else getattr(config, name)
+    return described

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from genre_tasks.config import EffectsConfig, PipelineConfig
+from genre_tasks.config import LPIPS_NETWORKS, EffectsConfig, PipelineConfig
 from storage import keys
 from storage.code_digest import code_digest
 from storage.keys import digest_file, digest_value
@@ -296,7 +296,9 @@ def stage_key(
     configuration = config_section(spec, config).model_dump(mode="json", exclude=excluded)
     for key in _FILE_SETTINGS.get(spec.section, ()):
         # A file that a setting names is an input: its bytes count, not its name alone.
-        if configuration[key] and Path(configuration[key]).is_file():
+        # The name of a network is no file's name, even where a file has it.
+        is_network = key == "lpips" and configuration[key] in LPIPS_NETWORKS
+        if configuration[key] and not is_network and Path(configuration[key]).is_file():
             configuration[key] = digest_file(Path(configuration[key]))
     code = code_digest(spec.module, lazy_modules=(*spec.lazy_modules, *more_modules))
     return keys.stage_key(spec.name, code, configuration, inputs, weights)

@@ -13,7 +13,7 @@ from flows.pipeline.log_cache import cached_log, select_chunks
 from flows.pipeline.stage_runner import Job
 from flows.preflight.machine_checks import assess_disk, assess_memory, estimate_disk_mib
 from flows.preflight.store_checks import check_store
-from genre_tasks.config import PipelineConfig
+from genre_tasks.config import LPIPS_NETWORKS, PipelineConfig
 from genre_tasks.errors import ConfigError, GenreError, InputError
 
 if TYPE_CHECKING:
@@ -187,8 +187,11 @@ def check_files(config: PipelineConfig, stages: Iterable[str] = ALL_STAGES) -> l
         if spec.name in wanted and spec.weights is not None:
             lines += [f"weights of {spec.name}: {path}" for path in _check_weights(spec, config)]
     if any(name.startswith("evaluate/") for name in wanted):
+        from genre_tasks.metrics.lpips_weights import require_size
         from genre_tasks.metrics.network_files import check_evaluation_networks
 
+        if config.evaluate.lpips in LPIPS_NETWORKS:
+            require_size(config.evaluate.lpips, config.ingest.width_px, config.ingest.height_px)
         lines += [f"network of evaluation: {path}" for path in check_evaluation_networks(config.evaluate)]
     return lines
 

@@ -21,6 +21,7 @@ from genre_tasks.config.optimisation_sections import (
 from genre_tasks.config.section import FilePlacement, LearningRate, LearningRates, LearningRateTuple, Section
 from genre_tasks.config.simulation_sections import KinematicBounds, SimulateConfig
 from genre_tasks.config.stage_sections import (
+    LPIPS_NETWORKS,
     EvaluateConfig,
     FnetConfig,
     IngestConfig,
@@ -30,6 +31,7 @@ from genre_tasks.config.stage_sections import (
 )
 
 __all__ = [
+    "LPIPS_NETWORKS",
     "AdamConfig",
     "DensityConfig",
     "EffectSetting",

@@ -135,6 +135,10 @@ class FnetConfig(Section):
     )
 
 
+LPIPS_NETWORKS = ("alex", "vgg")
+"""Networks of LPIPS that have a name, since a package brings their weights."""
+
+
 class EvaluateConfig(Section):
     """What is measured after a stage."""
 
@@ -157,7 +161,8 @@ class EvaluateConfig(Section):
     )
     lpips: FilePath | None = Field(
         None,
-        description="Path of a TorchScript file of LPIPS on VGG; with it LPIPS is measured where there is a truth.",
+        description="Network of LPIPS, measured where there is a truth: alex or vgg with the weights of the extra "
+        "`lpips`, or the path of a TorchScript file.",
     )
 
 

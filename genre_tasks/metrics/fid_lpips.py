@@ -1,8 +1,8 @@
-"""FID and LPIPS proper, on the networks of published numbers; the user gives their weights.
+"""FID and LPIPS on networks as TorchScript, whose files the user gives.
 
 Both networks are TorchScript files as NVIDIA publishes them for StyleGAN. ``inception-2015-12-05.pt`` is the network of
 Heusel et al. 2017 with pooled features of 2048; ``vgg16.pt`` is LPIPS of Zhang et al. 2018 on VGG. They take images
-[V, 3, H, W] in [0, 255] and resize them on their own.
+[V, 3, H, W] in [0, 255] and resize them on their own. LPIPS without such a file: :mod:`genre_tasks.metrics.lpips`.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from genre_tasks.checks import check_finite
 from genre_tasks.errors import InputError
+from genre_tasks.metrics.network_files import describe_network_remedy
 from genre_tasks.threads import map_single_threaded
 
 FID_DIMENSIONS = 2048
@@ -66,8 +67,8 @@ class Inception:
         return torch.cat([torch.zeros((0, FID_DIMENSIONS)), *(x.float() for x in found)]).double()
 
 
-class Lpips:
-    """The perceptual distance LPIPS on VGG.
+class ScriptedLpips:
+    """The perceptual distance LPIPS by a network of the user's.
 
     Args:
         file: its TorchScript file.
@@ -75,6 +76,9 @@ class Lpips:
     Raises:
         InputError: the file is missing or holds no such network.
     """
+
+    # Without a network's name, since nothing tells which one the file holds.
+    metric = "lpips"
 
     def __init__(self, file: str | Path) -> None:
         self._network = _load_network(Path(file), "return_lpips", "evaluate.lpips")
@@ -157,22 +161,9 @@ def load_inception(file: str) -> Inception:
     return Inception(file)
 
 
-@lru_cache(maxsize=4)
-def load_lpips(file: str) -> Lpips:
-    """Loads LPIPS, once per process.
-
-    Args:
-        file: its TorchScript file.
-
-    Raises:
-        InputError: the file is missing or holds no such network.
-    """
-    return Lpips(file)
-
-
 def _load_network(file: Path, argument: str, key: str) -> Any:
     """The TorchScript network of a file; ``argument`` is one of its forward, ``key`` the setting that named it."""
-    remedy = f"Give by {key} a TorchScript network whose forward takes {argument}."
+    remedy = describe_network_remedy(argument, key)
     if not file.is_file():
         raise InputError("no such file", remedy=remedy, file=file)
     try:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from genre_tasks.checks import check_finite
-from genre_tasks.logs.types import Float32
+from genre_tasks.logs.types import Float32, Float64
 
 PSNR_CAP_DB = 100.0
 """PSNR of identical images, and the most that any pair gets: without it a mean over images would be infinite."""
@@ -17,8 +17,8 @@ _GAUSSIAN_WINDOW_PX = 11
 
 
 def psnr(
-    image: Float32,  # [H, W, 3] sRGB in [0, 1]
-    truth: Float32,  # [H, W, 3]
+    image: Float32 | Float64,  # [H, W, 3] sRGB in [0, 1]
+    truth: Float32 | Float64,  # [H, W, 3]
     mask: NDArray[np.bool_] | None = None,  # [H, W]
 ) -> float:
     """Computes the peak signal-to-noise ratio ``−10 log10 MSE`` over all pixels and channels.
@@ -42,7 +42,7 @@ def psnr(
     # Imported here: scikit-image is slow to load, and most commands compute no metric.
     from skimage.metrics import peak_signal_noise_ratio
 
-    image64, truth64 = _check_and_widen(image, truth, mask)
+    image64, truth64 = widen_pair(image, truth, mask)
     if mask is not None:
         image64 = image64[mask]
         truth64 = truth64[mask]
@@ -80,7 +80,7 @@ def ssim(
     """
     from skimage.metrics import structural_similarity
 
-    image64, truth64 = _check_and_widen(image, truth, mask)
+    image64, truth64 = widen_pair(image, truth, mask)
     # As published: covariances without Bessel's correction.
     options: dict[str, Any] = {"data_range": 1.0, "channel_axis": 2, "use_sample_covariance": False}
     smallest_side = min(image64.shape[:2])
@@ -95,10 +95,25 @@ def ssim(
     return float(similarity[mask].mean())
 
 
-def _check_and_widen(
-    image: Float32, truth: Float32, mask: NDArray[np.bool_] | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Both images in float64. Raises for what cannot be compared."""
+def widen_pair(
+    image: Float32 | Float64,  # [H, W, 3]
+    truth: Float32 | Float64,  # [H, W, 3]
+    mask: NDArray[np.bool_] | None,  # [H, W]
+) -> tuple[Float64, Float64]:
+    """Checks that two images can be compared, and takes them to float64.
+
+    Args:
+        image: the image to judge.
+        truth: what it should show.
+        mask: pixels that count; ``None``: all.
+
+    Returns:
+        Image and truth.
+
+    Raises:
+        ValueError: shapes differ, or the mask is empty.
+        NonFiniteError: a value is NaN or infinite.
+    """
     if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise ValueError(f"expected two images of shape [H, W, 3], got {image.shape} and {truth.shape}")
     if mask is not None and mask.shape != image.shape[:2]:

@@ -15,10 +15,11 @@ from torch import Tensor
 from genre_tasks.checks import check_finite
 from genre_tasks.logs.types import Truth
 from genre_tasks.metrics.distribution_distances import frechet_distance, kernel_distance
-from genre_tasks.metrics.fid_lpips import Inception, Lpips, fid
-from genre_tasks.metrics.image_quality import psnr, ssim
+from genre_tasks.metrics.fid_lpips import Inception, fid
+from genre_tasks.metrics.lpips import Lpips
 from genre_tasks.metrics.perceptual import POOLED_DIMENSIONS, perceptual_distance
 from genre_tasks.metrics.results import Metric, ViewScore
+from genre_tasks.metrics.view_scores import fitted_psnr, score_views, show_truth_on_ego
 from genre_tasks.scene.chunk import Chunk, View
 from genre_tasks.scene.image_decoding import decode_image
 from genre_tasks.scene.novel_views import NovelView
@@ -141,15 +142,17 @@ class ScoreCollector:
     Attributes:
         stage: the stage that errors name.
         distributions: whether features for the distribution distances are computed.
+        recorded: whether the views are of the log: then colours are fitted, too, for exposures that scenes cannot know.
         prefix: goes before a metric's last word: ``render_`` makes ``shift_3m/render_psnr``.
         inception: the network for FID proper, where the user gave it.
-        lpips: the network for LPIPS proper, where the user gave it.
+        lpips: the network for LPIPS proper, where the user named it.
         scores: of the images with a truth, in the order in which they came.
     """
 
     stage: str
     distributions: bool
     prefix: str = ""
+    recorded: bool = False
     inception: Inception | None = None
     lpips: Lpips | None = None
     scores: list[ViewScore] = field(default_factory=list)
@@ -157,6 +160,7 @@ class ScoreCollector:
     _frames: list[int] = field(default_factory=list)
     _inception_features: list[Tensor] = field(default_factory=list)
     _lpips: list[float] = field(default_factory=list)
+    _cc_psnr: list[float] = field(default_factory=list)
 
     def add(
         self,
@@ -186,6 +190,8 @@ class ScoreCollector:
             self._inception_features.append(self.inception.features(images))
         if truths is not None:
             self.scores += score_views(views, images, truths)
+            if self.recorded:
+                self._cc_psnr += fitted_psnr(views, images, truths)
             if self.lpips is not None:
                 self._lpips += self.lpips.distances(show_truth_on_ego(views, images, truths), truths)
 
@@ -196,16 +202,18 @@ class ScoreCollector:
             group: first part of the metrics' names.
 
         Returns:
-            ``group/psnr``, ``group/ssim``, ``group/perceptual``, and ``group/lpips`` where its network is given;
-            nothing without images that have a truth.
+            ``group/psnr``, ``group/ssim``, ``group/perceptual``, ``group/cc_psnr`` of recorded views, and
+            ``group/lpips…`` where its network is named; nothing without images that have a truth.
         """
         n = len(self.scores)
         metrics = []
         for name in ("psnr", "ssim", "perceptual") if n else ():
             # Every image counts alike, whatever its camera.
             metrics.append(Metric(self._name(group, name), sum(getattr(s, name) for s in self.scores) / n, n))
-        if self._lpips:
-            metrics.append(Metric(self._name(group, "lpips"), sum(self._lpips) / n, n))
+        if self._cc_psnr:
+            metrics.append(Metric(self._name(group, "cc_psnr"), sum(self._cc_psnr) / n, n))
+        if self.lpips is not None and self._lpips:
+            metrics.append(Metric(self._name(group, self.lpips.metric), sum(self._lpips) / n, n))
         return metrics
 
     def fid_metrics(self, group: str, chunk: Chunk) -> list[Metric]:
@@ -253,68 +261,6 @@ class ScoreCollector:
 
     def _name(self, group: str, metric: str) -> str:
         return f"{group}/{self.prefix}{metric}"
-
-
-def show_truth_on_ego(views: Sequence[View | NovelView], images: Tensor, truths: Tensor) -> Tensor:
-    """Puts the truth where an image shows the ego vehicle, which is neither an error of the scene nor its merit.
-
-    Args:
-        views: V views; only recorded ones can have a mask.
-        images: [V, H, W, 3].
-        truths: [V, H, W, 3].
-
-    Returns:
-        [V, H, W, 3]; ``images`` itself where no view has a mask.
-    """
-    # A mask alone would not do: perceptual features and SSIM's windows reach over its edge.
-    masks = _outside_ego(views)
-    if all(mask is None for mask in masks):
-        return images
-    return torch.stack(
-        [
-            image if mask is None else torch.where(torch.from_numpy(mask)[..., None], image, truth)
-            for mask, image, truth in zip(masks, images, truths, strict=True)
-        ]
-    )
-
-
-def score_views(views: Sequence[View | NovelView], images: Tensor, truths: Tensor) -> list[ViewScore]:
-    """Computes PSNR, SSIM and perceptual distance of each image, without the pixels that show the ego vehicle.
-
-    Args:
-        views: V views.
-        images: [V, H, W, 3] sRGB in [0, 1], the images to judge.
-        truths: [V, H, W, 3] what they should show.
-
-    Returns:
-        V scores.
-    """
-    images = show_truth_on_ego(views, images, truths)
-    with torch.no_grad():
-        # It has threads of its own, so it runs before the others share them.
-        perceptual = perceptual_distance()(images, truths).tolist()
-    # scikit-image works on one thread: images go side by side.
-    arguments = [
-        (image.numpy(), truth.numpy(), mask)
-        for image, truth, mask in zip(images, truths, _outside_ego(views), strict=True)
-    ]
-    psnr_and_ssim = map_single_threaded(lambda pair: (psnr(*pair), ssim(*pair)), arguments)
-    return [
-        ViewScore(
-            camera=view.camera,
-            frame=view.frame,
-            shift_m=view.shift_m if isinstance(view, NovelView) else 0.0,
-            psnr=view_psnr,
-            ssim=view_ssim,
-            perceptual=view_perceptual,
-        )
-        for view, (view_psnr, view_ssim), view_perceptual in zip(views, psnr_and_ssim, perceptual, strict=True)
-    ]
-
-
-def _outside_ego(views: Sequence[View | NovelView]) -> list[NDArray[np.bool_] | None]:
-    """For each view a mask [H, W] of the pixels that count, ``None`` where all do."""
-    return [~v.ego_mask if isinstance(v, View) and v.ego_mask is not None else None for v in views]
 
 
 def _decode_batches(chunk: Chunk) -> Iterator[Tensor]:

@@ -17,7 +17,8 @@ from genre_tasks.config import EvaluateConfig
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.logs.types import Truth
 from genre_tasks.metrics.distribution_distances import SetDistance, frechet_distance, kernel_difference, kernel_distance
-from genre_tasks.metrics.fid_lpips import FID_DIMENSIONS, Inception, Lpips, fid, load_inception, load_lpips
+from genre_tasks.metrics.fid_lpips import FID_DIMENSIONS, Inception, fid, load_inception
+from genre_tasks.metrics.lpips import Lpips, load_lpips
 from genre_tasks.metrics.perceptual import POOLED_DIMENSIONS, perceptual_distance
 from genre_tasks.metrics.results import Metric, ViewScore
 from genre_tasks.metrics.scoring import (
@@ -25,8 +26,8 @@ from genre_tasks.metrics.scoring import (
     FeatureSet,
     real_image_features,
     real_inception_features,
-    score_views,
 )
+from genre_tasks.metrics.view_scores import score_views
 from genre_tasks.rollout.render_rollout import RolloutImages
 from genre_tasks.rollout.rig import RigCamera
 from genre_tasks.scene.chunk import Chunk
@@ -41,7 +42,7 @@ class RolloutScores:
     """What was measured along a rollout.
 
     Attributes:
-        metrics: ``psnr``, ``ssim``, ``perceptual`` and ``lpips``, means over the images with a truth; ``kernel``,
+        metrics: ``psnr``, ``ssim``, ``perceptual`` and ``lpips…``, means over the images with a truth; ``kernel``,
             ``frechet`` and ``fid``, distances of all images to the real ones. What could not be measured is missing.
         views: scores of the images with a truth.
         features: pooled features of all images, for paired comparisons; none without distances.
@@ -234,8 +235,8 @@ class _Collector:
     def summarise(self) -> RolloutScores:
         n = len(self.scores)
         metrics = [Metric(name, sum(getattr(s, name) for s in self.scores) / n, n) for name in QUALITY if n]
-        if self._lpips_distances:
-            metrics.append(Metric("lpips", sum(self._lpips_distances) / n, n))
+        if self._lpips is not None and self._lpips_distances:
+            metrics.append(Metric(self._lpips.metric, sum(self._lpips_distances) / n, n))
         features = FeatureSet(torch.cat(self._features), tuple(self._frames))
         distances = {}
         if self._config.distributions:

@@ -16,8 +16,9 @@ from genre_tasks.config import EvaluateConfig
 from genre_tasks.effects.apply_plan import apply_plan
 from genre_tasks.effects.types import DEFAULT_PLAN, EffectsPlan
 from genre_tasks.logs.types import Truth
-from genre_tasks.metrics.fid_lpips import load_inception, load_lpips
+from genre_tasks.metrics.fid_lpips import load_inception
 from genre_tasks.metrics.image_quality import psnr
+from genre_tasks.metrics.lpips import load_lpips
 from genre_tasks.metrics.results import Evaluation, Metric, ViewScore
 from genre_tasks.metrics.scoring import ScoreCollector, decode_view_image, real_image_features, truth_image
 from genre_tasks.progress import Progress, silent
@@ -49,8 +50,8 @@ def evaluate_scene(
     """Measures what the scene of a stage looks like on the path and to the side of it.
 
     ``interpolation/…`` compares held-out views with their images, ``shift_0m/…`` the same renders as a set with all
-    real images. ``shift_Xm/…`` looks at both sides of every ``config.every``-th frame. ``…/fid`` and ``…/lpips`` are
-    there where the configuration names their networks.
+    real images. ``shift_Xm/…`` looks at both sides of every ``config.every``-th frame. ``…/fid`` and ``…/lpips…``
+    are there where the configuration names their networks.
 
     Args:
         config: what is measured.
@@ -83,7 +84,7 @@ def evaluate_scene(
     shifted_count = sum(len(views) for views in views_at_shift.values())
     counter = ImageProgress(progress, len(heldout) + shifted_count + len(scenes) * len(curve_views), stage)
 
-    collector = _new_collector(config, stage)
+    collector = _new_collector(config, stage, recorded=True)
     for batch, images in render_batches(scene, heldout, settings, counter):
         collector.add(batch, images, torch.stack([decode_view_image(view) for view in batch]))
     metrics, scores = _collect(config, chunk, "interpolation", "shift_0m", [collector])
@@ -164,12 +165,13 @@ def _view_keys(views: Sequence[NovelView]) -> list[tuple[str, int, float]]:
     return [(view.camera, view.frame, view.shift_m) for view in views]
 
 
-def _new_collector(config: EvaluateConfig, stage: str, prefix: str = "") -> ScoreCollector:
+def _new_collector(config: EvaluateConfig, stage: str, prefix: str = "", recorded: bool = False) -> ScoreCollector:
     """Raises ``InputError`` for a network that cannot be loaded."""
     return ScoreCollector(
         stage,
         config.distributions,
         prefix,
+        recorded,
         inception=None if config.inception is None else load_inception(config.inception),
         lpips=None if config.lpips is None else load_lpips(config.lpips),
     )

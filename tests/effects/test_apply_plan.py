@@ -30,7 +30,8 @@ from genre_tasks.logs.synthetic.camera_effects import bonnet_mask
 from genre_tasks.logs.synthetic.parameters import StreetParameters
 from genre_tasks.losses.rendering_loss import image_gradients, select_loss_terms
 from genre_tasks.losses.targets import Target, view_targets
-from genre_tasks.metrics.scoring import decode_view_image, score_views
+from genre_tasks.metrics.scoring import decode_view_image
+from genre_tasks.metrics.view_scores import score_views
 from genre_tasks.render import cpu
 from genre_tasks.render.motion_blur import BlurSamples, mean_in_linear_light
 from genre_tasks.scene.chunk import Chunk

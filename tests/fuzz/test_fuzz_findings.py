@@ -33,9 +33,9 @@ from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.errors import ArtifactCorruptError, ConfigError, InputError
 from genre_tasks.exchange.usd.package import extract_layers
 from genre_tasks.learned.weights import load_optimiser
-from genre_tasks.logs.pandaset.pickle_machine import MAX_OPCODES
 from genre_tasks.logs.pandaset.pickle_reader import read_table as read_pickle
 from genre_tasks.logs.posed_images.transforms_json import read_transforms
+from genre_tasks.pickles.pickle_machine import MAX_OPCODES
 from genre_tasks.scene.image_decoding import decode_pixels, read_image_size
 from genre_tasks.scene.ply_reader import read_ply
 from genre_tasks.weights import list_weights_files

@@ -23,9 +23,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from genre_tasks.errors import InputError
-from genre_tasks.logs.pandaset.pickle_machine import PickleBrokenError, PickleRefusedError
 from genre_tasks.logs.pandaset.pickle_reader import Table, parse_table, read_table
 from genre_tasks.logs.pandaset.pickle_writer import pickle_table
+from genre_tasks.pickles.pickle_machine import PickleBrokenError, PickleRefusedError
 
 REAL = Path(__file__).resolve().parents[3] / "shared/data/pandaset/002"
 

@@ -12,7 +12,7 @@ from scipy.linalg import sqrtm
 from torch import Tensor, nn
 
 from genre_tasks.errors import InputError, NonFiniteError
-from genre_tasks.metrics.fid_lpips import FID_DIMENSIONS, Inception, Lpips, fid
+from genre_tasks.metrics.fid_lpips import FID_DIMENSIONS, Inception, ScriptedLpips, fid
 
 
 class FakeInception(nn.Module):
@@ -78,7 +78,7 @@ def test_features_are_of_eight_bit_images_one_by_one(tmp_path: Path) -> None:
 
 
 def test_lpips_is_the_squared_distance_of_what_the_network_gives(tmp_path: Path) -> None:
-    network = Lpips(saved(FakeVgg(), tmp_path / "v.pt"))
+    network = ScriptedLpips(saved(FakeVgg(), tmp_path / "v.pt"))
     a, b = torch.zeros(2, 4, 5, 3), torch.zeros(2, 4, 5, 3)
     b[1] = 1.0
     assert network.distances(a, b) == [0.0, pytest.approx(60 * 0.25)]
@@ -91,7 +91,7 @@ def test_files_that_are_no_such_network_are_named(tmp_path: Path) -> None:
             Inception(tmp_path / file)
         assert file in str(caught.value) and "evaluate.inception" in str(caught.value)
     with pytest.raises(InputError, match=r"takes self, img.*forward takes return_lpips"):
-        Lpips(saved(FakeInception(), tmp_path / "i.pt"))
+        ScriptedLpips(saved(FakeInception(), tmp_path / "i.pt"))
     narrow = Inception(saved(NarrowInception(), tmp_path / "n.pt"))
     with pytest.raises(InputError, match=r"\[1, 64\], expected \[1, 2048\]"):
         narrow.features(torch.zeros(1, 8, 8, 3))

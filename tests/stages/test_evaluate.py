@@ -91,7 +91,7 @@ def test_a_perfect_renderer_scores_perfectly(chunk: Chunk, scene: SceneGraph, mo
     assert set(values) == {
         f"{g}/{k}"
         for g, ks in {
-            "interpolation": ("psnr", "ssim", "perceptual"),
+            "interpolation": ("psnr", "ssim", "perceptual", "cc_psnr"),
             "shift_0m": ("frechet", "kernel"),
             "shift_1m": ("psnr", "ssim", "perceptual", "frechet", "kernel"),
             "shift_3m": ("psnr", "ssim", "perceptual", "frechet", "kernel"),
@@ -166,7 +166,7 @@ def test_curve_follows_the_snapshots(chunk: Chunk, scene: SceneGraph) -> None:
     result = evaluate_scene(config, chunk, "gnet", reconstruction, None)
     assert [i for i, _ in result.curve] == [0, 2, 4]
     assert result.curve[1][1] == result.curve[2][1] != result.curve[0][1]
-    assert {m.name for m in result.metrics} == {f"interpolation/{k}" for k in ("psnr", "ssim", "perceptual")}
+    assert {m.name for m in result.metrics} == {f"interpolation/{k}" for k in ("psnr", "ssim", "perceptual", "cc_psnr")}
 
 
 def views_of(chunk: Chunk, better: float = 0.02, worse: float = 0.1) -> tuple[FixedViews, NovelViews]:
@@ -276,3 +276,30 @@ def test_fid_and_lpips_are_there_once_their_networks_are_given(
     assert "shift_3m/fid" in values and "shift_3m/render_fid" in values
     bare = by_name(evaluate_fixed(CONFIG, chunk, fixed, novel, FakeTruth(LOG)))
     assert bare == {k: v for k, v in values.items() if not k.endswith(("fid", "lpips"))}
+
+
+def test_exposure_that_no_scene_can_know_costs_psnr_and_no_cc_psnr(
+    chunk: Chunk, scene: SceneGraph, monkeypatch
+) -> None:
+    def render_darker(scene, views, settings) -> Render:
+        render = oracle(chunk)(scene, views, settings)
+        return Render(render.color * 0.7, render.alpha, render.depth)
+
+    monkeypatch.setattr(evaluation_renders, "render_views", render_darker)
+    result = evaluate_scene(CONFIG, chunk, "gnet", Reconstruction(scene), FakeTruth(LOG))
+    values = by_name(result)
+    assert values["interpolation/psnr"] < 20 < 50 < values["interpolation/cc_psnr"]
+    assert {m.name: m.n for m in result.metrics}["interpolation/cc_psnr"] == 12  # 6 held-out frames × 2 cameras
+
+
+def test_lpips_has_the_name_of_its_network(chunk: Chunk, scene: SceneGraph, monkeypatch) -> None:
+    found = []
+    for network, noise in (("alex", 0.02), ("alex", 0.3), ("vgg", 0.02)):
+        monkeypatch.setattr(evaluation_renders, "render_views", oracle(chunk, noise))
+        config = CONFIG.model_copy(update={"lpips": network, "shifts_m": (1.0,), "every": 4})
+        found.append(by_name(evaluate_scene(config, chunk, "gnet", Reconstruction(scene), FakeTruth(LOG))))
+    better, worse, vgg = found
+    assert {n for n in better if "lpips" in n} == {"interpolation/lpips_alex", "shift_1m/lpips_alex"}
+    assert {n for n in vgg if "lpips" in n} == {"interpolation/lpips_vgg", "shift_1m/lpips_vgg"}
+    assert 0 < better["interpolation/lpips_alex"] < worse["interpolation/lpips_alex"] < 2
+    assert better["shift_1m/lpips_alex"] < worse["shift_1m/lpips_alex"]

@@ -29,8 +29,12 @@ class MetricFormat:
 
 METRIC_FORMATS = {
     "psnr": MetricFormat("PSNR, dB", higher_is_better=True, decimals=2),
+    "cc_psnr": MetricFormat("PSNR, colours fitted, dB", higher_is_better=True, decimals=2),
     "ssim": MetricFormat("SSIM", higher_is_better=True, decimals=4),
     "perceptual": MetricFormat("Perceptual", higher_is_better=False, decimals=4),
+    "lpips_alex": MetricFormat("LPIPS, AlexNet", higher_is_better=False, decimals=4),
+    "lpips_vgg": MetricFormat("LPIPS, VGG16", higher_is_better=False, decimals=4),
+    "lpips": MetricFormat("LPIPS, network of a file", higher_is_better=False, decimals=4),
     "kernel": MetricFormat("Kernel", higher_is_better=False, decimals=4),
     "frechet": MetricFormat("Fréchet", higher_is_better=False, decimals=3),
 }

@@ -1,1 +1,1 @@
-"""The public PandaSet layout: its reader, a writer, and pickles read without running anything in them."""
+"""The public PandaSet layout: its reader and a writer."""

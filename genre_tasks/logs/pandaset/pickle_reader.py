@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 from genre_tasks.errors import InputError
 from genre_tasks.logs.file_kinds import describe_non_pickle
 from genre_tasks.logs.file_reading import describe_os_error
-from genre_tasks.logs.pandaset.pickle_arrays import expect_call, read_array, require
-from genre_tasks.logs.pandaset.pickle_machine import (
+from genre_tasks.logs.pandaset.unpacking import UNPACKING_ERRORS, unpack
+from genre_tasks.pickles.pickle_arrays import expect_call, read_array, require
+from genre_tasks.pickles.pickle_machine import (
     Call,
     Global,
     PickleBrokenError,
     PickleRefusedError,
     read_pickle_tree,
 )
-from genre_tasks.logs.pandaset.unpacking import UNPACKING_ERRORS, unpack
 
 # A PandaSet sweep is 8 MB unpacked; a file that unpacks to more than this is no sweep (a "gzip bomb").
 MAX_UNPACKED_BYTES = 512 * 2**20

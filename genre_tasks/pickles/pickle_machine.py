@@ -1,6 +1,6 @@
 """Reads a pickle into a tree of plain values without ever calling or importing anything.
 
-PandaSet's sweeps and cuboids are pickles, and a pickle is a program: ``pickle.load`` would run whatever it asks for.
+PandaSet's sweeps and some networks' weights are pickles, and a pickle is a program: ``pickle.load`` would run it.
 Here the opcodes are interpreted by a small stack machine that knows only how to make values (numbers, strings, bytes,
 tuples, lists, dictionaries) and, for a global on the caller's allow-list, a ``Call`` node: a note that the pickle
 asked for it. What a note means is decided afterwards by the caller; any other global ends the reading at once.
@@ -209,7 +209,7 @@ def read_pickle_tree(data: bytes, allowed: Mapping[tuple[str, str], str]) -> obj
     >>> read_pickle_tree(pickle.dumps(print), {})
     Traceback (most recent call last):
     ...
-    genre_tasks.logs.pandaset.pickle_machine.PickleRefusedError: refused: builtins.print
+    genre_tasks.pickles.pickle_machine.PickleRefusedError: refused: builtins.print
     """
     machine = _StackMachine(allowed)
     try:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from genre_tasks.logs.pandaset.pickle_machine import Call, Global, PickleBrokenError, PickleRefusedError
+from genre_tasks.pickles.pickle_machine import Call, Global, PickleBrokenError, PickleRefusedError
 
 _NUMBER_DTYPE = re.compile(r"[fiu][1248]|b1")
 _TIME_UNITS: Mapping[bytes, float] = {b"s": 1.0, b"ms": 1e3, b"us": 1e6, b"ns": 1e9}
@@ -39,7 +39,7 @@ def require(condition: bool, expected: str) -> None:
     >>> require(False, "two axes")
     Traceback (most recent call last):
     ...
-    genre_tasks.logs.pandaset.pickle_machine.PickleBrokenError: expected two axes
+    genre_tasks.pickles.pickle_machine.PickleBrokenError: expected two axes
     """
     if not condition:
         raise PickleBrokenError(f"expected {expected}")

@@ -1,0 +1,1 @@
+"""Pickles of tables and arrays, read without running them."""
