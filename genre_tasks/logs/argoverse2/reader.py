@@ -16,9 +16,9 @@ from genre_tasks.logs.file_reading import read_file
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.image_sizes import choose_lens, measure_images, report_problems
 from genre_tasks.logs.labelled_boxes import LabelledBox, build_tracks
+from genre_tasks.logs.recorded_log import RecordedLog
 from genre_tasks.logs.timed_poses import TimedPoses
 from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Lens, Sweep, Truth
-from genre_tasks.suggestions import did_you_mean
 from genre_tasks.user_paths import expand_user_path
 
 _POSES = "city_SE3_egovehicle.feather"
@@ -58,7 +58,7 @@ def open_argoverse2(rest: str) -> Argoverse2Log:
     return Argoverse2Log(uri, folder.resolve())
 
 
-class Argoverse2Log:
+class Argoverse2Log(RecordedLog):
     """A ``DrivingLog`` over a log of Argoverse 2; see ``DrivingLog`` for methods, units and axes.
 
     A frame is a sweep; each camera gives its image that is nearest in time, with the pose of that time. Images are
@@ -76,7 +76,7 @@ class Argoverse2Log:
     truth: Truth | None = None
 
     def __init__(self, uri: str, folder: Path) -> None:
-        self.uri = uri
+        super().__init__(uri)
         self.folder = folder
         self.name = re.sub(r"[^\w.=,+-]", "_", folder.name, flags=re.ASCII)
         self._sweeps = _list_timed_files(folder / "sensors/lidar")
@@ -88,7 +88,6 @@ class Argoverse2Log:
         self._mounts = self._read_mounts()
         self._lenses = self._read_lenses()
         self._images = {name: _list_timed_files(folder / "sensors/cameras" / name) for name in self._lenses}
-        self._findings: dict[str, Finding] = {}
 
     def _read_poses(self) -> TimedPoses:
         path = self.folder / _POSES
@@ -255,20 +254,8 @@ class Argoverse2Log:
             files += timed.values()
         return digest_files(self.folder, files, ())
 
-    def _report(self, *findings: Finding) -> None:
-        self._findings |= {finding.message: finding for finding in findings}
-
-    def _check_frame(self, frame: int) -> int:
-        if not 0 <= frame < self.frame_count:
-            remedy = f"The log has frames 0 to {self.frame_count - 1}."
-            raise InputError("no such frame", remedy=remedy, log=self.uri, frame=frame)
-        return frame
-
     def _check_camera(self, camera: str, frame: int) -> None:
-        if camera not in self._lenses:
-            hint = did_you_mean(camera, self._lenses)
-            remedy = f"{hint}The log has {', '.join(self._lenses)}."
-            raise InputError("no such camera", remedy=remedy, log=self.uri, camera=camera, frame=frame)
+        self._check_camera_among(self._lenses, camera, frame)
 
 
 def _list_timed_files(folder: Path) -> dict[int, Path]:

@@ -26,6 +26,7 @@ from genre_tasks.logs.kitti.drive_files import (
 )
 from genre_tasks.logs.kitti.drive_poses import project_records
 from genre_tasks.logs.labelled_boxes import build_tracks
+from genre_tasks.logs.recorded_log import RecordedLog
 from genre_tasks.logs.timed_poses import TimedPoses
 from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Lens, Sweep, Truth
 from genre_tasks.suggestions import did_you_mean
@@ -65,7 +66,7 @@ def open_kitti(rest: str) -> KittiLog:
     return KittiLog(f"kitti:{rest}", expand_user_path(unquote(path)), labels)
 
 
-class KittiLog:
+class KittiLog(RecordedLog):
     """A ``DrivingLog`` over a drive of KITTI; see ``DrivingLog`` for methods, units and axes.
 
     A frame is a turn of the LiDAR. Poses hold for the time of each image and each point, between the records of the
@@ -84,7 +85,7 @@ class KittiLog:
     truth: Truth | None = None
 
     def __init__(self, uri: str, folder: Path, labels: Path | None) -> None:
-        self.uri = uri
+        super().__init__(uri)
         self.name = folder.resolve().name
         self._files = find_drive_files(folder, uri)
         if labels is not None and not labels.is_file():
@@ -95,7 +96,6 @@ class KittiLog:
         self._poses = self._read_poses()
         self._camera_times = {name: self._read_camera_times(name) for name in self._files.cameras}
         self._read_calibration()
-        self._findings: dict[str, Finding] = {}
 
     def _read_lidar_times(self) -> Float64:
         path = self._files.times_file("velodyne_points")
@@ -232,9 +232,7 @@ class KittiLog:
         rows = np.frombuffer(read_file(path, log=self.uri, frame=frame), dtype="<f4").reshape(-1, 4)
         finite = np.isfinite(rows).all(axis=1)
         if not finite.all():
-            count = int((~finite).sum())
-            message = f"{count} points of sweep {frame} are not finite and left out"
-            self._report(Finding("invalid_points", "warning", message, numbers={"points": count}, frames=(frame,)))
+            self._report_invalid_points(int((~finite).sum()), frame)
             rows = rows[finite]
         return rows
 
@@ -298,21 +296,8 @@ class KittiLog:
             parts.append(digest_files(self._labels.parent, [self._labels], ()))
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
-    def _report(self, *findings: Finding) -> None:
-        self._findings |= {finding.message: finding for finding in findings}
-
-    def _check_frame(self, frame: int) -> int:
-        if not 0 <= frame < self.frame_count:
-            remedy = f"The log has frames 0 to {self.frame_count - 1}."
-            raise InputError("no such frame", remedy=remedy, log=self.uri, frame=frame)
-        return frame
-
     def _check_camera(self, camera: str, frame: int) -> str:
-        if camera not in self._projections:
-            hint = did_you_mean(camera, self._projections)
-            remedy = f"{hint}The log has {', '.join(self._projections)}."
-            raise InputError("no such camera", remedy=remedy, log=self.uri, camera=camera, frame=frame)
-        return camera
+        return self._check_camera_among(self._projections, camera, frame)
 
 
 def _to_matrix(numbers: dict[str, Float64]) -> Float64:
