@@ -16,6 +16,7 @@ from genre_tasks.logs.file_reading import read_file
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.image_sizes import choose_lens, measure_images, report_problems
 from genre_tasks.logs.labelled_boxes import LabelledBox, build_tracks
+from genre_tasks.logs.nearest_images import find_nearest_images
 from genre_tasks.logs.recorded_log import RecordedLog
 from genre_tasks.logs.timed_poses import TimedPoses
 from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Lens, Sweep, Truth
@@ -34,7 +35,7 @@ _RING = "ring_"
 _INTENSITY_SCALE = 255.0
 _NS = 1e-9
 # Without a neighbour, what a sweep's frame lasts: ten sweeps a second.
-_PERIOD_S = 0.1
+_PERIOD_NS = 100_000_000
 
 
 def open_argoverse2(rest: str) -> Argoverse2Log:
@@ -148,16 +149,8 @@ class Argoverse2Log(RecordedLog):
         return {name: self._find_nearest(sorted(files)) for name, files in self._images.items()}
 
     def _find_nearest(self, times_ns: list[int]) -> list[int | None]:
-        steps = np.diff(self._sweep_times_ns)
-        period_ns = float(np.median(steps)) if len(steps) else _PERIOD_S / _NS
-        found: list[int | None] = []
-        times = np.array(times_ns, dtype=np.int64)
-        for frame_ns in self._sweep_times_ns:
-            nearest = int(times[np.argmin(np.abs(times - frame_ns))]) if len(times) else None
-            # Of another frame, where images are missing.
-            is_near = nearest is not None and abs(nearest - int(frame_ns)) <= period_ns / 2
-            found.append(nearest if is_near else None)
-        return found
+        nearest = find_nearest_images(self._sweep_times_ns.tolist(), times_ns, _PERIOD_NS)
+        return [None if index is None else times_ns[index] for index in nearest]
 
     def frame_timestamp_s(self, frame: int) -> float:
         """See ``DrivingLog``."""
