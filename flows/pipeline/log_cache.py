@@ -78,7 +78,7 @@ def select_chunks(log: str, config: PipelineConfig, chunks: list[int] | None) ->
 
 
 def expand_logs(logs: list[str]) -> list[str]:
-    """Replaces every ``reader:PATH/*`` by one URI for each folder that matches, sorted by name.
+    """Replaces every ``reader:PATH/*`` by one URI for each log that matches, sorted by name.
 
     Args:
         logs: URIs of logs, with or without stars in the path; ``~`` is the home folder.
@@ -87,11 +87,13 @@ def expand_logs(logs: list[str]) -> list[str]:
         URIs without stars, in the order of ``logs``.
 
     Raises:
-        InputError: a star matches no folder; or ``~NAME`` names no user.
+        InputError: a star matches no log; or ``~NAME`` names no user.
 
     >>> expand_logs(["synthetic:street?seed=1", "pandaset:logs/002"])
     ['synthetic:street?seed=1', 'pandaset:logs/002']
     """
+    from genre_tasks.logs.registry import list_logs
+
     expanded: list[str] = []
     for uri in logs:
         reader, _, text = uri.partition(":")
@@ -100,10 +102,13 @@ def expand_logs(logs: list[str]) -> list[str]:
         if "*" not in text or path.is_dir():
             expanded.append(uri)
             continue
-        folders = _match_folders(path)
-        if not folders:
+        # Logs of some layouts are rows of tables, or files beside one another.
+        found = list_logs(uri)
+        if found is None:
+            found = [f"{reader}:{folder}" for folder in _match_folders(path)]
+        if not found:
             raise InputError(f"no log matches {uri}", remedy="Name a folder that holds sequences.", file=path.parent)
-        expanded += [f"{reader}:{folder}" for folder in folders]
+        expanded += found
     return expanded
 
 
