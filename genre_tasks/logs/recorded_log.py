@@ -27,6 +27,10 @@ class RecordedLog:
         # By message, since a sweep that is read twice must count once.
         self._findings |= {finding.message: finding for finding in findings}
 
+    def _findings_after(self, *parts: object) -> tuple[Finding, ...]:
+        """Findings so far. Arguments are evaluated first: reading cameras adds what is wrong with their images."""
+        return tuple(self._findings.values())
+
     def _report_invalid_points(self, count: int, frame: int) -> None:
         message = f"{count} points of sweep {frame} are not finite and left out"
         self._report(Finding("invalid_points", "warning", message, numbers={"points": count}, frames=(frame,)))

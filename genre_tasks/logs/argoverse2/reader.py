@@ -237,7 +237,7 @@ class Argoverse2Log(RecordedLog):
 
     def findings(self) -> tuple[Finding, ...]:
         """What was left out, for ``genre check``."""
-        return tuple(self._findings.values()) if self.cameras else ()
+        return self._findings_after(self.cameras)
 
     def digest(self) -> str:
         """Identifies all files that are read."""

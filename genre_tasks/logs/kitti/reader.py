@@ -13,7 +13,7 @@ from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.logs.file_digest import digest_files
 from genre_tasks.logs.file_reading import read_file
 from genre_tasks.logs.findings import Finding
-from genre_tasks.logs.image_sizes import choose_lens, measure_images, report_problems
+from genre_tasks.logs.image_sizes import choose_lens, describe_no_images, measure_images, report_problems
 from genre_tasks.logs.kitti.boxes import read_tracking_labels, read_tracklets
 from genre_tasks.logs.kitti.drive_files import (
     CALIBRATION_FILES,
@@ -155,6 +155,7 @@ class KittiLog(RecordedLog):
             measured = measure_images({frame: path for frame, path in files.items() if frame < self.frame_count})
             self._report(*report_problems(measured, name))
             if measured.majority is None:
+                self._report(describe_no_images(measured, name))
                 continue
             width_px, height_px = measured.majority
             # Rectified images have neither distortion nor skew.
@@ -282,7 +283,7 @@ class KittiLog(RecordedLog):
 
     def findings(self) -> tuple[Finding, ...]:
         """What was left out, for ``genre check``."""
-        found = tuple(self._findings.values()) if self.cameras else ()
+        found = self._findings_after(self.cameras)
         if self._labels is None and not (self._files.folder / TRACKLETS_FILE).is_file():
             message = f"there are no boxes: neither {TRACKLETS_FILE} nor labels=FILE"
             remedy = "Without boxes, whatever moves is smeared over its path."

@@ -17,7 +17,7 @@ from genre_tasks.errors import InputError
 from genre_tasks.logs.file_digest import digest_files
 from genre_tasks.logs.file_reading import read_file
 from genre_tasks.logs.findings import Finding
-from genre_tasks.logs.image_sizes import choose_lens, measure_images, report_problems
+from genre_tasks.logs.image_sizes import choose_lens, describe_no_images, measure_images, report_problems
 from genre_tasks.logs.labelled_boxes import build_tracks
 from genre_tasks.logs.nearest_images import find_nearest_images
 from genre_tasks.logs.nuscenes.box_interpolation import interpolate_boxes
@@ -121,9 +121,7 @@ class NuScenesLog(RecordedLog):
             measured = measure_images({frame: path for frame, path in paths.items() if path.is_file()})
             self._report(*report_problems(measured, name))
             if measured.majority is None:
-                message = f"{name} has no readable image and is left out"
-                finding = Finding("camera_without_images", "warning", message, _COPY_REMEDY, camera=name)
-                self._report(finding)
+                self._report(describe_no_images(measured, name))
                 continue
             first = self._rows.cameras[name][0]
             lens, findings = choose_lens(_build_lens(first, measured.majority), measured, name)
@@ -222,7 +220,7 @@ class NuScenesLog(RecordedLog):
 
     def findings(self) -> tuple[Finding, ...]:
         """What was left out or interpolated, for ``genre check``."""
-        found = tuple(self._findings.values()) if self.cameras else ()
+        found = self._findings_after(self.cameras)
         tracks, interpolated = self._boxes
         if not tracks:
             message = "there are no boxes, as in the test split"

@@ -21,7 +21,7 @@ from genre_tasks.logs.file_reading import (
     read_times,
 )
 from genre_tasks.logs.findings import Finding
-from genre_tasks.logs.image_sizes import ImageSizes, choose_lens, measure_images, report_problems
+from genre_tasks.logs.image_sizes import choose_lens, describe_no_images, measure_images, report_problems
 from genre_tasks.logs.lens_validity import with_distortion
 from genre_tasks.logs.pandaset.cuboids import FrameBoxes, build_tracks, read_boxes
 from genre_tasks.logs.pandaset.folder_index import LIDAR_FILES, SequenceIndex, index_sequence
@@ -143,7 +143,7 @@ class PandaSetLog(RecordedLog):
         files = self._index.cameras[name].files
         measured = measure_images({frame: files[frame] for frame in files if frame < self.frame_count})
         if measured.majority is None:
-            self._report(_describe_no_images(measured, name))
+            self._report(describe_no_images(measured, name))
             return None
         self._report(*report_problems(measured, name))
         where: dict[str, Any] = {"file": path, "log": self.uri, "camera": name}
@@ -314,11 +314,3 @@ def _describe_bad_intrinsics(intrinsics: object, error: Exception) -> str:
 def _name_sides(size: tuple[int, int]) -> Iterator[tuple[str, int]]:
     """Keys of ``intrinsics.json`` that state the size of the images, with their defaults."""
     return zip(("width", "height"), size, strict=True)
-
-
-def _describe_no_images(measured: ImageSizes, camera: str) -> Finding:
-    problems = sorted(set(measured.problems.values()))
-    reason = f": {problems[0]}" if problems else ""
-    message = f"{camera} has no readable image and is left out{reason}"
-    remedy = "Copy the camera's folder again, or remove it."
-    return Finding("camera_without_images", "warning", message, remedy, camera=camera)
