@@ -72,6 +72,12 @@ _READERS: dict[str, ReaderEntry] = {
         "synthetic:street?seed=1000",
         "pip install trimesh embreex (the street is ray-cast with Embree)",
     ),
+    "waymo": ReaderEntry(
+        "genre_tasks.logs.waymo.reader:open_waymo",
+        "waymo:PATH/10023947602400723454_1120_000_1140_000",
+        "pip install genre (pyarrow is part of it)",
+        "genre_tasks.logs.waymo.segment_address:list_segments",
+    ),
 }
 
 
@@ -89,8 +95,8 @@ def register(name: str, target: str, install_hint: str, example: str = "") -> No
 
     Example::
 
-        register("waymo", "my_package.waymo:open_waymo", "pip install my_package", "waymo:PATH/segment.tfrecord")
-        log = open_log("waymo:/data/segment.tfrecord")
+        register("rosbag", "my_package.bags:open_bag", "pip install my_package", "rosbag:PATH/drive.bag")
+        log = open_log("rosbag:/data/drive.bag")
     """
     # The same target again is no error: a module that registers its reader may be imported twice.
     if name in _READERS and _READERS[name].target != target:
@@ -105,7 +111,7 @@ def known_readers() -> tuple[str, ...]:
         The names, sorted.
 
     >>> known_readers()
-    ('argoverse2', 'genre', 'kitti', 'nuscenes', 'pandaset', 'posed_images', 'synthetic')
+    ('argoverse2', 'genre', 'kitti', 'nuscenes', 'pandaset', 'posed_images', 'synthetic', 'waymo')
     """
     return tuple(sorted(_READERS))
 
