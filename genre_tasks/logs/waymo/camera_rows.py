@@ -76,7 +76,7 @@ def read_cameras(calibration: ComponentTable, images: ComponentTable) -> Segment
     """
     rows, readouts = _read_images(images)
     fields = [f"intrinsic.{name}" for name in _INTRINSICS]
-    columns = calibration.read([_NAME, *fields, "width", "height", "rolling_shutter_direction"])
+    columns = calibration.read([_NAME, *fields, "width", "height", "rolling_shutter_direction"], names=[_NAME])
     mounts = calibration.read_poses("extrinsic.transform")
     cameras: list[Camera] = []
     findings: list[Finding] = []
@@ -135,7 +135,7 @@ def _describe_readout(name: str, direction: str, readout_s: float) -> Finding:
 
 def _read_images(images: ComponentTable) -> tuple[dict[str, dict[int, ImageRow]], dict[str, tuple[float, float]]]:
     """Camera → time of the frame → image, and camera → exposure and readout in seconds."""
-    columns = images.read([_NAME, "pose_timestamp", *_VELOCITY, *_SHUTTER])
+    columns = images.read([_NAME, "pose_timestamp", *_VELOCITY, *_SHUTTER], names=[_NAME])
     poses = images.read_poses("pose.transform")
     shutter_s, trigger_s, done_s = (columns[field] for field in _SHUTTER)
     # Exposure of the first column begins at the trigger, and that of the last one ends before it is read.

@@ -81,14 +81,15 @@ class ComponentTable:
         """
         return self.column(field) in self._names
 
-    def read(self, fields: Sequence[str]) -> dict[str, Any]:
-        """Reads columns of numbers, lists of numbers, or texts.
+    def read(self, fields: Sequence[str], names: Sequence[str] = ()) -> dict[str, Any]:
+        """Reads columns of numbers, transforms or names.
 
         Args:
             fields: as for :meth:`column`.
+            names: those of the fields that may be texts.
 
         Returns:
-            Field → [N] or [N, K] float64, [N] int64, or a list of texts.
+            Field → [N] float64 or int64, [N, K] float64 of a transform, or a list of texts.
 
         Raises:
             InputError: a column is missing, has nulls, or holds something else.
@@ -103,7 +104,12 @@ class ComponentTable:
             raise self.fault(str(error)) from error
         except (OSError, ValueError, pa.ArrowException) as error:
             raise self.fault(f"the table cannot be read ({error})") from error
-        return {field: self._convert(field, table.column(self.column(field))) for field in fields}
+        found = {field: self._convert(field, table.column(self.column(field))) for field in fields}
+        for field, values in found.items():
+            is_expected = field in names if isinstance(values, list) else values.ndim == 1 + field.endswith("transform")
+            if not is_expected:
+                raise self.fault(f"{field} holds {table.column(self.column(field)).type}")
+        return found
 
     def _convert(self, field: str, column: pa.ChunkedArray) -> Any:
         array = column.combine_chunks()
@@ -140,7 +146,7 @@ class ComponentTable:
             InputError: they are no poses.
         """
         values = self.read([field])[field]
-        if values.ndim != 2 or values.shape[1] != 16:
+        if values.shape[1] != 16:
             raise self.fault(f"{field} has no 16 numbers")
         poses: Float64 = values.reshape(-1, 4, 4).copy()
         u, _, v = np.linalg.svd(poses[:, :3, :3])
@@ -183,5 +189,8 @@ class ComponentTable:
     @cached_property
     def times_us(self) -> list[int]:
         """[N] microseconds of the rows' frames."""
-        times: list[int] = self.read([TIME])[TIME].tolist()
-        return times
+        times = self.read([TIME])[TIME]
+        if times.dtype != np.int64:
+            raise self.fault(f"{TIME} holds {times.dtype}")
+        whole: list[int] = times.tolist()
+        return whole

@@ -159,7 +159,7 @@ class WaymoLog(RecordedLog):
     def _index_rows(self, component: str) -> dict[int, dict[str, int]]:
         table = self._tables[component]
         found: dict[int, dict[str, int]] = {}
-        for row, name in enumerate(name_sensors(table.read([_LASER])[_LASER], LIDAR_NAMES)):
+        for row, name in enumerate(name_sensors(table.read([_LASER], names=[_LASER])[_LASER], LIDAR_NAMES)):
             found.setdefault(table.times_us[row], {})[name] = row
         return found
 
@@ -168,7 +168,7 @@ class WaymoLog(RecordedLog):
         if "lidar_calibration" not in self._tables:
             raise self._tables["lidar"].fault("there are range images without lidar_calibration")
         table = self._tables["lidar_calibration"]
-        columns = table.read([_LASER, "beam_inclination.min", "beam_inclination.max"])
+        columns = table.read([_LASER, "beam_inclination.min", "beam_inclination.max"], names=[_LASER])
         mounts = table.read_poses("extrinsic.transform")
         found = {}
         for row, name in enumerate(name_sensors(columns[_LASER], LIDAR_NAMES)):
@@ -217,7 +217,7 @@ class WaymoLog(RecordedLog):
         if "lidar_box" not in self._tables:
             return ()
         table = self._tables["lidar_box"]
-        columns = table.read([_OBJECT, "type", "box.heading", *_CENTRE, *_SIZE])
+        columns = table.read([_OBJECT, "type", "box.heading", *_CENTRE, *_SIZE], names=[_OBJECT])
         sizes = np.stack([columns[field] for field in _SIZE], axis=1)
         if (sizes <= 0).any():
             raise table.fault("a box has no size")
