@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ from genre_tasks.logs.waymo.segment_address import COMPONENTS
 Float64 = NDArray[np.float64]
 START_US = 1_552_440_195_000_000
 SEGMENT = "10023947602400723454_1120_000_1140_000"
-CAMERAS = {"front": 1, "left": 4, "right": 5, "back": 6}
+# Waymo has no camera that looks back.
+CAMERAS = {"front": 1, "front_left": 2, "front_right": 3, "left": 4, "right": 5, "back": 6}
 NAMES = {"front": "FRONT", "left": "SIDE_LEFT", "right": "SIDE_RIGHT", "back": "SENSOR_6"}
 # The LiDAR is turned on the roof.
 LIDAR_MOUNT = np.eye(4)
@@ -147,10 +149,10 @@ def change_column(root: Path, component: str, field: str, values: Any, segment: 
 
 
 def _write_cameras(log: DrivingLog, write: _Writer) -> None:
-    cameras = [camera for camera in log.cameras if camera.name in CAMERAS]
+    cameras = list(log.cameras)
     mounts = {c.name: np.linalg.inv(log.world_SE3_lidar(0)) @ log.world_SE3_camera(c.name, 0) for c in cameras}
     lenses = [camera.lens for camera in cameras]
-    keys = {"key.camera_name": pa.array([CAMERAS[camera.name] for camera in cameras], pa.int8())}
+    keys = {"key.camera_name": _number(camera.name for camera in cameras)}
     values: dict[str, Any] = {
         "intrinsic.f_u": [lens.fx_px for lens in lenses],
         "intrinsic.f_v": [lens.fy_px for lens in lenses],
@@ -165,7 +167,7 @@ def _write_cameras(log: DrivingLog, write: _Writer) -> None:
         values[f"intrinsic.{name}"] = [lens.coefficients[k] for lens in lenses]
     write("camera_calibration", None, keys, values)
     rows = [(c.name, f) for f in range(log.frame_count) for c in cameras if log.image_bytes(c.name, f) is not None]
-    keys = {"key.camera_name": pa.array([CAMERAS[name] for name, _ in rows], pa.int8())}
+    keys = {"key.camera_name": _number(name for name, _ in rows)}
     fired = np.array([START_US * 1e-6 + log.camera_timestamp_s(name, frame) for name, frame in rows])
     poses = [log.world_SE3_camera(name, frame) @ np.linalg.inv(mounts[name]) for name, frame in rows]
     images: dict[str, Any] = {"image": pa.array([log.image_bytes(name, frame) for name, frame in rows], pa.binary())}
@@ -178,6 +180,10 @@ def _write_cameras(log: DrivingLog, write: _Writer) -> None:
     images["rolling_shutter_params.camera_readout_done_time"] = fired
     times = [to_us(log.frame_timestamp_s(frame)) for _, frame in rows]
     write("camera_image", times, keys, images)
+
+
+def _number(cameras: Iterable[str]) -> pa.Array:
+    return pa.array([CAMERAS[name.removesuffix("_camera")] for name in cameras], pa.int8())
 
 
 def _list_boxes(log: DrivingLog) -> list[tuple[int, Any, Float64]]:

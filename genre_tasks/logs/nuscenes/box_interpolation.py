@@ -36,6 +36,7 @@ def interpolate_boxes(boxes: SceneBoxes, frame_times_us: Sequence[int]) -> tuple
     found: list[LabelledBox] = []
     interpolated = 0
     for instance, row_at in by_instance.items():
+        # By their times and not by the tables' links, which may lead anywhere.
         times_us = np.array(sorted(row_at), dtype=np.int64)
         rows = np.array([row_at[time_us] for time_us in times_us.tolist()])
         after = np.searchsorted(times_us, frames_us)

@@ -99,8 +99,10 @@ class NuScenesLog(RecordedLog):
         times_us = [datum.time_us for datum in self._frames]
         self._images = {name: _choose_data(data, times_us) for name, data in rows.cameras.items()}
         self._sweeps = {name: _choose_data(data, times_us) for name, data in rows.lidars.items()}
+        # Frames that lie close together may share a nearest sweep; each has its own.
         if main:
             self._sweeps[main] = list(self._frames)
+        # The sensor data come in parts that are downloaded apart: a scene may have none of them.
         if not any(self._path(datum).is_file() for datum in self._list_data()):
             problem = f"none of the scene's files is there, such as {self._frames[0].file}"
             raise InputError(problem, remedy=_COPY_REMEDY, file=self.folder, log=uri)

@@ -64,6 +64,7 @@ def parse_scene_address(rest: str) -> SceneAddress:
     if not text or not path.name or not root.is_dir():
         raise InputError("there is no such folder", remedy=_REMEDY, file=root, log=uri)
     query = rest.partition("?")[2]
+    # Mini and full tables may lie beside one another.
     versions = _list_versions(root)
     # A user may name the version's folder instead of the one above it.
     if not versions and (root / _SCENES_FILE).is_file():

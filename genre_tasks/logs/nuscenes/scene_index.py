@@ -78,6 +78,7 @@ def open_scene_index(tables: Path, log: str, folder: Path | None = None) -> sqli
         InputError: a table is missing, malformed, or lacks a column.
         ResourceError: the index cannot be written.
     """
+    # One index for all scenes: reading the tables for each scene would take as long for every one.
     path = (folder or find_cache_folder()) / "nuscenes" / f"{_digest_tables(tables, log)}.sqlite"
     try:
         if not path.is_file():
@@ -109,11 +110,13 @@ def _build_index(tables: Path, path: Path, log: str) -> None:
         # Nobody reads the file before it is complete, so that nothing is lost if this process dies.
         for setting in ("journal_mode=OFF", "synchronous=OFF", f"cache_size=-{_CACHE_KIBIBYTES}"):
             index.execute(f"PRAGMA {setting}")
+        # One transaction, as millions of them would take hours.
         index.execute("BEGIN")
         for name, table in _TABLES.items():
             file = tables / f"{name}.json"
             unused = _find_radars(index, file, log) if name == "sample_data" else frozenset()
             _fill_table(index, name, table, _parse_rows(file, table, unused, log))
+            # After the rows: SQLite then sorts once, within the memory of its cache.
             try:
                 index.execute(f"CREATE UNIQUE INDEX {name}_by_token ON {name} (token)")
             except sqlite3.IntegrityError as error:
@@ -152,6 +155,7 @@ def _parse_rows(file: Path, table: _Table, unused: frozenset[str], log: str) -> 
             values = [parse(row.get(column)) for column, parse in parsers]
         except ValueError as error:
             problem = f"row {number} (token {str(row.get('token'))[:40]}): {error}"
+            # Which column it is takes time to find out, so that only a row that fails is asked.
             bad = next((name for name, parse in parsers if not _is_readable(parse, row.get(name))), "")
             raise InputError(f"{problem} in column {bad}", remedy=REMEDY, file=file, log=log) from error
         if row.get("calibrated_sensor_token") in unused:
@@ -175,7 +179,7 @@ def _parse_text(value: Any) -> str:
     return value
 
 
-def _parse_whole(value: Any) -> int:
+def _parse_integer(value: Any) -> int:
     if not isinstance(value, int) or not -(1 << 62) < value < 1 << 62:
         raise ValueError("a whole number was expected")
     return int(value)
@@ -183,7 +187,7 @@ def _parse_whole(value: Any) -> int:
 
 def _parse_size(value: Any) -> int:
     # Sweeps have none.
-    return 0 if value is None else _parse_whole(value)
+    return 0 if value is None else _parse_integer(value)
 
 
 def _parse_list(count: int) -> Callable[[Any], tuple[float | None, ...]]:
@@ -206,4 +210,4 @@ def _parse_list(count: int) -> Callable[[Any], tuple[float | None, ...]]:
     return parse
 
 
-_PARSERS: dict[str, Callable[[Any], Any]] = {"TEXT": _parse_text, "INTEGER": _parse_whole, "SIZE": _parse_size}
+_PARSERS: dict[str, Callable[[Any], Any]] = {"TEXT": _parse_text, "INTEGER": _parse_integer, "SIZE": _parse_size}

@@ -20,6 +20,7 @@ _MAX_SCENES_LISTED = 10
 _MAX_ROWS = 1_000_000
 _MIN_QUATERNION_NORM = 1e-6
 
+# Outer joins, so that a token that points nowhere is seen and not left out.
 _DATA_QUERY = """
     SELECT data.*, calibrated.token AS calibrated, sensor.token AS sensor, pose.token AS pose,
         channel, modality,
@@ -141,6 +142,7 @@ def read_scene(index: sqlite3.Connection, name: str, tables: Path, log: str) -> 
     Raises:
         InputError: there is no such scene, or a row points to one that is not there.
     """
+    # Names are what users know; nothing in the tables keeps two scenes from having the same one.
     scenes = index.execute("SELECT token FROM scene WHERE name = ?", (name,)).fetchall()
     if len(scenes) != 1:
         raise _describe_no_scene(index, name, len(scenes), tables, log)

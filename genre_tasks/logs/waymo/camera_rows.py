@@ -74,6 +74,7 @@ def read_cameras(calibration: ComponentTable, images: ComponentTable) -> Segment
     Raises:
         InputError: a table lacks columns, or holds what no camera has.
     """
+    # Cameras that took no image of this segment are left out.
     rows, readouts = _read_images(images)
     fields = [f"intrinsic.{name}" for name in _INTRINSICS]
     columns = calibration.read([_NAME, *fields, "width", "height", "rolling_shutter_direction"], names=[_NAME])
@@ -97,6 +98,7 @@ def read_cameras(calibration: ComponentTable, images: ComponentTable) -> Segment
         lens = _build_lens(numbers, size, calibration, name)
         cameras.append(Camera(name, lens, readout_s if direction == _TOP_TO_BOTTOM else 0.0, exposure_s))
         poses[name] = mounts[index] @ _WAYMO_SE3_CAMERA
+    # A pair of files of two segments would look like this.
     if not cameras:
         raise calibration.fault("no camera has both a calibration and images")
     return SegmentCameras(tuple(cameras), poses, {name: rows[name] for name in poses}, tuple(findings))

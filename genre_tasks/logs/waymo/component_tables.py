@@ -149,6 +149,7 @@ class ComponentTable:
         if values.shape[1] != 16:
             raise self.fault(f"{field} has no 16 numbers")
         poses: Float64 = values.reshape(-1, 4, 4).copy()
+        # The nearest rotation: what is printed with few digits is none by itself.
         u, _, v = np.linalg.svd(poses[:, :3, :3])
         rotations = u @ v
         skew = np.abs(rotations - poses[:, :3, :3]).max(initial=0.0)
@@ -176,6 +177,7 @@ class ComponentTable:
         if not columns:
             return {}
         try:
+            # A reader goes on where it stopped, so that frames in their order are read once.
             if columns not in self._readers:
                 self._readers[columns] = RowReader(self.path, _FOR_LARGE_VALUES, columns)
             batch = self._readers[columns].read(row)

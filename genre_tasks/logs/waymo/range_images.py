@@ -75,9 +75,11 @@ def compute_points(
     height, width = range_image.shape[:2]
     if pixel_poses is not None and pixel_poses.shape[:2] != (height, width):
         raise ValueError(f"poses of pixels are {pixel_poses.shape[:2]}, and the range image is {(height, width)}")
+    # Most of a range image may be sky; only pixels with a return are computed.
     rows, columns = np.nonzero(range_image[..., 0] > 0)
     distances = range_image[rows, columns, 0].astype(np.float64)
     mount = calibration.vehicle_SE3_lidar
+    # Columns are even in the axes of the vehicle, whichever way the LiDAR is mounted.
     yaw = np.arctan2(mount[1, 0], mount[0, 0])
     azimuths = (2.0 * (width - columns - 0.5) / width - 1.0) * np.pi - yaw
     inclinations = calibration.row_inclinations(height)[rows]

@@ -73,6 +73,7 @@ class WaymoLog(RecordedLog):
         self._files = files
         self._tables = {name: ComponentTable(path, COMPONENTS[name], uri) for name, path in files.items()}
         poses = self._tables["vehicle_pose"]
+        # Rows of a component may stand in any order.
         order = np.argsort(poses.times_us, kind="stable")
         self._times_us = [poses.times_us[index] for index in order.tolist()]
         self.frame_count = len(self._times_us)
@@ -163,6 +164,7 @@ class WaymoLog(RecordedLog):
             found.setdefault(table.times_us[row], {})[name] = row
         return found
 
+    # When first asked for: a segment without sweeps needs none.
     @cached_property
     def _calibrations(self) -> dict[str, LidarCalibration]:
         if "lidar_calibration" not in self._tables:
@@ -260,6 +262,7 @@ def _read_tensor(table: ComponentTable, row: int, field: str, channels: int, fra
         return None
     sides = shape.as_py() if len(shape.values) == 3 else []
     is_shape = bool(sides) and all(isinstance(side, int) and side > 0 for side in sides) and sides[2] == channels
+    # Before it becomes an array: numbers and shape are columns of their own.
     if not is_shape or sides[0] * sides[1] > _MAX_PIXELS or len(numbers.values) != sides[0] * sides[1] * channels:
         count = len(numbers.values)
         raise table.fault(f"a range image of {count} numbers has the shape {sides}", frame=frame)
