@@ -15,7 +15,7 @@ from genre_tasks.logs.file_digest import digest_files
 from genre_tasks.logs.file_reading import read_file
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.image_sizes import choose_lens, measure_images, report_problems
-from genre_tasks.logs.labelled_boxes import LabelledBox, build_tracks
+from genre_tasks.logs.labelled_boxes import MAX_BOXES, LabelledBox, build_tracks
 from genre_tasks.logs.nearest_images import find_nearest_images
 from genre_tasks.logs.recorded_log import RecordedLog
 from genre_tasks.logs.timed_poses import TimedPoses
@@ -26,7 +26,7 @@ _POSES = "city_SE3_egovehicle.feather"
 _MOUNTS = "calibration/egovehicle_SE3_sensor.feather"
 _LENSES = "calibration/intrinsics.feather"
 _BOXES = "annotations.feather"
-_TIMED_FILE = re.compile(r"([0-9]{1,18})\.(?:jpg|png|feather)")
+_TIMED_FILE = re.compile(r"([0-9]{1,19})\.(?:jpg|png|feather)")
 _REMEDY = "Give the folder of one log, as in argoverse2:PATH/7fab2350-7eaf-3b7e-a39d-6937a4c1bede."
 _LENS_COLUMNS = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
 _SIZE_COLUMNS = ("length_m", "width_m", "height_m")
@@ -213,7 +213,7 @@ class Argoverse2Log(RecordedLog):
         if not path.is_file():
             return ()
         numbers = ("timestamp_ns", *QUATERNION, *POSITION, *_SIZE_COLUMNS)
-        columns = read_columns(path, numbers, self.uri, texts=("track_uuid", "category"))
+        columns = read_columns(path, numbers, self.uri, texts=("track_uuid", "category"), max_rows=MAX_BOXES)
         sizes = np.stack([columns[name] for name in _SIZE_COLUMNS], axis=1)
         if (sizes <= 0).any():
             raise InputError("a box has no size", remedy="Download the log again.", file=path, log=self.uri)
@@ -256,4 +256,5 @@ def _list_timed_files(folder: Path) -> dict[int, Path]:
     if not folder.is_dir():
         return {}
     matches = ((_TIMED_FILE.fullmatch(path.name), path) for path in sorted(folder.iterdir()))
-    return {int(match[1]): path for match, path in matches if match is not None}
+    # Larger numbers are no times, and fit in no table.
+    return {int(match[1]): path for match, path in matches if match is not None and int(match[1]) < 1 << 63}

@@ -11,13 +11,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from genre_tasks.errors import InputError
+from genre_tasks.logs.labelled_boxes import MAX_BOXES
 from genre_tasks.logs.nuscenes.json_rows import REMEDY
 from genre_tasks.logs.types import Float64
 from genre_tasks.suggestions import did_you_mean
 
 _MAX_SCENES_LISTED = 10
 # A scene of twenty seconds has a few thousand data and boxes.
-_MAX_ROWS = 1_000_000
+_MAX_ROWS = MAX_BOXES
 _MIN_QUATERNION_NORM = 1e-6
 
 # Outer joins, so that a token that points nowhere is seen and not left out.

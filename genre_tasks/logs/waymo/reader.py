@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from genre_tasks.logs.file_digest import digest_files
 from genre_tasks.logs.findings import Finding
-from genre_tasks.logs.labelled_boxes import LabelledBox, build_tracks
+from genre_tasks.logs.labelled_boxes import MAX_BOXES, LabelledBox, build_tracks
 from genre_tasks.logs.recorded_log import RecordedLog
 from genre_tasks.logs.types import Camera, CuboidTrack, Float32, Float64, Sweep, Truth
 from genre_tasks.logs.waymo.camera_rows import name_sensors, read_cameras
@@ -175,9 +176,11 @@ class WaymoLog(RecordedLog):
         found = {}
         for row, name in enumerate(name_sensors(columns[_LASER], LIDAR_NAMES)):
             stated = table.read_row(row, ["beam_inclination.values"], 0).get("beam_inclination.values")
-            values = [] if stated is None else stated.as_py() or []
+            values = _read_list(table, stated, 0)
             lowest, highest = (float(columns[f"beam_inclination.{end}"][row]) for end in ("min", "max"))
-            found[name] = LidarCalibration(mounts[row], np.array(values, dtype=np.float64), lowest, highest)
+            found[name] = LidarCalibration(
+                mounts[row], np.zeros(0) if values is None else values.astype(np.float64), lowest, highest
+            )
         return found
 
     def _read_lidar(self, name: str, row: int, frame: int) -> list[tuple[Float64, Float32]]:
@@ -219,6 +222,8 @@ class WaymoLog(RecordedLog):
         if "lidar_box" not in self._tables:
             return ()
         table = self._tables["lidar_box"]
+        if table.row_count > MAX_BOXES:
+            raise table.fault(f"there are {table.row_count} boxes, and {MAX_BOXES} are allowed")
         columns = table.read([_OBJECT, "type", "box.heading", *_CENTRE, *_SIZE], names=[_OBJECT])
         sizes = np.stack([columns[field] for field in _SIZE], axis=1)
         if (sizes <= 0).any():
@@ -258,17 +263,28 @@ def _read_tensor(table: ComponentTable, row: int, field: str, channels: int, fra
     """[H, W, channels] of a range image; ``None`` where there is none."""
     values = table.read_row(row, [f"{field}.values", f"{field}.shape"], frame)
     numbers, shape = (values.get(f"{field}.{part}") for part in ("values", "shape"))
-    if numbers is None or shape is None or not numbers.is_valid or not shape.is_valid:
+    array = _read_list(table, numbers, frame)
+    stated = _read_list(table, shape, frame)
+    if array is None or stated is None:
         return None
-    sides = shape.as_py() if len(shape.values) == 3 else []
-    is_shape = bool(sides) and all(isinstance(side, int) and side > 0 for side in sides) and sides[2] == channels
-    # Before it becomes an array: numbers and shape are columns of their own.
-    if not is_shape or sides[0] * sides[1] > _MAX_PIXELS or len(numbers.values) != sides[0] * sides[1] * channels:
-        count = len(numbers.values)
-        raise table.fault(f"a range image of {count} numbers has the shape {sides}", frame=frame)
-    try:
-        array = numbers.values.to_numpy(zero_copy_only=False).astype(np.float32)
-    except (TypeError, ValueError) as error:
-        raise table.fault(f"a range image holds {numbers.type}", frame=frame) from error
-    image: Float32 = array.reshape(sides)
+    height, width, depth = (
+        (int(side) for side in stated) if len(stated) == 3 and stated.dtype.kind == "i" else (0, 0, 0)
+    )
+    # Numbers and shape are columns of their own, which may differ.
+    is_shape = min(height, width) > 0 and depth == channels and height * width <= _MAX_PIXELS
+    if not is_shape or len(array) != height * width * depth:
+        problem = f"a range image of {len(array)} numbers has the shape {stated[:4].tolist()}"
+        raise table.fault(problem, frame=frame)
+    image: Float32 = array.astype(np.float32).reshape(height, width, depth)
     return image
+
+
+def _read_list(table: ComponentTable, value: Any, frame: int) -> Any:
+    """[N] numbers of a list of Arrow; ``None`` where it is missing."""
+    if value is None or not value.is_valid:
+        return None
+    is_list = pa.types.is_list(value.type) or pa.types.is_fixed_size_list(value.type)
+    kind = value.type.value_type if is_list else None
+    if kind is None or not (pa.types.is_floating(kind) or pa.types.is_integer(kind)) or value.values.null_count:
+        raise table.fault(f"a list of numbers is {value.type}, or has nulls", frame=frame)
+    return value.values.to_numpy(zero_copy_only=False)
