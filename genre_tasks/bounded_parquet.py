@@ -12,6 +12,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from genre_tasks.parquet_footer import check_footer
+
 
 @dataclass(frozen=True)
 class MemoryBound:
@@ -64,6 +66,10 @@ def read_bounded_table(path: Path, bound: MemoryBound, columns: Sequence[str] | 
     most_bytes = max(bound.most_bytes, bound.file_ratio * path.stat().st_size)
     with pq.ParquetFile(path, page_checksum_verification=True) as file:
         expected = file.schema_arrow
+        check_footer(path, file.metadata)
+        if len(set(expected.names)) < len(expected.names):
+            # Asked for by its name, none of them is found.
+            raise ValueError("two columns have the same name")
         size, repeated = _measure_metadata(file.metadata, bound, columns)
         _require_within(size, most_bytes)
         if not repeated:
@@ -73,6 +79,10 @@ def read_bounded_table(path: Path, bound: MemoryBound, columns: Sequence[str] | 
     with pq.ParquetFile(path, page_checksum_verification=True, read_dictionary=repeated) as file:
         table = file.read(columns=columns, use_threads=False)
     _require_within(table.nbytes + sum(_measure_texts(table.column(name)) for name in repeated), most_bytes)
+    unknown = set(table.column_names) - set(expected.names)
+    if unknown:
+        # Arrow takes names from the schema, or from beside the bytes.
+        raise ValueError(f"the schema has no columns {', '.join(map(repr, sorted(unknown)))}")
     fields = [expected.field(name) for name in table.column_names]
     return _validate(table.cast(pa.schema(fields, expected.metadata)))
 
@@ -153,6 +163,7 @@ class RowReader:
         most_bytes = max(bound.most_bytes, bound.file_ratio * path.stat().st_size)
         with pq.ParquetFile(path) as file:
             metadata = file.metadata
+            check_footer(path, metadata)
             self._first_rows = [0]
             for group in range(metadata.num_row_groups):
                 _require_within(_measure_group(metadata, group, self._columns), most_bytes)

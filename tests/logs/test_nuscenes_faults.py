@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -159,3 +160,18 @@ def test_a_row_without_end_is_refused(tmp_path: Path) -> None:
     path.write_text('[{"token": "' + "x" * (12 << 20))
     with pytest.raises(InputError, match="no list of JSON objects"):
         list(stream_rows(path, "log"))
+
+
+def test_a_large_table_takes_little_memory(tmp_path: Path) -> None:
+    path = tmp_path / "rows.json"
+    rows = [{"token": f"{k:032x}", "translation": [k, 1.5, 2.5], "text": "x" * 300} for k in range(50_000)]
+    path.write_text(json.dumps(rows, indent=0))
+    del rows
+    assert path.stat().st_size > 18 << 20
+    tracemalloc.start()
+    try:
+        assert sum(1 for _ in stream_rows(path, "log")) == 50_000
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 8 << 20

@@ -23,6 +23,7 @@ _MAX_FILE_BYTES = 1 << 25
 _MAX_MEMORY_BYTES = 1 << 28
 _REMEDY = "Download the log again."
 _MIN_QUATERNION_NORM = 1e-6
+_MAX_DISTANCE_M = 1e9
 
 
 def read_columns(
@@ -111,6 +112,9 @@ def compose_poses(columns: dict[str, Any], path: Path, log: str) -> tuple[Rotati
     quats = np.stack([columns[name] for name in QUATERNION], axis=1).astype(np.float64)
     if len(quats) and np.linalg.norm(quats, axis=1).min() < _MIN_QUATERNION_NORM:
         raise InputError("a quaternion is zero", remedy=_REMEDY, file=path, log=log)
+    positions = np.stack([columns[name] for name in POSITION], axis=1).astype(np.float64)
+    if np.abs(positions).max(initial=0.0) > _MAX_DISTANCE_M or np.abs(quats).max(initial=0.0) > _MAX_DISTANCE_M:
+        raise InputError("a pose leads out of the world", remedy=_REMEDY, file=path, log=log)
     # SciPy puts the scalar part last.
     rotations = Rotation.from_quat(quats[:, [1, 2, 3, 0]].reshape(-1, 4))
-    return rotations, np.stack([columns[name] for name in POSITION], axis=1).astype(np.float64)
+    return rotations, positions

@@ -5,11 +5,10 @@ from __future__ import annotations
 import hashlib
 from functools import cached_property
 from pathlib import Path
-from urllib.parse import parse_qsl, unquote
 
 import numpy as np
 
-from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.errors import InputError
 from genre_tasks.logs.file_digest import digest_files
 from genre_tasks.logs.file_reading import read_file
 from genre_tasks.logs.findings import Finding
@@ -26,10 +25,10 @@ from genre_tasks.logs.kitti.drive_files import (
 )
 from genre_tasks.logs.kitti.drive_poses import project_records
 from genre_tasks.logs.labelled_boxes import build_tracks
+from genre_tasks.logs.log_address import split_log_address
 from genre_tasks.logs.recorded_log import RecordedLog
 from genre_tasks.logs.timed_poses import TimedPoses
 from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Lens, Sweep, Truth
-from genre_tasks.suggestions import did_you_mean
 from genre_tasks.user_paths import expand_user_path
 
 _OPTIONS = ("labels",)
@@ -56,14 +55,9 @@ def open_kitti(rest: str) -> KittiLog:
         InputError: no such drive, or its calibration, times or poses cannot be read.
         ConfigError: an option is unknown.
     """
-    path, _, query = rest.partition("?")
-    options = dict(parse_qsl(query, keep_blank_values=True))
-    for name in options:
-        if name not in _OPTIONS:
-            hint = did_you_mean(name, _OPTIONS) or f"Known: {', '.join(_OPTIONS)}."
-            raise ConfigError(f"KITTI drives have no option '{name}'", remedy=hint)
-    labels = expand_user_path(options["labels"]) if options.get("labels") else None
-    return KittiLog(f"kitti:{rest}", expand_user_path(unquote(path)), labels)
+    path, options = split_log_address(rest, _OPTIONS, "KITTI")
+    labels = expand_user_path(options["labels"]) if "labels" in options else None
+    return KittiLog(f"kitti:{rest}", expand_user_path(path), labels)
 
 
 class KittiLog(RecordedLog):

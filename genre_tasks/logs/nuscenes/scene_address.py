@@ -114,5 +114,6 @@ def list_scenes(rest: str) -> list[str]:
         names = list_scene_names(index)
     # Only a star stands for other characters, as in names of folders.
     pattern = address.scene.replace("[", "[[]").replace("?", "[?]")
-    folder = quote(str(expand_user_path(split_log_address(rest, _OPTIONS, "nuScenes")[0]).parent), safe="/ ")
-    return [f"{folder}/{name}{address.query}" for name in names if fnmatch.fnmatchcase(name, pattern)]
+    folder = expand_user_path(split_log_address(rest, _OPTIONS, "nuScenes")[0]).parent
+    found = [folder / name for name in names if fnmatch.fnmatchcase(name, pattern)]
+    return [quote(str(path), safe="/ ") + address.query for path in found]

@@ -25,6 +25,8 @@ _SHUTTER = tuple(
 )
 # An image is exposed and read within a frame.
 _MAX_READOUT_S = 0.1
+# Metres and radians a second.
+_MAX_VELOCITY = 1e3
 # Axes x right, y down, z forward in those of Waymo's cameras: x forward, y left, z up.
 _WAYMO_SE3_CAMERA = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
@@ -147,6 +149,8 @@ def _read_images(images: ComponentTable) -> tuple[dict[str, dict[int, ImageRow]]
     is_near = np.abs(middles_s - columns["pose_timestamp"]) < _MAX_READOUT_S
     middles_s = np.where(is_near, middles_s, columns["pose_timestamp"])
     velocity = np.stack([columns[field] for field in _VELOCITY], axis=1)
+    if np.abs(velocity).max(initial=0.0) > _MAX_VELOCITY:
+        raise images.fault("a velocity is out of all proportion")
     moved = _move_poses(poses, velocity, middles_s - columns["pose_timestamp"])
     rows: dict[str, dict[int, ImageRow]] = {}
     times: dict[str, list[int]] = {}

@@ -24,6 +24,7 @@ _FOR_LARGE_VALUES = MemoryBound(256 << 20, file_ratio=64, value_bytes=1, row_byt
 _MAX_ROWS = 5_000_000
 # Files of the tests of the dataset's own code state rotations in single precision.
 _MAX_SKEW = 1e-3
+_MAX_DISTANCE_M = 1e9
 
 
 class ComponentTable:
@@ -155,6 +156,8 @@ class ComponentTable:
         skew = np.abs(rotations - poses[:, :3, :3]).max(initial=0.0)
         if skew > _MAX_SKEW or (np.linalg.det(rotations) < 0).any():
             raise self.fault(f"{field} is no rotation and translation")
+        if np.abs(poses[:, :3, 3]).max(initial=0.0) > _MAX_DISTANCE_M:
+            raise self.fault(f"{field} leads out of the world")
         poses[:, :3, :3] = rotations
         poses[:, 3] = 0.0, 0.0, 0.0, 1.0
         return poses
