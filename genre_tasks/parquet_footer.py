@@ -35,7 +35,7 @@ _BINARY = 8
 _LIST = 9
 _SET = 10
 _STRUCT = 12
-_WHOLE = (4, 5, 6)
+_INTEGERS = (4, 5, 6)
 
 
 def check_footer(path: Path, metadata: pq.FileMetaData) -> None:
@@ -109,13 +109,13 @@ class _CompactReader:
             kind = head & 15
             if kind == 0:
                 return fields
-            number = number + (head >> 4) if head >> 4 else self._read_whole()
+            number = number + (head >> 4) if head >> 4 else self._read_integer()
             # In a structure the type of a truth is its value.
             fields[number] = kind == _TRUE if kind in (_TRUE, _FALSE) else self._read_value(kind, depth)
 
     def _read_value(self, kind: int, depth: int) -> Any:
-        if kind in _WHOLE:
-            return self._read_whole()
+        if kind in _INTEGERS:
+            return self._read_integer()
         if kind == _STRUCT:
             return self.read_struct(depth + 1)
         if kind in (_LIST, _SET):
@@ -137,7 +137,7 @@ class _CompactReader:
             raise ValueError("the footer is cut off")
         return [self._read_value(head & 15, depth + 1) for _ in range(count)]
 
-    def _read_whole(self) -> int:
+    def _read_integer(self) -> int:
         value = self._read_varint()
         return (value >> 1) ^ -(value & 1)
 

@@ -35,7 +35,7 @@ def main(path: Path) -> None:
             counts["read"] += 1
         except (OSError, ValueError, pa.ArrowException, TableTooLargeError):
             counts["refused"] += 1
-    print(counts["read"], counts["refused"])
+    sys.stdout.write(f"{counts['read']} {counts['refused']}\n")
 
 
 if __name__ == "__main__":
