@@ -16,10 +16,10 @@ from typing import Any
 
 from genre_tasks import source_code
 from genre_tasks.atomic_path import atomic_path
+from genre_tasks.cache_folder import find_cache_folder
 from genre_tasks.errors import ConfigError
 from genre_tasks.json_files import read_json_object
 from genre_tasks.source_code import KNOWN_SOURCES, Source
-from storage.cache_folder import find_cache_folder
 
 # Many times the files of the package: what belongs to files that have changed since goes at some time.
 _MOST = 4000

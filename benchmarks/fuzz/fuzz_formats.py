@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from benchmarks.fuzz import fuzz_log_formats, fuzz_store_formats
+from benchmarks.fuzz import fuzz_dataset_formats, fuzz_log_formats, fuzz_store_formats
 from benchmarks.fuzz.fuzz_target import FuzzTarget
 
 _GROUPS = (
@@ -15,6 +15,7 @@ _GROUPS = (
     fuzz_store_formats.splat_targets,
     fuzz_store_formats.weight_targets,
     fuzz_store_formats.manifest_targets,
+    fuzz_dataset_formats.dataset_targets,
 )
 
 

@@ -14,13 +14,13 @@ from flows.cli.parsing import parse_path
 LogArgument = Annotated[
     str,
     typer.Argument(
-        help="The driving log: pandaset:FOLDER for a PandaSet sequence, such as pandaset:data/002, or "
-        "synthetic:street?seed=1000 for a made-up street."
+        help="The driving log: pandaset:FOLDER for a PandaSet sequence, such as pandaset:data/002, "
+        "synthetic:street?seed=1000 for a made-up street, or a log of another layout, such as kitti:PATH."
     ),
 ]
 _LOGS = typer.Argument(
     help="One or more driving logs, such as pandaset:data/002 or synthetic:street?seed=1000. 'pandaset:data/*' "
-    "stands for every sequence in a folder."
+    "stands for every sequence in a folder, and 'nuscenes:data/@val.txt' for the names in a text file."
 )
 LogsArgument = Annotated[list[str], _LOGS]
 OptionalLogsArgument = Annotated[list[str] | None, _LOGS]

@@ -7,6 +7,7 @@ import glob
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flows.pipeline.log_lists import expand_log_list
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import InputError
 from genre_tasks.user_paths import expand_user_path
@@ -78,32 +79,37 @@ def select_chunks(log: str, config: PipelineConfig, chunks: list[int] | None) ->
 
 
 def expand_logs(logs: list[str]) -> list[str]:
-    """Replaces every ``reader:PATH/*`` by one URI for each folder that matches, sorted by name.
+    """Replaces every ``reader:PATH/*`` by one URI for each log that matches, and ``reader:PATH/@FILE`` by a list.
 
     Args:
-        logs: URIs of logs, with or without stars in the path; ``~`` is the home folder.
+        logs: URIs of logs, with or without stars in the path; ``~`` is the home folder. FILE holds one name a line.
 
     Returns:
-        URIs without stars, in the order of ``logs``.
+        URIs without stars, in the order of ``logs``; those of a star are sorted by name.
 
     Raises:
-        InputError: a star matches no folder; or ``~NAME`` names no user.
+        InputError: a star matches no log; or ``~NAME`` names no user.
 
     >>> expand_logs(["synthetic:street?seed=1", "pandaset:logs/002"])
     ['synthetic:street?seed=1', 'pandaset:logs/002']
     """
+    from genre_tasks.logs.registry import list_logs
+
     expanded: list[str] = []
-    for uri in logs:
+    for uri in [name for entry in logs for name in expand_log_list(entry) or [entry]]:
         reader, _, text = uri.partition(":")
         path = expand_user_path(text)
         # A folder may really have a star in its name.
         if "*" not in text or path.is_dir():
             expanded.append(uri)
             continue
-        folders = _match_folders(path)
-        if not folders:
+        # Logs of some layouts are rows of tables, or files beside one another.
+        found = list_logs(uri)
+        if found is None:
+            found = [f"{reader}:{folder}" for folder in _match_folders(path)]
+        if not found:
             raise InputError(f"no log matches {uri}", remedy="Name a folder that holds sequences.", file=path.parent)
-        expanded += [f"{reader}:{folder}" for folder in folders]
+        expanded += found
     return expanded
 
 

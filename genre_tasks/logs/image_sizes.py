@@ -148,3 +148,20 @@ def report_problems(measured: ImageSizes, camera: str) -> list[Finding]:
         )
         for problem, frames in by_problem.items()
     ]
+
+
+def describe_no_images(measured: ImageSizes, camera: str) -> Finding:
+    """Names a camera that is left out, since none of its images says how large they are.
+
+    Args:
+        measured: the images.
+        camera: name of the camera.
+
+    Returns:
+        Finding ``camera_without_images``.
+    """
+    problems = sorted(set(measured.problems.values()))
+    reason = f": {problems[0]}" if problems else ""
+    message = f"{camera} has no readable image and is left out{reason}"
+    remedy = "Copy the camera's folder again, or remove it."
+    return Finding("camera_without_images", "warning", message, remedy, camera=camera)

@@ -9,6 +9,9 @@ import numpy as np
 
 from genre_tasks.logs.types import CuboidTrack, Float64
 
+MAX_BOXES = 300_000
+"""What a log may have: twenty times the boxes of the busiest segment. A row of a table takes a kilobyte here."""
+
 # The boxes of a standing car wander by less over twenty frames.
 _MOVES_M = 1.0
 

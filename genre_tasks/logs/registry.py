@@ -6,7 +6,9 @@ A reader is a function ``open(rest: str) -> DrivingLog``, given as ``"module:fun
 from __future__ import annotations
 
 import importlib
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from genre_tasks.errors import InputError
 from genre_tasks.logs.types import DrivingLog
@@ -22,11 +24,13 @@ class ReaderEntry:
         target: ``"module:function"``.
         example: a URI that the reader opens, for error messages.
         install_hint: what to install if importing the module fails.
+        lister: ``"module:function"`` that lists the logs of a pattern, where logs are no folders; empty: they are.
     """
 
     target: str
     example: str
     install_hint: str
+    lister: str = ""
 
 
 # Targets are text, not functions: importing every reader would need the packages of all, and would slow down each
@@ -47,6 +51,12 @@ _READERS: dict[str, ReaderEntry] = {
         "kitti:PATH/2011_09_26/2011_09_26_drive_0009_sync",
         "pip install genre (scipy and pillow are part of it)",
     ),
+    "nuscenes": ReaderEntry(
+        "genre_tasks.logs.nuscenes.reader:open_nuscenes",
+        "nuscenes:PATH/scene-0061",
+        "pip install genre (scipy and pillow are part of it)",
+        "genre_tasks.logs.nuscenes.scene_address:list_scenes",
+    ),
     "pandaset": ReaderEntry(
         "genre_tasks.logs.pandaset.reader:open_pandaset",
         "pandaset:PATH/002",
@@ -61,6 +71,12 @@ _READERS: dict[str, ReaderEntry] = {
         "genre_tasks.logs.synthetic:open_synthetic",
         "synthetic:street?seed=1000",
         "pip install trimesh embreex (the street is ray-cast with Embree)",
+    ),
+    "waymo": ReaderEntry(
+        "genre_tasks.logs.waymo.reader:open_waymo",
+        "waymo:PATH/10023947602400723454_1120_000_1140_000",
+        "pip install genre (pyarrow is part of it)",
+        "genre_tasks.logs.waymo.segment_address:list_segments",
     ),
 }
 
@@ -79,8 +95,8 @@ def register(name: str, target: str, install_hint: str, example: str = "") -> No
 
     Example::
 
-        register("waymo", "my_package.waymo:open_waymo", "pip install my_package", "waymo:PATH/segment.tfrecord")
-        log = open_log("waymo:/data/segment.tfrecord")
+        register("rosbag", "my_package.bags:open_bag", "pip install my_package", "rosbag:PATH/drive.bag")
+        log = open_log("rosbag:/data/drive.bag")
     """
     # The same target again is no error: a module that registers its reader may be imported twice.
     if name in _READERS and _READERS[name].target != target:
@@ -95,7 +111,7 @@ def known_readers() -> tuple[str, ...]:
         The names, sorted.
 
     >>> known_readers()
-    ('argoverse2', 'genre', 'kitti', 'pandaset', 'posed_images', 'synthetic')
+    ('argoverse2', 'genre', 'kitti', 'nuscenes', 'pandaset', 'posed_images', 'synthetic', 'waymo')
     """
     return tuple(sorted(_READERS))
 
@@ -125,12 +141,40 @@ def open_log(uri: str) -> DrivingLog:
         hint = f"Did you mean 'pandaset:{uri}'? " if is_folder else did_you_mean(name, _READERS)
         problem = f"unknown reader {name!r}" if colon else f"a log is given as reader:where, {uri!r} names no reader"
         raise InputError(problem, remedy=hint + examples, log=uri)
-    module_name, _, function = entry.target.partition(":")
+    log: DrivingLog = _import_function(entry, entry.target, uri)(rest)
+    return log
+
+
+def list_logs(uri: str) -> list[str] | None:
+    """Lists the logs that a pattern stands for, where the logs of a reader are no folders.
+
+    Args:
+        uri: ``reader:rest`` with stars, such as ``nuscenes:PATH/*``.
+
+    Returns:
+        Their URIs; ``None`` where the reader's logs are folders, or there is no such reader.
+
+    Raises:
+        InputError: the reader cannot list them.
+
+    >>> list_logs("pandaset:PATH/*") is None
+    True
+    """
+    name, _, rest = uri.partition(":")
+    entry = _READERS.get(name)
+    if entry is None or not entry.lister:
+        return None
+    found: list[str] = _import_function(entry, entry.lister, uri)(rest)
+    return [f"{name}:{log}" for log in found]
+
+
+def _import_function(entry: ReaderEntry, target: str, uri: str) -> Callable[[str], Any]:
+    module_name, _, function = target.partition(":")
     # Imported here, since a reader may need packages that users of other readers do not have.
     try:
-        reader = getattr(importlib.import_module(module_name), function)
+        found: Callable[[str], Any] = getattr(importlib.import_module(module_name), function)
     except ImportError as error:
         remedy = f"Install what it needs: {entry.install_hint}."
-        raise InputError(f"the reader {name!r} cannot be loaded ({error})", remedy=remedy, log=uri) from error
-    log: DrivingLog = reader(rest)
-    return log
+        reader = uri.partition(":")[0]
+        raise InputError(f"the reader {reader!r} cannot be loaded ({error})", remedy=remedy, log=uri) from error
+    return found

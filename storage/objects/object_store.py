@@ -9,11 +9,11 @@ from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any
 
+from genre_tasks.cache_folder import find_cache_folder
 from genre_tasks.errors import ArtifactCorruptError, ConfigError, TransientIOError
 from genre_tasks.progress import Progress, silent
 from genre_tasks.temporary_names import describe_owner
 from storage.address import Address
-from storage.cache_folder import find_cache_folder
 from storage.codecs import get_codec
 from storage.io_errors import make_corruption_error, os_errors_translated
 from storage.manifest import MANIFEST, Manifest, NewerSchemaError, parse_manifest

@@ -28,7 +28,9 @@ from genre_tasks.logs.pandaset.writer import write_pandaset
 from genre_tasks.logs.registry import open_log
 from tests.faults.small_run import LOG, SETTINGS
 from tests.logs.kitti_folder import DRIVE, write_kitti, write_tracking_labels
+from tests.logs.nuscenes_folder import write_nuscenes
 from tests.logs.posed_images_folder import write_transforms
+from tests.logs.waymo_folder import write_waymo
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (ROOT / "README.md", ROOT / "docs/quickstart.md", *sorted((ROOT / "docs/guides").glob("*.md")))
@@ -60,6 +62,8 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, 
     write_pandaset(open_log(LOG), folder / "pandaset/002")
     write_kitti(open_log(LOG), folder / "kitti", camera_count=1)
     write_tracking_labels(open_log(LOG), folder / "kitti/labels.txt")
+    write_nuscenes(open_log(LOG), folder / "nuscenes")
+    write_waymo(open_log(LOG), folder / "waymo/training")
     guide = (ROOT / "docs/guides/simulation.md").read_text()
     (folder / "edits.yaml").write_text(re.findall(r"```yaml\n(.*?)```", guide, flags=re.DOTALL)[0])
     with prefect_test_harness(server_startup_timeout=120):
@@ -96,6 +100,7 @@ def small(command: str, folder: Path, run: str, pandaset: str) -> list[str]:
     words = [pandaset if word == "pandaset:/data/pandaset/002" else word for word in words]
     words = [word.replace("/data/kitti/label_02/0001.txt", f"{folder}/kitti/labels.txt") for word in words]
     words = [re.sub(r"/data/kitti/\w+/\w+", f"{folder}/kitti/{DRIVE}", word) for word in words]
+    words = [re.sub(r"/data/(nuscenes|waymo)/", rf"{folder}/\1/", word) for word in words]
     if "--budget" in words:  # a budget chooses these settings itself, and is not given them
         return [*words, "--store", str(folder / "store"), "--dry-run"]
     if words[0] == "simulate":

@@ -10,8 +10,13 @@ import pytest
 from genre_tasks.logs.genre_layout.writer import write_genre_layout
 from genre_tasks.logs.pandaset.writer import write_pandaset
 from genre_tasks.logs.registry import open_log
+from genre_tasks.logs.types import Sweep
 from tests.fakes import FakeCar, FakeLog
+from tests.logs.argoverse2_folder import START_NS, write_argoverse2
 from tests.logs.kitti_folder import shifted_world, write_kitti
+from tests.logs.nuscenes_folder import LIDAR_MOUNT, START_US, token, write_nuscenes
+from tests.logs.waymo_folder import NAMES, write_waymo
+from tests.logs.waymo_folder import START_US as WAYMO_START_US
 
 # Two hundred logs in each layout. They are drawn by the tests' own fake, and are no streets.
 SEEDS = range(200)
@@ -92,6 +97,77 @@ def test_kitti(tmp_path: Path) -> None:
             else:
                 assert found.sweep(frame) is None
         _assert_same_tracks(found.tracks(), log.tracks(), shift, atol=1e-5, by_order=True)
+
+
+def test_nuscenes(tmp_path: Path) -> None:
+    """Times are whole microseconds, points single precision in the axes of the LiDAR."""
+    for seed in SEEDS:
+        log = make_log(seed)
+        found = open_log(f"nuscenes:{write_nuscenes(log, tmp_path / str(seed))}?rate=20")
+        names = {name: f"CAM_{name.upper()}" for name in log.camera_names}
+        _assert_same_frames(found, log, names, np.eye(4), START_US * 1e-6, seed)
+        for frame in range(log.frame_count):
+            expected = log.sweep(frame)
+            if expected is not None:
+                pose = log.world_SE3_lidar(frame) @ LIDAR_MOUNT
+                local = (expected.points_world - pose[:3, 3]) @ pose[:3, :3]
+                # What is nearer counts as the vehicle's own roof.
+                far = np.hypot(local[:, 0], local[:, 1]) >= 1.0
+                expected = Sweep(expected.points_world[far], expected.intensity[far], expected.timestamps_s[far])
+            _assert_same_sweep(found.sweep(frame), expected, atol=1e-4, times=False)
+        tracks = {token(track.track_id): track for track in log.tracks()}
+        assert {track.track_id for track in found.tracks()} == set(tracks)
+        for track in found.tracks():
+            np.testing.assert_array_equal(track.frames, tracks[track.track_id].frames)
+            np.testing.assert_allclose(track.size_m, tracks[track.track_id].size_m, rtol=1e-12)
+            np.testing.assert_allclose(track.world_SE3_box, tracks[track.track_id].world_SE3_box, atol=1e-8)
+
+
+def test_waymo(tmp_path: Path) -> None:
+    """Times are whole microseconds, poses of pixels single precision in the world."""
+    for seed in SEEDS:
+        log = make_log(seed)
+        found = open_log(f"waymo:{write_waymo(log, tmp_path / str(seed))}")
+        names = {name: NAMES[name] for name in log.camera_names}
+        _assert_same_frames(found, log, names, np.eye(4), WAYMO_START_US * 1e-6, seed)
+        # Half a step for the numbers, and what angles of single precision turn at 80 m.
+        step = float(np.spacing(np.float32(np.abs(log.world_offset_m).max() + 100)))
+        for frame in range(log.frame_count):
+            _assert_same_sweep(found.sweep(frame), log.sweep(frame), atol=step / 2 + 1e-4, times=False)
+        _assert_same_tracks(found.tracks(), log.tracks(), np.eye(4), atol=1e-8)
+
+
+def test_argoverse2(tmp_path: Path) -> None:
+    """Frames are sweeps; points are half precision in the axes of the vehicle, intensities bytes."""
+    for seed in SEEDS:
+        log = make_log(seed).with_(missing_sweeps=frozenset())
+        found = open_log(f"argoverse2:{write_argoverse2(log, tmp_path / str(seed), np.float16)}")
+        shift = np.eye(4)
+        shift[:3, 3] = -log.world_SE3_lidar(0)[:3, 3]
+        names = {name: f"ring_{name}" for name in log.camera_names}
+        _assert_same_frames(found, log, names, shift, START_NS * 1e-9, seed)
+        for frame in range(log.frame_count):
+            expected, sweep = log.sweep(frame), found.sweep(frame)
+            pose = log.world_SE3_lidar(frame)
+            local = (expected.points_world - pose[:3, 3]) @ pose[:3, :3]
+            error = (sweep.points_world - shift[:3, 3] - pose[:3, 3]) @ pose[:3, :3] - local
+            # Half a step of eleven bits.
+            assert (np.abs(error) <= np.abs(local) * 2.0**-11 + 1e-6).all(), seed
+            np.testing.assert_allclose(sweep.intensity, expected.intensity, atol=0.5 / 255 + 1e-7)
+        _assert_same_tracks(found.tracks(), log.tracks(), shift, atol=1e-8)
+
+
+def _assert_same_frames(found, log, names: dict[str, str], shift, start_s: float, seed: int) -> None:
+    """Cameras, times, poses and images; times since 1970 are right to a microsecond."""
+    assert {camera.name: camera.lens for camera in found.cameras} == {names[c.name]: c.lens for c in log.cameras}, seed
+    assert found.frame_count == log.frame_count
+    for frame in range(log.frame_count):
+        assert found.frame_timestamp_s(frame) - start_s == pytest.approx(log.frame_timestamp_s(frame), abs=1.5e-6)
+        np.testing.assert_allclose(found.world_SE3_lidar(frame), shift @ log.world_SE3_lidar(frame), atol=1e-8)
+        for camera, name in names.items():
+            pose = found.world_SE3_camera(name, frame)
+            np.testing.assert_allclose(pose, shift @ log.world_SE3_camera(camera, frame), atol=1e-8)
+            assert found.image_bytes(name, frame) == log.image_bytes(camera, frame), (seed, camera, frame)
 
 
 def _assert_same_sweep(found, expected, atol: float, times: bool = True) -> None:

@@ -24,7 +24,16 @@ def open_fake(rest: str) -> FakeLog:
 
 
 def test_known_readers() -> None:
-    assert known_readers() == ("argoverse2", "genre", "kitti", "pandaset", "posed_images", "synthetic")
+    assert known_readers() == (
+        "argoverse2",
+        "genre",
+        "kitti",
+        "nuscenes",
+        "pandaset",
+        "posed_images",
+        "synthetic",
+        "waymo",
+    )
 
 
 def test_a_reader_is_one_line() -> None:
@@ -41,8 +50,8 @@ def test_a_reader_is_one_line() -> None:
         ("pandset:x/002", "unknown reader 'pandset'.*Did you mean 'pandaset'"),
         ("PandaSet:x/002", "unknown reader 'PandaSet'.*Did you mean 'pandaset'"),
         (
-            "nuscenes:x",
-            r"unknown reader 'nuscenes'.*Known: .*kitti:\S+, pandaset:PATH/002, posed_images:\S+, synthetic",
+            "rosbag:x",
+            r"unknown reader 'rosbag'.*Known: .*kitti:\S+, nuscenes:\S+, pandaset:PATH/002, posed_images:\S+, syn",
         ),
         ("../data/002", "names no reader.*Known: .*pandaset:PATH/002"),
         ("", "names no reader"),

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from genre_tasks.cache_folder import FOLDER_VARIABLE
 from genre_tasks.source_code import KNOWN_SOURCES, read_source
 from storage import known_sources
-from storage.cache_folder import FOLDER_VARIABLE
 from storage.code_digest import _digest_closure, code_digest
 
 MODULE = "genre_tasks.stages.effects"

@@ -15,13 +15,20 @@ from genre_tasks.logs.types import Float64
 QUATERNION = ("qw", "qx", "qy", "qz")
 POSITION = ("tx_m", "ty_m", "tz_m")
 
-# A sweep of a hundred thousand points has a megabyte. Compressed, a file holds 255 times its size at most.
+MAX_ROWS = 4_000_000
+"""What a table may have: forty times the points of a sweep."""
+
+# A sweep of a hundred thousand points has a megabyte.
 _MAX_FILE_BYTES = 1 << 25
+_MAX_MEMORY_BYTES = 1 << 28
 _REMEDY = "Download the log again."
 _MIN_QUATERNION_NORM = 1e-6
+_MAX_DISTANCE_M = 1e9
 
 
-def read_columns(path: Path, names: Sequence[str], log: str, texts: Sequence[str] = ()) -> dict[str, Any]:
+def read_columns(
+    path: Path, names: Sequence[str], log: str, texts: Sequence[str] = (), max_rows: int = MAX_ROWS
+) -> dict[str, Any]:
     """Reads columns of a table.
 
     Args:
@@ -29,6 +36,7 @@ def read_columns(path: Path, names: Sequence[str], log: str, texts: Sequence[str
         names: of columns that hold finite numbers.
         log: URI of the log, for errors.
         texts: of columns that hold text.
+        max_rows: of the table.
 
     Returns:
         Name → [N] array of the file's own type of numbers, or a list of texts.
@@ -37,7 +45,6 @@ def read_columns(path: Path, names: Sequence[str], log: str, texts: Sequence[str
         InputError: the file is missing, too large or damaged; a column is missing or holds something else.
     """
     import pyarrow as pa
-    from pyarrow import feather
 
     where: dict[str, Any] = {"file": path, "log": log, "remedy": _REMEDY}
     if not path.is_file():
@@ -46,9 +53,7 @@ def read_columns(path: Path, names: Sequence[str], log: str, texts: Sequence[str
     if size > _MAX_FILE_BYTES:
         raise InputError(f"the table has {size >> 20} MiB, and {_MAX_FILE_BYTES >> 20} are allowed", **where)
     try:
-        table = feather.read_table(path, memory_map=False, use_threads=False)
-        table.validate(full=True)
-        columns = table.column_names
+        table, columns = _read_bounded(path, {*names, *texts}, max_rows)
     except (OSError, ValueError, pa.ArrowException) as error:
         raise InputError(f"the table cannot be read ({error})", **where) from error
     missing = [name for name in (*names, *texts) if name not in columns]
@@ -65,6 +70,29 @@ def read_columns(path: Path, names: Sequence[str], log: str, texts: Sequence[str
             raise InputError(f"the column {name} is not finite", **where)
         found[name] = values
     return found
+
+
+def _read_bounded(path: Path, wanted: set[str], max_rows: int) -> tuple[Any, list[str]]:
+    """The table, with no more than the wanted columns, and the names of all."""
+    import pyarrow as pa
+
+    with pa.OSFile(str(path)) as source:
+        # Version 1 of Feather is no file of Arrow; the dataset has none.
+        schema = pa.ipc.open_file(source).schema
+        fields = [index for index, name in enumerate(schema.names) if name in wanted]
+        options = pa.ipc.IpcReadOptions(included_fields=fields, use_threads=False)
+        reader = pa.ipc.open_file(source, options=options)
+        batches: list[pa.RecordBatch] = []
+        # Batch by batch, as a few compressed bytes may become gigabytes.
+        for index in range(reader.num_record_batches):
+            batches.append(reader.get_batch(index))
+            if sum(batch.nbytes for batch in batches) > _MAX_MEMORY_BYTES:
+                raise ValueError(f"it takes more than {_MAX_MEMORY_BYTES >> 20} MiB of memory")
+            if sum(batch.num_rows for batch in batches) > max_rows:
+                raise ValueError(f"it has more than {max_rows} rows")
+        table = pa.Table.from_batches(batches, reader.schema)
+    table.validate(full=True)
+    return table, schema.names
 
 
 def compose_poses(columns: dict[str, Any], path: Path, log: str) -> tuple[Rotation, Float64]:
@@ -84,6 +112,9 @@ def compose_poses(columns: dict[str, Any], path: Path, log: str) -> tuple[Rotati
     quats = np.stack([columns[name] for name in QUATERNION], axis=1).astype(np.float64)
     if len(quats) and np.linalg.norm(quats, axis=1).min() < _MIN_QUATERNION_NORM:
         raise InputError("a quaternion is zero", remedy=_REMEDY, file=path, log=log)
+    positions = np.stack([columns[name] for name in POSITION], axis=1).astype(np.float64)
+    if np.abs(positions).max(initial=0.0) > _MAX_DISTANCE_M or np.abs(quats).max(initial=0.0) > _MAX_DISTANCE_M:
+        raise InputError("a pose leads out of the world", remedy=_REMEDY, file=path, log=log)
     # SciPy puts the scalar part last.
     rotations = Rotation.from_quat(quats[:, [1, 2, 3, 0]].reshape(-1, 4))
-    return rotations, np.stack([columns[name] for name in POSITION], axis=1).astype(np.float64)
+    return rotations, positions

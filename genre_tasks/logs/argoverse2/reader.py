@@ -15,17 +15,18 @@ from genre_tasks.logs.file_digest import digest_files
 from genre_tasks.logs.file_reading import read_file
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.image_sizes import choose_lens, measure_images, report_problems
-from genre_tasks.logs.labelled_boxes import LabelledBox, build_tracks
+from genre_tasks.logs.labelled_boxes import MAX_BOXES, LabelledBox, build_tracks
+from genre_tasks.logs.nearest_images import find_nearest_images
+from genre_tasks.logs.recorded_log import RecordedLog
 from genre_tasks.logs.timed_poses import TimedPoses
 from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Lens, Sweep, Truth
-from genre_tasks.suggestions import did_you_mean
 from genre_tasks.user_paths import expand_user_path
 
 _POSES = "city_SE3_egovehicle.feather"
 _MOUNTS = "calibration/egovehicle_SE3_sensor.feather"
 _LENSES = "calibration/intrinsics.feather"
 _BOXES = "annotations.feather"
-_TIMED_FILE = re.compile(r"([0-9]{1,18})\.(?:jpg|png|feather)")
+_TIMED_FILE = re.compile(r"([0-9]{1,19})\.(?:jpg|png|feather)")
 _REMEDY = "Give the folder of one log, as in argoverse2:PATH/7fab2350-7eaf-3b7e-a39d-6937a4c1bede."
 _LENS_COLUMNS = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
 _SIZE_COLUMNS = ("length_m", "width_m", "height_m")
@@ -34,7 +35,7 @@ _RING = "ring_"
 _INTENSITY_SCALE = 255.0
 _NS = 1e-9
 # Without a neighbour, what a sweep's frame lasts: ten sweeps a second.
-_PERIOD_S = 0.1
+_PERIOD_NS = 100_000_000
 
 
 def open_argoverse2(rest: str) -> Argoverse2Log:
@@ -58,7 +59,7 @@ def open_argoverse2(rest: str) -> Argoverse2Log:
     return Argoverse2Log(uri, folder.resolve())
 
 
-class Argoverse2Log:
+class Argoverse2Log(RecordedLog):
     """A ``DrivingLog`` over a log of Argoverse 2; see ``DrivingLog`` for methods, units and axes.
 
     A frame is a sweep; each camera gives its image that is nearest in time, with the pose of that time. Images are
@@ -76,7 +77,7 @@ class Argoverse2Log:
     truth: Truth | None = None
 
     def __init__(self, uri: str, folder: Path) -> None:
-        self.uri = uri
+        super().__init__(uri)
         self.folder = folder
         self.name = re.sub(r"[^\w.=,+-]", "_", folder.name, flags=re.ASCII)
         self._sweeps = _list_timed_files(folder / "sensors/lidar")
@@ -88,7 +89,6 @@ class Argoverse2Log:
         self._mounts = self._read_mounts()
         self._lenses = self._read_lenses()
         self._images = {name: _list_timed_files(folder / "sensors/cameras" / name) for name in self._lenses}
-        self._findings: dict[str, Finding] = {}
 
     def _read_poses(self) -> TimedPoses:
         path = self.folder / _POSES
@@ -149,16 +149,8 @@ class Argoverse2Log:
         return {name: self._find_nearest(sorted(files)) for name, files in self._images.items()}
 
     def _find_nearest(self, times_ns: list[int]) -> list[int | None]:
-        steps = np.diff(self._sweep_times_ns)
-        period_ns = float(np.median(steps)) if len(steps) else _PERIOD_S / _NS
-        found: list[int | None] = []
-        times = np.array(times_ns, dtype=np.int64)
-        for frame_ns in self._sweep_times_ns:
-            nearest = int(times[np.argmin(np.abs(times - frame_ns))]) if len(times) else None
-            # Of another frame, where images are missing.
-            is_near = nearest is not None and abs(nearest - int(frame_ns)) <= period_ns / 2
-            found.append(nearest if is_near else None)
-        return found
+        nearest = find_nearest_images(self._sweep_times_ns.tolist(), times_ns, _PERIOD_NS)
+        return [None if index is None else times_ns[index] for index in nearest]
 
     def frame_timestamp_s(self, frame: int) -> float:
         """See ``DrivingLog``."""
@@ -221,7 +213,7 @@ class Argoverse2Log:
         if not path.is_file():
             return ()
         numbers = ("timestamp_ns", *QUATERNION, *POSITION, *_SIZE_COLUMNS)
-        columns = read_columns(path, numbers, self.uri, texts=("track_uuid", "category"))
+        columns = read_columns(path, numbers, self.uri, texts=("track_uuid", "category"), max_rows=MAX_BOXES)
         sizes = np.stack([columns[name] for name in _SIZE_COLUMNS], axis=1)
         if (sizes <= 0).any():
             raise InputError("a box has no size", remedy="Download the log again.", file=path, log=self.uri)
@@ -245,7 +237,7 @@ class Argoverse2Log:
 
     def findings(self) -> tuple[Finding, ...]:
         """What was left out, for ``genre check``."""
-        return tuple(self._findings.values()) if self.cameras else ()
+        return self._findings_after(self.cameras)
 
     def digest(self) -> str:
         """Identifies all files that are read."""
@@ -255,20 +247,8 @@ class Argoverse2Log:
             files += timed.values()
         return digest_files(self.folder, files, ())
 
-    def _report(self, *findings: Finding) -> None:
-        self._findings |= {finding.message: finding for finding in findings}
-
-    def _check_frame(self, frame: int) -> int:
-        if not 0 <= frame < self.frame_count:
-            remedy = f"The log has frames 0 to {self.frame_count - 1}."
-            raise InputError("no such frame", remedy=remedy, log=self.uri, frame=frame)
-        return frame
-
     def _check_camera(self, camera: str, frame: int) -> None:
-        if camera not in self._lenses:
-            hint = did_you_mean(camera, self._lenses)
-            remedy = f"{hint}The log has {', '.join(self._lenses)}."
-            raise InputError("no such camera", remedy=remedy, log=self.uri, camera=camera, frame=frame)
+        self._check_camera_among(self._lenses, camera, frame)
 
 
 def _list_timed_files(folder: Path) -> dict[int, Path]:
@@ -276,4 +256,5 @@ def _list_timed_files(folder: Path) -> dict[int, Path]:
     if not folder.is_dir():
         return {}
     matches = ((_TIMED_FILE.fullmatch(path.name), path) for path in sorted(folder.iterdir()))
-    return {int(match[1]): path for match, path in matches if match is not None}
+    # Larger numbers are no times, and fit in no table.
+    return {int(match[1]): path for match, path in matches if match is not None and int(match[1]) < 1 << 63}

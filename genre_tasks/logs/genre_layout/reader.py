@@ -28,8 +28,8 @@ from genre_tasks.logs.genre_layout.layout import (
 )
 from genre_tasks.logs.genre_layout.sweep_files import read_sweep
 from genre_tasks.logs.lens_validity import with_distortion
+from genre_tasks.logs.recorded_log import RecordedLog
 from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Lens, Sweep, Truth
-from genre_tasks.suggestions import did_you_mean
 from genre_tasks.user_paths import expand_user_path
 
 # A frame with ten cameras has two kilobytes.
@@ -59,7 +59,7 @@ def open_genre_layout(rest: str) -> GenreLayoutLog:
     return GenreLayoutLog(uri, folder)
 
 
-class GenreLayoutLog:
+class GenreLayoutLog(RecordedLog):
     """A ``DrivingLog`` over a folder of the layout; see ``DrivingLog`` for methods, units and axes.
 
     Args:
@@ -74,7 +74,7 @@ class GenreLayoutLog:
     truth: Truth | None = None
 
     def __init__(self, uri: str, folder: Path) -> None:
-        self.uri = uri
+        super().__init__(uri)
         self.folder = folder.resolve()
         self.name = re.sub(r"[^\w.=,+-]", "_", self.folder.name, flags=re.ASCII) or "log"
         self._file = self.folder / LOG_FILE
@@ -91,7 +91,6 @@ class GenreLayoutLog:
             self.frame_count = len(self._frames)
         except EntryError as error:
             raise describe_entry_error(error, self._file, uri) from error
-        self._findings: dict[str, Finding] = {}
 
     def _check_format(self, values: object) -> None:
         entries = parse_mapping(values, LOG_FILE)
@@ -132,9 +131,7 @@ class GenreLayoutLog:
 
     def _image_entry(self, camera: str, frame: int) -> Mapping[str, Any]:
         names = [known.name for known in self.cameras]
-        if camera not in names:
-            remedy = f"{did_you_mean(camera, names)}The log has {', '.join(names)}."
-            raise InputError("no such camera", remedy=remedy, log=self.uri, camera=camera, frame=frame)
+        self._check_camera_among(names, camera, frame)
         # Frames are parsed when they are asked for: one that is broken must not take the others with it.
         values = self._frame(frame)
         try:
@@ -144,10 +141,7 @@ class GenreLayoutLog:
             raise describe_entry_error(error, self._file, self.uri) from error
 
     def _frame(self, frame: int) -> Mapping[str, Any]:
-        if not 0 <= frame < self.frame_count:
-            remedy = f"The log has frames 0 to {self.frame_count - 1}."
-            raise InputError("no such frame", remedy=remedy, log=self.uri, frame=frame)
-        return self._frames[frame]
+        return self._frames[self._check_frame(frame)]
 
     def _parse(self, parse: Any, *arguments: Any) -> Any:
         try:
@@ -193,9 +187,7 @@ class GenreLayoutLog:
             return None
         sweep, invalid = read_sweep(path, self.frame_timestamp_s(frame), self.uri, frame)
         if invalid:
-            message = f"{invalid} points of sweep {frame} are not finite and left out"
-            finding = Finding("invalid_points", "warning", message, numbers={"points": invalid}, frames=(frame,))
-            self._findings[message] = finding
+            self._report_invalid_points(invalid, frame)
         return sweep
 
     def _sweep_file(self, frame: int) -> Path | None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import math
 import re
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,12 @@ _MAX_POINTS = 4_000_000
 _MAX_BYTES = _MAX_POINTS * len(POINT_COLUMNS) * 8 + (1 << 20)
 _PLY_HEADER_BYTES = 1 << 16
 _PLY_COUNT = re.compile(rb"^[ \t]*element[ \t]+\S+[ \t]+(\S+)", re.MULTILINE)
+_HEADER_READERS: dict[tuple[int, int], Any] = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+# An archive may be damaged, encrypted, or compressed by a method that Python lacks.
+_ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, RuntimeError)
 _REMEDY = "Write arrays x, y, z (metres, world), intensity (0 to 1) and time_s, each [N]."
 
 
@@ -71,7 +80,7 @@ def read_sweep(path: Path, frame_time_s: float, log: str, frame: int) -> tuple[S
         lengths = {values.shape for values in arrays.values()}
         if len(lengths) != 1 or len(next(iter(lengths))) != 1:
             raise ValueError(f"its columns have the shapes {sorted(lengths)}, not one length")
-    except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile, MemoryError) as error:
+    except (OSError, ValueError, TypeError, KeyError, EOFError, MemoryError, *_ZIP_ERRORS) as error:
         raise InputError(f"the sweep cannot be read ({error})", remedy=_REMEDY, **where) from error
     count = len(arrays["x"])
     arrays = {"intensity": np.zeros(count), "time_s": np.full(count, frame_time_s)} | arrays
@@ -91,9 +100,22 @@ def _read_npz(path: Path) -> dict[str, Float64]:
         columns = {}
         for entry in archive.infolist():
             if entry.filename in wanted:
-                with archive.open(entry) as file:
-                    columns[entry.filename.removesuffix(".npy")] = np.lib.format.read_array(file, allow_pickle=False)
+                columns[entry.filename.removesuffix(".npy")] = _parse_npy(archive.read(entry))
         return columns
+
+
+def _parse_npy(data: bytes) -> Any:
+    """The array of a file, unless its header claims another size than the file has."""
+    stream = io.BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    if version not in _HEADER_READERS:
+        raise ValueError(f"an array has version {version}")
+    shape, _, dtype = _HEADER_READERS[version](stream)
+    # NumPy takes the memory of what a header claims before it reads the values.
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(data) - stream.tell():
+        raise ValueError("an array has another size than its header says")
+    stream.seek(0)
+    return np.lib.format.read_array(stream, allow_pickle=False)
 
 
 def _read_parquet(path: Path) -> dict[str, Any]:

@@ -61,6 +61,8 @@ def _find_items(root: Element) -> list[Element]:
 
 def _read_tracklet(item: Element, number: int) -> Iterator[LabelledBox]:
     height, width, length = (_number(item, name) for name in "hwl")
+    if not min(height, width, length) > 0:
+        raise ValueError(f"tracklet {number} has no size")
     # A tracklet has a pose for every frame from there on.
     first = int(_number(item, "first_frame"))
     for index, pose in enumerate(item.findall("poses/item")):
@@ -105,6 +107,8 @@ def read_tracking_labels(path: Path, log: str) -> list[LabelledBox]:
         # The box in the image and its truncation lie between.
         values = parse_numbers(" ".join(words[10:]), 7, what, path, log)
         height, width, length, *lower, turn = (float(value) for value in values)
+        if not min(height, width, length) > 0:
+            raise InputError(f"{what}: the box has no size", remedy=_REMEDY, file=path, log=log, frame=frame)
         # At a turn of 0 the object heads along the camera's x; its origin is the middle of its lower face, y down.
         axes = _rotate("y", turn) @ _CAMERA_R_BOX
         centre = np.array(lower) - np.array([0.0, height / 2, 0.0])

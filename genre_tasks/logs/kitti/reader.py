@@ -5,15 +5,14 @@ from __future__ import annotations
 import hashlib
 from functools import cached_property
 from pathlib import Path
-from urllib.parse import parse_qsl, unquote
 
 import numpy as np
 
-from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.errors import InputError
 from genre_tasks.logs.file_digest import digest_files
 from genre_tasks.logs.file_reading import read_file
 from genre_tasks.logs.findings import Finding
-from genre_tasks.logs.image_sizes import choose_lens, measure_images, report_problems
+from genre_tasks.logs.image_sizes import choose_lens, describe_no_images, measure_images, report_problems
 from genre_tasks.logs.kitti.boxes import read_tracking_labels, read_tracklets
 from genre_tasks.logs.kitti.drive_files import (
     CALIBRATION_FILES,
@@ -26,9 +25,10 @@ from genre_tasks.logs.kitti.drive_files import (
 )
 from genre_tasks.logs.kitti.drive_poses import project_records
 from genre_tasks.logs.labelled_boxes import build_tracks
+from genre_tasks.logs.log_address import split_log_address
+from genre_tasks.logs.recorded_log import RecordedLog
 from genre_tasks.logs.timed_poses import TimedPoses
 from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Lens, Sweep, Truth
-from genre_tasks.suggestions import did_you_mean
 from genre_tasks.user_paths import expand_user_path
 
 _OPTIONS = ("labels",)
@@ -55,17 +55,12 @@ def open_kitti(rest: str) -> KittiLog:
         InputError: no such drive, or its calibration, times or poses cannot be read.
         ConfigError: an option is unknown.
     """
-    path, _, query = rest.partition("?")
-    options = dict(parse_qsl(query, keep_blank_values=True))
-    for name in options:
-        if name not in _OPTIONS:
-            hint = did_you_mean(name, _OPTIONS) or f"Known: {', '.join(_OPTIONS)}."
-            raise ConfigError(f"KITTI drives have no option '{name}'", remedy=hint)
-    labels = expand_user_path(options["labels"]) if options.get("labels") else None
-    return KittiLog(f"kitti:{rest}", expand_user_path(unquote(path)), labels)
+    path, options = split_log_address(rest, _OPTIONS, "KITTI")
+    labels = expand_user_path(options["labels"]) if "labels" in options else None
+    return KittiLog(f"kitti:{rest}", expand_user_path(path), labels)
 
 
-class KittiLog:
+class KittiLog(RecordedLog):
     """A ``DrivingLog`` over a drive of KITTI; see ``DrivingLog`` for methods, units and axes.
 
     A frame is a turn of the LiDAR. Poses hold for the time of each image and each point, between the records of the
@@ -84,7 +79,7 @@ class KittiLog:
     truth: Truth | None = None
 
     def __init__(self, uri: str, folder: Path, labels: Path | None) -> None:
-        self.uri = uri
+        super().__init__(uri)
         self.name = folder.resolve().name
         self._files = find_drive_files(folder, uri)
         if labels is not None and not labels.is_file():
@@ -95,7 +90,6 @@ class KittiLog:
         self._poses = self._read_poses()
         self._camera_times = {name: self._read_camera_times(name) for name in self._files.cameras}
         self._read_calibration()
-        self._findings: dict[str, Finding] = {}
 
     def _read_lidar_times(self) -> Float64:
         path = self._files.times_file("velodyne_points")
@@ -155,6 +149,7 @@ class KittiLog:
             measured = measure_images({frame: path for frame, path in files.items() if frame < self.frame_count})
             self._report(*report_problems(measured, name))
             if measured.majority is None:
+                self._report(describe_no_images(measured, name))
                 continue
             width_px, height_px = measured.majority
             # Rectified images have neither distortion nor skew.
@@ -232,9 +227,7 @@ class KittiLog:
         rows = np.frombuffer(read_file(path, log=self.uri, frame=frame), dtype="<f4").reshape(-1, 4)
         finite = np.isfinite(rows).all(axis=1)
         if not finite.all():
-            count = int((~finite).sum())
-            message = f"{count} points of sweep {frame} are not finite and left out"
-            self._report(Finding("invalid_points", "warning", message, numbers={"points": count}, frames=(frame,)))
+            self._report_invalid_points(int((~finite).sum()), frame)
             rows = rows[finite]
         return rows
 
@@ -284,7 +277,7 @@ class KittiLog:
 
     def findings(self) -> tuple[Finding, ...]:
         """What was left out, for ``genre check``."""
-        found = tuple(self._findings.values()) if self.cameras else ()
+        found = self._findings_after(self.cameras)
         if self._labels is None and not (self._files.folder / TRACKLETS_FILE).is_file():
             message = f"there are no boxes: neither {TRACKLETS_FILE} nor labels=FILE"
             remedy = "Without boxes, whatever moves is smeared over its path."
@@ -298,21 +291,8 @@ class KittiLog:
             parts.append(digest_files(self._labels.parent, [self._labels], ()))
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
-    def _report(self, *findings: Finding) -> None:
-        self._findings |= {finding.message: finding for finding in findings}
-
-    def _check_frame(self, frame: int) -> int:
-        if not 0 <= frame < self.frame_count:
-            remedy = f"The log has frames 0 to {self.frame_count - 1}."
-            raise InputError("no such frame", remedy=remedy, log=self.uri, frame=frame)
-        return frame
-
     def _check_camera(self, camera: str, frame: int) -> str:
-        if camera not in self._projections:
-            hint = did_you_mean(camera, self._projections)
-            remedy = f"{hint}The log has {', '.join(self._projections)}."
-            raise InputError("no such camera", remedy=remedy, log=self.uri, camera=camera, frame=frame)
-        return camera
+        return self._check_camera_among(self._projections, camera, frame)
 
 
 def _to_matrix(numbers: dict[str, Float64]) -> Float64:

@@ -21,7 +21,7 @@ from genre_tasks.logs.file_reading import (
     read_times,
 )
 from genre_tasks.logs.findings import Finding
-from genre_tasks.logs.image_sizes import ImageSizes, choose_lens, measure_images, report_problems
+from genre_tasks.logs.image_sizes import choose_lens, describe_no_images, measure_images, report_problems
 from genre_tasks.logs.lens_validity import with_distortion
 from genre_tasks.logs.pandaset.cuboids import FrameBoxes, build_tracks, read_boxes
 from genre_tasks.logs.pandaset.folder_index import LIDAR_FILES, SequenceIndex, index_sequence
@@ -29,8 +29,8 @@ from genre_tasks.logs.pandaset.layout import PIXEL_CENTRE, READOUT_S, RIG_ORDER,
 from genre_tasks.logs.pandaset.pickle_reader import read_table
 from genre_tasks.logs.pandaset.sweeps import build_sweep
 from genre_tasks.logs.pandaset.unread_files import find_unread_files
+from genre_tasks.logs.recorded_log import RecordedLog
 from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Lens, Sweep, Truth
-from genre_tasks.suggestions import did_you_mean
 from genre_tasks.user_paths import expand_user_path
 
 _MAX_SEQUENCES_LISTED = 10
@@ -86,7 +86,7 @@ def _describe_no_sequence(index: SequenceIndex, missing: list[str], uri: str, re
     return InputError("; ".join([problem, *unlistable]), remedy=remedy, file=folder, log=uri)
 
 
-class PandaSetLog:
+class PandaSetLog(RecordedLog):
     """A ``DrivingLog`` over a PandaSet sequence folder; see ``DrivingLog`` for methods, units and axes.
 
     The world frame is PandaSet's own. Of a sweep, the points of the spinning 64-beam LiDAR are read (``d == 0``).
@@ -106,7 +106,7 @@ class PandaSetLog:
     truth: Truth | None = None
 
     def __init__(self, uri: str, folder: Path, index: SequenceIndex | None = None) -> None:
-        self.uri = uri
+        super().__init__(uri)
         self.folder = folder
         self.name = folder.resolve().name
         self._index = index_sequence(folder) if index is None else index
@@ -114,7 +114,6 @@ class PandaSetLog:
         self.frame_count = len(self._lidar_poses)
         self._lidar_times = self._read_times(self._index.lidar.setting("timestamps.json"))
         self._camera_tables: dict[str, tuple[list[object], Float64]] = {}
-        self._findings: dict[str, Finding] = {}
 
     def _read_times(self, path: Path) -> Float64:
         """[F] seconds, from a JSON file of the sequence."""
@@ -127,12 +126,6 @@ class PandaSetLog:
             problem = f"{count} entries, but lidar/poses.json has {self.frame_count} frames"
             remedy = "Copy the whole sequence folder again."
             raise InputError(problem, remedy=remedy, file=path, log=self.uri)
-
-    def _check_frame(self, frame: int) -> int:
-        if not 0 <= frame < self.frame_count:
-            remedy = f"The log has frames 0 to {self.frame_count - 1}."
-            raise InputError("no such frame", remedy=remedy, log=self.uri, frame=frame)
-        return frame
 
     # Read when first asked for: opening a log must stay cheap, and a folder may lack cameras that nobody uses.
     @cached_property
@@ -150,7 +143,7 @@ class PandaSetLog:
         files = self._index.cameras[name].files
         measured = measure_images({frame: files[frame] for frame in files if frame < self.frame_count})
         if measured.majority is None:
-            self._report(_describe_no_images(measured, name))
+            self._report(describe_no_images(measured, name))
             return None
         self._report(*report_problems(measured, name))
         where: dict[str, Any] = {"file": path, "log": self.uri, "camera": name}
@@ -183,9 +176,7 @@ class PandaSetLog:
     def _poses_and_times(self, camera: str, frame: int) -> tuple[list[object], Float64]:
         """Entries of a camera's ``poses.json``, and [F] seconds; ``frame`` is for the error."""
         names = [known.name for known in self.cameras]
-        if camera not in names:
-            remedy = f"{did_you_mean(camera, names)}The log has {', '.join(names) or 'no camera'}."
-            raise InputError("no such camera", remedy=remedy, log=self.uri, camera=camera, frame=frame)
+        self._check_camera_among(names, camera, frame)
         # Camera by camera, since one that is broken must not take the others with it.
         if camera not in self._camera_tables:
             folder = self._index.cameras[camera]
@@ -283,10 +274,6 @@ class PandaSetLog:
         """
         return self._tracks
 
-    def _report(self, *findings: Finding) -> None:
-        # By message, since a sweep that is read twice must count once.
-        self._findings |= {finding.message: finding for finding in findings}
-
     @cached_property
     def _unread(self) -> tuple[Finding, ...]:
         return find_unread_files(self._index, self.frame_count)
@@ -327,11 +314,3 @@ def _describe_bad_intrinsics(intrinsics: object, error: Exception) -> str:
 def _name_sides(size: tuple[int, int]) -> Iterator[tuple[str, int]]:
     """Keys of ``intrinsics.json`` that state the size of the images, with their defaults."""
     return zip(("width", "height"), size, strict=True)
-
-
-def _describe_no_images(measured: ImageSizes, camera: str) -> Finding:
-    problems = sorted(set(measured.problems.values()))
-    reason = f": {problems[0]}" if problems else ""
-    message = f"{camera} has no readable image and is left out{reason}"
-    remedy = "Copy the camera's folder again, or remove it."
-    return Finding("camera_without_images", "warning", message, remedy, camera=camera)

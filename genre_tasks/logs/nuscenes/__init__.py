@@ -1,0 +1,1 @@
+"""Scenes of nuScenes, and of datasets in its layout."""

@@ -1,0 +1,73 @@
+"""Boxes of key frames, at two a second, for the frames between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from genre_tasks.logs.labelled_boxes import LabelledBox
+from genre_tasks.logs.nuscenes.scene_rows import SceneBoxes
+from genre_tasks.logs.timed_poses import TimedPoses
+from genre_tasks.logs.types import Float64
+
+# Two key frames and some jitter: an object that is labelled again later was not seen in between.
+_MAX_GAP_US = 1_100_000
+_US = 1e-6
+
+
+def interpolate_boxes(boxes: SceneBoxes, frame_times_us: Sequence[int]) -> tuple[list[LabelledBox], int]:
+    """Gives every frame the boxes of its time: centres on a line, turns at a constant rate.
+
+    Nothing is extrapolated. Where an object lacks boxes for longer than a second, it lacks them between too.
+
+    Args:
+        boxes: of key frames, in the world.
+        frame_times_us: [F] increasing microseconds.
+
+    Returns:
+        The boxes, and how many of them no key frame has.
+    """
+    frames_us = np.asarray(frame_times_us, dtype=np.int64)
+    by_instance: dict[str, dict[int, int]] = {}
+    for row, instance in enumerate(boxes.instances):
+        by_instance.setdefault(instance, {})[boxes.times_us[row]] = row
+    found: list[LabelledBox] = []
+    interpolated = 0
+    for instance, row_at in by_instance.items():
+        # By their times and not by the tables' links, which may lead anywhere.
+        times_us = np.array(sorted(row_at), dtype=np.int64)
+        rows = np.array([row_at[time_us] for time_us in times_us.tolist()])
+        after = np.searchsorted(times_us, frames_us)
+        last = len(times_us) - 1
+        is_stated = times_us[np.minimum(after, last)] == frames_us
+        gaps_us = times_us[np.clip(after, 0, last)] - times_us[np.clip(after - 1, 0, last)]
+        is_between = (after > 0) & (after <= last) & (gaps_us <= _MAX_GAP_US)
+        chosen = np.flatnonzero(is_stated | is_between)
+        interpolated += int((~is_stated[chosen]).sum())
+        poses = _interpolate_poses(boxes, rows, times_us, frames_us[chosen])
+        length, width, height = np.median(boxes.sizes_m[rows], axis=0).tolist()
+        for frame, pose in zip(chosen.tolist(), poses, strict=True):
+            found.append(LabelledBox(frame, instance, boxes.labels[rows[0]], pose, (length, width, height)))
+    return found, interpolated
+
+
+def _interpolate_poses(
+    boxes: SceneBoxes,
+    rows: NDArray[np.int64],
+    times_us: NDArray[np.int64],
+    wanted_us: NDArray[np.int64],
+) -> Float64:
+    """[N, 4, 4] poses of one object."""
+    poses = np.tile(np.eye(4), (len(wanted_us), 1, 1))
+    if len(rows) == 1:
+        poses[:, :3, :3] = boxes.rotations[rows].as_matrix()
+        poses[:, :3, 3] = boxes.positions[rows]
+    elif len(wanted_us):
+        # Seconds since 1970 would round to a quarter of a microsecond.
+        path = TimedPoses((times_us - times_us[0]) * _US, boxes.rotations[rows], boxes.positions[rows])
+        rotations, positions = path.at((wanted_us - times_us[0]) * _US)
+        poses[:, :3, :3] = rotations.as_matrix()
+        poses[:, :3, 3] = positions
+    return poses

@@ -1,0 +1,248 @@
+"""The rows of one scene, from the index of the tables."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from genre_tasks.errors import InputError
+from genre_tasks.logs.labelled_boxes import MAX_BOXES
+from genre_tasks.logs.nuscenes.json_rows import REMEDY
+from genre_tasks.logs.types import Float64
+from genre_tasks.suggestions import did_you_mean
+
+_MAX_SCENES_LISTED = 10
+# A scene of twenty seconds has a few thousand data and boxes.
+_MAX_ROWS = MAX_BOXES
+_MIN_QUATERNION_NORM = 1e-6
+
+# Outer joins, so that a token that points nowhere is seen and not left out.
+_DATA_QUERY = """
+    SELECT data.*, calibrated.token AS calibrated, sensor.token AS sensor, pose.token AS pose,
+        channel, modality,
+        calibrated.translation0 AS mount_x, calibrated.translation1 AS mount_y, calibrated.translation2 AS mount_z,
+        calibrated.rotation0 AS mount_qw, calibrated.rotation1 AS mount_qx,
+        calibrated.rotation2 AS mount_qy, calibrated.rotation3 AS mount_qz,
+        pose.translation0 AS pose_x, pose.translation1 AS pose_y, pose.translation2 AS pose_z,
+        pose.rotation0 AS pose_qw, pose.rotation1 AS pose_qx, pose.rotation2 AS pose_qy, pose.rotation3 AS pose_qz,
+        camera_intrinsic0 AS fx, camera_intrinsic4 AS fy, camera_intrinsic2 AS cx, camera_intrinsic5 AS cy
+    FROM sample JOIN sample_data AS data ON data.sample_token = sample.token
+        LEFT JOIN calibrated_sensor AS calibrated ON calibrated.token = calibrated_sensor_token
+        LEFT JOIN sensor ON sensor.token = sensor_token
+        LEFT JOIN ego_pose AS pose ON pose.token = ego_pose_token
+    WHERE scene_token = ? ORDER BY data.timestamp, data.token LIMIT ?
+"""
+_BOX_QUERY = """
+    SELECT box.*, sample.timestamp AS timestamp, instance.token AS instance, category.name AS label
+    FROM sample JOIN sample_annotation AS box ON box.sample_token = sample.token
+        LEFT JOIN instance ON instance.token = instance_token
+        LEFT JOIN category ON category.token = category_token
+    WHERE scene_token = ? ORDER BY sample.timestamp, box.token LIMIT ?
+"""
+# Column that is null where a token points nowhere → the row's token, its table, the table it points to.
+_DATA_LINKS = {
+    "calibrated": ("calibrated_sensor_token", "sample_data", "calibrated_sensor"),
+    "sensor": ("calibrated_sensor_token", "calibrated_sensor", "sensor"),
+    "pose": ("ego_pose_token", "sample_data", "ego_pose"),
+}
+_BOX_LINKS = {
+    "instance": ("instance_token", "sample_annotation", "instance"),
+    "label": ("instance_token", "instance", "category"),
+}
+
+
+@dataclass(frozen=True)
+class SensorData:
+    """An image or a sweep.
+
+    Attributes:
+        time_us: microseconds since 1970.
+        file: its path below the root.
+        sample: token of the key frame that it belongs to.
+        is_key_frame: its sensor's datum of that key frame.
+        world_SE3_vehicle: [4, 4] at that time.
+        vehicle_SE3_sensor: [4, 4].
+        lens: fx, fy, cx, cy in pixels, as the file has them; ``None`` for other sensors than cameras.
+        size_px: width and height; 0 where they are not stated.
+    """
+
+    time_us: int
+    file: PurePosixPath
+    sample: str
+    is_key_frame: bool
+    world_SE3_vehicle: Float64
+    vehicle_SE3_sensor: Float64
+    lens: tuple[float, float, float, float] | None
+    size_px: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class SceneBoxes:
+    """The boxes of a scene, in the world.
+
+    Attributes:
+        samples: [B] tokens of key frames.
+        times_us: [B] of key frames.
+        instances: [B] tokens of objects.
+        labels: [B] categories.
+        positions: [B, 3] centres.
+        rotations: [B].
+        sizes_m: [B, 3] length, width, height.
+    """
+
+    samples: tuple[str, ...]
+    times_us: tuple[int, ...]
+    instances: tuple[str, ...]
+    labels: tuple[str, ...]
+    positions: Float64
+    rotations: Rotation
+    sizes_m: Float64
+
+
+@dataclass(frozen=True)
+class SceneRows:
+    """A scene.
+
+    Attributes:
+        cameras: channel → data by time.
+        lidars: channel → data by time.
+        boxes: of key frames.
+    """
+
+    cameras: dict[str, tuple[SensorData, ...]]
+    lidars: dict[str, tuple[SensorData, ...]]
+    boxes: SceneBoxes
+
+
+def list_scene_names(index: sqlite3.Connection) -> list[str]:
+    """Lists the names of all scenes of a version, sorted.
+
+    Args:
+        index: of the version's tables.
+    """
+    return [name for (name,) in index.execute("SELECT name FROM scene ORDER BY name")]
+
+
+def read_scene(index: sqlite3.Connection, name: str, tables: Path, log: str) -> SceneRows:
+    """Reads the rows of a scene.
+
+    Args:
+        index: of the version's tables.
+        name: of the scene.
+        tables: folder of the version, for errors.
+        log: URI of the log, for errors.
+
+    Returns:
+        The rows, of cameras and LiDARs alone.
+
+    Raises:
+        InputError: there is no such scene, or a row points to one that is not there.
+    """
+    # Names are what users know; nothing in the tables keeps two scenes from having the same one.
+    scenes = index.execute("SELECT token FROM scene WHERE name = ?", (name,)).fetchall()
+    if len(scenes) != 1:
+        raise _describe_no_scene(index, name, len(scenes), tables, log)
+    token = scenes[0]["token"]
+    data = _fetch(index, _DATA_QUERY, token, tables / "sample_data.json", log)
+    _check_links(data, _DATA_LINKS, tables, log)
+    boxes = _fetch(index, _BOX_QUERY, token, tables / "sample_annotation.json", log)
+    _check_links(boxes, _BOX_LINKS, tables, log)
+    file = tables / "sample_data.json"
+    mounts = _compose(data, "mount", tables / "calibrated_sensor.json", log)
+    poses = _compose(data, "pose", tables / "ego_pose.json", log)
+    by_modality: dict[str, dict[str, list[SensorData]]] = {"camera": {}, "lidar": {}}
+    for row, mount, pose in zip(data, mounts, poses, strict=True):
+        if row["modality"] in by_modality:
+            datum = _build_datum(row, mount, pose, file, log)
+            by_modality[row["modality"]].setdefault(row["channel"], []).append(datum)
+    cameras, lidars = (
+        {channel: tuple(by_channel[channel]) for channel in sorted(by_channel)} for by_channel in by_modality.values()
+    )
+    return SceneRows(cameras, lidars, _build_boxes(boxes, tables / "sample_annotation.json", log))
+
+
+def _describe_no_scene(index: sqlite3.Connection, name: str, count: int, tables: Path, log: str) -> InputError:
+    names = list_scene_names(index)
+    known = ", ".join(names[:_MAX_SCENES_LISTED]) + (", …" if len(names) > _MAX_SCENES_LISTED else "")
+    problem = f"{tables.name} has {count} scenes of the name {name!r}"
+    remedy = f"{did_you_mean(name, names)}It has {known or 'none'}."
+    return InputError(problem, remedy=remedy, file=tables / "scene.json", log=log)
+
+
+def _fetch(index: sqlite3.Connection, query: str, scene: str, file: Path, log: str) -> list[sqlite3.Row]:
+    rows = index.execute(query, (scene, _MAX_ROWS + 1)).fetchall()
+    if len(rows) > _MAX_ROWS:
+        raise InputError(f"a scene has more than {_MAX_ROWS} rows", remedy=REMEDY, file=file, log=log)
+    return rows
+
+
+def _check_links(rows: list[sqlite3.Row], links: dict[str, tuple[str, str, str]], tables: Path, log: str) -> None:
+    for row in rows:
+        for column, (token, table, target) in links.items():
+            if row[column] is None:
+                problem = f"{table} points to a row of {target} that is not there, from {token} {row[token]!r}"
+                raise InputError(problem, remedy=REMEDY, file=tables / f"{target}.json", log=log)
+
+
+def _compose(rows: list[sqlite3.Row], prefix: str, file: Path, log: str) -> Float64:
+    """[N, 4, 4] poses of the columns that begin with a prefix."""
+    numbers = np.array([[row[f"{prefix}_{name}"] for name in _POSE_COLUMNS] for row in rows]).reshape(-1, 7)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = _to_rotations(numbers[:, 3:], file, log).as_matrix()
+    poses[:, :3, 3] = numbers[:, :3]
+    return poses
+
+
+_POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
+
+
+def _to_rotations(quats: Float64, file: Path, log: str) -> Rotation:
+    if len(quats) and np.linalg.norm(quats, axis=1).min() < _MIN_QUATERNION_NORM:
+        raise InputError("a quaternion is zero", remedy=REMEDY, file=file, log=log)
+    # SciPy puts the scalar part last.
+    return Rotation.from_quat(quats[:, [1, 2, 3, 0]].reshape(-1, 4))
+
+
+def _build_datum(row: sqlite3.Row, mount: Float64, pose: Float64, file: Path, log: str) -> SensorData:
+    name = PurePosixPath(row["filename"])
+    # A table must not make the reader open files elsewhere.
+    if name.is_absolute() or ".." in name.parts or not name.parts:
+        raise InputError(f"a file lies outside of the root: {row['filename']!r}", remedy=REMEDY, file=file, log=log)
+    lens = None if row["fx"] is None else (row["fx"], row["fy"], row["cx"], row["cy"])
+    if row["modality"] == "camera" and (lens is None or not min(lens[:2]) > 0):
+        problem = f"{row['channel']} has no positive focal lengths"
+        where = file.with_name("calibrated_sensor.json")
+        raise InputError(problem, remedy=REMEDY, file=where, log=log, camera=row["channel"])
+    return SensorData(
+        time_us=row["timestamp"],
+        file=name,
+        sample=row["sample_token"],
+        is_key_frame=bool(row["is_key_frame"]),
+        world_SE3_vehicle=pose,
+        vehicle_SE3_sensor=mount,
+        lens=lens,
+        size_px=(row["width"], row["height"]),
+    )
+
+
+def _build_boxes(rows: list[sqlite3.Row], file: Path, log: str) -> SceneBoxes:
+    take: Callable[..., Float64] = lambda *names: np.array([[row[name] for name in names] for row in rows])  # noqa: E731
+    # Sizes stand in the order width, length, height.
+    sizes = take("size1", "size0", "size2").reshape(-1, 3)
+    if (sizes <= 0).any():
+        raise InputError("a box has no size", remedy=REMEDY, file=file, log=log)
+    quats = take("rotation0", "rotation1", "rotation2", "rotation3").reshape(-1, 4)
+    return SceneBoxes(
+        samples=tuple(row["sample_token"] for row in rows),
+        times_us=tuple(row["timestamp"] for row in rows),
+        instances=tuple(row["instance_token"] for row in rows),
+        labels=tuple(row["label"] for row in rows),
+        positions=take("translation0", "translation1", "translation2").reshape(-1, 3),
+        rotations=_to_rotations(quats, file, log) if rows else Rotation.identity(0),
+        sizes_m=sizes,
+    )

@@ -1,0 +1,49 @@
+"""What readers of recorded logs share: questions for frames and cameras that are not there, and a list of findings."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from genre_tasks.errors import InputError
+from genre_tasks.logs.findings import Finding
+from genre_tasks.suggestions import did_you_mean
+
+
+class RecordedLog:
+    """Base of readers that read files; a log of another package need not inherit it.
+
+    Args:
+        uri: what the user wrote.
+    """
+
+    # Readers know it once their tables are read.
+    frame_count: int
+
+    def __init__(self, uri: str) -> None:
+        self.uri = uri
+        self._findings: dict[str, Finding] = {}
+
+    def _report(self, *findings: Finding) -> None:
+        # By message, since a sweep that is read twice must count once.
+        self._findings |= {finding.message: finding for finding in findings}
+
+    def _findings_after(self, *parts: object) -> tuple[Finding, ...]:
+        """Findings so far. Arguments are evaluated first: reading cameras adds what is wrong with their images."""
+        return tuple(self._findings.values())
+
+    def _report_invalid_points(self, count: int, frame: int) -> None:
+        message = f"{count} points of sweep {frame} are not finite and left out"
+        self._report(Finding("invalid_points", "warning", message, numbers={"points": count}, frames=(frame,)))
+
+    def _check_frame(self, frame: int) -> int:
+        if not 0 <= frame < self.frame_count:
+            remedy = f"The log has frames 0 to {self.frame_count - 1}."
+            raise InputError("no such frame", remedy=remedy, log=self.uri, frame=frame)
+        return frame
+
+    def _check_camera_among(self, names: Collection[str], camera: str, frame: int) -> str:
+        if camera not in names:
+            # A log whose images are all missing has no camera to suggest.
+            remedy = f"{did_you_mean(camera, names)}The log has {', '.join(names) or 'no camera'}."
+            raise InputError("no such camera", remedy=remedy, log=self.uri, camera=camera, frame=frame)
+        return camera

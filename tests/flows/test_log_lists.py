@@ -1,0 +1,55 @@
+"""Lists of logs: the names of a text file stand for logs, in their order and with the options of the address."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from flows.pipeline.log_cache import expand_logs
+from flows.pipeline.log_lists import expand_log_list
+from genre_tasks.errors import InputError
+
+
+def test_names_of_a_file_stand_for_logs(tmp_path: Path) -> None:
+    (tmp_path / "val.txt").write_text("# validation\nscene-0103\n\n  scene-0003  \n", encoding="utf-8-sig")
+    expected = [f"nuscenes:{tmp_path}/{name}?rate=2" for name in ("scene-0103", "scene-0003")]
+    assert expand_logs([f"nuscenes:{tmp_path}/@val.txt?rate=2"]) == expected
+    assert expand_logs([f"nuscenes:{tmp_path}/@{tmp_path}/val.txt?rate=2"]) == expected
+    assert expand_logs(["pandaset:a", f"kitti:x/@{tmp_path}/val.txt"]) == [
+        "pandaset:a",
+        "kitti:x/scene-0103",
+        "kitti:x/scene-0003",
+    ]
+
+
+def test_stars_in_a_list(tmp_path: Path) -> None:
+    for name in ("001", "002", "010"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "some.txt").write_text("00*\n010\n")
+    found = expand_logs([f"pandaset:{tmp_path}/@some.txt"])
+    assert found == [f"pandaset:{tmp_path}/{name}" for name in ("001", "002", "010")]
+
+
+def test_a_folder_that_begins_with_the_sign(tmp_path: Path) -> None:
+    (tmp_path / "@val").mkdir()
+    assert expand_log_list(f"pandaset:{tmp_path}/@val") is None
+    assert expand_log_list("pandaset:a@b/002") is None
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [(None, "cannot be read"), (b"# nothing\n", "names no logs"), (b"\xff\xfe\xff", "cannot be read")],
+)
+def test_lists_that_cannot_be_read(tmp_path: Path, content: bytes | None, problem: str) -> None:
+    if content is not None:
+        (tmp_path / "val.txt").write_bytes(content)
+    with pytest.raises(InputError, match=problem) as caught:
+        expand_logs([f"pandaset:{tmp_path}/@val.txt"])
+    assert caught.value.file == f"{tmp_path}/val.txt"
+
+
+def test_a_list_that_is_too_long(tmp_path: Path) -> None:
+    (tmp_path / "val.txt").write_bytes(b"x\n" * (1 << 22))
+    with pytest.raises(InputError, match="more than"):
+        expand_logs([f"pandaset:{tmp_path}/@val.txt"])

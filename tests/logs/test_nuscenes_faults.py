@@ -1,0 +1,177 @@
+"""nuScenes: whatever is wrong with the tables is one error that names the table and what to do."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from genre_tasks.errors import ConfigError, InputError, ResourceError
+from genre_tasks.logs.nuscenes.json_rows import stream_rows
+from genre_tasks.logs.registry import open_log
+from tests.fakes import FakeLog
+from tests.logs.nuscenes_folder import VERSION, change_table, write_nuscenes
+
+FAKE = FakeLog(frame_count=3, camera_names=("front",), lidar_azimuths=24, lidar_rings=4, width_px=16, height_px=12)
+TABLES = ("scene", "sample", "sensor", "calibrated_sensor", "sample_data", "ego_pose", "category", "instance")
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("nuscenes")
+    write_nuscenes(FAKE, root)
+    return root
+
+
+@pytest.fixture
+def root(written: Path, tmp_path: Path) -> Path:
+    """A dataset for a test to break."""
+    shutil.copytree(written, tmp_path / "nuscenes")
+    return tmp_path / "nuscenes"
+
+
+def _set(table: str, column: str, value: Any) -> Callable[[Path], None]:
+    return lambda root: change_table(root, table, lambda rows: rows[0].__setitem__(column, value))
+
+
+def _write(table: str, text: str) -> Callable[[Path], None]:
+    return lambda root: (root / VERSION / f"{table}.json").write_text(text)
+
+
+def _cut(root: Path) -> None:
+    path = root / VERSION / "ego_pose.json"
+    path.write_text(path.read_text()[:-200])
+
+
+def _repeat(root: Path) -> None:
+    change_table(root, "ego_pose", lambda rows: rows.append(rows[0]))
+
+
+BROKEN: dict[str, tuple[Callable[[Path], None], str, str]] = {
+    "a sensor that is not there": (
+        _set("calibrated_sensor", "sensor_token", "x"),
+        "points to a row of sensor",
+        "sensor",
+    ),
+    "a pose that is not there": (_set("sample_data", "ego_pose_token", "x"), "row of ego_pose .* 'x'", "ego_pose"),
+    "a calibration that is not there": (
+        _set("sample_data", "calibrated_sensor_token", "x"),
+        "points to a row of calibrated_sensor",
+        "calibrated_sensor",
+    ),
+    "an object that is not there": (_set("sample_annotation", "instance_token", "x"), "row of instance", "instance"),
+    "a category that is not there": (_set("instance", "category_token", "x"), "row of category", "category"),
+    "no such column": (_set("sample", "timestamp", None), r"row 0 .* in column timestamp", "sample"),
+    "text for a number": (_set("ego_pose", "translation", ["0", 1, 2]), "in column translation", "ego_pose"),
+    "too few numbers": (_set("ego_pose", "rotation", [1, 0, 0]), "list of 4 numbers", "ego_pose"),
+    "no number": (_set("ego_pose", "translation", [0, float("nan"), 0]), "finite number", "ego_pose"),
+    "no turn": (_set("ego_pose", "rotation", [0, 0, 0, 0]), "quaternion is zero", "ego_pose"),
+    "no size": (_set("sample_annotation", "size", [1, 0, 1]), "no size", "sample_annotation"),
+    "half a character": (_set("scene", "name", "\ud800"), "row 0", "scene"),
+    "a file elsewhere": (_set("sample_data", "filename", "../../etc/passwd"), "outside of the root", "sample_data"),
+    "no lens": (
+        lambda root: change_table(root, "calibrated_sensor", lambda rows: rows[2].update(camera_intrinsic=[])),
+        "CAM_FRONT has no positive focal lengths",
+        "calibrated_sensor",
+    ),
+    "a token twice": (_repeat, "two rows have the same token", "ego_pose"),
+    "cut off": (_cut, "no list of JSON objects", "ego_pose"),
+    "an object for a list": (_write("sample", "{}"), r"'\['", "sample"),
+    "a list of numbers": (_write("sample", "[1, 2]"), "an object was expected", "sample"),
+    "nested without end": (_write("sample", '[{"a":' + "[" * 200_000), "no list of JSON objects", "sample"),
+    "a pointer": (_write("sample", "version https://git-lfs.github.com/spec/v1\n"), "Git LFS pointer", "sample"),
+    "empty": (_write("sensor", ""), "the file is empty", "sensor"),
+    "no scenes": (_write("scene", "[]"), "has 0 scenes of the name 'scene-0061'", "scene"),
+}
+BROKEN |= {
+    f"without {name}": (lambda root, name=name: (root / VERSION / f"{name}.json").unlink(), "is missing", name)
+    for name in (*TABLES[1:], "sample_annotation")
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_table_is_an_error_that_names_it(root: Path, name: str) -> None:
+    break_it, problem, table = BROKEN[name]
+    break_it(root)
+    with pytest.raises(InputError, match=problem) as caught:
+        open_log(f"nuscenes:{root}/scene-0061")
+    assert caught.value.file == str(root / VERSION / f"{table}.json")
+    assert caught.value.remedy
+    assert caught.value.log == f"nuscenes:{root}/scene-0061"
+
+
+def test_another_layout(root: Path) -> None:
+    for address, problem in (
+        (f"{root}/samples/scene-0061", "no tables of nuScenes here"),
+        (f"{root}/nowhere/scene-0061", "no such folder"),
+        (f"{root}", "no scene is named"),
+        (f"{root}/scene-0061?version=v1.0-trainval", "no version 'v1.0-trainval'"),
+        ("", "no such folder"),
+    ):
+        with pytest.raises(InputError, match=problem):
+            open_log(f"nuscenes:{address}")
+    with pytest.raises(ConfigError, match="no option 'verion'"):
+        open_log(f"nuscenes:{root}/scene-0061?verion=v1.0-mini")
+    with pytest.raises(InputError) as caught:
+        open_log(f"nuscenes:{root}/scene-0016")
+    assert "Did you mean 'scene-0061'" in caught.value.remedy
+
+
+def test_without_the_files_of_the_scene(root: Path) -> None:
+    shutil.rmtree(root / "samples/LIDAR_TOP")
+    log = open_log(f"nuscenes:{root}/scene-0061")
+    assert log.sweep(0) is None
+    shutil.rmtree(root / "samples")
+    with pytest.raises(InputError, match="none of the scene's files is there, such as samples/LIDAR_TOP"):
+        open_log(f"nuscenes:{root}/scene-0061")
+
+
+def test_a_camera_without_images_is_left_out(root: Path) -> None:
+    for path in (root / "samples/CAM_FRONT").iterdir():
+        path.write_bytes(b"")
+    log = open_log(f"nuscenes:{root}/scene-0061")
+    assert log.cameras == ()
+    assert {finding.word for finding in log.findings()} == {"unreadable_image", "camera_without_images"}
+
+
+def test_an_index_that_cannot_be_written(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GENRE_CACHE_DIR", str(root / VERSION / "scene.json"))
+    with pytest.raises(ResourceError, match="index cannot be written"):
+        open_log(f"nuscenes:{root}/scene-0061")
+
+
+@pytest.mark.parametrize("text", ["", " \n"])
+@pytest.mark.parametrize("length", [1, 1000, (1 << 20) - 12, 1 << 20, 3 << 20])
+def test_rows_of_any_length_are_split(tmp_path: Path, length: int, text: str) -> None:
+    """Blocks of the file end within rows, texts and numbers."""
+    rows = [{"token": "x" * length, "number": k * 1.5} for k in range(5)]
+    path = tmp_path / "rows.json"
+    path.write_text(f"{text}[" + f"{text},{text}".join(map(json.dumps, rows)) + f"{text}]")
+    assert list(stream_rows(path, "log")) == rows
+
+
+def test_a_row_without_end_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "rows.json"
+    path.write_text('[{"token": "' + "x" * (12 << 20))
+    with pytest.raises(InputError, match="no list of JSON objects"):
+        list(stream_rows(path, "log"))
+
+
+def test_a_large_table_takes_little_memory(tmp_path: Path) -> None:
+    path = tmp_path / "rows.json"
+    rows = [{"token": f"{k:032x}", "translation": [k, 1.5, 2.5], "text": "x" * 300} for k in range(50_000)]
+    path.write_text(json.dumps(rows, indent=0))
+    del rows
+    assert path.stat().st_size > 18 << 20
+    tracemalloc.start()
+    try:
+        assert sum(1 for _ in stream_rows(path, "log")) == 50_000
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 8 << 20
