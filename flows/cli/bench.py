@@ -54,6 +54,9 @@ _BENCHES: dict[str, BenchEntry] = {
     "raster": BenchEntry(
         "benchmarks.raster:BENCH", "the renderer's speed against gsplat's torch reference and the machine's limits"
     ),
+    "real_logs": BenchEntry(
+        "benchmarks.real_logs:BENCH", "what stereo, refined poses and exposure gain on real logs and streets that err"
+    ),
     "scale": BenchEntry(
         "benchmarks.scale:BENCH", "workers, orchestration, the store on S3, a simulated cluster, and damaged files"
     ),

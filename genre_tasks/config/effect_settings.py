@@ -28,6 +28,9 @@ class EffectsConfig(Section):
     ``effects=none`` (or ``auto``, ``on``, ``off``) sets them all; ``on`` sets those that are modelled.
     """
 
+    pose_refinement: EffectSetting = Field(
+        "auto", description="Recorded camera poses err; images and LiDAR tell by how much."
+    )
     rigid_actors: EffectSetting = Field("auto", description="Moving vehicles get Gaussians that move with their box.")
     nonrigid_actors: EffectSetting = Field("auto", description="Pedestrians and cyclists change their shape.")
     distant_region: EffectSetting = Field(

@@ -5,19 +5,20 @@ This module imports no effect: a plan's artifact holds all that is needed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from genre_tasks.effects.types import EffectsPlan
+from genre_tasks.effects.types import EffectsPlan, ImageKey
+from genre_tasks.logs.types import Float64
 from genre_tasks.scene.chunk import Actor, Chunk, Points, View
 
 _POINT_ATTRIBUTES = ("positions", "colors", "colored", "frames")
 
 
 def apply_plan(chunk: Chunk, plan: EffectsPlan) -> Chunk:
-    """Gives each view its gain, ego mask, shutter and blur, and the background what effects add to it.
+    """Gives each view its pose, gain, ego mask, shutter and blur, and the background what effects add to it.
 
     That is points of multi-view stereo, and actors where they are not modelled.
 
@@ -43,6 +44,20 @@ def apply_plan(chunk: Chunk, plan: EffectsPlan) -> Chunk:
     return replace(chunk, views=views)
 
 
+def move_views(chunk: Chunk, poses: Mapping[ImageKey, Float64]) -> Chunk:
+    """Gives views other poses.
+
+    Args:
+        chunk: any chunk.
+        poses: [4, 4] chunk_SE3_camera by camera and frame; other views keep theirs.
+
+    Returns:
+        The chunk with moved views.
+    """
+    views = (replace(v, chunk_SE3_camera=poses.get((v.camera, v.frame), v.chunk_SE3_camera)) for v in chunk.views)
+    return replace(chunk, views=tuple(views))
+
+
 def _apply_to_view(view: View, plan: EffectsPlan, undistort: bool) -> View:
     """Returns the view itself where nothing changes; with ``undistort`` its lens is taken to be free of distortion."""
     parameters = plan.parameters
@@ -51,12 +66,20 @@ def _apply_to_view(view: View, plan: EffectsPlan, undistort: bool) -> View:
     ego_mask = parameters.ego_masks.get(view.camera)
     shutter = parameters.shutters.get(key)
     blur = parameters.blurs.get(key)
+    pose = parameters.poses.get(key)
     undistort = undistort and any(view.lens.distortion)
-    unchanged = all(parameter is None for parameter in (gain, ego_mask, shutter, blur))
+    unchanged = all(parameter is None for parameter in (gain, ego_mask, shutter, blur, pose))
     if unchanged and not undistort:
         return view
-    lens = replace(view.lens, distortion=()) if undistort else view.lens
-    return replace(view, lens=lens, log_gain=gain, ego_mask=ego_mask, shutter=shutter, blur=blur)
+    return replace(
+        view,
+        chunk_SE3_camera=view.chunk_SE3_camera if pose is None else pose,
+        lens=replace(view.lens, distortion=()) if undistort else view.lens,
+        log_gain=gain,
+        ego_mask=ego_mask,
+        shutter=shutter,
+        blur=blur,
+    )
 
 
 def _merge_actors_into_background(chunk: Chunk) -> Points:

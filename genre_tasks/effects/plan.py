@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from genre_tasks.config import EffectsConfig
+from genre_tasks.effects.apply_plan import move_views
 from genre_tasks.effects.measurements import ChunkMeasurements
 from genre_tasks.effects.types import Choice, Decision, Effect, EffectParameters, EffectsPlan, Measurement
 from genre_tasks.errors import ConfigError
@@ -63,6 +64,9 @@ def plan_effects(
         # An effect that is only reported has nothing to apply.
         if decision.choice == "on":
             parameters = parameters.merge(load_effect(name).fit(measurements))
+            if name == "pose_refinement":
+                # It is the first effect: all others are measured at the poses that later stages have.
+                measurements = ChunkMeasurements(move_views(chunk, parameters.poses), cameras)
     progress(len(EFFECT_NAMES), len(EFFECT_NAMES), "effects")
     return EffectsPlan(tuple(decisions), parameters)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from genre_tasks.logs.types import MotionBlur, RollingShutter
+from genre_tasks.logs.types import Float64, MotionBlur, RollingShutter
 from genre_tasks.scene.chunk import Points
 
 if TYPE_CHECKING:
@@ -53,6 +53,7 @@ class EffectParameters:
         shutters: how the camera moves while the rows of an image are read out.
         blurs: how the camera moves while an image is exposed.
         stereo_points: of the background, where LiDAR has none; ``None``: there are none.
+        poses: [4, 4] refined chunk_SE3_camera of an image.
     """
 
     gains: Mapping[ImageKey, tuple[float, float, float]] = field(default_factory=dict)
@@ -60,6 +61,7 @@ class EffectParameters:
     shutters: Mapping[ImageKey, RollingShutter] = field(default_factory=dict)
     blurs: Mapping[ImageKey, MotionBlur] = field(default_factory=dict)
     stereo_points: Points | None = None
+    poses: Mapping[ImageKey, Float64] = field(default_factory=dict)
 
     def merge(self, other: EffectParameters) -> EffectParameters:
         """Combines the parameters of two effects.
@@ -82,6 +84,7 @@ class EffectParameters:
             shutters={**self.shutters, **other.shutters},
             blurs={**self.blurs, **other.blurs},
             stereo_points=self.stereo_points if other.stereo_points is None else other.stereo_points,
+            poses={**self.poses, **other.poses},
         )
 
 

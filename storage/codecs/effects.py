@@ -1,7 +1,7 @@
 """Plan of effects ↔ ``effects.parquet``, a row an effect, and what those that are on need to be applied.
 
-That is ``gains.parquet``, ``shutters.parquet``, ``blurs.parquet``, ``own/CAMERA.png`` and, where stereo found points,
-``points.parquet``.
+That is ``gains.parquet``, ``shutters.parquet``, ``blurs.parquet``, ``own/CAMERA.png`` and, where there are any,
+``points.parquet`` of multi-view stereo and ``poses.parquet``, refined.
 """
 
 from __future__ import annotations
@@ -14,10 +14,20 @@ import numpy as np
 import pyarrow as pa
 
 from genre_tasks.effects.types import Decision, EffectParameters, EffectsPlan
-from genre_tasks.logs.types import MotionBlur, RollingShutter
+from genre_tasks.logs.types import Float64, MotionBlur, RollingShutter
 from storage.codecs.png import read_png, write_png
 from storage.codecs.point_table import read_points, write_points
-from storage.codecs.tables import column, read_records, read_rows, schema, write_records, write_table
+from storage.codecs.tables import (
+    POSE,
+    column,
+    poses_from_rows,
+    poses_to_column,
+    read_records,
+    read_rows,
+    schema,
+    write_records,
+    write_table,
+)
 from storage.codecs.view_columns import CAMERA_AND_FRAME, image_columns
 
 CameraMotion = TypeVar("CameraMotion", RollingShutter, MotionBlur)
@@ -60,6 +70,10 @@ GAINS = schema(
         *(column(c, pa.float64(), "natural logarithm of the image's gain in linear light") for c in _CHANNELS),
     ],
 )
+POSES = schema(
+    "refined_poses/1",
+    [*CAMERA_AND_FRAME, column("chunk_SE3_camera", POSE, "camera to chunk coordinates, 4 x 4 row by row, metres")],
+)
 SHUTTERS = _motion_schema("shutters/1", "readout_s", "seconds from the first row to the last")
 BLURS = _motion_schema("blurs/1", "exposure_s", "seconds for which the shutter is open")
 
@@ -87,6 +101,12 @@ def write(folder: Path, value: EffectsPlan) -> None:
     # Only where there are any, as masks: plans without the effect keep their bytes.
     if value.parameters.stereo_points is not None:
         write_points(folder / "points.parquet", [(0, value.parameters.stereo_points)])
+    poses = value.parameters.poses
+    if poses:
+        columns = image_columns(list(poses)) | {
+            "chunk_SE3_camera": poses_to_column(np.stack(list(poses.values())), "refined poses")
+        }
+        write_table(folder / "poses.parquet", POSES, columns)
 
 
 def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> EffectsPlan:
@@ -111,7 +131,8 @@ def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> Effects
     decisions = read_records(folder / "effects.parquet", EFFECTS, Decision)
     points_path = folder / "points.parquet"
     stereo_points = read_points(points_path).get(0) if points_path.is_file() else None
-    return EffectsPlan(decisions, EffectParameters(gains, masks, shutters, blurs, stereo_points))
+    poses = _read_poses(folder / "poses.parquet")
+    return EffectsPlan(decisions, EffectParameters(gains, masks, shutters, blurs, stereo_points, poses))
 
 
 def measurements(value: EffectsPlan) -> dict[str, Any]:
@@ -121,6 +142,14 @@ def measurements(value: EffectsPlan) -> dict[str, Any]:
         An empty dictionary.
     """
     return {}
+
+
+def _read_poses(path: Path) -> dict[tuple[str, int], Float64]:
+    # A plan whose poses are those of the log has no such table.
+    if not path.is_file():
+        return {}
+    rows = read_rows(path, POSES)
+    return {(row["camera"], row["frame"]): poses_from_rows(row["chunk_SE3_camera"])[0] for row in rows}
 
 
 def _write_motions(

@@ -187,7 +187,8 @@ def effects(rng: np.random.Generator, count: int = 3) -> EffectsPlan:
         for k, x in enumerate(numbers)
     }
     stereo_points = points(rng, 7 * count) if count else None
-    return EffectsPlan(tuple(rows), EffectParameters(gains, own, shutters, blurs, stereo_points))
+    poses = {(f"camera_{k}", k): rng.normal(size=(4, 4)) for k in range(count)}
+    return EffectsPlan(tuple(rows), EffectParameters(gains, own, shutters, blurs, stereo_points, poses))
 
 
 MAKERS = {

@@ -1,0 +1,188 @@
+"""Camera poses refined such that LiDAR points have one colour in all images that see them.
+
+Direct bundle adjustment (Engel, Koltun and Cremers 2018) with the LiDAR's geometry: the brightness of a point in each
+image is compared with its mean over images. Two small rigid motions explain the differences: one of each camera's
+mount, which is the same at all times, and one of the whole rig at each frame. Priors keep both near zero, which also
+fixes what images cannot tell, such as a motion of everything. Frames in between take the rig's motion from their
+neighbours in time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from genre_tasks.logs.types import Float32, Float64
+from genre_tasks.scene.alignment_step import AlignedImage, ImageSlopes, move_pose, pose_of, project_points, take_step
+from genre_tasks.scene.chunk import Chunk
+from genre_tasks.scene.image_decoding import decode_pixels
+from genre_tasks.scene.transforms import distance_to_path
+from genre_tasks.scene.visibility import find_visible_points
+
+BLURS_PX = (4.0, 2.0, 1.0, 0.6, 0.6)
+"""Standard deviations by which images are blurred, one after the other: a coarse image leads over larger errors."""
+
+COARSE_BLURS_PX = (4.0, 2.0)
+"""The same where it is only asked whether poses err at all."""
+
+ITERATIONS = 6
+"""Gauss–Newton steps at each blur."""
+
+POINT_COUNT = 40_000
+"""Points whose colours are compared; those with more texture are drawn more often."""
+
+COARSE_POINT_COUNT = 10_000
+"""The same where it is only asked whether poses err at all."""
+
+MAX_RANGE_M = 40.0
+"""Points are drawn up to this distance from the path."""
+
+MAX_WIDTH_PX = 1280
+"""Images are compared at twice the working width, and at most at this one."""
+
+_LUMA = np.array([0.299, 0.587, 0.114], np.float32)
+# The mean and contrast that are taken away are those of a neighbourhood so many times as wide as the blur.
+_SURROUND = 5.0
+_CONTRAST_FLOOR = 4e-4
+
+
+@dataclass(frozen=True)
+class PoseAlignment:
+    """Refined poses of a chunk's cameras.
+
+    Attributes:
+        poses: chunk_SE3_camera [4, 4] of each view, by camera and frame.
+        displacement_px: by how many pixels of the working resolution LiDAR returns move in their image; the median of
+            each source view, and the mean of those.
+        mounts: [C, 6] turn (radians) and shift (metres) of each camera, in its own axes.
+        rig: [F, 6] the same of the rig at each source frame, in the LiDAR's axes.
+    """
+
+    poses: dict[tuple[str, int], Float64]
+    displacement_px: float
+    mounts: Float64
+    rig: Float64
+
+
+def align_poses(chunk: Chunk, *, coarse: bool = False) -> PoseAlignment | None:
+    """Refines the camera poses of a chunk. Deterministic.
+
+    Args:
+        chunk: with LiDAR points and source views.
+        coarse: take fewer points and stop at a larger blur, which tells whether poses err in a third of the time.
+
+    Returns:
+        The poses of all views; ``None`` where no two source views see the same points.
+
+    Raises:
+        InputError: an image cannot be decoded.
+    """
+    images = _load_images(chunk)
+    frame_count = 1 + max((image.rig for image in images), default=-1)
+    mounts = np.zeros((len(chunk.camera_names), 6))
+    rig = np.zeros((frame_count, 6))
+    near = distance_to_path(chunk.static.positions, chunk.chunk_SE3_ego) < MAX_RANGE_M
+    usable = near & (chunk.static.frames >= 0)
+    point_count = COARSE_POINT_COUNT if coarse else POINT_COUNT
+    for blur_px in COARSE_BLURS_PX if coarse else BLURS_PX:
+        levels = [_normalise(image.luma, blur_px) for image in images]
+        # Anew at each blur: what hides what follows from poses, which are better by now.
+        moved = [replace(image.view, chunk_SE3_camera=pose_of(image, mounts, rig)) for image in images]
+        visible = [find_visible_points(chunk.static.positions, view)[0] for view in moved]
+        points, observed = _draw_points(
+            chunk.static.positions, usable, visible, images, levels, mounts, rig, point_count
+        )
+        if not observed.any():
+            return None
+        for _ in range(ITERATIONS):
+            mounts, rig = take_step(points, observed, images, levels, mounts, rig)
+    poses = _interpolate(chunk, images, mounts, rig)
+    return PoseAlignment(poses, _measure_displacement(chunk, poses), mounts, rig)
+
+
+def _load_images(chunk: Chunk) -> list[AlignedImage]:
+    views = chunk.views_with_role("source")
+    frames = sorted({view.frame for view in views})
+    width_px = min(2 * chunk.width_px, MAX_WIDTH_PX)
+    images = []
+    for view in views:
+        lens = view.lens.resized_to_width(width_px)
+        luma = decode_pixels(view.image, lens.width_px, lens.height_px).astype(np.float32) @ _LUMA / np.float32(255)
+        ego = chunk.chunk_SE3_ego[chunk.frames.index(view.frame)]
+        mount = chunk.camera_names.index(view.camera)
+        images.append(AlignedImage(view, lens, luma, ego, mount, frames.index(view.frame)))
+    return images
+
+
+def _normalise(luma: Float32, blur_px: float) -> ImageSlopes:
+    # Without local mean and contrast, so that exposure and white balance make no difference.
+    blurred = gaussian_filter(luma, blur_px)
+    mean = gaussian_filter(luma, _SURROUND * blur_px)
+    variance = gaussian_filter((luma - mean) ** 2, _SURROUND * blur_px)
+    brightness = (blurred - mean) / np.sqrt(variance + np.float32(_CONTRAST_FLOOR))
+    by_v, by_u = np.gradient(brightness)
+    return ImageSlopes(brightness, by_u, by_v)
+
+
+def _draw_points(
+    positions: Float32,
+    usable: NDArray[np.bool_],
+    visible: Sequence[NDArray[np.int64]],
+    images: Sequence[AlignedImage],
+    levels: Sequence[ImageSlopes],
+    mounts: Float64,
+    rig: Float64,
+    point_count: int,
+) -> tuple[Float64, NDArray[np.bool_]]:
+    """Points [P, 3] that at least two views see, and which of the V views see them [V, P]."""
+    count = np.zeros(len(positions), np.int64)
+    slope = np.zeros(len(positions), np.float32)
+    for image, level, index in zip(images, levels, visible, strict=True):
+        count[index] += 1
+        _, u, v, inside = project_points(positions[index].astype(np.float64), pose_of(image, mounts, rig), image.lens)
+        steepness = np.hypot(level.by_u, level.by_v)[v[inside].astype(int), u[inside].astype(int)]
+        slope[index[inside]] = np.maximum(slope[index[inside]], steepness)
+    candidates = np.flatnonzero(usable & (count >= 2) & (slope > 0))
+    chosen = np.empty(0, np.int64)
+    if len(candidates):
+        # A fixed seed: the poses are an input of later stages, and the same chunk must have the same.
+        weights = slope[candidates].astype(np.float64)
+        size = min(point_count, len(candidates))
+        rng = np.random.default_rng(0)
+        chosen = np.sort(rng.choice(candidates, size, replace=False, p=weights / weights.sum()))
+    column = np.full(len(positions), -1)
+    column[chosen] = np.arange(len(chosen))
+    observed = np.zeros((len(images), len(chosen)), bool)
+    for k, index in enumerate(visible):
+        observed[k, column[index][column[index] >= 0]] = True
+    return positions[chosen].astype(np.float64), observed
+
+
+def _interpolate(
+    chunk: Chunk, images: Sequence[AlignedImage], mounts: Float64, rig: Float64
+) -> dict[tuple[str, int], Float64]:
+    """Moves all views; those between source frames take the rig's motion from both neighbours in time."""
+    times = np.array([np.mean([i.view.timestamp_s for i in images if i.rig == k]) for k in range(len(rig))])
+    poses = {}
+    for view in chunk.views:
+        at_time = np.array([np.interp(view.timestamp_s, times, rig[:, k]) for k in range(6)])
+        ego = chunk.chunk_SE3_ego[chunk.frames.index(view.frame)]
+        mount = mounts[chunk.camera_names.index(view.camera)]
+        poses[view.camera, view.frame] = move_pose(view.chunk_SE3_camera, ego, mount, at_time)
+    return poses
+
+
+def _measure_displacement(chunk: Chunk, poses: dict[tuple[str, int], Float64]) -> float:
+    medians = []
+    for view in chunk.views_with_role("source"):
+        returns = chunk.static.positions[chunk.static.frames == view.frame].astype(np.float64)
+        _, u, v, inside = project_points(returns, view.chunk_SE3_camera, view.lens)
+        _, moved_u, moved_v, still_inside = project_points(returns, poses[view.camera, view.frame], view.lens)
+        both = inside & still_inside
+        if both.any():
+            medians.append(float(np.median(np.hypot(moved_u - u, moved_v - v)[both])))
+    return float(np.mean(medians)) if medians else 0.0

@@ -1,0 +1,143 @@
+"""Refined camera poses: nearer to the truth of a street whose recorded poses err, and unmoved where nothing errs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from genre_tasks.config import EffectsConfig, IngestConfig, InitialConfig
+from genre_tasks.effects import pose_refinement
+from genre_tasks.effects.apply_plan import apply_plan, move_views
+from genre_tasks.effects.plan import EFFECT_NAMES, plan_effects
+from genre_tasks.logs.registry import open_log
+from genre_tasks.logs.synthetic.log import SyntheticStreet
+from genre_tasks.scene.chunk import Chunk
+from genre_tasks.scene.pose_alignment import PoseAlignment, align_poses
+from genre_tasks.stages.ingest import ingest
+from genre_tasks.stages.initial import initial
+
+EXACT = "synthetic:street?seed=903&cameras=3&samples=4&frames=12"
+NOISY = EXACT + "&pose_noise_deg=0.4&pose_noise_m=0.1"
+LATE = EXACT + "&camera_delay_s=0.05"
+ONLY = EffectsConfig(**{name: "auto" if name == "pose_refinement" else "off" for name in EFFECT_NAMES})
+
+
+@cache
+def street(uri: str) -> SyntheticStreet:
+    log = open_log(uri)
+    assert isinstance(log, SyntheticStreet)
+    return log
+
+
+@cache
+def chunk(uri: str) -> Chunk:
+    return ingest(IngestConfig(width_px=320, height_px=180, source_every=2), street(uri), 0)
+
+
+@cache
+def aligned(uri: str) -> PoseAlignment:
+    found = align_poses(chunk(uri))
+    assert found is not None
+    return found
+
+
+def true_poses(uri: str) -> dict[tuple[str, int], np.ndarray]:
+    chunk_SE3_world = np.linalg.inv(chunk(uri).world_SE3_chunk)
+    return {
+        (v.camera, v.frame): chunk_SE3_world @ street(uri).true_world_SE3_camera(v.camera, v.frame)
+        for v in chunk(uri).views
+    }
+
+
+def displacement_px(uri: str, poses: dict[tuple[str, int], np.ndarray]) -> float:
+    """By how far LiDAR returns are from where they are in the images, in the median."""
+    true = true_poses(uri)
+    errors = []
+    for view in chunk(uri).views:
+        points = chunk(uri).static.positions[chunk(uri).static.frames == view.frame].astype(float)
+        pixels = []
+        for pose in (poses[view.camera, view.frame], true[view.camera, view.frame]):
+            local = (points - pose[:3, 3]) @ pose[:3, :3]
+            ahead = np.where(local[:, 2:] > 3, local[:, 2:], np.nan)
+            pixels.append(local[:, :2] / ahead * [view.lens.fx_px, view.lens.fy_px])
+        errors.append(np.linalg.norm(pixels[0] - pixels[1], axis=1))
+    return float(np.nanmedian(np.concatenate(errors)))
+
+
+# A delay moves the whole rig along its path, which colours hardly tell: a part of it stays.
+@pytest.mark.parametrize(("uri", "left"), [(NOISY, 0.6), (LATE, 0.8)])
+def test_refined_poses_are_nearer_to_the_truth(uri: str, left: float) -> None:
+    recorded = {(v.camera, v.frame): v.chunk_SE3_camera for v in chunk(uri).views}
+    before = displacement_px(uri, recorded)
+    after = displacement_px(uri, aligned(uri).poses)
+    assert before > 0.8
+    assert after < left * before
+
+
+def test_poses_stay_rigid_and_held_out_views_have_them_too() -> None:
+    poses = aligned(NOISY).poses
+    assert set(poses) == {(v.camera, v.frame) for v in chunk(NOISY).views}
+    for pose in poses.values():
+        np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)
+        assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
+    # A held-out frame's motion of the rig is between those of its neighbours.
+    rig = aligned(NOISY).rig
+    frames = sorted({v.frame for v in chunk(NOISY).views_with_role("source")})
+    view = next(v for v in chunk(NOISY).views if v.role == "heldout" and frames[0] < v.frame < frames[1])
+    ego = chunk(NOISY).chunk_SE3_ego[chunk(NOISY).frames.index(view.frame)]
+    mount = aligned(NOISY).mounts[chunk(NOISY).camera_names.index(view.camera)]
+    turned = np.eye(4)
+    turned[:3, :3] = Rotation.from_rotvec(mount[:3]).as_matrix()
+    turned[:3, 3] = mount[3:]
+    in_rig = np.linalg.inv(ego) @ poses[view.camera, view.frame] @ np.linalg.inv(turned)
+    found = in_rig @ np.linalg.inv(np.linalg.inv(ego) @ view.chunk_SE3_camera)
+    np.testing.assert_allclose(found[:3, 3], (rig[0, 3:] + rig[1, 3:]) / 2, atol=1e-6)
+
+
+def test_the_same_chunk_has_the_same_poses() -> None:
+    again = align_poses(chunk(NOISY))
+    assert again is not None
+    assert all(np.array_equal(again.poses[key], pose) for key, pose in aligned(NOISY).poses.items())
+
+
+def test_an_exact_street_is_off_by_its_gate_and_keeps_its_bytes() -> None:
+    plan = plan_effects(ONLY, chunk(EXACT), street(EXACT).cameras)
+    decision = plan["pose_refinement"]
+    assert decision.choice == "off" and decision.value < pose_refinement.EFFECT.threshold
+    none = plan_effects(ONLY.model_copy(update={"pose_refinement": "off"}), chunk(EXACT), street(EXACT).cameras)
+    config = InitialConfig(max_points=2000, distant_count=200)
+    scenes = [initial(config, chunk(EXACT), p).scene.gaussians.pack() for p in (plan, none)]
+    assert torch.equal(*scenes)
+
+
+def test_a_noisy_street_is_on_and_its_views_are_moved_before_other_effects_look_at_them() -> None:
+    settings = ONLY.model_copy(update={"multi_view_stereo": "auto"})
+    plan = plan_effects(settings, chunk(NOISY), street(NOISY).cameras)
+    assert plan["pose_refinement"].choice == "on"
+    moved = apply_plan(chunk(NOISY), plan)
+    assert all(np.array_equal(v.chunk_SE3_camera, aligned(NOISY).poses[v.camera, v.frame]) for v in moved.views)
+    # The other effect has measured at the moved poses.
+    alone = ONLY.model_copy(update={"pose_refinement": "off", "multi_view_stereo": "auto"})
+    at_moved = plan_effects(alone, move_views(chunk(NOISY), plan.parameters.poses), street(NOISY).cameras)
+    assert plan["multi_view_stereo"].value == at_moved["multi_view_stereo"].value
+
+
+def test_the_gate_flips_at_its_threshold(monkeypatch: pytest.MonkeyPatch) -> None:
+    for factor, choice in ((0.98, "on"), (1.02, "off")):
+        coarse = align_poses(chunk(NOISY), coarse=True)
+        assert coarse is not None
+        threshold = factor * coarse.displacement_px
+        monkeypatch.setattr(pose_refinement, "EFFECT", replace(pose_refinement.EFFECT, threshold=threshold))
+        assert plan_effects(ONLY, chunk(NOISY), street(NOISY).cameras)["pose_refinement"].choice == choice
+
+
+def test_without_common_points_nothing_is_refined() -> None:
+    lone = replace(chunk(EXACT), views=chunk(EXACT).views_with_role("source")[:1])
+    assert align_poses(lone) is None
+    decision = plan_effects(ONLY, lone, street(EXACT).cameras)["pose_refinement"]
+    assert decision.choice == "off" and "the same LiDAR points" in decision.reason
