@@ -20,6 +20,7 @@ sys.path.insert(0, str(ROOT))
 from docs import (
     exchange_tables,
     fault_tables,
+    real_log_tables,
     references,
     result_tables,
     scale_tables,
@@ -44,6 +45,10 @@ BLOCKS: Mapping[str, Callable[[], str]] = {
     "evaluation-claims": lambda: result_tables.claims("evaluation"),
     "log-faults": result_tables.log_faults,
     "log-faults-claims": lambda: result_tables.claims("log_faults"),
+    "real-logs-claims": real_log_tables.claims,
+    "real-logs-chain": real_log_tables.chain,
+    "real-logs-effects": real_log_tables.effects,
+    "real-logs-pose-noise": real_log_tables.pose_noise,
     "faults": fault_tables.matrix,
     "fault-injections": fault_tables.injections,
     "scale-claims": lambda: result_tables.claims("scale"),

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from genre_tasks.config import IngestConfig, PipelineConfig
 from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.logs.log_selection import choose_working_size
 
 if TYPE_CHECKING:
     import numpy as np
@@ -21,9 +22,6 @@ ASSUMED_HEIGHT_M = 1.6
 """Height of a camera over the road that ``--scale auto`` assumes: between that of a car's mirror and of a van's."""
 
 _SHORT_CHUNK_SOURCE_EVERY = 2
-# Images whose shape differs less than this from the preset's are resized without a change of the working size.
-_MAX_SHAPE_ERROR = 0.02
-_SIDE_STEP_PX = 4
 
 
 @dataclass(frozen=True)
@@ -160,7 +158,7 @@ def _make_settings(inputs: EnhancementInputs, log: PosedImagesLog, ingest: Inges
     chunk_frames = ingest.chunk_frames if inputs.chunk_frames is None else inputs.chunk_frames
     placement = f"{{scale: {log.metres_per_unit!r}, quat: {_find_quat(log.world_R_source)}}}"
     points = f"ingest.points={inputs.lidar}" if inputs.lidar else f"ingest.scene={inputs.scene}"
-    width, height = _choose_size(log, ingest)
+    width, height = choose_working_size(ingest, log.cameras[:1])
     frames = min(chunk_frames, log.frame_count)
     settings = [
         f"ingest.chunk_frames={chunk_frames}",
@@ -185,17 +183,6 @@ def _find_quat(rotation: NDArray[np.float64]) -> list[float]:
 
     x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()
     return [w + 0.0, x + 0.0, y + 0.0, z + 0.0]
-
-
-def _choose_size(log: PosedImagesLog, ingest: IngestConfig) -> tuple[int, int]:
-    """The working size: as many pixels as the preset has, in the images' shape."""
-    lens = log.cameras[0].lens
-    shape = lens.width_px / lens.height_px
-    if abs(shape * ingest.height_px / ingest.width_px - 1) < _MAX_SHAPE_ERROR:
-        return ingest.width_px, ingest.height_px
-    area = min(ingest.width_px * ingest.height_px, lens.width_px * lens.height_px)
-    width = max(_SIDE_STEP_PX, round((area * shape) ** 0.5 / _SIDE_STEP_PX) * _SIDE_STEP_PX)
-    return width, max(_SIDE_STEP_PX, round(width / shape / _SIDE_STEP_PX) * _SIDE_STEP_PX)
 
 
 def _measure_scale(log: PosedImagesLog, inputs: EnhancementInputs) -> float:

@@ -20,8 +20,14 @@ class IngestConfig(Section):
         description="Every n-th frame has source views, which scenes are fitted to; others are held out.",
     )
     # The paper's resolution (Sec. IV-A). Presets for a CPU take a sixteenth of its pixels.
-    width_px: int = Field(1280, ge=16, le=4096, description="Working width of all images, pixels.")
-    height_px: int = Field(720, ge=16, le=4096, description="Working height of all images, pixels.")
+    width_px: int = Field(
+        1280,
+        ge=16,
+        le=4096,
+        description="Working width of all images, pixels. Images of another shape are used at as many pixels in "
+        "their own.",
+    )
+    height_px: int = Field(720, ge=16, le=4096, description="Working height of all images, pixels; see width_px.")
     cameras: TextList | None = Field(None, description="Names of the cameras to use; null: all.")
     points: FilePath | None = Field(
         None, description="Path of a PLY file with coloured points, for a log without LiDAR."

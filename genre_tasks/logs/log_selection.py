@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from genre_tasks.config import IngestConfig
 from genre_tasks.errors import ConfigError
 from genre_tasks.logs.types import Camera, DrivingLog
+
+# Sizes that differ by less are of one shape: a rounded height is never exactly in proportion.
+_MAX_SHAPE_ERROR = 0.02
+_SIDE_STEP_PX = 2
 
 
 def chunk_count(config: IngestConfig, log: DrivingLog) -> int:
@@ -138,3 +142,31 @@ def count_source_frames(source_every: int, has_images: Iterable[bool]) -> int:
             schedule.take(index)
             count += 1
     return count
+
+
+def choose_working_size(config: IngestConfig, cameras: Sequence[Camera]) -> tuple[int, int]:
+    """Chooses the size at which a log's images are used: as many pixels as configured, in the images' own shape.
+
+    Args:
+        config: with width and height.
+        cameras: those that are used.
+
+    Returns:
+        Width and height in pixels; those of the configuration where the cameras differ in shape.
+
+    >>> from genre_tasks.logs.types import Lens
+    >>> wide = Camera("image_02", Lens(721.5, 721.5, 609.6, 172.9, 1242, 375))
+    >>> choose_working_size(IngestConfig(width_px=320, height_px=180), [wide])
+    (436, 132)
+    """
+    configured = config.width_px, config.height_px
+    shapes = [camera.lens.width_px / camera.lens.height_px for camera in cameras]
+    # One size holds for all images of a chunk: some are stretched where portrait and landscape cameras meet.
+    if not shapes or max(shapes) > (1 + _MAX_SHAPE_ERROR) * min(shapes):
+        return configured
+    shape = shapes[0]
+    if abs(shape * config.height_px / config.width_px - 1) < _MAX_SHAPE_ERROR:
+        return configured
+    area = min(config.width_px * config.height_px, min(c.lens.width_px * c.lens.height_px for c in cameras))
+    width = max(_SIDE_STEP_PX, round((area * shape) ** 0.5 / _SIDE_STEP_PX) * _SIDE_STEP_PX)
+    return width, max(_SIDE_STEP_PX, round(width / shape / _SIDE_STEP_PX) * _SIDE_STEP_PX)

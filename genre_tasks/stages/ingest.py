@@ -14,7 +14,7 @@ from genre_tasks.log_checks.images import LEFT_OUT
 from genre_tasks.log_checks.plausibility import assess_plausibility
 from genre_tasks.log_checks.reader_findings import collect_reader_findings
 from genre_tasks.logs.findings import Finding
-from genre_tasks.logs.log_selection import chunk_count, select_cameras, select_frames
+from genre_tasks.logs.log_selection import choose_working_size, chunk_count, select_cameras, select_frames
 from genre_tasks.logs.types import Camera, DrivingLog
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.actor_track import ActorTrack
@@ -56,6 +56,8 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
     frames = select_frames(config, log, chunk_index)
     cameras = select_cameras(config, log)
     _require_cameras(log, cameras, chunk_index)
+    width_px, height_px = choose_working_size(config, cameras)
+    config = config.model_copy(update={"width_px": width_px, "height_px": height_px})
     poses = np.stack([log.world_SE3_lidar(frame) for frame in frames])
     world_SE3_chunk = np.eye(4)
     # A translation alone, to the middle of the path: coordinates are then small enough for float32.
@@ -86,8 +88,8 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
         index=chunk_index,
         frames=frames,
         camera_names=tuple(camera.name for camera in cameras),
-        width_px=config.width_px,
-        height_px=config.height_px,
+        width_px=width_px,
+        height_px=height_px,
         world_SE3_chunk=world_SE3_chunk,
         chunk_SE3_ego=chunk_SE3_ego,
         views=tuple(views),
