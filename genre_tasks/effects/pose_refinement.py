@@ -43,7 +43,7 @@ EFFECT = Effect(
     property="misalignment of LiDAR and images",
     unit="px",
     threshold=0.6,
-    cost="four seconds for fifteen source images",
+    cost="ten seconds for fifteen source images",
     measure=measure,
     fit=fit,
 )
