@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.ndimage import map_coordinates
@@ -216,12 +217,15 @@ def _solve(
     for k, image in enumerate(images):
         start = mounts.size + 6 * image.rig
         unknowns = np.r_[6 * image.mount : 6 * image.mount + 6, start : start + 6]
-        weighted = slopes[k] * weight[k][:, None]
-        normal[np.ix_(unknowns, unknowns)] += weighted.T @ slopes[k]
-        right[unknowns] += weighted.T @ residual[k]
-        by_point[:, unknowns] += weighted
+        # Most points are seen by a few views only: the others' rows are zeros.
+        rows = np.flatnonzero(weight[k])
+        observed = slopes[k, rows]
+        weighted = observed * weight[k, rows, None]
+        normal[np.ix_(unknowns, unknowns)] += _transposed_product(weighted, observed)
+        right[unknowns] += (weighted * residual[k, rows, None]).sum(0)
+        by_point[np.ix_(rows, unknowns)] += weighted
     # The mean over views moves with the views: Schur complement of the points' own brightness.
-    normal -= (by_point / np.maximum(weight.sum(0), _TINY)[:, None]).T @ by_point
+    normal -= _transposed_product(by_point / np.maximum(weight.sum(0), _TINY)[:, None], by_point)
     variance = _VARIANCE_OF_MEDIAN * np.median(np.abs(residual[weight > 0])) ** 2 + _TINY
     scale = _INDEPENDENT_SHARE / variance
     prior = _prior_precision(len(mounts), len(rig))
@@ -231,6 +235,14 @@ def _solve(
         mounts + step[: mounts.size].reshape(mounts.shape),
         rig + step[mounts.size :].reshape(rig.shape),
     )
+
+
+def _transposed_product(a: Float64, b: Float64) -> Float64:
+    """aᵀ b [M, N] of arrays [P, M] and [P, N]."""
+    # By torch, whose threads the caller has set to one: NumPy's own product has other last bits at each number of
+    # threads, and its threads wait for each other where other work is done beside it.
+    product: Float64 = (torch.from_numpy(a).T @ torch.from_numpy(b)).numpy()
+    return product
 
 
 def _prior_precision(camera_count: int, frame_count: int) -> Float64:
