@@ -6,6 +6,9 @@ from genre_tasks.effects.measurements import ChunkMeasurements
 from genre_tasks.effects.types import Effect, EffectParameters, Measurement
 from genre_tasks.scene.pose_alignment import align_poses
 
+MIN_WIDTH_PX = 320
+"""Narrower images are too coarse: on exact streets refined poses then move by as much as the gate's threshold."""
+
 
 def measure(measurements: ChunkMeasurements) -> Measurement:
     """Measures by how far LiDAR points miss their place in the images.
@@ -15,8 +18,11 @@ def measure(measurements: ChunkMeasurements) -> Measurement:
 
     Returns:
         Pixels at the working resolution, by which refined poses move LiDAR returns; no value where no two images see
-        the same points.
+        the same points, or images are narrower than ``MIN_WIDTH_PX``.
     """
+    width_px = measurements.chunk.width_px
+    if width_px < MIN_WIDTH_PX:
+        return Measurement(None, f"images of {width_px} pixels in width are too coarse to tell")
     # Coarse, since most logs err by nothing and should not pay for it.
     alignment = align_poses(measurements.chunk, coarse=True)
     if alignment is None:

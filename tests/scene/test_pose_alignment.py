@@ -136,6 +136,12 @@ def test_the_gate_flips_at_its_threshold(monkeypatch: pytest.MonkeyPatch) -> Non
         assert plan_effects(ONLY, chunk(NOISY), street(NOISY).cameras)["pose_refinement"].choice == choice
 
 
+def test_images_that_are_too_coarse_are_left_alone() -> None:
+    small = ingest(IngestConfig(width_px=160, height_px=90, source_every=2), street(NOISY), 0)
+    decision = plan_effects(ONLY, small, street(NOISY).cameras)["pose_refinement"]
+    assert decision.choice == "off" and "160 pixels in width are too coarse" in decision.reason
+
+
 def test_without_common_points_nothing_is_refined() -> None:
     lone = replace(chunk(EXACT), views=chunk(EXACT).views_with_role("source")[:1])
     assert align_poses(lone) is None
