@@ -1,4 +1,4 @@
-"""Exposure that swings: gains after the last source image, and images that are clipped."""
+"""Exposure: gains, found and applied; after the last source image; and images that are clipped."""
 
 from __future__ import annotations
 
@@ -9,12 +9,17 @@ import pytest
 import torch
 
 from genre_tasks.config import EffectsConfig, LossConfig
+from genre_tasks.effects import color_gain
+from genre_tasks.effects.apply_plan import apply_plan
 from genre_tasks.effects.plan import EFFECT_NAMES, plan_effects
+from genre_tasks.effects.types import EffectParameters
+from genre_tasks.fixer.source_images import load_source_images
 from genre_tasks.logs.registry import open_log
 from genre_tasks.losses.rendering_loss import image_gradients, residual_image, select_loss_terms
 from genre_tasks.losses.ssim import SsimTarget
-from genre_tasks.losses.targets import Target
-from tests.effects.test_apply_plan import chunk
+from genre_tasks.losses.targets import Target, view_targets
+from genre_tasks.stages.evaluation_renders import apply_view_gains
+from tests.effects.test_apply_plan import DEFAULT_EFFECTS, chunk, with_
 from tests.optimiser.street_scenes import LENS, pose
 
 SWINGING = "synthetic:street?seed=1020&cameras=2&width=160&height=90&samples=1&exposure_jitter=0.3"
@@ -75,3 +80,78 @@ def test_without_gains_a_clipped_image_is_compared_as_it_is() -> None:
     gradient = image_gradients(config, color, torch.zeros(1, 32, 48), [target], terms)[1]
     assert (gradient > 0).all()
     assert (residual_image(color, [replace(target, ego_mask=None)])[0] < 0).all()
+
+
+def test_the_exposures_derivatives_are_those_of_finite_differences() -> None:
+    g = torch.Generator().manual_seed(0)
+    color = torch.rand(2, 5, 4, 3, generator=g, dtype=torch.float64, requires_grad=True)
+    gains = torch.randn(2, 1, 1, 3, generator=g, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(color_gain.apply_gain, (color, gains))
+
+
+def test_the_loss_takes_its_gradient_through_the_gain() -> None:
+    view = chunk().views_with_role("source")[0]
+    (target,) = view_targets(chunk(), [replace(view, log_gain=(0.5, -0.3, 0.1))])
+    g = torch.Generator().manual_seed(1)
+    color = torch.rand(1, 90, 160, 3, generator=g)
+    config = LossConfig(perceptual=0)
+    loss_plan = select_loss_terms(config, [target], 0, g, perceptual=False)
+    depth = torch.zeros(1, 90, 160)
+
+    def loss(at: torch.Tensor) -> float:
+        return image_gradients(config, at, depth, [target], loss_plan)[0]
+
+    by_color = image_gradients(config, color, depth, [target], loss_plan)[1]
+    way = by_color / by_color.abs().max()
+    step = 1e-3
+    found = (loss(color + step * way) - loss(color - step * way)) / (2 * step)
+    assert float((by_color * way).sum()) == pytest.approx(found, rel=0.02)
+    (plain,) = view_targets(chunk(), [view])
+    assert image_gradients(config, color, depth, [plain], loss_plan)[0] != pytest.approx(loss(color), rel=0.01)
+
+
+@pytest.mark.parametrize("gain", [0.0, 1.5, -1.5, -30.0, 30.0])
+def test_neutral_undoes_what_a_gain_does_and_stays_finite(gain: float) -> None:
+    """Hard case 52: a gain towards zero, or without bound, is applied up to a factor of 55."""
+    own = torch.rand(40, 30, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    gains = own.new_tensor([gain, 0.5 * gain, 0.0])
+    shown = color_gain.apply_gain(own, gains)
+    assert torch.isfinite(shown).all()
+    back = color_gain.remove_gain(shown, gains)
+    seen = shown < 1
+    torch.testing.assert_close(back[seen], own[seen])
+    assert torch.isfinite(back).all() and (back >= 0).all() and (back <= 1).all()
+
+
+def test_gains_of_a_street_are_found_and_held_out_views_take_their_neighbours() -> None:
+    uri = "synthetic:street?seed=1020&cameras=2&width=160&height=90&samples=1&exposure_jitter=0.3"
+    log = open_log(uri)
+    found = plan_effects(
+        EffectsConfig(**{n: "on" if n == "exposure" else "off" for n in EFFECT_NAMES}), chunk(uri), log.cameras
+    )
+    views = chunk(uri).views
+    true = np.array([log.camera_effects.log_gain(v.camera, v.frame * 0.1) for v in views])
+    gains = np.array([found.parameters.gains[v.camera, v.frame] for v in views])
+    assert true.std() > 0.1
+    assert np.sqrt(np.square((gains - gains.mean(0)) - (true - true.mean(0))).mean()) < 0.06
+    held = [k for k, v in enumerate(views) if v.role == "heldout"]
+    assert np.abs((gains - gains.mean(0) - true + true.mean(0))[held]).max() < 0.2
+    source = [gains[k] for k, v in enumerate(views) if v.role == "source"]
+    np.testing.assert_allclose(np.mean(source, 0), 0, atol=1e-9)
+
+
+def test_renders_take_a_views_gain_and_recorded_images_lose_it() -> None:
+    view = chunk().views_with_role("source")[0]
+    color = torch.rand(2, 90, 160, 3, generator=torch.Generator().manual_seed(5))
+    gained = replace(view, log_gain=(0.4, 0.4, 0.4))
+    assert apply_view_gains(color, [view, view]) is color
+    shown = apply_view_gains(color, [view, gained])
+    assert torch.equal(shown[0], color[0]) and (shown[1] > color[1]).all()
+    gains = {(v.camera, v.frame): (0.4, 0.4, 0.4) for v in chunk().views}
+    own = {view.camera: np.ones((90, 160), bool)}
+    plain, planned = (
+        load_source_images(chunk()),
+        load_source_images(apply_plan(chunk(), with_(*DEFAULT_EFFECTS, parameters=EffectParameters(gains, own)))),
+    )
+    assert all(b.image.mean() < a.image.mean() for a, b in zip(plain, planned, strict=True))
+    assert all((b.depth <= 0.11).all() == (b.camera == view.camera) for b in planned)
