@@ -7,6 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+LUMA_WEIGHTS = (0.299, 0.587, 0.114)
+"""Weights of red, green and blue in brightness, ITU-R BT.601, by which JPEG files are made grey, too."""
+
 
 def srgb_to_linear(display: ArrayLike) -> NDArray[np.float64]:
     """Converts display-referred sRGB into linear light.

@@ -20,7 +20,7 @@ NOISE = "pose_noise_deg=0.2&pose_noise_m=0.05&camera_delay_s=0.02"
 
 # What no table of this benchmark shows would only cost time.
 _HELDOUT_ONLY = ("evaluate.shifts_m=[1]", "evaluate.every=20", "evaluate.distributions=false", "evaluate.pictures=0")
-_WITHOUT = {
+_VARIANTS = {
     "none": ("effects.multi_view_stereo=off", "effects.pose_refinement=off"),
     "stereo": ("effects.pose_refinement=off",),
     "poses": ("effects.multi_view_stereo=off", "effects.pose_refinement=on"),
@@ -53,11 +53,6 @@ class LogOfBench:
         parts = re.split(r"[?&]", rest)
         word = parts[1] if kind == "synthetic" else parts[0].rstrip("/").rsplit("/", 1)[-1]
         return f"{kind} {word} chunk {self.chunk}"
-
-    @property
-    def slug(self) -> str:
-        """The same as a name of a claim."""
-        return re.sub(r"[^a-z0-9]+", "_", self.name.lower()).strip("_")
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -110,8 +105,8 @@ def measure_effects(log: LogOfBench) -> Row:
     Returns:
         The row: held-out PSNR of each, and what the gates measured.
     """
-    row: Row = {"kind": "effects", "log": log.name, "slug": log.slug}
-    for name, settings in _WITHOUT.items():
+    row: Row = {"kind": "effects", "log": log.name}
+    for name, settings in _VARIANTS.items():
         job, refs = _reconstruct_path(log, settings)
         row[name] = read_metrics(job, refs["evaluate/gnet"])["interpolation/psnr"]
         if name == "auto":

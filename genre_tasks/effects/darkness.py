@@ -6,12 +6,10 @@ import numpy as np
 
 from genre_tasks.effects.measurements import ChunkMeasurements
 from genre_tasks.effects.types import Effect, Measurement
+from genre_tasks.srgb import LUMA_WEIGHTS
 
 DARK_LUMA = 0.15
 """An image is dark where the mean of its luma, from 0 to 1, is below."""
-
-# Luma weights of ITU-R BT.601.
-_LUMA_WEIGHTS = np.array([0.299, 0.587, 0.114])
 
 
 def measure(measurements: ChunkMeasurements) -> Measurement:
@@ -23,9 +21,8 @@ def measure(measurements: ChunkMeasurements) -> Measurement:
     Returns:
         Percentage of the source images; no value where there is no image.
     """
-    lumas = [
-        float((image.reshape(-1, 3).mean(0) @ _LUMA_WEIGHTS) / 255) for image in measurements.source_images.values()
-    ]
+    weights = np.array(LUMA_WEIGHTS)
+    lumas = [float((image.reshape(-1, 3).mean(0) @ weights) / 255) for image in measurements.source_images.values()]
     if not lumas:
         return Measurement(None, "there is no image")
     percent = 100 * float(np.mean([luma < DARK_LUMA for luma in lumas]))

@@ -63,10 +63,11 @@ def plan_effects(
         decisions.append(decision)
         # An effect that is only reported has nothing to apply.
         if decision.choice == "on":
-            parameters = parameters.merge(load_effect(name).fit(measurements))
-            if name == "pose_refinement":
-                # It is the first effect: all others are measured at the poses that later stages have.
-                measurements = ChunkMeasurements(move_views(chunk, parameters.poses), cameras)
+            fitted = load_effect(name).fit(measurements)
+            parameters = parameters.merge(fitted)
+            # Effects after one that moves views are measured at the poses that later stages have.
+            if fitted.poses:
+                measurements = ChunkMeasurements(move_views(chunk, fitted.poses), cameras)
     progress(len(EFFECT_NAMES), len(EFFECT_NAMES), "effects")
     return EffectsPlan(tuple(decisions), parameters)
 

@@ -37,6 +37,7 @@ _OUTLIER = 0.5
 _REWEIGHTINGS = 2
 # Points side by side err alike, so that each counts for less than one observation.
 _INDEPENDENT_SHARE = 0.1
+# Of a normal distribution: its variance over the square of its median absolute deviation, 1.4826².
 _VARIANCE_OF_MEDIAN = 2.2
 _BORDER_PX = 3
 _NEAR_M = 1.0
@@ -44,7 +45,16 @@ _TINY = 1e-9
 
 
 class AlignedImage(NamedTuple):
-    """A view with its image at the width of the comparison, and where its motions are among the unknowns."""
+    """A view with its image at the width of the comparison, and where its motions are among the unknowns.
+
+    Attributes:
+        view: as the chunk has it.
+        lens: at the size of ``luma``.
+        luma: [H, W] brightness in [0, 1].
+        chunk_SE3_ego: [4, 4] LiDAR pose at the view's frame.
+        mount: number of the camera.
+        rig: number of the source frame.
+    """
 
     view: View
     lens: Lens
@@ -55,7 +65,13 @@ class AlignedImage(NamedTuple):
 
 
 class ImageSlopes(NamedTuple):
-    """Normalised brightness [H, W] of an image at one blur, and its slopes along columns and rows."""
+    """An image at one blur, without the brightness and contrast of its surroundings.
+
+    Attributes:
+        brightness: [H, W].
+        by_u: [H, W] slope along columns, per pixel.
+        by_v: [H, W] slope along rows, per pixel.
+    """
 
     brightness: Float32
     by_u: Float32
@@ -97,8 +113,8 @@ def move_pose(pose: Float64, chunk_SE3_ego: Float64, mount: Float64, rig: Float6
     return moved
 
 
-def pose_of(image: AlignedImage, mounts: Float64, rig: Float64) -> Float64:
-    """Gives the pose of an image's camera.
+def compute_pose(image: AlignedImage, mounts: Float64, rig: Float64) -> Float64:
+    """Computes the pose of an image's camera after the motions.
 
     Args:
         image: one of the images.
@@ -164,7 +180,7 @@ def take_step(
     seen = np.zeros(observed.shape, bool)
     for k, (image, level) in enumerate(zip(images, levels, strict=True)):
         index = np.flatnonzero(observed[k])
-        local, u, v, inside = project_points(points[index], pose_of(image, mounts, rig), image.lens)
+        local, u, v, inside = project_points(points[index], compute_pose(image, mounts, rig), image.lens)
         index = index[inside]
         seen[k, index] = True
         where = np.stack([v[inside], u[inside]])

@@ -15,6 +15,9 @@ Role = Literal["source", "heldout"]
 Gain = tuple[float, float, float]
 """Logarithm of an image's gain in linear light: red, green, blue."""
 
+NO_SWEEP = -1
+"""The frame of points that are of no sweep: those of a file, of images, and of the road where LiDAR is blind."""
+
 
 @dataclass(frozen=True)
 class View:
@@ -57,8 +60,7 @@ class Points:
         positions: [P, 3] float32 metres.
         colors: [P, 3] uint8 sRGB; grey 128 where no image saw the point.
         colored: [P] bool: some image saw the point unoccluded.
-        frames: [P] int16, the log frame of the sweep each point is from; −1 for points of no sweep (of a point file,
-            or filled in where LiDAR is blind).
+        frames: [P] int16, the log frame of the sweep each point is from; ``NO_SWEEP`` for points of none.
     """
 
     positions: Float32

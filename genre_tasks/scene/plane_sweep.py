@@ -21,6 +21,7 @@ from genre_tasks.scene.chunk import View
 from genre_tasks.scene.image_decoding import decode_pixels
 from genre_tasks.scene.lens_distortion import pixels_to_rays
 from genre_tasks.scene.transforms import invert_se3
+from genre_tasks.srgb import LUMA_WEIGHTS
 
 NEAREST_M = 4.0
 """Nearest depth that is tried; LiDAR sees what is nearer."""
@@ -34,8 +35,6 @@ DEPTH_COUNT = 64
 WINDOW_PX = 5
 """Side of the square in which two images are compared."""
 
-# Rec. 601, as grey images of JPEG files are made.
-_LUMA = (0.299, 0.587, 0.114)
 # Added to the variance of a window: without texture, noise would decide.
 _VARIANCE_FLOOR = 1e-5
 # Cost of a pixel that no neighbour sees: as if nothing could be said of it.
@@ -85,7 +84,7 @@ class SweepImage:
         """
         lens = view.lens.resized_to_width(width_px)
         pixels = decode_pixels(view.image, lens.width_px, lens.height_px)
-        luma = torch.from_numpy(pixels.astype(np.float32) / np.float32(255)) @ torch.tensor(_LUMA)
+        luma = torch.from_numpy(pixels.astype(np.float32) / np.float32(255)) @ torch.tensor(LUMA_WEIGHTS)
         mean = _window_mean(luma[None])[0]
         variance = _window_mean((luma * luma)[None])[0] - mean * mean
         contrast = (variance.clamp_min(0) + _VARIANCE_FLOOR).sqrt()

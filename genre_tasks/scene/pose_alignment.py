@@ -17,11 +17,19 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from genre_tasks.logs.types import Float32, Float64
-from genre_tasks.scene.alignment_step import AlignedImage, ImageSlopes, move_pose, pose_of, project_points, take_step
+from genre_tasks.scene.alignment_step import (
+    AlignedImage,
+    ImageSlopes,
+    compute_pose,
+    move_pose,
+    project_points,
+    take_step,
+)
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.image_decoding import decode_pixels
 from genre_tasks.scene.transforms import distance_to_path
 from genre_tasks.scene.visibility import find_visible_points
+from genre_tasks.srgb import LUMA_WEIGHTS
 from genre_tasks.threads import torch_threads
 
 BLURS_PX = (4.0, 2.0, 1.0, 0.6)
@@ -48,7 +56,12 @@ MAX_RANGE_M = 40.0
 MAX_WIDTH_PX = 1280
 """Images are compared at twice the working width, and at most at this one."""
 
-_LUMA = np.array([0.299, 0.587, 0.114], np.float32)
+MAX_PIXELS = 16_000_000
+"""Of all images together, which bounds the memory of long chunks with many cameras."""
+
+MAX_OBSERVATIONS = 1_200_000
+"""Points times images, for the same reason: more images have fewer points each."""
+
 # The mean and contrast that are taken away are those of a neighbourhood so many times as wide as the blur.
 _SURROUND = 5.0
 _CONTRAST_FLOOR = 4e-4
@@ -102,11 +115,11 @@ def _find_motions(chunk: Chunk, images: Sequence[AlignedImage], coarse: bool) ->
     rig = np.zeros((frame_count, 6))
     near = distance_to_path(chunk.static.positions, chunk.chunk_SE3_ego) < MAX_RANGE_M
     usable = near & (chunk.static.frames >= 0)
-    point_count = COARSE_POINT_COUNT if coarse else POINT_COUNT
+    point_count = min(COARSE_POINT_COUNT if coarse else POINT_COUNT, MAX_OBSERVATIONS // max(len(images), 1))
     for blur_px in COARSE_BLURS_PX if coarse else BLURS_PX:
         levels = [_normalise(image.luma, blur_px) for image in images]
         # Anew at each blur: what hides what follows from poses, which are better by now.
-        moved = [replace(image.view, chunk_SE3_camera=pose_of(image, mounts, rig)) for image in images]
+        moved = [replace(image.view, chunk_SE3_camera=compute_pose(image, mounts, rig)) for image in images]
         visible = [find_visible_points(chunk.static.positions, view)[0] for view in moved]
         points, observed = _draw_points(
             chunk.static.positions, usable, visible, images, levels, mounts, rig, point_count
@@ -124,11 +137,13 @@ def _find_motions(chunk: Chunk, images: Sequence[AlignedImage], coarse: bool) ->
 def _load_images(chunk: Chunk) -> list[AlignedImage]:
     views = chunk.views_with_role("source")
     frames = sorted({view.frame for view in views})
-    width_px = min(2 * chunk.width_px, MAX_WIDTH_PX)
+    fitting_px = (MAX_PIXELS / max(len(views), 1) * chunk.width_px / chunk.height_px) ** 0.5
+    width_px = min(2 * chunk.width_px, MAX_WIDTH_PX, round(fitting_px))
+    weights = np.array(LUMA_WEIGHTS, np.float32)
     images = []
     for view in views:
         lens = view.lens.resized_to_width(width_px)
-        luma = decode_pixels(view.image, lens.width_px, lens.height_px).astype(np.float32) @ _LUMA / np.float32(255)
+        luma = decode_pixels(view.image, lens.width_px, lens.height_px).astype(np.float32) @ weights / np.float32(255)
         ego = chunk.chunk_SE3_ego[chunk.frames.index(view.frame)]
         mount = chunk.camera_names.index(view.camera)
         images.append(AlignedImage(view, lens, luma, ego, mount, frames.index(view.frame)))
@@ -160,7 +175,9 @@ def _draw_points(
     slope = np.zeros(len(positions), np.float32)
     for image, level, index in zip(images, levels, visible, strict=True):
         count[index] += 1
-        _, u, v, inside = project_points(positions[index].astype(np.float64), pose_of(image, mounts, rig), image.lens)
+        _, u, v, inside = project_points(
+            positions[index].astype(np.float64), compute_pose(image, mounts, rig), image.lens
+        )
         steepness = np.hypot(level.by_u, level.by_v)[v[inside].astype(int), u[inside].astype(int)]
         slope[index[inside]] = np.maximum(slope[index[inside]], steepness)
     candidates = np.flatnonzero(usable & (count >= 2) & (slope > 0))

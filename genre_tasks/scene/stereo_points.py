@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from genre_tasks.logs.types import Float32, Float64
 from genre_tasks.scene.box_projection import project_box
-from genre_tasks.scene.chunk import Chunk, Points, View
+from genre_tasks.scene.chunk import NO_SWEEP, Chunk, Points, View
 from genre_tasks.scene.image_decoding import decode_pixels
 from genre_tasks.scene.plane_sweep import SweepImage, compute_depth_map, unproject_pixels
 from genre_tasks.scene.projection import project, splat_depth
@@ -42,9 +42,6 @@ FARTHEST_POINT_M = 120.0
 
 LIDAR_FOOTPRINT_M = 0.15
 """Half the square around a LiDAR point in which no other point is needed."""
-
-NO_SWEEP = -1
-"""The frame of these points, as of all that no sweep saw."""
 
 # Overlap is judged by points of the image at this distance: that of the houses along a street.
 _TYPICAL_DEPTH_M = 15.0

@@ -12,7 +12,7 @@ from genre_tasks.config import FilePlacement
 from genre_tasks.errors import InputError
 from genre_tasks.logs.types import CuboidTrack, Float32, Float64
 from genre_tasks.scene.actor_track import ActorTrack
-from genre_tasks.scene.chunk import View
+from genre_tasks.scene.chunk import NO_SWEEP, View
 from genre_tasks.scene.facade_completion import complete_facades
 from genre_tasks.scene.moving_actors import MovingActors, find_points_in_box, select_moving_actors
 from genre_tasks.scene.ply_reader import read_ply
@@ -25,9 +25,6 @@ from genre_tasks.stages.ingest_views import REMEDY
 EGO_BOX_M = (2.6, 1.3, 2.6)
 """Half length, width and height, about the LiDAR pose, of what is the ego vehicle itself and its sensors. Some logs
 put that pose on the road, others at the sensor: the height covers both."""
-
-NO_SWEEP = -1
-"""The frame of points that are of no sweep: those of a file, and of the road where LiDAR is blind."""
 
 FramePoints = tuple[int, Float32]
 """A log frame and points [P, 3]."""

@@ -19,14 +19,14 @@ from torch import Tensor
 from genre_tasks.fixer.view_surface import unproject_surface
 from genre_tasks.logs.types import Float32
 from genre_tasks.render.surface import render_surfaces
-from genre_tasks.scene.chunk import View
+from genre_tasks.scene.chunk import NO_SWEEP, View
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.projection import project
 from genre_tasks.scene.road_completion import complete_road
 from genre_tasks.scene.road_smoothing import smooth_road
 from genre_tasks.scene.visibility import PointCloud
 from genre_tasks.stages.chunk_reading import ChunkReading
-from genre_tasks.stages.ingest_points import NO_SWEEP, ChunkPoints
+from genre_tasks.stages.ingest_points import ChunkPoints
 from genre_tasks.stages.scene_file import read_placed_scene
 
 MAX_PIXELS = 4_000_000

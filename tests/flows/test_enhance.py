@@ -26,12 +26,11 @@ from genre_tasks.exchange.types import SplatCloud
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.types import Lens
 from genre_tasks.render import render_views
-from genre_tasks.scene.chunk import Chunk
+from genre_tasks.scene.chunk import NO_SWEEP, Chunk
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.novel_views import NovelView
 from genre_tasks.scene.transforms import invert_se3
 from genre_tasks.stages.ingest import ingest
-from genre_tasks.stages.ingest_points import NO_SWEEP
 from genre_tasks.stages.initial import initial
 from genre_tasks.stages.scene_file import read_placed_scene
 from tests.faults.small_run import LOG, SETTINGS

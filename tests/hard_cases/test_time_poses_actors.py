@@ -12,13 +12,12 @@ from genre_tasks.config import IngestConfig
 from genre_tasks.logs.types import CuboidTrack, Lens
 from genre_tasks.render import Cameras, RenderSettings, render
 from genre_tasks.scene.actor_node import ActorNode
-from genre_tasks.scene.chunk import Chunk
+from genre_tasks.scene.chunk import NO_SWEEP, Chunk
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import FIRST_ACTOR, SceneGraph
 from genre_tasks.scene.rotations import quats_to_matrices_numpy
 from genre_tasks.scene.transforms import interpolate_pose, is_rigid_transform
 from genre_tasks.stages.ingest import ingest
-from genre_tasks.stages.ingest_points import NO_SWEEP
 from tests.fakes import FakeCar, FakeLog, camera_turn, yaw_pose
 
 CONFIG = IngestConfig(width_px=96, height_px=64)

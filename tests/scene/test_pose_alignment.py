@@ -16,6 +16,8 @@ from genre_tasks.effects.apply_plan import apply_plan, move_views
 from genre_tasks.effects.plan import EFFECT_NAMES, plan_effects
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.synthetic.log import SyntheticStreet
+from genre_tasks.scene import pose_alignment
+from genre_tasks.scene.alignment_step import AlignedImage
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.pose_alignment import PoseAlignment, align_poses
 from genre_tasks.stages.ingest import ingest
@@ -128,9 +130,9 @@ def test_a_noisy_street_is_on_and_its_views_are_moved_before_other_effects_look_
 
 
 def test_the_gate_flips_at_its_threshold(monkeypatch: pytest.MonkeyPatch) -> None:
+    coarse = align_poses(chunk(NOISY), coarse=True)
+    assert coarse is not None
     for factor, choice in ((0.98, "on"), (1.02, "off")):
-        coarse = align_poses(chunk(NOISY), coarse=True)
-        assert coarse is not None
         threshold = factor * coarse.displacement_px
         monkeypatch.setattr(pose_refinement, "EFFECT", replace(pose_refinement.EFFECT, threshold=threshold))
         assert plan_effects(ONLY, chunk(NOISY), street(NOISY).cameras)["pose_refinement"].choice == choice
@@ -140,6 +142,24 @@ def test_images_that_are_too_coarse_are_left_alone() -> None:
     small = ingest(IngestConfig(width_px=160, height_px=90, source_every=2), street(NOISY), 0)
     decision = plan_effects(ONLY, small, street(NOISY).cameras)["pose_refinement"]
     assert decision.choice == "off" and "160 pixels in width are too coarse" in decision.reason
+
+
+def test_many_images_are_smaller_and_share_their_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    views = chunk(NOISY).views_with_role("source")
+    taken: list[tuple[int, int, int]] = []
+
+    def record(
+        points: np.ndarray, observed: np.ndarray, images: list[AlignedImage], *rest: object
+    ) -> tuple[object, ...]:
+        taken.append((len(points), images[0].luma.size, len(images)))
+        return rest[1:]
+
+    monkeypatch.setattr(pose_alignment, "take_step", record)
+    monkeypatch.setattr(pose_alignment, "MAX_PIXELS", 100_000)
+    monkeypatch.setattr(pose_alignment, "MAX_OBSERVATIONS", 9_000)
+    assert align_poses(chunk(NOISY)) is not None
+    assert {count for _, _, count in taken} == {len(views)}
+    assert all(points * count <= 9_000 and size * count <= 102_000 for points, size, count in taken)
 
 
 def test_without_common_points_nothing_is_refined() -> None:

@@ -15,11 +15,10 @@ from genre_tasks.effects.plan import EFFECT_NAMES, plan_effects
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.synthetic.log import SyntheticStreet
 from genre_tasks.scene.box_projection import project_box
-from genre_tasks.scene.chunk import Chunk, Points
+from genre_tasks.scene.chunk import NO_SWEEP, Chunk, Points
 from genre_tasks.scene.plane_sweep import FARTHEST_M, NEAREST_M, SweepImage, compute_depth_map
 from genre_tasks.scene.stereo_points import (
     NEIGHBOURS,
-    NO_SWEEP,
     SWEEP_PIXELS,
     choose_sweep_width,
     find_neighbours,

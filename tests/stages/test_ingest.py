@@ -11,10 +11,9 @@ import pytest
 from genre_tasks.config import IngestConfig
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.log_checks.check_log import check_log
-from genre_tasks.scene.chunk import Chunk, LogIssue
+from genre_tasks.scene.chunk import NO_SWEEP, Chunk, LogIssue
 from genre_tasks.scene.facade_completion import STEP_M
 from genre_tasks.stages.ingest import chunk_count, ingest
-from genre_tasks.stages.ingest_points import NO_SWEEP
 from tests.fakes import SENSOR_HEIGHT_M, WALL_HEIGHT_M, FakeLog
 
 CONFIG = IngestConfig(width_px=96, height_px=64)
