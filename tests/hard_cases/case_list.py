@@ -234,7 +234,7 @@ LISTED: dict[int, tuple[str, tuple[str, ...] | str]] = {
     ),
     52: (
         "gain towards 0, and without bound: applied up to a factor of 55",
-        ("tests/effects/test_apply_plan.py::test_neutral_undoes_what_a_gain_does_and_stays_finite",),
+        ("tests/effects/test_exposure.py::test_neutral_undoes_what_a_gain_does_and_stays_finite",),
     ),
     53: (
         "view direction at zero distance",
