@@ -1,0 +1,1 @@
+"""Training sets for detectors: images with labelled boxes, written in the layouts that other people's trainers read."""
