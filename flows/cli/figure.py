@@ -30,7 +30,8 @@ FigureKindArgument = Annotated[
     str,
     typer.Argument(
         help="What to compare: recon for the methods of table 1, fixers for those of table 3, swerve for those of "
-        "table 6 along a swerve, manipulation for one actor removed, inserted and moved."
+        "table 6 along a swerve, manipulation for one actor removed, inserted and moved, agreement for what a "
+        "detector finds on those of table 7."
     ),
 ]
 FigureChunkOption = Annotated[
@@ -61,6 +62,14 @@ ActorOption = Annotated[
     ),
 ]
 
+FigureDetectorOption = Annotated[
+    str | None,
+    typer.Option(
+        "--detector",
+        help="For agreement, the detector: an ONNX or TFLite file, torchvision:NAME or detectron2:CONFIG.",
+    ),
+]
+
 FigureFileOption = Annotated[
     Path,
     typer.Option(
@@ -83,13 +92,14 @@ def figure(
     settings: SettingsOption = None,
     methods: MethodsOption = None,
     weights: WeightsOption = None,
+    detector: FigureDetectorOption = None,
     store: StoreOption = DEFAULT_STORE,
 ) -> None:
     """Draw a figure that compares methods, or edits of a scene.
 
     recon and fixers have a row for each method and a column for each distance to the left of the path. swerve has
     columns along its path. Their last row is the truth, where the log can tell it. manipulation has a row for each
-    camera and a column for each edit of GenRe+'s scene.
+    camera and a column for each edit of GenRe+'s scene. agreement shows the front-left camera at several moments.
 
     Stages that are not in the store are computed.
 
@@ -119,6 +129,7 @@ def figure(
         settings=tuple(settings or ()),
         methods=tuple(str(file) for file in methods or ()),
         weights=tuple(weights or ()),
+        detector=detector,
     )
     checked = request.check()
     strips = _make_strips(parsed_kind, checked, _Choice(camera, frame, actor))
@@ -155,6 +166,10 @@ def _make_strips(kind: Kind, checked: CheckedRequest, choice: _Choice) -> list[C
         return ref
 
     with reporter:
+        if kind == "agreement":
+            from flows.paper_tables.agreement_figure import agreement_strips
+
+            return agreement_strips(checked, run_reported, choice.frame)
         if kind == "swerve":
             return swerve_strips(checked, run_reported, choice.camera)
         if kind == "manipulation":

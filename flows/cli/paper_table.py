@@ -37,7 +37,8 @@ TableNumberArgument = Annotated[
     int,
     typer.Argument(
         help="The table's number: 1 comparison of methods, 2 GenRe after other methods, 3 fixers by their inputs, 4 "
-        "ablation, 5 runtime by phase, 6 re-simulation with other behaviours."
+        "ablation, 5 runtime by phase, 6 re-simulation with other behaviours, 7 agreement of a detector "
+        "across cameras."
     ),
 ]
 TableFolderOption = Annotated[
@@ -59,6 +60,14 @@ PageOption = Annotated[
 RemarksOption = Annotated[
     list[str] | None,
     typer.Option("--remark", help="A sentence for the reader, written below the table. May be given several times."),
+]
+TableDetectorOption = Annotated[
+    str | None,
+    typer.Option(
+        "--detector",
+        help="For table 7, the detector: an ONNX or TFLite file, torchvision:NAME or detectron2:CONFIG. One with masks "
+        "fills the columns of masks too.",
+    ),
 ]
 StoredOption = Annotated[
     bool,
@@ -86,6 +95,7 @@ def table(
     up: UpOption = "auto",
     scale: ScaleOption = None,
     chunk_frames: ChunkFramesOption = None,
+    detector: TableDetectorOption = None,
     dry_run: DryRunOption = False,
 ) -> None:
     """Measure a table of the paper, with the paper's numbers beside.
@@ -124,6 +134,7 @@ def table(
         remarks=tuple(remarks or ()),
         stored=stored,
         scene=make_scene_inputs(scene, cameras, images, lidar, up=up, scale=scale, chunk_frames=chunk_frames),
+        detector=detector,
     )
     # Mistakes in the request show here, before Prefect's server takes seconds to start.
     checked = _check(request)
@@ -169,5 +180,6 @@ def _measure_table(request: TableRequest) -> None:
             remarks=list(request.remarks),
             stored=request.stored,
             scene=None if request.scene is None else request.scene.to_values(),
+            detector=request.detector,
         )
     typer.echo(f"{done['cells']} cells, {len(done['failed'])} left out; wrote {', '.join(done['files'])}")

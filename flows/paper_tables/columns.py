@@ -195,3 +195,34 @@ def behaviour_truth_columns() -> tuple[Column, ...]:
             for behaviour, words in BEHAVIOUR_LABELS.items()
         ]
     return tuple(columns)
+
+
+def agreement_columns(kind: str) -> tuple[Column, ...]:
+    """Makes columns of how far a detector's finds on renders agree with those on recorded images.
+
+    Args:
+        kind: ``box`` or ``mask``.
+    """
+    return tuple(
+        Column(
+            f"{kind}_{name}",
+            f"{kind} {heading}",
+            read_metric(f"{kind}/{name}"),
+            digits=3,
+            paper=f"{kind}_{name}",
+            more_is_better=True,
+        )
+        for name, heading in (("ap", "AP"), ("recall", "recall"), ("iou", "IoU"))
+    )
+
+
+def agreement_count_columns() -> tuple[Column, ...]:
+    """Makes columns of the overlap over all instances, and of their number."""
+    columns = []
+    for kind in ("box", "mask"):
+        overlap = read_metric(f"{kind}/iou_all")
+        columns += [
+            Column(f"{kind}_iou_all", f"{kind} IoU, 0 where missed", overlap, 3, more_is_better=True),
+            Column(f"{kind}_instances", f"{kind} instances", read_metric(f"{kind}/instances"), 0),
+        ]
+    return tuple(columns)

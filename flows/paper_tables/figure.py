@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 from flows.experiments.stages import StageRunner, run_stages
 from flows.paper_tables.comparison_strips import ComparisonStrip, Pixels
 from flows.paper_tables.request import CheckedRequest
+from flows.perception.camera_names import select_front_camera
 from flows.pipeline.definition import stages_until
 from flows.pipeline.log_cache import cached_log
 from flows.pipeline.stage_runner import read_artifact
@@ -18,8 +19,8 @@ if TYPE_CHECKING:
     from genre_tasks.scene.chunk import Chunk
     from genre_tasks.scene.novel_views import NovelView
 
-Kind = Literal["recon", "fixers", "swerve", "manipulation"]
-TABLE: Mapping[str, int] = {"recon": 1, "fixers": 3, "swerve": 6, "manipulation": 6}
+Kind = Literal["recon", "fixers", "swerve", "manipulation", "agreement"]
+TABLE: Mapping[str, int] = {"recon": 1, "fixers": 3, "swerve": 6, "manipulation": 6, "agreement": 7}
 """The table whose methods a kind of figure shows."""
 SHIFTS_M: Mapping[str, tuple[float, ...]] = {"recon": (0.0, 1.0, 3.0, 5.0), "fixers": (1.0, 2.0, 3.0)}
 """Metres to the left of the path, a column each; of the kinds that compare shifts."""
@@ -96,19 +97,6 @@ def _true_strip(
     if truth is None:
         return None
     return ComparisonStrip("the truth", tuple(truth_image(chunk, truth, v) for v in views), captions)
-
-
-def select_front_camera(names: Sequence[str]) -> str:
-    """Selects the camera that looks straight ahead.
-
-    Args:
-        names: of the rig, at least one.
-
-    >>> select_front_camera(["left_camera", "front_left_camera", "front_camera"])
-    'front_camera'
-    """
-    # Of several front cameras the shortest name is the one that looks straight ahead.
-    return min(names, key=lambda name: ("front" not in name, len(name)))
 
 
 def _select_views(chunk: Chunk, shifts_m: Sequence[float], camera: str | None, frame: int | None) -> list[NovelView]:

@@ -15,6 +15,7 @@ from flows.enhancement.enhancement_request import EnhancementInputs
 from flows.experiments.log_chunks import LogChunk
 from flows.experiments.result_files import machine_facts, write_text
 from flows.experiments.stages import run_reported_stage
+from flows.paper_tables.agreement_cells import measure_agreement_cell
 from flows.paper_tables.columns import MeasuredCell
 from flows.paper_tables.measure import measure_cell, warm_up
 from flows.paper_tables.page import list_differences, render_page
@@ -49,6 +50,7 @@ def paper_table(
     remarks: list[str] | None = None,
     stored: bool = False,
     scene: dict[str, Any] | None = None,
+    detector: str | None = None,
 ) -> dict[str, Any]:
     """Measures a table of the paper, and writes it with the paper's numbers beside the measured ones.
 
@@ -56,7 +58,7 @@ def paper_table(
     is left out, and the table says so.
 
     Args:
-        number: of the table, 1 to 6.
+        number: of the table, 1 to 7.
         logs: URIs, all of one dataset; ``pandaset:PATH/*`` stands for every sequence in a folder. None with a scene.
         preset: name of the preset.
         store: folder of the store.
@@ -69,6 +71,7 @@ def paper_table(
         remarks: what else the reader should know.
         stored: compute nothing, and leave out the methods that the store has not completely.
         scene: a scene of another program in the place of logs, see :meth:`EnhancementInputs.to_values`.
+        detector: file or name of the detector that table 7 asks.
 
     Returns:
         ``cells``, their number; ``failed``, labels of methods that failed; ``files`` that were written.
@@ -90,6 +93,7 @@ def paper_table(
         remarks=tuple(remarks or ()),
         stored=stored,
         scene=None if scene is None else EnhancementInputs.from_values(scene),
+        detector=detector,
     )
     checked = request.check()
     if stored:
@@ -152,6 +156,8 @@ def cell_task(checked: CheckedRequest, label: str, places: tuple[LogChunk, ...])
     method = replace(next(row.method for row in checked.layout.rows if row.label == label), name=label)
     if checked.layout.rollouts:
         return measure_rollout_cell(checked.basis, checked.layout, method, places, run_reported_stage)
+    if checked.layout.across_cameras:
+        return measure_agreement_cell(checked, method, places[0], run_reported_stage)
     return measure_cell(checked.basis, checked.layout, method, places[0], run_reported_stage)
 
 
@@ -215,6 +221,8 @@ def collect_facts(request: TableRequest, checked: CheckedRequest, cells: Sequenc
         counts = sorted({int(c.metrics[f"{group}/n"]) for c in cells if f"{group}/n" in c.metrics})
         if counts:
             facts[name] = ", ".join(map(str, counts))
+    if checked.detector is not None:
+        facts["detector"] = Path(checked.detector).name
     if checked.explanation:
         facts["scene"] = "; ".join(checked.explanation)
     # Every method drives the same rollouts, so a remark on one is written once.

@@ -12,7 +12,8 @@ from flows.configuration import load_configuration
 from flows.enhancement.enhancement_request import EnhancementInputs, prepare_enhancement
 from flows.experiments.log_chunks import LogChunk, select_log_chunks
 from flows.experiments.stage_prediction import StagePredictor, find_stored_stages
-from flows.paper_tables.layouts import Layout, Row, get_layout
+from flows.paper_tables.agreement_cells import open_cached_detector, restrict_to_front_camera
+from flows.paper_tables.layouts import LAYOUTS, Layout, Row, get_layout
 from flows.paper_tables.measure import PRESET_METHOD, Basis, list_stages
 from flows.paper_tables.rollout_cells import count_missing_rollouts, predict_rollouts
 from flows.paper_tables.user_methods import read_method
@@ -37,7 +38,7 @@ class TableRequest:
     """What a user asks for; its files are read by :meth:`check`.
 
     Attributes:
-        number: of the table, 1 to 6.
+        number: of the table, 1 to 7.
         logs: URIs; ``pandaset:PATH/*`` stands for every sequence in a folder; none where there is a scene.
         preset: name of the preset.
         store: folder of the store.
@@ -50,6 +51,7 @@ class TableRequest:
         remarks: what else the reader should know.
         stored: whether methods that the store has not completely are left out.
         scene: a scene of another program, with its cameras and images, in the place of logs.
+        detector: file or name of the detector that table 7 asks.
     """
 
     number: int
@@ -65,6 +67,7 @@ class TableRequest:
     remarks: tuple[str, ...] = ()
     stored: bool = False
     scene: EnhancementInputs | None = None
+    detector: str | None = None
 
     def check(self) -> CheckedRequest:
         """Reads the files, finds the table's rows and chunks, and checks that all stages can run.
@@ -76,6 +79,7 @@ class TableRequest:
         """
         of_scene = self.scene is not None
         inputs = self._find_inputs(get_layout(self.number, of_scene=of_scene).protocol)
+        self._check_detector()
         basis = Basis(self.preset, inputs.settings, self.store)
         # Files are read once, as they could change while the table is measured.
         user_methods = [read_method(Path(f), self.preset, inputs.settings) for f in self.methods]
@@ -99,12 +103,32 @@ class TableRequest:
         # Weights change the notes too, so the layout itself is rebuilt.
         rows = tuple(replace(row, method=row.method.with_weights(weights)) for row in layout.rows)
         checked = CheckedRequest(
-            basis, replace(layout, rows=rows), tuple(places), missing, "".join(datasets), inputs.explanation
+            basis,
+            replace(layout, rows=rows),
+            tuple(places),
+            missing,
+            "".join(datasets),
+            inputs.explanation,
+            self.detector,
         )
+        if layout.across_cameras:
+            checked = replace(checked, layout=restrict_to_front_camera(checked.layout, places[0].log))
         # What is only read from the store needs neither weights nor a store that can be written to.
         if not self.stored:
             check_jobs(checked.list_jobs())
         return checked
+
+    def _check_detector(self) -> None:
+        """Opens the detector, so that a wrong file is found before hours of computing."""
+        if not LAYOUTS[self.number].across_cameras:
+            if self.detector is not None:
+                raise ConfigError(f"table {self.number} asks no detector", remedy="Leave out --detector.")
+            return
+        if self.detector is None:
+            raise ConfigError(
+                f"table {self.number} asks a detector", remedy="Give an ONNX or TFLite file by --detector."
+            )
+        open_cached_detector(self.detector)
 
     def _find_inputs(self, protocol: tuple[str, ...]) -> _Inputs:
         """Finds the logs, and what a scene asks for before the user's settings."""
@@ -130,6 +154,8 @@ class TableRequest:
         # Neither --out nor --stored: they do not change what the numbers mean.
         scene = [] if self.scene is None else self.scene.list_options()
         parts = ["genre", "table", str(self.number), *self.logs, *scene, "--preset", self.preset]
+        if self.detector is not None:
+            parts += ["--detector", self.detector]
         if self.chunks is not None:
             parts += ["--chunks", ",".join(map(str, self.chunks))]
         for option, values in (("--set", self.settings), ("--method", self.methods), ("--weights", self.weights)):
@@ -151,6 +177,7 @@ class CheckedRequest:
         missing: label of a row → why it cannot be measured.
         dataset: of all logs.
         explanation: a line for each thing that was found or assumed about a scene.
+        detector: that table 7 asks.
     """
 
     basis: Basis
@@ -159,6 +186,7 @@ class CheckedRequest:
     missing: dict[str, str]
     dataset: str
     explanation: tuple[str, ...] = ()
+    detector: str | None = None
 
     @property
     def config(self) -> PipelineConfig:

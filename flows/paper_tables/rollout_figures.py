@@ -12,11 +12,11 @@ from torch import Tensor
 
 from flows.experiments.stages import StageRunner, run_stages
 from flows.paper_tables.comparison_strips import ComparisonStrip
-from flows.paper_tables.figure import select_front_camera
 from flows.paper_tables.layouts import Row
 from flows.paper_tables.request import CheckedRequest
 from flows.paper_tables.rollouts import START_OFFSET_M, TableRollout
 from flows.paper_tables.simulation_scores import LogMeasurement
+from flows.perception.camera_names import select_front_camera
 from flows.pipeline.definition import stages_until
 from flows.pipeline.log_cache import cached_log
 from flows.simulation.stage_scenes import StageScenes

@@ -1,0 +1,111 @@
+"""A cell of table 7: a method's scene of the front camera, as a detector sees it from the front-left one."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from flows.experiments.log_chunks import LogChunk
+from flows.experiments.stages import StageRunner, read_stage_costs, run_stages
+from flows.paper_tables.columns import MeasuredCell
+from flows.paper_tables.layouts import Layout
+from flows.paper_tables.measure import list_stages
+from flows.paper_tables.methods import Method
+from flows.perception.camera_names import select_front_camera, select_front_left_camera
+from flows.pipeline.log_cache import cached_log
+from flows.pipeline.stage_runner import ArtifactRef, Job, read_artifact
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from flows.paper_tables.request import CheckedRequest
+    from flows.perception.camera_transfer import ImagePairs
+    from genre_tasks.detection.detector import Detector
+
+
+@functools.lru_cache(maxsize=2)
+def open_cached_detector(detector: str) -> Detector:
+    """Opens a detector; the last ones stay open.
+
+    Args:
+        detector: file or name, see :func:`genre_tasks.detection.detector.open_detector`.
+
+    Raises:
+        ConfigError: a package is missing.
+        InputError: the file is missing or holds no detector.
+    """
+    from genre_tasks.detection.detector import open_detector
+
+    return open_detector(detector)
+
+
+def restrict_to_front_camera(layout: Layout, log: str) -> Layout:
+    """Puts the front camera into a table's protocol.
+
+    Args:
+        layout: the table.
+        log: URI of a log, which must have a front-left camera too.
+
+    Raises:
+        ConfigError: it has none.
+    """
+    names = [camera.name for camera in cached_log(log).cameras]
+    select_front_left_camera(names)
+    return replace(layout, protocol=(*layout.protocol, f"ingest.cameras=[{select_front_camera(names)}]"))
+
+
+def measure_agreement_cell(
+    checked: CheckedRequest, method: Method, where: LogChunk, runner: StageRunner
+) -> MeasuredCell:
+    """Measures how far a detector's finds on a method's renders agree with those on recorded images.
+
+    Args:
+        checked: the table, with its detector.
+        method: the row's method.
+        where: the chunk.
+        runner: runs one stage.
+
+    Returns:
+        The cell.
+
+    Raises:
+        GenreError: as the stages and the detector raise it.
+    """
+    from flows.perception.camera_transfer import agreement_metrics, detect_pairs
+
+    job = checked.basis.job(checked.layout, method, where)
+    refs = run_stages(list_stages(checked.layout, method), job, runner)
+    detector = open_cached_detector(str(checked.detector))
+    pairs = detect_pairs(detector, render_front_left(job, refs, method.end))
+    costs = read_stage_costs(job, refs)
+    return MeasuredCell(
+        method=method.name,
+        log=where.log,
+        chunk=where.chunk,
+        seconds=costs.seconds,
+        # NaN and not zero: an artifact from before CPU seconds were counted did cost some.
+        cpu_seconds={name: math.nan if s is None else float(s) for name, s in costs.cpu_seconds.items()},
+        metrics=agreement_metrics([pairs], has_masks=detector.has_masks),
+        gaussians=len(read_artifact(job, refs[method.end]).scene),
+        fixed_views=len(read_artifact(job, refs["fnet"]).views) if "fnet" in refs else 0,
+    )
+
+
+def render_front_left(job: Job, refs: Mapping[str, ArtifactRef], end: str) -> ImagePairs:
+    """Renders a scene of the front camera as the front-left one recorded it.
+
+    Args:
+        job: of the scene.
+        refs: its stages' artifacts.
+        end: the stage whose scene is rendered.
+
+    Raises:
+        InputError: the front-left camera has no image in the chunk.
+    """
+    from flows.perception.camera_transfer import render_camera
+
+    log = cached_log(job.log)
+    camera = select_front_left_camera([camera.name for camera in log.cameras])
+    return render_camera(log, read_artifact(job, refs["ingest"]), read_artifact(job, refs[end]).scene, camera)
