@@ -1,0 +1,140 @@
+"""Table 7 as claims: scenes of the front camera, as detectors see them from the front-left one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+
+from benchmarks.common.bench import Row
+from benchmarks.common.claims import Claim, claim
+from benchmarks.common.run_stages import print_progress
+from benchmarks.common.task import require_log_folder
+from benchmarks.perception.scenes import (
+    METHOD,
+    OTHER_METHODS,
+    PerceptionCase,
+    list_detectors,
+    restrict_to_front_camera,
+    run_method,
+)
+from flows.paper_tables.agreement_cells import render_front_left
+from flows.paper_tables.builtin_methods import BUILT_IN
+from flows.perception.camera_transfer import DetectionPairs, agreement_metrics, detect_pairs
+from genre_tasks.detection.agreement import Agreement, resample_images, summarise_matches
+from genre_tasks.detection.detector import open_detector
+
+MEASURES: Mapping[str, str] = {
+    "ap": "average_precision",
+    "recall": "recall",
+    "iou": "matched_overlap",
+    "iou_all": "mean_overlap",
+}
+"""Attributes of an agreement by the words of metrics."""
+
+RESAMPLES = 1000
+
+
+def measure_camera_transfer(case: PerceptionCase, folder: str, detectors: tuple[str, ...]) -> Row:
+    """Measures all methods on a chunk with every detector.
+
+    Args:
+        case: the chunk, with all cameras.
+        folder: that holds the detectors.
+        detectors: names of their files.
+
+    Returns:
+        ``agreement``: metrics by detector and method; ``differences``: by detector, other method and metric, GenRe+
+        less the other with the 95 % interval over images.
+
+    Raises:
+        NotMeasuredError: the log or a detector is missing.
+    """
+    require_log_folder(case.log)
+    paths = list_detectors(folder, detectors)
+    front = restrict_to_front_camera(case)
+    images = {}
+    for method in (METHOD, *OTHER_METHODS):
+        job, refs = run_method(front, method)
+        images[method] = render_front_left(job, refs, BUILT_IN[method].end)
+    agreement: dict[str, dict[str, Row]] = {}
+    differences: list[Row] = []
+    for name, path in paths.items():
+        detector = open_detector(str(path))
+        pairs = {method: detect_pairs(detector, found) for method, found in images.items()}
+        agreement[name] = {
+            method: _drop_missing(agreement_metrics([pair], has_masks=detector.has_masks))
+            for method, pair in pairs.items()
+        }
+        for kind in ("box", "mask") if detector.has_masks else ("box",):
+            differences += [
+                _compare(pairs[METHOD], pairs[other], kind, measure) | {"detector": name, "other": other}
+                for other in OTHER_METHODS
+                for measure in MEASURES
+            ]
+        print_progress(f"{case.name} {name}: done")
+    return {"kind": "transfer", "log": case.name, "agreement": agreement, "differences": differences}
+
+
+def _drop_missing(metrics: Mapping[str, float]) -> Row:
+    # JSON has no NaN: what was not measured is missing.
+    return {name: value for name, value in metrics.items() if math.isfinite(value)}
+
+
+def _compare(ours: DetectionPairs, others: DetectionPairs, kind: str, measure: str) -> Row:
+    """The difference of one number, with its interval over images."""
+    matches = [pairs.match(of_masks=kind == "mask") for pairs in (ours, others)]
+
+    def difference(found: Sequence[Agreement]) -> float:
+        first, second = (float(getattr(agreement, MEASURES[measure])) for agreement in found)
+        # A method that finds nothing has no overlap of what it found; nothing agrees less than that.
+        return first - (0.0 if math.isnan(second) else second)
+
+    value = difference([summarise_matches(images) for images in matches])
+    bounds = resample_images(matches, difference, RESAMPLES)
+    interval = [bound if math.isfinite(bound) else None for bound in bounds]
+    return {"measure": f"{kind}/{measure}", "mean": value if math.isfinite(value) else None, "interval": interval}
+
+
+def camera_transfer_claims(rows: Sequence[Row]) -> Iterator[Claim]:
+    """Claims that GenRe+ agrees better than each other method, in every number of the paper.
+
+    A claim is about the difference; its spread is the 95 % interval over images.
+
+    Args:
+        rows: see :func:`measure_camera_transfer`.
+    """
+    for row in rows:
+        for difference in row["differences"]:
+            low, high = difference["interval"]
+            yield claim(
+                f"perception.transfer_{difference['measure'].replace('/', '_')}",
+                difference["mean"],
+                ">",
+                0.0,
+                "difference",
+                f"{row['log']}, {difference['detector']}, GenRe+ less {BUILT_IN[difference['other']].name}; spread: "
+                "95 % over images",
+                1,
+                None if low is None or high is None else (low, high),
+            )
+
+
+def camera_transfer_table(rows: Sequence[Row]) -> Iterator[str]:
+    """Gives a line for each chunk, detector and method.
+
+    Args:
+        rows: see :func:`measure_camera_transfer`.
+    """
+    yield "| chunk | detector | method | kind | AP | recall | IoU | IoU, 0 where missed | instances |"
+    yield "|---|---|---|---|---|---|---|---|---|"
+    for row in rows:
+        for detector, methods in row["agreement"].items():
+            for method, metrics in methods.items():
+                for kind in ("box", "mask"):
+                    if f"{kind}/instances" not in metrics:
+                        continue
+                    values = [metrics.get(f"{kind}/{name}") for name in MEASURES]
+                    texts = ["–" if value is None else f"{value:.3f}" for value in values]
+                    count = int(metrics[f"{kind}/instances"])
+                    line = [row["log"], detector, BUILT_IN[method].name, kind, *texts, str(count)]
+                    yield f"| {' | '.join(line)} |"
