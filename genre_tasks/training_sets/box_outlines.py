@@ -99,8 +99,9 @@ def outline_box(corners: Float64, lens: Lens) -> Outline | None:
     >>> lens = Lens(fx_px=100.0, fy_px=100.0, cx_px=50.0, cy_px=50.0, width_px=100, height_px=100)
     >>> pose = np.eye(4)
     >>> pose[:3, 3] = 2.5, 0.0, 6.0
-    >>> outline_box(box_corners(pose, np.array([2.0, 2.0, 2.0])), lens)
-    Outline(box_px=(75.0, 30.0, 100.0, 70.0), truncated=0.545...)
+    >>> outline = outline_box(box_corners(pose, np.array([2.0, 2.0, 2.0])), lens)
+    >>> [round(edge, 2) for edge in outline.box_px], round(outline.truncated, 4)
+    ([71.43, 30.0, 100.0, 70.0], 0.4118)
     """
     pixels = _project_edges(corners, lens)
     if not len(pixels):
@@ -144,13 +145,13 @@ def _to_pixels(points: Float64, lens: Lens) -> tuple[Float64, NDArray[np.bool_]]
     # Points on the plane itself are where edges are cut, to within rounding.
     valid = points[:, 2] > NEAR_M * (1 - 1e-6)
     z = np.where(valid, points[:, 2], 1.0)
-    x = points[:, 0] / z
-    y = points[:, 1] / z
+    x: NDArray[np.floating] = points[:, 0] / z
+    y: NDArray[np.floating] = points[:, 1] / z
     if any(lens.distortion):
         valid &= x * x + y * y < fold_radius(lens.coefficients) ** 2
         # Others may overflow a polynomial.
         x, y = distort(np.where(valid, x, 0.0), np.where(valid, y, 0.0), lens.coefficients)
-    pixels = np.stack([x * lens.fx_px + lens.cx_px, y * lens.fy_px + lens.cy_px], 1)
+    pixels: Float64 = np.stack([x * lens.fx_px + lens.cx_px, y * lens.fy_px + lens.cy_px], 1)
     return pixels[valid], valid
 
 
