@@ -1,0 +1,114 @@
+"""Checkpoints of the detector's training, from which it goes on to the same bytes as without an interruption."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from genre_tasks.atomic_path import write_atomically
+from genre_tasks.detection3d.network import Detector3dNetwork
+from genre_tasks.detection3d.settings import Detector3dConfig
+from genre_tasks.errors import InputError
+from genre_tasks.weight_checks import require_weights_fit
+
+STAGE = "train detector"
+ADAM_NAMES = ("step", "exp_avg", "exp_avg_sq")
+REMEDY = "Delete it to train again, or train into another folder."
+# How often a training is written down has no influence on it.
+_FREE_SETTINGS = ("checkpoint_every",)
+
+
+@dataclass
+class DetectorTraining:
+    """Everything that the next step depends on.
+
+    Attributes:
+        network: in training mode.
+        optimiser: with its moments.
+        step: number of steps done.
+        losses: one for each step done.
+    """
+
+    network: Detector3dNetwork
+    optimiser: torch.optim.Optimizer
+    step: int = 0
+    losses: list[float] = field(default_factory=list)
+
+
+def save_checkpoint(training: DetectorTraining, path: Path, config: Detector3dConfig, examples_digest: str) -> None:
+    """Writes a checkpoint as one file, complete or not at all.
+
+    Args:
+        training: between two steps.
+        path: of the file; its folder is made where it is missing.
+        config: of the training.
+        examples_digest: of the training examples.
+    """
+    from safetensors.torch import save
+
+    tensors = {f"weights.{name}": value for name, value in training.network.state_dict().items()}
+    for name, parameter in training.network.named_parameters():
+        # By name and not by index, so that a checkpoint does not depend on the order of parameters.
+        for key, value in training.optimiser.state.get(parameter, {}).items():
+            tensors[f"optimiser.{key}.{name}"] = torch.as_tensor(value)
+    tensors["losses"] = torch.tensor(training.losses, dtype=torch.float64)
+    description = {"step": training.step, "config": config.model_dump(mode="json"), "examples": examples_digest}
+    # Clones, because safetensors refuses tensors that share memory.
+    copies = {name: value.detach().clone().contiguous() for name, value in tensors.items()}
+    write_atomically(path, save(copies, {"training": json.dumps(description)}))
+
+
+def restore_checkpoint(training: DetectorTraining, path: Path, config: Detector3dConfig, examples_digest: str) -> None:
+    """Continues from a checkpoint, if there is one.
+
+    Args:
+        training: at its beginning; changed in place.
+        path: of the file.
+        config: of the training.
+        examples_digest: of the training examples.
+
+    Raises:
+        InputError: the file is no checkpoint, or one of other images or settings.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    if not path.exists():
+        return
+    try:
+        with safe_open(path, "pt") as file:
+            description: dict[str, Any] = json.loads((file.metadata() or {})["training"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dictionary
+        losses = tensors.pop("losses").tolist()
+        step = int(description["step"])
+        changed = _find_changes(description, config, examples_digest)
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise InputError(f"the checkpoint cannot be read: {error}", remedy=REMEDY, file=path, stage=STAGE) from error
+    if changed:
+        problem = f"the checkpoint is of a training with other {', '.join(changed)}"
+        raise InputError(problem, remedy=REMEDY, file=path, stage=STAGE)
+    weights = {name.removeprefix("weights."): value for name, value in tensors.items() if name.startswith("weights.")}
+    # Before anything is changed: a refused checkpoint leaves the training as it was.
+    require_weights_fit(weights, training.network.state_dict(), path, REMEDY, STAGE)
+    training.network.load_state_dict(weights)
+    for name, parameter in training.network.named_parameters():
+        state = {key: tensors.get(f"optimiser.{key}.{name}") for key in ADAM_NAMES}
+        if any(value is None for value in state.values()):
+            raise InputError(f"the checkpoint has no moments of {name}", remedy=REMEDY, file=path, stage=STAGE)
+        # In the layout of the weights, as the optimiser makes them: sums in another order have other last bits.
+        training.optimiser.state[parameter] = {
+            "step": state["step"],
+            **{key: torch.empty_like(parameter.detach()).copy_(state[key]) for key in ADAM_NAMES[1:]},
+        }
+    training.step = step
+    training.losses = losses
+
+
+def _find_changes(description: dict[str, Any], config: Detector3dConfig, examples_digest: str) -> list[str]:
+    stored = description["config"]
+    now = config.model_dump(mode="json")
+    changed = [name for name, value in now.items() if name not in _FREE_SETTINGS and stored.get(name) != value]
+    return changed + (["images"] if description["examples"] != examples_digest else [])
