@@ -11,7 +11,7 @@ from flows.experiments.log_chunks import LogChunk
 from flows.experiments.stages import StageRunner, read_stage_costs, run_stages
 from flows.paper_tables.columns import MeasuredCell
 from flows.paper_tables.layouts import Layout
-from flows.paper_tables.measure import list_stages
+from flows.paper_tables.measure import Basis, list_stages
 from flows.paper_tables.methods import Method
 from flows.perception.camera_names import select_front_camera, select_front_left_camera
 from flows.pipeline.log_cache import cached_log
@@ -20,7 +20,6 @@ from flows.pipeline.stage_runner import ArtifactRef, Job, read_artifact
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from flows.paper_tables.request import CheckedRequest
     from flows.perception.camera_transfer import ImagePairs
     from genre_tasks.detection.detector import Detector
 
@@ -57,14 +56,16 @@ def restrict_to_front_camera(layout: Layout, log: str) -> Layout:
 
 
 def measure_agreement_cell(
-    checked: CheckedRequest, method: Method, where: LogChunk, runner: StageRunner
+    basis: Basis, layout: Layout, method: Method, where: LogChunk, detector_name: str, runner: StageRunner
 ) -> MeasuredCell:
     """Measures how far a detector's finds on a method's renders agree with those on recorded images.
 
     Args:
-        checked: the table, with its detector.
+        basis: what all methods share.
+        layout: the table.
         method: the row's method.
         where: the chunk.
+        detector_name: file or name of the detector.
         runner: runs one stage.
 
     Returns:
@@ -75,9 +76,9 @@ def measure_agreement_cell(
     """
     from flows.perception.camera_transfer import agreement_metrics, detect_pairs
 
-    job = checked.basis.job(checked.layout, method, where)
-    refs = run_stages(list_stages(checked.layout, method), job, runner)
-    detector = open_cached_detector(str(checked.detector))
+    job = basis.job(layout, method, where)
+    refs = run_stages(list_stages(layout, method), job, runner)
+    detector = open_cached_detector(detector_name)
     pairs = detect_pairs(detector, render_front_left(job, refs, method.end))
     costs = read_stage_costs(job, refs)
     return MeasuredCell(

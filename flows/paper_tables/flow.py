@@ -157,7 +157,8 @@ def cell_task(checked: CheckedRequest, label: str, places: tuple[LogChunk, ...])
     if checked.layout.rollouts:
         return measure_rollout_cell(checked.basis, checked.layout, method, places, run_reported_stage)
     if checked.layout.across_cameras:
-        return measure_agreement_cell(checked, method, places[0], run_reported_stage)
+        detector = str(checked.detector)
+        return measure_agreement_cell(checked.basis, checked.layout, method, places[0], detector, run_reported_stage)
     return measure_cell(checked.basis, checked.layout, method, places[0], run_reported_stage)
 
 

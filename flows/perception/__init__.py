@@ -1,1 +1,1 @@
-"""What a detector makes of scenes: agreement of recorded and rendered images, and training sets of renders."""
+"""What a detector makes of scenes: agreement of recorded and rendered images, and labelled renders to train with."""
