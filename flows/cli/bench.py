@@ -50,6 +50,10 @@ _BENCHES: dict[str, BenchEntry] = {
     "optimiser": BenchEntry(
         "benchmarks.optimiser:BENCH", "GNet's seconds and renders against per-scene 3DGS and tuned Adam"
     ),
+    "perception": BenchEntry(
+        "benchmarks.perception:BENCH",
+        "how far detectors agree on recorded and rendered images, and train on these",
+    ),
     "pipeline": BenchEntry("benchmarks.pipeline:BENCH", "the pipeline on synthetic streets and a real chunk"),
     "raster": BenchEntry(
         "benchmarks.raster:BENCH", "the renderer's speed against gsplat's torch reference and the machine's limits"

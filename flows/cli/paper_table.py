@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from flows.cli.detector_table import NUMBER, measure_detector_table, refuse_table_8_options
 from flows.cli.options import (
     ChunksOption,
     DryRunOption,
@@ -38,7 +39,7 @@ TableNumberArgument = Annotated[
     typer.Argument(
         help="The table's number: 1 comparison of methods, 2 GenRe after other methods, 3 fixers by their inputs, 4 "
         "ablation, 5 runtime by phase, 6 re-simulation with other behaviours, 7 agreement of a detector "
-        "across cameras."
+        "across cameras, 8 a detector trained with renders."
     ),
 ]
 TableFolderOption = Annotated[
@@ -69,6 +70,15 @@ TableDetectorOption = Annotated[
         "fills the columns of masks too.",
     ),
 ]
+TestLogsOption = Annotated[
+    list[str] | None,
+    typer.Option("--test", help="For table 8, a log to test detectors on, as LOG. May be given several times."),
+]
+SeedsOption = Annotated[int, typer.Option(help="For table 8, the number of trainings of each row.")]
+StepsOption = Annotated[
+    int | None,
+    typer.Option(help="For table 8, the gradient steps of a training. If not given, those that it is made for."),
+]
 StoredOption = Annotated[
     bool,
     typer.Option("--stored", help="Compute nothing, and leave out methods whose stages are not all in the store."),
@@ -96,6 +106,9 @@ def table(
     scale: ScaleOption = None,
     chunk_frames: ChunkFramesOption = None,
     detector: TableDetectorOption = None,
+    test: TestLogsOption = None,
+    seeds: SeedsOption = 3,
+    steps: StepsOption = None,
     dry_run: DryRunOption = False,
 ) -> None:
     """Measure a table of the paper, with the paper's numbers beside.
@@ -111,6 +124,8 @@ def table(
     \b
         genre table 4 'synthetic:street?seed=1000' --chunks 0 --out tables
         genre table 2 --scene point_cloud.ply --cameras transforms.json --scale 1
+        genre table 7 pandaset:PATH/002 --chunks 1 --detector yolox_nano.onnx
+        genre table 8 'synthetic:street?seed=100' --test 'synthetic:street?seed=900'
     """
     from flows.cli.output_paths import check_output_file, check_output_folder
     from flows.cli.parsing import parse_numbers
@@ -120,6 +135,23 @@ def table(
     if into is not None:
         check_output_file(into, "--into")
     numbers = parse_numbers(chunks, "--chunks")
+    if number == NUMBER:
+        from flows.paper_tables.detector_flow import DetectorRequest
+
+        trained = DetectorRequest(
+            train=tuple(logs or ()),
+            test=tuple(test or ()),
+            preset=preset,
+            store=store,
+            chunks=None if numbers is None else tuple(numbers),
+            settings=tuple(settings or ()),
+            seeds=seeds,
+            steps=steps,
+            out=str(out),
+        )
+        measure_detector_table(trained, dry_run)
+        return
+    refuse_table_8_options(test, steps)
     request = TableRequest(
         number=number,
         logs=tuple(logs or ()),

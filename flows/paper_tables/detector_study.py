@@ -20,7 +20,7 @@ from flows.experiments.result_files import write_text
 from flows.experiments.stages import StageRunner
 from flows.paper_tables.builtin_methods import BUILT_IN
 from flows.paper_tables.layouts import PROTOCOL
-from flows.paper_tables.training_images import build_source, label_recorded, label_truth, render_shifted
+from flows.paper_tables.training_images import ImageSource, build_source, label_recorded, label_truth, render_shifted
 from genre_tasks.detection3d.settings import Detector3dConfig
 from genre_tasks.json_files import read_json_object
 from genre_tasks.progress import Progress, silent
@@ -35,6 +35,9 @@ ROWS = {"real": "Real", "real+3dgs": "Real + Sim (3DGS)", "real+genre+": "Real +
 """The paper's rows: recorded images, and what is added to them."""
 
 _LazyImages = Callable[[], "list[LabelledImage]"]
+
+_RECORDED = "genre+"
+"""Whose chunk is read where recorded images are all that is needed: the chunk is the same for every method."""
 
 TEST_EVERY = 2
 TRUTH_EVERY = 4
@@ -109,18 +112,28 @@ class DetectorStudy:
         write_text(scores_file, json.dumps(scores, indent=1) + "\n")
         return scores
 
+    def build_source(self, where: LogChunk, method: str) -> ImageSource:
+        """Builds the source of a chunk's images.
+
+        Args:
+            where: the chunk.
+            method: a key of ``BUILT_IN`` that reconstructs it.
+        """
+        settings = (*PROTOCOL, *self.settings)
+        return build_source(where, BUILT_IN[method], settings, self.preset, self.store)
+
     def _collect_training_images(self, row: str, runner: StageRunner) -> tuple[_LazyImages, list[str]]:
         """The images of a row, read when they are asked for, and what names them."""
         _, plus, method = row.partition("+")
         parts: list[_LazyImages] = []
         names = [row, f"{self.shift_m:g}"]
         for where in self.train:
-            real = build_source(where, BUILT_IN["genre+"], (*PROTOCOL, *self.settings), self.preset, self.store)
+            real = self.build_source(where, _RECORDED)
             ingest = runner("ingest", real.job, {})
             parts.append(partial(label_recorded, real.job, ingest))
             names.append(ingest.key)
             if plus:
-                source = build_source(where, BUILT_IN[method], (*PROTOCOL, *self.settings), self.preset, self.store)
+                source = self.build_source(where, method)
                 refs = source.run(runner)
                 parts.append(partial(render_shifted, source, refs, (self.shift_m, -self.shift_m)))
                 names.append(refs[str(source.end)].key)
@@ -129,7 +142,7 @@ class DetectorStudy:
     def _collect_test_images(self, runner: StageRunner) -> dict[str, list[LabelledImage]]:
         found: dict[str, list[LabelledImage]] = {"recorded": [], "shifted": []}
         for where in self.test:
-            source = build_source(where, BUILT_IN["genre+"], (*PROTOCOL, *self.settings), self.preset, self.store)
+            source = self.build_source(where, _RECORDED)
             ingest = runner("ingest", source.job, {})
             found["recorded"] += label_recorded(source.job, ingest, TEST_EVERY)
             found["shifted"] += label_truth(source.job, ingest, (self.shift_m, -self.shift_m), TRUTH_EVERY)
@@ -149,3 +162,12 @@ def _name_scores(scores: DetectionScores, thresholds_m: Sequence[float]) -> dict
     named["boxes"] = float(scores.truth_count)
     # JSON has no NaN: what was not measured is missing.
     return {name: value for name, value in named.items() if math.isfinite(value)}
+
+
+def list_methods() -> tuple[str, ...]:
+    """Lists the methods whose renders are trained on, keys of ``BUILT_IN``.
+
+    >>> list_methods()
+    ('3dgs', 'genre+')
+    """
+    return tuple(row.partition("+")[2] for row in ROWS if "+" in row)

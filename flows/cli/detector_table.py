@@ -1,0 +1,86 @@
+"""``genre table 8``: detectors trained on recorded images alone, and with renders of scenes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from genre_tasks.errors import ConfigError
+
+if TYPE_CHECKING:
+    from flows.paper_tables.detector_flow import DetectorRequest
+    from flows.paper_tables.detector_study import DetectorStudy
+
+NUMBER = 8
+_SECONDS_PER_STEP = 0.2
+"""Measured on one core: eight images of 320×180."""
+
+
+def measure_detector_table(request: DetectorRequest, dry_run: bool) -> None:
+    """Measures table 8, or prints what it would take.
+
+    Args:
+        request: what the user asked for.
+        dry_run: whether nothing is computed.
+
+    Raises:
+        GenreError: the request is wrong, or a stage or training fails.
+    """
+    from flows.cli.terminal import report_on_terminal
+    from flows.paper_tables.detector_flow import detector_table
+
+    # Mistakes in the request show here, before Prefect's server takes seconds to start.
+    study = request.check()
+    if dry_run:
+        _print_prediction(study, request.seeds)
+        return
+    with report_on_terminal():
+        done: dict[str, Any] = detector_table(
+            list(request.train),
+            list(request.test),
+            preset=request.preset,
+            store=request.store,
+            chunks=None if request.chunks is None else list(request.chunks),
+            settings=list(request.settings),
+            seeds=request.seeds,
+            steps=request.steps,
+            out=request.out,
+        )
+    typer.echo(f"{done['trainings']} trainings; wrote {', '.join(done['files'])}")
+
+
+def refuse_table_8_options(test: list[str] | None, steps: int | None) -> None:
+    """Checks that options of table 8 are not given for another table.
+
+    Args:
+        test: logs to test on.
+        steps: of a training.
+
+    Raises:
+        ConfigError: one is given.
+    """
+    for option, value in (("--test", test), ("--steps", steps)):
+        if value is not None:
+            raise ConfigError(f"{option} belongs to table {NUMBER}", remedy=f"Leave it out, or ask for table {NUMBER}.")
+
+
+def _print_prediction(study: DetectorStudy, seeds: int) -> None:
+    from flows.cli.printing import print_rows
+    from flows.experiments.stage_prediction import StagePredictor
+    from flows.paper_tables.detector_study import ROWS, list_methods
+    from flows.pipeline.definition import stages_until
+    from genre_tasks.config import PipelineConfig
+
+    predictor = StagePredictor(study.store)
+    rows: list[dict[str, Any]] = []
+    for where in study.train:
+        for method in list_methods():
+            source = study.build_source(where, method)
+            base = PipelineConfig.model_validate(source.job.config)
+            names = stages_until(str(source.end))
+            rows.append(predictor.predict(f"{method} · {where}", source.job, base, names))
+    seconds = _SECONDS_PER_STEP * study.detector.steps
+    trainings = [(label, seed) for label in ROWS.values() for seed in range(seeds)]
+    rows += [{"cell": f"{label} · seed {seed}", "seconds": seconds, "cached": ""} for label, seed in trainings]
+    print_rows(f"{len(rows)} cells, {sum(row['seconds'] for row in rows) / 60:.0f} minutes", rows)
