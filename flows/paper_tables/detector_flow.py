@@ -215,7 +215,7 @@ def render_page(scores: dict[str, list[dict[str, dict[str, float]]]], facts: dic
             lines.append(f"| {label} | {' | '.join(cells)} |")
         lines.append("")
     lines += [
-        "Not comparable with the paper's numbers: its detector is BEVFormer-tiny on PandaSet, this one a small one that "
+        "Not comparable with the paper's numbers: its detector is BEVFormer-tiny on PandaSet, this one is small and "
         "looks at single images.",
         "",
         *(f"* {name}: {value}" for name, value in facts.items()),
