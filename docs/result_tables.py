@@ -9,71 +9,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from docs.claim_words import CLAIM_WORDS
+
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT / "docs/results/data"
-
-CLAIM_WORDS = {
-    "main.gnet_over_initial_db": "GNet gains over the initial scene, held-out frames",
-    "main.gnet_vs_adam_db": "GNet gains over tuned Adam with as many renders",
-    "main.enet_interpolation_db": "ENet keeps held-out PSNR: ENet minus GNet",
-    "main.minutes_per_chunk": "Stages of one chunk with preset `fine`, without evaluation",
-    "main.fine_heldout_db": "Preset `fine` over `small`, held-out frames",
-    "main.fine_kernel_3m": "Kernel distance at 3 m, preset `fine` minus `small`",
-    "main.fnet_psnr_3m_db": "FNet's images gain over the renders at 3 m",
-    "main.fnet_perceptual_3m": "Perceptual distance at 3 m, FNet over renders",
-    "main.enet_perceptual_3m": "Perceptual distance at 3 m, ENet over GNet",
-    "main.enet_kernel_3m": "Kernel distance at 3 m, ENet minus GNet",
-    "optimiser.vs_standard_3dgs": "Time of standard 3DGS to GNet's held-out PSNR, over GNet's time",
-    "optimiser.vs_tuned_adam": "Time of the best tuned Adam to GNet's held-out PSNR, over GNet's time",
-    "optimiser.equal_renders_db": "GNet over the best tuned Adam with as many renders",
-    "optimiser.converged": "Time of preset `long` to within 0.2 dB of converged Adam, over Adam's time",
-    "optimiser.distillation": "ENet's time over that of the best distillation by tuned Adam",
-    "optimiser.distillation_standard": "ENet's time over that of distillation by the 3DGS recipe",
-    "optimiser.enhance_1m": "Fraction of runs in which ENet beats GNet at 1 m",
-    "optimiser.enhance_2m": "Fraction of runs in which ENet beats GNet at 2 m",
-    "optimiser.enhance_3m": "Fraction of runs in which ENet beats GNet at 3 m",
-    "optimiser.enhance_4m": "Fraction of runs in which ENet beats GNet at 4 m",
-    "optimiser.enhance_5m": "Fraction of runs in which ENet beats GNet at 5 m",
-    "optimiser.enet_vs_gnet": "Distance to the truth that ENet removes, minus what GNet's network removes",
-    "optimiser.interpolation": "Held-out PSNR, ENet minus GNet, worst run",
-    "optimiser.stable_10x": "Loss after ten times the iterations, over the loss at the end, worst run",
-    "optimiser.network_100k": "Seconds of the network on 100,000 Gaussians",
-    "raster.vs_gsplat_torch": "Speed over gsplat's torch reference, forward and backward",
-    "raster.ns_per_pair": "Nanoseconds a contributing Gaussian-pixel pair, forward and backward",
-    "raster.gemm_share": "Fraction of the floating-point rate of a matrix product",
-    "raster.many_views": "Time a view of 32 views in one call, over single calls",
-    "raster.threads": "Speed of two threads over one",
-    "raster.avx2": "Time with AVX2 over time with AVX-512",
-    "raster.build_s": "Seconds to compile all instruction sets",
-    "start_up.cached_run_s": "Seconds of a run that finds every stage in the store",
-    "start_up.api_s": "Seconds until Prefect's local API answers",
-    "start_up.first_api_s": "Seconds until Prefect's local API answers, at its first start ever",
-    "evaluation.budget_kept": "Fraction of runs that end within their budget",
-    "evaluation.budget_overrun": "Seconds used over the budget, worst run",
-    "evaluation.budget_used": "Seconds used over the budget, least of the runs that had something better to spend on",
-    "evaluation.budget_worth": "Rise of perceptual distance from a budget to the next larger one, worst",
-    "evaluation.reliability_gnet": "Rank correlation of estimated and true PSNR, scenes of GNet",
-    "evaluation.reliability": "Rank correlation of estimated and true PSNR, scenes of ENet",
-    "evaluation.reliability_worst": "Rank correlation of estimated and true PSNR, worst street",
-    "real_logs.kitti_psnr_gain": "KITTI slice: held-out PSNR after ENet over that before these effects",
-    "real_logs.kitti_kernel_cut": "KITTI slice: what ENet takes off the kernel distance at 3 m",
-    "real_logs.kitti_enet_heldout": "KITTI slice: held-out PSNR, ENet minus GNet",
-    "real_logs.effects_gain": "Held-out PSNR, both effects by their gates minus none",
-    "real_logs.pose_noise_recovered": "Share of the PSNR lost to noisy poses that refinement brings back",
-    "real_logs.exact_streets_same": "Exact streets whose scene keeps its bytes with the gate",
-    "log_faults.false_alarms_streets": "Findings on sound streets",
-    "log_faults.false_alarms_real": "Findings on sound real chunks",
-    "log_faults.found_strongest": "Fraction of faults and logs of which the strongest form is found",
-    "log_faults.seconds": "CPU seconds of all checks of a chunk, six cameras",
-    "scale.two_workers": "Time of 16 logs with one worker, over that with two, on two cores",
-    "scale.orchestration_share": "A worker's time for a log without computation, over the computation",
-    "scale.cached_log_s": "A worker's time for a log whose stages are all in the store",
-    "scale.object_store_ratio": "Time of a run with its store on S3, over a store on the local disk",
-    "scale.cluster_lost": "Stages lost in the simulated dataset",
-    "scale.cluster_doubled": "Stages of the simulated dataset that the store holds twice",
-    "scale.fuzz_findings": "Damaged and harmful files that are a finding",
-}
-"""What each claim says, for people. A claim without words is an error."""
 
 
 def result(name: str) -> dict[str, Any]:

@@ -107,7 +107,7 @@ def camera_transfer_claims(rows: Sequence[Row]) -> Iterator[Claim]:
         for difference in row["differences"]:
             low, high = difference["interval"]
             yield claim(
-                f"perception.transfer_{difference['measure'].replace('/', '_')}",
+                f"perception.transfer_{difference['other']}_{difference['measure'].replace('/', '_')}",
                 difference["mean"],
                 ">",
                 0.0,
