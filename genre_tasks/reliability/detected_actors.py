@@ -65,21 +65,14 @@ def count_detected_actors(detector: Detector, chunk: Chunk, view: AnyView, image
     # Without actors to find the network need not run.
     if not expected:
         return 0, 0
-    found = detector.detect(to_uint8(image))
+    found = detector.detect(_round_to_bytes(image))
     finds = found.boxes[np.isin(found.classes, find_road_users(detector.class_names))]
     return len(expected), _count_overlapped(np.array(expected, np.float32), finds)
 
 
-def to_uint8(image: Tensor) -> NDArray[np.uint8]:
-    """Brings an image to the 8 bits that detectors take.
-
-    Args:
-        image: [H, W, 3] sRGB in [0, 1].
-
-    Returns:
-        [H, W, 3] 0 to 255.
-    """
-    pixels: NDArray[np.uint8] = (image.detach().float().clamp(0, 1) * 255).round().numpy().astype(np.uint8)
+def _round_to_bytes(image: Tensor) -> NDArray[np.uint8]:
+    """An image [H, W, 3] in [0, 1] in the 8 bits that detectors take."""
+    pixels: NDArray[np.uint8] = (image.detach().float().clamp(0, 1) * 255).round().cpu().numpy().astype(np.uint8)
     return pixels
 
 
