@@ -31,6 +31,7 @@ from flows.cli.ops import app as ops_app
 from flows.cli.outcome import start_outcome, wants_json
 from flows.cli.paper_table import table
 from flows.cli.parsing import check_words
+from flows.cli.perceive import perceive
 from flows.cli.pin import pin, unpin
 from flows.cli.range import range_command
 from flows.cli.render import render
@@ -68,6 +69,7 @@ app.command(name="view")(view)
 app.command(name="simulate")(simulate)
 app.command(name="serve")(serve)
 app.command(name="range")(range_command)
+app.command(name="perceive")(perceive)
 app.command(name="augment")(augment)
 app.command(name="edit")(edit)
 app.command(name="export")(export)

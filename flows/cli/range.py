@@ -14,16 +14,15 @@ from flows.defaults import DEFAULT_STORE
 
 if TYPE_CHECKING:
     from genre_tasks.config import RangeConfig
-    from genre_tasks.reliability.detector import Detector
+    from genre_tasks.detection.detector import Detector
     from genre_tasks.reliability.reliable_range import CurvePoint
 
 DetectorOption = Annotated[
-    Path | None,
+    str | None,
     typer.Option(
-        parser=parse_path,
-        metavar="PATH",
-        help="An ONNX model that detects road users, in the form of FastestDet. The fraction of actors that it "
-        "finds is then one more guard.",
+        metavar="DETECTOR",
+        help="A detector that knows road users: an ONNX or TFLite file of FastestDet or of a YOLO family, "
+        "torchvision:NAME or detectron2:CONFIG. The fraction of actors that it finds is then one more guard.",
     ),
 ]
 RangeFolderOption = Annotated[
@@ -102,13 +101,13 @@ def range_command(
         typer.echo(f"seam to chunk {number + 1}, the same view from both scenes without actors: {values}")
 
 
-def _load_detector(path: Path | None) -> Detector | None:
+def _load_detector(path_or_name: str | None) -> Detector | None:
     # Without a detector the other guards decide alone.
-    if path is None:
+    if path_or_name is None:
         return None
-    from genre_tasks.reliability.detector import Detector
+    from genre_tasks.reliability.detected_actors import open_actor_detector
 
-    return Detector.load(path)
+    return open_actor_detector(path_or_name)
 
 
 def _rewrite_report(store: str, run: str) -> list[str]:

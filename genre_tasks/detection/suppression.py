@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from genre_tasks.detection.agreement import box_overlaps
 from genre_tasks.detection.detections import Detections
-from genre_tasks.logs.types import Float32, Float64
+from genre_tasks.logs.types import Float32
 
 MAX_OVERLAP = 0.45
 """Of two boxes of a class that overlap more (intersection over union), only the one with the better score stays."""
@@ -42,29 +43,6 @@ class Candidates:
         return Candidates(self.boxes[kept], self.scores[kept], self.classes[kept], self.coefficients[kept])
 
 
-def compute_overlaps(boxes: Float32 | Float64, others: Float32 | Float64) -> Float64:
-    """Computes the intersection over union of boxes with others.
-
-    Args:
-        boxes: [A, 4] x and y of the upper left, then of the lower right corner.
-        others: [B, 4] the same.
-
-    Returns:
-        [A, B] in [0, 1]; 0 where both boxes have no area.
-
-    >>> compute_overlaps(np.array([[0.0, 0, 2, 2]]), np.array([[1.0, 0, 3, 2], [5, 5, 6, 6]])).round(3)
-    array([[0.333, 0.   ]])
-    """
-    # In float64, since products of pixels lose digits in float32.
-    a = np.asarray(boxes, np.float64)[:, None]
-    b = np.asarray(others, np.float64)[None]
-    sides = np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
-    common = sides.clip(0).prod(-1)
-    union = (a[..., 2:] - a[..., :2]).prod(-1) + (b[..., 2:] - b[..., :2]).prod(-1) - common
-    overlaps: Float64 = np.divide(common, union, out=np.zeros_like(common), where=union > 0)
-    return overlaps
-
-
 def suppress_overlaps(
     boxes: Float32, scores: Float32, classes: NDArray[np.int64], max_overlap: float = MAX_OVERLAP
 ) -> NDArray[np.int64]:
@@ -90,7 +68,7 @@ def suppress_overlaps(
         best = remaining[0]
         rest = remaining[1:]
         kept.append(int(best))
-        hidden = compute_overlaps(boxes[best][None], boxes[rest])[0] > max_overlap
+        hidden = box_overlaps(boxes[best][None], boxes[rest])[0] > max_overlap
         remaining = rest[~(hidden & (classes[rest] == classes[best]))]
     return np.array(kept, np.int64)
 

@@ -5,18 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from genre_tasks.detection.detector import Detector
 from genre_tasks.fixer.inputs import build_inputs
 from genre_tasks.fixer.warping import SourceImage
+from genre_tasks.reliability.detected_actors import count_detected_actors
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.novel_views import NovelView, NovelViews
-
-if TYPE_CHECKING:
-    from genre_tasks.reliability.detector import Detector
 
 MIN_COVERAGE = 0.5
 """A pixel counts as shown where recorded images cover at least so much of it, and as covered from this alpha on."""
@@ -110,7 +108,7 @@ def _guard_view(
     detected = 0
     if detector is not None:
         image = inputs.color[0].clamp(0, 1).permute(1, 2, 0)
-        actors, detected = detector.count_detected_actors(chunk, view, image)
+        actors, detected = count_detected_actors(detector, chunk, view, image)
     return Guards(
         camera=view.camera,
         frame=view.frame,

@@ -7,9 +7,9 @@ import math
 import statistics
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from genre_tasks.config import RangeConfig
+from genre_tasks.detection.detector import Detector
 from genre_tasks.effects.apply_plan import apply_plan
 from genre_tasks.effects.types import DEFAULT_PLAN, EffectsPlan
 from genre_tasks.fixer.source_images import load_source_images
@@ -20,9 +20,6 @@ from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.novel_poses import place_novel_views
 from genre_tasks.scene.novel_views import NovelViews
 from genre_tasks.stages.novel_views import render_novel
-
-if TYPE_CHECKING:
-    from genre_tasks.reliability.detector import Detector
 
 _MEDIAN_OF = ("estimate_db", "agreement_db", "shown", "thin", "floating")
 
@@ -98,7 +95,7 @@ def estimate_reliable_range(
         scene: the scene to judge.
         plan: the effects that the chunk was reconstructed with.
         progress: called for every shift.
-        detector: of road users; how many of them it finds is a guard, too.
+        detector: how many road users it finds is a guard, too.
 
     Returns:
         The range with the curve and the guards that it comes from.
