@@ -253,5 +253,3 @@ def _require_sound(box: LabelledBox, image: LabelledImage) -> None:
         camera=image.camera,
         frame=image.frame,
     )
-
-

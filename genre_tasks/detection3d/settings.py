@@ -65,7 +65,9 @@ class Detector3dConfig(Section):
     )
     width_px: int = Field(320, ge=32, le=2048, description="Width that images are brought to.")
     height_px: int = Field(180, ge=32, le=2048, description="Height that images are brought to.")
-    width: int = Field(32, ge=16, le=256, multiple_of=16, description="Channels of the feature map at a quarter of the resolution.")
+    width: int = Field(
+        32, ge=16, le=256, multiple_of=16, description="Channels of the feature map at a quarter of the resolution."
+    )
     steps: int = Field(1500, ge=1, le=1_000_000, description="Gradient steps.")
     batch: int = Field(8, ge=1, le=256, description="Images per step.")
     learning_rate: LearningRate = Field(2e-3, description="Of AdamW, at its largest.")

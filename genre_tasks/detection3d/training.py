@@ -120,9 +120,7 @@ def draw_batch(examples: TrainingExamples, config: Detector3dConfig, step: int) 
         order = torch.randperm(len(examples), generator=_generator(config.seed, 2 * epoch))
         rows.append(order[place])
     generator = _generator(config.seed, 2 * step + 1)
-    batch = apply_changes(
-        take_batch(examples, torch.stack(rows)), draw_changes(config.batch, config, generator)
-    )
+    batch = apply_changes(take_batch(examples, torch.stack(rows)), draw_changes(config.batch, config, generator))
     return jitter_colours(batch, config.colour_jitter, generator)
 
 
