@@ -20,7 +20,7 @@ from flows.experiments.result_files import write_text
 from flows.experiments.stages import StageRunner
 from flows.paper_tables.builtin_methods import BUILT_IN
 from flows.paper_tables.layouts import PROTOCOL
-from flows.paper_tables.training_images import ImageSource, build_source, label_recorded, label_truth, render_shifted
+from flows.paper_tables.training_images import RenderSource, build_source, label_recorded, label_truth, render_shifted
 from genre_tasks.detection3d.settings import Detector3dConfig
 from genre_tasks.json_files import read_json_object
 from genre_tasks.progress import Progress, silent
@@ -112,7 +112,7 @@ class DetectorStudy:
         write_text(scores_file, json.dumps(scores, indent=1) + "\n")
         return scores
 
-    def build_source(self, where: LogChunk, method: str) -> ImageSource:
+    def build_source(self, where: LogChunk, method: str) -> RenderSource:
         """Builds the source of a chunk's images.
 
         Args:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ImageSource:
+class RenderSource:
     """Where the images of one chunk come from.
 
     Attributes:
@@ -39,7 +39,7 @@ class ImageSource:
         return run_stages(("ingest",) if self.end is None else stages_until(self.end), self.job, runner)
 
 
-def build_source(where: LogChunk, method: Method, settings: Sequence[str], preset: str, store: str) -> ImageSource:
+def build_source(where: LogChunk, method: Method, settings: Sequence[str], preset: str, store: str) -> RenderSource:
     """Builds the source of a chunk's renders by a method.
 
     Args:
@@ -53,7 +53,7 @@ def build_source(where: LogChunk, method: Method, settings: Sequence[str], prese
         ConfigError: a setting is unknown or out of range.
     """
     config = method.configuration(preset, tuple(settings)).model_dump(mode="json")
-    return ImageSource(Job(where.log, where.chunk, store, config), method.end)
+    return RenderSource(Job(where.log, where.chunk, store, config), method.end)
 
 
 def label_recorded(job: Job, ref: ArtifactRef, every: int = 1) -> list[LabelledImage]:
@@ -75,7 +75,7 @@ def label_recorded(job: Job, ref: ArtifactRef, every: int = 1) -> list[LabelledI
     return [labeller.label_recorded_image(chunk, view) for view in chunk.views if view.frame in frames]
 
 
-def render_shifted(source: ImageSource, refs: dict[str, ArtifactRef], shifts_m: Sequence[float]) -> list[LabelledImage]:
+def render_shifted(source: RenderSource, refs: dict[str, ArtifactRef], shifts_m: Sequence[float]) -> list[LabelledImage]:
     """Renders a scene at the recorded poses, moved by each shift, with the boxes of its log.
 
     Args:
