@@ -75,7 +75,9 @@ def label_recorded(job: Job, ref: ArtifactRef, every: int = 1) -> list[LabelledI
     return [labeller.label_recorded_image(chunk, view) for view in chunk.views if view.frame in frames]
 
 
-def render_shifted(source: RenderSource, refs: dict[str, ArtifactRef], shifts_m: Sequence[float]) -> list[LabelledImage]:
+def render_shifted(
+    source: RenderSource, refs: dict[str, ArtifactRef], shifts_m: Sequence[float]
+) -> list[LabelledImage]:
     """Renders a scene at the recorded poses, moved by each shift, with the boxes of its log.
 
     Args:
