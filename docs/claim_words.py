@@ -52,6 +52,7 @@ CLAIM_WORDS = {
     "real_logs.pose_noise_recovered": "Share of the PSNR lost to noisy poses that refinement brings back",
     "real_logs.exact_streets_same": "Exact streets whose scene keeps its bytes with the gate",
     "perception.shift_rises": "Steps from 0 to 5 m at which GenRe+'s box AP on streets rises",
+    "perception.shift_fall": "Box AP of GenRe+ on streets, on the path minus at 5 m",
     "perception.shift_1m_ap": "Box AP on streets at 1 m, GenRe+ minus 3DGS",
     "perception.shift_2m_ap": "Box AP on streets at 2 m, GenRe+ minus 3DGS",
     "perception.shift_3m_ap": "Box AP on streets at 3 m, GenRe+ minus 3DGS",

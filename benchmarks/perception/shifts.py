@@ -111,6 +111,14 @@ def shift_claims(rows: Sequence[Row]) -> Iterator[Claim]:
         rises = sum(later > earlier for earlier, later in itertools.pairwise(known))
         note = f"{streets}, {detector}: steps from 0 to 5 m at which GenRe+'s box AP rises"
         yield claim("perception.shift_rises", float(rises) if known else None, "<=", 0.0, "steps", note, len(rows))
+        falls = [
+            curves["0"]["box/ap"] - curves["5"]["box/ap"]
+            for curves in (row["agreement"][detector][METHOD] for row in rows)
+            if "box/ap" in curves["0"] and "box/ap" in curves["5"]
+        ]
+        note = f"{streets}, {detector}: GenRe+'s box AP on the path less that at 5 m; spread: 95 % over streets"
+        fall = mean(falls) if falls else None
+        yield claim("perception.shift_fall", fall, ">", 0.0, "difference", note, len(falls), bootstrap_mean(falls))
         for shift in SHIFTS_M[1:]:
             differences = list_differences(rows, detector, shift, "ap")
             value = mean(differences) if differences else None
