@@ -47,6 +47,7 @@ BLOCKS: Mapping[str, Callable[[], str]] = {
     "log-faults": result_tables.log_faults,
     "log-faults-claims": lambda: result_tables.claims("log_faults"),
     "perception-claims": perception_tables.claims,
+    "perception-differences": perception_tables.differences,
     "perception-ranges": perception_tables.ranges,
     "perception-shifts": perception_tables.shifts,
     "perception-speed": perception_tables.speed,

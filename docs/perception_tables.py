@@ -38,6 +38,20 @@ def transfer() -> str:
     return table(head, lines) + "\n" + provenance("perception")
 
 
+def differences() -> str:
+    """By how much GenRe+ agrees better than other methods, with intervals over images."""
+    lines = []
+    for row in _rows("transfer"):
+        for found in row["differences"]:
+            low, high = found["interval"]
+            known = found["mean"] is not None and low is not None
+            interval = f"{low:.3f} to {high:.3f}" if known else "–"
+            name = _NAMES[found["other"]]
+            lines.append([row["log"], found["detector"], name, found["measure"], _text(found["mean"]), interval])
+    head = ["chunk", "detector", "GenRe+ minus", "number", "difference", "95 % interval"]
+    return table(head, lines) + "\n" + provenance("perception")
+
+
 def shifts() -> str:
     """Box AP against the truth of streets over shift, the mean of all streets."""
     rows = _rows("shifts")
