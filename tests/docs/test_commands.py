@@ -35,7 +35,10 @@ from tests.logs.waymo_folder import write_waymo
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (ROOT / "README.md", ROOT / "docs/quickstart.md", *sorted((ROOT / "docs/guides").glob("*.md")))
 TAKES_SETTINGS = ("run", "enhance", "effects", "cost", "table", "figure")
-READS_STORE = ("show", "diff", "render", "view", "range", "perceive", "verify", "simulate", "edit", "export", "import", "serve")
+READS_STORE = (
+    *("show", "diff", "render", "view", "range", "perceive", "verify"),
+    *("simulate", "edit", "export", "import", "serve"),
+)
 TAKES_STORE = (*TAKES_SETTINGS, *READS_STORE)
 
 
