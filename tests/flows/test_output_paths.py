@@ -97,6 +97,7 @@ def test_permissions_are_respected(tmp_path: Path) -> None:
         ("table", "4", STREET, "--into", "FILE/page.md"),
         ("cost", STREET, "--out", "FILE"),
         ("range", "4b1c", "--out", "FILE"),
+        ("perceive", "4b1c", "--detector", "x.onnx", "--out", "FILE"),
         ("bench", "nothing", "--json", "FILE/x.json"),
         ("train", "pairs", "--folder", "FILE"),
         ("train", "gnet", "--folder", "FILE/below"),
