@@ -16,7 +16,7 @@ _MAX_SHIFT_M = 1000.0
 """Farther beside the path no log has recorded anything."""
 _MAX_COUNT = 1_000_000
 
-_NUMBER = r"\d+(?:\.\d+)?"
+_NUMBER = r"[0-9]{1,9}(?:\.[0-9]{1,9})?"
 _SHIFT = re.compile(rf"(?P<sign>±|\+/?-|[+-])?\s*(?P<size>{_NUMBER})\s*m?")
 
 
@@ -119,7 +119,7 @@ def parse_shifts(text: str, option: str) -> list[float]:
             raise ConfigError(f"cannot read {option} {text!r}", remedy=remedy)
         size = check_number(float(found["size"]), option, 0, _MAX_SHIFT_M)
         sign = found["sign"] or "+"
-        if sign in "+-":
+        if sign in ("+", "-"):
             # Without a minus zero, which would be another path by its name.
             shifts.append(size if sign == "+" or not size else -size)
         else:
