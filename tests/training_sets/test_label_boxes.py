@@ -11,7 +11,7 @@ import pytest
 from genre_tasks.errors import InputError
 from genre_tasks.logs.types import Lens
 from genre_tasks.scene.projection import project
-from genre_tasks.training_sets.box_outlines import box_corners, find_boxes_in_sight, measure_occlusion, outline_box
+from genre_tasks.training_sets.box_outlines import box_corners, find_boxes_in_view, measure_occlusion, outline_box
 from genre_tasks.training_sets.label_boxes import (
     LogLabeller,
     count_points_in_boxes,
@@ -86,7 +86,7 @@ def test_the_fast_search_leaves_out_nothing() -> None:
     poses = np.stack([pose(*rng.uniform(-15, 15, 3), rng.uniform(-3, 3)) for _ in range(400)])
     corners = box_corners(poses, rng.uniform(0.5, 12, (400, 3)))
     shown = {k for k in range(400) if outline_box(corners[k], LENS)}
-    assert 40 < len(shown) < 300 and shown <= set(find_boxes_in_sight(corners, LENS).tolist())
+    assert 40 < len(shown) < 300 and shown <= set(find_boxes_in_view(corners, LENS).tolist())
 
 
 def test_a_distorted_rectangle_is_that_of_the_projected_surface() -> None:
