@@ -16,48 +16,52 @@ _MAX_SHIFT_M = 1000.0
 """Farther beside the path no log has recorded anything."""
 _MAX_COUNT = 1_000_000
 
-_NUMBER = r"\d+(?:\.\d+)?"
+_NUMBER = r"[0-9]{1,9}(?:\.[0-9]{1,9})?"
 _SHIFT = re.compile(rf"(?P<sign>±|\+/?-|[+-])?\s*(?P<size>{_NUMBER})\s*m?")
 
 
+RunsArgument = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="RUN...",
+        help="The names of finished runs, or their first characters. `genre show runs` lists the names.",
+    ),
+]
+SetFolderOption = Annotated[
+    Path,
+    typer.Option(parser=parse_path, metavar="PATH", help="The folder of the training set; a new one, or an empty one."),
+]
+ShiftsOption = Annotated[
+    str,
+    typer.Option(
+        help="How many metres to the left of the path scenes are rendered; negative is to the right, and ±3 is "
+        "both sides. Several are separated by commas: 1,2 or -3,3."
+    ),
+]
+FormatOption = Annotated[
+    str,
+    typer.Option(
+        "--format", help="The layout: kitti, nuscenes, coco (rectangles alone) or own (Parquet tables and PNG images)."
+    ),
+]
+MinPointsOption = Annotated[
+    int,
+    typer.Option(
+        help="How many LiDAR points a box needs to be in the set. Boxes of which nearer surfaces hide more than "
+        "95 % are left out in any case."
+    ),
+]
+
+
 def augment(
-    runs: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="RUN...",
-            help="The names of finished runs, or their first characters. `genre show runs` lists the names.",
-        ),
-    ],
-    out: Annotated[
-        Path,
-        typer.Option(
-            parser=parse_path, metavar="PATH", help="The folder of the training set; a new one, or an empty one."
-        ),
-    ],
-    shift: Annotated[
-        str,
-        typer.Option(
-            help="How many metres to the left of the path scenes are rendered; negative is to the right, and ±3 is "
-            "both sides. Several are separated by commas: 1,2 or -3,3."
-        ),
-    ] = "±3",
-    format_name: Annotated[
-        str,
-        typer.Option(
-            "--format",
-            help="The layout: kitti, nuscenes, coco (rectangles alone) or own (Parquet tables and PNG images).",
-        ),
-    ] = "kitti",
+    runs: RunsArgument,
+    out: SetFolderOption,
+    shift: ShiftsOption = "±3",
+    format_name: FormatOption = "kitti",
     stage: SceneStageOption = None,
     every: Annotated[int, typer.Option(help="Take every n-th frame of each chunk.")] = 1,
     no_recorded: Annotated[bool, typer.Option("--no-recorded", help="Leave the recorded images out.")] = False,
-    min_points: Annotated[
-        int,
-        typer.Option(
-            help="How many LiDAR points a box needs to be in the set. Boxes of which nearer surfaces hide more than "
-            "95 % are left out in any case."
-        ),
-    ] = 1,
+    min_points: MinPointsOption = 1,
     store: StoreOption = DEFAULT_STORE,
 ) -> None:
     """Make a training set with images next to the recorded path.
@@ -119,7 +123,7 @@ def parse_shifts(text: str, option: str) -> list[float]:
             raise ConfigError(f"cannot read {option} {text!r}", remedy=remedy)
         size = check_number(float(found["size"]), option, 0, _MAX_SHIFT_M)
         sign = found["sign"] or "+"
-        if sign in "+-":
+        if sign in ("+", "-"):
             # Without a minus zero, which would be another path by its name.
             shifts.append(size if sign == "+" or not size else -size)
         else:

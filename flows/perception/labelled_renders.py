@@ -86,7 +86,7 @@ def _choose_frames(chunk: Chunk, frames: Sequence[int] | None, every: int) -> li
     if unknown:
         remedy = f"It has {chunk.frames[0]} to {chunk.frames[-1]}."
         raise InputError(
-            "the chunk has no such frame", remedy=remedy, log=chunk.log, chunk=chunk.index, frame=unknown[0]
+            f"the chunk has no frame {unknown[0]}", remedy=remedy, log=chunk.log, chunk=chunk.index, frame=unknown[0]
         )
     return sorted(frames)
 

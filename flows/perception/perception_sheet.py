@@ -14,7 +14,7 @@ from genre_tasks.detection.drawing import draw_detections
 
 _TILE_WIDTH_PX = 640
 _TITLE_PX = 24
-_FONT_PX = 16
+_FONT_PX = 14
 
 
 def draw_sheet(perceived: Sequence[PerceivedImage], class_names: Sequence[str]) -> NDArray[np.uint8]:
@@ -42,8 +42,9 @@ def draw_sheet(perceived: Sequence[PerceivedImage], class_names: Sequence[str]) 
         # Drawn at the tile's size, so that the labels can be read.
         scaled = _scale(one, tile_width, tile_height)
         picture = draw_detections(scaled.image, scaled.detections, class_names)
-        where = "recorded" if one.source == "recorded" else f"rendered, {one.shift_m:+g} m"
-        title = f"{one.camera}, frame {one.frame}, {where}: {len(one.detections)} detections"
+        where = "recorded" if one.source == "recorded" else f"rendered {one.shift_m:+g} m"
+        # Short enough for an image of the presets' width.
+        title = f"{one.camera} {one.frame}, {where}: {len(one.detections)}"
         draw.text((left + 4, top + 2), title, fill="black", font=font)
         sheet.paste(Image.fromarray(picture), (left, top + _TITLE_PX))
     return np.asarray(sheet).copy()

@@ -64,7 +64,7 @@ def box_corners(camera_SE3_box: Float64, size_m: Float64) -> Float64:
     return placed
 
 
-def find_boxes_in_sight(corners: Float64, lens: Lens) -> NDArray[np.int64]:
+def find_boxes_in_view(corners: Float64, lens: Lens) -> NDArray[np.int64]:
     """Finds the boxes that may be in an image, fast: the others lie behind the camera or on one side of its view.
 
     Args:

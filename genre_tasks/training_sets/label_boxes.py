@@ -20,7 +20,7 @@ from genre_tasks.scene.novel_views import NovelView
 from genre_tasks.scene.transforms import invert_se3, shift_laterally
 from genre_tasks.training_sets.box_outlines import (
     box_corners,
-    find_boxes_in_sight,
+    find_boxes_in_view,
     measure_occlusion,
     outline_box,
 )
@@ -145,7 +145,7 @@ class LogLabeller:
         velocities = found.world_velocity_m_s @ camera_SE3_world[:3, :3].T
         corners = box_corners(poses, found.size_m)
         labelled = []
-        for k in find_boxes_in_sight(corners, view.lens):
+        for k in find_boxes_in_view(corners, view.lens):
             outline = outline_box(corners[k], view.lens)
             if outline is None or _holds_camera(poses[k], found.size_m[k]):
                 continue
