@@ -81,19 +81,17 @@ class Detector3dNetwork(nn.Module):
         super().__init__()
         half = width // 2
         levels = (width, 2 * width, 3 * width, 4 * width)
-        self.stem = nn.Conv2d(5, half, 3, 2, 1, bias=False)
-        self.stem_norm = _norm(half)
+        # Without a norm: its input has about zero mean and unit variance, and the largest map's norm is slow.
+        self.stem = nn.Conv2d(5, half, 3, 2, 1)
         self.levels = nn.ModuleList(
             _Block(inputs, outputs, 2) for inputs, outputs in zip((half, *levels[:-1]), levels, strict=True)
         )
         self.laterals = nn.ModuleList(nn.Conv2d(channels, width, 1) for channels in levels)
-        self.smooth = nn.Conv2d(width, width, 3, 1, 1, bias=False)
-        self.smooth_norm = _norm(width)
         self.heat_hidden = nn.Conv2d(width, width, 3, 1, 1)
         self.heat = nn.Conv2d(width, classes, 1)
         self.regression_hidden = nn.Linear(9 * width, 4 * width)
         self.regression = nn.Linear(4 * width, _REGRESSIONS)
-        nn.init.constant_(self.heat.bias, math.log(_FIRST_HEAT / (1 - _FIRST_HEAT)))
+        nn.init.constant_(self.get_parameter("heat.bias"), math.log(_FIRST_HEAT / (1 - _FIRST_HEAT)))
         nn.init.zeros_(self.regression.bias)
 
     def forward(self, images: Tensor, principal_points: Tensor) -> tuple[Tensor, Tensor]:
@@ -107,7 +105,7 @@ class Detector3dNetwork(nn.Module):
             Logits of the heatmaps [B, C, h, w], and features [B, F, h, w]; h and w are those of the padded image over
             ``STRIDE``.
         """
-        x = functional.relu(self.stem_norm(self.stem(_prepare(images, principal_points))))
+        x = functional.relu(self.stem(_prepare(images, principal_points)))
         features = []
         for level in self.levels:
             x = level(x)
@@ -115,9 +113,7 @@ class Detector3dNetwork(nn.Module):
         merged = self.laterals[-1](features[-1])
         for lateral, feature in zip(list(self.laterals)[-2::-1], features[-2::-1], strict=True):
             merged = functional.interpolate(merged, scale_factor=2.0, mode="nearest") + lateral(feature)
-        shared = functional.relu(self.smooth_norm(self.smooth(merged)))
-        heat = self.heat(functional.relu(self.heat_hidden(shared)))
-        return heat, shared
+        return self.heat(functional.relu(self.heat_hidden(merged))), merged
 
     def regress(self, features: Tensor, images: Tensor, cells: Tensor) -> Regressions:
         """Reads off what objects are like.
@@ -153,7 +149,7 @@ def _norm(channels: int) -> nn.Module:
 
 
 def _prepare(images: Tensor, principal_points: Tensor) -> Tensor:
-    """Pads images, brings them to about zero mean and unit variance, and adds places relative to the principal point."""
+    """Pads images, centres and scales their values, and adds places relative to the principal point."""
     height, width = images.shape[-2:]
     padded_height = math.ceil(height / PADDING) * PADDING
     padded_width = math.ceil(width / PADDING) * PADDING
