@@ -81,12 +81,14 @@ class Detector3dNetwork(nn.Module):
         super().__init__()
         half = width // 2
         levels = (width, 2 * width, 3 * width, 4 * width)
-        # Without a norm: its input has about zero mean and unit variance, and the largest map's norm is slow.
-        self.stem = nn.Conv2d(5, half, 3, 2, 1)
+        self.stem = nn.Conv2d(5, half, 3, 2, 1, bias=False)
+        self.stem_norm = _norm(half)
         self.levels = nn.ModuleList(
             _Block(inputs, outputs, 2) for inputs, outputs in zip((half, *levels[:-1]), levels, strict=True)
         )
         self.laterals = nn.ModuleList(nn.Conv2d(channels, width, 1) for channels in levels)
+        self.smooth = nn.Conv2d(width, width, 3, 1, 1, bias=False)
+        self.smooth_norm = _norm(width)
         self.heat_hidden = nn.Conv2d(width, width, 3, 1, 1)
         self.heat = nn.Conv2d(width, classes, 1)
         self.regression_hidden = nn.Linear(9 * width, 4 * width)
@@ -105,7 +107,7 @@ class Detector3dNetwork(nn.Module):
             Logits of the heatmaps [B, C, h, w], and features [B, F, h, w]; h and w are those of the padded image over
             ``STRIDE``.
         """
-        x = functional.relu(self.stem(_prepare(images, principal_points)))
+        x = functional.relu(self.stem_norm(self.stem(_prepare(images, principal_points))))
         features = []
         for level in self.levels:
             x = level(x)
@@ -113,7 +115,9 @@ class Detector3dNetwork(nn.Module):
         merged = self.laterals[-1](features[-1])
         for lateral, feature in zip(list(self.laterals)[-2::-1], features[-2::-1], strict=True):
             merged = functional.interpolate(merged, scale_factor=2.0, mode="nearest") + lateral(feature)
-        return self.heat(functional.relu(self.heat_hidden(merged))), merged
+        shared = functional.relu(self.smooth_norm(self.smooth(merged)))
+        heat = self.heat(functional.relu(self.heat_hidden(shared)))
+        return heat, shared
 
     def regress(self, features: Tensor, images: Tensor, cells: Tensor) -> Regressions:
         """Reads off what objects are like.
