@@ -93,11 +93,12 @@ def restore_checkpoint(training: DetectorTraining, path: Path, config: Detector3
     weights = {name.removeprefix("weights."): value for name, value in tensors.items() if name.startswith("weights.")}
     # Before anything is changed: a refused checkpoint leaves the training as it was.
     require_weights_fit(weights, training.network.state_dict(), path, REMEDY, STAGE)
+    for name, _ in training.network.named_parameters():
+        if any(f"optimiser.{key}.{name}" not in tensors for key in ADAM_NAMES):
+            raise InputError(f"the checkpoint has no moments of {name}", remedy=REMEDY, file=path, stage=STAGE)
     training.network.load_state_dict(weights)
     for name, parameter in training.network.named_parameters():
-        state = {key: tensors.get(f"optimiser.{key}.{name}") for key in ADAM_NAMES}
-        if any(value is None for value in state.values()):
-            raise InputError(f"the checkpoint has no moments of {name}", remedy=REMEDY, file=path, stage=STAGE)
+        state = {key: tensors[f"optimiser.{key}.{name}"] for key in ADAM_NAMES}
         # In the layout of the weights, as the optimiser makes them: sums in another order have other last bits.
         training.optimiser.state[parameter] = {
             "step": state["step"],

@@ -12,6 +12,7 @@ from genre_tasks.detection3d.detector import Detector3d
 from genre_tasks.detection3d.examples import select_boxes
 from genre_tasks.detection3d.settings import Detector3dConfig
 from genre_tasks.errors import InputError
+from genre_tasks.logs.types import Float64
 from genre_tasks.progress import Progress, silent
 from genre_tasks.training_sets.labelled_images import LabelledImage
 
@@ -36,6 +37,7 @@ def evaluate_detector(
     for n, image in enumerate(images):
         progress(n, len(images), "detect")
         found.append(detector.detect(image.image, image.lens))
+    progress(len(images), len(images), "detect")
     return score_detections(found, images, detector.config)
 
 
@@ -68,7 +70,7 @@ def score_detections(
     return DetectionScores(tuple(classes), len(images))
 
 
-def _collect(found: Sequence[Detections3d], kind: int, max_range_m: float) -> tuple[Centres, np.ndarray]:
+def _collect(found: Sequence[Detections3d], kind: int, max_range_m: float) -> tuple[Centres, Float64]:
     """Centres and scores of one class in all images, as far as truth is counted."""
     samples = []
     centres = []

@@ -203,8 +203,8 @@ def project_centre(centre: NDArray[np.float64], lens: Lens) -> tuple[float, floa
     >>> project_centre(np.array([1.0, 0.5, 10.0]), Lens(100.0, 100.0, 32.0, 16.0, 64, 32))
     (42.0, 21.0)
     """
-    x, y = distort(float(centre[0] / centre[2]), float(centre[1] / centre[2]), lens.coefficients)
-    return lens.fx_px * x + lens.cx_px, lens.fy_px * y + lens.cy_px
+    x, y = distort(centre[:1] / centre[2], centre[1:2] / centre[2], lens.coefficients)
+    return float(lens.fx_px * x[0] + lens.cx_px), float(lens.fy_px * y[0] + lens.cy_px)
 
 
 def observation_angle(camera_SE3_box: NDArray[np.float64]) -> float:

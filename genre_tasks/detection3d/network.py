@@ -93,7 +93,7 @@ class Detector3dNetwork(nn.Module):
         self.heat = nn.Conv2d(width, classes, 1)
         self.regression_hidden = nn.Linear(9 * width, 4 * width)
         self.regression = nn.Linear(4 * width, _REGRESSIONS)
-        nn.init.constant_(self.heat.bias, math.log(_FIRST_HEAT / (1 - _FIRST_HEAT)))
+        nn.init.constant_(self.get_parameter("heat.bias"), math.log(_FIRST_HEAT / (1 - _FIRST_HEAT)))
         nn.init.zeros_(self.regression.bias)
 
     def forward(self, images: Tensor, principal_points: Tensor) -> tuple[Tensor, Tensor]:
@@ -153,7 +153,7 @@ def _norm(channels: int) -> nn.Module:
 
 
 def _prepare(images: Tensor, principal_points: Tensor) -> Tensor:
-    """Pads images, brings them to about zero mean and unit variance, and adds places relative to the principal point."""
+    """Pads images, centres and scales their values, and adds places relative to the principal point."""
     height, width = images.shape[-2:]
     padded_height = math.ceil(height / PADDING) * PADDING
     padded_width = math.ceil(width / PADDING) * PADDING

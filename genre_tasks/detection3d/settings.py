@@ -41,6 +41,7 @@ PEDESTRIAN = DetectedClass(
     name="pedestrian",
     labels=(
         "Pedestrian",
+        "Pedestrian with Object",
         "Person",
         "human.pedestrian.adult",
         "human.pedestrian.child",

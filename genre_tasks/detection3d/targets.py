@@ -1,4 +1,4 @@
-"""What the network should answer for a batch: heatmaps with a bump at each centre, and numbers at the centres' cells."""
+"""What the network should answer for a batch: heatmaps with a bump at each centre, and numbers at its cell."""
 
 from __future__ import annotations
 
