@@ -14,43 +14,49 @@ from flows.defaults import DEFAULT_STORE
 _MAX_COUNT = 1_000_000
 
 
+DetectorOption = Annotated[
+    str,
+    typer.Option(
+        metavar="DETECTOR",
+        help="An ONNX or TFLite file of FastestDet or of a YOLO family, torchvision:NAME, or detectron2:CONFIG.",
+    ),
+]
+PerceptionFolderOption = Annotated[
+    Path,
+    typer.Option(
+        parser=parse_path,
+        metavar="PATH",
+        help="The folder for detections.parquet and perception.png; those that are there are replaced.",
+    ),
+]
+ShiftsOption = Annotated[
+    str,
+    typer.Option(
+        help="How many metres to the left of the path scenes are rendered; negative is to the right, and ±3 is "
+        "both sides. Several are separated by commas. Renders at 0 are compared with the recorded images."
+    ),
+]
+ClassNamesOption = Annotated[
+    Path | None,
+    typer.Option(
+        parser=parse_path,
+        metavar="PATH",
+        help="A text file with the names of the detector's classes, one a line. Those in the detector's file, or "
+        "COCO's, if not given.",
+    ),
+]
+
+
 def perceive(
     run: RunArgument,
-    detector: Annotated[
-        str,
-        typer.Option(
-            metavar="DETECTOR",
-            help="An ONNX or TFLite file of FastestDet or of a YOLO family, torchvision:NAME, or detectron2:CONFIG.",
-        ),
-    ],
-    out: Annotated[
-        Path,
-        typer.Option(
-            parser=parse_path,
-            metavar="PATH",
-            help="The folder for detections.parquet and perception.png; those that are there are replaced.",
-        ),
-    ],
-    shift: Annotated[
-        str,
-        typer.Option(
-            help="How many metres to the left of the path scenes are rendered; negative is to the right, and ±3 is "
-            "both sides. Several are separated by commas. Renders at 0 are compared with the recorded images."
-        ),
-    ] = "0,1,2,3",
+    detector: DetectorOption,
+    out: PerceptionFolderOption,
+    shift: ShiftsOption = "0,1,2,3",
     cameras: Annotated[
         str | None, typer.Option(help="Names of cameras, separated by commas. All cameras if not given.")
     ] = None,
     every: Annotated[int, typer.Option(help="Take every n-th frame.")] = 1,
-    class_names: Annotated[
-        Path | None,
-        typer.Option(
-            parser=parse_path,
-            metavar="PATH",
-            help="A text file with the names of the detector's classes, one a line. Those in the detector's file, or "
-            "COCO's, if not given.",
-        ),
-    ] = None,
+    class_names: ClassNamesOption = None,
     min_score: Annotated[float, typer.Option(help="Leave out detections with a lower score.")] = 0.3,
     stage: SceneStageOption = None,
     chunk: RunChunkOption = None,

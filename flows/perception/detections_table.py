@@ -59,6 +59,7 @@ class DetectionsTable:
                 *(self._class_names[found.classes[index]], float(found.scores[index]), *corners),
                 None if found.masks is None else encode_mask(found.masks[index]),
             )
+            # In the order of the schema.
             for values, value in zip(self._columns.values(), row, strict=True):
                 values.append(value)
 

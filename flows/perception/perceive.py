@@ -117,6 +117,7 @@ def perceive_run(request: PerceiveRequest, detector: Detector, progress: Progres
     findings = _Findings(detector, frames[len(frames) // 2], has_path=0.0 in request.shifts_m)
     for perceived in perceive_views(part.chunk, part.scene, views, request.shifts_m, detector, progress):
         findings.add(perceived)
+    # Read from the run, since the request may leave it open.
     stage = scenes.find_stage(number)
     facts = {"log": part.chunk.log, "chunk": str(number), "stage": stage, "run": str(scenes.record["run"])}
     files = findings.write(request.out, facts)
@@ -158,6 +159,7 @@ class _Findings:
         kind = (perceived.source, perceived.shift_m)
         self._images[kind] += 1
         self._finds[kind] += int(np.isin(perceived.detections.classes, self.counted).sum())
+        # The pixels of one frame alone are kept.
         if perceived.frame == self.shown_frame:
             self._shown.append(perceived)
         place = (perceived.camera, perceived.frame)
@@ -169,6 +171,7 @@ class _Findings:
 
     def _match(self, recorded: Detections, rendered: Detections) -> None:
         self.box_matches.append(match_image(recorded, rendered, self.counted))
+        # Masks as well, because they tell shapes apart that share a rectangle.
         if self.detector.has_masks:
             self.mask_matches.append(match_image(recorded, rendered, self.counted, of_masks=True))
 
@@ -178,6 +181,7 @@ class _Findings:
 
     def write(self, folder: Path, facts: dict[str, str]) -> tuple[str, ...]:
         """Writes the table and the picture, and gives their paths."""
+        # Made only now: a run that fails leaves no empty folder.
         folder.mkdir(parents=True, exist_ok=True)
         table = folder / TABLE_NAME
         self._table.write(table, facts)

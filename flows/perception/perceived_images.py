@@ -106,6 +106,7 @@ def perceive_views(
     Raises:
         InputError: a recorded image cannot be decoded.
     """
+    # Poses of these frames alone, as finding the nearest recorded image of each view takes time.
     frames = sorted({view.frame for view in views})
     # Without a shift the recorded view itself, which knows exposure and shutter.
     moved: dict[float, dict[tuple[str, int], NovelView]] = {

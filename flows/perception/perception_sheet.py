@@ -27,6 +27,7 @@ def draw_sheet(perceived: Sequence[PerceivedImage], class_names: Sequence[str]) 
     Returns:
         [H, W, 3] sRGB.
     """
+    # In the order in which they came, which is that of the rig and of the shifts.
     cameras = list(dict.fromkeys(one.camera for one in perceived))
     rows = list(dict.fromkeys((one.source, one.shift_m) for one in perceived))
     height, width = perceived[0].image.shape[:2]

@@ -31,15 +31,18 @@ def choose_class_names(
     >>> choose_class_names(2, {"names": "{0: 'car', 1: 'tram'}"}, None, Path("x.onnx"))
     ('car', 'tram')
     """
+    # Most published weights are trained on COCO, and few files say so.
     names: tuple[str, ...] = COCO_CLASSES
     source = "COCO's list of class names"
     stored = find_stored_names(metadata)
+    # What the user gives counts more than what the file says of itself.
     if class_names_file is not None:
         names = read_class_names(class_names_file)
         source = f"the list {class_names_file}"
     elif stored is not None:
         names = stored
         source = "the file's list of class names"
+    # A list that is too short would fail at some image, and a longer one would give wrong names without an error.
     if class_count is not None and len(names) != class_count:
         raise InputError(
             f"the detector has {class_count} classes, and {source} has {len(names)}",
@@ -64,6 +67,7 @@ def read_class_names(path: Path) -> tuple[str, ...]:
         raise InputError(
             f"the list of class names cannot be read: {error}", remedy="Give a text file, a name a line.", file=path
         ) from error
+    # Editors leave an empty line at the end.
     names = tuple(line.strip() for line in lines if line.strip())
     if not names:
         raise InputError("the list of class names is empty", remedy="Give a text file, a name a line.", file=path)
@@ -84,10 +88,12 @@ def find_stored_names(metadata: dict[str, str]) -> tuple[str, ...] | None:
     ('car', 'tram')
     """
     for key, text in metadata.items():
+        # ONNX files hold the mapping itself, archives behind TFLite files a text with all facts.
         value = _parse_literal(text)
         found = value if key == "names" else value.get("names") if isinstance(value, dict) else None
         if isinstance(found, list | tuple) and found:
             return tuple(str(name) for name in found)
+        # JSON has only texts for keys, so the numbers are compared as numbers: "10" comes after "9".
         if isinstance(found, dict) and found and all(str(number).isdigit() for number in found):
             return tuple(str(found[number]) for number in sorted(found, key=int))
     return None

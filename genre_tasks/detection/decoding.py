@@ -75,6 +75,7 @@ def decode_yolox(output: Float32, input_size: tuple[int, int], min_score: float)
     Returns:
         The candidates, with boxes in pixels of the input.
     """
+    # Only the best class of a cell: a second one would be a second box in the same place.
     score = output[:, 4] * output[:, 5:].max(1)
     good = score >= min_score
     centre = output[good, :2].astype(np.float64)
@@ -100,6 +101,7 @@ def decode_yolov5(output: Float32, input_size: tuple[int, int], min_score: float
     Returns:
         The candidates, with boxes in pixels of the input.
     """
+    # Coefficients are no scores: as classes they would win everywhere.
     end = output.shape[1] - mask_channels
     score = output[:, 4] * output[:, 5:end].max(1)
     good = score >= min_score
@@ -124,6 +126,7 @@ def decode_yolov8(output: Float32, input_size: tuple[int, int], min_score: float
     score = output[4:end].max(0)
     good = score >= min_score
     rows = output[:, good].T
+    # The unit is found from all cells, since the boxes of one image can all be small.
     boxes = _corners(rows[:, :2], rows[:, 2:4]) * _find_unit(output[:4].T, input_size)
     return _gather(boxes, score[good], rows[:, 4:end].argmax(1), rows[:, end:])
 
@@ -139,6 +142,7 @@ def decode_end_to_end(output: Float32, input_size: tuple[int, int], min_score: f
     Returns:
         The candidates, with boxes in pixels of the input.
     """
+    # Rows without a box are zeros, whose score is below any but 0.
     rows = output[output[:, 4] >= min_score]
     boxes = rows[:, :4] * _find_unit(output[:, :4], input_size)
     return _gather(boxes, rows[:, 4], rows[:, 5].round(), rows[:, 6:])

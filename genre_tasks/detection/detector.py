@@ -64,10 +64,13 @@ def open_detector(
         ConfigError: a package that the detector needs is not installed, or ``min_score`` is out of range.
         InputError: there is no such detector, it is of no supported family, or the names do not fit it.
     """
+    # Written so that NaN is refused, too.
     if not 0 <= min_score <= 1:
         raise ConfigError(f"a detector's least score is {min_score}", remedy="Give one between 0 and 1.")
+    # Only these two words: a drive letter or any other colon belongs to a path.
     library, colon, name = path_or_name.partition(":")
     if colon and library in ("torchvision", "detectron2"):
+        # The libraries are imported by who asks for them.
         from genre_tasks.detection.library_detectors import Detectron2Detector, TorchvisionDetector
 
         kind = TorchvisionDetector if library == "torchvision" else Detectron2Detector
@@ -82,6 +85,7 @@ def _open_file(path: Path, class_names_file: Path | None, min_score: float) -> D
 
     openers: dict[str, Callable[[Path], Network]] = {".onnx": open_onnx, ".tflite": open_litert}
     opener = openers.get(path.suffix.lower())
+    # The ending first: a folder, say, is no detector in any case.
     if opener is None:
         raise InputError(
             "this is no detector",

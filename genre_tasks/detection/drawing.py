@@ -58,6 +58,7 @@ def draw_detections(image: NDArray[np.uint8], detections: Detections, class_name
         number = int(detections.classes[index])
         color = choose_color(number)
         left, top, right, bottom = (float(x) for x in detections.boxes[index])
+        # Pillow draws the last row and column, too.
         corners = (left, top, max(left, right - 1), max(top, bottom - 1))
         draw.rectangle(corners, outline=color, width=thickness)
         text = f"{class_names[number]} {detections.scores[index]:.2f}"

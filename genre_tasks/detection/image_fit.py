@@ -56,6 +56,7 @@ def fit_image(image: NDArray[np.uint8], input_size: tuple[int, int], form: Outpu
     """
     height, width = input_size
     rows, columns = image.shape[:2]
+    # Stretched images fill the input, whatever their shape is.
     scaled_size = (width, height)
     if form.fit is not Fit.STRETCHED:
         scale = min(width / columns, height / rows)
@@ -69,5 +70,6 @@ def fit_image(image: NDArray[np.uint8], input_size: tuple[int, int], form: Outpu
     canvas[top : top + scaled_size[1], left : left + scaled_size[0]] = scaled
     channels = canvas[..., ::-1] if form.blue_first else canvas
     values = channels.transpose(2, 0, 1)[None].astype(np.float32) / np.float32(form.divisor)
+    # The scale of the rounded size: rounding moves far edges by up to half a pixel.
     placement = Placement((scaled_size[0] / columns, scaled_size[1] / rows), (float(left), float(top)))
     return np.ascontiguousarray(values), placement

@@ -59,6 +59,7 @@ class TorchvisionDetector:
         known = models.list_models(module=models.detection)
         if name not in known:
             raise InputError(f"torchvision has no detector '{name}'", remedy=f"It has {', '.join(sorted(known))}.")
+        # The best weights that torchvision has; their list of classes comes with them.
         weights = models.get_model_weights(name).DEFAULT
         names = _choose_names(tuple(weights.meta["categories"]), class_names_file)
         device = _find_device()
@@ -74,6 +75,7 @@ class TorchvisionDetector:
         Returns:
             The detections, best score first.
         """
+        # A copy, since torch warns about arrays that may not be written.
         values = torch.from_numpy(image.copy()).to(self.device).permute(2, 0, 1).float() / 255
         with torch.no_grad():
             found = {key: value.cpu().numpy() for key, value in self.network([values])[0].items()}
@@ -130,6 +132,7 @@ class Detectron2Detector:
             ) from error
         config = get_cfg()
         try:
+            # A file of the user comes first; in the model zoo names have the form of paths, too.
             if Path(name).is_file():
                 config.merge_from_file(name)
             else:
@@ -142,6 +145,7 @@ class Detectron2Detector:
             ) from error
         config.MODEL.DEVICE = _find_device()
         config.MODEL.ROI_HEADS.SCORE_THRESH_TEST = min_score
+        # Data that are not registered have no names.
         known = getattr(MetadataCatalog.get(config.DATASETS.TRAIN[0]), "thing_classes", None)
         names = _choose_names(None if known is None else tuple(known), class_names_file)
         return Detectron2Detector(DefaultPredictor(config), names, bool(config.MODEL.MASK_ON), min_score)

@@ -79,6 +79,7 @@ class OnnxNetwork:
         Args:
             image: [1, 3, H, W].
         """
+        # Converters to TensorFlow put the channels last.
         given = image.transpose(0, 2, 3, 1) if self._rows_first else image
         outputs = self._session.run(None, {self._name: np.ascontiguousarray(given, self._type)})
         return [_order_map(np.asarray(output, np.float32), self.input_size) for output in outputs]
@@ -222,6 +223,7 @@ def _quantise(values: Float32, detail: dict[str, Any]) -> NDArray[Any]:
     step, zero = detail["quantization"]
     if kind.kind == "f" or not step:
         return np.ascontiguousarray(values, kind)
+    # Rounded and clipped, because a cast would wrap around.
     limits = np.iinfo(kind)
     return np.ascontiguousarray((values / step + zero).round().clip(limits.min, limits.max).astype(kind))
 
@@ -236,6 +238,7 @@ def _dequantise(values: NDArray[Any], detail: dict[str, Any]) -> Float32:
 
 def _read_attached_metadata(path: Path) -> dict[str, str]:
     """Texts of a ZIP archive that tools append to a TFLite file; empty without one."""
+    # The archive stands behind the network, so the ending does not tell.
     if not zipfile.is_zipfile(path):
         return {}
     with zipfile.ZipFile(path) as archive:

@@ -88,6 +88,7 @@ def recognise_form(input_size: tuple[int, int], shapes: Sequence[tuple[int, ...]
     height, width = input_size
     rows = [shape for shape in shapes if len(shape) == 3]
     maps = [shape for shape in shapes if len(shape) == 4]
+    # A batch would be several images, of which all but the first were lost.
     if any(shape[0] != 1 for shape in shapes) or len(rows) + len(maps) != len(shapes):
         return None
     if not rows and len(maps) == 1:
@@ -122,6 +123,7 @@ def _recognise_rows(shape: tuple[int, ...], cells: int, mask_channels: int) -> O
         return OutputForm(Family.YOLOV5, second - 5 - mask_channels, mask_channels)
     if second == cells and first - mask_channels > 4:
         return OutputForm(Family.YOLOV8, first - 4 - mask_channels, mask_channels)
+    # Last, as any other family could have as many numbers in a row by chance.
     if second == 6 + mask_channels:
         return OutputForm(Family.END_TO_END, None, mask_channels)
     return None

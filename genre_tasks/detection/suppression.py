@@ -68,6 +68,7 @@ def suppress_overlaps(
         best = remaining[0]
         rest = remaining[1:]
         kept.append(int(best))
+        # One row at a time: the table of all pairs would have millions of entries at a low least score.
         hidden = box_overlaps(boxes[best][None], boxes[rest])[0] > max_overlap
         remaining = rest[~(hidden & (classes[rest] == classes[best]))]
     return np.array(kept, np.int64)
@@ -106,6 +107,7 @@ def sort_detections(detections: Detections, min_score: float, width: int, height
     """
     limits = np.array([width, height, width, height], np.float32)
     boxes = detections.boxes.clip(0, limits)
+    # Libraries have least scores of their own, which may be lower.
     good = (detections.scores >= min_score) & (boxes[:, 2:] > boxes[:, :2]).all(1)
     cut = Detections(boxes, detections.scores, detections.classes, detections.masks)
     order = np.argsort(-detections.scores, kind="stable")

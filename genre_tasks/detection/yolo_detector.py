@@ -92,6 +92,7 @@ class YoloDetector:
         outputs = self.network.run(values)
         rows, prototypes = self._split_outputs(outputs)
         found = decode_output(self.form, rows, self.network.input_size, self.min_score)
+        # Before the boxes are chosen: a class without a name is an error of the list, wherever its box is.
         self._check_classes(found)
         moved = Candidates(placement.to_image(found.boxes), found.scores, found.classes, found.coefficients)
         best = finish_candidates(moved, width, height)

@@ -65,6 +65,7 @@ def count_detected_actors(detector: Detector, chunk: Chunk, view: AnyView, image
     # Without actors to find the network need not run.
     if not expected:
         return 0, 0
+    # Rounded as a file of the render would be.
     found = detector.detect(_round_to_bytes(image))
     finds = found.boxes[np.isin(found.classes, find_road_users(detector.class_names))]
     return len(expected), _count_overlapped(np.array(expected, np.float32), finds)
