@@ -24,8 +24,8 @@ _CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z i
 _EDGES = np.array([(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit])
 # Between points of an edge, a distorting lens bends it by a fraction of a pixel.
 _BENT_STEPS = 16
-# Points along each side of a face where nearer surfaces are looked for.
-_FACE_STEPS = 8
+# Points along each side of a face where nearer surfaces are looked for; the finer ones where an image shows a strip.
+_FACE_STEPS = (8, 64)
 # A rendered surface is soft, and boxes are drawn to within a hand's breadth.
 _DEPTH_MARGIN_M = 0.2
 _DEPTH_MARGIN = 0.02
@@ -210,23 +210,24 @@ def measure_occlusion(camera_SE3_box: Float64, size_m: Float64, lens: Lens, dept
     Returns:
         Share of the points that are hidden, in [0, 1]; NaN where the image has none of them.
     """
-    points = _points_on_near_faces(camera_SE3_box, size_m)
-    pixels, valid = _to_pixels(points, lens)
-    z = points[valid, 2]
-    column = np.floor(pixels[:, 0]).astype(np.int64)
-    row = np.floor(pixels[:, 1]).astype(np.int64)
-    inside = (column >= 0) & (column < lens.width_px) & (row >= 0) & (row < lens.height_px)
-    if not inside.any():
-        return float("nan")
-    surface = depth[row[inside], column[inside]]
-    limit = z[inside] * (1 - _DEPTH_MARGIN) - _DEPTH_MARGIN_M
-    return float(((surface > 0) & (surface < limit)).mean())
+    for steps in _FACE_STEPS:
+        points = _points_on_near_faces(camera_SE3_box, size_m, steps)
+        pixels, valid = _to_pixels(points, lens)
+        z = points[valid, 2]
+        column = np.floor(pixels[:, 0]).astype(np.int64)
+        row = np.floor(pixels[:, 1]).astype(np.int64)
+        inside = (column >= 0) & (column < lens.width_px) & (row >= 0) & (row < lens.height_px)
+        if inside.any():
+            surface = depth[row[inside], column[inside]]
+            limit = z[inside] * (1 - _DEPTH_MARGIN) - _DEPTH_MARGIN_M
+            return float(((surface > 0) & (surface < limit)).mean())
+    return float("nan")
 
 
-def _points_on_near_faces(camera_SE3_box: Float64, size_m: Float64) -> Float64:
+def _points_on_near_faces(camera_SE3_box: Float64, size_m: Float64, steps: int) -> Float64:
     """Points [N, 3] in camera axes."""
     # Centres of cells: at a box's lower edge the road is as near as the box.
-    ticks = (np.arange(_FACE_STEPS) + 0.5) / _FACE_STEPS - 0.5
+    ticks = (np.arange(steps) + 0.5) / steps - 0.5
     first, second = (grid.ravel() for grid in np.meshgrid(ticks, ticks, indexing="ij"))
     rotation = camera_SE3_box[:3, :3]
     eye = -(rotation * camera_SE3_box[:3, 3, None]).sum(0)

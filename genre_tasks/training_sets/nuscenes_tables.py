@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -176,9 +177,9 @@ class NuScenesTables:
             frames: of the log, rising.
             times_us: of the frames, microseconds since 1970.
         """
-        log_key = self._add(
-            "log", token("log", log), logfile=log, vehicle="unknown", date_captured="1970-01-01", location="unknown"
-        )
+        date = datetime.fromtimestamp(times_us[0] / 1_000_000, UTC).date().isoformat()
+        where = {"vehicle": "unknown", "location": "unknown"}
+        log_key = self._add("log", token("log", log), logfile=log, date_captured=date, **where)
         keys = [token("sample", scene, frame) for frame in frames]
         scene_key = self._add(
             "scene",

@@ -115,6 +115,10 @@ def test_half_a_face_behind_a_nearer_surface_is_half_hidden() -> None:
     depth[:, 50:] = 0.0
     assert measure_occlusion(pose(0, 0, 10), size, LENS, depth) == 0
     assert math.isnan(measure_occlusion(pose(0, 0, -10), size, LENS, depth))
+    # Of a box 2 m wide at 4 m, the image shows a strip of 4 cm, between the points of the coarse grid.
+    strip = pose(2.96, 0, 6)
+    assert outline(strip, (4, 2, 2)).box_px[0] < 100
+    assert measure_occlusion(strip, size, LENS, np.full((100, 100), 1.0, np.float32)) == 1
 
 
 def test_points_are_counted_in_turned_boxes() -> None:

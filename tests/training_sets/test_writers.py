@@ -16,6 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
@@ -265,6 +266,26 @@ def test_images_of_a_parquet_set_are_read_when_they_are_asked_for(street: list[L
         read_training_set(out)
     with pytest.raises(InputError, match=r"description of the training set cannot be read.*genre augment"):
         read_training_set(tmp_path)
+
+
+def test_a_damaged_table_is_one_error_and_opens_no_file_elsewhere(street: list[LabelledImage], tmp_path: Path) -> None:
+    out = tmp_path / "set"
+    write_training_set(street[:1], out, "own")
+    images, boxes = pq.read_table(out / "images.parquet"), pq.read_table(out / "boxes.parquet")
+    wrong_images = {
+        "row 0 names a file outside": ("file", ["../secret.png"]),
+        "row 0 is no image": ("world_SE3_ego", [[math.nan] * 16]),
+        "values are missing in fx_px": ("fx_px", pa.nulls(1, pa.float64())),
+        "a box is of image 0, which is not there": ("image", [7]),
+    }
+    for text, (name, values) in wrong_images.items():
+        pq.write_table(images.set_column(images.column_names.index(name), name, [values]), out / "images.parquet")
+        with pytest.raises(InputError, match=rf"{text}.*images\.parquet.*Write the set again"):
+            read_training_set(out)
+    pq.write_table(images, out / "images.parquet")
+    pq.write_table(boxes.drop_columns(["label"]), out / "boxes.parquet")
+    with pytest.raises(InputError, match=r"lacks the columns label.*boxes\.parquet"):
+        read_training_set(out)
 
 
 @pytest.mark.parametrize("layout", training_set_formats())
