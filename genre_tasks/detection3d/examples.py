@@ -208,7 +208,7 @@ def project_centre(centre: NDArray[np.float64], lens: Lens) -> tuple[float, floa
 
 
 def observation_angle(camera_SE3_box: NDArray[np.float64]) -> float:
-    """Measures how a box is turned to whoever looks at it, which its image shows; its heading alone shows nowhere.
+    """Measures how a box is turned to the camera's ray; the image shows this angle, and not the heading.
 
     Args:
         camera_SE3_box: [4, 4] pose in camera axes.
