@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from flows.cli.augment import augment
 from flows.cli.bench import bench
 from flows.cli.check import check
 from flows.cli.convert import convert
@@ -67,6 +68,7 @@ app.command(name="view")(view)
 app.command(name="simulate")(simulate)
 app.command(name="serve")(serve)
 app.command(name="range")(range_command)
+app.command(name="augment")(augment)
 app.command(name="edit")(edit)
 app.command(name="export")(export)
 app.command(name="import")(import_command)

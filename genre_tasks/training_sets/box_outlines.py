@@ -24,8 +24,8 @@ _CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z i
 _EDGES = np.array([(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit])
 # Between points of an edge, a distorting lens bends it by a fraction of a pixel.
 _BENT_STEPS = 16
-# Points along each side of a face where nearer surfaces are looked for.
-_FACE_STEPS = 8
+# Points along each side of a face where nearer surfaces are looked for; the finer ones where an image shows a strip.
+_FACE_STEPS = (8, 64)
 # A rendered surface is soft, and boxes are drawn to within a hand's breadth.
 _DEPTH_MARGIN_M = 0.2
 _DEPTH_MARGIN = 0.02
@@ -64,7 +64,7 @@ def box_corners(camera_SE3_box: Float64, size_m: Float64) -> Float64:
     return placed
 
 
-def find_boxes_in_sight(corners: Float64, lens: Lens) -> NDArray[np.int64]:
+def find_boxes_in_view(corners: Float64, lens: Lens) -> NDArray[np.int64]:
     """Finds the boxes that may be in an image, fast: the others lie behind the camera or on one side of its view.
 
     Args:
@@ -99,8 +99,9 @@ def outline_box(corners: Float64, lens: Lens) -> Outline | None:
     >>> lens = Lens(fx_px=100.0, fy_px=100.0, cx_px=50.0, cy_px=50.0, width_px=100, height_px=100)
     >>> pose = np.eye(4)
     >>> pose[:3, 3] = 2.5, 0.0, 6.0
-    >>> outline_box(box_corners(pose, np.array([2.0, 2.0, 2.0])), lens)
-    Outline(box_px=(75.0, 30.0, 100.0, 70.0), truncated=0.545...)
+    >>> outline = outline_box(box_corners(pose, np.array([2.0, 2.0, 2.0])), lens)
+    >>> [round(edge, 2) for edge in outline.box_px], round(outline.truncated, 4)
+    ([71.43, 30.0, 100.0, 70.0], 0.4118)
     """
     pixels = _project_edges(corners, lens)
     if not len(pixels):
@@ -144,13 +145,13 @@ def _to_pixels(points: Float64, lens: Lens) -> tuple[Float64, NDArray[np.bool_]]
     # Points on the plane itself are where edges are cut, to within rounding.
     valid = points[:, 2] > NEAR_M * (1 - 1e-6)
     z = np.where(valid, points[:, 2], 1.0)
-    x = points[:, 0] / z
-    y = points[:, 1] / z
+    x: NDArray[np.floating] = points[:, 0] / z
+    y: NDArray[np.floating] = points[:, 1] / z
     if any(lens.distortion):
         valid &= x * x + y * y < fold_radius(lens.coefficients) ** 2
         # Others may overflow a polynomial.
         x, y = distort(np.where(valid, x, 0.0), np.where(valid, y, 0.0), lens.coefficients)
-    pixels = np.stack([x * lens.fx_px + lens.cx_px, y * lens.fy_px + lens.cy_px], 1)
+    pixels: Float64 = np.stack([x * lens.fx_px + lens.cx_px, y * lens.fy_px + lens.cy_px], 1)
     return pixels[valid], valid
 
 
@@ -209,23 +210,24 @@ def measure_occlusion(camera_SE3_box: Float64, size_m: Float64, lens: Lens, dept
     Returns:
         Share of the points that are hidden, in [0, 1]; NaN where the image has none of them.
     """
-    points = _points_on_near_faces(camera_SE3_box, size_m)
-    pixels, valid = _to_pixels(points, lens)
-    z = points[valid, 2]
-    column = np.floor(pixels[:, 0]).astype(np.int64)
-    row = np.floor(pixels[:, 1]).astype(np.int64)
-    inside = (column >= 0) & (column < lens.width_px) & (row >= 0) & (row < lens.height_px)
-    if not inside.any():
-        return float("nan")
-    surface = depth[row[inside], column[inside]]
-    limit = z[inside] * (1 - _DEPTH_MARGIN) - _DEPTH_MARGIN_M
-    return float(((surface > 0) & (surface < limit)).mean())
+    for steps in _FACE_STEPS:
+        points = _points_on_near_faces(camera_SE3_box, size_m, steps)
+        pixels, valid = _to_pixels(points, lens)
+        z = points[valid, 2]
+        column = np.floor(pixels[:, 0]).astype(np.int64)
+        row = np.floor(pixels[:, 1]).astype(np.int64)
+        inside = (column >= 0) & (column < lens.width_px) & (row >= 0) & (row < lens.height_px)
+        if inside.any():
+            surface = depth[row[inside], column[inside]]
+            limit = z[inside] * (1 - _DEPTH_MARGIN) - _DEPTH_MARGIN_M
+            return float(((surface > 0) & (surface < limit)).mean())
+    return float("nan")
 
 
-def _points_on_near_faces(camera_SE3_box: Float64, size_m: Float64) -> Float64:
+def _points_on_near_faces(camera_SE3_box: Float64, size_m: Float64, steps: int) -> Float64:
     """Points [N, 3] in camera axes."""
     # Centres of cells: at a box's lower edge the road is as near as the box.
-    ticks = (np.arange(_FACE_STEPS) + 0.5) / _FACE_STEPS - 0.5
+    ticks = (np.arange(steps) + 0.5) / steps - 0.5
     first, second = (grid.ravel() for grid in np.meshgrid(ticks, ticks, indexing="ij"))
     rotation = camera_SE3_box[:3, :3]
     eye = -(rotation * camera_SE3_box[:3, 3, None]).sum(0)

@@ -6,7 +6,6 @@ moving object moves between the sweep and the image is left out.
 
 from __future__ import annotations
 
-import functools
 from collections import OrderedDict
 from dataclasses import dataclass
 
@@ -21,7 +20,7 @@ from genre_tasks.scene.novel_views import NovelView
 from genre_tasks.scene.transforms import invert_se3, shift_laterally
 from genre_tasks.training_sets.box_outlines import (
     box_corners,
-    find_boxes_in_sight,
+    find_boxes_in_view,
     measure_occlusion,
     outline_box,
 )
@@ -32,6 +31,8 @@ NO_SWEEP_POINTS = -1
 
 # A chunk has twenty frames, and neighbours share some.
 _CACHED_FRAMES = 64
+# Two: whoever compares logs goes from one to the next.
+_CACHED_LOGS = 2
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,7 @@ class LogLabeller:
         velocities = found.world_velocity_m_s @ camera_SE3_world[:3, :3].T
         corners = box_corners(poses, found.size_m)
         labelled = []
-        for k in find_boxes_in_sight(corners, view.lens):
+        for k in find_boxes_in_view(corners, view.lens):
             outline = outline_box(corners[k], view.lens)
             if outline is None or _holds_camera(poses[k], found.size_m[k]):
                 continue
@@ -190,6 +191,9 @@ class LogLabeller:
         else:
             counts = count_points_in_boxes(sweep.points_world, poses, sizes)
         return _FrameBoxes(tracks, poses, sizes, velocities, counts)
+
+
+_labellers: OrderedDict[int, LogLabeller] = OrderedDict()
 
 
 def label_recorded_image(log: DrivingLog, chunk: Chunk, view: View) -> LabelledImage:
@@ -239,18 +243,22 @@ def label_view(
     return labeller_of(log).label_view(chunk, view, image, shift_m=shift_m, rendered=rendered, depth=depth)
 
 
-# Two: whoever compares logs goes from one to the next.
-@functools.lru_cache(maxsize=2)
 def labeller_of(log: DrivingLog) -> LogLabeller:
     """Makes the labeller of a log once.
 
     Args:
-        log: the same object gives the same labeller.
+        log: the same object gives the same labeller, as long as no two others were asked for since.
 
     Raises:
         InputError: the log has no annotations, or they cannot be read.
     """
-    return LogLabeller(log)
+    # By identity: logs need not be comparable. The labeller holds its log, so that the number is not used again.
+    key = id(log)
+    if key not in _labellers:
+        _labellers[key] = LogLabeller(log)
+        if len(_labellers) > _CACHED_LOGS:
+            _labellers.popitem(last=False)
+    return _labellers[key]
 
 
 def count_points_in_boxes(points_world: Float64, world_SE3_box: Float64, size_m: Float64) -> NDArray[np.int64]:

@@ -1,0 +1,1 @@
+"""What perception gains from scenes: labelled images of moved viewpoints."""
