@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -15,6 +17,50 @@ if TYPE_CHECKING:
 NUMBER = 8
 _SECONDS_PER_STEP = 0.2
 """Measured on one core: eight images of 320×180."""
+
+
+@dataclass(frozen=True)
+class DetectorTableParts:
+    """Options that table 8 shares with the other tables, as the command line has them.
+
+    Attributes:
+        logs: to train on.
+        test: logs to test on.
+        preset: name of the preset.
+        store: folder of the store.
+        chunks: of each log; all if ``None``.
+        settings: ``section.key=value``.
+        out: folder to write into.
+    """
+
+    logs: list[str] | None
+    test: list[str] | None
+    preset: str
+    store: str
+    chunks: list[int] | None
+    settings: list[str] | None
+    out: Path
+
+    def request(self, seeds: int, steps: int | None) -> DetectorRequest:
+        """Makes the request.
+
+        Args:
+            seeds: trainings of each row.
+            steps: of a training.
+        """
+        from flows.paper_tables.detector_flow import DetectorRequest
+
+        return DetectorRequest(
+            train=tuple(self.logs or ()),
+            test=tuple(self.test or ()),
+            preset=self.preset,
+            store=self.store,
+            chunks=None if self.chunks is None else tuple(self.chunks),
+            settings=tuple(self.settings or ()),
+            seeds=seeds,
+            steps=steps,
+            out=str(self.out),
+        )
 
 
 def measure_detector_table(request: DetectorRequest, dry_run: bool) -> None:

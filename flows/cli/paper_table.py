@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flows.cli.detector_table import NUMBER, measure_detector_table, refuse_table_8_options
+from flows.cli.detector_table import NUMBER, DetectorTableParts, measure_detector_table, refuse_table_8_options
 from flows.cli.options import (
     ChunksOption,
     DryRunOption,
@@ -136,20 +136,8 @@ def table(
         check_output_file(into, "--into")
     numbers = parse_numbers(chunks, "--chunks")
     if number == NUMBER:
-        from flows.paper_tables.detector_flow import DetectorRequest
-
-        trained = DetectorRequest(
-            train=tuple(logs or ()),
-            test=tuple(test or ()),
-            preset=preset,
-            store=store,
-            chunks=None if numbers is None else tuple(numbers),
-            settings=tuple(settings or ()),
-            seeds=seeds,
-            steps=steps,
-            out=str(out),
-        )
-        measure_detector_table(trained, dry_run)
+        parts = DetectorTableParts(logs, test, preset, store, numbers, settings, out)
+        measure_detector_table(parts.request(seeds, steps), dry_run)
         return
     refuse_table_8_options(test, steps)
     request = TableRequest(
@@ -168,20 +156,19 @@ def table(
         scene=make_scene_inputs(scene, cameras, images, lidar, up=up, scale=scale, chunk_frames=chunk_frames),
         detector=detector,
     )
+    _measure_or_predict(request, dry_run)
+
+
+def _measure_or_predict(request: TableRequest, dry_run: bool) -> None:
+    """Checks a request, prints what was found or assumed about a scene, and measures or predicts."""
     # Mistakes in the request show here, before Prefect's server takes seconds to start.
-    checked = _check(request)
+    checked = request.check()
+    for line in checked.explanation:
+        typer.echo(line, err=True)
     if dry_run:
         _print_prediction(checked)
     else:
         _measure_table(request)
-
-
-def _check(request: TableRequest) -> CheckedRequest:
-    """Checks a request, and prints what was found or assumed about a scene."""
-    checked = request.check()
-    for line in checked.explanation:
-        typer.echo(line, err=True)
-    return checked
 
 
 def _print_prediction(checked: CheckedRequest) -> None:

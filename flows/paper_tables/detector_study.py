@@ -6,10 +6,9 @@ training is found again by its images, settings and code; one that was stopped g
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,22 +18,20 @@ from flows.experiments.log_chunks import LogChunk
 from flows.experiments.result_files import write_text
 from flows.experiments.stages import StageRunner
 from flows.paper_tables.builtin_methods import BUILT_IN
+from flows.paper_tables.cached_images import CachedImages, JoinedImages, digest_values
 from flows.paper_tables.layouts import PROTOCOL
 from flows.paper_tables.training_images import RenderSource, build_source, label_recorded, label_truth, render_shifted
+from flows.pipeline.log_cache import cached_log
 from genre_tasks.detection3d.settings import Detector3dConfig
 from genre_tasks.json_files import read_json_object
 from genre_tasks.progress import Progress, silent
-from storage.code_digest import code_digest
 
 if TYPE_CHECKING:
     from genre_tasks.detection3d.average_precision import DetectionScores
     from genre_tasks.detection3d.detector import Detector3d
-    from genre_tasks.training_sets.labelled_images import LabelledImage
 
 ROWS = {"real": "Real", "real+3dgs": "Real + Sim (3DGS)", "real+genre+": "Real + Sim (GenRe+)"}
 """The paper's rows: recorded images, and what is added to them."""
-
-_LazyImages = Callable[[], "list[LabelledImage]"]
 
 _RECORDED = "genre+"
 """Whose chunk is read where recorded images are all that is needed: the chunk is the same for every method."""
@@ -43,12 +40,7 @@ TEST_EVERY = 2
 TRUTH_EVERY = 4
 """Of recorded test images every second frame is used, of the truth beside the path, which is ray-cast, every fourth."""
 
-_CODE = (
-    "genre_tasks.detection3d.training",
-    "genre_tasks.detection3d.evaluate",
-    "genre_tasks.training_sets.label_boxes",
-    "genre_tasks.render",
-)
+_TRAINING_CODE = ("genre_tasks.detection3d.training", "genre_tasks.detection3d.evaluate")
 
 
 @dataclass(frozen=True)
@@ -97,18 +89,21 @@ class DetectorStudy:
         from genre_tasks.detection3d.evaluate import evaluate_detector
         from genre_tasks.detection3d.training import train_detector
 
-        images, names = self._collect_training_images(row, runner)
+        sets = self._list_training_sets(row, runner)
+        tested = self._list_test_sets(runner)
         config = self.detector.model_copy(update={"seed": seed})
-        folder = self.folder / self._digest(config, names)
+        # Keys of sets follow from all that their images follow from.
+        names = [*(part.key for part in sets), *(joined.key for joined in tested.values())]
+        key = digest_values((config.model_dump(mode="json"), names), _TRAINING_CODE)
+        folder = self.folder / "trainings" / key
         scores_file = folder / "scores.json"
         if scores_file.is_file():
             return dict(read_json_object(scores_file, "the detector's scores", "Delete it, and run again."))
-        detector: Detector3d = train_detector(images(), config, folder / "training.safetensors", progress)
-        scores = {
-            name: _name_scores(evaluate_detector(detector, tested), config.thresholds_m)
-            for name, tested in self._collect_test_images(runner).items()
-            if tested
-        }
+        images = [image for part in sets for image in part.read()]
+        detector: Detector3d = train_detector(images, config, folder / "training.safetensors", progress)
+        scores = {}
+        for name, joined in tested.items():
+            scores[name] = _name_scores(evaluate_detector(detector, joined.read()), config.thresholds_m)
         write_text(scores_file, json.dumps(scores, indent=1) + "\n")
         return scores
 
@@ -122,37 +117,40 @@ class DetectorStudy:
         settings = (*PROTOCOL, *self.settings)
         return build_source(where, BUILT_IN[method], settings, self.preset, self.store)
 
-    def _collect_training_images(self, row: str, runner: StageRunner) -> tuple[_LazyImages, list[str]]:
-        """The images of a row, read when they are asked for, and what names them."""
+    def _list_training_sets(self, row: str, runner: StageRunner) -> list[CachedImages]:
+        """The training sets of a row: recorded images of every chunk, and its renders."""
         _, plus, method = row.partition("+")
-        parts: list[_LazyImages] = []
-        names = [row, f"{self.shift_m:g}"]
+        sets = []
         for where in self.train:
-            real = self.build_source(where, _RECORDED)
-            ingest = runner("ingest", real.job, {})
-            parts.append(partial(label_recorded, real.job, ingest))
-            names.append(ingest.key)
+            sets.append(self._cache_recorded(where, runner, every=1))
             if plus:
                 source = self.build_source(where, method)
                 refs = source.run(runner)
-                parts.append(partial(render_shifted, source, refs, (self.shift_m, -self.shift_m)))
-                names.append(refs[str(source.end)].key)
-        return (lambda: [image for part in parts for image in part()]), names
+                shifts = (self.shift_m, -self.shift_m)
+                names = ("renders", refs["ingest"].key, refs["effects"].key, refs[str(source.end)].key, shifts)
+                sets.append(CachedImages.named(self.folder, names, partial(render_shifted, source, refs, shifts)))
+        return sets
 
-    def _collect_test_images(self, runner: StageRunner) -> dict[str, list[LabelledImage]]:
-        found: dict[str, list[LabelledImage]] = {"recorded": [], "shifted": []}
-        for where in self.test:
-            source = self.build_source(where, _RECORDED)
-            ingest = runner("ingest", source.job, {})
-            found["recorded"] += label_recorded(source.job, ingest, TEST_EVERY)
-            found["shifted"] += label_truth(source.job, ingest, (self.shift_m, -self.shift_m), TRUTH_EVERY)
-        return found
+    def _list_test_sets(self, runner: StageRunner) -> dict[str, JoinedImages]:
+        """The test sets by name; that of shifted images only where every log has a truth."""
+        recorded = [self._cache_recorded(where, runner, TEST_EVERY) for where in self.test]
+        sets = {"recorded": JoinedImages(tuple(recorded))}
+        if all(cached_log(where.log).truth is not None for where in self.test):
+            sets["shifted"] = JoinedImages(tuple(self._cache_truth(where, runner) for where in self.test))
+        return sets
 
-    def _digest(self, config: Detector3dConfig, names: Sequence[str]) -> str:
-        tested = [str(where) for where in self.test]
-        code = code_digest(_CODE[0], lazy_modules=_CODE[1:])
-        values = [config.model_dump(mode="json"), list(names), tested, TEST_EVERY, TRUTH_EVERY, code]
-        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:24]
+    def _cache_recorded(self, where: LogChunk, runner: StageRunner, every: int) -> CachedImages:
+        job = self.build_source(where, _RECORDED).job
+        ingest = runner("ingest", job, {})
+        names = ("recorded", ingest.key, every)
+        return CachedImages.named(self.folder, names, partial(label_recorded, job, ingest, every))
+
+    def _cache_truth(self, where: LogChunk, runner: StageRunner) -> CachedImages:
+        job = self.build_source(where, _RECORDED).job
+        ingest = runner("ingest", job, {})
+        shifts = (self.shift_m, -self.shift_m)
+        names = ("truth", ingest.key, shifts, TRUTH_EVERY)
+        return CachedImages.named(self.folder, names, partial(label_truth, job, ingest, shifts, TRUTH_EVERY))
 
 
 def _name_scores(scores: DetectionScores, thresholds_m: Sequence[float]) -> dict[str, float]:

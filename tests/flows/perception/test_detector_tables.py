@@ -187,7 +187,7 @@ def test_a_row_is_trained_and_tested_once(tmp_path: Path) -> None:
     assert not steps
     study.measure("real", 0, run_stage, count)
     assert steps[-1] == 2
-    assert len(list((tmp_path / "detectors").glob("*/scores.json"))) == 2
+    assert len(list((tmp_path / "detectors").glob("trainings/*/scores.json"))) == 2
 
 
 def test_the_page_of_table_8_has_means_ranges_and_the_papers_numbers() -> None:
