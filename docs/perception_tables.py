@@ -30,6 +30,7 @@ def transfer() -> str:
             for method, name in _NAMES.items():
                 metrics = methods[method]
                 for kind in ("box", "mask"):
+                    # A detector without masks has no such numbers.
                     if f"{kind}/instances" in metrics:
                         values = [_text(metrics.get(f"{kind}/{number}")) for number in _NUMBERS]
                         count = str(int(metrics[f"{kind}/instances"]))
@@ -60,6 +61,7 @@ def shifts() -> str:
         for method in ("genre+", "3dgs"):
             curves = [row["agreement"][detector][method] for row in rows]
             values = []
+            # JSON has shifts as text.
             for shift in ("0", "1", "2", "3", "4", "5"):
                 found = [curve[shift]["box/ap"] for curve in curves if "box/ap" in curve.get(shift, {})]
                 values.append(_text(mean(found) if found else None))
@@ -70,11 +72,13 @@ def shifts() -> str:
 
 def ranges() -> str:
     """How far the guards call scenes reliable, and a detector's agreement there."""
+    # Imported here: the other tables do without the renderer.
     from benchmarks.perception.shifts import agreement_at_range
 
     found = {row["log"]: row for row in _rows("range")}
     lines = []
     for row in _rows("shifts"):
+        # The range takes longer than all else, and is measured on a few streets.
         if row["log"] not in found:
             continue
         reach = found[row["log"]]
@@ -91,6 +95,7 @@ def training() -> str:
     """Scores of detectors that were trained with and without renders: mean over seeds, with least and most."""
     rows = _rows("training")
     lines = []
+    # As in the paper first, then where the paper has no truth.
     for tested in ("recorded", "shifted"):
         for images, words in _ROWS.items():
             scores = [row["scores"][tested] for row in rows if row["images"] == images and tested in row["scores"]]

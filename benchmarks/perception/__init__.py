@@ -100,8 +100,10 @@ class PerceptionBench:
             Cell("metrics", _METRICS_S, measure_metrics),
             Cell("speed", _SPEED_S, partial(measure_speed, folder, every), asked),
         ]
+        # Cars a lane away are a few pixels wide at the preset's size.
         larger = (*settings, *options["transfer_settings"].split())
         for chunk in [int(number) for number in split_option(options["chunks"])][: 1 if quick else None]:
+            # Real data is not shipped, so the benchmark has to run without it.
             if options["pandaset"]:
                 case = PerceptionCase(f"pandaset:{options['pandaset']}", chunk, store, larger)
                 measure = partial(measure_camera_transfer, case, folder, every)

@@ -51,6 +51,7 @@ def measure_camera_transfer(case: PerceptionCase, folder: str, detectors: tuple[
     """
     require_log_folder(case.log)
     paths = list_detectors(folder, detectors)
+    # The front-left camera stays unseen, as in the paper.
     front = restrict_to_front_camera(case)
     images = {}
     for method in (METHOD, *OTHER_METHODS):
@@ -58,6 +59,7 @@ def measure_camera_transfer(case: PerceptionCase, folder: str, detectors: tuple[
         images[method] = render_front_left(job, refs, BUILT_IN[method].end)
     agreement: dict[str, dict[str, Row]] = {}
     differences: list[Row] = []
+    # One detector at a time, so that memory holds one network.
     for name, path in paths.items():
         detector = open_detector(str(path))
         pairs = {method: detect_pairs(detector, found) for method, found in images.items()}
@@ -105,6 +107,7 @@ def camera_transfer_claims(rows: Sequence[Row]) -> Iterator[Claim]:
     """
     for row in rows:
         for difference in row["differences"]:
+            # Unknown where too few images have a find.
             low, high = difference["interval"]
             yield claim(
                 f"perception.transfer_{difference['other']}_{difference['measure'].replace('/', '_')}",

@@ -43,6 +43,7 @@ class PerceptionCase:
     @property
     def name(self) -> str:
         """A short name, such as ``pandaset 002 chunk 1``."""
+        # A folder of a real log, or the seed of a street.
         kind, _, rest = self.log.partition(":")
         part = rest.partition("?")[2].partition("&")[0] or rest.rpartition("/")[2]
         return f"{kind} {part} chunk {self.chunk}"
@@ -63,6 +64,7 @@ class PerceptionCase:
             methods: keys of ``BUILT_IN``.
         """
         configurations = {method: self.job(method).config for method in methods}
+        # Other methods use no weights but the fixer's, which is the same.
         config = PipelineConfig.model_validate(configurations[METHOD])
         weights = [digest_stage_weights(STAGE_BY_NAME[stage], config) for stage in ("gnet", "fnet", "enet")]
         return {"log": self.log, "chunk": self.chunk, "configurations": configurations, "weights": weights}
@@ -77,6 +79,7 @@ def restrict_to_front_camera(case: PerceptionCase) -> PerceptionCase:
     Raises:
         NotMeasuredError: the log is not on this machine.
     """
+    # A setting and not another kind of case, so that stages find it in their keys.
     camera = select_front_camera([camera.name for camera in cached_log(case.log).cameras])
     return PerceptionCase(case.log, case.chunk, case.store, (*case.settings, f"ingest.cameras=[{camera}]"))
 
@@ -105,6 +108,7 @@ def read_scene(case: PerceptionCase, method: str) -> tuple[Chunk, SceneGraph]:
         method: a key of ``BUILT_IN``.
     """
     job, refs = run_method(case, method)
+    # Renders need the lenses that the plan decided on.
     chunk = apply_plan(read_artifact(job, refs["ingest"]), read_artifact(job, refs["effects"]))
     return chunk, read_artifact(job, refs[BUILT_IN[method].end]).scene
 
@@ -123,6 +127,7 @@ def list_detectors(folder: str, names: tuple[str, ...]) -> dict[str, Path]:
         NotMeasuredError: one is missing.
     """
     paths = {Path(name).stem: Path(folder) / name for name in names}
+    # Detectors do not ship; where they are missing the row says so.
     missing = [str(path) for path in paths.values() if not path.is_file()]
     if missing:
         raise NotMeasuredError(f"no detector {missing[0]}")

@@ -54,6 +54,7 @@ def measure_shifts(case: PerceptionCase, folder: str, detectors: tuple[str, ...]
     truth = cached_log(case.log).truth
     if truth is None:
         raise NotMeasuredError("a recorded log has no truth beside its path")
+    # Opened once: reading a network takes longer than an image.
     opened = {name: open_detector(str(path)) for name, path in list_detectors(folder, detectors).items()}
     scenes = {method: read_scene(case, method) for method in COMPARED}
     agreement: dict[str, dict[str, Row]] = {name: {method: {} for method in COMPARED} for name in opened}
@@ -62,6 +63,7 @@ def measure_shifts(case: PerceptionCase, folder: str, detectors: tuple[str, ...]
         chunk = scenes[METHOD][0]
         frames = chunk.frames[::EVERY_FRAME]
         views = place_novel_views(chunk, (shift, -shift) if shift else (0.0,), frames)
+        # Ray-cast once for all methods and detectors.
         true_images = [truth_image(chunk, truth, view) for view in views]
         found = {name: tuple(detector.detect(image) for image in true_images) for name, detector in opened.items()}
         for method, (own_chunk, scene) in scenes.items():
@@ -69,6 +71,7 @@ def measure_shifts(case: PerceptionCase, folder: str, detectors: tuple[str, ...]
             for name, detector in opened.items():
                 finds = tuple(detector.detect(image) for image in images)
                 pairs = DetectionPairs(found[name], finds, find_road_users(detector.class_names))
+                # JSON has no NaN: what was not found has no overlap.
                 numbers = agreement_metrics([pairs], has_masks=detector.has_masks)
                 agreement[name][method][f"{shift:g}"] = {k: v for k, v in numbers.items() if math.isfinite(v)}
         print_progress(f"{case.name} {shift:g} m: done")
@@ -111,6 +114,7 @@ def shift_claims(rows: Sequence[Row]) -> Iterator[Claim]:
         rises = sum(later > earlier for earlier, later in itertools.pairwise(known))
         note = f"{streets}, {detector}: steps from 0 to 5 m at which GenRe+'s box AP rises"
         yield claim("perception.shift_rises", float(rises) if known else None, "<=", 0.0, "steps", note, len(rows))
+        # Paired by street, since streets differ more than shifts do.
         falls = [
             curves["0"]["box/ap"] - curves["5"]["box/ap"]
             for curves in (row["agreement"][detector][METHOD] for row in rows)
@@ -186,6 +190,7 @@ def bootstrap_mean(values: Sequence[float]) -> tuple[float, float] | None:
     """
     if len(values) < 2:
         return None
+    # The same resamples for every claim.
     random = np.random.default_rng(0)
     means = random.choice(np.asarray(values), (_RESAMPLES, len(values))).mean(1)
     low, high = np.percentile(means, (2.5, 97.5))
@@ -208,6 +213,7 @@ def agreement_at_range(row: Row, ranges: Mapping[str, Row], detector: str) -> fl
         return None
     curve = row["agreement"][detector][METHOD]
     known = [(shift, curve[f"{shift:g}"]["box/ap"]) for shift in SHIFTS_M if "box/ap" in curve.get(f"{shift:g}", {})]
+    # Views of both sides are pooled in the curve, so the range is, too.
     reach = (found["left_m"] + found["right_m"]) / 2
     return float(np.interp(reach, [s for s, _ in known], [v for _, v in known])) if known else None
 

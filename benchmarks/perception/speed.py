@@ -33,6 +33,7 @@ def measure_speed(folder: str, detectors: tuple[str, ...]) -> Row:
     Raises:
         NotMeasuredError: a detector is missing.
     """
+    # Noise: what a detector takes hardly depends on what is in the image.
     random = np.random.default_rng(0)
     image = random.integers(0, 256, (SIZE_PX[1], SIZE_PX[0], 3), dtype=np.uint8)
     seconds = {}

@@ -57,6 +57,7 @@ class TrainingCase:
         Args:
             row: a key of ``ROWS``.
         """
+        # Recorded images come from a chunk of this method's, whatever is added to them.
         names = (METHOD, *row.split("+", 1)[1:])
         configurations = {
             name: BUILT_IN[name].configuration("small", (*PROTOCOL, *self.settings)).model_dump(mode="json")
@@ -84,6 +85,7 @@ def measure_training(case: TrainingCase, row: str, seed: int) -> Row:
     Returns:
         ``scores``: by test set, see :meth:`DetectorStudy.measure`.
     """
+    # The product's own study, so that the claim is about what users run.
     study = DetectorStudy(
         train=tuple(LogChunk(log, 0) for log in case.train),
         test=tuple(LogChunk(log, 0) for log in case.test),
@@ -96,9 +98,11 @@ def measure_training(case: TrainingCase, row: str, seed: int) -> Row:
     )
 
     def report(done: int, total: int, note: str = "") -> None:
+        # A line a step would bury what other cells print.
         if done % 100 == 0:
             print_progress(f"training {row} seed {seed}: {done} of {total}, {note}")
 
+    # Training leaves one thread, and later cells need them all.
     threads = torch.get_num_threads()
     scores = study.measure(row, seed, run_stage, report)
     torch.set_num_threads(threads)
@@ -159,6 +163,7 @@ def training_table(rows: Sequence[Row]) -> Iterator[str]:
     yield "| trained on | tested on | mAP | AP@1m | AP@2m | AP@4m | seeds |"
     yield "|---|---|---|---|---|---|---|"
     for tested in ("recorded", "shifted"):
+        # In the paper's order.
         for images, label in ROWS.items():
             texts = []
             for name in _NUMBERS:

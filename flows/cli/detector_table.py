@@ -106,6 +106,7 @@ def refuse_table_8_options(test: list[str] | None, steps: int | None) -> None:
     Raises:
         ConfigError: one is given.
     """
+    # An option without effect would hide a mistake in the number of the table.
     for option, value in (("--test", test), ("--steps", steps)):
         if value is not None:
             raise ConfigError(f"{option} belongs to table {NUMBER}", remedy=f"Leave it out, or ask for table {NUMBER}.")
@@ -126,6 +127,7 @@ def _print_prediction(study: DetectorStudy, seeds: int) -> None:
             base = PipelineConfig.model_validate(source.job.config)
             names = stages_until(str(source.end))
             rows.append(predictor.predict(f"{method} · {where}", source.job, base, names))
+    # Trainings are predicted in full, since only their images tell whether they are there.
     seconds = _SECONDS_PER_STEP * study.detector.steps
     trainings = [(label, seed) for label in ROWS.values() for seed in range(seeds)]
     rows += [{"cell": f"{label} · seed {seed}", "seconds": seconds, "cached": ""} for label, seed in trainings]

@@ -18,7 +18,7 @@ from flows.cli.options import (
     StoreOption,
     WeightsOption,
 )
-from flows.cli.parsing import parse_path
+from flows.cli.parsing import parse_numbers, parse_path
 from flows.cli.scene_options import (
     ChunkFramesOption,
     ImagesOption,
@@ -114,7 +114,6 @@ def table(
     """Measure a table of the paper, with the paper's numbers beside.
 
     Every method runs on every chunk by the paper's protocol. All logs must be of one dataset.
-
     Finished stages come from the store, so a table that was stopped goes on where it was, and tables share stages.
 
     Table 2 also takes a 3D Gaussian scene of any program in the place of logs, and compares it before and after.
@@ -127,18 +126,13 @@ def table(
         genre table 7 pandaset:PATH/002 --chunks 1 --detector yolox_nano.onnx
         genre table 8 'synthetic:street?seed=100' --test 'synthetic:street?seed=900'
     """
-    from flows.cli.output_paths import check_output_file, check_output_folder
-    from flows.cli.parsing import parse_numbers
     from flows.paper_tables.request import TableRequest
 
-    check_output_folder(out, "--out")
-    if into is not None:
-        check_output_file(into, "--into")
+    _check_outputs(out, into)
     numbers = parse_numbers(chunks, "--chunks")
     if number == NUMBER:
         parts = DetectorTableParts(logs, test, preset, store, numbers, settings, out)
-        measure_detector_table(parts.request(seeds, steps), dry_run)
-        return
+        return measure_detector_table(parts.request(seeds, steps), dry_run)
     refuse_table_8_options(test, steps)
     request = TableRequest(
         number=number,
@@ -157,6 +151,14 @@ def table(
         detector=detector,
     )
     _measure_or_predict(request, dry_run)
+
+
+def _check_outputs(out: Path, into: Path | None) -> None:
+    from flows.cli.output_paths import check_output_file, check_output_folder
+
+    check_output_folder(out, "--out")
+    if into is not None:
+        check_output_file(into, "--into")
 
 
 def _measure_or_predict(request: TableRequest, dry_run: bool) -> None:

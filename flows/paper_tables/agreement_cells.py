@@ -50,6 +50,7 @@ def restrict_to_front_camera(layout: Layout, log: str) -> Layout:
     Raises:
         ConfigError: it has none.
     """
+    # Checked before hours of computing.
     names = [camera.name for camera in cached_log(log).cameras]
     select_front_left_camera(names)
     return replace(layout, protocol=(*layout.protocol, f"ingest.cameras=[{select_front_camera(names)}]"))
@@ -74,6 +75,7 @@ def measure_agreement_cell(
     Raises:
         GenreError: as the stages and the detector raise it.
     """
+    # Imported here: what only predicts a table should not load the renderer.
     from flows.perception.camera_transfer import agreement_metrics, detect_pairs
 
     job = basis.job(layout, method, where)
@@ -107,6 +109,7 @@ def render_front_left(job: Job, refs: Mapping[str, ArtifactRef], end: str) -> Im
     """
     from flows.perception.camera_transfer import render_camera
 
+    # Its images are read from the log: the chunk was made without this camera.
     log = cached_log(job.log)
     camera = select_front_left_camera([camera.name for camera in log.cameras])
     return render_camera(log, read_artifact(job, refs["ingest"]), read_artifact(job, refs[end]).scene, camera)

@@ -29,6 +29,7 @@ def agreement_strips(checked: CheckedRequest, runner: StageRunner, frame: int | 
     Raises:
         InputError: the camera has no image of this frame.
     """
+    # The same detector for all rows, or they would not compare.
     detector = open_cached_detector(str(checked.detector))
     where = checked.places[0]
     strips: list[ComparisonStrip] = []

@@ -40,6 +40,7 @@ class CachedImages:
             names: JSON values.
             make: makes the images.
         """
+        # A label's rule may change as well as its scene.
         key = digest_values(list(names), _CODE)
         return CachedImages(key, root / "images" / f"{names[0]}-{key}", make)
 

@@ -67,6 +67,7 @@ class DetectorRequest:
                 "table 8 needs logs to train on and others to test on",
                 remedy="Give the first as arguments, and the others by --test, which may be given several times.",
             )
+        # The protocol decides how long a chunk is.
         config = load_configuration(self.preset, settings=(*PROTOCOL, *self.settings))
         chunks = None if self.chunks is None else list(self.chunks)
         train = select_log_chunks(self.train, chunks, config)
@@ -137,9 +138,11 @@ def detector_table(
         out=out,
     )
     study = request.check()
+    # What killed runs left behind would only take space.
     open_store(store).clean_temporaries()
     reporter = get_reporter()
     scores: dict[str, list[dict[str, dict[str, float]]]] = {row: [] for row in ROWS}
+    # Seed by seed, so that a stopped table has all rows of the first seeds.
     planned = [(row, seed) for seed in range(seeds) for row in ROWS]
     for k, (row, seed) in enumerate(planned):
         reporter.part_started(f"{k + 1}/{len(planned)} {ROWS[row]} · seed {seed}")
@@ -178,6 +181,7 @@ def write_results(
     out = Path(request.out)
     out.mkdir(parents=True, exist_ok=True)
     dataset = cached_log(study.test[0].log).dataset
+    # Numbers without their logs, seeds and machine could not be measured again.
     facts = {
         "trained on": _describe(study.train),
         "tested on": _describe(study.test),
@@ -202,6 +206,7 @@ def render_page(scores: dict[str, list[dict[str, dict[str, float]]]], facts: dic
     paper = PAPER[NUMBER]
     lines = [f"## Table {NUMBER} on {dataset}: {paper.caption}", ""]
     for tested, words in _TESTED.items():
+        # Recorded logs have no truth at the shift.
         if not all(tested in found for runs in scores.values() for found in runs):
             continue
         lines += [f"Tested on {words}: mean over seeds (least–most)" + _PAPERS_NOTE.get(tested, "") + ".", ""]

@@ -89,8 +89,10 @@ class DetectorStudy:
         from genre_tasks.detection3d.evaluate import evaluate_detector
         from genre_tasks.detection3d.training import train_detector
 
+        # Scenes first: they take longest, and fail first if something is wrong.
         sets = self._list_training_sets(row, runner)
         tested = self._list_test_sets(runner)
+        # The seed is part of the key, so that every training has a folder of its own.
         config = self.detector.model_copy(update={"seed": seed})
         # Keys of sets follow from all that their images follow from.
         names = [*(part.key for part in sets), *(joined.key for joined in tested.values())]
@@ -133,8 +135,10 @@ class DetectorStudy:
 
     def _list_test_sets(self, runner: StageRunner) -> dict[str, JoinedImages]:
         """The test sets by name; that of shifted images only where every log has a truth."""
+        # Recorded test images lie on the path, as in the paper.
         recorded = [self._cache_recorded(where, runner, TEST_EVERY) for where in self.test]
         sets = {"recorded": JoinedImages(tuple(recorded))}
+        # Half of a test set would be another test.
         if all(cached_log(where.log).truth is not None for where in self.test):
             sets["shifted"] = JoinedImages(tuple(self._cache_truth(where, runner) for where in self.test))
         return sets

@@ -52,6 +52,7 @@ def build_source(where: LogChunk, method: Method, settings: Sequence[str], prese
     Raises:
         ConfigError: a setting is unknown or out of range.
     """
+    # Values and not the configuration itself: jobs go to workers.
     config = method.configuration(preset, tuple(settings)).model_dump(mode="json")
     return RenderSource(Job(where.log, where.chunk, store, config), method.end)
 
@@ -71,6 +72,7 @@ def label_recorded(job: Job, ref: ArtifactRef, every: int = 1) -> list[LabelledI
 
     chunk: Chunk = read_artifact(job, ref)
     labeller = labeller_of(cached_log(job.log))
+    # Source and held-out frames alike: a detector may learn from all that was recorded.
     frames = chunk.frames[::every]
     return [labeller.label_recorded_image(chunk, view) for view in chunk.views if view.frame in frames]
 
@@ -93,6 +95,7 @@ def render_shifted(
     from genre_tasks.effects.apply_plan import apply_plan
 
     job = source.job
+    # Poses and lenses are those that the scene was fitted with.
     chunk = apply_plan(read_artifact(job, refs["ingest"]), read_artifact(job, refs["effects"]))
     scene = read_artifact(job, refs[str(source.end)]).scene
     return list(render_labelled_images(cached_log(job.log), chunk, scene, shifts_m, recorded=False))
@@ -118,6 +121,7 @@ def label_truth(job: Job, ref: ArtifactRef, shifts_m: Sequence[float], every: in
     from genre_tasks.training_sets.label_boxes import labeller_of
 
     log = cached_log(job.log)
+    # Nobody recorded what is beside the path of a real log.
     if log.truth is None:
         return []
     chunk: Chunk = read_artifact(job, ref)

@@ -41,6 +41,7 @@ def select_front_left_camera(names: Sequence[str]) -> str:
     >>> select_front_left_camera(["CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT"])
     'CAM_FRONT_LEFT'
     """
+    # The word alone: datasets write it in upper and lower case.
     found = [name for name in names if "front" in name.lower() and "left" in name.lower()]
     if not found:
         raise ConfigError(

@@ -78,6 +78,7 @@ def list_camera_views(log: DrivingLog, chunk: Chunk, camera: str) -> tuple[View,
         InputError: the camera has no image in the chunk, or an image or pose cannot be read.
     """
     chunk_SE3_world = invert_se3(chunk.world_SE3_chunk)
+    # At the working resolution, which renders have, too.
     lens = next(c.lens for c in log.cameras if c.name == camera).resized(chunk.width_px, chunk.height_px)
     views = []
     for frame in chunk.frames:
@@ -114,6 +115,7 @@ def render_camera(log: DrivingLog, chunk: Chunk, scene: SceneGraph, camera: str)
     from genre_tasks.stages.evaluation_renders import render_batches
 
     views = list_camera_views(log, chunk, camera)
+    # Recorded images are as coarse as renders, so that size alone makes no difference.
     recorded = [to_pixels(decode_image(v.image, v.lens.width_px, v.lens.height_px)[None])[0] for v in views]
     rendered = [to_pixels(images) for _, images in render_batches(scene, views, RenderSettings(), None)]
     return ImagePairs(views, np.stack(recorded), np.concatenate(rendered))
@@ -143,6 +145,7 @@ def agreement_metrics(pairs: Sequence[DetectionPairs], *, has_masks: bool) -> di
         not found) and ``box/instances``; ``mask/…`` likewise where there are masks.
     """
     metrics: dict[str, float] = {}
+    # Instances are pooled over images first: an image may have none.
     for kind in ("box", "mask") if has_masks else ("box",):
         matches = [image for pair in pairs for image in pair.match(of_masks=kind == "mask")]
         metrics |= {f"{kind}/{name}": value for name, value in _name_numbers(summarise_matches(matches)).items()}

@@ -35,5 +35,6 @@ class Detections:
         Args:
             kept: [N] true for those to keep, or their indices in the wanted order.
         """
+        # Detectors of boxes alone have no masks to select from.
         masks = None if self.masks is None else self.masks[kept]
         return Detections(self.boxes[kept], self.scores[kept], self.classes[kept], masks)

@@ -59,10 +59,12 @@ def score_detections(
     """
     if not images:
         raise InputError("there are no images to evaluate on", remedy="Choose logs with images and boxes.")
+    # The rule of training: what cannot be seen cannot be missed.
     truth = [select_boxes(image, config) for image in images]
     classes = []
     for kind, settings in enumerate(config.classes):
         samples = [n for n, boxes in enumerate(truth) for box_kind, _ in boxes if box_kind == kind]
+        # On the ground, which is the plane of x and z in camera axes.
         centres = [box.camera_SE3_box[[0, 2], 3] for boxes in truth for box_kind, box in boxes if box_kind == kind]
         detected, scores = _collect(found, kind, config.max_range_m)
         true = Centres(np.array(samples, np.int64), np.array(centres, np.float64).reshape(-1, 2))
@@ -77,6 +79,7 @@ def _collect(found: Sequence[Detections3d], kind: int, max_range_m: float) -> tu
     scores = []
     for n, detections in enumerate(found):
         positions = detections.camera_SE3_box[:, [0, 2], 3]
+        # Detections beyond the range of the truth would all be false.
         counts = (detections.classes == kind) & (np.linalg.norm(positions, axis=1) < max_range_m)
         samples.append(np.full(int(counts.sum()), n))
         centres.append(positions[counts])

@@ -36,6 +36,7 @@ class CocoWriter:
         Args:
             labelled: of any lens, since rectangles need no calibration.
         """
+        # The number keeps names apart where several runs have the same log.
         name = f"{len(self._images):06d}_{name_image(labelled)}.png"
         write_image(self._root / _IMAGES / name, labelled.image)
         image_id = len(self._images) + 1
@@ -46,6 +47,7 @@ class CocoWriter:
                 "file_name": name,
                 "width": width,
                 "height": height,
+                # Beyond COCO's own keys, which readers skip: where the image is from.
                 "log": labelled.log,
                 "camera": labelled.camera,
                 "frame": labelled.frame,
@@ -74,6 +76,7 @@ class CocoWriter:
             "bbox": [left, top, right - left, bottom - top],
             "area": (right - left) * (bottom - top),
             "iscrowd": 0,
+            # Trainers of masks expect one; a rectangle says no more than the box.
             "segmentation": [[left, top, right, top, right, bottom, left, bottom]],
             "track_id": box.track_id,
             "truncated": box.truncated,

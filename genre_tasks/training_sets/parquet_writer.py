@@ -67,6 +67,7 @@ class ParquetWriter:
         _write_table(self._root / IMAGES_TABLE, self._images, IMAGE_COLUMNS)
         _write_table(self._root / BOXES_TABLE, self._boxes, BOX_COLUMNS)
         tables = {IMAGES_TABLE: IMAGE_COLUMNS, BOXES_TABLE: BOX_COLUMNS}
+        # The description makes the set readable without this project.
         meanings = {file: {name: text for name, (_, text) in columns.items()} for file, columns in tables.items()}
         counts = {"images": len(self._images), "boxes": len(self._boxes)}
         about = "Images of driving logs, recorded and rendered, with the boxes of their annotation. Units are in names."
@@ -101,6 +102,7 @@ def _describe_box(box: LabelledBox, image: int) -> Row:
 
 
 def _write_table(path: Path, rows: list[Row], columns: Mapping[str, tuple[str, str]]) -> None:
+    # Imported here, because the command line should start without it.
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -112,5 +114,6 @@ def _write_table(path: Path, rows: list[Row], columns: Mapping[str, tuple[str, s
         "numbers": pa.list_(pa.float64()),
         "matrix": pa.list_(pa.float64(), 16),
     }
+    # Stated and not inferred: a set without boxes has the same columns.
     schema = pa.schema([(name, kinds[kind]) for name, (kind, _) in columns.items()])
     pq.write_table(pa.Table.from_pylist(rows, schema=schema), path, compression="zstd")
