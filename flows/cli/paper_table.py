@@ -77,7 +77,7 @@ TestLogsOption = Annotated[
 SeedsOption = Annotated[int, typer.Option(help="For table 8, the number of trainings of each row.")]
 StepsOption = Annotated[
     int | None,
-    typer.Option(help="For table 8, the gradient steps of a training. If not given, 1500."),
+    typer.Option(help="For table 8, the gradient steps of a training. If not given, 1000."),
 ]
 StoredOption = Annotated[
     bool,

@@ -27,6 +27,7 @@ from flows.paper_tables.columns import (
     truth_columns,
 )
 from flows.paper_tables.methods import Method
+from flows.paper_tables.published_numbers import PAPER
 from flows.paper_tables.rollouts import TABLE_ROLLOUTS, TableRollout
 from genre_tasks.errors import ConfigError
 
@@ -102,7 +103,7 @@ def get_layout(number: int, user_methods: Sequence[Method] = (), *, of_scene: bo
     """
     if number not in LAYOUTS:
         raise ConfigError(
-            f"there is no table {number}", remedy=f"Choose from {', '.join(map(str, LAYOUTS))} (paper Sec. IV)."
+            f"there is no table {number}", remedy=f"Choose from {', '.join(map(str, PAPER))} (paper Sec. IV)."
         )
     if of_scene and number not in SCENE_LAYOUTS:
         raise ConfigError(

@@ -58,7 +58,7 @@ class Detector3dConfig(Section):
     The number of gradient steps is fixed, whatever the number of training images.
 
     >>> Detector3dConfig().steps
-    1500
+    1000
     """
 
     classes: Annotated[tuple[DetectedClass, ...], Field(strict=False, min_length=1, max_length=20)] = Field(
@@ -69,7 +69,7 @@ class Detector3dConfig(Section):
     width: int = Field(
         32, ge=16, le=256, multiple_of=16, description="Channels of the feature map at a quarter of the resolution."
     )
-    steps: int = Field(1500, ge=1, le=1_000_000, description="Gradient steps.")
+    steps: int = Field(1000, ge=1, le=1_000_000, description="Gradient steps.")
     batch: int = Field(8, ge=1, le=256, description="Images per step.")
     learning_rate: LearningRate = Field(2e-3, description="Of AdamW, at its largest.")
     warm_up: int = Field(100, ge=1, description="Steps over which the learning rate rises.")
