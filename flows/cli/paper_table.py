@@ -121,7 +121,7 @@ def table(
     Example:
 
     \b
-        genre table 4 'synthetic:street?seed=1000' --chunks 0 --out tables
+        genre table 4 'synthetic:street?seed=1000'
         genre table 2 --scene point_cloud.ply --cameras transforms.json --scale 1
         genre table 7 pandaset:PATH/002 --chunks 1 --detector yolox_nano.onnx
         genre table 8 'synthetic:street?seed=100' --test 'synthetic:street?seed=900'
