@@ -47,7 +47,7 @@ class PerceptionBench:
     options: Mapping[str, str] = {
         "seeds": "1001,1002,1003,1004,1005,1006,1007,1008,1009,1010",
         "train": "100,101,102,103,104,105,106,107",
-        "steps": "",
+        "trainings": "8x1000,4x1500",
         "pandaset": "../shared/data/pandaset/002",
         "chunks": "0,1",
         "detectors": "../shared/data/detectors",
@@ -79,11 +79,11 @@ class PerceptionBench:
         {
             "seeds": TINY_STREET,
             "train": TINY_STREET.replace("900", "901"),
-            "steps": "2",
+            "trainings": "1x2",
             "pandaset": "",
             "settings": TINY_SETTINGS,
         },
-        "training real seed 0",
+        "training 1x2 real seed 0",
     )
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
@@ -118,22 +118,22 @@ class PerceptionBench:
         return cells + self._training_cells(options, quick, streets)
 
     def _training_cells(self, options: Mapping[str, str], quick: bool, streets: list[PerceptionCase]) -> list[Cell]:
-        train = split_option(options["train"])[: 1 if quick else None]
-        logs = [f"synthetic:street?seed={seed}" for seed in train]
-        steps = int(options["steps"]) if options["steps"] else None
-        case = TrainingCase(
-            tuple(logs),
-            tuple(street.log for street in streets),
-            settings_from_options(options),
-            options["store"],
-            steps,
-            Path(options["store"]).parent / "detectors",
-        )
+        logs = tuple(f"synthetic:street?seed={seed}" for seed in split_option(options["train"]))
         cells = []
-        for row in ROWS:
-            for seed in range(1 if quick else _TRAINING_SEEDS):
-                measure = partial(measure_training, case, row, seed)
-                cells.append(Cell(f"training {row} seed {seed}", _TRAINING_S, measure, case.describe(row)))
+        for size in split_option(options["trainings"])[: 1 if quick else None]:
+            count, _, steps = size.partition("x")
+            case = TrainingCase(
+                logs[: int(count)],
+                tuple(street.log for street in streets),
+                settings_from_options(options),
+                options["store"],
+                int(steps),
+                Path(options["store"]).parent / "detectors",
+            )
+            for row in ROWS:
+                for seed in range(1 if quick else _TRAINING_SEEDS):
+                    measure = partial(measure_training, case, row, seed)
+                    cells.append(Cell(f"training {size} {row} seed {seed}", _TRAINING_S, measure, case.describe(row)))
         return cells
 
     def claims(self, rows: Mapping[str, Row]) -> Iterator[Claim]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
+import uuid
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,8 +57,21 @@ class CachedImages:
 
         # A set appears complete or not at all, so that a folder is enough to know.
         if not self.folder.is_dir():
-            write_training_set(self.make(), self.folder, "own")
+            own = self.folder.with_name(f"{self.folder.name}.{uuid.uuid4().hex[:8]}")
+            write_training_set(self.make(), own, "own")
+            _publish(own, self.folder)
         return read_training_set(self.folder)
+
+
+def _publish(own: Path, folder: Path) -> None:
+    """Gives a finished set its name; the first of several trainings that make the same one wins."""
+    try:
+        own.rename(folder)
+    except OSError:
+        # Another training may have been faster, and its images are the same.
+        if not folder.is_dir():
+            raise
+        shutil.rmtree(own)
 
 
 @dataclass(frozen=True)
