@@ -95,19 +95,26 @@ def training() -> str:
     """Scores of detectors that were trained with and without renders: mean over seeds, with least and most."""
     rows = _rows("training")
     lines = []
-    # As in the paper first, then where the paper has no truth.
-    for tested in ("recorded", "shifted"):
-        for images, words in _ROWS.items():
-            scores = [row["scores"][tested] for row in rows if row["images"] == images and tested in row["scores"]]
-            if not scores:
-                continue
-            cells = []
-            for name in ("map", "ap_1m", "ap_2m", "ap_4m"):
-                values = [found[name] for found in scores]
-                cells.append(f"{mean(values):.3f} ({min(values):.3f} to {max(values):.3f})")
-            lines.append([words, tested, *cells, str(len(scores))])
-    head = ["trained on", "tested on", "mAP", "AP@1m", "AP@2m", "AP@4m", "seeds"]
+    for size in sorted({(row["train_logs"], row["steps"]) for row in rows}, reverse=True):
+        # As in the paper first, then where the paper has no truth.
+        for tested in ("recorded", "shifted"):
+            lines += _training_lines([row for row in rows if (row["train_logs"], row["steps"]) == size], tested)
+    head = ["streets", "steps", "trained on", "tested on", "mAP", "AP@1m", "AP@2m", "AP@4m", "mAP of cars", "seeds"]
     return table(head, lines) + "\n" + provenance("perception")
+
+
+def _training_lines(rows: list[dict[str, Any]], tested: str) -> list[list[str]]:
+    lines = []
+    for images, words in _ROWS.items():
+        scores = [row["scores"][tested] for row in rows if row["images"] == images and tested in row["scores"]]
+        if not scores:
+            continue
+        cells = []
+        for name in ("map", "ap_1m", "ap_2m", "ap_4m", "map_car"):
+            values = [found[name] for found in scores]
+            cells.append(f"{mean(values):.3f} ({min(values):.3f} to {max(values):.3f})")
+        lines.append([str(rows[0]["train_logs"]), str(rows[0]["steps"]), words, tested, *cells, str(len(scores))])
+    return lines
 
 
 def speed() -> str:
