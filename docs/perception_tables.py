@@ -95,12 +95,28 @@ def training() -> str:
     """Scores of detectors that were trained with and without renders: mean over seeds, with least and most."""
     rows = _rows("training")
     lines = []
-    for size in sorted({(row["train_logs"], row["steps"]) for row in rows}, reverse=True):
+    for size in sorted({_size_of(row) for row in rows}, reverse=True):
         # As in the paper first, then where the paper has no truth.
         for tested in ("recorded", "shifted"):
-            lines += _training_lines([row for row in rows if (row["train_logs"], row["steps"]) == size], tested)
-    head = ["streets", "steps", "trained on", "tested on", "mAP", "AP@1m", "AP@2m", "AP@4m", "mAP of cars", "seeds"]
+            lines += _training_lines([row for row in rows if _size_of(row) == size], tested)
+    head = [
+        "streets",
+        "steps",
+        "hidden up to",
+        "trained on",
+        "tested on",
+        "mAP",
+        "AP@1m",
+        "AP@2m",
+        "AP@4m",
+        "mAP of cars",
+        "seeds",
+    ]
     return table(head, lines) + "\n" + provenance("perception")
+
+
+def _size_of(row: dict[str, Any]) -> tuple[int, int, float]:
+    return row["train_logs"], row["steps"], row.get("max_occluded", 1.0)
 
 
 def _training_lines(rows: list[dict[str, Any]], tested: str) -> list[list[str]]:
@@ -113,7 +129,8 @@ def _training_lines(rows: list[dict[str, Any]], tested: str) -> list[list[str]]:
         for name in ("map", "ap_1m", "ap_2m", "ap_4m", "map_car"):
             values = [found[name] for found in scores]
             cells.append(f"{mean(values):.3f} ({min(values):.3f} to {max(values):.3f})")
-        lines.append([str(rows[0]["train_logs"]), str(rows[0]["steps"]), words, tested, *cells, str(len(scores))])
+        streets, steps, hidden = _size_of(rows[0])
+        lines.append([str(streets), str(steps), f"{hidden:g}", words, tested, *cells, str(len(scores))])
     return lines
 
 

@@ -47,7 +47,7 @@ class PerceptionBench:
     options: Mapping[str, str] = {
         "seeds": "1001,1002,1003,1004,1005,1006,1007,1008,1009,1010",
         "train": "100,101,102,103,104,105,106,107",
-        "trainings": "8x1000,4x1500",
+        "trainings": "8x1000,4x1500,4x2000x0.7",
         "pandaset": "../shared/data/pandaset/002",
         "chunks": "0,1",
         "detectors": "../shared/data/detectors",
@@ -121,13 +121,15 @@ class PerceptionBench:
         logs = tuple(f"synthetic:street?seed={seed}" for seed in split_option(options["train"]))
         cells = []
         for size in split_option(options["trainings"])[: 1 if quick else None]:
-            count, _, steps = size.partition("x")
+            # Streets, steps, and how much of a box may be hidden.
+            count, steps, hidden = (*size.split("x"), "1")[:3]
             case = TrainingCase(
                 logs[: int(count)],
                 tuple(street.log for street in streets),
                 settings_from_options(options),
                 options["store"],
                 int(steps),
+                float(hidden),
                 Path(options["store"]).parent / "detectors",
             )
             for row in ROWS:

@@ -36,6 +36,7 @@ class TrainingCase:
         settings: ``section.key=value`` over the preset ``small`` and the paper's protocol.
         store: folder of the store.
         steps: of a training.
+        max_occluded: boxes of renders of which nearer surfaces hide more are not trained on.
         folder: where trainings are kept.
     """
 
@@ -44,12 +45,13 @@ class TrainingCase:
     settings: tuple[str, ...]
     store: str
     steps: int
+    max_occluded: float
     folder: Path
 
     @property
     def detector(self) -> Detector3dConfig:
         """The detector's settings."""
-        return Detector3dConfig(steps=self.steps)
+        return Detector3dConfig(steps=self.steps, max_occluded=self.max_occluded)
 
     def describe(self, row: str) -> dict[str, object]:
         """Says what a training depends on beyond the code, for the cells' cache.
@@ -112,7 +114,8 @@ def measure_training(case: TrainingCase, row: str, seed: int) -> Row:
         "seed": seed,
         "train_logs": len(case.train),
         "test_logs": len(case.test),
-        "steps": case.detector.steps,
+        "steps": case.steps,
+        "max_occluded": case.max_occluded,
         "scores": scores,
     }
 
@@ -124,14 +127,14 @@ def training_claims(rows: Sequence[Row]) -> Iterator[Claim]:
         rows: see :func:`measure_training`.
     """
     for size in list_sizes(rows):
-        of_size = [row for row in rows if (row["train_logs"], row["steps"]) == size]
+        of_size = [row for row in rows if size_of(row) == size]
         for tested in ("recorded", "shifted"):
             base = list_scores(of_size, "real", tested, "map")
             ours = list_scores(of_size, "real+genre+", tested, "map")
             gain = mean(ours) - mean(base) if ours and base else None
             # The larger range over seeds of the two rows has to be less than what is gained.
             beyond = None if gain is None else gain - max(max(values) - min(values) for values in (ours, base))
-            trained = f"trained on {size[0]} streets for {size[1]} steps"
+            trained = f"trained on {size[0]} streets for {size[1]} steps, boxes hidden up to {size[2]:g}"
             note = f"{trained}, {tested} images, mean over {len(ours)} seeds, Real + Sim (GenRe+) less Real"
             name = f"perception.training_{tested}"
             yield claim(f"{name}_gain", gain, ">", 0.0, "mAP", note, len(ours))
@@ -139,13 +142,22 @@ def training_claims(rows: Sequence[Row]) -> Iterator[Claim]:
             yield claim(f"{name}_beyond_spread", beyond, ">", 0.0, "mAP", ranged, len(ours))
 
 
-def list_sizes(rows: Sequence[Row]) -> list[tuple[int, int]]:
-    """Lists the sizes of trainings: number of streets, and steps.
+def size_of(row: Row) -> tuple[int, int, float]:
+    """Gives the size of a training: number of streets, steps, and how much of a box may be hidden.
+
+    Args:
+        row: see :func:`measure_training`.
+    """
+    return row["train_logs"], row["steps"], row.get("max_occluded", 1.0)
+
+
+def list_sizes(rows: Sequence[Row]) -> list[tuple[int, int, float]]:
+    """Lists the sizes of trainings.
 
     Args:
         rows: see :func:`measure_training`.
     """
-    return sorted({(row["train_logs"], row["steps"]) for row in rows}, reverse=True)
+    return sorted({size_of(row) for row in rows}, reverse=True)
 
 
 def list_scores(rows: Sequence[Row], images: str, tested: str, name: str) -> list[float]:
@@ -167,10 +179,10 @@ def training_table(rows: Sequence[Row]) -> Iterator[str]:
     Args:
         rows: see :func:`measure_training`.
     """
-    yield "| streets, steps | trained on | tested on | mAP | AP@1m | AP@2m | AP@4m | seeds |"
+    yield "| streets, steps, hidden up to | trained on | tested on | mAP | AP@1m | AP@2m | AP@4m | seeds |"
     yield "|---|---|---|---|---|---|---|---|"
     for size in list_sizes(rows):
-        of_size = [row for row in rows if (row["train_logs"], row["steps"]) == size]
+        of_size = [row for row in rows if size_of(row) == size]
         for tested in ("recorded", "shifted"):
             # In the paper's order.
             for images, label in ROWS.items():
@@ -179,4 +191,4 @@ def training_table(rows: Sequence[Row]) -> Iterator[str]:
                     values = list_scores(of_size, images, tested, name)
                     texts.append(f"{mean(values):.3f} ({min(values):.3f}–{max(values):.3f})" if values else "–")
                 count = len(list_scores(of_size, images, tested, "map"))
-                yield f"| {size[0]}, {size[1]} | {label} | {tested} | {' | '.join(texts)} | {count} |"
+                yield f"| {size[0]}, {size[1]}, {size[2]:g} | {label} | {tested} | {' | '.join(texts)} | {count} |"
