@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from flows.paper_tables.detector_study import DetectorStudy
 
 NUMBER = 8
+OTHER_OPTIONS = ("--method", "--weights", "--into", "--remark", "--stored", "--scene", "--detector")
 _SECONDS_PER_STEP = 0.2
 """Measured on one core: eight images of 320×180."""
 
@@ -110,6 +111,21 @@ def refuse_table_8_options(test: list[str] | None, steps: int | None) -> None:
     for option, value in (("--test", test), ("--steps", steps)):
         if value is not None:
             raise ConfigError(f"{option} belongs to table {NUMBER}", remedy=f"Leave it out, or ask for table {NUMBER}.")
+
+
+def refuse_other_options(*values: object) -> None:
+    """Checks that options of other tables are not given for table 8.
+
+    Args:
+        values: those of ``OTHER_OPTIONS``; ``None``, ``False`` and an empty list stand for one that is not given.
+
+    Raises:
+        ConfigError: one is given.
+    """
+    for option, value in zip(OTHER_OPTIONS, values, strict=True):
+        # Without an effect it would be taken for one that has one.
+        if value:
+            raise ConfigError(f"table {NUMBER} has no use for {option}", remedy="Leave it out.")
 
 
 def _print_prediction(study: DetectorStudy, seeds: int) -> None:

@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flows.cli.detector_table import NUMBER, DetectorTableParts, measure_detector_table, refuse_table_8_options
+from flows.cli.detector_table import (
+    NUMBER,
+    DetectorTableParts,
+    measure_detector_table,
+    refuse_other_options,
+    refuse_table_8_options,
+)
 from flows.cli.options import (
     ChunksOption,
     DryRunOption,
@@ -115,7 +121,6 @@ def table(
 
     Every method runs on every chunk by the paper's protocol. All logs must be of one dataset.
     Finished stages come from the store, so a table that was stopped goes on where it was, and tables share stages.
-
     Table 2 also takes a 3D Gaussian scene of any program in the place of logs, and compares it before and after.
 
     Example:
@@ -131,6 +136,7 @@ def table(
     _check_outputs(out, into)
     numbers = parse_numbers(chunks, "--chunks")
     if number == NUMBER:
+        refuse_other_options(methods, weights, into, remarks, stored, scene, detector)
         parts = DetectorTableParts(logs, test, preset, store, numbers, settings, out)
         return measure_detector_table(parts.request(seeds, steps), dry_run)
     refuse_table_8_options(test, steps)

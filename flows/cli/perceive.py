@@ -9,6 +9,7 @@ import typer
 
 from flows.cli.options import RunArgument, RunChunkOption, SceneStageOption, StoreOption
 from flows.cli.parsing import parse_path
+from flows.cli.shifts import parse_shifts
 from flows.defaults import DEFAULT_STORE
 
 _MAX_COUNT = 1_000_000
@@ -73,7 +74,6 @@ def perceive(
     \b
         genre perceive 4b1c --detector yolox_nano.onnx --shift 0,3 --out perception
     """
-    from flows.cli.augment import parse_shifts
     from flows.cli.existing_store import open_existing_store
     from flows.cli.output_paths import check_output_folder
     from flows.cli.parsing import check_number

@@ -18,6 +18,8 @@ from genre_tasks.logs.types import Float32
 DEFAULT_SIZE = 640
 """Height and width of the input where a file leaves them open."""
 
+_MAX_METADATA_FILES = 16
+_MAX_METADATA_BYTES = 1_000_000
 _ONNX_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 
 
@@ -241,10 +243,10 @@ def _read_attached_metadata(path: Path) -> dict[str, str]:
     # The archive stands behind the network, so the ending does not tell.
     if not zipfile.is_zipfile(path):
         return {}
+    texts: dict[str, str] = {}
     with zipfile.ZipFile(path) as archive:
-        # A file of a few KB; an archive that unpacks to gigabytes is not read.
-        return {
-            entry.filename: archive.read(entry).decode("utf-8", "replace")
-            for entry in archive.infolist()
-            if entry.file_size < 1_000_000
-        }
+        for entry in archive.infolist()[:_MAX_METADATA_FILES]:
+            # Files of a few KB; an archive that unpacks to gigabytes is not read.
+            if entry.file_size < _MAX_METADATA_BYTES:
+                texts[entry.filename] = archive.read(entry).decode("utf-8", "replace")
+    return texts

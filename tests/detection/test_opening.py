@@ -261,3 +261,12 @@ def test_a_real_detector_finds_the_cars_of_a_street(name: str) -> None:
         if detector.has_masks:
             assert cars.masks is not None and cars.masks[inside][:, place[1], place[0]].any()
     assert len(detector.detect(np.full_like(image, 127))) == 0
+
+
+def test_an_archive_of_many_files_is_not_unpacked(tmp_path: Path) -> None:
+    path = tmp_path / "many.tflite"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for number in range(200):
+            archive.writestr(f"{number}.txt", "0" * 900_000)
+        archive.writestr("large.txt", "0" * 2_000_000)
+    assert sum(map(len, _read_attached_metadata(path).values())) < 20_000_000

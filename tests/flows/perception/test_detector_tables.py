@@ -22,7 +22,9 @@ from flows.perception.camera_transfer import DetectionPairs, agreement_metrics, 
 from flows.pipeline.log_cache import cached_log
 from flows.pipeline.stage_runner import run_stage
 from genre_tasks.detection.detections import Detections
+from genre_tasks.detection3d.detector import load_detector
 from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.logs.types import Lens
 from tests.faults.small_run import SETTINGS
 
 LOG = "synthetic:street?seed=900&frames=8&cameras=2&width=64&height=36&lidar_beams=32&lidar_azimuths=300"
@@ -168,6 +170,12 @@ def test_options_of_table_8_are_refused_elsewhere() -> None:
     assert isinstance(result.exception, ConfigError) and "belongs to table 8" in str(result.exception)
 
 
+@pytest.mark.parametrize("option", [["--stored"], ["--detector", "x.onnx"], ["--weights", "difix=x.safetensors"]])
+def test_table_8_refuses_options_that_it_has_no_use_for(option: list[str]) -> None:
+    result = CliRunner().invoke(app, ["table", "8", LOG, "--test", OTHER, *option])
+    assert isinstance(result.exception, ConfigError) and f"no use for {option[0]}" in str(result.exception)
+
+
 def test_a_row_is_trained_and_tested_once(tmp_path: Path) -> None:
     request = DetectorRequest(
         (LOG,), (OTHER,), preset="demo", store=str(tmp_path / "store"), settings=SETTINGS, steps=2, out=str(tmp_path)
@@ -187,7 +195,13 @@ def test_a_row_is_trained_and_tested_once(tmp_path: Path) -> None:
     assert not steps
     study.measure("real", 0, run_stage, count)
     assert steps[-1] == 2
-    assert len(list((tmp_path / "detectors").glob("trainings/*/scores.json"))) == 2
+    folders = [path.parent for path in (tmp_path / "detectors").glob("trainings/*/scores.json")]
+    assert len(folders) == 2
+    # The detector itself is there for who wants to use it.
+    image = np.zeros((36, 64, 3), np.uint8)
+    for folder in folders:
+        found = load_detector(folder / "detector.safetensors").detect(image, Lens(60.0, 60.0, 32.0, 18.0, 64, 36))
+        assert np.isfinite(found.scores).all()
 
 
 def test_the_page_of_table_8_has_means_ranges_and_the_papers_numbers() -> None:
