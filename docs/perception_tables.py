@@ -19,7 +19,7 @@ def _rows(kind: str) -> list[dict[str, Any]]:
 
 def claims() -> str:
     """All claims on perception."""
-    return claims_of("perception")
+    return claims_of("perception", several="cases")
 
 
 def transfer() -> str:

@@ -62,8 +62,13 @@ def provenance(name: str) -> str:
     )
 
 
-def claims(name: str) -> str:
-    """Every claim of a benchmark: target, measured number, and whether it holds. Several logs share a row."""
+def claims(name: str, several: str = "logs") -> str:
+    """Every claim of a benchmark: target, measured number, and whether it holds. Claims of one id share a row.
+
+    Args:
+        name: of the benchmark.
+        several: what the claims of one id are of.
+    """
     grouped: dict[str, list[dict[str, Any]]] = {}
     for claim in result(name)["claims"]:
         grouped.setdefault(claim["id"], []).append(claim)
@@ -74,7 +79,7 @@ def claims(name: str) -> str:
         held = sum(c["holds"] for c in found)
         verdict = "yes" if held == len(found) else "**missed**" if held == 0 else f"**{held} of {len(found)}**"
         unit = {"share": "", "ratio": "", "share of runs": ""}.get(found[0]["unit"], found[0]["unit"])
-        runs = ", ".join(str(c["n"]) for c in found) if len(found) == 1 else f"{len(found)} logs"
+        runs = ", ".join(str(c["n"]) for c in found) if len(found) == 1 else f"{len(found)} {several}"
         target = f"{found[0]['op']} {found[0]['target']:g} {unit}".strip()
         rows.append([CLAIM_WORDS[claim_id], target, values, runs, verdict])
     return table(["claim", "target", "measured", "n", "holds"], rows) + "\n" + provenance(name)

@@ -13,6 +13,7 @@ from benchmarks.perception.scenes import (
     METHOD,
     OTHER_METHODS,
     PerceptionCase,
+    drop_missing,
     list_detectors,
     restrict_to_front_camera,
     run_method,
@@ -64,7 +65,7 @@ def measure_camera_transfer(case: PerceptionCase, folder: str, detectors: tuple[
         detector = open_detector(str(path))
         pairs = {method: detect_pairs(detector, found) for method, found in images.items()}
         agreement[name] = {
-            method: _drop_missing(agreement_metrics([pair], has_masks=detector.has_masks))
+            method: drop_missing(agreement_metrics([pair], has_masks=detector.has_masks))
             for method, pair in pairs.items()
         }
         for kind in ("box", "mask") if detector.has_masks else ("box",):
@@ -75,11 +76,6 @@ def measure_camera_transfer(case: PerceptionCase, folder: str, detectors: tuple[
             ]
         print_progress(f"{case.name} {name}: done")
     return {"kind": "transfer", "log": case.name, "agreement": agreement, "differences": differences}
-
-
-def _drop_missing(metrics: Mapping[str, float]) -> Row:
-    # JSON has no NaN: what was not measured is missing.
-    return {name: value for name, value in metrics.items() if math.isfinite(value)}
 
 
 def _compare(ours: DetectionPairs, others: DetectionPairs, kind: str, measure: str) -> Row:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from benchmarks.common.bench import NotMeasuredError
 from benchmarks.common.run_stages import print_progress
+from flows.paper_tables.agreement_cells import front_camera_setting
 from flows.paper_tables.builtin_methods import BUILT_IN
 from flows.paper_tables.layouts import PROTOCOL
-from flows.perception.camera_names import select_front_camera
 from flows.pipeline.definition import STAGE_BY_NAME, digest_stage_weights, stages_until
-from flows.pipeline.log_cache import cached_log
 from flows.pipeline.stage_runner import ArtifactRef, Job, read_artifact, run_stage
 from genre_tasks.config import PipelineConfig
 from genre_tasks.effects.apply_plan import apply_plan
@@ -75,13 +75,9 @@ def restrict_to_front_camera(case: PerceptionCase) -> PerceptionCase:
 
     Args:
         case: with all cameras.
-
-    Raises:
-        NotMeasuredError: the log is not on this machine.
     """
     # A setting and not another kind of case, so that stages find it in their keys.
-    camera = select_front_camera([camera.name for camera in cached_log(case.log).cameras])
-    return PerceptionCase(case.log, case.chunk, case.store, (*case.settings, f"ingest.cameras=[{camera}]"))
+    return replace(case, settings=(*case.settings, front_camera_setting(case.log)))
 
 
 def run_method(case: PerceptionCase, method: str) -> tuple[Job, Mapping[str, ArtifactRef]]:
@@ -111,6 +107,18 @@ def read_scene(case: PerceptionCase, method: str) -> tuple[Chunk, SceneGraph]:
     # Renders need the lenses that the plan decided on.
     chunk = apply_plan(read_artifact(job, refs["ingest"]), read_artifact(job, refs["effects"]))
     return chunk, read_artifact(job, refs[BUILT_IN[method].end]).scene
+
+
+def drop_missing(metrics: Mapping[str, float]) -> dict[str, float]:
+    """Leaves out numbers that are not finite: JSON has no NaN, and what was not measured is missing.
+
+    Args:
+        metrics: by name.
+
+    >>> drop_missing({"box/ap": 0.5, "box/iou": float("nan")})
+    {'box/ap': 0.5}
+    """
+    return {name: value for name, value in metrics.items() if math.isfinite(value)}
 
 
 def list_detectors(folder: str, names: tuple[str, ...]) -> dict[str, Path]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from statistics import mean
 
@@ -13,7 +12,7 @@ import torch
 from benchmarks.common.bench import NotMeasuredError, Row
 from benchmarks.common.claims import Claim, claim
 from benchmarks.common.run_stages import print_progress
-from benchmarks.perception.scenes import METHOD, PerceptionCase, list_detectors, read_scene
+from benchmarks.perception.scenes import METHOD, PerceptionCase, drop_missing, list_detectors, read_scene
 from flows.paper_tables.builtin_methods import BUILT_IN
 from flows.perception.camera_transfer import DetectionPairs, agreement_metrics
 from flows.pipeline.log_cache import cached_log
@@ -66,14 +65,13 @@ def measure_shifts(case: PerceptionCase, folder: str, detectors: tuple[str, ...]
         # Ray-cast once for all methods and detectors.
         true_images = [truth_image(chunk, truth, view) for view in views]
         found = {name: tuple(detector.detect(image) for image in true_images) for name, detector in opened.items()}
-        for method, (own_chunk, scene) in scenes.items():
-            images = _render(own_chunk, scene, shift, frames)
+        for method, (method_chunk, scene) in scenes.items():
+            images = _render(method_chunk, scene, shift, frames)
             for name, detector in opened.items():
                 finds = tuple(detector.detect(image) for image in images)
                 pairs = DetectionPairs(found[name], finds, find_road_users(detector.class_names))
-                # JSON has no NaN: what was not found has no overlap.
                 numbers = agreement_metrics([pairs], has_masks=detector.has_masks)
-                agreement[name][method][f"{shift:g}"] = {k: v for k, v in numbers.items() if math.isfinite(v)}
+                agreement[name][method][f"{shift:g}"] = drop_missing(numbers)
         print_progress(f"{case.name} {shift:g} m: done")
     return {"kind": "shifts", "log": case.name, "agreement": agreement}
 
@@ -94,8 +92,8 @@ def measure_range(case: PerceptionCase) -> Row:
     Returns:
         ``left_m`` and ``right_m``.
     """
-    job_chunk, scene = read_scene(case, METHOD)
-    found = estimate_reliable_range(RangeConfig(every=RANGE_EVERY), job_chunk, scene)
+    chunk, scene = read_scene(case, METHOD)
+    found = estimate_reliable_range(RangeConfig(every=RANGE_EVERY), chunk, scene)
     return {"kind": "range", "log": case.name, "left_m": found.left_m, "right_m": found.right_m}
 
 

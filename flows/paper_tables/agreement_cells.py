@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import functools
-import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from flows.experiments.log_chunks import LogChunk
-from flows.experiments.stages import StageRunner, read_stage_costs, run_stages
+from flows.experiments.stages import StageRunner, run_stages
 from flows.paper_tables.columns import MeasuredCell
 from flows.paper_tables.layouts import Layout
-from flows.paper_tables.measure import Basis, list_stages
+from flows.paper_tables.measure import Basis, build_cell, list_stages
 from flows.paper_tables.methods import Method
 from flows.perception.camera_names import select_front_camera, select_front_left_camera
 from flows.pipeline.log_cache import cached_log
@@ -41,7 +40,7 @@ def open_cached_detector(detector: str) -> Detector:
 
 
 def restrict_to_front_camera(layout: Layout, log: str) -> Layout:
-    """Puts the front camera into a table's protocol.
+    """Restricts a table's protocol to the front camera.
 
     Args:
         layout: the table.
@@ -50,10 +49,22 @@ def restrict_to_front_camera(layout: Layout, log: str) -> Layout:
     Raises:
         ConfigError: it has none.
     """
-    # Checked before hours of computing.
+    return replace(layout, protocol=(*layout.protocol, front_camera_setting(log)))
+
+
+def front_camera_setting(log: str) -> str:
+    """Gives the setting that reads the front camera alone.
+
+    Args:
+        log: URI of a log, which must have a front-left camera too.
+
+    Raises:
+        ConfigError: it has none.
+    """
     names = [camera.name for camera in cached_log(log).cameras]
+    # Checked before hours of computing.
     select_front_left_camera(names)
-    return replace(layout, protocol=(*layout.protocol, f"ingest.cameras=[{select_front_camera(names)}]"))
+    return f"ingest.cameras=[{select_front_camera(names)}]"
 
 
 def measure_agreement_cell(
@@ -82,18 +93,8 @@ def measure_agreement_cell(
     refs = run_stages(list_stages(layout, method), job, runner)
     detector = open_cached_detector(detector_name)
     pairs = detect_pairs(detector, render_front_left(job, refs, method.end))
-    costs = read_stage_costs(job, refs)
-    return MeasuredCell(
-        method=method.name,
-        log=where.log,
-        chunk=where.chunk,
-        seconds=costs.seconds,
-        # NaN and not zero: an artifact from before CPU seconds were counted did cost some.
-        cpu_seconds={name: math.nan if s is None else float(s) for name, s in costs.cpu_seconds.items()},
-        metrics=agreement_metrics([pairs], has_masks=detector.has_masks),
-        gaussians=len(read_artifact(job, refs[method.end]).scene),
-        fixed_views=len(read_artifact(job, refs["fnet"]).views) if "fnet" in refs else 0,
-    )
+    metrics = agreement_metrics([pairs], has_masks=detector.has_masks)
+    return build_cell(method, where, job, refs, metrics)
 
 
 def render_front_left(job: Job, refs: Mapping[str, ArtifactRef], end: str) -> ImagePairs:

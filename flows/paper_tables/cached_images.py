@@ -57,21 +57,21 @@ class CachedImages:
 
         # A set appears complete or not at all, so that a folder is enough to know.
         if not self.folder.is_dir():
-            own = self.folder.with_name(f"{self.folder.name}.{uuid.uuid4().hex[:8]}")
-            write_training_set(self.make(), own, "own")
-            _publish(own, self.folder)
+            finished = self.folder.with_name(f"{self.folder.name}.{uuid.uuid4().hex[:8]}")
+            write_training_set(self.make(), finished, "own")
+            _publish(finished, self.folder)
         return read_training_set(self.folder)
 
 
-def _publish(own: Path, folder: Path) -> None:
+def _publish(finished: Path, folder: Path) -> None:
     """Gives a finished set its name; the first of several trainings that make the same one wins."""
     try:
-        own.rename(folder)
+        finished.rename(folder)
     except OSError:
         # Another training may have been faster, and its images are the same.
         if not folder.is_dir():
             raise
-        shutil.rmtree(own)
+        shutil.rmtree(finished)
 
 
 @dataclass(frozen=True)

@@ -86,6 +86,7 @@ class DetectorStudy:
             InputError: a log has no annotations, or no box that counts.
             NonFiniteError: the training diverges.
         """
+        from genre_tasks.detection3d.detector import save_detector
         from genre_tasks.detection3d.evaluate import evaluate_detector
         from genre_tasks.detection3d.training import train_detector
 
@@ -103,6 +104,7 @@ class DetectorStudy:
             return dict(read_json_object(scores_file, "the detector's scores", "Delete it, and run again."))
         images = [image for part in sets for image in part.read()]
         detector: Detector3d = train_detector(images, config, folder / "training.safetensors", progress)
+        save_detector(detector, folder / "detector.safetensors")
         scores = {}
         for name, joined in tested.items():
             scores[name] = _name_scores(evaluate_detector(detector, joined.read()), config.thresholds_m)

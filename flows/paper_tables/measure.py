@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from flows.experiments.log_chunks import LogChunk
@@ -90,6 +91,22 @@ def measure_cell(basis: Basis, layout: Layout, method: Method, where: LogChunk, 
     """
     job = basis.job(layout, method, where)
     refs = run_stages(list_stages(layout, method), job, runner)
+    metrics = _read_metrics(job, refs[f"evaluate/{method.end}"]) if layout.evaluated else {}
+    return build_cell(method, where, job, refs, metrics)
+
+
+def build_cell(
+    method: Method, where: LogChunk, job: Job, refs: Mapping[str, ArtifactRef], metrics: dict[str, float]
+) -> MeasuredCell:
+    """Builds the cell of a method on a chunk, with what its stages cost.
+
+    Args:
+        method: the row's method.
+        where: the chunk.
+        job: of the cell.
+        refs: its stages' artifacts; those of evaluations cost nothing.
+        metrics: what was measured.
+    """
     costs = read_stage_costs(job, {name: ref for name, ref in refs.items() if not name.startswith("evaluate/")})
     # A fixer's result is images; the scene that they were rendered from is GNet's.
     scene_stage = "gnet" if method.end == "fnet" else method.end
@@ -100,7 +117,7 @@ def measure_cell(basis: Basis, layout: Layout, method: Method, where: LogChunk, 
         seconds=costs.seconds,
         # NaN and not zero: an artifact from before CPU seconds were counted did cost some.
         cpu_seconds={name: math.nan if s is None else float(s) for name, s in costs.cpu_seconds.items()},
-        metrics=_read_metrics(job, refs[f"evaluate/{method.end}"]) if layout.evaluated else {},
+        metrics=metrics,
         gaussians=len(read_artifact(job, refs[scene_stage]).scene),
         fixed_views=len(read_artifact(job, refs["fnet"]).views) if "fnet" in refs else 0,
     )

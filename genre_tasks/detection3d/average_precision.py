@@ -186,31 +186,6 @@ class DetectionScores:
         """Number of true boxes of all classes."""
         return sum(scores.truth_count for scores in self.classes)
 
-    def as_plain(self) -> dict[str, object]:
-        """Converts to plain values, as records in JSON hold them.
-
-        Returns:
-            ``images``, ``mean_average_precision``, and for each class its counts and ``average_precisions``, by
-            threshold in metres; ``None`` stands for a mean of nothing.
-
-        >>> DetectionScores((ClassScores("car", 1, 2, {1.0: 0.5}),), 1).as_plain()["mean_average_precision"]
-        0.5
-        """
-        mean = self.mean_average_precision
-        return {
-            "images": self.images,
-            # JSON has no NaN.
-            "mean_average_precision": None if np.isnan(mean) else mean,
-            "classes": {
-                scores.name: {
-                    "truth_count": scores.truth_count,
-                    "found_count": scores.found_count,
-                    "average_precisions": {f"{key:g}": value for key, value in scores.average_precisions.items()},
-                }
-                for scores in self.classes
-            },
-        }
-
     def at_threshold(self, threshold_m: float) -> float:
         """Average precision at one threshold: the mean over classes that have a true box.
 

@@ -181,7 +181,8 @@ def resize_image(image: NDArray[np.uint8], lens: Lens, config: Detector3dConfig)
     Returns:
         [3, H, W] uint8.
     """
-    pixels = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)
+    # A copy, since torch warns about arrays that may not be written, such as decoded images.
+    pixels = torch.from_numpy(np.array(image)).permute(2, 0, 1)
     size = (lens.height_px, lens.width_px)
     if tuple(pixels.shape[1:]) != size:
         # Averaged over the area of a pixel: fine texture would else turn into noise.

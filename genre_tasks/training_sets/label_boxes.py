@@ -196,53 +196,6 @@ class LogLabeller:
 _labellers: OrderedDict[int, LogLabeller] = OrderedDict()
 
 
-def label_recorded_image(log: DrivingLog, chunk: Chunk, view: View) -> LabelledImage:
-    """Decodes a recorded image at the chunk's working resolution and labels it.
-
-    Args:
-        log: that the chunk is of; what belongs to its frames is kept for the next image.
-        chunk: as ``ingest`` made it, or with its plan applied.
-        view: of the chunk.
-
-    Returns:
-        The image with its boxes; how much of them is hidden is not known.
-
-    Raises:
-        InputError: the log has no annotations, or something of it cannot be read.
-    """
-    return labeller_of(log).label_recorded_image(chunk, view)
-
-
-def label_view(
-    log: DrivingLog,
-    chunk: Chunk,
-    view: View | NovelView,
-    image: NDArray[np.uint8],
-    *,
-    shift_m: float,
-    rendered: bool,
-    depth: Float32 | None,
-) -> LabelledImage:
-    """Labels an image of any viewpoint, as :meth:`LogLabeller.label_view` does.
-
-    Args:
-        log: that the chunk is of; what belongs to its frames is kept for the next image.
-        chunk: as ``ingest`` made it, or with its plan applied.
-        view: pose and lens of the image.
-        image: [H, W, 3] sRGB, of the lens's size.
-        shift_m: metres to the left of the recorded path.
-        rendered: whether a scene was rendered.
-        depth: [H, W] metres along the camera's axis, 0 where nothing is; ``None``: unknown.
-
-    Returns:
-        The image with its boxes.
-
-    Raises:
-        InputError: the log has no annotations, or something of it cannot be read.
-    """
-    return labeller_of(log).label_view(chunk, view, image, shift_m=shift_m, rendered=rendered, depth=depth)
-
-
 def labeller_of(log: DrivingLog) -> LogLabeller:
     """Makes the labeller of a log once.
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from flows.cli.augment import parse_shifts
 from flows.cli.main import app
+from flows.cli.shifts import parse_shifts
 from flows.configuration import load_configuration
 from flows.perception.labelled_renders import render_labelled_images
 from flows.pipeline.definition import STAGE_BY_NAME

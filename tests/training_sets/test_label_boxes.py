@@ -15,8 +15,7 @@ from genre_tasks.training_sets.box_outlines import box_corners, find_boxes_in_vi
 from genre_tasks.training_sets.label_boxes import (
     LogLabeller,
     count_points_in_boxes,
-    label_recorded_image,
-    label_view,
+    labeller_of,
 )
 from genre_tasks.training_sets.label_filter import keep_visible_boxes
 from genre_tasks.training_sets.labelled_images import LabelledBox, LabelledImage
@@ -192,15 +191,15 @@ def test_a_camera_in_a_car_does_not_see_it() -> None:
     assert image.boxes == ()
 
 
-def test_the_functions_are_the_labeller_and_count_a_frame_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_log_has_one_labeller_that_counts_a_frame_once(monkeypatch: pytest.MonkeyPatch) -> None:
     log = replace(LOG, uri="fake:counted", _images={})
     chunk = chunk_of(log)
     read: list[int] = []
     original = FakeLog.sweep
     monkeypatch.setattr(FakeLog, "sweep", lambda self, frame: (read.append(frame), original(self, frame))[1])
     for view in chunk.views:
-        one = label_recorded_image(log, chunk, view)
-        other = label_view(log, chunk, view, one.image, shift_m=0.0, rendered=False, depth=None)
+        one = labeller_of(log).label_recorded_image(chunk, view)
+        other = labeller_of(log).label_view(chunk, view, one.image, shift_m=0.0, rendered=False, depth=None)
         assert [box.box_px for box in one.boxes] == [box.box_px for box in other.boxes]
         assert one.timestamp_s == view.timestamp_s and one.lens == view.lens
     assert sorted(read) == list(chunk.frames)
