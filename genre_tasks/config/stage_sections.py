@@ -135,10 +135,24 @@ class FnetConfig(Section):
         description="A view is fixed where more than this fraction of its pixels is thinly covered or not supported by "
         "recorded images; 0: every view is fixed.",
     )
+    max_network_px: int | None = Field(
+        None,
+        ge=64,
+        le=4096,
+        description="Largest width and height that the network sees: larger views are reduced for it by a whole factor, "
+        "and its correction is enlarged; null: no limit.",
+    )
     half: bool | None = Field(None, description="Compute in bfloat16; null: where the device is faster with it.")
     temporal: bool = Field(
         False, description="In a simulation, look pixels up in the fixed image of the frame before, too."
     )
+
+    @model_validator(mode="after")
+    def _require_correction(self) -> Self:
+        # SD-Turbo draws the whole image, which would be blurred where it is enlarged.
+        if self.model == "sd-turbo" and self.max_network_px is not None:
+            raise ValueError("max_network_px is for model: small, whose output is a correction of the render")
+        return self
 
 
 LPIPS_NETWORKS = ("alex", "vgg")

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from genre_tasks.fixer.inputs import FixerInputs
-from genre_tasks.fixer.network import Conditions
+from genre_tasks.fixer.network import HINT_CHANNELS, Conditions
 
 # A fixer repairs structure: a larger drift of the whole image is an error of the network. The bound is about 8 of 255
 # levels, which is just visible side by side.
@@ -71,17 +71,21 @@ def _pull_push(color: Tensor, weight: Tensor) -> Tensor:
     return torch.where(weight > 1e-4, trust * local + (1 - trust) * coarse, coarse)
 
 
-def build_conditions(views: FixerInputs) -> Conditions:
+def build_conditions(views: FixerInputs, with_evidence: bool = True) -> Conditions:
     """Builds the network's input from renders, LiDAR maps and sampled images, scaled to about unit size.
 
     Args:
         views: what V views of H × W pixels are fixed from.
+        with_evidence: fill the hints that the network alone reads; without them the conditions are only composed with.
 
     Returns:
         Conditions of the same V, H and W.
     """
     render = fill_holes(views.color, views.alpha, views.lidar_color, views.lidar_alpha)
     aligned = [views.alpha, views.lidar_alpha, views.warped, views.warp_mask, views.lidar_warped, views.lidar_warp_mask]
+    if not with_evidence:
+        blank = torch.zeros_like(views.alpha).expand(-1, HINT_CHANNELS - sum(x.shape[1] for x in aligned), -1, -1)
+        return Conditions(render, views.reference, views.lidar_color, torch.cat([*aligned, blank], 1))
     # Factors bring all maps to about unit size.
     uncertainty = [4 * views.warp_spread, 4 * views.lidar_warp_spread, views.depth_gap]
     hints = torch.cat([*aligned, *_evidence_maps(render, views), *uncertainty], 1)

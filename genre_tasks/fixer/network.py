@@ -195,7 +195,7 @@ class Fnet(nn.Module):
             inputs: of the batch; their hints enter at every level.
 
         Returns:
-            [B, 3, H, W] the image, not clamped.
+            [B, 3 + GATE_COUNT, H, W] what makes the image, see :meth:`compose`.
         """
         decoder = self.vae.decoder
         z = latent / self.vae.config.scaling_factor
@@ -209,8 +209,19 @@ class Fnet(nn.Module):
             added = skip(torch.cat([render_features, lidar_features, hints], 1))
             x = block(_normalise(x) + _normalise(added) if self.architecture.residual else x + added)
         # Autocast ends here: the output is of the inputs' type.
-        x = decoder.conv_out(decoder.conv_act(decoder.conv_norm_out(x))).to(inputs.render.dtype) / 2
-        return apply_correction(x, inputs) if self.architecture.residual else x + 0.5
+        return decoder.conv_out(decoder.conv_act(decoder.conv_norm_out(x))).to(inputs.render.dtype) / 2
+
+    def compose(self, output: Tensor, inputs: Conditions) -> Tensor:
+        """Makes the image of what the decoder gives.
+
+        Args:
+            output: [B, 3 + GATE_COUNT, H, W] residual and gates, or [B, 3, H, W] where the architecture has no residual.
+            inputs: of the batch, of the same H and W.
+
+        Returns:
+            [B, 3, H, W] the image, not clamped.
+        """
+        return apply_correction(output, inputs) if self.architecture.residual else output + 0.5
 
     def forward(self, conditions: Conditions, noise: Tensor, reference: Encoded | None = None) -> Tensor:
         """Fixes a batch of views.
@@ -222,6 +233,22 @@ class Fnet(nn.Module):
 
         Returns:
             [B, 3, H, W] the fixed images, not clamped, because a loss needs the gradient outside of 0 and 1.
+
+        Raises:
+            ValueError: a size is no multiple of :attr:`stride`.
+        """
+        return self.compose(self.predict(conditions, noise, reference), conditions)
+
+    def predict(self, conditions: Conditions, noise: Tensor, reference: Encoded | None = None) -> Tensor:
+        """Predicts what makes the images of a batch, without making them; see :meth:`forward` for the arguments.
+
+        Args:
+            conditions: of the batch.
+            noise: of the batch.
+            reference: the encoded references, where they are at hand.
+
+        Returns:
+            What :meth:`compose` takes, of the conditions' size.
 
         Raises:
             ValueError: a size is no multiple of :attr:`stride`.

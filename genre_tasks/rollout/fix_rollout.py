@@ -7,13 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from genre_tasks.checks import check_finite
 from genre_tasks.config import FnetConfig
 from genre_tasks.errors import InputError
-from genre_tasks.fixer.inference import draw_noise, fix, prefers_bfloat16
+from genre_tasks.fixer.inference import draw_noise, encode_reference, find_reduction, fix, prefers_bfloat16
 from genre_tasks.fixer.inputs import build_inputs
 from genre_tasks.fixer.network import Encoded, Fnet
 from genre_tasks.fixer.source_images import load_source_images
@@ -231,6 +230,7 @@ class RolloutFixer:
         moving = self._pose_actors(images, chunk_images)
         names = chunk_images.chunk.camera_names
         half = prefers_bfloat16(novel.color.device) if self._config.half is None else self._config.half
+        reduction = find_reduction(*novel.alpha.shape[1:], self._config.max_network_px)
         latents = {k: self._encode_reference(novel.views[k].reference, chunk_images) for k in rows}
         # The fixer finds actors' poses in a chunk: one whose actors are where they are at this moment.
         chunk = replace(chunk_images.chunk, actors=moving)
@@ -241,8 +241,9 @@ class RolloutFixer:
                 inputs = self._last.look_up(images, novel, batch, moving, inputs)
             # By camera and not by pose: noise that changes from pose to pose is seen as flicker.
             seeds = [names.index(images.views[k].camera) for k in batch]
-            noise = draw_noise(self._network, self._config.seed, seeds, *novel.alpha.shape[1:])
-            return fix(self._network, inputs, noise, Encoded(torch.cat([latents[k] for k in batch]), ()), half)
+            noise = draw_noise(self._network, self._config.seed, seeds, *novel.alpha.shape[1:], reduction)
+            references = Encoded(torch.cat([latents[k] for k in batch]), ())
+            return fix(self._network, inputs, noise, references, half, reduction=reduction)
 
         size = self._config.batch_views
         batches = [rows[first : first + size] for first in range(0, len(rows), size)]
@@ -260,10 +261,8 @@ class RolloutFixer:
     def _encode_reference(self, reference: tuple[str, int], chunk_images: _ChunkImages) -> Tensor:
         if reference not in chunk_images.latents:
             image = next(s.image for s in chunk_images.removed.sources if (s.camera, s.frame) == reference)
-            stride = self._network.stride
-            pad = (0, -image.shape[-1] % stride, 0, -image.shape[-2] % stride)
-            encoded = self._network.encode(F.pad(image[None], pad, mode="replicate"))
-            chunk_images.latents[reference] = encoded.latent
+            reduction = find_reduction(*image.shape[1:], self._config.max_network_px)
+            chunk_images.latents[reference] = encode_reference(self._network, image, reduction).latent
         return chunk_images.latents[reference]
 
 

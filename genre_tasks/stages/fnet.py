@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from functools import partial
 from threading import Lock
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from genre_tasks.checks import check_finite
 from genre_tasks.config import FnetConfig
 from genre_tasks.effects.apply_plan import apply_plan
 from genre_tasks.effects.types import DEFAULT_PLAN, EffectsPlan
-from genre_tasks.fixer.inference import draw_noise, fix, prefers_bfloat16
+from genre_tasks.fixer.inference import draw_noise, encode_reference, find_reduction, fix, prefers_bfloat16
 from genre_tasks.fixer.inputs import build_inputs
 from genre_tasks.fixer.network import Encoded, Fnet
 from genre_tasks.fixer.source_images import find_references, load_source_images
@@ -107,7 +107,8 @@ def fix_views(
     if not selected:
         return FixedViews(novel.views, color, tuple(range(total)))
     # Both sides of a frame and all shifts share their reference.
-    encoded = _encode_references(network, [references[i] for i in selected])
+    reduction = find_reduction(*novel.alpha.shape[1:], config.max_network_px)
+    encoded = _encode_references(network, [references[i] for i in selected], reduction)
     half = prefers_bfloat16(novel.color.device) if config.half is None else config.half
     done = 0
     lock = Lock()
@@ -116,9 +117,9 @@ def fix_views(
         nonlocal done
         views = build_inputs(chunk, novel, indices, sources)
         # Noise depends on a view's index, so that batches and threads do not matter.
-        noise = draw_noise(network, config.seed, indices, *novel.alpha.shape[1:])
+        noise = draw_noise(network, config.seed, indices, *novel.alpha.shape[1:], reduction)
         latent = torch.cat([encoded[novel.views[i].reference].latent for i in indices])
-        fixed = fix(network, views, noise, Encoded(latent, ()), half)
+        fixed = fix(network, views, noise, Encoded(latent, ()), half, reduction=reduction)
         # Batches end in any order, on several threads.
         with lock:
             done += len(indices)
@@ -154,17 +155,10 @@ def estimate_need(chunk: Chunk, novel: NovelViews, index: int, sources: Sequence
     return unseen_fraction(surface, alpha, sources, chunk.actors, view.frame)
 
 
-@torch.no_grad()
-def _encode_references(network: Fnet, images: Sequence[SourceImage]) -> dict[tuple[str, int], Encoded]:
+def _encode_references(
+    network: Fnet, images: Sequence[SourceImage], reduction: int
+) -> dict[tuple[str, int], Encoded]:
     """Latents of source images by camera and frame, each encoded once."""
-
-    def encode(image: Tensor) -> Encoded:
-        height, width = image.shape[-2:]
-        pad = (0, -width % network.stride, 0, -height % network.stride)
-        # The gradient mode is a property of a thread: that of the caller does not reach the pool's.
-        with torch.no_grad():
-            return Encoded(network.encode(F.pad(image[None], pad, mode="replicate")).latent, ())
-
     image_of_source = {(s.camera, s.frame): s.image for s in images}
-    encoded = map_single_threaded(encode, list(image_of_source.values()))
+    encoded = map_single_threaded(partial(encode_reference, network, reduction=reduction), list(image_of_source.values()))
     return dict(zip(image_of_source, encoded, strict=True))
