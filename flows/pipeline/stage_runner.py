@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from flows.machine.facts import describe_environment
+from flows.machine.memory_reuse import reuse_freed_memory
 from flows.machine.resource_usage import measure_usage
 from flows.observability.stage_observation import count_read, count_written, measure_lease_wait, note_key, observed
 from flows.pipeline.definition import (
@@ -213,7 +214,8 @@ def run_stage(
         _, ref, _ = find_artifact(spec, job, inputs)
         if ref is not None:
             return ref
-        artifact = _compute_artifact(spec, job, inputs, store, address, note, attempt, progress)
+        with reuse_freed_memory():
+            artifact = _compute_artifact(spec, job, inputs, store, address, note, attempt, progress)
     return _reference(artifact, cached=False, note=note)
 
 
@@ -237,6 +239,8 @@ def _compute_artifact(
     with measure_usage() as usage:
         function = getattr(importlib.import_module(module), name)
         value = function(section, *(values[argument] for argument in spec.arguments), progress=progress)
+    # Large images of the inputs need not be there while the result is written.
+    values.clear()
     provenance = Provenance(
         inputs={name: inputs[name].key for name in spec.inputs},
         # As configured, not with the smaller batch of a retry, which is no part of the result.

@@ -6,6 +6,7 @@ import numpy as np
 
 from genre_tasks.effects.measurements import ChunkMeasurements
 from genre_tasks.effects.types import Effect, EffectParameters, Measurement
+from genre_tasks.scene.chunk import View
 from genre_tasks.scene.plane_sweep import SweepImage
 from genre_tasks.scene.stereo_points import (
     choose_sweep_width,
@@ -13,6 +14,7 @@ from genre_tasks.scene.stereo_points import (
     find_stereo_points,
     find_unscanned_pixels,
 )
+from genre_tasks.threads import map_single_threaded
 
 # Of brightness within a window, in [0, 1]: sky and plain walls stay below, foliage and windows are above.
 _LEAST_CONTRAST = 0.02
@@ -29,13 +31,14 @@ def measure(measurements: ChunkMeasurements) -> Measurement:
         there are none.
     """
     views = measurements.source_views
-    areas = []
-    for view in views:
-        if not find_neighbours(view, views):
-            continue
+    compared = [view for view in views if find_neighbours(view, views)]
+
+    def measure_area(view: View) -> float:
         image = SweepImage.from_view(view, choose_sweep_width(view))
         unscanned = find_unscanned_pixels(measurements.chunk, view, image.lens.width_px)
-        areas.append(float((unscanned & (image.contrast.numpy() > _LEAST_CONTRAST)).mean()))
+        return float((unscanned & (image.contrast.numpy() > _LEAST_CONTRAST)).mean())
+
+    areas = map_single_threaded(measure_area, compared)
     if not areas:
         return Measurement(None, "no two source images see the same from different places")
     return Measurement(100 * float(np.mean(areas)), f"of {len(areas)} images, where they have texture")

@@ -73,12 +73,10 @@ def is_supported(color: Tensor, depth: Tensor, targets: Sequence[Target]) -> boo
         targets: the V targets that they are compared with.
     """
     # Other devices and precisions, as in tests, are for ``torch_image_loss``.
-    tensors = [color, depth]
+    tensors: list[Tensor | None] = [color, depth]
     for target in targets:
-        tensors += [target.image.pixels, target.image.mean, target.image.variance]
-        if target.depth is not None:
-            tensors.append(target.depth)
-    return all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors)
+        tensors += [target.image.pixels, target.image.mean, target.image.variance, target.depth]
+    return all(t is None or t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors)
 
 
 def image_loss(
@@ -113,8 +111,9 @@ def image_loss(
     depth = depth.detach().contiguous()
     # Contiguous copies must live until the kernel returns, as it only gets their addresses.
     images = [target.image.pixels.contiguous() for target in targets]
-    means = [target.image.mean.contiguous() for target in targets]
-    variances = [target.image.variance.contiguous() for target in targets]
+    statistics = [target.image.get_statistics() for target in targets]
+    means = [mean.contiguous() for mean, _ in statistics]
+    variances = [variance.contiguous() for _, variance in statistics]
     lidar_depths = [None if target.depth is None else target.depth.contiguous() for target in targets]
     # In float64, as the kernel's sums are.
     view_weights = torch.tensor(weights, dtype=torch.float64)
@@ -171,7 +170,7 @@ def _check_inputs(color: Tensor, depth: Tensor, targets: Sequence[Target], weigh
         # By name, so that the error says which statistic is of another image.
         parts = {"image": target.image.pixels, "mean": target.image.mean, "variance": target.image.variance}
         for name, part in parts.items():
-            if part.shape != color.shape[1:]:
+            if part is not None and part.shape != color.shape[1:]:
                 raise ValueError(f"expected a target {name} of shape {tuple(color.shape[1:])}, got {tuple(part.shape)}")
         if target.depth is not None and target.depth.shape != depth.shape[1:]:
             raise ValueError(f"expected LiDAR depth of shape {tuple(depth.shape[1:])}, got {tuple(target.depth.shape)}")

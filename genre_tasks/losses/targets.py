@@ -15,6 +15,7 @@ from genre_tasks.scene.chunk import Chunk, Gain, View
 from genre_tasks.scene.image_decoding import decode_image
 from genre_tasks.scene.lidar_depth import compute_lidar_depth
 from genre_tasks.scene.novel_views import FixedViews
+from genre_tasks.threads import map_single_threaded
 
 
 @dataclass(frozen=True)
@@ -64,30 +65,29 @@ def view_targets(chunk: Chunk, views: Sequence[View], depth: bool = False) -> tu
     Raises:
         InputError: an image cannot be decoded; the error names its camera and frame.
     """
-    targets = []
-    for view in views:
+
+    def decode(view: View) -> Target:
         try:
             image = decode_image(view.image, view.lens.width_px, view.lens.height_px)
         except InputError as error:
             # The decoder knows bytes only; the user needs to know which image it is.
             where = {"log": chunk.log, "chunk": chunk.index, "camera": view.camera, "frame": view.frame}
             raise InputError(error.problem, remedy=error.remedy, **where) from error  # type: ignore[arg-type]
-        targets.append(
-            Target(
-                camera=view.camera,
-                frame=view.frame,
-                chunk_SE3_camera=view.chunk_SE3_camera,
-                lens=view.lens,
-                image=SsimTarget.from_image(image),
-                depth=torch.as_tensor(compute_lidar_depth(chunk, view)).float() if depth else None,
-                # How the image was taken goes along, so that the render can be made in the same way.
-                log_gain=view.log_gain,
-                ego_mask=None if view.ego_mask is None else torch.from_numpy(view.ego_mask),
-                shutter=view.shutter,
-                blur=view.blur,
-            )
+        return Target(
+            camera=view.camera,
+            frame=view.frame,
+            chunk_SE3_camera=view.chunk_SE3_camera,
+            lens=view.lens,
+            image=SsimTarget.of_many(image),
+            depth=torch.as_tensor(compute_lidar_depth(chunk, view)).float() if depth else None,
+            # How the image was taken goes along, so that the render can be made in the same way.
+            log_gain=view.log_gain,
+            ego_mask=None if view.ego_mask is None else torch.from_numpy(view.ego_mask),
+            shutter=view.shutter,
+            blur=view.blur,
         )
-    return tuple(targets)
+
+    return tuple(map_single_threaded(decode, views))
 
 
 def source_targets(chunk: Chunk, depth: bool) -> tuple[Target, ...]:
@@ -131,7 +131,7 @@ def novel_targets(fixed: FixedViews) -> tuple[Target, ...]:
             chunk_SE3_camera=view.chunk_SE3_camera,
             lens=view.lens,
             # The store has half floats, the losses compute in float32. No depth: LiDAR never measured a fixed view.
-            image=SsimTarget.from_image(color.float().contiguous()),
+            image=SsimTarget.of_many(color.float().contiguous()),
             novel=True,
         )
         for view, color in zip(fixed.views, fixed.color, strict=True)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,12 +26,12 @@ from genre_tasks.scene.alignment_step import (
     project_points,
     take_step,
 )
-from genre_tasks.scene.chunk import Chunk
+from genre_tasks.scene.chunk import Chunk, View
 from genre_tasks.scene.image_decoding import decode_pixels
 from genre_tasks.scene.transforms import distance_to_path
 from genre_tasks.scene.visibility import find_visible_points
 from genre_tasks.srgb import LUMA_WEIGHTS
-from genre_tasks.threads import torch_threads
+from genre_tasks.threads import map_single_threaded, torch_threads
 
 BLURS_PX = (4.0, 2.0, 1.0, 0.6)
 """Standard deviations by which images are blurred, one after the other: a coarse image leads over larger errors."""
@@ -99,8 +100,7 @@ def align_poses(chunk: Chunk, *, coarse: bool = False) -> PoseAlignment | None:
         InputError: an image cannot be decoded.
     """
     images = _load_images(chunk)
-    with torch_threads(1):
-        motions = _find_motions(chunk, images, coarse)
+    motions = _find_motions(chunk, images, coarse)
     if motions is None:
         return None
     mounts, rig = motions
@@ -117,10 +117,10 @@ def _find_motions(chunk: Chunk, images: Sequence[AlignedImage], coarse: bool) ->
     usable = near & (chunk.static.frames >= 0)
     point_count = min(COARSE_POINT_COUNT if coarse else POINT_COUNT, MAX_OBSERVATIONS // max(len(images), 1))
     for blur_px in COARSE_BLURS_PX if coarse else BLURS_PX:
-        levels = [_normalise(image.luma, blur_px) for image in images]
+        levels = map_single_threaded(partial(_normalise, blur_px=blur_px), [image.luma for image in images])
         # Anew at each blur: what hides what follows from poses, which are better by now.
         moved = [replace(image.view, chunk_SE3_camera=compute_pose(image, mounts, rig)) for image in images]
-        visible = [find_visible_points(chunk.static.positions, view)[0] for view in moved]
+        visible = map_single_threaded(partial(_find_visible, chunk.static.positions), moved)
         points, observed = _draw_points(
             chunk.static.positions, usable, visible, images, levels, mounts, rig, point_count
         )
@@ -128,10 +128,17 @@ def _find_motions(chunk: Chunk, images: Sequence[AlignedImage], coarse: bool) ->
             return None
         for _ in range(ITERATIONS):
             before = np.concatenate([mounts, rig])
-            mounts, rig = take_step(points, observed, images, levels, mounts, rig)
+            # One thread: sums do not depend on the number of cores.
+            with torch_threads(1):
+                mounts, rig = take_step(points, observed, images, levels, mounts, rig)
             if np.abs(np.concatenate([mounts, rig]) - before).max() < SMALLEST_STEP:
                 break
     return mounts, rig
+
+
+def _find_visible(positions: Float32, view: View) -> NDArray[np.int64]:
+    """Indices of the points that a view sees."""
+    return find_visible_points(positions, view)[0]
 
 
 def _load_images(chunk: Chunk) -> list[AlignedImage]:
@@ -173,13 +180,18 @@ def _draw_points(
     """Points [P, 3] that at least two views see, and which of the V views see them [V, P]."""
     count = np.zeros(len(positions), np.int64)
     slope = np.zeros(len(positions), np.float32)
-    for image, level, index in zip(images, levels, visible, strict=True):
-        count[index] += 1
+
+    def find_slopes(k: int) -> tuple[NDArray[np.int64], Float32]:
+        image, level, index = images[k], levels[k], visible[k]
         _, u, v, inside = project_points(
             positions[index].astype(np.float64), compute_pose(image, mounts, rig), image.lens
         )
         steepness = np.hypot(level.by_u, level.by_v)[v[inside].astype(int), u[inside].astype(int)]
-        slope[index[inside]] = np.maximum(slope[index[inside]], steepness)
+        return index[inside], steepness
+
+    for index, (inside, steepness) in zip(visible, map_single_threaded(find_slopes, range(len(images))), strict=True):
+        count[index] += 1
+        slope[inside] = np.maximum(slope[inside], steepness)
     candidates = np.flatnonzero(usable & (count >= 2) & (slope > 0))
     chosen = np.empty(0, np.int64)
     if len(candidates):

@@ -17,6 +17,7 @@ from genre_tasks.scene.chunk import NO_SWEEP, Chunk, Points, View
 from genre_tasks.scene.image_decoding import decode_pixels
 from genre_tasks.scene.plane_sweep import SweepImage, compute_depth_map, unproject_pixels
 from genre_tasks.scene.projection import project, splat_depth
+from genre_tasks.threads import map_single_threaded
 
 SWEEP_PIXELS = 16_000
 """Images are compared at about so many pixels, whatever their size: the points' colours are coarser than the image's
@@ -128,21 +129,26 @@ def find_stereo_points(chunk: Chunk, views: Sequence[View]) -> Points:
     """
     neighbours = {k: find_neighbours(view, views) for k, view in enumerate(views)}
     # A view without neighbours has no depth, and confirms no other's.
-    images = [SweepImage.from_view(view, choose_sweep_width(view)) for view in views]
-    depth_maps = {
-        k: compute_depth_map(images[k], [images[other] for other in others])
-        for k, others in neighbours.items()
-        if others
-    }
+    images = map_single_threaded(lambda view: SweepImage.from_view(view, choose_sweep_width(view)), views)
+    compared = [k for k, others in neighbours.items() if others]
+
+    def compute_depth(k: int) -> Float32:
+        return compute_depth_map(images[k], [images[other] for other in neighbours[k]])
+
+    depth_maps = dict(zip(compared, map_single_threaded(compute_depth, compared), strict=True))
     positions = [np.empty((0, 3), np.float32)]
     colors = [np.empty((0, 3), np.uint8)]
-    for k, depth in depth_maps.items():
+
+    def take_points(k: int) -> tuple[Float32, NDArray[np.uint8]]:
         others = [(images[other], depth_maps[other]) for other in depth_maps if other != k]
-        surface, is_confirmed = _confirm(images[k], depth, others)
+        surface, is_confirmed = _confirm(images[k], depth_maps[k], others)
         lens = images[k].lens
         kept = is_confirmed & find_unscanned_pixels(chunk, views[k], lens.width_px)
-        positions.append(surface[kept].astype(np.float32))
-        colors.append(decode_pixels(views[k].image, lens.width_px, lens.height_px)[kept])
+        return surface[kept].astype(np.float32), decode_pixels(views[k].image, lens.width_px, lens.height_px)[kept]
+
+    for position, color in map_single_threaded(take_points, compared):
+        positions.append(position)
+        colors.append(color)
     return _collect_points(np.concatenate(positions), np.concatenate(colors))
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,8 @@ from genre_tasks.errors import ArtifactCorruptError, ConfigError
 from storage.codecs.tables import REMEDY
 from storage.files import write_file
 from storage.srgb import to_linear_half
+
+Result = TypeVar("Result")
 
 # More threads do not pay for images of this size, and stages run beside each other.
 EXR_THREADS = 2
@@ -39,6 +42,26 @@ def _load_openexr() -> Any:
     _stop_threads_before_forks()
     OpenEXR.set_global_thread_count(EXR_THREADS)
     return OpenEXR
+
+
+def map_images(function: Callable[..., Result], *items: Iterable[Any]) -> list[Result]:
+    """Reads or writes several images at a time: most of the work is in code that runs beside other threads.
+
+    Args:
+        function: of one image.
+        items: its arguments, as for ``map``.
+
+    Returns:
+        What it returns for each image, in order.
+
+    Raises:
+        Exception: what ``function`` raises for the first image that fails.
+
+    >>> map_images(pow, [2, 3], [2, 2])
+    [4, 9]
+    """
+    with ThreadPoolExecutor(EXR_THREADS) as pool:
+        return list(pool.map(function, *items))
 
 
 def write_channels(path: Path, channels: Mapping[str, NDArray[Any]]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from genre_tasks.scene.novel_views import FixedViews
-from storage.codecs.exr import read_channels, write_exr
+from storage.codecs.exr import map_images, read_channels, write_exr
 from storage.codecs.novel_views import read_view_table, write_view_table
 from storage.codecs.tables import check_array
 from storage.srgb import from_linear_half
@@ -34,8 +34,7 @@ def write(folder: Path, value: FixedViews) -> None:
     color = check_array(
         value.color.detach().cpu().numpy(), "fixed colour", np.float32, (len(value.views), height, width, 3)
     )
-    for i, path in enumerate(write_view_table(folder, value.views, height, width)):
-        write_exr(path, color[i])
+    map_images(write_exr, write_view_table(folder, value.views, height, width), color)
 
 
 def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> FixedViews:
@@ -56,8 +55,11 @@ def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> FixedVi
     views, paths, (height, width) = read_view_table(folder)
     # Filled in place: stacking the images at the end would need the memory twice.
     color = np.empty((len(views), height, width, 3), np.float32)
-    for i, path in enumerate(paths):
+
+    def fill(i: int, path: Path) -> None:
         color[i] = read_image(path, (height, width))
+
+    map_images(fill, range(len(paths)), paths)
     # The fixer writes these entries only where it copied a view.
     known = measurements or {}
     return FixedViews(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from genre_tasks.errors import ArtifactCorruptError
 from genre_tasks.scene.novel_views import NovelView, NovelViews
-from storage.codecs.exr import read_channels, write_channels
+from storage.codecs.exr import map_images, read_channels, write_channels
 from storage.codecs.tables import REMEDY, check_array, column, read_table, schema, write_table
 from storage.codecs.view_columns import CAMERA_AND_FRAME, LENS_AND_POSE, SHIFT, lens_columns, pose_and_lens
 from storage.srgb import from_linear_half, to_linear_half
@@ -146,13 +146,17 @@ def write(folder: Path, value: NovelViews) -> None:
             check_array(alpha.detach().cpu().numpy(), f"{name} alpha", np.float32, shape),
             check_array(depth.detach().cpu().numpy(), f"{name} depth", np.float32, shape),
         )
-    for i, path in enumerate(write_view_table(folder, value.views, height, width)):
+
+    def write_image(i: int, path: Path) -> None:
         channels: dict[str, Any] = {}
         for layer, (colors, alphas, depths) in arrays.items():
             light = to_linear_half(colors[i], alphas[i], f"colour of {path.name}")
             channels |= {f"{layer}{c}": light[..., k] for k, c in enumerate("RGB")}
             channels |= {f"{layer}A": alphas[i], f"{layer}Z": depths[i]}
         write_channels(path, channels)
+
+    paths = write_view_table(folder, value.views, height, width)
+    map_images(write_image, range(len(paths)), paths)
 
 
 def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> NovelViews:
@@ -177,10 +181,13 @@ def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> NovelVi
         layer: (np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32))
         for layer in LAYERS
     }
-    for i, path in enumerate(paths):
+
+    def fill(i: int, path: Path) -> None:
         for layer, images in read_image(path, (height, width)).items():
             for array, image in zip(arrays[layer], images, strict=True):
                 array[i] = image
+
+    map_images(fill, range(len(paths)), paths)
     color, alpha, depth = (torch.from_numpy(array) for array in arrays[""])
     lidar_color, lidar_alpha, lidar_depth = (torch.from_numpy(array) for array in arrays["lidar."])
     return NovelViews(
