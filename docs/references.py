@@ -18,6 +18,7 @@ def presets() -> str:
         "small": "quick runs, and time budgets",
         "fine": "the default: real logs on a CPU",
         "long": "a longer GNet at the size of `small`",
+        "hd": "the paper's image size on a CPU: minutes and 6 GB a chunk",
         "paper": "the paper's settings with SD-Turbo; needs a GPU, never run whole",
     }
     lines = []

@@ -25,7 +25,7 @@ _LOGS = typer.Argument(
 LogsArgument = Annotated[list[str], _LOGS]
 OptionalLogsArgument = Annotated[list[str] | None, _LOGS]
 PresetOption = Annotated[
-    str, typer.Option(help="The named configuration to start from: demo, small, fine, long or paper.")
+    str, typer.Option(help="The named configuration to start from: demo, small, fine, long, hd or paper.")
 ]
 SettingsOption = Annotated[
     list[str] | None,

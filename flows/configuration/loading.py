@@ -14,7 +14,7 @@ from genre_tasks.config import EffectsConfig, PipelineConfig
 from genre_tasks.errors import ConfigError
 from genre_tasks.suggestions import did_you_mean
 
-PRESETS = ("demo", "small", "fine", "long", "paper")
+PRESETS = ("demo", "small", "fine", "long", "hd", "paper")
 _PRESET_FOLDER = Path(__file__).resolve().parents[2] / "configs"
 
 

@@ -50,7 +50,7 @@ def reconstruct_dataset(
 
     Args:
         logs: URIs of logs; ``pandaset:PATH/*`` stands for every sequence in a folder.
-        preset: demo, small, fine, long or paper.
+        preset: demo, small, fine, long, hd or paper.
         store: folder (or URI) of the store; with a pool, one that every worker reaches.
         settings: ``section.key=value`` strings over the preset.
         pool: the work pool of the child runs; ``None`` runs the logs in this process, one after another.

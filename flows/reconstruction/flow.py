@@ -54,7 +54,7 @@ def reconstruct_log(
 
     Args:
         log: the log's URI, such as ``pandaset:PATH/002`` or ``synthetic:street?seed=1000``.
-        preset: demo, small, fine, long or paper.
+        preset: demo, small, fine, long, hd or paper.
         store: folder (or URI) of the store.
         chunks: numbers of the chunks; ``None`` for all.
         config: a whole effective configuration as JSON values, in place of the preset's.

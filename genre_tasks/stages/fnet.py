@@ -113,24 +113,24 @@ def fix_views(
     done = 0
     lock = Lock()
 
-    def fix_batch(indices: Sequence[int]) -> Tensor:
+    def fix_batch(indices: Sequence[int]) -> None:
         nonlocal done
         views = build_inputs(chunk, novel, indices, sources)
         # Noise depends on a view's index, so that batches and threads do not matter.
         noise = draw_noise(network, config.seed, indices, *novel.alpha.shape[1:], reduction)
         latent = torch.cat([encoded[novel.views[i].reference].latent for i in indices])
         fixed = fix(network, views, noise, Encoded(latent, ()), half, reduction=reduction)
+        # Filled in place: joining the batches at the end would need the memory twice.
+        color[list(indices)] = fixed.permute(0, 2, 3, 1)
         # Batches end in any order, on several threads.
         with lock:
             done += len(indices)
             progress(done, len(selected), "fixing views")
-        return fixed
 
     size = config.batch_views
     start_s = time.perf_counter()
     batches = [selected[first : first + size] for first in range(0, len(selected), size)]
-    fixed = map_single_threaded(fix_batch, batches)
-    color[selected] = torch.cat(fixed).permute(0, 2, 3, 1)
+    map_single_threaded(fix_batch, batches)
     # Reported with the time that copying saved, so that a gate can be judged.
     copied = tuple(sorted(set(range(total)) - set(selected)))
     seconds_per_view = (time.perf_counter() - start_s) / len(selected)

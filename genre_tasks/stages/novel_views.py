@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from genre_tasks.checks import check_finite
 from genre_tasks.config import NovelViewsConfig
@@ -87,10 +89,10 @@ def render_novel(
         views=tuple(views),
         color=image.color,
         alpha=image.alpha,
-        depth=image.expected_depth(),
+        depth=image.depth,
         lidar_color=lidar.color,
         lidar_alpha=lidar.alpha,
-        lidar_depth=lidar.expected_depth(),
+        lidar_depth=lidar.depth,
         culled=image.culled,
         lidar_culled=lidar.culled,
     )
@@ -98,6 +100,16 @@ def render_novel(
     for name in ("color", "alpha", "depth", "lidar_color", "lidar_alpha", "lidar_depth"):
         check_finite(getattr(images, name), name, "novel_views", log=chunk.log, chunk=chunk.index)
     return images
+
+
+@dataclass(frozen=True)
+class _Images:
+    """Renders of all views, with depths that are not premultiplied."""
+
+    color: Tensor
+    alpha: Tensor
+    depth: Tensor
+    culled: dict[str, int]
 
 
 def _render(
@@ -108,9 +120,11 @@ def _render(
     progress: Progress,
     done: int,
     note: str,
-) -> Render:
+) -> _Images:
     """Renders the views of each frame in one call, so that progress moves between frames."""
-    parts = []
+    tensors: tuple[Tensor, ...] = ()
+    # Counts of Gaussians that were left out are added up, for the report.
+    culled: Counter[str] = Counter()
     start = 0
     with torch.no_grad():
         while start < len(views):
@@ -118,15 +132,12 @@ def _render(
             while end < len(views) and views[end].frame == views[start].frame:
                 end += 1
             progress(done + start, 2 * len(views), note)
-            parts.append(render(scene, views[start:end], settings))
+            part = render(scene, views[start:end], settings)
+            images = (part.color, part.alpha, part.expected_depth())
+            # Filled in place: joining the parts at the end would need the memory twice.
+            tensors = tensors or tuple(image.new_empty(len(views), *image.shape[1:]) for image in images)
+            for tensor, image in zip(tensors, images, strict=True):
+                tensor[start:end] = image
+            culled.update(part.culled)
             start = end
-    # Counts of Gaussians that were left out are added up, for the report.
-    culled: Counter[str] = Counter()
-    for part in parts:
-        culled.update(part.culled)
-    return Render(
-        color=torch.cat([part.color for part in parts]),
-        alpha=torch.cat([part.alpha for part in parts]),
-        depth=torch.cat([part.depth for part in parts]),
-        culled=dict(culled),
-    )
+    return _Images(*tensors, culled=dict(culled))
