@@ -34,7 +34,7 @@ _TRANSFER_S = 120.0
 _SHIFTS_S = 60.0
 _RANGE_S = 70.0
 _SPEED_S = 60.0
-_TRAINING_S = 300.0
+_TRAINING_S = 600.0
 _METRICS_S = 10.0
 _RANGE_LOGS = 3
 _TRAINING_SEEDS = 3
@@ -47,7 +47,7 @@ class PerceptionBench:
     options: Mapping[str, str] = {
         "seeds": "1001,1002,1003,1004,1005,1006,1007,1008,1009,1010",
         "train": "100,101,102,103,104,105,106,107",
-        "trainings": "8x1000,4x1500,4x2000x0.7",
+        "trainings": "4x3000x0.7",
         "pandaset": "../shared/data/pandaset/002",
         "chunks": "0,1",
         "detectors": "../shared/data/detectors",

@@ -1,7 +1,7 @@
 """What renders are worth to a detector (paper Table 8): trained on recorded images alone, and with renders added.
 
-Every training takes as many steps from the same first weights, so that rows differ in their images alone. A finished
-training is found again by its images, settings and code; one that was stopped goes on at its last checkpoint.
+Every training takes as many steps from the same first weights, so that rows differ in their images alone. Recorded
+images are half of those that a detector sees, however many renders are added. A finished training is found again by its images, settings and code; one that was stopped goes on at its last checkpoint.
 """
 
 from __future__ import annotations
@@ -125,12 +125,13 @@ class DetectorStudy:
         """The training sets of a row: recorded images of every chunk, and its renders."""
         _, plus, method = row.partition("+")
         sets = []
+        shifts = (self.shift_m, -self.shift_m)
         for where in self.train:
-            sets.append(self._cache_recorded(where, runner, every=1))
+            # As often as renders, which there are of every shift: the test is on recorded images.
+            sets += [self._cache_recorded(where, runner, every=1)] * (len(shifts) if plus else 1)
             if plus:
                 source = self.build_source(where, method)
                 refs = source.run(runner)
-                shifts = (self.shift_m, -self.shift_m)
                 names = ("renders", refs["ingest"].key, refs["effects"].key, refs[str(source.end)].key, shifts)
                 sets.append(CachedImages.named(self.folder, names, partial(render_shifted, source, refs, shifts)))
         return sets
