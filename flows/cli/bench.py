@@ -43,6 +43,7 @@ _BENCHES: dict[str, BenchEntry] = {
         "benchmarks.optimiser.ablation:FACADES", "what completing façades above the LiDAR's view gains"
     ),
     "fixer": BenchEntry("benchmarks.fixer:BENCH", "what FNet gains beside the path, and what it costs"),
+    "full_size": BenchEntry("benchmarks.full_size:BENCH", "seconds, memory and images of the preset hd"),
     "ground": BenchEntry("benchmarks.optimiser.ablation:GROUND", "what constraining the ground to its plane gains"),
     "log_faults": BenchEntry(
         "benchmarks.log_faults:BENCH", "from which strength faults of logs are found, and false alarms on sound logs"

@@ -14,6 +14,7 @@ from functools import lru_cache
 # Of glibc's malloc.h.
 _M_TRIM_THRESHOLD = -1
 _M_MMAP_MAX = -4
+_M_ARENA_MAX = -8
 
 # The allocator is only told by how much its heap may be free at the end: more than any stage needs.
 _NEVER = 2**31 - 1
@@ -33,6 +34,8 @@ def reuse_freed_memory() -> Iterator[None]:
         # No block of its own for a large tensor: blocks go back to the system as soon as they are freed.
         libc.mallopt(_M_MMAP_MAX, 0)
         libc.mallopt(_M_TRIM_THRESHOLD, _NEVER)
+        # One heap for all threads: what one of them has freed, any other can take.
+        libc.mallopt(_M_ARENA_MAX, 1)
     try:
         yield
     finally:

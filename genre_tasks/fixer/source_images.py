@@ -14,6 +14,7 @@ from genre_tasks.fixer.view_surface import MIN_ALPHA
 from genre_tasks.fixer.warping import SourceImage
 from genre_tasks.render.surface import render_surfaces
 from genre_tasks.scene.chunk import Chunk, View
+from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.image_decoding import decode_image
 from genre_tasks.scene.lidar_map import build_lidar_scene
 from genre_tasks.scene.novel_views import NovelView
@@ -37,11 +38,11 @@ def load_source_images(chunk: Chunk) -> tuple[SourceImage, ...]:
     """
     # Depth has no motion blur, and without it each view is rendered once.
     views = [v if v.blur is None else replace(v, blur=None) for v in chunk.views_with_role("source")]
-    with torch.no_grad():
-        lidar_map = render_surfaces(build_lidar_scene(chunk, OCCLUDING_POINTS), views)
-    depths = torch.where(lidar_map.alpha >= MIN_ALPHA, lidar_map.expected_depth(), torch.zeros_like(lidar_map.alpha))
+    lidar_scene = build_lidar_scene(chunk, OCCLUDING_POINTS)
     sources = []
-    for view, depth in zip(views, depths, strict=True):
+    for view in views:
+        # One by one: colours, which a map has too, would take more memory than all depths.
+        depth = _render_depth(lidar_scene, view)
         if view.ego_mask is not None:
             # The vehicle itself hides whatever lies behind it.
             depth = torch.where(torch.from_numpy(view.ego_mask), NEAR_M, depth)
@@ -56,6 +57,14 @@ def load_source_images(chunk: Chunk) -> tuple[SourceImage, ...]:
         )
         sources.append(source)
     return tuple(sources)
+
+
+@torch.no_grad()
+def _render_depth(lidar_scene: SceneGraph, view: View) -> Tensor:
+    """[H, W] metres, 0 where the map has no surface."""
+    lidar_map = render_surfaces(lidar_scene, [view])
+    known = lidar_map.alpha >= MIN_ALPHA
+    return torch.where(known, lidar_map.expected_depth(), torch.zeros_like(lidar_map.alpha))[0]
 
 
 def _decode_without_gain(view: View) -> Tensor:

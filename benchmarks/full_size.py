@@ -1,0 +1,257 @@
+"""The paper's image size on a CPU: seconds and memory of every stage of the preset hd, and what its images are worth.
+
+genre bench full_size --json docs/results/data/full_size.json [--set chunks=1] [--set store=DIR]
+
+A run starts from an empty store, in a process of its own, and takes the stages in order as ``genre run`` does, without
+evaluation. Images are judged in a store that stays, so that a measurement that was stopped goes on.
+"""
+
+from __future__ import annotations
+
+import resource
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from functools import partial
+from multiprocessing import get_context
+from typing import Any
+
+import torch
+from torch.nn import functional
+
+from benchmarks.common.bench import (
+    TINY_SETTINGS,
+    TINY_STREET,
+    Bench,
+    Cell,
+    Row,
+    SmallestForm,
+    settings_from_options,
+    split_option,
+)
+from benchmarks.common.claims import Claim, claim
+from benchmarks.common.run_stages import read_metrics, reconstruct
+from benchmarks.common.task import require_log_folder
+from flows.configuration import load_configuration
+from flows.pipeline.definition import STAGE_BY_NAME, digest_stage_weights
+from flows.pipeline.stage_runner import ArtifactRef, Job, read_artifact, run_stage
+from genre_tasks.config import PipelineConfig
+from genre_tasks.effects.apply_plan import apply_plan
+from genre_tasks.metrics.scoring import ScoreCollector, decode_view_image
+from genre_tasks.render.types import RenderSettings
+from genre_tasks.scene.chunk import View
+from genre_tasks.stages.evaluation_renders import render_batches
+
+STAGES = ("ingest", "effects", "initial", "gnet", "novel_views", "fnet", "enet")
+PAPER_MINUTES = 2.77
+PAPER_FNET_S = 0.83
+"""The paper's, for one chunk and one image on a GPU."""
+
+_RUN_S = 400.0
+_QUALITY_S = 1800.0
+_LIMIT_MINUTES = 6.0
+_LIMIT_GIB = 6.0 * 1e9 / 2**30
+_LIMIT_FNET_S = 2.0
+_KERNEL_CUT = 0.25
+_SHARPER = 0.20
+_KIB_PER_GIB = 2**20
+
+
+class FullSize:
+    """Seconds, memory and image quality of the preset ``hd``."""
+
+    name = "full_size"
+    options: Mapping[str, str] = {
+        "log": "pandaset:../shared/data/pandaset/002",
+        "chunks": "0,1",
+        "settings": "",
+        "store": "genre-store",
+    }
+    code: tuple[str, ...] = (
+        "benchmarks.full_size",
+        "genre_tasks.stages.ingest",
+        "genre_tasks.stages.effects",
+        "genre_tasks.stages.initial",
+        "genre_tasks.stages.optimise",
+        "genre_tasks.stages.novel_views",
+        "genre_tasks.stages.fnet",
+        "genre_tasks.stages.evaluate",
+        "genre_tasks.logs.pandaset.reader",
+    )
+    smallest = SmallestForm(
+        {"log": f"synthetic:street?seed={TINY_STREET}", "chunks": "0", "settings": TINY_SETTINGS}, only="run"
+    )
+
+    def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
+        """Lists a run and the images' quality for each chunk; ``quick`` leaves the quality out."""
+        cells = []
+        settings = settings_from_options(options)
+        for chunk in [int(number) for number in split_option(options["chunks"])]:
+            measures = [("run", partial(measure_run, settings), _RUN_S)]
+            if not quick:
+                measures.append(("quality", partial(measure_quality, settings, options["store"]), _QUALITY_S))
+            for kind, measure, seconds in measures:
+                described = describe(options["log"], chunk, settings)
+                cells.append(
+                    Cell(f"{kind} chunk {chunk}", seconds, partial(measure, options["log"], chunk), described)
+                )
+        return cells
+
+    def claims(self, rows: Mapping[str, Row]) -> Iterator[Claim]:
+        """Makes the claims, chunk by chunk."""
+        for row in rows.values():
+            if row.get("kind") == "run":
+                yield from _run_claims(row)
+            if row.get("kind") == "quality":
+                yield from _quality_claims(row)
+
+    def table(self, rows: Mapping[str, Row]) -> Iterator[str]:
+        """Makes the table that the command prints."""
+        yield "| chunk | stage | seconds | CPU seconds | GiB |"
+        yield "|---|---|---|---|---|"
+        for row in rows.values():
+            for stage, measured in row.get("stages", {}).items():
+                numbers = " | ".join(f"{measured[name]:.1f}" for name in ("seconds", "cpu_seconds", "peak_gib"))
+                yield f"| {row['chunk']} | {stage} | {numbers} |"
+
+
+def describe(log: str, chunk: int, settings: tuple[str, ...]) -> dict[str, Any]:
+    """Says what a cell depends on beyond the code, for the cells' cache.
+
+    Args:
+        log: URI.
+        chunk: its number.
+        settings: over the preset.
+    """
+    config = load_configuration("hd", settings=settings)
+    weights = [digest_stage_weights(STAGE_BY_NAME[stage], config) for stage in ("gnet", "fnet", "enet")]
+    return {"log": log, "chunk": chunk, "configuration": config.model_dump(mode="json"), "weights": weights}
+
+
+def build_job(preset: str, log: str, chunk: int, store: str, settings: tuple[str, ...]) -> Job:
+    """Builds the job of a preset.
+
+    Args:
+        preset: its name.
+        log: URI.
+        chunk: its number.
+        store: folder of the store.
+        settings: over the preset.
+    """
+    config: PipelineConfig = load_configuration(preset, settings=settings)
+    return Job(log, chunk, store, config.model_dump(mode="json"))
+
+
+def measure_run(settings: tuple[str, ...], log: str, chunk: int) -> Row:
+    """Runs all stages from an empty store in a new process.
+
+    Args:
+        settings: over the preset.
+        log: URI.
+        chunk: its number.
+
+    Returns:
+        ``stages`` with seconds, CPU seconds and the largest memory while each ran; ``seconds`` and ``peak_gib`` of the
+        whole; views that were fixed, and Gaussians at the end.
+    """
+    require_log_folder(log)
+    with tempfile.TemporaryDirectory() as folder:
+        job = build_job("hd", log, chunk, folder, settings)
+        # A new process: what this one has loaded and cached would count as the run's memory and save its seconds.
+        with get_context("spawn").Pool(1) as pool:
+            return pool.apply(_run_all, (job, torch.get_num_threads()))
+
+
+def _run_all(job: Job, threads: int) -> Row:
+    torch.set_num_threads(threads)
+    stages = {}
+    refs: dict[str, ArtifactRef] = {}
+    began = time.perf_counter()
+    for stage in STAGES:
+        stage_began, cpu_began = time.perf_counter(), time.process_time()
+        refs[stage] = run_stage(stage, job, refs)
+        stages[stage] = {
+            # Reading inputs and writing the artifact count, as a user's clock counts them.
+            "seconds": time.perf_counter() - stage_began,
+            "cpu_seconds": time.process_time() - cpu_began,
+            # Each stage starts the count again, see ``measure_usage``.
+            "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _KIB_PER_GIB,
+        }
+    seconds = time.perf_counter() - began
+    return {
+        "kind": "run",
+        "log": job.log,
+        "chunk": job.chunk,
+        "stages": stages,
+        "seconds": seconds,
+        "peak_gib": max(stage["peak_gib"] for stage in stages.values()),
+        "fixed_views": len(read_artifact(job, refs["fnet"]).views),
+        "gaussians": len(read_artifact(job, refs["enet"]).scene),
+    }
+
+
+def measure_quality(settings: tuple[str, ...], store: str, log: str, chunk: int) -> Row:
+    """Judges the images of GNet, FNet and ENet, and those of the preset ``small`` that are scaled up.
+
+    Args:
+        settings: over the presets.
+        store: folder of the store.
+        log: URI.
+        chunk: its number.
+
+    Returns:
+        Metrics by stage, and the perceptual distance of held-out images of ``hd`` and of ``small`` scaled up.
+    """
+    require_log_folder(log)
+    job = build_job("hd", log, chunk, store, settings)
+    evaluated = ("gnet", "fnet", "enet")
+    refs = reconstruct(job, (*STAGES, *(f"evaluate/{stage}" for stage in evaluated)))
+    metrics = {stage: read_metrics(job, refs[f"evaluate/{stage}"]) for stage in evaluated}
+    full = apply_plan(read_artifact(job, refs["ingest"]), read_artifact(job, refs["effects"]))
+    small = build_job("small", log, chunk, store, settings)
+    return {
+        "kind": "quality",
+        "log": log,
+        "chunk": chunk,
+        "metrics": metrics,
+        "small_scaled_up": _judge_scaled_up(small, full.views_with_role("heldout")),
+    }
+
+
+def _judge_scaled_up(job: Job, views: tuple[View, ...]) -> float:
+    """Perceptual distance of a smaller preset's held-out renders, scaled up to the views' size."""
+    refs = reconstruct(job, STAGES)
+    chunk = apply_plan(read_artifact(job, refs["ingest"]), read_artifact(job, refs["effects"]))
+    scene = read_artifact(job, refs["enet"]).scene
+    same = {(view.camera, view.frame): view for view in views}
+    collector = ScoreCollector("enet", distributions=False)
+    for batch, images in render_batches(scene, chunk.views_with_role("heldout"), RenderSettings(), None):
+        for view, image in zip(batch, images, strict=True):
+            target = same[view.camera, view.frame]
+            size = (target.lens.height_px, target.lens.width_px)
+            # The sharpest of the usual ways, so that the comparison is with a good enlargement.
+            scaled = functional.interpolate(image.permute(2, 0, 1)[None], size, mode="bicubic", antialias=True)
+            collector.add([target], scaled.clamp(0, 1).permute(0, 2, 3, 1), decode_view_image(target)[None])
+    return sum(score.perceptual for score in collector.scores) / len(collector.scores)
+
+
+def _run_claims(row: Row) -> Iterator[Claim]:
+    where = f"chunk {row['chunk']} of {row['log'].rpartition('/')[2]}, six cameras at 1280×720, without evaluation"
+    fnet_s = row["stages"]["fnet"]["seconds"] / row["fixed_views"]
+    yield claim("full_size.minutes", row["seconds"] / 60, "<=", _LIMIT_MINUTES, "minutes", where)
+    yield claim("full_size.peak_gib", row["peak_gib"], "<=", _LIMIT_GIB, "GiB", where)
+    yield claim("full_size.fnet_s", fnet_s, "<=", _LIMIT_FNET_S, "s", f"{where}, an image with reading and writing")
+
+
+def _quality_claims(row: Row) -> Iterator[Claim]:
+    where = f"chunk {row['chunk']} of {row['log'].rpartition('/')[2]} at 1280×720"
+    gnet, enet = row["metrics"]["gnet"], row["metrics"]["enet"]
+    cut = 1 - enet["shift_3m/kernel"] / gnet["shift_3m/kernel"]
+    gain = enet["interpolation/psnr"] - gnet["interpolation/psnr"]
+    sharper = 1 - enet["interpolation/perceptual"] / row["small_scaled_up"]
+    yield claim("full_size.kernel_cut", cut, ">=", _KERNEL_CUT, "share", where)
+    yield claim("full_size.heldout_gain", gain, ">=", 0.0, "dB", where)
+    yield claim("full_size.perceptual_gain", sharper, ">=", _SHARPER, "share", where)
+
+
+BENCH: Bench = FullSize()
