@@ -92,9 +92,7 @@ class FullSize:
                 measures.append(("quality", partial(measure_quality, settings, options["store"]), _QUALITY_S))
             for kind, measure, seconds in measures:
                 described = describe(options["log"], chunk, settings)
-                cells.append(
-                    Cell(f"{kind} chunk {chunk}", seconds, partial(measure, options["log"], chunk), described)
-                )
+                cells.append(Cell(f"{kind} chunk {chunk}", seconds, partial(measure, options["log"], chunk), described))
         return cells
 
     def claims(self, rows: Mapping[str, Row]) -> Iterator[Claim]:

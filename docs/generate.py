@@ -20,6 +20,7 @@ sys.path.insert(0, str(ROOT))
 from docs import (
     exchange_tables,
     fault_tables,
+    full_size_tables,
     perception_tables,
     real_log_tables,
     references,
@@ -44,6 +45,10 @@ BLOCKS: Mapping[str, Callable[[], str]] = {
     "start-up-claims": lambda: result_tables.claims("start_up"),
     "budget-runs": result_tables.budget_runs,
     "evaluation-claims": lambda: result_tables.claims("evaluation"),
+    "full-size-claims": full_size_tables.claims,
+    "full-size-paper": full_size_tables.paper,
+    "full-size-quality": full_size_tables.quality,
+    "full-size-stages": full_size_tables.stages,
     "log-faults": result_tables.log_faults,
     "log-faults-claims": lambda: result_tables.claims("log_faults"),
     "perception-claims": perception_tables.claims,

@@ -1,7 +1,10 @@
 """What renders are worth to a detector (paper Table 8): trained on recorded images alone, and with renders added.
 
 Every training takes as many steps from the same first weights, so that rows differ in their images alone. Recorded
-images are half of those that a detector sees, however many renders are added. A finished training is found again by its images, settings and code; one that was stopped goes on at its last checkpoint.
+images are half of those that a detector sees, however many renders are added.
+
+A finished training is found again by its images, settings and code; one that was stopped goes on at its last
+checkpoint.
 """
 
 from __future__ import annotations

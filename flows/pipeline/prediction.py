@@ -12,19 +12,34 @@ from flows.pipeline.stage_runner import ArtifactRef, Job, find_artifact
 from genre_tasks.config import PipelineConfig
 from storage.opening import open_store
 
-# Measured on two cores at 320×180 with six cameras and 44k Gaussians (preset small), for one chunk.
-# Used where the store holds no finished stage to learn from; scaled with the number of pixels.
-_TYPICAL_SECONDS_AND_GB = {
-    "ingest": (10.0, 2.5),
-    "initial": (4.0, 2.0),
-    "gnet": (4.0, 2.5),
-    "effects": (7.0, 2.0),
-    "novel_views": (10.0, 2.5),
-    "fnet": (24.0, 3.0),
-    "enet": (16.0, 2.5),
-    "evaluate": (40.0, 3.0),
+# Seconds and GiB of one chunk, measured on two cores with six cameras. Used where the store holds no finished stage to
+# learn from; in between and beyond they follow a line over the number of pixels, and never fall below the smaller size.
+_TYPICAL_SMALL = {
+    "ingest": (10.0, 1.2),
+    "initial": (4.0, 1.3),
+    "gnet": (4.0, 1.7),
+    "effects": (7.0, 1.4),
+    "novel_views": (10.0, 1.8),
+    "fnet": (24.0, 1.9),
+    "enet": (16.0, 1.7),
+    "evaluate": (40.0, 1.8),
 }
-_TYPICAL_PIXELS = 320 * 180
+"""With the preset ``small``: 320×180."""
+
+_TYPICAL_LARGE = {
+    "ingest": (12.0, 1.2),
+    "initial": (7.0, 1.3),
+    "gnet": (41.0, 3.4),
+    "effects": (50.0, 1.5),
+    "novel_views": (27.0, 4.5),
+    "fnet": (83.0, 5.6),
+    "enet": (77.0, 5.1),
+    "evaluate": (180.0, 3.2),
+}
+"""With the preset ``hd``: 1280×720."""
+
+_SMALL_PIXELS = 320 * 180
+_LARGE_PIXELS = 1280 * 720
 
 
 def predict_run(
@@ -78,7 +93,7 @@ def median_stage_seconds(store: str) -> dict[str, float]:
     Returns:
         Seconds by stage; all evaluation stages share the name ``evaluate``.
     """
-    typical = {stage: seconds for stage, (seconds, _) in _TYPICAL_SECONDS_AND_GB.items()}
+    typical = {stage: seconds for stage, (seconds, _) in _TYPICAL_SMALL.items()}
     stored: dict[str, list[float]] = {}
     for artifact in open_store(store).artifacts():
         stage = artifact.manifest.stage.partition("/")[0]
@@ -143,7 +158,12 @@ def _measured_stages(store: str, dataset: str) -> dict[str, tuple[float, float]]
 
 
 def _typical_stage(spec: StageSpec, config: PipelineConfig) -> tuple[float, float]:
-    scale = config.ingest.width_px * config.ingest.height_px / _TYPICAL_PIXELS
-    seconds, gigabytes = _TYPICAL_SECONDS_AND_GB[spec.name.partition("/")[0]]
-    # Most of the memory at low resolution is torch and the Gaussians, which do not grow with the pixels.
-    return seconds * scale, gigabytes * max(1.0, scale / 4)
+    pixels = config.ingest.width_px * config.ingest.height_px
+    share = max(0.0, (pixels - _SMALL_PIXELS) / (_LARGE_PIXELS - _SMALL_PIXELS))
+    stage = spec.name.partition("/")[0]
+    # Most at the smaller size is torch, points and Gaussians, which do not grow with the pixels.
+    seconds, gigabytes = (
+        small + share * (large - small)
+        for small, large in zip(_TYPICAL_SMALL[stage], _TYPICAL_LARGE[stage], strict=True)
+    )
+    return seconds, gigabytes

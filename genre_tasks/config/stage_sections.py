@@ -139,8 +139,8 @@ class FnetConfig(Section):
         None,
         ge=64,
         le=4096,
-        description="Largest width and height that the network sees: larger views are reduced for it by a whole factor, "
-        "and its correction is enlarged; null: no limit.",
+        description="Largest width and height that the network sees: larger views are reduced for it by a whole "
+        "factor, and its correction is enlarged; null: no limit.",
     )
     half: bool | None = Field(None, description="Compute in bfloat16; null: where the device is faster with it.")
     temporal: bool = Field(

@@ -76,18 +76,18 @@ def fix(
     return bound_colour_shift(out, inputs.render, views.alpha)
 
 
-def find_reduction(height: int, width: int, max_px: int | None) -> int:
+def find_reduction(max_px: int | None, height: int, width: int) -> int:
     """Finds by which factor views are reduced for the network.
 
     Args:
+        max_px: largest height and width that the network is to see; ``None``: any.
         height: of the views.
         width: likewise.
-        max_px: largest height and width that the network is to see; ``None``: any.
 
     Returns:
         The smallest whole factor that is large enough.
 
-    >>> find_reduction(720, 1280, 640), find_reduction(180, 320, 640), find_reduction(720, 1280, None)
+    >>> find_reduction(640, 720, 1280), find_reduction(640, 180, 320), find_reduction(None, 720, 1280)
     (2, 1, 1)
     """
     return 1 if max_px is None else -(-max(height, width) // max_px)
@@ -187,9 +187,7 @@ def _fade(start: int, end: int, size: int) -> Tensor:
     return torch.minimum(rise, fall).clamp(max=1)
 
 
-def draw_noise(
-    fnet: Fnet, seed: int, indices: Sequence[int], height: int, width: int, reduction: int = 1
-) -> Tensor:
+def draw_noise(fnet: Fnet, seed: int, indices: Sequence[int], height: int, width: int, reduction: int = 1) -> Tensor:
     """Draws the noise of views, each from the seed and its index alone.
 
     Args:

@@ -215,7 +215,7 @@ class Fnet(nn.Module):
         """Makes the image of what the decoder gives.
 
         Args:
-            output: [B, 3 + GATE_COUNT, H, W] residual and gates, or [B, 3, H, W] where the architecture has no residual.
+            output: [B, 3 + GATE_COUNT, H, W] residual and gates; [B, 3, H, W] of an architecture without residual.
             inputs: of the batch, of the same H and W.
 
         Returns:

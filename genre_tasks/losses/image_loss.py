@@ -76,7 +76,7 @@ def is_supported(color: Tensor, depth: Tensor, targets: Sequence[Target]) -> boo
     tensors: list[Tensor | None] = [color, depth]
     for target in targets:
         tensors += [target.image.pixels, target.image.mean, target.image.variance, target.depth]
-    return all(t is None or t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors)
+    return all(t is None or (t.device.type == "cpu" and t.dtype == torch.float32) for t in tensors)
 
 
 def image_loss(

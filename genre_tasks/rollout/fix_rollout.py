@@ -230,7 +230,8 @@ class RolloutFixer:
         moving = self._pose_actors(images, chunk_images)
         names = chunk_images.chunk.camera_names
         half = prefers_bfloat16(novel.color.device) if self._config.half is None else self._config.half
-        reduction = find_reduction(*novel.alpha.shape[1:], self._config.max_network_px)
+        height, width = novel.alpha.shape[1:]
+        reduction = find_reduction(self._config.max_network_px, height, width)
         latents = {k: self._encode_reference(novel.views[k].reference, chunk_images) for k in rows}
         # The fixer finds actors' poses in a chunk: one whose actors are where they are at this moment.
         chunk = replace(chunk_images.chunk, actors=moving)
@@ -241,7 +242,7 @@ class RolloutFixer:
                 inputs = self._last.look_up(images, novel, batch, moving, inputs)
             # By camera and not by pose: noise that changes from pose to pose is seen as flicker.
             seeds = [names.index(images.views[k].camera) for k in batch]
-            noise = draw_noise(self._network, self._config.seed, seeds, *novel.alpha.shape[1:], reduction)
+            noise = draw_noise(self._network, self._config.seed, seeds, height, width, reduction)
             references = Encoded(torch.cat([latents[k] for k in batch]), ())
             return fix(self._network, inputs, noise, references, half, reduction=reduction)
 
@@ -261,7 +262,7 @@ class RolloutFixer:
     def _encode_reference(self, reference: tuple[str, int], chunk_images: _ChunkImages) -> Tensor:
         if reference not in chunk_images.latents:
             image = next(s.image for s in chunk_images.removed.sources if (s.camera, s.frame) == reference)
-            reduction = find_reduction(*image.shape[1:], self._config.max_network_px)
+            reduction = find_reduction(self._config.max_network_px, *image.shape[1:])
             chunk_images.latents[reference] = encode_reference(self._network, image, reduction).latent
         return chunk_images.latents[reference]
 

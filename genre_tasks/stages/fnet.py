@@ -8,7 +8,6 @@ from functools import partial
 from threading import Lock
 
 import torch
-from torch import Tensor
 
 from genre_tasks.checks import check_finite
 from genre_tasks.config import FnetConfig
@@ -107,7 +106,8 @@ def fix_views(
     if not selected:
         return FixedViews(novel.views, color, tuple(range(total)))
     # Both sides of a frame and all shifts share their reference.
-    reduction = find_reduction(*novel.alpha.shape[1:], config.max_network_px)
+    height, width = novel.alpha.shape[1:]
+    reduction = find_reduction(config.max_network_px, height, width)
     encoded = _encode_references(network, [references[i] for i in selected], reduction)
     half = prefers_bfloat16(novel.color.device) if config.half is None else config.half
     done = 0
@@ -117,7 +117,7 @@ def fix_views(
         nonlocal done
         views = build_inputs(chunk, novel, indices, sources)
         # Noise depends on a view's index, so that batches and threads do not matter.
-        noise = draw_noise(network, config.seed, indices, *novel.alpha.shape[1:], reduction)
+        noise = draw_noise(network, config.seed, indices, height, width, reduction)
         latent = torch.cat([encoded[novel.views[i].reference].latent for i in indices])
         fixed = fix(network, views, noise, Encoded(latent, ()), half, reduction=reduction)
         # Filled in place: joining the batches at the end would need the memory twice.
@@ -155,10 +155,10 @@ def estimate_need(chunk: Chunk, novel: NovelViews, index: int, sources: Sequence
     return unseen_fraction(surface, alpha, sources, chunk.actors, view.frame)
 
 
-def _encode_references(
-    network: Fnet, images: Sequence[SourceImage], reduction: int
-) -> dict[tuple[str, int], Encoded]:
+def _encode_references(network: Fnet, images: Sequence[SourceImage], reduction: int) -> dict[tuple[str, int], Encoded]:
     """Latents of source images by camera and frame, each encoded once."""
     image_of_source = {(s.camera, s.frame): s.image for s in images}
-    encoded = map_single_threaded(partial(encode_reference, network, reduction=reduction), list(image_of_source.values()))
+    encoded = map_single_threaded(
+        partial(encode_reference, network, reduction=reduction), list(image_of_source.values())
+    )
     return dict(zip(image_of_source, encoded, strict=True))

@@ -140,4 +140,5 @@ def _render(
                 tensor[start:end] = image
             culled.update(part.culled)
             start = end
-    return _Images(*tensors, culled=dict(culled))
+    color, alpha, depth = tensors
+    return _Images(color, alpha, depth, dict(culled))

@@ -18,7 +18,7 @@ from tests.fixer.conftest import random_views, toy
 
 def test_an_untrained_fixer_returns_the_filled_render_at_full_size():
     fnet, views = toy(trained=False), random_views(2, 70, 101)
-    out = fix(fnet, views, draw_noise(fnet, 0, range(2), 70, 101, 3), reduction=3)
+    out = fix(fnet, views, draw_noise(fnet, 0, range(2), 70, 101, reduction=3), reduction=3)
     torch.testing.assert_close(out, build_conditions(views).render, rtol=0, atol=1e-6)
 
 
@@ -37,7 +37,7 @@ def test_a_copied_source_stays_as_sharp_as_it_is(monkeypatch):
         return output
 
     monkeypatch.setattr(fnet, "predict", open_first_gate)
-    out = fix(fnet, views, draw_noise(fnet, 0, range(1), 64, 96, 2), reduction=2)
+    out = fix(fnet, views, draw_noise(fnet, 0, range(1), 64, 96, reduction=2), reduction=2)
     assert (out - source).abs().max() < 0.03  # the bound on the mean colour moves all pixels alike
 
 
@@ -47,24 +47,24 @@ def test_the_network_sees_means_of_blocks(monkeypatch):
     predict = fnet.predict
     monkeypatch.setattr(fnet, "predict", lambda *args: seen.append(args[0]) or predict(*args))
     reference = encode_reference(fnet, views.reference[0], 2)
-    out = fix(fnet, views, draw_noise(fnet, 0, range(1), 64, 96, 2), reference, reduction=2)
+    out = fix(fnet, views, draw_noise(fnet, 0, range(1), 64, 96, reduction=2), reference, reduction=2)
     assert out.shape == (1, 3, 64, 96)
     small = build_conditions(views.map(lambda x: F.avg_pool2d(x, 2)))
     torch.testing.assert_close(seen[0].hints[..., :32, :48], small.hints)
-    assert reference.latent.shape == draw_noise(fnet, 0, range(1), 64, 96, 2).shape
+    assert reference.latent.shape == draw_noise(fnet, 0, range(1), 64, 96, reduction=2).shape
 
 
 def test_blocks_at_the_edge_repeat_it():
     image = torch.arange(15.0).reshape(1, 1, 3, 5)
     assert reduce_images(image, 2).tolist() == [[[[3, 5, 6.5], [10.5, 12.5, 14]]]]
     assert torch.equal(reduce_images(image, 1), image)
-    assert find_reduction(721, 1281, 640) == 3
+    assert find_reduction(640, 721, 1281) == 3
 
 
 def test_a_network_that_draws_the_whole_image_is_not_reduced():
     architecture = replace(small_architecture((8, 8, 16, 16), 4, (16, 16)), residual=False)
     fnet = build_fnet(architecture).eval()
     with pytest.raises(ValueError, match="residual"):
-        fix(fnet, random_views(1, 64, 96), draw_noise(fnet, 0, range(1), 64, 96, 2), reduction=2)
+        fix(fnet, random_views(1, 64, 96), draw_noise(fnet, 0, range(1), 64, 96, reduction=2), reduction=2)
     with pytest.raises(ValidationError, match="max_network_px"):
         FnetConfig(model="sd-turbo", weights="there", max_network_px=640)
