@@ -58,7 +58,7 @@ class Detector3dConfig(Section):
     The number of gradient steps is fixed, whatever the number of training images.
 
     >>> Detector3dConfig().steps
-    1000
+    3000
     """
 
     classes: Annotated[tuple[DetectedClass, ...], Field(strict=False, min_length=1, max_length=20)] = Field(
@@ -69,7 +69,7 @@ class Detector3dConfig(Section):
     width: int = Field(
         32, ge=16, le=256, multiple_of=16, description="Channels of the feature map at a quarter of the resolution."
     )
-    steps: int = Field(1000, ge=1, le=1_000_000, description="Gradient steps.")
+    steps: int = Field(3000, ge=1, le=1_000_000, description="Gradient steps.")
     batch: int = Field(8, ge=1, le=256, description="Images per step.")
     learning_rate: LearningRate = Field(2e-3, description="Of AdamW, at its largest.")
     warm_up: int = Field(100, ge=1, description="Steps over which the learning rate rises.")
@@ -85,7 +85,7 @@ class Detector3dConfig(Section):
     size_weight: LossWeight = Field(1.0, description="Weight of the size's loss.")
     angle_weight: LossWeight = Field(0.5, description="Weight of the observation angle's loss.")
     min_lidar_points: int = Field(1, ge=0, description="Boxes with fewer points do not count; those of no sweep do.")
-    max_occluded: float = Field(1.0, ge=0, le=1, description="Boxes of which more is hidden do not count.")
+    max_occluded: float = Field(0.7, ge=0, le=1, description="Boxes of which more is hidden do not count.")
     max_range_m: Metres = Field(40.0, description="Boxes and detections farther away on the ground do not count.")
     thresholds_m: Annotated[tuple[Metres, ...], Field(strict=False, min_length=1)] = Field(
         THRESHOLDS_M, description="Distances within which a detection matches a box."
