@@ -22,7 +22,9 @@ _NEVER = 2**31 - 1
 
 @contextmanager
 def reuse_freed_memory() -> Iterator[None]:
-    """Keeps freed memory with the process for the length of a block, and gives it back at its end.
+    """Keeps freed memory with the process while a block runs, and gives it back at its end.
+
+    The allocator's settings stay with the process: undoing them would slow down another stage that runs beside.
 
     Elsewhere than on glibc it does nothing: other allocators keep freed memory by themselves.
 
