@@ -58,6 +58,12 @@ class LocalStore:
         """The folder's path."""
         return str(self.root)
 
+    @property
+    def scratch_folder(self) -> Path:
+        """The store's own folder: see :attr:`storage.store.Store.scratch_folder`."""
+        make_folders(self.root)
+        return self.root
+
     def check_writable(self) -> None:
         """Writes and removes a small file: see :meth:`storage.store.Store.check_writable`."""
         probe = self.root / f"{TEMPORARY_PREFIX}probe-{describe_owner()}-{uuid.uuid4().hex}"

@@ -72,6 +72,11 @@ class Store(Protocol):
         """The records of runs and datasets."""
         ...
 
+    @property
+    def scratch_folder(self) -> Path:
+        """A folder on a disk of this machine, for files that live no longer than a stage."""
+        ...
+
     def check_writable(self) -> None:
         """Writes and removes a small file.
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 # A bare number counts as seconds.
 _SECONDS_PER_UNIT = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
+_BYTES_PER_UNIT = {"mb": 1e6, "gb": 1e9, "mib": 2.0**20, "gib": 2.0**30}
 
 
 def parse_numbers(text: str | None, option: str) -> list[int] | None:
@@ -141,3 +142,30 @@ def parse_duration(text: str | None, option: str) -> float | None:
 
         raise ConfigError(f"cannot read {option} {text!r}", remedy="Write a time above 0: 90s, 2m or 1h.")
     return float(match[1]) * _SECONDS_PER_UNIT[match[2]]
+
+
+def parse_memory(text: str | None, option: str) -> float | None:
+    """Reads an amount of memory such as ``4GB``, ``3.5GiB`` or ``800MiB``.
+
+    Args:
+        text: what the user wrote; ``None`` if the option was not given.
+        option: the option's name, for the error.
+
+    Returns:
+        GiB, or ``None`` for ``None``.
+
+    Raises:
+        ConfigError: the text is no amount above 0, or has no unit.
+
+    >>> parse_memory("4GB", "--memory")
+    3.725...
+    """
+    if text is None:
+        return None
+    match = re.fullmatch(r"\s*([0-9]{1,9}(?:\.[0-9]+)?)\s*([a-z]+)\s*", text.lower())
+    # Without a unit 4096 could be meant for megabytes as well as 4 for gigabytes.
+    if match is None or match[2] not in _BYTES_PER_UNIT or float(match[1]) == 0:
+        from genre_tasks.errors import ConfigError
+
+        raise ConfigError(f"cannot read {option} {text!r}", remedy="Write an amount with its unit: 4GB or 800MiB.")
+    return float(match[1]) * _BYTES_PER_UNIT[match[2]] / 2**30

@@ -41,6 +41,13 @@ BudgetOption = Annotated[
         "The most accurate settings that fit are chosen."
     ),
 ]
+MemoryOption = Annotated[
+    str | None,
+    typer.Option(
+        help="How much memory the process may take, such as 4GB; the machine's if not given. What does not fit is "
+        "worked on in parts, with the same result."
+    ),
+]
 TableOption = Annotated[
     Path | None,
     typer.Option(
@@ -87,6 +94,7 @@ def run(
     strict: StrictOption = False,
     budget: BudgetOption = None,
     table: TableOption = None,
+    memory: MemoryOption = None,
     dry_run: DryRunOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -108,19 +116,21 @@ def run(
     import psutil
 
     from flows.cli.outcome import add_facts
-    from flows.cli.parsing import parse_duration, parse_numbers
+    from flows.cli.parsing import parse_duration, parse_memory, parse_numbers
     from flows.configuration import load_configuration
 
     # Known from here on, whatever happens: what a program reads where the run does not come to its end.
     add_facts(log=log, preset=preset, store=store, run=None, report=None, chunks=[], left_out=[])
     # Over the settings, as --strict is the more explicit wish.
     strict_settings = ["ingest.strict=true"] if strict else []
+    memory_gib = parse_memory(memory, "--memory")
+    limit_settings = [] if memory_gib is None else [f"limits.memory_gib={memory_gib!r}"]
     request = RunRequest(
         log=log,
         preset=preset,
         store=store,
         chunks=parse_numbers(chunks, "--chunks"),
-        config=load_configuration(preset, config, [*(settings or []), *strict_settings]),
+        config=load_configuration(preset, config, [*(settings or []), *strict_settings, *limit_settings]),
         budget_s=parse_duration(budget, "--budget"),
         # A budget counts from when the user pressed return, imports included.
         start_time=psutil.Process().create_time(),

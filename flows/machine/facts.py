@@ -24,12 +24,24 @@ def describe_machine() -> str:
 
     from genre_tasks.compiled.loader import supported_instruction_sets
 
-    # A container may have fewer cores than the machine: the affinity says how many this process may use.
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    parts = [_cpu_model(), f"{cores} cores", supported_instruction_sets()[0], f"torch {torch.__version__}"]
+    parts = [_cpu_model(), f"{count_cores()} cores", supported_instruction_sets()[0], f"torch {torch.__version__}"]
     if torch.cuda.is_available():
         parts.append(torch.cuda.get_device_name())
     return ", ".join(parts)
+
+
+def count_cores() -> int:
+    """Counts the cores that this process may use, of which a container may have fewer than the machine.
+
+    Returns:
+        At least 1.
+
+    >>> count_cores() >= 1
+    True
+    """
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 @functools.lru_cache(maxsize=1)

@@ -13,11 +13,16 @@ from functools import lru_cache
 
 # Of glibc's malloc.h.
 _M_TRIM_THRESHOLD = -1
+_M_MMAP_THRESHOLD = -3
 _M_MMAP_MAX = -4
 _M_ARENA_MAX = -8
 
 # The allocator is only told by how much its heap may be free at the end: more than any stage needs.
 _NEVER = 2**31 - 1
+
+# glibc's own values.
+_USUAL_MMAP_MAX = 65_536
+_USUAL_THRESHOLD = 2**17
 
 
 @contextmanager
@@ -57,3 +62,16 @@ def _load_glibc() -> ctypes.CDLL | None:
     except (OSError, TypeError):
         return None
     return libc
+
+
+def return_freed_memory() -> None:
+    """Undoes :func:`reuse_freed_memory`: freed memory goes back at once, which takes longer and needs less at a time.
+
+    >>> return_freed_memory()
+    """
+    libc = _load_glibc()
+    if libc is not None:
+        libc.mallopt(_M_MMAP_MAX, _USUAL_MMAP_MAX)
+        libc.mallopt(_M_MMAP_THRESHOLD, _USUAL_THRESHOLD)
+        libc.mallopt(_M_TRIM_THRESHOLD, _USUAL_THRESHOLD)
+        libc.malloc_trim(0)

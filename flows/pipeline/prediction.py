@@ -6,35 +6,38 @@ import statistics
 from collections.abc import Mapping
 from typing import Any
 
+from flows.machine.facts import count_cores
 from flows.pipeline.definition import PIPELINE, RECONSTRUCTION_STAGES, StageSpec, stages_until
 from flows.pipeline.log_cache import cached_log, select_chunks
+from flows.pipeline.memory_plan import ChunkSize, estimate_chunk_size, grow_until, needs_disk, predict_memory
 from flows.pipeline.stage_runner import ArtifactRef, Job, find_artifact
 from genre_tasks.config import PipelineConfig
+from genre_tasks.logs.log_selection import select_cameras
 from storage.opening import open_store
 
-# Seconds and GiB of one chunk, measured on two cores with six cameras. Used where the store holds no finished stage to
-# learn from; in between and beyond they follow a line over the number of pixels, and never fall below the smaller size.
-_TYPICAL_SMALL = {
-    "ingest": (10.0, 1.2),
-    "initial": (4.0, 1.3),
-    "gnet": (4.0, 1.7),
-    "effects": (7.0, 1.4),
-    "novel_views": (10.0, 1.8),
-    "fnet": (24.0, 1.9),
-    "enet": (16.0, 1.7),
-    "evaluate": (40.0, 1.8),
+# Seconds of one chunk, measured on two cores with six cameras. Used where the store holds no finished stage to learn
+# from; in between and beyond they follow a line over the number of pixels, and never fall below the smaller size.
+_SECONDS_SMALL = {
+    "ingest": 10.0,
+    "initial": 4.0,
+    "gnet": 4.0,
+    "effects": 7.0,
+    "novel_views": 10.0,
+    "fnet": 24.0,
+    "enet": 16.0,
+    "evaluate": 40.0,
 }
 """With the preset ``small``: 320×180."""
 
-_TYPICAL_LARGE = {
-    "ingest": (12.0, 1.2),
-    "initial": (7.0, 1.3),
-    "gnet": (45.0, 3.3),
-    "effects": (50.0, 1.5),
-    "novel_views": (27.0, 4.5),
-    "fnet": (87.0, 5.2),
-    "enet": (121.0, 5.5),
-    "evaluate": (180.0, 3.2),
+_SECONDS_LARGE = {
+    "ingest": 12.0,
+    "initial": 7.0,
+    "gnet": 45.0,
+    "effects": 50.0,
+    "novel_views": 27.0,
+    "fnet": 87.0,
+    "enet": 121.0,
+    "evaluate": 180.0,
 }
 """With the preset ``hd``: 1280×720. FNet takes far longer where ``fnet.max_network_px`` is not set."""
 
@@ -62,7 +65,9 @@ def predict_run(
     Raises:
         InputError: the log cannot be opened, or does not have one of the chunks.
     """
-    measured = _measured_stages(store, cached_log(log).dataset)
+    opened = cached_log(log)
+    size = estimate_chunk_size(opened, select_cameras(config.ingest, opened), config)
+    measured = _measured_seconds(store, opened.dataset)
     included = stages_until(end)
     rows: list[dict[str, Any]] = []
     for chunk in select_chunks(log, config, chunks):
@@ -70,7 +75,7 @@ def predict_run(
         refs: dict[str, ArtifactRef] = {}
         for spec in PIPELINE:
             if spec.name.removeprefix("evaluate/") in included:
-                rows.append(_predict_stage(spec, job, refs, measured, config))
+                rows.append(_predict_stage(spec, job, refs, measured, size, config))
     # A damaged artifact is computed again, so it costs as much as one that is not there.
     misses = [row for row in rows if row["cache"] != "hit"]
     return {
@@ -93,31 +98,19 @@ def median_stage_seconds(store: str) -> dict[str, float]:
     Returns:
         Seconds by stage; all evaluation stages share the name ``evaluate``.
     """
-    typical = {stage: seconds for stage, (seconds, _) in _TYPICAL_SMALL.items()}
     stored: dict[str, list[float]] = {}
     for artifact in open_store(store).artifacts():
         stage = artifact.manifest.stage.partition("/")[0]
         stored.setdefault(stage, []).append(artifact.manifest.seconds)
-    return typical | {stage: statistics.median(values) for stage, values in stored.items()}
-
-
-def typical_gigabytes(config: PipelineConfig) -> float:
-    """Gives the memory that the largest stage usually takes.
-
-    Args:
-        config: its image size counts.
-
-    Returns:
-        GiB.
-    """
-    return max(_typical_stage(spec, config)[1] for spec in PIPELINE)
+    return _SECONDS_SMALL | {stage: statistics.median(values) for stage, values in stored.items()}
 
 
 def _predict_stage(
     spec: StageSpec,
     job: Job,
     refs: dict[str, ArtifactRef],
-    measured: Mapping[str, tuple[float, float]],
+    measured: Mapping[str, float],
+    size: ChunkSize,
     config: PipelineConfig,
 ) -> dict[str, Any]:
     """One row of the prediction; a hit is added to ``refs``, so that later stages can be looked up."""
@@ -132,38 +125,33 @@ def _predict_stage(
             cache = "hit"
         else:
             cache = "corrupt" if note else "miss"
-    seconds, gigabytes = measured.get(spec.name) or _typical_stage(spec, config)
+    seconds = measured[spec.name] if spec.name in measured else _typical_seconds(spec, config)
+    memory = predict_memory(spec.name, grow_until(spec.name, size, config), config, count_cores())
+    on_disk = needs_disk(spec.name, memory, config)
     return {
         "chunk": job.chunk,
         "stage": spec.name,
         "key": key,
         "cache": cache,
         "seconds": 0.0 if cache == "hit" else seconds,
-        "gigabytes": gigabytes,
+        "gigabytes": (memory.with_images_on_disk_mib if on_disk else memory.in_memory_mib) / 1024,
     }
 
 
-def _measured_stages(store: str, dataset: str) -> dict[str, tuple[float, float]]:
-    """Median seconds and largest memory (GiB) of the stages in a store, by stage."""
+def _measured_seconds(store: str, dataset: str) -> dict[str, float]:
+    """Median seconds of the stages in a store, by stage."""
     seconds: dict[str, list[float]] = {}
-    memory: dict[str, list[float]] = {}
     for artifact in open_store(store).artifacts():
         manifest = artifact.manifest
         # Cameras and images differ between datasets, and with them the time of every stage.
         if manifest.dataset == dataset:
             seconds.setdefault(manifest.stage, []).append(manifest.seconds)
-            memory.setdefault(manifest.stage, []).append(manifest.peak_mib / 1024)
-    # The median of the time, but the largest memory: too little of it ends a run, too much time only delays it.
-    return {stage: (statistics.median(seconds[stage]), max(memory[stage])) for stage in seconds}
+    return {stage: statistics.median(values) for stage, values in seconds.items()}
 
 
-def _typical_stage(spec: StageSpec, config: PipelineConfig) -> tuple[float, float]:
+def _typical_seconds(spec: StageSpec, config: PipelineConfig) -> float:
     pixels = config.ingest.width_px * config.ingest.height_px
     share = max(0.0, (pixels - _SMALL_PIXELS) / (_LARGE_PIXELS - _SMALL_PIXELS))
     stage = spec.name.partition("/")[0]
     # Most at the smaller size is torch, points and Gaussians, which do not grow with the pixels.
-    seconds, gigabytes = (
-        small + share * (large - small)
-        for small, large in zip(_TYPICAL_SMALL[stage], _TYPICAL_LARGE[stage], strict=True)
-    )
-    return seconds, gigabytes
+    return _SECONDS_SMALL[stage] + share * (_SECONDS_LARGE[stage] - _SECONDS_SMALL[stage])

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from flows.machine.facts import describe_environment
-from flows.machine.memory_reuse import reuse_freed_memory
 from flows.machine.resource_usage import measure_usage
 from flows.observability.stage_observation import count_read, count_written, measure_lease_wait, note_key, observed
 from flows.pipeline.definition import (
@@ -20,6 +19,8 @@ from flows.pipeline.definition import (
     stage_key,
 )
 from flows.pipeline.log_cache import cached_log
+from flows.pipeline.memory_plan import shrink_batch
+from flows.pipeline.stage_inputs import open_inputs
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ArtifactCorruptError
 from genre_tasks.progress import Progress, silent
@@ -214,8 +215,7 @@ def run_stage(
         _, ref, _ = find_artifact(spec, job, inputs)
         if ref is not None:
             return ref
-        with reuse_freed_memory():
-            artifact = _compute_artifact(spec, job, inputs, store, address, note, attempt, progress)
+        artifact = _compute_artifact(spec, job, inputs, store, address, note, attempt, progress)
     return _reference(artifact, cached=False, note=note)
 
 
@@ -229,32 +229,39 @@ def _compute_artifact(
     attempt: int,
     progress: Progress,
 ) -> Artifact:
-    # Read here and not before the look-up: a hit reads the manifests alone.
-    values = {name: store.read(_find_input(store, inputs[name], job)) for name in spec.inputs}
-    values |= _special_arguments(spec, job)
-    configured = config_section(spec, PipelineConfig.model_validate(job.config))
-    section = _shrink_batch(spec, configured, attempt)
+    config = PipelineConfig.model_validate(job.config)
+    configured = config_section(spec, config)
+    section = shrink_batch(spec, configured, attempt)
     module, _, name = spec.function.partition(":")
-    # The import counts: a first run's seconds include loading torch, as a user's clock does.
-    with measure_usage() as usage:
-        function = getattr(importlib.import_module(module), name)
-        value = function(section, *(values[argument] for argument in spec.arguments), progress=progress)
-    # Large images of the inputs need not be there while the result is written.
-    values.clear()
-    provenance = Provenance(
-        inputs={name: inputs[name].key for name in spec.inputs},
-        # As configured, not with the smaller batch of a retry, which is no part of the result.
-        configuration=configured.model_dump(mode="json"),
-        code_digest=code_digest(spec.module, lazy_modules=(*spec.lazy_modules, *reading_modules(spec, job))),
-        weights_digest=digest_stage_weights(spec, PipelineConfig.model_validate(job.config)),
-        seconds=usage.seconds,
-        peak_mib=usage.peak_mib,
-        environment=describe_environment(),
-        measurements={"cpu_seconds": usage.cpu_seconds, "marks": _group_issues(getattr(value, "log_issues", ()))},
-        warnings=(note,) if note else (),
-    )
-    # The first writer wins: if another process has committed this key meanwhile, its artifact is the result.
-    return store.commit(address, spec.kind, value, provenance)
+    # Read here and not before the look-up: a hit reads the manifests alone.
+    artifacts = {name: _find_input(store, inputs[name], job) for name in spec.inputs}
+    with open_inputs(spec, job.log, config, store, artifacts, is_retry=attempt > 0) as opened:
+        values = opened.values | _special_arguments(spec, job)
+        # The import counts: a first run's seconds include loading torch, as a user's clock does.
+        with measure_usage() as usage:
+            function = getattr(importlib.import_module(module), name)
+            value = function(section, *(values[argument] for argument in spec.arguments), progress=progress)
+        # Large images of the inputs need not be there while the result is written.
+        values.clear()
+        opened.values.clear()
+        provenance = Provenance(
+            inputs={name: inputs[name].key for name in spec.inputs},
+            # As configured, not with the smaller batch of a retry, which is no part of the result.
+            configuration=configured.model_dump(mode="json"),
+            code_digest=code_digest(spec.module, lazy_modules=(*spec.lazy_modules, *reading_modules(spec, job))),
+            weights_digest=digest_stage_weights(spec, config),
+            seconds=usage.seconds,
+            peak_mib=usage.peak_mib,
+            environment=describe_environment(),
+            measurements={
+                "cpu_seconds": usage.cpu_seconds,
+                "predicted_mib": opened.predicted_mib,
+                "marks": _group_issues(getattr(value, "log_issues", ())),
+            },
+            warnings=(note,) if note else (),
+        )
+        # The first writer wins: if another process has committed this key meanwhile, its artifact is the result.
+        return store.commit(address, spec.kind, value, provenance)
 
 
 def open_artifact(job: Job, ref: ArtifactRef) -> Artifact:
@@ -309,15 +316,6 @@ def _group_issues(issues: Iterable[LogIssue]) -> list[str]:
             line += f" (and {len(details) - 1} more)"
         lines.append(line)
     return lines
-
-
-def _shrink_batch(spec: StageSpec, section: Any, attempt: int) -> Any:
-    """The stage's section with its ``batch_setting`` halved once for each attempt that ran out of memory."""
-    # Other stages have no such setting: their retry runs the same again, when other processes may have ended.
-    if spec.batch_setting is None or attempt == 0:
-        return section
-    smaller = max(1, getattr(section, spec.batch_setting) >> attempt)
-    return section.model_copy(update={spec.batch_setting: smaller})
 
 
 def _find_input(store: Store, ref: ArtifactRef, job: Job) -> Artifact:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flows.machine.facts import count_cores
 from flows.machine.memory import memory_limit_gib
-from flows.pipeline.prediction import typical_gigabytes
+from flows.pipeline.memory_plan import ChunkSize, grow_until, needs_disk, predict_memory
 from flows.preflight.store_checks import free_space_mib
 from genre_tasks.config import PipelineConfig
 
@@ -22,9 +23,6 @@ _BYTES_PER_GAUSSIAN = 120
 _BYTES_PER_POINT = 16
 _POINTS_PER_SWEEP = 100_000
 _REPORT_MIB = 5
-
-_BYTES_PER_OPTIMISED_GAUSSIAN = 1500
-"""Memory of the learned optimiser: attributes, gradients, moments, features and one layer of the network."""
 
 _CLEARLY_TOO_LITTLE = 0.7
 """Memory is estimated from other machines, so that less than the estimate may still suffice."""
@@ -75,21 +73,30 @@ def assess_disk(root: Path, needed_mib: float) -> str | None:
     )
 
 
-def assess_memory(config: PipelineConfig) -> str | None:
-    """Compares the memory that this process may use with an estimate.
+def assess_memory(size: ChunkSize, config: PipelineConfig, stages: Iterable[str]) -> str | None:
+    """Compares the memory that this process may use with what the stages will take.
 
     Args:
+        size: of a chunk.
         config: the effective configuration.
+        stages: names of the stages that will run.
 
     Returns:
         A warning, or ``None``.
+
+    Raises:
+        ResourceError: the limit that the user sets is too low for a stage.
     """
-    needed_gib = typical_gigabytes(config) + max(_count_gaussians(config)) * _BYTES_PER_OPTIMISED_GAUSSIAN / 2**30
+    needed_mib = 0.0
+    for stage in stages:
+        memory = predict_memory(stage, grow_until(stage, size, config), config, count_cores())
+        needs_disk(stage, memory, config)
+        needed_mib = max(needed_mib, memory.with_images_on_disk_mib)
     limit_gib = memory_limit_gib()
-    if limit_gib >= _CLEARLY_TOO_LITTLE * needed_gib:
+    if config.limits.memory_gib is not None or limit_gib >= _CLEARLY_TOO_LITTLE * needed_mib / 1024:
         return None
     return (
-        f"this process may use {limit_gib:.1f} GiB of memory, and the run needs about {needed_gib:.1f} GiB; "
+        f"this process may use {limit_gib:.1f} GiB of memory, and the run needs about {needed_mib / 1024:.1f} GiB; "
         "smaller images or fewer Gaussians (ingest.width_px, initial.max_points) need less"
     )
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from flows.pipeline.definition import PIPELINE, StageSpec, find_scene_modules, find_weights_file
 from flows.pipeline.log_cache import cached_log, select_chunks
+from flows.pipeline.memory_plan import estimate_chunk_size
 from flows.pipeline.stage_runner import Job
 from flows.preflight.machine_checks import assess_disk, assess_memory, estimate_disk_mib
 from flows.preflight.store_checks import check_store
@@ -87,7 +88,7 @@ def check_requirements(
     Raises:
         InputError: the log, a chunk, a file or weights are missing or unreadable, or the store cannot be written to.
         ConfigError: a camera is unknown, a package is not installed, or the store is no folder.
-        ResourceError: the disk is full.
+        ResourceError: the disk is full, or the limit that is set on memory is too low.
 
     >>> from flows.configuration import load_configuration
     >>> report = check_requirements("synthetic:street?seed=1000", "no-store-yet", None, load_configuration("demo"))
@@ -105,7 +106,8 @@ def check_requirements(
         f"store {where}: can be written to",
         f"disk: about {needed_mib:.0f} MiB for a run from nothing",
     )
-    found = (None if root is None else assess_disk(root, needed_mib), assess_memory(config))
+    size = estimate_chunk_size(inputs.log, inputs.cameras, config)
+    found = (None if root is None else assess_disk(root, needed_mib), assess_memory(size, config, stages))
     return RequirementReport(checked, tuple(warning for warning in found if warning is not None))
 
 

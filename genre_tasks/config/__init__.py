@@ -9,6 +9,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from genre_tasks.config.effect_settings import EffectsConfig, EffectSetting, ReportOnlySetting
+from genre_tasks.config.limits import LimitsConfig
 from genre_tasks.config.optimisation_sections import (
     AdamConfig,
     DensityConfig,
@@ -46,6 +47,7 @@ __all__ = [
     "LearningRate",
     "LearningRateTuple",
     "LearningRates",
+    "LimitsConfig",
     "LossConfig",
     "NovelViewsConfig",
     "OptimiserConfig",
@@ -80,3 +82,4 @@ class PipelineConfig(Section):
     evaluate: EvaluateConfig = Field(EvaluateConfig(), description="What is measured after a stage.")
     effects: EffectsConfig = Field(EffectsConfig(), description="Parts of the forward model that a scene gets.")
     simulate: SimulateConfig = Field(SimulateConfig(), description="Re-simulation of a finished run.")
+    limits: LimitsConfig = Field(LimitsConfig(), description="What a run may take of the machine.")

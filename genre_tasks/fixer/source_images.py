@@ -12,6 +12,7 @@ from genre_tasks.effects.color_gain import remove_gain
 from genre_tasks.errors import InputError
 from genre_tasks.fixer.view_surface import MIN_ALPHA
 from genre_tasks.fixer.warping import SourceImage
+from genre_tasks.image_memory import allocate_images
 from genre_tasks.render.surface import render_surfaces
 from genre_tasks.scene.chunk import Chunk, View
 from genre_tasks.scene.graph import SceneGraph
@@ -39,19 +40,22 @@ def load_source_images(chunk: Chunk) -> tuple[SourceImage, ...]:
     # Depth has no motion blur, and without it each view is rendered once.
     views = [v if v.blur is None else replace(v, blur=None) for v in chunk.views_with_role("source")]
     lidar_scene = build_lidar_scene(chunk, OCCLUDING_POINTS)
+    images = allocate_images(len(views), chunk.height_px, chunk.width_px, 3)
+    depths = allocate_images(len(views), chunk.height_px, chunk.width_px)
     sources = []
-    for view in views:
+    for view, image, depth in zip(views, images, depths, strict=True):
+        image.copy_(_decode_without_gain(view))
         # One by one: colours, which a map has too, would take more memory than all depths.
-        depth = _render_depth(lidar_scene, view)
+        depth.copy_(_render_depth(lidar_scene, view))
         if view.ego_mask is not None:
             # The vehicle itself hides whatever lies behind it.
-            depth = torch.where(torch.from_numpy(view.ego_mask), NEAR_M, depth)
+            depth[torch.from_numpy(view.ego_mask)] = NEAR_M
         source = SourceImage(
             camera=view.camera,
             frame=view.frame,
             chunk_SE3_camera=view.chunk_SE3_camera,
             lens=view.lens,
-            image=_decode_without_gain(view).permute(2, 0, 1),
+            image=image.permute(2, 0, 1),
             depth=depth,
             shutter=view.shutter,
         )

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from genre_tasks.errors import InputError
+from genre_tasks.image_memory import allocate_images
 from genre_tasks.logs.types import Float64, Lens, MotionBlur, RollingShutter
 from genre_tasks.losses.ssim import SsimTarget
 from genre_tasks.scene.chunk import Chunk, Gain, View
@@ -66,20 +67,26 @@ def view_targets(chunk: Chunk, views: Sequence[View], depth: bool = False) -> tu
         InputError: an image cannot be decoded; the error names its camera and frame.
     """
 
-    def decode(view: View) -> Target:
+    images = allocate_images(len(views), chunk.height_px, chunk.width_px, 3)
+    depths = allocate_images(len(views), chunk.height_px, chunk.width_px) if depth else None
+
+    def decode(index: int) -> Target:
+        view = views[index]
         try:
-            image = decode_image(view.image, view.lens.width_px, view.lens.height_px)
+            images[index] = decode_image(view.image, view.lens.width_px, view.lens.height_px)
         except InputError as error:
             # The decoder knows bytes only; the user needs to know which image it is.
             where = {"log": chunk.log, "chunk": chunk.index, "camera": view.camera, "frame": view.frame}
             raise InputError(error.problem, remedy=error.remedy, **where) from error  # type: ignore[arg-type]
+        if depths is not None:
+            depths[index] = compute_lidar_depth(chunk, view)
         return Target(
             camera=view.camera,
             frame=view.frame,
             chunk_SE3_camera=view.chunk_SE3_camera,
             lens=view.lens,
-            image=SsimTarget.of_many(image),
-            depth=torch.as_tensor(compute_lidar_depth(chunk, view)).float() if depth else None,
+            image=SsimTarget.of_many(images[index]),
+            depth=None if depths is None else depths[index],
             # How the image was taken goes along, so that the render can be made in the same way.
             log_gain=view.log_gain,
             ego_mask=None if view.ego_mask is None else torch.from_numpy(view.ego_mask),
@@ -87,7 +94,7 @@ def view_targets(chunk: Chunk, views: Sequence[View], depth: bool = False) -> tu
             blur=view.blur,
         )
 
-    return tuple(map_single_threaded(decode, views))
+    return tuple(map_single_threaded(decode, range(len(views))))
 
 
 def source_targets(chunk: Chunk, depth: bool) -> tuple[Target, ...]:

@@ -21,6 +21,7 @@ from genre_tasks.fixer.view_surface import unproject_surface
 from genre_tasks.fixer.warping import SourceImage, unseen_fraction
 from genre_tasks.fixer.weight_files import find_fixer_weights, require_timestep
 from genre_tasks.fixer.weights import load_fnet
+from genre_tasks.image_memory import allocate_images
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.novel_views import FixedViews, NovelViews
@@ -102,7 +103,7 @@ def fix_views(
     # A gate of 0 fixes every view, without the time that estimating the need takes.
     selected = [i for i in range(total) if config.gate == 0 or estimate_need(chunk, novel, i, sources) > config.gate]
     # Views that are not selected are their renders, clamped as the fixer's output is.
-    color = novel.color.clamp(0, 1)
+    color = torch.clamp(novel.color, 0, 1, out=allocate_images(*novel.color.shape, device=novel.color.device))
     if not selected:
         return FixedViews(novel.views, color, tuple(range(total)))
     # Both sides of a frame and all shifts share their reference.

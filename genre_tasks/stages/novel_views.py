@@ -13,6 +13,7 @@ from genre_tasks.checks import check_finite
 from genre_tasks.config import NovelViewsConfig
 from genre_tasks.effects.apply_plan import apply_plan
 from genre_tasks.effects.types import DEFAULT_PLAN, EffectsPlan
+from genre_tasks.image_memory import allocate_images
 from genre_tasks.progress import Progress, silent
 from genre_tasks.render import Render, RenderSettings, render_views
 from genre_tasks.render.surface import render_surfaces
@@ -135,7 +136,9 @@ def _render(
             part = render(scene, views[start:end], settings)
             images = (part.color, part.alpha, part.expected_depth())
             # Filled in place: joining the parts at the end would need the memory twice.
-            tensors = tensors or tuple(image.new_empty(len(views), *image.shape[1:]) for image in images)
+            tensors = tensors or tuple(
+                allocate_images(len(views), *image.shape[1:], device=image.device) for image in images
+            )
             for tensor, image in zip(tensors, images, strict=True):
                 tensor[start:end] = image
             culled.update(part.culled)

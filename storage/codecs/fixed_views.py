@@ -50,21 +50,20 @@ def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> FixedVi
     Raises:
         ArtifactCorruptError: the table or an image is damaged.
     """
-    import torch
+    from genre_tasks.image_memory import allocate_images
 
     views, paths, (height, width) = read_view_table(folder)
     # Filled in place: stacking the images at the end would need the memory twice.
-    color = np.empty((len(views), height, width, 3), np.float32)
+    color = allocate_images(len(views), height, width, 3)
+    pixels = color.numpy()
 
     def fill(i: int, path: Path) -> None:
-        color[i] = read_image(path, (height, width))
+        pixels[i] = read_image(path, (height, width))
 
     map_images(fill, range(len(paths)), paths)
     # The fixer writes these entries only where it copied a view.
     known = measurements or {}
-    return FixedViews(
-        views, torch.from_numpy(color), tuple(known.get("copied", ())), float(known.get("seconds_saved", 0.0))
-    )
+    return FixedViews(views, color, tuple(known.get("copied", ())), float(known.get("seconds_saved", 0.0)))
 
 
 def read_image(path: Path, shape: tuple[int, int]) -> NDArray[np.float32]:

@@ -172,15 +172,13 @@ def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> NovelVi
     Raises:
         ArtifactCorruptError: the table or an image is damaged.
     """
-    import torch
+    from genre_tasks.image_memory import allocate_images
 
     views, paths, (height, width) = read_view_table(folder)
     shape = (len(views), height, width)
     # Filled in place: stacking single views at the end would need the memory twice.
-    arrays = {
-        layer: (np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32))
-        for layer in LAYERS
-    }
+    stacks = {layer: (allocate_images(*shape, 3), allocate_images(*shape), allocate_images(*shape)) for layer in LAYERS}
+    arrays = {layer: tuple(stack.numpy() for stack in layer_stacks) for layer, layer_stacks in stacks.items()}
 
     def fill(i: int, path: Path) -> None:
         for layer, images in read_image(path, (height, width)).items():
@@ -188,8 +186,8 @@ def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> NovelVi
                 array[i] = image
 
     map_images(fill, range(len(paths)), paths)
-    color, alpha, depth = (torch.from_numpy(array) for array in arrays[""])
-    lidar_color, lidar_alpha, lidar_depth = (torch.from_numpy(array) for array in arrays["lidar."])
+    color, alpha, depth = stacks[""]
+    lidar_color, lidar_alpha, lidar_depth = stacks["lidar."]
     return NovelViews(
         views=views,
         color=color,

@@ -57,6 +57,11 @@ class ObjectStore:
         """The URI, without credentials."""
         return self._bucket.uri
 
+    @property
+    def scratch_folder(self) -> Path:
+        """Where downloaded objects are, too: see :attr:`storage.store.Store.scratch_folder`."""
+        return find_cache_folder()
+
     def check_writable(self) -> None:
         """Writes and removes a small object: see :meth:`storage.store.Store.check_writable`."""
         self._bucket.delete([self._write_probe()])

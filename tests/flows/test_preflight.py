@@ -273,7 +273,7 @@ def test_little_free_space_is_a_warning_and_almost_none_an_error(
 
 def test_too_little_memory_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Report: none found; case 25 of the list of odd logs."""
-    monkeypatch.setattr(machine_checks, "memory_limit_gib", lambda: 1.0)
+    monkeypatch.setattr(machine_checks, "memory_limit_gib", lambda: 0.25)
     (warning,) = check_requirements(LOG, str(tmp_path), None, load_configuration("demo")).warnings
     assert "memory" in warning
 

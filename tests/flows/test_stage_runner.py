@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -144,15 +143,6 @@ def test_out_of_memory_becomes_a_resource_error() -> None:
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes")
     with pytest.raises(RuntimeError, match="shapes"), measure_usage():
         raise RuntimeError("shapes do not fit")
-
-
-def test_a_retry_after_out_of_memory_is_smaller_and_the_key_stays(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[int] = []
-    section = load_configuration("demo").fnet
-    for attempt in range(4):
-        smaller: Any = room._shrink_batch(STAGE_BY_NAME["fnet"], section, attempt)
-        seen.append(smaller.batch_views)
-    assert seen == [4, 2, 1, 1]
 
 
 def test_an_impossible_chunk_leaves_nothing_behind(tmp_path: Path) -> None:

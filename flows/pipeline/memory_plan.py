@@ -1,0 +1,292 @@
+"""How much memory a stage will take, and whether the images of many views have to lie on disk for it.
+
+A stage takes memory for its networks and Gaussians, for the few views it works on at a time, and for the images of all
+views that it reads or makes. The last part alone grows with the length of a chunk, and can lie on disk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from flows.machine.memory import memory_limit_gib
+from genre_tasks.config import PipelineConfig
+from genre_tasks.errors import ResourceError
+from genre_tasks.losses.constants import KEPT_PIXELS
+
+if TYPE_CHECKING:
+    from flows.pipeline.definition import StageSpec
+    from genre_tasks.logs.types import Camera, DrivingLog
+    from genre_tasks.scene.chunk import Chunk
+
+_FLOAT_BYTES = 4
+
+# Channels of the images of all views that a stage holds.
+_NOVEL_CHANNELS = 10
+_FIXED_CHANNELS = 3
+_SOURCE_CHANNELS = 4
+_STATISTICS_CHANNELS = 6
+"""SSIM's, of small images alone."""
+
+_SHARE_OF_MACHINE = 0.85
+"""Of the machine's memory, where no limit is set: predictions are that exact, and other programs need some."""
+
+
+@dataclass(frozen=True)
+class _Terms:
+    """Factors of a stage's memory.
+
+    Attributes:
+        base_mib: networks and what does not grow with the chunk.
+        gaussian_bytes: for each Gaussian of the scene that it ends with.
+        pixel_bytes: for each pixel of the views that are worked on at a time.
+        reuse: what freed memory that stays with the process costs, as a factor.
+    """
+
+    base_mib: float
+    gaussian_bytes: float = 0.0
+    pixel_bytes: float = 0.0
+    reuse: float = 1.0
+
+
+# Optimisers take most for a step of the network, which sees all Gaussians at once; the views are few.
+_TERMS: Mapping[str, _Terms] = {
+    "ingest": _Terms(0, 0, 100),
+    "effects": _Terms(725, 0, 276),
+    "initial": _Terms(230, 1560),
+    "gnet": _Terms(165, 4470, 0, 1.29),
+    "novel_views": _Terms(400, 1500, 30),
+    "fnet": _Terms(525, 0, 320, 1.25),
+    "enet": _Terms(150, 5470, 0, 1.29),
+    "evaluate": _Terms(350, 1100, 0),
+}
+"""Fitted to stages at 320×180 and 1280×720; ``genre bench full_size`` compares predictions with what runs took."""
+
+_NETWORK_PIXEL_BYTES = 1500
+"""Of FNet, for each pixel that its network sees."""
+
+_PROCESS_MIB = 150
+"""Python, torch and the pipeline, before a stage begins."""
+
+
+@dataclass(frozen=True)
+class ChunkSize:
+    """What the memory of a chunk's stages depends on.
+
+    Attributes:
+        cameras: that are used.
+        source_views: views that scenes are fitted to.
+        novel_views: views beside the path.
+        width_px: working width of images.
+        height_px: working height of images.
+        native_px: pixels of the largest recorded image.
+        gaussians: of the scene that the stage starts from.
+    """
+
+    cameras: int
+    source_views: int
+    novel_views: int
+    width_px: int
+    height_px: int
+    native_px: int
+    gaussians: int
+
+    @property
+    def pixels(self) -> int:
+        """Pixels of an image at the working resolution."""
+        return self.width_px * self.height_px
+
+
+@dataclass(frozen=True)
+class StageMemory:
+    """What a stage takes, as predicted.
+
+    Attributes:
+        working_mib: networks, Gaussians, and the views that are worked on at a time.
+        images_mib: images of all views.
+        reuse: what freed memory that stays with the process costs, as a factor of ``working_mib``.
+    """
+
+    working_mib: float
+    images_mib: float
+    reuse: float = 1.0
+
+    @property
+    def with_images_on_disk_mib(self) -> float:
+        """Where freed memory is returned at once, too."""
+        return self.working_mib
+
+    @property
+    def in_memory_mib(self) -> float:
+        """Where freed memory stays with the process, which is faster."""
+        return self.reuse * self.working_mib + self.images_mib
+
+
+def estimate_chunk_size(log: DrivingLog, cameras: Sequence[Camera], config: PipelineConfig) -> ChunkSize:
+    """Estimates a chunk's size before it is ingested.
+
+    Args:
+        log: that is reconstructed.
+        cameras: those that are used.
+        config: the effective configuration.
+
+    Returns:
+        The sizes of a full chunk; LiDAR may give fewer Gaussians.
+    """
+    frames = min(config.ingest.chunk_frames, log.frame_count)
+    source_views = -(-frames // config.ingest.source_every) * len(cameras)
+    return ChunkSize(
+        cameras=len(cameras),
+        source_views=source_views,
+        novel_views=source_views * len(config.novel_views.shifts_m),
+        width_px=config.ingest.width_px,
+        height_px=config.ingest.height_px,
+        native_px=max((camera.lens.width_px * camera.lens.height_px for camera in cameras), default=0),
+        gaussians=config.initial.max_points + config.initial.distant_count,
+    )
+
+
+def grow_until(stage: str, size: ChunkSize, config: PipelineConfig) -> ChunkSize:
+    """Estimates the size at a later stage, where GNet and ENet have split Gaussians before it.
+
+    Args:
+        stage: the stage's name.
+        size: with the Gaussians of the initial scene.
+        config: the effective configuration.
+
+    Returns:
+        The size with the Gaussians that the stage starts from.
+    """
+    before = {"gnet": ("novel_views", "enet", "evaluate/gnet", "evaluate/enet"), "enet": ("evaluate/enet",)}
+    for optimiser, later in before.items():
+        if stage in later:
+            size = replace(size, gaussians=_count_final_gaussians(optimiser, size, config))
+    return size
+
+
+def measure_chunk_size(chunk: Chunk, config: PipelineConfig, gaussians: int) -> ChunkSize:
+    """Takes a chunk's size from the chunk itself.
+
+    Args:
+        chunk: as ``ingest`` made it.
+        config: the effective configuration.
+        gaussians: of the scene that the stage starts from.
+
+    Returns:
+        The sizes; recorded images play no part in stages after ``ingest``.
+    """
+    source_views = len(chunk.views_with_role("source"))
+    novel_views = source_views * len(config.novel_views.shifts_m)
+    cameras = len(chunk.camera_names)
+    return ChunkSize(cameras, source_views, novel_views, chunk.width_px, chunk.height_px, 0, gaussians)
+
+
+def predict_memory(stage: str, size: ChunkSize, config: PipelineConfig, threads: int) -> StageMemory:
+    """Predicts what a stage takes: sums of terms whose factors were fitted to measurements.
+
+    Args:
+        stage: the stage's name.
+        size: of its chunk.
+        config: the effective configuration.
+        threads: of torch.
+
+    Returns:
+        Memory of the process, without pages of files.
+    """
+    terms = _TERMS[stage.partition("/")[0]]
+    gaussians = _count_final_gaussians(stage, size, config)
+    pixels = _count_pixels_at_a_time(stage, size, config, threads)
+    working = terms.gaussian_bytes * gaussians + terms.pixel_bytes * pixels
+    if stage == "fnet":
+        # Along both axes, as its network sees reduced views.
+        reduction = -(-max(size.width_px, size.height_px) // (config.fnet.max_network_px or 10**6))
+        working += _NETWORK_PIXEL_BYTES * pixels / max(1, reduction) ** 2
+    images = _FLOAT_BYTES * _count_image_values(stage, size, config)
+    return StageMemory(_PROCESS_MIB + terms.base_mib + working / 2**20, images / 2**20, terms.reuse)
+
+
+def _count_final_gaussians(stage: str, size: ChunkSize, config: PipelineConfig) -> int:
+    """Gaussians of the scene that a stage works on at its end."""
+    count = float(size.gaussians)
+    if stage == "gnet":
+        refinement = config.gnet.refinement
+        count *= (1 + config.gnet.split_fraction) * (1 + (0.0 if refinement is None else refinement.split_fraction))
+        if config.gnet.method in ("standard_3dgs", "street_gs"):
+            count = max(count, config.gnet.per_scene.density.max_gaussians)
+    elif stage == "enet":
+        count *= 1 + config.enet.split_fraction
+    return round(count)
+
+
+def _count_pixels_at_a_time(stage: str, size: ChunkSize, config: PipelineConfig, threads: int) -> float:
+    """Pixels of the images that a stage works on at a time."""
+    views: dict[str, float] = {
+        "effects": threads,
+        "gnet": config.gnet.views_per_iteration,
+        # All sides of a frame's cameras are rendered in one call.
+        "novel_views": size.cameras * len(config.novel_views.shifts_m),
+        "fnet": threads * config.fnet.batch_views,
+        "enet": config.enet.views_per_iteration + config.enet.novel_views_per_iteration,
+    }
+    return threads * size.native_px if stage == "ingest" else views.get(stage, 0) * size.pixels
+
+
+def _count_image_values(stage: str, size: ChunkSize, config: PipelineConfig) -> int:
+    """Values of the images of all views that a stage holds."""
+    statistics = _STATISTICS_CHANNELS if size.pixels <= KEPT_PIXELS else 0
+    source = size.source_views * (_SOURCE_CHANNELS + statistics)
+    fixed = size.novel_views * _FIXED_CHANNELS
+    channels = {
+        "gnet": source,
+        "novel_views": size.novel_views * _NOVEL_CHANNELS,
+        "fnet": size.novel_views * _NOVEL_CHANNELS + fixed + size.source_views * _SOURCE_CHANNELS,
+        "enet": source + fixed + size.novel_views * statistics,
+        "evaluate/fnet": size.novel_views * _NOVEL_CHANNELS + fixed,
+    }
+    return channels.get(stage, 0) * size.pixels
+
+
+def shrink_batch(spec: StageSpec, section: Any, attempt: int) -> Any:
+    """Halves the setting that bounds a stage's memory, once for each attempt that ran out of it.
+
+    Args:
+        spec: the stage.
+        section: its section of the configuration.
+        attempt: how many tries ran out of memory.
+
+    Returns:
+        The section; other stages have no such setting, and keep theirs.
+    """
+    if spec.batch_setting is None or attempt == 0:
+        return section
+    smaller = max(1, getattr(section, spec.batch_setting) >> attempt)
+    return section.model_copy(update={spec.batch_setting: smaller})
+
+
+def needs_disk(stage: str, memory: StageMemory, config: PipelineConfig) -> bool:
+    """Decides whether the images of a stage's views lie on disk.
+
+    Args:
+        stage: the stage's name.
+        memory: that it will take.
+        config: with the limit.
+
+    Returns:
+        True where they do not fit into memory.
+
+    Raises:
+        ResourceError: the limit that is set is too low for the stage even so.
+    """
+    limit_gib = config.limits.memory_gib
+    if limit_gib is None:
+        # The machine's limit is no wish: where a prediction is too high, the stage may still succeed.
+        return memory.in_memory_mib > _SHARE_OF_MACHINE * memory_limit_gib() * 1024
+    if memory.working_mib > limit_gib * 1024:
+        raise ResourceError(
+            f"{stage} needs about {memory.working_mib / 1024:.1f} GiB of memory with its images on disk, and may use "
+            f"{limit_gib:.1f} GiB",
+            remedy="Allow more (--memory), or choose a smaller ingest.width_px or initial.max_points.",
+            stage=stage,
+        )
+    return memory.in_memory_mib > limit_gib * 1024

@@ -1,0 +1,81 @@
+"""Where the images of many views are held: in memory, or in files that the system can take back from it.
+
+At 1280×720 the renders, maps and repairs of a chunk take more than all else together, and each is needed for a moment.
+Where memory is short, they lie in files that are mapped into the process: what is not in use costs disk, not memory.
+The values are the same.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from genre_tasks.errors import ResourceError
+
+_MIN_BYTES = 2**24
+"""Smaller tensors stay in memory: each file takes a mapping and whole pages."""
+
+_scratch_folder: ContextVar[Path | None] = ContextVar("scratch_folder", default=None)
+
+
+@contextmanager
+def hold_images_on_disk(folder: Path | None) -> Iterator[None]:
+    """Lets :func:`allocate_images` use files while a block runs.
+
+    Args:
+        folder: for the files, on a disk; ``None``: images stay in memory.
+
+    >>> with hold_images_on_disk(Path(tempfile.gettempdir())):
+    ...     allocate_images(2, 1024, 1024, 3).shape
+    torch.Size([2, 1024, 1024, 3])
+    """
+    token = _scratch_folder.set(folder)
+    try:
+        yield
+    finally:
+        _scratch_folder.reset(token)
+
+
+def allocate_images(*shape: int, device: torch.device | str = "cpu") -> Tensor:
+    """Makes a tensor for the images of many views, to be filled.
+
+    The file of a tensor on disk has no name any more: it goes with the tensor, even when the process is killed.
+
+    Args:
+        shape: of the tensor.
+        device: of the tensor; files hold images of the CPU alone.
+
+    Returns:
+        float32, not initialised.
+
+    Raises:
+        ResourceError: the disk has no space for it.
+    """
+    folder = _scratch_folder.get()
+    count = math.prod(shape)
+    size = 4 * count
+    # Other systems can neither reserve a file's blocks nor remove a file that is mapped.
+    on_disk = folder is not None and size >= _MIN_BYTES and hasattr(os, "posix_fallocate")
+    if not on_disk or torch.device(device).type != "cpu":
+        return torch.empty(shape, device=device)
+    handle, name = tempfile.mkstemp(prefix=".genre-images-", dir=folder)
+    try:
+        # Without its blocks a full disk would kill the process, at the first write to a page.
+        os.posix_fallocate(handle, 0, size)
+        return torch.from_file(name, shared=True, size=count, dtype=torch.float32).view(shape)
+    except OSError as error:
+        raise ResourceError(
+            f"the disk of {folder} has no space for {size / 2**20:.0f} MiB of images ({error.strerror})",
+            remedy="Free some space, or let the run use more memory (--memory).",
+        ) from error
+    finally:
+        os.close(handle)
+        Path(name).unlink()

@@ -1,0 +1,111 @@
+"""Memory is predicted before a stage starts; what does not fit lies on disk, and no result depends on it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flows.configuration import load_configuration
+from flows.pipeline import memory_plan, stage_inputs
+from flows.pipeline.definition import PIPELINE, STAGE_BY_NAME
+from flows.pipeline.memory_plan import (
+    ChunkSize,
+    StageMemory,
+    grow_until,
+    needs_disk,
+    predict_memory,
+    shrink_batch,
+)
+from flows.pipeline.stage_runner import Job, run_stage
+from genre_tasks import image_memory
+from genre_tasks.config import PipelineConfig
+from genre_tasks.errors import ResourceError
+from storage.opening import open_store
+from tests.faults.small_run import LOG, SETTINGS
+
+HD = ChunkSize(6, 30, 60, 1280, 720, 1920 * 1080, 310_000)
+
+
+def limited(memory_gib: float | None, preset: str = "hd") -> PipelineConfig:
+    return load_configuration(preset, settings=[f"limits.memory_gib={json.dumps(memory_gib)}"])
+
+
+@pytest.mark.parametrize(
+    ("limit_gib", "expected"), [(4.0, True), (5.0, False)], ids=["below what it takes", "above what it takes"]
+)
+def test_images_lie_on_disk_where_they_do_not_fit(limit_gib: float, expected: bool) -> None:
+    memory = StageMemory(working_mib=2048, images_mib=2048)
+    assert needs_disk("enet", memory, limited(limit_gib)) is expected
+
+
+def test_without_a_limit_it_is_the_machines(monkeypatch: pytest.MonkeyPatch) -> None:
+    memory = StageMemory(working_mib=2048, images_mib=2048)
+    monkeypatch.setattr(memory_plan, "memory_limit_gib", lambda: 64.0)
+    assert not needs_disk("enet", memory, limited(None))
+    monkeypatch.setattr(memory_plan, "memory_limit_gib", lambda: 4.0)
+    assert needs_disk("enet", memory, limited(None))
+    # A machine that is too small is tried: the prediction may be too high.
+    monkeypatch.setattr(memory_plan, "memory_limit_gib", lambda: 1.0)
+    assert needs_disk("enet", memory, limited(None))
+
+
+def test_a_limit_that_is_too_low_is_an_error_before_the_stage() -> None:
+    with pytest.raises(ResourceError, match=r"enet needs about 2\.0 GiB.*may use 1\.0 GiB.*--memory"):
+        needs_disk("enet", StageMemory(2048, 10), limited(1.0))
+
+
+def test_memory_grows_with_what_a_stage_works_on() -> None:
+    config = limited(None)
+    for spec in PIPELINE:
+        before = predict_memory(spec.name, HD, config, 2)
+        larger = predict_memory(
+            spec.name, replace(HD, width_px=1920, height_px=1080, native_px=2 * HD.native_px), config, 2
+        )
+        assert larger.in_memory_mib >= before.in_memory_mib
+        assert before.with_images_on_disk_mib < before.in_memory_mib
+        # More views take disk alone.
+        longer = predict_memory(spec.name, replace(HD, source_views=300, novel_views=600), config, 2)
+        assert longer.working_mib == before.working_mib
+
+
+def test_gaussians_are_split_before_later_stages() -> None:
+    config = limited(None)
+    counts = {name: grow_until(name, HD, config).gaussians for name in ("gnet", "enet", "evaluate/enet")}
+    assert counts == {"gnet": 310_000, "enet": 403_000, "evaluate/enet": 544_050}
+
+
+def test_a_batch_is_halved_for_each_attempt_that_ran_out_of_memory() -> None:
+    section = PipelineConfig().fnet
+    assert [shrink_batch(STAGE_BY_NAME["fnet"], section, k).batch_views for k in range(4)] == [4, 2, 1, 1]
+    gnet = PipelineConfig().gnet
+    assert shrink_batch(STAGE_BY_NAME["gnet"], gnet, 3) is gnet
+
+
+def test_images_on_disk_give_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # A street's images are small: every stack goes to disk all the same.
+    monkeypatch.setattr(image_memory, "_MIN_BYTES", 0)
+    held: list[int] = []
+    allocate = image_memory.torch.from_file
+
+    def from_file(*arguments: Any, **options: Any) -> Any:
+        held.append(options["size"])
+        return allocate(*arguments, **options)
+
+    monkeypatch.setattr(image_memory.torch, "from_file", from_file)
+    digests: dict[bool, dict[str, str]] = {}
+    for on_disk in (False, True):
+        monkeypatch.setattr(stage_inputs, "needs_disk", lambda *_, answer=on_disk: answer)
+        store = tmp_path / f"store-{on_disk}"
+        job = Job(LOG, 0, str(store), load_configuration("demo", settings=SETTINGS).model_dump(mode="json"))
+        refs: dict[str, Any] = {}
+        for spec in PIPELINE:
+            refs[spec.name] = run_stage(spec.name, job, {name: refs[name] for name in spec.inputs})
+        digests[on_disk] = {name: ref.payload_digest for name, ref in refs.items()}
+        assert bool(held) is on_disk
+        for artifact in open_store(str(store)).artifacts():
+            assert artifact.manifest.measurements["predicted_mib"] > 0
+    assert digests[True] == digests[False]
