@@ -54,6 +54,7 @@ CLAIM_WORDS = {
     "evaluation.reliability_gnet": "Rank correlation of estimated and true PSNR, scenes of GNet",
     "evaluation.reliability": "Rank correlation of estimated and true PSNR, scenes of ENet",
     "evaluation.reliability_worst": "Rank correlation of estimated and true PSNR, worst street",
+    "evaluation.range_s": "Seconds of a reliable range with its default settings",
     "real_logs.kitti_psnr_gain": "KITTI slice: held-out PSNR after ENet over that before these effects",
     "real_logs.kitti_kernel_cut": "KITTI slice: what ENet takes off the kernel distance at 3 m",
     "real_logs.kitti_enet_heldout": "KITTI slice: held-out PSNR, ENet minus GNet",

@@ -24,17 +24,19 @@ from benchmarks.common.bench import (
 )
 from benchmarks.common.claims import Claim
 from benchmarks.evaluation.budgets import budget_claims, budget_table, run_with_budget
+from benchmarks.evaluation.range_seconds import measure_range_seconds, range_seconds_claims, range_seconds_table
 from benchmarks.evaluation.reliability import measure_street, reliability_claims, reliability_table
 from flows.configuration import load_configuration
 from flows.pipeline.definition import STAGE_BY_NAME, digest_stage_weights
 
 GUARDS_S = 150.0
+RANGE_S = 90.0
 START_S = 30.0
 """What a command takes beyond its budget: start of Python and Prefect, evaluation, report."""
 
 
 class EvaluationBench:
-    """A cell for each budget and seed, and one for each seed's guards.
+    """A cell for each budget and seed, one for each seed's guards, and one for the seconds of a reliable range.
 
     Budgets start where the shortest setting ends on two cores: start-up, drawing a street and GNet's first iterations
     take some 48 seconds.
@@ -52,9 +54,10 @@ class EvaluationBench:
     }
     code: tuple[str, ...] = (
         "benchmarks.evaluation.budgets",
+        "benchmarks.evaluation.range_seconds",
         "benchmarks.evaluation.reliability",
         "flows.budget.budget",
-        "genre_tasks.reliability.guards",
+        "genre_tasks.reliability.reliable_range",
         "genre_tasks.stages.ingest",
         "genre_tasks.stages.initial",
         "genre_tasks.stages.optimise",
@@ -66,7 +69,7 @@ class EvaluationBench:
     )
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
-        """Lists the guards of each seed, then the budgets; ``quick``: one round, one seed's guards."""
+        """Lists the guards of each seed, the budgets and a range; ``quick``: one round, one seed's guards."""
         seeds = split_option(options["seeds"])
         budgets = split_option(options["budgets"])
         settings = settings_from_options(options)
@@ -88,18 +91,25 @@ class EvaluationBench:
                 seed = seeds[(i + k) % len(seeds)]
                 run = partial(run_with_budget, seed, float(budget), options["table"], settings)
                 cells.append(Cell(f"budget {budget} s street {seed}", float(budget) + START_S, run, parameters))
+        # One street is enough: the seconds depend on the number of views and their size.
+        stage = split_option(options["stages"])[-1]
+        time_range = partial(measure_range_seconds, seeds[0], stage, options["store"], settings)
+        cells.append(Cell(f"range street {seeds[0]} {stage}", RANGE_S, time_range, parameters))
         return cells
 
     def claims(self, rows: Mapping[str, Row]) -> Iterator[Claim]:
         """Claims that budgets are kept, used and worth it, and that guards rank views as the truth does."""
         yield from budget_claims(_budget_rows(rows))
         yield from reliability_claims(_guard_rows(rows))
+        yield from range_seconds_claims(_range_rows(rows))
 
     def table(self, rows: Mapping[str, Row]) -> Iterator[str]:
         """Gives both tables, and what was not measured."""
         yield from budget_table(_budget_rows(rows))
         yield ""
         yield from reliability_table(_guard_rows(rows))
+        yield ""
+        yield from range_seconds_table(_range_rows(rows))
         yield from list_not_measured(rows)
 
 
@@ -109,6 +119,10 @@ def _budget_rows(rows: Mapping[str, Row]) -> list[Row]:
 
 def _guard_rows(rows: Mapping[str, Row]) -> list[Row]:
     return [r for r in rows.values() if "views" in r]
+
+
+def _range_rows(rows: Mapping[str, Row]) -> list[Row]:
+    return [r for r in rows.values() if "range_s" in r]
 
 
 EVALUATION: Bench = EvaluationBench()

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from genre_tasks.detection.detector import Detector
-from genre_tasks.fixer.inputs import build_inputs
 from genre_tasks.fixer.warping import SourceImage
 from genre_tasks.reliability.detected_actors import count_detected_actors
+from genre_tasks.reliability.recorded_support import look_up_support
 from genre_tasks.scene.chunk import Chunk
-from genre_tasks.scene.novel_views import NovelView, NovelViews
+from genre_tasks.scene.novel_views import NovelViews
+from genre_tasks.threads import map_single_threaded
 
 MIN_COVERAGE = 0.5
-"""A pixel counts as shown where recorded images cover at least so much of it, and as covered from this alpha on."""
+"""A pixel counts as covered from this alpha on."""
 
 FLOATING_DEPTH = 0.5
 """A pixel floats where its rendered depth is below this fraction of the LiDAR map's."""
@@ -85,43 +86,44 @@ def compute_guards(
     Returns:
         V guards, in the order of ``novel.views``.
     """
-    return [_guard_view(chunk, novel, index, view, sources, detector) for index, view in enumerate(novel.views)]
+
+    @torch.no_grad()
+    def guard_view(index: int) -> Guards:
+        return _guard_view(chunk, novel, index, sources)
+
+    # Single views are too small to keep several threads busy, so that several views are measured at once.
+    guards = map_single_threaded(guard_view, range(len(novel.views)))
+    if detector is None:
+        return guards
+    # One after the other: not every detector may be called by several threads.
+    return [_count_detected(guard, chunk, novel, index, detector) for index, guard in enumerate(guards)]
 
 
-def _guard_view(
-    chunk: Chunk,
-    novel: NovelViews,
-    index: int,
-    view: NovelView,
-    sources: Sequence[SourceImage],
-    detector: Detector | None,
-) -> Guards:
-    inputs = build_inputs(chunk, novel, [index], sources)
+def _guard_view(chunk: Chunk, novel: NovelViews, index: int, sources: Sequence[SourceImage]) -> Guards:
+    view = novel.views[index]
+    support = look_up_support(chunk, novel, index, sources)
     # By the LiDAR's depth: looked up by its own depth, a floater would agree with the images that made it.
-    covered = inputs.lidar_warp_mask > MIN_COVERAGE
-    # The warped images are premultiplied by how much of a pixel they cover.
-    recorded = inputs.lidar_warped / inputs.lidar_warp_mask.clamp_min(MIN_COVERAGE)
     # Clamped, as the image is shown.
-    error = ((inputs.color.clamp(0, 1) - recorded) ** 2).mean(1, keepdim=True)
+    rendered = novel.color[index][support.covered].clamp(0, 1).T
     floating, known = _find_floating_pixels(novel, index)
-    actors = 0
-    detected = 0
-    if detector is not None:
-        image = inputs.color[0].clamp(0, 1).permute(1, 2, 0)
-        actors, detected = count_detected_actors(detector, chunk, view, image)
     return Guards(
         camera=view.camera,
         frame=view.frame,
         shift_m=view.shift_m,
-        agreement_db=_mean_psnr(error[covered]),
+        agreement_db=_mean_psnr(((rendered - support.colors) ** 2).mean(0)),
         # By the render's own depth this time: does any image agree with the surface as it was rendered?
-        shown=_fraction(inputs.warp_mask > MIN_COVERAGE),
-        thin=_fraction(inputs.alpha < MIN_COVERAGE),
+        shown=_fraction(support.shown),
+        thin=_fraction(novel.alpha[index] < MIN_COVERAGE),
         # Only pixels with both depths can be judged; without any nothing floats.
         floating=float(floating.sum()) / max(1, int(known.sum())),
-        actors=actors,
-        detected=detected,
     )
+
+
+def _count_detected(guard: Guards, chunk: Chunk, novel: NovelViews, index: int, detector: Detector) -> Guards:
+    """The same guards with the actors that a detector finds."""
+    image = novel.color[index].clamp(0, 1)
+    actors, detected = count_detected_actors(detector, chunk, novel.views[index], image)
+    return replace(guard, actors=actors, detected=detected)
 
 
 def _find_floating_pixels(novel: NovelViews, index: int) -> tuple[Tensor, Tensor]:

@@ -13,6 +13,7 @@ from benchmarks.common.bench import NotMeasuredError
 from benchmarks.common.claims import Claim
 from benchmarks.evaluation import EVALUATION
 from benchmarks.evaluation.budgets import budget_claims, budget_table, run_with_budget
+from benchmarks.evaluation.range_seconds import range_seconds_claims, range_seconds_table
 from benchmarks.evaluation.reliability import fit_estimate, reliability_claims, reliability_table, true_reach_m
 from flows.budget.cost_table import find_shipped_table, load_cost_table
 from genre_tasks.reliability.guards import PSNR_COEFFICIENTS
@@ -90,6 +91,17 @@ def test_guards_are_judged_beside_the_path_over_all_streets_and_on_the_worst() -
     assert true_reach_m(farther, 1) == true_reach_m(farther, -1) == pytest.approx(1.5)
 
 
+def test_the_slowest_range_counts() -> None:
+    rows: list[Any] = [
+        {"log": "s?seed=1", "stage": "enet", "range_s": s, "range_cpu_s": 2 * s, "rendered_views": 510}
+        for s in (40, 61)
+    ]
+    fast, slow, none = (by_name(range_seconds_claims(r))["range_s"] for r in (rows[:1], rows, []))
+    assert fast.holds and fast.measured == 40 and not slow.holds and slow.measured == 61
+    assert none.measured is None and not none.holds
+    assert list(range_seconds_table(rows))[-1] == "| seed=1 | enet | 510 | 61.0 | 122.0 |"
+
+
 def test_the_estimate_can_be_fitted_again() -> None:
     """On views whose PSNR is linear in the guards the fit is exact, also of a street that it was not made on."""
     g, rows = np.random.default_rng(0), []
@@ -113,10 +125,11 @@ def test_the_estimate_can_be_fitted_again() -> None:
 def test_rounds_bring_every_budget_to_every_seed() -> None:
     options = dict(EVALUATION.options) | {"budgets": "30,60,90", "seeds": "1,2,3", "stages": "gnet"}
     names = [c.name for c in EVALUATION.cells(options | {"rounds": "1"}, quick=False)]
-    assert names[3:] == ["budget 30 s street 1", "budget 60 s street 2", "budget 90 s street 3"]
-    all_ = [c.name for c in EVALUATION.cells(options, quick=False)][3:]
+    assert names[3:-1] == ["budget 30 s street 1", "budget 60 s street 2", "budget 90 s street 3"]
+    assert names[-1] == "range street 1 gnet"
+    all_ = [c.name for c in EVALUATION.cells(options, quick=False)][3:-1]
     assert len(set(all_)) == len(all_) == 9
-    assert len(EVALUATION.cells(options, quick=True)) == 4
+    assert len(EVALUATION.cells(options, quick=True)) == 5
 
 
 def test_a_run_that_fails_says_what_the_command_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
