@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from pathlib import Path
 
@@ -25,3 +26,20 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--write-fault-table", action="store_true", help="Write rows into the table of faults.")
     group.addoption("--fault-times", type=int, default=5, help="How often every fault is injected.")
     group.addoption("--keep-fault-folder", action="store_true", help="Leave logs and stores of the faults on the disk.")
+
+
+def pytest_collection_finish() -> None:
+    """Takes what thousands of collected tests hold out of every later search for garbage, one at each stage's end."""
+    _freeze()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _modules_apart() -> None:
+    """The same for what the modules of tests before this one have imported and keep."""
+    _freeze()
+
+
+def _freeze() -> None:
+    # Garbage that is frozen would stay for good.
+    gc.collect()
+    gc.freeze()

@@ -49,7 +49,14 @@ def commands(page: Path) -> list[str]:
     return [line for block in blocks for line in block.splitlines() if line.startswith("genre ")]
 
 
-FOUND = [pytest.param(command, id=f"{page.stem}: {command}") for page in PAGES for command in commands(page)]
+# A command that several pages have is run once, in its first place.
+PAGES_OF: dict[str, list[str]] = {}
+for _page in PAGES:
+    for _command in commands(_page):
+        PAGES_OF.setdefault(_command.split("   #")[0].rstrip(), []).append(_page.stem)
+FOUND = [
+    pytest.param(command, id=f"{', '.join(dict.fromkeys(pages))}: {command}") for command, pages in PAGES_OF.items()
+]
 
 
 @pytest.fixture(scope="module")
@@ -120,6 +127,9 @@ def small(command: str, folder: Path, run: str, pandaset: str) -> list[str]:
     more = ("gnet.per_scene.iterations=20",) if words[0] in ("table", "figure") else ()
     sets = [part for setting in (*SETTINGS, *more) for part in ("--set", setting)]
     sets = sets if words[0] in TAKES_SETTINGS else []
+    if words[0] in ("run", "enhance") and LOG not in words:
+        # Distances between sets of images take long, and are those of the street's run whatever reads the log.
+        sets += ["--set", "evaluate.distributions=false"]
     store = ["--store", str(folder / "store")] if words[0] in TAKES_STORE else []
     return [*words[:1], *sets, *store, *words[1:]]
 
