@@ -255,6 +255,7 @@ def _memory_claims(rows: Mapping[str, Row]) -> Iterator[Claim]:
     runs = [row for row in rows.values() if row.get("kind") == "run"]
     free = {row["chunk"]: row for row in runs if row["limit_gib"] is None}
     for row in runs:
+        # A limited run alone says nothing of bytes: it has nothing to be compared with.
         if row["limit_gib"] is None or row["chunk"] not in free:
             continue
         pair = (free[row["chunk"]], row)
@@ -262,6 +263,7 @@ def _memory_claims(rows: Mapping[str, Row]) -> Iterator[Claim]:
         stages = [stage for run in pair for stage in run["stages"].values()]
         largest = max(stages, key=lambda stage: abs(stage["peak_gib"] / stage["predicted_gib"] - 1))
         error = largest["peak_gib"] / largest["predicted_gib"] - 1
+        # Digests of files and not of values: a stage that wrote other bytes would count.
         changed = [s for s in STAGES if len({run["stages"][s]["payload_digest"] for run in pair}) > 1]
         yield claim("full_size.limited_gib", row["peak_gib"], "<=", row["limit_gib"], "GiB", _place(row))
         yield claim("full_size.memory_error", abs(error), "<=", _MEMORY_ERROR, "share", f"{where}; of all stages")

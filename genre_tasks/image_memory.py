@@ -77,5 +77,6 @@ def allocate_images(*shape: int, device: torch.device | str = "cpu") -> Tensor:
             remedy="Free some space, or let the run use more memory (--memory).",
         ) from error
     finally:
+        # The mapping keeps the blocks; the name would outlive a process that is killed.
         os.close(handle)
         Path(name).unlink()

@@ -35,11 +35,13 @@ def measure_range_seconds(seed: str, stage: str, store: str, settings: Sequence[
     log = f"synthetic:street?seed={seed}"
     config = load_configuration("small", settings=settings)
     job = Job(log, 0, store, config.model_dump(mode="json"))
+    # As many threads as all benchmarks have, so that seconds can be compared.
     with torch_threads(THREADS):
         refs = reconstruct(job, stages_until(stage))
         chunk = read_artifact(job, refs["ingest"])
         plan = read_artifact(job, refs["effects"])
         scene = read_artifact(job, refs[stage]).scene
+        # Only from here on: the scene is there when a range is asked for.
         began = time.perf_counter()
         cpu_began = time.process_time()
         found = estimate_reliable_range(RangeConfig(), chunk, scene, plan)

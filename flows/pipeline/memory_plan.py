@@ -135,6 +135,7 @@ def estimate_chunk_size(log: DrivingLog, cameras: Sequence[Camera], config: Pipe
         The sizes of a full chunk; LiDAR may give fewer Gaussians.
     """
     frames = min(config.ingest.chunk_frames, log.frame_count)
+    # As if every frame had all images: a log with gaps takes less.
     source_views = -(-frames // config.ingest.source_every) * len(cameras)
     return ChunkSize(
         cameras=len(cameras),
@@ -158,6 +159,7 @@ def grow_until(stage: str, size: ChunkSize, config: PipelineConfig) -> ChunkSize
     Returns:
         The size with the Gaussians that the stage starts from.
     """
+    # FNet is not among them: it sees images alone.
     before = {"gnet": ("novel_views", "enet", "evaluate/gnet", "evaluate/enet"), "enet": ("evaluate/enet",)}
     for optimiser, later in before.items():
         if stage in later:
@@ -212,6 +214,7 @@ def _count_final_gaussians(stage: str, size: ChunkSize, config: PipelineConfig) 
     if stage == "gnet":
         refinement = config.gnet.refinement
         count *= (1 + config.gnet.split_fraction) * (1 + (0.0 if refinement is None else refinement.split_fraction))
+        # Per-scene training adds Gaussians up to a bound of its own.
         if config.gnet.method in ("standard_3dgs", "street_gs"):
             count = max(count, config.gnet.per_scene.density.max_gaussians)
     elif stage == "enet":
@@ -237,6 +240,7 @@ def _count_image_values(stage: str, size: ChunkSize, config: PipelineConfig) -> 
     statistics = _STATISTICS_CHANNELS if size.pixels <= KEPT_PIXELS else 0
     source = size.source_views * (_SOURCE_CHANNELS + statistics)
     fixed = size.novel_views * _FIXED_CHANNELS
+    # Other stages hold one view or one frame at a time.
     channels = {
         "gnet": source,
         "novel_views": size.novel_views * _NOVEL_CHANNELS,

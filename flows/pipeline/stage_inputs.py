@@ -71,6 +71,7 @@ def open_inputs(
     memory = _predict(spec, log, config, values)
     on_disk = needs_disk(spec.name, memory, config) or is_retry
     with ExitStack() as stack:
+        # Both together: with freed memory that stays, images on disk alone save too little.
         if on_disk:
             return_freed_memory()
             stack.enter_context(hold_images_on_disk(store.scratch_folder))
@@ -84,6 +85,7 @@ def _predict(spec: StageSpec, log: str, config: PipelineConfig, values: Mapping[
     import torch
 
     threads = torch.get_num_threads()
+    # ``ingest`` itself has no chunk yet, but the log says how large one will be.
     if "ingest" not in values:
         from genre_tasks.logs.log_selection import select_cameras
 

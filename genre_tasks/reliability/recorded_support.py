@@ -64,6 +64,7 @@ def look_up_support(chunk: Chunk, novel: NovelViews, index: int, sources: Sequen
     selected = select_sources(lidar, sources, view.reference, actors, view.frame)
     # Both surfaces in one row of points: an image is asked once for both.
     seen, colors = _look_up_points(_join_known_points(rendered, lidar), selected, actors, view.frame)
+    # Points of the render come first in the row, those of the LiDAR map after them.
     count = int(rendered.known.sum())
     seen_by_lidar = seen[count:]
     return RecordedSupport(
@@ -88,6 +89,7 @@ def select_actors_in_view(actors: Sequence[Actor], view: NovelView) -> list[Acto
     in_view = []
     for actor in actors:
         at_frame = np.flatnonzero(actor.frames == view.frame)
+        # An actor without a box at this frame has no points in it either.
         if not len(at_frame):
             continue
         center = camera_SE3_chunk @ actor.chunk_SE3_box[at_frame[0]][:, 3]

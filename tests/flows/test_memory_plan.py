@@ -38,7 +38,7 @@ def limited(memory_gib: float | None, preset: str = "hd") -> PipelineConfig:
     ("limit_gib", "expected"), [(4.0, True), (5.0, False)], ids=["below what it takes", "above what it takes"]
 )
 def test_images_lie_on_disk_where_they_do_not_fit(limit_gib: float, expected: bool) -> None:
-    memory = StageMemory(working_mib=2048, images_mib=2048)
+    memory = StageMemory(working_mib=2048, images_mib=2048, reuse=1.25)
     assert needs_disk("enet", memory, limited(limit_gib)) is expected
 
 
@@ -66,7 +66,8 @@ def test_memory_grows_with_what_a_stage_works_on() -> None:
             spec.name, replace(HD, width_px=1920, height_px=1080, native_px=2 * HD.native_px), config, 2
         )
         assert larger.in_memory_mib >= before.in_memory_mib
-        assert before.with_images_on_disk_mib < before.in_memory_mib
+        # Stages that hold no images of many views have nothing to put on disk.
+        assert before.with_images_on_disk_mib <= before.in_memory_mib - before.images_mib
         # More views take disk alone.
         longer = predict_memory(spec.name, replace(HD, source_views=300, novel_views=600), config, 2)
         assert longer.working_mib == before.working_mib
