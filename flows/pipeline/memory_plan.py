@@ -56,9 +56,9 @@ _TERMS: Mapping[str, _Terms] = {
     "effects": _Terms(725, 0, 276),
     "initial": _Terms(230, 1560),
     "gnet": _Terms(165, 4470, 0, 1.29),
-    "novel_views": _Terms(400, 1500, 30),
+    "novel_views": _Terms(400, 600, 30),
     "fnet": _Terms(525, 0, 320, 1.25),
-    "enet": _Terms(150, 5470, 0, 1.29),
+    "enet": _Terms(150, 4820, 0, 1.29),
     "evaluate": _Terms(350, 1100, 0),
 }
 """Fitted to stages at 320×180 and 1280×720; ``genre bench full_size`` compares predictions with what runs took."""

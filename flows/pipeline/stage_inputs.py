@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from flows.machine.memory_reuse import return_freed_memory, reuse_freed_memory
@@ -68,6 +68,9 @@ def open_inputs(
     """
     # These take little memory, and their sizes tell how much the others take.
     values = {name: store.read(artifacts[name]) for name in spec.inputs if name not in _IMAGE_STAGES}
+    if not spec.name.startswith("evaluate/"):
+        # Only an evaluation looks at the scenes on the way, which together are larger than the last one.
+        values = {name: _drop_snapshots(value) for name, value in values.items()}
     memory = _predict(spec, log, config, values)
     on_disk = needs_disk(spec.name, memory, config) or is_retry
     with ExitStack() as stack:
@@ -79,6 +82,10 @@ def open_inputs(
             stack.enter_context(reuse_freed_memory())
         values |= {name: store.read(artifacts[name]) for name in spec.inputs if name in _IMAGE_STAGES}
         yield StageInputs(values, memory, on_disk)
+
+
+def _drop_snapshots(value: Any) -> Any:
+    return replace(value, snapshots={}) if hasattr(value, "snapshots") else value
 
 
 def _predict(spec: StageSpec, log: str, config: PipelineConfig, values: Mapping[str, Any]) -> StageMemory:

@@ -19,6 +19,7 @@ from genre_tasks.effects.point_colors import (
 from genre_tasks.logs.types import Camera, Float64
 from genre_tasks.scene.chunk import Chunk, View
 from genre_tasks.scene.image_decoding import decode_pixels
+from genre_tasks.scene.pose_alignment import PoseAlignment, align_poses
 from genre_tasks.scene.projection import Projected, project
 from genre_tasks.scene.transforms import distance_to_path
 from genre_tasks.scene.visibility import find_visible_points
@@ -94,6 +95,11 @@ class ChunkMeasurements:
             # A camera without images has an empty array, so that callers only ask for its length.
             images_by_camera[camera] = np.stack(images) if images else np.zeros((0, 1, 1, 3), np.uint8)
         return images_by_camera
+
+    @cached_property
+    def coarse_alignment(self) -> PoseAlignment | None:
+        """Coarsely refined poses, which tell whether poses err; ``None`` where no two views see the same points."""
+        return align_poses(self.chunk, coarse=True)
 
     @cached_property
     def lidar_returns(self) -> list[Projected]:

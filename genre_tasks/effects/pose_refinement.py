@@ -24,7 +24,7 @@ def measure(measurements: ChunkMeasurements) -> Measurement:
     if width_px < MIN_WIDTH_PX:
         return Measurement(None, f"images of {width_px} pixels in width are too coarse to tell")
     # Coarse, since most logs err by nothing and should not pay for it.
-    alignment = align_poses(measurements.chunk, coarse=True)
+    alignment = measurements.coarse_alignment
     if alignment is None:
         return Measurement(None, "no two source images see the same LiDAR points")
     count = len(measurements.source_views)
@@ -40,7 +40,7 @@ def fit(measurements: ChunkMeasurements) -> EffectParameters:
     Returns:
         Poses of all views; those that are held out take theirs from their neighbours in time.
     """
-    alignment = align_poses(measurements.chunk)
+    alignment = align_poses(measurements.chunk, start=measurements.coarse_alignment)
     return EffectParameters() if alignment is None else EffectParameters(poses=alignment.poses)
 
 

@@ -15,7 +15,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, uniform_filter
 
 from genre_tasks.logs.types import Float32, Float64
 from genre_tasks.scene.alignment_step import (
@@ -86,12 +86,13 @@ class PoseAlignment:
     rig: Float64
 
 
-def align_poses(chunk: Chunk, *, coarse: bool = False) -> PoseAlignment | None:
+def align_poses(chunk: Chunk, *, coarse: bool = False, start: PoseAlignment | None = None) -> PoseAlignment | None:
     """Refines the camera poses of a chunk. Deterministic.
 
     Args:
         chunk: with LiDAR points and source views.
         coarse: take fewer points and stop at a larger blur, which tells whether poses err in a third of the time.
+        start: coarse motions to go on from, which spare the largest blur.
 
     Returns:
         The poses of all views; ``None`` where no two source views see the same points.
@@ -100,7 +101,7 @@ def align_poses(chunk: Chunk, *, coarse: bool = False) -> PoseAlignment | None:
         InputError: an image cannot be decoded.
     """
     images = _load_images(chunk)
-    motions = _find_motions(chunk, images, coarse)
+    motions = _find_motions(chunk, images, coarse, start)
     if motions is None:
         return None
     mounts, rig = motions
@@ -108,22 +109,23 @@ def align_poses(chunk: Chunk, *, coarse: bool = False) -> PoseAlignment | None:
     return PoseAlignment(poses, _measure_displacement(chunk, poses), mounts, rig)
 
 
-def _find_motions(chunk: Chunk, images: Sequence[AlignedImage], coarse: bool) -> tuple[Float64, Float64] | None:
+def _find_motions(
+    chunk: Chunk, images: Sequence[AlignedImage], coarse: bool, start: PoseAlignment | None
+) -> tuple[Float64, Float64] | None:
     """Motions of the mounts [C, 6] and of the rig [F, 6]; ``None`` where no two views see the same points."""
     frame_count = 1 + max((image.rig for image in images), default=-1)
-    mounts = np.zeros((len(chunk.camera_names), 6))
-    rig = np.zeros((frame_count, 6))
+    mounts = np.zeros((len(chunk.camera_names), 6)) if start is None else start.mounts
+    rig = np.zeros((frame_count, 6)) if start is None else start.rig
     near = distance_to_path(chunk.static.positions, chunk.chunk_SE3_ego) < MAX_RANGE_M
     usable = near & (chunk.static.frames >= 0)
     point_count = min(COARSE_POINT_COUNT if coarse else POINT_COUNT, MAX_OBSERVATIONS // max(len(images), 1))
-    for blur_px in COARSE_BLURS_PX if coarse else BLURS_PX:
+    blurs_px = COARSE_BLURS_PX if coarse else BLURS_PX
+    for blur_px in blurs_px if start is None else blurs_px[1:]:
         levels = map_single_threaded(partial(_normalise, blur_px=blur_px), [image.luma for image in images])
         # Anew at each blur: what hides what follows from poses, which are better by now.
         moved = [replace(image.view, chunk_SE3_camera=compute_pose(image, mounts, rig)) for image in images]
         visible = map_single_threaded(partial(_find_visible, chunk.static.positions), moved)
-        points, observed = _draw_points(
-            chunk.static.positions, usable, visible, images, levels, mounts, rig, point_count
-        )
+        points, observed = _draw_points(chunk.static.positions, usable, visible, images, levels, point_count)
         if not observed.any():
             return None
         for _ in range(ITERATIONS):
@@ -136,9 +138,10 @@ def _find_motions(chunk: Chunk, images: Sequence[AlignedImage], coarse: bool) ->
     return mounts, rig
 
 
-def _find_visible(positions: Float32, view: View) -> NDArray[np.int64]:
-    """Indices of the points that a view sees."""
-    return find_visible_points(positions, view)[0]
+def _find_visible(positions: Float32, view: View) -> tuple[NDArray[np.int64], Float32]:
+    """Indices [M] of the points that a view sees, and their pixels [M, 2]."""
+    index, uv, _ = find_visible_points(positions, view)
+    return index, uv
 
 
 def _load_images(chunk: Chunk) -> list[AlignedImage]:
@@ -160,38 +163,40 @@ def _load_images(chunk: Chunk) -> list[AlignedImage]:
 def _normalise(luma: Float32, blur_px: float) -> ImageSlopes:
     # Without local mean and contrast, so that exposure and white balance make no difference.
     blurred = gaussian_filter(luma, blur_px)
-    mean = gaussian_filter(luma, _SURROUND * blur_px)
-    variance = gaussian_filter((luma - mean) ** 2, _SURROUND * blur_px)
+    mean = _average_surround(luma, blur_px)
+    variance = _average_surround((luma - mean) ** 2, blur_px)
     brightness = (blurred - mean) / np.sqrt(variance + np.float32(_CONTRAST_FLOOR))
     by_v, by_u = np.gradient(brightness)
     return ImageSlopes(brightness, by_u, by_v)
 
 
+def _average_surround(values: Float32, blur_px: float) -> Float32:
+    """Means over a neighbourhood: a box taken twice, near a Gaussian that would take ten times as long."""
+    # Two boxes of this width have the variance of the Gaussian.
+    width_px = round((6 * (_SURROUND * blur_px) ** 2 + 1) ** 0.5)
+    averaged: Float32 = uniform_filter(uniform_filter(values, width_px), width_px)
+    return averaged
+
+
 def _draw_points(
     positions: Float32,
     usable: NDArray[np.bool_],
-    visible: Sequence[NDArray[np.int64]],
+    visible: Sequence[tuple[NDArray[np.int64], Float32]],
     images: Sequence[AlignedImage],
     levels: Sequence[ImageSlopes],
-    mounts: Float64,
-    rig: Float64,
     point_count: int,
 ) -> tuple[Float64, NDArray[np.bool_]]:
     """Points [P, 3] that at least two views see, and which of the V views see them [V, P]."""
     count = np.zeros(len(positions), np.int64)
     slope = np.zeros(len(positions), np.float32)
 
-    def find_slopes(k: int) -> tuple[NDArray[np.int64], Float32]:
-        image, level, index = images[k], levels[k], visible[k]
-        _, u, v, inside = project_points(
-            positions[index].astype(np.float64), compute_pose(image, mounts, rig), image.lens
-        )
-        steepness = np.hypot(level.by_u, level.by_v)[v[inside].astype(int), u[inside].astype(int)]
-        return index[inside], steepness
-
-    for index, (inside, steepness) in zip(visible, map_single_threaded(find_slopes, range(len(images))), strict=True):
+    for image, level, (index, uv) in zip(images, levels, visible, strict=True):
         count[index] += 1
-        slope[inside] = np.maximum(slope[inside], steepness)
+        # A point's pixel is known from the look-up: here it only has to be found at the width of the comparison.
+        column, row = (uv * np.float32(image.lens.width_px / image.view.lens.width_px)).astype(np.int64).T
+        row = row.clip(0, image.lens.height_px - 1)
+        column = column.clip(0, image.lens.width_px - 1)
+        slope[index] = np.maximum(slope[index], np.hypot(level.by_u[row, column], level.by_v[row, column]))
     candidates = np.flatnonzero(usable & (count >= 2) & (slope > 0))
     chosen = np.empty(0, np.int64)
     if len(candidates):
@@ -203,7 +208,7 @@ def _draw_points(
     column = np.full(len(positions), -1)
     column[chosen] = np.arange(len(chosen))
     observed = np.zeros((len(images), len(chosen)), bool)
-    for k, index in enumerate(visible):
+    for k, (index, _) in enumerate(visible):
         observed[k, column[index][column[index] >= 0]] = True
     return positions[chosen].astype(np.float64), observed
 

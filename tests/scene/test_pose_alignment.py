@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from genre_tasks.config import EffectsConfig, IngestConfig, InitialConfig
-from genre_tasks.effects import pose_refinement
+from genre_tasks.effects import measurements, pose_refinement
 from genre_tasks.effects.apply_plan import apply_plan, move_views
 from genre_tasks.effects.plan import EFFECT_NAMES, plan_effects
 from genre_tasks.logs.registry import open_log
@@ -45,23 +45,24 @@ def chunk(uri: str) -> Chunk:
 _found: dict[tuple[int, bool], PoseAlignment | None] = {}
 
 
-def align_once(chunk: Chunk, *, coarse: bool = False) -> PoseAlignment | None:
+def align_once(chunk: Chunk, *, coarse: bool = False, start: PoseAlignment | None = None) -> PoseAlignment | None:
     """``align_poses``, once for each chunk, and not in every test that plans its effects."""
     key = id(chunk), coarse
     if key not in _found:
-        _found[key] = align_poses(chunk, coarse=coarse)
+        _found[key] = align_poses(chunk, coarse=coarse, start=start)
     return _found[key]
 
 
 @pytest.fixture
 def poses_found_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Plans take the poses that an earlier test has found on the same chunk."""
+    monkeypatch.setattr(measurements, "align_poses", align_once)
     monkeypatch.setattr(pose_refinement, "align_poses", align_once)
 
 
 @cache
 def aligned(uri: str) -> PoseAlignment:
-    found = align_once(chunk(uri))
+    found = align_once(chunk(uri), start=align_once(chunk(uri), coarse=True))
     assert found is not None
     return found
 
