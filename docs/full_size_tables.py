@@ -31,6 +31,10 @@ def _rows(kind: str) -> list[dict[str, Any]]:
     return [row for row in result(NAME)["rows"] if row.get("kind") == kind]
 
 
+def _free_runs() -> list[dict[str, Any]]:
+    return [row for row in _rows("run") if row.get("limit_gib") is None]
+
+
 def claims() -> str:
     """All claims on the paper's size."""
     return claims_of(NAME, several="chunks")
@@ -39,7 +43,7 @@ def claims() -> str:
 def stages() -> str:
     """Seconds, CPU seconds and memory of every stage, chunk by chunk."""
     lines = []
-    for row in _rows("run"):
+    for row in _free_runs():
         chunk = f"chunk {row['chunk']}"
         for stage, measured in row["stages"].items():
             numbers = [f"{measured['seconds']:.0f}", f"{measured['cpu_seconds']:.0f}", f"{measured['peak_gib']:.1f}"]
@@ -49,10 +53,24 @@ def stages() -> str:
     return table(["of PandaSet 002", "stage", "seconds", "CPU seconds", "GiB at most"], lines) + "\n" + provenance(NAME)
 
 
+def memory() -> str:
+    """Memory of every stage, predicted and taken, with and without a limit."""
+    lines = []
+    for row in _rows("run"):
+        limit = "–" if row["limit_gib"] is None else f"{row['limit_gib']:.2f}"
+        for stage, measured in row["stages"].items():
+            taken, predicted = measured["peak_gib"], measured["predicted_gib"]
+            numbers = [f"{predicted:.2f}", f"{taken:.2f}", f"{taken / predicted - 1:+.0%}", f"{measured['seconds']:.0f}"]
+            lines.append([limit, f"`{stage}`", *numbers])
+        lines.append([limit, "all", "", f"{row['peak_gib']:.2f}", "", f"{row['seconds']:.0f}"])
+    head = ["limit, GiB", "stage", "predicted, GiB", "taken, GiB", "difference", "seconds"]
+    return table(head, lines) + "\n" + provenance(NAME)
+
+
 def paper() -> str:
     """The paper's seconds on a GPU beside those on two cores."""
     lines = []
-    for row in _rows("run"):
+    for row in _free_runs():
         fnet_s = row["stages"]["fnet"]["seconds"] / row["fixed_views"]
         lines.append([f"chunk {row['chunk']}, two cores", f"{row['seconds'] / 60:.1f}", f"{fnet_s:.2f}"])
     minutes = PAPER[5].rows["GenRe+"]["total"]
@@ -85,7 +103,7 @@ def draw_stages(path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    rows = _rows("run")
+    rows = _free_runs()
     figure = Figure(figsize=(8, 0.9 + 0.6 * len(rows)), dpi=110, layout="constrained")
     axes = figure.add_subplot()
     for place, row in enumerate(rows):
