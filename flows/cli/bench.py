@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from flows.cli.bench_all import ALL, list_benches, run_benches
 from flows.cli.parsing import parse_path
 
 if TYPE_CHECKING:
@@ -124,7 +125,9 @@ def bench(
     name: Annotated[
         str,
         typer.Argument(
-            help="The benchmark: " + ", ".join(f"{name} ({entry.about})" for name, entry in _BENCHES.items()) + "."
+            help="The benchmark: "
+            + ", ".join(f"{name} ({entry.about})" for name, entry in _BENCHES.items())
+            + "; or all of them: all."
         ),
     ],
     json_file: Annotated[
@@ -133,7 +136,8 @@ def bench(
             "--json",
             parser=parse_path,
             metavar="PATH",
-            help="The JSON file to write, over an existing one; required, except for a dry run.",
+            help="The JSON file to write, over an existing one; for all benchmarks their folder. Required, except for "
+            "a dry run.",
         ),
     ] = None,
     quick: Annotated[bool, typer.Option(help="Measure less, so that it ends within 20 minutes.")] = False,
@@ -158,10 +162,18 @@ def bench(
 
     \b
         genre bench pipeline --json pipeline.json --set seeds=1001
+        genre bench all --dry-run
     """
     from flows.cli.output_paths import check_output_file
     from genre_tasks.errors import ConfigError
 
+    if name == ALL:
+        if only or settings:
+            raise ConfigError(
+                "--only and --set belong to one benchmark", remedy="Name the benchmark, or leave them out."
+            )
+        _bench_all(json_file, quick, dry_run, fresh)
+        return
     # Before the benchmark is imported, which takes seconds.
     if json_file is not None:
         check_output_file(json_file, "--json")
@@ -181,6 +193,30 @@ def bench(
         raise typer.Exit(130) from None
     # On stderr, as stdout is the table alone and may go into a document.
     typer.echo(f"wrote {json_file}", err=True)
+
+
+def _bench_all(folder: Path | None, quick: bool, dry_run: bool, fresh: bool) -> None:
+    from flows.cli.printing import print_rows
+    from genre_tasks.errors import ConfigError
+
+    if dry_run:
+        lines = list_benches(sorted(_BENCHES), load_bench, quick, fresh)
+        print_rows("genre bench all (dry run)", lines)
+        typer.echo(f"about {sum(line['minutes'] for line in lines) / 60:.1f} hours to measure")
+        return
+    if folder is None or not folder.is_dir():
+        raise ConfigError(
+            f"there is no folder {folder or ''} to write to".replace("  ", " "), remedy="Add --json FOLDER."
+        )
+    flags = [flag for flag, is_set in (("--quick", quick), ("--fresh", fresh)) if is_set]
+    try:
+        failed = run_benches(sorted(_BENCHES), folder, flags)
+    except KeyboardInterrupt:
+        typer.echo("stopped; measured cells are kept: run the same command again to go on", err=True)
+        raise typer.Exit(130) from None
+    if failed:
+        typer.echo(f"ended with an error: {', '.join(failed)}", err=True)
+        raise typer.Exit(1)
 
 
 def _print_cells(name: str, cells: list[Mapping[str, Any]]) -> None:
