@@ -60,10 +60,9 @@ def memory() -> str:
         limit = "–" if row["limit_gib"] is None else f"{row['limit_gib']:.2f}"
         for stage, measured in row["stages"].items():
             taken, predicted = measured["peak_gib"], measured["predicted_gib"]
-            numbers = [f"{predicted:.2f}", f"{taken:.2f}", f"{taken / predicted - 1:+.0%}", f"{measured['seconds']:.0f}"]
-            lines.append([limit, f"`{stage}`", *numbers])
-        lines.append([limit, "all", "", f"{row['peak_gib']:.2f}", "", f"{row['seconds']:.0f}"])
-    head = ["limit, GiB", "stage", "predicted, GiB", "taken, GiB", "difference", "seconds"]
+            lines.append([limit, f"`{stage}`", f"{predicted:.2f}", f"{taken:.2f}", f"{taken / predicted - 1:+.0%}"])
+        lines.append([limit, "all", "", f"{row['peak_gib']:.2f}", ""])
+    head = ["limit, GiB", "stage", "predicted, GiB", "taken, GiB", "difference"]
     return table(head, lines) + "\n" + provenance(NAME)
 
 

@@ -46,6 +46,7 @@ BLOCKS: Mapping[str, Callable[[], str]] = {
     "budget-runs": result_tables.budget_runs,
     "evaluation-claims": lambda: result_tables.claims("evaluation"),
     "full-size-claims": full_size_tables.claims,
+    "full-size-memory": full_size_tables.memory,
     "full-size-paper": full_size_tables.paper,
     "full-size-quality": full_size_tables.quality,
     "full-size-stages": full_size_tables.stages,

@@ -107,9 +107,9 @@ def require_log_folder(log: str) -> None:
     >>> require_log_folder("synthetic:street?seed=1001")
     >>> require_log_folder("pandaset:nowhere/002")
     Traceback (most recent call last):
-    benchmarks.common.bench.NotMeasuredError: there is no folder nowhere/002; give it with --set pandaset=PATH
+    benchmarks.common.bench.NotMeasuredError: there is no folder nowhere/002; name it in the option of the log
     """
     reader, _, path = log.partition(":")
     # A missing download is no failure of the code, so the cell says why it was not measured.
     if reader == "pandaset" and not Path(path).is_dir():
-        raise NotMeasuredError(f"there is no folder {path}; give it with --set pandaset=PATH")
+        raise NotMeasuredError(f"there is no folder {path}; name it in the option of the log")

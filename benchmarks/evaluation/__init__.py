@@ -47,6 +47,7 @@ class EvaluationBench:
         "seeds": "1001,1002,1003,1004,1005",
         "budgets": "52,56,60,65,70,75,80,90,100,120",
         "rounds": "5",
+        "range_log": "pandaset:../shared/data/pandaset/002",
         "stages": "gnet,enet",
         "store": "genre-store",
         "table": "",
@@ -93,8 +94,13 @@ class EvaluationBench:
                 cells.append(Cell(f"budget {budget} s street {seed}", float(budget) + START_S, run, parameters))
         # One street is enough: the seconds depend on the number of views and their size.
         stage = split_option(options["stages"])[-1]
-        time_range = partial(measure_range_seconds, seeds[0], stage, options["store"], settings)
-        cells.append(Cell(f"range street {seeds[0]} {stage}", RANGE_S, time_range, parameters))
+        logs = {f"street {seeds[0]}": f"synthetic:street?seed={seeds[0]}"}
+        if options["range_log"] and not quick:
+            # A whole chunk of it, as nothing is compared but seconds.
+            logs["real chunk 0"] = options["range_log"]
+        for name, log in logs.items():
+            time_range = partial(measure_range_seconds, log, stage, options["store"], settings)
+            cells.append(Cell(f"range {name} {stage}", RANGE_S, time_range, parameters | {"log": log}))
         return cells
 
     def claims(self, rows: Mapping[str, Row]) -> Iterator[Claim]:

@@ -9,6 +9,7 @@ from benchmarks.common.bench import Row
 from benchmarks.common.claims import Claim, claim
 from benchmarks.common.context import THREADS
 from benchmarks.common.run_stages import reconstruct
+from benchmarks.common.task import require_log_folder
 from flows.configuration import load_configuration
 from flows.machine.facts import git_commit
 from flows.pipeline.definition import stages_until
@@ -20,11 +21,11 @@ from genre_tasks.threads import torch_threads
 MOST_S = 60.0
 
 
-def measure_range_seconds(seed: str, stage: str, store: str, settings: Sequence[str] = ()) -> Row:
+def measure_range_seconds(log: str, stage: str, store: str, settings: Sequence[str] = ()) -> Row:
     """Times what ``genre range`` computes, without the start of Python and the files that it writes.
 
     Args:
-        seed: of the street, with further parameters of its URI if need be.
+        log: URI; its chunk 0 is measured.
         stage: ``gnet`` or ``enet``, whose scene is rendered.
         store: folder of the store.
         settings: ``section.key=value`` over the preset ``small``.
@@ -32,7 +33,7 @@ def measure_range_seconds(seed: str, stage: str, store: str, settings: Sequence[
     Returns:
         A row: ``range_s`` of a clock, ``range_cpu_s`` of all threads together, and the number of rendered views.
     """
-    log = f"synthetic:street?seed={seed}"
+    require_log_folder(log)
     config = load_configuration("small", settings=settings)
     job = Job(log, 0, store, config.model_dump(mode="json"))
     # As many threads as all benchmarks have, so that seconds can be compared.
@@ -81,4 +82,4 @@ def range_seconds_table(rows: Sequence[Row]) -> Iterator[str]:
     yield "|---|---|---|---|---|"
     for r in rows:
         numbers = f"{r['rendered_views']} | {r['range_s']:.1f} | {r['range_cpu_s']:.1f}"
-        yield f"| {r['log'].partition('?')[2]} | {r['stage']} | {numbers} |"
+        yield f"| {r['log'].partition('?')[2] or r['log'].rpartition('/')[2]} | {r['stage']} | {numbers} |"

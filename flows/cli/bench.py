@@ -164,56 +164,55 @@ def bench(
         genre bench pipeline --json pipeline.json --set seeds=1001
         genre bench all --dry-run
     """
+    try:
+        if name == ALL:
+            _bench_all(json_file, quick, dry_run, fresh, is_one=bool(only or settings))
+        else:
+            _bench_one(name, json_file, quick, dry_run, fresh, only, settings or [])
+    except KeyboardInterrupt:
+        typer.echo("stopped; measured cells are kept: run the same command again to go on", err=True)
+        raise typer.Exit(130) from None
+
+
+def _bench_one(
+    name: str, json_file: Path | None, quick: bool, dry_run: bool, fresh: bool, only: str, settings: list[str]
+) -> None:
     from flows.cli.output_paths import check_output_file
     from genre_tasks.errors import ConfigError
 
-    if name == ALL:
-        if only or settings:
-            raise ConfigError(
-                "--only and --set belong to one benchmark", remedy="Name the benchmark, or leave them out."
-            )
-        _bench_all(json_file, quick, dry_run, fresh)
-        return
     # Before the benchmark is imported, which takes seconds.
     if json_file is not None:
         check_output_file(json_file, "--json")
     benchmark = load_bench(name)
     runner = importlib.import_module("benchmarks.common.runner")
     # The options are read before anything is measured, so that a mistyped one costs nothing.
-    options = runner.parse_options(benchmark, settings or ())
+    options = runner.parse_options(benchmark, settings)
     if dry_run:
         _print_cells(name, runner.list_cells(runner.find_cached_rows(benchmark, options, quick, fresh), only))
         return
     if json_file is None:
         raise ConfigError("there is no file to write to", remedy="Add --json FILE, or --dry-run.")
-    try:
-        runner.run_bench(benchmark, json_file, options, quick, fresh, only=only)
-    except KeyboardInterrupt:
-        typer.echo("stopped; measured cells are kept: run the same command again to go on", err=True)
-        raise typer.Exit(130) from None
+    runner.run_bench(benchmark, json_file, options, quick, fresh, only=only)
     # On stderr, as stdout is the table alone and may go into a document.
     typer.echo(f"wrote {json_file}", err=True)
 
 
-def _bench_all(folder: Path | None, quick: bool, dry_run: bool, fresh: bool) -> None:
+def _bench_all(folder: Path | None, quick: bool, dry_run: bool, fresh: bool, is_one: bool) -> None:
     from flows.cli.printing import print_rows
     from genre_tasks.errors import ConfigError
 
+    if is_one:
+        raise ConfigError("--only and --set belong to one benchmark", remedy="Name the benchmark, or leave them out.")
     if dry_run:
         lines = list_benches(sorted(_BENCHES), load_bench, quick, fresh)
         print_rows("genre bench all (dry run)", lines)
         typer.echo(f"about {sum(line['minutes'] for line in lines) / 60:.1f} hours to measure")
         return
     if folder is None or not folder.is_dir():
-        raise ConfigError(
-            f"there is no folder {folder or ''} to write to".replace("  ", " "), remedy="Add --json FOLDER."
-        )
+        problem = "there is no folder to write to" if folder is None else f"there is no folder {folder}"
+        raise ConfigError(problem, remedy="Add --json FOLDER.")
     flags = [flag for flag, is_set in (("--quick", quick), ("--fresh", fresh)) if is_set]
-    try:
-        failed = run_benches(sorted(_BENCHES), folder, flags)
-    except KeyboardInterrupt:
-        typer.echo("stopped; measured cells are kept: run the same command again to go on", err=True)
-        raise typer.Exit(130) from None
+    failed = run_benches(sorted(_BENCHES), folder, flags)
     if failed:
         typer.echo(f"ended with an error: {', '.join(failed)}", err=True)
         raise typer.Exit(1)

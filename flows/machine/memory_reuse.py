@@ -7,8 +7,6 @@ and asks for a new one a moment later, whose pages the system has to clear: a qu
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import lru_cache
 
 # Of glibc's malloc.h.
@@ -25,16 +23,12 @@ _USUAL_MMAP_MAX = 65_536
 _USUAL_THRESHOLD = 2**17
 
 
-@contextmanager
-def reuse_freed_memory() -> Iterator[None]:
-    """Keeps freed memory with the process while a block runs, and gives it back at its end.
-
-    The allocator's settings stay with the process: undoing them would slow down another stage that runs beside.
+def reuse_freed_memory() -> None:
+    """Keeps freed memory with the process from now on, until :func:`return_freed_memory`.
 
     Elsewhere than on glibc it does nothing: other allocators keep freed memory by themselves.
 
-    >>> with reuse_freed_memory():
-    ...     pass
+    >>> reuse_freed_memory()
     """
     libc = _load_glibc()
     if libc is not None:
@@ -43,12 +37,29 @@ def reuse_freed_memory() -> Iterator[None]:
         libc.mallopt(_M_TRIM_THRESHOLD, _NEVER)
         # One heap for all threads: what one of them has freed, any other can take.
         libc.mallopt(_M_ARENA_MAX, 1)
-    try:
-        yield
-    finally:
-        if libc is not None:
-            # Other stages of the machine may need the memory.
-            libc.malloc_trim(0)
+
+
+def return_freed_memory() -> None:
+    """Undoes :func:`reuse_freed_memory`: freed memory goes back at once, which takes longer and needs less at a time.
+
+    >>> return_freed_memory()
+    """
+    libc = _load_glibc()
+    if libc is not None:
+        libc.mallopt(_M_MMAP_MAX, _USUAL_MMAP_MAX)
+        libc.mallopt(_M_MMAP_THRESHOLD, _USUAL_THRESHOLD)
+        libc.mallopt(_M_TRIM_THRESHOLD, _USUAL_THRESHOLD)
+        trim_memory()
+
+
+def trim_memory() -> None:
+    """Gives the memory that is free now back to the system, which other stages of the machine may need.
+
+    >>> trim_memory()
+    """
+    libc = _load_glibc()
+    if libc is not None:
+        libc.malloc_trim(0)
 
 
 @lru_cache(maxsize=1)
@@ -62,16 +73,3 @@ def _load_glibc() -> ctypes.CDLL | None:
     except (OSError, TypeError):
         return None
     return libc
-
-
-def return_freed_memory() -> None:
-    """Undoes :func:`reuse_freed_memory`: freed memory goes back at once, which takes longer and needs less at a time.
-
-    >>> return_freed_memory()
-    """
-    libc = _load_glibc()
-    if libc is not None:
-        libc.mallopt(_M_MMAP_MAX, _USUAL_MMAP_MAX)
-        libc.mallopt(_M_MMAP_THRESHOLD, _USUAL_THRESHOLD)
-        libc.mallopt(_M_TRIM_THRESHOLD, _USUAL_THRESHOLD)
-        libc.malloc_trim(0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -73,13 +73,12 @@ def open_inputs(
         values = {name: _drop_snapshots(value) for name, value in values.items()}
     memory = _predict(spec, log, config, values)
     on_disk = needs_disk(spec.name, memory, config) or is_retry
-    with ExitStack() as stack:
-        # Both together: with freed memory that stays, images on disk alone save too little.
-        if on_disk:
-            return_freed_memory()
-            stack.enter_context(hold_images_on_disk(store.scratch_folder))
-        else:
-            stack.enter_context(reuse_freed_memory())
+    # Both together: with freed memory that stays, images on disk alone save too little.
+    if on_disk:
+        return_freed_memory()
+    else:
+        reuse_freed_memory()
+    with hold_images_on_disk(store.scratch_folder if on_disk else None):
         values |= {name: store.read(artifacts[name]) for name in spec.inputs if name in _IMAGE_STAGES}
         yield StageInputs(values, memory, on_disk)
 

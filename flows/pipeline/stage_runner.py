@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from flows.machine.facts import describe_environment
+from flows.machine.memory_reuse import trim_memory
 from flows.machine.resource_usage import measure_usage
 from flows.observability.stage_observation import count_read, count_written, measure_lease_wait, note_key, observed
 from flows.pipeline.definition import (
@@ -60,7 +61,7 @@ class ArtifactRef:
         payload_digest: digest of its files; later keys depend on it.
         address: where it is in the store.
         cached: whether it was in the store already.
-        note: a warning for the user, such as that a damaged artifact was computed again; empty without one.
+        note: a warning for the user, such as that a damaged artifact was computed again.
     """
 
     stage: str
@@ -216,6 +217,7 @@ def run_stage(
         if ref is not None:
             return ref
         artifact = _compute_artifact(spec, job, inputs, store, address, note, attempt, progress)
+        trim_memory()  # only now, as the stage's values are gone
     return _reference(artifact, cached=False, note=note)
 
 
@@ -231,7 +233,6 @@ def _compute_artifact(
 ) -> Artifact:
     config = PipelineConfig.model_validate(job.config)
     configured = config_section(spec, config)
-    section = shrink_batch(spec, configured, attempt)
     module, _, name = spec.function.partition(":")
     # Read here and not before the look-up: a hit reads the manifests alone.
     artifacts = {name: _find_input(store, inputs[name], job) for name in spec.inputs}
@@ -240,6 +241,7 @@ def _compute_artifact(
         # The import counts: a first run's seconds include loading torch, as a user's clock does.
         with measure_usage() as usage:
             function = getattr(importlib.import_module(module), name)
+            section = shrink_batch(spec, configured, attempt)
             value = function(section, *(values[argument] for argument in spec.arguments), progress=progress)
         # Large images of the inputs need not be there while the result is written.
         values.clear()

@@ -23,6 +23,3 @@ DEPTH_MIN_M = 1e-3
 
 DEPTH_LOSS_MAX = 1.0
 """A pixel's relative depth error is clamped to this, so that a missing surface cannot outweigh the rest."""
-
-KEPT_PIXELS = 300_000
-"""SSIM's statistics of larger images are computed at every comparison: kept, they take twice the images' memory."""

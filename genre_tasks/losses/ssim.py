@@ -15,7 +15,10 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from genre_tasks.losses.constants import C1, C2, KEPT_PIXELS, RADIUS, SIGMA
+from genre_tasks.losses.constants import C1, C2, RADIUS, SIGMA
+
+KEPT_PIXELS = 300_000
+"""Statistics of larger images are computed at every comparison: kept, they take twice the memory of the images."""
 
 
 @dataclass(frozen=True)

@@ -125,9 +125,9 @@ def test_the_estimate_can_be_fitted_again() -> None:
 def test_rounds_bring_every_budget_to_every_seed() -> None:
     options = dict(EVALUATION.options) | {"budgets": "30,60,90", "seeds": "1,2,3", "stages": "gnet"}
     names = [c.name for c in EVALUATION.cells(options | {"rounds": "1"}, quick=False)]
-    assert names[3:-1] == ["budget 30 s street 1", "budget 60 s street 2", "budget 90 s street 3"]
-    assert names[-1] == "range street 1 gnet"
-    all_ = [c.name for c in EVALUATION.cells(options, quick=False)][3:-1]
+    assert names[3:-2] == ["budget 30 s street 1", "budget 60 s street 2", "budget 90 s street 3"]
+    assert names[-2:] == ["range street 1 gnet", "range real chunk 0 gnet"]
+    all_ = [c.name for c in EVALUATION.cells(options | {"range_log": ""}, quick=False)][3:-1]
     assert len(set(all_)) == len(all_) == 9
     assert len(EVALUATION.cells(options, quick=True)) == 5
 

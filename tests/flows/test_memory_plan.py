@@ -24,6 +24,7 @@ from flows.pipeline.stage_runner import Job, run_stage
 from genre_tasks import image_memory
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ResourceError
+from genre_tasks.losses.ssim import KEPT_PIXELS
 from storage.opening import open_store
 from tests.faults.small_run import LOG, SETTINGS
 
@@ -71,6 +72,10 @@ def test_memory_grows_with_what_a_stage_works_on() -> None:
         # More views take disk alone.
         longer = predict_memory(spec.name, replace(HD, source_views=300, novel_views=600), config, 2)
         assert longer.working_mib == before.working_mib
+
+
+def test_small_images_are_those_whose_statistics_are_kept() -> None:
+    assert memory_plan._LARGEST_WITH_STATISTICS_PX == KEPT_PIXELS
 
 
 def test_gaussians_are_split_before_later_stages() -> None:

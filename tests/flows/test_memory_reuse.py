@@ -1,4 +1,4 @@
-"""Freed memory stays with the process inside the block, and goes back at its end."""
+"""Freed memory stays with the process until it is to go back."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import pytest
 _COUNT = """
 import resource
 import torch
-from contextlib import nullcontext
-from flows.machine.memory_reuse import _load_glibc, reuse_freed_memory
+from flows.machine.memory_reuse import _load_glibc, return_freed_memory, reuse_freed_memory
 
 def faults():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
@@ -24,9 +23,10 @@ def resident_mib():
 
 torch.set_num_threads(1)
 without = faults()
-with reuse_freed_memory():
-    faults()
-    within = faults()
+reuse_freed_memory()
+faults()
+within = faults()
+return_freed_memory()
 print(without, within, resident_mib(), _load_glibc() is not None)
 """
 
