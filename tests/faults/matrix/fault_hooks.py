@@ -68,7 +68,8 @@ def fail_to_allocate() -> None:
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + _LIMIT_BYTES, hard))
     try:
-        numpy.ones(4 * _LIMIT_BYTES, dtype=numpy.uint8)
+        # More than the process has altogether: memory that was freed and stays with it can never be enough.
+        numpy.ones(used + 4 * _LIMIT_BYTES, dtype=numpy.uint8)
     finally:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
