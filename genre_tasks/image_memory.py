@@ -63,19 +63,25 @@ def allocate_images(*shape: int, device: torch.device | str = "cpu") -> Tensor:
     count = math.prod(shape)
     size = 4 * count
     # Other systems can neither reserve a file's blocks nor remove a file that is mapped.
-    on_disk = folder is not None and size >= _MIN_BYTES and hasattr(os, "posix_fallocate")
-    if not on_disk or torch.device(device).type != "cpu":
+    can_map = hasattr(os, "posix_fallocate") and torch.device(device).type == "cpu"
+    if folder is None or size < _MIN_BYTES or not can_map:
         return torch.empty(shape, device=device)
-    handle, name = tempfile.mkstemp(prefix=".genre-images-", dir=folder)
     try:
-        # Without its blocks a full disk would kill the process, at the first write to a page.
-        os.posix_fallocate(handle, 0, size)
-        return torch.from_file(name, shared=True, size=count, dtype=torch.float32).view(shape)
+        return _map_file(folder, count).view(shape)
     except OSError as error:
         raise ResourceError(
             f"the disk of {folder} has no space for {size / 2**20:.0f} MiB of images ({error.strerror})",
             remedy="Free some space, or let the run use more memory (--memory).",
         ) from error
+
+
+def _map_file(folder: Path, count: int) -> Tensor:
+    """[count] float32 in a new file of a folder, which has lost its name already."""
+    handle, name = tempfile.mkstemp(prefix=".genre-images-", dir=folder)
+    try:
+        # Without its blocks a full disk would kill the process, at the first write to a page.
+        os.posix_fallocate(handle, 0, 4 * count)
+        return torch.from_file(name, shared=True, size=count, dtype=torch.float32)
     finally:
         # The mapping keeps the blocks; the name would outlive a process that is killed.
         os.close(handle)

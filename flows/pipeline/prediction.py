@@ -31,12 +31,12 @@ _SECONDS_SMALL = {
 
 _SECONDS_LARGE = {
     "ingest": 12.0,
-    "initial": 7.0,
-    "gnet": 45.0,
-    "effects": 50.0,
+    "initial": 8.0,
+    "gnet": 43.0,
+    "effects": 41.0,
     "novel_views": 27.0,
-    "fnet": 87.0,
-    "enet": 121.0,
+    "fnet": 83.0,
+    "enet": 128.0,
     "evaluate": 180.0,
 }
 """With the preset ``hd``: 1280×720. FNet takes far longer where ``fnet.max_network_px`` is not set."""

@@ -68,6 +68,11 @@ def test_a_full_disk_is_a_clear_error(tmp_path: Path, monkeypatch: pytest.Monkey
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_folder_that_is_gone_is_a_clear_error(tmp_path: Path) -> None:
+    with hold_images_on_disk(tmp_path / "gone"), pytest.raises(ResourceError, match="gone"):
+        allocate_images(*LARGE)
+
+
 def test_the_folder_counts_inside_the_block_alone(tmp_path: Path) -> None:
     with hold_images_on_disk(tmp_path), hold_images_on_disk(None):
         assert image_memory._scratch_folder.get() is None
