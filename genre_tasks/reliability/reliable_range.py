@@ -8,9 +8,6 @@ import statistics
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-import torch
-
-from genre_tasks.checks import check_finite
 from genre_tasks.config import RangeConfig
 from genre_tasks.detection.detector import Detector
 from genre_tasks.effects.apply_plan import apply_plan
@@ -18,13 +15,12 @@ from genre_tasks.effects.types import DEFAULT_PLAN, EffectsPlan
 from genre_tasks.fixer.source_images import load_source_images
 from genre_tasks.progress import Progress, silent
 from genre_tasks.reliability.guards import Guards, compute_guards
-from genre_tasks.render import render_views
-from genre_tasks.render.surface import render_surfaces
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.lidar_map import build_lidar_scene
 from genre_tasks.scene.novel_poses import place_novel_views
-from genre_tasks.scene.novel_views import NovelView, NovelViews
+from genre_tasks.scene.novel_views import NovelViews
+from genre_tasks.stages.novel_views import render_with_map
 
 _MEDIAN_OF = ("estimate_db", "agreement_db", "shown", "thin", "floating")
 
@@ -146,30 +142,9 @@ def measure_guards(
             views = place_novel_views(chunk, (shift,), [frame])
             # A frame may have lost all of its images.
             if views:
-                novel = _render_novel(chunk, scene, lidar_scene, views)
+                novel = render_with_map(chunk, scene, lidar_scene, views)
                 yield novel, compute_guards(chunk, novel, sources, detector)
     progress(len(shifts), len(shifts), "guards")
-
-
-@torch.no_grad()
-def _render_novel(chunk: Chunk, scene: SceneGraph, lidar_scene: SceneGraph, views: tuple[NovelView, ...]) -> NovelViews:
-    """Renders views of one frame as the stage ``novel_views`` does, from a LiDAR map that serves all frames."""
-    image = render_views(scene, views)
-    lidar = render_surfaces(lidar_scene, views)
-    images = NovelViews(
-        views=views,
-        color=image.color,
-        alpha=image.alpha,
-        depth=image.expected_depth(),
-        lidar_color=lidar.color,
-        lidar_alpha=lidar.alpha,
-        lidar_depth=lidar.expected_depth(),
-        culled=image.culled,
-        lidar_culled=lidar.culled,
-    )
-    for name in ("color", "alpha", "depth", "lidar_color", "lidar_alpha", "lidar_depth"):
-        check_finite(getattr(images, name), name, "range", log=chunk.log, chunk=chunk.index)
-    return images
 
 
 def find_reliable_range(guards: Sequence[Guards], limits: RangeConfig) -> ReliableRange:

@@ -81,9 +81,35 @@ def render_novel(
     Raises:
         NonFiniteError: an image is not finite.
     """
+    return render_with_map(chunk, scene, build_lidar_scene(chunk, lidar_max_points), views, progress, settings)
+
+
+def render_with_map(
+    chunk: Chunk,
+    scene: SceneGraph,
+    lidar_scene: SceneGraph,
+    views: Sequence[NovelView],
+    progress: Progress = silent,
+    settings: RenderSettings = DEFAULT_SETTINGS,
+) -> NovelViews:
+    """Renders the scene and a LiDAR map that is there already, for callers who render a chunk part by part.
+
+    Args:
+        chunk: that both are of, for messages.
+        scene: to render.
+        lidar_scene: the map, of :func:`~genre_tasks.scene.lidar_map.build_lidar_scene`.
+        views: all of one image size.
+        progress: called with the renders done and their total.
+        settings: of the renderer.
+
+    Returns:
+        Images in the order of ``views``.
+
+    Raises:
+        NonFiniteError: an image is not finite.
+    """
     # Render and map are drawn from the same poses, so that they are aligned pixel by pixel.
     image = _render(render_views, scene, views, settings, progress, 0, "novel views")
-    lidar_scene = build_lidar_scene(chunk, lidar_max_points)
     lidar = _render(render_surfaces, lidar_scene, views, settings, progress, len(views), "LiDAR maps")
     progress(2 * len(views), 2 * len(views), "novel views")
     images = NovelViews(
