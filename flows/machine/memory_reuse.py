@@ -7,6 +7,7 @@ and asks for a new one a moment later, whose pages the system has to clear: a qu
 from __future__ import annotations
 
 import ctypes
+import sys
 from functools import lru_cache
 
 # Of glibc's malloc.h.
@@ -57,6 +58,10 @@ def trim_memory() -> None:
 
     >>> trim_memory()
     """
+    # Not imported: a process that has rendered nothing need not load the renderer for this.
+    renderer = sys.modules.get("genre_tasks.render.kernel.library")
+    if renderer is not None:
+        renderer.release_pooled_memory()
     libc = _load_glibc()
     if libc is not None:
         libc.malloc_trim(0)

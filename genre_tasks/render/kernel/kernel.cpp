@@ -188,4 +188,7 @@ void genre_free(void* state) {
   for (auto& v : forward_state->views) view_pool().give(std::move(v));
   delete forward_state;
 }
+
+// Gives back the memory that waits for later calls: up to MemoryPool's LIMIT of each kind.
+void genre_release() { view_pool().clear(), scratch_pool().clear(), gradient_list_pool().clear(); }
 }

@@ -36,4 +36,16 @@ def load_kernel(folder: Path = KERNEL.folder) -> ctypes.CDLL:
     # Declared although it is simple: ctypes passes undeclared integers with 32 bits, which would cut the pointer.
     library.genre_free.argtypes = [p]
     library.genre_free.restype = None
+    library.genre_release.argtypes = []
+    library.genre_release.restype = None
     return library
+
+
+def release_pooled_memory() -> None:
+    """Gives back the memory that waits for later renders, after the last one of a piece of work.
+
+    >>> release_pooled_memory()
+    """
+    # Nothing waits in a kernel that was never loaded, and loading it may fail.
+    if load_kernel.cache_info().currsize:
+        load_kernel().genre_release()

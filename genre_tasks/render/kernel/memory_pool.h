@@ -69,4 +69,8 @@ struct MemoryPool {
     std::lock_guard<std::mutex> lock(guard);
     if (pooled_bytes + x->bytes() <= LIMIT) pooled_bytes += x->bytes(), free.push_back(std::move(x));
   }
+  void clear() {
+    std::lock_guard<std::mutex> lock(guard);
+    free.clear(), pooled_bytes = 0;
+  }
 };
