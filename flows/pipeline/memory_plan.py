@@ -59,9 +59,9 @@ _TERMS: Mapping[str, _Terms] = {
     "effects": _Terms(725, 0, 276),
     "initial": _Terms(330, 1560),
     "gnet": _Terms(300, 4470, 0, 1.29),
-    "novel_views": _Terms(400, 2670, 30),
-    "fnet": _Terms(720, 0, 320, 1.25),
-    "enet": _Terms(400, 4820, 0, 1.29),
+    "novel_views": _Terms(400, 1600, 30),
+    "fnet": _Terms(280, 0, 320, 1.25),
+    "enet": _Terms(550, 4820, 0, 1.29),
     "evaluate": _Terms(350, 1100, 0),
 }
 """Fitted to stages at 320×180 and 1280×720; ``genre bench full_size`` compares predictions with what runs took."""
