@@ -62,7 +62,7 @@ _TERMS: Mapping[str, _Terms] = {
     "novel_views": _Terms(400, 1600, 30),
     "fnet": _Terms(280, 0, 320, 1.25),
     "enet": _Terms(550, 4820, 0, 1.29),
-    "evaluate": _Terms(350, 1100, 0),
+    "evaluate": _Terms(238, 1100, 840),
 }
 """Fitted to stages at 320×180 and 1280×720; ``genre bench full_size`` compares predictions with what runs took."""
 
@@ -234,8 +234,10 @@ def _count_pixels_at_a_time(stage: str, size: ChunkSize, config: PipelineConfig,
         "novel_views": size.cameras * len(config.novel_views.shifts_m),
         "fnet": threads * config.fnet.batch_views,
         "enet": config.enet.views_per_iteration + config.enet.novel_views_per_iteration,
+        # Each thread scores an image with a network.
+        "evaluate": threads,
     }
-    return threads * size.native_px if stage == "ingest" else views.get(stage, 0) * size.pixels
+    return threads * size.native_px if stage == "ingest" else views.get(stage.partition("/")[0], 0) * size.pixels
 
 
 def _count_image_values(stage: str, size: ChunkSize, config: PipelineConfig) -> int:

@@ -66,7 +66,8 @@ def test_memory_grows_with_what_a_stage_works_on() -> None:
         larger = predict_memory(
             spec.name, replace(HD, width_px=1920, height_px=1080, native_px=2 * HD.native_px), config, 2
         )
-        assert larger.in_memory_mib >= before.in_memory_mib
+        # The initial scene is made from points alone.
+        assert larger.in_memory_mib > before.in_memory_mib or spec.name == "initial"
         # Stages that hold no images of many views have nothing to put on disk.
         assert before.with_images_on_disk_mib <= before.in_memory_mib - before.images_mib
         # More views take disk alone.
