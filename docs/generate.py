@@ -63,6 +63,7 @@ BLOCKS: Mapping[str, Callable[[], str]] = {
     "real-logs-chain": real_log_tables.chain,
     "real-logs-effects": real_log_tables.effects,
     "real-logs-pose-noise": real_log_tables.pose_noise,
+    "real-logs-race": real_log_tables.race,
     "faults": fault_tables.matrix,
     "fault-injections": fault_tables.injections,
     "scale-claims": lambda: result_tables.claims("scale"),

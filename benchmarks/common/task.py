@@ -13,9 +13,12 @@ from flows.configuration import load_configuration
 from flows.pipeline.stage_runner import Job, read_artifact
 from flows.training.optimiser_training import mean_psnr
 from flows.training.training_scenes import evenly_spaced
-from genre_tasks.effects.types import DEFAULT_EFFECTS
+from genre_tasks.config import PipelineConfig
+from genre_tasks.effects.apply_plan import apply_plan
+from genre_tasks.effects.types import DEFAULT_EFFECTS, DEFAULT_PLAN, EffectsPlan
 from genre_tasks.losses.targets import Target, source_targets, view_targets
 from genre_tasks.scene.graph import SceneGraph
+from genre_tasks.stages.gnet import prepare_start
 
 HELDOUT_VIEWS = 12
 """Number of held-out views that a scene is evaluated by, spread evenly: a curve has some twenty points."""
@@ -34,12 +37,14 @@ class OptimisationTask:
         source: targets of the source views, with LiDAR depth, which per-scene 3DGS does not use.
         heldout: targets of held-out views, which no method sees.
         novel_targets: ray-cast at ±3 m; none on a real log.
+        plan: of the effects that scene and targets have.
     """
 
     scene: SceneGraph
     source: tuple[Target, ...]
     heldout: tuple[Target, ...]
     novel_targets: tuple[Target, ...] = ()
+    plan: EffectsPlan = DEFAULT_PLAN
 
     def psnr(self, scene: SceneGraph) -> float:
         """Averages a scene's PSNR over the held-out views, dB."""
@@ -72,6 +77,27 @@ def load_task(log: str, chunk: int, store: str, *settings: str) -> OptimisationT
         source=source_targets(ingested, depth=True),
         heldout=view_targets(ingested, evenly_spaced(ingested.views_with_role("heldout"), HELDOUT_VIEWS)),
         novel_targets=load_true_targets(log, store, ingested, SIDE_M),
+    )
+
+
+def load_planned_task(job: Job) -> OptimisationTask:
+    """Runs a job up to the initial scene, with the effects that its plan calls for, as a run has them.
+
+    Args:
+        job: of a log without a truth beside its path.
+
+    Returns:
+        The scene with its targets, at their refined poses and exposures.
+    """
+    refs = reconstruct(job, ("ingest", "effects", "initial"))
+    plan = read_artifact(job, refs["effects"])
+    chunk = apply_plan(read_artifact(job, refs["ingest"]), plan)
+    gnet = PipelineConfig.model_validate(job.config).gnet
+    return OptimisationTask(
+        scene=prepare_start(gnet, read_artifact(job, refs["initial"]).scene, plan),
+        source=source_targets(chunk, depth=True),
+        heldout=view_targets(chunk, evenly_spaced(chunk.views_with_role("heldout"), HELDOUT_VIEWS)),
+        plan=plan,
     )
 
 

@@ -23,11 +23,13 @@ from benchmarks.common.bench import (
 )
 from benchmarks.common.claims import Claim, claim
 from benchmarks.real_logs.measures import NOISE, LogOfBench, measure_chain, measure_effects, measure_pose_noise
+from benchmarks.real_logs.optimiser_race import METHODS, format_races, make_race_claims, measure_race
 
 _KITTI_SETTINGS = ("ingest.width_px=480", "ingest.height_px=145")
 _CHAIN_S = 150.0
 _EFFECTS_S = 120.0
 _NOISE_S = 120.0
+_RACE_S = 180.0
 
 BASE_PSNR_DB = 19.7
 """Held-out PSNR of the KITTI slice before exposure, stereo and poses were looked at."""
@@ -43,11 +45,13 @@ class RealLogsBench:
         "?labels=../shared/data/kitti/tracking_labels/0001_first20.txt",
         "pandaset": "../shared/data/pandaset/002",
         "preset": "small",
+        "orders": "0,1,2",
         "settings": "",
         "store": "genre-store",
     }
     code: tuple[str, ...] = (
         "benchmarks.real_logs.measures",
+        "benchmarks.real_logs.optimiser_race",
         "genre_tasks.logs.kitti.reader",
         "genre_tasks.logs.pandaset.reader",
         "genre_tasks.logs.synthetic",
@@ -75,6 +79,13 @@ class RealLogsBench:
             logs.append(kitti)
         if options["pandaset"]:
             logs += [self._log(options, f"pandaset:{options['pandaset']}", chunk, settings) for chunk in (0, 1)]
+        # Orders are outermost: a run that is stopped early has every log once. Chunk 0 was trained on.
+        for order in map(int, split_option(options["orders"])[: 1 if quick else None]):
+            for method in METHODS[: 1 if quick else None]:
+                for log in (log for log in logs if (log.chunk, log.uri.partition(":")[0]) != (0, "pandaset")):
+                    parameters = {**log.parameters, "order": order, "method": method}
+                    name = f"race {log.name} order {order} {method}"
+                    cells.append(Cell(name, _RACE_S, partial(measure_race, log, order, method), parameters))
         for log in (*logs, *streets):
             cells.append(Cell(f"effects {log.name}", _EFFECTS_S, partial(measure_effects, log), log.parameters))
         for log in streets:
@@ -103,6 +114,7 @@ class RealLogsBench:
                 # Noise of one run is about 0.05 dB; the effects may not cost more than that on any log.
                 yield claim("real_logs.effects_gain", row["auto"] - row["none"], ">=", -0.05, "dB", row["log"], 1)
         yield from self._noise_claims([row for row in measured if row["kind"] == "pose_noise"])
+        yield from make_race_claims(measured)
 
     def _noise_claims(self, rows: list[Row]) -> Iterator[Claim]:
         lost = sum(row["exact"] - row["noisy"] for row in rows)
@@ -129,6 +141,8 @@ class RealLogsBench:
             if row["kind"] == "pose_noise":
                 values = " | ".join(f"{row[name]:.2f}" for name in ("exact", "noisy", "refined", "misalignment_px"))
                 yield f"| {row['log']} | {values} |"
+        yield ""
+        yield from format_races(measured)
         yield from list_not_measured(rows)
 
 

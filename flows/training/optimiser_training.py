@@ -12,6 +12,7 @@ import torch
 from flows.training import checkpoint
 from flows.training.curve_plot import read_curve, save_curve
 from genre_tasks.config import LossConfig
+from genre_tasks.effects.color_gain import apply_gain
 from genre_tasks.errors import InputError
 from genre_tasks.learned.learned_optimiser import LearnedOptimiser
 from genre_tasks.learned.meta_episodes import TrainingScene
@@ -170,7 +171,7 @@ def score_rule(
 
 @torch.no_grad()
 def mean_psnr(scene: SceneGraph, targets: Sequence[Target]) -> float:
-    """Computes the mean PSNR of a scene's renders.
+    """Computes the mean PSNR of a scene's renders, at the targets' exposures and without the ego vehicle's pixels.
 
     Args:
         scene: the scene.
@@ -182,7 +183,12 @@ def mean_psnr(scene: SceneGraph, targets: Sequence[Target]) -> float:
     # A stack of nothing would raise, and NaN is what a table shows as a gap.
     if not targets:
         return float("nan")
-    truth = torch.stack([t.image.pixels for t in targets])
-    # The floor of 100 dB keeps equal images from an infinite PSNR, which would hide the others in the mean.
-    error = (render_views(scene, targets).color.clamp(0, 1) - truth).square().mean((1, 2, 3)).clamp_min(1e-10)
-    return float((-10 * torch.log10(error)).mean())
+    values = []
+    for image, target in zip(render_views(scene, targets).color, targets, strict=True):
+        shown = image if target.log_gain is None else apply_gain(image, image.new_tensor(target.log_gain))
+        error = (shown.clamp(0, 1) - target.image.pixels).square()
+        if target.ego_mask is not None:
+            error = error[~target.ego_mask]
+        # The floor of 100 dB keeps equal images from an infinite PSNR, which would hide the others in the mean.
+        values.append(-10 * torch.log10(error.mean().clamp_min(1e-10)))
+    return float(torch.stack(values).mean())

@@ -40,12 +40,21 @@ def gnet(
     # A scene of another program is enhanced as it is.
     if config.method == "none":
         return Reconstruction(initial.scene)
-    start = _prepare_start(config, initial.scene, plan)
+    start = prepare_start(config, initial.scene, plan)
     return optimise("gnet", drop_unplanned_losses(config, plan), apply_plan(chunk, plan), start, None, progress)
 
 
-def _prepare_start(config: OptimiserConfig, scene: SceneGraph, plan: EffectsPlan) -> SceneGraph:
-    """Adds spherical harmonics where the plan has them; per-scene 3DGS has one colour per Gaussian in any case."""
+def prepare_start(config: OptimiserConfig, scene: SceneGraph, plan: EffectsPlan) -> SceneGraph:
+    """Adds spherical harmonics where the plan has them; per-scene 3DGS has one colour per Gaussian in any case.
+
+    Args:
+        config: the stage's section.
+        scene: of the stage ``initial``.
+        plan: of the chunk's effects.
+
+    Returns:
+        SceneGraph: where the optimisation starts.
+    """
     if not plan.is_on("view_dependent_colour") or config.method in PER_SCENE_METHODS:
         return scene
     # A scene without view-dependent colours imports none of their code.
