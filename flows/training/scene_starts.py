@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from flows.pipeline.definition import digest_weights
 from flows.training.training_scenes import PreparedScene, SceneRecipe, get_or_make
-from genre_tasks.config import LearningRates, LossConfig, OptimiserConfig, PerSceneConfig
+from genre_tasks.config import LossConfig, OptimiserConfig, PerSceneConfig
 from genre_tasks.errors import ConfigError
 from genre_tasks.losses.targets import source_targets
 from genre_tasks.optimiser.objective import Objective
@@ -93,14 +93,11 @@ class ByGnet:
         stage: the training stage whose weights it has.
         iterations: iterations of GNet.
         views: views per iteration.
-        learning_rates: of means, log-scales, quaternions, logit opacities and colours; ``None`` for those of the
-            weights.
     """
 
     stage: str
     iterations: int = 24
     views: int = 6
-    learning_rates: tuple[float, ...] | None = None
 
     def __str__(self) -> str:
         return f"gnet@{self.iterations} by {self.stage}"
@@ -188,9 +185,6 @@ def _key_fields(start: SceneStart) -> dict[str, Any]:
     if isinstance(start, PerScene):
         # The key's old name; scenes that took hours to make would not be found under a new one.
         fields["of"] = fields.pop("iterations")
-    # For the same reason: scenes at the weights' learning rates keep the keys that they had before there was a choice.
-    if isinstance(start, ByGnet) and start.learning_rates is None:
-        del fields["learning_rates"]
     return fields
 
 
@@ -223,13 +217,11 @@ def _run_adam(scene: PreparedScene, start: Adam, seed: int) -> Reconstruction:
 
 
 def _run_gnet(scene: PreparedScene, start: ByGnet, weights: Path, seed: int) -> Reconstruction:
-    rates = start.learning_rates
     settings = {
         "iterations": start.iterations,
         "views_per_iteration": start.views,
         "loss": LOSS,
         "weights": str(weights),
-        "learning_rates": None if rates is None else LearningRates.from_sequence(rates),
         "snapshots": 0,
         "seed": seed,
     }
