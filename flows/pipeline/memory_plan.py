@@ -208,7 +208,20 @@ def predict_memory(stage: str, size: ChunkSize, config: PipelineConfig, threads:
         reduction = -(-max(size.width_px, size.height_px) // (config.fnet.max_network_px or 10**6))
         working += _NETWORK_PIXEL_BYTES * pixels / max(1, reduction) ** 2
     images = _FLOAT_BYTES * _count_image_values(stage, size, config)
-    return StageMemory(_PROCESS_MIB + terms.base_mib + working / 2**20, images / 2**20, terms.reuse)
+    reuse = terms.reuse if keeps_freed_memory(config) else 1.0
+    return StageMemory(_PROCESS_MIB + terms.base_mib + working / 2**20, images / 2**20, reuse)
+
+
+def keeps_freed_memory(config: PipelineConfig) -> bool:
+    """Decides whether freed memory may stay with the process, which is faster.
+
+    Args:
+        config: with the limit.
+
+    Returns:
+        False under a limit: a heap that a stage has grown is never given back as a whole, and later stages take it.
+    """
+    return config.limits.memory_gib is None
 
 
 def _count_final_gaussians(stage: str, size: ChunkSize, config: PipelineConfig) -> int:

@@ -13,6 +13,7 @@ from flows.pipeline.log_cache import cached_log
 from flows.pipeline.memory_plan import (
     StageMemory,
     estimate_chunk_size,
+    keeps_freed_memory,
     measure_chunk_size,
     needs_disk,
     predict_memory,
@@ -32,7 +33,7 @@ class StageInputs:
     Attributes:
         values: by the name of the stage that made them.
         memory: of the stage that will work on them.
-        images_on_disk: whether the images of many views lie on disk, and freed memory is returned at once.
+        images_on_disk: whether the images of many views lie on disk; freed memory is then returned at once.
     """
 
     values: dict[str, Any]
@@ -73,11 +74,11 @@ def open_inputs(
         values = {name: _drop_snapshots(value) for name, value in values.items()}
     memory = _predict(spec, log, config, values)
     on_disk = needs_disk(spec.name, memory, config) or is_retry
-    # Both together: with freed memory that stays, images on disk alone save too little.
-    if on_disk:
-        return_freed_memory()
-    else:
+    # With freed memory that stays, images on disk alone save too little.
+    if keeps_freed_memory(config) and not on_disk:
         reuse_freed_memory()
+    else:
+        return_freed_memory()
     with hold_images_on_disk(store.scratch_folder if on_disk else None):
         values |= {name: store.read(artifacts[name]) for name in spec.inputs if name in _IMAGE_STAGES}
         yield StageInputs(values, memory, on_disk)

@@ -59,6 +59,19 @@ def test_a_limit_that_is_too_low_is_an_error_before_the_stage() -> None:
         needs_disk("enet", StageMemory(2048, 10), limited(1.0))
 
 
+def test_under_a_limit_freed_memory_goes_back(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    # A heap that one stage has grown stays, and the next one takes it: a limit has to hold from the first stage on.
+    for config, factor in ((limited(None), 1.29), (limited(8.0), 1.0)):
+        assert predict_memory("gnet", HD, config, 2).reuse == factor
+    called: list[str] = []
+    for name in ("reuse_freed_memory", "return_freed_memory"):
+        monkeypatch.setattr(stage_inputs, name, lambda name=name: called.append(name))
+    for settings in ([], ["limits.memory_gib=8"]):
+        config = load_configuration("demo", settings=[*SETTINGS, *settings])
+        run_stage("ingest", Job(LOG, 0, str(tmp_path / f"{len(called)}"), config.model_dump(mode="json")), {})
+    assert called == ["reuse_freed_memory", "return_freed_memory"]
+
+
 def test_memory_grows_with_what_a_stage_works_on() -> None:
     config = limited(None)
     for spec in PIPELINE:
