@@ -40,9 +40,11 @@ def measure_race(log: LogOfBench, order: int, method: str) -> Row:
     gnet = load_configuration(log.preset, settings=log.settings).gnet
     # Only the loss depends on the plan: the effects themselves are in the scene and in its targets.
     configs = {name: _planned(config, task.plan) for name, config in variants(method).items()}
-    return {"kind": "race", "log": log.name, "order": order} | race_row(
-        task, _planned(gnet, task.plan), configs, order, method, CAP
-    )
+    row = race_row(task, _planned(gnet, task.plan), configs, order, method, CAP)
+    # No page draws these curves, and they would be most of the file.
+    for run in (row["gnet"], *row["variants"].values()):
+        del run["curve"]
+    return {"kind": "race", "log": log.name, "order": order} | row
 
 
 def make_race_claims(rows: Sequence[Row]) -> Iterator[Claim]:

@@ -35,7 +35,7 @@ def test_both_sides_of_the_race_show_the_planned_exposures(
     row = optimiser_race.measure_race(log, 1, "tuned_adam")
     assert (row["order"], row["method"], row["gaussians"]) == (1, "tuned_adam", len(task.scene))
     assert row["gnet"]["renders"] > 0 and list(row["variants"]) == ["6x2"]
-    assert row["gnet"]["curve"][0][2] == pytest.approx(task.psnr(task.scene), abs=1e-3)
+    assert row["gnet"]["psnr"] > task.psnr(task.scene)
 
 
 def test_psnr_is_at_the_images_exposure_and_outside_of_the_vehicle() -> None:
