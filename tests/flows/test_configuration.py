@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_presets_are_valid(preset: str) -> None:
     config = load_configuration(preset)
     assert config.gnet.iterations == {"fine": 120, "long": 120, "paper": 24}.get(preset, 72)
-    enet = {"paper": (12, 0.0), "demo": (72, 0.7), "fine": (96, 0.5), "hd": (90, 0.5)}
+    enet = {"paper": (12, 0.0), "demo": (72, 0.7), "fine": (96, 0.5), "hd": (100, 0.5)}
     assert (config.enet.iterations, config.enet.split_fraction) == enet.get(preset, (96, 1.0))
     assert config.gnet.refine_iterations == {"demo": 48, "small": 48, "fine": 80, "long": 72, "hd": 48}.get(preset, 0)
     assert diff_from_preset(config, preset) == {}
