@@ -64,10 +64,12 @@ def race_of(log: str, gnet_psnr: float, equal: float | None, reached_s: float | 
 def test_a_claim_takes_the_middle_gain_and_the_worst_time() -> None:
     log = "kitti drive chunk 0"
     rows = [race_of(log, 22.0, 21.5, 12.0), race_of(log, 22.0, 20.0, None), race_of(log, 22.0, 20.8, 6.0)]
-    gain, time_ratio = optimiser_race.make_race_claims(rows)
+    gain, time_ratio, *other_log = optimiser_race.make_race_claims(rows)
     assert (gain.id, gain.measured, gain.target) == ("real_logs.kitti_equal_renders", pytest.approx(1.2), 1.0)
     assert (time_ratio.measured, time_ratio.n, time_ratio.holds) == (1.5, 3, False)
     lines = list(optimiser_race.format_races(rows))
     assert lines[2] == "| kitti drive chunk 0 | 0 | tuned_adam | 4.0 | 22.00 | 21.50 | 21.00 | 3.0 |"
     assert lines[3].endswith("| ≥ 5.0 |")
-    assert not list(optimiser_race.make_race_claims([]))
+    # A log that did not race does not hold its claims.
+    assert [(c.measured, c.holds) for c in other_log] == 2 * [(None, False)]
+    assert len(list(optimiser_race.make_race_claims([]))) == 4
