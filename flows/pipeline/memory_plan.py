@@ -116,7 +116,7 @@ class StageMemory:
 
     @property
     def with_images_on_disk_mib(self) -> float:
-        """Earlier stages have left some of their freed memory, unless it was returned at once from the first one on."""
+        """Where images lie on disk. What earlier stages left counts, too; under a limit they leave nothing."""
         return self.reuse * self.working_mib
 
     @property
@@ -218,7 +218,7 @@ def keeps_freed_memory(config: PipelineConfig) -> bool:
         config: with the limit.
 
     Returns:
-        False under a limit: a heap that a stage has grown is never given back as a whole, and later stages take it.
+        False under a limit: later stages would take what earlier ones left, and pass the limit by it.
     """
     return config.limits.memory_gib is None
 

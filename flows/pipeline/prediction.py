@@ -35,8 +35,8 @@ _SECONDS_LARGE = {
     "gnet": 43.0,
     "effects": 41.0,
     "novel_views": 27.0,
-    "fnet": 83.0,
-    "enet": 128.0,
+    "fnet": 90.0,
+    "enet": 143.0,
     "evaluate": 180.0,
 }
 """With the preset ``hd``: 1280×720. FNet takes far longer where ``fnet.max_network_px`` is not set."""
