@@ -19,7 +19,6 @@ typedef float Vector __attribute__((vector_size(VECTOR_BYTES)));
 
 constexpr int WIDTH = VECTOR_BYTES / 4;
 constexpr int TAPS = 2 * RADIUS + 1, MARGIN = 3 * RADIUS;  // floats: rows are RGB RGB …, a pixel's neighbour is 3 away
-constexpr int PLANES = 3;                                  // what is blurred at once: x, x², xy, or the derivatives
 constexpr int BLOCK = 4;                                   // rows blurred at once: a row is loaded once for all of them
 constexpr int LAG = (RADIUS + BLOCK - 1) / BLOCK;          // blocks between a blur's input and its output
 constexpr int RING = (LAG + 1) * BLOCK + (RADIUS + BLOCK - 1) / BLOCK * BLOCK;  // rows that are still needed
@@ -55,27 +54,27 @@ class Floats {
   std::unique_ptr<float, Free> p_;
 };
 
-// The last rows of three planes of an image, and their blur; zeros outside of the image.
+// The last rows of some planes of an image, and their blur; zeros outside of the image.
 class Blur {
  public:
-  Blur(int height, int stride)
-      : height_(height), stride_(stride), rows_((size_t)(RING * PLANES + 1) * stride), between_((size_t)stride + 2 * LANES),
-        out_((size_t)BLOCK * PLANES * stride) {}
+  Blur(int planes, int height, int stride)
+      : planes_(planes), height_(height), stride_(stride), rows_((size_t)(RING * planes + 1) * stride),
+        between_((size_t)stride + 2 * LANES), out_((size_t)BLOCK * planes * stride) {}
 
-  float* row(int r, int plane) const { return rows_ + (size_t)(r % RING * PLANES + plane) * stride_; }
-  const float* blurred(int b, int plane) const { return out_ + (size_t)(b * PLANES + plane) * stride_; }
+  float* row(int r, int plane) const { return rows_ + (size_t)(r % RING * planes_ + plane) * stride_; }
+  const float* blurred(int b, int plane) const { return out_ + (size_t)(b * planes_ + plane) * stride_; }
 
   // Of the BLOCK rows from `first` on, from rows up to RADIUS away.
   void run(int first, const Window& window) const {
     static_assert(MARGIN <= LANES, "the margins of `between_`");
-    for (int plane = 0; plane < PLANES; plane++) {
+    for (int plane = 0; plane < planes_; plane++) {
       const float* in[BLOCK + TAPS - 1];
       for (int k = 0; k < BLOCK + TAPS - 1; k++) {
         const int r = first + k - RADIUS;
-        in[k] = r < 0 || r >= height_ ? rows_ + (size_t)RING * PLANES * stride_ : row(r, plane);
+        in[k] = r < 0 || r >= height_ ? rows_ + (size_t)RING * planes_ * stride_ : row(r, plane);
       }
       float* vertical[BLOCK];
-      for (int b = 0; b < BLOCK; b++) vertical[b] = out_ + (size_t)(b * PLANES + plane) * stride_;
+      for (int b = 0; b < BLOCK; b++) vertical[b] = out_ + (size_t)(b * planes_ + plane) * stride_;
       for (int j = 0; j < stride_; j += WIDTH) {
         Vector sum[BLOCK] = {};
         UNROLLED for (int k = 0; k < BLOCK + TAPS - 1; k++) {
@@ -101,7 +100,7 @@ class Blur {
     }
   }
 
-  int height_, stride_;
+  int planes_, height_, stride_;
   Floats rows_, between_, out_;
 };
 
@@ -130,6 +129,15 @@ class Sum {
 static void products(const float* __restrict x, const float* __restrict y, int n, float* __restrict copy,
                      float* __restrict square, float* __restrict product) {
   for (int j = 0; j < n; j++) copy[j] = x[j], square[j] = x[j] * x[j], product[j] = x[j] * y[j];
+}
+
+// y, y².
+static void squares(const float* __restrict y, int n, float* __restrict copy, float* __restrict square) {
+  for (int j = 0; j < n; j++) copy[j] = y[j], square[j] = y[j] * y[j];
+}
+
+static void variances(const float* __restrict mean, const float* __restrict square, int n, float* __restrict out) {
+  for (int j = 0; j < n; j++) out[j] = square[j] - mean[j] * mean[j];
 }
 
 // SSIM of each entry from the local means of x, x², xy, and its derivatives by the three.
@@ -163,7 +171,9 @@ static void gradient_row(const float* __restrict x, const float* __restrict y, i
 }
 
 struct View {
-  const float *color, *depth, *image, *mean, *variance, *sparse;  // sparse: null where depth does not supervise
+  const float *color, *depth, *image;
+  const float *mean, *variance;  // of the image; null where they are still to be computed
+  const float* sparse;           // null where depth does not supervise
   double weight;
   double* terms;  // rgb, 1 − SSIM, depth
   float *by_color, *by_depth;
@@ -179,8 +189,10 @@ static void color_terms(const View& v, const Weights& weights, int height, int w
   const bool structural = weights.ssim > 0;
   const double entries = (double)n * height;
   const float rgb = (float)(v.weight * weights.rgb / entries), ssim = (float)(v.weight * weights.ssim / entries);
-  const Blur moments(structural ? height : 0, structural ? stride : 0), maps(structural ? height : 0, structural ? stride : 0);
-  const Floats value(stride);
+  const bool known = v.mean && v.variance;
+  const int blurred_height = structural ? height : 0, blurred_stride = structural ? stride : 0;
+  const Blur moments(known ? 3 : 5, blurred_height, blurred_stride), maps(3, blurred_height, blurred_stride);
+  const Floats value(stride), variance(stride);
   Sum of_difference, of_ssim;
   // Three stages on blocks of rows, each LAG blocks behind the one that it reads from.
   for (int entered = 0; entered < height + 2 * LAG * BLOCK; entered += BLOCK) {
@@ -188,14 +200,17 @@ static void color_terms(const View& v, const Weights& weights, int height, int w
       for (int r = entered; r < std::min(entered + BLOCK, height); r++) {
         const size_t at = (size_t)n * r;
         products(v.color + at, v.image + at, n, moments.row(r, 0), moments.row(r, 1), moments.row(r, 2));
+        if (!known) squares(v.image + at, n, moments.row(r, 3), moments.row(r, 4));
       }
       const int mapped = entered - LAG * BLOCK;
       if (mapped >= 0 && mapped < height) moments.run(mapped, window);
       for (int r = std::max(mapped, 0); r < std::min(mapped + BLOCK, height); r++) {
         const int b = r - mapped;
         const size_t at = (size_t)n * r;
-        ssim_row(moments.blurred(b, 0), moments.blurred(b, 1), moments.blurred(b, 2), v.mean + at, v.variance + at, n,
-                 value + 0, maps.row(r, 0), maps.row(r, 1), maps.row(r, 2));
+        const float* mean = known ? v.mean + at : moments.blurred(b, 3);
+        if (!known) variances(mean, moments.blurred(b, 4), n, variance + 0);
+        ssim_row(moments.blurred(b, 0), moments.blurred(b, 1), moments.blurred(b, 2), mean,
+                 known ? v.variance + at : variance + 0, n, value + 0, maps.row(r, 0), maps.row(r, 1), maps.row(r, 2));
         of_ssim.add(value + 0, stride);
       }
     }
@@ -251,9 +266,9 @@ static void depth_term(const View& v, const Weights& weights, int height, int wi
   for (size_t i = 0; i < pixels; i++) v.by_depth[i] *= scale;
 }
 
-// color [V, H, W, 3], depth [V, H, W]; images, means, variances: V pointers to [H, W, 3]; sparse: V pointers to [H, W] or
-// null; weights [V]. Writes terms [V, 3] (before their weights; those without weight are 0), by_color and by_depth: the
-// gradients of the sum of weights · (rgb, ssim, depth) · terms.
+// color [V, H, W, 3], depth [V, H, W]; images, means, variances: V pointers to [H, W, 3], of which the last two may be null;
+// sparse: V pointers to [H, W] or null; weights [V]. Writes terms [V, 3] (before their weights; those without weight are 0),
+// by_color and by_depth: the gradients of the sum of weights · (rgb, ssim, depth) · terms.
 extern "C" int genre_image_loss(int views, int height, int width, const float* color, const float* depth,
                                 const float* const* images, const float* const* means, const float* const* variances,
                                 const float* const* sparse, const double* weights, double rgb, double ssim,

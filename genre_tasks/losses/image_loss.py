@@ -111,10 +111,10 @@ def image_loss(
     depth = depth.detach().contiguous()
     # Contiguous copies must live until the kernel returns, as it only gets their addresses.
     images = [target.image.pixels.contiguous() for target in targets]
-    statistics = [target.image.get_statistics() for target in targets]
-    means = [mean.contiguous() for mean, _ in statistics]
-    variances = [variance.contiguous() for _, variance in statistics]
-    lidar_depths = [None if target.depth is None else target.depth.contiguous() for target in targets]
+    # Where an image has no statistics, the kernel computes them row by row.
+    means = [_contiguous(target.image.mean) for target in targets]
+    variances = [_contiguous(target.image.variance) for target in targets]
+    lidar_depths = [_contiguous(target.depth) for target in targets]
     # In float64, as the kernel's sums are.
     view_weights = torch.tensor(weights, dtype=torch.float64)
     terms = torch.empty(views, 3, dtype=torch.float64)
@@ -149,6 +149,10 @@ def _check_status(status: int) -> None:
         raise ResourceError("not enough memory for the image loss", remedy="Take fewer views or smaller images")
     if status:
         raise ResourceError(f"{KERNEL.title} failed", remedy="Report the images' size and the number of views")
+
+
+def _contiguous(tensor: Tensor | None) -> Tensor | None:
+    return None if tensor is None else tensor.contiguous()
 
 
 def _pointers(tensors: Sequence[Tensor | None]) -> ctypes.Array[ctypes.c_void_p]:

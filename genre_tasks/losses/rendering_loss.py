@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from genre_tasks.config import LossConfig
-from genre_tasks.effects.color_gain import apply_gain, gain_factor
 from genre_tasks.losses.constants import DEPTH_LOSS_MAX, DEPTH_MIN_M
+from genre_tasks.losses.exposed_renders import ExposedRenders
 from genre_tasks.losses.image_loss import ImageLoss, image_loss, is_supported
 from genre_tasks.losses.ssim import ssim
 from genre_tasks.losses.targets import Target
@@ -25,9 +25,6 @@ from genre_tasks.threads import map_single_threaded
 
 CROP_PX = 128
 """Side of the perceptual term's crop: the network's stride is 32, its features see about a hundred pixels."""
-
-CLIPPED = 254.0 / 255
-"""Pixels of an image from here on are taken to be clipped: resizing leaves few of them at exactly 1."""
 
 ImageDistance = Callable[[Tensor, Tensor], Tensor]
 """A perceptual distance: two batches of images [B, H, W, 3] in [0, 1] → [B]."""
@@ -132,33 +129,29 @@ def depth_loss(depth: Tensor, target: Tensor) -> Tensor:
 
 def image_gradients(
     config: LossConfig,
-    color: Tensor,  # [V, H, W, 3]
+    renders: ExposedRenders,
     depth: Tensor,  # [V, H, W]
-    targets: Sequence[Target],
     terms: LossTerms,
     distance: ImageDistance | None = None,
 ) -> tuple[float, Tensor, Tensor]:
     """Computes a batch's loss and its gradients at the rendered images.
 
     The compiled kernel computes all but the perceptual term where tensors are float32 on the CPU; elsewhere torch does.
-    Where a target has a gain, the render gets that gain before it is compared. Pixels that show the ego vehicle have
-    no gradient.
+    Pixels that show the ego vehicle have no gradient.
 
     Args:
         config: weights of the terms.
-        color: rendered colours, sRGB.
+        renders: of V views, with what they are compared with.
         depth: rendered depths in metres, 0 where nothing was rendered.
-        targets: V targets.
-        terms: what :func:`select_loss_terms` chose for them.
+        terms: what :func:`select_loss_terms` chose for the views.
         distance: the perceptual distance; ``None`` leaves its term out.
 
     Returns:
-        The loss, its gradient with respect to ``color`` [V, H, W, 3], and that with respect to ``depth`` [V, H, W].
+        The loss, its gradient with respect to the scene's own colours [V, H, W, 3], and that with respect to ``depth``
+        [V, H, W].
     """
-    gains = _stack_gains(targets, color)
-    if gains is not None:
-        # The render gets the gain, rather than the image losing it: what is clipped in an image cannot be restored.
-        color, beyond_clipped = _clip_where_images_are(apply_gain(color, gains), targets)
+    color = renders.color
+    targets = renders.targets
     compute = image_loss if is_supported(color, depth, targets) else torch_image_loss
     result = compute(config, color, depth, targets, terms.weights)
     # In float64 and in the order of the views, whatever number of threads computed them.
@@ -172,31 +165,26 @@ def image_gradients(
         if target.ego_mask is not None:
             color_gradient[i][target.ego_mask] = 0.0
             depth_gradient[i][target.ego_mask] = 0.0
-    if gains is not None:
-        # The chain rule: gradients are with respect to the render without the gain.
-        color_gradient = torch.where(beyond_clipped, 0.0, color_gradient * gain_factor(gains))
+    renders.undo_in_gradient(color_gradient)
     return loss, color_gradient, depth_gradient
 
 
-def residual_image(color: Tensor, targets: Sequence[Target]) -> Tensor:
+def residual_image(renders: ExposedRenders) -> Tensor:
     """Subtracts renders from the images they are compared with, in the scene's colours without exposure gains.
 
     Args:
-        color: [V, H, W, 3] rendered colours, sRGB.
-        targets: V targets.
+        renders: of V views, with what they are compared with.
 
     Returns:
         [V, H, W, 3] image minus render, 0 on the ego vehicle.
     """
-    gains = _stack_gains(targets, color)
-    exposed = color if gains is None else _clip_where_images_are(apply_gain(color, gains), targets)[0]
-    residual = torch.empty_like(color)
-    for i, target in enumerate(targets):
-        _subtract(target.image.pixels, exposed[i], residual[i])
+    residual = torch.empty_like(renders.color)
+    for i, target in enumerate(renders.targets):
+        _subtract(target.image.pixels, renders.color[i], residual[i])
         if target.ego_mask is not None:
             residual[i][target.ego_mask] = 0.0
-    # A residual is a difference, in which the offset of the gain cancels: only its factor is undone.
-    return residual if gains is None else residual / gain_factor(gains)
+    renders.undo_in_difference(residual)
+    return residual
 
 
 def torch_image_loss(
@@ -259,24 +247,6 @@ def _subtract(a: Tensor, b: Tensor, out: Tensor) -> None:
         np.subtract(a.numpy(), b.numpy(), out=out.numpy())
     else:
         torch.sub(a, b, out=out)
-
-
-def _stack_gains(targets: Sequence[Target], like: Tensor) -> Tensor | None:
-    """[V, 1, 1, 3] log gains of the targets' images, ``None`` where no target has one."""
-    if all(target.log_gain is None for target in targets):
-        return None
-    return like.new_tensor([target.log_gain or (0.0, 0.0, 0.0) for target in targets])[:, None, None]
-
-
-def _clip_where_images_are(color: Tensor, targets: Sequence[Target]) -> tuple[Tensor, Tensor]:
-    """Takes renders [V, H, W, 3] that are brighter than a clipped image to agree with it, and says where.
-
-    A clipped pixel tells that the scene is at least so bright. Pulled down to 1 by a bright image, a sky would be too
-    dark in the images of a shorter exposure.
-    """
-    images = torch.stack([target.image.pixels for target in targets])
-    beyond = (images >= CLIPPED) & (color > images)
-    return torch.where(beyond, images, color), beyond
 
 
 def _random_below(limit: int, generator: torch.Generator) -> int:

@@ -81,4 +81,7 @@ def mark_drawn(by_colors: Tensor) -> Tensor:
     """
     # The renderer keeps no record of what it drew. A drawn Gaussian with a gradient of exactly 0 in all channels
     # would be missed, which costs it one view in a mean over many.
-    return (by_colors != 0).any(-1, keepdim=True).to(by_colors.dtype).expand_as(by_colors).contiguous()
+    red, green, blue = (by_colors != 0).unbind(-1)
+    # Not ``any``: torch is several times as slow where it reduces three entries at a time.
+    drawn = (red | green | blue).to(by_colors.dtype)
+    return drawn[..., None].expand_as(by_colors).contiguous()

@@ -1,8 +1,11 @@
-"""Steps by the compiled kernel: those of the learned optimiser and of tuned Adam, which share Adam's direction."""
+"""Steps by the compiled kernel: of the learned optimiser, of tuned Adam, and of spherical harmonics.
+
+The first two share Adam's direction.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -69,6 +72,52 @@ def adam_step(state: State, signed_rates: Tensor) -> Tensor:
     return _step(library.load_network().genre_adam_step, state, state.first_moment, signed_rates, signed_rates)
 
 
+def sh_step(
+    before: Sequence[Tensor], gradients: Sequence[Tensor], by_colors: Tensor, signed_rate: float
+) -> tuple[list[Tensor], Tensor]:
+    """Takes one step in spherical harmonics; the torch code of ``ShState`` is its oracle.
+
+    Args:
+        before: the tensors of ``ShState``, in its order, of N Gaussians.
+        gradients: the tensors of ``ShGradients``, in its order.
+        by_colors: [N, 3] gradient of the colours that all views share.
+        signed_rate: negative learning rate, with the scale of the schedule in it.
+
+    Returns:
+        tuple: the tensors of the state afterwards, and the shift [N, 3] of the colours.
+
+    Raises:
+        ValueError: shapes do not fit together, or a tensor is not float32 on the CPU.
+        ResourceError: the kernel is not compiled.
+    """
+    coefficients = before[0]
+    count, sh_count, _ = coefficients.shape
+    whole, column, colors = (count, sh_count, 3), (count, 1, 1), (count, 3)
+    shapes = [whole, whole, column, column, whole, colors, whole, whole, colors, colors]
+    arrays = [array.detach().contiguous() for array in (*before, *gradients, by_colors)]
+    # The kernel knows no shapes: what passes here is read without another check.
+    if [tuple(array.shape) for array in arrays] != shapes or not library.is_supported(*arrays):
+        raise ValueError(f"expected float32 on the CPU of shapes {shapes}, got {[list(a.shape) for a in arrays]}")
+    # New tensors: states are values.
+    after = [torch.empty_like(array) for array in arrays[:6]]
+    shift = torch.empty_like(arrays[9])
+    # This iteration counts, too.
+    by_count = _factors_by_count(_largest(arrays[3]) + 1)
+    inputs = library.ShStepInputs(
+        count,
+        sh_count,
+        library.ShState(*(array.data_ptr() for array in arrays[:6])),
+        *(array.data_ptr() for array in arrays[6:]),
+        by_count.data_ptr(),
+        library.ShState(*(array.data_ptr() for array in after)),
+        shift.data_ptr(),
+    )
+    decay_rates = (1 - FIRST_MOMENT_DECAY, 1 - SECOND_MOMENT_DECAY)
+    threads = torch.get_num_threads()
+    library.check_status(library.load_network().genre_sh_step(inputs, signed_rate, *decay_rates, threads))
+    return after, shift
+
+
 def _step(
     call: KernelCall,
     state: State,
@@ -85,7 +134,7 @@ def _step(
     if not library.is_supported(*arrays):
         raise ValueError("expected float32 tensors on the CPU")
     arrays = [array.detach().contiguous() for array in arrays]
-    by_count = _factors_by_count(arrays[3])
+    by_count = _factors_by_count(_largest(arrays[3]))
     delta = torch.empty_like(arrays[0])
     # In a variable: the kernel reads it by its address, and a temporary would be freed before the call.
     scale = torch.tensor([lr_scale])
@@ -115,13 +164,16 @@ def _check_shapes(state: State, gradient: Tensor, image_residuals: Tensor | None
         raise ValueError(f"expected residuals [{rows}, {IMAGE_RESIDUALS}], got {list(image_residuals.shape)}")
 
 
-def _factors_by_count(visit_count: Tensor) -> Tensor:
-    """What depends only on how often a Gaussian was seen, for 0 … the largest count.
+def _largest(visit_count: Tensor) -> int:
+    # Numpy, because torch would wake its threads, which then spin beside the kernel's threads.
+    return int(visit_count.numpy().max(initial=0))
+
+
+def _factors_by_count(largest: int) -> Tensor:
+    """What depends only on how often a Gaussian was seen, for 0 … ``largest``.
 
     [counts, 3]: Adam's two bias corrections, and a feature of the network.
     """
-    # Numpy, because torch would wake its threads, which then spin beside the kernel's threads.
-    largest = int(visit_count.numpy().max(initial=0))
     counts = torch.arange(largest + 1, dtype=torch.float32)
     # A table, because a power of the decays for each attribute would cost more than the rest of Adam's step.
     n = counts.clamp_min(1)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from genre_tasks.config import LossConfig
+from genre_tasks.losses.exposed_renders import ExposedRenders
 from genre_tasks.losses.rendering_loss import ImageDistance, image_gradients, residual_image, select_loss_terms
 from genre_tasks.losses.targets import Target
 from genre_tasks.optimiser.auxiliary import NO_AUXILIARY, AuxiliaryParameters
@@ -79,9 +80,8 @@ class Objective:
         terms = select_loss_terms(self.config, targets, iteration, generator, self.distance is not None)
         # No gradient mode is set here: a render by autograd makes its own graph, and one by kernels needs none.
         render = render_differentiable(parameterization, offsets, targets, self.settings, auxiliary)
-        loss, by_color, by_depth = image_gradients(
-            self.config, render.color, render.depth, targets, terms, self.distance
-        )
+        exposed = ExposedRenders.from_renders(render.color, targets)
+        loss, by_color, by_depth = image_gradients(self.config, exposed, render.depth, terms, self.distance)
         # Before ``gradient``, which uses up the render's tensors.
-        residual = residual_image(render.color, targets) if image_residuals else None
+        residual = residual_image(exposed) if image_residuals else None
         return LossAndGradients(loss, render.gradient(by_color, by_depth, residual), render.culled)

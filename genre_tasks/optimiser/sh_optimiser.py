@@ -13,18 +13,19 @@ seen from nearly one direction gets small coefficients.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
 
 from genre_tasks.optimiser.auxiliary import AuxiliaryParameters
 from genre_tasks.optimiser.gradients import Gradients, ShGradients
+from genre_tasks.optimiser.kernel_steps import sh_step
 from genre_tasks.optimiser.kernels.constants import RMS_FLOOR
+from genre_tasks.optimiser.kernels.library import is_supported
 from genre_tasks.optimiser.state import FIRST_MOMENT_DECAY, SECOND_MOMENT_DECAY
 from genre_tasks.optimiser.step_rules import cosine_decay
 from genre_tasks.scene.graph import SceneGraph
-from genre_tasks.threads import torch_threads
 
 LEARNING_RATE = 0.15
 """Of a first step, in sRGB per unit of a basis function.
@@ -75,11 +76,15 @@ class ShState:
         Returns:
             tuple: the next state, and the shift [N, 3] of the colours that keeps the mean over views where it was.
         """
-        # On one thread, so that the bits of the sums do not depend on the number of threads.
-        with torch_threads(1):
-            return self._apply_step(gradients, by_colors, lr_scale)
+        tensors = [getattr(self, field.name) for field in fields(self)]
+        if is_supported(*tensors, by_colors):
+            by_harmonics = (gradients.coefficients, gradients.basis_sums, gradients.view_counts)
+            after, shift = sh_step(tensors, by_harmonics, by_colors, -LEARNING_RATE * lr_scale)
+            return ShState(*after), shift
+        return self.apply_torch_step(gradients, by_colors, lr_scale)
 
-    def _apply_step(self, gradients: ShGradients, by_colors: Tensor, lr_scale: float) -> tuple[ShState, Tensor]:
+    def apply_torch_step(self, gradients: ShGradients, by_colors: Tensor, lr_scale: float) -> tuple[ShState, Tensor]:
+        """Does what :meth:`apply_step` does, on any device and in any precision."""
         basis_sums = self.basis_sums + gradients.basis_sums
         view_counts = self.view_counts + gradients.view_counts
         # The mean is over all views so far: the few views of one iteration would all but have a mean of their own.

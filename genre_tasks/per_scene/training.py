@@ -20,6 +20,7 @@ from torch import Tensor
 from genre_tasks.checks import check_finite
 from genre_tasks.config import LossConfig, PerSceneConfig
 from genre_tasks.errors import NonFiniteError
+from genre_tasks.losses.exposed_renders import ExposedRenders
 from genre_tasks.losses.rendering_loss import image_gradients, select_loss_terms
 from genre_tasks.losses.targets import Target
 from genre_tasks.per_scene.densification import GaussiansWithMoments, densify, prune, reset_opacity
@@ -188,7 +189,8 @@ class PerSceneTraining:
         if self._loss.depth > 0:
             with torch.enable_grad():
                 depth = image.expected_depth()
-        loss, color_gradient, depth_gradient = image_gradients(self._loss, image.color, depth, [target], terms)
+        exposed = ExposedRenders.from_renders(image.color, [target])
+        loss, color_gradient, depth_gradient = image_gradients(self._loss, exposed, depth, terms)
         if self._loss.depth > 0:
             # One pass for both outputs, since they share a graph.
             torch.autograd.backward([image.color, depth], [color_gradient, depth_gradient])

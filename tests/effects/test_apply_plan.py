@@ -27,6 +27,7 @@ from genre_tasks.fixer.warping import SourceImage, sample_source
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.synthetic.camera_effects import bonnet_mask
 from genre_tasks.logs.synthetic.parameters import StreetParameters
+from genre_tasks.losses.exposed_renders import ExposedRenders
 from genre_tasks.losses.rendering_loss import image_gradients, select_loss_terms
 from genre_tasks.losses.targets import Target, view_targets
 from genre_tasks.metrics.scoring import decode_view_image
@@ -121,7 +122,8 @@ def test_nothing_pulls_where_the_vehicle_itself_is() -> None:
     color = torch.rand(1, 90, 160, 3, generator=torch.Generator().manual_seed(2))
     config = LossConfig(perceptual=0)
     loss_plan = select_loss_terms(config, [target], 0, torch.Generator(), perceptual=False)
-    by_color = image_gradients(config, color, torch.ones(1, 90, 160), [target], loss_plan)[1]
+    renders = ExposedRenders.from_renders(color, [target])
+    by_color = image_gradients(config, renders, torch.ones(1, 90, 160), loss_plan)[1]
     assert not by_color[0, 70:].any() and by_color[0, :60].any()
     images = torch.rand(1, 90, 160, 3, generator=torch.Generator().manual_seed(3))
     worse = images.clone()

@@ -15,6 +15,7 @@ from genre_tasks.effects.plan import EFFECT_NAMES, plan_effects
 from genre_tasks.effects.types import EffectParameters
 from genre_tasks.fixer.source_images import load_source_images
 from genre_tasks.logs.registry import open_log
+from genre_tasks.losses.exposed_renders import ExposedRenders
 from genre_tasks.losses.rendering_loss import image_gradients, residual_image, select_loss_terms
 from genre_tasks.losses.ssim import SsimTarget
 from genre_tasks.losses.targets import Target, view_targets
@@ -62,8 +63,8 @@ def test_a_clipped_image_pulls_up_what_is_darker_and_leaves_what_is_brighter(bri
     # What the loss sees is brighter than this by the gain.
     color = torch.full((1, 32, 48, 3), brightness) / float(np.exp(0.2 / 2.4))
     color[..., 24:, :] = 0.8
-    gradient = image_gradients(config, color, torch.zeros(1, 32, 48), [target], terms)[1]
-    residual = residual_image(color, [target])
+    gradient = image_gradients(config, ExposedRenders.from_renders(color, [target]), torch.zeros(1, 32, 48), terms)[1]
+    residual = residual_image(ExposedRenders.from_renders(color, [target]))
     # Where the image is not clipped, a render that is too bright is pulled down.
     assert (gradient[0, :, 32:] > 0).all() and (residual[0, :, 32:] < 0).all()
     if brightness > 1:
@@ -77,9 +78,9 @@ def test_without_gains_a_clipped_image_is_compared_as_it_is() -> None:
     config = LossConfig(perceptual=0, ssim=0)
     terms = select_loss_terms(config, [target], 0, torch.Generator(), perceptual=False)
     color = torch.full((1, 32, 48, 3), 1.2)
-    gradient = image_gradients(config, color, torch.zeros(1, 32, 48), [target], terms)[1]
+    gradient = image_gradients(config, ExposedRenders.from_renders(color, [target]), torch.zeros(1, 32, 48), terms)[1]
     assert (gradient > 0).all()
-    assert (residual_image(color, [replace(target, ego_mask=None)])[0] < 0).all()
+    assert (residual_image(ExposedRenders.from_renders(color, [replace(target, ego_mask=None)]))[0] < 0).all()
 
 
 def test_the_exposures_derivatives_are_those_of_finite_differences() -> None:
@@ -99,15 +100,16 @@ def test_the_loss_takes_its_gradient_through_the_gain() -> None:
     depth = torch.zeros(1, 90, 160)
 
     def loss(at: torch.Tensor) -> float:
-        return image_gradients(config, at, depth, [target], loss_plan)[0]
+        return image_gradients(config, ExposedRenders.from_renders(at, [target]), depth, loss_plan)[0]
 
-    by_color = image_gradients(config, color, depth, [target], loss_plan)[1]
+    by_color = image_gradients(config, ExposedRenders.from_renders(color, [target]), depth, loss_plan)[1]
     way = by_color / by_color.abs().max()
     step = 1e-3
     found = (loss(color + step * way) - loss(color - step * way)) / (2 * step)
     assert float((by_color * way).sum()) == pytest.approx(found, rel=0.02)
     (plain,) = view_targets(chunk(), [view])
-    assert image_gradients(config, color, depth, [plain], loss_plan)[0] != pytest.approx(loss(color), rel=0.01)
+    without_gain = ExposedRenders.from_renders(color, [plain])
+    assert image_gradients(config, without_gain, depth, loss_plan)[0] != pytest.approx(loss(color), rel=0.01)
 
 
 @pytest.mark.parametrize("gain", [0.0, 1.5, -1.5, -30.0, 30.0])

@@ -47,6 +47,12 @@ def _batch(views: int = 3, height: int = 37, width: int = 53, seed: int = 0) -> 
     return color, depth, targets, [0.5, 0.25, 0.125, 1.0][:views]
 
 
+def _without_statistics(batch: Batch) -> Batch:
+    """The same views with images as large ones have them: the kernel computes their mean and variance itself."""
+    color, depth, targets, weights = batch
+    return color, depth, [replace(t, image=SsimTarget(t.image.pixels)) for t in targets], weights
+
+
 def _oracle(batch: Batch, config: LossConfig = CONFIG) -> ImageLoss:
     color, depth, targets, weights = batch
     exact = [
@@ -73,6 +79,7 @@ def _close(ours: ImageLoss, exact: ImageLoss, bound: float = 1e-5) -> None:
 def test_values_and_gradients_are_the_oracles(size: tuple[int, int]) -> None:
     batch = _batch(3, *size)
     _close(image_loss(CONFIG, *batch), _oracle(batch))
+    _close(image_loss(CONFIG, *_without_statistics(batch)), _oracle(batch))
 
 
 @pytest.mark.parametrize("change", [{"ssim": 0.0}, {"depth": 0.0}, {"rgb": 0.0}, {"rgb": 0.0, "ssim": 0.0}])
@@ -87,6 +94,7 @@ def test_every_instruction_set_is_right(isa: str, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(module, "load_image_loss", load_image_loss.__wrapped__)
     batch = _batch()
     _close(image_loss(CONFIG, *batch), _oracle(batch))
+    _close(image_loss(CONFIG, *_without_statistics(batch)), _oracle(batch))
 
 
 def test_smooth_images_are_as_exact_as_in_torch() -> None:
@@ -95,6 +103,7 @@ def test_smooth_images_are_as_exact_as_in_torch() -> None:
     color = torch.stack([x, y, 0.5 * (x + y)], -1)[None]
     batch = color, torch.zeros(1, 60, 80), [_target(color[0] * 0.9 + 0.05)], [1.0]
     _close(image_loss(CONFIG, *batch), _oracle(batch), 1e-3)
+    _close(image_loss(CONFIG, *_without_statistics(batch)), _oracle(batch), 1e-3)
 
 
 @pytest.mark.parametrize("returns", [0.0, float("nan"), float("inf"), -1.0])

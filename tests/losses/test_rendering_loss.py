@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from genre_tasks.config import LossConfig
+from genre_tasks.losses.exposed_renders import ExposedRenders
 from genre_tasks.losses.rendering_loss import depth_loss, image_gradients, select_loss_terms, view_loss
 from genre_tasks.losses.ssim import SsimTarget, ssim
 from genre_tasks.losses.targets import Target
@@ -34,7 +35,8 @@ def test_novel_views_count_with_their_weight_and_without_depth() -> None:
     terms = select_loss_terms(config, targets, 1, torch.Generator())
     assert terms.weights == (0.5, 0.5, 0.5)
     color, depth = torch.rand(3, 32, 48, 3), torch.ones(3, 32, 48)
-    loss, color_gradient, depth_gradient = image_gradients(config, color, depth, targets, terms)
+    renders = ExposedRenders.from_renders(color, targets)
+    loss, color_gradient, depth_gradient = image_gradients(config, renders, depth, terms)
     expected = sum(0.5 * float(view_loss(config, color[i], depth[i], t)) for i, t in enumerate(targets))
     assert loss == pytest.approx(expected, rel=1e-6)
     assert not depth_gradient.any() and bool((color_gradient != 0).any())
@@ -95,7 +97,8 @@ def test_constant_images_and_small_crops_are_finite(left: float, right: float) -
     color, depth = torch.full((1, 7, 9, 3), left), torch.zeros(1, 7, 9)
     config = LossConfig()
     terms = select_loss_terms(config, [target], 0, torch.Generator())
-    loss, color_gradient, depth_gradient = image_gradients(config, color, depth, [target], terms, perceptual_distance())
+    renders = ExposedRenders.from_renders(color, [target])
+    loss, color_gradient, depth_gradient = image_gradients(config, renders, depth, terms, perceptual_distance())
     assert torch.isfinite(torch.tensor(loss)) and bool(
         torch.isfinite(color_gradient).all() and torch.isfinite(depth_gradient).all()
     )
@@ -110,7 +113,8 @@ def test_the_gradient_is_the_same_bytes_at_any_thread_count() -> None:
     try:
         for threads in (1, 3):
             torch.set_num_threads(threads)
-            results.append(image_gradients(config, color, depth, targets, terms, perceptual_distance()))
+            renders = ExposedRenders.from_renders(color, targets)
+            results.append(image_gradients(config, renders, depth, terms, perceptual_distance()))
     finally:
         torch.set_num_threads(before)
     assert results[0][0] == results[1][0] and torch.equal(results[0][1], results[1][1])

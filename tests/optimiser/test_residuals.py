@@ -20,6 +20,7 @@ from genre_tasks.learned.meta_training import MetaConfig, MetaTraining
 from genre_tasks.learned.network import NetworkConfig
 from genre_tasks.learned.weights import load_optimiser, save_optimiser
 from genre_tasks.logs.types import MotionBlur
+from genre_tasks.losses.exposed_renders import ExposedRenders
 from genre_tasks.losses.rendering_loss import residual_image
 from genre_tasks.losses.ssim import SsimTarget
 from genre_tasks.optimiser.autograd_render import AutogradRender
@@ -131,7 +132,7 @@ def test_the_residual_is_in_the_scenes_own_colours_and_not_of_the_vehicle() -> N
 
     shown = apply_gain(color[1], torch.tensor(gain))
     bright = replace(targets[1], log_gain=gain, image=SsimTarget.from_image(shown.contiguous()))
-    found = residual_image(color - 0.1, [replace(targets[0], ego_mask=own), bright])
+    found = residual_image(ExposedRenders.from_renders(color - 0.1, [replace(targets[0], ego_mask=own), bright]))
     torch.testing.assert_close(found[0, :20], torch.full((20, 48, 3), 0.1))
     assert not found[0, 20:].any()
     torch.testing.assert_close(found[1], torch.full((32, 48, 3), 0.1), atol=1e-5, rtol=0)

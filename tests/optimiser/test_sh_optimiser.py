@@ -108,6 +108,29 @@ def test_a_step_moves_what_is_seen_and_no_farther_than_its_rate() -> None:
     assert torch.equal(rest.coefficients, moved.coefficients)
 
 
+@pytest.mark.parametrize("sh_count", [3, 8, 15])
+def test_the_kernels_steps_are_torchs(sh_count: int) -> None:
+    g = torch.Generator().manual_seed(sh_count)
+    ours = exact = ShState.from_coefficients(0.1 * torch.randn(500, sh_count, 3, generator=g))
+    for iteration in range(5):
+        # Gaussians come and go; some are never seen, and gradients have many sizes.
+        seen = (torch.rand(500, 1, generator=g) < 0.7) & (torch.arange(500)[:, None] >= 20)
+        size = 10.0 ** torch.randint(-9, 5, (500, 1), generator=g)
+        by_colors = torch.randn(500, 3, generator=g) * size * seen
+        counts = torch.randint(0, 4, (500, 1), generator=g).expand(500, 3) * seen
+        basis_sums = torch.randn(500, sh_count, 3, generator=g) * counts[:, None]
+        gradients = ShGradients(basis_sums * by_colors[:, None], basis_sums, counts.float())
+        ours, shift = ours.apply_step(gradients, by_colors, 1 - iteration / 5)
+        exact, exact_shift = exact.apply_torch_step(gradients, by_colors, 1 - iteration / 5)
+        torch.testing.assert_close(shift, exact_shift, atol=1e-6, rtol=1e-4)
+        for name in ("visit_count", "view_counts", "basis_sums"):
+            assert torch.equal(getattr(ours, name), getattr(exact, name))
+        torch.testing.assert_close(ours.coefficients, exact.coefficients, atol=1e-6, rtol=1e-4)
+        torch.testing.assert_close(ours.second_moment, exact.second_moment, atol=0, rtol=1e-5)
+    with pytest.raises(ValueError, match="expected float32"):
+        ours.apply_step(replace(gradients, view_counts=counts[1:].float()), by_colors, 1.0)
+
+
 def test_what_all_views_ask_for_is_left_to_the_colour() -> None:
     """A gradient that is the same in each view moves no harmonics; another leaves the views' mean colour as it is."""
     by_colors, state = torch.full((3, 3), 0.7), ShState.from_coefficients(torch.zeros(3, 3, 3))

@@ -62,6 +62,24 @@ class StepInputs(ctypes.Structure):
     ]
 
 
+class ShState(ctypes.Structure):
+    """The state of spherical harmonics."""
+
+    _fields_ = _pointers("coefficients first_moment second_moment visit_count basis_sums view_counts")
+
+
+class ShStepInputs(ctypes.Structure):
+    """One iteration of spherical harmonics, and where the state after it is written."""
+
+    _fields_ = [
+        *_numbers("count sh_count"),
+        ("before", ShState),
+        *_pointers("by_coefficients basis_sums view_counts by_colors by_count"),
+        ("after", ShState),
+        *_pointers("shift"),
+    ]
+
+
 @cache
 def load_network(folder: Path = KERNEL.folder) -> ctypes.CDLL:
     """Loads the kernel once, with its argument types declared.
@@ -84,6 +102,8 @@ def load_network(folder: Path = KERNEL.folder) -> ctypes.CDLL:
     # The types must be declared: without them ctypes passes a pointer as an int of 32 bits.
     learning_rates = [ctypes.c_float] * 2
     library.genre_accumulate.argtypes = [ctypes.c_int64, *[pointer] * 4, *learning_rates, ctypes.c_int, *[pointer] * 4]
+    sh_inputs = ctypes.POINTER(ShStepInputs)
+    library.genre_sh_step.argtypes = [sh_inputs, *[ctypes.c_float] * 3, ctypes.c_int]
     library.genre_apply_step.argtypes = [ctypes.c_int64, *[pointer] * 7, ctypes.c_int, pointer]
     return library
 

@@ -184,7 +184,58 @@ static const float* project_onto_ground(const float* delta, const float* constra
   return along;
 }
 
+// ShState of N Gaussians, [N, K, 3] but for second_moment [N], visit_count [N] and view_counts [N, 3].
+struct ShState {
+  float *coefficients, *first_moment, *second_moment, *visit_count, *basis_sums, *view_counts;
+};
+
+// What one iteration of the spherical harmonics takes; by_colors is [N, 3], by_count as of StepInputs.
+struct ShStepInputs {
+  int64_t count, sh_count;
+  ShState before;
+  const float *by_coefficients, *basis_sums, *view_counts, *by_colors, *by_count;
+  ShState after;
+  float* shift;  // [N, 3]
+};
+
+// ShState.apply_step of sh_optimiser.py for Gaussian i: the same sums, entry by entry.
+static void sh_step(const ShStepInputs& in, float rate, float first_rate, float second_rate, int64_t i) {
+  const ShState &from = in.before, &to = in.after;
+  const int64_t entries = 3 * in.sh_count, at = entries * i;
+  const float* by_color = in.by_colors + 3 * i;
+  const float square = (by_color[0] * by_color[0] + by_color[1] * by_color[1] + by_color[2] * by_color[2]) / 3.f;
+  const float now = square > 0 ? 1.f : 0.f, visits = from.visit_count[i] + now;
+  const float second = from.second_moment[i] + now * second_rate * (square - from.second_moment[i]);
+  const float* bias = in.by_count + 3 * (int64_t)visits;
+  const float scale = now / (bias[0] * (std::sqrt(second / bias[1]) + RMS_FLOOR));
+  to.visit_count[i] = visits, to.second_moment[i] = second;
+  float seen[3], shift[3] = {};
+  for (int c = 0; c < 3; c++) {
+    const float views = from.view_counts[3 * i + c] + in.view_counts[3 * i + c];
+    to.view_counts[3 * i + c] = views;
+    seen[c] = views < 1.f ? 1.f : views;
+  }
+  for (int64_t k = 0; k < entries; k += 3)
+    for (int c = 0; c < 3; c++) {
+      const int64_t e = at + k + c;
+      const float sum = from.basis_sums[e] + in.basis_sums[e], mean = sum / seen[c];
+      const float gradient = in.by_coefficients[e] - mean * by_color[c];
+      const float moment = from.first_moment[e] + now * first_rate * (gradient - from.first_moment[e]);
+      const float direction = moment * scale, step = rate * (direction < -6.f ? -6.f : direction > 6.f ? 6.f : direction);
+      to.basis_sums[e] = sum, to.first_moment[e] = moment, to.coefficients[e] = from.coefficients[e] + step;
+      shift[c] += mean * step;
+    }
+  for (int c = 0; c < 3; c++) in.shift[3 * i + c] = -shift[c];
+}
+
 extern "C" {
+
+// Writes in->after and in->shift; `rate` is the signed learning rate, the others are 1 - decay.
+int genre_sh_step(const ShStepInputs* in, float rate, float first_rate, float second_rate, int threads) {
+  return guarded([&] {
+    each_gaussian(in->count, threads, [&](int64_t i) { sh_step(*in, rate, first_rate, second_rate, i); });
+  });
+}
 
 // Writes in->delta, the learned optimiser's step: 0 for Gaussians that are not visible.
 int genre_network_step(const Network* network, const Scene* scene, const StepInputs* in, int threads) {

@@ -1,0 +1,100 @@
+"""Renders as their images' exposures would show them, and the way back to the scene's own colours.
+
+The render gets the gain, rather than the image losing it: what is clipped in an image cannot be restored. Views are
+taken one by one, each on one thread: most batches also have views without a gain, which need nothing of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from genre_tasks.effects.color_gain import apply_gain, gain_factor
+from genre_tasks.losses.targets import Target
+from genre_tasks.threads import map_single_threaded
+
+CLIPPED = 254.0 / 255
+"""Pixels of an image from here on are taken to be clipped: resizing leaves few of them at exactly 1."""
+
+
+@dataclass(frozen=True)
+class ExposedRenders:
+    """Renders of V views, at the exposures of the images that they are compared with.
+
+    Attributes:
+        targets: V images to compare with.
+        color: [V, H, W, 3] sRGB, not clamped.
+        gains: V log gains [3], ``None`` where an image has none.
+        beyond_clipped: V masks [H, W, 3] of what is brighter than a clipped image, ``None`` where it has no gain.
+    """
+
+    targets: tuple[Target, ...]
+    color: Tensor
+    gains: tuple[Tensor | None, ...]
+    beyond_clipped: tuple[Tensor | None, ...]
+
+    @staticmethod
+    def from_renders(color: Tensor, targets: Sequence[Target]) -> ExposedRenders:
+        """Gives each render its image's gain.
+
+        Where an image is clipped, a brighter render is taken to agree with it: a clipped pixel tells that the scene is
+        at least so bright. Pulled down to 1 by a bright image, a sky would be too dark in those of a shorter exposure.
+
+        Args:
+            color: [V, H, W, 3] in the scene's own colours, sRGB; left as it is, and without its graph.
+            targets: V targets.
+
+        Returns:
+            ExposedRenders: ``color`` itself where no target has a gain.
+        """
+        color = color.detach()
+        gains = tuple(None if target.log_gain is None else color.new_tensor(target.log_gain) for target in targets)
+        if all(gain is None for gain in gains):
+            return ExposedRenders(tuple(targets), color, gains, (None,) * len(gains))
+        exposed = torch.empty_like(color)
+
+        def expose(i: int) -> Tensor | None:
+            gain = gains[i]
+            if gain is None:
+                exposed[i] = color[i]
+                return None
+            image = targets[i].image.pixels
+            shown = apply_gain(color[i], gain)
+            beyond = (image >= CLIPPED) & (shown > image)
+            torch.where(beyond, image, shown, out=exposed[i])
+            return beyond
+
+        beyond_clipped = tuple(map_single_threaded(expose, range(len(targets))))
+        return ExposedRenders(tuple(targets), exposed, gains, beyond_clipped)
+
+    def undo_in_gradient(self, by_color: Tensor) -> None:
+        """Turns the gradient at the exposed renders into that at the scene's own colours, in place.
+
+        Args:
+            by_color: [V, H, W, 3]; 0 afterwards where a render is beyond a clipped image.
+        """
+
+        def undo(i: int) -> None:
+            gain = self.gains[i]
+            beyond = self.beyond_clipped[i]
+            if gain is not None and beyond is not None:
+                by_color[i].mul_(gain_factor(gain)).masked_fill_(beyond, 0.0)
+
+        map_single_threaded(undo, range(len(self.gains)))
+
+    def undo_in_difference(self, difference: Tensor) -> None:
+        """Brings differences of images and exposed renders back to the scene's own colours, in place.
+
+        Args:
+            difference: [V, H, W, 3]. The offset of a gain cancels in it: only its factor is undone.
+        """
+
+        def undo(i: int) -> None:
+            gain = self.gains[i]
+            if gain is not None:
+                difference[i].div_(gain_factor(gain))
+
+        map_single_threaded(undo, range(len(self.gains)))
