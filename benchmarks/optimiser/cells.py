@@ -64,6 +64,7 @@ def race_row(
         The row of the cell, without the log.
     """
     # GNet runs anew in every cell: the machine's speed drifts, and only neighbours in time compare.
+    race.warm_up(task, gnet, order)
     curve = race.run_learned(task, gnet, order)
     goal = curve[-1]
     cap_s = cap * goal.seconds

@@ -32,11 +32,11 @@ _SECONDS_SMALL = {
 _SECONDS_LARGE = {
     "ingest": 12.0,
     "initial": 8.0,
-    "gnet": 43.0,
+    "gnet": 38.0,
     "effects": 41.0,
-    "novel_views": 27.0,
-    "fnet": 90.0,
-    "enet": 143.0,
+    "novel_views": 26.0,
+    "fnet": 86.0,
+    "enet": 109.0,
     "evaluate": 180.0,
 }
 """With the preset ``hd``: 1280×720. FNet takes far longer where ``fnet.max_network_px`` is not set."""
