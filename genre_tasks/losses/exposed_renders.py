@@ -1,7 +1,7 @@
 """Renders as their images' exposures would show them, and the way back to the scene's own colours.
 
-The render gets the gain, rather than the image losing it: what is clipped in an image cannot be restored. Views are
-taken one by one, each on one thread: most batches also have views without a gain, which need nothing of it.
+The render gets the gain, rather than the image losing it: what is clipped in an image cannot be restored. That goes
+for fixed novel views as well, which have no gain and yet end at 1, where the scene's own colours go on.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class ExposedRenders:
         targets: V images to compare with.
         color: [V, H, W, 3] sRGB, not clamped.
         gains: V log gains [3], ``None`` where an image has none.
-        beyond_clipped: V masks [H, W, 3] of what is brighter than a clipped image, ``None`` where it has no gain.
+        beyond_clipped: V masks [H, W, 3] of what is brighter than a clipped image, ``None`` where no image has a gain.
     """
 
     targets: tuple[Target, ...]
@@ -58,11 +58,8 @@ class ExposedRenders:
 
         def expose(i: int) -> Tensor | None:
             gain = gains[i]
-            if gain is None:
-                exposed[i] = color[i]
-                return None
             image = targets[i].image.pixels
-            shown = apply_gain(color[i], gain)
+            shown = color[i] if gain is None else apply_gain(color[i], gain)
             beyond = (image >= CLIPPED) & (shown > image)
             torch.where(beyond, image, shown, out=exposed[i])
             return beyond
@@ -80,8 +77,10 @@ class ExposedRenders:
         def undo(i: int) -> None:
             gain = self.gains[i]
             beyond = self.beyond_clipped[i]
-            if gain is not None and beyond is not None:
-                by_color[i].mul_(gain_factor(gain)).masked_fill_(beyond, 0.0)
+            if gain is not None:
+                by_color[i].mul_(gain_factor(gain))
+            if beyond is not None:
+                by_color[i].masked_fill_(beyond, 0.0)
 
         map_single_threaded(undo, range(len(self.gains)))
 

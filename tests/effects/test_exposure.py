@@ -83,6 +83,18 @@ def test_without_gains_a_clipped_image_is_compared_as_it_is() -> None:
     assert (residual_image(ExposedRenders.from_renders(color, [replace(target, ego_mask=None)]))[0] < 0).all()
 
 
+def test_a_clipped_novel_view_pulls_nothing_down_where_exposures_differ() -> None:
+    """Its scene's own colours go beyond 1, as images of a shorter exposure tell; the fixer's images end there."""
+    targets = [_clipped_target((0.2, 0.2, 0.2)), replace(_clipped_target(None), novel=True)]
+    config = LossConfig(perceptual=0)
+    terms = select_loss_terms(config, targets, 0, torch.Generator(), perceptual=False)
+    color = torch.full((2, 32, 48, 3), 1.3)
+    renders = ExposedRenders.from_renders(color, targets)
+    gradient = image_gradients(config, renders, torch.zeros(2, 32, 48), terms)[1]
+    assert not gradient[:, :, :24].any() and (gradient[:, :, 32:] > 0).all()
+    assert not residual_image(renders)[:, :, :24].any()
+
+
 def test_the_exposures_derivatives_are_those_of_finite_differences() -> None:
     g = torch.Generator().manual_seed(0)
     color = torch.rand(2, 5, 4, 3, generator=g, dtype=torch.float64, requires_grad=True)
