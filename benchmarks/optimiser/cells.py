@@ -63,8 +63,9 @@ def race_row(
     Returns:
         The row of the cell, without the log.
     """
-    # GNet runs anew in every cell: the machine's speed drifts, and only neighbours in time compare.
+    # Otherwise GNet, which runs first, would pay for code that the other methods find loaded.
     race.warm_up(task, gnet, order)
+    # GNet runs anew in every cell: the machine's speed drifts, and only neighbours in time compare.
     curve = race.run_learned(task, gnet, order)
     goal = curve[-1]
     cap_s = cap * goal.seconds

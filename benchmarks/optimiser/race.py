@@ -1,7 +1,7 @@
 """Accuracy over seconds and renders: the unrolled methods and per-scene 3DGS, each as points along its way.
 
 The clock runs from the scene and the decoded images in memory, and includes the loading of weights. It stands still
-while a scene is scored. All methods of a cell find the process warm: the first would pay for the others.
+while a scene is scored.
 """
 
 from __future__ import annotations

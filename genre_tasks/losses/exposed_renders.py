@@ -27,14 +27,14 @@ class ExposedRenders:
     Attributes:
         targets: V images to compare with.
         color: [V, H, W, 3] sRGB, not clamped.
-        gains: V log gains [3], ``None`` where an image has none.
-        beyond_clipped: V masks [H, W, 3] of what is brighter than a clipped image, ``None`` where no image has a gain.
+        gains: V log gains [3], ``None`` for an image without one; empty where no image has a gain.
+        beyond_clipped: V masks [H, W, 3] of what is brighter than a clipped image; empty where no image has a gain.
     """
 
     targets: tuple[Target, ...]
     color: Tensor
     gains: tuple[Tensor | None, ...]
-    beyond_clipped: tuple[Tensor | None, ...]
+    beyond_clipped: tuple[Tensor, ...]
 
     @staticmethod
     def from_renders(color: Tensor, targets: Sequence[Target]) -> ExposedRenders:
@@ -51,12 +51,13 @@ class ExposedRenders:
             ExposedRenders: ``color`` itself where no target has a gain.
         """
         color = color.detach()
+        # Most synthetic logs have no gain at all: nothing is to be done for them here, nor on the way back.
+        if all(target.log_gain is None for target in targets):
+            return ExposedRenders(tuple(targets), color, (), ())
         gains = tuple(None if target.log_gain is None else color.new_tensor(target.log_gain) for target in targets)
-        if all(gain is None for gain in gains):
-            return ExposedRenders(tuple(targets), color, gains, (None,) * len(gains))
         exposed = torch.empty_like(color)
 
-        def expose(i: int) -> Tensor | None:
+        def expose(i: int) -> Tensor:
             gain = gains[i]
             image = targets[i].image.pixels
             shown = color[i] if gain is None else apply_gain(color[i], gain)
@@ -76,11 +77,9 @@ class ExposedRenders:
 
         def undo(i: int) -> None:
             gain = self.gains[i]
-            beyond = self.beyond_clipped[i]
             if gain is not None:
                 by_color[i].mul_(gain_factor(gain))
-            if beyond is not None:
-                by_color[i].masked_fill_(beyond, 0.0)
+            by_color[i].masked_fill_(self.beyond_clipped[i], 0.0)
 
         map_single_threaded(undo, range(len(self.gains)))
 

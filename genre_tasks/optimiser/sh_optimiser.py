@@ -26,6 +26,7 @@ from genre_tasks.optimiser.kernels.library import is_supported
 from genre_tasks.optimiser.state import FIRST_MOMENT_DECAY, SECOND_MOMENT_DECAY
 from genre_tasks.optimiser.step_rules import cosine_decay
 from genre_tasks.scene.graph import SceneGraph
+from genre_tasks.threads import torch_threads
 
 LEARNING_RATE = 0.15
 """Of a first step, in sRGB per unit of a basis function.
@@ -81,10 +82,21 @@ class ShState:
             by_harmonics = (gradients.coefficients, gradients.basis_sums, gradients.view_counts)
             after, shift = sh_step(tensors, by_harmonics, by_colors, -LEARNING_RATE * lr_scale)
             return ShState(*after), shift
-        return self.apply_torch_step(gradients, by_colors, lr_scale)
+        # On one thread, so that the bits of the sums do not depend on the number of threads.
+        with torch_threads(1):
+            return self.apply_torch_step(gradients, by_colors, lr_scale)
 
     def apply_torch_step(self, gradients: ShGradients, by_colors: Tensor, lr_scale: float) -> tuple[ShState, Tensor]:
-        """Does what :meth:`apply_step` does, on any device and in any precision."""
+        """Takes the step of :meth:`apply_step` with torch, on any device and in any precision: the kernel's oracle.
+
+        Args:
+            gradients: of the coefficients.
+            by_colors: [N, 3] gradient of the colours that all views share.
+            lr_scale: factor of the learning rate, in [0, 1].
+
+        Returns:
+            tuple: as :meth:`apply_step`.
+        """
         basis_sums = self.basis_sums + gradients.basis_sums
         view_counts = self.view_counts + gradients.view_counts
         # The mean is over all views so far: the few views of one iteration would all but have a mean of their own.
