@@ -15,25 +15,25 @@ import yaml
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def _run(*command: str) -> None:
+def _assert_runs(*command: str) -> None:
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
 
 
 def test_imports_go_one_way() -> None:
-    _run(str(Path(sys.executable).parent / "lint-imports"))
+    _assert_runs(str(Path(sys.executable).parent / "lint-imports"))
 
 
 def test_ruff_finds_nothing() -> None:
-    _run(sys.executable, "-m", "ruff", "check", ".")
+    _assert_runs(sys.executable, "-m", "ruff", "check", ".")
 
 
 def test_code_is_formatted() -> None:
-    _run(sys.executable, "-m", "ruff", "format", "--check", ".")
+    _assert_runs(sys.executable, "-m", "ruff", "format", "--check", ".")
 
 
 def test_types_hold() -> None:
-    _run(sys.executable, "-m", "mypy")
+    _assert_runs(sys.executable, "-m", "mypy")
 
 
 def test_compose_file_follows_the_specification() -> None:
@@ -91,4 +91,4 @@ def test_help_does_not_load_the_heavy_packages() -> None:
         "heavy = {'torch', 'prefect', 'kornia', 'diffusers', 'pyarrow', 'numpy'} & set(sys.modules)\n"
         "sys.exit(', '.join(sorted(heavy)) or 0)"
     )
-    _run(sys.executable, "-c", code)
+    _assert_runs(sys.executable, "-c", code)

@@ -64,7 +64,7 @@ def _oracle(batch: Batch, config: LossConfig = CONFIG) -> ImageLoss:
     return torch_image_loss(config, color.double(), depth.double(), exact, weights)
 
 
-def _close(ours: ImageLoss, exact: ImageLoss, bound: float = 1e-5) -> None:
+def _assert_close(ours: ImageLoss, exact: ImageLoss, bound: float = 1e-5) -> None:
     assert ours.losses.dtype == torch.float64
     assert ours.losses.tolist() == pytest.approx(exact.losses.tolist(), rel=bound)
     for name in ("color_gradient", "depth_gradient"):
@@ -78,14 +78,14 @@ def _close(ours: ImageLoss, exact: ImageLoss, bound: float = 1e-5) -> None:
 )
 def test_values_and_gradients_are_the_oracles(size: tuple[int, int]) -> None:
     batch = _batch(3, *size)
-    _close(image_loss(CONFIG, *batch), _oracle(batch))
-    _close(image_loss(CONFIG, *_without_statistics(batch)), _oracle(batch))
+    _assert_close(image_loss(CONFIG, *batch), _oracle(batch))
+    _assert_close(image_loss(CONFIG, *_without_statistics(batch)), _oracle(batch))
 
 
 @pytest.mark.parametrize("change", [{"ssim": 0.0}, {"depth": 0.0}, {"rgb": 0.0}, {"rgb": 0.0, "ssim": 0.0}])
 def test_each_term_can_be_left_out(change: dict[str, float]) -> None:
     batch, config = _batch(), CONFIG.model_copy(update=change)
-    _close(image_loss(config, *batch), _oracle(batch, config))
+    _assert_close(image_loss(config, *batch), _oracle(batch, config))
 
 
 @pytest.mark.parametrize("isa", supported_instruction_sets())
@@ -93,8 +93,8 @@ def test_every_instruction_set_is_right(isa: str, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setenv("GENRE_RENDER_ISA", isa)
     monkeypatch.setattr(module, "load_image_loss", load_image_loss.__wrapped__)
     batch = _batch()
-    _close(image_loss(CONFIG, *batch), _oracle(batch))
-    _close(image_loss(CONFIG, *_without_statistics(batch)), _oracle(batch))
+    _assert_close(image_loss(CONFIG, *batch), _oracle(batch))
+    _assert_close(image_loss(CONFIG, *_without_statistics(batch)), _oracle(batch))
 
 
 def test_smooth_images_are_as_exact_as_in_torch() -> None:
@@ -102,8 +102,8 @@ def test_smooth_images_are_as_exact_as_in_torch() -> None:
     x, y = torch.meshgrid(torch.linspace(0, 1, 60), torch.linspace(0, 1, 80), indexing="ij")
     color = torch.stack([x, y, 0.5 * (x + y)], -1)[None]
     batch = color, torch.zeros(1, 60, 80), [_target(color[0] * 0.9 + 0.05)], [1.0]
-    _close(image_loss(CONFIG, *batch), _oracle(batch), 1e-3)
-    _close(image_loss(CONFIG, *_without_statistics(batch)), _oracle(batch), 1e-3)
+    _assert_close(image_loss(CONFIG, *batch), _oracle(batch), 1e-3)
+    _assert_close(image_loss(CONFIG, *_without_statistics(batch)), _oracle(batch), 1e-3)
 
 
 @pytest.mark.parametrize("returns", [0.0, float("nan"), float("inf"), -1.0])

@@ -35,7 +35,7 @@ def fresh(tmp_path_factory: pytest.TempPathFactory):
     return lambda: tmp_path_factory.mktemp("artifact")
 
 
-def there_and_back(kind: str, value: object, folder: Path) -> None:
+def assert_survives_writing(kind: str, value: object, folder: Path) -> None:
     codec = get_codec(kind)
     codec.write(folder, value)
     assert_same(value, codec.read(folder, codec.measurements(value)), kind, COLORS)
@@ -44,32 +44,36 @@ def there_and_back(kind: str, value: object, folder: Path) -> None:
 @SOME
 @given(seed=seeds, frames=st.integers(0, 3), actors=st.integers(0, 3), count=st.integers(0, 9))
 def test_chunk(fresh, seed: int, frames: int, actors: int, count: int) -> None:
-    there_and_back("chunk", values.chunk(np.random.default_rng(seed), frames, actors, count), fresh())
+    assert_survives_writing("chunk", values.chunk(np.random.default_rng(seed), frames, actors, count), fresh())
 
 
 @SOME
 @given(seed=seeds, count=st.integers(0, 9), actors=st.integers(0, 3), snapshots=st.integers(0, 3))
 def test_reconstruction(fresh, seed: int, count: int, actors: int, snapshots: int) -> None:
     value = values.reconstruction(np.random.default_rng(seed), count, actors, snapshots)
-    there_and_back("reconstruction", value, fresh())
+    assert_survives_writing("reconstruction", value, fresh())
 
 
 @SOME
 @given(seed=seeds, count=st.integers(0, 2), width=st.integers(1, 20), height=st.integers(1, 20))
 def test_novel_views(fresh, seed: int, count: int, width: int, height: int) -> None:
-    there_and_back("novel_views", values.novel_views(np.random.default_rng(seed), count, width, height), fresh())
+    assert_survives_writing(
+        "novel_views", values.novel_views(np.random.default_rng(seed), count, width, height), fresh()
+    )
 
 
 @SOME
 @given(seed=seeds, count=st.integers(0, 2), width=st.integers(1, 20), height=st.integers(1, 20))
 def test_fixed_views(fresh, seed: int, count: int, width: int, height: int) -> None:
-    there_and_back("fixed_views", values.fixed_views(np.random.default_rng(seed), count, width, height), fresh())
+    assert_survives_writing(
+        "fixed_views", values.fixed_views(np.random.default_rng(seed), count, width, height), fresh()
+    )
 
 
 @SOME
 @given(seed=seeds, count=st.integers(0, 3))
 def test_evaluation(fresh, seed: int, count: int) -> None:
-    there_and_back("evaluation", values.evaluation(np.random.default_rng(seed), count), fresh())
+    assert_survives_writing("evaluation", values.evaluation(np.random.default_rng(seed), count), fresh())
 
 
 @SOME
