@@ -147,8 +147,8 @@ class Optimiser:
             methods = [method for method in methods if method in CLAIMED]
         # Per-scene methods run until the cap, so it decides how long a quick run takes.
         cap = min(float(options["cap"]), QUICK_CAP) if quick else float(options["cap"])
-        caps = {method: float(options["adam_cap"]) if method in ADAM else cap for method in METHODS}
-        factory = _CellFactory(options["store"], cap, caps, quick, settings_from_options(options))
+        settings = settings_from_options(options)
+        factory = _CellFactory(options["store"], cap, float(options["adam_cap"]), quick, settings)
         network = factory.network(3 if quick else 9)
         out: list[Cell] = []
         if "trade" in parts:
@@ -182,14 +182,11 @@ class Optimiser:
 class _CellFactory:
     """Makes the cells, each with a prediction of its seconds from its renders and steps."""
 
-    def __init__(
-        self, store: str, cap: float, race_caps: Mapping[str, float], quick: bool, over_preset: tuple[str, ...]
-    ) -> None:
+    def __init__(self, store: str, cap: float, adam_cap: float, quick: bool, over_preset: tuple[str, ...]) -> None:
         self._store = store
         self._cap = cap
-        # A race's cap by method: tuned Adam at constant rates never ends, and gains nothing after a few times GNet's
-        # seconds.
-        self._race_caps = race_caps
+        # Tuned Adam at constant rates never ends, and gains nothing after a few times GNet's seconds.
+        self._adam_cap = adam_cap
         self._quick = quick
         self._over_preset = over_preset
         small = load_configuration("small", settings=over_preset)
@@ -218,7 +215,7 @@ class _CellFactory:
     def race(self, log: str, chunk: int, order: int, method: str) -> Cell:
         """Makes the race of one method on one log."""
         configs = variants(method)
-        cap = self._race_caps[method]
+        cap = self._adam_cap if method in ADAM else self._cap
         seconds = self._gnet_s + sum(_baseline_s(c, self._gnet_s, cap) for c in configs.values())
         measure = partial(measure_race, log, chunk, self._store, order, method, cap, self._over_preset)
         values = {name: config.model_dump(mode="json") for name, config in configs.items()}

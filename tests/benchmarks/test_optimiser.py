@@ -235,6 +235,12 @@ def test_options_choose_cells_and_a_quick_run_ends_in_time() -> None:
     assert len({c.name for c in full}) == len(full)
 
 
+def test_tuned_adam_has_a_cap_of_its_own() -> None:
+    listed = BENCH.cells({**BENCH.options, "parts": "race", "orders": "0", "cap": "50", "adam_cap": "5"}, False)
+    caps = {cell.name.rsplit(" ", 1)[1]: cell.parameters["cap"] for cell in listed if " order " in cell.name}
+    assert caps == {"tuned_adam": 5.0, "tuned_adam_split": 5.0, "standard_3dgs": 50.0, "street_gs": 50.0}
+
+
 def test_what_would_not_end_in_the_minutes_given_is_left_out() -> None:
     given = {**BENCH.options, "seeds": "900", "pandaset": "", "minutes": "0.1"}
     with pytest.raises(NotMeasuredError, match="minutes given"):
