@@ -99,6 +99,7 @@ def test_every_renamed_key_leads_to_a_key_that_exists() -> None:
     for new in RENAMED_KEYS.values():
         model: Any = PipelineConfig
         for part in new.split("."):
+            assert part in model.model_fields, new
             field = model.model_fields[part]
             model, _ = section_type(field.annotation)
 

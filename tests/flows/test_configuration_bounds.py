@@ -53,7 +53,7 @@ def list_numbers(value: object) -> Iterator[float]:
         yield value
 
 
-def holds_in_json(config: BaseModel) -> None:
+def assert_survives_json(config: BaseModel) -> None:
     text = json.dumps(config.model_dump(mode="json"), allow_nan=False)
     text.encode()
     assert type(config).model_validate(json.loads(text)) == config
@@ -69,12 +69,12 @@ def test_what_is_accepted_is_finite_and_survives_json(path: tuple[str, ...], val
         config = PipelineConfig.model_validate(nested(path, value))
     except ValidationError:
         return
-    holds_in_json(config)
+    assert_survives_json(config)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_presets_survive_json(preset: str) -> None:
-    holds_in_json(load_configuration(preset))
+    assert_survives_json(load_configuration(preset))
 
 
 @pytest.mark.parametrize("path", sorted(FIELDS), ids=".".join)
@@ -124,7 +124,7 @@ def test_the_range_is_bounded_too() -> None:
     for values in ({"shifts_m": []}, {"max_drop_db": math.inf}, {"every": 0}, {"max_thin": 1.5}):
         with pytest.raises(ValidationError):
             RangeConfig.model_validate(values)
-    holds_in_json(RangeConfig())
+    assert_survives_json(RangeConfig())
 
 
 def test_a_path_may_begin_at_home(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -47,7 +47,7 @@ def band_mask(like: Tensor, bands: tuple[int, ...] | None) -> Tensor:
     return chosen[None, :, None].expand(like.shape)
 
 
-def compare(case: Case, backend: str, stability) -> None:
+def assert_matches_float64(case: Case, backend: str, stability) -> None:
     """Finite everywhere, alpha in [0, 1], the same Gaussians culled, image and gradients within the case's bounds."""
     if backend == "reference" and not case.light:
         pytest.skip("takes long and shows nothing new")

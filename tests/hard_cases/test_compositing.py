@@ -12,7 +12,7 @@ from genre_tasks.render import Cameras, render
 from genre_tasks.render import constants as const
 from genre_tasks.scene.gaussians import Splats
 from tests.hard_cases.case_measurements import ALPHA_BOUND, DIFFERENCES, HALF, NO_WEIGHT
-from tests.hard_cases.comparison import REFERENCE, SETTINGS, compare, on_all, on_both, worst
+from tests.hard_cases.comparison import REFERENCE, SETTINGS, assert_matches_float64, on_all, on_both, worst
 from tests.hard_cases.render_cases import COMPOSITING, layers
 from tests.render.oracles import agreement, alpha_excess, survey
 from tests.scenes import NAMES, Scene, cloud, gradients, street
@@ -21,7 +21,7 @@ from tests.scenes import NAMES, Scene, cloud, gradients, street
 @on_all
 @pytest.mark.parametrize("case", COMPOSITING, ids=lambda c: f"{c.number} {c.words}")
 def test_against_float64(case, backend, stability):
-    compare(case, backend, stability)
+    assert_matches_float64(case, backend, stability)
 
 
 def _stack(opacities: list[float], size_px: float) -> Scene:

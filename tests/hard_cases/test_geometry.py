@@ -18,9 +18,9 @@ from tests.hard_cases.case_measurements import FAR_WORLD, HIDDEN, NEEDLES_ONLY, 
 from tests.hard_cases.comparison import (
     REFERENCE,
     SETTINGS,
+    assert_matches_float64,
     band_mask,
     changed_bits,
-    compare,
     different,
     joined,
     on_all,
@@ -35,7 +35,7 @@ from tests.scenes import NAMES, Scene, cloud, gradients, street
 @on_all
 @pytest.mark.parametrize("case", GEOMETRY, ids=lambda c: f"{c.number} {c.words}")
 def test_against_float64(case, backend, stability):
-    compare(case, backend, stability)
+    assert_matches_float64(case, backend, stability)
 
 
 @on_both

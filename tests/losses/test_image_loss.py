@@ -174,7 +174,9 @@ def test_tensors_need_not_be_contiguous() -> None:
     assert torch.equal(image_loss(CONFIG, *strided).depth_gradient, image_loss(CONFIG, *batch).depth_gradient)
 
 
-def _refused(color: Tensor, depth: Tensor, targets: Sequence[Target], weights: Sequence[float], match: str) -> None:
+def _assert_refused(
+    color: Tensor, depth: Tensor, targets: Sequence[Target], weights: Sequence[float], match: str
+) -> None:
     with pytest.raises(ValueError, match=match):
         image_loss(CONFIG, color, depth, targets, weights)
 
@@ -182,15 +184,17 @@ def _refused(color: Tensor, depth: Tensor, targets: Sequence[Target], weights: S
 def test_what_does_not_fit_is_refused() -> None:
     color, depth, targets, weights = _batch()
     other = _batch(height=36)[2]
-    _refused(color[0], depth, targets, weights, r"expected colour \[V, H, W, 3\]")
-    _refused(color, depth[:, 1:], targets, weights, "expected colour")
-    _refused(color, depth, targets[:2], weights, "expected 3 targets and weights, got 2 and 3")
-    _refused(color, depth, targets, weights[:2], "expected 3 targets and weights, got 3 and 2")
-    _refused(color, depth, other, weights, r"expected a target image of shape \(37, 53, 3\), got \(36, 53, 3\)")
+    _assert_refused(color[0], depth, targets, weights, r"expected colour \[V, H, W, 3\]")
+    _assert_refused(color, depth[:, 1:], targets, weights, "expected colour")
+    _assert_refused(color, depth, targets[:2], weights, "expected 3 targets and weights, got 2 and 3")
+    _assert_refused(color, depth, targets, weights[:2], "expected 3 targets and weights, got 3 and 2")
+    _assert_refused(color, depth, other, weights, r"expected a target image of shape \(37, 53, 3\), got \(36, 53, 3\)")
     lacking = replace(targets[0], image=replace(targets[0].image, mean=other[0].image.mean))
-    _refused(color, depth, [lacking, *targets[1:]], weights, "expected a target mean")
-    _refused(color, depth, [replace(targets[0], depth=other[0].depth), *targets[1:]], weights, "LiDAR depth of shape")
-    _refused(color.double(), depth, targets, weights, "float32")
+    _assert_refused(color, depth, [lacking, *targets[1:]], weights, "expected a target mean")
+    _assert_refused(
+        color, depth, [replace(targets[0], depth=other[0].depth), *targets[1:]], weights, "LiDAR depth of shape"
+    )
+    _assert_refused(color.double(), depth, targets, weights, "float32")
 
 
 def test_it_is_for_float32_on_the_cpu() -> None:
