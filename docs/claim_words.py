@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from benchmarks.effects.cases import CASES
+
 CLAIM_WORDS = {
     "main.gnet_over_initial_db": "GNet gains over the initial scene, held-out frames",
     "main.gnet_vs_adam_db": "GNet gains over tuned Adam with as many renders",
@@ -44,6 +46,29 @@ CLAIM_WORDS = {
     "full_size.kernel_cut": "What ENet takes off GNet's kernel distance at 3 m",
     "full_size.heldout_gain": "Held-out PSNR, ENet minus GNet",
     "full_size.perceptual_gain": "Held-out perceptual distance, `hd` less than images of `small` scaled up",
+    "fixer.psnr_3m": "FNet over the renders at 3 m",
+    "fixer.perceptual_3m": "Part of the renders' perceptual distance at 3 m that FNet takes away",
+    "fixer.psnr_3m_loose": "FNet over the renders at 3 m, scenes whose ground is not held",
+    "fixer.perceptual_3m_loose": "Part of the perceptual distance that FNet takes away, ground not held",
+    "fixer.identity": "PSNR of what FNet makes of a true image, worst view",
+    "fixer.vs_src": "FNet over a fixer of the render alone, trained as long, lower end of the interval",
+    "fixer.vs_src_ref": "FNet over a fixer of render and reference, trained as long",
+    "fixer.vs_src_ref_low": "The same, lower end of the interval",
+    "fixer.vs_ref_lidar": "FNet over a fixer of reference and LiDAR, trained as long, lower end of the interval",
+    "fixer.real_kernel_1m": "Kernel distance at 1 m, FNet minus renders, upper end of the interval",
+    "fixer.real_kernel_2m": "Kernel distance at 2 m, FNet minus renders, upper end of the interval",
+    "fixer.real_kernel_3m": "Kernel distance at 3 m, FNet minus renders, upper end of the interval",
+    "fixer.flicker": "Difference between consecutive frames, fixed over renders, worst log",
+    "fixer.no_view_worse": "Rise of a view's perceptual distance by fixing, worst view at 0.25 to 3 m",
+    "fixer.seconds_per_frame": "Seconds a view",
+    "ground.street_heldout_db": "Streets: held-out PSNR of GNet, ground held less not held",
+    "ground.street_3m_db": "Streets: PSNR of GNet at 3 m, ground held less not held",
+    "ground.real_heldout_db": "Real chunk: held-out PSNR of GNet, ground held less not held",
+    "facades.street_heldout_db": "Streets: held-out PSNR of GNet, façades completed less not",
+    "facades.street_3m_db": "Streets: PSNR of GNet at 3 m, façades completed less not",
+    "facades.real_heldout_db": "Real chunk: held-out PSNR of GNet, façades completed less not",
+    "effects.plain_cost": "Instructions of a street without actors, given its plan, over one without a plan",
+    "effects.auto_vs_on": "Streets with every effect: held-out PSNR, all set on less as planned",
     "start_up.cached_run_s": "Seconds of a run that finds every stage in the store",
     "start_up.api_s": "Seconds until Prefect's local API answers",
     "start_up.first_api_s": "Seconds until Prefect's local API answers, at its first start ever",
@@ -104,5 +129,13 @@ CLAIM_WORDS = {
     "scale.cluster_lost": "Stages lost in the simulated dataset",
     "scale.cluster_doubled": "Stages of the simulated dataset that the store holds twice",
     "scale.fuzz_findings": "Damaged and harmful files that are a finding",
+}
+CLAIM_WORDS |= {
+    f"effects.{kind}_{name}": f"{name.replace('_', ' ').capitalize()}: {words}"
+    for name in CASES
+    for kind, words in (
+        ("gain", "gain on streets that call for it"),
+        ("loss", "gain that leaving it out of other streets gives away"),
+    )
 }
 """What each claim says, for people. A claim without words is an error."""

@@ -78,6 +78,8 @@ def claims(name: str, several: str = "logs") -> str:
         values = ", ".join(number(m) for m in measured) or "not measured"
         held = sum(c["holds"] for c in found)
         verdict = "yes" if held == len(found) else "**missed**" if held == 0 else f"**{held} of {len(found)}**"
+        # A number that nobody took neither holds nor misses.
+        verdict = verdict if measured else "–"
         unit = {"share": "", "ratio": "", "share of runs": ""}.get(found[0]["unit"], found[0]["unit"])
         runs = ", ".join(str(c["n"]) for c in found) if len(found) == 1 else f"{len(found)} {several}"
         target = f"{found[0]['op']} {found[0]['target']:g} {unit}".strip()

@@ -50,14 +50,14 @@ def render_page(
         "",
         "measured / the paper's. " + _legend(layout),
         "",
-        *_papers_table(layout, cells, missing),
+        *render_papers_columns(layout, cells, missing),
         "",
         *layout.notes,
     ]
     if layout.notes:
         lines.append("")
     lines += [
-        *_extra_table(layout, cells),
+        *render_extra_columns(layout, cells),
         *_method_notes(layout, missing),
         "Not comparable with the paper's numbers:",
         "",
@@ -132,7 +132,14 @@ def _has_per_scene_method(layout: Layout) -> bool:
     return any(per_scene.intersection(r.method.settings) for r in layout.rows)
 
 
-def _papers_table(layout: Layout, cells: Sequence[MeasuredCell], missing: Mapping[str, str]) -> Iterator[str]:
+def render_papers_columns(layout: Layout, cells: Sequence[MeasuredCell], missing: Mapping[str, str]) -> Iterator[str]:
+    """Writes the lines of the table that the paper has too, the measured mean before the paper's number.
+
+    Args:
+        layout: the table.
+        cells: what was measured.
+        missing: label of a row → why it was not measured.
+    """
     means = {(r.label, c.key): mean_over_cells(c, _cells_of(r, cells)) for r in layout.rows for c in layout.columns}
     best = {c.key: _best([means[r.label, c.key] for r in layout.rows], c) for c in layout.columns}
     printed = PAPER[layout.number].rows
@@ -151,8 +158,13 @@ def _papers_table(layout: Layout, cells: Sequence[MeasuredCell], missing: Mappin
         yield f"| {row.label} | " + " | ".join(values) + " |"
 
 
-def _extra_table(layout: Layout, cells: Sequence[MeasuredCell]) -> Iterator[str]:
-    """Shows what the paper's table does not have, where it could be measured."""
+def render_extra_columns(layout: Layout, cells: Sequence[MeasuredCell]) -> Iterator[str]:
+    """Writes what the paper's table does not have, where it could be measured.
+
+    Args:
+        layout: the table.
+        cells: what was measured.
+    """
     columns = [
         c
         for c in layout.extra_columns

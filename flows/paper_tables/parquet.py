@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 
 from flows.paper_tables.columns import MeasuredCell
 from flows.paper_tables.layouts import Layout, Row
 from flows.paper_tables.published_numbers import PAPER
-from storage.codecs.tables import column, schema, write_table
+from storage.codecs.tables import column, read_table, schema, write_table
 
 CELLS = schema(
     "paper_table/1",
@@ -75,6 +77,47 @@ def write_cells(
         "paper": [_to_json(PAPER[layout.number].rows.get(r.paper, {})) for r, _ in lines],
     }
     write_table(path, CELLS, columns, facts)
+
+
+def read_cells(path: Path) -> tuple[list[MeasuredCell], dict[str, str], dict[str, str]]:
+    """Reads what :func:`write_cells` wrote.
+
+    Args:
+        path: the Parquet file.
+
+    Returns:
+        (measured cells, label of a row → why it was not measured, facts).
+
+    Raises:
+        ArtifactCorruptError: the file is missing or damaged.
+    """
+    table, facts = read_table(path, CELLS)
+    cells = []
+    missing = {}
+    for line in table.to_pylist():
+        if line["log"]:
+            cells.append(_to_cell(line))
+        # A row that was neither measured nor found wanting has no reason.
+        elif line["not_measured"]:
+            missing[line["method"]] = line["not_measured"]
+    return cells, missing, facts
+
+
+def _to_cell(line: Mapping[str, Any]) -> MeasuredCell:
+    return MeasuredCell(
+        method=line["method"],
+        log=line["log"],
+        chunk=line["chunk"],
+        seconds=_from_json(line["seconds"]),
+        cpu_seconds=_from_json(line["cpu_seconds"]),
+        metrics=_from_json(line["metrics"]),
+        gaussians=line["gaussians"],
+        fixed_views=line["fixed"],
+    )
+
+
+def _from_json(text: str) -> dict[str, float]:
+    return {k: math.nan if v is None else v for k, v in json.loads(text).items()}
 
 
 def _to_json(values: Mapping[str, float]) -> str:

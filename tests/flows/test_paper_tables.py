@@ -26,6 +26,7 @@ from flows.paper_tables.measure import Basis, list_stages, measure_cell
 from flows.paper_tables.methods import Method
 from flows.paper_tables.page import list_differences, render_page
 from flows.paper_tables.page_sections import replace_section
+from flows.paper_tables.parquet import read_cells
 from flows.paper_tables.published_numbers import PAPER
 from flows.paper_tables.request import CheckedRequest, TableRequest, find_unstored_methods, predict_table
 from flows.paper_tables.user_methods import read_method
@@ -252,6 +253,10 @@ def test_the_files_say_the_same(tmp_path: Path) -> None:
     assert json.loads(table["metrics"][0])["shift_3m/kernel"] == pytest.approx(0.9)
     assert json.loads(table["cpu_seconds"][0])["gnet"] is None
     assert json.loads(table["paper"][1])["fid_3m"] == 99.69
+    cells, missing, facts = read_cells(Path(files[0]))
+    assert [(c.method, c.chunk, c.metrics["shift_3m/kernel"]) for c in cells] == [("3DGS", 0, pytest.approx(0.9))]
+    assert math.isnan(cells[0].cpu_seconds["gnet"]) and missing == planned.missing
+    assert facts["command"] == f"`{request.command}`"
     text = Path(files[1]).read_text()
     assert text.strip() in Path(files[2]).read_text()
     for said in ("0.900 / 154.21", "measured at night", "genre table 2", "--set gnet.iterations=7"):
