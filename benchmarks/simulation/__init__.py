@@ -57,7 +57,7 @@ from genre_tasks.config import PipelineConfig
 _BEHAVIOURS_S = 500.0
 _REMOVAL_S = 60.0
 _INSERTION_S = 45.0
-_FLICKER_S = 60.0
+_FLICKER_S = 240.0
 _HANDOVER_S = 35.0
 _PLAUSIBILITY_S = 30.0
 _REFUSALS_S = 4.0

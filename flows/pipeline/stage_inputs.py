@@ -19,7 +19,6 @@ from flows.pipeline.memory_plan import (
     predict_memory,
 )
 from genre_tasks.config import PipelineConfig
-from genre_tasks.image_memory import hold_images_on_disk
 from storage.store import Artifact, Store
 
 _IMAGE_STAGES = ("novel_views", "fnet")
@@ -79,6 +78,9 @@ def open_inputs(
         reuse_freed_memory()
     else:
         return_freed_memory()
+    # Here and not above: it imports torch, which commands that only read records would wait seconds for.
+    from genre_tasks.image_memory import hold_images_on_disk
+
     with hold_images_on_disk(store.scratch_folder if on_disk else None):
         values |= {name: store.read(artifacts[name]) for name in spec.inputs if name in _IMAGE_STAGES}
         yield StageInputs(values, memory, on_disk)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,20 @@ from tests.storage.artifact_values import MAKERS, make
 
 def show(*words: str) -> Result:
     return CliRunner().invoke(app, ["show", *words], catch_exceptions=False, env={"COLUMNS": "200"})
+
+
+def test_the_table_of_a_run_needs_no_torch(tmp_path: Path) -> None:
+    write_run(tmp_path, 1)
+    code = (
+        "import sys\n"
+        "from typer.testing import CliRunner\n"
+        "from flows.cli.main import app\n"
+        f"done = CliRunner().invoke(app, ['show', 'abcdef012345', '--store', {str(tmp_path)!r}])\n"
+        "assert done.exit_code == 0, done.output\n"
+        "sys.exit('torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def write_run(store: Path, chunks: int) -> None:
