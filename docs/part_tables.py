@@ -7,7 +7,7 @@ from statistics import fmean, median
 from typing import Any
 
 from docs.result_tables import claims as claims_of
-from docs.result_tables import provenance, result, short_log, table
+from docs.result_tables import result, short_log, table
 
 _DASH = "–"
 
@@ -43,7 +43,7 @@ def fixer_logs() -> str:
         "flicker, fixed over render",
         "seconds a view",
     ]
-    return table(head, lines) + "\n" + provenance("fixer")
+    return table(head, lines)
 
 
 def _before_and_after(scores: Mapping[str, Any]) -> list[str]:

@@ -62,6 +62,10 @@ def provenance(name: str) -> str:
     )
 
 
+_UNITS_OF_NO_WORD = ("share", "ratio", "share of runs", "part", "distance")
+"""Units that a claim's words say already."""
+
+
 def claims(name: str, several: str = "logs") -> str:
     """Every claim of a benchmark: target, measured number, and whether it holds. Claims of one id share a row.
 
@@ -80,7 +84,8 @@ def claims(name: str, several: str = "logs") -> str:
         verdict = "yes" if held == len(found) else "**missed**" if held == 0 else f"**{held} of {len(found)}**"
         # A number that nobody took neither holds nor misses.
         verdict = verdict if measured else "–"
-        unit = {"share": "", "ratio": "", "share of runs": ""}.get(found[0]["unit"], found[0]["unit"])
+        unit = found[0]["unit"]
+        unit = "" if unit in _UNITS_OF_NO_WORD else unit
         runs = ", ".join(str(c["n"]) for c in found) if len(found) == 1 else f"{len(found)} {several}"
         target = f"{found[0]['op']} {found[0]['target']:g} {unit}".strip()
         rows.append([CLAIM_WORDS[claim_id], target, values, runs, verdict])
