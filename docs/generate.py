@@ -18,6 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from docs import (
+    effect_tables,
     exchange_tables,
     fault_tables,
     full_size_tables,
@@ -46,6 +47,10 @@ BLOCKS: Mapping[str, Callable[[], str]] = {
     "raster-claims": lambda: result_tables.claims("raster"),
     "start-up-claims": lambda: result_tables.claims("start_up"),
     "budget-runs": result_tables.budget_runs,
+    "effects-claims": effect_tables.claims,
+    "effects-real": effect_tables.on_real_chunks,
+    "effects-streets": effect_tables.on_streets,
+    "effects-whole-plans": effect_tables.whole_plans,
     "evaluation-claims": lambda: result_tables.claims("evaluation"),
     "full-size-claims": full_size_tables.claims,
     "full-size-memory": full_size_tables.memory,
