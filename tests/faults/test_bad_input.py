@@ -36,7 +36,7 @@ class Hostile:
         return os.system, ("touch hostile-was-here",)
 
 
-def refused(folder: Path, *args: str, words: tuple[str, ...]) -> None:
+def assert_refused(folder: Path, *args: str, words: tuple[str, ...]) -> None:
     done = small_run.genre(folder, *args)
     assert done.returncode not in (0, -9), done.stdout
     # One object, which says the same as the line on stderr.
@@ -57,23 +57,23 @@ def run_of(log: Path | str, store: Path, *more: str) -> list[str]:
 
 
 def test_no_such_log(tmp_path: Path) -> None:
-    refused(tmp_path, *run_of(tmp_path / "nowhere", tmp_path / "store"), words=("error:", "nowhere"))
+    assert_refused(tmp_path, *run_of(tmp_path / "nowhere", tmp_path / "store"), words=("error:", "nowhere"))
 
 
 def test_unknown_reader(tmp_path: Path) -> None:
-    refused(tmp_path, *run_of("pandset:x/002", tmp_path / "store"), words=("pandset", "pandaset"))
+    assert_refused(tmp_path, *run_of("pandset:x/002", tmp_path / "store"), words=("pandset", "pandaset"))
 
 
 def test_unknown_configuration_key(tmp_path: Path) -> None:
     more = ("--set", "gnet.iteratons=8")
-    refused(
+    assert_refused(
         tmp_path, *run_of(STREET, tmp_path / "store", *more), words=("gnet.iteratons", "Did you mean 'gnet.iterations'")
     )
 
 
 @pytest.mark.slow
 def test_no_lidar(tmp_path: Path) -> None:
-    refused(tmp_path, *run_of(STREET + "&lidar=0", tmp_path / "store"), words=("LiDAR", "ingest.points"))
+    assert_refused(tmp_path, *run_of(STREET + "&lidar=0", tmp_path / "store"), words=("LiDAR", "ingest.points"))
 
 
 @pytest.mark.slow
@@ -81,7 +81,7 @@ def test_a_corrupt_image_under_strict(log: Path, tmp_path: Path) -> None:
     file = log / "camera/front_camera/04.png"
     file.write_bytes(file.read_bytes()[:300])
     words = ("frame 4", "front_camera", "strict")
-    refused(tmp_path, *run_of(log, tmp_path / "store", "--strict"), words=words)
+    assert_refused(tmp_path, *run_of(log, tmp_path / "store", "--strict"), words=words)
 
 
 @pytest.mark.slow
@@ -90,14 +90,14 @@ def test_a_pose_that_is_not_a_number(log: Path, tmp_path: Path) -> None:
     poses = json.loads(file.read_text())
     poses[4]["position"]["x"] = float("nan")
     file.write_text(json.dumps(poses))
-    refused(tmp_path, *run_of(log, tmp_path / "store", "--strict"), words=("poses.json", "frame 4"))
+    assert_refused(tmp_path, *run_of(log, tmp_path / "store", "--strict"), words=("poses.json", "frame 4"))
 
 
 @pytest.mark.slow
 def test_a_pickle_that_tries_to_run_code(log: Path, tmp_path: Path) -> None:
     with gzip.open(log / "lidar/02.pkl.gz", "wb") as stream:
         pickle.dump(Hostile(), stream)
-    refused(tmp_path, *run_of(log, tmp_path / "store", "--strict"), words=("02.pkl.gz", "system"))
+    assert_refused(tmp_path, *run_of(log, tmp_path / "store", "--strict"), words=("02.pkl.gz", "system"))
     assert not (tmp_path / "hostile-was-here").exists()
 
 

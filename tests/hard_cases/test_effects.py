@@ -90,3 +90,4 @@ def test_a_readout_of_0_is_no_shutter(backend, stability):
         image, found = gradients(splats, one, SETTINGS[backend])
         changed = different(plain, image) + sum(changed_bits(found[n], expected[n]) for n in NAMES)
         stability.record(NO_READOUT, backend, changed)
+        assert changed == 0

@@ -140,4 +140,4 @@ def test_a_camera_that_sees_its_own_bonnet(tmp_path: Path) -> None:
         pixels = np.array(Image.open(io.BytesIO(file.read_bytes())))
         pixels[-8:] = (20, 22, 30)
         Image.fromarray(pixels).save(file)
-    whole_run(tmp_path, log)
+    assert set(whole_run(tmp_path, log)) == {spec.name for spec in PIPELINE}

@@ -35,11 +35,13 @@ def active_slots() -> int:
 def test_a_stage_without_a_limit_needs_no_server(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(GPU_LIMIT_VARIABLE, raising=False)
     monkeypatch.setenv("PREFECT_API_URL", "http://127.0.0.1:9/api")
+    entered = []
     with gpu_slot("gnet"):
-        pass
+        entered.append("gnet")
     monkeypatch.setenv(GPU_LIMIT_VARIABLE, LIMIT)
     with gpu_slot("ingest"):
-        pass
+        entered.append("ingest")
+    assert entered == ["gnet", "ingest"]
 
 
 def _refuse(status: int) -> httpx.HTTPStatusError:
