@@ -12,6 +12,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -65,11 +66,7 @@ BLOCKS: Mapping[str, Callable[[], str]] = {
     "facades": part_tables.facades,
     "log-faults": result_tables.log_faults,
     "log-faults-claims": lambda: result_tables.claims("log_faults"),
-    "paper-table-1": lambda: published_tables.published_table(1),
-    "paper-table-2": lambda: published_tables.published_table(2),
-    "paper-table-3": lambda: published_tables.published_table(3),
-    "paper-table-4": lambda: published_tables.published_table(4),
-    "paper-table-5": lambda: published_tables.published_table(5),
+    **{f"paper-table-{number}": partial(published_tables.published_table, number) for number in range(1, 6)},
     "perception-claims": perception_tables.claims,
     "perception-differences": perception_tables.differences,
     "perception-ranges": perception_tables.ranges,

@@ -14,25 +14,20 @@ _DASH = "–"
 
 def fixer_claims() -> str:
     """Claims on the fixer, over the views of all logs."""
-    return claims_of("fixer", "shifts")
+    return claims_of("fixer")
 
 
 def fixer_logs() -> str:
     """Renders and fixed views at 3 m, log by log, and where the ground is not held."""
     lines = []
     for row in result("fixer")["rows"]:
-        flicker = row["flicker"]
-        seconds = median(row["time"]["seconds"]) / row["time"]["views"]
+        seconds = f"{median(row['time']['seconds']) / row['time']['views']:.2f}"
         # A log without a true image has kernel distances instead, which are a table of their own.
-        for scene, ground in (("truth", "held"), ("loose", "not held")):
-            if scene in row:
-                lines.append([short_log(row), ground, *_before_and_after(row[scene]), *[_DASH] * 2])
-        if "truth" in row:
-            true = flicker["truth"] / flicker["render"]
-            lines[-2][-2:] = [f"{flicker['fixed'] / flicker['render']:.2f} (true: {true:.2f})", f"{seconds:.2f}"]
-        else:
-            ratio = f"{flicker['fixed'] / flicker['render']:.2f}"
-            lines.append([short_log(row), "held", *[_DASH] * 4, ratio, f"{seconds:.2f}"])
+        held = _before_and_after(row["truth"]) if "truth" in row else [_DASH] * 4
+        lines.append([short_log(row), "held", *held, _flicker(row["flicker"]), seconds])
+        if "loose" in row:
+            # Flicker and seconds are measured on scenes whose ground is held.
+            lines.append([short_log(row), "not held", *_before_and_after(row["loose"]), _DASH, _DASH])
     head = [
         "log",
         "ground",
@@ -44,6 +39,12 @@ def fixer_logs() -> str:
         "seconds a view",
     ]
     return table(head, lines)
+
+
+def _flicker(found: Mapping[str, float]) -> str:
+    """Flicker of fixed views over that of renders, and that of true images where there are any."""
+    fixed = f"{found['fixed'] / found['render']:.2f}"
+    return f"{fixed} (true: {found['truth'] / found['render']:.2f})" if "truth" in found else fixed
 
 
 def _before_and_after(scores: Mapping[str, Any]) -> list[str]:

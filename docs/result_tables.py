@@ -62,7 +62,7 @@ def provenance(name: str) -> str:
     )
 
 
-_UNITS_OF_NO_WORD = ("share", "ratio", "share of runs", "part", "distance")
+_UNITS_WITHOUT_WORD = ("share", "ratio", "share of runs", "part", "distance")
 """Units that a claim's words say already."""
 
 
@@ -85,7 +85,7 @@ def claims(name: str, several: str = "logs") -> str:
         # A number that nobody took neither holds nor misses.
         verdict = verdict if measured else "–"
         unit = found[0]["unit"]
-        unit = "" if unit in _UNITS_OF_NO_WORD else unit
+        unit = "" if unit in _UNITS_WITHOUT_WORD else unit
         runs = ", ".join(str(c["n"]) for c in found) if len(found) == 1 else f"{len(found)} {several}"
         target = f"{found[0]['op']} {found[0]['target']:g} {unit}".strip()
         rows.append([CLAIM_WORDS[claim_id], target, values, runs, verdict])
