@@ -44,6 +44,7 @@ BLOCKS: Mapping[str, Callable[[], str]] = {
     "pipeline-claims": lambda: result_tables.claims("pipeline"),
     "optimiser-claims": lambda: result_tables.claims("optimiser"),
     "optimiser-logs": result_tables.optimiser_logs,
+    "raster-machines": result_tables.raster_machines,
     "raster-times": result_tables.raster_times,
     "raster-claims": lambda: result_tables.claims("raster"),
     "start-up-claims": lambda: result_tables.claims("start_up"),

@@ -219,6 +219,28 @@ def raster_times() -> str:
     return table(["Gaussians", "what, threads", "median, ms", "quartiles, ms", "n"], lines)
 
 
+RASTER_MACHINES = ("raster", "raster_xeon")
+"""Results of ``genre bench raster`` on different machines; the first one's are the page's."""
+
+
+def raster_machines() -> str:
+    """The renderer's claims on each machine, and how fast each multiplies matrices and copies memory."""
+    found = [result(name) for name in RASTER_MACHINES]
+    claims_by_id = [{claim["id"]: claim for claim in each["claims"]} for each in found]
+    lines = []
+    for claim_id, first in claims_by_id[0].items():
+        measured = [number(claims[claim_id]["measured"]) for claims in claims_by_id]
+        lines.append([CLAIM_WORDS[claim_id], f"{first['op']} {first['target']:g}", *measured])
+    scenes = [next(row for row in each["rows"] if row["cell"] == "scene/300k") for each in found]
+    # What a machine can do at best says why its renderer is slower or faster.
+    for key, words in (("gemm_gflop_s", "matrix product, GFLOP/s"), ("copy_gb_s", "copy, GB/s")):
+        for threads in ("1", "2"):
+            measured = [number(scene[key][threads]["median"]) for scene in scenes]
+            lines.append([f"{words}, threads: {threads}", "–", *measured])
+    machines = [f"{each['machine'].split(',')[0]}, `{each['commit'][:12]}`" for each in found]
+    return table(["what", "target", *machines], lines)
+
+
 def budget_runs() -> str:
     """Every budget that was tried: seconds used, and what was made of them."""
     lines = []
