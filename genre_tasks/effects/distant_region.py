@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from genre_tasks.effects.measurements import ChunkMeasurements
@@ -9,6 +11,7 @@ from genre_tasks.effects.types import Effect, Measurement
 from genre_tasks.logs.types import Float32
 from genre_tasks.scene.chunk import View
 from genre_tasks.scene.projection import project
+from genre_tasks.threads import map_single_threaded
 
 BLOCK_PX = 8
 """Images are divided into blocks of so many pixels; a block with a return counts as near."""
@@ -34,7 +37,8 @@ def measure(measurements: ChunkMeasurements) -> Measurement:
     baseline_m = float(np.linalg.norm(centers - centers[:1], axis=1).max())
     static = measurements.chunk.static
     swept_points = static.positions[static.frames >= 0]
-    fractions = [_far_fraction(swept_points, view, baseline_m) for view in measurements.source_views]
+    far_fraction = partial(_far_fraction, swept_points, baseline_m=baseline_m)
+    fractions = map_single_threaded(far_fraction, measurements.source_views)
     if baseline_m >= STANDSTILL_M:
         baseline = f"over {baseline_m:.1f} m of path"
     else:

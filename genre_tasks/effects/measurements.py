@@ -23,6 +23,7 @@ from genre_tasks.scene.pose_alignment import PoseAlignment, align_poses
 from genre_tasks.scene.projection import Projected, project
 from genre_tasks.scene.transforms import distance_to_path
 from genre_tasks.scene.visibility import find_visible_points
+from genre_tasks.threads import map_single_threaded
 
 IMAGES_OVER_TIME = 10
 """About so many images of each camera are compared over time."""
@@ -66,7 +67,8 @@ class ChunkMeasurements:
     @cached_property
     def source_images(self) -> dict[tuple[str, int], NDArray[np.uint8]]:
         """By camera and frame, the source images at the working resolution, [H, W, 3]."""
-        return {(v.camera, v.frame): self.decode_view(v) for v in self.source_views}
+        decoded = map_single_threaded(self.decode_view, self.source_views)
+        return {(v.camera, v.frame): image for v, image in zip(self.source_views, decoded, strict=True)}
 
     def decode_view(self, view: View) -> NDArray[np.uint8]:
         """Decodes a view's image at the working resolution.
@@ -124,15 +126,22 @@ class ChunkMeasurements:
         log_color = np.full((len(self.source_views), len(sample), 3), np.nan)
         texture = np.full(log_color.shape[:2], np.nan)
         distance_m = np.zeros(log_color.shape[:2])
-        for k, view in enumerate(self.source_views):
+        # Before the threads, which would decode the images several times.
+        images = self.source_images
+
+        def sample_view(k: int) -> None:
+            view = self.source_views[k]
             # All points take part in the occlusion test, not the sampled ones alone.
             index, uv, depth = find_visible_points(static.positions, view)
             # A point near the path may still be far away from this camera.
-            sampled = (column_of_point[index] >= 0) & (depth < SAMPLE_RANGE_M)
+            sampled = np.flatnonzero((column_of_point.take(index) >= 0) & (depth < SAMPLE_RANGE_M))
             columns = column_of_point[index[sampled]]
-            image = self.source_images[view.camera, view.frame]
-            log_color[k, columns], texture[k, columns] = sample_log_colors(image, uv[sampled])
+            colors, contrast = sample_log_colors(images[view.camera, view.frame], uv[sampled])
+            log_color[k, columns] = colors
+            texture[k, columns] = contrast
             distance_m[k, columns] = depth[sampled]
+
+        map_single_threaded(sample_view, range(len(self.source_views)))
         return PointColors(self.source_views, log_color, texture, distance_m)
 
     @cached_property

@@ -16,6 +16,7 @@ from genre_tasks.logs.brown_conrady import distort, distortion_jacobian
 from genre_tasks.logs.types import Float32, Float64, Lens
 from genre_tasks.scene.chunk import View
 from genre_tasks.scene.transforms import invert_se3
+from genre_tasks.threads import map_single_threaded, torch_threads
 
 TURN_PRIOR_DEG = 0.2
 """Standard deviation that is expected of a mount's and of the rig's turn."""
@@ -176,20 +177,27 @@ def take_step(
         The motions after the step.
     """
     brightness = np.zeros(observed.shape)
-    slopes = np.zeros((*observed.shape, 12))
     seen = np.zeros(observed.shape, bool)
-    for k, (image, level) in enumerate(zip(images, levels, strict=True)):
+
+    def measure(k: int) -> Float64:
+        image = images[k]
+        level = levels[k]
         index = np.flatnonzero(observed[k])
-        local, u, v, inside = project_points(points[index], compute_pose(image, mounts, rig), image.lens)
-        index = index[inside]
+        local, u, v, inside = project_points(points.take(index, axis=0), compute_pose(image, mounts, rig), image.lens)
+        well_inside = np.flatnonzero(inside)
+        index = index.take(well_inside)
         seen[k, index] = True
-        where = np.stack([v[inside], u[inside]])
+        where = np.stack([v.take(well_inside), u.take(well_inside)])
         brightness[k, index] = map_coordinates(level.brightness, where, order=1)
         slope_u = map_coordinates(level.by_u, where, order=1) * image.lens.fx_px
         slope_v = map_coordinates(level.by_v, where, order=1) * image.lens.fy_px
-        slopes[k, index] = _slopes_by_motion(image, mounts[image.mount], local[inside], slope_u, slope_v)
+        return _slopes_by_motion(image, mounts[image.mount], local.take(well_inside, axis=0), slope_u, slope_v)
+
+    slopes = map_single_threaded(measure, range(len(images)))
     residual, weight = _robust_residual(brightness, seen)
-    return _solve(slopes, residual, weight, images, mounts, rig)
+    # One thread: sums do not depend on the number of cores.
+    with torch_threads(1):
+        return _solve(slopes, seen, residual, weight, images, mounts, rig)
 
 
 def _slopes_by_motion(
@@ -219,7 +227,8 @@ def _robust_residual(brightness: Float64, seen: NDArray[np.bool_]) -> tuple[Floa
 
 
 def _solve(
-    slopes: Float64,
+    slopes: Sequence[Float64],
+    seen: NDArray[np.bool_],
     residual: Float64,
     weight: Float64,
     images: Sequence[AlignedImage],
@@ -229,13 +238,13 @@ def _solve(
     size = mounts.size + rig.size
     normal = np.zeros((size, size))
     right = np.zeros(size)
-    by_point = np.zeros((slopes.shape[1], size))
+    by_point = np.zeros((seen.shape[1], size))
     for k, image in enumerate(images):
         start = mounts.size + 6 * image.rig
         unknowns = np.r_[6 * image.mount : 6 * image.mount + 6, start : start + 6]
-        # Most points are seen by a few views only: the others' rows are zeros.
-        rows = np.flatnonzero(weight[k])
-        observed = slopes[k, rows]
+        # Most points are seen by a few views only: the others have no slopes.
+        rows = np.flatnonzero(seen[k])
+        observed = slopes[k]
         weighted = observed * weight[k, rows, None]
         normal[np.ix_(unknowns, unknowns)] += _transposed_product(weighted, observed)
         right[unknowns] += (weighted * residual[k, rows, None]).sum(0)

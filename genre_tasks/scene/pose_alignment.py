@@ -31,7 +31,7 @@ from genre_tasks.scene.image_decoding import decode_pixels
 from genre_tasks.scene.transforms import distance_to_path
 from genre_tasks.scene.visibility import find_visible_points
 from genre_tasks.srgb import LUMA_WEIGHTS
-from genre_tasks.threads import map_single_threaded, torch_threads
+from genre_tasks.threads import map_single_threaded
 
 BLURS_PX = (4.0, 2.0, 1.0, 0.6)
 """Standard deviations by which images are blurred, one after the other: a coarse image leads over larger errors."""
@@ -130,9 +130,7 @@ def _find_motions(
             return None
         for _ in range(ITERATIONS):
             before = np.concatenate([mounts, rig])
-            # One thread: sums do not depend on the number of cores.
-            with torch_threads(1):
-                mounts, rig = take_step(points, observed, images, levels, mounts, rig)
+            mounts, rig = take_step(points, observed, images, levels, mounts, rig)
             if np.abs(np.concatenate([mounts, rig]) - before).max() < SMALLEST_STEP:
                 break
     return mounts, rig

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from genre_tasks.logs.brown_conrady import distort, distortion_jacobian
@@ -55,8 +56,9 @@ def project(points: Float32, chunk_SE3_camera: Float64, lens: Lens, shutter: Rol
     # Depth first: half of all points are behind a camera and need no more arithmetic.
     depth = points @ camera_SE3_chunk[2, :3] + camera_SE3_chunk[2, 3]
     index = np.flatnonzero(depth > NEAR_M)
-    depth = depth[index]
-    ahead = points[index]
+    depth = depth.take(index)
+    # Here and below ``take``: brackets give the same in several times the time, with an index or a mask.
+    ahead = points.take(index, axis=0)
     x = (ahead @ camera_SE3_chunk[0, :3] + camera_SE3_chunk[0, 3]) / depth
     y = (ahead @ camera_SE3_chunk[1, :3] + camera_SE3_chunk[1, 3]) / depth
     inside = np.ones(len(index), dtype=bool)
@@ -72,7 +74,8 @@ def project(points: Float32, chunk_SE3_camera: Float64, lens: Lens, shutter: Rol
     u = x * np.float32(lens.fx_px) + np.float32(lens.cx_px)
     v = y * np.float32(lens.fy_px) + np.float32(lens.cy_px)
     inside &= (u >= 0) & (u < lens.width_px) & (v >= 0) & (v < lens.height_px)
-    return Projected(index[inside], np.stack([u[inside], v[inside]], 1), depth[inside])
+    seen = np.flatnonzero(inside)
+    return Projected(index.take(seen), np.stack([u.take(seen), v.take(seen)], 1), depth.take(seen))
 
 
 def _move_to_exposure(x: Reals, y: Reals, z: Reals, lens: Lens, shutter: RollingShutter) -> tuple[Reals, Reals, Reals]:
@@ -110,19 +113,25 @@ def splat_depth(projected: Projected, lens: Lens, footprint_m: float, max_radius
     Returns:
         Nearest depth of each pixel [H, W] float32 metres, ∞ where there is no point.
     """
-    from scipy.ndimage import minimum_filter
-
     height = lens.height_px
     width = lens.width_px
     out = np.full((height, width), np.inf, np.float32)
     # In pixels: near points hide more of the image.
     radius = np.rint(lens.fx_px * footprint_m / projected.depth).astype(np.int64).clip(1, max_radius_px)
     pixel = projected.uv[:, 1].astype(np.int64) * width + projected.uv[:, 0].astype(np.int64)
-    # Points of one radius are drawn together and spread by a minimum filter: a square each would cost far more.
-    for size in np.unique(radius):
+    # All squares grow together, by one pixel at a time; the largest start first. A square each would cost far more.
+    for size in range(int(radius.max(initial=0)), 0, -1):
         chosen = radius == size
-        layer = np.full(height * width, np.inf, np.float32)
-        np.minimum.at(layer, pixel[chosen], projected.depth[chosen])
-        spread = minimum_filter(layer.reshape(height, width), 2 * int(size) + 1, mode="constant", cval=np.inf)
-        np.minimum(out, spread, out=out)
+        # By torch: NumPy's ``minimum.at`` gives the same in thirty times the time.
+        depth = torch.from_numpy(projected.depth[chosen])
+        torch.from_numpy(out).view(-1).scatter_reduce_(0, torch.from_numpy(pixel[chosen]), depth, "amin")
+        out = _spread_minimum(_spread_minimum(out).T).T
     return out
+
+
+def _spread_minimum(depth: Float32) -> Float32:
+    """Gives each pixel the least of itself and of its neighbours above and below."""
+    spread = depth.copy(order="K")
+    np.minimum(spread[1:], depth[:-1], out=spread[1:])
+    np.minimum(spread[:-1], depth[1:], out=spread[:-1])
+    return spread

@@ -124,9 +124,10 @@ def find_visible_points(points: Float32, view: View) -> tuple[NDArray[np.int64],
     column = inside.uv[:, 0].astype(np.int64)
     row = inside.uv[:, 1].astype(np.int64)
     front = nearest[row, column] * np.float32(1 + RELATIVE_TOLERANCE) + np.float32(ABSOLUTE_TOLERANCE_M)
-    visible = inside.depth <= front
+    # Indices and ``take``, since a mask in brackets takes several times as long.
+    visible = np.flatnonzero(inside.depth <= front)
     # From the depth map's pixels to those of the view's own lens.
     scale = np.array([view.lens.width_px / lens.width_px, view.lens.height_px / lens.height_px], np.float32)
     last_pixel = np.array([view.lens.width_px - 1, view.lens.height_px - 1], np.float32)
-    uv = np.minimum(inside.uv[visible] * scale, last_pixel)
-    return inside.index[visible], uv, inside.depth[visible]
+    uv = np.minimum(inside.uv.take(visible, axis=0) * scale, last_pixel)
+    return inside.index.take(visible), uv, inside.depth.take(visible)

@@ -49,6 +49,18 @@ def test_splat_keeps_the_nearest() -> None:
     assert np.isfinite(depth).sum() == 25
 
 
+def test_splats_are_squares_whose_side_follows_from_distance() -> None:
+    rng = np.random.default_rng(3)
+    points = np.stack([rng.uniform(1, 30, 300), rng.uniform(-9, 9, 300), rng.uniform(-9, 9, 300)], 1)
+    seen = project(points.astype(np.float32), _view().chunk_SE3_camera, LENS)
+    expected = np.full((LENS.height_px, LENS.width_px), np.inf, np.float32)
+    for (u, v), distance_m in zip(seen.uv.astype(int), seen.depth, strict=True):
+        half_px = int(np.clip(np.rint(LENS.fx_px * 0.2 / distance_m), 1, 10))
+        square = expected[max(v - half_px, 0) : v + half_px + 1, max(u - half_px, 0) : u + half_px + 1]
+        np.minimum(square, distance_m, out=square)
+    assert len(seen.depth) > 30 and np.array_equal(splat_depth(seen, LENS, 0.2), expected)
+
+
 def test_occluded_points_stay_grey() -> None:
     front, behind = _wall(5.0, 1.0), _wall(20.0, 8.0, 0.1)
     cloud = PointCloud(np.concatenate([front, behind]), np.zeros(len(front) + len(behind), np.int16))
