@@ -19,6 +19,7 @@ from flows.pipeline.stage_runner import Job, open_artifact, read_artifact
 from genre_tasks.effects.apply_plan import apply_plan
 from genre_tasks.effects.measurements import ChunkMeasurements
 from genre_tasks.effects.pixel_motion import measure_pixel_speeds
+from genre_tasks.effects.plan import load_effect
 from genre_tasks.effects.types import EffectParameters, EffectsPlan
 from genre_tasks.threads import torch_threads
 
@@ -77,9 +78,13 @@ def measure_on_pandaset(name: str, location: ChunkLocation) -> Row:
     """Measures an effect on a chunk of a real sequence.
 
     Raises:
-        NotMeasuredError: the sequence's folder is missing.
+        NotMeasuredError: the sequence's folder is missing, or what the effect needs is not in it.
     """
     require_log_folder(location.log)
+    missing = load_effect(name).find_missing(_read_measurements(location))
+    # A plan refuses such an effect, and its error would end the benchmark before the cells that follow.
+    if missing is not None:
+        raise NotMeasuredError(f"{location.log}: {missing}")
     return measure_effect(name, location, factor=-1.0)
 
 
@@ -149,10 +154,14 @@ def evaluate_settings(
 
 
 def _fastest_camera_px_per_s(location: ChunkLocation) -> float:
-    job = location.job()
-    chunk = read_artifact(job, reconstruct(job, STAGES[:1])["ingest"])
-    speeds = measure_pixel_speeds(ChunkMeasurements(chunk, cached_log(location.log).cameras)).values()
+    speeds = measure_pixel_speeds(_read_measurements(location)).values()
     # A standing camera shears and blurs nothing, so no duration reaches the threshold.
     if not speeds:
         raise NotMeasuredError(f"{location.log}: no camera moves over returns")
     return max(speeds)
+
+
+def _read_measurements(location: ChunkLocation) -> ChunkMeasurements:
+    job = location.job()
+    chunk = read_artifact(job, reconstruct(job, STAGES[:1])["ingest"])
+    return ChunkMeasurements(chunk, cached_log(location.log).cameras)

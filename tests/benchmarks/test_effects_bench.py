@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from benchmarks.common.bench import TINY_SETTINGS, TINY_STREET, NotMeasuredError
 from benchmarks.effects import EFFECTS
 from benchmarks.effects.cases import CASES, LONGEST_S, MILD_FACTOR
+from benchmarks.effects.cells import ChunkLocation, measure_on_pandaset
 from benchmarks.effects.measures import FOOTPRINT_RATIO, psnr_where_footprints_change
 from benchmarks.effects.report import find_threshold
 from flows.cli.bench import load_bench
@@ -63,6 +67,13 @@ def test_cells_are_streets_with_and_without_and_the_real_chunks() -> None:
     assert len(EFFECTS.cells(options, True)) == 4
     whole = [c.name for c in EFFECTS.cells(options | {"effects": "auto_vs_on,plain_cost"}, False)]
     assert whole == ["auto_vs_on street 1", "auto_vs_on street 2", "plain_cost street 1"]
+
+
+def test_a_log_without_what_an_effect_needs_is_not_measured(tmp_path: Path) -> None:
+    location = ChunkLocation(f"synthetic:street?seed={TINY_STREET}", 0, str(tmp_path), tuple(TINY_SETTINGS.split()))
+    # As PandaSet's logs, this street states no exposure time.
+    with pytest.raises(NotMeasuredError, match="states no exposure time"):
+        measure_on_pandaset("motion_blur", location)
 
 
 def test_claims_are_of_four_times_the_threshold_and_of_plain_streets() -> None:
