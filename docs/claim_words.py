@@ -130,8 +130,16 @@ CLAIM_WORDS = {
     "scale.cluster_doubled": "Stages of the simulated dataset that the store holds twice",
     "scale.fuzz_findings": "Damaged and harmful files that are a finding",
 }
+EFFECT_WORDS = {name: name.replace("_", " ") for name in CASES} | {
+    "nonrigid_actors": "non-rigid actors",
+    "view_dependent_colour": "view-dependent colour",
+    "lidar_depth": "LiDAR depth",
+    "anti_aliasing": "anti-aliasing",
+}
+"""What people call each effect, where its name in settings is not that already."""
 CLAIM_WORDS |= {
-    f"effects.{kind}_{name}": f"{name.replace('_', ' ').capitalize()}: {words}"
+    # The first letter alone: ``capitalize`` would spell LiDAR small.
+    f"effects.{kind}_{name}": f"{EFFECT_WORDS[name][0].upper()}{EFFECT_WORDS[name][1:]}: {words}"
     for name in CASES
     for kind, words in (
         ("gain", "gain on streets that call for it"),

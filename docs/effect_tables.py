@@ -7,6 +7,7 @@ from statistics import median
 from benchmarks.common.bench import Row
 from benchmarks.effects.cases import CASES
 from benchmarks.effects.report import effect_gain
+from docs.claim_words import EFFECT_WORDS
 from docs.result_tables import claims as claims_of
 from docs.result_tables import provenance, result, short_log, table
 
@@ -34,7 +35,7 @@ def on_streets() -> str:
         planned = f"{sum(row['choice'] == 'on' for row in called)} of {len(called)}"
         planned_plain = f"{sum(row['choice'] == 'on' for row in plain)} of {len(plain)}"
         threshold = f"{first['threshold']:g} {first['property_unit']}"
-        lines.append([_words(name), threshold, planned, _gains(called), planned_plain, _gains(plain)])
+        lines.append([EFFECT_WORDS[name], threshold, planned, _gains(called), planned_plain, _gains(plain)])
     head = [
         "effect",
         "set on above",
@@ -54,7 +55,7 @@ def on_real_chunks() -> str:
             value = "–" if row["value"] is None else f"{row['value']:.3g} {row['property_unit']}"
             heldout = [f"{row[state]['heldout_db']:.2f}" for state in ("on", "off")]
             gain = f"{effect_gain(row):+.2f} {row['unit']}"
-            lines.append([_words(name), short_log(row), value, row["choice"], gain, *heldout])
+            lines.append([EFFECT_WORDS[name], short_log(row), value, row["choice"], gain, *heldout])
     head = ["effect", "chunk", "measured", "plan", "gain", "held-out PSNR with it, dB", "without it, dB"]
     return table(head, lines)
 
@@ -73,7 +74,3 @@ def _rows(name: str, factor: float) -> list[Row]:
 def _gains(rows: list[Row]) -> str:
     gains = [effect_gain(row) for row in rows]
     return f"{median(gains):+.2f} {rows[0]['unit']} ({min(gains):+.2f} to {max(gains):+.2f})"
-
-
-def _words(name: str) -> str:
-    return name.replace("_", " ")
