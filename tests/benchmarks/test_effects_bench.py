@@ -49,7 +49,8 @@ def test_it_is_registered_and_its_cases_are_effects() -> None:
 def test_streets_can_be_asked_to_call_for_each(name: str) -> None:
     case = CASES[name]
     for factor in (0.0, 1.0, 4.0):
-        open_log(f"synthetic:street?seed=1{case.query(factor, 340.0)}")
+        # A parameter that streets do not have would be refused here.
+        assert open_log(f"synthetic:street?seed=1{case.query(factor, 340.0)}").frame_count
 
 
 def test_a_slow_street_takes_longer_for_as_many_pixels() -> None:

@@ -221,7 +221,7 @@ class FormatSuite:
         cuts = np.unique(np.linspace(0, len(complete) - 1, CUTS).astype(int))
         for size in cuts.tolist():
             self.file(tmp_path).write_bytes(complete[:size])
-            scene = self.read_or_refuse(self.file(tmp_path))
+            scene = self.assert_read_or_refused(self.file(tmp_path))
             # A file without a header may be a shorter sound one.
             for node in scene.nodes if scene is not None else ():
                 assert same_bits(node.cloud, found.select(slice(0, len(node.cloud)))), size
@@ -239,7 +239,7 @@ class FormatSuite:
             damaged = bytearray(complete)
             damaged[place] ^= int(random.integers(1, 256))
             self.file(tmp_path).write_bytes(bytes(damaged))
-            self.read_or_refuse(self.file(tmp_path))
+            self.assert_read_or_refused(self.file(tmp_path))
 
     def test_garbage(self) -> None:
         @settings(max_examples=40, deadline=None)
@@ -248,16 +248,16 @@ class FormatSuite:
             with tempfile.TemporaryDirectory() as folder:
                 path = self.file(Path(folder))
                 path.write_bytes(garbage)
-                self.read_or_refuse(path)
+                self.assert_read_or_refused(path)
                 path.write_bytes(sound[:start] + garbage)
-                self.read_or_refuse(path)
+                self.assert_read_or_refused(path)
 
         with tempfile.TemporaryDirectory() as folder:
             self.write(self.file(Path(folder)), make_cloud(2))
             sound = self.file(Path(folder)).read_bytes()
         search()
 
-    def read_or_refuse(self, path: Path) -> ExchangeScene | None:
+    def assert_read_or_refused(self, path: Path) -> ExchangeScene | None:
         """Reads a file; what is not refused must be finite. Any other exception fails the test."""
         try:
             scene = self.format.read(path)

@@ -164,7 +164,7 @@ def test_long_json_is_not_parsed(tmp_path: Path) -> None:
     check_refused(tmp_path, b"[" + b"0," * (9 << 20) + b"0]", b"", "at most 16777216 are read")
 
 
-def refuse_within(folder: Path, document: dict[str, Any], binary: bytes, most_bytes: int) -> None:
+def assert_refused_within(folder: Path, document: dict[str, Any], binary: bytes, most_bytes: int) -> None:
     (folder / "bomb.glb").write_bytes(join_glb(document, binary))
     tracemalloc.start()
     try:
@@ -181,14 +181,14 @@ def test_memory_is_bounded(tmp_path: Path) -> None:
     for accessor in document["accessors"]:
         del accessor["bufferView"]
         accessor["count"] = 2**31
-    refuse_within(tmp_path, document, binary, 1 << 20)
+    assert_refused_within(tmp_path, document, binary, 1 << 20)
     # One mesh, shown by many nodes.
     document, binary = foreign_file(float_attributes(count=100_000))
     document["nodes"] = [{"mesh": 0} for _ in range(60)]
     document["scenes"] = [{"nodes": list(range(60))}]
-    refuse_within(tmp_path, document, binary, 600 << 20)
+    assert_refused_within(tmp_path, document, binary, 600 << 20)
     # Many nodes below one that moves at many moments.
     times = np.arange(3000.0)
     document, binary = animated(times.tolist(), np.zeros((3000, 3)).tolist())
     document["nodes"] = [{"children": list(range(1, 2000))}, *({} for _ in range(1999))]
-    refuse_within(tmp_path, document, binary, 300 << 20)
+    assert_refused_within(tmp_path, document, binary, 300 << 20)

@@ -243,7 +243,7 @@ def test_headers_with_lines_in_disorder() -> None:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "scene.ply"
             path.write_bytes(b"\n".join(lines) + body)
-            TestPly().read_or_refuse(path)
+            TestPly().assert_read_or_refused(path)
 
     with tempfile.TemporaryDirectory() as folder:
         text = write(Path(folder) / "scene.ply", make_cloud(20, 1))
