@@ -179,7 +179,7 @@ def take_step(
     brightness = np.zeros(observed.shape)
     seen = np.zeros(observed.shape, bool)
 
-    def measure(k: int) -> Float64:
+    def measure_image(k: int) -> Float64:
         image = images[k]
         level = levels[k]
         index = np.flatnonzero(observed[k])
@@ -193,7 +193,7 @@ def take_step(
         slope_v = map_coordinates(level.by_v, where, order=1) * image.lens.fy_px
         return _slopes_by_motion(image, mounts[image.mount], local.take(well_inside, axis=0), slope_u, slope_v)
 
-    slopes = map_single_threaded(measure, range(len(images)))
+    slopes = map_single_threaded(measure_image, range(len(images)))
     residual, weight = _robust_residual(brightness, seen)
     # One thread: sums do not depend on the number of cores.
     with torch_threads(1):
