@@ -67,8 +67,7 @@ class ChunkMeasurements:
     @cached_property
     def source_images(self) -> dict[tuple[str, int], NDArray[np.uint8]]:
         """By camera and frame, the source images at the working resolution, [H, W, 3]."""
-        decoded = map_single_threaded(self.decode_view, self.source_views)
-        return {(v.camera, v.frame): image for v, image in zip(self.source_views, decoded, strict=True)}
+        return {(v.camera, v.frame): self.decode_view(v) for v in self.source_views}
 
     def decode_view(self, view: View) -> NDArray[np.uint8]:
         """Decodes a view's image at the working resolution.
