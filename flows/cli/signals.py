@@ -8,14 +8,25 @@ import socket
 import sys
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
-from types import FrameType
+from types import CodeType, FrameType
+from typing import TypeVar
 
 # A user who stops a command waits for it; what takes longer than this is not worth the wait.
 _MAX_SECONDS_TO_END = 6.0
 _SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 # A shell reports a command that a signal ended by this number plus that of the signal.
 _EXIT_STATUS_BASE = 128
+# How often a signal waits for a function that must not be broken off, and how long each time: half a second at most,
+# since a write may wait for ever for a reader.
+_MOST_DELAYS = 50
+_DELAY_S = 0.01
+
+_delaying_code: set[CodeType] = set()
+_delays = 0
+
+Function = TypeVar("Function", bound=Callable[..., object])
 
 
 # No KeyboardInterrupt, which the parser of commands would turn into a status of its own.
@@ -37,6 +48,21 @@ class Interrupted(BaseException):
     def exit_status(self) -> int:
         """What a shell would report: 130 for Ctrl-C, 143 for SIGTERM, 129 for SIGHUP."""
         return _EXIT_STATUS_BASE + self.number
+
+
+def delay_signals(function: Function) -> Function:
+    """Lets a function finish before a signal ends the command, as a decorator.
+
+    The signal comes again a moment later, and again for half a second; then it ends the command wherever it is.
+
+    Args:
+        function: what is short, and leaves something half-done where an exception breaks it off.
+
+    Returns:
+        The same function.
+    """
+    _delaying_code.add(function.__code__)  # type: ignore[attr-defined]
+    return function
 
 
 def end_on_signals() -> None:
@@ -99,6 +125,11 @@ def _end_soon_after_signals() -> None:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
+    global _delays
+    if _delays < _MOST_DELAYS and _is_delaying(frame):
+        _delays += 1
+        threading.Timer(_DELAY_S, signal.pthread_kill, (threading.main_thread().ident, number)).start()
+        return
     for name in _SIGNALS:
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), _end_at_once)
@@ -107,6 +138,14 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
         _say_stopped(_EXIT_STATUS_BASE + number)
         _end_at_once(number, frame)
     raise Interrupted(number)
+
+
+def _is_delaying(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code in _delaying_code:
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _is_importing(frame: FrameType | None) -> bool:

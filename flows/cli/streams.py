@@ -12,6 +12,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
+from flows.cli.signals import delay_signals
+
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
@@ -79,6 +81,8 @@ class _ForgivingFile(io.FileIO):
         super().__init__(descriptor, "wb", closefd=False)
         self._is_result = is_result
 
+    # Broken off after the last byte, it would leave the text in the buffer above, and the text would be written twice.
+    @delay_signals
     def write(self, data: ReadableBuffer, /) -> int:
         remaining = memoryview(data).cast("B")
         count = len(remaining)
