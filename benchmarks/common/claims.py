@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import operator
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -19,6 +20,9 @@ _COMPARE: dict[str, Callable[[float, float], bool]] = {
     "<=": operator.le,
     "<": operator.lt,
 }
+# No string of JSON holds a line break, so these brackets and commas are those of a list.
+_PLAIN_LIST = re.compile(r"\[\n\s*([^\[\]{}]*?)\n\s*\]")
+_NEXT_LINE = re.compile(r",\n\s*")
 
 
 class _Strict(BaseModel):
@@ -110,6 +114,8 @@ def _holds(measured: float | None, op: str, target: float) -> bool:
 def write_json(path: Path, value: Any) -> None:
     """Writes JSON that appears whole or not at all, also when two processes write it.
 
+    A list of numbers or words stands in one line, since curves of a thousand points would be a thousand lines.
+
     Args:
         path: the file to write or replace; its folder is made if need be.
         value: JSON values.
@@ -119,6 +125,7 @@ def write_json(path: Path, value: Any) -> None:
     """
     # NaN is no JSON, and other readers would fail on the file much later.
     text = json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False)
+    short = _PLAIN_LIST.sub(lambda found: f"[{_NEXT_LINE.sub(', ', found[1])}]", text)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as part:
-        part.write_text(text + "\n", encoding="utf-8")
+        part.write_text(short + "\n", encoding="utf-8")

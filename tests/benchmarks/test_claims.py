@@ -68,3 +68,11 @@ def test_writing_that_fails_leaves_the_file_as_it_was(tmp_path: Path) -> None:
         write_json(path, {"a": float("nan")})
     assert json.loads(path.read_text()) == {"a": 1}
     assert [p.name for p in path.parent.iterdir()] == ["result.json"]
+
+
+def test_a_list_of_plain_values_stands_in_one_line(tmp_path: Path) -> None:
+    value = {"curve": [0.5, 1, None], "words": ["a, b", "[c]", "line\nbreak", "{"], "rows": [{"n": []}, [[1], [2]]]}
+    write_json(tmp_path / "result.json", value)
+    text = (tmp_path / "result.json").read_text()
+    assert json.loads(text) == value
+    assert ' "curve": [0.5, 1, null],\n' in text
