@@ -19,6 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from docs import (
+    cost_tables,
     effect_tables,
     exchange_tables,
     fault_tables,
@@ -48,6 +49,9 @@ BLOCKS: Mapping[str, Callable[[], str]] = {
     "raster-times": result_tables.raster_times,
     "raster-claims": lambda: result_tables.claims("raster"),
     "start-up-claims": lambda: result_tables.claims("start_up"),
+    "cost-included": cost_tables.included,
+    **{f"cost-{preset}": partial(cost_tables.accuracy, preset) for preset in cost_tables.PRESETS},
+    **{f"cost-{preset}-seconds": partial(cost_tables.seconds, preset) for preset in cost_tables.PRESETS},
     "budget-runs": result_tables.budget_runs,
     "effects-claims": effect_tables.claims,
     "effects-real": effect_tables.on_real_chunks,

@@ -7,14 +7,14 @@ from collections.abc import Iterator, Sequence
 
 from flows.cost_sweep.summary import COSTS, KERNEL_3M, MEASURES, PSNR, Measure, SettingSummary, Spread
 
-INCLUDED = (
-    "Seconds are the wall time of the stages up to the scene (ingest, plan of effects, initial scene, GNet, and unless "
-    "it is off novel views, FNet and ENet), each as measured when it was computed; evaluation, reading artifacts back, "
-    "hashing, the start of Python, imports and other first calls are not in them (the process was warm, and had read "
-    "each log once: a synthetic street is drawn when it is first read). A stage that "
-    "settings share was computed once. Seconds, CPU seconds, memory and Gaussians are medians over seeds, all else "
-    "means; ± is the standard deviation over seeds (order of views, noise of the fixer), pooled over logs."
-)
+INCLUDED = """Seconds are the wall time of the stages up to the scene, each as it was measured when it was computed:
+ingest, plan of effects, initial scene and GNet, and unless the fixer is off novel views, FNet and ENet.
+A stage that settings share was computed once.
+Left out are evaluation, reading artifacts back, hashing, the start of Python, imports and other first calls.
+The process was warm, and had read each log once: a synthetic street is drawn when it is first read.
+
+Seconds, CPU seconds, memory and Gaussians are medians over seeds, all else means.
+± is the standard deviation over seeds (order of views, noise of the fixer), pooled over logs."""
 
 
 def render_page(summaries: Sequence[SettingSummary], novel_measure: Measure, facts: Sequence[str], picture: str) -> str:
@@ -39,15 +39,42 @@ def render_page(summaries: Sequence[SettingSummary], novel_measure: Measure, fac
         f"![Accuracy against seconds]({picture})",
         "",
     ]
-    return "\n".join([*head, *_accuracy_table(summaries, novel_measure), "", *_stage_table(summaries), ""])
+    tables = [render_accuracy(summaries, novel_measure), "Median seconds of each stage:", "", render_seconds(summaries)]
+    return "\n".join([*head, *tables])
 
 
-def _accuracy_table(summaries: Sequence[SettingSummary], novel_measure: Measure) -> Iterator[str]:
+def render_accuracy(summaries: Sequence[SettingSummary], novel_measure: Measure) -> str:
+    """Writes accuracy and costs of a sweep as a table.
+
+    Args:
+        summaries: the settings.
+        novel_measure: what settings are compared by away from the path.
+
+    Returns:
+        Markdown: how to read the table, and a row for each setting.
+    """
+    return "\n".join([*_accuracy_lines(summaries, novel_measure), ""])
+
+
+def render_seconds(summaries: Sequence[SettingSummary]) -> str:
+    """Writes the seconds of every stage as a table.
+
+    Args:
+        summaries: the settings.
+
+    Returns:
+        Markdown: a row for each setting.
+    """
+    return "\n".join([*_seconds_lines(summaries), ""])
+
+
+def _accuracy_lines(summaries: Sequence[SettingSummary], novel_measure: Measure) -> Iterator[str]:
     # Real logs lack some measures, whose columns would be empty.
     measured = [m for m in MEASURES if any(math.isfinite(x.values[m.name].average) for x in summaries)]
-    yield "Gains are over the preset in the same place with the same seed, positive where the setting is better. "
+    yield "Gains are over the preset in the same place with the same seed, positive where the setting is better."
     yield f"**Bold**: no setting with as many cells is as good in less time (held-out PSNR, {novel_measure.label})."
-    if KERNEL_3M in measured:
+    # A table that was read back does not hold the number of images.
+    if KERNEL_3M in measured and math.isfinite(summaries[0].images_at_3m):
         # The kernel distance is unbiased, but its variance and the Fréchet distance's bias depend on the set's size.
         count = f"{summaries[0].images_at_3m:.0f}"
         yield f"Distances between sets are of N = {count} images at 3 m; compare them at equal N only."
@@ -61,10 +88,8 @@ def _accuracy_table(summaries: Sequence[SettingSummary], novel_measure: Measure)
         yield f"| {x.knob} | {x.value} | {x.n} | " + " | ".join([*values, *gains]) + " |"
 
 
-def _stage_table(summaries: Sequence[SettingSummary]) -> Iterator[str]:
+def _seconds_lines(summaries: Sequence[SettingSummary]) -> Iterator[str]:
     names = list(dict.fromkeys(s for x in summaries for s in x.stage_seconds))
-    yield "Median seconds by stage:"
-    yield ""
     yield "| knob | value | " + " | ".join(names) + " |"
     yield "|---" * (2 + len(names)) + "|"
     for x in summaries:

@@ -49,8 +49,6 @@ def test_generated_parts_are_those_of_code_and_measurements(generator: dict[str,
 
 @pytest.mark.parametrize("page", [PAGES[0], *sorted((ROOT / "docs/results").glob("*.md"))], ids=lambda p: p.name)
 def test_no_measured_number_is_typed_by_hand(page: Path) -> None:
-    if page.name == "cost.md":  # written whole by `genre cost`; compared with its cells below
-        return
     text = NO_MEASUREMENT.sub("", prose(page.read_text()))
     assert not MEASURED.findall(text)
 
@@ -62,9 +60,7 @@ def test_the_readme_is_short_and_has_its_limits_and_picture() -> None:
     assert re.search(r"!\[[^\]]+\]\(docs/images/", "\n".join(text.splitlines()[:12])), "a picture in the first screen"
 
 
-@pytest.mark.parametrize(
-    "page", [p for p in PAGES if "results/cost" not in str(p)], ids=lambda p: p.relative_to(ROOT).as_posix()
-)
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
 def test_sentences_are_short(page: Path) -> None:
     if "reference/stability" in str(page):
         return

@@ -321,12 +321,15 @@ def test_the_command_says_what_it_would_choose(tmp_path: Path) -> None:
         )
 
 
-def test_the_shipped_table_is_of_today_s_settings() -> None:
-    table = load_cost_table(find_shipped_table("small"), "small")
-    lines, facts = read_settings(find_shipped_table("small"))
-    assert len(table.points) >= 20 and min(x.n for x in lines) >= 3 and facts["machine"] == table.machine
+@pytest.mark.parametrize(("preset", "least_points", "seeds"), [("small", 20, 3)])
+def test_the_shipped_table_is_of_today_s_settings(preset: str, least_points: int, seeds: int) -> None:
+    table = load_cost_table(find_shipped_table(preset), preset)
+    lines, facts = read_settings(find_shipped_table(preset))
+    assert len(table.points) >= least_points and min(x.n for x in lines) >= seeds
+    assert facts["machine"] == table.machine
+    base = load_configuration(preset)
     for p in table.points:
-        config = apply_settings(SMALL, p.changes)
-        assert p.name == "preset" or p.end == "gnet" or config != SMALL, p.name
+        config = apply_settings(base, p.changes)
+        assert p.name == "preset" or p.end == "gnet" or config != base, p.name
         assert set(p.seconds) == set(stages_until(p.end)) and all(s >= 0 for s in p.seconds.values())
     assert set(table.first_call_s) == set(stages_until("enet")) and table.calibration_s > 0 and table.images > 1
