@@ -111,7 +111,7 @@ def run(
     \b
         genre run 'synthetic:street?seed=1000' --preset demo
         genre run pandaset:data/002 --chunks 0,1 --set gnet.iterations=96
-        genre run pandaset:data/002 --preset small --budget 5m
+        genre run pandaset:data/002 --budget 5m
     """
     import psutil
 

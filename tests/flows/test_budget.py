@@ -321,7 +321,7 @@ def test_the_command_says_what_it_would_choose(tmp_path: Path) -> None:
         )
 
 
-@pytest.mark.parametrize(("preset", "least_points", "seeds"), [("small", 20, 3)])
+@pytest.mark.parametrize(("preset", "least_points", "seeds"), [("small", 20, 3), ("fine", 20, 1)])
 def test_the_shipped_table_is_of_today_s_settings(preset: str, least_points: int, seeds: int) -> None:
     table = load_cost_table(find_shipped_table(preset), preset)
     lines, facts = read_settings(find_shipped_table(preset))
