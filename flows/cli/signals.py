@@ -126,7 +126,7 @@ def _end_soon_after_signals() -> None:
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
     global _delays
-    if _delays < _MOST_DELAYS and _is_delaying(frame):
+    if _delays < _MOST_DELAYS and _is_within(frame, _is_delaying):
         _delays += 1
         threading.Timer(_DELAY_S, signal.pthread_kill, (threading.main_thread().ident, number)).start()
         return
@@ -134,23 +134,24 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), _end_at_once)
     # Half a module stays behind where an import is broken off, and some packages go on with it.
-    if _is_importing(frame):
+    if _is_within(frame, _is_importing):
         _say_stopped(_EXIT_STATUS_BASE + number)
         _end_at_once(number, frame)
     raise Interrupted(number)
 
 
-def _is_delaying(frame: FrameType | None) -> bool:
-    while frame is not None:
-        if frame.f_code in _delaying_code:
-            return True
-        frame = frame.f_back
-    return False
+def _is_importing(code: CodeType) -> bool:
+    return code.co_filename == "<frozen importlib._bootstrap>"
 
 
-def _is_importing(frame: FrameType | None) -> bool:
+def _is_delaying(code: CodeType) -> bool:
+    return code in _delaying_code
+
+
+def _is_within(frame: FrameType | None, is_meant: Callable[[CodeType], bool]) -> bool:
+    """Whether the frame or one of its callers runs such code."""
     while frame is not None:
-        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+        if is_meant(frame.f_code):
             return True
         frame = frame.f_back
     return False
