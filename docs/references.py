@@ -15,7 +15,7 @@ def presets() -> str:
 
     purpose = {
         "demo": "a first look: the synthetic street, minutes",
-        "small": "quick runs",
+        "small": "quick runs, parameter studies",
         "fine": "the default: real logs on a CPU",
         "long": "a longer GNet at the size of `small`",
         "hd": "the paper's image size on a CPU: minutes and 6 GB a chunk",
