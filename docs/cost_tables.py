@@ -19,7 +19,7 @@ from flows.cost_sweep.parquet import read_settings
 from flows.cost_sweep.plot import draw_sweep
 from flows.cost_sweep.summary import MEASURES, Measure, SettingSummary
 
-PRESETS = ("small", "fine")
+PRESETS = ("small", "fine", "hd")
 _FACTS = ("command", "logs", "seeds", "machine", "commit", "date")
 _COLOURS_OF_A_PICTURE = 32
 

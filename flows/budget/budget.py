@@ -9,7 +9,7 @@ from typing import Any
 from flows.budget.chooser import Chooser, count_images
 from flows.budget.cost_table import CostTable, find_shipped_table, load_cost_table
 from flows.budget.deadline import Deadline
-from flows.configuration import diff_from_preset
+from flows.configuration import apply_settings, diff_from_preset
 from flows.machine.calibration import measure_calibration_s
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ConfigError
@@ -27,10 +27,18 @@ def resolve_table(table: str | None, preset: str, config: PipelineConfig) -> Cos
         The table.
 
     Raises:
-        ConfigError: as :func:`flows.budget.cost_table.load_cost_table` and ``find_shipped_table`` raise it.
+        ConfigError: the table was measured with settings that the run does not have, or as
+            :func:`flows.budget.cost_table.load_cost_table` and ``find_shipped_table`` raise it.
     """
     path = Path(table) if table else find_shipped_table(preset)
-    return load_cost_table(path, preset, diff_from_preset(config, preset))
+    loaded = load_cost_table(path, preset, diff_from_preset(config, preset))
+    if lacking := [setting for setting in loaded.settings if apply_settings(config, [setting]) != config]:
+        raise ConfigError(
+            f"this table was measured with {', '.join(lacking)}, which this run does not have",
+            remedy="Give the run the same with --set, or a table that was measured without.",
+            file=path,
+        )
+    return loaded
 
 
 class Budget:
@@ -80,9 +88,12 @@ class Budget:
             self.deadline,
             image_factor=count_images(log, chunk, self._config) / self._table.images,
             measure_speed=self.measure_speed,
-            # The stages of the first chunk are also the first ones of the process: they load code and weights.
-            first_calls=not self.choosers,
+            # The first stage of a kind in a process loads code and weights.
+            warm_stages={stage for earlier in self.choosers.values() for stage in earlier.computed_stages},
         )
+        # The first chunk has to wait with this; later ones know it from the start.
+        if self.speed is not None:
+            chooser.calibrate()
         self.choosers[chunk] = chooser
         return chooser
 

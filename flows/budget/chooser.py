@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
@@ -59,9 +59,9 @@ class _Candidate(NamedTuple):
 class Chooser:
     """Chooses the setting of one chunk, stage by stage.
 
-    The machine's speed is measured only when the first stage was computed. Until then Prefect's server is starting,
-    which makes a machine look up to 1.6 times as slow as it is. Nothing is lost by waiting: the first stage is ingest,
-    which is the same in all settings.
+    The machine's speed is measured when the first stage was computed. Until then Prefect's server is starting, which
+    makes a machine look up to 1.6 times as slow as it is. Nothing is lost by waiting: ingest and the plan of effects
+    are the same in nearly all settings. Where both come from the store, it is measured after them.
 
     Args:
         table: the settings to choose from.
@@ -69,11 +69,12 @@ class Chooser:
         deadline: the time of the run.
         image_factor: images of the chunk over images of a chunk of the table.
         measure_speed: gives this machine's calibration over the table's.
-        first_calls: whether no stage has run in this process yet.
+        warm_stages: stages that this process has computed before; their first calls are over.
 
     Attributes:
         deadline: the time of the run.
         choices: every choice that changed the setting, in order.
+        computed_stages: stages that were computed for this chunk, and did not come from the store.
         used_s: seconds of the budget that were used when the latest choice was made.
     """
 
@@ -84,15 +85,18 @@ class Chooser:
         deadline: Deadline,
         image_factor: float,
         measure_speed: Callable[[], float],
-        first_calls: bool = True,
+        warm_stages: Collection[str] = (),
     ) -> None:
         self.deadline = deadline
         self.choices: list[BudgetChoice] = []
+        self.computed_stages: set[str] = set()
         self.used_s = 0.0
         self._table = table
         self._image_factor = image_factor
         self._measure_speed = measure_speed
-        self._first_call_s = table.first_call_s if first_calls else {}
+        # More pixels take more time. Fewer do not take as much less: points and Gaussians stay as many.
+        self._pixel_factor = max(1.0, base.ingest.width_px * base.ingest.height_px / table.pixels)
+        self._first_call_s = {s: seconds for s, seconds in table.first_call_s.items() if s not in warm_stages}
         self._candidates = [_Candidate(point, apply_settings(base, point.changes)) for point in table.points]
         self._finished: list[str] = []
         self._current: _Candidate | None = None
@@ -151,9 +155,11 @@ class Chooser:
             cached: whether the stage came from the store.
         """
         assert self._current is not None
+        # The initial scene's points and GNet are chosen next, and cannot be taken back: they need this machine's speed.
+        if not self._table_s and (not cached or stage == "effects"):
+            self.calibrate()
         if not cached:
-            if not self._table_s:
-                self.calibrate()
+            self.computed_stages.add(stage)
             # How long ingest takes depends on the log's reader more than on the machine, so its pace says little.
             if stage != "ingest":
                 self._measured_s += seconds
@@ -199,6 +205,8 @@ class Chooser:
         """Seconds of a stage of this chunk on the table's machine."""
         # GNet's and ENet's time goes with their iterations, which the setting fixes; all other stages' with the images.
         factor = 1.0 if stage in ("gnet", "enet") else self._image_factor
+        # A log's images are read and reduced, which depends on their own size alone.
+        factor *= 1.0 if stage == "ingest" else self._pixel_factor
         return point.seconds[stage] * factor + self._first_call_s.get(stage, 0.0) + STAGE_OVERHEAD_S
 
     def _remaining(self, point: CostPoint) -> list[str]:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from flows.configuration import load_configuration
 from flows.cost_sweep.knobs import EFFECTS
 from flows.cost_sweep.parquet import read_settings
-from flows.cost_sweep.summary import MEASURES, PSNR, SettingSummary
+from flows.cost_sweep.summary import MEASURES, PSNR, Measure, SettingSummary
+from flows.pipeline.definition import RECONSTRUCTION_STAGES, STAGE_BY_NAME
 from genre_tasks.errors import ConfigError
 
 _CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -44,6 +46,9 @@ class CostTable:
         accuracy_label: what the accuracy is, for readers.
         points: the settings.
         images: images in a chunk of the sweep, source views and held-out ones.
+        pixels: of an image of the sweep.
+        settings: ``section.key=value`` over the preset that all of the sweep was measured with, as far as they change
+            a scene or what it takes.
         calibration_s: seconds of :func:`flows.machine.calibration.measure_calibration_s` on the sweep's machine.
         first_call_s: by stage, how many seconds more the first call in a process takes than a later one.
         machine: the sweep's machine, one line.
@@ -53,6 +58,8 @@ class CostTable:
     accuracy_label: str
     points: tuple[CostPoint, ...]
     images: float
+    pixels: int
+    settings: tuple[str, ...]
     calibration_s: float
     first_call_s: Mapping[str, float]
     machine: str
@@ -99,8 +106,8 @@ def load_cost_table(path: Path, preset: str, user_keys: Iterable[str] = ()) -> C
         The table.
 
     Raises:
-        ConfigError: there is no table, it is of another preset, it does not say how fast its machine was, or it changes
-            a key that the user has set.
+        ConfigError: there is no table, it is of another preset, it does not say how fast its machine was, none of its
+            settings was judged, or it changes a key that the user has set.
         ArtifactCorruptError: the file is not a sweep's table.
 
     >>> table = load_cost_table(find_shipped_table("small"), "small")
@@ -119,14 +126,9 @@ def load_cost_table(path: Path, preset: str, user_keys: Iterable[str] = ()) -> C
     if missing := [name for name in ("calibration_s", "judged", "cold_seconds", "machine") if name not in facts]:
         raise ConfigError(f"this table does not say how fast its machine was ({missing[0]})", remedy=remedy, file=path)
     measure = next((m for m in MEASURES if m.name == facts["judged"]), PSNR)
-    # Accuracy is better when larger; of distances it is the opposite.
-    sign = 1.0 if measure.more_is_better else -1.0
-    points = tuple(
-        CostPoint(x.setting, x.changes, x.end, sign * x.values[measure.name].average, x.stage_seconds)
-        for x in summaries
-        # The first line is the preset itself: fewer cells than it has means other chunks, which do not compare.
-        if _budget_may_choose(x) and x.n == summaries[0].n and math.isfinite(x.values[measure.name].average)
-    )
+    points = _list_points(summaries, measure)
+    if not points:
+        raise ConfigError(f"no setting of this table has a {measure.label}", remedy=remedy, file=path)
     changed_keys = {change.partition("=")[0] for point in points for change in point.changes}
     # A key that both the user and the table set has no right value: one would silently lose.
     if both := sorted(changed_keys & set(user_keys)):
@@ -134,19 +136,57 @@ def load_cost_table(path: Path, preset: str, user_keys: Iterable[str] = ()) -> C
             f"{', '.join(both)} is what a budget decides", remedy="Leave out either --budget or that setting."
         )
     try:
-        calibration_s = float(facts["calibration_s"])
-        first_call_s = {str(stage): float(seconds) for stage, seconds in json.loads(facts["cold_seconds"]).items()}
+        measured = _Measured.parse(facts)
     except (ValueError, TypeError, AttributeError, RecursionError) as error:
         raise ConfigError(f"this table's facts are damaged ({error})", remedy=remedy, file=path) from error
+    ingest = load_configuration(preset, settings=measured.settings).ingest
     return CostTable(
         preset=preset,
         accuracy_label=measure.label,
         points=points,
         images=summaries[0].source_images,
-        calibration_s=calibration_s,
-        first_call_s=first_call_s,
+        pixels=ingest.width_px * ingest.height_px,
+        settings=tuple(setting for setting in measured.settings if _changes_scenes(setting)),
+        calibration_s=measured.calibration_s,
+        first_call_s=measured.first_call_s,
         machine=facts["machine"],
     )
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """What a table says of the sweep that it is of."""
+
+    settings: tuple[str, ...]
+    calibration_s: float
+    first_call_s: Mapping[str, float]
+
+    @classmethod
+    def parse(cls, facts: Mapping[str, str]) -> _Measured:
+        """Reads it from the metadata of the table; raises what parsing raises."""
+        cold_seconds = json.loads(facts["cold_seconds"])
+        return cls(
+            settings=tuple(str(setting) for setting in json.loads(facts.get("settings", "[]"))),
+            calibration_s=float(facts["calibration_s"]),
+            first_call_s={str(stage): float(seconds) for stage, seconds in cold_seconds.items()},
+        )
+
+
+def _list_points(summaries: Sequence[SettingSummary], measure: Measure) -> tuple[CostPoint, ...]:
+    # Accuracy is better when larger; of distances it is the opposite.
+    sign = 1.0 if measure.more_is_better else -1.0
+    return tuple(
+        CostPoint(x.setting, x.changes, x.end, sign * x.values[measure.name].average, x.stage_seconds)
+        for x in summaries
+        # The first line is the preset itself: fewer cells than it has means other chunks, which do not compare.
+        if _budget_may_choose(x) and x.n == summaries[0].n and math.isfinite(x.values[measure.name].average)
+    )
+
+
+def _changes_scenes(setting: str) -> bool:
+    section, _, key = setting.partition("=")[0].partition(".")
+    # Evaluation is no part of a budget, and what is kept for its curve takes next to no time.
+    return section in {STAGE_BY_NAME[stage].section for stage in RECONSTRUCTION_STAGES} and key != "snapshots"
 
 
 def _budget_may_choose(summary: SettingSummary) -> bool:

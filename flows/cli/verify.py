@@ -61,14 +61,10 @@ def _repair(store: Store, damaged: Mapping[str, ArtifactCorruptError]) -> bool:
     from flows.upkeep.repair import repair_artifacts
 
     def run_again(record: Mapping[str, Any]) -> None:
-        # All chunks, so that the run keeps its name: the sound ones are served from the store.
-        chunks = [chunk["chunk"] for chunk in record["chunks"]]
         with report_on_terminal():
-            from flows.reconstruction.flow import reconstruct_log
+            from flows.reconstruction.flow import recompute_run
 
-            reconstruct_log(
-                record["log"], preset=record["preset"], store=store.uri, chunks=chunks, config=record["config"]
-            )
+            recompute_run(store.uri, record["run"])
 
     is_complete = True
     for done in repair_artifacts(store, damaged, run_again):

@@ -12,6 +12,7 @@ from flows.comparison.gaussian_differences import compare_gaussians
 from flows.comparison.metric_differences import Score, average_scores, compare_scores
 from flows.comparison.picture_pairs import pair_pictures
 from flows.comparison.setting_differences import list_differences
+from flows.reconstruction.chunk_configuration import read_chunk_config
 from flows.reconstruction.stored_values import SCENE_STAGES
 from genre_tasks.errors import InputError
 
@@ -85,7 +86,9 @@ def compare_runs(a: RunSide, b: RunSide, chunk: int | None = None) -> Comparison
     facts = ("run", "log", "preset")
     comparison.add_table("runs", [{"": f, "A": a.record[f], "B": b.record[f]} for f in facts])
     settings = list_differences(a.record["config"], b.record["config"])
-    comparison.add_table("settings", settings, if_empty="The settings are the same.")
+    has_budget = "budget" in a.record or "budget" in b.record
+    which = "that were asked for " if has_budget else ""
+    comparison.add_table("settings", settings, if_empty=f"The settings {which}are the same.")
     chunks = _choose_chunks(comparison, a, b, chunk)
     if not chunks or len(chunks) > MOST_CHUNKS:
         _add_means(comparison, a, b, chunks)
@@ -126,6 +129,10 @@ def _add_means(comparison: Comparison, a: RunSide, b: RunSide, chunks: Sequence[
 
 
 def _add_chunk(comparison: Comparison, a: RunSide, b: RunSide, number: int) -> None:
+    if "budget" in a.record or "budget" in b.record:
+        used = [read_chunk_config(side.record, number).model_dump(mode="json") for side in (a, b)]
+        same = f"Chunk {number} was made with the same settings."
+        comparison.add_table(f"chunk {number} settings within a budget", list_differences(*used), if_empty=same)
     stages = dict.fromkeys([*a.stages(number), *b.stages(number)])
     comparison.add_table(f"chunk {number} stages", [_stage_row(a, b, number, stage) for stage in stages])
     equal = []

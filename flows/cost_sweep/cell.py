@@ -67,7 +67,7 @@ class Sweep:
         config = cell.setting.configuration(self.preset, self.settings, cell.seed)
         threads = cell.setting.threads
         # A shared store would hand a cell the seconds of another number of threads.
-        store = f"{self.store}-threads-{threads}" if threads else self.store
+        store = f"{self.store.rstrip('/')}-threads-{threads}" if threads else self.store
         return Job(cell.where.log, cell.where.chunk, store, config.model_dump(mode="json"))
 
     def reference_job(self, cell: Cell) -> Job:

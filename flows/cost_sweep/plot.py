@@ -104,6 +104,9 @@ def _limits(values: Sequence[float], least: float) -> tuple[float, float]:
     """Gives limits of an axis that hold these values, are at least ``least`` apart, and leave space for labels."""
     # A NaN among the values would make both limits NaN, and the panel empty.
     known = [v for v in values if math.isfinite(v)]
+    # A log without held-out images has no such value at all.
+    if not known:
+        return 0.0, 1.0
     low = min(known)
     high = max(known)
     # Without a least range, noise of a hundredth of a second would fill the panel.

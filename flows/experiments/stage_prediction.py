@@ -48,7 +48,9 @@ class StagePredictor:
     """
 
     def __init__(self, store: str) -> None:
-        self._stage_seconds = median_stage_seconds(store)
+        self._store = store
+        # Looked up once for each size of images: a store may hold many thousand artifacts.
+        self._usual: dict[int, dict[str, float]] = {}
         self._computed: set[str] = set()
 
     def predict(self, cell: str, job: Job, base: PipelineConfig, names: Sequence[str]) -> dict[str, Any]:
@@ -83,8 +85,10 @@ class StagePredictor:
         # A scene of another program is passed on as it is.
         if isinstance(section, GnetConfig) and section.method == "none":
             return 0.0
+        if _pixels(base) not in self._usual:
+            self._usual[_pixels(base)] = median_stage_seconds(self._store, base)
         # Stages are dominated by rasterising, whose time grows with the pixels.
-        seconds = self._stage_seconds[name.partition("/")[0]] * (_pixels(config) / _pixels(base))
+        seconds = self._usual[_pixels(base)][name.partition("/")[0]] * (_pixels(config) / _pixels(base))
         # An iteration's cost is that of rendering its views, so their number is what scales.
         if name in ("gnet", "enet"):
             seconds *= _rendered_views(section) / _rendered_views(getattr(base, name))

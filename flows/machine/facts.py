@@ -44,7 +44,6 @@ def count_cores() -> int:
     return os.cpu_count() or 1
 
 
-@functools.lru_cache(maxsize=1)
 def describe_environment() -> dict[str, str]:
     """Lists what can change a measured number, for the manifest of an artifact.
 
@@ -53,13 +52,8 @@ def describe_environment() -> dict[str, str]:
     """
     import torch
 
-    return {
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "processor": platform.machine(),
-        "threads": str(torch.get_num_threads()),
-        **{name: version(name) for name in ("torch", "numpy", "genre")},
-    }
+    # A sweep over numbers of threads changes theirs within a process; nothing else changes.
+    return {**_describe_installation(), "threads": str(torch.get_num_threads())}
 
 
 def git_commit(folder: Path = CHECKOUT) -> str:
@@ -82,6 +76,16 @@ def git_commit(folder: Path = CHECKOUT) -> str:
         return f"{head}+changes" if changed else head
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
+
+
+@functools.lru_cache(maxsize=1)
+def _describe_installation() -> dict[str, str]:
+    return {
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "processor": platform.machine(),
+        **{name: version(name) for name in ("torch", "numpy", "genre")},
+    }
 
 
 def _cpu_model() -> str:

@@ -67,7 +67,8 @@ def predict_run(
     """
     opened = cached_log(log)
     size = estimate_chunk_size(opened, select_cameras(config.ingest, opened), config)
-    measured = _measured_seconds(store, opened.dataset)
+    stored = _stored_seconds(store, config, opened.dataset)
+    measured = {stage: statistics.median(values) for stage, values in stored.items()}
     included = stages_until(end)
     rows: list[dict[str, Any]] = []
     for chunk in select_chunks(log, config, chunks):
@@ -89,20 +90,21 @@ def predict_run(
     }
 
 
-def median_stage_seconds(store: str) -> dict[str, float]:
+def median_stage_seconds(store: str, config: PipelineConfig) -> dict[str, float]:
     """Looks up how long stages usually take: the median of those in a store, or a typical value.
 
     Args:
         store: folder (or URI) of the store.
+        config: the size of its images is the size of which stages count.
 
     Returns:
         Seconds by stage; all evaluation stages share the name ``evaluate``.
     """
-    stored: dict[str, list[float]] = {}
-    for artifact in open_store(store).artifacts():
-        stage = artifact.manifest.stage.partition("/")[0]
-        stored.setdefault(stage, []).append(artifact.manifest.seconds)
-    return _SECONDS_SMALL | {stage: statistics.median(values) for stage, values in stored.items()}
+    usual = {stage: _typical_seconds(stage, config) for stage in _SECONDS_SMALL}
+    by_kind: dict[str, list[float]] = {}
+    for stage, values in _stored_seconds(store, config).items():
+        by_kind.setdefault(stage.partition("/")[0], []).extend(values)
+    return usual | {stage: statistics.median(values) for stage, values in by_kind.items()}
 
 
 def _predict_stage(
@@ -125,7 +127,7 @@ def _predict_stage(
             cache = "hit"
         else:
             cache = "corrupt" if note else "miss"
-    seconds = measured[spec.name] if spec.name in measured else _typical_seconds(spec, config)
+    seconds = measured[spec.name] if spec.name in measured else _typical_seconds(spec.name, config)
     memory = predict_memory(spec.name, grow_until(spec.name, size, config), config, count_cores())
     on_disk = needs_disk(spec.name, memory, config)
     return {
@@ -138,20 +140,24 @@ def _predict_stage(
     }
 
 
-def _measured_seconds(store: str, dataset: str) -> dict[str, float]:
-    """Median seconds of the stages in a store, by stage."""
+def _stored_seconds(store: str, config: PipelineConfig, dataset: str = "") -> dict[str, list[float]]:
+    """Seconds of the stages in a store that have images of this size, by stage; of all datasets if none is named."""
+    manifests = [artifact.manifest for artifact in open_store(store).artifacts()]
+    # Cameras and images differ between datasets, and with them the time of every stage.
+    manifests = [m for m in manifests if not dataset or m.dataset == dataset]
+    size = {"width_px": config.ingest.width_px, "height_px": config.ingest.height_px}
+    of_size = {m.key for m in manifests if m.stage == "ingest" and size.items() <= m.configuration.items()}
     seconds: dict[str, list[float]] = {}
-    for artifact in open_store(store).artifacts():
-        manifest = artifact.manifest
-        # Cameras and images differ between datasets, and with them the time of every stage.
-        if manifest.dataset == dataset:
+    for manifest in manifests:
+        # Every later stage reads the ingested images, and its own section does not say how large they are.
+        if (manifest.key if manifest.stage == "ingest" else manifest.inputs.get("ingest")) in of_size:
             seconds.setdefault(manifest.stage, []).append(manifest.seconds)
-    return {stage: statistics.median(values) for stage, values in seconds.items()}
+    return seconds
 
 
-def _typical_seconds(spec: StageSpec, config: PipelineConfig) -> float:
+def _typical_seconds(stage: str, config: PipelineConfig) -> float:
     pixels = config.ingest.width_px * config.ingest.height_px
     share = max(0.0, (pixels - _SMALL_PIXELS) / (_LARGE_PIXELS - _SMALL_PIXELS))
-    stage = spec.name.partition("/")[0]
+    stage = stage.partition("/")[0]
     # Most at the smaller size is torch, points and Gaussians, which do not grow with the pixels.
     return _SECONDS_SMALL[stage] + share * (_SECONDS_LARGE[stage] - _SECONDS_SMALL[stage])

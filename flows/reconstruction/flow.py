@@ -19,9 +19,10 @@ from flows.pipeline.progress import get_reporter
 from flows.pipeline.stage_runner import ArtifactRef, Job
 from flows.pipeline.stage_task import stage_task
 from flows.preflight.requirements import check_requirements
+from flows.reconstruction.chunk_configuration import read_chunk_config
 from flows.reconstruction.left_out import ChunksLeftOutError, record_failures
 from flows.reconstruction.outcome_artifact import is_child_run, publish_outcome
-from flows.reconstruction.run_records import FinishedRun, summarise_run, write_run_record
+from flows.reconstruction.run_records import FinishedRun, find_run_record, summarise_run, write_run_record
 from flows.reconstruction.run_summary import RunSummary
 from flows.reconstruction.stored_run import find_stored_run
 from genre_tasks.config import PipelineConfig
@@ -86,6 +87,39 @@ def reconstruct_log(
         raise
     publish_outcome(log, record, None)
     return record
+
+
+@flow(name="recompute-run", flow_run_name="{run}", persist_result=False, validate_parameters=False)
+def recompute_run(store: str, run: str) -> None:
+    """Computes what the store lacks of a finished run, with the settings that each chunk was made with.
+
+    The run's record stays as it is. Artifacts come out with the same keys unless code, weights or the log have changed.
+
+    Args:
+        store: folder (or URI) of the store.
+        run: the run's name.
+
+    Raises:
+        GenreError: a chunk cannot be computed; the others are, before the first error is raised.
+    """
+    record = find_run_record(store, run)
+    failures: list[GenreError] = []
+    for entry in record["chunks"]:
+        chunk = entry["chunk"]
+        try:
+            config = read_chunk_config(record, chunk)
+            _check_needs(record["log"], store, [chunk], config)
+            job = Job(record["log"], chunk, store, config.model_dump(mode="json"))
+            # Within a budget a chunk may end at GNet's scene.
+            names = {stage["stage"] for stage in entry["stages"]}
+            refs: dict[str, ArtifactRef] = {}
+            for spec in PIPELINE:
+                if spec.name in names:
+                    refs[spec.name] = _run_stage_task(spec, job, refs)
+        except GenreError as error:
+            failures.append(error)
+    if failures:
+        raise failures[0]
 
 
 def _open_budget(

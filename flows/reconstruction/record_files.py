@@ -28,6 +28,15 @@ class _LeftOut(BaseModel):
     chunk: int
 
 
+class _Choices(BaseModel):
+    chunk: int
+    settings: list[str]
+
+
+class _Budget(BaseModel):
+    chunks: list[_Choices]
+
+
 class _Record(BaseModel):
     """What every reader of a record relies on; a record has more."""
 
@@ -40,6 +49,8 @@ class _Record(BaseModel):
     chunks: list[_Chunk]
     # Records of earlier versions do not have it.
     left_out: list[_LeftOut] = []
+    # Of runs within a budget.
+    budget: _Budget = _Budget(chunks=[])
 
 
 def read_record(path: Path) -> dict[str, Any]:

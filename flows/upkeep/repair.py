@@ -41,7 +41,7 @@ def repair_artifacts(
     Args:
         store: that has them.
         damaged: by path, as :meth:`storage.store.Store.verify_all` names them.
-        run_again: runs the log of a record again; called with the record.
+        run_again: computes what the store lacks of a run; called with the run's record.
 
     Yields:
         What became of each artifact.

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from flows.configuration.loading import apply_settings
-from flows.configuration.validation import validate_config
 from flows.pipeline.definition import PIPELINE, StageSpec, digest_stage_weights, stage_key
 from flows.pipeline.stage_runner import Job, reading_modules
+from flows.reconstruction.chunk_configuration import read_chunk_config
 from genre_tasks.code_closure import find_module_file, import_closure
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ConfigError
@@ -58,12 +59,16 @@ def find_recomputations(record: Mapping[str, Any], change: str) -> list[Recomput
         InputError: the log or the weights are gone.
     """
     _check_change(change)
-    config = validate_config(record["config"], f"the record of run {record['run']}")
     found: list[Recomputation] = []
-    # All chunks share the configuration and the code: what changes in one changes in all.
-    job = Job(record["log"], 0, record["store"], record["config"])
-    reasons = {spec.name: _explain(spec, job, config, change) for spec in PIPELINE}
+    reasons_of: dict[str, dict[str, str]] = {}
     for chunk in record["chunks"]:
+        config = read_chunk_config(record, int(chunk["chunk"]))
+        values = config.model_dump(mode="json")
+        # Chunks share code and, but for a budget's choices, settings: what changes in one changes in all like it.
+        if (settings := json.dumps(values, sort_keys=True)) not in reasons_of:
+            job = Job(record["log"], 0, record["store"], values)
+            reasons_of[settings] = {spec.name: _explain(spec, job, config, change) for spec in PIPELINE}
+        reasons = reasons_of[settings]
         seconds = {stage["stage"]: float(stage["seconds"]) for stage in chunk["stages"]}
         changed: set[str] = set()
         for spec in PIPELINE:

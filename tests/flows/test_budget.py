@@ -20,12 +20,17 @@ from flows.budget.cost_table import CostPoint, CostTable, find_shipped_table, lo
 from flows.budget.deadline import Deadline
 from flows.cli.main import app
 from flows.cli.parsing import parse_duration
+from flows.comparison.run_comparison import compare_runs, open_side
 from flows.configuration import apply_settings, load_configuration
 from flows.cost_sweep.parquet import read_settings, write_settings
 from flows.cost_sweep.summary import summarise_settings
 from flows.pipeline.definition import stages_until
 from flows.reconstruction import flow
+from flows.reconstruction.chunk_configuration import read_chunk_config
+from flows.reconstruction.run_records import list_runs
+from flows.upkeep.what_if import find_recomputations
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
+from storage.local import LocalStore
 from tests.faults.small_run import LOG, SETTINGS
 
 EARLY = {"ingest": 5.0, "effects": 1.0, "initial": 2.0}
@@ -48,7 +53,7 @@ POINTS = (
     point("long", 10, 8, 26.0),
     point("most", 30, 8, 27.0),
 )
-TABLE = CostTable("small", "accuracy", POINTS, 120.0, 0.1, {"ingest": 3.0}, "somewhere")
+TABLE = CostTable("small", "accuracy", POINTS, 120.0, 320 * 180, (), 0.1, {"ingest": 3.0}, "somewhere")
 
 
 class Frozen(Deadline):
@@ -300,6 +305,27 @@ def test_a_run_ends_where_its_budget_says(tmp_path: Path, monkeypatch: pytest.Mo
     assert stages == ["ingest", "effects", "initial", "gnet", "evaluate/initial", "evaluate/gnet"]
     assert record["chunks"][0]["choices"][0]["point"] == "together=alone"
     assert "nothing fits" in record["chunks"][0]["choices"][0]["why"]
+    _check_later_readers(LocalStore(tmp_path / "store"))
+
+
+def _check_later_readers(store: LocalStore) -> None:
+    """What reads a run's record later takes the settings that were chosen, and not those that were asked for."""
+    long, short = list_runs(store.uri)
+    assert long["config"]["gnet"]["iterations"] != 1 and read_chunk_config(short, 0).gnet.iterations == 1
+    assert find_recomputations(short, "gnet.iterations=1") == []
+    assert find_recomputations(short, f"gnet.iterations={short['config']['gnet']['iterations']}")
+    compared = compare_runs(open_side(store, long), open_side(store, short))
+    (rows,) = (table.rows for table in compared.tables if table.name == "chunk 0 settings within a budget")
+    assert [row["setting"] for row in rows] == ["enet.iterations"]
+    before = {artifact.address: artifact.manifest.payload_digest for artifact in store.artifacts()}
+    (gnet,) = store.artifacts(stage="gnet")
+    scene = next(gnet.path.glob("*.parquet"))
+    scene.write_bytes(scene.read_bytes()[:-1])
+    done = CliRunner().invoke(app, ["verify", "--repair", "--store", store.uri], catch_exceptions=False)
+    assert done.exit_code == 0 and "repaired: " in done.output, done.output
+    # Neither another run nor a stage beyond the chunk's last one.
+    assert {artifact.address: artifact.manifest.payload_digest for artifact in store.artifacts()} == before
+    assert [run["run"] for run in list_runs(store.uri)] == [long["run"], short["run"]]
 
 
 def test_the_command_says_what_it_would_choose(tmp_path: Path) -> None:
@@ -321,7 +347,7 @@ def test_the_command_says_what_it_would_choose(tmp_path: Path) -> None:
         )
 
 
-@pytest.mark.parametrize(("preset", "least_points", "seeds"), [("small", 20, 3), ("fine", 20, 1)])
+@pytest.mark.parametrize(("preset", "least_points", "seeds"), [("small", 20, 3), ("fine", 20, 1), ("hd", 15, 1)])
 def test_the_shipped_table_is_of_today_s_settings(preset: str, least_points: int, seeds: int) -> None:
     table = load_cost_table(find_shipped_table(preset), preset)
     lines, facts = read_settings(find_shipped_table(preset))

@@ -174,6 +174,12 @@ def test_a_stage_that_settings_share_is_predicted_once(tmp_path: Path) -> None:
     assert 0 < both[1]["seconds"] < both[0]["seconds"]
 
 
+def test_a_number_of_threads_has_a_store_beside_the_store(tmp_path: Path) -> None:
+    cell = Cell(LogChunk(LOG, 0), 0, Setting("threads", "1", threads=1))
+    # A shell completes the name of a folder with a slash.
+    assert Sweep("demo", (), f"{tmp_path}/store/").job(cell).store == f"{tmp_path}/store-threads-1"
+
+
 def test_the_command_lists_what_it_would_run_and_refuses_what_it_does_not_know(tmp_path: Path) -> None:
     told = ["cost", LOG, "--preset", "demo", "--knobs", "fixer", "--store", str(tmp_path), "--seeds", "0", "--dry-run"]
     done = CliRunner().invoke(app, told, terminal_width=200)

@@ -38,7 +38,10 @@ from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Lens, Sweep
 
 # In 2023: a time as recorded logs have it, which a float32 cannot hold to the second.
 _EPOCH_S = 1.7e9
-_PNG_CACHE_BYTES = 32 << 20
+# A chunk's images are drawn once, however large they are: a PNG takes no more than its pixels.
+_CACHED_FRAMES = 20
+_LEAST_CACHE_BYTES = 32 << 20
+_PIXEL_BYTES = 3
 
 
 def open_synthetic(rest: str) -> SyntheticStreet:
@@ -101,7 +104,8 @@ class SyntheticStreet:
         self.offset_m = np.add(rng.uniform([-40, -40, -10], [40, 40, 10]), [self.parameters.origin_m, 0.0, 0.0])
         # Logs of different seeds do not share a time, as recorded logs do not.
         self._start_s = _EPOCH_S + 60.0 * (self.parameters.seed % 100_000)
-        self._png_images: RecentValues[bytes] = RecentValues(_PNG_CACHE_BYTES, len)
+        frame_bytes = self.parameters.cameras * self.parameters.width * self.parameters.height * _PIXEL_BYTES
+        self._png_images: RecentValues[bytes] = RecentValues(max(_LEAST_CACHE_BYTES, _CACHED_FRAMES * frame_bytes), len)
         self._truth = StreetTruth(self.render, self.offset_m, self.name)
         self._build_lock = threading.Lock()
 
