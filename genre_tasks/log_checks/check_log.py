@@ -19,6 +19,7 @@ from genre_tasks.logs.findings import Finding, ReportsFindings, Severity, format
 from genre_tasks.logs.log_selection import count_source_frames
 from genre_tasks.logs.types import DrivingLog, Float64
 from genre_tasks.progress import Progress, silent
+from genre_tasks.scene.chunk import MOST_FRAMES
 
 # With a single frame, no point is seen from two positions of the same camera.
 _MIN_CHUNK_FRAMES = 2
@@ -173,6 +174,11 @@ def _report_plausibility(inspector: LogInspector, chunk_frames: int) -> None:
 
 
 def _report_chunks(check: LogCheck, inspector: LogInspector, chunk_frames: int) -> None:
+    if check.frames > MOST_FRAMES:
+        message = f"chunks beyond the first {MOST_FRAMES:,} of {check.frames:,} frames cannot be reconstructed"
+        remedy = "Divide the log, or leave these chunks out with --chunks."
+        numbers = {"frames": float(check.frames), "limit": float(MOST_FRAMES)}
+        inspector.report(Finding("too_many_frames", "warning", message, remedy, numbers))
     for chunk in check.standstill_chunks:
         travel = check.chunk_travel_m[chunk]
         message = f"chunk {chunk}: the ego vehicle stands still ({travel:.2f} m), no parallax"

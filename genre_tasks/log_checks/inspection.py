@@ -164,11 +164,28 @@ class LogInspector:
         """Reads the times of all sweeps, and reports frames whose order they do not give.
 
         Returns:
-            [F] seconds, of the sweeps.
+            [F] seconds, of the sweeps; NaN where the time cannot be read.
         """
-        times = np.array([self.log.frame_timestamp_s(frame) for frame in range(self.log.frame_count)])
-        self._check_order(times)
+        times = np.full(self.log.frame_count, np.nan)
+        errors: list[GenreError] = []
+        unreadable: list[int] = []
+        for frame in range(self.log.frame_count):
+            time_s = _read_or_note(partial(self.log.frame_timestamp_s, frame), errors)
+            if time_s is None:
+                unreadable.append(frame)
+            else:
+                times[frame] = time_s
+        if errors:
+            self._report_unreadable_times(unreadable, errors[0])
+        self._check_order(times, unreadable)
         return times
+
+    def _report_unreadable_times(self, frames: list[int], first: GenreError) -> None:
+        """Reports times that the reader refuses; one finding, though each of them is an error of its frame."""
+        location = f" ({first.where})" if first.where else ""
+        message = f"frames {format_frames(frames)} have no time that can be read: {first.problem}{location}; "
+        message += "their chunks cannot be reconstructed"
+        self.report(Finding("missing_timestamp", "warning", message, first.remedy, frames=tuple(frames)))
 
     def _report_errors(self, word: str, errors: list[GenreError]) -> None:
         """Reports what could not be read of single frames; one finding for all frames with the same problem."""
@@ -183,11 +200,11 @@ class LogInspector:
             message = f"{problem}{location}"
             self.report(Finding(word, "warning", message, first.remedy, camera=first.camera, frames=frames))
 
-    def _check_order(self, times: Float64) -> None:
-        """Reports sweep times that are not finite, equal or decreasing."""
+    def _check_order(self, times: Float64, unreadable: list[int]) -> None:
+        """Reports sweep times that are not finite, but for the unreadable ones, equal or decreasing."""
         # A step from or to a time that is not finite is NaN, which no comparison below counts.
         steps = np.diff(times)
-        not_finite = np.flatnonzero(~np.isfinite(times))
+        not_finite = np.setdiff1d(np.flatnonzero(~np.isfinite(times)), unreadable)
         if not_finite.size:
             self._report_clock("missing_timestamp", "frames {} have no finite timestamp", not_finite)
         if (steps == 0).any():

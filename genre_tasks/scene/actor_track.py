@@ -12,6 +12,9 @@ from genre_tasks.logs.types import CuboidTrack, Float64
 from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.transforms import interpolate_pose, invert_se3, is_rigid_transform
 
+MOST_GAP_FRAMES = 10
+"""So many frames without an annotation are bridged: over longer gaps the object was out of range, or another one."""
+
 
 @dataclass(frozen=True)
 class ActorTrack(ActorNode):
@@ -29,8 +32,8 @@ def cut_track_to_chunk(
 ) -> tuple[ActorTrack | None, int]:
     """Cuts a log's track to a chunk's frames and takes it to chunk coordinates.
 
-    Frames between two annotated ones are interpolated. Before the first and after the last the object is absent, since
-    poses are never extrapolated.
+    Frames between two annotated ones are interpolated, over at most :data:`MOST_GAP_FRAMES`. In longer gaps, before the
+    first and after the last the object is absent, since poses are never extrapolated.
 
     Args:
         track: of the log, in world coordinates.
@@ -49,7 +52,7 @@ def cut_track_to_chunk(
     annotated, first = np.unique(track.frames[valid], return_index=True)
     poses = track.world_SE3_box[valid][first]
     invalid = int((~valid).sum())
-    inside = [f for f in frames if len(annotated) and annotated[0] <= f <= annotated[-1]]
+    inside = [f for f in frames if _is_inside(annotated, f)]
     if not inside:
         return None, invalid
     # Logs are kilometres from their origin; in the chunk poses are small enough for float32.
@@ -64,6 +67,16 @@ def cut_track_to_chunk(
         chunk_SE3_box=chunk_SE3_box,
     )
     return cut, invalid
+
+
+def _is_inside(annotated: NDArray[np.int64], frame: int) -> bool:
+    """Whether a frame is annotated, or lies in a gap of annotated frames [A] that is bridged."""
+    after = int(np.searchsorted(annotated, frame))
+    if after == len(annotated):
+        return False
+    if annotated[after] == frame:
+        return True
+    return after > 0 and int(annotated[after] - annotated[after - 1]) <= MOST_GAP_FRAMES + 1
 
 
 def _interpolate_annotations(annotated: NDArray[np.int64], poses: Float64, frame: int) -> Float64:

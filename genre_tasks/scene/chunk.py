@@ -18,6 +18,9 @@ Gain = tuple[float, float, float]
 NO_SWEEP = -1
 """The frame of points that are of no sweep: those of a file, of images, and of the road where LiDAR is blind."""
 
+MOST_FRAMES = 1 << 15
+"""A log may have so many frames: points have the numbers of theirs as int16."""
+
 
 @dataclass(frozen=True)
 class View:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from urllib.parse import quote
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -98,10 +100,21 @@ def _choose_viewpoints(config: EvaluateConfig, chunk: Chunk) -> list[View | Nove
 
 
 def _name_picture(view: View | NovelView) -> str:
+    camera = _encode_camera(view.camera)
     if isinstance(view, View):
-        return f"0m_{view.camera}_{view.frame:02d}"
+        return f"0m_{camera}_{view.frame:02d}"
     side = "left" if view.shift_m > 0 else "right"
-    return f"{abs(view.shift_m):g}m_{side}_{view.camera}_{view.frame:02d}"
+    return f"{abs(view.shift_m):g}m_{side}_{camera}_{view.frame:02d}"
+
+
+def _encode_camera(camera: str) -> str:
+    """The name of a camera in the characters that the store allows in a picture's name, as in a URL but with = for %.
+
+    >>> _encode_camera("front_camera"), _encode_camera("front camera")
+    ('front_camera', 'front=20camera')
+    """
+    # A folder may have a name that is no text. URLs leave ~ as it is, and the store refuses it.
+    return quote(camera, safe="+", errors="surrogateescape").replace("~", "%7E").replace("%", "=")
 
 
 def _to_uint8(image: Tensor) -> NDArray[np.uint8]:

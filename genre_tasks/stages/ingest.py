@@ -18,7 +18,7 @@ from genre_tasks.logs.log_selection import choose_working_size, chunk_count, sel
 from genre_tasks.logs.types import Camera, DrivingLog
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.actor_track import ActorTrack
-from genre_tasks.scene.chunk import Actor, Chunk, Points, View
+from genre_tasks.scene.chunk import MOST_FRAMES, Actor, Chunk, Points, View
 from genre_tasks.scene.transforms import invert_se3
 from genre_tasks.scene.visibility import color_point_clouds
 from genre_tasks.stages.chunk_reading import ChunkReading
@@ -50,10 +50,12 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
         The chunk, in coordinates of its own.
 
     Raises:
-        InputError: fewer than two source frames have images, or there is neither LiDAR nor ``points`` nor ``scene``.
+        InputError: fewer than two source frames have images, there is neither LiDAR nor ``points`` nor ``scene``, or
+            the chunk lies beyond the frames that can be numbered.
         ConfigError: the chunk or a camera is unknown.
     """
     frames = select_frames(config, log, chunk_index)
+    _require_numbered_frames(log, frames, chunk_index)
     cameras = select_cameras(config, log)
     _require_cameras(log, cameras, chunk_index)
     width_px, height_px = choose_working_size(config, cameras)
@@ -111,6 +113,14 @@ def _note_path_issues(reading: ChunkReading) -> None:
     travel = np.linalg.norm(centers - centers[0], axis=1).max()
     if travel < STANDSTILL_M:
         reading.add_issue("standstill", f"the ego vehicle travels {travel:.2f} m: no parallax")
+
+
+def _require_numbered_frames(log: DrivingLog, frames: Sequence[int], chunk: int) -> None:
+    """Raises before anything is read where points could not have the numbers of the chunk's frames."""
+    if max(frames) >= MOST_FRAMES:
+        problem = f"the log has more than {MOST_FRAMES:,} frames"
+        remedy = "Divide the log, or leave the chunks beyond them out with --chunks."
+        raise InputError(problem, remedy=remedy, log=log.name, chunk=chunk)
 
 
 def _require_cameras(log: DrivingLog, cameras: tuple[Camera, ...], chunk: int) -> None:

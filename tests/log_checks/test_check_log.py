@@ -54,6 +54,12 @@ def test_chunks_and_the_short_last_one() -> None:
     assert short.verdict == "good"
 
 
+def test_more_frames_than_can_be_numbered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("genre_tasks.log_checks.check_log.MOST_FRAMES", 4)
+    check = check_log(log_of(frame_count=5, speed_mps=20.0), chunk_frames=5)
+    assert "chunks beyond the first 4 of 5 frames cannot be reconstructed" in messages(check, "warning")
+
+
 def test_missing_things_are_named_by_frame() -> None:
     log = log_of(
         frame_count=6,

@@ -118,6 +118,7 @@ BROKEN = {
     "no lens": (lambda folder: (folder / "calibration/intrinsics.feather").unlink(), "lacks a table"),
     "no column": (_drop("calibration/intrinsics.feather", "fy_px"), "lacks fy_px"),
     "no mount": (_set("calibration/egovehicle_SE3_sensor.feather", "sensor_name", "x"), "no place on the vehicle"),
+    "a camera elsewhere": (_set("calibration/intrinsics.feather", "sensor_name", "ring_/../x"), "a folder's name"),
     "no focus": (_set("calibration/intrinsics.feather", "fx_px", 0.0), "no positive focal length"),
     "an infinite pose": (_set("city_SE3_egovehicle.feather", "tx_m", float("inf")), "not finite"),
     "one time": (_set("city_SE3_egovehicle.feather", "timestamp_ns", 5), "1 poses"),

@@ -14,11 +14,13 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from genre_tasks.errors import InputError
+from genre_tasks.log_checks.check_log import check_log
 from genre_tasks.logs.genre_layout.writer import write_genre_layout
 from genre_tasks.logs.pandaset.writer import write_pandaset
 from genre_tasks.logs.registry import open_log
-from genre_tasks.logs.types import DrivingLog
+from genre_tasks.logs.types import Camera, DrivingLog
 from tests.fakes import FakeLog
+from tests.log_checks.edited_log import EditedLog
 from tests.logs.kitti_folder import write_kitti
 
 FAKE = FakeLog(frame_count=5, lidar_azimuths=60, lidar_rings=8, ego_yaw_rad=0.4, track_every=2)
@@ -143,6 +145,7 @@ BROKEN = {
     "no cameras": (lambda v: v.update(cameras={}), "no cameras"),
     "a camera of text": (lambda v: v["cameras"].update(front="wide"), "camera front is no object"),
     "a name that is a path": (lambda v: v["cameras"].update({"../x": v["cameras"]["front"]}), "no name of a camera"),
+    "a name of dots": (lambda v: v["cameras"].update({"..": v["cameras"]["front"]}), "no name of a camera"),
     "no focal length": (lambda v: v["cameras"]["front"].pop("fx_px"), "no finite number fx_px"),
     "a focal length of 400 digits": (lambda v: v["cameras"]["front"].update(fx_px=10**400), "no finite number fx_px"),
     "half a pixel": (lambda v: v["cameras"]["front"].update(width_px=95.5), "half a pixel"),
@@ -246,3 +249,40 @@ def test_every_file_that_is_read_counts(folder: Path) -> None:
         path.write_bytes(data)
     (folder / "notes.txt").write_text("nothing")
     assert open_log(f"genre:{folder}").digest() == digest
+
+
+def test_a_camera_that_is_slower_is_mounted_as_at_the_nearest_frame(folder: Path, tmp_path: Path) -> None:
+    def drop(values: dict[str, Any]) -> None:
+        for frame in (0, 2, 3):
+            del values["frames"][frame]["images"]["left"]
+
+    _change(folder, drop)
+    log = open_log(f"genre:{folder}")
+    for frame in range(log.frame_count):
+        np.testing.assert_allclose(
+            log.world_SE3_camera("left", frame), FAKE.world_SE3_camera("left", frame), rtol=0, atol=1e-9
+        )
+    written = open_log(f"genre:{write_genre_layout(log, tmp_path / 'converted')}")
+    assert written.image_bytes("left", 2) is None
+    assert written.image_bytes("left", 4) == FAKE.image_bytes("left", 4)
+
+
+def test_an_image_with_a_time_needs_none_of_its_frame(folder: Path) -> None:
+    _change(folder, lambda values: values["frames"][2].pop("time_s"))
+    assert open_log(f"genre:{folder}").camera_timestamp_s("front", 2) == FAKE.camera_timestamp_s("front", 2)
+
+
+@pytest.mark.parametrize("change", [lambda frame: frame.pop("time_s"), lambda frame: frame.update(time_s=float("nan"))])
+def test_the_check_reports_a_frame_without_a_time(folder: Path, change: Any) -> None:
+    _change(folder, lambda values: change(values["frames"][2]))
+    check = check_log(open_log(f"genre:{folder}"))
+    (finding,) = [finding for finding in check.findings if finding.word == "missing_timestamp"]
+    assert finding.frames == (2,) and "frame 2 has no finite number time_s" in finding.message
+
+
+@pytest.mark.parametrize("name", ["../../x", "/home/u/x", "..", "front camera", "a\\b", ""])
+def test_a_name_that_is_no_folder_is_not_written(tmp_path: Path, name: str) -> None:
+    log = EditedLog(FAKE, cameras=(Camera(name, FAKE.lens),))
+    with pytest.raises(InputError, match="cannot be a folder's name") as caught:
+        write_genre_layout(log, tmp_path / "logs/007")
+    assert caught.value.remedy and list(tmp_path.iterdir()) == []

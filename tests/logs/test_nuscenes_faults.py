@@ -73,6 +73,11 @@ BROKEN: dict[str, tuple[Callable[[Path], None], str, str]] = {
     "no turn": (_set("ego_pose", "rotation", [0, 0, 0, 0]), "quaternion is zero", "ego_pose"),
     "no size": (_set("sample_annotation", "size", [1, 0, 1]), "no size", "sample_annotation"),
     "half a character": (_set("scene", "name", "\ud800"), "row 0", "scene"),
+    "a camera elsewhere": (
+        lambda root: change_table(root, "sensor", lambda rows: [{**row, "channel": "../x"} for row in rows]),
+        "cannot be a folder's name",
+        "sensor",
+    ),
     "a file elsewhere": (_set("sample_data", "filename", "../../etc/passwd"), "outside of the root", "sample_data"),
     "no lens": (
         lambda root: change_table(root, "calibrated_sensor", lambda rows: rows[2].update(camera_intrinsic=[])),

@@ -13,8 +13,9 @@ from genre_tasks.errors import InputError, ResourceError
 from genre_tasks.logs.pandaset.reader import open_pandaset
 from genre_tasks.logs.pandaset.writer import write_pandaset
 from genre_tasks.logs.registry import open_log
-from genre_tasks.logs.types import CuboidTrack, DrivingLog
+from genre_tasks.logs.types import Camera, CuboidTrack, DrivingLog
 from tests.fakes import FakeCar, FakeLog
+from tests.log_checks.edited_log import EditedLog
 from tests.logs.pandaset_folder import small_log
 
 
@@ -125,6 +126,14 @@ class TestRoundTrip:
         write_pandaset(small_log(), tmp_path / "002", lambda done, total, note="": calls.append((done, total)))
         assert [done for done, _ in calls] == list(range(1, 13))
         assert {total for _, total in calls} == {12}
+
+
+@pytest.mark.parametrize("name", ["../../x", "/home/u/x", "..", "a\\b", "a\0b", ""])
+def test_a_name_that_is_no_folder_is_not_written(tmp_path: Path, name: str) -> None:
+    log = EditedLog(small_log(), cameras=(Camera(name, small_log().lens),))
+    with pytest.raises(InputError, match="cannot be a folder's name") as caught:
+        write_pandaset(log, tmp_path / "logs/002")
+    assert caught.value.remedy and list(tmp_path.iterdir()) == []
 
 
 class TestAtomic:

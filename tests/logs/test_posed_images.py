@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -92,6 +93,20 @@ def test_half_size_images_scale_the_lens(tmp_path: Path, written: Path) -> None:
     assert log.digest() != full.digest()
 
 
+def test_one_small_image_does_not_define_the_lens(tmp_path: Path, written: Path) -> None:
+    shutil.copytree(written / "images", tmp_path / "images")
+    path = tmp_path / "images/front_camera/0000.png"
+    Image.open(path).resize((48, 27)).save(path)
+    log = open_log(f"posed_images:{written}?images={tmp_path}")
+    assert log.cameras == open_log(f"posed_images:{written}").cameras
+
+
+def test_the_folder_of_one_camera_is_not_that_of_all(written: Path) -> None:
+    with pytest.raises(InputError, match="two images of the poses are one file") as caught:
+        open_log(f"posed_images:{written}?images={written}/images/front_camera")
+    assert "--images" in caught.value.remedy and caught.value.file
+
+
 def no_overlap(values: dict[str, Any]) -> None:
     for n, frame in enumerate(values["frames"]):
         frame["file_path"] = frame["file_path"].replace(".png", f"-{n}.png")
@@ -110,6 +125,11 @@ def not_there(values: dict[str, Any]) -> None:
         frame["file_path"] += ".jpeg"
 
 
+def labelled_elsewhere(values: dict[str, Any]) -> None:
+    for n, frame in enumerate(values["frames"]):
+        frame.update(camera=("a", "b", "../../x")[n % 3], time=n // 3)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -123,6 +143,7 @@ def not_there(values: dict[str, Any]) -> None:
         (lambda v: v["frames"][0].update(fl_x=float("1e400")), "cannot be read"),
         (lambda v: v["frames"][0].update(cx="middle"), "lack a number for cx"),
         (lambda v: v["frames"][0].pop("transform_matrix"), "no transform_matrix"),
+        (labelled_elsewhere, "cannot be a folder's name"),
     ],
 )
 def test_what_cannot_be_read_is_an_error_with_a_remedy(

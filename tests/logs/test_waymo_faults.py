@@ -53,6 +53,14 @@ def _cut(component: str) -> Callable[[Path], None]:
     return cut
 
 
+def _name_cameras(name: str) -> Callable[[Path], None]:
+    def change(root: Path) -> None:
+        change_column(root, "camera_calibration", "key.camera_name", [name])
+        change_column(root, "camera_image", "key.camera_name", [name] * IMAGES)
+
+    return change
+
+
 def _lists(values: list[float]) -> pa.Array:
     return pa.array([values] * IMAGES, LISTS)
 
@@ -91,6 +99,7 @@ BROKEN: dict[str, tuple[Callable[[Path], None], str, str]] = {
     "nulls": (_set("camera_image", "pose_timestamp", pa.array([None] * 3, pa.float64())), "nulls", "camera_image"),
     "no focus": (_set("camera_calibration", "intrinsic.f_u", [0.0]), "no positive focal length", "camera_calibration"),
     "a lens that folds": (_set("camera_calibration", "intrinsic.k1", [-3.0]), "folds back", "camera_calibration"),
+    "a camera elsewhere": (_name_cameras("../x"), "cannot be a folder's name", "camera_calibration"),
     "another camera": (
         _set("camera_calibration", "key.camera_name", pa.array([3], pa.int8())),
         "no camera has both",

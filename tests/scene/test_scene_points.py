@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from genre_tasks.logs.types import Lens
-from genre_tasks.scene.actor_track import ActorTrack
+from genre_tasks.logs.types import CuboidTrack, Lens
+from genre_tasks.scene.actor_track import MOST_GAP_FRAMES, ActorTrack, cut_track_to_chunk
 from genre_tasks.scene.chunk import View
 from genre_tasks.scene.projection import project, splat_depth
 from genre_tasks.scene.road_completion import complete_road
@@ -93,6 +93,16 @@ def test_an_actor_is_coloured_where_it_is_at_the_view_and_occludes() -> None:
     both = color_point_clouds([wall, actor], [(_view(0), at_0), (_view(4), at_4)])
     assert (both[1][0] == 200).all(), "the view at the points' own frame wins"
     assert both[0][1].all() and (both[0][0][both[0][1]] == 200).any()
+
+
+def test_a_track_is_absent_in_a_long_gap() -> None:
+    frames = np.array([0, MOST_GAP_FRAMES + 1, 2 * MOST_GAP_FRAMES + 3])
+    boxes = np.stack([yaw_pose(0, (float(frame), 0, 0)) for frame in frames])
+    log_track = CuboidTrack("a", "Car", frames, boxes, (4.0, 2.0, 1.5), moving=True)
+    track, _ = cut_track_to_chunk(log_track, range(30), np.eye(4))
+    assert track is not None and track.frames.tolist() == [*range(MOST_GAP_FRAMES + 2), 2 * MOST_GAP_FRAMES + 3]
+    assert np.allclose(track.chunk_SE3_box[:-1, 0, 3], np.arange(MOST_GAP_FRAMES + 2))
+    assert cut_track_to_chunk(log_track, range(13, 20), np.eye(4)) == (None, 0)
 
 
 def test_voxels_grow_in_octaves() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from flows.reconstruction.report.viewpoints import describe_viewpoint
 from genre_tasks.config import EvaluateConfig, IngestConfig
 from genre_tasks.errors import NonFiniteError
 from genre_tasks.logs.types import Float64, Lens
@@ -26,6 +27,7 @@ from genre_tasks.scene.reconstruction import Reconstruction
 from genre_tasks.stages import evaluation_renders
 from genre_tasks.stages.evaluate import evaluate_fixed, evaluate_scene
 from genre_tasks.stages.ingest import ingest
+from storage.codecs.evaluation import read, write
 from tests.fakes import FakeLog
 from tests.metrics.test_fid_lpips import FakeInception, FakeVgg, saved
 
@@ -157,6 +159,19 @@ def test_pictures_have_the_same_names_in_every_stage(chunk: Chunk, scene: SceneG
     assert sorted(evaluate_fixed(CONFIG, chunk, fixed, novel, None).pictures) == names[1:]
     none = EvaluateConfig(shifts_m=(), pictures=0)
     assert evaluate_scene(none, chunk, "gnet", Reconstruction(scene), None).pictures == {}
+
+
+def test_a_camera_of_any_name_has_pictures(chunk: Chunk, scene: SceneGraph, monkeypatch, tmp_path: Path) -> None:
+    names = {name: f"{name} (öst), 100 %~=" for name in chunk.camera_names}
+    views = tuple(replace(view, camera=names[view.camera]) for view in chunk.views)
+    renamed = replace(chunk, camera_names=tuple(names.values()), views=views)
+    monkeypatch.setattr(evaluation_renders, "render_views", oracle(renamed))
+    config = EvaluateConfig(shifts_m=(), distributions=False)
+    evaluation = evaluate_scene(config, renamed, "gnet", Reconstruction(scene), None)
+    write(tmp_path, evaluation)
+    labels = [describe_viewpoint(name) for name in read(tmp_path).pictures]
+    assert len(labels) == len(evaluation.pictures) > 0
+    assert f"3 m to the left · {names['front']} · frame 4" in labels
 
 
 def test_curve_follows_the_snapshots(chunk: Chunk, scene: SceneGraph) -> None:

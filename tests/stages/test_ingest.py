@@ -11,7 +11,7 @@ import pytest
 from genre_tasks.config import IngestConfig
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.log_checks.check_log import check_log
-from genre_tasks.scene.chunk import NO_SWEEP, Chunk, LogIssue
+from genre_tasks.scene.chunk import MOST_FRAMES, NO_SWEEP, Chunk, LogIssue
 from genre_tasks.scene.facade_completion import STEP_M
 from genre_tasks.stages.ingest import chunk_count, ingest
 from tests.fakes import SENSOR_HEIGHT_M, WALL_HEIGHT_M, FakeLog
@@ -131,6 +131,12 @@ def test_images_of_another_shape_are_left_out(log: FakeLog) -> None:
 
     with pytest.raises(InputError, match=r"0 source frames.*16 images are left out.*96×64.*lens is 96×96"):
         ingest(CONFIG, Taller(frame_count=8), 0)
+
+
+def test_a_frame_that_points_cannot_number_is_refused() -> None:
+    with pytest.raises(InputError, match="more than 32,768 frames") as caught:
+        ingest(CONFIG, FakeLog(frame_count=MOST_FRAMES + 1), MOST_FRAMES // CONFIG.chunk_frames)
+    assert "Divide the log" in caught.value.remedy
 
 
 def test_short_last_chunk(log: FakeLog) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import NamedTuple
+from urllib.parse import unquote
 
 from flows.reconstruction.report.error_maps import ErrorMap, make_error_map
 from flows.reconstruction.report.photos import EmbeddedImage, embed_photo
@@ -110,6 +111,8 @@ def describe_viewpoint(name: str) -> str:
 
     >>> describe_viewpoint("3m_left_front_camera_04")
     '3 m to the left · front camera · frame 4'
+    >>> describe_viewpoint("0m_front=20camera_04")
+    'On the path · front camera · frame 4'
     """
     shift, side, camera, frame = _parse_name(name)
     where = "On the path" if shift == "0m" else f"{shift.removesuffix('m')} m to the {side}"
@@ -128,7 +131,8 @@ def _parse_name(name: str) -> _Place:
     # On the path there is no side: a name like 0m_left_camera_05 is of the camera to the left.
     side = next((s for s in ("left", "right") if shift != "0m" and rest.startswith(f"{s}_")), "")
     camera, _, frame = rest.removeprefix(f"{side}_" if side else "").rpartition("_")
-    return _Place(shift, side, camera, frame)
+    # Spaces and other characters of a camera are written as in a URL, with = for %.
+    return _Place(shift, side, unquote(camera.replace("=", "%")), frame)
 
 
 def _view_order(name: str) -> tuple[object, ...]:

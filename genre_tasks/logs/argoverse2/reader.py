@@ -11,6 +11,7 @@ import numpy as np
 
 from genre_tasks.errors import InputError
 from genre_tasks.logs.argoverse2.feather_tables import POSITION, QUATERNION, compose_poses, read_columns
+from genre_tasks.logs.camera_names import require_camera_names
 from genre_tasks.logs.file_digest import digest_files
 from genre_tasks.logs.file_reading import read_file
 from genre_tasks.logs.findings import Finding
@@ -120,6 +121,7 @@ class Argoverse2Log(RecordedLog):
         for name, row in zip(columns["sensor_name"], rows.tolist(), strict=True):
             if not name.startswith(_RING):
                 continue
+            require_camera_names([name], log=self.uri, file=path)
             fx_px, fy_px, cx_px, cy_px, width_px, height_px = row
             if name not in self._mounts or not (fx_px > 0 and fy_px > 0 and width_px >= 1 and height_px >= 1):
                 problem = f"{name} has no place on the vehicle, or no positive focal length and size"

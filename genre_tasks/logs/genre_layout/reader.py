@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import re
+from bisect import bisect_left
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from genre_tasks.errors import InputError
+from genre_tasks.logs.camera_names import is_plain_name
 from genre_tasks.logs.file_digest import digest_files
 from genre_tasks.logs.file_reading import read_file, read_json
 from genre_tasks.logs.findings import Finding
@@ -34,7 +38,6 @@ from genre_tasks.user_paths import expand_user_path
 
 # A frame with ten cameras has two kilobytes.
 _MAX_JSON_BYTES = 1 << 28
-_NAME = re.compile(r"[\w.=,+-]+", re.ASCII)
 
 
 def open_genre_layout(rest: str) -> GenreLayoutLog:
@@ -107,8 +110,9 @@ class GenreLayoutLog(RecordedLog):
 
     def _parse_camera(self, name: str, values: Mapping[str, Any]) -> Camera:
         what = f"camera {name}"
-        if not _NAME.fullmatch(name):
-            raise EntryError(f"{name!r} is no name of a camera: letters, digits and . = , + - _ are allowed")
+        if not is_plain_name(name):
+            rule = "letters, digits and . = , + - _ are allowed, and dots alone are none"
+            raise EntryError(f"{name!r} is no name of a camera: {rule}")
         numbers = {key: parse_number(values, key, what) for key in LENS_KEYS}
         sides = (numbers["width_px"], numbers["height_px"])
         is_whole = all(side >= 1 and side == int(side) for side in sides)
@@ -159,16 +163,48 @@ class GenreLayoutLog(RecordedLog):
         return pose
 
     def world_SE3_camera(self, camera: str, frame: int) -> Float64:
-        """See ``DrivingLog``."""
+        """See ``DrivingLog``; where a frame has neither image nor pose, mounted as at the nearest frame with a pose."""
+        entry = self._image_entry(camera, frame)
+        # A camera that is slower than the LiDAR has no entry at some frames, and is on the vehicle all the same.
+        lacks_both = entry.get("pose") is None and entry.get("file") is None
+        near = self._find_nearest_pose(camera, frame) if lacks_both else None
+        if near is None:
+            return self._parse_camera_pose(camera, frame)
+        mount = np.linalg.inv(self.world_SE3_lidar(near)) @ self._parse_camera_pose(camera, near)
+        pose: Float64 = self.world_SE3_lidar(frame) @ mount
+        return pose
+
+    def _parse_camera_pose(self, camera: str, frame: int) -> Float64:
         entry = self._image_entry(camera, frame)
         pose: Float64 = self._parse(parse_pose, entry.get("pose"), f"pose of {camera} in frame {frame}")
         return pose
+
+    def _find_nearest_pose(self, camera: str, frame: int) -> int | None:
+        """The frame nearest to this one that has a pose of the camera; of two the earlier one."""
+        frames = self._frames_with_pose[camera]
+        after = bisect_left(frames, frame)
+        return min(frames[max(after - 1, 0) : after + 1], key=lambda near: abs(near - frame), default=None)
+
+    @cached_property
+    def _frames_with_pose(self) -> dict[str, list[int]]:
+        """Camera → frames whose entry has a pose, in order; listed once, so that long logs take no quadratic time."""
+        found: dict[str, list[int]] = {camera.name: [] for camera in self.cameras}
+        for frame, values in enumerate(self._frames):
+            images = values.get("images")
+            # What is broken is an error of its frame, and no place to look for a pose.
+            for name, entry in images.items() if isinstance(images, dict) else ():
+                if name in found and isinstance(entry, dict) and entry.get("pose") is not None:
+                    found[name].append(frame)
+        return found
 
     def camera_timestamp_s(self, camera: str, frame: int) -> float:
         """See ``DrivingLog``; the frame's time where the image has none."""
         entry = self._image_entry(camera, frame)
         what = f"{camera} of frame {frame}"
-        return float(self._parse(parse_number, entry, "time_s", what, self.frame_timestamp_s(frame)))
+        # Asked for only where it is needed: a frame without a time must not cost an image that has one.
+        if "time_s" not in entry:
+            return self.frame_timestamp_s(frame)
+        return float(self._parse(parse_number, entry, "time_s", what))
 
     def image_bytes(self, camera: str, frame: int) -> bytes | None:
         """See ``DrivingLog``."""

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from genre_tasks.logs.camera_names import require_camera_names
 from genre_tasks.logs.genre_layout.box_table import write_boxes
 from genre_tasks.logs.genre_layout.layout import BOXES_FILE, FORMAT, LENS_KEYS, LOG_FILE, VERSION
 from genre_tasks.logs.genre_layout.sweep_files import write_sweep
@@ -29,7 +30,8 @@ def write_genre_layout(log: DrivingLog, folder: Path, progress: Progress = silen
         ``folder``.
 
     Raises:
-        InputError: the folder holds something already; the log itself raises; an image is of another format.
+        InputError: the folder holds something already; the log itself raises; an image is of another format; the name
+            of a camera cannot be a folder's name.
         ResourceError: the disk is full or not writable.
 
     Example::
@@ -37,6 +39,7 @@ def write_genre_layout(log: DrivingLog, folder: Path, progress: Progress = silen
         write_genre_layout(open_log("kitti:2011_09_26/2011_09_26_drive_0009_sync"), Path("drive-9"))
         log = open_log("genre:drive-9")
     """
+    require_camera_names((camera.name for camera in log.cameras), plain=True, log=log.uri, file=folder)
     with new_log_folder(folder, log.uri) as root:
         frames = []
         for frame in range(log.frame_count):

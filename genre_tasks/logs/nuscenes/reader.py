@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from genre_tasks.errors import InputError
+from genre_tasks.logs.camera_names import require_camera_names
 from genre_tasks.logs.file_digest import digest_files
 from genre_tasks.logs.file_reading import read_file
 from genre_tasks.logs.findings import Finding
@@ -77,7 +78,7 @@ class NuScenesLog(RecordedLog):
         rows: of the scene.
 
     Raises:
-        InputError: the scene has no data, or none of its files is there.
+        InputError: the scene has no data, none of its files is there, or the name of a camera leads out of a folder.
     """
 
     dataset = "nuscenes"
@@ -89,6 +90,7 @@ class NuScenesLog(RecordedLog):
         self.name = re.sub(r"[^\w.=,+-]", "_", address.scene, flags=re.ASCII)
         self._tables = address.tables
         self._rows = rows
+        require_camera_names(rows.cameras, log=uri, file=self._tables / "sensor.json")
         main = _MAIN_LIDAR if _MAIN_LIDAR in rows.lidars else next(iter(rows.lidars), None)
         # Without a LiDAR, a camera is the clock.
         clock = rows.lidars[main] if main else next(iter(rows.cameras.values()), ())

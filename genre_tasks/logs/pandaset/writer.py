@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from genre_tasks.logs.camera_names import require_camera_names
 from genre_tasks.logs.image_suffixes import find_image_suffix
 from genre_tasks.logs.new_log_folder import new_log_folder
 from genre_tasks.logs.pandaset.layout import (
@@ -49,7 +50,8 @@ def write_pandaset(log: DrivingLog, folder: Path, progress: Progress = silent) -
         ``folder``.
 
     Raises:
-        InputError: the folder holds something already; the log itself raises; an image is of another format.
+        InputError: the folder holds something already; the log itself raises; an image is of another format; the name
+            of a camera cannot be a folder's name.
         ResourceError: the disk is full or not writable.
 
     Example::
@@ -57,6 +59,7 @@ def write_pandaset(log: DrivingLog, folder: Path, progress: Progress = silent) -
         write_pandaset(open_log("synthetic:street?seed=7"), Path("sequences/007"))
         log = open_log("pandaset:sequences/007")
     """
+    require_camera_names((camera.name for camera in log.cameras), log=log.uri, file=folder)
     with new_log_folder(folder, log.uri) as root:
         _write_cameras(log, root, progress)
         _write_lidar(log, root, progress)

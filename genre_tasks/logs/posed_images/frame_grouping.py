@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from genre_tasks.errors import InputError
+from genre_tasks.logs.camera_names import require_camera_names
 from genre_tasks.logs.posed_images.posed_image import PosedImage
 
 ONE_CAMERA = "camera"
@@ -47,11 +48,13 @@ def group_frames(images: Sequence[PosedImage], file: Path) -> FrameGroups:
         Frames in the order of their times, or of their names without times.
 
     Raises:
-        InputError: names of several folders do not agree, two images claim one place, or a camera has two lenses.
+        InputError: names of several folders do not agree, two images claim one place, a camera has two lenses, or its
+            name would lead out of a folder.
     """
     has_times = all(image.time_s is not None for image in images)
     cameras = _name_cameras(images)
     names = sorted(set(cameras), key=_natural_key)
+    require_camera_names(names, file=file)
     frames: dict[float | str, dict[str, PosedImage]] = {}
     for image, camera in zip(images, cameras, strict=True):
         key = float(image.time_s or 0.0) if has_times else PurePosixPath(image.name).stem

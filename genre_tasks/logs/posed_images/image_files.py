@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from genre_tasks.errors import InputError
+from genre_tasks.logs.image_sizes import measure_images
 from genre_tasks.logs.types import Lens
 
 # instant-ngp's names may lack the suffix.
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
-_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
 # Rounding of both sides of a resampled image changes its shape by so many pixels at most.
 _ROUNDING_PX = 2.0
 
@@ -26,6 +25,7 @@ class ImageFolder:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._dropped_parts = 0
+        self._name_of_file: dict[Path, str] = {}
 
     def find(self, name: str) -> Path | None:
         """Finds an image. Leading folders of a name that are not in this folder are left out.
@@ -35,6 +35,9 @@ class ImageFolder:
 
         Returns:
             The file; ``None`` if there is none.
+
+        Raises:
+            InputError: the file is that of another name already.
         """
         # Without a root and steps upwards, so that no name leads out of the folder.
         parts = [part for part in PurePosixPath(name).parts if part not in ("/", "..", ".")]
@@ -45,8 +48,17 @@ class ImageFolder:
                 path = self._folder.joinpath(*parts[dropped:-1], parts[-1] + suffix)
                 if path.is_file():
                     self._dropped_parts = dropped
+                    self._require_one_name(path, name)
                     return path
         return None
+
+    def _require_one_name(self, path: Path, name: str) -> None:
+        """Refuses that a camera gets the images of another one, as where the folder is that of one camera alone."""
+        first = self._name_of_file.setdefault(path, name)
+        if first != name:
+            problem = f"two images of the poses are one file: {first} and {name}"
+            remedy = "Name the folder above those of the cameras with --images."
+            raise InputError(problem, remedy=remedy, file=path)
 
 
 def fit_lens(lens: Lens, camera: str, files: Sequence[Path]) -> Lens:
@@ -55,7 +67,7 @@ def fit_lens(lens: Lens, camera: str, files: Sequence[Path]) -> Lens:
     Args:
         lens: at the size that the file of poses states.
         camera: name of the camera, for errors.
-        files: its images; the first readable one counts.
+        files: its images; the most frequent size counts.
 
     Returns:
         The lens at the images' size.
@@ -63,31 +75,17 @@ def fit_lens(lens: Lens, camera: str, files: Sequence[Path]) -> Lens:
     Raises:
         InputError: the images have another shape, or none can be read.
     """
-    for file in files:
-        size = _read_size(file)
-        if size is None:
-            continue
-        width, height = size
-        # Half-size images of odd sides are rounded.
-        if abs(lens.height_px * width / lens.width_px - height) > _ROUNDING_PX:
-            problem = f"images of {camera} are {width}×{height}, the intrinsics are for "
-            problem += f"{lens.width_px}×{lens.height_px}"
-            raise InputError(problem, remedy="Give the images that the poses were made from.", file=file, camera=camera)
-        return lens if size == (lens.width_px, lens.height_px) else lens.resized(width, height)
-    raise InputError(
-        f"no image of {camera} can be read", remedy="Give images as PNG or JPEG.", file=files[0], camera=camera
-    )
-
-
-def _read_size(file: Path) -> tuple[int, int] | None:
-    from PIL import Image
-
-    try:
-        with warnings.catch_warnings():
-            # Ingest judges whether an image is too large.
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(file, formats=_FORMATS) as image:
-                return image.size
-    # Damaged headers raise whatever the decoder of their format stumbles over.
-    except Exception:
-        return None
+    sizes = measure_images(dict(enumerate(files)))
+    # By majority, as one thumbnail among the images must not define the lens.
+    majority = sizes.majority
+    if majority is None:
+        remedy = "Give images as PNG or JPEG."
+        raise InputError(f"no image of {camera} can be read", remedy=remedy, file=files[0], camera=camera)
+    width, height = majority
+    # Half-size images of odd sides are rounded.
+    if abs(lens.height_px * width / lens.width_px - height) > _ROUNDING_PX:
+        file = files[next(index for index, size in sizes.sizes.items() if size == majority)]
+        problem = f"images of {camera} are {width}×{height}, the intrinsics are for "
+        problem += f"{lens.width_px}×{lens.height_px}"
+        raise InputError(problem, remedy="Give the images that the poses were made from.", file=file, camera=camera)
+    return lens if majority == (lens.width_px, lens.height_px) else lens.resized(width, height)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from genre_tasks.logs.camera_names import require_camera_names
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.lens_validity import with_distortion
 from genre_tasks.logs.types import Camera, Float64, Lens
@@ -74,7 +75,7 @@ def read_cameras(calibration: ComponentTable, images: ComponentTable) -> Segment
         Cameras that have a calibration and images.
 
     Raises:
-        InputError: a table lacks columns, or holds what no camera has.
+        InputError: a table lacks columns, or holds what no camera has, such as a name that leads out of a folder.
     """
     # Cameras that took no image of this segment are left out.
     rows, readouts = _read_images(images)
@@ -103,6 +104,7 @@ def read_cameras(calibration: ComponentTable, images: ComponentTable) -> Segment
     # A pair of files of two segments would look like this.
     if not cameras:
         raise calibration.fault("no camera has both a calibration and images")
+    require_camera_names(poses, log=calibration.log, file=calibration.path)
     return SegmentCameras(tuple(cameras), poses, {name: rows[name] for name in poses}, tuple(findings))
 
 
