@@ -51,7 +51,7 @@ class NeuroncapClient:
                     "image_format": image_format,
                 }
                 images.append(json.dumps(message).encode())
-        actors = write_trajectories(describe_recorded(renderer.actors()))
+        actors = write_trajectories(describe_recorded(renderer.actors(), renderer.frame_s))
         self._samples: Mapping[str, Sequence[bytes]] = {
             "POST /render_image": images,
             "POST /update_actors": [json.dumps(actors).encode(), json.dumps(actors[:1]).encode(), b"[]"],

@@ -60,8 +60,8 @@ def augment_runs(
         How much was written.
 
     Raises:
-        InputError: there is no such run or stage, a log is gone or has no annotations, two runs have the same chunk, or
-            the folder holds something already.
+        InputError: there is no such run or stage, a run is there twice or has edited traffic, a log is gone or has no
+            annotations, two runs have the same chunk, or the folder holds something already.
         ConfigError: there is no such format.
         ResourceError: the disk is full or not writable.
     """
@@ -81,17 +81,27 @@ def _open_sources(request: AugmentRequest) -> list[tuple[RunScenes, DrivingLog]]
     from genre_tasks.training_sets.label_boxes import labeller_of
 
     sources = []
+    names: set[str] = set()
     known: dict[tuple[str, int], str] = {}
     for run in request.runs:
         scenes = RunScenes(request.store, run, request.stage)
+        name = str(scenes.record["run"])
+        if name in names:
+            raise InputError(f"the run {name} is there twice", remedy="Name each run once.")
+        names.add(name)
+        edited = scenes.record.get("edited")
+        if edited is not None:
+            # The log's annotation knows neither of removed actors nor of moved ones.
+            problem = f"the traffic of the run {name} is edited, and the labels would be those of the recorded traffic"
+            raise InputError(problem, remedy=f"Take the recorded run {edited['run']}.")
         log = cached_log(scenes.record["log"])
         # Raises where there is nothing to label with.
         labeller_of(log)
         for number in scenes.chunk_numbers:
-            other = known.setdefault((log.name, number), run)
+            other = known.setdefault((log.name, number), name)
             # Two scenes of one place would put every recorded image into the set twice.
-            if other != run:
-                problem = f"the runs {other} and {run} both have chunk {number} of the log {log.name}"
+            if other != name:
+                problem = f"the runs {other} and {name} both have chunk {number} of the log {log.name}"
                 raise InputError(problem, remedy="Make a training set of each.", log=log.uri)
         sources.append((scenes, log))
     return sources

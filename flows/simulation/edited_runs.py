@@ -13,6 +13,7 @@ from flows.machine.resource_usage import measure_usage
 from flows.pipeline.stage_runner import ArtifactRef
 from flows.reconstruction.run_records import (
     FinishedRun,
+    find_run_record,
     summarise_run,
     write_run_record,
 )
@@ -23,7 +24,7 @@ from genre_tasks.config.simulation_sections import SimulateConfig
 from genre_tasks.scene.reconstruction import Reconstruction
 from genre_tasks.scene_edits.actor_library import ActorLibrary
 from genre_tasks.scene_edits.edited_scenes import EditedScenes
-from genre_tasks.scene_edits.edits import EditList, Insert
+from genre_tasks.scene_edits.edits import Edit, EditList, Insert
 from storage.address import Address
 from storage.code_digest import code_digest
 from storage.opening import open_store
@@ -95,9 +96,11 @@ def open_edited_scenes(
     Raises:
         InputError: there is no such run, chunk or actor.
     """
-    opened = open_run(store, run, stage, chunks)
+    # Surveyed as a whole, whichever chunks are shown: names, tracks and the ground are those of the run.
+    opened = open_run(store, run, stage)
+    shown = None if chunks is None else RunScenes(store, run, stage, chunks).chunk_numbers
     library = ActorLibrary(lambda name: open_shown_scenes(store, name))
-    return EditedScenes(opened.recorded, opened.edits + edits, library, config)
+    return EditedScenes(opened.recorded, opened.edits + edits, library, config, shown)
 
 
 def open_shown_scenes(store: str, run: str) -> RunScenes | EditedScenes:
@@ -117,23 +120,27 @@ def open_shown_scenes(store: str, run: str) -> RunScenes | EditedScenes:
     return open_edited_scenes(store, run, EditList(), config)
 
 
-def digest_edits(store: str, edits: EditList, config: SimulateConfig) -> str:
+def digest_edits(store: str, recorded: RunScenes, edits: EditList, config: SimulateConfig) -> str:
     """Computes what edits add to the key of all that is made with them.
 
     Args:
         store: folder (or URI) of the store.
+        recorded: all chunks of the run, as they were reconstructed.
         edits: the list.
         config: of re-simulation.
 
     Returns:
-        64 hex digits over the edits, the scenes that actors are taken from, the settings and the code.
+        64 hex digits over the edits, all scenes of the run and of those that actors are taken from, the settings and
+        the code.
 
     Raises:
-        InputError: a run that an actor is from does not exist.
+        InputError: a run that an actor is from does not exist, or an artifact of the run is gone.
     """
     runs = sorted({edit.from_run for edit in edits.edits if isinstance(edit, Insert) and edit.from_run is not None})
     values = {
         "edits": edits.model_dump(mode="json"),
+        # A chunk depends on the others: they decide on names, tracks and the ground, and lend it actors.
+        "inputs": recorded.payload_digests(),
         "runs": {name: RunScenes(store, name).record["run"] for name in runs},
         "contact_shadow": config.contact_shadow,
         "code": code_digest(_CODE),
@@ -161,8 +168,12 @@ def write_edited_run(store: str, run: str, edits: EditList, config: SimulateConf
     record = opened.recorded.record
     settings = PipelineConfig.model_validate(record["config"]).simulate if config is None else config
     scenes = open_edited_scenes(store, run, edits, settings)
-    digest = digest_edits(store, scenes.edits, settings)
-    chunks = {number: _write_chunk(store, record["run"], number, scenes, digest) for number in scenes.chunk_numbers}
+    # The start of a name may be that of several runs one day.
+    named = EditList(edits=tuple(_name_source_run(store, edit) for edit in scenes.edits.edits))
+    digest = digest_edits(store, opened.recorded, named, settings)
+    chunks = {
+        number: _write_chunk(store, record["run"], number, scenes, named, digest) for number in scenes.chunk_numbers
+    }
     finished = FinishedRun(
         log=record["log"],
         preset=record["preset"],
@@ -172,11 +183,20 @@ def write_edited_run(store: str, run: str, edits: EditList, config: SimulateConf
         chunks=chunks,
         notes=dict.fromkeys(chunks, f"the traffic of run {record['run']} is edited"),
     )
-    edited = {"run": record["run"], "edits": scenes.edits.model_dump(mode="json")}
+    edited = {"run": record["run"], "edits": named.model_dump(mode="json")}
     return write_run_record(finished, summarise_run(finished), {"edited": edited})
 
 
-def _write_chunk(store: str, run: str, number: int, scenes: EditedScenes, digest: str) -> dict[str, ArtifactRef]:
+def _name_source_run(store: str, edit: Edit) -> Edit:
+    """The edit with the full name of the run that an actor is from."""
+    if not isinstance(edit, Insert) or edit.from_run is None:
+        return edit
+    return edit.model_copy(update={"from_run": find_run_record(store, edit.from_run)["run"]})
+
+
+def _write_chunk(
+    store: str, run: str, number: int, scenes: EditedScenes, edits: EditList, digest: str
+) -> dict[str, ArtifactRef]:
     stage = find_last_stage(store, run, number)
     keys = _stage_keys(store, run, number)
     with measure_usage() as usage:
@@ -195,7 +215,7 @@ def _write_chunk(store: str, run: str, number: int, scenes: EditedScenes, digest
         address = Address(ingested.dataset, ingested.log, number, name, key)
         provenance = Provenance(
             inputs={name: keys[name]},
-            configuration=scenes.edits.model_dump(mode="json"),
+            configuration=edits.model_dump(mode="json"),
             code_digest=code_digest(_CODE),
             seconds=usage.seconds,
             peak_mib=usage.peak_mib,

@@ -9,6 +9,7 @@ from flows.pipeline.log_cache import cached_log
 from flows.simulation.edited_runs import OpenedRun, digest_edits
 from flows.simulation.parked_actors import find_log
 from flows.simulation.request import SimulationRequest
+from flows.simulation.run_scenes import RunScenes
 from flows.simulation.sensors import MODULES as SENSOR_MODULES
 from genre_tasks.config import PipelineConfig
 from genre_tasks.ego_paths.behaviours import BEHAVIOURS
@@ -52,28 +53,36 @@ def compute_rollout_key(request: SimulationRequest, run: OpenedRun, config: Pipe
         # Which rays the sensor sends is read from the log's sweeps.
         inputs["log"] = cached_log(run.recorded.record["log"]).digest()
     if len(edits):
-        inputs["edits"] = digest_edits(request.store, edits, config.simulate)
-    if request.fix or len(edits):
-        # FNet fills what removed actors hid, so edits may need it as well.
-        modules.append("genre_tasks.rollout.fix_rollout")
-        weights = digest_stage_weights(STAGE_BY_NAME["fnet"], config)
-    # Parked vehicles are known from the log alone: where it is gone, a path is not checked against them.
-    parked = find_log(run.recorded.record["log"]) is not None
-    if request.path_file is not None:
-        inputs["path file"] = _digest_file(request.path_file)
+        inputs["edits"] = digest_edits(request.store, _open_all_chunks(request, run), edits, config.simulate)
     configuration = {
         "simulate": config.simulate.model_dump(mode="json"),
         "request": request.key_values(),
         "fnet": config.fnet.model_dump(mode="json"),
-        "parked": parked,
+        # Parked vehicles are known from the log alone: where it is gone, a path is not checked against them.
+        "parked": find_log(run.recorded.record["log"]) is not None,
         "layout": _LAYOUT,
         # The encoder's version decides on the bytes of films.
         "ffmpeg": imageio_ffmpeg.__version__,
     }
+    if request.fix or len(edits):
+        # FNet fills what removed actors hid, so edits may need it as well.
+        modules.append("genre_tasks.rollout.fix_rollout")
+        weights = digest_stage_weights(STAGE_BY_NAME["fnet"], config)
+        # Of the LiDAR maps that FNet sees.
+        configuration["lidar_max_points"] = config.novel_views.lidar_max_points
+    if request.path_file is not None:
+        inputs["path file"] = _digest_file(request.path_file)
     # Behaviours are named by strings, which a reader of imports does not see.
     planners = [behaviour.target.partition(":")[0] for behaviour in BEHAVIOURS.values()]
     code = code_digest("genre_tasks.rollout.render_rollout", (*modules, *planners))
     return stage_key("rollout", code, configuration, inputs, weights)
+
+
+def _open_all_chunks(request: SimulationRequest, run: OpenedRun) -> RunScenes:
+    """All chunks of the recorded run: edits depend on those too that are not shown."""
+    if request.chunks is None:
+        return run.recorded
+    return RunScenes(request.store, run.recorded.record["run"], request.stage)
 
 
 def _digest_file(path: Path) -> str:

@@ -68,6 +68,7 @@ def simulate_run(request: SimulationRequest, progress: Progress = silent) -> dic
             configuration={
                 "simulate": config.simulate.model_dump(mode="json"),
                 "fnet": config.fnet.model_dump(mode="json"),
+                "lidar_max_points": config.novel_views.lidar_max_points,
                 "request": request.key_values(),
                 "edits": (run.edits + request.edits).model_dump(mode="json")["edits"],
             },

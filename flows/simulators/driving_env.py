@@ -117,6 +117,8 @@ class GenreDrivingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             raise ConfigError(f"unknown render_mode '{render_mode}'", remedy="Take rgb_array, or None.")
         self.render_mode = render_mode
         self._renderer = SceneRenderer(store, run, stage)
+        # Logs have frame rates of their own, and films of the environment are to be as fast as the drive.
+        self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self._renderer.frame_s))}
         self._world = DrivingWorld(store, run, stage, reliable_m, progress)
         self._model = BicycleModel(self._world.config.bounds)
         self._cameras = _resize(self._renderer.select_cameras(cameras), width_px)

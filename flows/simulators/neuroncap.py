@@ -53,7 +53,7 @@ class ActorState:
     def __init__(self, renderer: SceneRenderer) -> None:
         self._renderer = renderer
         self._lock = threading.Lock()
-        self._trajectories = describe_recorded(renderer.actors())
+        self._trajectories = describe_recorded(renderer.actors(), renderer.frame_s)
         self._is_recorded = True
 
     @property

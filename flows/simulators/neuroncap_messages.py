@@ -128,18 +128,21 @@ def parse_trajectories(body: bytes) -> tuple[Trajectory, ...]:
     return tuple(_read_trajectory(message) for message in messages)
 
 
-def describe_recorded(actors: Sequence[ActorDescription]) -> tuple[Trajectory, ...]:
+def describe_recorded(actors: Sequence[ActorDescription], frame_s: float) -> tuple[Trajectory, ...]:
     """Writes the recorded actors as trajectories.
+
+    A recorded actor is in the images of all cameras of its frames, and cameras fire up to half a frame before or after
+    the mean time of a frame. So a trajectory begins half a frame before its first frame and ends half a frame after
+    its last one.
 
     Args:
         actors: of a run.
+        frame_s: seconds of a log frame.
+
+    Returns:
+        A trajectory for each actor, in the same order.
     """
-    trajectories = []
-    for actor in actors:
-        length, width, height = actor.size_m
-        times_us = tuple(round(float(time_s) * MICROSECONDS) for time_s in actor.times_s)
-        trajectories.append(Trajectory(actor.track_id, times_us, actor.world_SE3_box, (width, length, height)))
-    return tuple(trajectories)
+    return tuple(_describe_actor(actor, frame_s) for actor in actors)
 
 
 def write_trajectories(trajectories: Sequence[Trajectory]) -> list[dict[str, object]]:
@@ -157,6 +160,23 @@ def write_trajectories(trajectories: Sequence[Trajectory]) -> list[dict[str, obj
         }
         for trajectory in trajectories
     ]
+
+
+def _describe_actor(actor: ActorDescription, frame_s: float) -> Trajectory:
+    length, width, height = actor.size_m
+    times_us = tuple(round(float(time_s) * MICROSECONDS) for time_s in actor.times_s)
+    poses = actor.world_SE3_box
+    if times_us:
+        half_us = round(frame_s / 2 * MICROSECONDS)
+        # The protocol has no times before 0, where the clocks of some logs start.
+        before_us = (max(0, times_us[0] - half_us),) if times_us[0] > 0 else ()
+        after_us = (times_us[-1] + half_us,)
+        moments = np.array([time - times_us[0] for time in times_us], np.float64)
+        asked = np.array([time - times_us[0] for time in (*before_us, *after_us)], np.float64)
+        ends = interpolate_poses(poses, moments, asked)
+        poses = np.concatenate([ends[: len(before_us)], poses, ends[len(before_us) :]])
+        times_us = (*before_us, *times_us, *after_us)
+    return Trajectory(actor.track_id, times_us, poses, (width, length, height))
 
 
 def _read_trajectory(message: TrajectoryMessage) -> Trajectory:

@@ -208,6 +208,21 @@ def fit_reference_path(recorded: EgoPath) -> ReferencePath:
     return ReferencePath(dense, distances, arc, table)
 
 
+def drives_backwards(recorded: EgoPath) -> bool:
+    """Tells whether a vehicle reverses further than it drives forwards.
+
+    Args:
+        recorded: one pose for each log frame.
+
+    Returns:
+        Whether ``fit_reference_path`` refuses it; false for fewer than two poses.
+    """
+    if len(recorded) < 2:
+        return False
+    dense, speed = _measure_forward_speed(recorded.times_s - recorded.times_s[0], recorded.world_SE3_ego)
+    return _measure_backwards(dense, speed) > 0
+
+
 def choose_smoothing_m(speed_m_s: Float64) -> float:
     """Chooses how smooth the shape of a path is.
 
@@ -239,17 +254,30 @@ def integrate_speed(times_s: Float64, speed_m_s: Float64) -> Float64:
 
 def _measure_distances(times: Float64, poses: Float64) -> tuple[Float64, Float64]:
     """Dense times and the metres driven by then."""
+    dense, speed = _measure_forward_speed(times, poses)
+    backwards_m = _measure_backwards(dense, speed)
+    if backwards_m:
+        problem = f"the recorded vehicle drives backwards, {backwards_m:.1f} m"
+        raise InputError(problem, remedy="Behaviours are for vehicles that drive forwards: take other chunks.")
+    return dense, integrate_speed(dense, speed)
+
+
+def _measure_forward_speed(times: Float64, poses: Float64) -> tuple[Float64, Float64]:
+    """Dense times and the speed in the direction that the vehicle faces, negative where it reverses."""
     curve = fit_smooth_curve(times, poses[:, :2, 3], SMOOTHING_S)
     dense = np.linspace(0.0, times[-1], max(2, round(times[-1] / _DENSE_S) + 1))
     velocity = curve.evaluate(dense, 1)
     forward = np.stack([np.interp(dense, times, poses[:, k, 0]) for k in (0, 1)], axis=1)
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    speed = np.einsum("tk,tk->t", velocity, forward)
-    backwards_m = float(np.trapezoid(np.maximum(-speed, 0.0), dense))
-    if backwards_m > _STANDING_M and backwards_m > np.trapezoid(np.maximum(speed, 0.0), dense):
-        problem = f"the recorded vehicle drives backwards, {backwards_m:.1f} m"
-        raise InputError(problem, remedy="Behaviours are for vehicles that drive forwards: take other chunks.")
-    return dense, integrate_speed(dense, speed)
+    return dense, np.einsum("tk,tk->t", velocity, forward)
+
+
+def _measure_backwards(times: Float64, speed_m_s: Float64) -> float:
+    """Metres in reverse where a vehicle reverses further than it drives forwards, else 0."""
+    backwards_m = float(np.trapezoid(np.maximum(-speed_m_s, 0.0), times))
+    if backwards_m > _STANDING_M and backwards_m > np.trapezoid(np.maximum(speed_m_s, 0.0), times):
+        return backwards_m
+    return 0.0
 
 
 def _turn_back(rotations: Float64, heading: Float64) -> Float64:

@@ -13,7 +13,7 @@ from genre_tasks.logs.brown_conrady import distort
 from genre_tasks.logs.types import Float64, Lens
 from genre_tasks.render.surface import render_surfaces
 from genre_tasks.render.types import RenderSettings
-from genre_tasks.rollout.instance_masks import MIN_ALPHA, Masks, render_masks
+from genre_tasks.rollout.instance_masks import MIN_ALPHA, render_masks
 from genre_tasks.rollout.render_rollout import DEFAULT_SETTINGS, RolloutImages
 from genre_tasks.rollout.rig import RolloutView
 from genre_tasks.scene.lens_distortion import fold_radius, pixels_to_rays
@@ -27,10 +27,7 @@ _NEAR_M = 0.1
 
 
 def compute_flow(
-    images: RolloutImages,
-    next_images: RolloutImages,
-    settings: RenderSettings = DEFAULT_SETTINGS,
-    masks: Masks | None = None,
+    images: RolloutImages, next_images: RolloutImages, settings: RenderSettings = DEFAULT_SETTINGS
 ) -> Tensor:
     """Computes optical flow from one pose to the next.
 
@@ -41,13 +38,15 @@ def compute_flow(
         images: of a pose.
         next_images: of the next one, with the same cameras; its chunk may be another one.
         settings: backend and threads.
-        masks: of ``images``, where they are at hand.
 
     Returns:
         [C, H, W, 2] pixels to the right and down; NaN where nothing is, where the point is hidden in the next image or
         behind its camera, and where its actor does not exist there. What leaves the image has its flow.
     """
-    masks = masks or render_masks(images, settings)
+    # All without the readout: masks and surfaces that differ by it would move background with an actor.
+    images = _stop_cameras(images)
+    next_images = _stop_cameras(next_images)
+    masks = render_masks(images, settings)
     depth, covered = _render_depth(images, settings)
     next_depth, _ = _render_depth(next_images, settings)
     flows = []
@@ -62,10 +61,14 @@ def compute_flow(
     return torch.stack(flows)
 
 
+def _stop_cameras(images: RolloutImages) -> RolloutImages:
+    """The images with cameras that rest at their poses: neither a rolling shutter nor motion blur."""
+    return replace(images, views=tuple(replace(view, blur=None, shutter=None) for view in images.views))
+
+
 def _render_depth(images: RolloutImages, settings: RenderSettings) -> tuple[Tensor, Tensor]:
     """[C, H, W] metres along the cameras' axes, and where there is a surface."""
-    views = [replace(view, blur=None, shutter=None) for view in images.views]
-    surfaces = render_surfaces(images.chunk_scene.scene, views, settings)
+    surfaces = render_surfaces(images.chunk_scene.scene, images.views, settings)
     return surfaces.expected_depth(), surfaces.alpha >= MIN_ALPHA
 
 

@@ -62,6 +62,8 @@ class EditedScenes:
         edits: what is changed.
         library: where inserted actors of other runs are from.
         config: darkness of contact shadows.
+        chunks: numbers of the chunks that are shown; ``None``: those of ``source``. Names, tracks and the ground are
+            those of all chunks in any case, so that an edit means the same in any selection.
 
     Attributes:
         edits: all edits, with those of ``source`` where that was edited before.
@@ -71,9 +73,17 @@ class EditedScenes:
         InputError: an edit names an actor or a run that does not exist, or a new actor has a name that is taken.
     """
 
-    def __init__(self, source: SceneSource, edits: EditList, library: ActorLibrary, config: SimulateConfig) -> None:
+    def __init__(
+        self,
+        source: SceneSource,
+        edits: EditList,
+        library: ActorLibrary,
+        config: SimulateConfig,
+        chunks: Sequence[int] | None = None,
+    ) -> None:
         self.edits: EditList = edits
         self._source: SceneSource = source
+        self._numbers: Sequence[int] = [n for n in source.chunk_numbers if chunks is None or n in chunks]
         if isinstance(source, EditedScenes):
             # Applied together: what was moved away and is moved back now is where it was, to the bit.
             self.edits = source.edits + edits
@@ -98,8 +108,8 @@ class EditedScenes:
 
     @property
     def chunk_numbers(self) -> Sequence[int]:
-        """Numbers of the chunks, in the order of the log."""
-        return self._source.chunk_numbers
+        """Numbers of the chunks that are shown, in the order of the log."""
+        return self._numbers
 
     def load(self, number: int) -> ChunkScene:
         """Reads one chunk and its scene, and edits them; the last two stay in memory.

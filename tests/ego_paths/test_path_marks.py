@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -55,6 +57,19 @@ def test_before_the_first_pose_is_outside_of_the_recording() -> None:
     marks = mark_path(early, recorded, 1.0, 1.0)
     assert marks.ahead_m == pytest.approx(np.full(20, -2.0), abs=0.01)
     assert np.array_equal(marks.outside_recording, recorded.world_SE3_ego[:, 0, 3] < 1.7)
+
+
+def test_a_vehicle_that_reverses_has_marks_of_its_sides() -> None:
+    poses = CURVE.world_SE3_ego.copy()
+    poses[:, :3, :2] *= -1
+    recorded = replace(CURVE, world_SE3_ego=poses)
+    marks = mark_path(recorded, recorded, 0.5, 0.5)
+    assert np.abs(marks.lateral_m).max() < 0.05 and np.abs(marks.ahead_m).max() < 0.05
+    assert marks.reliable.all() and not marks.outside_recording.any()
+    moved = poses.copy()
+    moved[:, :3, 3] += poses[:, :3, 1]
+    marks = mark_path(replace(recorded, world_SE3_ego=moved), recorded, left_m=2.0, right_m=0.5)
+    assert marks.lateral_m == pytest.approx(np.ones(40), abs=0.05) and marks.reliable.all()
 
 
 def test_a_relative_path_has_the_marks_that_it_was_stated_with() -> None:

@@ -14,18 +14,23 @@ import typer
 
 from flows.cli.main import app
 from flows.cli.simulate_options import read_request
+from flows.configuration.loading import apply_settings
 from flows.simulation import simulate as simulate_module
 from flows.simulation.edit_file import parse_edit_options
+from flows.simulation.edited_runs import open_edited_scenes, open_run, write_edited_run
 from flows.simulation.request import SimulationRequest
+from flows.simulation.rollout_key import compute_rollout_key
 from flows.simulation.rollout_metrics import METRICS_FILE
 from flows.simulation.run_scenes import RunScenes
 from flows.simulation.simulate import simulate_run
+from genre_tasks.config import PipelineConfig, SimulateConfig
 from genre_tasks.ego_paths.recorded_path import join_recorded_path
 from genre_tasks.errors import ConfigError, GenreError, InputError
 from genre_tasks.rollout.handover import plan_handovers
 from genre_tasks.rollout.render_rollout import render_rollout
 from genre_tasks.rollout.rig import estimate_rig
 from genre_tasks.scene_edits.actor_names import name_actors
+from genre_tasks.scene_edits.run_survey import survey_run
 from storage.files import digest_file
 from storage.manifest import MANIFEST, parse_manifest
 from tests.flows.small_simulation import make_run
@@ -175,6 +180,62 @@ def test_what_a_removed_actor_hid_is_in_the_output(recorded: SimulationRequest, 
     assert plain["key"] != record["key"]
     with pytest.raises(InputError, match="no actor"):
         simulate_run(replace(recorded, out=tmp_path / "none", edits=parse_edit_options(remove=["car-99"])))
+
+
+def find_seen_actor(recorded: SimulationRequest) -> str:
+    """The name of an actor with Gaussians."""
+    survey = survey_run(RunScenes(recorded.store, recorded.run))
+    return next(survey.names[name] for name, track in survey.tracks.items() if any(track.gaussians.values()))
+
+
+def test_edits_of_some_chunks_are_those_of_the_run(recorded: SimulationRequest) -> None:
+    edits = parse_edit_options(insert=[f"taxi@{find_seen_actor(recorded)},ahead=8,speed=0"])
+    everything = open_edited_scenes(recorded.store, recorded.run, edits, SimulateConfig())
+    part = open_edited_scenes(recorded.store, recorded.run, edits, SimulateConfig(), chunks=(1,))
+    assert list(part.chunk_numbers) == [1] and part.names == everything.names
+    # It starts ahead of where the run starts, and not of where the chunk does.
+    first, second = (
+        next(node for node in scenes.load(1).scene.actors if node.track_id == "taxi") for scenes in (everything, part)
+    )
+    assert np.array_equal(first.frames, second.frames) and np.array_equal(first.chunk_SE3_box, second.chunk_SE3_box)
+    with pytest.raises(InputError, match="no chunk 7"):
+        open_edited_scenes(recorded.store, recorded.run, edits, SimulateConfig(), chunks=(7,))
+
+
+def test_keys_of_edits_depend_on_all_chunks(recorded: SimulationRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    edits = parse_edit_options(remove=[name_actors(RunScenes(recorded.store, recorded.run))["car-0"]])
+    request = replace(recorded, edits=edits, chunks=(0,))
+
+    def find_keys() -> tuple[str, set[str]]:
+        run = open_run(request.store, request.run, request.stage, request.chunks)
+        config = PipelineConfig.model_validate(run.recorded.record["config"])
+        stages = write_edited_run(request.store, request.run, edits)["chunks"][0]["stages"]
+        keys = {stage["key"] for stage in stages if stage["stage"] != "effects"}
+        return compute_rollout_key(request, run, config), keys
+
+    def change(scenes: RunScenes) -> dict[str, str]:
+        return {name: "0" * 64 if "chunk 1" in name else digest for name, digest in find_digests(scenes).items()}
+
+    rollout_key, chunk_keys = find_keys()
+    find_digests = RunScenes._find_digests
+    monkeypatch.setattr(RunScenes, "_find_digests", change)
+    other_rollout_key, other_chunk_keys = find_keys()
+    assert rollout_key != other_rollout_key and not chunk_keys & other_chunk_keys
+
+
+def test_an_edited_run_names_other_runs_in_full(recorded: SimulationRequest) -> None:
+    edits = parse_edit_options(insert=[f"taxi@{recorded.run[:8]}:{find_seen_actor(recorded)},ahead=8"])
+    written = write_edited_run(recorded.store, recorded.run, edits)
+    assert written["edited"]["edits"]["edits"][0]["from_run"] == recorded.run
+
+
+def test_the_points_that_fnet_sees_are_in_the_key(recorded: SimulationRequest) -> None:
+    run = open_run(recorded.store, recorded.run)
+    config = PipelineConfig.model_validate(run.recorded.record["config"])
+    other = apply_settings(config, ("novel_views.lidar_max_points=12345",))
+    fixed = replace(recorded, fix=True)
+    assert compute_rollout_key(fixed, run, config) != compute_rollout_key(fixed, run, other)
+    assert compute_rollout_key(recorded, run, config) == compute_rollout_key(recorded, run, other)
 
 
 def test_poses_are_marked_by_the_reliable_range(recorded: SimulationRequest, tmp_path: Path) -> None:

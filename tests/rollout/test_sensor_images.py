@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from genre_tasks.logs.types import Float64, Lens
+from genre_tasks.logs.types import Float64, Lens, RollingShutter
 from genre_tasks.render.types import RenderSettings
 from genre_tasks.rollout.instance_masks import (
     DISTANT_CLASS,
@@ -150,3 +150,18 @@ def test_flow_finds_an_actor_by_its_name_in_another_scene():
     first, second = scene.actors
     swapped = build_scene((second, first))
     assert np.allclose(flow_of(scene, 0.1), flow_of(scene, 0.1, swapped), atol=1e-3, equal_nan=True)
+
+
+def test_flow_leaves_the_readout_out_of_masks_too():
+    shutter = RollingShutter(0.1, velocity_m_s=(20.0, 0.0, 0.0), turn_rad_s=(0.0, 0.0, 0.0))
+
+    def read_out(images: RolloutImages) -> RolloutImages:
+        return replace(images, views=tuple(replace(view, shutter=shutter) for view in images.views))
+
+    scene = two_actors()
+    resting = images_at(scene, 0)
+    moving = read_out(resting)
+    # The masks that are written are those of the image with its readout.
+    assert (render_masks(moving, SETTINGS).instances != render_masks(resting, SETTINGS).instances).any()
+    flow = compute_flow(moving, read_out(images_at(scene, 1, 0.2)), SETTINGS)
+    assert np.array_equal(flow[0].double().numpy(), flow_of(scene, 0.2), equal_nan=True)

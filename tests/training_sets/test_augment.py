@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +18,11 @@ from flows.pipeline.definition import STAGE_BY_NAME
 from flows.pipeline.log_cache import cached_log
 from flows.pipeline.stage_runner import ArtifactRef, Job, run_stage
 from flows.reconstruction.run_records import FinishedRun, summarise_run, write_run_record
+from flows.simulation.edited_runs import write_edited_run
 from flows.simulation.run_scenes import RunScenes
 from genre_tasks.errors import ConfigError, GenreError, InputError
 from genre_tasks.logs.registry import open_log
+from genre_tasks.scene_edits.edits import EditList
 from genre_tasks.training_sets.reading import read_training_set
 
 pytest.importorskip("embreex", reason="the synthetic street is ray-cast with Embree")
@@ -133,10 +136,19 @@ def test_what_cannot_work_is_refused_before_anything_is_rendered(finished: Finis
     assert not out.exists()
     (out / "old").mkdir(parents=True)
     assert "holds something already" in str(refusal(finished, "--out", str(out)))
-    done = CliRunner().invoke(
-        app, ["augment", finished.name, finished.name[:6], "--store", finished.store, "--out", str(tmp_path / "two")]
-    )
-    assert "both have chunk 0 of the log" in str(done.exception)
+    other = replace(finished, preset="other")
+    write_run_record(other, summarise_run(other), {})
+    assert "both have chunk 0 of the log" in str(refusal(finished, other.name, "--out", str(tmp_path / "two")))
+
+
+def test_a_run_counts_once_and_edited_traffic_has_no_labels(finished: FinishedRun, tmp_path: Path) -> None:
+    out = ("--out", str(tmp_path / "set"))
+    assert f"the run {finished.name} is there twice" in str(refusal(finished, finished.name[:6], *out))
+    edited = write_edited_run(finished.store, finished.name, EditList())["run"]
+    done = CliRunner().invoke(app, ["augment", edited, "--store", finished.store, *out])
+    assert isinstance(done.exception, InputError)
+    assert f"Take the recorded run {finished.name}." in str(done.exception)
+    assert not (tmp_path / "set").exists()
 
 
 def test_a_log_without_annotations_is_one_clear_error(tmp_path: Path) -> None:

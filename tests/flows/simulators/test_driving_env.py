@@ -16,6 +16,7 @@ from flows.simulation import stored_ranges
 from flows.simulation.stored_ranges import SideRange
 from flows.simulators import driving_world
 from flows.simulators.driving_env import ENVIRONMENT_ID, GenreDrivingEnv, RewardWeights, StartRange
+from flows.simulators.scene_renderer import SceneRenderer
 from genre_tasks.ego_paths.world_actors import WorldActor
 from genre_tasks.errors import ConfigError, InputError
 
@@ -105,6 +106,16 @@ def test_a_collision_ends_the_drive(served: tuple[str, str], monkeypatch: pytest
     rewards, terminated, truncated, info = drive_on(env, np.array([4.0, 0.0], np.float32))
     assert terminated and not truncated and info["collision"] == "wall" and info["frame"] < 11
     assert rewards[-1] < -6.0 < rewards[-2]
+
+
+@pytest.mark.parametrize(("frame_s", "fps"), [(0.5, 2), (3.0, 1)])
+def test_films_are_as_fast_as_the_log(
+    served: tuple[str, str], monkeypatch: pytest.MonkeyPatch, frame_s: float, fps: int
+) -> None:
+    monkeypatch.setattr(SceneRenderer, "frame_s", property(lambda self: frame_s))
+    env = GenreDrivingEnv(*served, reliable_m=3.0)
+    assert env.metadata["render_fps"] == fps
+    assert GenreDrivingEnv.metadata["render_fps"] == 10
 
 
 def test_seeds_choose_the_start(env: GenreDrivingEnv) -> None:

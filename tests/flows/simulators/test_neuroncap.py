@@ -6,6 +6,7 @@ import http.client
 import io
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -23,9 +24,9 @@ from benchmarks.exchange.service_fuzz import (
     service_fuzz_table,
 )
 from flows.simulators import neuroncap
-from flows.simulators.image_request import ActorPose, ImageRequest
+from flows.simulators.image_request import ActorDescription, ActorPose, ImageRequest
 from flows.simulators.neuroncap import start_neuroncap
-from flows.simulators.neuroncap_messages import Trajectory
+from flows.simulators.neuroncap_messages import Trajectory, describe_recorded
 from flows.simulators.scene_renderer import SceneRenderer
 from flows.simulators.service import RunningService, ServiceRequest
 from flows.simulators.service_metrics import SilentMetrics
@@ -120,6 +121,31 @@ def test_trajectories_are_interpolated() -> None:
     pose = trajectory.pose_at(start_us + 100)
     assert isinstance(pose, ActorPose) and pose.start_world_SE3_box[0, 3] == 2.0
     assert trajectory.pose_at(start_us - 1) is None and trajectory.pose_at(start_us + 401) is None
+
+
+def test_recorded_actors_exist_half_a_frame_around_their_frames() -> None:
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 0, 3] = 8.0
+    driving = ActorDescription("a", "car-1", "Car", (4.5, 1.8, 1.5), np.array([3.0, 3.1]), poses)
+    once = ActorDescription("b", "car-2", "Car", (4.5, 1.8, 1.5), np.array([0.02]), poses[1:])
+    first, second = describe_recorded((driving, once), 0.1)
+    assert first.times_us == (2_950_000, 3_000_000, 3_100_000, 3_150_000)
+    assert first.world_SE3_box[:, 0, 3] == pytest.approx([-4.0, 0.0, 8.0, 12.0])
+    # No time of the protocol is negative.
+    assert second.times_us == (0, 20_000, 70_000)
+    pose = second.pose_at(0)
+    assert pose is not None and pose.start_world_SE3_box[0, 3] == 8.0
+    at_zero = describe_recorded((replace(once, times_s=np.zeros(1)),), 0.1)[0]
+    assert at_zero.times_us == (0, 50_000) and len(at_zero.world_SE3_box) == 2
+
+
+def test_recorded_actors_are_there_at_the_start_time(renderer: SceneRenderer) -> None:
+    start_us = round(renderer.time_range_s[0] * 1e6)
+    first_s = renderer.ego_trajectory()[0][0]
+    from_first = [actor.times_s[0] == first_s for actor in renderer.actors()]
+    described = describe_recorded(renderer.actors(), renderer.frame_s)
+    assert any(from_first)
+    assert [trajectory.pose_at(start_us) is not None for trajectory in described] == from_first
 
 
 MISTAKES: dict[str, tuple[str, Any, int, str]] = {
