@@ -70,11 +70,11 @@ def augment(
         genre augment 4b1c 77d0 --shift 1,2 --every 2 --format coco --out training
     """
     from flows.cli.existing_store import open_existing_store
-    from flows.cli.output_paths import check_output_folder
+    from flows.cli.output_paths import check_new_folder
     from flows.cli.parsing import check_number
     from flows.cli.terminal import TerminalReporter
 
-    check_output_folder(out, "--out")
+    check_new_folder(out, "--out")
     shifts_m = parse_shifts(shift, "--shift")
     check_number(every, "--every", 1, _MAX_COUNT)
     check_number(min_points, "--min-points", 0, _MAX_COUNT)

@@ -26,6 +26,7 @@ def convert(log: LogArgument, target: TargetArgument, as_json: JsonOption = Fals
         genre convert kitti:2011_09_26/2011_09_26_drive_0009_sync genre:drive-9
     """
     from flows.cli.outcome import add_facts, print_outcome
+    from flows.cli.output_paths import check_new_folder
     from flows.cli.terminal import TerminalReporter
     from genre_tasks.errors import ConfigError
     from genre_tasks.logs.genre_layout.writer import write_genre_layout
@@ -39,9 +40,11 @@ def convert(log: LogArgument, target: TargetArgument, as_json: JsonOption = Fals
     if layout not in writers or not folder:
         remedy = "Give the layout and a folder, as in genre:my-log or pandaset:007."
         raise ConfigError(f"{target!r} names no layout that can be written", remedy=remedy)
+    goal = expand_user_path(folder)
+    check_new_folder(goal, "the target")
     source = open_log(log)
     with TerminalReporter("reading the log") as reporter:
-        written: Path = writers[layout](source, expand_user_path(folder), reporter.progress)
+        written: Path = writers[layout](source, goal, reporter.progress)
     record = {
         "written": f"{layout}:{written}",
         "frames": source.frame_count,

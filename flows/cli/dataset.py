@@ -27,7 +27,7 @@ AttemptsOption = Annotated[
 ]
 GpuLimitOption = Annotated[
     str | None,
-    typer.Option(help="The Prefect concurrency limit of which a stage on a GPU takes a slot. None if not given."),
+    typer.Option(help="The Prefect concurrency limit of which GNet, FNet, ENet and evaluation take a slot."),
 ]
 
 
@@ -70,7 +70,7 @@ def dataset(
     # A mistake in a setting or a path shows here, before anything is submitted.
     load_configuration(preset, settings=settings or ())
     expanded = expand_logs(logs)
-    name = name_dataset(expanded, preset, settings)
+    name = name_dataset(expanded, preset, store, settings)
     facts = {"dataset": name, "preset": preset, "store": store}
     add_facts(**facts, logs=[])
     parameters = {"logs": expanded, "preset": preset, "store": store, "settings": settings}

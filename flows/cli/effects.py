@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -78,8 +77,10 @@ def _write_plan(plan: EffectsPlan, folder: Path, title: str) -> list[str]:
     with temporary_folder(folder) as temporary:
         get_codec("effects").write(temporary, plan)
         write_png(temporary / "effects.png", plot_effects_plan(plan, title))
-        # An earlier plan may have had masks of the ego vehicle that this one does not have.
-        shutil.rmtree(folder / "own", ignore_errors=True)
+        # An earlier plan may have had masks of the ego vehicle that this one lacks. Anything else is the user's.
+        if (folder / "effects.parquet").is_file():
+            for mask in (folder / "own").glob("*.png"):
+                mask.unlink()
         for source in sorted(temporary.rglob("*")):
             if source.is_file():
                 target = folder / source.relative_to(temporary)

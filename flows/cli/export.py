@@ -64,13 +64,13 @@ def export(
     """
     from flows.cli.existing_store import open_existing_store
     from flows.cli.outcome import add_facts
-    from flows.cli.output_paths import check_output_folder
+    from flows.cli.output_paths import check_new_folder
     from flows.cli.parsing import parse_numbers
     from flows.cli.terminal import TerminalReporter
     from flows.exchange.export_request import ExportRequest
 
     add_facts(run=scene, store=store, out=str(out), format=file_format)
-    check_output_folder(out, "--out")
+    check_new_folder(out, "--out")
     open_existing_store(store)
     numbers = parse_numbers(chunks, "--chunks")
     request = ExportRequest(

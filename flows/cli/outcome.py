@@ -117,7 +117,10 @@ def wants_json(command: Any, words: Sequence[str]) -> bool:
         Whether the named command has a flag ``--json``, and the words hold it. For ``bench`` it names a file.
     """
     options = list(words[: words.index("--")] if "--" in words else words)
-    subcommand = next((command.commands[word] for word in options if word in command.commands), None)
+    subcommand = command
+    # Some commands are groups of further ones, such as `store`.
+    for word in options:
+        subcommand = getattr(subcommand, "commands", {}).get(word, subcommand)
     flags = [name for p in getattr(subcommand, "params", ()) if getattr(p, "is_flag", False) for name in p.opts]
     return "--json" in options and "--json" in flags
 

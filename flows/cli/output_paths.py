@@ -11,7 +11,7 @@ from genre_tasks.errors import InputError
 
 _MAX_NAME_BYTES = 255
 """The longest name that the usual file systems take."""
-_TEMPORARY_NAME_BYTES = 24
+_TEMPORARY_NAME_BYTES = 40
 """How much longer the name is under which a file is written before it is complete."""
 
 
@@ -61,6 +61,21 @@ def check_output_folder(path: Path, option: str, files: Collection[str] = ()) ->
     _check_can_create(path, option)
     for name in files:
         check_output_file(path / name, f"{name} in {option}")
+
+
+def check_new_folder(path: Path, option: str) -> None:
+    """Checks that a folder can be written as a whole: under another name at first, which it loses when it is complete.
+
+    Args:
+        path: the folder.
+        option: the option that names it, for the error.
+
+    Raises:
+        InputError: the path has no name of its own, such as ``.``, or as :func:`check_output_folder` raises it.
+    """
+    if path.name in ("", ".."):
+        raise InputError(f"{option} names no folder of its own", remedy="Name a new folder.", file=path)
+    check_output_folder(path, option)
 
 
 def _exists(path: Path, option: str) -> bool:

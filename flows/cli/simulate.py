@@ -91,11 +91,11 @@ def simulate(
 def _run(options: Mapping[str, Any]) -> None:
     from flows.cli.existing_store import open_existing_store
     from flows.cli.outcome import add_facts
-    from flows.cli.output_paths import check_output_folder
+    from flows.cli.output_paths import check_new_folder
     from flows.cli.terminal import TerminalReporter
 
     add_facts(run=options["run"], store=options["store"], out=str(options["out"]))
-    check_output_folder(options["out"], "--out")
+    check_new_folder(options["out"], "--out")
     open_existing_store(options["store"])
     request = read_request(options)
     with TerminalReporter("simulating") as reporter:

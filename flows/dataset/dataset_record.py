@@ -19,21 +19,22 @@ DATASETS = "datasets"
 """Name of the folder of all datasets' records."""
 
 
-def name_dataset(logs: Sequence[str], preset: str, settings: Sequence[str] | None) -> str:
+def name_dataset(logs: Sequence[str], preset: str, store: str, settings: Sequence[str] | None) -> str:
     """Names what a dataset's flow is asked for; the same request has the same name.
 
     Args:
         logs: URIs of logs, without stars.
         preset: name of the preset.
+        store: folder (or URI) of the store; another store is another dataset, whose runs are not those of this one.
         settings: ``section.key=value`` strings over the preset.
 
     Returns:
         Twelve hex digits.
 
-    >>> name_dataset(["synthetic:street?seed=1"], "demo", None) == name_dataset(["synthetic:street?seed=1"], "demo", [])
+    >>> name_dataset(["kitti:a"], "demo", "store", None) == name_dataset(["kitti:a"], "demo", "store", [])
     True
     """
-    text = json.dumps([list(logs), preset, list(settings or ())])
+    text = json.dumps([list(logs), preset, store, list(settings or ())])
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 

@@ -76,7 +76,7 @@ def reconstruct_dataset(
     """
     _check_parameters(in_flight, unit, attempts)
     expanded = expand_logs(logs)
-    name = name_dataset(expanded, preset, settings)
+    name = name_dataset(expanded, preset, store, settings)
     table = LiveTable()
     if pool is None:
         outcomes = _reconstruct_here(expanded, preset, store, settings, table)

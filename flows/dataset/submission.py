@@ -118,6 +118,9 @@ def follow_dataset(
         watch = HeartbeatWatch(client, run_id)
         while True:
             run = call_server(client.read_flow_run, run_id)
+            if run.state is not None and run.state.type in (StateType.SCHEDULED, StateType.PENDING):
+                # A run that waits for its worker sends no heartbeats yet.
+                watch.restart()
             is_silent = watch.is_silent()
             if run.state is not None and run.state.type is StateType.RUNNING and is_silent:
                 # Nobody else notices that the parent's worker died with all its processes.
@@ -204,6 +207,10 @@ class HeartbeatWatch:
         self._count = -1
         self._since_s = clock()
         self._next_s = self._since_s
+
+    def restart(self) -> None:
+        """Counts the time without a heartbeat from now on."""
+        self._since_s = self._clock()
 
     def is_silent(self) -> bool:
         """Says whether no heartbeat has come for three periods in which the server was there; asks now and then."""

@@ -23,8 +23,8 @@ HEARTBEAT_S = 30
 _MOST_DELAY = 10.0
 Rows = list[dict[str, Any]]
 _STATUS_BY_STATE = {"SCHEDULED": "waiting", "PENDING": "starting", "RUNNING": "running", SILENT: "running"}
-# States in which a living run sends heartbeats.
-_SENDING = frozenset({"RUNNING", SILENT})
+# States in which a living run sends heartbeats. One that is being cancelled does until its worker has stopped it.
+_SENDING = frozenset({"RUNNING", "CANCELLING", SILENT})
 
 
 @dataclass(frozen=True)
@@ -96,11 +96,13 @@ class _Watch:
         run: as last read.
         since_s: when its state or heartbeat changed.
         heartbeat: the last one.
+        is_cancelled: whether somebody has asked for its end.
     """
 
     run: ChildRun
     since_s: float
     heartbeat: str = ""
+    is_cancelled: bool = False
 
 
 @dataclass
@@ -203,7 +205,7 @@ class Supervisor:
                 self._watch(run)
 
     def _watch(self, run: ChildRun) -> None:
-        self._state.watches[run.id] = _Watch(run, self._clock())
+        self._state.watches[run.id] = _Watch(run, self._clock(), is_cancelled=run.state == "CANCELLING")
         self._update_row(run)
 
     def _poll(self) -> None:
@@ -223,6 +225,7 @@ class Supervisor:
             if run.state not in (watch.run.state, SILENT):
                 watch.since_s = now
             watch.run = run
+            watch.is_cancelled |= run.state == "CANCELLING"
             self._update_row(run)
         self._judge(list(self._state.watches.values()))
         self._read_signs_of_life()
@@ -285,7 +288,8 @@ class Supervisor:
         return True
 
     def _end(self, watch: _Watch, outcome: dict[str, Any] | None) -> None:
-        if watch.run.state == "CANCELLED":
+        # A dead worker cannot end what was cancelled, and nobody wants it submitted again.
+        if watch.run.state == "CANCELLED" or (watch.run.state == "CRASHED" and watch.is_cancelled):
             self._finish(watch, {"status": "failed", "why": "cancelled"})
         elif watch.run.state == "CRASHED" or outcome is None or outcome["is_passing"]:
             # A run that says nothing was ended from outside, or by an error of its surroundings.

@@ -83,8 +83,11 @@ def open_stored_scenes(
         ConfigError: a stage is named for an imported scene.
     """
     imported = _find_imported(store, name)
-    if not imported or list_runs(store, name):
+    if not imported:
         return _RunStoredScenes(store, name, stage, chunks)
+    # A whole name is meant as it is, although the names of runs may begin so.
+    if all(artifact.manifest.log != name for artifact in imported) and list_runs(store, name):
+        raise InputError(f"a run and an imported scene begin with '{name}'", remedy="Give more of it.", file=store)
     if stage is not None:
         raise ConfigError("an imported scene has no stages", remedy="Leave out --stage.")
     return _ImportedScenes(store, imported, chunks)

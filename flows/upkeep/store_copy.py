@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from flows.dataset.dataset_record import DATASETS
 from flows.reconstruction.run_records import find_run_record, name_run_folder
 from flows.upkeep.garbage import add_ancestors, measure_bytes
 from flows.upkeep.pins import PINS, list_pins, list_run_keys
 from genre_tasks.atomic_path import atomic_path
+from genre_tasks.scene_edits.edits import EditList, Insert
 from storage.io_errors import as_genre_error
 from storage.store import Artifact, Store
 
@@ -64,9 +66,11 @@ def copy_store(
     records = _list_records(source)
     if runs or pinned:
         by_key = {artifact.address.key: artifact for artifact in artifacts}
-        found = [find_run_record(source.uri, run) for run in runs]
         pins = list_pins(source) if pinned else []
-        wanted = [key for record in found for key in list_run_keys(record)] + [key for pin in pins for key in pin.keys]
+        pinned_runs = [pin.name for pin in pins if source.records.find("runs", "run.json", pin.name)]
+        found = _find_with_recorded([find_run_record(source.uri, run) for run in (*runs, *pinned_runs)], source)
+        wanted = [key for record in found for key in list_run_keys(dict(record))]
+        wanted += [key for pin in pins for key in pin.keys]
         kept = add_ancestors(wanted, by_key)
         artifacts = [artifact for artifact in artifacts if artifact.address.key in kept]
         names = {name_run_folder(str(record["run"])) for record in found}
@@ -77,6 +81,23 @@ def copy_store(
     for name in records:
         _copy_record(source, target, name)
     return CopyResult(len(copied), len(artifacts) - len(copied), measure_bytes(copied), len(records))
+
+
+def _find_with_recorded(records: Iterable[Mapping[str, Any]], source: Store) -> list[Mapping[str, Any]]:
+    """Adds the runs that edited ones are made from, and those that their inserted actors come from."""
+    found: dict[str, Mapping[str, Any]] = {}
+    waiting = list(records)
+    while waiting:
+        record = waiting.pop()
+        if str(record["run"]) in found:
+            continue
+        found[str(record["run"])] = record
+        edited = record.get("edited")
+        if edited is not None:
+            edits = EditList.model_validate(edited["edits"]).edits
+            givers = {edit.from_run for edit in edits if isinstance(edit, Insert) and edit.from_run is not None}
+            waiting += [find_run_record(source.uri, name) for name in (str(edited["run"]), *sorted(givers))]
+    return list(found.values())
 
 
 def _copy_artifacts(

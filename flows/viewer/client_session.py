@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -78,7 +79,7 @@ class ClientSession:
             note = ""
         except (GenreError, OSError) as error:
             sides = None
-            note = f"The reliable range is not known: {error}"
+            note = f"The reliable range is not known: {_escape_markdown(str(error))}"
         with self._lock:
             # The client may have gone on to another chunk meanwhile.
             if self.drawing.viewed is not viewed:
@@ -254,7 +255,12 @@ class ClientSession:
 
 def _describe_chunk(viewed: ViewedChunk) -> str:
     # Two spaces end a line in Markdown.
-    return "  \n".join([f"**{viewed.log}**", *viewed.scene.losses])
+    return "  \n".join([f"**{_escape_markdown(viewed.log)}**", *map(_escape_markdown, viewed.scene.losses)])
+
+
+def _escape_markdown(text: str) -> str:
+    # The browser runs HTML in Markdown, and a log's name is any folder's. A backslash makes punctuation plain.
+    return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", text)
 
 
 def _needs_new_controls(before: ViewedChunk, after: ViewedChunk) -> bool:

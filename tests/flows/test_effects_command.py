@@ -25,6 +25,11 @@ def test_the_command_says_why_and_writes_what_anyone_can_open(tmp_path) -> None:
         stale.parent.mkdir(exist_ok=True)
         stale.touch()  # as of another plan
     assert "rolling_shutter" in done.output and "96×54" in done.output
+    elsewhere = tmp_path / "training" / "own" / "image.png"
+    elsewhere.parent.mkdir(parents=True)
+    elsewhere.touch()
+    done = CliRunner().invoke(app, ["effects", *told[:-1], str(tmp_path / "training")], terminal_width=200)
+    assert done.exit_code == 0 and elsewhere.exists()  # a folder of the user's that no plan was written to
     table = pq.read_table(tmp_path / "out" / "effects.parquet").to_pydict()
     assert table["name"] == list(EffectsConfig.model_fields)
     assert table["choice"][table["name"].index("darkness")] == "off"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,9 +18,12 @@ from flows.exchange.export_request import ExportRequest
 from flows.exchange.export_scenes import export_scenes
 from flows.exchange.exporters import list_export_formats
 from flows.exchange.import_scene import import_scene
+from flows.exchange.stored_scenes import open_stored_scenes
+from flows.reconstruction.run_records import list_runs
 from flows.simulation.edit_file import parse_edit_options
 from flows.simulation.edited_runs import write_edited_run
 from flows.simulation.run_scenes import RunScenes
+from flows.upkeep.store_copy import copy_store
 from genre_tasks.errors import ConfigError, GenreError, InputError
 from genre_tasks.exchange.conversion import to_scene_graph
 from genre_tasks.exchange.one_cloud import make_resting_scene
@@ -30,6 +34,7 @@ from genre_tasks.exchange.types import SplatCloud
 from genre_tasks.exchange.usd.format import USDZ
 from genre_tasks.scene_edits.actor_names import name_actors
 from storage.files import digest_file, payload_files
+from storage.local import LocalStore
 from tests.exchange.splat_clouds import make_cloud, make_driving_scene
 from tests.flows.small_simulation import make_run
 
@@ -223,6 +228,25 @@ def test_an_edited_run_is_exported_as_it_is(run: ExportRequest, tmp_path: Path) 
     export_scenes(replace(run, scene=edited, out=tmp_path / "out"))
     found = {node.name for chunk in read_document(tmp_path / "out").chunks for node in chunk.nodes}
     assert found == {"background", "distant", *names.values()} - {removed}
+
+
+def test_the_whole_name_of_an_imported_scene_is_not_the_start_of_a_run(run: ExportRequest, tmp_path: Path) -> None:
+    store = str(tmp_path / "store")
+    name = run.scene[:2]
+    shutil.copytree(run.store, store)
+    write_random_scene(tmp_path / f"{name}.ply", 5)
+    import_scene(store, tmp_path / f"{name}.ply", name)
+    assert "run" not in open_stored_scenes(store, name).describe()
+    assert open_stored_scenes(store, run.scene).describe()["run"] == run.scene
+
+
+def test_a_copied_edited_run_has_the_run_that_it_is_made_from(run: ExportRequest, tmp_path: Path) -> None:
+    actor = name_actors(RunScenes(run.store, run.scene))["car-0"]
+    edited = write_edited_run(run.store, run.scene, parse_edit_options(remove=[actor]))
+    target = LocalStore(tmp_path / "copy")
+    copied = copy_store(LocalStore(Path(run.store)), target, runs=[str(edited["run"])])
+    assert copied.records == 2
+    assert {record["run"] for record in list_runs(target.uri)} == {edited["run"], run.scene}
 
 
 def test_names_of_somebody_else_do_not_leave_the_folder(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.main import get_command
 from typer.testing import CliRunner
 
 from flows.cli import outcome
@@ -127,6 +128,13 @@ def test_what_is_done_is_in_the_object_of_a_command_that_was_stopped(capsys: pyt
     found = parse(capsys.readouterr().out)
     assert found["chunks"] == [{"chunk": 0, "stages": [{"stage": "ingest", "key": "5f41", "cached": True}]}]
     assert (found["status"], found["error"], found["log"]) == ("interrupted", None, "a log")
+
+
+@pytest.mark.parametrize("words", [["store", "copy", "a", "b"], ["ops", "status"], ["run", "a log"]])
+def test_json_is_wanted_of_commands_in_groups_too(words: list[str]) -> None:
+    command = get_command(app)
+    assert outcome.wants_json(command, [*words, "--json"])
+    assert not outcome.wants_json(command, words) and not outcome.wants_json(command, [*words, "--", "--json"])
 
 
 def test_numbers_that_json_lacks_are_null(capsys: pytest.CaptureFixture[str]) -> None:

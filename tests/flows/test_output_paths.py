@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from flows.cli.main import app
-from flows.cli.output_paths import check_output_file, check_output_folder
+from flows.cli.output_paths import check_new_folder, check_output_file, check_output_folder
 from flows.cli.parsing import check_number, parse_duration, parse_numbers, parse_path
 from flows.pipeline.log_cache import expand_logs
 from genre_tasks.errors import ConfigError, GenreError, InputError
@@ -49,6 +49,19 @@ def test_a_file_that_cannot_be_written_is_refused(tmp_path: Path, name: str, tex
     with pytest.raises(InputError, match=text) as caught:
         check_output_file(tmp_path / name, "--out", (".png", ".mp4"))
     assert caught.value.file is not None and caught.value.remedy and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", [".", "..", "x/.."])
+def test_a_folder_without_a_name_cannot_be_written_as_a_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="names no folder"):
+        check_new_folder(Path(name), "--out")
+    for words in (["simulate", "4b1c"], ["export", "4b1c", "--format", "ply"], ["augment", "4b1c", "--format", "own"]):
+        assert "names no folder" in str(refusal(*words, "--out", name))
+    assert "names no folder" in str(refusal("convert", STREET, f"genre:{name}"))
+    check_new_folder(Path("new"), "--out")
 
 
 def test_a_file_that_can_be_written_is_not_touched(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from uuid import uuid4
 import pytest
 
 from flows.dataset import submission
+from flows.dataset.dataset_record import name_dataset
 from flows.dataset.prefect_runs import ChildRequest, PrefectRuns, has_heartbeat
 from flows.dataset.submission import HeartbeatWatch
 
@@ -110,3 +111,20 @@ def test_a_dead_parent_is_noticed_and_one_whose_heartbeats_were_lost_is_not(monk
     assert _silent_after([10.0, 160.0, 190.0, 220.0, 250.0, 280.0], [38.0, 68.0, 99.0, 128.0], monkeypatch) is None
     late_s = _silent_after([10.0], [60.0], monkeypatch)
     assert late_s is not None and late_s > 150.0
+
+
+def test_a_parent_that_waits_for_its_worker_is_not_silent() -> None:
+    clock_s = [0.0]
+    watch = HeartbeatWatch(FakeClient(), uuid4(), clock=lambda: clock_s[0])  # type: ignore[arg-type]
+    assert not watch.is_silent()
+    for clock_s[0] in (60.0, 120.0, 180.0):
+        watch.restart()
+        assert not watch.is_silent()
+    # It runs now, and its first heartbeat is still on its way.
+    clock_s[0] = 190.0
+    assert not watch.is_silent()
+
+
+def test_another_store_is_another_dataset() -> None:
+    names = {name_dataset(["kitti:a"], "demo", store, None) for store in ("s3://a", "s3://b")}
+    assert len(names) == 2

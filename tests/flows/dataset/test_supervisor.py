@@ -139,6 +139,13 @@ def test_a_run_that_the_server_calls_silent_goes_on_while_it_sends_heartbeats() 
     assert (row["status"], row["attempts"]) == ("done", 2) and dead.crashed == ["synthetic:a/0"]
 
 
+def test_a_cancelled_run_whose_worker_died_ends_and_is_not_submitted_again() -> None:
+    runs = FakeRuns({A: [["RUNNING", "CANCELLING"]], B: [["RUNNING", "COMPLETED"]]})
+    rows = supervise(runs, [A, B])
+    assert [(row["status"], row["why"]) for row in rows] == [("failed", "cancelled"), ("done", "")]
+    assert runs.crashed == ["synthetic:a/0"] and runs.submitted == [(A, 0), (B, 0)]
+
+
 def test_a_run_in_the_queue_is_never_freed() -> None:
     runs = FakeRuns({A: [["SCHEDULED"] * 100 + ["COMPLETED"]]})
     assert supervise(runs, [A])[0]["status"] == "done" and not runs.crashed

@@ -8,6 +8,7 @@ import subprocess
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,7 +17,7 @@ import pytest
 from typer.testing import CliRunner
 
 from flows.cli.main import app
-from flows.viewer.client_session import ClientSession
+from flows.viewer.client_session import ClientSession, _describe_chunk
 from flows.viewer.live_viewer import LiveViewer
 from flows.viewer.local_server import find_free_port
 from flows.viewer.viewed_chunks import ViewedRun
@@ -53,6 +54,11 @@ def only_session(viewer: LiveViewer) -> ClientSession:
 
 def set_value(control: Any, value: Any) -> None:
     control.value = value
+
+
+def test_the_name_of_a_log_is_no_html() -> None:
+    heading = _describe_chunk(replace(make_viewed(), log="<iframe srcdoc='x'> 002"))
+    assert heading.startswith(r"**\<iframe srcdoc\=\'x\'\> 002**")
 
 
 @needs_browser
