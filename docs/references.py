@@ -47,11 +47,12 @@ def configuration_reference() -> str:
     parts = [
         "# Configuration\n\nThis page is generated from `genre_tasks/config/`. Set a key with "
         "`--set section.key=value`, or in a YAML file given by `--config`. A preset is such a file; "
-        "`genre show config --preset NAME` prints its values.\n"
+        "`genre show config --preset NAME` prints its values.\n\n"
+        "A default holds where the preset sets nothing. `genre run` takes the preset `fine` where you name none.\n"
     ]
     for name, field in PipelineConfig.model_fields.items():
         parts.append(_section(name, field.annotation, field.default))
-    parts.append(_section("range (command `genre range` only)", RangeConfig, RangeConfig()))
+    parts.append(_section("range (options of `genre range`, and fixed values)", RangeConfig, RangeConfig()))
     return "\n".join(parts)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from flows.configuration import load_configuration
 from genre_tasks.logs.registry import open_log
 from genre_tasks.metrics.results import Evaluation
+from genre_tasks.stages.effects import effects
 from genre_tasks.stages.enet import enet
 from genre_tasks.stages.evaluate import evaluate_scene
 from genre_tasks.stages.fnet import fnet
@@ -22,11 +23,14 @@ def reconstruct(uri: str, settings: list[str]) -> dict[str, Evaluation]:
     config = load_configuration("demo", settings=settings)
     log = open_log(uri)
     chunk = ingest(config.ingest, log, 0)
-    scenes = {"initial": initial(config.initial, chunk)}
-    scenes["gnet"] = gnet(config.gnet, chunk, scenes["initial"])
-    fixed = fnet(config.fnet, chunk, novel_views(config.novel_views, chunk, scenes["gnet"]))
-    scenes["enet"] = enet(config.enet, chunk, scenes["gnet"], fixed)
-    return {name: evaluate_scene(config.evaluate, chunk, name, scene, log.truth) for name, scene in scenes.items()}
+    plan = effects(config.effects, chunk, log)
+    scenes = {"initial": initial(config.initial, chunk, plan)}
+    scenes["gnet"] = gnet(config.gnet, chunk, scenes["initial"], plan)
+    fixed = fnet(config.fnet, chunk, novel_views(config.novel_views, chunk, scenes["gnet"], plan), plan)
+    scenes["enet"] = enet(config.enet, chunk, scenes["gnet"], fixed, plan)
+    return {
+        name: evaluate_scene(config.evaluate, chunk, name, scene, log.truth, plan) for name, scene in scenes.items()
+    }
 
 
 if __name__ == "__main__":

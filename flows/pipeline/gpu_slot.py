@@ -1,4 +1,4 @@
-"""A slot of a GPU that many workers share: a stage on the GPU waits for one, if the worker's environment says so."""
+"""A slot of a GPU that many workers share: heavy stages wait for one, if the worker's environment says so."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _MAX_PAUSE_S = 10.0
 _FIRST_SERVER_ERROR = 500
 _log = logging.getLogger("genre")
 GPU_STAGES = frozenset({"gnet", "fnet", "enet"})
-"""Stages that compute on a GPU where there is one, apart from those of evaluation."""
+"""Stages that wait for a slot, apart from those of evaluation: networks and rendering. They run on the CPU so far."""
 
 
-def uses_gpu(stage: str) -> bool:
-    """Says whether a stage computes on a GPU where there is one.
+def takes_gpu_slot(stage: str) -> bool:
+    """Says whether a stage waits for a slot.
 
     Args:
         stage: the stage's name.
@@ -32,7 +32,7 @@ def uses_gpu(stage: str) -> bool:
     Returns:
         Whether it does.
 
-    >>> uses_gpu("gnet"), uses_gpu("evaluate/enet"), uses_gpu("ingest")
+    >>> takes_gpu_slot("gnet"), takes_gpu_slot("evaluate/enet"), takes_gpu_slot("ingest")
     (True, True, False)
     """
     return stage in GPU_STAGES or stage.startswith("evaluate/")
@@ -55,7 +55,7 @@ def gpu_slot(stage: str) -> Iterator[None]:
         TransientIOError: the server has been away for minutes.
     """
     limit = os.environ.get(GPU_LIMIT_VARIABLE)
-    if not limit or not uses_gpu(stage):
+    if not limit or not takes_gpu_slot(stage):
         yield
         return
     with ExitStack() as stack:
