@@ -88,12 +88,12 @@ def as_genre_error(error: OSError, path: Path, address: Address | None = None) -
 
 
 @contextmanager
-def os_errors_translated(path: Path, address: Address) -> Iterator[None]:
+def os_errors_translated(path: Path, address: Address | None) -> Iterator[None]:
     """Turns an ``OSError`` inside the block into one of the project's errors.
 
     Args:
         path: the file or folder, for an error that names none.
-        address: the artifact that is read or written.
+        address: the artifact that is read or written, if it is known.
 
     Yields:
         Nothing.

@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any
 
-from genre_tasks.errors import ArtifactCorruptError, ConfigError
+from genre_tasks.errors import ArtifactCorruptError, ConfigError, GenreError, InputError, TransientIOError
 from genre_tasks.progress import Progress, silent
 from genre_tasks.temporary_names import describe_owner, is_abandoned, remove_path
 from genre_tasks.user_paths import expand_user_path
@@ -236,7 +236,7 @@ class LocalStore:
                 if fits and folder == self.root / address.relative_path:
                     yield Artifact(address, folder, manifest)
 
-    def verify_all(self) -> Iterator[tuple[str, ArtifactCorruptError | None]]:
+    def verify_all(self) -> Iterator[tuple[str, GenreError | None]]:
         """Checks every artifact of the store: see :meth:`storage.store.Store.verify_all`.
 
         Yields:
@@ -245,13 +245,15 @@ class LocalStore:
         for folder in find_artifact_folders(self.root):
             name = folder.relative_to(self.root).as_posix()
             try:
-                manifest = load_manifest(folder)
+                # A file that cannot be read must not hide what is wrong with those after it.
+                with os_errors_translated(folder / MANIFEST, None):
+                    manifest = load_manifest(folder)
                 artifact = Artifact(manifest.address, folder, manifest)
                 if folder != self.root / artifact.address.relative_path:
                     raise make_corruption_error(artifact.address, folder, f"The manifest belongs to {artifact.address}")
                 self.verify(artifact)
                 yield name, None
-            except ArtifactCorruptError as error:
+            except (ArtifactCorruptError, InputError, TransientIOError) as error:
                 yield name, error
 
     def clean_temporaries(self, older_than_s: float = 3600.0, everywhere: bool = False) -> int:

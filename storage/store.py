@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from genre_tasks.errors import ArtifactCorruptError
+from genre_tasks.errors import GenreError
 from genre_tasks.progress import Progress, silent
 from storage.address import Address
 from storage.manifest import Manifest
@@ -246,11 +246,12 @@ class Store(Protocol):
         """
         ...
 
-    def verify_all(self) -> Iterator[tuple[str, ArtifactCorruptError | None]]:
+    def verify_all(self) -> Iterator[tuple[str, GenreError | None]]:
         """Checks every byte of every artifact, also of those whose manifest cannot be read.
 
         Yields:
             (the artifact's path relative to the store, what is wrong with it or ``None``), in the order of the paths.
+            It is damaged only where that is an ``ArtifactCorruptError``; with any other error it cannot be read now.
         """
         ...
 

@@ -12,7 +12,7 @@ from flows.defaults import DEFAULT_STORE
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from genre_tasks.errors import ArtifactCorruptError
+    from genre_tasks.errors import GenreError
     from storage.store import Store
 
 
@@ -37,7 +37,7 @@ def verify(
 
     opened = open_existing_store(store)
     sound = 0
-    damaged: dict[str, ArtifactCorruptError] = {}
+    damaged: dict[str, GenreError] = {}
     for name, error in opened.verify_all():
         if error is None:
             sound += 1
@@ -55,7 +55,7 @@ def verify(
         raise typer.Exit(1)
 
 
-def _repair(store: Store, damaged: Mapping[str, ArtifactCorruptError]) -> bool:
+def _repair(store: Store, damaged: Mapping[str, GenreError]) -> bool:
     """Repairs artifacts and prints what became of each; whether all were repaired."""
     from flows.cli.terminal import report_on_terminal
     from flows.upkeep.repair import repair_artifacts

@@ -16,7 +16,9 @@ from flows.training.stage_scenes import list_scene_uses
 from flows.training.train_job import TrainJob
 from flows.training.training_scenes import check_for_training
 from genre_tasks.config import FnetConfig
+from genre_tasks.errors import InputError
 from genre_tasks.fixer.network import INPUTS
+from genre_tasks.fixer.training_checkpoint import CHECKPOINT_FILE, count_steps
 from genre_tasks.fixer.weight_files import check_described_weights, check_fixer_files, check_sd_turbo
 
 _TRAINING_PRESET = "small"
@@ -54,7 +56,8 @@ def check_fixer_training(job: FixerJob, is_training: bool = True) -> None:
 
     Raises:
         ConfigError: there is nothing to make pairs of, or a chunk is not for training.
-        InputError: the real log or the weights to start from are missing or unfit, or the folder cannot be written to.
+        InputError: the real log or the weights to start from are missing or unfit, the training to go on from has not
+            come to its end, or the folder cannot be written to.
     """
     list_pair_scenes(job.streets, job.real)
     _check_real_log(job.real)
@@ -66,6 +69,20 @@ def check_fixer_training(job: FixerJob, is_training: bool = True) -> None:
     elif job.initial_weights is not None:
         path, described = check_described_weights(job.initial_weights, "small")
         require_same_inputs(described.get("inputs", INPUTS), job, path)
+        # Weights that the user names are taken as they are.
+        if job.start is None:
+            _require_finished(job.initial_weights.with_name(CHECKPOINT_FILE))
+
+
+def _require_finished(checkpoint: Path) -> None:
+    """Raises where the training to go on from was stopped: it writes weights at every checkpoint."""
+    # Weights that were copied here without one are taken as they are, too.
+    if not checkpoint.is_file():
+        return
+    done, steps = count_steps(checkpoint)
+    if done < steps:
+        remedy = "Run its command again first, or name weights with --start."
+        raise InputError(f"the training to go on from has made {done} of {steps} steps", remedy=remedy, file=checkpoint)
 
 
 def _check_real_log(real: str | None) -> None:

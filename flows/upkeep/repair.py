@@ -33,7 +33,7 @@ class Repair:
 
 def repair_artifacts(
     store: Store,
-    damaged: Mapping[str, ArtifactCorruptError],
+    damaged: Mapping[str, GenreError],
     run_again: Callable[[Mapping[str, Any]], None],
 ) -> Iterator[Repair]:
     """Removes damaged artifacts, and has the runs that they are of computed again.
@@ -53,7 +53,8 @@ def repair_artifacts(
     addresses: dict[str, Address] = {}
     for name, error in damaged.items():
         try:
-            if isinstance(error, NewerSchemaError):
+            # What cannot be read now may be whole: a mount that is away must not cost an artifact.
+            if isinstance(error, NewerSchemaError) or not isinstance(error, ArtifactCorruptError):
                 raise error
             addresses[name] = Address.parse(name)
             store.discard(addresses[name])

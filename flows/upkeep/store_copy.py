@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from flows.dataset.dataset_record import DATASETS
-from flows.reconstruction.run_records import find_run_record, name_run_folder
-from flows.upkeep.garbage import add_ancestors, measure_bytes
+from flows.reconstruction.run_records import find_run_record, list_runs, name_run_folder
+from flows.upkeep.garbage import add_ancestors, list_sources, measure_bytes
 from flows.upkeep.pins import PINS, list_pins, list_run_keys
 from genre_tasks.atomic_path import atomic_path
-from genre_tasks.scene_edits.edits import EditList, Insert
+from genre_tasks.errors import InputError
 from storage.io_errors import as_genre_error
 from storage.store import Artifact, Store
 
@@ -58,15 +58,19 @@ def copy_store(
         What was done.
 
     Raises:
-        InputError: no run, or several, begin so; or the target cannot be written.
+        InputError: no run, or several, begin so; the target cannot be written; or an artifact of a run or a pin is gone
+            or has a damaged manifest, which is said when all else is copied.
         ArtifactCorruptError: an artifact of the source is damaged.
         TransientIOError: a store does not answer.
     """
     artifacts = list(source.artifacts())
+    by_key = {artifact.address.key: artifact for artifact in artifacts}
     records = _list_records(source)
-    if runs or pinned:
-        by_key = {artifact.address.key: artifact for artifact in artifacts}
-        pins = list_pins(source) if pinned else []
+    pins = list_pins(source) if pinned or not runs else []
+    if not runs and not pinned:
+        wanted = [key for record in list_runs(source.uri) for key in list_run_keys(record)]
+        wanted += [key for pin in pins for key in pin.keys]
+    else:
         pinned_runs = [pin.name for pin in pins if source.records.find("runs", "run.json", pin.name)]
         found = _find_with_recorded([find_run_record(source.uri, run) for run in (*runs, *pinned_runs)], source)
         wanted = [key for record in found for key in list_run_keys(dict(record))]
@@ -80,6 +84,12 @@ def copy_store(
     # After the artifacts: a record must not refer to what is not there yet.
     for name in records:
         _copy_record(source, target, name)
+    if gone := sorted(key for key in set(wanted) if key not in by_key):
+        # All that is sound is copied first: whoever moves away from a failing disk needs that most.
+        problem = (
+            f"{len(gone)} artifacts of runs or pins are damaged or gone, such as {gone[0][:12]}; all else is copied"
+        )
+        raise InputError(problem, remedy="Run `genre verify --repair` there, and copy again.", file=source.uri)
     return CopyResult(len(copied), len(artifacts) - len(copied), measure_bytes(copied), len(records))
 
 
@@ -92,11 +102,7 @@ def _find_with_recorded(records: Iterable[Mapping[str, Any]], source: Store) -> 
         if str(record["run"]) in found:
             continue
         found[str(record["run"])] = record
-        edited = record.get("edited")
-        if edited is not None:
-            edits = EditList.model_validate(edited["edits"]).edits
-            givers = {edit.from_run for edit in edits if isinstance(edit, Insert) and edit.from_run is not None}
-            waiting += [find_run_record(source.uri, name) for name in (str(edited["run"]), *sorted(givers))]
+        waiting += [find_run_record(source.uri, name) for name in list_sources(record)]
     return list(found.values())
 
 

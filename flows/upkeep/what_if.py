@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from flows.configuration.loading import apply_settings
-from flows.pipeline.definition import PIPELINE, StageSpec, digest_stage_weights, stage_key
+from flows.pipeline.definition import PIPELINE, StageSpec, digest_stage_weights, find_weights_file, stage_key
 from flows.pipeline.stage_runner import Job, reading_modules
 from flows.reconstruction.chunk_configuration import read_chunk_config
 from genre_tasks.code_closure import find_module_file, import_closure
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ConfigError
+from genre_tasks.weights import resolve_weights
 from storage.code_digest import NUMERIC_PACKAGES
 
 _ROOT = Path(__file__).resolve().parents[2]
@@ -92,15 +93,23 @@ def _explain(spec: StageSpec, job: Job, config: PipelineConfig, change: str) -> 
         ]
         return "" if keys[0] == keys[1] else "its setting"
     if kind == "weights":
-        refinement = getattr(getattr(config, spec.section), "refinement", None)
-        is_loaded = digest_stage_weights(spec, config) is not None and spec.weights == name
-        return "its weights" if is_loaded or (refinement is not None and name == "gnet") else ""
+        return "its weights" if _loads_weights(spec, config, name) else ""
     if kind in ("code", "package"):
         modules = (*spec.lazy_modules, *reading_modules(spec, job))
         closure = import_closure(spec.module, modules, _ROOT)
         found = closure.modules if kind == "code" else closure.packages
         return f"its {'code' if kind == 'code' else 'packages'}" if name in found else ""
     return ""
+
+
+def _loads_weights(spec: StageSpec, config: PipelineConfig, network: str) -> bool:
+    """Whether a stage loads weights for a network, or the ones that ship for it, as GNet's refinement does ENet's."""
+    file = find_weights_file(spec, config)
+    files = [] if file is None else [file]
+    refinement = getattr(getattr(config, spec.section), "refinement", None)
+    if refinement is not None:
+        files.append(resolve_weights("gnet", refinement.weights, "gnet.refine.weights"))
+    return (file is not None and spec.weights == network) or resolve_weights(network, "builtin") in files
 
 
 def _check_change(change: str) -> None:

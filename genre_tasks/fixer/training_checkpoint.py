@@ -109,6 +109,20 @@ def restore_checkpoint(state: TrainingState, path: Path, settings: TrainingSetti
     state.losses = stored["losses"]
 
 
+def count_steps(path: Path) -> tuple[int, int]:
+    """Reads how far a training has come.
+
+    Args:
+        path: of its checkpoint.
+
+    Returns:
+        Steps that are done, and all of them.
+    """
+    # Mapped, as most of a checkpoint is weights and moments.
+    stored = torch.load(path, weights_only=True, mmap=True)
+    return int(stored["step"]), int(stored["settings"]["steps"])
+
+
 def save_autoencoder(
     autoencoder: TrainedAutoencoder, path: Path, settings: TrainingSettings, origin: Mapping[str, str]
 ) -> None:

@@ -8,7 +8,7 @@ from genre_tasks.errors import ArtifactCorruptError
 from storage.manifest import MANIFEST, parse_manifest
 from storage.objects.bucket import Bucket, ObjectInfo
 from storage.objects.object_lease import LEASES_FOLDER
-from storage.objects.payloads import ETAGS_START, PAYLOAD_START, is_payload
+from storage.objects.payloads import find_payload_owner
 
 PROBE_START = ".probe-"
 """How the names of objects begin that only try whether the store can be written."""
@@ -38,8 +38,7 @@ def find_abandoned(bucket: Bucket, probe: str, older_than_s: float) -> list[str]
             now = info.modified
         elif info.name.startswith((f"{LEASES_FOLDER}/", PROBE_START)):
             abandoned.append(info)
-        elif is_payload(info.name):
-            folder = info.name.partition(f"/{PAYLOAD_START}")[0].partition(f"/{ETAGS_START}")[0]
+        elif (folder := find_payload_owner(info.name)) is not None:
             payloads.setdefault(folder, []).append(info)
     if now is None:
         # Another process cleans at the same moment: it does the work.

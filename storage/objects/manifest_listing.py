@@ -10,7 +10,7 @@ from pathlib import PurePosixPath
 
 from storage.manifest import MANIFEST
 from storage.objects.bucket import Bucket, ObjectInfo
-from storage.objects.payloads import is_payload
+from storage.objects.payloads import find_payload_owner
 from storage.objects.read_cache import ReadCache
 
 _MANIFESTS_AT_ONCE = 16
@@ -47,7 +47,9 @@ class ManifestListing:
         for info in self._bucket.list(folder):
             parts = PurePosixPath(info.name).parts
             # A file of a payload may have the name, too. Hidden folders and records are no artifacts.
-            is_manifest = parts[-1] == MANIFEST and not is_payload(info.name) and not info.name.startswith(".")
+            is_manifest = (
+                parts[-1] == MANIFEST and find_payload_owner(info.name) is None and not info.name.startswith(".")
+            )
             if is_manifest and len(parts) >= _FEWEST_PARTS and parts[-2].startswith(key_start):
                 yield info
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from genre_tasks.cache_folder import find_cache_folder
-from genre_tasks.errors import ArtifactCorruptError, ConfigError, TransientIOError
+from genre_tasks.errors import ArtifactCorruptError, ConfigError, GenreError, TransientIOError
 from genre_tasks.progress import Progress, silent
 from genre_tasks.temporary_names import describe_owner
 from storage.address import Address
@@ -202,7 +202,7 @@ class ObjectStore:
                 if all(v is None or v == getattr(artifact.manifest, name) for name, v in wanted.items()):
                     yield artifact
 
-    def verify_all(self) -> Iterator[tuple[str, ArtifactCorruptError | None]]:
+    def verify_all(self) -> Iterator[tuple[str, GenreError | None]]:
         """Reads every byte of every artifact: see :meth:`storage.store.Store.verify_all`.
 
         Yields:

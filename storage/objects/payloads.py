@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -20,6 +21,10 @@ PAYLOAD_START = "payload-"
 """How the folder of an artifact's files begins; the digest of the payload follows."""
 ETAGS_START = "etags-"
 """How the object begins that remembers the ETags of an artifact's files."""
+# By the place in the name: a log may be called anything, also as these are.
+_PAYLOAD = re.compile(
+    rf"(?P<artifact>(?:[^/]+/){{4,}}[^/]+)/(?:{PAYLOAD_START}[0-9a-f]{{12}}/.+|{ETAGS_START}[0-9a-f]{{12}}\.json)"
+)
 # More threads gain little, and a server that is slow already gets slower by them.
 _THREADS = 4
 
@@ -180,19 +185,22 @@ class Payloads:
         return make_corruption_error(artifact.address, file, problem)
 
 
-def is_payload(name: str) -> bool:
-    """Tells whether an object belongs to the files of an artifact, and is no manifest of one.
+def find_payload_owner(name: str) -> str | None:
+    """Finds the artifact that an object is a file of.
 
     Args:
         name: below the store's prefix.
 
     Returns:
-        Whether it is a file or the list of their ETags.
+        The artifact's path, if the object is one of its files or the list of their ETags; ``None`` for a manifest and
+        for all else.
 
-    >>> is_payload("d/l/0000/gnet/5f41/payload-0a1b/manifest.json"), is_payload("d/l/0000/gnet/5f41/manifest.json")
-    (True, False)
+    >>> find_payload_owner("d/l/0000/gnet/5f41/payload-0123456789ab/manifest.json")
+    'd/l/0000/gnet/5f41'
+    >>> find_payload_owner("d/payload-l/0000/gnet/5f41/manifest.json")
     """
-    return f"/{PAYLOAD_START}" in name or name.rpartition("/")[2].startswith(ETAGS_START)
+    found = _PAYLOAD.fullmatch(name)
+    return found and found["artifact"]
 
 
 def _payload_folder(manifest: Manifest) -> str:

@@ -18,10 +18,12 @@ from flows.training.fixer_flow import train_fnet, train_pairs
 from flows.training.fixer_job import CURVE_FILE, SCORES_FILE, FixerJob
 from flows.training.fixer_pairs import TRAINING_PAIRS, PairRecipe, PairSet
 from flows.training.fixer_training import load_pairs, train_fixer
+from flows.training.requirements import check_fixer_training
 from flows.training.training_scenes import SceneRecipe
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.fixer import training
 from genre_tasks.fixer.architectures import small_architecture
+from genre_tasks.fixer.training_checkpoint import CHECKPOINT_FILE
 from genre_tasks.fixer.training_settings import TrainingSettings
 from genre_tasks.fixer.weights import load_fnet
 from storage.files import digest_file
@@ -208,6 +210,17 @@ def test_a_fixer_is_trained_further_in_a_folder_of_its_own(trained) -> None:
     last = Path(train_fnet(str(folder), None, 2, preset="last")["weights"])
     assert last == folder / "fnet-last" / "fnet.safetensors"
     assert not torch.equal(load_fnet(last.parent).state_dict()["skips.0.weight"], after["skips.0.weight"])
+
+
+def test_an_unfinished_fixer_is_not_trained_further(trained, tmp_path: Path) -> None:
+    shutil.copytree(trained[0] / "fnet", tmp_path / "fnet")
+    checkpoint = tmp_path / "fnet" / CHECKPOINT_FILE
+    stored = torch.load(checkpoint, weights_only=True)
+    torch.save({**stored, "step": stored["step"] - 1}, checkpoint)
+    with pytest.raises(InputError, match=r"has made \d+ of \d+ steps.*--start"):
+        check_fixer_training(FixerJob(str(tmp_path), streets=2, preset="further"))
+    # Weights that the user names are taken as they are.
+    check_fixer_training(FixerJob(str(tmp_path), streets=2, preset="further", start=str(tmp_path / "fnet")))
 
 
 def test_faults_are_said(monkeypatch) -> None:

@@ -152,6 +152,49 @@ def test_one_run_is_copied_without_the_rest(store: LocalStore, tmp_path: Path) -
     assert target.find(address()) is None
 
 
+def test_a_copy_says_what_it_could_not_read(store: LocalStore, tmp_path: Path) -> None:
+    (gnet,) = store.artifacts(stage="gnet")
+    (gnet.path / "manifest.json").write_text("{")
+    target = LocalStore(tmp_path / "target")
+    for runs in ((), (str(record_of(store)["run"]),)):
+        with pytest.raises(InputError, match=f"1 artifacts .* such as {gnet.address.key[:12]}; all else is copied"):
+            copy_store(store, target, runs=runs)
+    # A run is copied with ancestors, so that only what was made from the damaged one needs it.
+    assert len(list(target.artifacts())) == len(PIPELINE) - 1
+
+
+def test_what_a_damaged_pin_needs_is_no_garbage(store: LocalStore) -> None:
+    (fnet,) = store.artifacts(stage="fnet")
+    add_pin(store, fnet.address.key[:10])
+    store.records.remove(f"runs/{record_of(store)['run']}")
+    (fnet.path / "manifest.json").write_text("{")
+    with pytest.raises(InputError, match=r"pins is damaged or gone.*genre unpin"):
+        find_garbage(store, now=LATER)
+
+
+def test_an_edited_run_whose_recorded_run_is_gone_keeps_everything(store: LocalStore) -> None:
+    record = record_of(store)
+    edited = {**record, "run": "e" * 12, "edited": {"run": record["run"], "edits": {"edits": []}}}
+    folder = store.root / "runs" / ("e" * 12)
+    folder.mkdir()
+    (folder / "run.json").write_text(json.dumps(edited))
+    assert find_garbage(store, now=LATER).artifacts == ()
+    store.records.remove(f"runs/{record['run']}")
+    with pytest.raises(InputError, match=r"is edited from run .*, whose record is gone"):
+        find_garbage(store, now=LATER)
+
+
+def test_a_file_that_cannot_be_read_hides_no_damage(store: LocalStore, genre: Callable[..., tuple[int, str]]) -> None:
+    first, *_, last = sorted(store.artifacts(), key=lambda artifact: str(artifact.path))
+    payload = next(path for path in first.path.iterdir() if path.name != "manifest.json")
+    payload.unlink()
+    payload.mkdir()  # reading a folder is an error of the system, as a bad sector is
+    (last.path / "manifest.json").write_text("{")
+    code, text = genre("verify")
+    assert code == 1 and text.count("damaged: ") == 2
+    assert "repaired: " in genre("verify", "--repair")[1]
+
+
 def test_damage_is_not_copied(store: LocalStore, tmp_path: Path) -> None:
     (gnet,) = store.artifacts(stage="gnet")
     next(gnet.path.glob("*.parquet")).write_bytes(b"else")
@@ -167,6 +210,7 @@ def test_damage_is_not_copied(store: LocalStore, tmp_path: Path) -> None:
         ("gnet.iterations=5", {"gnet"}, {"novel_views", "fnet", "enet", "evaluate/gnet"}),
         ("code:genre_tasks.stages.fnet", {"fnet"}, {"enet", "evaluate/fnet", "evaluate/enet"}),
         ("weights:fnet", {"fnet"}, {"enet", "evaluate/fnet", "evaluate/enet"}),
+        ("weights:enet", {"gnet", "enet"}, {"novel_views", "fnet", "evaluate/gnet"}),
         ("log", {"ingest", "effects"}, {"initial", "gnet", "enet"}),
         ("package:torch", {"gnet", "fnet", "enet"}, set()),
         ("gnet.iterations=2", set(), set()),
