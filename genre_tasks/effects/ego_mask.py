@@ -45,6 +45,9 @@ THRESHOLD_PERCENT = 1.2
 # Smaller parts are as often road as vehicle.
 MIN_MASK_PERCENT = 0.3
 
+MAX_MASK_PERCENT = 60.0
+"""No vehicle fills more of an image: what stands still there is the night, a cover, or a picture that is stuck."""
+
 MIN_TRAVEL_M = 2.0
 MIN_FRAMES = 4
 
@@ -102,7 +105,8 @@ def _find_vehicle_masks(measurements: ChunkMeasurements) -> dict[str, NDArray[np
     for camera in measurements.chunk.camera_names:
         images = measurements.images_over_time[camera]
         if len(images) >= MIN_FRAMES:
-            masks[camera] = find_vehicle(images.astype(np.float32))
+            mask = find_vehicle(images.astype(np.float32))
+            masks[camera] = mask if 100 * mask.mean() <= MAX_MASK_PERCENT else np.zeros_like(mask)
     return masks
 
 

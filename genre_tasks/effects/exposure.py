@@ -43,12 +43,12 @@ def fit(measurements: ChunkMeasurements) -> EffectParameters:
         along the line through the two nearest ones before the first and after the last source view.
     """
     # Held-out views are not measured: their images are what the scene is judged by.
-    known: dict[str, list[tuple[float, Gain]]] = {}
+    known: dict[str, list[tuple[View, Gain]]] = {}
     views = zip(measurements.source_views, measurements.log_gains, measurements.linked, strict=True)
     for view, gain, linked in views:
         if linked:
             red, green, blue = (float(channel) for channel in gain)
-            known.setdefault(view.camera, []).append((view.timestamp_s, (red, green, blue)))
+            known.setdefault(view.camera, []).append((view, (red, green, blue)))
     gains = {
         (view.camera, view.frame): _interpolate_gain(view, known[view.camera])
         for view in measurements.chunk.views
@@ -57,13 +57,18 @@ def fit(measurements: ChunkMeasurements) -> EffectParameters:
     return EffectParameters(gains=gains)
 
 
-def _interpolate_gain(view: View, known: list[tuple[float, Gain]]) -> Gain:
-    ordered = sorted(known)
-    times = np.array([time for time, _ in ordered])
+def _interpolate_gain(view: View, known: list[tuple[View, Gain]]) -> Gain:
+    ordered = sorted(known, key=lambda entry: entry[0].frame)
+    times = np.array([source.timestamp_s for source, _ in ordered])
     gains = np.array([gain for _, gain in ordered])
+    moment = view.timestamp_s
+    if not (np.diff(times) > 0).all():
+        # Times that repeat or go back say nothing of the order, which the frames have in any case.
+        times = np.array([source.frame for source, _ in ordered], np.float64)
+        moment = float(view.frame)
     if len(times) > 1:
         times, gains = _extend_linearly(times, gains)
-    red, green, blue = (float(np.interp(view.timestamp_s, times, gains[:, k])) for k in range(3))
+    red, green, blue = (float(np.interp(moment, times, gains[:, k])) for k in range(3))
     return red, green, blue
 
 

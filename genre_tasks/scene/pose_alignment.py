@@ -66,6 +66,8 @@ MAX_OBSERVATIONS = 1_200_000
 # The mean and contrast that are taken away are those of a neighbourhood so many times as wide as the blur.
 _SURROUND = 5.0
 _CONTRAST_FLOOR = 4e-4
+# Cameras of a rig fire within a frame; further from their frame's mean is a clock that is wrong.
+_MOST_OFFSET_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -216,9 +218,15 @@ def _interpolate(
 ) -> dict[tuple[str, int], Float64]:
     """Moves all views; those between source frames take the rig's motion from both neighbours in time."""
     times = np.array([np.mean([i.view.timestamp_s for i in images if i.rig == k]) for k in range(len(rig))])
+    offsets_s = np.array([abs(i.view.timestamp_s - times[i.rig]) for i in images])
+    # A clock that goes back, stands, or is another camera's would give a view the motion of another frame.
+    is_by_time = bool((np.diff(times) > 0).all() and (offsets_s <= _MOST_OFFSET_S).all())
+    frames = np.array([next(i.view.frame for i in images if i.rig == k) for k in range(len(rig))], np.float64)
+    knots = times if is_by_time else frames
     poses = {}
     for view in chunk.views:
-        at_time = np.array([np.interp(view.timestamp_s, times, rig[:, k]) for k in range(6)])
+        moment = view.timestamp_s if is_by_time else float(view.frame)
+        at_time = np.array([np.interp(moment, knots, rig[:, k]) for k in range(6)])
         ego = chunk.chunk_SE3_ego[chunk.frames.index(view.frame)]
         mount = mounts[chunk.camera_names.index(view.camera)]
         poses[view.camera, view.frame] = move_pose(view.chunk_SE3_camera, ego, mount, at_time)

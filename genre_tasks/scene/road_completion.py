@@ -7,13 +7,16 @@ beside the path would stay a hole in every view. They are coloured from the imag
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from genre_tasks.errors import InputError
 from genre_tasks.logs.types import Float32, Float64
 
 REACH_M = 9.0
 """Only this near to the path: farther away rings are close and the road is not known to be flat."""
 
 CELL_M = 0.1
+_MOST_CELLS = 2e8
 _COARSE_M = 1.0
 _SMOOTH_M = 0.8
 # A coarse cell's lowest point this near to the fitted road plane is road: kerbs and camber stay, cars do not.
@@ -40,8 +43,7 @@ def complete_road(positions: Float32, chunk_SE3_ego: Float64) -> Float32:
     from scipy.ndimage import gaussian_filter, maximum_filter
 
     path = chunk_SE3_ego[:, :2, 3]
-    low = path.min(0) - REACH_M
-    shape = np.ceil((path.max(0) + REACH_M - low) / CELL_M).astype(int)
+    low, shape = span_road_grid(path)
     cell = np.floor((positions[:, :2] - low) / CELL_M).astype(np.int64)
     inside = ((cell >= 0) & (cell < shape)).all(1)
     near = positions[inside].astype(np.float64)
@@ -62,11 +64,36 @@ def complete_road(positions: Float32, chunk_SE3_ego: Float64) -> Float32:
     # Over the plane, so that the plane's own height is 0 and enters only the denominator.
     smooth = gaussian_filter(total, sigma) / (gaussian_filter(count, sigma) + _PLANE_WEIGHT)
     centres = np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in shape), indexing="ij"), -1) * CELL_M + low
-    distance = np.min([np.hypot(*np.moveaxis(centres - p, -1, 0)) for p in path], axis=0)
+    distance = np.full(centres.shape[:-1], np.inf)
+    # Pose after pose: all distances at once would take gigabytes where a chunk is long.
+    for position in path:
+        np.minimum(distance, np.hypot(*np.moveaxis(centres - position, -1, 0)), out=distance)
     # Grown by a cell, so that no added point touches a real one.
     empty = (maximum_filter(count, 3) == 0) & (distance < REACH_M)
     added = centres[empty]
     return np.column_stack([added, _plane_height(plane, added) + smooth[empty]]).astype(np.float32)
+
+
+def span_road_grid(path: Float64) -> tuple[Float64, NDArray[np.int64]]:
+    """Spans a grid of cells of ``CELL_M`` around a path.
+
+    Args:
+        path: [F, 2] metres, chunk coordinates.
+
+    Returns:
+        The grid's corner [2] in metres, and its numbers of cells [2].
+
+    Raises:
+        InputError: the path is so long that no memory would hold the grid.
+    """
+    low = path.min(0) - REACH_M
+    sides = np.ceil((path.max(0) + REACH_M - low) / CELL_M)
+    # A single wrong pose, such as one at the origin of a map, is enough for that.
+    if sides.prod() > _MOST_CELLS:
+        extent_m = float((path.max(0) - path.min(0)).max())
+        remedy = "Correct the poses, leave the chunk out with --chunks, or set a smaller ingest.chunk_frames."
+        raise InputError(f"the chunk's path spans {extent_m:.0f} m", remedy=remedy)
+    return low, sides.astype(np.int64)
 
 
 def measure_height_over_road(positions: Float64, chunk_SE3_ego: Float64) -> Float64:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from genre_tasks.logs.types import Float32, Float64
-from genre_tasks.scene.road_completion import CELL_M, REACH_M, measure_height_over_road
+from genre_tasks.scene.road_completion import CELL_M, measure_height_over_road, span_road_grid
 
 _SMOOTH_M = 0.5
 # Heights of the road over its plane, where it is fitted: kerbs and camber stay, cars do not.
@@ -34,8 +34,7 @@ def smooth_road(positions: Float32, reliable: Float32, chunk_SE3_ego: Float64) -
     from scipy.ndimage import gaussian_filter
 
     path = chunk_SE3_ego[:, :2, 3]
-    low = path.min(0) - REACH_M
-    shape = np.ceil((path.max(0) + REACH_M - low) / CELL_M).astype(int)
+    low, shape = span_road_grid(path)
     near = reliable[_find_cells(reliable, low, shape)[1]].astype(np.float64)
     over_plane = measure_height_over_road(near, chunk_SE3_ego)
     squares = np.unique(np.floor(near[np.abs(over_plane) < _MAX_CAMBER_M, :2]), axis=0)

@@ -78,7 +78,8 @@ def select_fixed_pictures(
         name = _name_picture(view)
         pictures[name] = _to_uint8(fixed.color[index])
         if truth is not None:
-            pictures[f"{name}.truth"] = truth_image(chunk, truth, view)
+            # Of the fixed view: its pose and lens may be refined ones.
+            pictures[f"{name}.truth"] = truth_image(chunk, truth, fixed.views[index])
     return pictures
 
 

@@ -21,6 +21,8 @@ from genre_tasks.stages.chunk_reading import ChunkReading
 REMEDY = "Fetch the file again, or run without strict to go on without it."
 
 _STRICT_REMEDY = "Or run without strict to go on without it."
+# Between two frames of a camera without any time.
+_FRAME_S = 0.1
 _MISSING = Finding("missing_image", "warning", "there is no image")
 
 
@@ -74,7 +76,7 @@ def read_views(reading: ChunkReading, cameras: Sequence[Camera]) -> tuple[list[V
                 camera=camera.name,
                 frame=frame,
                 role="source" if is_source else "heldout",
-                timestamp_s=log.camera_timestamp_s(camera.name, frame),
+                timestamp_s=_read_time(reading, camera, frame),
                 chunk_SE3_camera=chunk_SE3_world @ world_SE3_camera,
                 # The bytes are stored as they came; the lens is of the working resolution, to which they are decoded.
                 lens=camera.lens.resized(config.width_px, config.height_px),
@@ -88,6 +90,18 @@ def read_views(reading: ChunkReading, cameras: Sequence[Camera]) -> tuple[list[V
             schedule.take(n)
     _note_remarks(reading, remarks)
     return views, pixels
+
+
+def _read_time(reading: ChunkReading, camera: Camera, frame: int) -> float:
+    """An image's time in seconds; where it is not finite, the one that the camera's other images give."""
+    time_s = reading.log.camera_timestamp_s(camera.name, frame)
+    if np.isfinite(time_s):
+        return time_s
+    # The checks have noted it; what effects compute from times would be NaN in all views of the camera.
+    frames = np.array(reading.frames, np.float64)
+    times = np.array([reading.log.camera_timestamp_s(camera.name, f) for f in reading.frames])
+    known = np.isfinite(times)
+    return float(np.interp(frame, frames[known], times[known])) if known.any() else _FRAME_S * frame
 
 
 def require_source_frames(reading: ChunkReading, sources: Sequence[View]) -> None:

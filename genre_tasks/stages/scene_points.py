@@ -73,9 +73,13 @@ def read_points_from_scene(reading: ChunkReading, file: str, views: Sequence[Vie
     """
     scene = read_placed_scene(file, reading.config.placement, reading.world_SE3_chunk)
     opaque = _sharpen_opacities(scene)
-    renders = [render_surfaces(opaque, [view]) for view in views]
-    depths = [_smooth_depth(render.expected_depth()[0]) for render in renders]
-    alphas = [render.alpha[0] for render in renders]
+    depths = []
+    alphas = []
+    for view in views:
+        # A render has much that is not needed any more, and there are many views.
+        render = render_surfaces(opaque, [view])
+        depths.append(_smooth_depth(render.expected_depth()[0]))
+        alphas.append(render.alpha[0])
     stride = _choose_stride(views)
     parts = []
     for index, view in enumerate(views):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -285,6 +286,19 @@ def test_paint_of_the_roads_colour_is_found_by_what_moves_beside_it() -> None:
     assert np.array_equal(find_vehicle(images), covered)
     fading = (np.arange(90, dtype=np.float32)[::-1] / 40)[None, :, None, None]
     assert not find_vehicle((5 + fading * (road - 60) / 8).astype(np.float32)).any()
+
+
+def test_a_night_with_passing_lights_is_no_vehicle() -> None:
+    from genre_tasks.effects import ego_mask
+
+    images = np.full((8, 40, 60, 3), 5.0, np.float32)
+    for frame in range(8):
+        images[frame, 10:20, 5 * frame : 5 * frame + 8] = 200
+    chunk = SimpleNamespace(camera_names=("front",))
+    assert ego_mask.find_vehicle(images).all()
+    over_time = SimpleNamespace(chunk=chunk, images_over_time={"front": images})
+    found = ego_mask._find_vehicle_masks(over_time)  # type: ignore[arg-type]
+    assert not found["front"].any()
 
 
 def test_dark_images_are_marked(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import torch
 from genre_tasks.config import EffectsConfig, LossConfig
 from genre_tasks.effects import color_gain
 from genre_tasks.effects.apply_plan import apply_plan
+from genre_tasks.effects.exposure import _interpolate_gain
 from genre_tasks.effects.plan import EFFECT_NAMES, plan_effects
 from genre_tasks.effects.types import EffectParameters
 from genre_tasks.fixer.source_images import load_source_images
@@ -47,6 +49,16 @@ def test_gains_go_on_along_their_line_after_the_last_source_image() -> None:
     ]
     extended = [np.mean(found[v.camera, v.frame]) - np.mean(found[v.camera, last]) for v in after]
     assert np.abs(np.subtract(extended, swung)).mean() < 0.6 * np.abs(swung).mean()
+
+
+@pytest.mark.parametrize("times_s", [(0.0, 0.4, 0.4), (5.0, 5.0, 5.0), (0.8, 0.4, 0.0)])
+def test_gains_follow_the_frames_where_times_repeat_or_go_back(times_s: tuple[float, ...]) -> None:
+    sources = [SimpleNamespace(frame=4 * k, timestamp_s=time_s) for k, time_s in enumerate(times_s)]
+    known = [(source, (0.1 * k, 0.2 * k, 0.0)) for k, source in enumerate(sources)]
+    for source, gain in known:
+        assert _interpolate_gain(source, known) == pytest.approx(gain)  # type: ignore[arg-type]
+    between = SimpleNamespace(frame=6, timestamp_s=times_s[1])
+    assert _interpolate_gain(between, known) == pytest.approx((0.15, 0.3, 0.0))  # type: ignore[arg-type]
 
 
 def _clipped_target(log_gain: tuple[float, float, float] | None) -> Target:

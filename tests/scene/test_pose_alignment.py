@@ -120,6 +120,31 @@ def test_poses_stay_rigid_and_held_out_views_have_them_too() -> None:
     np.testing.assert_allclose(found[:3, 3], (rig[0, 3:] + rig[1, 3:]) / 2, atol=1e-6)
 
 
+@pytest.mark.parametrize("wrong_s", [0.0, float("nan"), 1e9])
+def test_a_wrong_clock_gives_no_view_the_motion_of_another_frame(wrong_s: float) -> None:
+    frames = sorted({view.frame for view in chunk(EXACT).views_with_role("source")})
+    odd = replace(
+        chunk(EXACT),
+        views=tuple(
+            replace(view, timestamp_s=wrong_s) if view.frame == frames[1] and view.camera == "front_camera" else view
+            for view in chunk(EXACT).views
+        ),
+    )
+    rig = np.zeros((len(frames), 6))
+    rig[:, 3] = np.arange(len(frames))
+    mounts = np.zeros((len(odd.camera_names), 6))
+
+    def moved(of: Chunk) -> dict[tuple[str, int], np.ndarray]:
+        sources = of.views_with_role("source")
+        ego = np.eye(4)
+        images = [AlignedImage(v, v.lens, np.zeros((1, 1), np.float32), ego, 0, frames.index(v.frame)) for v in sources]
+        return pose_alignment._interpolate(of, images, mounts, rig)
+
+    expected = moved(chunk(EXACT))
+    for place, pose in moved(odd).items():
+        np.testing.assert_allclose(pose, expected[place], atol=1e-4)
+
+
 def test_the_same_chunk_has_the_same_poses() -> None:
     # A third of the views takes a third of the time.
     frames = sorted({view.frame for view in chunk(NOISY).views_with_role("source")})[:2]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from genre_tasks.errors import InputError
 from genre_tasks.logs.types import CuboidTrack, Lens
 from genre_tasks.scene.actor_track import MOST_GAP_FRAMES, ActorTrack, cut_track_to_chunk
 from genre_tasks.scene.chunk import View
@@ -139,6 +140,13 @@ def test_road_is_filled_where_lidar_is_blind(slope: float) -> None:
     assert np.abs(fill[:, 2] - (slope * fill[:, 0] - 1.8)).max() < 0.03
     # A cell beside one with road points counts as known: 1.5 cells less than the hole's radius.
     assert len(fill) == pytest.approx(np.pi * 3.85**2 / 0.01, rel=0.02) and np.hypot(*fill[:, :2].T).max() < 4.0
+
+
+def test_a_pose_far_away_is_an_error_and_no_lack_of_memory() -> None:
+    far = np.stack([np.eye(4), np.eye(4)])
+    far[1, :2, 3] = [-5e5, 4e6]
+    with pytest.raises(InputError, match="the chunk's path spans 4000000 m"):
+        complete_road(_wall(5.0, 2.0), far)
 
 
 def test_no_road_no_fill() -> None:
