@@ -203,14 +203,12 @@ def test_progress_rises_to_the_end(log: FakeLog) -> None:
 
 
 def test_an_image_without_a_time_takes_that_of_its_neighbours(log: FakeLog, monkeypatch: pytest.MonkeyPatch) -> None:
-    true_time_s = log.camera_timestamp_s
+    def read_time(self: FakeLog, camera: str, frame: int) -> float:
+        return float("nan") if camera == "left" and frame in (3, 4) else self.frame_timestamp_s(frame)
 
-    def read_time(camera: str, frame: int) -> float:
-        return float("nan") if camera == "left" and frame in (3, 4) else true_time_s(camera, frame)
-
-    monkeypatch.setattr(log, "camera_timestamp_s", read_time)
+    monkeypatch.setattr(FakeLog, "camera_timestamp_s", read_time)
     for view in ingest(CONFIG, log, 0).views:
-        assert view.timestamp_s == pytest.approx(true_time_s(view.camera, view.frame), abs=1e-6)
-    monkeypatch.setattr(log, "camera_timestamp_s", lambda camera, frame: float("nan"))
+        assert view.timestamp_s == pytest.approx(log.frame_timestamp_s(view.frame), abs=1e-6)
+    monkeypatch.setattr(FakeLog, "camera_timestamp_s", lambda self, camera, frame: float("nan"))
     times = [view.timestamp_s for view in ingest(CONFIG, log, 0).views if view.camera == "left"]
     assert np.diff(times) == pytest.approx(0.1)
