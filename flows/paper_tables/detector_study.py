@@ -20,18 +20,21 @@ from typing import TYPE_CHECKING
 from flows.experiments.log_chunks import LogChunk
 from flows.experiments.result_files import write_text
 from flows.experiments.stages import StageRunner
+from flows.machine.folder_lock import hold_training_folder
 from flows.paper_tables.builtin_methods import BUILT_IN
 from flows.paper_tables.cached_images import CachedImages, JoinedImages, digest_values
 from flows.paper_tables.layouts import PROTOCOL
 from flows.paper_tables.training_images import RenderSource, build_source, label_recorded, label_truth, render_shifted
 from flows.pipeline.log_cache import cached_log
 from genre_tasks.detection3d.settings import Detector3dConfig
+from genre_tasks.errors import InputError
 from genre_tasks.json_files import read_json_object
 from genre_tasks.progress import Progress, silent
 
 if TYPE_CHECKING:
     from genre_tasks.detection3d.average_precision import DetectionScores
     from genre_tasks.detection3d.detector import Detector3d
+    from genre_tasks.training_sets.labelled_images import LabelledImage
 
 ROWS = {"real": "Real", "real+3dgs": "Real + Sim (3DGS)", "real+genre+": "Real + Sim (GenRe+)"}
 """The paper's rows: recorded images, and what is added to them."""
@@ -86,7 +89,8 @@ class DetectorStudy:
             on, and ``boxes``, their number.
 
         Raises:
-            InputError: a log has no annotations, or no box that counts.
+            InputError: a log has no annotations, no image to train or to test on has a box that counts, or another
+                process runs the same training.
             NonFiniteError: the training diverges.
         """
         from genre_tasks.detection3d.detector import save_detector
@@ -106,11 +110,16 @@ class DetectorStudy:
         if scores_file.is_file():
             return dict(read_json_object(scores_file, "the detector's scores", "Delete it, and run again."))
         images = [image for part in sets for image in part.read()]
-        detector: Detector3d = train_detector(images, config, folder / "training.safetensors", progress)
-        save_detector(detector, folder / "detector.safetensors")
+        test_images = {name: joined.read() for name, joined in tested.items()}
+        # Before a training of minutes, after which there would be nothing to score.
+        for name, held in test_images.items():
+            _require_boxes(held, config, name)
+        with hold_training_folder(folder):
+            detector: Detector3d = train_detector(images, config, folder / "training.safetensors", progress)
+            save_detector(detector, folder / "detector.safetensors")
         scores = {}
-        for name, joined in tested.items():
-            scores[name] = _name_scores(evaluate_detector(detector, joined.read()), config.thresholds_m)
+        for name, held in test_images.items():
+            scores[name] = _name_scores(evaluate_detector(detector, held), config.thresholds_m)
         write_text(scores_file, json.dumps(scores, indent=1) + "\n")
         return scores
 
@@ -161,6 +170,18 @@ class DetectorStudy:
         shifts = (self.shift_m, -self.shift_m)
         names = ("truth", ingest.key, shifts, TRUTH_EVERY)
         return CachedImages.named(self.folder, names, partial(label_truth, job, ingest, shifts, TRUTH_EVERY))
+
+
+def _require_boxes(images: Sequence[LabelledImage], config: Detector3dConfig, name: str) -> None:
+    from genre_tasks.detection3d.examples import select_boxes
+
+    if not any(select_boxes(image, config) for image in images):
+        labels = ", ".join(kind.name for kind in config.classes)
+        raise InputError(
+            f"no {name} image of the logs to test on has a box of {labels} that counts",
+            remedy="Choose other logs to test on: boxes have to be in the image, within range and seen by LiDAR.",
+            log=images[0].log if images else None,
+        )
 
 
 def _name_scores(scores: DetectionScores, thresholds_m: Sequence[float]) -> dict[str, float]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from flows.machine.folder_lock import hold_training_folder
 from flows.training.curve_table import FIXER_CURVE, FIXER_SCORES, load_rows, save_rows
 from flows.training.fixer_job import CURVE_FILE, SCORES_FILE, WEIGHTS_FILE, FixerJob
 from flows.training.fixer_pairs import VALIDATION_PAIRS, get_pairs, list_pair_scenes, list_validation_scenes
@@ -107,8 +108,14 @@ def train_fixer(job: FixerJob, progress: Progress = silent) -> tuple[Path, bool]
         (path of the weights, whether anything was left to train).
 
     Raises:
-        InputError: the checkpoint is of other settings, pairs or initial weights, or those have other inputs.
+        InputError: the checkpoint is of other settings, pairs or initial weights, those have other inputs, or another
+            process trains in the folder.
     """
+    with hold_training_folder(job.run_folder):
+        return _train_to_end(job, progress)
+
+
+def _train_to_end(job: FixerJob, progress: Progress) -> tuple[Path, bool]:
     from genre_tasks.fixer.pairs import concatenate_pairs
     from genre_tasks.metrics.perceptual import perceptual_distance
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 
+from flows.machine.folder_lock import hold_training_folder
 from flows.pipeline.definition import digest_weights
 from flows.training import checkpoint
 from flows.training.device import choose_device, move_scene
@@ -53,8 +54,14 @@ def train_stage(job: TrainJob, stage: Stage, progress: Progress = silent) -> Tra
         The stage's weights.
 
     Raises:
-        InputError: a stage that it needs is not trained, or its folder holds another training.
+        InputError: a stage that it needs is not trained, its folder holds another training, or another process trains
+            in it.
     """
+    with hold_training_folder(Path(job.folder) / stage.name):
+        return _train_or_find(job, stage, progress)
+
+
+def _train_or_find(job: TrainJob, stage: Stage, progress: Progress) -> TrainedStage:
     folder = Path(job.folder) / stage.name
     weights = folder / WEIGHTS_FILE
     stage_scenes = list_stage_scenes(stage, job.real)

@@ -64,13 +64,18 @@ def measure(measurements: ChunkMeasurements) -> Measurement:
     travel = _travel_m(measurements)
     if travel < MIN_TRAVEL_M:
         return Measurement(None, f"the vehicle travels {travel:.1f} m: all of the image stands still")
-    masks = _find_vehicle_masks(measurements)
-    if not masks:
+    parts = _find_still_parts(measurements)
+    if not parts:
         return Measurement(None, f"no camera has {MIN_FRAMES} images")
-    fractions = {camera: float(mask.mean()) for camera, mask in masks.items()}
-    camera = max(fractions, key=lambda name: fractions[name])
-    explanation = f"of {camera}" if fractions[camera] else "no part of an image stands still"
-    return Measurement(100 * fractions[camera], explanation)
+    percents = {camera: 100 * float(part.mean()) for camera, part in parts.items()}
+    percents_of_vehicle = {camera: percent for camera, percent in percents.items() if percent <= MAX_MASK_PERCENT}
+    largest = max(percents_of_vehicle.values(), default=0.0)
+    if largest:
+        return Measurement(largest, f"of {max(percents_of_vehicle, key=percents_of_vehicle.__getitem__)}")
+    stuck = [camera for camera in percents if camera not in percents_of_vehicle]
+    if stuck:
+        return Measurement(0.0, f"{percents[stuck[0]]:.0f} % of {stuck[0]} stand still, more than a vehicle fills")
+    return Measurement(0.0, "no part of an image stands still")
 
 
 def fit(measurements: ChunkMeasurements) -> EffectParameters:
@@ -87,9 +92,9 @@ def fit(measurements: ChunkMeasurements) -> EffectParameters:
     from scipy import ndimage
 
     masks = {
-        camera: ndimage.binary_dilation(mask, iterations=MARGIN_PX)
-        for camera, mask in _find_vehicle_masks(measurements).items()
-        if 100 * mask.mean() > MIN_MASK_PERCENT
+        camera: ndimage.binary_dilation(part, iterations=MARGIN_PX)
+        for camera, part in _find_still_parts(measurements).items()
+        if MIN_MASK_PERCENT < 100 * part.mean() <= MAX_MASK_PERCENT
     }
     return EffectParameters(ego_masks=masks)
 
@@ -99,15 +104,14 @@ def _travel_m(measurements: ChunkMeasurements) -> float:
     return float(np.linalg.norm(centers - centers[:1], axis=1).max())
 
 
-def _find_vehicle_masks(measurements: ChunkMeasurements) -> dict[str, NDArray[np.bool_]]:
+def _find_still_parts(measurements: ChunkMeasurements) -> dict[str, NDArray[np.bool_]]:
     """By camera, [H, W]; cameras with fewer than ``MIN_FRAMES`` images are left out."""
-    masks = {}
+    parts = {}
     for camera in measurements.chunk.camera_names:
         images = measurements.images_over_time[camera]
         if len(images) >= MIN_FRAMES:
-            mask = find_vehicle(images.astype(np.float32))
-            masks[camera] = mask if 100 * mask.mean() <= MAX_MASK_PERCENT else np.zeros_like(mask)
-    return masks
+            parts[camera] = find_vehicle(images.astype(np.float32))
+    return parts
 
 
 def find_vehicle(images: Float32) -> NDArray[np.bool_]:

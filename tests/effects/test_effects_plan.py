@@ -294,11 +294,15 @@ def test_a_night_with_passing_lights_is_no_vehicle() -> None:
     images = np.full((8, 40, 60, 3), 5.0, np.float32)
     for frame in range(8):
         images[frame, 10:20, 5 * frame : 5 * frame + 8] = 200
-    chunk = SimpleNamespace(camera_names=("front",))
+    poses = np.tile(np.eye(4), (8, 1, 1))
+    poses[:, 0, 3] = np.arange(8)
+    chunk = SimpleNamespace(camera_names=("front",), chunk_SE3_ego=poses)
     assert ego_mask.find_vehicle(images).all()
     over_time = SimpleNamespace(chunk=chunk, images_over_time={"front": images})
-    found = ego_mask._find_vehicle_masks(over_time)  # type: ignore[arg-type]
-    assert not found["front"].any()
+    measured = ego_mask.measure(over_time)  # type: ignore[arg-type]
+    assert measured.value == 0
+    assert "100 % of front stand still, more than a vehicle fills" in str(measured)
+    assert not ego_mask.fit(over_time).ego_masks  # type: ignore[arg-type]
 
 
 def test_dark_images_are_marked(monkeypatch: pytest.MonkeyPatch) -> None:

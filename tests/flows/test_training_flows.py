@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 
+from flows.machine.folder_lock import hold_training_folder
 from flows.training import recipes, scene_lists, stage_scenes, training_scenes, validation
 from flows.training.curve_table import LEARNING_CURVE, VALIDATION_SCORES, load_rows
 from flows.training.fixed_images import FixedImages
@@ -164,6 +165,18 @@ def test_a_checkpoint_of_another_training_is_refused(trained: Trained, tmp_path:
     (folder / "gnet/only/checkpoint.safetensors").write_bytes(b"no checkpoint")
     with pytest.raises(InputError, match="checkpoint cannot be read"):
         train_stage(job, TABLE[1])
+
+
+def test_two_processes_do_not_train_one_stage(trained: Trained, tmp_path: Path) -> None:
+    folder = tmp_path / "busy"
+    shutil.copytree(trained[0], folder)
+    job = TrainJob(str(folder), "tiny")
+    with hold_training_folder(folder / "gnet/only"):
+        with pytest.raises(InputError, match="another process trains in this folder"):
+            train_stage(job, TABLE[1])
+        # Another stage has a folder of its own.
+        assert train_stage(job, TABLE[0]).cached
+    assert train_stage(job, TABLE[1]).cached
 
 
 def test_a_stage_alone_needs_those_before_it(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -95,14 +96,10 @@ def test_a_cell_compares_the_camera_that_its_scene_was_made_without(tmp_path: Pa
 
 
 def _rename(cell: MeasuredCell, label: str) -> MeasuredCell:
-    from dataclasses import replace
-
     return replace(cell, method=label)
 
 
 def test_the_figure_shows_the_recorded_images_and_a_row_for_each_method(tmp_path: Path, detector: str) -> None:
-    from dataclasses import replace
-
     checked = make_request(tmp_path, detector).check()
     one = replace(checked, layout=replace(checked.layout, rows=checked.layout.rows[-1:]))
     strips = agreement_strips(one, run_stage)
@@ -150,8 +147,6 @@ def test_a_detector_belongs_to_table_7(number: int, detector: str | None, words:
 
 def test_a_rig_without_a_front_left_camera_is_refused(detector: str, tmp_path: Path) -> None:
     request = make_request(tmp_path, detector)
-    from dataclasses import replace
-
     with pytest.raises(ConfigError, match="no front-left camera"):
         replace(request, logs=(LOG.replace("cameras=2", "cameras=1"),)).check()
 
@@ -202,6 +197,34 @@ def test_a_row_is_trained_and_tested_once(tmp_path: Path) -> None:
     for folder in folders:
         found = load_detector(folder / "detector.safetensors").detect(image, Lens(60.0, 60.0, 32.0, 18.0, 64, 36))
         assert np.isfinite(found.scores).all()
+
+
+def test_test_logs_without_a_box_that_counts_are_refused_before_the_training(tmp_path: Path) -> None:
+    request = DetectorRequest(
+        (LOG,), (OTHER,), preset="demo", store=str(tmp_path / "store"), settings=SETTINGS, steps=2, out=str(tmp_path)
+    )
+    study = request.check()
+    # Nothing is so near.
+    near = replace(study, detector=study.detector.model_copy(update={"max_range_m": 0.1}))
+    with pytest.raises(InputError, match="no recorded image of the logs to test on has a box of car"):
+        near.measure("real", 0, run_stage)
+    assert not list((tmp_path / "detectors").glob("trainings/*"))
+
+
+def test_two_processes_do_not_train_the_same_detector(tmp_path: Path) -> None:
+    request = DetectorRequest(
+        (LOG,), (OTHER,), preset="demo", store=str(tmp_path / "store"), settings=SETTINGS, steps=2, out=str(tmp_path)
+    )
+    study = request.check()
+
+    def start_another(done: int, total: int, note: str = "") -> None:
+        # A lock of another object of this process is as foreign as that of another process.
+        with pytest.raises(InputError, match="another process trains in this folder"):
+            study.measure("real", 0, run_stage)
+
+    first = study.measure("real", 0, run_stage, start_another)
+    assert study.measure("real", 0, run_stage) == first
+    assert not list((tmp_path / "detectors").glob("trainings/*/.lock"))
 
 
 def test_the_page_of_table_8_has_means_ranges_and_the_papers_numbers() -> None:
