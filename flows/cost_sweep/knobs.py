@@ -19,6 +19,7 @@ from genre_tasks.suggestions import did_you_mean
 End = Literal["gnet", "enet"]
 PRESET_ITSELF = "preset"
 TOGETHER = "together"
+MORE_GAUSSIANS = "more_gaussians"
 EFFECTS = "effects"
 GNET_ITERATIONS = (1, 4, 8, 16, 24, 48, 72, 144)
 ENET_FRACTIONS = (1 / 6, 1 / 3, 2 / 3, 2.0)
@@ -30,6 +31,9 @@ PERCEPTUAL_WEIGHTS = (0.0, 0.1, 0.2)
 FIXER_GATES = (0.05, 0.2)
 NOVEL_VIEW_SHIFTS_M = ((3.0,), (1.5, -1.5), (3.0, 1.5, -1.5, -3.0))
 COMBINED_GNET_ITERATIONS = (4, 8, 16, 24, 48, 144)
+# On validation street 900, 160 000 LiDAR points and 72 iterations of GNet alone give the perceptual distance at 3 m
+# that the preset small reaches with its fixer, in half of the time.
+COMBINED_GAUSSIAN_FACTORS = (2, 4)
 NOT_SWEPT = frozenset({"ego_mask"})
 """Effects that change which pixels are compared, or that are knobs of their own (``fixer``)."""
 
@@ -160,6 +164,7 @@ def _knobs(base: PipelineConfig) -> Mapping[str, list[Setting]]:
         ],
         "threads": [Setting("threads", f"{n}", threads=n) for n in _fewer_threads(os.cpu_count() or 1)],
         TOGETHER: _combinations(points, (enet_iterations[0], enet_iterations[-1])),
+        MORE_GAUSSIANS: _settings_of_more_gaussians(base, enet_iterations[1:3]),
     }
 
 
@@ -186,6 +191,21 @@ def _combinations(points: int, enet_iterations: tuple[int, int]) -> list[Setting
             out.append(Setting(TOGETHER, f"GNet {gnet}, ENet {enet}", changes))
     most = (f"initial.max_points={2 * points}", "gnet.iterations=144", "gnet.views_per_iteration=6")
     out.append(Setting(TOGETHER, "most", (*most, f"enet.iterations={enet_iterations[1]}")))
+    return out
+
+
+def _settings_of_more_gaussians(base: PipelineConfig, enet_iterations: Sequence[int]) -> list[Setting]:
+    """Starts from more LiDAR points, and spends less on ENet or nothing on the fixer."""
+    out = []
+    for points in (base.initial.max_points * factor for factor in COMBINED_GAUSSIAN_FACTORS):
+        start = f"initial.max_points={points}"
+        most = GNET_ITERATIONS[-1]
+        for gnet in sorted({base.gnet.iterations, most}):
+            alone = (start, f"gnet.iterations={gnet}")
+            out.append(Setting(MORE_GAUSSIANS, f"{points}, GNet {gnet} alone", alone, "gnet"))
+        for enet in enet_iterations:
+            fixed = (start, f"gnet.iterations={most}", f"enet.iterations={enet}")
+            out.append(Setting(MORE_GAUSSIANS, f"{points}, GNet {most}, ENet {enet}", fixed))
     return out
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.cost_sweep.knobs import EFFECTS, PRESET_ITSELF, TOGETHER
+from flows.cost_sweep.knobs import EFFECTS, MORE_GAUSSIANS, PRESET_ITSELF, TOGETHER
 from flows.cost_sweep.summary import PSNR, Measure, SettingSummary
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def _is_labelled(summary: SettingSummary, measure: Measure, preset_value: float)
         # Written with "not", so that an unknown gain, which is NaN, gets its label.
         return not abs(summary.gains[measure.name].average) < LABELLED_CHANGE * abs(preset_value)
     # Two dozen combinations would hide each other's labels: only the best ones are named.
-    return summary.knob != TOGETHER or measure.name in summary.on_front
+    return summary.knob not in (TOGETHER, MORE_GAUSSIANS) or measure.name in summary.on_front
 
 
 def _limits(values: Sequence[float], least: float) -> tuple[float, float]:
