@@ -58,10 +58,12 @@ class YamlMapping:
     Attributes:
         values: plain values by key.
         lines: the line in which each key stands, from 1, by the keys that lead to it.
+        texts: the text of each value that is a number, by the same keys: a name such as 0012 or 77e2 looks like one.
     """
 
     values: dict[str, Any]
     lines: Mapping[KeyPath, int]
+    texts: Mapping[KeyPath, str]
 
 
 def parse_yaml(text: str) -> Any:
@@ -82,7 +84,7 @@ def parse_yaml(text: str) -> Any:
     Traceback (most recent call last):
     flows.yaml_values.YamlError: line 1: the key 'a' is there twice, the first time in line 1
     """
-    return _parse(text)[0]
+    return _parse(text).value
 
 
 def read_yaml_mapping(path: Path, about: str, expected: str, remedy: str) -> YamlMapping:
@@ -102,15 +104,15 @@ def read_yaml_mapping(path: Path, about: str, expected: str, remedy: str) -> Yam
     """
     text = read_text(path, about, remedy)
     try:
-        values, lines = _parse(text)
+        parsed = _parse(text)
     except YamlError as error:
         raise ConfigError(f"the file is not YAML: {error}", remedy="Mend that line.", file=path) from error
     # An empty file is no mistake: it changes nothing.
-    if values is None:
-        return YamlMapping({}, {})
-    if not isinstance(values, dict):
+    if parsed.value is None:
+        return YamlMapping({}, {}, {})
+    if not isinstance(parsed.value, dict):
         raise ConfigError(f"expected {expected} at the top level", remedy=remedy, file=path)
-    return YamlMapping(values, lines)
+    return YamlMapping(parsed.value, parsed.lines, parsed.texts)
 
 
 def read_text(path: Path, about: str, remedy: str) -> str:
@@ -171,8 +173,16 @@ class _Composer(yaml.BaseLoader):
         return node
 
 
-def _parse(text: str) -> tuple[Any, dict[KeyPath, int]]:
-    """The value, and the line of each key in it."""
+@dataclass
+class _Parsed:
+    """A value, the line of each key in it, and the text of each number."""
+
+    value: Any
+    lines: dict[KeyPath, int]
+    texts: dict[KeyPath, str]
+
+
+def _parse(text: str) -> _Parsed:
     try:
         composer = _Composer(text)
         node = composer.get_single_node()
@@ -181,8 +191,10 @@ def _parse(text: str) -> tuple[Any, dict[KeyPath, int]]:
         raise YamlError(f"the character U+{ord(text[error.position]):04X} is not allowed", line) from None
     except yaml.MarkedYAMLError as error:
         raise _translate(error) from None
-    lines: dict[KeyPath, int] = {}
-    return (None if node is None else _to_plain(node, (), lines)), lines
+    parsed = _Parsed(None, {}, {})
+    if node is not None:
+        parsed.value = _to_plain(node, (), parsed)
+    return parsed
 
 
 def _translate(error: yaml.MarkedYAMLError) -> YamlError:
@@ -196,17 +208,21 @@ def _translate(error: yaml.MarkedYAMLError) -> YamlError:
     return YamlError(problem, line)
 
 
-def _to_plain(node: yaml.Node, path: KeyPath, lines: dict[KeyPath, int]) -> Any:
+def _to_plain(node: yaml.Node, path: KeyPath, parsed: _Parsed) -> Any:
     if isinstance(node, yaml.MappingNode):
-        return _to_dict(node, path, lines)
+        return _to_dict(node, path, parsed)
     if isinstance(node, yaml.SequenceNode):
-        return [_to_plain(item, (*path, str(index)), lines) for index, item in enumerate(node.value)]
+        return [_to_plain(item, (*path, str(index)), parsed) for index, item in enumerate(node.value)]
     # Quotes and block styles say that a value is text.
-    is_quoted = isinstance(node, yaml.ScalarNode) and bool(node.style)
-    return node.value if is_quoted else _parse_scalar(node.value, node.start_mark.line + 1)
+    if isinstance(node, yaml.ScalarNode) and node.style:
+        return node.value
+    value = _parse_scalar(node.value, node.start_mark.line + 1)
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        parsed.texts[path] = str(node.value)
+    return value
 
 
-def _to_dict(node: yaml.MappingNode, path: KeyPath, lines: dict[KeyPath, int]) -> dict[str, Any]:
+def _to_dict(node: yaml.MappingNode, path: KeyPath, parsed: _Parsed) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for key_node, value_node in node.value:
         line = key_node.start_mark.line + 1
@@ -217,10 +233,10 @@ def _to_dict(node: yaml.MappingNode, path: KeyPath, lines: dict[KeyPath, int]) -
         if key == "<<" and not key_node.style:
             raise YamlError("merge keys (<<) are not supported; write the keys out", line)
         if key in values:
-            first = lines[*path, key]
+            first = parsed.lines[*path, key]
             raise YamlError(f"the key {key!r} is there twice, the first time in line {first}", line)
-        lines[*path, key] = line
-        values[key] = _to_plain(value_node, (*path, key), lines)
+        parsed.lines[*path, key] = line
+        values[key] = _to_plain(value_node, (*path, key), parsed)
     return values
 
 

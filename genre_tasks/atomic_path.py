@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from genre_tasks.errors import ConfigError
 from genre_tasks.temporary_names import describe_owner, remove_abandoned, remove_path
 
 
@@ -54,17 +55,35 @@ def write_atomically(path: Path, data: bytes) -> None:
         os.fsync(file.fileno())
 
 
-def replace_folder(folder: Path, complete: Path) -> None:
+def holds_files(folder: Path) -> bool:
+    """Says whether there is a folder with anything in it.
+
+    Args:
+        folder: that may be missing.
+
+    >>> holds_files(Path("no such folder"))
+    False
+    """
+    return folder.exists() and any(folder.iterdir())
+
+
+def replace_folder(folder: Path, complete: Path, held_files: bool) -> None:
     """Puts a complete folder in the place of another one, which goes only when the new one is there.
 
     Args:
         folder: the place; there may be nothing, an empty folder or a full one.
         complete: the new folder, on the same file system.
+        held_files: whether the place was full when it was found that it may be replaced.
 
     Raises:
+        ConfigError: the place was empty then and is full now; what is there stays.
         OSError: it cannot be renamed; what was at the place is there again.
     """
-    if not folder.exists() or not any(folder.iterdir()):
+    is_full = holds_files(folder)
+    # Hours may lie between: another command's result, or notes of the user, may be the only copy.
+    if is_full and not held_files:
+        raise ConfigError("the folder was filled meanwhile", remedy="Run again with another folder.", file=folder)
+    if not is_full:
         # A rename takes the place of an empty folder.
         complete.rename(folder)
         return

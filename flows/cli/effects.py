@@ -77,10 +77,11 @@ def _write_plan(plan: EffectsPlan, folder: Path, title: str) -> list[str]:
     with temporary_folder(folder) as temporary:
         get_codec("effects").write(temporary, plan)
         write_png(temporary / "effects.png", plot_effects_plan(plan, title))
-        # An earlier plan may have had masks of the ego vehicle that this one lacks. Anything else is the user's.
+        # An earlier plan may have had masks, points or poses that this one lacks. Anything else is the user's.
         if (folder / "effects.parquet").is_file():
-            for mask in (folder / "own").glob("*.png"):
-                mask.unlink()
+            earlier = [*(folder / "own").glob("*.png"), folder / "points.parquet", folder / "poses.parquet"]
+            for path in earlier:
+                path.unlink(missing_ok=True)
         for source in sorted(temporary.rglob("*")):
             if source.is_file():
                 target = folder / source.relative_to(temporary)

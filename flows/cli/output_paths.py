@@ -71,11 +71,18 @@ def check_new_folder(path: Path, option: str) -> None:
         option: the option that names it, for the error.
 
     Raises:
-        InputError: the path has no name of its own, such as ``.``, or as :func:`check_output_folder` raises it.
+        InputError: the path has no name of its own, such as ``.``, it is a link or where a file system is mounted, or
+            as :func:`check_output_folder` raises it.
     """
     if path.name in ("", ".."):
         raise InputError(f"{option} names no folder of its own", remedy="Name a new folder.", file=path)
+    # A folder that was completed under another name can take the place of neither.
+    if path.is_symlink() or os.path.ismount(path):
+        found = "a link" if path.is_symlink() else "where a file system is mounted"
+        remedy = f"Name a new folder in the one that it leads to, such as {path / 'out'}."
+        raise InputError(f"{option} is {found}, which cannot be replaced as a whole", remedy=remedy, file=path)
     check_output_folder(path, option)
+    _check_can_create(path.parent, option)
 
 
 def _exists(path: Path, option: str) -> bool:

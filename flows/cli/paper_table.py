@@ -83,7 +83,7 @@ TestLogsOption = Annotated[
 SeedsOption = Annotated[int, typer.Option(help="For table 8, the number of trainings of each row.")]
 StepsOption = Annotated[
     int | None,
-    typer.Option(help="For table 8, the gradient steps of a training. If not given, 1000."),
+    typer.Option(help="For table 8, the gradient steps of a training. If not given, 3000."),
 ]
 StoredOption = Annotated[
     bool,

@@ -70,6 +70,7 @@ def range_command(
     from flows.reconstruction.reliable_range import write_range
     from flows.reconstruction.run_records import find_run_folder, name_run_folder
     from flows.reconstruction.stored_values import find_last_stage, read_next_scene, read_stage_scene, read_stage_value
+    from genre_tasks.effects.apply_plan import apply_plan
     from genre_tasks.reliability.chunk_seam import measure_seam, median_psnr_by_distance
     from genre_tasks.reliability.reliable_range import estimate_reliable_range
 
@@ -96,7 +97,7 @@ def range_command(
     print_rows(f"{ingested.log}, chunk {number}, after {scene_stage}", rows)
     typer.echo(f"{reliable_range}; wrote {', '.join(files)}")
     if following is not None:
-        psnr_by_distance = median_psnr_by_distance(measure_seam((ingested, scene), following))
+        psnr_by_distance = median_psnr_by_distance(measure_seam((apply_plan(ingested, plan), scene), following))
         values = ", ".join(f"{db:.1f} dB at {distance:g} m" for distance, db in psnr_by_distance.items())
         typer.echo(f"seam to chunk {number + 1}, the same view from both scenes without actors: {values}")
 

@@ -56,6 +56,7 @@ def render(
     from flows.cli.output_paths import check_output_file
     from flows.cli.parsing import check_number
     from flows.reconstruction.stored_values import find_last_stage, read_stage_scene, read_stage_value
+    from genre_tasks.effects.apply_plan import apply_plan
     from genre_tasks.errors import ConfigError, InputError
 
     # Checked first, because reading a scene takes seconds.
@@ -67,6 +68,8 @@ def render(
     check_number(shift, "--shift", -_MAX_SHIFT_M, _MAX_SHIFT_M)
     open_existing_store(store)
     number, ingested = read_stage_value(store, run, chunk, "ingest")
+    # Scenes are fitted to refined poses and straight lenses, where the plan has any.
+    planned = apply_plan(ingested, read_stage_value(store, run, number, "effects")[1])
     stage = find_last_stage(store, run, number) if stage is None else stage
     scene = read_stage_scene(store, run, number, stage)
     frames = list(ingested.frames) if is_film else [_select_frame(ingested, frame)]
@@ -75,7 +78,7 @@ def render(
         raise InputError(
             f"the chunk has no camera '{camera}'", remedy=f"It has {', '.join(ingested.camera_names)}.", chunk=number
         )
-    images = _render_views(ingested, scene, camera, frames, shift)
+    images = _render_views(planned, scene, camera, frames, shift)
     _write_images(out, images)
     count = "1 frame" if len(frames) == 1 else f"{len(frames)} frames"
     typer.echo(f"wrote {out}: {count} of {camera}, {shift:+g} m, chunk {number}, after {stage}")

@@ -193,7 +193,7 @@ def _find_scores(side: RunSide, number: int, stage: str) -> dict[str, Score]:
     evaluation = side.find(number, f"{_EVALUATE}{stage}")
     if evaluation is None:
         return {name: Score(float(value)) for name, value in entry["metrics"].items()}
-    side.store.verify(evaluation)
+    _verify((side, evaluation))
     return read_scores(evaluation)
 
 

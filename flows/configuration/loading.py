@@ -100,7 +100,8 @@ def diff_from_preset(config: PipelineConfig, preset: str) -> dict[str, tuple[Any
         preset: one of :data:`PRESETS`.
 
     Returns:
-        (the preset's value, the effective value) by ``section.key``.
+        (the preset's value, the effective value) by ``section.key``; ``None`` where one of them has no such key, since
+        the section that would hold it is null there.
 
     Raises:
         ConfigError: there is no such preset.
@@ -110,7 +111,9 @@ def diff_from_preset(config: PipelineConfig, preset: str) -> dict[str, tuple[Any
     """
     base = _flatten(validate_config(read_preset(preset), preset).model_dump(mode="json"))
     effective = _flatten(config.model_dump(mode="json"))
-    return {key: (base[key], effective[key]) for key in base if base[key] != effective[key]}
+    # A section that is null has no keys of its own, so that either may have some that the other lacks.
+    keys = dict.fromkeys((*base, *effective))
+    return {key: (base.get(key), effective.get(key)) for key in keys if base.get(key) != effective.get(key)}
 
 
 def _apply(settings: Sequence[str], values: Mapping[str, Any], places: Places) -> PipelineConfig:

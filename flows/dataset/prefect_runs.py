@@ -271,26 +271,29 @@ def has_heartbeat(client: SyncPrefectClient, run_id: str, since_s: float) -> boo
     return any(event.received >= earliest for event in page.events)
 
 
-def count_heartbeats(client: SyncPrefectClient, run_id: str) -> int:
+def count_heartbeats(client: SyncPrefectClient, run_id: str, since: datetime) -> int:
     """Counts the heartbeats of a flow run that the server has received.
 
     Args:
         client: of the server.
         run_id: of the run.
+        since: when the watch began. The count has to begin at a fixed time: of a window that moves on, one heartbeat
+            leaves for each that comes.
 
     Returns:
         Their number.
     """
-    return int(call_server(client.read_events, _heartbeats_of([run_id]), limit=1).total)
+    return int(call_server(client.read_events, _heartbeats_of([run_id], since), limit=1).total)
 
 
-def _heartbeats_of(run_ids: Sequence[str]) -> EventFilter:
+def _heartbeats_of(run_ids: Sequence[str], watched_since: datetime | None = None) -> EventFilter:
     now = datetime.now(UTC)
+    began = watched_since or now
     return EventFilter(
         event=EventNameFilter(name=[HEARTBEAT_EVENT]),
         resource=EventResourceFilter(id=[f"{_RUN_RESOURCE}{run_id}" for run_id in run_ids]),
         # Far enough for any worker's clock.
-        occurred=EventOccurredFilter(since=now - timedelta(days=_DAYS), until=now + timedelta(days=_DAYS)),
+        occurred=EventOccurredFilter(since=began - timedelta(days=_DAYS), until=now + timedelta(days=_DAYS)),
         order=EventOrder.DESC,
     )
 

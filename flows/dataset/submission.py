@@ -7,6 +7,7 @@ import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import Any
 from uuid import UUID
 
@@ -205,6 +206,7 @@ class HeartbeatWatch:
         self._run_id = str(run_id)
         self._clock = clock
         self._count = -1
+        self._began = datetime.now(UTC)
         self._since_s = clock()
         self._next_s = self._since_s
 
@@ -219,7 +221,7 @@ class HeartbeatWatch:
         if now_s < self._next_s:
             return False
         self._next_s = now_s + _HEARTBEAT_POLL_S
-        count = count_heartbeats(self._client, self._run_id)
+        count = count_heartbeats(self._client, self._run_id, self._began)
         if count != self._count:
             self._count = count
             self._since_s = now_s

@@ -21,6 +21,7 @@ AUTO = "auto"
 ASSUMED_HEIGHT_M = 1.6
 """Height of a camera over the road that ``--scale auto`` assumes: between that of a car's mirror and of a van's."""
 
+_FORMATS_WITH_AXES = frozenset({"spz", "glb", "usdz"})
 _SHORT_CHUNK_SOURCE_EVERY = 2
 
 
@@ -110,6 +111,7 @@ def prepare_enhancement(inputs: EnhancementInputs, config: PipelineConfig) -> En
     for file in (inputs.scene, inputs.lidar):
         if file is not None and not file.is_file():
             raise InputError("there is no such file", remedy="Correct the path.", file=file)
+    _require_axes_of_poses(inputs.scene)
     if inputs.scale is None and inputs.lidar is None:
         raise ConfigError(
             "nothing tells how long a metre is in this scene",
@@ -146,6 +148,19 @@ def prepare_enhancement(inputs: EnhancementInputs, config: PipelineConfig) -> En
             f"ENet splits none of the {count} Gaussians: the preset is made for {expected} before a split"
         )
     return EnhancementRequest(uri, tuple(settings), tuple(explanation))
+
+
+def _require_axes_of_poses(scene: Path) -> None:
+    """Refuses formats that state axes or units: readers turn and scale their Gaussians, and nothing turns the poses."""
+    from genre_tasks.exchange.registry import find_format
+
+    name = find_format(scene).name
+    if name in _FORMATS_WITH_AXES:
+        raise InputError(
+            f"a {name} file has axes of its own, in which the poses of the cameras need not be",
+            remedy="Give the scene as .ply or .splat, in the axes and units of the poses.",
+            file=scene,
+        )
 
 
 def _count_gaussians(scene: Path) -> int:

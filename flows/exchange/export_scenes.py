@@ -8,7 +8,7 @@ from typing import Any
 from flows.exchange.export_request import ExportRequest
 from flows.exchange.exporters import load_exporter
 from flows.exchange.stored_scenes import open_stored_scenes
-from genre_tasks.atomic_path import replace_folder
+from genre_tasks.atomic_path import holds_files, replace_folder
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.exchange.scene_folder import SCENE_FILE, read_document
 from genre_tasks.progress import Progress, silent
@@ -38,6 +38,7 @@ def export_scenes(request: ExportRequest, progress: Progress = silent) -> dict[s
     exporter = load_exporter(request.format)
     exporter.check(request)
     _check_folder(request.out, request.overwrite)
+    held_files = holds_files(request.out)
     scenes = open_stored_scenes(request.store, request.scene, request.stage, request.chunks)
     make_folders(request.out.parent)
     # In the same folder, because a rename is atomic only within one file system.
@@ -46,13 +47,13 @@ def export_scenes(request: ExportRequest, progress: Progress = silent) -> dict[s
         folder.chmod(_FOLDER_MODE)
         for _, path in payload_files(folder):
             sync(path)
-        replace_folder(request.out, folder)
+        replace_folder(request.out, folder, held_files)
         sync(request.out.parent)
     return {"out": str(request.out), "format": request.format, "source": scenes.describe(), **written}
 
 
 def _check_folder(folder: Path, overwrite: bool) -> None:
-    if not folder.exists() or not any(folder.iterdir()):
+    if not holds_files(folder):
         return
     # Never replaced, not even by --overwrite: a user's files may be the only copy.
     foreign = InputError("--out holds files that are no export's", remedy="Name a new or empty folder.", file=folder)

@@ -20,7 +20,7 @@ from flows.paper_tables.layouts import PROTOCOL
 from flows.paper_tables.published_numbers import PAPER
 from flows.pipeline.log_cache import cached_log
 from flows.pipeline.progress import get_reporter
-from genre_tasks.detection3d.settings import Detector3dConfig
+from genre_tasks.detection3d.settings import MOST_STEPS, Detector3dConfig
 from genre_tasks.errors import ConfigError
 from storage.opening import open_store
 
@@ -72,12 +72,18 @@ class DetectorRequest:
         chunks = None if self.chunks is None else list(self.chunks)
         train = select_log_chunks(self.train, chunks, config)
         test = select_log_chunks(self.test, chunks, config)
-        both = sorted({where.log for where in train} & {where.log for where in test})
-        # A detector knows the images that it was trained on by heart.
-        if both:
-            raise ConfigError(f"{both[0]} is among the logs to train on and to test on", remedy="Leave it out of one.")
+        # A detector knows the images that it was trained on by heart. Two URIs may be one log: spelled by another path,
+        # or with a parameter that is the default.
+        trained_on = {cached_log(log).digest() for log in dict.fromkeys(where.log for where in train)}
+        for log in dict.fromkeys(where.log for where in test):
+            if cached_log(log).digest() in trained_on:
+                raise ConfigError(f"{log} is among the logs to train on and to test on", remedy="Leave it out of one.")
         if self.seeds < 1:
             raise ConfigError(f"there are {self.seeds} seeds", remedy="Give --seeds 1 or more.")
+        if self.steps is not None and not 1 <= self.steps <= MOST_STEPS:
+            raise ConfigError(
+                f"a training of {self.steps} steps is asked for", remedy=f"Give --steps 1 to {MOST_STEPS}."
+            )
         detector = Detector3dConfig() if self.steps is None else Detector3dConfig(steps=self.steps)
         return DetectorStudy(
             train=tuple(train),

@@ -58,8 +58,16 @@ def comparison_strips(
         log can tell it.
 
     Raises:
+        ConfigError: the settings leave out novel views that the figure shows.
         InputError: the chunk has no source image of this camera and frame.
     """
+    # Found before hours of computing.
+    missing = set(SHIFTS_M[kind]) - set(checked.config.novel_views.shifts_m)
+    if kind == "fixers" and missing:
+        raise ConfigError(
+            f"no image is fixed at {', '.join(f'{shift:g}' for shift in sorted(missing))} m, which the figure shows",
+            remedy="Leave out the setting of novel_views.shifts_m.",
+        )
     strips: list[ComparisonStrip] = []
     captions = tuple(f"{shift:g} m" for shift in SHIFTS_M[kind])
     # Every method has the same ingest, so the last row's chunk and views serve the truth too.

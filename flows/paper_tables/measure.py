@@ -23,7 +23,6 @@ from flows.pipeline.definition import PIPELINE, stages_until
 from flows.pipeline.stage_runner import ArtifactRef, Job, read_artifact
 
 PRESET_METHOD = Method("the preset", ())
-_OF_THE_USERS_LOG = ("ingest", "initial.scene", "initial.placement")
 
 
 @dataclass(frozen=True)
@@ -133,10 +132,8 @@ def warm_up(basis: Basis, layout: Layout) -> None:
     """Runs the preset to its end on a tiny log, so that imports, weights and first calls are in no cell's seconds.
 
     Args:
-        basis: its settings of ``ingest`` are left out, as cameras and points are of the user's log; so is a scene.
+        basis: the preset and the user's settings.
         layout: the table, whose stages are run.
     """
-    # Cameras and points are those of the user's log, which the tiny log does not have.
-    settings = tuple(s for s in basis.settings if not s.startswith(_OF_THE_USERS_LOG))
-    config = PRESET_METHOD.configuration(basis.preset, (*layout.protocol, *settings))
+    config = PRESET_METHOD.configuration(basis.preset, (*layout.protocol, *basis.settings))
     run_on_tiny_log(config, list_stages(layout, PRESET_METHOD))

@@ -22,6 +22,7 @@ from flows.pipeline.log_cache import cached_log
 from flows.pipeline.stage_runner import Job
 from flows.preflight.requirements import check_jobs
 from genre_tasks.config import PipelineConfig
+from genre_tasks.detection.coco_classes import require_road_users
 from genre_tasks.errors import ConfigError
 
 
@@ -128,7 +129,7 @@ class TableRequest:
             raise ConfigError(
                 f"table {self.number} asks a detector", remedy="Give an ONNX or TFLite file by --detector."
             )
-        open_cached_detector(self.detector)
+        require_road_users(open_cached_detector(self.detector).class_names, self.detector)
 
     def _find_inputs(self, protocol: tuple[str, ...]) -> _Inputs:
         """Finds the logs, and what a scene asks for before the user's settings."""
@@ -206,7 +207,9 @@ class CheckedRequest:
         if not self.layout.rollouts:
             return [(where,) for where in self.places]
         logs = dict.fromkeys(where.log for where in self.places)
-        return [tuple(where for where in self.places if where.log == log) for log in logs]
+        # A recorded path goes through the chunks in the order of the log, however they were named.
+        in_order = sorted(self.places, key=lambda where: where.chunk)
+        return [tuple(where for where in in_order if where.log == log) for log in logs]
 
     @property
     def measurable_rows(self) -> tuple[Row, ...]:

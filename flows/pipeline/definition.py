@@ -289,7 +289,7 @@ def stage_key(
     Returns:
         64 hex digits of sha256.
     """
-    # A retry with a smaller batch makes the same payload, so it must have the same key.
+    # A retry with a smaller batch makes the same payload but for rounding, so it must have the same key.
     excluded: dict[str, Any] = dict(_WEIGHTS_SETTINGS)
     if spec.batch_setting:
         excluded[spec.batch_setting] = True

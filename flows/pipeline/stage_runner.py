@@ -106,8 +106,10 @@ def compute_key(spec: StageSpec, job: Job, inputs: Mapping[str, ArtifactRef]) ->
     # later key.
     digests = {name: inputs[name].payload_digest for name in spec.inputs}
     if spec.needs_log:
-        # The digest is of the log's content, so a log that was moved keeps its keys.
-        digests["log"] = cached_log(job.log).digest()
+        log = cached_log(job.log)
+        # The digest is of the log's content, so a log that was moved keeps its keys. Its names are in the payload.
+        digests["log"] = log.digest()
+        digests["name"] = f"{log.dataset}/{log.name}"
         digests["chunk"] = str(job.chunk)
     weights = digest_stage_weights(spec, config)
     return stage_key(spec, config, digests, weights, reading_modules(spec, job)), weights

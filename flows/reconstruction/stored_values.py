@@ -103,15 +103,19 @@ def read_next_scene(store: str, run: str, chunk: int, stage: str | None) -> tupl
         stage: the stage whose scene is read; ``None`` for the last one of that chunk.
 
     Returns:
-        The next chunk and its scene, or ``None`` if the run does not have that chunk.
+        The next chunk with its plan of effects and its scene, or ``None`` if the run does not have that chunk.
 
     Raises:
         InputError: as :func:`read_stage_value` raises it.
         ArtifactCorruptError: an artifact is damaged.
     """
+    # Imported here: commands that read one value need not load the plan's code.
+    from genre_tasks.effects.apply_plan import apply_plan
+
     following = chunk + 1
     if following not in {c["chunk"] for c in find_run_record(store, run)["chunks"]}:
         return None
     name = stage or find_last_stage(store, run, following)
     _, ingested = read_stage_value(store, run, following, "ingest")
-    return ingested, read_stage_scene(store, run, following, name)
+    planned = apply_plan(ingested, read_stage_value(store, run, following, "effects")[1])
+    return planned, read_stage_scene(store, run, following, name)

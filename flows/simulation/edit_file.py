@@ -103,7 +103,8 @@ def read_edit_file(path: Path) -> EditList:
     edits = []
     for index, entry in enumerate(entries):
         lines = {key[2]: line for key, line in content.lines.items() if key[:2] == ("edits", str(index)) and key[2:]}
-        edits.append(_make_edit(entry, _EntryPlace(str(path), index + 1, lines)))
+        texts = {key[2]: text for key, text in content.texts.items() if key[:2] == ("edits", str(index)) and key[2:]}
+        edits.append(_make_edit(entry, _EntryPlace(str(path), index + 1, lines), texts))
     return EditList(edits=tuple(edits))
 
 
@@ -160,7 +161,8 @@ class _EntryPlace:
         return Place(self.source, line).error(f"edit {self.number}: {problem}", remedy)
 
 
-def _make_edit(entry: object, place: _EntryPlace) -> Any:
+def _make_edit(entry: object, place: _EntryPlace, texts: Mapping[str, str]) -> Any:
+    """``texts``: what was written where a value is a number, by key."""
     known = ", ".join(EDIT_KINDS)
     if not isinstance(entry, dict):
         raise place.error(f"expected an edit such as `remove: car-3`, got {describe_value(entry)}", f"Known: {known}.")
@@ -171,12 +173,9 @@ def _make_edit(entry: object, place: _EntryPlace) -> Any:
         raise place.error(problem, f"{suggestion}One of {known}, with the actor as its value.")
     kind = kinds[0]
     values = {key: value for key, value in entry.items() if key != kind}
-    # Numbers are names here: `remove: 12` means the actor with this number.
-    actor = entry[kind]
-    values["actor"] = str(actor) if isinstance(actor, int) and not isinstance(actor, bool) else actor
-    for key in ("from_run", "name"):
-        if isinstance(values.get(key), int) and not isinstance(values[key], bool):
-            values[key] = str(values[key])
+    # Numbers are names here, as they were written: 0012 may be a track of the log, and 77e2 a run.
+    values["actor"] = texts.get(kind, entry[kind])
+    values |= {key: texts[key] for key in ("from_run", "name") if key in texts}
     return _validate(kind, values, place)
 
 

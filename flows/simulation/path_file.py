@@ -43,6 +43,10 @@ MARK_COLUMNS = (
 """What a rollout writes next to its poses; a path that is read has marks of its own."""
 
 _COLUMNS = (*TIME_COLUMNS, *POSE_COLUMNS, *RELATIVE_COLUMNS)
+# Of a moment from the nearest frame of a chunk, in frames.
+_FURTHEST_FRAME = 0.5
+# A drive through the log in so many times its time is meant in other units.
+_SLOWEST = 100.0
 _LEAST_STEP_S = 0.001
 _QUATERNION_TOLERANCE = 0.01
 # Farther away than any detour: coordinates of another origin.
@@ -159,7 +163,7 @@ def _place_in_time(numbers: Mapping[str, Float64], recorded: EgoPath) -> tuple[F
     if "frame" in numbers:
         frames = numbers["frame"]
         distance = np.abs(frames[:, None] - recorded.frames).min(axis=1)
-        outside = (distance > 0.5) | (frames < recorded.frames[0]) | (frames > recorded.frames[-1])
+        outside = (distance > _FURTHEST_FRAME) | (frames < recorded.frames[0]) | (frames > recorded.frames[-1])
         _refuse_rows(outside, "frame", frames, f"the log's frames {recorded.frames[0]:g} to {recorded.frames[-1]:g}")
         _refuse_order(np.diff(frames) < 0, "frame", frames, "Traffic goes forward in time: let no frame fall.")
     if "time_s" in numbers:
@@ -170,6 +174,11 @@ def _place_in_time(numbers: Mapping[str, Float64], recorded: EgoPath) -> tuple[F
             outside = (times < -_LEAST_STEP_S) | (times > recorded_s[-1] + _LEAST_STEP_S)
             _refuse_rows(outside, "time_s", times, f"the log's 0 to {recorded_s[-1]:.2f} s")
             frames = np.interp(times, recorded_s, recorded.frames)
+            apart = np.abs(frames[:, None] - recorded.frames).min(axis=1) > _FURTHEST_FRAME
+            _refuse_rows(apart, "time_s", times, "the chunks, which do not follow each other")
+        elif times[-1] - times[0] > _SLOWEST * (recorded_s[-1] + 1):
+            problem = f"time_s spans {times[-1] - times[0]:g} s, and the log {recorded_s[-1]:.2f} s"
+            raise InputError(problem, remedy="Write time_s in seconds.")
     else:
         times = np.interp(frames, recorded.frames, recorded_s)
         _refuse_order(np.diff(times) < _LEAST_STEP_S, "frame", frames, "Let frames rise, or state time_s as well.")

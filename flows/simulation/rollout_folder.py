@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from genre_tasks.atomic_path import replace_folder
+from genre_tasks.atomic_path import holds_files, replace_folder
 from genre_tasks.errors import ArtifactCorruptError, ConfigError, InputError
 from genre_tasks.temporary_names import temporary_folder
 from storage.files import make_folders, payload_files, sync
@@ -34,7 +34,7 @@ def find_rollout(folder: Path, key: str, overwrite: bool) -> Manifest | None:
         InputError: the folder holds files that are no rollout's.
         ConfigError: it holds another rollout, or a damaged one, which may not be replaced.
     """
-    if not folder.exists() or not any(folder.iterdir()):
+    if not holds_files(folder):
         return None
     manifest = _read_manifest(folder)
     damage = _find_damage(folder, manifest)
@@ -60,15 +60,17 @@ def write_rollout(folder: Path, make_manifest: Callable[[tuple[FileEntry, ...]],
         The folder to write to.
 
     Raises:
+        ConfigError: the folder was empty, and is full when the block ends.
         OSError: a file cannot be written.
     """
+    held_files = holds_files(folder)
     make_folders(folder.parent)
     # In the same folder, because a rename is atomic only within one file system.
     with temporary_folder(folder.parent) as temporary:
         yield temporary
         temporary.chmod(_FOLDER_MODE)
         write_manifest(temporary, make_manifest(list_payload(temporary)))
-        replace_folder(folder, temporary)
+        replace_folder(folder, temporary, held_files)
         sync(folder.parent)
 
 

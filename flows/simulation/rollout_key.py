@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from flows.pipeline.definition import STAGE_BY_NAME, digest_stage_weights
-from flows.pipeline.log_cache import cached_log
 from flows.simulation.edited_runs import OpenedRun, digest_edits
 from flows.simulation.parked_actors import find_log
 from flows.simulation.request import SimulationRequest
 from flows.simulation.run_scenes import RunScenes
 from flows.simulation.sensors import MODULES as SENSOR_MODULES
+from flows.simulation.stored_ranges import MARKS_CONFIG
 from genre_tasks.config import PipelineConfig
 from genre_tasks.ego_paths.behaviours import BEHAVIOURS
 from genre_tasks.errors import InputError
@@ -23,6 +23,8 @@ _MODULES = (
     "genre_tasks.ego_paths.behaviours",
     "genre_tasks.ego_paths.collisions",
     "genre_tasks.ego_paths.path_marks",
+    "genre_tasks.ego_paths.recorded_path",
+    "genre_tasks.ego_paths.relative_path",
     "genre_tasks.reliability.reliable_range",
 )
 
@@ -49,17 +51,17 @@ def compute_rollout_key(request: SimulationRequest, run: OpenedRun, config: Pipe
     weights = None
     for sensor in request.sensors:
         modules += SENSOR_MODULES[sensor]
-    if "lidar" in request.sensors:
-        # Which rays the sensor sends is read from the log's sweeps.
-        inputs["log"] = cached_log(run.recorded.record["log"]).digest()
+    # Parked vehicles are known from the log alone, and which rays a sensor sends is read from its sweeps. Where it is
+    # gone, a path is not checked against them.
+    log = find_log(run.recorded.record["log"])
+    inputs["log"] = "gone" if log is None else log.digest()
     if len(edits):
         inputs["edits"] = digest_edits(request.store, _open_all_chunks(request, run), edits, config.simulate)
     configuration = {
         "simulate": config.simulate.model_dump(mode="json"),
         "request": request.key_values(),
         "fnet": config.fnet.model_dump(mode="json"),
-        # Parked vehicles are known from the log alone: where it is gone, a path is not checked against them.
-        "parked": find_log(run.recorded.record["log"]) is not None,
+        "marks": MARKS_CONFIG.model_dump(mode="json"),
         "layout": _LAYOUT,
         # The encoder's version decides on the bytes of films.
         "ffmpeg": imageio_ffmpeg.__version__,

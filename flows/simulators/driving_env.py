@@ -115,6 +115,9 @@ class GenreDrivingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise ConfigError(f"unknown render_mode '{render_mode}'", remedy="Take rgb_array, or None.")
+        if start.first_index > start.last_index or start.lateral_m < 0:
+            remedy = "Give first_index up to last_index, and lateral_m of at least 0."
+            raise ConfigError(f"no place lies in {start}", remedy=remedy)
         self.render_mode = render_mode
         self._renderer = SceneRenderer(store, run, stage)
         # Logs have frame rates of their own, and films of the environment are to be as fast as the drive.

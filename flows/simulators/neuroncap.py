@@ -31,8 +31,8 @@ from flows.simulators.service import RunningService, ServiceRequest
 from flows.simulators.service_metrics import ServiceMetrics
 from genre_tasks.errors import ConfigError, GenreError, InputError, ResourceError
 
-MAX_BODY_BYTES = 16 * 2**20
-"""Of one request: a thousand actors over twenty seconds take less."""
+MAX_BODY_BYTES = 64 * 2**20
+"""Of one request: a thousand actors over twenty seconds take less, at some 300 bytes a pose."""
 
 _REFUSED_FORMAT = 406
 _TOO_LARGE = 413

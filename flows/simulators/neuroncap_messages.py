@@ -17,8 +17,8 @@ from genre_tasks.lidar_simulation.ego_motion import interpolate_poses
 from genre_tasks.logs.types import Float64
 
 MICROSECONDS = 1e6
-MAX_POSES = 20_000
-"""Poses of all trajectories of one message."""
+MAX_POSES = 200_000
+"""Poses of all trajectories of one message: what ``/get_actors`` answers for a long log may be sent back."""
 
 _Text = Annotated[str, Field(max_length=200)]
 _Row = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]

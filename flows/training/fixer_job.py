@@ -55,6 +55,8 @@ class FixerJob:
                 "the paper's fixer starts from SD-Turbo",
                 remedy="Give a folder with its vae and unet in diffusers' layout, or a hub id, by --start.",
             )
+        if self.preset == "paper" and set(self.inputs.split("+")) != set(INPUTS):
+            raise ConfigError("the paper's fixer is given all inputs", remedy="Leave out --inputs, or --preset paper.")
 
     @property
     def store(self) -> LocalStore:

@@ -16,7 +16,7 @@ from flows.training.stage_scenes import list_scene_uses
 from flows.training.train_job import TrainJob
 from flows.training.training_scenes import check_for_training
 from genre_tasks.config import FnetConfig
-from genre_tasks.errors import InputError
+from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.fixer.network import INPUTS
 from genre_tasks.fixer.training_checkpoint import CHECKPOINT_FILE, count_steps
 from genre_tasks.fixer.weight_files import check_described_weights, check_fixer_files, check_sd_turbo
@@ -33,12 +33,17 @@ def check_optimiser_training(job: TrainJob, network: str | None = None, stage: s
         stage: this stage alone; ``None`` for all of the network.
 
     Raises:
-        ConfigError: the recipe, the stage or the device is unknown, or a chunk is not for training.
+        ConfigError: the recipe, the stage or the device is unknown, the stage is another network's, or a chunk is not
+            for training.
         InputError: the real log or the fixer's weights are missing or unfit, or the folder cannot be written to.
     """
     stages = list(job.stages()) if network is None else select_stages(job.stages(), network)
     if stage is not None:
-        stages = [job.get_stage(stage)]
+        found = job.get_stage(stage)
+        if network is not None and found.network_name != network:
+            remedy = f"Train it with `genre train {found.network_name}`."
+            raise ConfigError(f"{stage} is no stage of {network}", remedy=remedy)
+        stages = [found]
     choose_device(job.device)
     for scene in list_scene_uses(stages, job.real):
         check_for_training(scene)

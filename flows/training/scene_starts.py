@@ -236,7 +236,7 @@ def _run_per_scene(scene: PreparedScene, starts: Sequence[PerScene]) -> dict[Per
     # The published 3DGS knows no motion, so its errors at actors are part of what ENet has to repair.
     initial = scene.initial.scene if method == "street_gs" else freeze_actors(scene.initial.scene)
     # The seed is the run's and not the age's, so that all ages lie on one optimisation.
-    seed = _seed_from(digest_value([scene.recipe.key_fields(), method, iterations]))
+    seed = _seed_from(digest_value([scene.recipe.seed_fields(), method, iterations]))
     training = PerSceneTraining(
         PerSceneConfig(iterations=iterations), initial, source_targets(scene.chunk, depth=False), seed, "per_scene"
     )

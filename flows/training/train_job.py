@@ -100,7 +100,10 @@ class TrainJob:
             return resolve_weights("gnet", name)
         folder = Path(self.folder) / name
         path = folder / CHECKPOINT_FILE
-        remedy = f"Run `genre train {name.split('/', maxsplit=1)[0]} --stage {name}` first."
+        network = name.split("/", maxsplit=1)[0]
+        # G3R is GNet's training without λ_novel, and has no command of its own.
+        command = "gnet --novel 0" if network == "g3r" else network
+        remedy = f"Run `genre train {command} --stage {name}` with the same folder and recipe first."
         # Weights are written at every checkpoint, so that the file alone does not tell whether training is done.
         if not path.is_file():
             raise InputError(f"the stage {name} is not trained yet", remedy=remedy, file=path)

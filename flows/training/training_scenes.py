@@ -10,6 +10,7 @@ from urllib.parse import parse_qs
 import numpy as np
 import torch
 
+from flows.pipeline.log_cache import cached_log
 from flows.training.subsampled_log import SubsampledLog
 from genre_tasks.config import EffectsConfig, IngestConfig, InitialConfig
 from genre_tasks.effects.apply_plan import apply_plan
@@ -75,11 +76,24 @@ class SceneRecipe:
         Returns:
             JSON values by field name.
         """
+        return self.seed_fields() | self._log_fields()
+
+    def seed_fields(self) -> dict[str, Any]:
+        """Lists what random numbers of this scene follow from: how it is made, and not what its log's files hold.
+
+        Returns:
+            JSON values by field name.
+        """
         values = asdict(self)
         # Plain scenes keep the digests that they had before there were plans.
         if not self.planned:
             del values["planned"]
         return values
+
+    def _log_fields(self) -> dict[str, str]:
+        """The files of a real log: they may be corrected, or be others in another working folder."""
+        # A street follows from its URI.
+        return {} if self.uri.startswith("synthetic:") else {"log": cached_log(self.uri).digest()}
 
     def image_key_fields(self) -> dict[str, Any]:
         """Lists what the scene's images depend on, for digests.
@@ -89,8 +103,9 @@ class SceneRecipe:
         Returns:
             JSON values by field name.
         """
-        values = self.key_fields()
-        return {name: values[name] for name in ("uri", "chunk", "width_px", "height_px", "every")}
+        values = self.seed_fields()
+        fields = {name: values[name] for name in ("uri", "chunk", "width_px", "height_px", "every")}
+        return fields | self._log_fields()
 
     def truth_key_fields(self) -> dict[str, Any]:
         """Lists what the scene's true novel views depend on, for digests.
@@ -150,7 +165,8 @@ def check_for_training(recipe: SceneRecipe) -> None:
 def prepare_scene(store: Store, recipe: SceneRecipe) -> PreparedScene:
     """Reads the parts of a training scene from the store; what it lacks is made and stored.
 
-    Keys are the recipe's alone, not the code's: after a change of how scenes are made, take an empty store.
+    Keys are of the recipe and of a real log's files, not of the code: after a change of how scenes are made, take an
+    empty store.
 
     Args:
         store: the training's store.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from genre_tasks.errors import InputError
+
 COCO_CLASSES = (
     *("person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat", "traffic light"),
     *("fire hydrant", "stop sign", "parking meter", "bench", "bird", "cat", "dog", "horse", "sheep", "cow"),
@@ -32,3 +34,18 @@ def find_road_users(class_names: tuple[str, ...]) -> tuple[int, ...]:
     (1, 2)
     """
     return tuple(index for index, name in enumerate(class_names) if name.strip().lower() in ROAD_USERS)
+
+
+def require_road_users(class_names: tuple[str, ...], detector: str) -> None:
+    """Refuses a detector that knows no road users: it would find none on recorded images either.
+
+    Args:
+        class_names: the detector's names.
+        detector: its file or name, for the error.
+
+    Raises:
+        InputError: no class is one of ``ROAD_USERS``.
+    """
+    if not find_road_users(class_names):
+        remedy = f"Give one with a class of these: {', '.join(ROAD_USERS)}."
+        raise InputError("the detector knows no road users", remedy=remedy, file=detector)

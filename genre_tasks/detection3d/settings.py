@@ -10,6 +10,7 @@ from genre_tasks.config.section import LearningRate, LossWeight, Section, Seed, 
 from genre_tasks.detection3d.average_precision import THRESHOLDS_M
 
 Size = Annotated[tuple[float, float, float], Field(strict=False)]
+MOST_STEPS = 1_000_000
 Metres = Annotated[float, Field(gt=0, le=1000)]
 
 
@@ -69,7 +70,7 @@ class Detector3dConfig(Section):
     width: int = Field(
         32, ge=16, le=256, multiple_of=16, description="Channels of the feature map at a quarter of the resolution."
     )
-    steps: int = Field(3000, ge=1, le=1_000_000, description="Gradient steps.")
+    steps: int = Field(3000, ge=1, le=MOST_STEPS, description="Gradient steps.")
     batch: int = Field(8, ge=1, le=256, description="Images per step.")
     learning_rate: LearningRate = Field(2e-3, description="Of AdamW, at its largest.")
     warm_up: int = Field(100, ge=1, description="Steps over which the learning rate rises.")

@@ -37,7 +37,8 @@ def measure_frame_s(chunks: Sequence[Chunk]) -> float:
         chunks: of one log.
 
     Returns:
-        Seconds, the median over cameras and frames; ``DEFAULT_FRAME_S`` without two images of one camera.
+        Seconds, the median over cameras and frames; ``DEFAULT_FRAME_S`` without two images of one camera, or where the
+        log's clock stands or runs backwards.
 
     >>> measure_frame_s(())
     0.1
@@ -51,4 +52,5 @@ def measure_frame_s(chunks: Sequence[Chunk]) -> float:
         times.sort()
         # Divided by the frames between them, since images may be missing.
         steps += [(t1 - t0) / (f1 - f0) for (f0, t0), (f1, t1) in itertools.pairwise(times) if f1 > f0]
-    return statistics.median(steps) if steps else DEFAULT_FRAME_S
+    frame_s = statistics.median(steps) if steps else 0.0
+    return frame_s if frame_s > 0 else DEFAULT_FRAME_S

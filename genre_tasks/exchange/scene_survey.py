@@ -105,7 +105,9 @@ def _check_up_axis(cloud: SplatCloud) -> list[str]:
 def _find_up_axis(cloud: SplatCloud) -> int | None:
     """The axis that most surfaces face and that the scene is short along; ``None`` where they do not agree."""
     scales = np.sort(cloud.log_scales, axis=1)
-    rows = np.flatnonzero((scales[:, 0] - scales[:, 1] < np.log(_FLAT)) & (cloud.logit_opacities > 0))
+    is_flat = scales[:, 0] - scales[:, 1] < np.log(_FLAT)
+    # A quaternion of zeros turns nowhere, and formats may hold one.
+    rows = np.flatnonzero(is_flat & (cloud.logit_opacities > 0) & cloud.quats.any(1))
     if len(rows) < _FEWEST_NORMALS:
         return None
     normals = _find_normals(cloud.select(rows))

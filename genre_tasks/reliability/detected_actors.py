@@ -7,9 +7,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from genre_tasks.detection.agreement import box_overlaps
-from genre_tasks.detection.coco_classes import ROAD_USERS, find_road_users
+from genre_tasks.detection.coco_classes import find_road_users, require_road_users
 from genre_tasks.detection.detector import Detector, open_detector
-from genre_tasks.errors import InputError
 from genre_tasks.logs.types import Float32
 from genre_tasks.scene.box_projection import AnyView, project_box
 from genre_tasks.scene.chunk import Chunk
@@ -39,12 +38,7 @@ def open_actor_detector(path_or_name: str) -> Detector:
     """
     detector = open_detector(path_or_name, min_score=MIN_SCORE)
     # It would find no actor on the path either, so that nothing could be lost beside it.
-    if not find_road_users(detector.class_names):
-        raise InputError(
-            "the detector knows no road users",
-            remedy=f"Give one with a class of these: {', '.join(ROAD_USERS)}.",
-            file=path_or_name,
-        )
+    require_road_users(detector.class_names, path_or_name)
     return detector
 
 

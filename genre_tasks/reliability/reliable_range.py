@@ -12,6 +12,7 @@ from genre_tasks.config import RangeConfig
 from genre_tasks.detection.detector import Detector
 from genre_tasks.effects.apply_plan import apply_plan
 from genre_tasks.effects.types import DEFAULT_PLAN, EffectsPlan
+from genre_tasks.errors import InputError
 from genre_tasks.fixer.source_images import load_source_images
 from genre_tasks.progress import Progress, silent
 from genre_tasks.reliability.guards import Guards, compute_guards
@@ -125,10 +126,14 @@ def measure_guards(
         The renders of one frame at one shift and their guards, shift 0 first.
 
     Raises:
-        InputError: an image of the chunk cannot be decoded.
+        InputError: the chunk has no image, or one that cannot be decoded.
     """
+    # Cameras may be slower than frames, or images be lost.
+    seen = sorted({view.frame for view in chunk.views})
+    if not seen:
+        raise InputError("the chunk has no image", remedy="Choose another --chunk.", log=chunk.log, chunk=chunk.index)
     # From the middle of an interval on, so that few frames stand for the whole chunk.
-    frames = chunk.frames[config.every // 2 :: config.every] or chunk.frames[:1]
+    frames = seen[config.every // 2 :: config.every] or seen[:1]
     # The path first: everything is compared with it.
     shifts = [0.0]
     for shift in sorted(config.shifts_m):
@@ -140,10 +145,8 @@ def measure_guards(
         progress(k, len(shifts), f"guards at {shift:+g} m")
         for frame in frames:
             views = place_novel_views(chunk, (shift,), [frame])
-            # A frame may have lost all of its images.
-            if views:
-                novel = render_with_map(chunk, scene, lidar_scene, views)
-                yield novel, compute_guards(chunk, novel, sources, detector)
+            novel = render_with_map(chunk, scene, lidar_scene, views)
+            yield novel, compute_guards(chunk, novel, sources, detector)
     progress(len(shifts), len(shifts), "guards")
 
 

@@ -94,7 +94,11 @@ def resolve_actor(word: str, names: Mapping[str, str]) -> str:
     track_ids = {name: track_id for track_id, name in names.items()}
     if word in track_ids:
         return track_ids[word]
-    by_number = {name.rpartition("-")[2]: track_id for name, track_id in track_ids.items() if "-" in name}
+    by_number: dict[str, str] = {}
+    for name, track_id in track_ids.items():
+        if "-" in name:
+            # The first counts: an inserted actor, which comes last, may have been named like one of the log.
+            by_number.setdefault(name.rpartition("-")[2], track_id)
     if word in by_number:
         return by_number[word]
     if word in names:

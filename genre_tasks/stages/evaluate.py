@@ -74,7 +74,8 @@ def evaluate_scene(
     chunk = apply_plan(chunk, plan)
     scene = reconstruction.scene
     heldout = chunk.views_with_role("heldout")
-    frames = chunk.frames[:: config.every]
+    # Cameras may be slower than frames, or images be lost.
+    frames = sorted({view.frame for view in chunk.views})[:: config.every]
     views_at_shift = {
         shift: place_novel_views(chunk, (shift, -shift), frames) for shift in _measurable_shifts(config, truth)
     }

@@ -89,7 +89,16 @@ def read_views(reading: ChunkReading, cameras: Sequence[Camera]) -> tuple[list[V
         if is_source and len(views) > count_before:
             schedule.take(n)
     _note_remarks(reading, remarks)
+    _note_unsupervised_cameras(reading, views)
     return views, pixels
+
+
+def _note_unsupervised_cameras(reading: ChunkReading, views: list[View]) -> None:
+    """Names cameras whose images all lie between the source frames of the others: no scene is fitted to them."""
+    supervised = {view.camera for view in views if view.role == "source"}
+    for camera in sorted({view.camera for view in views} - supervised):
+        detail = "none of its images is of a source frame: it supervises nothing; set ingest.source_every=1"
+        reading.add_issue("no_source_view", detail, camera=camera)
 
 
 def _read_time(reading: ChunkReading, camera: Camera, frame: int) -> float:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from genre_tasks.atomic_path import replace_folder
+from genre_tasks.atomic_path import holds_files, replace_folder
 from genre_tasks.errors import ConfigError, InputError, ResourceError
 from genre_tasks.suggestions import did_you_mean
 from genre_tasks.temporary_names import describe_owner, remove_abandoned
@@ -132,6 +132,7 @@ def write_training_set(images: Iterable[LabelledImage], out: Path, format_name: 
 def _new_folder(out: Path) -> Iterator[Path]:
     """A temporary folder next to the wanted one, which takes its place when the block ends."""
     # Next to the target, since only a rename within one file system is atomic.
+    held_files = holds_files(out)
     part = out.parent / f".{out.name}.{describe_owner()}-{uuid.uuid4().hex[:8]}.part"
     with _disk_errors(out):
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -140,7 +141,7 @@ def _new_folder(out: Path) -> Iterator[Path]:
     try:
         yield part
         with _disk_errors(out):
-            replace_folder(out, part)
+            replace_folder(out, part, held_files)
     finally:
         # After a success there is nothing left to remove.
         shutil.rmtree(part, ignore_errors=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from genre_tasks.config.simulation_sections import SimulateConfig
 from genre_tasks.ego_paths.behaviours import plan_behaviour
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.ego_paths.path_marks import mark_path
+from genre_tasks.ego_paths.recorded_path import DEFAULT_FRAME_S, measure_frame_s
 from genre_tasks.ego_paths.relative_path import place_relative_path
 from genre_tasks.errors import InputError
 from tests.ego_paths.drives import drive, straight, yaw_of
@@ -25,6 +27,12 @@ def test_the_recorded_path_is_on_itself() -> None:
     assert np.abs(marks.ahead_m).max() < 0.05
     assert marks.reliable.all()
     assert not marks.outside_recording.any()
+
+
+@pytest.mark.parametrize("times_s", [(0.0, 0.0, 0.0), (0.2, 0.1, 0.0), (5.0,)])
+def test_a_clock_that_stands_or_runs_backwards_tells_no_frame_time(times_s: tuple[float, ...]) -> None:
+    views = [SimpleNamespace(camera="front", frame=frame, timestamp_s=time_s) for frame, time_s in enumerate(times_s)]
+    assert measure_frame_s([SimpleNamespace(views=views)]) == DEFAULT_FRAME_S  # type: ignore[list-item]
 
 
 def test_a_lane_change_leaves_the_reliable_range_on_its_side() -> None:

@@ -198,6 +198,18 @@ def test_what_is_no_gaussian_is_a_loss(tmp_path: Path) -> None:
     assert scene.losses == ("Surfaces and points of the file that are no Gaussians are not read.",)
 
 
+def test_hidden_nodes_are_a_loss(tmp_path: Path) -> None:
+    document, binary = foreign_file(float_attributes())
+    hidden = {"extensions": {"KHR_node_visibility": {"visible": False}}, "children": [2]}
+    shown = {"mesh": 0, "name": "shown", "extensions": {"KHR_node_visibility": {"visible": True}}}
+    document["nodes"] = [hidden, shown, {"mesh": 0, "name": "below"}]
+    document["scenes"] = [{"nodes": [0, 1]}]
+    document["extensionsRequired"] = ["KHR_node_visibility"]
+    scene = read_foreign(tmp_path, document, binary)
+    assert [node.name for node in scene.nodes] == ["shown"]
+    assert scene.losses == ("Hidden nodes of the file are not read.",)
+
+
 def test_names_become_distinct(tmp_path: Path) -> None:
     document, binary = foreign_file(float_attributes())
     document["nodes"] = [{"mesh": 0, "name": "car"}, {"mesh": 0, "name": "car"}, {"mesh": 0, "name": "../.."}]

@@ -80,6 +80,15 @@ def test_the_far_shell_may_be_large() -> None:
     assert find_scene_warnings(replace(scene, nodes=(nodes[0], shell, *nodes[2:]))) == ()
 
 
+def test_a_quaternion_of_zeros_is_no_fault() -> None:
+    street = make_street()
+    scales = street.log_scales.copy()
+    scales[:, 2] -= 3
+    flat = replace(street, log_scales=scales, quats=np.where(np.arange(len(street))[:, None] == 7, 0, street.quats))
+    whole = replace(flat, quats=street.quats)
+    assert find_scene_warnings(make_resting_scene(flat)) == find_scene_warnings(make_resting_scene(whole))
+
+
 def test_a_node_in_numbers() -> None:
     street = survey_node(make_resting_scene(make_street()).nodes[0])
     assert street.gaussians == 3000 and street.sh_degree == 0 and not street.moves

@@ -137,6 +137,17 @@ def test_names_that_are_no_identifiers_are_kept_apart(tmp_path: Path) -> None:
 # --- the process that reads
 
 
+def test_a_package_that_openusd_could_not_open_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = make_driving_scene(1)
+    for limit in (100, 5000):
+        # Of the arrays alone, and of the layer that was written.
+        monkeypatch.setattr("genre_tasks.exchange.usd.format._MOST_LAYER_BYTES", limit)
+        with pytest.raises(InputError, match=r"takes less than 1\.9"):
+            USDZ.write(tmp_path / "scene.usdz", scene)
+    assert not list(tmp_path.iterdir())
+    USDZ.write(tmp_path / "scene.usdc", scene)
+
+
 @pytest.mark.usefixtures("real_process")
 def test_the_process_reads_and_passes_errors_on(package: Path, tmp_path: Path) -> None:
     found = USDZ.read(package)

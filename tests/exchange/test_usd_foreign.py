@@ -38,6 +38,16 @@ def test_a_foreign_layer_comes_in_metres_with_z_up(tmp_path: Path, suffix: str) 
     np.testing.assert_allclose(node.cloud.sh_dc, [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]], atol=1e-7)
 
 
+def test_invisible_fields_are_a_loss(tmp_path: Path) -> None:
+    path = tmp_path / "foreign.usda"
+    make_layer(path)
+    stage = Usd.Stage.Open(str(path))
+    UsdGeom.Imageable(stage.GetPrimAtPath("/World")).MakeInvisible()
+    stage.Save()
+    scene = USDZ.read(path)
+    assert scene.nodes == () and "Invisible are 1 fields of Gaussians, which are not read." in scene.losses
+
+
 def test_half_precision_is_read(tmp_path: Path) -> None:
     halves = {
         "positions": None,

@@ -55,6 +55,9 @@ def test_real_shapes_train_a_step_save_and_reload(base, tmp_path):
     assert 0.8e9 < count < 1.1e9
     trained = sum(p.numel() for p in trainable_state(network).values())
     assert trained < 0.06 * count
+    # Pairs have 320 × 180 pixels, and SD-Turbo a stride of 64.
+    height, width = PRESETS["paper"].crop
+    assert height <= 180 and width <= 320 and height % 64 == width % 64 == 0
     settings = replace(PRESETS["paper"], steps=1, batch=1, crop=(64, 64), warmup=1, perceptual=0.0, half=False)
 
     def distance(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:

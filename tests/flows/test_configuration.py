@@ -44,6 +44,19 @@ def test_settings_win_over_file_over_preset(tmp_path: Path) -> None:
     assert diff_from_preset(config, "demo")["gnet.iterations"] == (72, 8)
 
 
+@pytest.mark.parametrize("section", ["enet.learning_rates", "gnet.refine", "gnet.refine.lr_before_refine"])
+def test_a_section_that_is_null_differs_in_all_that_the_preset_has(section: str) -> None:
+    differences = diff_from_preset(load_configuration("small", settings=[f"{section}=null"]), "small")
+    assert differences and all(key.startswith(f"{section}.") for key in differences)
+    assert {after for _, after in differences.values()} == {None}
+
+
+def test_a_section_that_the_preset_lacks_differs_in_all_that_it_has() -> None:
+    rates = "{means: 0.2, log_scales: 0.3, quats: 0.1, logit_opacities: 0.1, colors: 0.01}"
+    config = load_configuration("demo", settings=[f"gnet.refine.lr_before_refine={rates}"])
+    assert diff_from_preset(config, "demo")["gnet.refine.lr_before_refine.means"] == (None, 0.2)
+
+
 @pytest.mark.parametrize(
     ("setting", "words"),
     [

@@ -120,6 +120,21 @@ def test_a_run_and_itself(runs: Runs) -> None:
     assert any("same metrics" in note for note in found.notes)
 
 
+def test_evaluations_are_fetched_before_they_are_read(runs: Runs, monkeypatch: pytest.MonkeyPatch) -> None:
+    fetched: list[str] = []
+    kind = type(runs.store)
+    fetch = kind.fetch
+
+    def count(self: Any, artifact: Artifact, suffix: str = "") -> Path:
+        fetched.append(artifact.manifest.stage)
+        return fetch(self, artifact, suffix)
+
+    monkeypatch.setattr(kind, "fetch", count)
+    runs.compare("aa11", "bb22")
+    # Of both runs for the scores, and again for the pictures.
+    assert fetched.count("evaluate/gnet") == 4
+
+
 def test_runs_of_different_logs_share_means_only(runs: Runs) -> None:
     runs.add("cc33", log="synthetic:street?seed=7", gray=140, chunks=2)
     found = runs.compare("aa11", "cc33")

@@ -8,6 +8,7 @@ import pytest
 
 from flows.simulation.edit_file import parse_edit_options, read_edit_file
 from genre_tasks.errors import ConfigError
+from genre_tasks.scene_edits.actor_names import resolve_actor
 from genre_tasks.scene_edits.edits import Insert, Move, Remove, Retime, Rotate, ScaleSpeed
 from tests.flows.command_line import genre
 
@@ -40,6 +41,20 @@ def test_file_holds_every_kind_of_edit(tmp_path: Path) -> None:
     )
     file.write_text("")
     assert len(read_edit_file(file)) == 0
+
+
+def test_the_bare_number_of_an_actor_is_the_logs() -> None:
+    names = {"a": "car-1", "inserted": "taxi-1"}
+    assert resolve_actor("1", names) == "a" and resolve_actor("taxi-1", names) == "inserted"
+
+
+def test_names_that_look_like_numbers_are_taken_as_they_are_written(tmp_path: Path) -> None:
+    file = tmp_path / "edits.yaml"
+    file.write_text("edits:\n  - remove: 0012\n  - insert: 7.50\n    from_run: 77e2\n    name: 007\n    ahead_m: 1e1\n")
+    assert read_edit_file(file).edits == (
+        Remove(actor="0012"),
+        Insert(actor="7.50", from_run="77e2", name="007", ahead_m=10),
+    )
 
 
 def test_options_hold_every_kind_of_edit() -> None:

@@ -146,6 +146,14 @@ def test_a_scale_has_to_come_from_somewhere(inputs: EnhancementInputs) -> None:
         prepare_enhancement(replace(inputs, scale=None), PipelineConfig())
 
 
+@pytest.mark.parametrize("suffix", [".spz", ".glb", ".usda"])
+def test_a_format_with_axes_of_its_own_is_refused(inputs: EnhancementInputs, tmp_path: Path, suffix: str) -> None:
+    scene = tmp_path / f"scene{suffix}"
+    scene.write_bytes(b"")
+    with pytest.raises(InputError, match="has axes of its own"):
+        prepare_enhancement(replace(inputs, scene=scene), PipelineConfig())
+
+
 def test_errors_of_the_command(folder: Path, tmp_path: Path) -> None:
     scene = str(folder / "scene.ply")
     runner = CliRunner()

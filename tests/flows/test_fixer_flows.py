@@ -230,6 +230,8 @@ def test_faults_are_said(monkeypatch) -> None:
         FixerJob("x", preset="huge")
     with pytest.raises(ConfigError, match="starts from SD-Turbo"):
         FixerJob("x", preset="paper")
+    with pytest.raises(ConfigError, match="given all inputs"):
+        FixerJob("x", preset="paper", start="sd-turbo", inputs="render")
     with pytest.raises(ConfigError, match="nothing to make pairs of"):
         train_pairs("x", None, 0)
     monkeypatch.setattr(

@@ -12,6 +12,7 @@ from flows.cli.main import app
 from flows.cli.output_paths import check_new_folder, check_output_file, check_output_folder
 from flows.cli.parsing import check_number, parse_duration, parse_numbers, parse_path
 from flows.pipeline.log_cache import expand_logs
+from genre_tasks.atomic_path import replace_folder
 from genre_tasks.errors import ConfigError, GenreError, InputError
 from genre_tasks.logs.registry import open_log
 
@@ -62,6 +63,31 @@ def test_a_folder_without_a_name_cannot_be_written_as_a_whole(
         assert "names no folder" in str(refusal(*words, "--out", name))
     assert "names no folder" in str(refusal("convert", STREET, f"genre:{name}"))
     check_new_folder(Path("new"), "--out")
+
+
+def test_a_link_and_a_mount_cannot_be_replaced_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    link = tmp_path / "link"
+    link.symlink_to(folder)
+    with pytest.raises(InputError, match=r"is a link, .*link/out"):
+        check_new_folder(link, "--out")
+    check_new_folder(link / "out", "--out")
+    monkeypatch.setattr("os.path.ismount", lambda path: Path(path) == folder)
+    with pytest.raises(InputError, match="where a file system is mounted"):
+        check_new_folder(folder, "--out")
+
+
+def test_what_appeared_meanwhile_is_not_replaced(tmp_path: Path) -> None:
+    complete, folder = tmp_path / "complete", tmp_path / "out"
+    for made in (complete, folder):
+        made.mkdir()
+        (made / "file").write_text(made.name)
+    with pytest.raises(ConfigError, match="filled meanwhile"):
+        replace_folder(folder, complete, held_files=False)
+    assert (folder / "file").read_text() == "out" and (complete / "file").is_file()
+    replace_folder(folder, complete, held_files=True)
+    assert (folder / "file").read_text() == "complete" and not complete.exists()
 
 
 def test_a_file_that_can_be_written_is_not_touched(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -333,12 +334,7 @@ def test_logs_of_several_datasets_make_no_table(monkeypatch: pytest.MonkeyPatch)
     both = ("synthetic:street?seed=1001", "synthetic:street?seed=1002")
     assert plan(4).dataset == "synthetic"
     assert len(TableRequest(4, both, chunks=(0,)).check().places) == 2
-
-    class Elsewhere:
-        def __init__(self, uri: str) -> None:
-            self.dataset = uri[-4:]
-
-    monkeypatch.setattr("flows.paper_tables.request.cached_log", Elsewhere)
+    monkeypatch.setattr("flows.paper_tables.request.cached_log", lambda uri: SimpleNamespace(dataset=uri[-4:]))
     with pytest.raises(ConfigError, match=r"several datasets \(1001, 1002\).*--into keeps a section for each"):
         TableRequest(4, both, chunks=(0,)).check()
 
@@ -361,6 +357,8 @@ def test_a_figure_has_a_row_for_each_method_and_the_truth(kind: Kind, labels: li
     assert picture.dtype == np.uint8 and picture.shape[1] > 64 * len(SHIFTS_M[kind])
     with pytest.raises(InputError, match="no source image of camera back at frame"):
         comparison_strips(kind, planned, run_stage, camera="back")
+    with pytest.raises(ConfigError, match="no image is fixed at 1, 2 m"):
+        comparison_strips("fixers", replace(request, settings=("novel_views.shifts_m=[3.0]",)).check(), run_stage)
 
 
 def test_the_flow_leaves_out_what_fails_and_says_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -146,3 +146,14 @@ def test_frames_between_chunks_that_do_not_follow_each_other_are_refused(tmp_pat
     file = write(tmp_path / "path.json", {"frame": [8, 9, 20], "lateral_m": [0, 0, 0], "ahead_m": [0, 0, 0]})
     with pytest.raises(InputError, match="frame 20 in row 2"):
         read_path_file(file, recorded)
+    # The same moments by their times.
+    file = write(tmp_path / "path.json", {"time_s": [0.8, 0.9, 2.0], "lateral_m": [0, 0, 0], "ahead_m": [0, 0, 0]})
+    with pytest.raises(InputError, match=r"time_s 2 in row 2 .* do not follow each other"):
+        read_path_file(file, recorded)
+
+
+def test_times_in_other_units_are_refused(tmp_path: Path) -> None:
+    nanoseconds = (1e8 * np.arange(20)).tolist()
+    columns = {"frame": list(range(20)), "time_s": nanoseconds, "lateral_m": [0] * 20, "ahead_m": [0] * 20}
+    with pytest.raises(InputError, match=r"time_s spans 1.9e\+09 s.*in seconds"):
+        read_path_file(write(tmp_path / "path.json", columns), RECORDED)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import re
 import shlex
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -19,6 +21,7 @@ from flows.paper_tables.layouts import SCENE_LAYOUTS
 from flows.paper_tables.measure import warm_up
 from flows.paper_tables.published_numbers import PAPER
 from flows.paper_tables.request import TableRequest
+from flows.pipeline.stage_runner import ArtifactRef, Job
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ConfigError, GenreError, InputError
 from tests.faults.small_run import LOG, SETTINGS
@@ -112,9 +115,16 @@ def test_passing_a_scene_on_is_predicted_to_cost_nothing(folder: Path, tmp_path:
 
 def test_the_warm_up_is_without_the_scene(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     warmed: list[PipelineConfig] = []
-    monkeypatch.setattr("flows.paper_tables.measure.run_on_tiny_log", lambda config, names: warmed.append(config))
+
+    def keep(names: Sequence[str], job: Job, runner: object) -> dict[str, ArtifactRef]:
+        warmed.append(PipelineConfig.model_validate(job.config))
+        return {}
+
+    monkeypatch.setattr("flows.experiments.warm_up.run_stages", keep)
     checked = make_request(folder, tmp_path / "store").check()
-    warm_up(checked.basis, checked.layout)
+    basis = replace(checked.basis, settings=(*checked.basis.settings, "ingest.cameras=[CAM_FRONT]"))
+    warm_up(basis, checked.layout)
+    assert warmed[0].ingest.cameras is None and warmed[0].ingest.placement == warmed[0].initial.placement
     preset = load_configuration("demo")
     # The tiny log's street is not where the scene is.
     assert warmed[0].initial.scene is None and warmed[0].initial.placement == preset.initial.placement

@@ -138,6 +138,9 @@ def test_the_page_of_table_6_has_the_papers_numbers_and_what_was_driven(tmp_path
     request = TableRequest(6, ("synthetic:street?seed=950&frames=40",), out=str(tmp_path))
     checked = request.check()
     assert [len(places) for places in checked.group_places()] == [2]
+    # A recorded path goes through the chunks in the order of the log.
+    turned = replace(request, chunks=(1, 0)).check().group_places()
+    assert [[where.chunk for where in places] for places in turned] == [[0, 1]]
     assert checked.config.evaluate.every == 2
 
     def cell(method: str, kernel: float) -> MeasuredCell:

@@ -11,6 +11,7 @@ from flows.configuration import load_configuration
 from flows.machine.resource_usage import measure_usage
 from flows.pipeline import stage_runner as room
 from flows.pipeline.definition import PIPELINE, STAGE_BY_NAME, stage_key
+from flows.pipeline.log_cache import cached_log
 from flows.pipeline.stage_runner import ArtifactRef, Job, compute_key, run_stage
 from genre_tasks.code_closure import import_closure
 from genre_tasks.config import EffectsConfig, EvaluateConfig, PipelineConfig
@@ -108,6 +109,14 @@ def test_the_key_follows_the_logs_content_and_the_chunk(store: Path) -> None:
     here, _ = compute_key(spec, job(store), {})
     other, _ = compute_key(spec, job(store, log=LOG.replace("seed=900", "seed=901")), {})
     assert here != other
+
+
+def test_the_key_follows_the_logs_name(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = STAGE_BY_NAME["ingest"]
+    here, _ = compute_key(spec, job(store), {})
+    monkeypatch.setattr(type(cached_log(LOG)), "name", "renamed")
+    # The name is in the payload, so that a renamed log's artifact is another one.
+    assert compute_key(spec, job(store), {})[0] != here
 
 
 def test_deleting_an_artifact_computes_it_again_and_nothing_else(store: Path) -> None:

@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -165,6 +166,19 @@ def test_a_checkpoint_of_another_training_is_refused(trained: Trained, tmp_path:
     (folder / "gnet/only/checkpoint.safetensors").write_bytes(b"no checkpoint")
     with pytest.raises(InputError, match="checkpoint cannot be read"):
         train_stage(job, TABLE[1])
+
+
+def test_a_stage_of_another_network_is_refused(trained: Trained) -> None:
+    with pytest.raises(ConfigError, match=r"enet/gnet is no stage of gnet .*genre train enet"):
+        train_network("gnet", str(trained[0]), "tiny", stage="enet/gnet")
+
+
+def test_scenes_of_a_real_log_follow_its_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    digests = iter("abab")
+    monkeypatch.setattr(training_scenes, "cached_log", lambda uri: SimpleNamespace(digest=lambda: next(digests)))
+    real, street = SceneRecipe("pandaset:002"), SceneRecipe("synthetic:street?seed=5")
+    assert real.key_fields() != real.key_fields() and real.image_key_fields() != real.image_key_fields()
+    assert real.seed_fields() == real.seed_fields() and "log" not in street.key_fields()
 
 
 def test_two_processes_do_not_train_one_stage(trained: Trained, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from genre_tasks.config import IngestConfig, RangeConfig
+from genre_tasks.errors import InputError
 from genre_tasks.fixer.inputs import build_inputs
 from genre_tasks.fixer.source_images import load_source_images
 from genre_tasks.fixer.view_surface import unproject_surface
@@ -102,6 +103,19 @@ def test_guards_do_not_depend_on_the_number_of_threads(
         with torch_threads(count):
             guards.append(compute_guards(chunk, novel, sources))
     assert guards[0] == guards[1]
+
+
+def test_the_range_looks_at_frames_that_have_images(chunk: Chunk) -> None:
+    config = RangeConfig(shifts_m=(2.0,), every=4, lidar_max_points=2000)
+    # The middle of the only interval, and of every camera half of the images.
+    for kept in (chunk.frames[:1], chunk.frames[::2]):
+        slow = replace(chunk, views=tuple(view for view in chunk.views if view.frame in kept))
+        found = {
+            n.views[0].frame for n, _ in measure_guards(config, slow, build_lidar_scene(chunk, 500), lambda *_: None)
+        }
+        assert found and found <= set(kept)
+    with pytest.raises(InputError, match="no image"):
+        list(measure_guards(config, replace(chunk, views=()), build_lidar_scene(chunk, 500), lambda *_: None))
 
 
 def test_the_range_renders_what_the_stage_renders(chunk: Chunk) -> None:

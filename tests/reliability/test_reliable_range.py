@@ -25,6 +25,7 @@ from flows.reconstruction.run_records import (
 )
 from flows.reconstruction.stored_values import find_last_stage, read_stage_value
 from genre_tasks.config import RangeConfig
+from genre_tasks.effects.types import EffectsPlan
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.fixer.source_images import load_source_images
 from genre_tasks.metrics.image_quality import psnr
@@ -200,6 +201,25 @@ def test_a_finished_run_is_rendered_beside_the_path(finished: FinishedRun, tmp_p
         )
         assert done.exit_code == 0 and "+1 m, chunk 0, after gnet" in done.output, done.output
     assert list(tmp_path.iterdir()) == [out] and out.stat().st_size > 1000
+
+
+def test_a_finished_run_is_rendered_from_refined_poses(
+    finished: FinishedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def move(chunk: Chunk, plan: EffectsPlan) -> Chunk:
+        poses = [view.chunk_SE3_camera.copy() for view in chunk.views]
+        for pose in poses:
+            pose[2, 3] += 1.0
+        views = zip(chunk.views, poses, strict=True)
+        return replace(chunk, views=tuple(replace(view, chunk_SE3_camera=pose) for view, pose in views))
+
+    pictures = []
+    for name in ("recorded.png", "refined.png"):
+        words = ["render", finished.name, "--store", finished.store, "--out", str(tmp_path / name)]
+        assert CliRunner().invoke(app, words).exit_code == 0
+        pictures.append((tmp_path / name).read_bytes())
+        monkeypatch.setattr("genre_tasks.effects.apply_plan.apply_plan", move)
+    assert pictures[0] != pictures[1]
 
 
 def test_a_record_says_what_a_budget_did(finished: FinishedRun) -> None:

@@ -87,6 +87,13 @@ def test_same_bytes_again(log: FakeLog, chunk: Chunk) -> None:
         assert np.array_equal(getattr(again.actors[0].points, name), getattr(chunk.actors[0].points, name))
 
 
+def test_a_camera_between_the_source_frames_is_named(log: FakeLog) -> None:
+    alternating = {("front" if frame % 2 else "left", frame) for frame in range(20)}
+    out = ingest(CONFIG, log.with_(missing_images=frozenset(alternating)), 0)
+    assert {view.camera for view in out.views_with_role("source")} == {"front"}
+    assert [issue.camera for issue in out.log_issues if issue.kind == "no_source_view"] == ["left"]
+
+
 def test_missing_and_unreadable_parts_are_marked(log: FakeLog) -> None:
     broken = log.with_(
         missing_images=frozenset({("front", 4)}),

@@ -15,6 +15,9 @@ from genre_tasks.errors import InputError
 SPLATTING = "KHR_gaussian_splatting"
 """The extension of primitives that are Gaussians, and the prefix of their attributes."""
 
+VISIBILITY = "KHR_node_visibility"
+"""The extension of nodes that are hidden with all that is below them."""
+
 EXTRAS_KEY = "genre"
 """Under this name ``extras`` hold what glTF has no place for."""
 
@@ -22,7 +25,7 @@ MOST_JSON_BYTES = 16 << 20
 """No longer JSON is parsed: values take many times their text in memory, and nodes and names need little."""
 
 # Required by files that are read all the same: what they add is either read here or does not concern Gaussians.
-_READABLE_EXTENSIONS = {SPLATTING, "KHR_mesh_quantization", "KHR_node_visibility", "KHR_materials_unlit"}
+_READABLE_EXTENSIONS = {SPLATTING, "KHR_mesh_quantization", VISIBILITY, "KHR_materials_unlit"}
 _REMEDY = "Export the file again, or check it with a glTF validator."
 
 _Item = TypeVar("_Item")
@@ -121,7 +124,14 @@ class Node(_Part):
     translation: Vector3 = [0.0, 0.0, 0.0]
     rotation: Vector4 = [0.0, 0.0, 0.0, 1.0]
     scale: Vector3 = [1.0, 1.0, 1.0]
+    extensions: dict[str, Any] = {}
     extras: Any = None
+
+    @property
+    def is_hidden(self) -> bool:
+        """Whether the node is not shown, and nothing below it."""
+        visibility = self.extensions.get(VISIBILITY)
+        return isinstance(visibility, dict) and visibility.get("visible") is False
 
 
 class Scene(_Part):

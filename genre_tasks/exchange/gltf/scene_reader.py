@@ -133,6 +133,9 @@ class SceneReader:
                 problem = f"node {index} of the file has several parents, or is below itself"
                 raise InputError(problem, remedy=_REMEDY, file=self._path)
             reached.add(index)
+            if node.is_hidden:
+                self._losses["Hidden nodes of the file are not read."] = None
+                continue
             moves = parent_moves or index in self._curves
             # Counted before they are made: many nodes at many moments are much more than their text.
             self._reader.charge(_MATRIX_BYTES * (len(self._times_s) if moves else 1))

@@ -14,8 +14,9 @@ from genre_tasks.exchange.usd.stage_scene import make_scene
 from genre_tasks.exchange.usd.stage_writer import write_stage
 from genre_tasks.temporary_names import temporary_folder
 
-_MOST_LAYER_BYTES = 2**32 - 2**20
-"""A package's members stay below 4 GiB."""
+# Python's zipfile writes Zip64 headers from here on, which OpenUSD does not read; a MiB is for what is no array.
+_MOST_LAYER_BYTES = int((2**31 - 1) / 1.05) - 2**20
+"""A package's member stays below 1.9 GiB."""
 
 _LAYER_NAME = "scene"
 
@@ -52,19 +53,16 @@ class UsdFormat:
         """
         for node in scene.nodes:
             check_finite_cloud(path, node.cloud)
-        size = sum(len(node.cloud) * (11 + 3 + node.cloud.sh_rest[:1].size) * 4 for node in scene.nodes)
-        if size > _MOST_LAYER_BYTES:
-            raise InputError(
-                f"the scene has about {size / 2**30:.1f} GiB, and a USDZ package takes less than 4",
-                remedy="Export fewer Gaussians, or one node at a time.",
-                file=path,
-            )
         suffix = path.suffix.lower()
+        if suffix == ".usdz":
+            # Before minutes of writing; the layer itself is judged as well.
+            _check_size(sum(len(node.cloud) * (11 + 3 + node.cloud.sh_rest[:1].size) * 4 for node in scene.nodes), path)
         # Beside the target: moving it there must not copy it to another disk.
         with temporary_folder(path.parent) as folder:
             layer = folder / f"{_LAYER_NAME}{'.usdc' if suffix == '.usdz' else suffix}"
             write_stage(layer, scene, path)
             if suffix == ".usdz":
+                _check_size(layer.stat().st_size, path)
                 write_package(path, layer)
             else:
                 layer.replace(path)
@@ -81,6 +79,15 @@ class UsdFormat:
 
 
 USDZ = UsdFormat()
+
+
+def _check_size(size: int, path: Path) -> None:
+    if size > _MOST_LAYER_BYTES:
+        raise InputError(
+            f"the scene has about {size / 2**30:.1f} GiB, and a USDZ package takes less than 1.9",
+            remedy="Export fewer Gaussians, one node at a time, or a .usdc layer.",
+            file=path,
+        )
 
 
 def _copy_layers(path: Path, folder: Path) -> Path:

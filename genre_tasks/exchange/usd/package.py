@@ -30,7 +30,7 @@ def write_package(path: Path, layer: Path) -> None:
 
     Args:
         path: the package; an existing one is replaced.
-        layer: the layer's file, below 4 GiB.
+        layer: the layer's file, below 1.9 GiB: OpenUSD reads no Zip64.
 
     Raises:
         OSError: a file cannot be read or written.

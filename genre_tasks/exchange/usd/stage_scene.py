@@ -41,15 +41,22 @@ def make_scene(stage: Mapping[str, Any], arrays: Mapping[str, Any], file: Path) 
     scene_from_stage = _find_axes(stage, file)
     nodes = []
     taken: set[str] = set()
+    hidden = 0
     for k, field in enumerate(stage["fields"]):
         prefix = f"{k}/"
         mine = {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
+        if not field["moves"] and not mine[names.SHOWN].any():
+            hidden += 1
+            continue
         node = _make_node(field, mine, scene_from_stage, file)
         check_finite_cloud(file, node.cloud)
         nodes.append(replace(node, name=_choose_name(node.name, taken)))
     if not stage["scene"] and not any(node.motion for node in nodes):
         scene = replace(scene, times_s=np.zeros(0))
-    return replace(scene, nodes=tuple(nodes), losses=(*scene.losses, *stage["losses"]))
+    losses = [*scene.losses, *stage["losses"]]
+    if hidden:
+        losses.append(f"Invisible are {hidden} fields of Gaussians, which are not read.")
+    return replace(scene, nodes=tuple(nodes), losses=tuple(losses))
 
 
 def _make_moments(stage: Mapping[str, Any], file: Path) -> ExchangeScene:

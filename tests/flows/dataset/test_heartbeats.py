@@ -26,6 +26,7 @@ class FakeClient:
         return SimpleNamespace(name=name)
 
     def read_events(self, wanted: Any, limit: int) -> SimpleNamespace:
+        self.asked_since = wanted.occurred.since
         newest = sorted(self.events, key=lambda event: event.occurred, reverse=True)
         return SimpleNamespace(events=newest[:limit], total=len(newest))
 
@@ -111,6 +112,18 @@ def test_a_dead_parent_is_noticed_and_one_whose_heartbeats_were_lost_is_not(monk
     assert _silent_after([10.0, 160.0, 190.0, 220.0, 250.0, 280.0], [38.0, 68.0, 99.0, 128.0], monkeypatch) is None
     late_s = _silent_after([10.0], [60.0], monkeypatch)
     assert late_s is not None and late_s > 150.0
+
+
+def test_heartbeats_of_long_runs_are_counted_from_a_fixed_time() -> None:
+    client = FakeClient()
+    clock_s = [0.0]
+    watch = HeartbeatWatch(client, uuid4(), clock=lambda: clock_s[0])  # type: ignore[arg-type]
+    since = []
+    for clock_s[0] in (0.0, 60.0):
+        watch.is_silent()
+        since.append(client.asked_since)
+    # Of a window that moves on, one heartbeat would leave for each that comes.
+    assert since[0] == since[1]
 
 
 def test_a_parent_that_waits_for_its_worker_is_not_silent() -> None:

@@ -145,6 +145,14 @@ def test_a_detector_belongs_to_table_7(number: int, detector: str | None, words:
         TableRequest(number, (LOG,), detector=detector).check()
 
 
+def test_a_detector_without_road_users_is_refused_before_the_scenes(
+    detector: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(QuadrantDetector, "class_names", ("tree", "vehicle"))
+    with pytest.raises(InputError, match="knows no road users"):
+        make_request(tmp_path, detector).check()
+
+
 def test_a_rig_without_a_front_left_camera_is_refused(detector: str, tmp_path: Path) -> None:
     request = make_request(tmp_path, detector)
     with pytest.raises(ConfigError, match="no front-left camera"):
@@ -158,6 +166,19 @@ def test_a_rig_without_a_front_left_camera_is_refused(detector: str, tmp_path: P
 def test_mistakes_in_the_logs_of_table_8(train: tuple[str, ...], test: tuple[str, ...], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         DetectorRequest(train, test, preset="demo", settings=SETTINGS).check()
+
+
+def test_the_same_log_spelled_differently_is_no_other_log() -> None:
+    scheme, _, parameters = LOG.partition("?")
+    turned = f"{scheme}?{'&'.join(reversed(parameters.split('&')))}"
+    with pytest.raises(ConfigError, match="among the logs to train on and to test on"):
+        DetectorRequest((LOG,), (turned,), preset="demo", settings=SETTINGS).check()
+
+
+@pytest.mark.parametrize("steps", [0, -5, 2_000_000])
+def test_a_number_of_steps_out_of_range_is_refused(steps: int) -> None:
+    with pytest.raises(ConfigError, match=f"a training of {steps} steps"):
+        DetectorRequest((LOG,), (OTHER,), preset="demo", settings=SETTINGS, steps=steps).check()
 
 
 def test_options_of_table_8_are_refused_elsewhere() -> None:

@@ -160,6 +160,9 @@ def test_mistakes_are_named(env: GenreDrivingEnv, served: tuple[str, str]) -> No
         env.reset(options={"index": 11})
     with pytest.raises(InputError, match="nan m beside"):
         env.reset(options={"lateral_m": float("nan")})
+    for start in (StartRange(5, 2), StartRange(0, 0, -1.0)):
+        with pytest.raises(ConfigError, match="no place lies in"):
+            GenreDrivingEnv(*served, start=start, reliable_m=1.0)
     with pytest.raises(ConfigError, match="human"):
         GenreDrivingEnv(*served, render_mode="human")
     with pytest.raises(InputError, match="Did you mean 'front_camera'"):
