@@ -20,6 +20,9 @@ keeps its states."""
 SAFETY_MARGIN = 0.06
 """Safety margin, as a fraction of the predicted time."""
 
+KEPT_MARGIN = 0.03
+"""The same for a setting that was chosen before: its points are made, and without ENet most of its time would be left."""
+
 CALIBRATION_WEIGHT_S = 5.0
 """Seconds of stages that count as much as the calibration when the pace is estimated."""
 
@@ -123,7 +126,7 @@ class Chooser:
         reachable = [candidate for candidate in self._candidates if self._is_reachable(candidate)]
         # Most accurate first; of equally accurate settings the faster one.
         ranked = sorted(reachable, key=lambda c: (-c.point.accuracy, self.predict_s(c.point)))
-        chosen = next((c for c in ranked if self.predict_s(c.point) <= left_s), None)
+        chosen = next((c for c in ranked if self._fits(c, left_s)), None)
         why = self._explain(ranked, chosen)
         if chosen is None:
             # The time is too short for any setting: the one that exceeds it least is the best answer there is.
@@ -200,6 +203,11 @@ class Chooser:
         """
         table_s = sum(self._stage_s(point, stage) for stage in self._remaining(point))
         return (1 + SAFETY_MARGIN) * self._pace * table_s
+
+    def _fits(self, candidate: _Candidate, left_s: float) -> bool:
+        is_kept = self._current is not None and candidate.point is self._current.point
+        margin = KEPT_MARGIN if is_kept else SAFETY_MARGIN
+        return self.predict_s(candidate.point) * (1 + margin) / (1 + SAFETY_MARGIN) <= left_s
 
     def _stage_s(self, point: CostPoint, stage: str) -> float:
         """Seconds of a stage of this chunk on the table's machine."""

@@ -98,6 +98,19 @@ def test_the_most_accurate_that_fits_is_chosen_and_says_why() -> None:
     assert "the best accuracy that fits; long would take" in str(choice)
 
 
+def test_a_setting_that_was_chosen_is_kept_with_half_of_the_margin() -> None:
+    clock = Frozen(45.0)
+    by = chooser(clock)
+    by.next_stage()
+    without_margin_s = by.choices[0].predicted_s / 1.06
+    clock.now = 45.0 - 1.04 * without_margin_s
+    by.next_stage()
+    assert [choice.point for choice in by.choices] == ["short"]
+    clock.now = 45.0 - 1.02 * without_margin_s
+    by.next_stage()
+    assert [choice.point for choice in by.choices] == ["short", "alone"]
+
+
 def test_a_slower_machine_gets_a_shorter_setting() -> None:
     fast, slow = chooser(Frozen(60.0), 1.0), chooser(Frozen(60.0), 1.8)
     assert [by.next_stage() and by.choices[0].point for by in (fast, slow)] == ["long", "alone"]
