@@ -21,7 +21,7 @@ SAFETY_MARGIN = 0.06
 """Safety margin, as a fraction of the predicted time."""
 
 KEPT_MARGIN = 0.03
-"""The same for a setting that was chosen before: its points are made, and without ENet most of its time would be left."""
+"""The same for a setting that was chosen before: without ENet most of its time would be left."""
 
 CALIBRATION_WEIGHT_S = 5.0
 """Seconds of stages that count as much as the calibration when the pace is estimated."""

@@ -107,10 +107,8 @@ def compute_key(spec: StageSpec, job: Job, inputs: Mapping[str, ArtifactRef]) ->
     digests = {name: inputs[name].payload_digest for name in spec.inputs}
     if spec.needs_log:
         log = cached_log(job.log)
-        # The digest is of the log's content, so a log that was moved keeps its keys. Its names are in the payload.
-        digests["log"] = log.digest()
-        digests["name"] = f"{log.dataset}/{log.name}"
-        digests["chunk"] = str(job.chunk)
+        # By the log's content, so that one that was moved keeps its keys; and by its names, which the payload has.
+        digests |= {"log": log.digest(), "name": f"{log.dataset}/{log.name}", "chunk": str(job.chunk)}
     weights = digest_stage_weights(spec, config)
     return stage_key(spec, config, digests, weights, reading_modules(spec, job)), weights
 

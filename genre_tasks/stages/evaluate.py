@@ -74,11 +74,7 @@ def evaluate_scene(
     chunk = apply_plan(chunk, plan)
     scene = reconstruction.scene
     heldout = chunk.views_with_role("heldout")
-    # Cameras may be slower than frames, or images be lost.
-    frames = sorted({view.frame for view in chunk.views})[:: config.every]
-    views_at_shift = {
-        shift: place_novel_views(chunk, (shift, -shift), frames) for shift in _measurable_shifts(config, truth)
-    }
+    views_at_shift = {shift: _place_shifted_views(config, chunk, shift) for shift in _measurable_shifts(config, truth)}
     # The final scene is a point of the curve even where no snapshot was taken.
     scenes = dict(reconstruction.snapshots) | {_final_iteration(reconstruction): scene}
     curve_views = [heldout[i] for i in _spread_evenly(len(heldout), CURVE_VIEWS)]
@@ -176,6 +172,12 @@ def _new_collector(config: EvaluateConfig, stage: str, prefix: str = "", recorde
         inception=None if config.inception is None else load_inception(config.inception),
         lpips=None if config.lpips is None else load_lpips(config.lpips),
     )
+
+
+def _place_shifted_views(config: EvaluateConfig, chunk: Chunk, shift_m: float) -> tuple[NovelView, ...]:
+    # Of frames that have images: cameras may be slower than frames, and images be lost.
+    frames = sorted({view.frame for view in chunk.views})[:: config.every]
+    return place_novel_views(chunk, (shift_m, -shift_m), frames)
 
 
 def _measurable_shifts(config: EvaluateConfig, truth: Truth | None) -> list[float]:

@@ -42,7 +42,7 @@ def test_invisible_fields_are_a_loss(tmp_path: Path) -> None:
     path = tmp_path / "foreign.usda"
     make_layer(path)
     stage = Usd.Stage.Open(str(path))
-    UsdGeom.Imageable(stage.GetPrimAtPath("/World")).MakeInvisible()
+    UsdGeom.Imageable(stage.GetPrimAtPath("/World/splat")).MakeInvisible()
     stage.Save()
     scene = USDZ.read(path)
     assert scene.nodes == () and "Invisible are 1 fields of Gaussians, which are not read." in scene.losses

@@ -8,6 +8,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pyarrow.parquet as pq
 import pytest
@@ -121,6 +122,7 @@ def test_the_warm_up_is_without_the_scene(folder: Path, tmp_path: Path, monkeypa
         return {}
 
     monkeypatch.setattr("flows.experiments.warm_up.run_stages", keep)
+    monkeypatch.setattr("flows.experiments.warm_up.read_stage_costs", lambda job, refs: SimpleNamespace(seconds={}))
     checked = make_request(folder, tmp_path / "store").check()
     basis = replace(checked.basis, settings=(*checked.basis.settings, "ingest.cameras=[CAM_FRONT]"))
     warm_up(basis, checked.layout)

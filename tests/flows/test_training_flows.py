@@ -169,7 +169,7 @@ def test_a_checkpoint_of_another_training_is_refused(trained: Trained, tmp_path:
 
 
 def test_a_stage_of_another_network_is_refused(trained: Trained) -> None:
-    with pytest.raises(ConfigError, match=r"enet/gnet is no stage of gnet .*genre train enet"):
+    with pytest.raises(ConfigError, match=r"enet/gnet is no stage of gnet\. .*genre train enet"):
         train_network("gnet", str(trained[0]), "tiny", stage="enet/gnet")
 
 
