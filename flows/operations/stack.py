@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import signal
 import time
@@ -108,7 +109,8 @@ class Stack:
         file = self.folder / "env"
         handle = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
         with os.fdopen(handle, "w") as stream:
-            stream.writelines(f"export {name}='{value}'\n" for name, value in env.items())
+            # Quoted for a shell: a state folder may have an apostrophe in its name.
+            stream.writelines(f"export {name}={shlex.quote(value)}\n" for name, value in env.items())
 
 
 def stop_stack(folder: Path, delete: bool = False) -> list[str]:

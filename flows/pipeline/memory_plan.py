@@ -211,6 +211,25 @@ def predict_memory(stage: str, size: ChunkSize, config: PipelineConfig, threads:
     return StageMemory(_PROCESS_MIB + terms.base_mib + working / 2**20, images / 2**20, reuse)
 
 
+def choose_threads(stage: str, size: ChunkSize, config: PipelineConfig, threads: int) -> int:
+    """Chooses how many threads a stage works with: under a limit as many as fit, since each holds images of its own.
+
+    Args:
+        stage: the stage's name.
+        size: of its chunk.
+        config: with the limit.
+        threads: that there are.
+
+    Returns:
+        From 1 to ``threads``; the stage's result does not depend on it.
+    """
+    if config.limits.memory_gib is None:
+        return threads
+    limit_mib = config.limits.memory_gib * 1024
+    fewer = range(threads, 1, -1)
+    return next((n for n in fewer if predict_memory(stage, size, config, n).working_mib <= limit_mib), 1)
+
+
 def keeps_freed_memory(config: PipelineConfig) -> bool:
     """Decides whether freed memory may stay with the process, which is faster.
 

@@ -9,7 +9,14 @@ from typing import Any
 from flows.machine.facts import count_cores
 from flows.pipeline.definition import PIPELINE, RECONSTRUCTION_STAGES, StageSpec, stages_until
 from flows.pipeline.log_cache import cached_log, select_chunks
-from flows.pipeline.memory_plan import ChunkSize, estimate_chunk_size, grow_until, needs_disk, predict_memory
+from flows.pipeline.memory_plan import (
+    ChunkSize,
+    choose_threads,
+    estimate_chunk_size,
+    grow_until,
+    needs_disk,
+    predict_memory,
+)
 from flows.pipeline.stage_runner import ArtifactRef, Job, find_artifact
 from genre_tasks.config import PipelineConfig
 from genre_tasks.logs.log_selection import select_cameras
@@ -128,7 +135,8 @@ def _predict_stage(
         else:
             cache = "corrupt" if note else "miss"
     seconds = measured[spec.name] if spec.name in measured else _typical_seconds(spec.name, config)
-    memory = predict_memory(spec.name, grow_until(spec.name, size, config), config, count_cores())
+    grown = grow_until(spec.name, size, config)
+    memory = predict_memory(spec.name, grown, config, choose_threads(spec.name, grown, config, count_cores()))
     on_disk = needs_disk(spec.name, memory, config)
     return {
         "chunk": job.chunk,

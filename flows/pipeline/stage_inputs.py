@@ -12,6 +12,7 @@ from flows.pipeline.definition import StageSpec
 from flows.pipeline.log_cache import cached_log
 from flows.pipeline.memory_plan import (
     StageMemory,
+    choose_threads,
     estimate_chunk_size,
     keeps_freed_memory,
     measure_chunk_size,
@@ -71,7 +72,7 @@ def open_inputs(
     if not spec.name.startswith("evaluate/"):
         # Only an evaluation looks at the scenes on the way, which together are larger than the last one.
         values = {name: _drop_snapshots(value) for name, value in values.items()}
-    memory = _predict(spec, log, config, values)
+    memory, threads = _predict(spec, log, config, values)
     on_disk = needs_disk(spec.name, memory, config) or is_retry
     # With freed memory that stays, images on disk alone save too little.
     if keeps_freed_memory(config) and not on_disk:
@@ -80,8 +81,9 @@ def open_inputs(
         return_freed_memory()
     # Here and not above: it imports torch, which commands that only read records would wait seconds for.
     from genre_tasks.image_memory import hold_images_on_disk
+    from genre_tasks.threads import torch_threads
 
-    with hold_images_on_disk(store.scratch_folder if on_disk else None):
+    with torch_threads(threads), hold_images_on_disk(store.scratch_folder if on_disk else None):
         values |= {name: store.read(artifacts[name]) for name in spec.inputs if name in _IMAGE_STAGES}
         yield StageInputs(values, memory, on_disk)
 
@@ -90,10 +92,10 @@ def _drop_snapshots(value: Any) -> Any:
     return replace(value, snapshots={}) if hasattr(value, "snapshots") else value
 
 
-def _predict(spec: StageSpec, log: str, config: PipelineConfig, values: Mapping[str, Any]) -> StageMemory:
+def _predict(spec: StageSpec, log: str, config: PipelineConfig, values: Mapping[str, Any]) -> tuple[StageMemory, int]:
+    """The stage's memory, and the threads with which it takes no more."""
     import torch
 
-    threads = torch.get_num_threads()
     # ``ingest`` itself has no chunk yet, but the log says how large one will be.
     if "ingest" not in values:
         from genre_tasks.logs.log_selection import select_cameras
@@ -105,4 +107,5 @@ def _predict(spec: StageSpec, log: str, config: PipelineConfig, values: Mapping[
         scenes = [len(value.scene) for value in values.values() if hasattr(value, "scene")]
         start = config.initial.max_points + config.initial.distant_count
         size = measure_chunk_size(values["ingest"], config, max(scenes, default=start))
-    return predict_memory(spec.name, size, config, threads)
+    threads = choose_threads(spec.name, size, config, torch.get_num_threads())
+    return predict_memory(spec.name, size, config, threads), threads

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from flows.machine.facts import count_cores
 from flows.machine.memory import memory_limit_gib
-from flows.pipeline.memory_plan import ChunkSize, grow_until, needs_disk, predict_memory
+from flows.pipeline.memory_plan import ChunkSize, choose_threads, grow_until, needs_disk, predict_memory
 from flows.preflight.store_checks import free_space_mib
 from genre_tasks.config import PipelineConfig
 
@@ -89,7 +89,8 @@ def assess_memory(size: ChunkSize, config: PipelineConfig, stages: Iterable[str]
     """
     needed_mib = 0.0
     for stage in stages:
-        memory = predict_memory(stage, grow_until(stage, size, config), config, count_cores())
+        grown = grow_until(stage, size, config)
+        memory = predict_memory(stage, grown, config, choose_threads(stage, grown, config, count_cores()))
         needs_disk(stage, memory, config)
         needed_mib = max(needed_mib, memory.with_images_on_disk_mib)
     limit_gib = memory_limit_gib()

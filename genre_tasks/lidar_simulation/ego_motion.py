@@ -13,7 +13,7 @@ def interpolate_poses(poses: Float64, moments: Float64, asked: Float64) -> Float
 
     Args:
         poses: [F, 4, 4], at least one.
-        moments: [F] rising, of the poses: seconds, or log frames.
+        moments: [F] of the poses: seconds, or log frames; poses whose moment does not rise are left out.
         asked: [N] moments; outside of those of the poses, the motion at that end goes on.
 
     Returns:
@@ -22,9 +22,15 @@ def interpolate_poses(poses: Float64, moments: Float64, asked: Float64) -> Float
     >>> poses = compose_se3(np.stack([np.eye(3)] * 2), np.array([[0.0, 0, 0], [2.0, 0, 0]]))
     >>> interpolate_poses(poses, np.array([0.0, 1.0]), np.array([0.25, 1.5]))[:, 0, 3].tolist()
     [0.5, 3.0]
+    >>> poses = np.concatenate([poses, poses[1:]])
+    >>> interpolate_poses(poses, np.array([0.0, 1.0, 1.0]), np.array([0.25, 1.5]))[:, 0, 3].tolist()
+    [0.5, 3.0]
     """
     from scipy.spatial.transform import Rotation
 
+    # Clocks repeat: between two equal moments there is no motion to go on with.
+    rises = moments > np.r_[-np.inf, np.maximum.accumulate(moments)[:-1]]
+    poses, moments = poses[rises], moments[rises]
     if len(poses) == 1:
         return np.repeat(poses, len(asked), axis=0)
     last = np.clip(np.searchsorted(moments, asked, side="right"), 1, len(moments) - 1)

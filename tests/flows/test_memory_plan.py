@@ -15,12 +15,14 @@ from flows.pipeline.definition import PIPELINE, STAGE_BY_NAME
 from flows.pipeline.memory_plan import (
     ChunkSize,
     StageMemory,
+    choose_threads,
     grow_until,
     needs_disk,
     predict_memory,
     shrink_batch,
 )
 from flows.pipeline.stage_runner import Job, run_stage
+from flows.preflight import machine_checks
 from genre_tasks import image_memory
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ResourceError
@@ -96,6 +98,21 @@ def test_gaussians_are_split_before_later_stages() -> None:
     config = load_configuration("hd", settings=["gnet.refine.split_fraction=0.3", "enet.split_fraction=0.5"])
     counts = {name: grow_until(name, HD, config).gaussians for name in ("gnet", "enet", "evaluate/enet")}
     assert counts == {"gnet": 310_000, "enet": 403_000, "evaluate/enet": 604_500}
+
+
+def test_a_stage_works_with_as_many_threads_as_fit() -> None:
+    size = replace(HD, gaussians=600_000)
+    chosen = {gib: choose_threads("evaluate/enet", size, limited(gib), 16) for gib in (1.0, 3.725, 5.0, 100.0, None)}
+    assert chosen[1.0] == 1 < chosen[3.725] < chosen[5.0] < chosen[100.0] == chosen[None] == 16
+    for gib in (3.725, 5.0):
+        fits = [predict_memory("evaluate/enet", size, limited(gib), chosen[gib] + more).working_mib for more in (0, 1)]
+        assert fits[0] <= 1024 * gib < fits[1]
+
+
+def test_many_cores_do_not_pass_a_limit_that_two_keep(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machine_checks, "count_cores", lambda: 64)
+    names = [spec.name for spec in PIPELINE]
+    assert machine_checks.assess_memory(HD, limited(4e9 / 2**30), names) is None
 
 
 def test_a_batch_is_halved_for_each_attempt_that_ran_out_of_memory() -> None:
