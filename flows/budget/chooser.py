@@ -21,7 +21,7 @@ SAFETY_MARGIN = 0.06
 """Safety margin, as a fraction of the predicted time."""
 
 KEPT_MARGIN = 0.03
-"""The same for a setting that was chosen before: without ENet most of its time would be left."""
+"""The same for the setting that was chosen last: a little delay is no reason to leave out its ENet."""
 
 CALIBRATION_WEIGHT_S = 5.0
 """Seconds of stages that count as much as the calibration when the pace is estimated."""
@@ -192,22 +192,22 @@ class Chooser:
         record = self.as_record()
         return f"within a budget: {', '.join(record['settings']) or 'as configured'}; ends at {record['end']}"
 
-    def predict_s(self, point: CostPoint) -> float:
-        """Predicts the seconds of the stages that remain with a setting, with the safety margin.
+    def predict_s(self, point: CostPoint, margin: float = SAFETY_MARGIN) -> float:
+        """Predicts the seconds of the stages that remain with a setting, with a margin.
 
         Args:
             point: the setting.
+            margin: fraction of the predicted time that is added.
 
         Returns:
             Seconds on this machine; 0 when all stages are finished.
         """
         table_s = sum(self._stage_s(point, stage) for stage in self._remaining(point))
-        return (1 + SAFETY_MARGIN) * self._pace * table_s
+        return (1 + margin) * self._pace * table_s
 
     def _fits(self, candidate: _Candidate, left_s: float) -> bool:
         is_kept = self._current is not None and candidate.point is self._current.point
-        margin = KEPT_MARGIN if is_kept else SAFETY_MARGIN
-        return self.predict_s(candidate.point) * (1 + margin) / (1 + SAFETY_MARGIN) <= left_s
+        return self.predict_s(candidate.point, KEPT_MARGIN if is_kept else SAFETY_MARGIN) <= left_s
 
     def _stage_s(self, point: CostPoint, stage: str) -> float:
         """Seconds of a stage of this chunk on the table's machine."""

@@ -40,8 +40,9 @@ def draw_sweep(summaries: Sequence[SettingSummary], novel_measure: Measure, titl
     from matplotlib.figure import Figure
 
     knobs = list(dict.fromkeys(x.knob for x in summaries if x.knob != PRESET_ITSELF))
-    columns = min(COLUMNS, max(1, len(knobs)))
-    rows = math.ceil(max(1, len(knobs)) / columns)
+    rows = math.ceil(max(1, len(knobs)) / COLUMNS)
+    # As many in each row, as far as they go: a last row of one panel would leave the others' space empty.
+    columns = math.ceil(max(1, len(knobs)) / rows)
     figure = Figure(figsize=(3.6 * columns, 5.0 * rows), dpi=100, layout="constrained")
     # A canvas of its own and not pyplot, whose global state would leak between threads and need a display.
     canvas = FigureCanvasAgg(figure)
@@ -79,11 +80,14 @@ def _draw_panel(axes: Axes, summaries: Sequence[SettingSummary], knob: str, meas
     axes.errorbar(
         seconds, values, errors, fmt="o", color="C0", markersize=4, linewidth=1, label="a setting, ± over seeds"
     )
+    axes.set_xlim(*_limits([*seconds, preset.seconds], LEAST_WIDTH_S))
     for x, y, summary in zip(seconds, values, turned, strict=True):
         if _is_labelled(summary, measure, preset_value):
-            axes.annotate(summary.value, (x, y), fontsize=7, xytext=(4, 3), textcoords="offset points")
+            # Towards the middle of the panel, as long names would leave it.
+            is_right = x > sum(axes.get_xlim()) / 2
+            place = {"xytext": (-4, 3), "ha": "right"} if is_right else {"xytext": (4, 3)}
+            axes.annotate(summary.value, (x, y), fontsize=7, textcoords="offset points", **place)
     axes.plot([preset.seconds], [preset_value], "*", color="black", markersize=11, label="preset")
-    axes.set_xlim(*_limits([*seconds, preset.seconds], LEAST_WIDTH_S))
     axes.set_ylim(*_limits([*values, preset_value], LEAST_HEIGHT * abs(preset_value)))
     # Up has to mean better in every panel, also for distances.
     if not measure.more_is_better:
