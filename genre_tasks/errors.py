@@ -102,5 +102,9 @@ class ResourceError(GenreError):
     """Memory, disk or a device does not suffice; retried with less at once where a stage can split its work."""
 
 
+class DiskFullError(ResourceError):
+    """A disk is full, or a quota or a limit of file sizes is reached; not retried, as a retry fills it once more."""
+
+
 class TransientIOError(GenreError):
     """A read or write failed in a way that may pass, such as a busy network store; retried after a pause."""

@@ -8,7 +8,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from genre_tasks.errors import ArtifactCorruptError, GenreError, InputError, ResourceError, TransientIOError
+from genre_tasks.errors import (
+    ArtifactCorruptError,
+    DiskFullError,
+    GenreError,
+    InputError,
+    ResourceError,
+    TransientIOError,
+)
 from storage.address import Address
 
 
@@ -23,12 +30,12 @@ class _Translation:
 
 
 # The class decides what a flow does: it repeats a TransientIOError after a pause, and a ResourceError with less memory
-# at a time. Everything else stops the run.
+# at a time, unless it is a DiskFullError. Everything else stops the run.
 _TRANSLATIONS = (
     _Translation(
         # No retry helps here, so the remedy says what is most feared: nothing is lost.
         frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG}),
-        ResourceError,
+        DiskFullError,
         "The disk is full, or a quota or file-size limit is reached ({name})",
         "Free space there or choose another place with --store; finished stages are kept, nothing is half-written.",
     ),
@@ -71,8 +78,9 @@ def as_genre_error(error: OSError, path: Path, address: Address | None = None) -
         address: the artifact that was read or written, if any.
 
     Returns:
-        ``ResourceError`` for a full disk, quota or file-size limit and for exhausted memory or descriptors;
-        ``TransientIOError`` for what may pass by itself; ``InputError`` for everything else, such as permissions.
+        ``DiskFullError`` for a full disk, quota or file-size limit; ``ResourceError`` for exhausted memory or
+        descriptors; ``TransientIOError`` for what may pass by itself; ``InputError`` for everything else, such as
+        permissions.
 
     >>> print(as_genre_error(PermissionError(13, "denied"), Path("store")))
     Not permitted (EACCES) (file store). Give this user read and write permission there, ...

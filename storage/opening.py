@@ -7,6 +7,7 @@ from pathlib import Path
 from urllib.parse import unquote, urlparse
 
 from genre_tasks.errors import ConfigError
+from genre_tasks.user_paths import expand_user_path
 from storage.local import LocalStore
 from storage.store import Store
 
@@ -26,6 +27,24 @@ def is_remote(uri: str) -> bool:
     (False, True)
     """
     return bool(_SCHEME.match(uri)) and not uri.lower().startswith("file://")
+
+
+def make_address_absolute(uri: str) -> str:
+    """Writes a store's path or URI so that it names the same store from every working folder.
+
+    Args:
+        uri: a path or URI.
+
+    Returns:
+        The path from the root, with ``~`` replaced; a URI as it is.
+
+    Raises:
+        InputError: ``~NAME`` names no user.
+
+    >>> make_address_absolute("s3://bucket/logs"), make_address_absolute("/data/store")
+    ('s3://bucket/logs', '/data/store')
+    """
+    return uri if _SCHEME.match(uri) else str(expand_user_path(uri).absolute())
 
 
 def open_store(uri: str) -> Store:

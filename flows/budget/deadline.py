@@ -21,14 +21,15 @@ class Deadline:
 
     def __init__(self, budget_s: float, start_time: float | None = None) -> None:
         self.budget_s = budget_s
-        # Wall time and not time.monotonic: the start may come from another clock, when the process was created.
-        self._start_time = time.time() if start_time is None else start_time
+        used_s = 0.0 if start_time is None else max(time.time() - start_time, 0.0)
+        # The wall clock is read once, as it jumps where it is corrected.
+        self._start_s = time.monotonic() - used_s
         self._paused_s = 0.0
 
     @property
     def used_s(self) -> float:
         """Seconds that the run has used so far."""
-        return time.time() - self._start_time - self._paused_s
+        return time.monotonic() - self._start_s - self._paused_s
 
     @property
     def left_s(self) -> float:
@@ -38,9 +39,9 @@ class Deadline:
     @contextmanager
     def paused(self) -> Iterator[None]:
         """Stops the count for a block that is not the run's own work, such as evaluation."""
-        pause_start = time.time()
+        pause_start_s = time.monotonic()
         try:
             yield
         finally:
             # Also after an error, so that the time left stays right for whoever handles it.
-            self._paused_s += time.time() - pause_start
+            self._paused_s += time.monotonic() - pause_start_s

@@ -82,3 +82,5 @@ def cost(
             out=str(out),
         )
     typer.echo(f"{done['cells']} cells, {len(done['failed'])} left out; wrote {', '.join(done['files'])}")
+    if done["failed"]:
+        raise typer.Exit(1)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flows.cli.options import JsonOption, LogsArgument, PresetOption, SettingsOption, StoreOption
-from flows.defaults import DEFAULT_PRESET, DEFAULT_STORE
+from flows.defaults import DEFAULT_ATTEMPTS, DEFAULT_IN_FLIGHT, DEFAULT_PRESET, DEFAULT_STORE
 
 if TYPE_CHECKING:
     from uuid import UUID
@@ -35,9 +35,9 @@ def dataset(
     logs: LogsArgument,
     pool: PoolOption = None,
     follow: FollowOption = False,
-    in_flight: InFlightOption = 8,
+    in_flight: InFlightOption = DEFAULT_IN_FLIGHT,
     unit: ByOption = "log",
-    attempts: AttemptsOption = 3,
+    attempts: AttemptsOption = DEFAULT_ATTEMPTS,
     gpu_limit: GpuLimitOption = None,
     preset: PresetOption = DEFAULT_PRESET,
     store: StoreOption = DEFAULT_STORE,
@@ -46,8 +46,9 @@ def dataset(
 ) -> None:
     """Reconstruct many driving logs, here or on many workers.
 
-    A log that fails does not stop the others. With --pool every log is a run on a worker of a Prefect work pool. A log
-    whose worker dies is submitted again. The same command run again goes on where the dataset was.
+    A log that fails does not stop the others. With --pool every log is a run on a worker of a Prefect work pool, to
+    which paths of logs and the store must mean the same as here. A log whose worker dies is submitted again. The same
+    command run again goes on where the dataset was.
 
     The record is written to STORE/datasets/DATASET/dataset.json.
 
@@ -62,14 +63,28 @@ def dataset(
     from flows.dataset.dataset_record import name_dataset
     from flows.pipeline.log_cache import expand_logs
     from genre_tasks.errors import ConfigError
+    from genre_tasks.logs.registry import make_log_absolute
+    from storage.opening import make_address_absolute
 
     if unit not in ("log", "chunk"):
         raise ConfigError(f"--by is '{unit}'", remedy="Give log or chunk.")
-    if follow and pool is None:
-        raise ConfigError("--follow is for a dataset on a pool", remedy="Give a --pool, too, or leave it out.")
+    for_a_pool = {
+        "--follow": follow,
+        "--in-flight": in_flight != DEFAULT_IN_FLIGHT,
+        "--by": unit != "log",
+        "--attempts": attempts != DEFAULT_ATTEMPTS,
+        "--gpu-limit": gpu_limit is not None,
+    }
+    for option, is_given in for_a_pool.items():
+        if is_given and pool is None:
+            raise ConfigError(f"{option} is for a dataset on a pool", remedy="Give a --pool, too, or leave it out.")
     # A mistake in a setting or a path shows here, before anything is submitted.
     load_configuration(preset, settings=settings or ())
     expanded = expand_logs(logs)
+    if pool is not None:
+        # A worker runs in a folder of its own, which is removed with all that a relative store has got there.
+        store = make_address_absolute(store)
+        expanded = [make_log_absolute(log) for log in expanded]
     name = name_dataset(expanded, preset, store, settings)
     facts = {"dataset": name, "preset": preset, "store": store}
     add_facts(**facts, logs=[])
@@ -100,14 +115,14 @@ def _run_here(parameters: Mapping[str, Any], facts: Mapping[str, Any], as_json: 
 
 def _submit(name: str, parameters: Mapping[str, Any], follow: bool, as_json: bool) -> UUID:
     from flows.cli.outcome import add_facts, print_outcome
-    from flows.prefect_api.connection import check_server_answers, read_api_url
+    from flows.prefect_api.connection import check_server, read_api_url
     from genre_tasks.errors import ConfigError
 
     url = read_api_url()
     if url is None:
         remedy = "Set PREFECT_API_URL to the address of its API, such as http://127.0.0.1:4200/api."
         raise ConfigError("a dataset on a pool needs a Prefect server, and none is named", remedy=remedy)
-    check_server_answers(url)
+    check_server(url)
     from flows.dataset.submission import submit_dataset
 
     submission = submit_dataset(name, parameters)

@@ -122,16 +122,17 @@ def deploy(
     \b
         genre ops deploy --store s3://bucket/store
     """
-    import os
-
     from flows.operations.deployments import deploy_flows
+    from flows.prefect_api.connection import check_server, read_api_url
     from genre_tasks.errors import ConfigError
+    from storage.opening import make_address_absolute
 
-    url = os.environ.get("PREFECT_API_URL")
-    if not url:
+    url = read_api_url()
+    if url is None:
         raise ConfigError("PREFECT_API_URL is not set", remedy="Set it to the address of the Prefect API.")
-    address = store if "://" in store else str(Path(store).absolute())
-    for name in deploy_flows(url, os.environ.get("PREFECT_API_AUTH_STRING"), pool, address, Path.cwd()):
+    address = make_address_absolute(store)
+    check_server(url)
+    for name in deploy_flows(url, None, pool, address, Path.cwd()):
         typer.echo(name)
 
 

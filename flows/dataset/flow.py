@@ -18,7 +18,7 @@ from flows.dataset.server_calls import call_server, read_last_outage
 from flows.dataset.submission import mark_as_parent
 from flows.dataset.supervisor import Supervisor, read_limits
 from flows.dataset.work_units import Unit, list_units
-from flows.defaults import DEFAULT_PRESET, DEFAULT_STORE
+from flows.defaults import DEFAULT_ATTEMPTS, DEFAULT_IN_FLIGHT, DEFAULT_PRESET, DEFAULT_STORE
 from flows.pipeline.log_cache import expand_logs
 from flows.pipeline.progress import get_reporter
 from flows.reconstruction.flow import reconstruct_log
@@ -36,9 +36,9 @@ def reconstruct_dataset(
     store: str = DEFAULT_STORE,
     settings: list[str] | None = None,
     pool: str | None = None,
-    in_flight: int = 8,
+    in_flight: int = DEFAULT_IN_FLIGHT,
     unit: Unit = "log",
-    attempts: int = 3,
+    attempts: int = DEFAULT_ATTEMPTS,
     gpu_limit: str | None = None,
 ) -> list[dict[str, Any]]:
     """Reconstructs many logs, each in a child flow run; a log that fails does not stop the others.

@@ -37,10 +37,12 @@ def select_log_chunks(logs: Sequence[str], chunks: list[int] | None, config: Pip
         config: its section ``ingest`` decides how long a chunk is.
 
     Returns:
-        The chunks in the order of ``logs``, then of ``chunks``.
+        The chunks in the order of ``logs``, then of ``chunks``, each once.
 
     Raises:
         InputError: a log does not have one of the chunks, or no folder matches a URI.
     """
     # Log by log, because the cache keeps few opened logs.
-    return [LogChunk(log, chunk) for log in expand_logs(list(logs)) for chunk in select_chunks(log, config, chunks)]
+    named = (LogChunk(log, chunk) for log in expand_logs(list(logs)) for chunk in select_chunks(log, config, chunks))
+    # A log that a star and a name both name would count twice in every mean.
+    return list(dict.fromkeys(named))

@@ -42,8 +42,7 @@ def connect_to_prefect() -> Iterator[None]:
     """
     url = read_api_url()
     if url is not None:
-        check_server_answers(url)
-        _check_client_is_accepted(url)
+        check_server(url)
         yield
         return
     home = _make_home()
@@ -84,15 +83,21 @@ def read_api_url() -> str | None:
     return url
 
 
-def check_server_answers(url: str) -> None:
-    """Asks a Prefect server for its health.
+def check_server(url: str) -> None:
+    """Asks the user's own Prefect server for its health, and whether it serves this client.
 
     Args:
         url: address of its API.
 
     Raises:
-        ConfigError: it does not answer; says where the address comes from and how to unset it.
+        ConfigError: it does not answer, or wants another password; says where the address comes from and how to
+            unset it.
     """
+    _check_server_answers(url)
+    _check_client_is_accepted(url)
+
+
+def _check_server_answers(url: str) -> None:
     for variable, reason in find_unusable_files().items():
         remedy = f"Correct or unset {variable}."
         raise ConfigError(f"{variable}={os.environ[variable]} cannot be used ({reason})", remedy=remedy)

@@ -57,7 +57,7 @@ def repair_artifacts(
             if isinstance(error, NewerSchemaError) or not isinstance(error, ArtifactCorruptError):
                 raise error
             addresses[name] = Address.parse(name)
-            store.discard(addresses[name])
+            _discard_if_damaged(store, addresses[name])
         except GenreError as reason:
             yield Repair(name, error.problem, "left", f"{reason.problem}. {reason.remedy}")
     failures: dict[str, str] = {}
@@ -78,6 +78,17 @@ def repair_artifacts(
         else:
             why = failures.get(name, _explain(address, records))
             yield Repair(name, damaged[name].problem, "removed", why)
+
+
+def _discard_if_damaged(store: Store, address: Address) -> None:
+    # A run may have computed it again since the store was read, which takes long.
+    with store.lease(address):
+        try:
+            artifact = store.find(address)
+            if artifact is not None:
+                store.verify(artifact)
+        except ArtifactCorruptError:
+            store.discard(address)
 
 
 def _explain(address: Address, records: list[dict[str, Any]]) -> str:

@@ -14,7 +14,7 @@ from flows.reconstruction.run_records import find_run_record, list_runs, name_ru
 from flows.upkeep.garbage import add_ancestors, list_sources, measure_bytes
 from flows.upkeep.pins import PINS, list_pins, list_run_keys
 from genre_tasks.atomic_path import atomic_path
-from genre_tasks.errors import InputError
+from genre_tasks.errors import ArtifactCorruptError, InputError
 from storage.io_errors import as_genre_error
 from storage.store import Artifact, Store
 
@@ -60,7 +60,7 @@ def copy_store(
     Raises:
         InputError: no run, or several, begin so; the target cannot be written; or an artifact of a run or a pin is gone
             or has a damaged manifest, which is said when all else is copied.
-        ArtifactCorruptError: an artifact of the source is damaged.
+        ArtifactCorruptError: artifacts of the source or the target are damaged, which is said when all else is copied.
         TransientIOError: a store does not answer.
     """
     artifacts = list(source.artifacts())
@@ -80,17 +80,25 @@ def copy_store(
         names = {name_run_folder(str(record["run"])) for record in found}
         names |= {f"{PINS}/{pin.name}" for pin in pins} | {name_run_folder(pin.name) for pin in pins}
         records = [name for name in records if name in names]
-    copied = _copy_artifacts(source, target, artifacts, report)
+    copied, _ = _copy_artifacts(source, target, artifacts, report)
     # After the artifacts: a record must not refer to what is not there yet.
     for name in records:
         _copy_record(source, target, name)
+    # Once more, since `genre gc` removes what no record refers to, and the records have come only now.
+    added, damaged = _copy_artifacts(source, target, artifacts, report)
+    copied |= added
+    if damaged:
+        first = next(iter(damaged.values()))
+        problem = f"{len(damaged)} artifacts are damaged, and all else is copied; the first: {first.problem}"
+        remedy = "Run `genre verify --repair` there, and copy again."
+        raise ArtifactCorruptError(problem, remedy=remedy, file=first.file) from first
     if gone := sorted(key for key in set(wanted) if key not in by_key):
         # All that is sound is copied first: whoever moves away from a failing disk needs that most.
         problem = (
             f"{len(gone)} artifacts of runs or pins are damaged or gone, such as {gone[0][:12]}; all else is copied"
         )
         raise InputError(problem, remedy="Run `genre verify --repair` there, and copy again.", file=source.uri)
-    return CopyResult(len(copied), len(artifacts) - len(copied), measure_bytes(copied), len(records))
+    return CopyResult(len(copied), len(artifacts) - len(copied), measure_bytes(copied.values()), len(records))
 
 
 def _find_with_recorded(records: Iterable[Mapping[str, Any]], source: Store) -> list[Mapping[str, Any]]:
@@ -108,17 +116,22 @@ def _find_with_recorded(records: Iterable[Mapping[str, Any]], source: Store) -> 
 
 def _copy_artifacts(
     source: Store, target: Store, artifacts: Sequence[Artifact], report: Callable[[int, int, int], None]
-) -> list[Artifact]:
-    copied: list[Artifact] = []
+) -> tuple[dict[str, Artifact], dict[str, ArtifactCorruptError]]:
+    """Copies what the target lacks, and goes on where an artifact is damaged; both by key."""
+    copied: dict[str, Artifact] = {}
+    damaged: dict[str, ArtifactCorruptError] = {}
     for done, artifact in enumerate(artifacts):
-        report(done, len(artifacts), measure_bytes(copied))
-        present = target.find(artifact.address)
-        # Payloads may differ between machines; then the target's artifact is as right as the source's.
-        if present is None:
-            target.adopt(artifact.manifest, source.fetch(artifact))
-            copied.append(artifact)
-    report(len(artifacts), len(artifacts), measure_bytes(copied))
-    return copied
+        report(done, len(artifacts), measure_bytes(copied.values()))
+        try:
+            present = target.find(artifact.address)
+            # Payloads may differ between machines; then the target's artifact is as right as the source's.
+            if present is None:
+                target.adopt(artifact.manifest, source.fetch(artifact))
+                copied[artifact.address.key] = artifact
+        except ArtifactCorruptError as error:
+            damaged[artifact.address.key] = error
+    report(len(artifacts), len(artifacts), measure_bytes(copied.values()))
+    return copied, damaged
 
 
 def _list_records(store: Store) -> list[str]:

@@ -145,6 +145,30 @@ def open_log(uri: str) -> DrivingLog:
     return log
 
 
+def make_log_absolute(uri: str) -> str:
+    """Writes a log's URI so that it names the same log from every working folder.
+
+    Args:
+        uri: ``reader:rest``.
+
+    Returns:
+        The URI with its path from the root and ``~`` replaced; as it is where the reader takes no path.
+
+    Raises:
+        InputError: ``~NAME`` names no user.
+
+    >>> make_log_absolute("synthetic:street?seed=1"), make_log_absolute("pandaset:/data/002")
+    ('synthetic:street?seed=1', 'pandaset:/data/002')
+    """
+    name, _, rest = uri.partition(":")
+    entry = _READERS.get(name)
+    # A reader that somebody registered may take anything, so its example decides.
+    if entry is None or not entry.example.startswith(f"{name}:PATH"):
+        return uri
+    path, mark, options = rest.partition("?")
+    return f"{name}:{expand_user_path(path).absolute()}{mark}{options}"
+
+
 def list_logs(uri: str) -> list[str] | None:
     """Lists the logs that a pattern stands for, where the logs of a reader are no folders.
 

@@ -10,7 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from genre_tasks.errors import ArtifactCorruptError, GenreError, InputError, ResourceError, TransientIOError
+from genre_tasks.errors import (
+    ArtifactCorruptError,
+    DiskFullError,
+    GenreError,
+    InputError,
+    ResourceError,
+    TransientIOError,
+)
 from storage.local import LocalStore
 from tests.contracts.store_suite import address
 from tests.storage.artifact_values import MAKERS, make
@@ -50,7 +57,7 @@ def test_a_full_disk_at_every_moment_of_a_commit(
                 store.commit(address(), kind, value)
                 assert uses[0] <= after
                 break
-            except ResourceError as error:
+            except DiskFullError as error:
                 assert "disk is full" in str(error) and "--store" in error.remedy and error.stage == "gnet"
                 assert str(tmp_path) in str(error.file)
         found = store.find(address())
@@ -66,8 +73,8 @@ def test_a_full_disk_at_every_moment_of_a_commit(
 @pytest.mark.parametrize(
     ("code", "kind"),
     [
-        (errno.EDQUOT, ResourceError),
-        (errno.EFBIG, ResourceError),
+        (errno.EDQUOT, DiskFullError),
+        (errno.EFBIG, DiskFullError),
         (errno.EMFILE, ResourceError),
         (errno.EIO, TransientIOError),
         (errno.EAGAIN, TransientIOError),
@@ -91,7 +98,7 @@ def test_each_error_of_the_system_has_its_kind(
 def test_a_full_disk_loses_nothing_that_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = LocalStore(tmp_path)
     one = store.commit(address(), "evaluation", make("evaluation"))
-    with monkeypatch.context() as patch, pytest.raises(ResourceError):
+    with monkeypatch.context() as patch, pytest.raises(DiskFullError):
         failing("write", 2, errno.ENOSPC, patch)
         store.commit(address("enet"), "evaluation", make("evaluation"))
     store.verify(one)

@@ -215,6 +215,14 @@ def test_the_clock_stands_still_while_it_is_paused() -> None:
     assert 3.9 < clock.used_s < 4.15 and clock.left_s == pytest.approx(6.0, abs=0.15)
 
 
+def test_a_corrected_wall_clock_does_not_change_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Deadline(300.0, time.time() - 20.0)
+    now = time.time
+    for jump_s in (3600.0, -3600.0):
+        monkeypatch.setattr(time, "time", lambda jump_s=jump_s: now() + jump_s)
+        assert clock.left_s == pytest.approx(280.0, abs=5.0)
+
+
 @pytest.mark.parametrize(("text", "value"), [("90", 90), ("90s", 90), ("1.5m", 90), ("2min", 120), ("1h", 3600)])
 def test_times_are_read(text: str, value: float) -> None:
     assert parse_duration(text, "--budget") == value and parse_duration(None, "--budget") is None

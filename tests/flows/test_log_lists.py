@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from flows.configuration import load_configuration
+from flows.experiments.log_chunks import LogChunk, select_log_chunks
 from flows.pipeline.log_cache import expand_logs
 from flows.pipeline.log_lists import expand_log_list
 from genre_tasks.errors import InputError
@@ -53,3 +55,9 @@ def test_a_list_that_is_too_long(tmp_path: Path) -> None:
     (tmp_path / "val.txt").write_bytes(b"x\n" * (1 << 22))
     with pytest.raises(InputError, match="more than"):
         expand_logs([f"pandaset:{tmp_path}/@val.txt"])
+
+
+def test_a_log_named_twice_counts_once() -> None:
+    log = "synthetic:street?seed=1"
+    chunks = select_log_chunks([log, log], [0], load_configuration("demo"))
+    assert chunks == [LogChunk(log, 0)]

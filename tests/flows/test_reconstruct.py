@@ -18,7 +18,7 @@ from flows.pipeline.log_cache import cached_log, expand_logs
 from flows.pipeline.stage_runner import Job
 from flows.reconstruction import flow, run_records, stored_values
 from flows.reconstruction.left_out import ChunksLeftOutError, LogsFailedError
-from genre_tasks.errors import ConfigError, InputError, ResourceError, TransientIOError
+from genre_tasks.errors import ConfigError, DiskFullError, InputError, ResourceError, TransientIOError
 from tests.faults.small_run import LOG, SETTINGS
 
 OTHER_LOG = LOG.replace("seed=900", "seed=902")
@@ -82,15 +82,16 @@ def test_what_a_retry_can_cure_is_retried(tmp_path: Path, monkeypatch: pytest.Mo
     assert attempts == [0, 0, 0, 1, 2]
 
 
-def test_what_no_retry_can_cure_is_not_retried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("kind", [ConfigError, DiskFullError])
+def test_what_no_retry_can_cure_is_not_retried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: type) -> None:
     calls: list[str] = []
 
     def failing(stage: str, *args: Any, **kwargs: Any) -> Any:
         calls.append(stage)
-        raise ConfigError("wrong", remedy="Mend it.")
+        raise kind("wrong", remedy="Mend it.")
 
     monkeypatch.setattr(stage_task, "run_stage", failing)
-    with pytest.raises(ConfigError, match="wrong"):
+    with pytest.raises(kind, match="wrong"):
         run(tmp_path)
     assert calls == ["ingest"]
 

@@ -8,15 +8,17 @@ import subprocess
 import sys
 import textwrap
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
+from prefect.settings import PREFECT_API_URL, temporary_settings
 
 from flows.cli.main import prepare_environment
 from flows.machine.state_folder import find_state_folder
-from flows.prefect_api.connection import check_server_answers, connect_to_prefect
+from flows.prefect_api.connection import check_server, connect_to_prefect
 from flows.prefect_api.network_variables import find_unusable_files
 from flows.prefect_api.server_thread import ServerThread
 from flows.prefect_api.settings_sources import check_settings_files, find_prefect_home, find_source
@@ -124,7 +126,7 @@ def test_a_server_that_is_not_there_is_named_with_its_source(tmp_path: Path, mon
     """Report: PrefectHQ/prefect#5837 (a traceback of a refused connection, and nothing says which address)."""
     monkeypatch.setenv("PREFECT_API_URL", NOBODY)
     with pytest.raises(ConfigError) as caught:
-        check_server_answers(NOBODY)
+        check_server(NOBODY)
     assert NOBODY in str(caught.value) and "unset PREFECT_API_URL" in str(caught.value)
     monkeypatch.delenv("PREFECT_API_URL")
     monkeypatch.setenv("PREFECT_HOME", str(tmp_path))
@@ -196,7 +198,19 @@ def test_nothing_is_started_beside_a_server_of_the_user(monkeypatch: pytest.Monk
 @pytest.mark.parametrize("status", [404, 500, 503])
 def test_a_server_of_something_else_is_no_prefect_server(status: int) -> None:
     """Report: none found; case 11 of the list of odd logs (an address at which another program answers)."""
+    refused = pytest.raises(ConfigError, match=f"no Prefect server answers at .* .HTTP status {status}")
+    with _server_that_answers(status) as url, refused:
+        check_server(url)
 
+
+def test_a_server_that_wants_another_password_is_a_mistake_of_the_user() -> None:
+    refused = pytest.raises(ConfigError, match=r"does not serve this client.*PREFECT_API_AUTH_STRING")
+    with _server_that_answers(401) as url, temporary_settings({PREFECT_API_URL: url}), refused:
+        check_server(url)
+
+
+@contextmanager
+def _server_that_answers(status: int) -> Iterator[str]:
     class Other(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             self.send_response(status)
@@ -207,15 +221,16 @@ def test_a_server_of_something_else_is_no_prefect_server(status: int) -> None:
 
     with ThreadingHTTPServer(("127.0.0.1", 0), Other) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        with pytest.raises(ConfigError, match=f"no Prefect server answers at .* .HTTP status {status}"):
-            check_server_answers(f"http://127.0.0.1:{server.server_port}/api")
-        server.shutdown()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}/api"
+        finally:
+            server.shutdown()
 
 
 @pytest.mark.parametrize("url", ["http://a b/api", "garbage", "http://127.0.0.1:99999/api", "http://127.0.0.1:x/api"])
 def test_an_address_that_is_none_is_one_error(url: str) -> None:
     with pytest.raises(ConfigError, match="no Prefect server answers"):
-        check_server_answers(url)
+        check_server(url)
 
 
 def test_a_users_server_that_refuses_this_client_is_one_error(tmp_path: Path) -> None:
@@ -230,7 +245,7 @@ def test_a_users_server_that_refuses_this_client_is_one_error(tmp_path: Path) ->
                 print("accepted")
             os.environ["PREFECT_API_URL"] += "/of/another/program"
             import flows.prefect_api.connection as connection
-            connection.check_server_answers = lambda url: None
+            connection._check_server_answers = lambda url: None
             connection._set_environment({"PREFECT_API_URL": os.environ["PREFECT_API_URL"]})
             with connect_to_prefect():
                 print("accepted")
@@ -250,7 +265,7 @@ def test_certificates_that_are_not_there_are_named_for_a_users_server(
     monkeypatch.setenv("SSLKEYLOGFILE", str(tmp_path / "missing" / "keys"))
     assert set(find_unusable_files()) == {"SSL_CERT_FILE", "SSLKEYLOGFILE"}
     with pytest.raises(ConfigError, match=r"SSL_CERT_FILE=.*ca\.pem cannot be used"):
-        check_server_answers(NOBODY)
+        check_server(NOBODY)
     monkeypatch.delenv("SSL_CERT_FILE")
     monkeypatch.setenv("SSLKEYLOGFILE", str(tmp_path / "keys"))
     assert find_unusable_files() == {}

@@ -18,6 +18,7 @@ from flows.pipeline.stage_runner import ArtifactRef, Job, run_stage
 from flows.reconstruction.run_records import FinishedRun, list_runs, summarise_run, write_run_record
 from flows.upkeep.garbage import find_garbage
 from flows.upkeep.pins import add_pin, list_pins, remove_pin
+from flows.upkeep.repair import repair_artifacts
 from flows.upkeep.store_copy import copy_store
 from flows.upkeep.what_if import find_recomputations
 from genre_tasks.errors import ArtifactCorruptError, ConfigError, GenreError, InputError
@@ -195,13 +196,37 @@ def test_a_file_that_cannot_be_read_hides_no_damage(store: LocalStore, genre: Ca
     assert "repaired: " in genre("verify", "--repair")[1]
 
 
-def test_damage_is_not_copied(store: LocalStore, tmp_path: Path) -> None:
+def test_damage_is_not_copied_and_all_else_is(store: LocalStore, tmp_path: Path) -> None:
     (gnet,) = store.artifacts(stage="gnet")
     next(gnet.path.glob("*.parquet")).write_bytes(b"else")
     target = LocalStore(tmp_path / "target")
-    with pytest.raises(ArtifactCorruptError, match="parquet"):
+    with pytest.raises(ArtifactCorruptError, match=r"1 artifacts are damaged, and all else is copied.*parquet"):
         copy_store(store, target)
-    assert target.find(gnet.address) is None and list_runs(target.uri) == []
+    assert target.find(gnet.address) is None
+    assert len(list(target.artifacts())) == len(PIPELINE) - 1 and len(list_runs(target.uri)) == 1
+
+
+def test_a_copy_puts_back_what_was_removed_before_the_records_came(store: LocalStore, tmp_path: Path) -> None:
+    target = LocalStore(tmp_path / "target")
+    removed = []
+
+    def remove_garbage(done: int, total: int, bytes_copied: int) -> None:
+        if done == total and not removed:
+            removed.extend(find_garbage(target, now=LATER).artifacts)
+            for artifact in removed:
+                target.discard(artifact)
+
+    copy_store(store, target, report=remove_garbage)
+    assert len(removed) == len(list(target.artifacts())) == len(PIPELINE)
+
+
+def test_a_repair_leaves_what_has_become_sound_meanwhile(store: LocalStore) -> None:
+    (gnet,) = store.artifacts(stage="gnet")
+    damage: dict[str, GenreError] = {str(gnet.address.relative_path): ArtifactCorruptError("was damaged", remedy="")}
+    again: list[object] = []
+    (repair,) = repair_artifacts(store, damage, again.append)
+    assert repair.outcome == "repaired" and again == []
+    store.verify(gnet)
 
 
 @pytest.mark.parametrize(
