@@ -17,10 +17,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from genre_tasks.process_start import read_start_ticks
+
 _OWNER = re.compile(r"(?P<machine>[0-9a-f]{8})-(?P<process>\d+)-(?P<started>\d+)")
 _FOLDER_PREFIX = "genre-"
-# Hundredths of a second: the start is counted from the machine's, which moves a little whenever its clock is set.
-_START_TOLERANCE = 200
 
 
 def describe_owner() -> str:
@@ -32,7 +32,7 @@ def describe_owner() -> str:
     >>> describe_owner() == describe_owner()
     True
     """
-    return f"{_machine()}-{os.getpid()}-{_start_of(os.getpid())}"
+    return f"{_machine()}-{os.getpid()}-{read_start_ticks(os.getpid())}"
 
 
 def is_abandoned(path: Path) -> bool:
@@ -54,9 +54,27 @@ def is_abandoned(path: Path) -> bool:
     with suppress(OSError):
         # A system may hide the processes of other users, which then seem to be gone.
         if path.lstat().st_uid == os.getuid():
-            # Numbers of processes are used again, so the start has to be the same too.
-            return abs(_start_of(int(owner["process"])) - int(owner["started"])) > _START_TOLERANCE
+            return not is_in_use(path)
     return False
+
+
+def is_in_use(path: Path) -> bool:
+    """Tells whether the process that a temporary file or folder belongs to is seen to run.
+
+    Args:
+        path: its name has :func:`describe_owner` in it.
+
+    Returns:
+        False also where it cannot be told: of another machine, or where the system hides the process.
+
+    >>> is_in_use(Path(f".tmp-{describe_owner()}")), is_in_use(Path("report.html"))
+    (True, False)
+    """
+    owner = _OWNER.search(path.name)
+    if owner is None or owner["machine"] != _machine():
+        return False
+    # Numbers of processes are used again, so the start has to be the same too.
+    return read_start_ticks(int(owner["process"])) == int(owner["started"])
 
 
 def remove_abandoned(folder: Path) -> int:
@@ -115,16 +133,3 @@ def _machine() -> str:
         with suppress(OSError):
             known.append(str(path.readlink()) if path.is_symlink() else path.read_text())
     return hashlib.sha256("\n".join(known).encode()).hexdigest()[:8]
-
-
-def _start_of(process: int) -> int:
-    """When a process started, in hundredths of a second; −1 for one that is not there or waits for its parent."""
-    import psutil
-
-    try:
-        found = psutil.Process(process)
-        if found.status() == psutil.STATUS_ZOMBIE:
-            return -1
-        return round(found.create_time() * 100)
-    except psutil.Error:
-        return -1

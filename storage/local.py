@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator
@@ -13,7 +14,7 @@ from typing import Any
 
 from genre_tasks.errors import ArtifactCorruptError, ConfigError, GenreError, InputError, TransientIOError
 from genre_tasks.progress import Progress, silent
-from genre_tasks.temporary_names import describe_owner, is_abandoned, remove_path
+from genre_tasks.temporary_names import describe_owner, is_abandoned, is_in_use, remove_path
 from genre_tasks.user_paths import expand_user_path
 from storage.address import Address
 from storage.artifact_folders import (
@@ -261,18 +262,20 @@ class LocalStore:
 
         Args:
             older_than_s: folders of other machines, whose processes cannot be asked for, go when nothing in them was
-                touched for so many seconds.
+                touched for so many seconds by the file system's clock.
             everywhere: makes no difference for a folder.
 
         Returns:
             How many files and folders were removed.
         """
         removed = 0
+        now = _read_file_system_clock(self.root)
         for folder, names, files in os.walk(self.root):
             for name in [name for name in (*names, *files) if name.startswith(".")]:
                 path = Path(folder) / name
                 is_temporary = name.startswith((TEMPORARY_PREFIX, TRASH_PREFIX))
-                is_old = is_temporary and time.time() - last_modified(path) >= older_than_s
+                # A process that was suspended for long goes on afterwards.
+                is_old = is_temporary and now - last_modified(path) >= older_than_s and not is_in_use(path)
                 # Removed from the walk too, which would otherwise enter a folder that is going away.
                 if is_temporary and name in names:
                     names.remove(name)
@@ -314,3 +317,13 @@ class LocalStore:
             return True
         except ArtifactCorruptError:
             return False
+
+
+def _read_file_system_clock(folder: Path) -> float:
+    """Reads the clock that stamps files there, which on a server may differ from this machine's."""
+    try:
+        with tempfile.TemporaryFile(dir=folder) as probe:
+            return os.fstat(probe.fileno()).st_mtime
+    except OSError:
+        # Where nothing can be written, nothing can be removed either.
+        return time.time()

@@ -19,6 +19,7 @@ from flows.cli.outcome import EXIT_CODES, Status, print_unfinished
 from flows.cli.signals import Interrupted
 from flows.error_record import as_one_line, record_error
 from flows.machine.state_folder import find_state_folder
+from genre_tasks.errors import ConfigError
 
 if TYPE_CHECKING:
     from genre_tasks.errors import GenreError
@@ -169,7 +170,7 @@ def _write_fault_log(text: str) -> str | None:
         folder.mkdir(exist_ok=True)
         with (folder / name).open("a", encoding="utf-8", errors="backslashreplace") as file:
             file.write(f"{facts}{text}\n")
-    except OSError:
+    except (OSError, ConfigError):
         return None
     return str(folder / name)
 

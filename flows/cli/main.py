@@ -161,13 +161,13 @@ def main() -> None:
     debug = "--debug" in sys.argv
     if debug:
         sys.argv.remove("--debug")
-    prepare_environment(debug)
     prepare_streams()
     command = typer.main.get_command(app)
     words = sys.argv[1:]
     start_outcome(as_json=wants_json(command, words))
 
     def invoke() -> None:
+        prepare_environment(debug)
         check_words(words)
         # Not by `app()`, which prints errors and chooses exit statuses by itself.
         with command.make_context("genre", words) as context:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import functools
+import math
 import os
 import platform
 import subprocess
 from importlib.metadata import version
 from pathlib import Path
+
+from flows.machine.cgroups import read_cgroup_files
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 """The folder that holds the packages: the checkout, where they run from one."""
@@ -34,14 +37,19 @@ def count_cores() -> int:
     """Counts the cores that this process may use, of which a container may have fewer than the machine.
 
     Returns:
-        At least 1.
+        At least 1: the smallest of the machine's cores, those that it is bound to, and the quotas of its cgroups.
 
     >>> count_cores() >= 1
     True
     """
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    # A quota is of microseconds of all cores in a period; a part of a core is still worth a thread.
+    quotas = [text.split() for text in read_cgroup_files("", "cpu.max")]
+    v1 = [read_cgroup_files("cpu", name) for name in ("cpu.cfs_quota_us", "cpu.cfs_period_us")]
+    quotas += [[quota, period] for quota, period in zip(*v1, strict=False)]
+    # The word "max", or -1, says that there is no quota.
+    granted = [math.ceil(int(quota) / int(period)) for quota, period in quotas if quota.isdigit()]
+    return max(min([cores, *granted]), 1)
 
 
 def describe_environment() -> dict[str, str]:

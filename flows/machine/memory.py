@@ -1,10 +1,8 @@
-"""How much memory this process may use: the smaller of the machine's and its cgroup's."""
+"""How much memory this process may use: the smaller of the machine's and its cgroups'."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
-_CGROUP_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
+from flows.machine.cgroups import read_cgroup_files
 
 
 def memory_limit_gib() -> float:
@@ -13,7 +11,8 @@ def memory_limit_gib() -> float:
     On Linux the kernel kills a process that uses more, so work is planned against this limit beforehand.
 
     Returns:
-        The smaller of the machine's memory and the limit of the process's cgroup (a container's limit).
+        The smallest of the machine's memory and the limits of the process's cgroup and of all above it, as containers
+        and batch systems set them.
 
     >>> memory_limit_gib() > 0
     True
@@ -21,10 +20,7 @@ def memory_limit_gib() -> float:
     import psutil
 
     limits = [float(psutil.virtual_memory().total)]
-    for path in _CGROUP_LIMITS:
-        try:
-            limits.append(float(path.read_text()))
-        except (OSError, ValueError):
-            # There is no cgroup here, or its file says "max": no limit.
-            continue
+    texts = [*read_cgroup_files("", "memory.max"), *read_cgroup_files("memory", "memory.limit_in_bytes")]
+    # The word "max" says that there is no limit.
+    limits += [float(text) for text in texts if text.isdigit()]
     return min(limits) / 2**30

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import os
+import stat
 import tempfile
 from contextlib import suppress
 from pathlib import Path
+
+from genre_tasks.errors import ConfigError
+
+_WRITABLE_BY_OTHERS = stat.S_IWGRP | stat.S_IWOTH
 
 
 def find_state_folder() -> Path:
@@ -20,6 +25,7 @@ def find_state_folder() -> Path:
 
     Raises:
         OSError: neither can be made.
+        ConfigError: the folder among the temporary files belongs to another user, or others may write to it.
     """
     for folder in _candidates():
         try:
@@ -31,6 +37,11 @@ def find_state_folder() -> Path:
     folder = Path(tempfile.gettempdir()).absolute() / f"genre-{os.getuid()}"
     # The folder of temporary files is everyone's: nobody else is to read a log's name in a database.
     folder.mkdir(mode=0o700, exist_ok=True)
+    found = folder.lstat()
+    # What others could have put there would be read as settings, and lines of it are given to shells.
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & _WRITABLE_BY_OTHERS:
+        problem = f"{folder} belongs to another user, or others may write to it"
+        raise ConfigError(problem, remedy="Set XDG_STATE_HOME to a folder of yours.", file=folder)
     return folder
 
 

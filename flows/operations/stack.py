@@ -19,7 +19,7 @@ from flows.operations.object_server import ObjectServer
 from flows.operations.postgres_server import PostgresServer
 from flows.operations.prefect_services import HEARTBEAT_SECONDS, PrefectServer, Worker
 from flows.operations.service import Service, kill_group, kill_tree
-from flows.operations.state_file import ServiceRecord, locked, read_records, read_start_ticks, write_records
+from flows.operations.state_file import ServiceRecord, locked, read_records, write_records
 from genre_tasks.errors import ConfigError
 
 _STOP_SECONDS = 40.0

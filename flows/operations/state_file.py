@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from genre_tasks.errors import ConfigError
+from genre_tasks.process_start import read_start_ticks
 
 
 @dataclass(frozen=True)
@@ -37,17 +38,6 @@ class ServiceRecord:
     def alive(self) -> bool:
         """Whether this very process still runs."""
         return read_start_ticks(self.pid) == self.start_ticks
-
-
-def read_start_ticks(pid: int) -> int | None:
-    """Returns when a process started, in clock ticks; ``None`` where it does not run or has ended unreaped."""
-    try:
-        text = Path(f"/proc/{pid}/stat").read_text()
-    except OSError:
-        return None
-    # The name in parentheses may hold spaces and parentheses.
-    fields = text.rpartition(")")[2].split()
-    return None if fields[0] in "ZX" else int(fields[19])
 
 
 def read_records(folder: Path) -> dict[str, ServiceRecord]:

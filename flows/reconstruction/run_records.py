@@ -68,7 +68,10 @@ class FinishedRun:
         """Twelve hex digits, the same for runs that made (or found) the same artifacts."""
         # Keys and no time: a run that finds everything in the cache has the same name and replaces its own record.
         keys = {f"{chunk}/{stage}": ref.key for chunk, refs in self.chunks.items() for stage, ref in refs.items()}
-        text = "\n".join([self.log, self.preset, *(f"{name}={key}" for name, key in sorted(keys.items()))])
+        made = [f"{name}={key}" for name, key in sorted(keys.items())]
+        # A run that was asked for all chunks and lacks some is not the run of those that it has.
+        lacking = [f"{chunk} is left out" for chunk in sorted(str(entry.get("chunk")) for entry in self.left_out)]
+        text = "\n".join([self.log, self.preset, *made, *lacking])
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
     @property

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
+import tempfile
 from pathlib import Path
 
+import pytest
 import torch
 
-from flows.machine.facts import describe_environment, describe_machine, git_commit
+from flows.machine import cgroups
+from flows.machine.facts import count_cores, describe_environment, describe_machine, git_commit
+from flows.machine.memory import memory_limit_gib
+from flows.machine.state_folder import find_state_folder
 from genre_tasks.compiled.loader import supported_instruction_sets
+from genre_tasks.errors import ConfigError
 from genre_tasks.threads import torch_threads
 
 
@@ -43,3 +50,50 @@ def test_commit_says_whether_the_tree_was_changed(tmp_path: Path) -> None:
     below = tmp_path / "below"
     below.mkdir()
     assert git_commit(below.resolve()) == "unknown"
+
+
+@pytest.mark.parametrize(
+    ("line", "files", "gib", "cores"),
+    [
+        # A job of a batch system: its limit is above the process's own cgroup and below the root.
+        ("0::/slurm/job_7/step", {"slurm/job_7/memory.max": "1073741824", "slurm/memory.max": "max"}, 1.0, None),
+        # A container that sees its cgroup as the root, while its path is the machine's.
+        ("0::/docker/x", {"memory.max": "536870912", "cpu.max": "50000 100000"}, 0.5, 1),
+        ("3:memory:/job\n2:cpu,cpuacct:/job", {"memory/job/memory.limit_in_bytes": "1073741824"}, 1.0, None),
+        ("2:cpu,cpuacct:/a", {"cpu/a/cpu.cfs_quota_us": "100000", "cpu/a/cpu.cfs_period_us": "100000"}, None, 1),
+        ("2:cpu,cpuacct:/a", {"cpu/a/cpu.cfs_quota_us": "-1", "cpu/a/cpu.cfs_period_us": "100000"}, None, None),
+    ],
+)
+def test_limits_of_the_processs_own_cgroup_count(
+    line: str,
+    files: dict[str, str],
+    gib: float | None,
+    cores: int | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(cgroups, "CGROUP_ROOT", tmp_path / "cgroup")
+    monkeypatch.setattr(cgroups, "OWN_CGROUPS", tmp_path / "own")
+    (tmp_path / "own").write_text("")
+    without = (memory_limit_gib(), count_cores())
+    (tmp_path / "own").write_text(line + "\n")
+    for name, text in files.items():
+        (tmp_path / "cgroup" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "cgroup" / name).write_text(text + "\n")
+    assert (memory_limit_gib(), count_cores()) == (gib or without[0], cores or without[1])
+
+
+def test_a_state_folder_of_somebody_else_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("XDG_STATE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", lambda: tmp_path / "file" / "home")
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    folder = find_state_folder()
+    assert folder == tmp_path / f"genre-{os.getuid()}" and folder.stat().st_mode & 0o777 == 0o700
+    folder.chmod(0o777)
+    with pytest.raises(ConfigError, match="XDG_STATE_HOME"):
+        find_state_folder()
+    folder.rmdir()
+    folder.symlink_to(tmp_path)
+    with pytest.raises(ConfigError, match="belongs to another user"):
+        find_state_folder()

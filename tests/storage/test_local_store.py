@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
+from genre_tasks.temporary_names import describe_owner
 from storage.local import LocalStore, Provenance
 from storage.manifest import MANIFEST, NewerSchemaError
 from storage.opening import open_local_store
@@ -136,6 +137,17 @@ def test_temporaries_of_killed_processes_are_cleaned_by_age(tmp_path: Path) -> N
     assert store.clean_temporaries(older_than_s=3600) == 2
     assert sorted(p.name for p in artifact.path.parent.iterdir()) == [".tmp-new", KEY]
     store.verify(artifact)
+
+
+def test_an_old_folder_of_a_living_process_stays(tmp_path: Path) -> None:
+    """A process that was suspended for hours goes on with what it was writing."""
+    store = LocalStore(tmp_path)
+    artifact = store.commit(address(), "evaluation", make("evaluation"))
+    living = artifact.path.parent / f".tmp-gnet-{describe_owner()}-1"
+    living.mkdir()
+    before = time.time() - 7200
+    os.utime(living, (before, before))
+    assert store.clean_temporaries(older_than_s=3600) == 0 and living.is_dir()
 
 
 def test_a_corrupt_one_that_another_writer_repaired_meanwhile_is_kept(
