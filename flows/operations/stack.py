@@ -21,6 +21,7 @@ from flows.operations.prefect_services import HEARTBEAT_SECONDS, PrefectServer, 
 from flows.operations.service import Service, kill_group, kill_tree
 from flows.operations.state_file import ServiceRecord, locked, read_records, write_records
 from genre_tasks.errors import ConfigError
+from genre_tasks.process_start import read_start_ticks
 
 _STOP_SECONDS = 40.0
 _DATA_FOLDERS = ("postgres", "server", "store-server", "workers", "store")
