@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from genre_tasks.scene.chunk import Chunk
     from genre_tasks.scene.graph import SceneGraph
 
-_FRAMES_PER_SECOND = 10
 _MAX_SHIFT_M = 1000.0
 """Farther beside the path no log has recorded anything."""
 
@@ -57,6 +56,7 @@ def render(
     from flows.cli.parsing import check_number
     from flows.reconstruction.stored_values import find_last_stage, read_stage_scene, read_stage_value
     from genre_tasks.effects.apply_plan import apply_plan
+    from genre_tasks.ego_paths.recorded_path import measure_frame_s
     from genre_tasks.errors import ConfigError, InputError
 
     # Checked first, because reading a scene takes seconds.
@@ -79,7 +79,7 @@ def render(
             f"the chunk has no camera '{camera}'", remedy=f"It has {', '.join(ingested.camera_names)}.", chunk=number
         )
     images = _render_views(planned, scene, camera, frames, shift)
-    _write_images(out, images)
+    _write_images(out, images, 1 / measure_frame_s([ingested]))
     count = "1 frame" if len(frames) == 1 else f"{len(frames)} frames"
     typer.echo(f"wrote {out}: {count} of {camera}, {shift:+g} m, chunk {number}, after {stage}")
 
@@ -114,7 +114,7 @@ def _render_views(chunk: Chunk, scene: SceneGraph, camera: str, frames: list[int
         return render_views(scene, views)
 
 
-def _write_images(path: Path, images: Render) -> None:
+def _write_images(path: Path, images: Render, frames_per_s: float) -> None:
     from genre_tasks.atomic_path import atomic_path
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -123,7 +123,7 @@ def _write_images(path: Path, images: Render) -> None:
         if path.suffix.lower() == ".exr":
             _write_exr(part, images)
         else:
-            _write_pixels(part, images)
+            _write_pixels(part, images, frames_per_s)
 
 
 def _write_exr(path: Path, images: Render) -> None:
@@ -132,9 +132,10 @@ def _write_exr(path: Path, images: Render) -> None:
     write_exr(path, images.color[0].numpy(), images.alpha[0].numpy(), images.expected_depth()[0].numpy())
 
 
-def _write_pixels(path: Path, images: Render) -> None:
+def _write_pixels(path: Path, images: Render, frames_per_s: float) -> None:
     import imageio.v3 as imageio
 
+    from flows.simulation.film import FilmWriter
     from storage.codecs.png import to_pixels
 
     pixels = to_pixels(images.color)
@@ -143,6 +144,11 @@ def _write_pixels(path: Path, images: Render) -> None:
     if suffix == ".png":
         imageio.imwrite(path, pixels[0], extension=suffix)
         return
-    # H.264 stores colour for blocks of 2 × 2 pixels, so width and height must be even.
-    even = pixels[:, : pixels.shape[1] // 2 * 2, : pixels.shape[2] // 2 * 2]
-    imageio.imwrite(path, even, extension=suffix, fps=_FRAMES_PER_SECOND, codec="libx264", macro_block_size=2)
+    film = FilmWriter(path, pixels.shape[2], pixels.shape[1], frames_per_s)
+    try:
+        for image in pixels:
+            film.write(image)
+        film.close()
+    except BaseException:
+        film.abort()
+        raise

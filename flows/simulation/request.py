@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -72,12 +73,15 @@ class SimulationRequest:
         """Checks what needs no run to be read.
 
         Raises:
-            ConfigError: a sensor is unknown, or two values do not go together.
+            ConfigError: a sensor is unknown, a number is not finite, or two values do not go together.
         """
         for sensor in self.sensors:
             if sensor not in SENSORS:
                 remedy = f"{did_you_mean(sensor, SENSORS)}Known: {', '.join(SENSORS)}."
                 raise ConfigError(f"no sensor is called '{sensor}'", remedy=remedy)
+        for name, value in (("--strength", self.strength), ("--delay", self.delay_s)):
+            if not math.isfinite(value):
+                raise ConfigError(f"{name} is {value:g}", remedy="Give a finite number.")
         if self.behaviour is not None and self.path_file is not None:
             raise ConfigError("--behaviour and --path both say how to drive", remedy="Give one of them.")
         if self.path_file is not None and self.start_offset_m is not None:

@@ -28,6 +28,8 @@ _HEIGHT_M = np.arange(0.0, 3.05, 0.1)
 _TILT_RAD = np.radians(np.arange(-2.0, 2.1, 0.5))
 _AZIMUTH_BIN_RAD = np.radians(0.25)
 _FINE_BIN_RAD = np.radians(0.05)
+_REFINING_BINS_DEG = (0.1, 0.05, 0.03)
+_REFINED_HEIGHTS = 6
 
 
 @dataclass(frozen=True)
@@ -111,15 +113,25 @@ def _find_height(points: Float64) -> tuple[float, float, float]:
         elevation = np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1]))
         return _measure_entropy(elevation + np.pi, bin_rad)
 
-    grid = itertools.product(_HEIGHT_M, _TILT_RAD, _TILT_RAD)
-    best = np.array(min(grid, key=lambda values: measure(np.array(values), np.radians(0.1))))
+    def refine(best: Float64) -> tuple[float, tuple[float, ...]]:
+        # Finer and finer: a fine histogram alone is flat away from the solution.
+        for bin_deg in _REFINING_BINS_DEG:
+            simplex = best + np.vstack([np.zeros(3), steps * bin_deg / _REFINING_BINS_DEG[0]])
+            options = {"maxiter": 200, "initial_simplex": simplex}
+            best = minimize(measure, best, (np.radians(bin_deg),), method="Nelder-Mead", options=options).x
+        return measure(best, np.radians(_REFINING_BINS_DEG[-1])), tuple(best.tolist())
+
     steps = np.diag([0.1, 0.005, 0.005])
-    # Finer and finer: a fine histogram alone is flat away from the solution.
-    for bin_deg in (0.1, 0.05, 0.03):
-        simplex = best + np.vstack([np.zeros(3), steps * bin_deg / 0.1])
-        options = {"maxiter": 200, "initial_simplex": simplex}
-        best = minimize(measure, best, (np.radians(bin_deg),), method="Nelder-Mead", options=options).x
-    return float(best[0]), float(best[1]), float(best[2])
+    coarse_bin = np.radians(_REFINING_BINS_DEG[0])
+    tilts = list(itertools.product(_TILT_RAD, _TILT_RAD))
+    by_height = [min((measure(np.array([z, *tilt]), coarse_bin), z, *tilt) for tilt in tilts) for z in _HEIGHT_M]
+    entropies = np.pad([entry[0] for entry in by_height], 1, constant_values=np.inf)
+    is_low = (entropies[1:-1] <= entropies[:-2]) & (entropies[1:-1] <= entropies[2:])
+    # From a place on a flat road all its returns are at one elevation, which is a minimum too. It is as low as the
+    # right one while heights are coarse, and only fine histograms tell the two apart.
+    lowest = sorted(itertools.compress(by_height, is_low))[:_REFINED_HEIGHTS]
+    _, (z, roll, pitch) = min(refine(np.array(entry[1:])) for entry in lowest)
+    return z, roll, pitch
 
 
 def _tilt(roll: float, pitch: float) -> Float64:

@@ -26,7 +26,7 @@ from genre_tasks.scene_edits.actor_parts import (
 )
 from genre_tasks.scene_edits.chunk_scene import CHUNKS_IN_MEMORY, ChunkScene, SceneSource
 from genre_tasks.scene_edits.contact_shadow import build_contact_shadow
-from genre_tasks.scene_edits.edits import ActorChange, EditList, Insert, combine_changes
+from genre_tasks.scene_edits.edits import ActorChange, EditList, Insert, Remove, combine_changes
 from genre_tasks.scene_edits.insertion import place_inserted
 from genre_tasks.scene_edits.run_survey import survey_run
 from genre_tasks.scene_edits.symmetry import complete_by_symmetry
@@ -260,13 +260,21 @@ class EditedScenes:
 
     def _combine(self) -> dict[str, ActorChange]:
         by_actor: dict[str, list[object]] = {}
+        removed_by: dict[str, int] = {}
         for edit in self.edits.edits:
             if isinstance(edit, Insert):
                 continue
             try:
-                by_actor.setdefault(resolve_actor(edit.actor, self.names), []).append(edit)
+                track_id = resolve_actor(edit.actor, self.names)
             except InputError as error:
                 raise self._at_edit(edit, error) from error
+            if track_id in removed_by:
+                problem = f"'{edit.actor}' was removed by edit {removed_by[track_id]}"
+                remedy = "Leave out one of the two, or edit the run from before."
+                raise self._at_edit(edit, InputError(problem, remedy=remedy))
+            if isinstance(edit, Remove):
+                removed_by[track_id] = self._edit_numbers[id(edit)]
+            by_actor.setdefault(track_id, []).append(edit)
         return {track_id: combine_changes(edits) for track_id, edits in by_actor.items()}  # type: ignore[arg-type]
 
     def _at_edit(self, edit: object, error: InputError) -> InputError:

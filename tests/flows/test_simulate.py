@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import typer
+from typer.testing import CliRunner
 
 from flows.cli.main import app
 from flows.cli.simulate_options import read_request
@@ -120,6 +121,8 @@ def test_a_hand_over_spreads_the_seam(recorded: SimulationRequest) -> None:
         ({"behaviour": "brake", "path_file": Path("x.json")}, ConfigError, "both say how to drive"),
         ({"path_file": Path("nowhere.json")}, InputError, "no such file"),
         ({"strength": 2.0}, ConfigError, "those of a behaviour"),
+        ({"behaviour": "brake", "strength": float("nan")}, ConfigError, "--strength is nan"),
+        ({"behaviour": "brake", "delay_s": float("inf")}, ConfigError, "--delay is inf"),
         ({"settings": ("simulate.handover=2",)}, ConfigError, "handover"),
     ],
 )
@@ -129,6 +132,14 @@ def test_mistakes_are_named(
     with pytest.raises(kind, match=words):
         simulate_run(replace(recorded, out=tmp_path / "out", **change))  # type: ignore[arg-type]
     assert not list(tmp_path.iterdir())
+
+
+def test_a_rendered_film_plays_as_fast_as_the_log(recorded: SimulationRequest, tmp_path: Path) -> None:
+    film = tmp_path / "film.MP4"
+    words = ["render", recorded.run, "--store", recorded.store, "--chunk", "0", "--out", str(film)]
+    assert CliRunner().invoke(app, words, catch_exceptions=False).exit_code == 0
+    facts = imageio.immeta(film)
+    assert facts["fps"] == pytest.approx(10.0) and imageio.imread(film).shape[0] == 6
 
 
 def test_a_path_without_poses_is_refused(recorded: SimulationRequest, tmp_path: Path) -> None:

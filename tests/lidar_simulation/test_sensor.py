@@ -6,8 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from genre_tasks.lidar_simulation.rollout_lidar import LidarSimulator
 from genre_tasks.lidar_simulation.sensor import LidarSensor, estimate_sensor, to_ego_axes
 from genre_tasks.lidar_simulation.sweep_pattern import NO_RING, SweepPattern, build_pattern, find_rings
+from genre_tasks.logs.registry import open_log
+from genre_tasks.logs.synthetic.ego_vehicle import LIDAR_HEIGHT_M
 from tests.lidar_simulation.spinning_lidar import AZIMUTHS, FRAME_S, POSITION_M, RINGS, beams, ego_path, scan
 
 
@@ -29,6 +32,13 @@ def test_the_sensor_is_found_on_a_driving_vehicle():
     assert np.abs(sensor.position_m - POSITION_M).max() < 0.03
     assert np.isclose(sensor.turn_rad_s, -2 * np.pi / FRAME_S)
     assert np.abs(sensor.axes - np.eye(3)).max() < 0.01
+
+
+def test_a_flat_road_does_not_draw_the_sensor_down():
+    """Seen from the road itself, all its returns have one elevation, which looks sharp."""
+    log = open_log("synthetic:street?seed=950&frames=4&cameras=1&lidar_azimuths=450")
+    position_m = LidarSimulator(log).sensor.position_m
+    assert np.abs(position_m - [0.0, 0.0, LIDAR_HEIGHT_M]).max() < 0.05
 
 
 def test_a_sensor_that_does_not_spin_stays_at_the_origin():

@@ -260,6 +260,7 @@ def test_inserted_actors_are_edited_by_their_name(run: MadeRun) -> None:
     ("edits", "message"),
     [
         ((Remove(actor="a"), Remove(actor="caar-2")), "edit 2 (remove): there is no actor 'caar-2'. Did you mean"),
+        ((Remove(actor="a"), Move(actor="a", left_m=1)), "edit 2 (move): 'a' was removed by edit 1"),
         ((Move(actor="car"),), "edit 1 (move): 2 actors begin with 'car': car-1, car-2"),
         ((Insert(actor="zzz"),), "edit 1 (insert): there is no actor 'zzz'"),
         ((Insert(actor="a", name="car-2"),), "edit 1 (insert): an actor 'car-2' is there already"),

@@ -19,7 +19,7 @@ from flows.exchange.export_scenes import export_scenes
 from flows.simulators.alpasim.bundle import write_alpasim_bundle
 from flows.simulators.alpasim.wire_poses import read_pose
 from genre_tasks.errors import ConfigError, InputError
-from genre_tasks.exchange.scene_folder import find_changes, read_document
+from genre_tasks.exchange.scene_folder import find_changes, read_document, read_scene_folder
 from tests.flows.simulators.alpasim.wire_client import ServedRun, WireClient
 
 
@@ -157,6 +157,8 @@ def test_genre_export_writes_the_bundle(bundle: Path, served: ServedRun, tmp_pat
     assert [entry.chunk for entry in document.chunks] == [0, 1]
     assert any("genre serve" in loss for loss in document.losses)
     assert find_changes(out) == ()
+    with pytest.raises(InputError, match="format alpasim, which holds no Gaussians"):
+        read_scene_folder(out)
 
 
 @pytest.mark.parametrize("part", [{"frame": 2}, {"all_frames": True}, {"per_actor": True}, {"chunks": (0,)}])
