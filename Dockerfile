@@ -16,7 +16,7 @@ COPY prefect.yaml /app/prefect.yaml
 # Flows are started from here, and read the presets beside them.
 COPY flows /app/flows
 COPY configs /app/configs
-RUN useradd --create-home --uid 10001 genre && mkdir -p /var/lib/prefect && chown genre /var/lib/prefect /app
+RUN useradd --create-home --uid 10001 genre && mkdir -p /var/lib/prefect /app/training && chown genre /var/lib/prefect /app /app/training
 ENV PATH=/opt/venv/bin:$PATH DO_NOT_TRACK=1 PREFECT_SERVER_ANALYTICS_ENABLED=false
 WORKDIR /app
 USER genre
