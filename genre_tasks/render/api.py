@@ -242,7 +242,9 @@ def concatenate_renders(parts: Sequence[Render], views: Sequence[int]) -> Render
 def _render_on_cpu(splats: Splats, cameras: Cameras, threads: int | None, visible: VisibleRanges) -> Render:
     from genre_tasks.render.cpu import render_cpu
 
-    if not (cameras.camera_SE3_chunk.requires_grad and torch.is_grad_enabled()):
+    wants_pose_gradient = cameras.camera_SE3_chunk.requires_grad and torch.is_grad_enabled()
+    # Without views there is no pose that could have a gradient, and nothing to put together.
+    if not (wants_pose_gradient and len(cameras)):
         return _result(*render_cpu(splats, cameras, visible, threads))
     parts = []
     # The kernel has no gradient in poses. In the frame of one camera the Gaussians move instead, which autograd

@@ -96,3 +96,10 @@ def test_faulty_arguments_are_named(scene):
     with pytest.raises(NonFiniteError) as caught:
         render(splats, replace(cameras, camera_SE3_chunk=bad))
     assert caught.value.tensor == "camera_SE3_chunk" and caught.value.first_index == (0, 1, 3)
+
+
+def test_no_views_of_poses_that_want_a_gradient():
+    poses = torch.zeros(0, 4, 4, requires_grad=True)
+    cameras = Cameras(poses, torch.zeros(0, 2), torch.zeros(0, 2), 8, 6)
+    for backend in ("cpu", "reference"):
+        assert render(_on_axis([2.0], [0.5]), cameras, RenderSettings(backend)).color.shape == (0, 6, 8, 3)
