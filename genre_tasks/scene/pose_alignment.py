@@ -172,8 +172,9 @@ def _normalise(luma: Float32, blur_px: float) -> ImageSlopes:
 
 def _average_surround(values: Float32, blur_px: float) -> Float32:
     """Means over a neighbourhood: a box taken twice, near a Gaussian that would take ten times as long."""
-    # Two boxes of this width have the variance of the Gaussian.
-    width_px = round((6 * (_SURROUND * blur_px) ** 2 + 1) ** 0.5)
+    # Two boxes of this width have the variance of the Gaussian. It is odd: a box of even width has no pixel at its
+    # centre, and each pass would move the image by half a pixel.
+    width_px = 2 * round(((6 * (_SURROUND * blur_px) ** 2 + 1) ** 0.5 - 1) / 2) + 1
     averaged: Float32 = uniform_filter(uniform_filter(values, width_px), width_px)
     return averaged
 

@@ -217,3 +217,11 @@ def test_without_common_points_nothing_is_refined() -> None:
     assert align_poses(lone) is None
     decision = plan_effects(ONLY, lone, street(EXACT).cameras)["pose_refinement"]
     assert decision.choice == "off" and "the same LiDAR points" in decision.reason
+
+
+@pytest.mark.parametrize("blur_px", pose_alignment.BLURS_PX)
+def test_means_of_the_surroundings_stay_in_place(blur_px: float) -> None:
+    image = np.zeros((101, 101), np.float32)
+    image[50, 50] = 1
+    averaged = pose_alignment._average_surround(image, blur_px)
+    assert np.allclose(averaged, averaged[::-1, ::-1], atol=1e-7)
