@@ -60,23 +60,26 @@ class ActorNode:
     def motion(self, frame: float) -> tuple[Float64, Float64]:
         """Gives velocity and turn rate at a log frame, from the poses before and after.
 
-        At an end of the path the pose there takes the place of the missing one. Between frames the motion is that at
-        the nearest frame.
+        At an end of the path the pose there takes the place of the missing one. An end is also where the frame before
+        or after is missing: a gap tells nothing of the motion. Between frames the motion is that at the nearest frame.
 
         Args:
             frame: log frame.
 
         Returns:
             Velocity of the centre [3] in metres a frame and rotation vector [3] in radians a frame, both in chunk axes;
-            zero where the actor does not exist or has one pose only.
+            zero where the actor does not exist or has no pose at a frame next to this one.
         """
         index = np.flatnonzero(self.frames == round(frame))
         if not len(index):
             return np.zeros(3), np.zeros(3)
         # Central differences: annotations jitter, and a difference over two frames halves that.
-        first = max(index[0] - 1, 0)
-        last = min(index[0] + 1, len(self.frames) - 1)
-        span = max(int(self.frames[last] - self.frames[first]), 1)
+        # Across a gap they would spread what may be a leap, or another object's path, over its frames.
+        has_before = np.isin(round(frame) - 1, self.frames)
+        has_after = np.isin(round(frame) + 1, self.frames)
+        first = index[0] - int(has_before)
+        last = index[0] + int(has_after)
+        span = max(last - first, 1)
         before = self.chunk_SE3_box[first]
         after = self.chunk_SE3_box[last]
         # As a rotation vector, which divides by the number of frames as a matrix does not.

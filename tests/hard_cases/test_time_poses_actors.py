@@ -123,6 +123,18 @@ def test_actor_at_any_yaw_also_a_half_turn(yaw: float) -> None:
     )
 
 
+def test_a_gap_in_a_track_says_nothing_of_the_motion() -> None:
+    frames = np.array([0, 1, 2, 16, 17, 30])
+    poses = np.stack([np.eye(4)] * 6)
+    poses[:, 0, 3] = frames
+    # Beyond the gap the car is 40 m to the side, as another car with its name would be.
+    poses[3:, 1, 3] = 40.0
+    car = ActorNode("a", "car", (4.0, 2.0, 1.5), frames, poses)
+    for frame in (0, 1, 2, 16, 17):
+        assert car.motion(frame)[0].tolist() == [1.0, 0.0, 0.0]
+    assert not car.motion(30)[0].any()
+
+
 def test_actor_absent_past_its_track() -> None:
     posed = _one_actor_graph(0.0).gaussians_at(4)
     assert float(torch.sigmoid(posed.logit_opacities[1])) < 1 / 255 and float(posed.logit_opacities[0]) == 0.0
