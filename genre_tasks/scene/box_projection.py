@@ -5,17 +5,21 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from genre_tasks.logs.types import Float64
 from genre_tasks.scene.chunk import Actor, View
 from genre_tasks.scene.novel_views import NovelView
 from genre_tasks.scene.projection import NEAR_M
 
 AnyView = View | NovelView
 
+# Pairs of corners that differ along one axis; a corner's number has a bit for each axis.
+_EDGES = np.array([(k, k | bit) for bit in (1, 2, 4) for k in range(8) if not k & bit])
+
 
 def project_box(actor: Actor, view: AnyView) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Finds the rectangle of pixels that an actor's box covers in a view.
 
-    What is behind the camera plane is cut off there; the lens is taken to be free of distortion.
+    What is behind the camera plane is cut off there, edge by edge; the lens is taken to be free of distortion.
 
     Args:
         actor: with its poses in the chunk.
@@ -31,11 +35,24 @@ def project_box(actor: Actor, view: AnyView) -> tuple[NDArray[np.int64], NDArray
     corners = np.stack(np.meshgrid(*[(-s / 2, s / 2) for s in actor.size_m], indexing="ij"), -1).reshape(-1, 3)
     camera_SE3_box = np.linalg.inv(view.chunk_SE3_camera) @ actor.chunk_SE3_box[index[0]]
     points = corners @ camera_SE3_box[:3, :3].T + camera_SE3_box[:3, 3]
-    if (points[:, 2] < NEAR_M).all():
+    points = _cut_behind_camera(points)
+    if not len(points):
         return nothing, nothing
-    # Corners behind the camera plane are moved onto it: the rectangle then reaches the image's edge, as the box does.
-    z = np.maximum(points[:, 2], NEAR_M)
     lens = view.lens
-    u = (points[:, 0] / z * lens.fx_px + lens.cx_px).clip(0, lens.width_px)
-    v = (points[:, 1] / z * lens.fy_px + lens.cy_px).clip(0, lens.height_px)
+    u = (points[:, 0] / points[:, 2] * lens.fx_px + lens.cx_px).clip(0, lens.width_px)
+    v = (points[:, 1] / points[:, 2] * lens.fy_px + lens.cy_px).clip(0, lens.height_px)
     return np.array([round(u.min()), round(v.min())]), np.array([round(u.max()), round(v.max())])
+
+
+def _cut_behind_camera(corners: Float64) -> Float64:
+    """Corners [K, 3] of the part of a box [8, 3] that lies ahead of the camera plane, in camera axes."""
+    ends = corners[_EDGES]  # [12, 2, 3]
+    depth = ends[:, :, 2] - NEAR_M
+    crosses = (depth < 0).any(1) & (depth > 0).any(1)
+    # Corners that were merely moved onto the plane would lie far from where the edges meet it.
+    fraction = depth[crosses, 0] / (depth[crosses, 0] - depth[crosses, 1])
+    first = ends[crosses, 0]
+    cuts = first + fraction[:, None] * (ends[crosses, 1] - first)
+    # Rounding can leave a cut a little off the plane.
+    cuts[:, 2] = NEAR_M
+    return np.concatenate([corners[corners[:, 2] >= NEAR_M], cuts])
