@@ -183,13 +183,16 @@ def _kernel_statistic(
         for features, set_frames in zip(sets, frames, strict=True)
     ]
 
-    def statistic(weights: NDArray[np.float64]) -> float | None:
-        values = [v for b in blocks if (v := b.distance(weights)) is not None]
+    def statistic(weights: NDArray[np.float64], other_frames_weight: float = 1.0) -> float | None:
+        values = [v for b in blocks if (v := b.distance(weights, other_frames_weight)) is not None]
         return values[0] - sum(values[1:]) if len(values) == len(blocks) else None
 
     # Each frame once is the estimate itself.
     value = statistic(np.ones(len(known)))
-    low, high = _bootstrap_interval(statistic, len(known), bootstrap, seed)
+    # A resample holds a frame once on average, but two different frames together only (F − 1) / F times: without this
+    # weight, pairs of one frame, which are the more similar ones, would count for too much in every resample.
+    balance = len(known) / max(len(known) - 1, 1)
+    low, high = _bootstrap_interval(partial(statistic, other_frames_weight=balance), len(known), bootstrap, seed)
     return None if value is None else SetDistance(value, len(sets[0]), len(reference), low, high)
 
 
@@ -232,11 +235,14 @@ class _KernelBlocks:
             blocks.append((a_members @ pairs @ b_members.T).numpy())
         return _KernelBlocks(*blocks)
 
-    def distance(self, weights: NDArray[np.float64]) -> float | None:
-        """The unbiased estimate with frame f drawn ``weights[f]`` times; ``None`` if a set has no pair of images."""
+    def distance(self, weights: NDArray[np.float64], other_frames_weight: float = 1.0) -> float | None:
+        """The estimate with frame f drawn ``weights[f]`` times; ``None`` if a set has no pair of images.
+
+        Pairs of images of two different frames count ``other_frames_weight`` times as much as those of one frame.
+        """
         # Pairs between two copies of one frame are left out, as an image's pair with itself is: with them, every
         # resample would be biased towards similar pairs.
-        pairs = np.outer(weights, weights)
+        pairs = other_frames_weight * np.outer(weights, weights)
         np.fill_diagonal(pairs, weights)
         means = []
         for sums, counts in (

@@ -156,3 +156,16 @@ def test_faults() -> None:
     broken[1, 2] = math.inf
     with pytest.raises(NonFiniteError, match="features holds 1 non-finite"):
         frechet_distance(broken, torch.zeros(3, 4))
+
+
+def test_resamples_of_few_frames_are_not_biased() -> None:
+    """Images of a frame are alike: resamples that overweight their pairs would leave the estimate out."""
+    cameras = gaussian(6, 64, 99, scale=0.5).repeat(5, 1)
+    outside = 0
+    for seed in range(30):
+        street = gaussian(5, 64, seed, scale=0.3).repeat_interleave(6, 0)
+        reference = cameras + street + gaussian(30, 64, seed + 1000, scale=0.5)
+        x = 0.9 * reference + gaussian(30, 64, seed + 2000, scale=0.15) + 0.05
+        result = kernel_distance(x, reference, frames(30, 6), frames(30, 6), 100, seed)
+        outside += not result.low <= result.value <= result.high
+    assert outside <= 3
