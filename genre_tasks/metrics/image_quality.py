@@ -60,7 +60,8 @@ def ssim(
     """Computes the mean structural similarity over pixels and channels (Wang et al. 2004).
 
     The window is a Gaussian of σ = 1.5 over 11 pixels. Images narrower than that get the largest uniform window that
-    fits. Computed in float64; two equal constant images score 1.
+    fits. Computed in float64; two equal constant images score 1. Pixels at the border whose window would reach beyond
+    the image, 5 for the Gaussian, do not count, as in scikit-image; with a mask that has no other pixels they do.
 
     Args:
         image: the image to judge.
@@ -91,8 +92,15 @@ def ssim(
         options["win_size"] = smallest_side - 1 | 1
     if mask is None:
         return float(structural_similarity(image64, truth64, **options))
-    _, similarity = structural_similarity(image64, truth64, full=True, **options)
-    return float(similarity[mask].mean())
+    mean, similarity = structural_similarity(image64, truth64, full=True, **options)
+    border_px = (options.get("win_size", _GAUSSIAN_WINDOW_PX) - 1) // 2
+    inside = np.zeros_like(mask)
+    inside[border_px : mask.shape[0] - border_px, border_px : mask.shape[1] - border_px] = True
+    # A mask that leaves out nothing has the very value of no mask.
+    if mask[inside].all():
+        return float(mean)
+    counted = mask & inside
+    return float(similarity[counted if counted.any() else mask].mean())
 
 
 def widen_pair(

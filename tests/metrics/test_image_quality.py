@@ -83,3 +83,19 @@ def test_faults() -> None:
     with pytest.raises(NonFiniteError) as caught:
         psnr(broken, image)
     assert (caught.value.tensor, caught.value.count, caught.value.first_index) == ("image", 1, (3, 4, 1))
+
+
+@pytest.mark.parametrize("size", [(32, 40), (9, 12)])
+def test_ssim_leaves_out_the_border_with_a_mask_too(size: tuple[int, int]) -> None:
+    truth = picture(*size)
+    image = truth.copy()
+    image[:2] = 1 - image[:2]
+    everything = np.ones(size, bool)
+    assert ssim(image, truth, everything) == ssim(image, truth)
+    nearly = everything.copy()
+    nearly[-1, -1] = False
+    assert ssim(image, truth, nearly) == ssim(image, truth)
+    # A mask that has nothing but the border still gets a value.
+    border = np.zeros(size, bool)
+    border[0] = True
+    assert ssim(image, truth, border) < 0.5
