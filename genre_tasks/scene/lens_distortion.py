@@ -17,6 +17,9 @@ from genre_tasks.logs.types import Float64, Lens
 Reals = NDArray[np.floating]
 _NEWTON_STEPS = 25
 _CONVERGED = 1e-14
+# Images that are farther off than this, which is far less than a pixel, tell that Newton's method has not converged.
+_FAILED = 1e-9
+_BISECTIONS = 50
 
 
 def fold_radius(coefficients: Sequence[float]) -> float:
@@ -46,6 +49,8 @@ def fold_radius(coefficients: Sequence[float]) -> float:
 def undistort(x: Float64, y: Float64, coefficients: Sequence[float]) -> tuple[Float64, Float64]:
     """Inverts :func:`distort` within the fold radius, by Newton's method in float64.
 
+    Where it does not converge from the distorted point, it starts again from the inverse of the radial terms.
+
     Args:
         x: distorted normalised image coordinates of any shape.
         y: of the same shape.
@@ -59,16 +64,36 @@ def undistort(x: Float64, y: Float64, coefficients: Sequence[float]) -> tuple[Fl
     0.5
     """
     radius = fold_radius(coefficients)
+    x = np.asarray(x, np.float64)
+    y = np.asarray(y, np.float64)
+    # The distorted point is near enough as a start for nearly all points of nearly all lenses.
+    u, v = _run_newton(x, y, x, y, coefficients, radius)
+    failed = _distances(u, v, x, y, coefficients) > _FAILED
+    if not failed.any():
+        return u, v
+    # The radial inverse is nearer than that, and costs more. Points that fail from there too have no ray.
+    u = np.array(u)
+    v = np.array(v)
+    x = x[failed]
+    y = y[failed]
+    again = _run_newton(*_invert_radially(x, y, coefficients, radius), x, y, coefficients, radius)
+    found = _distances(*again, x, y, coefficients) <= _FAILED
+    u[failed] = np.where(found, again[0], u[failed])
+    v[failed] = np.where(found, again[1], v[failed])
+    return u, v
+
+
+def _run_newton(
+    u: Float64, v: Float64, x: Float64, y: Float64, coefficients: Sequence[float], radius: float
+) -> tuple[Float64, Float64]:
+    """Newton's method from the undistorted points (u, v), within the fold radius, for the distorted points (x, y)."""
 
     def limit(u: Float64, v: Float64) -> tuple[Float64, Float64]:
         # Beyond the fold Newton's method would run to a solution that no ray of the lens has.
         shrink = np.minimum(1.0, radius / np.maximum(np.hypot(u, v), 1e-30))
         return u * shrink, v * shrink
 
-    x = np.asarray(x, np.float64)
-    y = np.asarray(y, np.float64)
-    # The distorted point is near enough as a start for any real lens.
-    u, v = limit(x, y)
+    u, v = limit(u, v)
     for _ in range(_NEWTON_STEPS):
         found_x, found_y = distort(u, v, coefficients)
         error_x = found_x - x
@@ -81,6 +106,34 @@ def undistort(x: Float64, y: Float64, coefficients: Sequence[float]) -> tuple[Fl
         det = np.maximum(xx * yy - xy * xy, 1e-6)
         u, v = limit(u - (yy * error_x - xy * error_y) / det, v - (xx * error_y - xy * error_x) / det)
     return u, v
+
+
+def _distances(u: Float64, v: Float64, x: Float64, y: Float64, coefficients: Sequence[float]) -> Float64:
+    """How far the images of undistorted points (u, v) are from the distorted points (x, y)."""
+    found_x, found_y = distort(u, v, coefficients)
+    return np.asarray(np.hypot(found_x - x, found_y - y), np.float64)
+
+
+def _invert_radially(x: Float64, y: Float64, coefficients: Sequence[float], radius: float) -> tuple[Float64, Float64]:
+    """Undistorted points without the tangential terms, by bisection up to the fold radius."""
+    k1, k2, _, _, k3 = coefficients
+    target = np.hypot(x, y)
+
+    def image_radius(r: Float64) -> Float64:
+        return r * (1 + r**2 * (k1 + r**2 * (k2 + r**2 * k3)))
+
+    low = np.zeros_like(target)
+    high = np.full_like(target, radius if np.isfinite(radius) else 1.0)
+    # A lens that never folds has images at any radius: the bound grows until it is beyond all points.
+    while not np.isfinite(radius) and (image_radius(high) < target).any():
+        high *= 2
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2
+        beyond = image_radius(middle) > target
+        low = np.where(beyond, low, middle)
+        high = np.where(beyond, middle, high)
+    scale = low / np.maximum(target, 1e-30)
+    return x * scale, y * scale
 
 
 def pixels_to_rays(u: Float64, v: Float64, lens: Lens) -> tuple[Float64, Float64]:
