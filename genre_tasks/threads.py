@@ -11,7 +11,9 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -69,3 +71,23 @@ def map_single_threaded(function: Callable[[Item], Result], items: Sequence[Item
             return list(pool.map(function, items))
     finally:
         torch.set_num_threads(threads)
+
+
+def multiply_transposed(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Computes aᵀ b, with the same bytes wherever torch has one thread, as within ``torch_threads(1)``.
+
+    NumPy's product has other last bits at each number of threads of its BLAS, which torch does not set. These threads
+    also wait for each other where other work is done at the same time.
+
+    Args:
+        a: [P, M].
+        b: [P, N].
+
+    Returns:
+        [M, N].
+
+    >>> multiply_transposed(np.array([[1.0], [2.0]]), np.array([[3.0], [4.0]])).tolist()
+    [[11.0]]
+    """
+    product: NDArray[np.float64] = (torch.from_numpy(a).T @ torch.from_numpy(b)).numpy()
+    return product

@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from genre_tasks.logs.types import Float32, Float64
 from genre_tasks.scene.chunk import View
+from genre_tasks.threads import multiply_transposed, torch_threads
 
 MIN_SHARED_POINTS = 10
 """An image's gain is known where it shares at least so many points with other images."""
@@ -129,14 +131,18 @@ def _solve_normal_equations(target: Float64, haze_slope: Float64, weight: Float6
     """
     # Views are coupled by the points that they share. The system has one freedom left, a gain common to all views, so
     # that it takes a pseudo-inverse.
-    coupling = (weight / np.maximum(weight.sum(0), _SMALLEST)) @ weight.T
-    inverse = np.linalg.pinv(np.diag(weight.sum(1)) - coupling)
+    share = weight / np.maximum(weight.sum(0), _SMALLEST)
     gain_target = (weight * target).sum(2)  # [3, V]
     gain_haze = (weight * haze_slope).sum(2)  # [3, V]
+    # By torch on one thread: NumPy's products and decompositions have other last bits at each number of threads.
+    with torch_threads(1):
+        coupling = multiply_transposed(share.T, weight.T)
+        inverse = torch.linalg.pinv(torch.from_numpy(np.diag(weight.sum(1)) - coupling)).numpy()
     numerator = (weight * haze_slope * target).sum() - np.einsum("cv,vw,cw->", gain_haze, inverse, gain_target)
     denominator = (weight * haze_slope**2).sum() - np.einsum("cv,vw,cw->", gain_haze, inverse, gain_haze)
     haze = max(0.0, float(numerator / max(denominator, _SMALLEST)))
-    log_gain = ((gain_target - haze * gain_haze) @ inverse)[..., None]
+    # By einsum, whose sums do not depend on threads as those of a product do.
+    log_gain = np.einsum("cv,vw->cw", gain_target - haze * gain_haze, inverse)[..., None]
     return haze, log_gain
 
 

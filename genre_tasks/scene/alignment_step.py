@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.ndimage import map_coordinates
@@ -16,7 +15,7 @@ from genre_tasks.logs.brown_conrady import distort, distortion_jacobian
 from genre_tasks.logs.types import Float32, Float64, Lens
 from genre_tasks.scene.chunk import View
 from genre_tasks.scene.transforms import invert_se3
-from genre_tasks.threads import map_single_threaded, torch_threads
+from genre_tasks.threads import map_single_threaded, multiply_transposed, torch_threads
 
 TURN_PRIOR_DEG = 0.2
 """Standard deviation that is expected of a mount's and of the rig's turn."""
@@ -246,11 +245,11 @@ def _solve(
         rows = np.flatnonzero(seen[k])
         observed = slopes[k]
         weighted = observed * weight[k, rows, None]
-        normal[np.ix_(unknowns, unknowns)] += _transposed_product(weighted, observed)
+        normal[np.ix_(unknowns, unknowns)] += multiply_transposed(weighted, observed)
         right[unknowns] += (weighted * residual[k, rows, None]).sum(0)
         by_point[np.ix_(rows, unknowns)] += weighted
     # The mean over views moves with the views: Schur complement of the points' own brightness.
-    normal -= _transposed_product(by_point / np.maximum(weight.sum(0), _TINY)[:, None], by_point)
+    normal -= multiply_transposed(by_point / np.maximum(weight.sum(0), _TINY)[:, None], by_point)
     variance = _VARIANCE_OF_MEDIAN * np.median(np.abs(residual[weight > 0])) ** 2 + _TINY
     scale = _INDEPENDENT_SHARE / variance
     prior = _prior_precision(len(mounts), len(rig))
@@ -260,14 +259,6 @@ def _solve(
         mounts + step[: mounts.size].reshape(mounts.shape),
         rig + step[mounts.size :].reshape(rig.shape),
     )
-
-
-def _transposed_product(a: Float64, b: Float64) -> Float64:
-    """aᵀ b [M, N] of arrays [P, M] and [P, N]."""
-    # By torch, whose threads the caller has set to one: NumPy's own product has other last bits at each number of
-    # threads, and its threads wait for each other where other work is done beside it.
-    product: Float64 = (torch.from_numpy(a).T @ torch.from_numpy(b)).numpy()
-    return product
 
 
 def _prior_precision(camera_count: int, frame_count: int) -> Float64:
