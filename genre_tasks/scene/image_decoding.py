@@ -46,6 +46,7 @@ from PIL import Image
 from torch import Tensor
 
 from genre_tasks.logs.findings import Finding
+from genre_tasks.scene.area_means import average_areas
 from genre_tasks.scene.image_conversion import convert_to_srgb
 from genre_tasks.scene.image_header import DECODE_ERRORS, ImageHeader, describe_decode_error, open_image
 
@@ -197,15 +198,28 @@ def read_image_size(data: bytes) -> tuple[int, int]:
     return header.width_px, header.height_px
 
 
-def _load(data: bytes, draft_size: tuple[int, int]) -> tuple[Image.Image, ImageHeader]:
-    """Opens and decodes an image; a JPEG at a half, a quarter or an eighth, where that is not below the given size."""
+def _load(data: bytes, draft_size: tuple[int, int], exact: bool = False) -> tuple[Image.Image, ImageHeader]:
+    """Opens and decodes an image; a JPEG at a half, a quarter or an eighth, where that is not below the given size.
+
+    Where ``exact``, only at fractions that divide both sides: others are rounded up, so that the image would be
+    stretched.
+    """
     try:
         image, header = open_image(data)
-        image.draft("RGB", draft_size)
+        image.draft("RGB", _exact_draft_size(image.size, draft_size) if exact else draft_size)
         image.load()
     except DECODE_ERRORS as error:
         raise describe_decode_error(error) from error
     return image, header
+
+
+def _exact_draft_size(size: tuple[int, int], smallest: tuple[int, int]) -> tuple[int, int]:
+    """The smallest size, not below another one, of which an image's size is 1, 2, 4 or 8 times as much."""
+    for factor in (8, 4, 2):
+        fits = size[0] >= factor * smallest[0] and size[1] >= factor * smallest[1]
+        if fits and size[0] % factor == 0 and size[1] % factor == 0:
+            return size[0] // factor, size[1] // factor
+    return size
 
 
 def _convert(image: Image.Image, header: ImageHeader) -> tuple[Image.Image, tuple[Finding, ...]]:
@@ -219,13 +233,21 @@ def _convert(image: Image.Image, header: ImageHeader) -> tuple[Image.Image, tupl
 def _decode_resized(data: bytes, width_px: int, height_px: int) -> tuple[Image.Image, ImageHeader, tuple[Finding, ...]]:
     # JPEG decodes faster at a fraction of its size, an average over blocks of the DCT. At twice the size of the result
     # at least two of its pixels are left per pixel, so the average stays one.
-    image, header = _load(data, (2 * width_px, 2 * height_px))
+    image, header = _load(data, (2 * width_px, 2 * height_px), exact=True)
     rgb, findings = _convert(image, header)
-    # A box filter averages over areas, which only makes sense where there is more than a pixel in each.
-    reduces = rgb.width >= width_px and rgb.height >= height_px
     if rgb.size != (width_px, height_px):
-        rgb = rgb.resize((width_px, height_px), Image.Resampling.BOX if reduces else Image.Resampling.BILINEAR)
+        rgb = _resize(rgb, width_px, height_px)
     return rgb, header, findings
+
+
+def _resize(rgb: Image.Image, width_px: int, height_px: int) -> Image.Image:
+    # Means over areas only make sense where there is more than a pixel in each.
+    if rgb.width < width_px or rgb.height < height_px:
+        return rgb.resize((width_px, height_px), Image.Resampling.BILINEAR)
+    # Pillow's box filter is exact where areas end between pixels, and faster.
+    if rgb.width % width_px == 0 and rgb.height % height_px == 0:
+        return rgb.resize((width_px, height_px), Image.Resampling.BOX)
+    return Image.fromarray(average_areas(np.asarray(rgb), width_px, height_px))
 
 
 def _is_verifiable(image: Image.Image, header: ImageHeader, file_bytes: int) -> bool:

@@ -30,6 +30,35 @@ def test_png_is_area_averaged_on_each_axis() -> None:
     assert np.abs(out - expected).max() <= 1.0
 
 
+def _area_means(pixels: np.ndarray, size: int) -> np.ndarray:
+    """Exact means along the first axis, by differences of interpolated sums."""
+    sums = np.concatenate([np.zeros((1, *pixels.shape[1:])), pixels.astype(np.float64).cumsum(0)])
+    borders = np.arange(size + 1) * len(pixels) / size
+    index = np.floor(borders).astype(int).clip(0, len(pixels) - 1)
+    at = sums[index] + (borders - index)[:, None, None] * (sums[index + 1] - sums[index])
+    return np.diff(at, axis=0) * size / len(pixels)
+
+
+@pytest.mark.parametrize(("native", "working"), [((60, 90), (40, 60)), ((75, 248), (19, 64)), ((45, 80), (44, 80))])
+def test_areas_may_end_within_pixels(native: tuple[int, int], working: tuple[int, int]) -> None:
+    pixels = _noise(*native)
+    expected = _area_means(_area_means(pixels, working[0]).swapaxes(0, 1), working[1]).swapaxes(0, 1)
+    out = decode_pixels(_encoded(pixels, "PNG"), working[1], working[0])
+    # Rounded once.
+    assert np.abs(out - expected).max() <= 0.5 + 1e-3
+
+
+@pytest.mark.parametrize(("height", "width"), [(222, 480), (223, 481), (250, 484)])
+def test_a_jpeg_of_any_size_is_not_stretched(height: int, width: int) -> None:
+    ramp = np.broadcast_to(np.linspace(10, 245, height)[:, None], (height, width))
+    pixels = np.stack([ramp] * 3, -1).round().astype(np.uint8)
+    data = _encoded(pixels, "JPEG", quality=98)
+    full = np.asarray(Image.open(io.BytesIO(data)))
+    # Four rows of the image are one of the result, at most: a stretched one would be off by a level or more.
+    expected = _area_means(_area_means(full, height // 20).swapaxes(0, 1), width // 20).swapaxes(0, 1)
+    assert np.abs(decode_pixels(data, width // 20, height // 20) - expected).max() <= 1.6
+
+
 def test_jpeg_decoded_small_is_near_the_full_average() -> None:
     ramp = np.add.outer(np.arange(512), np.arange(1024)) / 6.1
     pixels = np.stack([ramp, 255 - ramp, 128 + 0 * ramp], -1).clip(0, 255).astype(np.uint8)
