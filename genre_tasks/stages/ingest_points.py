@@ -18,6 +18,7 @@ from genre_tasks.scene.moving_actors import MovingActors, find_points_in_box, se
 from genre_tasks.scene.ply_reader import read_ply
 from genre_tasks.scene.road_completion import complete_road
 from genre_tasks.scene.rotations import quats_to_matrices_numpy
+from genre_tasks.scene.transforms import distance_to_path
 from genre_tasks.scene.visibility import PointCloud
 from genre_tasks.stages.chunk_reading import ChunkReading
 from genre_tasks.stages.ingest_views import REMEDY
@@ -25,6 +26,15 @@ from genre_tasks.stages.ingest_views import REMEDY
 EGO_BOX_M = (2.6, 1.3, 2.6)
 """Half length, width and height, about the LiDAR pose, of what is the ego vehicle itself and its sensors. Some logs
 put that pose on the road, others at the sensor: the height covers both."""
+
+NEAR_PATH_M = 100.0
+"""What is farther from the path is left to the distant region, unless ``initial.max_range_m`` says otherwise."""
+
+# Fewer points than these (the smaller counts) are chance: a file in millimetres has some near its origin.
+_MIN_NEAR_POINTS = 100
+_MIN_NEAR_PART = 0.01
+# Points that spread farther about their middle are in a smaller unit; a chunk's surroundings have some hundred metres.
+_MAX_SPREAD_M = 5000.0
 
 FramePoints = tuple[int, Float32]
 """A log frame and points [P, 3]."""
@@ -56,15 +66,39 @@ def read_points_from_file(reading: ChunkReading, file: str) -> ChunkPoints:
         A background without actors.
 
     Raises:
-        InputError: the file cannot be read.
+        InputError: the file cannot be read, or next to none of its points lie near the path.
     """
     positions, colors = read_ply(file)
     positions = place_points(positions, reading.config.placement)
     # Subtracted in float64, as sweeps are.
     local = (positions - reading.world_SE3_chunk[:3, 3]).astype(np.float32)
+    _require_points_near_path(reading, local, file)
     for track in _select_actors(reading).tracks:
         reading.add_issue("actor_few_points", f"track {track.track_id}: points come from a file")
     return ChunkPoints(PointCloud(local, np.full(len(local), NO_SWEEP, np.int16)), [], colors)
+
+
+def _require_points_near_path(reading: ChunkReading, local: Float32, file: str) -> None:
+    """Raises where a file's points [P, 3] in chunk coordinates are not those of this path."""
+    distances = distance_to_path(local, reading.chunk_SE3_ego)
+    near = int((distances < NEAR_PATH_M).sum())
+    if near >= min(_MIN_NEAR_POINTS, _MIN_NEAR_PART * len(local)):
+        return
+    middle = np.median(local, axis=0)
+    spread_m = float(np.median(np.linalg.norm(local - middle, axis=1)))
+    offset = ", ".join(f"{value:.0f}" for value in middle)
+    reason = f"an offset: their middle lies at ({offset}) m from that of the path"
+    if spread_m > _MAX_SPREAD_M:
+        reason = f"another unit: they spread over {spread_m:.3g} m about their middle"
+    raise InputError(
+        f"{near} of {len(local)} points lie within {NEAR_PATH_M:g} m of the path, the median distance is "
+        f"{float(np.median(distances)):.4g} m; the likely reason is {reason}",
+        remedy="Set ingest.placement.scale to the metres a unit of the file has, or ingest.placement.quat to its "
+        "rotation; write the points with the origin of the camera poses, since placement has no offset.",
+        file=file,
+        log=reading.log.name,
+        chunk=reading.chunk,
+    )
 
 
 def place_points(positions: Float64, placement: FilePlacement) -> Float64:

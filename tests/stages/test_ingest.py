@@ -203,6 +203,25 @@ def test_no_lidar_needs_points(log: FakeLog, tmp_path: Path) -> None:
     assert out.static.colored.all() and _kinds(out.log_issues) == ["actor_few_points"]
 
 
+@pytest.mark.parametrize(("scale", "shift_m", "reason"), [(1.0, 5000.0, "an offset"), (1000.0, 0.0, "another unit")])
+def test_points_far_from_the_path_are_refused(
+    log: FakeLog, tmp_path: Path, scale: float, shift_m: float, reason: str
+) -> None:
+    points = scale * np.random.default_rng(1).uniform(1.0, 60.0, (400, 3)) + [shift_m, 0.0, 0.0]
+    header = "ply\nformat ascii 1.0\nelement vertex 400\nproperty double x\nproperty double y\nproperty double z\n"
+    file = tmp_path / "points.ply"
+    file.write_text(header + "end_header\n" + "\n".join(" ".join(map(str, row)) for row in points.tolist()) + "\n")
+    config = CONFIG.model_copy(update={"points": str(file)})
+    with pytest.raises(
+        InputError, match=f"0 of 400 points lie within 100 m .* median distance is .*{reason}"
+    ) as caught:
+        ingest(config, log.with_(no_lidar=True), 0)
+    assert caught.value.file == str(file) and "ingest.placement" in caught.value.remedy
+    placement = config.placement.model_copy(update={"scale": 1 / scale})
+    if not shift_m:
+        assert len(ingest(config.model_copy(update={"placement": placement}), log, 0).static.positions) == 400
+
+
 def test_progress_rises_to_the_end(log: FakeLog) -> None:
     calls: list[tuple[int, int]] = []
     ingest(CONFIG, log, 0, lambda done, total, note="": calls.append((done, total)))
