@@ -196,6 +196,12 @@ BROKEN_BOXES = {
     "no size": (_boxes(width=(2, 0.0)), "row 2 is not finite"),
     "no direction": (lambda columns: [columns[name].__setitem__(1, 0.0) for name in ("qw", "qx", "qy", "qz")], "row 1"),
     "no place": (_boxes(x=(0, float("nan"))), "row 0 is not finite"),
+    "moving as text": (
+        lambda columns: columns.update(moving=["False"] * len(columns["x"])),
+        "moving of row 0 is 'False'",
+    ),
+    "moving as digits": (lambda columns: columns.update(moving=["0"] * len(columns["x"])), "moving of row 0 is '0'"),
+    "no object": (_boxes(track_id=(1, None)), "row 1 has no track_id"),
     "words": (lambda columns: columns.update(x=["here"] * len(columns["x"])), "something else than numbers"),
 }
 
@@ -208,6 +214,13 @@ def test_broken_boxes(folder: Path, name: str) -> None:
     pq.write_table(pa.table(columns), folder / "boxes.parquet")
     with pytest.raises(InputError, match=problem):
         open_log(f"genre:{folder}").tracks()
+
+
+def test_moving_may_be_written_as_0_and_1(folder: Path) -> None:
+    columns = pq.read_table(folder / "boxes.parquet").to_pydict()
+    columns["moving"] = [int(value) for value in columns["moving"]]
+    pq.write_table(pa.table(columns), folder / "boxes.parquet")
+    assert_same_log(open_log(f"genre:{folder}"), FAKE)
 
 
 def test_many_boxes_are_read(folder: Path) -> None:

@@ -54,7 +54,8 @@ def read_boxes(path: Path, frame_count: int, log: str) -> tuple[CuboidTrack, ...
         The tracks, in the order of their first rows. The size of a track is the median over its frames.
 
     Raises:
-        InputError: the table is damaged, too large, or lacks a column; a row is not finite, of no frame, or double.
+        InputError: the table is damaged, too large, or lacks a column; a row is not finite, of no frame, of no object,
+            or double; ``moving`` is neither true nor false.
     """
     import pyarrow as pa
 
@@ -67,6 +68,7 @@ def read_boxes(path: Path, frame_count: int, log: str) -> tuple[CuboidTrack, ...
     if missing:
         raise InputError(f"the boxes lack the columns {', '.join(missing)}", **where)
     columns = {name: table.column(name).to_pylist() for name in BOX_COLUMNS if name in table.column_names}
+    _require_objects(columns, where)
     by_track: dict[str, dict[int, int]] = {}
     for row, (track_id, frame) in enumerate(zip(columns["track_id"], columns["frame"], strict=True)):
         if isinstance(frame, bool) or not isinstance(frame, int) or not 0 <= frame < frame_count:
@@ -88,6 +90,18 @@ def read_boxes(path: Path, frame_count: int, log: str) -> tuple[CuboidTrack, ...
         row = int(np.argmax(bad))
         raise InputError(f"row {row} is not finite, or has no size or no direction", **where)
     return tuple(_build_track(name, frames, columns, numbers) for name, frames in by_track.items())
+
+
+def _require_objects(columns: dict[str, list[Any]], where: dict[str, Any]) -> None:
+    """Raises where a row names no object, or does not say whether the object moves."""
+    for row, track_id in enumerate(columns["track_id"]):
+        # As text, nulls would join boxes of several objects. NaN is the one value that differs from itself.
+        if track_id is None or track_id == "" or track_id != track_id:
+            raise InputError(f"row {row} has no track_id ({track_id!r})", **where)
+    for row, moving in enumerate(columns.get("moving", [])):
+        # Python takes any text for true, "False" as well.
+        if moving is not None and moving not in (0, 1):
+            raise InputError(f"moving of row {row} is {moving!r}; write true or false, not as text", **where)
 
 
 def _build_track(track_id: str, rows: dict[int, int], columns: dict[str, list[Any]], numbers: Float64) -> CuboidTrack:
