@@ -193,9 +193,6 @@ BROKEN_BOXES = {
     "a column is missing": (lambda columns: columns.pop("qw"), "lack the columns qw"),
     "a later frame": (_boxes(frame=(0, 99)), "row 0 is of frame 99"),
     "two boxes of one object": (_boxes(frame=(1, 0)), "has two boxes in frame 0"),
-    "no size": (_boxes(width=(2, 0.0)), "row 2 is not finite"),
-    "no direction": (lambda columns: [columns[name].__setitem__(1, 0.0) for name in ("qw", "qx", "qy", "qz")], "row 1"),
-    "no place": (_boxes(x=(0, float("nan"))), "row 0 is not finite"),
     "moving as text": (
         lambda columns: columns.update(moving=["False"] * len(columns["x"])),
         "moving of row 0 is 'False'",
@@ -213,6 +210,36 @@ def test_broken_boxes(folder: Path, name: str) -> None:
     change(columns)
     pq.write_table(pa.table(columns), folder / "boxes.parquet")
     with pytest.raises(InputError, match=problem):
+        open_log(f"genre:{folder}").tracks()
+
+
+BAD_BOXES = {
+    "no size": (lambda columns, row: columns["width"].__setitem__(row, 0.0), "a size that is not positive"),
+    "no place": (lambda columns, row: columns["x"].__setitem__(row, float("nan")), "is not finite"),
+    "a null": (lambda columns, row: columns["z"].__setitem__(row, None), "is not finite"),
+    "no direction": (
+        lambda columns, row: [columns[name].__setitem__(row, 0.0) for name in ("qw", "qx", "qy", "qz")],
+        "has a quaternion of zeros",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD_BOXES)
+def test_a_bad_box_is_left_out_alone(folder: Path, name: str) -> None:
+    change, problem = BAD_BOXES[name]
+    columns = pq.read_table(folder / "boxes.parquet").to_pydict()
+    change(columns, 1)
+    pq.write_table(pa.table(columns), folder / "boxes.parquet")
+    log = open_log(f"genre:{folder}")
+    assert sum(len(track.frames) for track in log.tracks()) == len(columns["x"]) - 1
+    (found,) = [finding for finding in check_log(log).findings if finding.word == "invalid_box"]
+    frame = columns["frame"][1]
+    assert found.frames == (frame,) and problem in found.message
+    assert f"{columns['track_id'][1]} in frame {frame}" in found.message
+    for row in range(len(columns["x"])):
+        change(columns, row)
+    pq.write_table(pa.table(columns), folder / "boxes.parquet")
+    with pytest.raises(InputError, match=f"all {len(columns['x'])} boxes are bad: the first one .*{problem}"):
         open_log(f"genre:{folder}").tracks()
 
 

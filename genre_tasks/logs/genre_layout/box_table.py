@@ -10,6 +10,7 @@ import numpy as np
 
 from genre_tasks.bounded_parquet import FOR_ROWS, read_bounded_table
 from genre_tasks.errors import InputError
+from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.genre_layout.layout import BOX_COLUMNS
 from genre_tasks.logs.types import CuboidTrack, Float64
 
@@ -42,8 +43,8 @@ def write_boxes(path: Path, tracks: Sequence[CuboidTrack]) -> None:
     pq.write_table(pa.table(arrays), path)
 
 
-def read_boxes(path: Path, frame_count: int, log: str) -> tuple[CuboidTrack, ...]:
-    """Reads all boxes.
+def read_boxes(path: Path, frame_count: int, log: str) -> tuple[tuple[CuboidTrack, ...], tuple[Finding, ...]]:
+    """Reads all boxes, but for those without a place, a size or a direction.
 
     Args:
         path: the file.
@@ -51,11 +52,12 @@ def read_boxes(path: Path, frame_count: int, log: str) -> tuple[CuboidTrack, ...
         log: URI of the log, for errors.
 
     Returns:
-        The tracks, in the order of their first rows. The size of a track is the median over its frames.
+        The tracks, in the order of their first rows, and ``invalid_box`` for every box that is left out. The size of a
+        track is the median over its frames.
 
     Raises:
-        InputError: the table is damaged, too large, or lacks a column; a row is not finite, of no frame, of no object,
-            or double; ``moving`` is neither true nor false.
+        InputError: the table is damaged, too large, or lacks a column; a row is of no frame, of no object, or double;
+            ``moving`` is neither true nor false; no box can be used.
     """
     import pyarrow as pa
 
@@ -84,12 +86,31 @@ def read_boxes(path: Path, frame_count: int, log: str) -> tuple[CuboidTrack, ...
         numbers = np.array([columns[name] for name in BOX_COLUMNS[4:]], dtype=np.float64).T.reshape(-1, 10)
     except (TypeError, ValueError) as error:
         raise InputError(f"the boxes hold something else than numbers ({error})", **where) from error
-    bad = ~np.isfinite(numbers).all(axis=1) | (numbers[:, 7:] <= 0).any(axis=1)
-    bad |= np.linalg.norm(numbers[:, 3:7], axis=1) < _MIN_QUATERNION_NORM
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise InputError(f"row {row} is not finite, or has no size or no direction", **where)
-    return tuple(_build_track(name, frames, columns, numbers) for name, frames in by_track.items())
+    problems = _find_problems(numbers)
+    if problems and len(problems) == len(numbers):
+        raise InputError(f"all {len(numbers)} boxes are bad: the first one {problems[0]}", **where)
+    findings = []
+    for row, problem in problems.items():
+        track_id, frame = str(columns["track_id"][row]), columns["frame"][row]
+        del by_track[track_id][frame]
+        message = f"the box of {columns['label'][row]} {track_id} in frame {frame} {problem}"
+        findings.append(Finding("invalid_box", "warning", message, "Correct the box; it is left out.", frames=(frame,)))
+    tracks = (_build_track(name, frames, columns, numbers) for name, frames in by_track.items() if frames)
+    return tuple(tracks), tuple(findings)
+
+
+def _find_problems(numbers: Float64) -> dict[int, str]:
+    """Row → what is wrong with its box, of rows [N, 10] of position, quaternion and size."""
+    not_finite = ~np.isfinite(numbers).all(axis=1)
+    no_size = (numbers[:, 7:] <= 0).any(axis=1)
+    no_direction = np.linalg.norm(numbers[:, 3:7], axis=1) < _MIN_QUATERNION_NORM
+    problems = {}
+    for row in np.flatnonzero(not_finite | no_size | no_direction).tolist():
+        if not_finite[row]:
+            problems[row] = "is not finite"
+        else:
+            problems[row] = "has a size that is not positive" if no_size[row] else "has a quaternion of zeros"
+    return problems
 
 
 def _require_objects(columns: dict[str, list[Any]], where: dict[str, Any]) -> None:

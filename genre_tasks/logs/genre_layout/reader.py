@@ -233,14 +233,18 @@ class GenreLayoutLog(RecordedLog):
     @cached_property
     def _tracks(self) -> tuple[CuboidTrack, ...]:
         path = self.folder / BOXES_FILE
-        return read_boxes(path, self.frame_count, self.uri) if path.is_file() else ()
+        if not path.is_file():
+            return ()
+        tracks, findings = read_boxes(path, self.frame_count, self.uri)
+        self._report(*findings)
+        return tracks
 
     def tracks(self) -> tuple[CuboidTrack, ...]:
         """See ``DrivingLog``."""
         return self._tracks
 
     def findings(self) -> tuple[Finding, ...]:
-        """What sweeps that were read so far had to leave out."""
+        """What sweeps and boxes that were read so far had to leave out."""
         return tuple(self._findings.values())
 
     def digest(self) -> str:
