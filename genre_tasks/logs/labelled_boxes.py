@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
+from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.types import CuboidTrack, Float64
 
 MAX_BOXES = 300_000
@@ -37,7 +39,7 @@ class LabelledBox:
 
 def build_tracks(
     boxes: list[LabelledBox], world_SE3_sensor: Callable[[int], Float64], frame_count: int
-) -> tuple[CuboidTrack, ...]:
+) -> tuple[tuple[CuboidTrack, ...], tuple[Finding, ...]]:
     """Joins the boxes of each object.
 
     Args:
@@ -46,12 +48,17 @@ def build_tracks(
         frame_count: boxes of later frames are left out.
 
     Returns:
-        Tracks by their ids. Where labels do not say what moves, an object whose boxes are a metre apart does.
+        Tracks by their ids, and ``repeated_box_id`` where an id stands twice in a frame, of which the first box counts.
+        Where labels do not say what moves, an object whose boxes are a metre apart does.
     """
     by_track: dict[str, dict[int, LabelledBox]] = {}
+    repeated = []
     for box in boxes:
         if 0 <= box.frame < frame_count:
-            by_track.setdefault(box.track_id, {})[box.frame] = box
+            rows_at = by_track.setdefault(box.track_id, {})
+            if box.frame in rows_at:
+                repeated.append(box.frame)
+            rows_at.setdefault(box.frame, box)
     poses = {frame: world_SE3_sensor(frame) for frame in {box.frame for box in boxes} if 0 <= frame < frame_count}
     tracks = []
     # As numbers are sorted, though they are text.
@@ -72,4 +79,24 @@ def build_tracks(
                 moving=bool(distances.max() > _MOVES_M),
             )
         )
-    return tuple(tracks)
+    return tuple(tracks), describe_repeated(repeated)
+
+
+def describe_repeated(frames: Iterable[int]) -> tuple[Finding, ...]:
+    """Describes boxes that were left out because another box of their frame has their id.
+
+    Args:
+        frames: of these boxes, one entry a box.
+
+    Returns:
+        ``repeated_box_id`` for each frame.
+
+    >>> describe_repeated([7, 7])[0].message
+    '2 boxes of frame 7 have the id of another box of that frame, and are left out'
+    """
+    findings = []
+    for frame, count in sorted(Counter(frames).items()):
+        message = f"{count} boxes of frame {frame} have the id of another box of that frame, and are left out"
+        remedy = "Give every object an id, the same one in all frames."
+        findings.append(Finding("repeated_box_id", "warning", message, remedy, {"boxes": count}, frames=(frame,)))
+    return tuple(findings)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 
 from genre_tasks.errors import InputError
 from genre_tasks.logs.findings import Finding
+from genre_tasks.logs.labelled_boxes import LabelledBox, build_tracks
+from genre_tasks.logs.types import CuboidTrack, Float64
 from genre_tasks.suggestions import did_you_mean
 
 
@@ -30,6 +32,13 @@ class RecordedLog:
     def _findings_after(self, *parts: object) -> tuple[Finding, ...]:
         """Findings so far. Arguments are evaluated first: reading cameras adds what is wrong with their images."""
         return tuple(self._findings.values())
+
+    def _build_tracks(
+        self, boxes: list[LabelledBox], world_SE3_sensor: Callable[[int], Float64]
+    ) -> tuple[CuboidTrack, ...]:
+        tracks, findings = build_tracks(boxes, world_SE3_sensor, self.frame_count)
+        self._report(*findings)
+        return tracks
 
     def _report_invalid_points(self, count: int, frame: int) -> None:
         message = f"{count} points of sweep {frame} are not finite and left out"

@@ -61,6 +61,19 @@ def test_points_of_half_precision(tmp_path: Path) -> None:
     np.testing.assert_allclose(log.sweep(1).points_world, points, atol=0.05)
 
 
+def test_of_two_boxes_of_one_id_the_first_counts(folder: Path) -> None:
+    expected = open_log(f"argoverse2:{folder}").tracks()
+    table = feather.read_table(folder / "annotations.feather")
+    moved = table.slice(0, 1).to_pydict()
+    moved["tx_m"] = [moved["tx_m"][0] + 50.0]
+    table = pa.concat_tables([table, pa.table(moved, schema=table.schema)])
+    feather.write_feather(table, folder / "annotations.feather")
+    log = open_log(f"argoverse2:{folder}")
+    for track, known in zip(log.tracks(), expected, strict=True):
+        np.testing.assert_array_equal(track.world_SE3_box, known.world_SE3_box)
+    assert [finding.word for finding in log.findings()] == ["repeated_box_id"]
+
+
 def test_each_frame_has_the_nearest_image_and_its_pose(folder: Path) -> None:
     images = sorted((folder / "sensors/cameras/ring_front").iterdir())
     # Two images a sweep, as the cameras are twice as fast; the second ones are nobody's.

@@ -193,6 +193,18 @@ def test_a_drive_without_boxes_says_so(drive: Path) -> None:
     assert [finding.word for finding in log.findings()] == ["no_labels"]
 
 
+def test_of_two_boxes_of_one_id_the_first_counts(drive: Path, tmp_path: Path) -> None:
+    path = tmp_path / "kitti/labels.txt"
+    expected = open_log(f"kitti:{drive}?labels={path}").tracks()
+    words = path.read_text().splitlines()[1].split()
+    words[13] = "99.0"
+    path.write_text(path.read_text() + " ".join(words) + "\n")
+    log = open_log(f"kitti:{drive}?labels={path}")
+    np.testing.assert_array_equal(log.tracks()[0].world_SE3_box, expected[0].world_SE3_box)
+    (found,) = [finding for finding in log.findings() if finding.word == "repeated_box_id"]
+    assert found.frames == (int(words[0]),) and found.numbers == {"boxes": 1}
+
+
 def test_every_file_that_is_read_counts(drive: Path) -> None:
     digest = open_log(f"kitti:{drive}").digest()
     for path in sorted(path for path in drive.parent.rglob("*") if path.is_file()):

@@ -69,6 +69,21 @@ def test_boxes_between_key_frames_are_interpolated_and_said_to_be(tmp_path: Path
     assert finding.numbers == {"interpolated": 8, "boxes": 11}
 
 
+def test_of_two_boxes_of_one_id_the_first_counts(tmp_path: Path) -> None:
+    address = write_nuscenes(FAKE, tmp_path)
+    expected = open_log(f"nuscenes:{address}").tracks()
+
+    def repeat(rows: list[dict[str, Any]]) -> None:
+        rows.append({**rows[0], "token": token("another"), "translation": [99.0, 0.0, 0.0]})
+
+    change_table(tmp_path, "sample_annotation", repeat)
+    log = open_log(f"nuscenes:{address}")
+    for track, known in zip(log.tracks(), expected, strict=True):
+        np.testing.assert_array_equal(track.world_SE3_box, known.world_SE3_box)
+    (found,) = [finding for finding in log.findings() if finding.word == "repeated_box_id"]
+    assert found.frames == (0,)
+
+
 def test_a_long_gap_between_boxes_stays(tmp_path: Path) -> None:
     fake = FAKE.with_(frame_count=16)
     address = write_nuscenes(fake, tmp_path, key_every=3)

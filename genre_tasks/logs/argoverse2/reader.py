@@ -16,7 +16,7 @@ from genre_tasks.logs.file_digest import digest_files
 from genre_tasks.logs.file_reading import read_file
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.image_sizes import choose_lens, measure_images, report_problems
-from genre_tasks.logs.labelled_boxes import MAX_BOXES, LabelledBox, build_tracks
+from genre_tasks.logs.labelled_boxes import MAX_BOXES, LabelledBox
 from genre_tasks.logs.nearest_images import find_nearest_images
 from genre_tasks.logs.recorded_log import RecordedLog
 from genre_tasks.logs.timed_poses import TimedPoses
@@ -219,7 +219,7 @@ class Argoverse2Log(RecordedLog):
         sizes = np.stack([columns[name] for name in _SIZE_COLUMNS], axis=1)
         if (sizes <= 0).any():
             raise InputError("a box has no size", remedy="Download the log again.", file=path, log=self.uri)
-        return build_tracks(self._read_boxes(columns, sizes, path), self.world_SE3_lidar, self.frame_count)
+        return self._build_tracks(self._read_boxes(columns, sizes, path), self.world_SE3_lidar)
 
     def _read_boxes(self, columns: dict[str, Any], sizes: Float64, path: Path) -> list[LabelledBox]:
         rotations, positions = compose_poses(columns, path, self.uri)
@@ -238,7 +238,7 @@ class Argoverse2Log(RecordedLog):
         return boxes
 
     def findings(self) -> tuple[Finding, ...]:
-        """What was left out, for ``genre check``."""
+        """What was left out so far, for ``genre check``."""
         return self._findings_after(self.cameras)
 
     def digest(self) -> str:

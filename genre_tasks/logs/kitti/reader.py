@@ -24,7 +24,6 @@ from genre_tasks.logs.kitti.drive_files import (
     read_times,
 )
 from genre_tasks.logs.kitti.drive_poses import project_records
-from genre_tasks.logs.labelled_boxes import build_tracks
 from genre_tasks.logs.log_address import split_log_address
 from genre_tasks.logs.recorded_log import RecordedLog
 from genre_tasks.logs.timed_poses import TimedPoses
@@ -265,18 +264,16 @@ class KittiLog(RecordedLog):
             boxes = read_tracking_labels(self._labels, self.uri)
             # Labels of the benchmark were drawn into the images of the left colour camera.
             camera = next(iter(self._camera_times))
-            return build_tracks(
-                boxes,
-                lambda frame: self._world_SE3_rectified(self.camera_timestamp_s(camera, frame)),
-                self.frame_count,
+            return self._build_tracks(
+                boxes, lambda frame: self._world_SE3_rectified(self.camera_timestamp_s(camera, frame))
             )
         path = self._files.folder / TRACKLETS_FILE
         if not path.is_file():
             return ()
-        return build_tracks(read_tracklets(path, self.uri), self.world_SE3_lidar, self.frame_count)
+        return self._build_tracks(read_tracklets(path, self.uri), self.world_SE3_lidar)
 
     def findings(self) -> tuple[Finding, ...]:
-        """What was left out, for ``genre check``."""
+        """What was left out so far, for ``genre check``."""
         found = self._findings_after(self.cameras)
         if self._labels is None and not (self._files.folder / TRACKLETS_FILE).is_file():
             message = f"there are no boxes: neither {TRACKLETS_FILE} nor labels=FILE"

@@ -20,7 +20,8 @@ _US = 1e-6
 def interpolate_boxes(boxes: SceneBoxes, frame_times_us: Sequence[int]) -> tuple[list[LabelledBox], int]:
     """Gives every frame the boxes of its time: centres on a line, turns at a constant rate.
 
-    Nothing is extrapolated. Where an object lacks boxes for longer than a second, it lacks them between too.
+    Nothing is extrapolated. Where an object lacks boxes for longer than a second, it lacks them between too. Of two
+    boxes of an object at one time, the first counts.
 
     Args:
         boxes: of key frames, in the world.
@@ -32,7 +33,7 @@ def interpolate_boxes(boxes: SceneBoxes, frame_times_us: Sequence[int]) -> tuple
     frames_us = np.asarray(frame_times_us, dtype=np.int64)
     by_instance: dict[str, dict[int, int]] = {}
     for row, instance in enumerate(boxes.instances):
-        by_instance.setdefault(instance, {})[boxes.times_us[row]] = row
+        by_instance.setdefault(instance, {}).setdefault(boxes.times_us[row], row)
     found: list[LabelledBox] = []
     interpolated = 0
     for instance, row_at in by_instance.items():
@@ -51,6 +52,25 @@ def interpolate_boxes(boxes: SceneBoxes, frame_times_us: Sequence[int]) -> tuple
         for frame, pose in zip(chosen.tolist(), poses, strict=True):
             found.append(LabelledBox(frame, instance, boxes.labels[rows[0]], pose, (length, width, height)))
     return found, interpolated
+
+
+def find_repeated_boxes(boxes: SceneBoxes, frame_times_us: Sequence[int]) -> list[int]:
+    """Finds boxes whose object has another box at the same time.
+
+    Args:
+        boxes: of key frames.
+        frame_times_us: [F] increasing microseconds.
+
+    Returns:
+        The frame of each box but the object's first one; boxes before and after all frames are left out.
+    """
+    met: set[tuple[str, int]] = set()
+    repeated = []
+    for instance, time_us in zip(boxes.instances, boxes.times_us, strict=True):
+        if (instance, time_us) in met and frame_times_us[0] <= time_us <= frame_times_us[-1]:
+            repeated.append(int(np.searchsorted(np.asarray(frame_times_us), time_us)))
+        met.add((instance, time_us))
+    return repeated
 
 
 def _interpolate_poses(

@@ -19,9 +19,9 @@ from genre_tasks.logs.file_digest import digest_files
 from genre_tasks.logs.file_reading import read_file
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.image_sizes import choose_lens, describe_no_images, measure_images, report_problems
-from genre_tasks.logs.labelled_boxes import build_tracks
+from genre_tasks.logs.labelled_boxes import describe_repeated
 from genre_tasks.logs.nearest_images import find_nearest_images
-from genre_tasks.logs.nuscenes.box_interpolation import interpolate_boxes
+from genre_tasks.logs.nuscenes.box_interpolation import find_repeated_boxes, interpolate_boxes
 from genre_tasks.logs.nuscenes.scene_address import SceneAddress, parse_scene_address
 from genre_tasks.logs.nuscenes.scene_index import open_scene_index
 from genre_tasks.logs.nuscenes.scene_rows import SceneRows, SensorData, read_scene
@@ -216,16 +216,18 @@ class NuScenesLog(RecordedLog):
         times_us = tuple(
             key_times.get(sample, time) for sample, time in zip(boxes.samples, boxes.times_us, strict=True)
         )
-        labelled, interpolated = interpolate_boxes(
-            replace(boxes, times_us=times_us), [datum.time_us for datum in self._frames]
-        )
+        boxes = replace(boxes, times_us=times_us)
+        frame_times_us = [datum.time_us for datum in self._frames]
+        self._report(*describe_repeated(find_repeated_boxes(boxes, frame_times_us)))
+        labelled, interpolated = interpolate_boxes(boxes, frame_times_us)
         identity = np.eye(4)
-        return build_tracks(labelled, lambda frame: identity, self.frame_count), interpolated
+        return self._build_tracks(labelled, lambda frame: identity), interpolated
 
     def findings(self) -> tuple[Finding, ...]:
         """What was left out or interpolated, for ``genre check``."""
-        found = self._findings_after(self.cameras)
+        # Boxes first, which add to the findings.
         tracks, interpolated = self._boxes
+        found = self._findings_after(self.cameras)
         if not tracks:
             message = "there are no boxes, as in the test split"
             remedy = "Without boxes, whatever moves is smeared over its path."

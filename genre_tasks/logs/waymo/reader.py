@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from genre_tasks.logs.file_digest import digest_files
 from genre_tasks.logs.findings import Finding
-from genre_tasks.logs.labelled_boxes import MAX_BOXES, LabelledBox, build_tracks
+from genre_tasks.logs.labelled_boxes import MAX_BOXES, LabelledBox
 from genre_tasks.logs.recorded_log import RecordedLog
 from genre_tasks.logs.types import Camera, CuboidTrack, Float32, Float64, Sweep, Truth
 from genre_tasks.logs.waymo.camera_rows import name_sensors, read_cameras
@@ -241,12 +241,14 @@ class WaymoLog(RecordedLog):
             label = BOX_LABELS.get(int(columns["type"][row]), BOX_LABELS[0])
             length, width, height = sizes[row].tolist()
             boxes.append(LabelledBox(frames[time_us], str(columns[_OBJECT][row]), label, pose, (length, width, height)))
-        return build_tracks(boxes, self.world_SE3_lidar, self.frame_count)
+        return self._build_tracks(boxes, self.world_SE3_lidar)
 
     def findings(self) -> tuple[Finding, ...]:
         """What is not modelled or was left out, for ``genre check``."""
+        # Boxes first, which add to the findings.
+        tracks = self._tracks
         found = tuple(self._findings.values())
-        if not self._tracks:
+        if not tracks:
             message = "there are no boxes, as in the test split"
             remedy = "Without boxes, whatever moves is smeared over its path."
             found += (Finding("no_labels", "note", message, remedy),)
