@@ -124,6 +124,11 @@ BROKEN = {
         "do not increase",
         "timestamps.txt",
     ),
+    "sweeps of text": (
+        lambda drive: [path.rename(path.with_suffix(".txt")) for path in (drive / "velodyne_points/data").iterdir()],
+        "6 sweeps are text, as in an unsynced drive",
+        "0000000000.txt",
+    ),
     "few times": (_write("image_02/timestamps.txt", "2011-09-26 13:08:24.9\n"), "1 times for 6", "timestamps.txt"),
 }
 
@@ -191,6 +196,20 @@ def test_a_drive_without_boxes_says_so(drive: Path) -> None:
     log = open_log(f"kitti:{drive}")
     assert log.tracks() == ()
     assert [finding.word for finding in log.findings()] == ["no_labels"]
+
+
+def test_files_of_other_folders_are_no_sweeps_images_or_poses(drive: Path) -> None:
+    expected = open_log(f"kitti:{drive}").sweep(0).points_world
+    for folder, suffix in (
+        ("velodyne_points", "txt"),
+        ("velodyne_points", "png"),
+        ("image_02", "txt"),
+        ("oxts", "bin"),
+    ):
+        (drive / folder / f"data/0000000000.{suffix}").write_bytes(b"0 8 1 0 0 0 0 00")
+    log = open_log(f"kitti:{drive}")
+    np.testing.assert_array_equal(log.sweep(0).points_world, expected)
+    assert log.image_bytes("image_02", 0) == FAKE.image_bytes("front", 0)
 
 
 def test_of_two_boxes_of_one_id_the_first_counts(drive: Path, tmp_path: Path) -> None:

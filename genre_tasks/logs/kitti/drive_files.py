@@ -19,7 +19,10 @@ TRACKLETS_FILE = "tracklet_labels.xml"
 COLOUR_CAMERAS = ("image_02", "image_03")
 GREY_CAMERAS = ("image_00", "image_01")
 
-_FRAME_FILE = re.compile(r"([0-9]{10})\.(?:png|jpg|bin|txt)")
+_FRAME_NUMBER = re.compile(r"[0-9]{10}")
+_IMAGE_SUFFIXES = (".png", ".jpg")
+_SWEEP_SUFFIXES = (".bin",)
+_TEXT_SUFFIXES = (".txt",)
 _COPY_REMEDY = "Unpack the drive and the calibration of its day again, into KITTI's folders."
 # A file of one day's calibration has thirty lines.
 _MAX_TEXT_BYTES = 1 << 24
@@ -83,7 +86,7 @@ def find_drive_files(folder: Path, log: str) -> DriveFiles:
         The files. Grey cameras are listed only where there is no colour camera.
 
     Raises:
-        InputError: it is no folder of a drive.
+        InputError: it is no folder of a drive, or its sweeps are text.
     """
     remedy = "Give the folder of one drive, as in kitti:PATH/2011_09_26/2011_09_26_drive_0009_sync."
     # A link to a drive lies beside no calibration.
@@ -96,9 +99,9 @@ def find_drive_files(folder: Path, log: str) -> DriveFiles:
         if drives:
             remedy += f" Drives in it: {', '.join(drives[:10])}."
         raise InputError(f"no KITTI drive here: no {' and no '.join(missing)}", remedy=remedy, file=folder, log=log)
-    cameras = {name: _list_frames(folder / name / "data") for name in COLOUR_CAMERAS}
+    cameras = {name: _list_frames(folder / name / "data", _IMAGE_SUFFIXES) for name in COLOUR_CAMERAS}
     if not any(cameras.values()):
-        cameras = {name: _list_frames(folder / name / "data") for name in GREY_CAMERAS}
+        cameras = {name: _list_frames(folder / name / "data", _IMAGE_SUFFIXES) for name in GREY_CAMERAS}
     cameras = {name: files for name, files in cameras.items() if files}
     if not cameras:
         problem = f"there are no images in {', '.join((*COLOUR_CAMERAS, *GREY_CAMERAS))}"
@@ -107,16 +110,26 @@ def find_drive_files(folder: Path, log: str) -> DriveFiles:
         folder=folder,
         day=folder.parent,
         cameras=cameras,
-        sweeps=_list_frames(folder / "velodyne_points/data"),
-        poses=_list_frames(folder / "oxts/data"),
+        sweeps=_list_sweeps(folder / "velodyne_points/data", log),
+        poses=_list_frames(folder / "oxts/data", _TEXT_SUFFIXES),
     )
 
 
-def _list_frames(folder: Path) -> dict[int, Path]:
+def _list_sweeps(folder: Path, log: str) -> dict[int, Path]:
+    sweeps = _list_frames(folder, _SWEEP_SUFFIXES)
+    # Bytes of text would be read as floats, and some lengths fit.
+    as_text = [path for frame, path in _list_frames(folder, _TEXT_SUFFIXES).items() if frame not in sweeps]
+    if as_text:
+        problem = f"{len(as_text)} sweeps are text, as in an unsynced drive"
+        raise InputError(problem, remedy="Take the drive whose name ends in _sync.", file=as_text[0], log=log)
+    return sweeps
+
+
+def _list_frames(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
     if not folder.is_dir():
         return {}
-    matches = ((_FRAME_FILE.fullmatch(path.name), path) for path in sorted(folder.iterdir()))
-    return {int(match[1]): path for match, path in matches if match is not None}
+    paths = (path for path in sorted(folder.iterdir()) if path.suffix in suffixes)
+    return {int(path.stem): path for path in paths if _FRAME_NUMBER.fullmatch(path.stem)}
 
 
 def read_text(path: Path, log: str, frame: int | None = None) -> str:
