@@ -5,7 +5,7 @@ Every image is decoded, coarsely, and every sweep is read.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -26,6 +26,8 @@ _MIN_CHUNK_FRAMES = 2
 _MIN_SOURCE_FRAMES = 2
 # A complete sweep has tens of thousands; fewer are a file that was cut off or a sensor that was covered.
 _MIN_SWEEP_POINTS = 1000
+# Sweeps of one sensor differ with what stands around it, and by less: such a part is half a turn or a cut file.
+_MIN_SWEEP_PART = 0.25
 
 
 def check_log(log: DrivingLog, chunk_frames: int = 20, progress: Progress = silent, source_every: int = 4) -> LogCheck:
@@ -62,7 +64,7 @@ def check_log(log: DrivingLog, chunk_frames: int = 20, progress: Progress = sile
         cameras=cameras,
         missing_sweeps=missing,
         unreadable_sweeps=unreadable,
-        points=_summarise_counts(point_counts),
+        points=_summarise_counts(tuple(point_counts.values())),
         tracks_moving=sum(track.moving for track in tracks),
         tracks_static=sum(not track.moving for track in tracks),
         invalid=_count_left_out(log, inspector),
@@ -74,6 +76,7 @@ def check_log(log: DrivingLog, chunk_frames: int = 20, progress: Progress = sile
     )
     _report_lost_chunks(positions, inspector, chunk_frames)
     _report_findings(check, inspector, chunk_frames)
+    _report_small_sweeps(point_counts, inspector)
     _report_chunks_without_sources(check, inspector, chunk_frames, source_every)
     return replace(check, findings=tuple(inspector.findings))
 
@@ -233,10 +236,21 @@ def _report_lidar(check: LogCheck, inspector: LogInspector) -> None:
     if readable_sweeps and not check.points[-1]:
         message = "no LiDAR sweep has a point that can be used"
         inspector.report(Finding("no_lidar", "fatal", message, "Give points by ingest.points=FILE.ply."))
+
+
+def _report_small_sweeps(point_counts: Mapping[int, int], inspector: LogInspector) -> None:
+    """Adds which sweeps, of those with frame → point count, are empty or cut off."""
+    # Where no sweep has a point, another finding says so.
+    if not any(point_counts.values()):
         return
-    # ``points`` is 0 where no sweep is readable, which was reported as fatal already.
-    if readable_sweeps and check.points[0] < _MIN_SWEEP_POINTS:
-        message = f"a sweep has only {check.points[0]} points"
-        numbers = {"points": check.points[0], "limit": _MIN_SWEEP_POINTS}
-        remedy = "Look at the LiDAR files of the sequence."
-        inspector.report(Finding("few_lidar_points", "warning", message, remedy, numbers))
+    median = float(np.median(list(point_counts.values())))
+    limit = max(_MIN_SWEEP_POINTS, _MIN_SWEEP_PART * median)
+    frames = tuple(frame for frame, count in sorted(point_counts.items()) if count < limit)
+    if frames:
+        fewest = min(point_counts[frame] for frame in frames)
+        message = (
+            f"sweeps of frames {format_frames(frames)} have few points, down to {fewest}; the median is {median:g}"
+        )
+        numbers = {"points": fewest, "limit": limit, "median": median}
+        remedy = "Look at the LiDAR files of these frames; they are used as they are."
+        inspector.report(Finding("few_lidar_points", "warning", message, remedy, numbers, frames=frames))

@@ -119,16 +119,16 @@ class LogInspector:
             blank=frames[BLANK],
         )
 
-    def read_sweeps(self) -> tuple[tuple[int, ...], tuple[int, ...], list[int]]:
+    def read_sweeps(self) -> tuple[tuple[int, ...], tuple[int, ...], dict[int, int]]:
         """Reads every LiDAR sweep.
 
         Returns:
-            Frames without a sweep, frames whose sweep cannot be read, and the point counts of the rest.
+            Frames without a sweep, frames whose sweep cannot be read, and frame → point count of the rest.
         """
         missing: list[int] = []
         unreadable: list[int] = []
         errors: list[GenreError] = []
-        point_counts: list[int] = []
+        point_counts: dict[int, int] = {}
         for frame in range(self.log.frame_count):
             try:
                 sweep = self.log.sweep(frame)
@@ -139,7 +139,7 @@ class LogInspector:
                 if sweep is None:
                     missing.append(frame)
                 else:
-                    point_counts.append(len(sweep.points_world))
+                    point_counts[frame] = len(sweep.points_world)
             done = self._total_steps - self.log.frame_count + frame + 1
             self._progress(done, self._total_steps, f"sweep {frame}")
         self._report_errors("unreadable_sweep", errors)

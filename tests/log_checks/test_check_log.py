@@ -19,7 +19,9 @@ from genre_tasks.logs import registry
 from genre_tasks.logs.pandaset.reader import open_pandaset
 from genre_tasks.logs.pandaset.writer import write_pandaset
 from genre_tasks.logs.registry import open_log
+from genre_tasks.logs.types import Sweep
 from tests.fakes import FakeLog
+from tests.log_checks.edited_log import EditedLog
 from tests.logs.pandaset_folder import edit_json, edit_table, small_log
 
 REAL = Path(__file__).resolve().parents[3] / "shared/data/pandaset/002"
@@ -80,6 +82,24 @@ def test_missing_things_are_named_by_frame() -> None:
     assert "front: unreadable images at frames 4" in warnings
     assert "no LiDAR sweep at frames 2" in warnings
     assert "cannot read the sweep (frame 3, file 3.bin) [Fetch the file again.]" in warnings
+
+
+def test_sweeps_that_are_cut_off_are_named_by_frame() -> None:
+    log = FakeLog(frame_count=6, speed_mps=20.0, lidar_azimuths=720)
+
+    def sweep(frame: int) -> Sweep | None:
+        found = log.sweep(frame)
+        part = {1: 0, 4: len(found.points_world) // 5}.get(frame)
+        return replace(
+            found,
+            points_world=found.points_world[:part],
+            intensity=found.intensity[:part],
+            timestamps_s=found.timestamps_s[:part],
+        )
+
+    (found,) = [f for f in check_log(EditedLog(log, sweep=sweep)).findings if f.word == "few_lidar_points"]
+    assert found.frames == (1, 4) and "sweeps of frames 1, 4 have few points, down to 0" in found.message
+    assert found.numbers["limit"] == 0.25 * found.numbers["median"] > 1000
 
 
 def test_truncated_jpegs_and_odd_sizes() -> None:
