@@ -125,6 +125,13 @@ def not_there(values: dict[str, Any]) -> None:
         frame["file_path"] += ".jpeg"
 
 
+def timed_but_for_one(values: dict[str, Any]) -> None:
+    for n, frame in enumerate(values["frames"]):
+        frame.update(time=0.1 * n)
+    del values["frames"][7]["time"]
+    values["frames"][7]["file_path"] = "images/lacks-it.png"
+
+
 def labelled_elsewhere(values: dict[str, Any]) -> None:
     for n, frame in enumerate(values["frames"]):
         frame.update(camera=("a", "b", "../../x")[n % 3], time=n // 3)
@@ -136,6 +143,7 @@ def labelled_elsewhere(values: dict[str, Any]) -> None:
         (no_overlap, "no partner of the same name"),
         (other_lens, "more than one set of intrinsics"),
         (mirrored, "mirrored"),
+        (timed_but_for_one, "1 of 24 images have no time, the first one is .*lacks-it.png"),
         (not_there, "none of the 24 images is there"),
         (lambda v: v.update(camera_model="OPENCV_FISHEYE"), "camera model OPENCV_FISHEYE is not supported"),
         (lambda v: v.update(k4=0.1), "k4"),

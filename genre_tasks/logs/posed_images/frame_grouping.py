@@ -48,9 +48,10 @@ def group_frames(images: Sequence[PosedImage], file: Path) -> FrameGroups:
         Frames in the order of their times, or of their names without times.
 
     Raises:
-        InputError: names of several folders do not agree, two images claim one place, a camera has two lenses, or its
-            name would lead out of a folder.
+        InputError: names of several folders do not agree, two images claim one place, a camera has two lenses, its
+            name would lead out of a folder, or some images have a time and others have none.
     """
+    _require_times_of_all(images, file)
     has_times = all(image.time_s is not None for image in images)
     cameras = _name_cameras(images)
     names = sorted(set(cameras), key=_natural_key)
@@ -69,6 +70,15 @@ def group_frames(images: Sequence[PosedImage], file: Path) -> FrameGroups:
     _require_one_lens(images, cameras, file)
     groups = tuple(frames[key] for key in order)
     return FrameGroups(tuple(names), groups, tuple(map(float, order)) if has_times else None)
+
+
+def _require_times_of_all(images: Sequence[PosedImage], file: Path) -> None:
+    """Raises where some images lack a time: without them the others' times would say nothing of the order."""
+    missing = [image.name for image in images if image.time_s is None]
+    if 0 < len(missing) < len(images):
+        problem = f"{len(missing)} of {len(images)} images have no time, the first one is {missing[0]}"
+        remedy = "Write `time` in seconds into every frame, or into none."
+        raise InputError(problem, remedy=remedy, file=file)
 
 
 def _name_cameras(images: Sequence[PosedImage]) -> list[str]:
