@@ -25,7 +25,7 @@ _MAX_JITTER = 0.2
 # Clocks count from 1970 or from a log's start. 4.1e9 s is the year 2099.
 _DATE_RANGE_S = (0.0, 4.1e9)
 _CLOCK_REMEDY = "Frames keep the order of the files; effects that need time (rolling shutter, moving actors) suffer."
-_UNIT_REMEDY = "Check the unit of the timestamps: seconds, milliseconds and microseconds since 1970 are understood."
+_UNIT_REMEDY = "Check the unit of the timestamps: write seconds, or the unit that the format of the log prescribes."
 # Quartz clocks differ by 1e-4 at most; more is another unit or another rate of frames.
 _MAX_DRIFT = 1e-3
 # More are no jumps of a clock that is right between them.

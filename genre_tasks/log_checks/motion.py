@@ -41,7 +41,7 @@ _MIN_CHANGE = 8.0
 _IMAGE_WIDTH_PX = 64
 _FROZEN_REMEDY = "Export the pose of every frame at its own time."
 _AXES = ("forward (x)", "left (y)", "up (z)")
-_UNIT_REMEDY = "Check the unit of poses and times: metres, and seconds, milliseconds or microseconds."
+_UNIT_REMEDY = "Check the unit of poses and times: write metres and seconds, or what the format of the log prescribes."
 _AXES_REMEDY = "Poses must take x forward, y left, z up to a world whose z is up: check axes and quaternion order."
 
 

@@ -28,6 +28,13 @@ def with_times(*times: float) -> dict[str, Finding]:
     return assess(log)
 
 
+def test_the_remedy_of_a_wrong_unit_holds_for_every_reader() -> None:
+    """Most readers take seconds alone; milliseconds are understood in PandaSet's folders only."""
+    found = with_times(*(1e3 * (START_S + 0.1 * k) for k in range(8)))
+    for word in ("implausible_date", "implausible_frame_period"):
+        assert "write seconds" in found[word].remedy and "milliseconds" not in found[word].remedy
+
+
 @pytest.mark.parametrize("delay_s", [-0.1, -0.0812, 0.0, 0.03, 0.147])
 def test_cameras_fire_within_a_frame(delay_s: float) -> None:
     """Report: argoverse/av2-api#112 has an image 147 ms from its sweep."""
