@@ -101,8 +101,8 @@ def read_boxes(path: Path, frame_count: int, log: str) -> tuple[tuple[CuboidTrac
 
 def _find_problems(numbers: Float64) -> dict[int, str]:
     """Row → what is wrong with its box, of rows [N, 10] of position, quaternion and size."""
-    not_finite = ~np.isfinite(numbers).all(axis=1)
-    no_size = (numbers[:, 7:] <= 0).any(axis=1)
+    not_finite = np.asarray(~np.isfinite(numbers).all(axis=1))
+    no_size = np.asarray((numbers[:, 7:] <= 0).any(axis=1))
     no_direction = np.linalg.norm(numbers[:, 3:7], axis=1) < _MIN_QUATERNION_NORM
     problems = {}
     for row in np.flatnonzero(not_finite | no_size | no_direction).tolist():
