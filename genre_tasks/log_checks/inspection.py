@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from genre_tasks.errors import GenreError
 from genre_tasks.log_checks.images import BLANK, LEFT_OUT, ODD_SIZE, UNREADABLE, find_unfit, read_image
+from genre_tasks.log_checks.repeated_images import ImageRecord
 from genre_tasks.log_checks.results import CameraCheck
 from genre_tasks.logs.findings import Finding, Severity, format_frames
 from genre_tasks.logs.types import Camera, DrivingLog, Float64
@@ -93,8 +94,11 @@ class LogInspector:
         missing: list[int] = []
         pose_errors: list[GenreError] = []
         found = self.image_findings[camera.name] = []
+        record = ImageRecord(camera.name)
         for frame in range(self.log.frame_count):
-            facts, problem = read_image(partial(self.log.image_bytes, camera.name, frame), inspect_image, GenreError)
+            read = partial(self.log.image_bytes, camera.name, frame)
+            image, problem = read_image(read, lambda data: (inspect_image(data), data), GenreError)
+            facts, data = image or (None, b"")
             if facts is not None:
                 problem = find_unfit(camera.lens, facts)
             if problem is not None:
@@ -104,10 +108,16 @@ class LogInspector:
             else:
                 found.extend((frame, finding) for finding in facts.findings)
             # A camera pose that cannot be read costs one image, not the log.
-            _read_or_note(partial(self.log.world_SE3_camera, camera.name, frame), pose_errors)
+            pose = _read_or_note(partial(self.log.world_SE3_camera, camera.name, frame), pose_errors)
+            # Images that are left out for another reason, such as black ones, are reported by that.
+            if facts is not None and problem is None and pose is not None:
+                record.add(frame, data, pose)
             done = index * self.log.frame_count + frame + 1
             self._progress(done, self._total_steps, f"{camera.name} {frame}")
         self._report_errors("unreadable_pose", pose_errors)
+        repeated = record.find_repeated()
+        if repeated is not None:
+            self.report(repeated)
         frames = {word: tuple(n for n, finding in found if finding.word == word) for word in LEFT_OUT}
         return CameraCheck(
             name=camera.name,

@@ -14,6 +14,7 @@ from genre_tasks.log_checks.check_log import check_log
 from genre_tasks.logs.findings import Finding
 from genre_tasks.stages.ingest import ingest
 from tests.fakes import FakeLog
+from tests.log_checks.edited_log import EditedLog, is_complete, street
 from tests.logs.pandaset_folder import small_log
 from tests.scene.encoded_images import encode, picture
 
@@ -88,7 +89,9 @@ def test_what_is_in_doubt_is_one_issue_a_camera(make: Callable[[], bytes], word:
 def test_a_rule_that_loses_something_is_a_note() -> None:
     found, issues, used = judge(log_with(dict.fromkeys(range(4), encode(GREY16 * 257))))
     assert found["reduced_depth"].severity == "note" and issues == {} and used == 4
-    assert check_log(log_with(dict.fromkeys(range(4), encode(GREY16 * 257)))).verdict == "good"
+    # Images of a camera that moves differ.
+    moving = {frame: encode(np.roll(GREY16 * 257, frame, axis=1)) for frame in range(4)}
+    assert check_log(log_with(moving)).verdict == "good"
 
 
 def test_a_log_of_which_every_image_is_refused_is_unusable() -> None:
@@ -112,3 +115,15 @@ def test_a_file_that_the_reader_cannot_open_is_one_finding() -> None:
     found, issues, used = judge(Locked(frame_count=4, width_px=48, height_px=32, speed_mps=20.0, lidar_azimuths=360))
     assert "front: unreadable images at frames 2: permission denied (file 02.png)" in found["unreadable_image"].message
     assert issues["unreadable_image"] == ["permission denied (file 02.png). Change its mode."] and used == 3
+
+
+@pytest.mark.parametrize(("speed_mps", "is_found"), [(10.0, True), (0.5, False), (0.0, False)])
+def test_a_camera_that_hangs_while_the_vehicle_moves(speed_mps: float, is_found: bool) -> None:
+    log = street(speed_mps=speed_mps)
+
+    def image_bytes(camera: str, frame: int) -> bytes | None:
+        return log.image_bytes(camera, 3 if camera == "front" and 3 < frame < 6 else frame)
+
+    found = [f for f in check_log(EditedLog(log, image_bytes=image_bytes)).findings if f.word == "repeated_image"]
+    assert [(f.camera, f.frames) for f in found] == ([("front", (3, 4, 5))] if is_found else [])
+    assert all("front: the images of frames 3–5 repeat" in f.message and is_complete(f) for f in found)
