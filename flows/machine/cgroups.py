@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 CGROUP_ROOT = Path("/sys/fs/cgroup")
-OWN_CGROUPS = Path("/proc/self/cgroup")
+CGROUPS_OF_PROCESS = Path("/proc/self/cgroup")
 
 
 def read_cgroup_files(controller: str, name: str) -> Iterator[str]:
@@ -24,16 +24,16 @@ def read_cgroup_files(controller: str, name: str) -> Iterator[str]:
     """
     root = CGROUP_ROOT / controller
     folder = root
-    for part in ("", *_find_own_path(controller).split("/")):
+    for part in ("", *_find_cgroup_path(controller).split("/")):
         folder = folder / part
         # The path may be of the machine's tree, of which a container sees its branch alone.
         with suppress(OSError):
             yield (folder / name).read_text().strip()
 
 
-def _find_own_path(controller: str) -> str:
+def _find_cgroup_path(controller: str) -> str:
     with suppress(OSError):
-        for line in OWN_CGROUPS.read_text().splitlines():
+        for line in CGROUPS_OF_PROCESS.read_text().splitlines():
             _, controllers, path = line.split(":", 2)
             if controller in controllers.split(","):
                 return path.strip("/")

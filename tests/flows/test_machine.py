@@ -73,7 +73,7 @@ def test_limits_of_the_processs_own_cgroup_count(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(cgroups, "CGROUP_ROOT", tmp_path / "cgroup")
-    monkeypatch.setattr(cgroups, "OWN_CGROUPS", tmp_path / "own")
+    monkeypatch.setattr(cgroups, "CGROUPS_OF_PROCESS", tmp_path / "own")
     (tmp_path / "own").write_text("")
     without = (memory_limit_gib(), count_cores())
     (tmp_path / "own").write_text(line + "\n")
