@@ -181,6 +181,16 @@ def test_parts_of_a_segment(tmp_path: Path) -> None:
     assert log.image_bytes("FRONT", 0) == FAKE.image_bytes("front", 0)
 
 
+def test_of_two_boxes_of_one_id_the_first_counts(tmp_path: Path) -> None:
+    cars = (FakeCar("a", 5.0, 3.0), FakeCar("b", 9.0, 3.0))
+    address = write_waymo(FAKE.with_(cars=cars), tmp_path)
+    count = sum(len(track.frames) for track in open_log(f"waymo:{address}").tracks())
+    change_column(tmp_path, "lidar_box", "key.laser_object_id", ["same"] * count)
+    log = open_log(f"waymo:{address}")
+    assert [finding.word for finding in log.findings()] == ["repeated_box_id"] * FAKE.frame_count
+    assert len(log.tracks()) == 1 and len(log.tracks()[0].frames) == FAKE.frame_count < count
+
+
 def test_ten_thousand_boxes(tmp_path: Path) -> None:
     cars = tuple(FakeCar(f"car-{k}", 5.0 + k, 3.0, speed_mps=2.0) for k in range(500))
     fake = FAKE.with_(frame_count=20, camera_names=("front",), width_px=16, height_px=12, no_lidar=True, cars=cars)
