@@ -207,7 +207,8 @@ def read_scene_folder(folder: Path) -> dict[int, ExchangeScene]:
         raise InputError(
             "the folder holds a scene at single frames", remedy="Give one of its files, not the folder.", file=folder
         )
-    if not all(entry.file or entry.nodes for entry in document.chunks):
+    # A bundle for a simulator names actors, and leaves the Gaussians to its service.
+    if document.layout == "scenes" and not all(entry.file for entry in document.chunks):
         problem = f"the folder is of the format {document.format}, which holds no Gaussians of their own"
         raise InputError(problem, remedy="Export the scene as ply, glb or usdz.", file=folder)
     read = _read_chunk_file if document.layout == "scenes" else _read_nodes
