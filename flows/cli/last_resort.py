@@ -19,7 +19,7 @@ from flows.cli.outcome import EXIT_CODES, Status, print_unfinished
 from flows.cli.signals import Interrupted
 from flows.error_record import as_one_line, record_error
 from flows.machine.state_folder import find_state_folder
-from genre_tasks.errors import ConfigError
+from genre_tasks.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
     from genre_tasks.errors import GenreError
@@ -99,8 +99,6 @@ def find_status(error: GenreError) -> Status:
         ``refused`` for a mistake in the input or the configuration, ``partly_done`` where the error says that other
         parts are complete, ``failed`` for everything else.
     """
-    from genre_tasks.errors import ConfigError, InputError
-
     stated: Status | None = getattr(error, "status", None)
     return stated or ("refused" if isinstance(error, ConfigError | InputError) else "failed")
 

@@ -80,13 +80,15 @@ def copy_store(
         names = {name_run_folder(str(record["run"])) for record in found}
         names |= {f"{PINS}/{pin.name}" for pin in pins} | {name_run_folder(pin.name) for pin in pins}
         records = [name for name in records if name in names]
-    copied, _ = _copy_artifacts(source, target, artifacts, report)
+    copied, damaged = _copy_artifacts(source, target, artifacts, report)
     # After the artifacts: a record must not refer to what is not there yet.
     for name in records:
         _copy_record(source, target, name)
     # Once more, since `genre gc` removes what no record refers to, and the records have come only now.
-    added, damaged = _copy_artifacts(source, target, artifacts, report)
+    sound = [artifact for artifact in artifacts if artifact.address.key not in damaged]
+    added, damaged_since = _copy_artifacts(source, target, sound, lambda done, total, bytes_copied: None)
     copied |= added
+    damaged |= damaged_since
     if damaged:
         first = next(iter(damaged.values()))
         problem = f"{len(damaged)} artifacts are damaged, and all else is copied; the first: {first.problem}"

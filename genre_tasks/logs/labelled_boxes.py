@@ -55,10 +55,11 @@ def build_tracks(
     repeated = []
     for box in boxes:
         if 0 <= box.frame < frame_count:
-            rows_at = by_track.setdefault(box.track_id, {})
-            if box.frame in rows_at:
+            box_at = by_track.setdefault(box.track_id, {})
+            if box.frame in box_at:
                 repeated.append(box.frame)
-            rows_at.setdefault(box.frame, box)
+            else:
+                box_at[box.frame] = box
     poses = {frame: world_SE3_sensor(frame) for frame in {box.frame for box in boxes} if 0 <= frame < frame_count}
     tracks = []
     # As numbers are sorted, though they are text.

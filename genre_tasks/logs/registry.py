@@ -22,7 +22,8 @@ class ReaderEntry:
 
     Attributes:
         target: ``"module:function"``.
-        example: a URI that the reader opens, for error messages.
+        example: a URI that the reader opens, for error messages. ``PATH`` behind the colon says that a path stands
+            there, which is made absolute for other machines' workers.
         install_hint: what to install if importing the module fails.
         lister: ``"module:function"`` that lists the logs of a pattern, where logs are no folders; empty: they are.
     """
