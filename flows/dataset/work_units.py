@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 from flows.pipeline.log_cache import select_chunks
+from flows.pipeline.progress import get_reporter
 from genre_tasks.config import PipelineConfig
 
 Unit = Literal["log", "chunk"]
@@ -70,6 +71,10 @@ def list_units(logs: Sequence[str], unit: Unit, config: PipelineConfig) -> list[
     for log in dict.fromkeys(logs):
         try:
             units += [WorkUnit(log, chunk) for chunk in select_chunks(log, config, None)]
-        except GenreError:
+        except GenreError as error:
+            # Perhaps only the workers have the logs. Who asked for chunks is to know that they are not shared out.
+            get_reporter().message(
+                f"warning: {log} is one run for all chunks, as it cannot be opened here: {error.problem}"
+            )
             units.append(WorkUnit(log))
     return units

@@ -13,7 +13,7 @@ from flows.reconstruction.run_records import list_runs
 from flows.reconstruction.stored_values import read_stage_value
 from flows.simulation.edited_runs import open_shown_scenes
 from flows.simulation.run_scenes import RunScenes
-from genre_tasks.ego_paths.recorded_path import measure_frame_s
+from genre_tasks.ego_paths.recorded_path import list_image_times, measure_frame_times
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.exchange.conversion import to_exchange_scene
 from genre_tasks.exchange.types import ExchangeScene
@@ -131,11 +131,11 @@ class _RunStoredScenes:
         chunk = chunk_scene.chunk
         plan = read_stage_value(self._store, self._run, number, "effects")[1]
         # Clocks of logs round their times, and a scene of ten frames a second is to have ten.
-        frame_s = round(measure_frame_s([chunk]), _TIME_DIGITS)
+        steps_s = np.diff(measure_frame_times(chunk.frames, list_image_times(chunk)), prepend=0.0).round(_TIME_DIGITS)
         return to_exchange_scene(
             chunk_scene.scene,
             chunk.frames,
-            [(frame - chunk.frames[0]) * frame_s for frame in chunk.frames],
+            np.cumsum(steps_s).round(_TIME_DIGITS).tolist(),
             chunk.world_SE3_chunk,
             names=self._names,
             losses=describe_plan_losses(plan),

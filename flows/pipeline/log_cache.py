@@ -48,7 +48,7 @@ def select_chunks(log: str, config: PipelineConfig, chunks: list[int] | None) ->
     Args:
         log: the log's URI.
         config: its section ``ingest`` says how long a chunk is.
-        chunks: numbers of chunks, from 0; ``None`` for all chunks of the log.
+        chunks: numbers of chunks, from 0; ``None`` for all chunks of the log that are long enough.
 
     Returns:
         The numbers of the chunks to run.
@@ -58,14 +58,18 @@ def select_chunks(log: str, config: PipelineConfig, chunks: list[int] | None) ->
 
     >>> select_chunks("synthetic:street?seed=1000&frames=30", PipelineConfig(), None)
     [0, 1]
+    >>> select_chunks("synthetic:street?seed=1000&frames=22", PipelineConfig(), None)
+    [0]
     """
-    from genre_tasks.logs.log_selection import chunk_count
+    from genre_tasks.logs.log_selection import chunk_count, has_short_tail
 
     count = chunk_count(config.ingest, cached_log(log))
     if count == 0:
         raise InputError("the log has no frames", remedy="Copy it again, or choose another one.", log=log)
     known = f"Chunks are 0 to {count - 1}."
-    selected = list(range(count)) if chunks is None else chunks
+    # Who names the last chunk is told why it cannot be used; otherwise the other chunks are what is wanted.
+    usable_count = count - has_short_tail(config.ingest, cached_log(log))
+    selected = list(range(usable_count)) if chunks is None else chunks
     # None of these does anything that could be wanted, and a run of nothing would count as done.
     if not isinstance(selected, list | tuple) or not selected:
         raise InputError("no chunk is chosen", remedy=known, log=log)

@@ -39,7 +39,7 @@ class RequirementReport:
 
     Attributes:
         checked: a line for each thing that is there.
-        warnings: a line for each that may not suffice.
+        warnings: a line for each thing that may not suffice, and for frames that are left out.
     """
 
     checked: tuple[str, ...]
@@ -83,7 +83,7 @@ def check_requirements(
         stages: names of the stages that will run.
 
     Returns:
-        What was checked, and warnings where disk or memory may not suffice.
+        What was checked, and warnings where disk or memory may not suffice, or frames at the log's end are left out.
 
     Raises:
         InputError: the log, a chunk, a file or weights are missing or unreadable, or the store cannot be written to.
@@ -107,7 +107,11 @@ def check_requirements(
         f"disk: about {needed_mib:.0f} MiB for a run from nothing",
     )
     size = estimate_chunk_size(inputs.log, inputs.cameras, config)
-    found = (None if root is None else assess_disk(root, needed_mib), assess_memory(size, config, stages))
+    found = (
+        _describe_short_tail(config, inputs.log, chunks),
+        None if root is None else assess_disk(root, needed_mib),
+        assess_memory(size, config, stages),
+    )
     return RequirementReport(checked, tuple(warning for warning in found if warning is not None))
 
 
@@ -221,6 +225,21 @@ def _require_source_frames(config: PipelineConfig, log: DrivingLog, chunks: Sequ
             log=log.uri,
             chunk=chunks[0] if len(chunks) == 1 else None,
         )
+
+
+def _describe_short_tail(config: PipelineConfig, log: DrivingLog, chunks: list[int] | None) -> str | None:
+    """A warning about frames at the log's end that a run of all chunks leaves out."""
+    from genre_tasks.logs.findings import format_frames
+    from genre_tasks.logs.log_selection import chunk_count, has_short_tail, select_frames
+
+    if chunks is not None or not has_short_tail(config.ingest, log):
+        return None
+    last = chunk_count(config.ingest, log) - 1
+    frames = format_frames(select_frames(config.ingest, log, last))
+    return (
+        f"frames {frames} of {log.uri} are left out: chunk {last} would have one source frame, and needs two"
+        f" (ingest.source_every = {config.ingest.source_every})"
+    )
 
 
 def _check_points(config: PipelineConfig, log: DrivingLog, chunks: Sequence[int]) -> str:

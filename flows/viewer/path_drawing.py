@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flows.simulation.stored_ranges import SideRange
 from genre_tasks.ego_paths.ego_path import EgoPath
-from genre_tasks.ego_paths.recorded_path import measure_frame_s
+from genre_tasks.ego_paths.recorded_path import list_image_times, measure_frame_times
 from genre_tasks.logs.types import Float32, Float64, Lens
 from genre_tasks.scene.chunk import Chunk, View
 from genre_tasks.scene.image_decoding import decode_pixels
@@ -108,7 +108,7 @@ def draw_path(chunk: Chunk) -> PathDrawing:
     """
     poses = chunk.chunk_SE3_ego
     frames = np.asarray(chunk.frames, np.float64)
-    path = EgoPath((frames - frames[0]) * measure_frame_s([chunk]), frames, poses)
+    path = EgoPath(measure_frame_times(frames, list_image_times(chunk)), frames, poses)
     bottoms = [_box_bottoms(actor.chunk_SE3_box, actor.size_m[2]) for actor in chunk.actors]
     ground = Ground.from_points(chunk.static.positions.astype(np.float64), path, bottoms)
     heights, _ = ground.measure(poses[:, :2, 3])

@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from flows.reconstruction.stored_values import SCENE_STAGES, find_last_stage
 from flows.simulation.edited_runs import open_run, open_shown_scenes
 from flows.simulation.run_scenes import RunScenes
@@ -16,7 +14,7 @@ from flows.simulation.stored_ranges import SideRange, find_side_ranges
 from flows.viewer.path_colors import SHIFTS_M, PathColors, measure_path_colors
 from flows.viewer.path_drawing import CameraImage, PathDrawing, collect_images, draw_path
 from flows.viewer.scene_nodes import SceneNodes, build_scene_nodes, select_rows
-from genre_tasks.ego_paths.recorded_path import measure_frame_s
+from genre_tasks.ego_paths.recorded_path import list_image_times, measure_frame_times
 from genre_tasks.errors import InputError
 from genre_tasks.logs.types import Float64
 from genre_tasks.progress import Progress, silent
@@ -191,7 +189,7 @@ class ViewedRun:
             number=number,
             stage=stage,
             frames=chunk.frames,
-            times_s=(np.asarray(chunk.frames) - chunk.frames[0]) * measure_frame_s([chunk]),
+            times_s=measure_frame_times(chunk.frames, list_image_times(chunk)),
             chunk_SE3_ego=chunk.chunk_SE3_ego,
             scene=self._build_scene(chunk, loaded.scene, progress),
             path=draw_path(chunk),

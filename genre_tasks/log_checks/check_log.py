@@ -21,8 +21,7 @@ from genre_tasks.logs.types import DrivingLog, Float64
 from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.chunk import MOST_FRAMES
 
-# With a single frame, no point is seen from two positions of the same camera.
-_MIN_CHUNK_FRAMES = 2
+# With a single one, no point is seen from two positions of the same camera.
 _MIN_SOURCE_FRAMES = 2
 # A complete sweep has tens of thousands; fewer are a file that was cut off or a sensor that was covered.
 _MIN_SWEEP_POINTS = 1000
@@ -97,7 +96,7 @@ def _report_lost_chunks(positions: Float64, inspector: LogInspector, chunk_frame
 def _report_chunks_without_sources(
     check: LogCheck, inspector: LogInspector, chunk_frames: int, source_every: int
 ) -> None:
-    """Adds which chunks a run refuses, because images were left out of too many frames."""
+    """Adds which chunks a run refuses, because they have too few frames, or too few with images."""
     has_images = np.zeros(check.frames, dtype=bool)
     for camera in check.cameras:
         left_out = {*camera.missing, *camera.unreadable, *camera.odd_size, *camera.blank}
@@ -107,21 +106,28 @@ def _report_chunks_without_sources(
     # Without any image, another finding says so.
     if not has_images.any():
         return
-    lost = []
+    lost: list[int] = []
+    # Also with all its images, a chunk may have too few frames: only the last one can be that short.
+    too_short: list[int] = []
     for chunk in range(check.chunk_count):
         usable = has_images[chunk * chunk_frames : (chunk + 1) * chunk_frames]
-        # A chunk that is too short anyway is reported as short.
-        is_long_enough = count_source_frames(source_every, [True] * len(usable)) >= _MIN_SOURCE_FRAMES
-        if check.chunk_count == 1 and not is_long_enough:
-            message = f"a run needs more than {source_every} frames, or a smaller ingest.source_every"
-            inspector.report(Finding("few_source_frames", "note", message))
-        if is_long_enough and count_source_frames(source_every, usable) < _MIN_SOURCE_FRAMES:
+        if count_source_frames(source_every, [True] * len(usable)) < _MIN_SOURCE_FRAMES:
+            too_short.append(chunk)
+        elif count_source_frames(source_every, usable) < _MIN_SOURCE_FRAMES:
             lost.append(chunk)
+    severity: Severity = "fatal" if len(lost) + len(too_short) == check.chunk_count else "warning"
+    for chunk in too_short:
+        frames = range(chunk * chunk_frames, check.frames)
+        message = f"frames {format_frames(frames)} cannot be reconstructed: a chunk needs at least {source_every + 1}"
+        message += f" frames (ingest.source_every = {source_every})"
+        # A run leaves out the end of a log by itself; of a log of one chunk nothing would be left.
+        word: Severity = "fatal" if severity == "fatal" else "note"
+        remedy = "Set a smaller ingest.source_every."
+        inspector.report(Finding("few_source_frames", word, message, remedy, {"frames_needed": source_every + 1.0}))
     if lost:
         message = f"chunks {format_frames(lost)} cannot be reconstructed: they have fewer than two source frames with"
         message += f" images (ingest.source_every = {source_every})"
         remedy = "Export the images that are left out, choose other chunks, or set a smaller ingest.source_every."
-        severity: Severity = "fatal" if len(lost) == check.chunk_count else "warning"
         inspector.report(Finding("few_source_frames", severity, message, remedy, {"chunks": len(lost)}))
 
 
@@ -189,12 +195,7 @@ def _report_chunks(check: LogCheck, inspector: LogInspector, chunk_frames: int) 
         numbers = {"travel_m": travel, "limit_m": STANDSTILL_M}
         inspector.report(Finding("standstill", "warning", message, remedy, numbers))
     last_chunk_frames = check.frames - (check.chunk_count - 1) * chunk_frames
-    if last_chunk_frames < _MIN_CHUNK_FRAMES:
-        message = f"the last chunk has {last_chunk_frames} frame"
-        # A log of one frame has no other chunk.
-        severity: Severity = "warning" if check.chunk_count > 1 else "fatal"
-        inspector.report(Finding("single_frame_chunk", severity, message, "Leave it out with --chunks."))
-    elif last_chunk_frames < chunk_frames:
+    if last_chunk_frames < chunk_frames:
         message = f"the last chunk is short: {last_chunk_frames} of {chunk_frames} frames"
         inspector.report(Finding("short_chunk", "note", message))
 

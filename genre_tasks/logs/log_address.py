@@ -23,11 +23,12 @@ def split_log_address(rest: str, known: Sequence[str], layout: str) -> tuple[str
     Raises:
         ConfigError: an option is unknown.
 
-    >>> split_log_address("data/a%3Fb?labels=x.txt", ("labels",), "KITTI")
-    ('data/a?b', {'labels': 'x.txt'})
+    >>> split_log_address("data/a%3Fb?labels=x+1.txt", ("labels",), "KITTI")
+    ('data/a?b', {'labels': 'x+1.txt'})
     """
     path, _, query = rest.partition("?")
-    options = dict(parse_qsl(query, keep_blank_values=True))
+    # A plus is a plus here, as in the path, and no space as in the forms of web pages.
+    options = dict(parse_qsl(query.replace("+", "%2B"), keep_blank_values=True))
     for name in options:
         if name not in known:
             hint = did_you_mean(name, known) or f"Known: {', '.join(known)}."

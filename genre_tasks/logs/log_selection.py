@@ -60,6 +60,24 @@ def select_frames(config: IngestConfig, log: DrivingLog, chunk_index: int) -> tu
     return tuple(range(start, min(start + config.chunk_frames, log.frame_count)))
 
 
+def has_short_tail(config: IngestConfig, log: DrivingLog) -> bool:
+    """Tells whether a log ends with frames that are too few for a chunk, which needs two source frames.
+
+    Args:
+        config: with the frames of a chunk and the distance of source frames.
+        log: to divide.
+
+    Returns:
+        Whether its last chunk is too short; a log of one chunk has no tail.
+
+    >>> from types import SimpleNamespace
+    >>> [has_short_tail(IngestConfig(), SimpleNamespace(frame_count=count)) for count in (3, 20, 41, 45)]
+    [False, False, True, False]
+    """
+    tail = log.frame_count % config.chunk_frames
+    return log.frame_count > config.chunk_frames and 0 < tail <= config.source_every
+
+
 def select_cameras(config: IngestConfig, log: DrivingLog) -> tuple[Camera, ...]:
     """Selects the cameras to use.
 

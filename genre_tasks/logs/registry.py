@@ -26,12 +26,14 @@ class ReaderEntry:
             there, which is made absolute for other machines' workers.
         install_hint: what to install if importing the module fails.
         lister: ``"module:function"`` that lists the logs of a pattern, where logs are no folders; empty: they are.
+        path_options: options behind the question mark whose values are paths, too.
     """
 
     target: str
     example: str
     install_hint: str
     lister: str = ""
+    path_options: tuple[str, ...] = ()
 
 
 # Targets are text, not functions: importing every reader would need the packages of all, and would slow down each
@@ -51,6 +53,7 @@ _READERS: dict[str, ReaderEntry] = {
         "genre_tasks.logs.kitti.reader:open_kitti",
         "kitti:PATH/2011_09_26/2011_09_26_drive_0009_sync",
         "pip install genre (scipy and pillow are part of it)",
+        path_options=("labels",),
     ),
     "nuscenes": ReaderEntry(
         "genre_tasks.logs.nuscenes.reader:open_nuscenes",
@@ -67,6 +70,7 @@ _READERS: dict[str, ReaderEntry] = {
         "genre_tasks.logs.posed_images.image_log:open_posed_images",
         "posed_images:PATH/transforms.json?images=DIR",
         "pip install genre (scipy and pillow are part of it)",
+        path_options=("images",),
     ),
     "synthetic": ReaderEntry(
         "genre_tasks.logs.synthetic:open_synthetic",
@@ -153,7 +157,7 @@ def make_log_absolute(uri: str) -> str:
         uri: ``reader:rest``.
 
     Returns:
-        The URI with its path from the root and ``~`` replaced; as it is where the reader takes no path.
+        The URI with its paths from the root and ``~`` replaced; as it is where the reader takes no path.
 
     Raises:
         InputError: ``~NAME`` names no user.
@@ -166,8 +170,16 @@ def make_log_absolute(uri: str) -> str:
     # A reader that somebody registered may take anything, so its example decides.
     if entry is None or not entry.example.startswith(f"{name}:PATH"):
         return uri
-    path, mark, options = rest.partition("?")
+    path, mark, query = rest.partition("?")
+    options = "&".join(_make_option_absolute(option, entry) for option in query.split("&"))
     return f"{name}:{expand_user_path(path).absolute()}{mark}{options}"
+
+
+def _make_option_absolute(option: str, entry: ReaderEntry) -> str:
+    key, equals, value = option.partition("=")
+    if key not in entry.path_options or not value:
+        return option
+    return f"{key}{equals}{expand_user_path(value).absolute()}"
 
 
 def list_logs(uri: str) -> list[str] | None:

@@ -40,7 +40,7 @@ def place_inserted(insert: Insert, actor: LibraryActor, recorded_frame_s: float,
         InputError: the run ends before ``start_s``.
     """
     frames = survey.frames
-    times = (frames - frames[0]) * survey.frame_s
+    times = np.interp(frames, survey.path.frames, survey.path.times_s)
     # Half a frame of tolerance, as times come from rounded timestamps.
     present = times >= insert.start_s - 0.5 * survey.frame_s
     if not present.any():

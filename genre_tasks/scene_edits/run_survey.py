@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from genre_tasks.ego_paths.ego_path import EgoPath
-from genre_tasks.ego_paths.recorded_path import measure_frame_s
+from genre_tasks.ego_paths.recorded_path import ImageTime, list_image_times, measure_frame_s, measure_frame_times
 from genre_tasks.logs.types import Float64
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.graph import FIRST_ACTOR
@@ -96,6 +96,7 @@ def survey_run(source: SceneSource) -> RunSurvey:
     frames: dict[int, tuple[int, ...]] = {}
     points: list[Float64] = []
     steps: list[float] = []
+    images: list[ImageTime] = []
     for number in source.chunk_numbers:
         chunk_scene = source.load(number)
         chunk = chunk_scene.chunk
@@ -103,6 +104,7 @@ def survey_run(source: SceneSource) -> RunSurvey:
         ego.append((np.asarray(chunk.frames, np.float64), chunk.world_SE3_chunk @ chunk.chunk_SE3_ego))
         points.append(_ground_points(chunk))
         steps.append(measure_frame_s([chunk]))
+        images += list_image_times(chunk)
         counts = torch.bincount(chunk_scene.scene.nodes, minlength=FIRST_ACTOR + len(chunk_scene.scene.actors))
         for k, actor in enumerate(chunk_scene.scene.actors):
             entry = gathered.setdefault(actor.track_id, _Gathered(actor.label, actor.size_m))
@@ -110,7 +112,7 @@ def survey_run(source: SceneSource) -> RunSurvey:
             for frame, pose in zip(actor.frames, chunk.world_SE3_chunk @ actor.chunk_SE3_box, strict=True):
                 entry.poses.setdefault(int(frame), pose)
     tracks = {track_id: _make_track(track_id, entry) for track_id, entry in gathered.items()}
-    path = _join_path(ego, float(np.median(steps)))
+    path = _join_path(ego, images)
     if isinstance(source, NamedSource):
         names = {track_id: name for track_id, name in source.names.items() if track_id in tracks}
     else:
@@ -131,6 +133,6 @@ def _make_track(track_id: str, entry: _Gathered) -> Track:
     return Track(track_id, entry.label, entry.size_m, frames, poses, entry.gaussians)
 
 
-def _join_path(ego: Sequence[tuple[NDArray[np.float64], Float64]], frame_s: float) -> EgoPath:
+def _join_path(ego: Sequence[tuple[NDArray[np.float64], Float64]], images: Sequence[ImageTime]) -> EgoPath:
     frames = np.concatenate([f for f, _ in ego])
-    return EgoPath((frames - frames[0]) * frame_s, frames, np.concatenate([poses for _, poses in ego]))
+    return EgoPath(measure_frame_times(frames, images), frames, np.concatenate([poses for _, poses in ego]))

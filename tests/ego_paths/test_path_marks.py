@@ -12,7 +12,7 @@ from genre_tasks.config.simulation_sections import SimulateConfig
 from genre_tasks.ego_paths.behaviours import plan_behaviour
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.ego_paths.path_marks import mark_path
-from genre_tasks.ego_paths.recorded_path import DEFAULT_FRAME_S, measure_frame_s
+from genre_tasks.ego_paths.recorded_path import DEFAULT_FRAME_S, ImageTime, measure_frame_s, measure_frame_times
 from genre_tasks.ego_paths.relative_path import place_relative_path
 from genre_tasks.errors import InputError
 from tests.ego_paths.drives import drive, straight, yaw_of
@@ -33,6 +33,23 @@ def test_the_recorded_path_is_on_itself() -> None:
 def test_a_clock_that_stands_or_runs_backwards_tells_no_frame_time(times_s: tuple[float, ...]) -> None:
     views = [SimpleNamespace(camera="front", frame=frame, timestamp_s=time_s) for frame, time_s in enumerate(times_s)]
     assert measure_frame_s([SimpleNamespace(views=views)]) == DEFAULT_FRAME_S  # type: ignore[list-item]
+
+
+def test_a_pause_of_the_recording_is_in_the_times_of_its_frames() -> None:
+    def measure(times_s: dict[int, float], frames: list[int]) -> list[float]:
+        images = [ImageTime(camera, frame, time_s) for camera in ("front", "left") for frame, time_s in times_s.items()]
+        return measure_frame_times(frames, images).round(6).tolist()
+
+    jitter = {0: 5.0, 1: 5.09, 2: 5.21, 3: 5.3}
+    assert measure(jitter, [0, 1, 2, 3]) == pytest.approx([0.0, 0.09, 0.18, 0.27])
+    paused = {0: 5.0, 1: 5.1, 2: 8.1, 3: 8.2, 4: 8.3}
+    assert measure(paused, [0, 1, 2, 3, 4]) == pytest.approx([0.0, 0.1, 3.1, 3.2, 3.3])
+    # Chunk 0 and chunk 2 of a log: the frames between them took their time.
+    assert measure({0: 0.0, 1: 0.1, 2: 0.2, 40: 4.0, 41: 4.1}, [0, 1, 2, 40, 41])[3] == pytest.approx(4.0)
+    # A clock that jumps back tells nothing of that step.
+    assert measure({0: 5.0, 1: 5.1, 2: 1.1, 3: 1.2, 4: 1.3}, [0, 1, 2, 3, 4]) == pytest.approx(
+        [0.0, 0.1, 0.2, 0.3, 0.4]
+    )
 
 
 def test_a_lane_change_leaves_the_reliable_range_on_its_side() -> None:

@@ -103,6 +103,16 @@ def test_log_and_chunks_are_checked(tmp_path: Path, log: str, chunks: list[int] 
     assert words in refuse(tmp_path, log=log, chunks=chunks)
 
 
+def test_the_end_of_a_log_is_left_out_with_a_warning(tmp_path: Path) -> None:
+    config = load_configuration("demo")
+    longer = LOG.replace("frames=8", "frames=41")
+    report = check_requirements(longer, str(tmp_path), None, config)
+    assert "chunks: 0, 1" in report.checked
+    assert any("frames 40 of" in line and "chunk 2" in line for line in report.warnings)
+    named = check_requirements(longer, str(tmp_path), [0], config)
+    assert not any("left out" in line for line in named.warnings)
+
+
 def _truncate(weights: Path) -> None:
     weights.write_bytes(weights.read_bytes()[:1000])
 

@@ -48,12 +48,15 @@ def test_a_sound_log() -> None:
 
 
 def test_chunks_and_the_short_last_one() -> None:
-    check = check_log(log_of(frame_count=7, speed_mps=20.0), chunk_frames=3)
-    assert check.chunk_travel_m == pytest.approx((4.0, 4.0, 0.0))
-    assert "the last chunk has 1 frame" in messages(check, "warning")
-    short = check_log(log_of(frame_count=5, speed_mps=20.0), chunk_frames=3)
-    assert "the last chunk is short: 2 of 3 frames" in messages(short, "note")
-    assert short.verdict == "good"
+    check = check_log(log_of(frame_count=8, speed_mps=20.0), chunk_frames=5)
+    assert check.chunk_travel_m == pytest.approx((8.0, 4.0))
+    assert "the last chunk is short: 3 of 5 frames" in messages(check, "note")
+    assert "frames 5–7 cannot be reconstructed: a chunk needs at least 5" in messages(check, "note")
+    assert check.verdict == "good"
+    denser = check_log(log_of(frame_count=8, speed_mps=20.0), chunk_frames=5, source_every=2)
+    assert "the last chunk is short" in messages(denser, "note") and "cannot" not in messages(denser, "note")
+    lone = check_log(log_of(frame_count=4, speed_mps=20.0))
+    assert lone.verdict == "unusable" and "a chunk needs at least 5" in messages(lone, "fatal")
 
 
 def test_more_frames_than_can_be_numbered(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -125,7 +128,7 @@ def test_no_lidar_is_fatal_and_says_what_to_give() -> None:
 
 @pytest.mark.parametrize("no_lidar", [False, True])
 def test_the_command_ends_with_1_where_a_log_is_unusable(monkeypatch: pytest.MonkeyPatch, no_lidar: bool) -> None:
-    monkeypatch.setattr(registry, "open_log", lambda uri: log_of(no_lidar=no_lidar))
+    monkeypatch.setattr(registry, "open_log", lambda uri: log_of(no_lidar=no_lidar, frame_count=5, speed_mps=20.0))
     told, as_json = (CliRunner().invoke(app, ["check", "fake", *more]) for more in ((), ("--json",)))
     assert told.exit_code == as_json.exit_code == int(no_lidar)
     verdict = json.loads(as_json.stdout)["verdict"]
@@ -133,13 +136,13 @@ def test_the_command_ends_with_1_where_a_log_is_unusable(monkeypatch: pytest.Mon
 
 
 def test_no_cuboids_and_one_camera_are_survived() -> None:
-    check = check_log(log_of(without_tracks=True, camera_names=("front",), speed_mps=20.0))
+    check = check_log(log_of(without_tracks=True, camera_names=("front",), speed_mps=20.0), source_every=1)
     assert check.verdict == "good"
     assert "no cuboids" in messages(check, "note") and "one camera only" in messages(check, "note")
 
 
 def test_standstill() -> None:
-    check = check_log(log_of(speed_mps=0.0))
+    check = check_log(log_of(speed_mps=0.0), source_every=1)
     assert check.standstill_chunks == (0,) and check.verdict == "usable"
     assert "stands still (0.00 m)" in messages(check, "warning")
 
@@ -154,7 +157,7 @@ def test_standstill() -> None:
     ],
 )
 def test_clocks(times: tuple[float, ...], said: str) -> None:
-    check = check_log(log_of(timestamps_s=times, speed_mps=20.0))
+    check = check_log(log_of(timestamps_s=times, speed_mps=20.0), source_every=1)
     assert said in messages(check, "warning") and check.verdict == "usable"
 
 
@@ -171,7 +174,7 @@ class TestPandaSet:
 
     def test_left_out_boxes_are_counted(self, folder: Path) -> None:
         edit_table(folder / "annotations/cuboids/01.pkl.gz", yaw=np.array([0.0, np.nan]))
-        check = check_log(open_pandaset(str(folder)))
+        check = check_log(open_pandaset(str(folder)), source_every=1)
         assert check.invalid == (("invalid_box", 1),) and check.verdict == "usable"
         assert "is not finite" in messages(check, "warning")
 

@@ -224,6 +224,23 @@ BAD_BOXES = {
 }
 
 
+def test_keys_that_mean_nothing_are_named(folder: Path) -> None:
+    def misspell(values: dict[str, Any]) -> None:
+        values["comment"] = "a key of one's own"
+        values["cameras"]["front"]["readouts"] = 0.03
+        for frame in values["frames"]:
+            frame["images"]["frnt"] = frame["images"].pop("front")
+
+    _change(folder, misspell)
+    found = [finding for finding in open_log(f"genre:{folder}").findings() if finding.word == "unknown_key"]
+    assert [(finding.severity, finding.message.split("'")[1]) for finding in found] == [
+        ("note", "comment"),
+        ("warning", "readouts"),
+        ("warning", "frnt"),
+    ]
+    assert found[2].remedy == "Did you mean 'front'?" and "frame 0" in found[2].message
+
+
 @pytest.mark.parametrize("name", BAD_BOXES)
 def test_a_bad_box_is_left_out_alone(folder: Path, name: str) -> None:
     change, problem = BAD_BOXES[name]

@@ -71,6 +71,25 @@ def test_times_and_labels_of_the_file_make_the_frames(tmp_path: Path, written: P
     assert [log.frame_timestamp_s(frame) for frame in range(3)] == [93.0, 94.0, 95.0]
 
 
+def test_cameras_that_fire_one_after_the_other_share_frames(tmp_path: Path, written: Path) -> None:
+    delays = {"a": 0.0, "b": 0.03, "c": -0.02}
+
+    def label(values: dict[str, Any]) -> None:
+        for n, frame in enumerate(values["frames"]):
+            camera = "abc"[n % 3]
+            frame.update(camera=camera, time=50.0 + 0.1 * (n // 3) + delays[camera])
+
+    log = open_log(rewrite(tmp_path, written, label))
+    assert log.frame_count == 8 and all(log.image_bytes(c, frame) for c in "abc" for frame in range(8))
+    assert log.frame_timestamp_s(3) == pytest.approx(50.3)
+    assert [log.camera_timestamp_s(camera, 3) for camera in "abc"] == pytest.approx([50.3, 50.33, 50.28])
+
+
+def other_clock(values: dict[str, Any]) -> None:
+    for n, frame in enumerate(values["frames"]):
+        frame.update(camera="abc"[n % 3], time=0.1 * (n // 3) + (1000.0 if n % 3 == 2 else 0.0))
+
+
 def test_a_missing_image_is_none_and_its_camera_stays_on_the_rig(tmp_path: Path, written: Path) -> None:
     def drop(values: dict[str, Any]) -> None:
         values["frames"] = [f for f in values["frames"] if "front_camera/0003" not in f["file_path"]]
@@ -141,6 +160,7 @@ def labelled_elsewhere(values: dict[str, Any]) -> None:
     ("change", "words"),
     [
         (no_overlap, "no partner of the same name"),
+        (other_clock, "8 of 8 images of c have no partner near their time"),
         (other_lens, "more than one set of intrinsics"),
         (mirrored, "mirrored"),
         (timed_but_for_one, "1 of 24 images have no time, the first one is .*lacks-it.png"),

@@ -20,13 +20,19 @@ from typing import Any
 import numpy as np
 
 from genre_tasks.errors import InputError
+from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.types import Float64
+from genre_tasks.suggestions import did_you_mean
 
 LOG_FILE = "log.json"
 FORMAT = "genre-log"
 VERSION = 1
 BOXES_FILE = "boxes.parquet"
 LENS_KEYS = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
+LOG_KEYS = ("format", "version", "cameras", "frames")
+CAMERA_KEYS = (*LENS_KEYS, "distortion", "readout_s", "exposure_s")
+FRAME_KEYS = ("time_s", "lidar_pose", "sweep", "images")
+IMAGE_KEYS = ("file", "pose", "time_s")
 POINT_COLUMNS = ("x", "y", "z", "intensity", "time_s")
 BOX_COLUMNS = (
     "track_id",
@@ -171,3 +177,42 @@ def describe_entry_error(error: EntryError, file: Path, log: str) -> InputError:
     """
     remedy = "Correct the file; the guide of the genre layout lists every key."
     return InputError(str(error), remedy=remedy, file=file, log=log)
+
+
+def find_unknown_keys(values: Mapping[str, Any]) -> list[Finding]:
+    """Finds keys that the layout does not know: a misspelt one leaves out what it was to say.
+
+    Args:
+        values: of ``log.json``, its cameras and frames checked to be objects.
+
+    Returns:
+        A finding for each key and kind of place, a warning where it is near a known one.
+
+    >>> (found,) = find_unknown_keys({"cameras": {"front": {"readout": 0.03}}, "frames": []})
+    >>> found.message, found.remedy
+    ("log.json has the key 'readout' at camera front, which means nothing", "Did you mean 'readout_s'?")
+    """
+    cameras = values["cameras"]
+    unknown: dict[tuple[str, tuple[str, ...]], str] = {}
+
+    def look(entry: object, known: tuple[str, ...], what: str) -> None:
+        for key in entry if isinstance(entry, dict) else ():
+            if key not in known:
+                unknown.setdefault((str(key), known), what)
+
+    look(values, LOG_KEYS, "the top")
+    for name, camera in cameras.items():
+        look(camera, CAMERA_KEYS, f"camera {name}")
+    for index, frame in enumerate(values["frames"]):
+        look(frame, FRAME_KEYS, f"frame {index}")
+        images = frame.get("images")
+        look(images, tuple(cameras), f"the images of frame {index}")
+        for name, image in images.items() if isinstance(images, dict) else ():
+            look(image, IMAGE_KEYS, f"the image of {name} in frame {index}")
+    findings = []
+    for (key, known), what in unknown.items():
+        message = f"{LOG_FILE} has the key {key!r} at {what}, which means nothing"
+        hint = did_you_mean(key, known).strip()
+        remedy = hint or f"The keys there are {', '.join(known)}."
+        findings.append(Finding("unknown_key", "warning" if hint else "note", message, remedy))
+    return findings

@@ -25,6 +25,7 @@ from genre_tasks.logs.genre_layout.layout import (
     VERSION,
     EntryError,
     describe_entry_error,
+    find_unknown_keys,
     parse_mapping,
     parse_number,
     parse_pose,
@@ -92,6 +93,7 @@ class GenreLayoutLog(RecordedLog):
             self.cameras = tuple(self._parse_camera(*entry) for entry in self._list_cameras(values))
             self._frames = self._list_frames(values)
             self.frame_count = len(self._frames)
+            self._report(*find_unknown_keys(values))
         except EntryError as error:
             raise describe_entry_error(error, self._file, uri) from error
 

@@ -1,4 +1,7 @@
-"""Which images were taken together: by labels and times of the file, or by folders with equal file names."""
+"""Which images were taken together: by labels and times of the file, or by folders with equal file names.
+
+Cameras of a rig need not fire at once: by times, an image belongs to the nearest one of the camera with most images.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from pathlib import Path, PurePosixPath
 
 from genre_tasks.errors import InputError
 from genre_tasks.logs.camera_names import require_camera_names
+from genre_tasks.logs.nearest_images import find_nearest_images
 from genre_tasks.logs.posed_images.posed_image import PosedImage
 
 ONE_CAMERA = "camera"
@@ -17,9 +21,13 @@ _REMEDY = (
     "Keep the images of each camera in a folder of its own, with equal file names for images of one moment, or write "
     "`camera` and `time` into every frame of transforms.json."
 )
+_TIME_REMEDY = "Write times of one clock in seconds; images of one moment are less than half a frame apart."
 _LENS_REMEDY = "Give each camera a folder of its own; COLMAP then needs --ImageReader.single_camera_per_folder 1."
 # Of the frames of the camera that has fewer, so many must have a partner; else the names say nothing.
 _MIN_SHARED = 0.5
+_TICKS_PER_S = 1_000_000
+# Of a camera with one image.
+_ASSUMED_PERIOD_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -29,7 +37,7 @@ class FrameGroups:
     Attributes:
         cameras: names, in order.
         frames: for each frame the images by camera; a camera may lack some.
-        times_s: of each frame, ``None`` where the file has no times.
+        times_s: of each frame, ``None`` where the file has no times; images have times of their own.
     """
 
     cameras: tuple[str, ...]
@@ -56,20 +64,41 @@ def group_frames(images: Sequence[PosedImage], file: Path) -> FrameGroups:
     cameras = _name_cameras(images)
     names = sorted(set(cameras), key=_natural_key)
     require_camera_names(names, file=file)
+    keys: Sequence[float | str] = (
+        _match_times(images, cameras, names) if has_times else [PurePosixPath(image.name).stem for image in images]
+    )
     frames: dict[float | str, dict[str, PosedImage]] = {}
-    for image, camera in zip(images, cameras, strict=True):
-        key = float(image.time_s or 0.0) if has_times else PurePosixPath(image.name).stem
+    for image, camera, key in zip(images, cameras, keys, strict=True):
         frame = frames.setdefault(key, {})
         if camera in frame:
             problem = f"{image.name} and {frame[camera].name} are of one camera and one moment"
             raise InputError(problem, remedy=_REMEDY, file=file)
         frame[camera] = image
     if len(names) > 1:
-        _require_shared_frames(frames.values(), names, file)
+        _require_shared_frames(frames.values(), names, file, has_times)
     order = sorted(frames) if has_times else sorted(map(str, frames), key=_natural_key)
     _require_one_lens(images, cameras, file)
     groups = tuple(frames[key] for key in order)
     return FrameGroups(tuple(names), groups, tuple(map(float, order)) if has_times else None)
+
+
+def _match_times(images: Sequence[PosedImage], cameras: Sequence[str], names: Sequence[str]) -> list[float]:
+    """[N] for each image the time of its frame: that of the leading camera's image next to it, or its own."""
+    times = [float(image.time_s or 0.0) for image in images]
+    counts = Counter(cameras)
+    leader = max(names, key=lambda name: counts[name])
+    moments = sorted({time for time, camera in zip(times, cameras, strict=True) if camera == leader})
+    start = min(times)
+    ticks = [round((moment - start) * _TICKS_PER_S) for moment in moments]
+    matched = list(times)
+    for name in names:
+        places = [index for index, camera in enumerate(cameras) if camera == name]
+        image_ticks = [round((times[index] - start) * _TICKS_PER_S) for index in places]
+        nearest = find_nearest_images(ticks, image_ticks, round(_ASSUMED_PERIOD_S * _TICKS_PER_S))
+        for moment, place in zip(moments, nearest, strict=True):
+            if place is not None:
+                matched[places[place]] = moment
+    return matched
 
 
 def _require_times_of_all(images: Sequence[PosedImage], file: Path) -> None:
@@ -106,17 +135,16 @@ def _shared_parts(folders: Sequence[str]) -> tuple[str, ...]:
     return parts[0][:shared]
 
 
-def _require_shared_frames(frames: Collection[Mapping[str, PosedImage]], names: Sequence[str], file: Path) -> None:
+def _require_shared_frames(
+    frames: Collection[Mapping[str, PosedImage]], names: Sequence[str], file: Path, has_times: bool
+) -> None:
     counts = Counter(name for frame in frames for name in frame)
     together = Counter(name for frame in frames if len(frame) > 1 for name in frame)
     for name in names:
         if together[name] < _MIN_SHARED * counts[name]:
-            raise InputError(
-                f"{counts[name] - together[name]} of {counts[name]} images of {name} have no partner of the same name "
-                "in the folders of other cameras",
-                remedy=_REMEDY,
-                file=file,
-            )
+            partner = "near their time" if has_times else "of the same name in the folders of other cameras"
+            problem = f"{counts[name] - together[name]} of {counts[name]} images of {name} have no partner {partner}"
+            raise InputError(problem, remedy=_TIME_REMEDY if has_times else _REMEDY, file=file)
 
 
 def _require_one_lens(images: Sequence[PosedImage], cameras: Sequence[str], file: Path) -> None:

@@ -6,13 +6,13 @@ import hashlib
 import re
 from functools import cached_property
 from pathlib import Path
-from urllib.parse import parse_qsl, unquote
 
 import numpy as np
 
-from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.errors import InputError
 from genre_tasks.logs.file_digest import digest_files
 from genre_tasks.logs.findings import Finding
+from genre_tasks.logs.log_address import split_log_address
 from genre_tasks.logs.posed_images.colmap_model import read_colmap_model
 from genre_tasks.logs.posed_images.frame_grouping import FrameGroups, group_frames
 from genre_tasks.logs.posed_images.image_files import ImageFolder, fit_lens
@@ -21,7 +21,6 @@ from genre_tasks.logs.posed_images.rig_poses import RigPoses, fill_rig_poses
 from genre_tasks.logs.posed_images.transforms_json import read_transforms
 from genre_tasks.logs.posed_images.world_axes import UpDirection, find_up, turn_up_to_z
 from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Sweep, Truth
-from genre_tasks.suggestions import did_you_mean
 
 _OPTIONS = ("images", "up", "scale")
 # What a file without times is taken for; frames must neither stand on one moment nor be minutes apart.
@@ -46,15 +45,10 @@ def open_posed_images(rest: str) -> PosedImagesLog:
         InputError: poses or images are missing or unsound.
         ConfigError: an option is unknown or no such number.
     """
-    path, _, query = rest.partition("?")
-    options = dict(parse_qsl(query, keep_blank_values=True))
-    for name in options:
-        if name not in _OPTIONS:
-            hint = did_you_mean(name, _OPTIONS) or f"Known: {', '.join(_OPTIONS)}."
-            raise ConfigError(f"images with poses have no option '{name}'", remedy=hint)
+    path, options = split_log_address(rest, _OPTIONS, "images with poses")
     return PosedImagesLog(
         uri=f"posed_images:{rest}",
-        poses=find_poses(Path(unquote(path)).expanduser()),
+        poses=find_poses(Path(path).expanduser()),
         images=Path(options["images"]).expanduser() if options.get("images") else None,
         up=parse_direction(options["up"]) if options.get("up") else None,
         scale=parse_scale(options.get("scale", "1")),
@@ -155,9 +149,10 @@ class PosedImagesLog:
         return pose
 
     def camera_timestamp_s(self, camera: str, frame: int) -> float:
-        """The time of a camera's image, which is that of the frame."""
+        """The time of a camera's image; that of the frame where it has none."""
         self._check_camera(camera)
-        return self.frame_timestamp_s(frame)
+        image = self._groups.frames[self._check_frame(frame)].get(camera)
+        return self.frame_timestamp_s(frame) if image is None or image.time_s is None else float(image.time_s)
 
     def image_bytes(self, camera: str, frame: int) -> bytes | None:
         """The encoded image, ``None`` where there is none."""

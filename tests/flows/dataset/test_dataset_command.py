@@ -27,10 +27,15 @@ def test_paths_are_absolute_on_a_pool(tmp_path: Path, monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(dataset, "_submit", submit)
     monkeypatch.chdir(tmp_path)
-    logs = ["pandaset:data/002", "posed_images:t.json?scale=2", "synthetic:street?seed=1"]
+    logs = ["pandaset:data/002", "posed_images:t.json?images=i&scale=2", "kitti:d?labels=/l", "synthetic:street?seed=1"]
     CliRunner().invoke(app, ["dataset", *logs, "--pool", "genre", "--store", "kept"], catch_exceptions=False)
     CliRunner().invoke(app, ["dataset", *logs, "--pool", "genre", "--store", "s3://bucket/x"], catch_exceptions=False)
-    absolute = [f"pandaset:{tmp_path}/data/002", f"posed_images:{tmp_path}/t.json?scale=2", "synthetic:street?seed=1"]
+    absolute = [
+        f"pandaset:{tmp_path}/data/002",
+        f"posed_images:{tmp_path}/t.json?images={tmp_path}/i&scale=2",
+        f"kitti:{tmp_path}/d?labels=/l",
+        "synthetic:street?seed=1",
+    ]
     assert [(entry["store"], entry["logs"]) for entry in submitted] == [
         (str(tmp_path / "kept"), absolute),
         ("s3://bucket/x", absolute),
