@@ -71,6 +71,17 @@ def test_images_between_two_poses_have_a_pose_between_them(drive: Path) -> None:
     assert np.linalg.norm(after - before) > 0.1
 
 
+def test_a_time_far_from_all_poses_has_none(drive: Path) -> None:
+    path = drive / "image_02/timestamps.txt"
+    # A clock that is two seconds ahead: the path beyond the last record would be made up.
+    path.write_text(path.read_text().replace(":24.", ":26."))
+    log = open_log(f"kitti:{drive}")
+    with pytest.raises(InputError, match=r"pose is [12]\.\d+ s away, and 0.5 s") as caught:
+        log.world_SE3_camera("image_02", 3)
+    assert caught.value.file == str(drive / "oxts") and caught.value.frame == 3
+    assert np.isfinite(log.world_SE3_lidar(3)).all()
+
+
 def test_points_are_placed_by_their_own_time(drive: Path) -> None:
     still = open_log(f"kitti:{drive}").sweep(2)
     assert still is not None

@@ -19,7 +19,7 @@ from genre_tasks.logs.image_sizes import choose_lens, measure_images, report_pro
 from genre_tasks.logs.labelled_boxes import MAX_BOXES, LabelledBox
 from genre_tasks.logs.nearest_images import find_nearest_images
 from genre_tasks.logs.recorded_log import RecordedLog
-from genre_tasks.logs.timed_poses import TimedPoses
+from genre_tasks.logs.timed_poses import POSE_REACH_S, TimedPoses
 from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Lens, Sweep, Truth
 from genre_tasks.user_paths import expand_user_path
 
@@ -100,7 +100,8 @@ class Argoverse2Log(RecordedLog):
             raise InputError(f"{len(times_ns)} poses; two are needed", remedy=_REMEDY, file=path, log=self.uri)
         rotations, positions = compose_poses({name: values[rows] for name, values in columns.items()}, path, self.uri)
         # A city's origin may be kilometres away.
-        return TimedPoses(times_ns * _NS, rotations, positions - positions[0])
+        start = positions[0]
+        return TimedPoses(times_ns * _NS, rotations, positions - start, POSE_REACH_S, file=path, log=self.uri)
 
     def _read_mounts(self) -> dict[str, Float64]:
         """Sensor → [4, 4] vehicle_SE3_sensor."""
@@ -160,12 +161,12 @@ class Argoverse2Log(RecordedLog):
 
     def world_SE3_lidar(self, frame: int) -> Float64:
         """See ``DrivingLog``: the vehicle's own frame, in whose axes sweeps and boxes are."""
-        return self._poses.matrix_at(self.frame_timestamp_s(frame))
+        return self._poses.matrix_at(self.frame_timestamp_s(frame), frame)
 
     def world_SE3_camera(self, camera: str, frame: int) -> Float64:
         """See ``DrivingLog``."""
         time_s = self.camera_timestamp_s(camera, frame)
-        pose: Float64 = self._poses.matrix_at(time_s) @ self._mounts[camera]
+        pose: Float64 = self._poses.matrix_at(time_s, frame) @ self._mounts[camera]
         return pose
 
     def camera_timestamp_s(self, camera: str, frame: int) -> float:

@@ -115,7 +115,8 @@ class KittiLog(RecordedLog):
         if not (np.diff(times[frames]) > 0).all():
             file = self._files.times_file("oxts")
             raise InputError("the times of the poses do not increase", remedy=_COPY_REMEDY, file=file, log=self.uri)
-        return project_records(times[frames], np.stack(records))
+        folder = self._files.folder / "oxts"
+        return project_records(times[frames], np.stack(records), file=folder, log=self.uri)
 
     def _read_camera_times(self, camera: str) -> Float64:
         path = self._files.times_file(camera)
@@ -170,7 +171,7 @@ class KittiLog(RecordedLog):
 
     def world_SE3_lidar(self, frame: int) -> Float64:
         """See ``DrivingLog``."""
-        pose: Float64 = self._poses.matrix_at(self.frame_timestamp_s(frame)) @ self._imu_SE3_velodyne
+        pose: Float64 = self._poses.matrix_at(self.frame_timestamp_s(frame), frame) @ self._imu_SE3_velodyne
         return pose
 
     def world_SE3_camera(self, camera: str, frame: int) -> Float64:
@@ -179,11 +180,12 @@ class KittiLog(RecordedLog):
         matrix = self._projections[self._check_camera(camera, frame)]
         # The last column holds the way from the first camera, in pixels.
         rectified_SE3_camera[:3, 3] = -np.linalg.solve(matrix[:, :3], matrix[:, 3])
-        pose: Float64 = self._world_SE3_rectified(self.camera_timestamp_s(camera, frame)) @ rectified_SE3_camera
+        pose: Float64 = self._world_SE3_rectified(camera, frame) @ rectified_SE3_camera
         return pose
 
-    def _world_SE3_rectified(self, time_s: float) -> Float64:
-        pose: Float64 = self._poses.matrix_at(time_s) @ self._imu_SE3_rectified
+    def _world_SE3_rectified(self, camera: str, frame: int) -> Float64:
+        time_s = self.camera_timestamp_s(camera, frame)
+        pose: Float64 = self._poses.matrix_at(time_s, frame) @ self._imu_SE3_rectified
         return pose
 
     def camera_timestamp_s(self, camera: str, frame: int) -> float:
@@ -208,7 +210,7 @@ class KittiLog(RecordedLog):
         rows = self._read_points(path, frame)
         times = self._point_times(rows, frame)
         # Within a turn the vehicle goes a metre and more.
-        rotations, positions = self._poses.at(times)
+        rotations, positions = self._poses.at(times, frame)
         in_imu = rows[:, :3].astype(np.float64) @ self._imu_SE3_velodyne[:3, :3].T + self._imu_SE3_velodyne[:3, 3]
         return Sweep(
             points_world=rotations.apply(in_imu) + positions,
@@ -264,9 +266,7 @@ class KittiLog(RecordedLog):
             boxes = read_tracking_labels(self._labels, self.uri)
             # Labels of the benchmark were drawn into the images of the left colour camera.
             camera = next(iter(self._camera_times))
-            return self._build_tracks(
-                boxes, lambda frame: self._world_SE3_rectified(self.camera_timestamp_s(camera, frame))
-            )
+            return self._build_tracks(boxes, lambda frame: self._world_SE3_rectified(camera, frame))
         path = self._files.folder / TRACKLETS_FILE
         if not path.is_file():
             return ()
