@@ -121,9 +121,9 @@ def _report_chunks_without_sources(
         message = f"frames {format_frames(frames)} cannot be reconstructed: a chunk needs at least {source_every + 1}"
         message += f" frames (ingest.source_every = {source_every})"
         # A run leaves out the end of a log by itself; of a log of one chunk nothing would be left.
-        word: Severity = "fatal" if severity == "fatal" else "note"
+        weight: Severity = "fatal" if severity == "fatal" else "note"
         remedy = "Set a smaller ingest.source_every."
-        inspector.report(Finding("few_source_frames", word, message, remedy, {"frames_needed": source_every + 1.0}))
+        inspector.report(Finding("few_source_frames", weight, message, remedy, {"frames_needed": source_every + 1.0}))
     if lost:
         message = f"chunks {format_frames(lost)} cannot be reconstructed: they have fewer than two source frames with"
         message += f" images (ingest.source_every = {source_every})"

@@ -100,7 +100,7 @@ def test_a_chunk_that_cannot_be_made_leaves_the_others(tmp_path: Path) -> None:
     settings = [*SETTINGS, "ingest.chunk_frames=6", "ingest.source_every=2"]
     log = LOG.replace("frames=8", "frames=7")  # the second chunk has one frame, hence one source view
     with pytest.raises(ChunksLeftOutError, match=r"1 of 2 chunks left out: chunk 1: .*source") as caught:
-        flow.reconstruct_log(log, preset="demo", store=str(tmp_path), settings=settings)
+        flow.reconstruct_log(log, preset="demo", store=str(tmp_path), settings=settings, chunks=[0, 1])
     (record,) = run_records.list_runs(str(tmp_path))
     assert record == json.loads(json.dumps(caught.value.record))
     assert [c["chunk"] for c in record["chunks"]] == [0]
@@ -108,6 +108,14 @@ def test_a_chunk_that_cannot_be_made_leaves_the_others(tmp_path: Path) -> None:
     assert (entry["class"], entry["chunk"], entry["log"]) == ("InputError", 1, log) and entry["remedy"]
     assert (record["status"], caught.value.status) == ("partly_done", "partly_done")
     assert "chunk 1 is left out" in Path(record["report"]).read_text()
+
+
+def test_the_end_of_a_log_that_is_too_short_fails_nothing(tmp_path: Path) -> None:
+    settings = [*SETTINGS, "ingest.chunk_frames=6", "ingest.source_every=2"]
+    log = LOG.replace("frames=8", "frames=7")
+    flow.reconstruct_log(log, preset="demo", store=str(tmp_path), settings=settings)
+    (record,) = run_records.list_runs(str(tmp_path))
+    assert (record["status"], [c["chunk"] for c in record["chunks"]]) == ("done", [0])
 
 
 @pytest.mark.parametrize(("kind", "status"), [(InputError, "refused"), (ResourceError, "failed")])
@@ -132,7 +140,7 @@ def test_all_failures_are_listed_where_no_chunk_is_done(
 def test_a_dataset_ends_with_a_table_of_all_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports: PrefectHQ/prefect#9193, ploigos/ploigos-step-runner#179."""
     short = LOG.replace("frames=8", "frames=6")
-    partly = LOG.replace("frames=8", "frames=7")
+    partly = LOG.replace("frames=8", "frames=9")
     settings = [*SETTINGS, "ingest.chunk_frames=6", "ingest.source_every=2"]
     logs = ["synthetic:nothing", short, partly, OTHER_LOG]
     real = stage_task.run_stage
@@ -140,6 +148,8 @@ def test_a_dataset_ends_with_a_table_of_all_logs(tmp_path: Path, monkeypatch: py
     def faulty(stage: str, job: Job, *args: Any, **kwargs: Any) -> Any:
         if job.log == OTHER_LOG:
             raise IndexError("list index out of range")
+        if (job.log, job.chunk) == (partly, 1):
+            raise InputError("too few source frames", remedy="Choose other chunks.")
         return real(stage, job, *args, **kwargs)
 
     monkeypatch.setattr(stage_task, "run_stage", faulty)

@@ -12,6 +12,7 @@ POSE is a 4×4 matrix, row by row, that takes the sensor's axes to the world's.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
@@ -51,6 +52,8 @@ BOX_COLUMNS = (
     "height",
 )
 
+_MOST_UNKNOWN_KEYS = 50
+_LONGEST_KEY = 80
 _ROTATION_TOLERANCE = 1e-3
 # The Earth is 4e7 m around.
 _MAX_POSITION_M = 1e12
@@ -186,7 +189,8 @@ def find_unknown_keys(values: Mapping[str, Any]) -> list[Finding]:
         values: of ``log.json``, its cameras and frames checked to be objects.
 
     Returns:
-        A finding for each key and kind of place, a warning where it is near a known one.
+        A finding for each key and kind of place, a warning where it is near a known one; the first
+        ``_MOST_UNKNOWN_KEYS``.
 
     >>> (found,) = find_unknown_keys({"cameras": {"front": {"readout": 0.03}}, "frames": []})
     >>> found.message, found.remedy
@@ -210,9 +214,10 @@ def find_unknown_keys(values: Mapping[str, Any]) -> list[Finding]:
         for name, image in images.items() if isinstance(images, dict) else ():
             look(image, IMAGE_KEYS, f"the image of {name} in frame {index}")
     findings = []
-    for (key, known), what in unknown.items():
-        message = f"{LOG_FILE} has the key {key!r} at {what}, which means nothing"
-        hint = did_you_mean(key, known).strip()
+    # A damaged file may have millions of keys, or one of megabytes.
+    for (key, known), what in itertools.islice(unknown.items(), _MOST_UNKNOWN_KEYS):
+        message = f"{LOG_FILE} has the key {key[:_LONGEST_KEY]!r} at {what}, which means nothing"
+        hint = did_you_mean(key[:_LONGEST_KEY], known).strip()
         remedy = hint or f"The keys there are {', '.join(known)}."
         findings.append(Finding("unknown_key", "warning" if hint else "note", message, remedy))
     return findings
