@@ -107,26 +107,28 @@ def _report_chunks_without_sources(
     if not has_images.any():
         return
     lost: list[int] = []
-    # Also with all its images, a chunk may have too few frames: only the last one can be that short.
+    # Also with all its images a chunk may have too few frames, as the last one of a log.
     too_short: list[int] = []
+    short_frames: list[int] = []
     for chunk in range(check.chunk_count):
-        usable = has_images[chunk * chunk_frames : (chunk + 1) * chunk_frames]
-        if count_source_frames(source_every, [True] * len(usable)) < _MIN_SOURCE_FRAMES:
+        frames = range(chunk * chunk_frames, min((chunk + 1) * chunk_frames, check.frames))
+        if count_source_frames(source_every, [True] * len(frames)) < _MIN_SOURCE_FRAMES:
             too_short.append(chunk)
-        elif count_source_frames(source_every, usable) < _MIN_SOURCE_FRAMES:
+            short_frames += frames
+        elif count_source_frames(source_every, has_images[frames.start : frames.stop]) < _MIN_SOURCE_FRAMES:
             lost.append(chunk)
-    severity: Severity = "fatal" if len(lost) + len(too_short) == check.chunk_count else "warning"
-    for chunk in too_short:
-        frames = range(chunk * chunk_frames, check.frames)
-        message = f"frames {format_frames(frames)} cannot be reconstructed: a chunk needs at least {source_every + 1}"
-        message += f" frames (ingest.source_every = {source_every})"
+    is_all = len(lost) + len(too_short) == check.chunk_count
+    if too_short:
+        message = f"frames {format_frames(short_frames)} cannot be reconstructed: a chunk needs at least"
+        message += f" {source_every + 1} frames (ingest.source_every = {source_every})"
         # A run leaves out the end of a log by itself; of a log of one chunk nothing would be left.
-        weight: Severity = "fatal" if severity == "fatal" else "note"
+        severity: Severity = "fatal" if is_all else "note"
         remedy = "Set a smaller ingest.source_every."
-        inspector.report(Finding("few_source_frames", weight, message, remedy, {"frames_needed": source_every + 1.0}))
+        inspector.report(Finding("few_source_frames", severity, message, remedy, {"frames_needed": source_every + 1.0}))
     if lost:
         message = f"chunks {format_frames(lost)} cannot be reconstructed: they have fewer than two source frames with"
         message += f" images (ingest.source_every = {source_every})"
+        severity = "fatal" if is_all else "warning"
         remedy = "Export the images that are left out, choose other chunks, or set a smaller ingest.source_every."
         inspector.report(Finding("few_source_frames", severity, message, remedy, {"chunks": len(lost)}))
 

@@ -85,19 +85,20 @@ def group_frames(images: Sequence[PosedImage], file: Path) -> FrameGroups:
 def _match_times(images: Sequence[PosedImage], cameras: Sequence[str], names: Sequence[str]) -> list[float]:
     """[N] for each image the time of its frame: that of the leading camera's image next to it, or its own."""
     times = [float(image.time_s or 0.0) for image in images]
-    counts = Counter(cameras)
-    leader = max(names, key=lambda name: counts[name])
-    moments = sorted({time for time, camera in zip(times, cameras, strict=True) if camera == leader})
+    images_of: dict[str, list[int]] = {name: [] for name in names}
+    for index, camera in enumerate(cameras):
+        images_of[camera].append(index)
+    leader = max(names, key=lambda name: len(images_of[name]))
+    moments = sorted({times[index] for index in images_of[leader]})
     start = min(times)
     ticks = [round((moment - start) * _TICKS_PER_S) for moment in moments]
     matched = list(times)
-    for name in names:
-        places = [index for index, camera in enumerate(cameras) if camera == name]
-        image_ticks = [round((times[index] - start) * _TICKS_PER_S) for index in places]
+    for indices in images_of.values():
+        image_ticks = [round((times[index] - start) * _TICKS_PER_S) for index in indices]
         nearest = find_nearest_images(ticks, image_ticks, round(_ASSUMED_PERIOD_S * _TICKS_PER_S))
         for moment, place in zip(moments, nearest, strict=True):
             if place is not None:
-                matched[places[place]] = moment
+                matched[indices[place]] = moment
     return matched
 
 
