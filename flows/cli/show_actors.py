@@ -52,7 +52,7 @@ def _actor_row(survey: RunSurvey, track_id: str, name: str) -> dict[str, Any]:
         "size m": " x ".join(f"{side:.1f}" for side in track.size_m),
         "frames": f"{track.frames[0]}-{track.frames[-1]}",
         "points": max(track.gaussians.values()),
-        "speed m/s": round(measure_speed(path, survey.frame_s), 1),
+        "speed m/s": round(measure_speed(path, survey.clock), 1),
         "chunks": ", ".join(str(number) for number in sorted(track.gaussians)),
         # The start of a track id names the actor as well, and UUIDs would fill the terminal.
         "track": track_id[:_TRACK_CHARACTERS],

@@ -22,7 +22,7 @@ from flows.pipeline.log_cache import cached_log
 from flows.simulation.stage_scenes import StageScenes
 from genre_tasks.config import PipelineConfig
 from genre_tasks.ego_paths.ego_path import EgoPath
-from genre_tasks.ego_paths.recorded_path import measure_frame_s
+from genre_tasks.ego_paths.frame_clock import measure_clock
 from genre_tasks.errors import InputError
 from genre_tasks.metrics.scoring import decode_view_image
 from genre_tasks.render import render_views
@@ -204,12 +204,15 @@ def _measure_area(first: NDArray[np.int64], last: NDArray[np.int64], view: View)
     return area / 100 if is_cut else area
 
 
-def _edit_actor(scenes: StageScenes, config: PipelineConfig, best: _ActorView, name: str) -> dict[str, SceneSource]:
-    first_frame = scenes.load(scenes.chunk_numbers[0]).chunk.frames[0]
-    moment = (best.view.frame - first_frame) * measure_frame_s([best.chunk])
+def _edit_actor(scenes: SceneSource, config: PipelineConfig, best: _ActorView, name: str) -> dict[str, SceneSource]:
+    # The edit's start is in seconds, to which pauses of the recording add.
+    clock = measure_clock(scenes.load(number).chunk for number in scenes.chunk_numbers)
+    moment_s = float(clock.find_times([best.view.frame])[0])
     # To the other side of the ego vehicle than the actor, where nothing of it was.
     left_m = -INSERTED_LEFT_M if best.left_of_ego else INSERTED_LEFT_M
-    insert = Insert(actor=name, name="inserted", ahead_m=INSERTED_AHEAD_M, left_m=left_m, speed_m_s=0.0, start_s=moment)
+    insert = Insert(
+        actor=name, name="inserted", ahead_m=INSERTED_AHEAD_M, left_m=left_m, speed_m_s=0.0, start_s=moment_s
+    )
     edits: dict[str, Edit] = {
         "removed": Remove(actor=name),
         "inserted again": insert,

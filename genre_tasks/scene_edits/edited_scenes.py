@@ -221,7 +221,7 @@ class EditedScenes:
         track = self._survey.tracks[track_id]
         recorded = Trajectory(track.frames, track.world_SE3_box, track.frames.astype(np.float64))
         survey = self._survey
-        trajectory = change_trajectory(recorded, change, survey.frames, survey.frame_s, survey.ground)
+        trajectory = change_trajectory(recorded, change, survey.clock, survey.ground)
         return _ChangedActor(track_id, change, trajectory)
 
     def _insert(self, name: str, edit: Insert, change: ActorChange) -> _InsertedActor:
@@ -229,17 +229,17 @@ class EditedScenes:
             if edit.from_run is None:
                 track_id = resolve_actor(edit.actor, self._survey.names)
                 actor = take_actor(self._source, self._survey, track_id)
-                frame_s = self._survey.frame_s
+                clock = self._survey.clock
             else:
                 actor, other = self._library.take(edit.from_run, edit.actor)
-                frame_s = other.frame_s
-            trajectory = place_inserted(edit, actor, frame_s, self._survey)
+                clock = other.clock
+            trajectory = place_inserted(edit, actor, clock, self._survey)
         except InputError as error:
             raise self._at_edit(edit, error) from error
         if not change.is_identity and not change.removed:
             survey = self._survey
             shapes = trajectory.shape_frames
-            trajectory = change_trajectory(trajectory, change, survey.frames, survey.frame_s, survey.ground)
+            trajectory = change_trajectory(trajectory, change, survey.clock, survey.ground)
             # Its shapes are those of its recording, not of the run that it is in.
             trajectory = replace(trajectory, shape_frames=np.resize(shapes, len(trajectory)))
         return _InsertedActor(name, actor, trajectory, change, from_here=edit.from_run is None)

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from genre_tasks.ego_paths.ego_path import EgoPath
+from genre_tasks.ego_paths.frame_clock import FrameClock
 from genre_tasks.errors import InputError
 from genre_tasks.logs.types import Float64
 from genre_tasks.scene.transforms import compose_se3
@@ -21,7 +22,7 @@ _ALONG_COSINE = math.cos(math.radians(45))
 _MIN_STEP_M = 0.05
 
 
-def place_inserted(insert: Insert, actor: LibraryActor, recorded_frame_s: float, survey: RunSurvey) -> Trajectory:
+def place_inserted(insert: Insert, actor: LibraryActor, recorded_clock: FrameClock, survey: RunSurvey) -> Trajectory:
     """Places an inserted actor on the recorded path.
 
     It starts ``ahead_m`` in front of the ego vehicle and drives in the direction that it faces: along the path, against
@@ -30,7 +31,7 @@ def place_inserted(insert: Insert, actor: LibraryActor, recorded_frame_s: float,
     Args:
         insert: where, and how fast.
         actor: what is inserted.
-        recorded_frame_s: seconds of a log frame of the run that the actor is from.
+        recorded_clock: of the run that the actor is from.
         survey: of the run that is edited.
 
     Returns:
@@ -39,16 +40,16 @@ def place_inserted(insert: Insert, actor: LibraryActor, recorded_frame_s: float,
     Raises:
         InputError: the run ends before ``start_s``.
     """
-    frames = survey.frames
-    times = np.interp(frames, survey.path.frames, survey.path.times_s)
+    frames = survey.clock.frames.astype(np.int64)
+    times = survey.clock.times_s
     # Half a frame of tolerance, as times come from rounded timestamps.
-    present = times >= insert.start_s - 0.5 * survey.frame_s
+    present = times >= insert.start_s - 0.5 * survey.clock.frame_s
     if not present.any():
         problem = f"an inserted actor would appear after {insert.start_s:g} s, and the run ends at {times[-1]:.1f} s"
         raise InputError(problem, remedy="Give an earlier start_s.")
     track = actor.track
     recorded = Trajectory(track.frames, track.world_SE3_box, track.frames.astype(np.float64))
-    speed = measure_speed(recorded, recorded_frame_s) if insert.speed_m_s is None else insert.speed_m_s
+    speed = measure_speed(recorded, recorded_clock) if insert.speed_m_s is None else insert.speed_m_s
     travelled = speed * (times[present] - times[present][0])
     line = _PathLine(survey.path)
     start = line.length_at(float(frames[present][0])) + insert.ahead_m
@@ -63,9 +64,10 @@ def place_inserted(insert: Insert, actor: LibraryActor, recorded_frame_s: float,
     height, normal = survey.ground.measure(places)
     up = actor.clearance_m + track.size_m[2] / 2
     poses = compose_se3(_upright(yaw, normal), np.concatenate([places, height[:, None]], 1) + up * normal)
-    # Its recorded shapes one after the other: a pedestrian walks.
-    first = actor.shape_frames[0]
-    shapes = np.minimum(first + np.arange(len(places)), actor.shape_frames[-1])
+    # Its recorded shapes as time goes on: a pedestrian walks at the pace of the recording.
+    first_s = recorded_clock.find_times(actor.shape_frames[:1])
+    shapes = recorded_clock.find_frames(first_s + times[present] - times[present][0])
+    shapes = np.minimum(shapes, actor.shape_frames[-1])
     return Trajectory(frames[present], poses, shapes)
 
 

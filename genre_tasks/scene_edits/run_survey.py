@@ -11,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from genre_tasks.ego_paths.ego_path import EgoPath
-from genre_tasks.ego_paths.recorded_path import ImageTime, list_image_times, measure_frame_s, measure_frame_times
+from genre_tasks.ego_paths.frame_clock import FrameClock
+from genre_tasks.ego_paths.recorded_path import ImageTime, list_image_times, measure_frame_times
 from genre_tasks.logs.types import Float64
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.graph import FIRST_ACTOR
@@ -56,22 +57,18 @@ class RunSurvey:
         tracks: of all actors, by track id.
         names: readable name by track id.
         path: the recorded path of the ego vehicle.
-        frame_s: seconds of a log frame.
-        chunk_frames: log frames of the chunks, by number.
         ground: height of the ground.
     """
 
     tracks: Mapping[str, Track]
     names: Mapping[str, str]
     path: EgoPath
-    frame_s: float
-    chunk_frames: Mapping[int, tuple[int, ...]]
     ground: Ground
 
     @cached_property
-    def frames(self) -> NDArray[np.int64]:
-        """All log frames of the run, rising."""
-        return np.unique(np.concatenate([np.asarray(f, np.int64) for f in self.chunk_frames.values()]))
+    def clock(self) -> FrameClock:
+        """The times of all log frames of the run."""
+        return FrameClock.from_path(self.path)
 
 
 @dataclass
@@ -93,17 +90,13 @@ def survey_run(source: SceneSource) -> RunSurvey:
     """
     gathered: dict[str, _Gathered] = {}
     ego: list[tuple[NDArray[np.float64], Float64]] = []
-    frames: dict[int, tuple[int, ...]] = {}
     points: list[Float64] = []
-    steps: list[float] = []
     images: list[ImageTime] = []
     for number in source.chunk_numbers:
         chunk_scene = source.load(number)
         chunk = chunk_scene.chunk
-        frames[number] = chunk.frames
         ego.append((np.asarray(chunk.frames, np.float64), chunk.world_SE3_chunk @ chunk.chunk_SE3_ego))
         points.append(_ground_points(chunk))
-        steps.append(measure_frame_s([chunk]))
         images += list_image_times(chunk)
         counts = torch.bincount(chunk_scene.scene.nodes, minlength=FIRST_ACTOR + len(chunk_scene.scene.actors))
         for k, actor in enumerate(chunk_scene.scene.actors):
@@ -118,7 +111,7 @@ def survey_run(source: SceneSource) -> RunSurvey:
     else:
         names = number_tracks((int(t.frames[0]), t.track_id, t.label) for t in tracks.values())
     ground = Ground.from_points(np.concatenate(points), path, [track.bottoms for track in tracks.values()])
-    return RunSurvey(tracks, names, path, float(np.median(steps)), frames, ground)
+    return RunSurvey(tracks, names, path, ground)
 
 
 def _ground_points(chunk: Chunk) -> Float64:

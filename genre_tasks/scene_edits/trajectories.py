@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from genre_tasks.ego_paths.frame_clock import FrameClock
 from genre_tasks.logs.types import Float64
 from genre_tasks.scene.transforms import interpolate_pose
 from genre_tasks.scene_edits.edits import ActorChange
@@ -18,6 +19,9 @@ STANDING_M_S = 0.3
 
 _END_FRAMES = 5
 """The speed at an end of a path is the mean over so many frames."""
+
+_FRAME_TOLERANCE = 1e-3
+"""Fraction of a frame by which a delay may miss a frame's time and still meet it."""
 
 _SMOOTH_FRAMES = 5
 """The correction by the ground is averaged over so many frames, so that the noise of its height moves nothing."""
@@ -50,43 +54,94 @@ class Trajectory:
         return Trajectory(self.frames[inside], self.world_SE3_box[inside], self.shape_frames[inside])
 
 
-def change_trajectory(
-    recorded: Trajectory, change: ActorChange, run_frames: NDArray[np.int64], frame_s: float, ground: Ground
-) -> Trajectory:
+@dataclass(frozen=True)
+class _TimedPath:
+    # Where a recorded box was by seconds [F], which rise, and not by frames: a frame after a pause lasts long.
+    times_s: Float64
+    world_SE3_box: Float64
+
+    def pose_at(self, time_s: float) -> Float64:
+        # Between the ends of the path.
+        inside_s = min(max(time_s, self.times_s[0]), self.times_s[-1])
+        after = int(np.searchsorted(self.times_s, inside_s))
+        if self.times_s[after] == inside_s:
+            return np.asarray(self.world_SE3_box[after], np.float64)
+        before_s = float(self.times_s[after - 1])
+        fraction = (inside_s - before_s) / (float(self.times_s[after]) - before_s)
+        return interpolate_pose(self.world_SE3_box[after - 1], self.world_SE3_box[after], fraction)
+
+    def extrapolate(self, time_s: float, pose: Float64) -> Float64:
+        # Straight on from the pose at the end of the path that the time is past.
+        excess_s = time_s - min(max(time_s, self.times_s[0]), self.times_s[-1])
+        if not excess_s:
+            return pose
+        out = pose.copy()
+        out[:2, 3] += excess_s * self.measure_end_speed(at_start=excess_s < 0) * _heading(pose)
+        return out
+
+    def measure_end_speed(self, at_start: bool) -> float:
+        # Speed in the direction that the box faces, m/s; negative for one that drives back.
+        count = min(_END_FRAMES, len(self.times_s) - 1)
+        if not count:
+            return 0.0
+        a, b = (0, count) if at_start else (len(self.times_s) - 1 - count, len(self.times_s) - 1)
+        step = self.world_SE3_box[b, :2, 3] - self.world_SE3_box[a, :2, 3]
+        heading = _heading(self.world_SE3_box[a if at_start else b])
+        speed = float(step @ heading) / float(self.times_s[b] - self.times_s[a])
+        return speed if abs(speed) > STANDING_M_S else 0.0
+
+    def measure_length(self) -> Float64:
+        # Metres along the path at each pose; steps in which the box stands add nothing.
+        steps = np.linalg.norm(np.diff(self.world_SE3_box[:, :2, 3], axis=0), axis=1)
+        steps[steps < STANDING_M_S * np.diff(self.times_s)] = 0.0
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
+    def scale_progress(self, times_s: Float64, factor: float) -> Float64:
+        # The times of the recording at which the actor was as far along its path as it is now.
+        length = self.measure_length()
+        speeds = [self.measure_end_speed(at_start=start) for start in (True, False)]
+        before = np.minimum(times_s - self.times_s[0], 0) * abs(speeds[0])
+        after = np.maximum(times_s - self.times_s[-1], 0) * abs(speeds[1])
+        progress = factor * (np.interp(times_s, self.times_s, length) + before + after)
+        # Lengths must rise for the inverse: where the box stands, the last moment there is taken.
+        rising = np.concatenate([np.diff(length) > 0, [True]])
+        out = np.interp(progress, length[rising], self.times_s[rising])
+        out += np.where(progress > length[-1], (progress - length[-1]) / max(abs(speeds[1]), 1e-9), 0.0)
+        out = np.where((progress > length[-1]) & (speeds[1] == 0), self.times_s[-1], out)
+        return np.where(progress < 0, self.times_s[0] + progress / max(abs(speeds[0]), 1e-9), out)
+
+
+def change_trajectory(recorded: Trajectory, change: ActorChange, clock: FrameClock, ground: Ground) -> Trajectory:
     """Changes the path of an actor.
 
     With a delay an actor exists at its recorded frames and at the delayed ones. Before its path begins and after it
-    ends the actor drives straight on; one that stands there stands.
+    ends the actor drives straight on; one that stands there stands. Delays and speeds count the seconds of pauses of
+    the recording too.
 
     Args:
         recorded: at least one pose.
         change: what all edits of the actor come to.
-        run_frames: log frames of the run, rising.
-        frame_s: seconds of a log frame.
+        clock: of the run.
         ground: of the run.
 
     Returns:
-        The new path; its frames are some of ``run_frames``.
+        The new path; its frames are some of the run's.
     """
-    delay = float(change.delay_s) / frame_s
-    # Rounded, since the length of a frame is measured: four frames are not to be 4.000001.
-    first = min(recorded.frames[0], np.floor(recorded.frames[0] + delay + 1e-3))
-    last = max(recorded.frames[-1], np.ceil(recorded.frames[-1] + delay - 1e-3))
+    timed = _TimedPath(clock.find_times(recorded.frames), recorded.world_SE3_box)
     frames = recorded.frames
     if change.delay_s:
-        frames = run_frames[(run_frames >= first) & (run_frames <= last)]
+        frames = _list_delayed_frames(recorded.frames, float(change.delay_s), clock)
     if change.keeps_motion:
         poses = recorded.world_SE3_box
         reference = poses
         moments = recorded.shape_frames
     else:
-        moments = np.asarray(frames - delay, np.float64)
+        times_s = clock.find_times(frames) - float(change.delay_s)
         if change.speed_factor != 1:
-            moments = _scale_progress(recorded, moments, float(change.speed_factor), frame_s)
-        reference = np.stack(
-            [_pose_at(recorded, min(max(m, recorded.frames[0]), recorded.frames[-1])) for m in moments]
-        )
-        poses = np.stack([_extrapolate(recorded, m, pose, frame_s) for m, pose in zip(moments, reference, strict=True)])
+            times_s = timed.scale_progress(times_s, float(change.speed_factor))
+        reference = np.stack([timed.pose_at(time_s) for time_s in times_s])
+        poses = np.stack([timed.extrapolate(t, pose) for t, pose in zip(times_s, reference, strict=True)])
+        moments = clock.find_frames(times_s)
     shift = np.array([float(change.forward_m), float(change.left_m), 0.0])
     moved = _shift_level(poses, shift)
     moved[:, :3, :3] = moved[:, :3, :3] @ Rotation.from_euler("z", float(change.turn_deg), degrees=True).as_matrix()
@@ -123,18 +178,30 @@ def rest_on_ground(poses: Float64, reference: Float64, ground: Ground) -> Float6
     return out
 
 
-def measure_speed(trajectory: Trajectory, frame_s: float) -> float:
+def measure_speed(trajectory: Trajectory, clock: FrameClock) -> float:
     """Measures the mean speed along a path.
 
     Args:
         trajectory: of a box.
-        frame_s: seconds of a log frame.
+        clock: of the run that the box was recorded in.
 
     Returns:
         m/s; 0 for a box that stands or has one pose.
     """
-    span_s = float(trajectory.frames[-1] - trajectory.frames[0]) * frame_s
-    return float(_arc_length(trajectory, frame_s)[-1]) / span_s if span_s else 0.0
+    timed = _TimedPath(clock.find_times(trajectory.frames), trajectory.world_SE3_box)
+    span_s = float(timed.times_s[-1] - timed.times_s[0])
+    return float(timed.measure_length()[-1]) / span_s if span_s else 0.0
+
+
+def _list_delayed_frames(recorded: NDArray[np.int64], delay_s: float, clock: FrameClock) -> NDArray[np.int64]:
+    """Frames of the run from the earlier one of the recorded and the delayed beginning to the later end."""
+    begin_s, end_s = clock.find_times([recorded[0], recorded[-1]]) + delay_s
+    # A delay that is no multiple of a frame begins and ends between two frames, and both are taken. Slightly less than
+    # a frame, since its length is measured: four frames are not to be 4.000001.
+    margin_s = (1 - _FRAME_TOLERANCE) * clock.frame_s
+    is_after = (clock.frames >= recorded[0]) | (clock.times_s > begin_s - margin_s)
+    is_before = (clock.frames <= recorded[-1]) | (clock.times_s < end_s + margin_s)
+    return clock.frames[is_after & is_before].astype(np.int64)
 
 
 def _shift_level(poses: Float64, shift: Float64) -> Float64:
@@ -148,62 +215,9 @@ def _shift_level(poses: Float64, shift: Float64) -> Float64:
     return out
 
 
-def _pose_at(recorded: Trajectory, moment: float) -> Float64:
-    after = int(np.searchsorted(recorded.frames, moment))
-    if recorded.frames[after] == moment:
-        return recorded.world_SE3_box[after]
-    low = float(recorded.frames[after - 1])
-    fraction = (moment - low) / (float(recorded.frames[after]) - low)
-    return interpolate_pose(recorded.world_SE3_box[after - 1], recorded.world_SE3_box[after], fraction)
-
-
-def _extrapolate(recorded: Trajectory, moment: float, pose: Float64, frame_s: float) -> Float64:
-    excess = moment - min(max(moment, recorded.frames[0]), recorded.frames[-1])
-    if not excess:
-        return pose
-    out = pose.copy()
-    out[:2, 3] += excess * frame_s * _end_speed(recorded, frame_s, at_start=excess < 0) * _heading(pose)
-    return out
-
-
 def _heading(pose: Float64) -> Float64:
     forward = pose[:2, 0]
     return np.asarray(forward / np.linalg.norm(forward), np.float64)
-
-
-def _end_speed(recorded: Trajectory, frame_s: float, at_start: bool) -> float:
-    # Speed in the direction that the box faces, m/s; negative for one that drives back.
-    count = min(_END_FRAMES, len(recorded) - 1)
-    if not count:
-        return 0.0
-    a, b = (0, count) if at_start else (len(recorded) - 1 - count, len(recorded) - 1)
-    span_s = float(recorded.frames[b] - recorded.frames[a]) * frame_s
-    step = recorded.world_SE3_box[b, :2, 3] - recorded.world_SE3_box[a, :2, 3]
-    speed = float(step @ _heading(recorded.world_SE3_box[a if at_start else b])) / span_s
-    return speed if abs(speed) > STANDING_M_S else 0.0
-
-
-def _arc_length(recorded: Trajectory, frame_s: float) -> Float64:
-    # Metres along the path at each pose; frames in which the box stands add nothing.
-    steps = np.linalg.norm(np.diff(recorded.world_SE3_box[:, :2, 3], axis=0), axis=1)
-    steps[steps < STANDING_M_S * frame_s * np.diff(recorded.frames)] = 0.0
-    return np.concatenate([[0.0], np.cumsum(steps)])
-
-
-def _scale_progress(recorded: Trajectory, moments: Float64, factor: float, frame_s: float) -> Float64:
-    # The moments of the recording at which the actor was as far along its path as it is now.
-    frames = recorded.frames.astype(np.float64)
-    length = _arc_length(recorded, frame_s)
-    speeds = [_end_speed(recorded, frame_s, at_start=start) for start in (True, False)]
-    before = np.minimum(moments - frames[0], 0) * frame_s * abs(speeds[0])
-    after = np.maximum(moments - frames[-1], 0) * frame_s * abs(speeds[1])
-    progress = factor * (np.interp(moments, frames, length) + before + after)
-    # Lengths must rise for the inverse: where the box stands, the last moment there is taken.
-    rising = np.concatenate([np.diff(length) > 0, [True]])
-    out = np.interp(progress, length[rising], frames[rising])
-    out += np.where(progress > length[-1], (progress - length[-1]) / max(abs(speeds[1]), 1e-9) / frame_s, 0.0)
-    out = np.where((progress > length[-1]) & (speeds[1] == 0), frames[-1], out)
-    return np.where(progress < 0, frames[0] + progress / max(abs(speeds[0]), 1e-9) / frame_s, out)
 
 
 def _smooth(values: Float64) -> Float64:
