@@ -18,8 +18,8 @@ Size = tuple[int, int]
 # Others start programs, or have no signature that tells them from noise.
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "DIB", "PPM", "JPEG2000", "GIF", "AVIF")
 _SNIFFED_BYTES = 1024
-# Sides of an image may be in another proportion than stated by so much: files are rounded to whole pixels.
-_MAX_ASPECT_ERROR = 0.01
+# Resampled images are rounded to whole pixels, up or down, on both sides.
+_ROUNDING_PX = 2
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,28 @@ def _read_size(path: Path) -> tuple[Size | None, str]:
         return None, f"the file is a damaged image ({type(error).__name__})"
 
 
+def is_resampled(size: Size, stated: Size) -> bool:
+    """Tells whether images are those of a lens at another size, as all readers judge it: resampled, and not cropped.
+
+    Counted in pixels, and not as a fraction: a video encoder adds eight rows to 1080, which is less than one percent.
+
+    Args:
+        size: width and height of the images.
+        stated: width and height that the intrinsics are for.
+
+    Returns:
+        Whether the shorter side is as long as the longer one lets expect, but for rounding at the smaller size.
+
+    >>> is_resampled((960, 540), (1920, 1081)), is_resampled((124, 37), (1242, 375)), is_resampled((64, 36), (64, 36))
+    (True, True, True)
+    >>> is_resampled((1920, 1088), (1920, 1080)), is_resampled((1080, 1920), (1920, 1080))
+    (False, False)
+    """
+    return abs(size[0] * stated[1] - size[1] * stated[0]) <= _ROUNDING_PX * max(*size, *stated)
+
+
 def choose_lens(lens: Lens, measured: ImageSizes, camera: str) -> tuple[Lens, list[Finding]]:
-    """Fits a lens to the images that there are, and names the images of another size.
+    """Fits a lens to the images that there are, and names the images of another size, which are left out.
 
     Args:
         lens: of the size that the intrinsics state, or of the majority of images where they state none.
@@ -99,7 +119,7 @@ def choose_lens(lens: Lens, measured: ImageSizes, camera: str) -> tuple[Lens, li
     findings = []
     majority = measured.majority
     stated = (lens.width_px, lens.height_px)
-    if majority is not None and majority != stated and _has_shape(majority, stated):
+    if majority is not None and majority != stated and is_resampled(majority, stated):
         lens = lens.resized(*majority)
         message = f"{camera}: the images are {_format_size(majority)}, the intrinsics are for {_format_size(stated)}"
         numbers = {"width_px": majority[0], "stated_width_px": stated[0]}
@@ -113,10 +133,6 @@ def choose_lens(lens: Lens, measured: ImageSizes, camera: str) -> tuple[Lens, li
         numbers = {"images": len(odd), "width_px": expected[0], "height_px": expected[1]}
         findings.append(Finding("odd_image_size", "warning", message, remedy, numbers, camera, odd))
     return lens, findings
-
-
-def _has_shape(size: Size, other: Size) -> bool:
-    return abs(size[0] * other[1] - size[1] * other[0]) <= _MAX_ASPECT_ERROR * size[0] * other[1]
 
 
 def _format_size(size: Size) -> str:

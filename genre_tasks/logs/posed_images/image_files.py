@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from genre_tasks.errors import InputError
-from genre_tasks.logs.image_sizes import measure_images
+from genre_tasks.logs.image_sizes import is_resampled, measure_images
 from genre_tasks.logs.types import Lens
 
 # instant-ngp's names may lack the suffix.
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
-# Rounding of both sides of a resampled image changes its shape by so many pixels at most.
-_ROUNDING_PX = 2.0
 
 
 class ImageFolder:
@@ -62,7 +60,10 @@ class ImageFolder:
 
 
 def fit_lens(lens: Lens, camera: str, files: Sequence[Path]) -> Lens:
-    """Scales a lens to the images that there are.
+    """Scales a lens to the images that there are, by the rule that holds for logs too.
+
+    A log whose images have another shape is read on without them, and ``choose_lens`` says so. Of images with poses
+    nothing else would be left, so that they are refused.
 
     Args:
         lens: at the size that the file of poses states.
@@ -82,8 +83,7 @@ def fit_lens(lens: Lens, camera: str, files: Sequence[Path]) -> Lens:
         remedy = "Give images as PNG or JPEG."
         raise InputError(f"no image of {camera} can be read", remedy=remedy, file=files[0], camera=camera)
     width, height = majority
-    # Half-size images of odd sides are rounded.
-    if abs(lens.height_px * width / lens.width_px - height) > _ROUNDING_PX:
+    if not is_resampled(majority, (lens.width_px, lens.height_px)):
         file = files[next(index for index, size in sizes.sizes.items() if size == majority)]
         problem = f"images of {camera} are {width}×{height}, the intrinsics are for "
         problem += f"{lens.width_px}×{lens.height_px}"
