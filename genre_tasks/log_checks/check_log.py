@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from genre_tasks.log_checks.images import summarise_findings
 from genre_tasks.log_checks.inspection import LogInspector
@@ -97,14 +98,14 @@ def _report_chunks_without_sources(
     check: LogCheck, inspector: LogInspector, chunk_frames: int, source_every: int
 ) -> None:
     """Adds which chunks a run refuses, because they have too few frames, or too few with images."""
-    has_images = np.zeros(check.frames, dtype=bool)
+    has_images: dict[str, NDArray[np.bool_]] = {}
     for camera in check.cameras:
         left_out = {*camera.missing, *camera.unreadable, *camera.odd_size, *camera.blank}
         poses = [f.frames for f in inspector.findings if f.word == "unreadable_pose" and f.camera == camera.name]
         left_out.update(frame for frames in poses for frame in frames)
-        has_images |= ~np.isin(np.arange(check.frames), list(left_out))
+        has_images[camera.name] = ~np.isin(np.arange(check.frames), list(left_out))
     # Without any image, another finding says so.
-    if not has_images.any():
+    if not any(has_image.any() for has_image in has_images.values()):
         return
     lost: list[int] = []
     # Also with all its images a chunk may have too few frames, as the last one of a log.
@@ -112,10 +113,11 @@ def _report_chunks_without_sources(
     short_frames: list[int] = []
     for chunk in range(check.chunk_count):
         frames = range(chunk * chunk_frames, min((chunk + 1) * chunk_frames, check.frames))
-        if count_source_frames(source_every, [True] * len(frames)) < _MIN_SOURCE_FRAMES:
+        of_chunk = {camera: has_image[frames.start : frames.stop].tolist() for camera, has_image in has_images.items()}
+        if count_source_frames(source_every, {"any": [True] * len(frames)}) < _MIN_SOURCE_FRAMES:
             too_short.append(chunk)
             short_frames += frames
-        elif count_source_frames(source_every, has_images[frames.start : frames.stop]) < _MIN_SOURCE_FRAMES:
+        elif count_source_frames(source_every, of_chunk) < _MIN_SOURCE_FRAMES:
             lost.append(chunk)
     is_all = len(lost) + len(too_short) == check.chunk_count
     if too_short:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 
 from genre_tasks.config import IngestConfig
 from genre_tasks.errors import ConfigError
@@ -140,26 +140,53 @@ class SourceSchedule:
         self._next = (index // self._source_every + 1) * self._source_every
 
 
-def count_source_frames(source_every: int, has_images: Iterable[bool]) -> int:
+def select_source_frames(source_every: int, has_images: Mapping[str, Sequence[bool]]) -> dict[str, tuple[int, ...]]:
+    """Selects the frames of a chunk at which each camera has a source view.
+
+    Cameras share their source frames. One whose images all lie between them, as where two cameras take turns, has every
+    n-th of its images, since no scene would be fitted to it otherwise.
+
+    Args:
+        source_every: distance of source frames, from 1.
+        has_images: for each camera and frame of the chunk, whether its image can be used.
+
+    Returns:
+        Indices of frames in the chunk, by camera; none for a camera with a single image between the others' frames.
+
+    >>> select_source_frames(2, {"front": [True, False, True, False], "left": [False, True, False, True]})
+    {'front': (0, 2), 'left': (1,)}
+    """
+    schedule = SourceSchedule(source_every)
+    shared: list[int] = []
+    for index, is_there in enumerate(zip(*has_images.values(), strict=True)):
+        if any(is_there) and schedule.is_due(index):
+            schedule.take(index)
+            shared.append(index)
+    selected = {}
+    for camera, has_image in has_images.items():
+        selected[camera] = tuple(index for index in shared if has_image[index])
+        present = [index for index, is_there in enumerate(has_image) if is_there]
+        # Of two images one stays to be compared with.
+        if not selected[camera] and len(present) > 1:
+            selected[camera] = tuple(present[::source_every])
+    return selected
+
+
+def count_source_frames(source_every: int, has_images: Mapping[str, Sequence[bool]]) -> int:
     """Counts the source frames of a chunk.
 
     Args:
         source_every: distance of source frames, from 1.
-        has_images: for each frame of the chunk, whether any of its images can be used.
+        has_images: for each camera and frame of the chunk, whether its image can be used.
 
     Returns:
-        The count; a chunk needs two.
+        The count over all cameras; a chunk needs two.
 
-    >>> count_source_frames(4, [False, True, True, True, True]), count_source_frames(4, [True, True, True])
+    >>> count_source_frames(4, {"front": [False] + [True] * 4}), count_source_frames(4, {"front": [True] * 3})
     (2, 1)
     """
-    schedule = SourceSchedule(source_every)
-    count = 0
-    for index, has_image in enumerate(has_images):
-        if has_image and schedule.is_due(index):
-            schedule.take(index)
-            count += 1
-    return count
+    selected = select_source_frames(source_every, has_images)
+    return len({index for frames in selected.values() for index in frames})
 
 
 def choose_working_size(config: IngestConfig, cameras: Sequence[Camera]) -> tuple[int, int]:

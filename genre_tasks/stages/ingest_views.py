@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from genre_tasks.errors import InputError
 from genre_tasks.log_checks.images import LEFT_OUT, find_unfit, read_image, summarise_findings
 from genre_tasks.logs.findings import Finding
-from genre_tasks.logs.log_selection import SourceSchedule
+from genre_tasks.logs.log_selection import SourceSchedule, select_source_frames
 from genre_tasks.logs.types import Camera
 from genre_tasks.scene.chunk import View
 from genre_tasks.scene.image_decoding import decode_with_facts
@@ -30,7 +31,7 @@ def read_views(reading: ChunkReading, cameras: Sequence[Camera]) -> tuple[list[V
     """Reads the images of a chunk.
 
     Every ``source_every``-th frame has source views, the others are held out. Where none of its images can be used, the
-    next frame that has one takes its place.
+    next frame that has one takes its place. See :func:`select_source_frames` for cameras that take turns.
 
     Args:
         reading: the chunk; its issues grow.
@@ -89,15 +90,30 @@ def read_views(reading: ChunkReading, cameras: Sequence[Camera]) -> tuple[list[V
         if is_source and len(views) > count_before:
             schedule.take(n)
     _note_remarks(reading, remarks)
+    _supervise_cameras(reading, views, pixels)
     _note_unsupervised_cameras(reading, views)
     return views, pixels
 
 
+def _supervise_cameras(reading: ChunkReading, views: list[View], pixels: list[NDArray[np.uint8] | None]) -> None:
+    """Makes views sources, in place, of cameras that have images between the source frames of the others alone."""
+    row_of_frame = {frame: n for n, frame in enumerate(reading.frames)}
+    has_images = {view.camera: [False] * len(row_of_frame) for view in views}
+    for view in views:
+        has_images[view.camera][row_of_frame[view.frame]] = True
+    selected = select_source_frames(reading.config.source_every, has_images)
+    for n, view in enumerate(views):
+        if view.role == "heldout" and row_of_frame[view.frame] in selected[view.camera]:
+            views[n] = replace(view, role="source")
+            # Decoded once more: only now it shows that they are asked for.
+            pixels[n] = decode_with_facts(view.image, reading.config.width_px, reading.config.height_px).pixels
+
+
 def _note_unsupervised_cameras(reading: ChunkReading, views: list[View]) -> None:
-    """Names cameras whose images all lie between the source frames of the others: no scene is fitted to them."""
+    """Names cameras whose only image lies between the source frames of the others: no scene is fitted to them."""
     supervised = {view.camera for view in views if view.role == "source"}
     for camera in sorted({view.camera for view in views} - supervised):
-        detail = "none of its images is of a source frame: it supervises nothing; set ingest.source_every=1"
+        detail = "its only image is of no source frame: it supervises nothing; set ingest.source_every=1"
         reading.add_issue("no_source_view", detail, camera=camera)
 
 

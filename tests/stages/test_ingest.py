@@ -87,11 +87,35 @@ def test_same_bytes_again(log: FakeLog, chunk: Chunk) -> None:
         assert np.array_equal(getattr(again.actors[0].points, name), getattr(chunk.actors[0].points, name))
 
 
-def test_a_camera_between_the_source_frames_is_named(log: FakeLog) -> None:
+def test_cameras_that_take_turns_all_have_source_views(log: FakeLog) -> None:
     alternating = {("front" if frame % 2 else "left", frame) for frame in range(20)}
     out = ingest(CONFIG, log.with_(missing_images=frozenset(alternating)), 0)
+    sources = {(view.camera, view.frame) for view in out.views_with_role("source")}
+    assert sources == {("front", frame) for frame in (0, 4, 8, 12, 16)} | {("left", frame) for frame in (1, 9, 17)}
+    assert {view.camera for view in out.views_with_role("heldout")} == {"front", "left"}
+    assert "no_source_view" not in _kinds(out.log_issues)
+    # The left wall has the colours that the left camera alone can tell.
+    near_wall = (np.abs(out.static.positions[:, 1] - 8) < 0.01) & (np.abs(out.static.positions[:, 0]) < 2)
+    assert out.static.colored[near_wall].any()
+
+
+def test_a_camera_with_one_image_between_the_source_frames_is_named(log: FakeLog) -> None:
+    missing = frozenset(("left", frame) for frame in range(20) if frame != 5)
+    out = ingest(CONFIG, log.with_(missing_images=missing), 0)
     assert {view.camera for view in out.views_with_role("source")} == {"front"}
     assert [issue.camera for issue in out.log_issues if issue.kind == "no_source_view"] == ["left"]
+
+
+def test_check_and_ingest_agree_on_source_frames_of_cameras_that_take_turns(log: FakeLog) -> None:
+    # Frame 4 and those after it have no image: the left camera's frame 1 is the second source frame.
+    missing = {(camera, frame) for camera in ("front", "left") for frame in range(4, 20)}
+    missing |= {("front", 1), ("front", 2), ("front", 3), ("left", 0), ("left", 3)}
+    other = log.with_(missing_images=frozenset(missing))
+    assert "few_source_frames" not in {finding.word for finding in check_log(other).findings}
+    assert {(v.camera, v.frame) for v in ingest(CONFIG, other, 0).views_with_role("source")} == {
+        ("front", 0),
+        ("left", 1),
+    }
 
 
 def test_missing_and_unreadable_parts_are_marked(log: FakeLog) -> None:
