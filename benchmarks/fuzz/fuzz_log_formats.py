@@ -80,7 +80,7 @@ def pickle_targets() -> Iterator[FuzzTarget]:
         require_sound(all(len(c) == table.row_count for c in table.columns.values()), "columns of one length")
         if "x" in table.columns:
             return build_sweep(table, 0, file=path, log="log")
-        return build_tracks([read_boxes(table, 0, file=path, log="log")])
+        return build_tracks([read_boxes(table, 0, file=path, log="log")], "log")
 
     damages = (*BYTES, *(fuzz_attacks.make_running_pickle,) * 3, *(fuzz_attacks.change_pickle,) * 8)
     damages += (fuzz_attacks.compress_pickle, fuzz_attacks.compress_pickle, *(fuzz_attacks.make_odd_table,) * 4)

@@ -319,10 +319,10 @@ class DrivingLog(Protocol):
         ...
 
     def tracks(self) -> tuple[CuboidTrack, ...]:
-        """The annotated objects; empty where the log has no annotations.
+        """The annotated objects; empty where the log has no annotations. Bad boxes are left out, and are findings.
 
         Raises:
-            InputError: the annotations are there and cannot be read.
+            InputError: the annotations are there and cannot be read, or all boxes are bad.
         """
         ...
 

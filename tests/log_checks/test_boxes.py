@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -127,7 +128,7 @@ def test_headings_of_what_drives() -> None:
 def test_yaw_in_degrees_is_seen_in_the_file(yaw: float, fires: bool) -> None:
     """Report: tyagi-iiitv/PointPillars#4."""
     table = Table(cuboids({"yaw": yaw}, {"uuid": "b"}), 2)
-    _, findings = build_tracks([read_boxes(table, frame=0)])
+    _, findings = build_tracks([read_boxes(table, 0, file=Path("00.pkl.gz"), log="log")], "log")
     assert [finding.word for finding in findings] == (["odd_box_yaw"] if fires else [])
 
 

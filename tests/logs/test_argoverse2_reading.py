@@ -136,7 +136,7 @@ BROKEN = {
     "an infinite pose": (_set("city_SE3_egovehicle.feather", "tx_m", float("inf")), "not finite"),
     "one time": (_set("city_SE3_egovehicle.feather", "timestamp_ns", 5), "1 poses"),
     "poses of text": (_set("city_SE3_egovehicle.feather", "tx_m", "here"), "holds string"),
-    "no size": (_set("annotations.feather", "width_m", 0.0), "no size"),
+    "no size": (_set("annotations.feather", "width_m", 0.0), "boxes are bad: .* not positive"),
     "no sweeps": (lambda folder: shutil.rmtree(folder / "sensors/lidar"), "no sweeps"),
     "cut": (
         lambda folder: (folder / "annotations.feather").write_bytes(

@@ -159,6 +159,7 @@ def test_a_broken_drive_is_an_error_that_names_the_file(drive: Path, name: str) 
     [
         ("<boost_serialization/>", "no element tracklets"),
         ("<boost_serialization><tracklets>", "cannot be read"),
+        ('<?xml version="1.0" encoding="UTF-9"?><x><tracklets/></x>', "unknown encoding"),
         ("<x><tracklets><item><h>1</h></item></tracklets></x>", "item has no number w"),
         ('<!DOCTYPE x [<!ENTITY a "b">]><x><tracklets/></x>', "declares entities"),
     ],

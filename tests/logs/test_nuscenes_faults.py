@@ -71,7 +71,8 @@ BROKEN: dict[str, tuple[Callable[[Path], None], str, str]] = {
     "too few numbers": (_set("ego_pose", "rotation", [1, 0, 0]), "list of 4 numbers", "ego_pose"),
     "no number": (_set("ego_pose", "translation", [0, float("nan"), 0]), "finite number", "ego_pose"),
     "no turn": (_set("ego_pose", "rotation", [0, 0, 0, 0]), "quaternion is zero", "ego_pose"),
-    "no size": (_set("sample_annotation", "size", [1, 0, 1]), "no size", "sample_annotation"),
+    "two sizes": (_set("sample_annotation", "size", [1, 1]), "list of 3 numbers", "sample_annotation"),
+    "a size of text": (_set("sample_annotation", "size", ["1", 1, 1]), "finite number", "sample_annotation"),
     "half a character": (_set("scene", "name", "\ud800"), "row 0", "scene"),
     "a camera elsewhere": (
         lambda root: change_table(root, "sensor", lambda rows: [{**row, "channel": "../x"} for row in rows]),

@@ -131,7 +131,7 @@ BROKEN: dict[str, tuple[Callable[[Path], None], str, str]] = {
         "there is no frame",
         "lidar_box",
     ),
-    "no size": (_set("lidar_box", "box.size.z", [0.0] * 6), "no size", "lidar_box"),
+    "no size": (_set("lidar_box", "box.size.z", [0.0] * 6), "boxes are bad: .* not positive", "lidar_box"),
     "images of text": (_set("camera_image", "image", ["x", "y", "z"]), "holds no bytes", "camera_image"),
     "a cut table": (_cut("camera_image"), "cannot be read", "camera_image"),
 }

@@ -27,7 +27,12 @@ _MAX_DISTANCE_M = 1e9
 
 
 def read_columns(
-    path: Path, names: Sequence[str], log: str, texts: Sequence[str] = (), max_rows: int = MAX_ROWS
+    path: Path,
+    names: Sequence[str],
+    log: str,
+    texts: Sequence[str] = (),
+    max_rows: int = MAX_ROWS,
+    unchecked: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Reads columns of a table.
 
@@ -37,9 +42,11 @@ def read_columns(
         log: URI of the log, for errors.
         texts: of columns that hold text.
         max_rows: of the table.
+        unchecked: of columns that hold numbers, some of which may be missing or not finite.
 
     Returns:
-        Name → [N] array of the file's own type of numbers, or a list of texts.
+        Name → [N] array of the file's own type of numbers, or a list of texts. Unchecked columns are float64, with NaN
+        for a number that is missing.
 
     Raises:
         InputError: the file is missing, too large or damaged; a column is missing or holds something else.
@@ -53,20 +60,22 @@ def read_columns(
     if size > _MAX_FILE_BYTES:
         raise InputError(f"the table has {size >> 20} MiB, and {_MAX_FILE_BYTES >> 20} are allowed", **where)
     try:
-        table, columns = _read_bounded(path, {*names, *texts}, max_rows)
+        table, columns = _read_bounded(path, {*names, *texts, *unchecked}, max_rows)
     except (OSError, ValueError, pa.ArrowException) as error:
         raise InputError(f"the table cannot be read ({error})", **where) from error
-    missing = [name for name in (*names, *texts) if name not in columns]
+    missing = [name for name in (*names, *texts, *unchecked) if name not in columns]
     if missing:
         raise InputError(f"the table lacks {', '.join(missing)}; it has {', '.join(columns[:12])}", **where)
     found: dict[str, Any] = {name: [str(value) for value in table.column(name).to_pylist()] for name in texts}
-    for name in names:
+    for name in (*names, *unchecked):
         column = table.column(name).combine_chunks()
         is_number = pa.types.is_integer(column.type) or pa.types.is_floating(column.type)
-        if not is_number or column.null_count:
+        if not is_number or (column.null_count and name not in unchecked):
             raise InputError(f"the column {name} holds {column.type}, or nulls", **where)
         values = column.to_numpy(zero_copy_only=False)
-        if not np.isfinite(values.astype(np.float64)).all():
+        if name in unchecked:
+            values = values.astype(np.float64)
+        elif not np.isfinite(values.astype(np.float64)).all():
             raise InputError(f"the column {name} is not finite", **where)
         found[name] = values
     return found

@@ -11,6 +11,7 @@ import numpy as np
 
 from genre_tasks.errors import InputError
 from genre_tasks.logs.argoverse2.feather_tables import POSITION, QUATERNION, compose_poses, read_columns
+from genre_tasks.logs.box_validity import StatedBox, find_bad_boxes, report_bad_boxes
 from genre_tasks.logs.camera_names import require_camera_names
 from genre_tasks.logs.file_digest import digest_files
 from genre_tasks.logs.file_reading import read_file
@@ -205,7 +206,7 @@ class Argoverse2Log(RecordedLog):
         """See ``DrivingLog``.
 
         Raises:
-            InputError: there are boxes, and they cannot be read.
+            InputError: there are boxes, and they cannot be read, or all are bad.
         """
         return self._tracks
 
@@ -215,27 +216,39 @@ class Argoverse2Log(RecordedLog):
         # Logs of the test split have none.
         if not path.is_file():
             return ()
-        numbers = ("timestamp_ns", *QUATERNION, *POSITION, *_SIZE_COLUMNS)
-        columns = read_columns(path, numbers, self.uri, texts=("track_uuid", "category"), max_rows=MAX_BOXES)
-        sizes = np.stack([columns[name] for name in _SIZE_COLUMNS], axis=1)
-        if (sizes <= 0).any():
-            raise InputError("a box has no size", remedy="Download the log again.", file=path, log=self.uri)
-        return self._build_tracks(self._read_boxes(columns, sizes, path), self.world_SE3_lidar)
+        texts, numbers = ("track_uuid", "category"), (*QUATERNION, *POSITION, *_SIZE_COLUMNS)
+        columns = read_columns(path, ("timestamp_ns",), self.uri, texts, max_rows=MAX_BOXES, unchecked=numbers)
+        return self._build_tracks(self._read_boxes(columns, path), self.world_SE3_lidar)
 
-    def _read_boxes(self, columns: dict[str, Any], sizes: Float64, path: Path) -> list[LabelledBox]:
-        rotations, positions = compose_poses(columns, path, self.uri)
-        matrices = rotations.as_matrix()
-        frames = {int(time_ns): frame for frame, time_ns in enumerate(self._sweep_times_ns)}
+    def _read_boxes(self, columns: dict[str, Any], path: Path) -> list[LabelledBox]:
+        frame_at = {int(time_ns): frame for frame, time_ns in enumerate(self._sweep_times_ns)}
+        times_ns = columns["timestamp_ns"].astype(np.int64).tolist()
+        # A part of a log may lack the sweeps of most boxes.
+        rows = [row for row, time_ns in enumerate(times_ns) if time_ns in frame_at]
+        if not rows:
+            return []
+
+        def locate(index: int) -> StatedBox:
+            row = rows[index]
+            track_id, label = columns["track_uuid"][row], columns["category"][row]
+            return StatedBox(frame_at[times_ns[row]], track_id, label, f"{path.name}, row {row}")
+
+        quats, positions, sizes = (
+            np.stack([columns[name][rows] for name in names], axis=1) for names in (QUATERNION, POSITION, _SIZE_COLUMNS)
+        )
+        problems = find_bad_boxes(positions, sizes, quats=quats)
+        self._report(*report_bad_boxes(problems, len(rows), locate, file=path, log=self.uri))
+        sound = [row for index, row in enumerate(rows) if index not in problems]
+        stated = {name: columns[name][sound] for name in (*QUATERNION, *POSITION, *_SIZE_COLUMNS)}
+        rotations, centres = compose_poses(stated, path, self.uri)
+        poses = np.tile(np.eye(4), (len(sound), 1, 1))
+        poses[:, :3, :3] = rotations.as_matrix()
+        poses[:, :3, 3] = centres
         boxes = []
-        for row, time_ns in enumerate(columns["timestamp_ns"].astype(np.int64).tolist()):
-            # A part of a log may lack the sweeps of most boxes.
-            if time_ns not in frames:
-                continue
-            pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = matrices[row], positions[row]
-            length, width, height = sizes[row].tolist()
-            track, label = columns["track_uuid"][row], columns["category"][row]
-            boxes.append(LabelledBox(frames[time_ns], track, label, pose, (length, width, height)))
+        for row, pose, *size in zip(sound, poses, *(stated[name].tolist() for name in _SIZE_COLUMNS), strict=True):
+            track_id, label = columns["track_uuid"][row], columns["category"][row]
+            length, width, height = size
+            boxes.append(LabelledBox(frame_at[times_ns[row]], track_id, label, pose, (length, width, height)))
         return boxes
 
     def findings(self) -> tuple[Finding, ...]:

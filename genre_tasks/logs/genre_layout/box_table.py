@@ -10,13 +10,12 @@ import numpy as np
 
 from genre_tasks.bounded_parquet import FOR_ROWS, read_bounded_table
 from genre_tasks.errors import InputError
+from genre_tasks.logs.box_validity import StatedBox, find_bad_boxes, report_bad_boxes
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.genre_layout.layout import BOX_COLUMNS
 from genre_tasks.logs.types import CuboidTrack, Float64
 
 _REMEDY = "Write the columns of the genre layout: " + ", ".join(BOX_COLUMNS) + "."
-# Below that, rounding alone would decide where a box points.
-_MIN_QUATERNION_NORM = 1e-6
 
 
 def write_boxes(path: Path, tracks: Sequence[CuboidTrack]) -> None:
@@ -86,31 +85,17 @@ def read_boxes(path: Path, frame_count: int, log: str) -> tuple[tuple[CuboidTrac
         numbers = np.array([columns[name] for name in BOX_COLUMNS[4:]], dtype=np.float64).T.reshape(-1, 10)
     except (TypeError, ValueError) as error:
         raise InputError(f"the boxes hold something else than numbers ({error})", **where) from error
-    problems = _find_problems(numbers)
-    if problems and len(problems) == len(numbers):
-        raise InputError(f"all {len(numbers)} boxes are bad: the first one {problems[0]}", **where)
-    findings = []
-    for row, problem in problems.items():
-        track_id, frame = str(columns["track_id"][row]), columns["frame"][row]
-        del by_track[track_id][frame]
-        message = f"the box of {columns['label'][row]} {track_id} in frame {frame} {problem}"
-        findings.append(Finding("invalid_box", "warning", message, "Correct the box; it is left out.", frames=(frame,)))
+    problems = find_bad_boxes(numbers[:, :3], numbers[:, 7:], quats=numbers[:, 3:7])
+
+    def locate(row: int) -> StatedBox:
+        track_id, label = str(columns["track_id"][row]), str(columns["label"][row])
+        return StatedBox(columns["frame"][row], track_id, label, f"{path.name}, row {row}")
+
+    findings = report_bad_boxes(problems, len(numbers), locate, file=path, log=log)
+    for row in problems:
+        del by_track[str(columns["track_id"][row])][columns["frame"][row]]
     tracks = (_build_track(name, frames, columns, numbers) for name, frames in by_track.items() if frames)
-    return tuple(tracks), tuple(findings)
-
-
-def _find_problems(numbers: Float64) -> dict[int, str]:
-    """Row → what is wrong with its box, of rows [N, 10] of position, quaternion and size."""
-    not_finite = np.asarray(~np.isfinite(numbers).all(axis=1))
-    no_size = np.asarray((numbers[:, 7:] <= 0).any(axis=1))
-    no_direction = np.linalg.norm(numbers[:, 3:7], axis=1) < _MIN_QUATERNION_NORM
-    problems = {}
-    for row in np.flatnonzero(not_finite | no_size | no_direction).tolist():
-        if not_finite[row]:
-            problems[row] = "is not finite"
-        else:
-            problems[row] = "has a size that is not positive" if no_size[row] else "has a quaternion of zeros"
-    return problems
+    return tuple(tracks), findings
 
 
 def _require_objects(columns: dict[str, list[Any]], where: dict[str, Any]) -> None:

@@ -179,7 +179,9 @@ def read_calibration(path: Path, needed: Mapping[str, int], log: str) -> dict[st
     return found
 
 
-def parse_numbers(text: str, count: int, what: str, path: Path, log: str, frame: int | None = None) -> Float64:
+def parse_numbers(
+    text: str, count: int, what: str, path: Path, log: str, frame: int | None = None, unchecked: bool = False
+) -> Float64:
     """Reads numbers with spaces between them.
 
     Args:
@@ -189,20 +191,21 @@ def parse_numbers(text: str, count: int, what: str, path: Path, log: str, frame:
         path: the file, for errors.
         log: URI of the log, for errors.
         frame: log frame, for errors.
+        unchecked: whether they may be infinite or NaN.
 
     Returns:
-        [count] finite numbers.
+        [count] numbers.
 
     Raises:
-        InputError: there are fewer, or they are not finite.
+        InputError: there are fewer, or one is not finite and that is not allowed.
     """
     words = text.split()[:count]
     try:
         numbers = np.array([float(word) for word in words])
     except ValueError as error:
         raise InputError(f"{what}: {error}", remedy=_COPY_REMEDY, file=path, log=log, frame=frame) from error
-    if len(numbers) < count or not np.isfinite(numbers).all():
-        problem = f"{what} has {len(numbers)} numbers, not {count} finite ones"
+    if len(numbers) < count or not (unchecked or np.isfinite(numbers).all()):
+        problem = f"{what} has {len(numbers)} numbers, not {count}{'' if unchecked else ' finite ones'}"
         raise InputError(problem, remedy=_COPY_REMEDY, file=path, log=log, frame=frame)
     return numbers
 

@@ -256,21 +256,24 @@ class KittiLog(RecordedLog):
         """See ``DrivingLog``.
 
         Raises:
-            InputError: there are labels, and they cannot be read.
+            InputError: there are labels, and they cannot be read, or all are bad.
         """
         return self._tracks
 
     @cached_property
     def _tracks(self) -> tuple[CuboidTrack, ...]:
         if self._labels is not None:
-            boxes = read_tracking_labels(self._labels, self.uri)
+            boxes, findings = read_tracking_labels(self._labels, self.frame_count, self.uri)
+            self._report(*findings)
             # Labels of the benchmark were drawn into the images of the left colour camera.
             camera = next(iter(self._camera_times))
             return self._build_tracks(boxes, lambda frame: self._world_SE3_rectified(camera, frame))
         path = self._files.folder / TRACKLETS_FILE
         if not path.is_file():
             return ()
-        return self._build_tracks(read_tracklets(path, self.uri), self.world_SE3_lidar)
+        boxes, findings = read_tracklets(path, self.frame_count, self.uri)
+        self._report(*findings)
+        return self._build_tracks(boxes, self.world_SE3_lidar)
 
     def findings(self) -> tuple[Finding, ...]:
         """What was left out so far, for ``genre check``."""

@@ -21,7 +21,11 @@ from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.image_sizes import choose_lens, describe_no_images, measure_images, report_problems
 from genre_tasks.logs.labelled_boxes import describe_repeated
 from genre_tasks.logs.nearest_images import find_nearest_images
-from genre_tasks.logs.nuscenes.box_interpolation import find_repeated_boxes, interpolate_boxes
+from genre_tasks.logs.nuscenes.box_interpolation import (
+    find_repeated_boxes,
+    interpolate_boxes,
+    leave_out_bad_boxes,
+)
 from genre_tasks.logs.nuscenes.scene_address import SceneAddress, parse_scene_address
 from genre_tasks.logs.nuscenes.scene_index import open_scene_index
 from genre_tasks.logs.nuscenes.scene_rows import SceneRows, SensorData, read_scene
@@ -218,6 +222,9 @@ class NuScenesLog(RecordedLog):
         )
         boxes = replace(boxes, times_us=times_us)
         frame_times_us = [datum.time_us for datum in self._frames]
+        file = self._tables / "sample_annotation.json"
+        boxes, findings = leave_out_bad_boxes(boxes, frame_times_us, file=file, log=self.uri)
+        self._report(*findings)
         self._report(*describe_repeated(find_repeated_boxes(boxes, frame_times_us)))
         labelled, interpolated = interpolate_boxes(boxes, frame_times_us)
         identity = np.eye(4)

@@ -24,14 +24,16 @@ _INDEX_VERSION = 1
 _CACHE_KIBIBYTES = 1 << 16
 _MAX_SENSORS = 1 << 20
 _RADAR = "radar"
+_MAX_FLOAT = 1e300
 
 
 @dataclass(frozen=True)
 class _Table:
-    """A table of nuScenes: the columns that are read, and which are indexed."""
+    """A table of nuScenes: the columns that are read, which are indexed, and whose numbers may be any."""
 
     columns: dict[str, str]
     indexed: tuple[str, ...] = ()
+    unchecked: tuple[str, ...] = ()
 
 
 # TEXT is text, INTEGER a whole number, and a number says how many numbers a list has.
@@ -59,6 +61,8 @@ _TABLES = {
             **{"translation": "3", "size": "3", "rotation": "4"},
         },
         ("sample_token",),
+        # A bad box of one scene must not take all scenes with it.
+        unchecked=("translation", "size", "rotation"),
     ),
 }
 
@@ -72,7 +76,8 @@ def open_scene_index(tables: Path, log: str, folder: Path | None = None) -> sqli
         folder: where indexes are kept; ``None``: the user's folder of caches.
 
     Returns:
-        A connection that only reads. Lists of numbers are columns with a number behind their name, from 0.
+        A connection that only reads. Lists of numbers are columns with a number behind their name, from 0. Numbers of
+        boxes are null where they are missing or not finite.
 
     Raises:
         InputError: a table is missing, malformed, or lacks a column.
@@ -149,7 +154,10 @@ def _fill_table(index: sqlite3.Connection, name: str, table: _Table, rows: Itera
 
 
 def _parse_rows(file: Path, table: _Table, unused: frozenset[str], log: str) -> Iterator[tuple[Any, ...]]:
-    parsers = [(column, _PARSERS.get(kind) or _parse_list(int(kind))) for column, kind in table.columns.items()]
+    parsers = [
+        (column, _PARSERS.get(kind) or _parse_list(int(kind), column in table.unchecked))
+        for column, kind in table.columns.items()
+    ]
     for number, row in enumerate(stream_rows(file, log)):
         try:
             values = [parse(row.get(column)) for column, parse in parsers]
@@ -190,7 +198,7 @@ def _parse_size(value: Any) -> int:
     return 0 if value is None else _parse_integer(value)
 
 
-def _parse_list(count: int) -> Callable[[Any], tuple[float | None, ...]]:
+def _parse_list(count: int, unchecked: bool = False) -> Callable[[Any], tuple[float | None, ...]]:
     def parse(value: Any) -> tuple[float | None, ...]:
         numbers = value
         if count == 9:
@@ -201,6 +209,8 @@ def _parse_list(count: int) -> Callable[[Any], tuple[float | None, ...]]:
             numbers = [number for row in value for number in row] if is_matrix else None
         if not isinstance(numbers, list) or len(numbers) != count:
             raise ValueError(f"a list of {count} numbers was expected")
+        if unchecked and all(number is None or type(number) in (int, float) for number in numbers):
+            return tuple(_to_float(number) for number in numbers)
         for number in numbers:
             # Comparisons are false for what is not a number.
             if type(number) not in (int, float) or not -1e12 < number < 1e12:
@@ -208,6 +218,11 @@ def _parse_list(count: int) -> Callable[[Any], tuple[float | None, ...]]:
         return tuple(float(number) for number in numbers)
 
     return parse
+
+
+def _to_float(number: float | None) -> float | None:
+    # SQLite makes nulls of NaN in any case; whole numbers of JSON have no bound.
+    return float(number) if number is not None and abs(number) < _MAX_FLOAT else None
 
 
 _PARSERS: dict[str, Callable[[Any], Any]] = {"TEXT": _parse_text, "INTEGER": _parse_integer, "SIZE": _parse_size}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -83,25 +83,45 @@ class SensorData:
 
 @dataclass(frozen=True)
 class SceneBoxes:
-    """The boxes of a scene, in the world.
+    """The boxes of a scene, in the world. Their numbers are unchecked, and NaN where one is missing.
 
     Attributes:
+        tokens: [B] of the boxes.
         samples: [B] tokens of key frames.
         times_us: [B] of key frames.
         instances: [B] tokens of objects.
         labels: [B] categories.
         positions: [B, 3] centres.
-        rotations: [B].
+        quats: [B, 4] w, x, y, z.
         sizes_m: [B, 3] length, width, height.
     """
 
+    tokens: tuple[str, ...]
     samples: tuple[str, ...]
     times_us: tuple[int, ...]
     instances: tuple[str, ...]
     labels: tuple[str, ...]
     positions: Float64
-    rotations: Rotation
+    quats: Float64
     sizes_m: Float64
+
+    def select(self, rows: Sequence[int]) -> SceneBoxes:
+        """Takes some of the boxes.
+
+        Args:
+            rows: of these boxes.
+        """
+        indices = list(rows)
+        return SceneBoxes(
+            tokens=tuple(self.tokens[row] for row in indices),
+            samples=tuple(self.samples[row] for row in indices),
+            times_us=tuple(self.times_us[row] for row in indices),
+            instances=tuple(self.instances[row] for row in indices),
+            labels=tuple(self.labels[row] for row in indices),
+            positions=self.positions[indices],
+            quats=self.quats[indices],
+            sizes_m=self.sizes_m[indices],
+        )
 
 
 @dataclass(frozen=True)
@@ -163,7 +183,7 @@ def read_scene(index: sqlite3.Connection, name: str, tables: Path, log: str) -> 
     cameras, lidars = (
         {channel: tuple(by_channel[channel]) for channel in sorted(by_channel)} for by_channel in by_modality.values()
     )
-    return SceneRows(cameras, lidars, _build_boxes(boxes, tables / "sample_annotation.json", log))
+    return SceneRows(cameras, lidars, _build_boxes(boxes))
 
 
 def _describe_no_scene(index: sqlite3.Connection, name: str, count: int, tables: Path, log: str) -> InputError:
@@ -230,19 +250,19 @@ def _build_datum(row: sqlite3.Row, mount: Float64, pose: Float64, file: Path, lo
     )
 
 
-def _build_boxes(rows: list[sqlite3.Row], file: Path, log: str) -> SceneBoxes:
-    take: Callable[..., Float64] = lambda *names: np.array([[row[name] for name in names] for row in rows])  # noqa: E731
-    # Sizes stand in the order width, length, height.
-    sizes = take("size1", "size0", "size2").reshape(-1, 3)
-    if (sizes <= 0).any():
-        raise InputError("a box has no size", remedy=REMEDY, file=file, log=log)
-    quats = take("rotation0", "rotation1", "rotation2", "rotation3").reshape(-1, 4)
+def _build_boxes(rows: list[sqlite3.Row]) -> SceneBoxes:
+    def take(*names: str) -> Float64:
+        # Nulls become NaN.
+        return np.array([[row[name] for name in names] for row in rows], dtype=np.float64).reshape(-1, len(names))
+
     return SceneBoxes(
+        tokens=tuple(row["token"] for row in rows),
         samples=tuple(row["sample_token"] for row in rows),
         times_us=tuple(row["timestamp"] for row in rows),
         instances=tuple(row["instance_token"] for row in rows),
         labels=tuple(row["label"] for row in rows),
-        positions=take("translation0", "translation1", "translation2").reshape(-1, 3),
-        rotations=_to_rotations(quats, file, log) if rows else Rotation.identity(0),
-        sizes_m=sizes,
+        positions=take("translation0", "translation1", "translation2"),
+        quats=take("rotation0", "rotation1", "rotation2", "rotation3"),
+        # Sizes stand in the order width, length, height.
+        sizes_m=take("size1", "size0", "size2"),
     )

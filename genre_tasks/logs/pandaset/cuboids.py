@@ -8,12 +8,14 @@ other (``cuboids.sibling_id``: at times only one does, or with a truncated id). 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from genre_tasks.logs.box_validity import StatedBox, describe_bad_box, find_bad_boxes, report_bad_boxes
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.pandaset.layout import BOX_HEADING, PANDA_R_FLU, SPINNING_SENSOR, quats_to_matrices
 from genre_tasks.logs.pandaset.pickle_reader import Table
@@ -21,6 +23,8 @@ from genre_tasks.logs.pandaset.sweeps import read_numbers, require_columns
 from genre_tasks.logs.types import CuboidTrack, Float64
 
 _BOX_COLUMNS = ("position.x", "position.y", "position.z", "dimensions.x", "dimensions.y", "dimensions.z", "yaw")
+# Of a box row.
+_POSITION = slice(0, 3)
 # Of a box row: PandaSet's dimensions x (width), y (length), z (height).
 _SIZE = slice(3, 6)
 # Of a box row.
@@ -65,20 +69,23 @@ class FrameBoxes:
         frame: log frame.
         boxes: [N, 11] position, size and yaw as in the file, and the orientation as a quaternion (w, x, y, z).
         attributes: for every box, the values of the other columns by name.
+        file: that states them.
     """
 
     frame: int
     boxes: Float64
     attributes: tuple[Mapping[str, Any], ...]
+    file: Path
 
 
-def read_boxes(table: Table, frame: int, **where: Any) -> FrameBoxes:
+def read_boxes(table: Table, frame: int, *, file: Path, log: str) -> FrameBoxes:
     """Reads the boxes of a frame from its table.
 
     Args:
         table: columns uuid, label, yaw, position.*, dimensions.* are needed.
         frame: log frame.
-        where: ``log``, ``file``, … of the error, should there be one.
+        file: of the table.
+        log: URI of the log, for errors.
 
     Returns:
         The boxes, those with impossible numbers too.
@@ -86,7 +93,7 @@ def read_boxes(table: Table, frame: int, **where: Any) -> FrameBoxes:
     Raises:
         InputError: a needed column is missing, or not numeric.
     """
-    where = {**where, "frame": frame}
+    where: dict[str, Any] = {"file": file, "log": log, "frame": frame}
     require_columns(table, ("uuid", "label", *_BOX_COLUMNS), "the table of cuboids", **where)
     box = [read_numbers(table, name, **where) for name in _BOX_COLUMNS]
     if all(name in table.columns for name in BOX_HEADING):
@@ -99,10 +106,10 @@ def read_boxes(table: Table, frame: int, **where: Any) -> FrameBoxes:
     names = [name for name in table.columns if name not in _BOX_COLUMNS]
     columns = [table.columns[name].tolist() for name in names]
     rows = tuple(dict(zip(names, values, strict=True)) for values in zip(*columns, strict=True))
-    return FrameBoxes(frame, np.stack([*box, *quat], axis=1), rows)
+    return FrameBoxes(frame, np.stack([*box, *quat], axis=1), rows, file)
 
 
-def build_tracks(frames: Iterable[FrameBoxes]) -> tuple[tuple[CuboidTrack, ...], tuple[Finding, ...]]:
+def build_tracks(frames: Sequence[FrameBoxes], log: str) -> tuple[tuple[CuboidTrack, ...], tuple[Finding, ...]]:
     """Builds the tracks of a sequence from the cuboids of its frames.
 
     A box with a non-finite number, without volume or without a uuid is left out (``Finding`` with the word
@@ -111,17 +118,49 @@ def build_tracks(frames: Iterable[FrameBoxes]) -> tuple[tuple[CuboidTrack, ...],
 
     Args:
         frames: the boxes of each frame, in increasing order of frames.
+        log: URI of the log, for errors.
 
     Returns:
         The tracks, in the order in which they first appear, and the boxes that were left out.
+
+    Raises:
+        InputError: all boxes are bad.
     """
     objects: dict[str, _AnnotatedObject] = {}
-    findings: list[Finding] = []
-    for frame_boxes in frames:
-        findings += _add_frame(objects, frame_boxes)
+    problems, invalid = _find_bad_boxes(frames, log)
+    findings = list(invalid)
+    for frame_boxes, bad_rows in zip(frames, problems, strict=True):
+        findings += _add_frame(objects, frame_boxes, bad_rows)
     findings += _judge_yaw(objects)
     tracks = (_build_track(group) for group in _group_siblings(objects))
     return tuple(track for track in tracks if track is not None), tuple(findings)
+
+
+def _find_bad_boxes(frames: Sequence[FrameBoxes], log: str) -> tuple[list[set[int]], tuple[Finding, ...]]:
+    """For each frame the rows of boxes with impossible numbers, and their findings."""
+    places = [(index, row) for index, frame_boxes in enumerate(frames) for row in range(len(frame_boxes.boxes))]
+    bad_rows: list[set[int]] = [set() for _ in frames]
+    if not places:
+        return bad_rows, ()
+    boxes = np.concatenate([frame_boxes.boxes for frame_boxes in frames])
+    quats, yaws = boxes[:, _QUATERNION], boxes[:, _YAW, None]
+    problems = find_bad_boxes(boxes[:, _POSITION], boxes[:, _SIZE], quats=quats, angles_rad=yaws)
+    for number in problems:
+        index, row = places[number]
+        bad_rows[index].add(row)
+
+    def locate(number: int) -> StatedBox:
+        index, row = places[number]
+        return _locate_box(frames[index], row)
+
+    return bad_rows, report_bad_boxes(problems, len(boxes), locate, file=frames[0].file.parent, log=log)
+
+
+def _locate_box(frame_boxes: FrameBoxes, row: int) -> StatedBox:
+    attributes = frame_boxes.attributes[row]
+    # Without the folder: where a log lies must not change what a run stores.
+    source = f"cuboids/{frame_boxes.file.name}, row {row}"
+    return StatedBox(frame_boxes.frame, str(attributes["uuid"]), str(attributes["label"]), source)
 
 
 def _judge_yaw(objects: Mapping[str, _AnnotatedObject]) -> list[Finding]:
@@ -135,30 +174,26 @@ def _judge_yaw(objects: Mapping[str, _AnnotatedObject]) -> list[Finding]:
     return [Finding("odd_box_yaw", "warning", message, "Convert yaw from degrees to radians.", numbers)]
 
 
-def _add_frame(objects: dict[str, _AnnotatedObject], frame_boxes: FrameBoxes) -> list[Finding]:
-    """Adds the boxes of one frame to their objects; returns those that were left out."""
+def _add_frame(
+    objects: dict[str, _AnnotatedObject], frame_boxes: FrameBoxes, bad_rows: Collection[int]
+) -> list[Finding]:
+    """Adds the sound boxes of one frame to their objects; returns what else was left out."""
     frame = frame_boxes.frame
     findings = []
     repeated = 0
-    for box, row in zip(frame_boxes.boxes, frame_boxes.attributes, strict=True):
+    for number, (box, row) in enumerate(zip(frame_boxes.boxes, frame_boxes.attributes, strict=True)):
+        is_valid = number not in bad_rows
+        # Boxes without a name would all become one object.
+        if _is_missing(row["uuid"]):
+            if is_valid:
+                findings.append(describe_bad_box(_locate_box(frame_boxes, number), "has no uuid"))
+            continue
         new_object = _AnnotatedObject(
             uuid=str(row["uuid"]),
             label=str(row["label"]),
             sensor=_parse_sensor(row.get("cuboids.sensor_id")),
             sibling=str(row.get("cuboids.sibling_id", _NO_SIBLING)),
         )
-        is_valid = np.isfinite(box).all() and (box[_SIZE] > 0).all() and box[_QUATERNION].any()
-        # Boxes without a name would all become one object.
-        if not is_valid or _is_missing(row["uuid"]):
-            problem = "has no uuid"
-            if not is_valid:
-                problem = "has a size that is not positive" if np.isfinite(box).all() else "is not finite"
-            annotated = objects.get(new_object.uuid, new_object)
-            message = f"the box of {annotated.label} {annotated.uuid} in frame {frame} {problem}"
-            remedy = "Correct the box; it is left out."
-            findings.append(Finding("invalid_box", "warning", message, remedy, frames=(frame,)))
-            if _is_missing(row["uuid"]):
-                continue
         annotated = objects.setdefault(new_object.uuid, new_object)
         if is_valid:
             repeated += frame in annotated.boxes

@@ -241,7 +241,7 @@ class PandaSetLog(RecordedLog):
 
     @cached_property
     def _tracks(self) -> tuple[CuboidTrack, ...]:
-        tracks, findings = build_tracks(self._read_cuboids())
+        tracks, findings = build_tracks(self._read_cuboids(), self.uri)
         self._report(*findings)
         return tracks
 
@@ -270,7 +270,7 @@ class PandaSetLog(RecordedLog):
         """See ``DrivingLog``; an object that both LiDARs saw is one track.
 
         Raises:
-            InputError: there are cuboids, and those of no frame can be read.
+            InputError: there are cuboids, and those of no frame can be read, or all of them are bad.
         """
         return self._tracks
 

@@ -82,15 +82,17 @@ class ComponentTable:
         """
         return self.column(field) in self._names
 
-    def read(self, fields: Sequence[str], names: Sequence[str] = ()) -> dict[str, Any]:
+    def read(self, fields: Sequence[str], names: Sequence[str] = (), unchecked: Sequence[str] = ()) -> dict[str, Any]:
         """Reads columns of numbers, transforms or names.
 
         Args:
             fields: as for :meth:`column`.
             names: those of the fields that may be texts.
+            unchecked: those of the fields whose numbers may be missing or not finite.
 
         Returns:
-            Field → [N] float64 or int64, [N, K] float64 of a transform, or a list of texts.
+            Field → [N] float64 or int64, [N, K] float64 of a transform, or a list of texts. Unchecked fields are
+            float64, with NaN for a number that is missing.
 
         Raises:
             InputError: a column is missing, has nulls, or holds something else.
@@ -105,7 +107,10 @@ class ComponentTable:
             raise self.fault(str(error)) from error
         except (OSError, ValueError, pa.ArrowException) as error:
             raise self.fault(f"the table cannot be read ({error})") from error
-        found = {field: self._convert(field, table.column(self.column(field))) for field in fields}
+        found = {}
+        for field in fields:
+            convert = self._convert_unchecked if field in unchecked else self._convert
+            found[field] = convert(field, table.column(self.column(field)))
         for field, values in found.items():
             is_expected = field in names if isinstance(values, list) else values.ndim == 1 + field.endswith("transform")
             if not is_expected:
@@ -133,6 +138,13 @@ class ComponentTable:
         if not np.isfinite(values).all():
             raise self.fault(f"{field} is not finite")
         return values.reshape(-1, count) if count else values
+
+    def _convert_unchecked(self, field: str, column: pa.ChunkedArray) -> Float64:
+        if not (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)):
+            raise self.fault(f"{field} holds {column.type}")
+        # Missing numbers become NaN.
+        values: Float64 = column.combine_chunks().cast(pa.float64()).to_numpy(zero_copy_only=False)
+        return values
 
     def read_poses(self, field: str) -> Float64:
         """Reads a column of poses.

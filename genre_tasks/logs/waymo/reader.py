@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from genre_tasks.logs.box_validity import StatedBox, find_bad_boxes, report_bad_boxes
 from genre_tasks.logs.file_digest import digest_files
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.labelled_boxes import MAX_BOXES, LabelledBox
@@ -27,6 +28,7 @@ _US = 1e-6
 _LASER = "key.laser_name"
 _OBJECT = "key.laser_object_id"
 _CENTRE = ("box.center.x", "box.center.y", "box.center.z")
+_HEADING = "box.heading"
 _SIZE = ("box.size.x", "box.size.y", "box.size.z")
 _RETURNS = ("range_image_return1", "range_image_return2")
 # Ten times the pixels of the upper LiDAR.
@@ -212,7 +214,7 @@ class WaymoLog(RecordedLog):
         """See ``DrivingLog``.
 
         Raises:
-            InputError: there are boxes, and they cannot be read.
+            InputError: there are boxes, and they cannot be read, or all are bad.
         """
         return self._tracks
 
@@ -224,24 +226,38 @@ class WaymoLog(RecordedLog):
         table = self._tables["lidar_box"]
         if table.row_count > MAX_BOXES:
             raise table.fault(f"there are {table.row_count} boxes, and {MAX_BOXES} are allowed")
-        columns = table.read([_OBJECT, "type", "box.heading", *_CENTRE, *_SIZE], names=[_OBJECT])
-        sizes = np.stack([columns[field] for field in _SIZE], axis=1)
-        if (sizes <= 0).any():
-            raise table.fault("a box has no size")
-        centres = np.stack([columns[field] for field in _CENTRE], axis=1)
+        return self._build_tracks(self._read_boxes(table), self.world_SE3_lidar)
+
+    def _read_boxes(self, table: ComponentTable) -> list[LabelledBox]:
+        numbers = (_HEADING, *_CENTRE, *_SIZE)
+        columns = table.read([_OBJECT, "type", *numbers], names=[_OBJECT], unchecked=numbers)
         frames = {time_us: frame for frame, time_us in enumerate(self._times_us)}
-        boxes = []
-        for row, time_us in enumerate(table.times_us):
+        for time_us in table.times_us:
             if time_us not in frames:
                 raise table.fault(f"a box is of {time_us} µs, where there is no frame")
-            cos, sin = np.cos(columns["box.heading"][row]), np.sin(columns["box.heading"][row])
+
+        def locate(row: int) -> StatedBox:
+            label = BOX_LABELS.get(int(columns["type"][row]), BOX_LABELS[0])
+            source = f"{table.path.parent.name}/{table.path.name}, row {row}"
+            return StatedBox(frames[table.times_us[row]], str(columns[_OBJECT][row]), label, source)
+
+        centres, sizes, headings = (
+            np.stack([columns[field] for field in fields], axis=1) for fields in (_CENTRE, _SIZE, (_HEADING,))
+        )
+        problems = find_bad_boxes(centres, sizes, angles_rad=headings)
+        self._report(*report_bad_boxes(problems, len(sizes), locate, file=table.path, log=self.uri))
+        boxes = []
+        for row in range(len(sizes)):
+            if row in problems:
+                continue
+            cos, sin = np.cos(columns[_HEADING][row]), np.sin(columns[_HEADING][row])
             pose = np.eye(4)
             pose[:2, :2] = [[cos, -sin], [sin, cos]]
             pose[:3, 3] = centres[row]
-            label = BOX_LABELS.get(int(columns["type"][row]), BOX_LABELS[0])
+            stated = locate(row)
             length, width, height = sizes[row].tolist()
-            boxes.append(LabelledBox(frames[time_us], str(columns[_OBJECT][row]), label, pose, (length, width, height)))
-        return self._build_tracks(boxes, self.world_SE3_lidar)
+            boxes.append(LabelledBox(stated.frame, stated.track_id, stated.label, pose, (length, width, height)))
+        return boxes
 
     def findings(self) -> tuple[Finding, ...]:
         """What is not modelled or was left out, for ``genre check``."""
