@@ -30,6 +30,11 @@ HIDDEN_FRACTION = 0.03
 HIDDEN_M = 0.05
 """A point is hidden from an image that sees something nearer by more than this fraction and distance."""
 
+FREE_FRACTION = 0.15
+"""A point that is nearer than what an image sees there by more than this fraction is in free space: it is a floater,
+and the image shows something else. At ``HIDDEN_FRACTION`` real images become worse: wires stand before what LiDAR
+met."""
+
 _NEAREST_M = 0.1
 # A further image has to see this fraction of a view's pixels that none before it saw, or it is not worth its time.
 _MIN_NEW_FRACTION = 0.02
@@ -84,7 +89,7 @@ def sample_source(surface: Surface, source: SourceImage, actors: Sequence[Actor]
         frame: of the view.
 
     Returns:
-        Colours [3, ...], and [...] true where the source sees the point.
+        Colours [3, ...], and [...] true where the source sees the point: it is neither hidden nor in free space.
     """
     points, exists = surface_at_frame(surface, actors, frame, source.frame)
     x, y, z, in_domain = _project_when_exposed(move_points(points, np.linalg.inv(source.chunk_SE3_camera)), source)
@@ -97,7 +102,8 @@ def sample_source(surface: Surface, source: SourceImage, actors: Sequence[Actor]
     # Nearest and not bilinear: a mean of two depths is where nothing is.
     nearest = F.grid_sample(source.depth[None, None].to(z), grid, "nearest", "zeros", align_corners=False)[0, 0]
     hidden = (nearest > 0) & (z > nearest * (1 + HIDDEN_FRACTION) + HIDDEN_M)
-    visible = ahead & (u.abs() < 1) & (v.abs() < 1) & ~hidden
+    in_free_space = (nearest > 0) & (z < nearest * (1 - FREE_FRACTION) - HIDDEN_M)
+    visible = ahead & (u.abs() < 1) & (v.abs() < 1) & ~hidden & ~in_free_space
     # Colours are read from outside of the mask too; callers take those that are visible.
     color = F.grid_sample(source.image[None].to(z), grid, "bilinear", "border", align_corners=False)[0]
     return color, visible

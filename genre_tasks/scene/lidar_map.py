@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from genre_tasks.config import InitialConfig
 from genre_tasks.logs.types import Float64
 from genre_tasks.scene.chunk import Chunk, Points
-from genre_tasks.scene.gaussians import Gaussians
+from genre_tasks.scene.gaussians import Gaussians, map_attributes
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.initial_gaussians import assemble_scene, fit_discs, max_points_per_actor, select_points
 from genre_tasks.scene.rotations import quats_to_matrices_numpy
 from genre_tasks.scene.transforms import distance_to_path
+from genre_tasks.scene.voxel_grid import distance_octaves
 
 LIDAR_OPACITY = 0.95
 
@@ -29,6 +30,12 @@ MAX_GAP_M = 0.8
 """What is farther is another part. From half a metre on ever less of a gap is closed: the next ring is then not among
 the neighbours looked at."""
 
+ISOLATED = 8.0
+"""A disc is no surface if its fifth nearest return is so many times as far as that of the median disc of its octave."""
+
+# Fewer are what a bird, a wire or a reflection gives.
+_RETURNS = 5
+
 # Neighbours looked at for the next disc.
 _NEIGHBOURS = 32
 
@@ -40,7 +47,8 @@ def build_lidar_scene(chunk: Chunk, max_points: int) -> SceneGraph:
     """Turns a chunk's coloured LiDAR points into discs on the surfaces they lie on, nearly opaque.
 
     Discs, because the fixer looks images up by the map's depth: a ball as wide as its neighbours are far would stand
-    out of a road that is seen at a grazing angle.
+    out of a road that is seen at a grazing angle. Returns that stand alone are left out: a disc as wide as a voxel
+    would hide the sky behind a wire or a reflection.
 
     Args:
         chunk: points without colour are left out.
@@ -54,6 +62,7 @@ def build_lidar_scene(chunk: Chunk, max_points: int) -> SceneGraph:
     distance = distance_to_path(chunk.static.positions, chunk.chunk_SE3_ego)
     # The background needs no closing: as the vehicle drives on, its rings sweep over all of it.
     static = _fit_opaque_discs(chunk.static, distance, max_points - sum(len(a) for a in actors))
+    static = _remove_isolated(static, chunk)
     nothing_distant = Gaussians.unpack(torch.zeros(0, 14))
     return assemble_scene(chunk, static, nothing_distant, [close_gaps(a) for a in actors])
 
@@ -66,6 +75,38 @@ def _fit_opaque_discs(
         return Gaussians.unpack(torch.zeros(0, 14))
     config = InitialConfig(opacity=LIDAR_OPACITY)
     return fit_discs(select_points(points, colored), distance[colored], count, config, min_voxel_m)
+
+
+def _remove_isolated(discs: Gaussians, chunk: Chunk) -> Gaussians:
+    """The background's discs without those that stand alone."""
+    means = discs.means.double().numpy()
+    octave = distance_octaves(distance_to_path(means, chunk.chunk_SE3_ego))
+    isolated = torch.from_numpy(find_isolated(means, chunk.static.positions[chunk.static.colored], octave))
+    return map_attributes(lambda values: values[~isolated], discs)
+
+
+def find_isolated(means: Float64, returns: NDArray[np.floating], octave: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Finds discs that stand alone, as radius outlier removal does, with a radius from the recording's own density.
+
+    Args:
+        means: [N, 3] metres, of the discs.
+        returns: [P, 3] metres, all that the discs were made from.
+        octave: [N] of each disc's distance; discs are compared within an octave, as density falls with distance.
+
+    Returns:
+        [N] true where the fifth nearest return is more than ``ISOLATED`` times as far as that of the octave's median.
+    """
+    from scipy.spatial import cKDTree
+
+    isolated = np.zeros(len(means), bool)
+    # With so few returns there is no density to compare with.
+    if len(returns) < _RETURNS:
+        return isolated
+    distance = cKDTree(returns).query(means, k=[_RETURNS])[0][:, 0]
+    for k in np.unique(octave):
+        of_octave = octave == k
+        isolated[of_octave] = distance[of_octave] > ISOLATED * np.median(distance[of_octave])
+    return isolated
 
 
 def close_gaps(discs: Gaussians) -> Gaussians:

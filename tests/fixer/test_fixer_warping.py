@@ -117,6 +117,14 @@ def test_what_a_source_sees_something_nearer_before_is_hidden():
     assert not seen[:, 10:14].any() and seen[:, :10].all() and seen[:, 14:].all()
 
 
+def test_what_floats_before_what_a_source_sees_takes_no_colour():
+    depth = torch.full((HEIGHT, WIDTH), 20.0)
+    depth[:, 10:14] = 11.0  # a wall just behind the point: LiDAR met it between the wires of a fence
+    depth[:, 30:] = 0.0
+    _, seen = sample_source(plane(10.0), source(at(), depth=depth), (), 0)
+    assert seen[:, 10:14].all() and seen[:, 30:].all() and not seen[:, :10].any() and not seen[:, 14:30].any()
+
+
 def test_a_pixel_is_taken_from_the_first_image_that_sees_it_and_others_are_compared():
     blind = torch.zeros(HEIGHT, WIDTH)
     blind[:, :20] = 2.0  # something stands before the left half

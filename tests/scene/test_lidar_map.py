@@ -1,4 +1,4 @@
-"""The LiDAR map has no gaps between the rings on an actor, and does not grow beyond its outline."""
+"""The LiDAR map has no gaps between the rings on an actor, stays within its outline, and leaves out stray returns."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from genre_tasks.scene.chunk import Points
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.initial_gaussians import fit_discs
-from genre_tasks.scene.lidar_map import ACTOR_VOXEL_M, MAX_GAP_M, close_gaps
+from genre_tasks.scene.lidar_map import ACTOR_VOXEL_M, MAX_GAP_M, close_gaps, find_isolated
 
 LENS = Lens(80.0, 80.0, 48.0, 32.0, 96, 64)
 
@@ -95,3 +95,23 @@ def test_hardly_any_points_are_left_as_they_are_or_finite(count: int) -> None:
 def test_points_at_one_place_stay_finite() -> None:
     here = _discs(_rings(0.0, rings=3))
     assert bool(close_gaps(here).pack().isfinite().all())
+
+
+def test_returns_that_stand_alone_hide_nothing() -> None:
+    rng = np.random.default_rng(0)
+    road = np.stack([rng.uniform(-10, 10, 20_000), rng.uniform(-10, 10, 20_000), rng.normal(0, 0.01, 20_000)], 1)
+    few = np.array([[0.0, 0.0, 6.0], [4.0, 2.0, 8.0], [4.1, 2.0, 8.0]])
+    means = np.concatenate([road[::20], few])
+    isolated = find_isolated(means, np.concatenate([road, few]), np.zeros(len(means), np.int64))
+    assert isolated[-len(few) :].all() and not isolated[: -len(few)].any()
+
+
+def test_a_sparse_recording_is_not_isolated() -> None:
+    # Far away every return is metres from the next one, and so is each on all of a sparse log.
+    near, far = (
+        np.stack(np.meshgrid(*2 * [np.arange(0, 40 * gap, gap)], [0.0]), -1).reshape(-1, 3) for gap in (0.1, 4)
+    )
+    returns = np.concatenate([near, far + 200])
+    octave = np.repeat([0, 4], [len(near), len(far)])
+    assert not find_isolated(returns, returns, octave).any()
+    assert not find_isolated(returns[:3], returns[:3], octave[:3]).any()
