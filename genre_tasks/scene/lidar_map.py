@@ -102,7 +102,9 @@ def find_isolated(means: Float64, returns: NDArray[np.floating], octave: NDArray
     # With so few returns there is no density to compare with.
     if len(returns) < _RETURNS:
         return isolated
-    distance = cKDTree(returns).query(means, k=[_RETURNS])[0][:, 0]
+    # A tree for few queries: building a balanced one would take longer than all of them.
+    tree = cKDTree(returns, balanced_tree=False, compact_nodes=False)
+    distance = tree.query(means, k=[_RETURNS])[0][:, 0]
     for k in np.unique(octave):
         of_octave = octave == k
         isolated[of_octave] = distance[of_octave] > ISOLATED * np.median(distance[of_octave])
