@@ -78,7 +78,7 @@ def _fit_opaque_discs(
 
 
 def _remove_isolated(discs: Gaussians, chunk: Chunk) -> Gaussians:
-    """The background's discs without those that stand alone."""
+    """Leaves out the background's discs that stand alone."""
     means = discs.means.double().numpy()
     octave = distance_octaves(distance_to_path(means, chunk.chunk_SE3_ego))
     isolated = torch.from_numpy(find_isolated(means, chunk.static.positions[chunk.static.colored], octave))
