@@ -9,10 +9,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from genre_tasks.effects.types import EffectsPlan, ImageKey
 from genre_tasks.logs.types import Float64
 from genre_tasks.scene.chunk import Actor, Chunk, Points, View
+from genre_tasks.scene.visibility import GREY
 
 _POINT_ATTRIBUTES = ("positions", "colors", "colored", "frames")
 
@@ -29,6 +31,9 @@ def apply_plan(chunk: Chunk, plan: EffectsPlan) -> Chunk:
     Returns:
         The chunk that later stages work on; ``chunk`` itself where the plan changes nothing.
     """
+    ego_points = plan.parameters.ego_points
+    if ego_points is not None:
+        chunk = replace(chunk, static=_take_colors_away(chunk.static, ego_points))
     if chunk.actors and not plan.is_on("rigid_actors"):
         # Without nodes of their own, actors are smeared along their way, as in any static reconstruction.
         chunk = replace(chunk, static=_merge_actors_into_background(chunk), actors=())
@@ -80,6 +85,14 @@ def _apply_to_view(view: View, plan: EffectsPlan, undistort: bool) -> View:
         shutter=shutter,
         blur=blur,
     )
+
+
+def _take_colors_away(points: Points, rows: NDArray[np.int64]) -> Points:
+    colors = points.colors.copy()
+    colors[rows] = GREY
+    colored = points.colored.copy()
+    colored[rows] = False
+    return replace(points, colors=colors, colored=colored)
 
 
 def _merge_actors_into_background(chunk: Chunk) -> Points:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
 from genre_tasks.effects.measurements import ChunkMeasurements
 from genre_tasks.effects.types import Effect, EffectParameters, Measurement
 from genre_tasks.logs.types import Float32
+from genre_tasks.scene.visibility import find_visible_points
 
 STILL_LEVELS = 6.0
 """Standard deviation over the frames, of 255, up to which a pixel does not change."""
@@ -35,6 +38,10 @@ ARC_PX = 4
 
 MIN_ARC_COLUMNS = 12
 GAP_COLUMNS = 25
+
+STEP_PX = 2
+"""From one column to the next an outline goes up or down by at most so many rows."""
+
 # Where the arc is known, a fainter edge along it is evidence enough.
 FAINT_LEVELS = EDGE_LEVELS / 2
 
@@ -96,7 +103,29 @@ def fit(measurements: ChunkMeasurements) -> EffectParameters:
         for camera, part in _find_still_parts(measurements).items()
         if MIN_MASK_PERCENT < 100 * part.mean() <= MAX_MASK_PERCENT
     }
-    return EffectParameters(ego_masks=masks)
+    return EffectParameters(ego_masks=masks, ego_points=_find_ego_points(measurements, masks))
+
+
+def _find_ego_points(
+    measurements: ChunkMeasurements, masks: Mapping[str, NDArray[np.bool_]]
+) -> NDArray[np.int64] | None:
+    """The background's points that ``ingest`` coloured by a pixel of the vehicle; ``None`` where there is none."""
+    if not masks:
+        return None
+    chunk = measurements.ingested
+    rows = [np.empty(0, np.int64)]
+    for view in chunk.views_with_role("source"):
+        if view.camera not in masks:
+            continue
+        index, uv, _ = find_visible_points(chunk.static.positions, view)
+        row = uv[:, 1].astype(np.int64)
+        column = uv[:, 0].astype(np.int64)
+        pixels = measurements.decode_view(view)[row, column]
+        # Another camera may have given the point its colour, or the same one from a place that sees it.
+        is_source = (pixels == chunk.static.colors[index]).all(1)
+        rows.append(index[masks[view.camera][row, column] & is_source])
+    found = np.unique(np.concatenate(rows))
+    return found if len(found) else None
 
 
 def _travel_m(measurements: ChunkMeasurements) -> float:
@@ -203,8 +232,47 @@ def _fill_below_outline(part: NDArray[np.bool_], edge: Float32) -> NDArray[np.bo
     arc_rows = np.polyval(arc, columns)
     edge_on_arc = np.where(np.abs(rows - arc_rows) <= ARC_PX, edge, 0).max(0) >= FAINT_LEVELS
     arc_columns = part_columns[on_arc]
-    vehicle_columns = _connected_columns(edge_on_arc, int(arc_columns[len(arc_columns) // 2]))
-    return below_part | (vehicle_columns & (rows >= arc_rows))
+    middle = int(arc_columns[len(arc_columns) // 2])
+    vehicle_columns = _connected_columns(edge_on_arc, middle)
+    below_arc = vehicle_columns & (rows >= arc_rows)
+    # Where the outline leaves the arc, as a boot's does beside mirrored cars, its edge still leads on.
+    outline = _follow_edge(edge, middle, int(tops[part_columns == middle][0]))
+    # The edge is one pixel wide to either side of the step, and what is above the vehicle is not of it.
+    return below_part | below_arc | (rows > outline)
+
+
+def _follow_edge(edge: Float32, column: int, row: int) -> NDArray[np.int64]:
+    """Follows an edge to both sides, over gaps of up to ``GAP_COLUMNS``.
+
+    Args:
+        edge: [H, W] levels a pixel.
+        column: where it begins.
+        row: there, within ``ARC_PX`` of the edge.
+
+    Returns:
+        [W] rows; H where the edge has ended.
+    """
+    height, width = edge.shape
+    outline = np.full(width, height)
+    first = max(row - ARC_PX, 0)
+    first += int(edge[first : row + ARC_PX + 1, column].argmax())
+    for columns in (range(column, width), range(column, -1, -1)):
+        at = first
+        last_seen = 0
+        followed: list[int] = []
+        for x in columns:
+            top = max(at - STEP_PX, 0)
+            near = edge[top : at + STEP_PX + 1, x]
+            if near.max() >= EDGE_LEVELS:
+                at = top + int(near.argmax())
+                last_seen = len(followed) + 1
+            elif len(followed) - last_seen >= GAP_COLUMNS:
+                break
+            # A gap is filled at the row of its beginning.
+            followed.append(at)
+        # A gap that nothing follows is the end.
+        outline[list(columns)[:last_seen]] = followed[:last_seen]
+    return outline
 
 
 def _connected_columns(edge_on_arc: NDArray[np.bool_], start: int) -> NDArray[np.bool_]:

@@ -46,17 +46,20 @@ class ChunkMeasurements:
 
     Attributes:
         chunk: the chunk.
+        ingested: the same chunk as ``ingest`` made it, at the poses that its points were coloured at.
         cameras: the log's cameras that the chunk uses, by name.
     """
 
-    def __init__(self, chunk: Chunk, cameras: Sequence[Camera]) -> None:
+    def __init__(self, chunk: Chunk, cameras: Sequence[Camera], ingested: Chunk | None = None) -> None:
         """Takes a chunk and the cameras of its log.
 
         Args:
             chunk: the chunk to measure.
             cameras: of the log; those that the chunk does not use are left out.
+            ingested: the chunk at the poses that its points were coloured at; ``None``: the same.
         """
         self.chunk = chunk
+        self.ingested = chunk if ingested is None else ingested
         self.cameras = {c.name: c for c in cameras if c.name in chunk.camera_names}
 
     @cached_property

@@ -67,7 +67,7 @@ def plan_effects(
             parameters = parameters.merge(fitted)
             # Effects after one that moves views are measured at the poses that later stages have.
             if fitted.poses:
-                measurements = ChunkMeasurements(move_views(chunk, fitted.poses), cameras)
+                measurements = ChunkMeasurements(move_views(chunk, fitted.poses), cameras, ingested=chunk)
     progress(len(EFFECT_NAMES), len(EFFECT_NAMES), "effects")
     return EffectsPlan(tuple(decisions), parameters)
 

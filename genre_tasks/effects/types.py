@@ -54,6 +54,7 @@ class EffectParameters:
         blurs: how the camera moves while an image is exposed.
         stereo_points: of the background, where LiDAR has none; ``None``: there are none.
         poses: [4, 4] refined chunk_SE3_camera of an image.
+        ego_points: rows of the background's points that took their colour from the recording vehicle itself.
     """
 
     gains: Mapping[ImageKey, tuple[float, float, float]] = field(default_factory=dict)
@@ -62,6 +63,7 @@ class EffectParameters:
     blurs: Mapping[ImageKey, MotionBlur] = field(default_factory=dict)
     stereo_points: Points | None = None
     poses: Mapping[ImageKey, Float64] = field(default_factory=dict)
+    ego_points: NDArray[np.int64] | None = None
 
     def merge(self, other: EffectParameters) -> EffectParameters:
         """Combines the parameters of two effects.
@@ -85,6 +87,7 @@ class EffectParameters:
             blurs={**self.blurs, **other.blurs},
             stereo_points=self.stereo_points if other.stereo_points is None else other.stereo_points,
             poses={**self.poses, **other.poses},
+            ego_points=self.ego_points if other.ego_points is None else other.ego_points,
         )
 
 

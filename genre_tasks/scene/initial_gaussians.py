@@ -16,6 +16,7 @@ from genre_tasks.scene.chunk import Chunk, Points
 from genre_tasks.scene.distant_shell import build_distant_shell
 from genre_tasks.scene.gaussians import Gaussians, map_attributes
 from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR, STATIC, SceneGraph
+from genre_tasks.scene.road_colors import color_unseen_road
 from genre_tasks.scene.road_completion import CELL_M
 from genre_tasks.scene.rotations import matrices_to_quats
 from genre_tasks.scene.transforms import distance_to_path
@@ -66,7 +67,8 @@ def build_initial_scene(config: InitialConfig, chunk: Chunk) -> SceneGraph:
             log=chunk.log,
             chunk=chunk.index,
         )
-    static = fit_discs(select_points(chunk.static, near), distance[near], static_cap, config)
+    background = color_unseen_road(chunk.static, chunk.chunk_SE3_ego)
+    static = fit_discs(select_points(background, near), distance[near], static_cap, config)
     distant = build_distant_shell(chunk, config.distant_count, config.distant_radius_m)
     return assemble_scene(chunk, static, distant, actors)
 

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from genre_tasks.effects.types import Decision, EffectParameters, EffectsPlan
 from genre_tasks.logs.types import Float64, MotionBlur, RollingShutter
@@ -74,6 +75,10 @@ POSES = schema(
     "refined_poses/1",
     [*CAMERA_AND_FRAME, column("chunk_SE3_camera", POSE, "camera to chunk coordinates, 4 x 4 row by row, metres")],
 )
+EGO_POINTS = schema(
+    "ego_points/1",
+    [column("row", pa.int64(), "of the background's points: its colour is of the recording vehicle itself")],
+)
 SHUTTERS = _motion_schema("shutters/1", "readout_s", "seconds from the first row to the last")
 BLURS = _motion_schema("blurs/1", "exposure_s", "seconds for which the shutter is open")
 
@@ -98,6 +103,8 @@ def write(folder: Path, value: EffectsPlan) -> None:
     for camera, mask in value.parameters.ego_masks.items():
         # Three equal channels, because that is the one PNG format of the store, and any viewer shows it.
         write_png(folder / "own" / f"{camera}.png", np.repeat(np.uint8(255) * mask[..., None], 3, 2))
+    if value.parameters.ego_points is not None:
+        write_table(folder / "ego_points.parquet", EGO_POINTS, {"row": value.parameters.ego_points})
     # Only where there are any, as masks: plans without the effect keep their bytes.
     if value.parameters.stereo_points is not None:
         write_points(folder / "points.parquet", [(0, value.parameters.stereo_points)])
@@ -132,7 +139,9 @@ def read(folder: Path, measurements: Mapping[str, Any] | None = None) -> Effects
     points_path = folder / "points.parquet"
     stereo_points = read_points(points_path).get(0) if points_path.is_file() else None
     poses = _read_poses(folder / "poses.parquet")
-    return EffectsPlan(decisions, EffectParameters(gains, masks, shutters, blurs, stereo_points, poses))
+    ego_points = _read_ego_points(folder / "ego_points.parquet")
+    parameters = EffectParameters(gains, masks, shutters, blurs, stereo_points, poses, ego_points)
+    return EffectsPlan(decisions, parameters)
 
 
 def measurements(value: EffectsPlan) -> dict[str, Any]:
@@ -142,6 +151,13 @@ def measurements(value: EffectsPlan) -> dict[str, Any]:
         An empty dictionary.
     """
     return {}
+
+
+def _read_ego_points(path: Path) -> NDArray[np.int64] | None:
+    # A plan whose points show nothing of the vehicle has no such table.
+    if not path.is_file():
+        return None
+    return np.array([row["row"] for row in read_rows(path, EGO_POINTS)], np.int64)
 
 
 def _read_poses(path: Path) -> dict[tuple[str, int], Float64]:

@@ -18,7 +18,9 @@ from genre_tasks.config import (
     NovelViewsConfig,
     PerSceneConfig,
 )
-from genre_tasks.effects.apply_plan import apply_plan
+from genre_tasks.effects.apply_plan import apply_plan, move_views
+from genre_tasks.effects.ego_mask import fit as fit_ego_mask
+from genre_tasks.effects.measurements import ChunkMeasurements
 from genre_tasks.effects.plan import EFFECT_NAMES, plan_effects
 from genre_tasks.effects.types import DEFAULT_PLAN, Decision, EffectParameters, EffectsPlan
 from genre_tasks.fixer.source_images import load_source_images
@@ -36,6 +38,7 @@ from genre_tasks.render import cpu
 from genre_tasks.render.motion_blur import BlurSamples, mean_in_linear_light
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.novel_poses import place_novel_views
+from genre_tasks.scene.visibility import GREY
 from genre_tasks.stages.gnet import gnet
 from genre_tasks.stages.ingest import ingest
 from genre_tasks.stages.initial import initial
@@ -45,6 +48,7 @@ from tests.effects.imports import assert_imports_no_effect
 
 SMALL = "&frames=8&cameras=2&width=160&height=90&samples=1"
 STREET = "synthetic:street?seed=1020" + SMALL
+SHIFT = np.array([[1.0, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 
 
 @cache
@@ -147,6 +151,28 @@ def test_the_streets_bonnet_is_found_where_it_is() -> None:
     truth = log.truth.image(0, log.world_SE3_camera("front_camera", 0), lens).astype(float)
     image = decode_view_image(chunk(uri).views[0]).numpy() * 255
     assert np.abs(image - truth)[~true].max() <= 1 and np.abs(image - truth)[true].mean() > 20
+
+
+def test_the_road_takes_no_colours_from_the_bonnet() -> None:
+    uri = STREET + "&bonnet=0.08"
+    found = _planned(uri, "ego_mask")
+    rows = found.parameters.ego_points
+    assert rows is not None and len(rows) > 50
+    bonnet = chunk(uri).static
+    clean = chunk(STREET).static
+    # Both streets have the same points: those that differ took the bonnet's colours, and more levels mean more paint.
+    assert np.array_equal(bonnet.positions, clean.positions)
+    painted = np.abs(bonnet.colors.astype(int) - clean.colors).max(1) > 30
+    assert np.isin(np.flatnonzero(painted), rows).mean() > 0.95
+    applied = apply_plan(chunk(uri), found).static
+    assert not applied.colored[rows].any() and (applied.colors[rows] == GREY).all()
+    # Actors follow the background: their effect is off.
+    rest = np.setdiff1d(np.arange(len(bonnet)), rows)
+    assert np.array_equal(applied.colors[rest], bonnet.colors[rest])
+    # Where the plan moved the views, the points are still those that ingest coloured.
+    moved = move_views(chunk(uri), {(v.camera, v.frame): v.chunk_SE3_camera @ SHIFT for v in chunk(uri).views})
+    measured = ChunkMeasurements(moved, open_log(uri).cameras, ingested=chunk(uri))
+    assert np.array_equal(fit_ego_mask(measured).ego_points, rows)
 
 
 def test_shutters_are_the_cameras_own_motion() -> None:

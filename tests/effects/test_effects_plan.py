@@ -275,6 +275,20 @@ def test_paint_that_mirrors_the_world_is_the_vehicles_own_too() -> None:
     assert not find_vehicle(elsewhere.astype(np.float32)).any()
 
 
+def test_an_outline_that_is_no_arc_is_followed_along_its_edge() -> None:
+    """To the right the boot mirrors moving cars, and its outline is level, where the arc of its left goes down."""
+    from genre_tasks.effects.ego_mask import find_vehicle
+
+    g = np.random.default_rng(0)
+    columns = np.arange(320)
+    top = 120 + 14 * np.clip(150 - columns, 0, None) ** 2 / 150**2
+    covered = np.arange(180)[:, None] >= top
+    images = g.uniform(120, 160, (10, 180, 320, 3)).astype(np.float32)
+    mirrored = 30 + 25 * g.uniform(0, 1, (10, 1, 320, 1)).astype(np.float32) * (columns > 200)[None, None, :, None]
+    found = find_vehicle(np.where(covered[None, ..., None], mirrored, images))
+    assert (found & covered).sum() > 0.97 * covered.sum() and (found & ~covered).sum() < 0.02 * covered.sum()
+
+
 def test_paint_of_the_roads_colour_is_found_by_what_moves_beside_it() -> None:
     """A night's road is as still as the paint, and is not the vehicle."""
     from genre_tasks.effects.ego_mask import find_vehicle

@@ -188,7 +188,8 @@ def effects(rng: np.random.Generator, count: int = 3) -> EffectsPlan:
     }
     stereo_points = points(rng, 7 * count) if count else None
     poses = {(f"camera_{k}", k): rng.normal(size=(4, 4)) for k in range(count)}
-    return EffectsPlan(tuple(rows), EffectParameters(gains, own, shutters, blurs, stereo_points, poses))
+    ego_points = np.sort(rng.choice(1000, 5 * count, replace=False)) if count else None
+    return EffectsPlan(tuple(rows), EffectParameters(gains, own, shutters, blurs, stereo_points, poses, ego_points))
 
 
 MAKERS = {
