@@ -18,7 +18,7 @@ from genre_tasks.optimiser.auxiliary import AuxiliaryParameters
 from genre_tasks.optimiser.gradients import WEIGHTED_SQUARED_RESIDUAL
 from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.state import Parameterization
-from genre_tasks.scene.gaussians import map_attributes
+from genre_tasks.scene.gaussians import Gaussians, map_attributes
 from genre_tasks.scene.graph import DISTANT, SceneGraph
 from genre_tasks.scene.rotations import quats_to_matrices
 
@@ -33,13 +33,15 @@ REMAINING_ENERGY = 0.3
 
 ROUNDS_PER_DOUBLING = 8
 _BATCH_VIEWS = 6
+# Of the square of a side that points at the viewer, so that its logarithm is finite.
+_LEAST_ACROSS = 1e-6
 
 
 def split_by_residual(scene: SceneGraph, targets: Sequence[Target], fraction: float) -> SceneGraph:
     """Splits the Gaussians with the largest residual energy.
 
-    It goes in rounds, so that a Gaussian that explains little becomes four, eight and so on. The distant region keeps
-    its number, as in the density control of per-scene 3DGS.
+    It goes in rounds, so that a Gaussian that explains little becomes four, eight and so on. The distant shell takes
+    part: clouds are finer than its even spacing, and lie the same in every view beside the path.
 
     Args:
         scene: of N Gaussians.
@@ -54,10 +56,9 @@ def split_by_residual(scene: SceneGraph, targets: Sequence[Target], fraction: fl
     if not remaining or not targets:
         return scene
     energy = residual_energy(scene, targets)
-    # An energy of 0 is never split.
-    energy = torch.where(scene.nodes == DISTANT, 0.0, energy)
     round_limit = max(1, len(scene) // ROUNDS_PER_DOUBLING)
     while True:
+        # An energy of 0 is never split.
         count = min(remaining, round_limit, int((energy > 0).sum()))
         if count <= 0:
             return scene
@@ -100,7 +101,7 @@ def residual_energy(scene: SceneGraph, targets: Sequence[Target]) -> Tensor:
 
 
 def split_along_longest_axis(scene: SceneGraph, rows: Tensor) -> SceneGraph:
-    """Splits some Gaussians in two along their longest side.
+    """Splits some Gaussians in two along their longest side; distant ones along that which looks longest.
 
     Args:
         scene: of N Gaussians.
@@ -111,9 +112,12 @@ def split_along_longest_axis(scene: SceneGraph, rows: Tensor) -> SceneGraph:
         colour, opacity and spherical harmonics.
     """
     parents = map_attributes(lambda x: x[rows], scene.gaussians)
-    longest = parents.log_scales.argmax(1)
+    axes = quats_to_matrices(parents.quats)
+    is_distant = (scene.nodes[rows] == DISTANT)[:, None]
+    visible = torch.where(is_distant, _visible_log_scales(parents, axes), parents.log_scales)
+    longest = visible.argmax(1)
     index = torch.arange(len(rows), device=longest.device)
-    axis = quats_to_matrices(parents.quats)[index, :, longest]
+    axis = axes[index, :, longest]
     shift = axis * (SEPARATION * parents.log_scales[index, longest].exp())[:, None]
     log_scales = parents.log_scales.clone()
     # Opacity stays: the halves overlap in the middle, and each covers half of what the parent did.
@@ -133,3 +137,11 @@ def split_along_longest_axis(scene: SceneGraph, rows: Tensor) -> SceneGraph:
         nodes=torch.cat([scene.nodes, scene.nodes[rows]]),
         spherical_harmonics=coefficients,
     )
+
+
+def _visible_log_scales(gaussians: Gaussians, axes: Tensor) -> Tensor:
+    """Log-scales [N, 3] across the line of sight from the chunk's origin, which is on the path."""
+    direction = torch.nn.functional.normalize(gaussians.means, dim=1)
+    # Halves one behind the other would look like their parent.
+    along = torch.einsum("nda,nd->na", axes, direction)
+    return gaussians.log_scales + 0.5 * (1.0 - along.square()).clamp_min(_LEAST_ACROSS).log()
