@@ -30,7 +30,7 @@ MAX_GAP_M = 0.8
 """What is farther is another part. From half a metre on ever less of a gap is closed: the next ring is then not among
 the neighbours looked at."""
 
-ISOLATED = 8.0
+ISOLATED = 5.0
 """A disc is no surface if its fifth nearest return is so many times as far as that of the median disc of its octave."""
 
 # Fewer are what a bird, a wire or a reflection gives.
