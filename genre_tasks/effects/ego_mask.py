@@ -42,6 +42,9 @@ GAP_COLUMNS = 25
 STEP_PX = 2
 """From one column to the next an outline goes up or down by at most so many rows."""
 
+MEAN_STEP_PX = 0.3
+"""And on average by no more than this: what goes up and down more is the edges of a still road, in few small images."""
+
 # Where the arc is known, a fainter edge along it is evidence enough.
 FAINT_LEVELS = EDGE_LEVELS / 2
 
@@ -54,6 +57,9 @@ MIN_MASK_PERCENT = 0.3
 
 MAX_MASK_PERCENT = 60.0
 """No vehicle fills more of an image: what stands still there is the night, a cover, or a picture that is stuck."""
+
+MAX_COLOR_PERCENT = 35.0
+"""Larger parts may be a still road in small images, and take no colours away: that would cost more than paint does."""
 
 MIN_TRAVEL_M = 2.0
 MIN_FRAMES = 4
@@ -110,6 +116,7 @@ def _find_ego_points(
     measurements: ChunkMeasurements, masks: Mapping[str, NDArray[np.bool_]]
 ) -> NDArray[np.int64] | None:
     """The background's points that ``ingest`` coloured by a pixel of the vehicle; ``None`` where there is none."""
+    masks = {camera: mask for camera, mask in masks.items() if 100 * mask.mean() <= MAX_COLOR_PERCENT}
     if not masks:
         return None
     chunk = measurements.ingested
@@ -250,7 +257,7 @@ def _follow_edge(edge: Float32, column: int, row: int) -> NDArray[np.int64]:
         row: there, within ``ARC_PX`` of the edge.
 
     Returns:
-        [W] rows; H where the edge has ended.
+        [W] rows; H where the edge has ended, and everywhere if it is no smooth outline.
     """
     height, width = edge.shape
     outline = np.full(width, height)
@@ -272,6 +279,9 @@ def _follow_edge(edge: Float32, column: int, row: int) -> NDArray[np.int64]:
             followed.append(at)
         # A gap that nothing follows is the end.
         outline[list(columns)[:last_seen]] = followed[:last_seen]
+    rows = outline[outline < height]
+    if len(rows) > 1 and np.abs(np.diff(rows)).mean() > MEAN_STEP_PX:
+        return np.full(width, height)
     return outline
 
 

@@ -289,6 +289,13 @@ def test_an_outline_that_is_no_arc_is_followed_along_its_edge() -> None:
     assert (found & covered).sum() > 0.97 * covered.sum() and (found & ~covered).sum() < 0.02 * covered.sum()
 
 
+def test_a_still_road_keeps_its_colours() -> None:
+    """Eight small images of a street without a bonnet: half of them stands still, and is road."""
+    uri = "synthetic:street?seed=900&frames=8&cameras=1&width=128&height=72&moving=0&pedestrians=0"
+    street = ingest(IngestConfig(width_px=128, height_px=72), open_log(uri), 0)
+    assert planned("ego_mask", street, open_log(uri).cameras).parameters.ego_points is None
+
+
 def test_paint_of_the_roads_colour_is_found_by_what_moves_beside_it() -> None:
     """A night's road is as still as the paint, and is not the vehicle."""
     from genre_tasks.effects.ego_mask import find_vehicle
