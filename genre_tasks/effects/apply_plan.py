@@ -22,7 +22,8 @@ _POINT_ATTRIBUTES = ("positions", "colors", "colored", "frames")
 def apply_plan(chunk: Chunk, plan: EffectsPlan) -> Chunk:
     """Gives each view its pose, gain, ego mask, shutter and blur, and the background what effects add to it.
 
-    That is points of multi-view stereo, and actors where they are not modelled.
+    That is points of multi-view stereo, and actors where they are not modelled. Points that took their colour from the
+    recording vehicle lose it.
 
     Args:
         chunk: as ``ingest`` made it.

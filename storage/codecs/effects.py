@@ -1,7 +1,7 @@
 """Plan of effects ↔ ``effects.parquet``, a row an effect, and what those that are on need to be applied.
 
 That is ``gains.parquet``, ``shutters.parquet``, ``blurs.parquet``, ``own/CAMERA.png`` and, where there are any,
-``points.parquet`` of multi-view stereo and ``poses.parquet``, refined.
+``points.parquet`` of multi-view stereo, ``poses.parquet``, refined, and ``ego_points.parquet``.
 """
 
 from __future__ import annotations
@@ -21,10 +21,12 @@ from storage.codecs.point_table import read_points, write_points
 from storage.codecs.tables import (
     POSE,
     column,
+    column_array,
     poses_from_rows,
     poses_to_column,
     read_records,
     read_rows,
+    read_table,
     schema,
     write_records,
     write_table,
@@ -157,7 +159,7 @@ def _read_ego_points(path: Path) -> NDArray[np.int64] | None:
     # A plan whose points show nothing of the vehicle has no such table.
     if not path.is_file():
         return None
-    return np.array([row["row"] for row in read_rows(path, EGO_POINTS)], np.int64)
+    return column_array(read_table(path, EGO_POINTS)[0], "row")
 
 
 def _read_poses(path: Path) -> dict[tuple[str, int], Float64]:

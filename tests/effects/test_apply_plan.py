@@ -160,7 +160,7 @@ def test_the_road_takes_no_colours_from_the_bonnet() -> None:
     assert rows is not None and len(rows) > 50
     bonnet = chunk(uri).static
     clean = chunk(STREET).static
-    # Both streets have the same points: those that differ took the bonnet's colours, and more levels mean more paint.
+    # Both streets have the same points; a colour that differs by many levels is the bonnet's.
     assert np.array_equal(bonnet.positions, clean.positions)
     painted = np.abs(bonnet.colors.astype(int) - clean.colors).max(1) > 30
     assert np.isin(np.flatnonzero(painted), rows).mean() > 0.95
