@@ -237,11 +237,7 @@ class EditedScenes:
         except InputError as error:
             raise self._at_edit(edit, error) from error
         if not change.is_identity and not change.removed:
-            survey = self._survey
-            shapes = trajectory.shape_frames
-            trajectory = change_trajectory(trajectory, change, survey.clock, survey.ground)
-            # Its shapes are those of its recording, not of the run that it is in.
-            trajectory = replace(trajectory, shape_frames=np.resize(shapes, len(trajectory)))
+            trajectory = change_trajectory(trajectory, change, self._survey.clock, self._survey.ground)
         return _InsertedActor(name, actor, trajectory, change, from_here=edit.from_run is None)
 
     def _name_inserts(self) -> dict[str, Insert]:

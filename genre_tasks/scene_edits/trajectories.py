@@ -141,13 +141,14 @@ def change_trajectory(recorded: Trajectory, change: ActorChange, clock: FrameClo
             times_s = timed.scale_progress(times_s, float(change.speed_factor))
         reference = np.stack([timed.pose_at(time_s) for time_s in times_s])
         poses = np.stack([timed.extrapolate(t, pose) for t, pose in zip(times_s, reference, strict=True)])
-        moments = clock.find_frames(times_s)
+        # An inserted actor's shapes are those of its own recording, so its frames are not its moments.
+        moments = np.interp(clock.find_frames(times_s), recorded.frames, recorded.shape_frames)
     shift = np.array([float(change.forward_m), float(change.left_m), 0.0])
     moved = _shift_level(poses, shift)
     moved[:, :3, :3] = moved[:, :3, :3] @ Rotation.from_euler("z", float(change.turn_deg), degrees=True).as_matrix()
     moved = rest_on_ground(moved, reference, ground)
     moved[:, 2, 3] += float(change.up_m)
-    return Trajectory(frames, moved, np.clip(moments, recorded.frames[0], recorded.frames[-1]))
+    return Trajectory(frames, moved, moments)
 
 
 def rest_on_ground(poses: Float64, reference: Float64, ground: Ground) -> Float64:

@@ -220,6 +220,21 @@ def test_shape_follows_a_delayed_actor() -> None:
     assert torch.equal(removed.offsets, before.offsets)
 
 
+@pytest.mark.parametrize(
+    ("change", "frame", "frame_before"),
+    [(Retime(actor="x", delay_s=0.2), 5.0, 3.0), (ScaleSpeed(actor="x", factor=0.5), 4.0, 3.0)],
+)
+def test_shape_follows_a_delayed_inserted_actor(change: object, frame: float, frame_before: float) -> None:
+    run = MadeRun(deforming=True)
+    edits = (Insert(actor="a", name="x", start_s=0.2, ahead_m=9, speed_m_s=10.0), Remove(actor="a"))
+    before = edit(run, *edits).load(0).scene.deformation
+    after = edit(run, *edits, change).load(0).scene.deformation
+    assert before is not None
+    assert after is not None
+    assert torch.allclose(after.offsets_at([frame]), before.offsets_at([frame_before]), atol=1e-6)
+    assert not torch.allclose(after.offsets_at([frame]), before.offsets_at([frame]), atol=1e-3)
+
+
 def test_contact_shadow_darkens_the_ground_alone(run: MadeRun) -> None:
     insert = Insert(actor="a", name="x", ahead_m=9, left_m=0, speed_m_s=0)
     bare = edit(run, insert).load(0)
