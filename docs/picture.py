@@ -20,6 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.common.run_stages import reconstruct
 from benchmarks.pipeline import BENCH, GNET_STAGES, configurations
 from flows.pipeline.stage_runner import Job, read_artifact
+from genre_tasks.effects.apply_plan import apply_plan
 from genre_tasks.render import render_views
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.graph import SceneGraph
@@ -68,7 +69,9 @@ def main() -> None:
     jobs = {name: Job(options.log, options.chunk, options.store, runs[name]) for name in ("street_gs", "fine")}
     plain = reconstruct(jobs["street_gs"], GNET_STAGES[:-1])
     enhanced = reconstruct(jobs["fine"])
-    chunk = read_artifact(jobs["fine"], enhanced["ingest"])
+    # Both scenes are fitted to the refined poses.
+    plan = read_artifact(jobs["fine"], enhanced["effects"])
+    chunk = apply_plan(read_artifact(jobs["fine"], enhanced["ingest"]), plan)
     view = next(v for v in chunk.views if (v.camera, v.frame) == (options.camera, options.frame))
     place = (options.camera, options.frame, options.shift)
     images = [
