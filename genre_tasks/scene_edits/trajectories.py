@@ -141,7 +141,7 @@ def change_trajectory(recorded: Trajectory, change: ActorChange, clock: FrameClo
             times_s = timed.scale_progress(times_s, float(change.speed_factor))
         reference = np.stack([timed.pose_at(time_s) for time_s in times_s])
         poses = np.stack([timed.extrapolate(t, pose) for t, pose in zip(times_s, reference, strict=True)])
-        # An inserted actor's shapes are those of its own recording, so its frames are not its moments.
+        # Frames are those of this run, and shapes those of the actor's recording: for an inserted actor they differ.
         moments = np.interp(clock.find_frames(times_s), recorded.frames, recorded.shape_frames)
     shift = np.array([float(change.forward_m), float(change.left_m), 0.0])
     moved = _shift_level(poses, shift)

@@ -224,7 +224,7 @@ def test_shape_follows_a_delayed_actor() -> None:
     ("change", "frame", "frame_before"),
     [(Retime(actor="x", delay_s=0.2), 5.0, 3.0), (ScaleSpeed(actor="x", factor=0.5), 4.0, 3.0)],
 )
-def test_shape_follows_a_delayed_inserted_actor(change: object, frame: float, frame_before: float) -> None:
+def test_shape_follows_an_inserted_actor_at_its_new_times(change: object, frame: float, frame_before: float) -> None:
     run = MadeRun(deforming=True)
     edits = (Insert(actor="a", name="x", start_s=0.2, ahead_m=9, speed_m_s=10.0), Remove(actor="a"))
     before = edit(run, *edits).load(0).scene.deformation
