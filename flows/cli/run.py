@@ -32,7 +32,10 @@ ConfigFileOption = Annotated[
     ),
 ]
 StrictOption = Annotated[
-    bool, typer.Option("--strict", help="Stop at a missing or unreadable image or sweep, instead of leaving it out.")
+    bool,
+    typer.Option(
+        "--strict", help="Stop at what `genre check` warns of and at unreadable files, instead of going on without."
+    ),
 ]
 BudgetOption = Annotated[
     str | None,

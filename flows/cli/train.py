@@ -162,8 +162,8 @@ def scenes(
 ) -> None:
     """Make the scenes that GNet and ENet train on.
 
-    A scene has chunks, true views, a per-scene 3DGS reconstruction and FNet's images of it. The scenes are kept in
-    FOLDER/store.
+    A scene has chunks, true views, and FNet's images of reconstructions by Adam (recipe shipped) or 3DGS (paper).
+    Scenes that GNet's reconstruction starts are made once it is trained. All are kept in FOLDER/store.
 
     Example:
 

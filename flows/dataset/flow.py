@@ -57,7 +57,7 @@ def reconstruct_dataset(
         in_flight: child runs that are submitted and have not ended, at most.
         unit: ``log`` for one child run a log, ``chunk`` for one a chunk.
         attempts: how often a log whose run dies is submitted, at most.
-        gpu_limit: name of a global concurrency limit of Prefect, of which a stage on a GPU takes a slot.
+        gpu_limit: name of a global concurrency limit of Prefect, of which each heavy stage takes a slot, on any device.
 
     Returns:
         How each log (or chunk) ended, in order: ``log``, ``status``, ``run``, ``report`` and more.

@@ -35,8 +35,8 @@ class StageSpec:
         function: ``module:name``; it is called as ``function(section, *arguments, progress=…)``.
         arguments: for each argument the name of an earlier stage (its value is passed) or a special argument.
         weights: the network whose weights the stage loads; ``None`` for a stage without a network.
-        batch_setting: a setting of the section that bounds memory and does not change the payload. It is halved when
-            memory runs out, and it is not part of the key.
+        batch_setting: a setting of the section that bounds memory and changes the payload by rounding at most. It is
+            halved when memory runs out, and it is not part of the key.
         lazy_modules: modules that belong to the stage's code although no import names them.
     """
 

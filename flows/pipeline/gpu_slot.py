@@ -40,9 +40,10 @@ def takes_gpu_slot(stage: str) -> bool:
 
 @contextmanager
 def gpu_slot(stage: str) -> Iterator[None]:
-    """Holds a slot of the limit that ``GENRE_GPU_LIMIT`` names, while a stage that uses a GPU runs.
+    """Holds a slot of the limit that ``GENRE_GPU_LIMIT`` names, while a heavy stage runs, on any device.
 
-    The server takes the slot back some minutes after a worker died that had it.
+    Heavy are GNet, FNet, ENet and evaluations. The server takes the slot back some minutes after a worker died that had
+    it.
 
     Args:
         stage: the stage's name.

@@ -189,7 +189,7 @@ def run_stage(
         job: log, chunk, store and configuration.
         inputs: references of at least the stage's inputs, by stage name.
         attempt: how many tries before this one ran out of memory. The stage's ``batch_setting`` is halved that often,
-            which does not change the payload.
+            which changes the payload by rounding at most.
         progress: called with how far the computation is.
 
     Returns:

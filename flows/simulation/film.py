@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import tempfile
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -11,12 +12,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from genre_tasks.errors import ResourceError
+from genre_tasks.logs.types import Float64
 
 _MAX_MESSAGE_LENGTH = 200
 # Twice as quick as the default, for files a fifth larger.
 _PRESET = "veryfast"
 # Hardly to be told from the images; the default, 23, blurs a road's texture.
 _QUALITY = 18
+# Longer nobody wants to look at an image that stands still.
+_MAX_PAUSE_S = 3.0
+
+
+def count_repeats(times_s: Sequence[float] | Float64, image_s: float) -> list[int]:
+    """Counts how often a film writes each image: a film has even steps, and a log has pauses.
+
+    Args:
+        times_s: [F] when the images were taken, rising.
+        image_s: seconds for which the film shows an image.
+
+    Returns:
+        [F] counts of 1 or more. Pauses of more than 3 seconds are shortened to these.
+
+    >>> count_repeats([0.0, 0.1, 0.5, 60.5], 0.1)
+    [1, 4, 30, 1]
+    """
+    steps_s = np.minimum(np.diff(times_s), _MAX_PAUSE_S)
+    counts = np.maximum(np.rint(steps_s / image_s), 1).astype(int)
+    return [*counts.tolist(), 1]
 
 
 class FilmWriter:

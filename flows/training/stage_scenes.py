@@ -100,7 +100,7 @@ def rendered_start(stage: Stage, start: SceneStart) -> SceneStart:
 def make_scene_artifacts(job: TrainJob, recipe: SceneRecipe, uses: Sequence[tuple[Stage, SceneStart]]) -> int:
     """Makes what the store lacks of a training scene, except for what needs weights that are yet to be trained.
 
-    That is: chunk, initial scene, true views, per-scene 3DGS at its ages, FNet's images.
+    That is: chunk, initial scene, true views, the recipe's reconstructions, FNet's images.
 
     Args:
         job: the training.

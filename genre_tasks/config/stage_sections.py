@@ -42,7 +42,8 @@ class IngestConfig(Section):
         True, description="Complete façades above the LiDAR's field of view, as far as images support it."
     )
     strict: bool = Field(
-        False, description="Fail on a missing or unreadable image or sweep, instead of reporting it and going on."
+        False,
+        description="Fail on what `genre check` warns of and on unreadable files, instead of going on.",
     )
     min_actor_travel_m: float = Field(
         0.5, ge=0, le=1e6, description="A track that moves less than this, in metres, is part of the background."
@@ -66,7 +67,7 @@ class IngestConfig(Section):
 
 
 class InitialConfig(Section):
-    """Gaussians on LiDAR points, and a fixed number of them far away (paper Sec. III-A); or those of a file."""
+    """Gaussians on LiDAR points, and a number of them far away (paper Sec. III-A); or those of a file."""
 
     scene: FilePath | None = Field(
         None,

@@ -93,11 +93,12 @@ def describe_repeated(frames: Iterable[int]) -> tuple[Finding, ...]:
         ``repeated_box_id`` for each frame.
 
     >>> describe_repeated([7, 7])[0].message
-    '2 boxes of frame 7 have the id of another box of that frame, and are left out'
+    '2 boxes of frame 7 left out, because another box of that frame has the same id'
     """
     findings = []
     for frame, count in sorted(Counter(frames).items()):
-        message = f"{count} boxes of frame {frame} have the id of another box of that frame, and are left out"
+        some = "1 box" if count == 1 else f"{count} boxes"
+        message = f"{some} of frame {frame} left out, because another box of that frame has the same id"
         remedy = "Give every object an id, the same one in all frames."
         findings.append(Finding("repeated_box_id", "warning", message, remedy, {"boxes": count}, frames=(frame,)))
     return tuple(findings)

@@ -1,4 +1,4 @@
-"""The distant region: a fixed number of Gaussians on a far shell, for the sky and what LiDAR did not reach."""
+"""The distant region: Gaussians on a far shell, for the sky and what LiDAR did not reach."""
 
 from __future__ import annotations
 

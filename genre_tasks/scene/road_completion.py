@@ -1,7 +1,7 @@
 """The road where LiDAR is blind: around the vehicle itself and between the rings of a slow drive.
 
-A roof LiDAR sees no road nearer than some 4 m, and the number of Gaussians never grows: without these points the road
-beside the path would stay a hole in every view. They are coloured from the images like all others.
+A roof LiDAR sees no road nearer than some 4 m, and splitting adds Gaussians only where there are some: without these
+points the road beside the path would stay a hole in every view. They are coloured from the images like all others.
 """
 
 from __future__ import annotations

@@ -67,8 +67,9 @@ def color_point_clouds(
 ) -> list[tuple[NDArray[np.uint8], NDArray[np.bool_]]]:
     """Colours points from images.
 
-    Each point takes the pixel of the view that resolves it best (fewest metres a pixel), among those that see it. A
-    point is hidden where the depth map of all clouds, with actors where they are at the view's frame, is nearer.
+    Each point takes the pixel of the view that resolves it best (fewest metres a pixel), among those that see it. For
+    points of actors the view nearest in time comes first. A point is hidden where the depth map of all clouds, with
+    actors where they are at the view's frame, is nearer.
 
     Args:
         clouds: all that may hide each other.

@@ -107,7 +107,7 @@ def apply_view_gains(color: Tensor, views: Sequence[View | NovelView]) -> Tensor
     Returns:
         [V, H, W, 3]; ``color`` itself where no view has a gain.
     """
-    # Scenes have one exposure, and held-out images are judged at the exposure that they were recorded with.
+    # Scenes have one exposure. Held-out images are judged at the one that source views around them suggest.
     gains = {k: view.log_gain for k, view in enumerate(views) if isinstance(view, View) and view.log_gain is not None}
     if not gains:
         return color

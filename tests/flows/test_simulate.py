@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -25,11 +26,13 @@ from flows.simulation.rollout_metrics import METRICS_FILE
 from flows.simulation.run_scenes import RunScenes
 from flows.simulation.simulate import simulate_run
 from genre_tasks.config import PipelineConfig, SimulateConfig
-from genre_tasks.ego_paths.recorded_path import join_recorded_path
+from genre_tasks.ego_paths import recorded_path
+from genre_tasks.ego_paths.recorded_path import ImageTime, join_recorded_path, list_image_times
 from genre_tasks.errors import ConfigError, GenreError, InputError
 from genre_tasks.rollout.handover import plan_handovers
 from genre_tasks.rollout.render_rollout import render_rollout
 from genre_tasks.rollout.rig import estimate_rig
+from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene_edits.actor_names import name_actors
 from genre_tasks.scene_edits.run_survey import survey_run
 from storage.files import digest_file
@@ -140,6 +143,23 @@ def test_a_rendered_film_plays_as_fast_as_the_log(recorded: SimulationRequest, t
     assert CliRunner().invoke(app, words, catch_exceptions=False).exit_code == 0
     facts = imageio.immeta(film)
     assert facts["fps"] == pytest.approx(10.0) and imageio.imread(film).shape[0] == 6
+
+
+def test_a_rendered_film_stands_still_over_a_pause_of_the_log(
+    recorded: SimulationRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def list_with_pause(chunk: Chunk) -> list[ImageTime]:
+        first = chunk.frames[0]
+        return [image._replace(time_s=image.time_s + 0.4 * (image.frame > first)) for image in list_image_times(chunk)]
+
+    monkeypatch.setattr(recorded_path, "list_image_times", list_with_pause)
+    film = tmp_path / "film.mp4"
+    words = ["render", recorded.run, "--store", recorded.store, "--chunk", "0", "--out", str(film)]
+    assert CliRunner().invoke(app, words, catch_exceptions=False).exit_code == 0
+    images = imageio.imread(film).astype(int)
+    assert len(images) == 10
+    steps = [abs(after - before).mean() for before, after in itertools.pairwise(images)]
+    assert max(steps[:4]) < min(steps[4:])
 
 
 def test_a_path_without_poses_is_refused(recorded: SimulationRequest, tmp_path: Path) -> None:

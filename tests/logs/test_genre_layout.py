@@ -192,7 +192,6 @@ def _boxes(**changes: Any) -> Any:
 BROKEN_BOXES = {
     "a column is missing": (lambda columns: columns.pop("qw"), "lack the columns qw"),
     "a later frame": (_boxes(frame=(0, 99)), "row 0 is of frame 99"),
-    "two boxes of one object": (_boxes(frame=(1, 0)), "has two boxes in frame 0"),
     "moving as text": (
         lambda columns: columns.update(moving=["False"] * len(columns["x"])),
         "moving of row 0 is 'False'",
@@ -239,6 +238,21 @@ def test_keys_that_mean_nothing_are_named(folder: Path) -> None:
         ("warning", "frnt"),
     ]
     assert found[2].remedy == "Did you mean 'front'?" and "frame 0" in found[2].message
+
+
+def test_of_two_boxes_of_one_object_in_a_frame_the_first_sound_one_counts(folder: Path) -> None:
+    columns = pq.read_table(folder / "boxes.parquet").to_pydict()
+    sound = open_log(f"genre:{folder}").tracks()
+    rows = [0, 0, 0, *range(1, len(columns["x"]))]
+    repeated = {name: [values[row] for row in rows] for name, values in columns.items()}
+    repeated["width"][0] = 0.0
+    repeated["x"][2] += 50
+    pq.write_table(pa.table(repeated), folder / "boxes.parquet")
+    log = open_log(f"genre:{folder}")
+    for track, expected in zip(log.tracks(), sound, strict=True):
+        assert np.array_equal(track.world_SE3_box, expected.world_SE3_box)
+    (found,) = [finding for finding in check_log(log).findings if finding.word == "repeated_box_id"]
+    assert found.frames == (columns["frame"][0],) and found.message.startswith("1 box of frame")
 
 
 @pytest.mark.parametrize("name", BAD_BOXES)

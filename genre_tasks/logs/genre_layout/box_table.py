@@ -13,6 +13,7 @@ from genre_tasks.errors import InputError
 from genre_tasks.logs.box_validity import StatedBox, find_bad_boxes, report_bad_boxes
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.genre_layout.layout import BOX_COLUMNS
+from genre_tasks.logs.labelled_boxes import describe_repeated
 from genre_tasks.logs.types import CuboidTrack, Float64
 
 _REMEDY = "Write the columns of the genre layout: " + ", ".join(BOX_COLUMNS) + "."
@@ -51,11 +52,12 @@ def read_boxes(path: Path, frame_count: int, log: str) -> tuple[tuple[CuboidTrac
         log: URI of the log, for errors.
 
     Returns:
-        The tracks, in the order of their first rows, and ``invalid_box`` for every box that is left out. The size of a
-        track is the median over its frames.
+        The tracks, in the order of their first rows. The size of a track is the median over its frames. Then
+        ``invalid_box`` for every box that is left out, and ``repeated_box_id`` where an object has several boxes in a
+        frame, of which the first sound one counts.
 
     Raises:
-        InputError: the table is damaged, too large, or lacks a column; a row is of no frame, of no object, or double;
+        InputError: the table is damaged, too large, or lacks a column; a row is of no frame or of no object;
             ``moving`` is neither true nor false; no box can be used.
     """
     import pyarrow as pa
@@ -70,16 +72,10 @@ def read_boxes(path: Path, frame_count: int, log: str) -> tuple[tuple[CuboidTrac
         raise InputError(f"the boxes lack the columns {', '.join(missing)}", **where)
     columns = {name: table.column(name).to_pylist() for name in BOX_COLUMNS if name in table.column_names}
     _require_objects(columns, where)
-    by_track: dict[str, dict[int, int]] = {}
-    for row, (track_id, frame) in enumerate(zip(columns["track_id"], columns["frame"], strict=True)):
+    for row, frame in enumerate(columns["frame"]):
         if isinstance(frame, bool) or not isinstance(frame, int) or not 0 <= frame < frame_count:
             problem = f"row {row} is of frame {frame}, and the log has 0 to {frame_count - 1}"
             raise InputError(problem, **where)
-        frames = by_track.setdefault(str(track_id), {})
-        # Nobody knows which one is meant.
-        if frame in frames:
-            raise InputError(f"{track_id} has two boxes in frame {frame}", **where)
-        frames[frame] = row
     # Nulls of Parquet become NaN here.
     try:
         numbers = np.array([columns[name] for name in BOX_COLUMNS[4:]], dtype=np.float64).T.reshape(-1, 10)
@@ -92,10 +88,18 @@ def read_boxes(path: Path, frame_count: int, log: str) -> tuple[tuple[CuboidTrac
         return StatedBox(columns["frame"][row], track_id, label, f"{path.name}, row {row}")
 
     findings = report_bad_boxes(problems, len(numbers), locate, file=path, log=log)
-    for row in problems:
-        del by_track[str(columns["track_id"][row])][columns["frame"][row]]
-    tracks = (_build_track(name, frames, columns, numbers) for name, frames in by_track.items() if frames)
-    return tuple(tracks), findings
+    by_track: dict[str, dict[int, int]] = {}
+    repeated = []
+    for row, (track_id, frame) in enumerate(zip(columns["track_id"], columns["frame"], strict=True)):
+        if row in problems:
+            continue
+        frames = by_track.setdefault(str(track_id), {})
+        if frame in frames:
+            repeated.append(frame)
+        else:
+            frames[frame] = row
+    tracks = (_build_track(name, frames, columns, numbers) for name, frames in by_track.items())
+    return tuple(tracks), (*findings, *describe_repeated(repeated))
 
 
 def _require_objects(columns: dict[str, list[Any]], where: dict[str, Any]) -> None:

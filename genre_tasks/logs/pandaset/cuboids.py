@@ -201,7 +201,8 @@ def _add_frame(
             annotated.boxes.setdefault(frame, box)
             annotated.moving |= _is_moving(row)
     if repeated:
-        message = f"{repeated} boxes of frame {frame} have the uuid of another box of that frame, and are left out"
+        some = "1 box" if repeated == 1 else f"{repeated} boxes"
+        message = f"{some} of frame {frame} left out, because another box of that frame has the same uuid"
         numbers = {"boxes": repeated}
         findings.append(Finding("repeated_box_id", "warning", message, _UUID_REMEDY, numbers, frames=(frame,)))
     return findings
