@@ -13,6 +13,10 @@ os.environ.setdefault("DO_NOT_TRACK", "1")
 # A server of gRPC in this process would break programs that tests start, such as the encoder of films.
 os.environ.setdefault("GRPC_ENABLE_FORK_SUPPORT", "false")
 os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
+# Workers of pytest-xdist share the cores: threads of each for all of them would take a fifth more of their time.
+if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
+    share = (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(share, 1)))
 # The user's own caches are none of the tests' business.
 os.environ.setdefault("GENRE_CACHE_DIR", str(Path(__file__).resolve().parents[1] / "build/tests/cache"))
 

@@ -70,7 +70,8 @@ class FilmWriter:
                 *("-c:v", "libx264", "-preset", _PRESET, "-crf", str(_QUALITY), "-pix_fmt", "yuv420p"),
                 # One thread for each camera's film, and no version in the file: equal images give equal bytes.
                 *("-threads", "1", "-fflags", "+bitexact", "-flags:v", "+bitexact"),
-                *("-movflags", "+faststart", str(path)),
+                # Marked as a file, since ffmpeg takes what stands before a colon for a protocol.
+                *("-movflags", "+faststart", f"file:{path}"),
             ],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,

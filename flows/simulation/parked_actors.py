@@ -31,11 +31,14 @@ def list_parked(recorded: RunScenes) -> tuple[WorldActor, ...]:
         recorded: the run.
 
     Returns:
-        The vehicles; none where the log is gone.
+        The vehicles; none where the log is gone, or its boxes cannot be read.
     """
     log = find_log(recorded.record["log"])
-    if log is None:
+    try:
+        tracks = log.tracks() if log is not None else ()
+    except InputError:
+        # The run, too, went on without them.
         return ()
     # Those of the chunks as recorded: an actor that an edit has removed is not parked in its place.
     reconstructed = [recorded.load(number).chunk for number in recorded.chunk_numbers]
-    return list_parked_actors(log.tracks(), reconstructed)
+    return list_parked_actors(tracks, reconstructed)

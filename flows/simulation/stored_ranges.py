@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
+import logging
 from dataclasses import dataclass
 
 from flows.simulation.run_scenes import RunScenes
 from genre_tasks.atomic_path import write_atomically
 from genre_tasks.config import RangeConfig
 from genre_tasks.effects.types import DEFAULT_PLAN
+from genre_tasks.errors import GenreError
 from genre_tasks.progress import Progress
 from genre_tasks.reliability.reliable_range import estimate_reliable_range
 from storage.code_digest import code_digest
 from storage.keys import digest_value
+
+_log = logging.getLogger(__name__)
 
 # Coarser than `genre range`: marks need the distance to half a metre, and every shift is rendered for all cameras.
 MARKS_CONFIG = RangeConfig(shifts_m=(1.0, 2.0, 3.0, 4.0), every=10)
@@ -43,7 +47,6 @@ def find_side_ranges(scenes: RunScenes, progress: Progress) -> dict[int, SideRan
 
     Raises:
         InputError: an image of a chunk cannot be decoded.
-        OSError: the store cannot be written.
     """
     code = code_digest("genre_tasks.reliability.reliable_range")
     folder = scenes.folder / "ranges"
@@ -60,6 +63,10 @@ def find_side_ranges(scenes: RunScenes, progress: Progress) -> dict[int, SideRan
         found = estimate_reliable_range(MARKS_CONFIG, loaded.chunk, loaded.scene, DEFAULT_PLAN, progress)
         ranges[number] = SideRange(found.left_m, found.right_m)
         text = json.dumps({"left_m": found.left_m, "right_m": found.right_m})
-        write_atomically(file, text.encode())
-        scenes.push_folder()
+        # A store that may only be read serves simulations too: they find the range again each time.
+        try:
+            write_atomically(file, text.encode())
+            scenes.push_folder()
+        except (OSError, GenreError) as error:
+            _log.warning("the reliable range of chunk %d is not kept for the next simulation: %s", number, error)
     return ranges

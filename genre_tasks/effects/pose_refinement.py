@@ -9,6 +9,9 @@ from genre_tasks.scene.pose_alignment import align_poses
 MIN_WIDTH_PX = 320
 """Narrower images are too coarse: on exact streets refined poses then move by as much as the gate's threshold."""
 
+MIN_IMAGES = 8
+"""Fewer source images do not hold a motion that all of them share: on exact streets it then exceeds the threshold."""
+
 
 def measure(measurements: ChunkMeasurements) -> Measurement:
     """Measures by how far LiDAR points miss their place in the images.
@@ -18,16 +21,18 @@ def measure(measurements: ChunkMeasurements) -> Measurement:
 
     Returns:
         Pixels at the working resolution, by which refined poses move LiDAR returns; no value where no two images see
-        the same points, or images are narrower than ``MIN_WIDTH_PX``.
+        the same points, source images are fewer than ``MIN_IMAGES``, or they are narrower than ``MIN_WIDTH_PX``.
     """
     width_px = measurements.chunk.width_px
     if width_px < MIN_WIDTH_PX:
         return Measurement(None, f"images of {width_px} pixels in width are too coarse to tell")
+    count = len(measurements.source_views)
+    if count < MIN_IMAGES:
+        return Measurement(None, f"{count} source images are too few to tell")
     # Coarse, since most logs err by nothing and should not pay for it.
     alignment = measurements.coarse_alignment
     if alignment is None:
         return Measurement(None, "no two source images see the same LiDAR points")
-    count = len(measurements.source_views)
     return Measurement(alignment.displacement_px, f"of LiDAR returns in {count} images, where points keep their colour")
 
 

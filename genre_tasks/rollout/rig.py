@@ -74,14 +74,14 @@ def estimate_rig(chunks: Sequence[Chunk]) -> tuple[RigCamera, ...]:
             continue
         stacked = np.stack(poses)
         rotation = Rotation.from_matrix(stacked[:, :3, :3]).mean().as_matrix()
-        view = views[0][1]
         rig.append(
             RigCamera(
                 name=name,
-                lens=view.lens,
+                lens=views[0][1].lens,
                 ego_SE3_camera=compose_se3(rotation, stacked[:, :3, 3].mean(0)),
-                readout_s=0.0 if view.shutter is None else view.shutter.readout_s,
-                exposure_s=0.0 if view.blur is None else view.blur.exposure_s,
+                # Plans are made for each chunk: where the vehicle is slow, a shutter is left out as it does nothing.
+                readout_s=max(0.0 if view.shutter is None else view.shutter.readout_s for _, view in views),
+                exposure_s=max(0.0 if view.blur is None else view.blur.exposure_s for _, view in views),
             )
         )
     return tuple(rig)

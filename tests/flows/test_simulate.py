@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import json
 from dataclasses import replace
@@ -17,9 +18,11 @@ from typer.testing import CliRunner
 from flows.cli.main import app
 from flows.cli.simulate_options import read_request
 from flows.configuration.loading import apply_settings
+from flows.simulation import parked_actors, stored_ranges
 from flows.simulation import simulate as simulate_module
 from flows.simulation.edit_file import parse_edit_options
 from flows.simulation.edited_runs import open_edited_scenes, open_run, write_edited_run
+from flows.simulation.film import FilmWriter
 from flows.simulation.request import SimulationRequest
 from flows.simulation.rollout_key import compute_rollout_key
 from flows.simulation.rollout_metrics import METRICS_FILE
@@ -29,6 +32,7 @@ from genre_tasks.config import PipelineConfig, SimulateConfig
 from genre_tasks.ego_paths import recorded_path
 from genre_tasks.ego_paths.recorded_path import ImageTime, join_recorded_path, list_image_times
 from genre_tasks.errors import ConfigError, GenreError, InputError
+from genre_tasks.logs.synthetic import SyntheticStreet
 from genre_tasks.rollout.handover import plan_handovers
 from genre_tasks.rollout.render_rollout import render_rollout
 from genre_tasks.rollout.rig import estimate_rig
@@ -280,6 +284,37 @@ def test_poses_are_marked_by_the_reliable_range(recorded: SimulationRequest, tmp
     files[0].write_text(json.dumps({"left_m": 7.0, "right_m": 7.0}))
     again = simulate_run(replace(request, out=tmp_path / "again"))
     assert 7.0 in [side["left_m"] for side in again["metrics"]["ranges"].values()]
+
+
+def test_a_store_that_may_only_be_read_serves_simulations(
+    recorded: SimulationRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, data: bytes) -> None:
+        raise OSError(errno.EROFS, "Read-only file system", str(path))
+
+    for file in RunScenes(recorded.store, recorded.run).folder.glob("ranges/*.json"):
+        file.unlink()
+    monkeypatch.setattr(stored_ranges, "write_atomically", refuse)
+    request = replace(recorded, out=tmp_path / "marked", mark_range=True, cameras=("front_camera",))
+    assert set(simulate_run(request)["metrics"]["ranges"]) == {"0", "1"}
+
+
+def test_a_log_whose_boxes_cannot_be_read_has_no_parked_vehicles(
+    recorded: SimulationRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(log: object) -> tuple[object, ...]:
+        raise InputError("row 0 is of frame 999", remedy="Correct the boxes.")
+
+    monkeypatch.setattr(SyntheticStreet, "tracks", fail)
+    assert parked_actors.list_parked(RunScenes(recorded.store, recorded.run)) == ()
+
+
+def test_a_film_may_have_a_colon_in_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    film = FilmWriter(Path("2026-11-29T12:30.mp4"), 32, 16, 10.0)
+    film.write(np.zeros((16, 32, 3), np.uint8))
+    film.close()
+    assert Path("2026-11-29T12:30.mp4").stat().st_size > 0
 
 
 @pytest.mark.parametrize(

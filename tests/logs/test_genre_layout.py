@@ -322,6 +322,14 @@ def test_every_file_that_is_read_counts(folder: Path) -> None:
     assert open_log(f"genre:{folder}").digest() == digest
 
 
+def test_an_entry_without_sense_costs_its_frame_and_not_the_log(folder: Path) -> None:
+    _change(folder, lambda values: values["frames"][2]["images"].update(front=None))
+    log = open_log(f"genre:{folder}")
+    assert log.digest() and log.image_bytes("front", 1) is not None
+    with pytest.raises(InputError, match="front of frame 2"):
+        log.image_bytes("front", 2)
+
+
 def test_a_camera_that_is_slower_is_mounted_as_at_the_nearest_frame(folder: Path, tmp_path: Path) -> None:
     def drop(values: dict[str, Any]) -> None:
         for frame in (0, 2, 3):

@@ -179,6 +179,15 @@ def test_a_cut_sweep(drive: Path) -> None:
     assert caught.value.frame == 1
 
 
+def test_a_sweep_that_is_a_link_to_nothing(drive: Path) -> None:
+    path = drive / "velodyne_points/data/0000000001.bin"
+    path.unlink()
+    path.symlink_to(drive / "unmounted.bin")
+    with pytest.raises(InputError, match="lacks a file") as caught:
+        open_log(f"kitti:{drive}").sweep(1)
+    assert caught.value.file == str(path) or caught.value.file == path
+
+
 def test_points_that_are_not_finite_are_left_out(drive: Path) -> None:
     path = drive / "velodyne_points/data/0000000001.bin"
     rows = np.frombuffer(path.read_bytes(), "<f4").reshape(-1, 4).copy()

@@ -220,6 +220,19 @@ def test_the_index_is_made_once_for_all_scenes(tmp_path: Path, monkeypatch: pyte
     assert len(list((tmp_path / "cache/nuscenes").iterdir())) == 2
 
 
+def test_a_scene_whose_boxes_are_all_bad_has_a_digest(tmp_path: Path) -> None:
+    def flatten(rows: list[dict[str, Any]]) -> None:
+        for row in rows:
+            row["size"] = [0.0, 0.0, 0.0]
+
+    address = write_nuscenes(FAKE, tmp_path)
+    change_table(tmp_path, "sample_annotation", flatten)
+    log = open_log(f"nuscenes:{address}")
+    assert len(log.digest()) == 64
+    with pytest.raises(InputError, match="boxes are bad"):
+        log.tracks()
+
+
 def test_files_count_in_the_digest(tmp_path: Path) -> None:
     address = write_nuscenes(FAKE, tmp_path)
     digests = {open_log(f"nuscenes:{address}").digest()}

@@ -69,7 +69,7 @@ class TestConversions:
         camera = opened(folder).cameras[0]
         assert (camera.lens.cx_px, camera.lens.cy_px) == (24.0, 16.0)
         assert (camera.lens.width_px, camera.lens.height_px) == (48, 32)
-        assert camera.lens.distortion == () and camera.readout_s == 0.03
+        assert camera.lens.distortion == () and camera.readout_s == 0.0
 
     def test_rig_order(self, folder: Path) -> None:
         for name in ("back_camera", "front_camera", "left_camera"):

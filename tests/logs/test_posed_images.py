@@ -14,9 +14,13 @@ from PIL import Image
 
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.logs.posed_images.colmap_model import read_colmap_model
+from genre_tasks.logs.posed_images.frame_grouping import FrameGroups
 from genre_tasks.logs.posed_images.image_log import PosedImagesLog
+from genre_tasks.logs.posed_images.posed_image import PosedImage
+from genre_tasks.logs.posed_images.rig_poses import fill_rig_poses
 from genre_tasks.logs.posed_images.world_axes import find_up, place_vehicle, turn_up_to_z
 from genre_tasks.logs.registry import open_log
+from genre_tasks.logs.types import Lens
 from tests.logs.posed_images_folder import STREET, Y_DOWN, write_colmap, write_transforms
 
 pytest.importorskip("embreex", reason="the synthetic street is ray-cast with Embree")
@@ -101,6 +105,19 @@ def test_a_missing_image_is_none_and_its_camera_stays_on_the_rig(tmp_path: Path,
     assert np.linalg.norm(gap) < 0.05
 
 
+def test_pairs_of_cameras_that_take_turns_share_one_path() -> None:
+    def place(camera: str, frame: int) -> PosedImage:
+        pose = np.eye(4)
+        pose[:3, 3] = (1000.0 + frame, {"a": 0.0, "b": 0.0, "c": 0.5, "d": 0.5}[camera], 1.5)
+        return PosedImage(f"{camera}/{frame}.png", pose, Lens(60.0, 60.0, 32.0, 18.0, 64, 36))
+
+    frames = tuple({name: place(name, k) for name in ("ad" if k % 2 == 0 else "bc")} for k in range(12))
+    poses = fill_rig_poses(FrameGroups(tuple("abcd"), frames, None), np.eye(3), 1.0)
+    for name, across in zip("abcd", (0.0, 0.0, 0.5, 0.5), strict=True):
+        np.testing.assert_allclose(poses.world_SE3_camera[name][:, 0, 3], 1000.0 + np.arange(12), atol=1e-9)
+        np.testing.assert_allclose(poses.world_SE3_camera[name][:, 1, 3], across, atol=1e-9)
+
+
 def test_half_size_images_scale_the_lens(tmp_path: Path, written: Path) -> None:
     for path in sorted((written / "images").rglob("*.png")):
         target = tmp_path / path.relative_to(written)
@@ -151,6 +168,11 @@ def timed_but_for_one(values: dict[str, Any]) -> None:
     values["frames"][7]["file_path"] = "images/lacks-it.png"
 
 
+def one_unset_time(values: dict[str, Any]) -> None:
+    for n, frame in enumerate(values["frames"]):
+        frame.update(camera="abc"[n % 3], time=1.6e15 + 1e5 * (n // 3) if n else 0)
+
+
 def labelled_elsewhere(values: dict[str, Any]) -> None:
     for n, frame in enumerate(values["frames"]):
         frame.update(camera=("a", "b", "../../x")[n % 3], time=n // 3)
@@ -164,6 +186,7 @@ def labelled_elsewhere(values: dict[str, Any]) -> None:
         (other_lens, "more than one set of intrinsics"),
         (mirrored, "mirrored"),
         (timed_but_for_one, "1 of 24 images have no time, the first one is .*lacks-it.png"),
+        (one_unset_time, "the times of the images span 1.6e"),
         (not_there, "none of the 24 images is there"),
         (lambda v: v.update(camera_model="OPENCV_FISHEYE"), "camera model OPENCV_FISHEYE is not supported"),
         (lambda v: v.update(k4=0.1), "k4"),

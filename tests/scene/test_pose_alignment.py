@@ -212,11 +212,19 @@ def test_many_images_are_smaller_and_share_their_points(monkeypatch: pytest.Monk
     assert all(points * count <= 9_000 and size * count <= 102_000 for points, size, count in taken)
 
 
-def test_without_common_points_nothing_is_refined() -> None:
+def test_without_common_points_nothing_is_refined(monkeypatch: pytest.MonkeyPatch) -> None:
     lone = replace(chunk(EXACT), views=chunk(EXACT).views_with_role("source")[:1])
     assert align_poses(lone) is None
-    decision = plan_effects(ONLY, lone, street(EXACT).cameras)["pose_refinement"]
+    monkeypatch.setattr(measurements, "align_poses", lambda *_, **__: None)
+    decision = plan_effects(ONLY, chunk(EXACT), street(EXACT).cameras)["pose_refinement"]
     assert decision.choice == "off" and "the same LiDAR points" in decision.reason
+
+
+def test_the_images_of_one_camera_do_not_move_the_poses_of_an_exact_street() -> None:
+    uri = "synthetic:street?seed=12&samples=4"
+    config = IngestConfig(width_px=320, height_px=180, cameras=("front_camera",))
+    decision = plan_effects(ONLY, ingest(config, street(uri), 0), street(uri).cameras)["pose_refinement"]
+    assert decision.choice == "off" and decision.reason == "5 source images are too few to tell"
 
 
 @pytest.mark.parametrize("blur_px", pose_alignment.BLURS_PX)

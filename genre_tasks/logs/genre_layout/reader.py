@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 from bisect import bisect_left
 from collections.abc import Mapping
-from functools import cached_property
+from contextlib import suppress
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -253,8 +254,14 @@ class GenreLayoutLog(RecordedLog):
         """Identifies log.json and every file that it names."""
         # What else lies in the folder is the user's own.
         frames = range(self.frame_count)
-        files = [self._image_file(camera.name, frame) for camera in self.cameras for frame in frames]
-        files += [self._sweep_file(frame) for frame in frames]
-        named = {path for path in files if path is not None} | {self._file}
+        named = {self._file}
+        for frame in frames:
+            readers = [partial(self._image_file, camera.name, frame) for camera in self.cameras]
+            for find_file in (*readers, partial(self._sweep_file, frame)):
+                # An entry without sense names no file. It costs its frame, and log.json tells it from others.
+                with suppress(InputError):
+                    path = find_file()
+                    if path is not None:
+                        named.add(path)
         boxes = self.folder / BOXES_FILE
         return digest_files(self.folder, named | ({boxes} if boxes.is_file() else set()), ())

@@ -220,8 +220,8 @@ class KittiLog(RecordedLog):
 
     def _read_points(self, path: Path, frame: int) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
         """[N, 4] finite x, y, z and intensity in the axes of the LiDAR."""
-        size = path.stat().st_size
-        # Before it is read: the file may be anything.
+        # Before it is read: the file may be anything. A link may lead nowhere, which reading says.
+        size = path.stat().st_size if path.exists() else 0
         if size % _POINT_BYTES or size > _MAX_POINTS * _POINT_BYTES:
             problem = f"the sweep has {size} bytes, which are not up to {_MAX_POINTS} points of {_POINT_BYTES}"
             raise InputError(problem, remedy=_COPY_REMEDY, file=path, log=self.uri, frame=frame)

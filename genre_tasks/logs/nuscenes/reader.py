@@ -246,6 +246,13 @@ class NuScenesLog(RecordedLog):
             found += (Finding("interpolated_boxes", "note", message, numbers=numbers),)
         return found
 
+    def _list_readable_tracks(self) -> tuple[CuboidTrack, ...]:
+        """The objects; none where no box can be used, which a run reports and goes on without."""
+        try:
+            return self.tracks()
+        except InputError:
+            return ()
+
     def digest(self) -> str:
         """Identifies the scene's rows and all files that are read."""
         total = hashlib.sha256()
@@ -253,7 +260,7 @@ class NuScenesLog(RecordedLog):
         for name, data in sorted(channels.items()):
             for datum in data:
                 total.update(f"{name}\0{_describe_datum(datum)}\n".encode(errors="surrogateescape"))
-        for track in self.tracks():
+        for track in self._list_readable_tracks():
             values = np.concatenate([track.frames, track.world_SE3_box.ravel(), track.size_m])
             total.update(f"{track.track_id}\0{track.label}\0{values.tolist()}\n".encode())
         files = {self._path(datum) for datum in self._list_data()}

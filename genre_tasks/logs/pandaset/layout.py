@@ -32,8 +32,9 @@ TABLE_SUFFIXES = tuple(
 )
 # Column d, and cuboids.sensor_id: the 64-beam Pandar64; 1 is the forward PandarGT.
 SPINNING_SENSOR = 0
-# Rolling shutter of PandaSet's cameras, top to bottom row.
-READOUT_S = 0.03
+# Rolling shutter of PandaSet's cameras, top to bottom row, which its files do not state.
+_READOUT_S = 0.03
+_NATIVE_SIZE_PX = (1920, 1080)
 # PandaSet's principal points count from the centre of the first pixel, which lies here.
 PIXEL_CENTRE = 0.5
 # Intensities are 0 to 255 in the files.
@@ -50,6 +51,24 @@ _POSE_REMEDY = "Correct the pose in that file, or leave its chunk out with --chu
 _MAX_POSITION_M = 1e12
 # Below that, rounding alone would decide where the sensor points.
 _MIN_QUATERNION_NORM = 1e-6
+
+
+def assume_readout(name: str, width_px: int, height_px: int) -> float:
+    """Assumes the rolling shutter of a camera whose file states none.
+
+    Args:
+        name: of the camera.
+        width_px: of its images.
+        height_px: of its images.
+
+    Returns:
+        Seconds from the first row to the last: those of PandaSet's cameras, at their names and image size. Others
+        that are written in this layout have 0, a global shutter.
+
+    >>> assume_readout("front_camera", 1920, 1080), assume_readout("front_camera", 1280, 720)
+    (0.03, 0.0)
+    """
+    return _READOUT_S if name in RIG_ORDER and (width_px, height_px) == _NATIVE_SIZE_PX else 0.0
 
 
 def frame_stem(frame: int) -> str:

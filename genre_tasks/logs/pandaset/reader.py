@@ -25,7 +25,7 @@ from genre_tasks.logs.image_sizes import choose_lens, describe_no_images, measur
 from genre_tasks.logs.lens_validity import with_distortion
 from genre_tasks.logs.pandaset.cuboids import FrameBoxes, build_tracks, read_boxes
 from genre_tasks.logs.pandaset.folder_index import LIDAR_FILES, SequenceIndex, index_sequence
-from genre_tasks.logs.pandaset.layout import PIXEL_CENTRE, READOUT_S, RIG_ORDER, parse_pose, to_flu_axes
+from genre_tasks.logs.pandaset.layout import PIXEL_CENTRE, RIG_ORDER, assume_readout, parse_pose, to_flu_axes
 from genre_tasks.logs.pandaset.pickle_reader import read_table
 from genre_tasks.logs.pandaset.sweeps import build_sweep
 from genre_tasks.logs.pandaset.unread_files import find_unread_files
@@ -149,9 +149,9 @@ class PandaSetLog(RecordedLog):
         where: dict[str, Any] = {"file": path, "log": self.uri, "camera": name}
         try:
             fx, fy, cx, cy = (read_number(intrinsics[key]) for key in ("fx", "fy", "cx", "cy"))
-            readout_s = read_number(intrinsics.get("readout_s", READOUT_S))
             exposure_s = read_number(intrinsics.get("exposure_s", 0.0))
             width, height = (int(read_number(intrinsics.get(k, v))) for k, v in _name_sides(measured.majority))
+            readout_s = read_number(intrinsics.get("readout_s", assume_readout(name, width, height)))
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise InputError(_describe_bad_intrinsics(intrinsics, error), remedy=_INTRINSICS_REMEDY, **where) from error
         if not (np.isfinite([fx, fy, cx, cy]).all() and fx > 0 and fy > 0 and width > 0 and height > 0):

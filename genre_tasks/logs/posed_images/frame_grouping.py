@@ -28,6 +28,8 @@ _MIN_SHARED = 0.5
 _TICKS_PER_S = 1_000_000
 # Of a camera with one image.
 _ASSUMED_PERIOD_S = 0.1
+# Thirty years: one of the times is unset, or of another unit.
+_MOST_SPAN_S = 1e9
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,9 @@ def group_frames(images: Sequence[PosedImage], file: Path) -> FrameGroups:
     names = sorted(set(cameras), key=_natural_key)
     require_camera_names(names, file=file)
     keys: Sequence[float | str] = (
-        _match_times(images, cameras, names) if has_times else [PurePosixPath(image.name).stem for image in images]
+        _match_times(images, cameras, names, file)
+        if has_times
+        else [PurePosixPath(image.name).stem for image in images]
     )
     frames: dict[float | str, dict[str, PosedImage]] = {}
     for image, camera, key in zip(images, cameras, keys, strict=True):
@@ -82,7 +86,7 @@ def group_frames(images: Sequence[PosedImage], file: Path) -> FrameGroups:
     return FrameGroups(tuple(names), groups, tuple(map(float, order)) if has_times else None)
 
 
-def _match_times(images: Sequence[PosedImage], cameras: Sequence[str], names: Sequence[str]) -> list[float]:
+def _match_times(images: Sequence[PosedImage], cameras: Sequence[str], names: Sequence[str], file: Path) -> list[float]:
     """[N] for each image the time of its frame: that of the leading camera's image next to it, or its own."""
     times = [float(image.time_s or 0.0) for image in images]
     images_of: dict[str, list[int]] = {name: [] for name in names}
@@ -91,6 +95,9 @@ def _match_times(images: Sequence[PosedImage], cameras: Sequence[str], names: Se
     leader = max(names, key=lambda name: len(images_of[name]))
     moments = sorted({times[index] for index in images_of[leader]})
     start = min(times)
+    if max(times) - start > _MOST_SPAN_S:
+        problem = f"the times of the images span {max(times) - start:.3g} s"
+        raise InputError(problem, remedy=_TIME_REMEDY, file=file)
     ticks = [round((moment - start) * _TICKS_PER_S) for moment in moments]
     matched = list(times)
     for indices in images_of.values():
