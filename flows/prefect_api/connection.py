@@ -7,20 +7,28 @@ import os
 import secrets
 import sys
 import tempfile
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, redirect_stderr
+from contextlib import contextmanager, redirect_stderr, suppress
+from datetime import UTC, datetime
 from http.client import HTTPException
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from flows.prefect_api.network_variables import find_unusable_files, is_network_variable
 from flows.prefect_api.server_thread import DATABASE_VARIABLES, ServerThread, database_url, find_stated_database
 from flows.prefect_api.settings_sources import API_URL, check_settings_files, find_prefect_home, find_source
 from genre_tasks.errors import ConfigError
 
+if TYPE_CHECKING:
+    from prefect.client.orchestration import SyncPrefectClient
+
 _ANSWER_TIMEOUT_S = 10.0
 _SEND_TIMEOUT_S = 3.0
+_RECORD_TIMEOUT_S = 10.0
+_RECORD_STEP_S = 0.05
 _WITHOUT_PERMISSION = (401, 403)
 
 
@@ -50,10 +58,12 @@ def connect_to_prefect() -> Iterator[None]:
     changes = dict.fromkeys(name for name in os.environ if is_network_variable(name))
     with _changed_environment({**changes, **_server_settings(server.url, home)}):
         server.start()
+        started_at = datetime.now(UTC)
         try:
             yield
         finally:
             _send_remaining_events()
+            _wait_for_records(started_at)
             server.stop()
 
 
@@ -202,3 +212,42 @@ def _send_remaining_events() -> None:
     from prefect.events.worker import EventsWorker
 
     EventsWorker.drain_all(timeout=_SEND_TIMEOUT_S, at_exit=True)
+
+
+def _wait_for_records(started_at: datetime) -> None:
+    """Waits until the server of this process has recorded what it received: its end loses the rest.
+
+    Tasks of flows that were interrupted stay unfinished for good, and are not waited for.
+    """
+    from prefect.client.orchestration import get_client
+
+    end_s = time.monotonic() + _RECORD_TIMEOUT_S
+    # Records serve people who look back. Whatever fails here must not fail their run.
+    with suppress(Exception), get_client(sync_client=True) as client:
+        # Twice in a row, since an event may be on its way from the socket to the queue.
+        complete = 0
+        while complete < 2 and time.monotonic() < end_s:
+            complete = 0 if _count_queued_events() or _has_unfinished_tasks(client, started_at) else complete + 1
+            time.sleep(_RECORD_STEP_S)
+
+
+def _count_queued_events() -> int:
+    """Events that the server of this process has received, and not begun to record."""
+    from prefect.server.utilities.messaging.memory import Topic
+
+    subscriptions = list(Topic.by_name("events")._subscriptions)
+    return sum(subscription._queue.qsize() + subscription._retry.qsize() for subscription in subscriptions)
+
+
+def _has_unfinished_tasks(client: SyncPrefectClient, started_at: datetime) -> bool:
+    """Tells whether a flow is recorded as ended, and a task of it is not."""
+    from prefect.client.schemas.filters import FlowRunFilter, TaskRunFilter
+
+    flows = {"state": {"type": {"any_": ["COMPLETED", "FAILED"]}}, "start_time": {"after_": started_at}}
+    tasks = {"state": {"type": {"any_": ["SCHEDULED", "PENDING", "RUNNING"]}}}
+    unfinished = client.read_task_runs(
+        flow_run_filter=FlowRunFilter.model_validate(flows),
+        task_run_filter=TaskRunFilter.model_validate(tasks),
+        limit=1,
+    )
+    return bool(unfinished)

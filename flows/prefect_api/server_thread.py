@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import fcntl
-import logging
 import os
 import resource
 import socket
@@ -32,7 +31,6 @@ _MIN_OPEN_FILES = 64
 # What the file is to blame for; others, such as a full disk, are not cured by its removal.
 _DAMAGED_CODES = (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 _DATABASE = "prefect.db"
-_RECORDER = "prefect.server.services.task_run_recorder"
 DATABASE_VARIABLES = ("PREFECT_API_DATABASE_CONNECTION_URL", "PREFECT_SERVER_DATABASE_CONNECTION_URL")
 """Either names the database of a server, also of the one in this process."""
 
@@ -135,7 +133,6 @@ class ServerThread:
         try:
             await server.serve(sockets=[self._socket])
         finally:
-            logging.getLogger(_RECORDER).addFilter(_is_no_interrupted_write)
             await lifespan.__aexit__(None, None, None)
 
     def _start_error(self, reason: str) -> GenreError:
@@ -149,11 +146,6 @@ class ServerThread:
         if is_damaged or "revision" in reason:
             remedy = "Delete that file if it is damaged or of another version: it holds records of runs, no results."
         return ResourceError(f"Prefect's local API cannot start: {reason}", remedy=remedy, file=database)
-
-
-def _is_no_interrupted_write(record: logging.LogRecord) -> bool:
-    """Keeps an error from the log that is none: what the end of the server interrupts is written once more then."""
-    return record.exc_info is None or not isinstance(record.exc_info[1], asyncio.CancelledError)
 
 
 def _ensure_open_files() -> None:

@@ -9,7 +9,7 @@ import sys
 import textwrap
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -96,6 +96,10 @@ def test_two_at_once_share_a_new_database(tmp_path: Path) -> None:
     ]
     outputs = [command.communicate(timeout=120)[0] for command in commands]
     assert [output.split()[0] for output in outputs] == ["20", "20"]
+    # Both have waited for the records of their tasks.
+    with closing(sqlite3.connect(tmp_path / "prefect.db")) as database:
+        states = database.execute("select state_name, count(*) from task_run group by state_name").fetchall()
+    assert states == [("Completed", 10)]
 
 
 def damage(database: Path) -> None:
