@@ -6,7 +6,7 @@ from flows.pipeline.log_cache import cached_log
 from flows.simulation.run_scenes import RunScenes
 from genre_tasks.ego_paths.world_actors import WorldActor, list_parked_actors
 from genre_tasks.errors import InputError
-from genre_tasks.logs.types import DrivingLog
+from genre_tasks.logs.types import CuboidTrack, DrivingLog
 
 
 def find_log(uri: str) -> DrivingLog | None:
@@ -24,6 +24,22 @@ def find_log(uri: str) -> DrivingLog | None:
         return None
 
 
+def find_tracks(uri: str) -> tuple[CuboidTrack, ...] | None:
+    """Finds the annotated objects of a run's log.
+
+    Args:
+        uri: of the log.
+
+    Returns:
+        The objects; ``None`` where the log is gone, or its boxes cannot be read, without which the run went on too.
+    """
+    log = find_log(uri)
+    try:
+        return None if log is None else log.tracks()
+    except InputError:
+        return None
+
+
 def list_parked(recorded: RunScenes) -> tuple[WorldActor, ...]:
     """Lists the parked vehicles at a run's frames.
 
@@ -33,11 +49,8 @@ def list_parked(recorded: RunScenes) -> tuple[WorldActor, ...]:
     Returns:
         The vehicles; none where the log is gone, or its boxes cannot be read.
     """
-    log = find_log(recorded.record["log"])
-    try:
-        tracks = log.tracks() if log is not None else ()
-    except InputError:
-        # The run, too, went on without them.
+    tracks = find_tracks(recorded.record["log"])
+    if tracks is None:
         return ()
     # Those of the chunks as recorded: an actor that an edit has removed is not parked in its place.
     reconstructed = [recorded.load(number).chunk for number in recorded.chunk_numbers]

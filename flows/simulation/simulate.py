@@ -11,7 +11,7 @@ from flows.machine.facts import describe_environment
 from flows.machine.resource_usage import ResourceUsage, measure_usage
 from flows.simulation.edited_runs import open_run
 from flows.simulation.outputs import open_outputs
-from flows.simulation.parked_actors import find_log
+from flows.simulation.parked_actors import find_tracks
 from flows.simulation.poses_table import write_poses
 from flows.simulation.prepared_rollout import PreparedRollout, prepare_rollout
 from flows.simulation.repair import choose_repair
@@ -116,8 +116,9 @@ def _render(
 def _list_warnings(rollout: PreparedRollout, metrics: dict[str, Any]) -> tuple[str, ...]:
     warnings = [f"implausible: {violation}" for violation in rollout.checked.violations]
     warnings += [f"collision: {collision}" for collision in rollout.checked.collisions]
-    if find_log(rollout.recorded.record["log"]) is None:
-        warnings.append("the log is gone, so the path was not checked against parked vehicles")
+    if find_tracks(rollout.recorded.record["log"]) is None:
+        reason = "the log is gone, or its boxes cannot be read"
+        warnings.append(f"{reason}: the path was not checked against parked vehicles")
     reliable = metrics.get("reliable_fraction")
     if reliable is not None and reliable < 1:
         warnings.append(f"{1 - reliable:.0%} of the poses are outside of the scenes' reliable range")

@@ -300,13 +300,15 @@ def test_a_store_that_may_only_be_read_serves_simulations(
 
 
 def test_a_log_whose_boxes_cannot_be_read_has_no_parked_vehicles(
-    recorded: SimulationRequest, monkeypatch: pytest.MonkeyPatch
+    recorded: SimulationRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(log: object) -> tuple[object, ...]:
         raise InputError("row 0 is of frame 999", remedy="Correct the boxes.")
 
     monkeypatch.setattr(SyntheticStreet, "tracks", fail)
     assert parked_actors.list_parked(RunScenes(recorded.store, recorded.run)) == ()
+    done = simulate_run(replace(recorded, out=tmp_path / "out", cameras=("front_camera",)))
+    assert any("its boxes cannot be read" in warning for warning in done["warnings"])
 
 
 def test_a_film_may_have_a_colon_in_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
