@@ -55,7 +55,7 @@ class StartUp:
         Returns:
             Three cells.
         """
-        rounds = 2 if quick else 9
+        rounds = 1 if quick else 9
         run = partial(measure_cached_run, options["seed"], settings_from_options(options))
         measures: tuple[tuple[str, Callable[[int], Row], float], ...] = (
             ("cached_run", run, 60.0),

@@ -34,7 +34,7 @@ MOST_GROWTH = 0.05
 LARGE_POSES = 8
 MEMORY_POSES = 2000
 _MEMORY_FROM = 200
-_IMAGES_PER_S = 10.0
+_POSE_S = 0.1
 
 
 def measure_speed(case: SimulationCase, rounds: int) -> Row:
@@ -74,7 +74,7 @@ def _time_rollout(scenes: LogScenes, path: EgoPath, rig: Sequence[RigCamera]) ->
     torch.set_num_threads(THREADS)
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
-        films = Films(Path(folder), rig, _IMAGES_PER_S)
+        films = Films(Path(folder), rig, path.times_s, _POSE_S)
         with open_outputs([films]):
             settings = RenderSettings(threads=THREADS)
             for images in render_rollout(scenes.source, path, rig, settings, handovers):
@@ -102,7 +102,7 @@ def measure_memory(case: SimulationCase, poses: int = MEMORY_POSES) -> Row:
     process = psutil.Process()
     rss = {}
     with tempfile.TemporaryDirectory() as folder:
-        films = Films(Path(folder), rig, _IMAGES_PER_S)
+        films = Films(Path(folder), rig, path.times_s, _POSE_S)
         with open_outputs([films]):
             for images in render_rollout(scenes.source, path, rig, handovers=handovers):
                 films.write(images)

@@ -15,7 +15,7 @@ from flows.defaults import DEFAULT_STORE
 if TYPE_CHECKING:
     from genre_tasks.config import RangeConfig
     from genre_tasks.detection.detector import Detector
-    from genre_tasks.reliability.reliable_range import CurvePoint
+    from genre_tasks.reliability.reliable_range import CurvePoint, ReliableRange
 
 DetectorOption = Annotated[
     str | None,
@@ -66,9 +66,7 @@ def range_command(
     from flows.cli.parsing import check_number
     from flows.cli.printing import print_rows
     from flows.cli.terminal import TerminalReporter
-    from flows.reconstruction.range_record import write_range_record
     from flows.reconstruction.reliable_range import write_range
-    from flows.reconstruction.run_records import find_run_folder, name_run_folder
     from flows.reconstruction.stored_values import find_last_stage, read_next_scene, read_stage_scene, read_stage_value
     from genre_tasks.effects.apply_plan import apply_plan
     from genre_tasks.reliability.chunk_seam import measure_seam, median_psnr_by_distance
@@ -77,7 +75,7 @@ def range_command(
     check_output_folder(out, "--out", ("range.parquet", "range.png"))
     config = _range_config(max_drop_db, every)
     check_number(max_drop_db, "--max-drop-db", 0, 100)
-    opened = open_existing_store(store)
+    open_existing_store(store)
     network = _load_detector(detector)
     number, ingested = read_stage_value(store, run, chunk, "ingest")
     scene_stage = find_last_stage(store, run, number) if stage is None else stage
@@ -89,12 +87,9 @@ def range_command(
     following = read_next_scene(store, run, number, stage)
     facts = {"log": ingested.log, "chunk": str(number), "stage": scene_stage, "run": run}
     files = write_range(out, reliable_range, facts)
-    folder = find_run_folder(store, run)
-    write_range_record(folder, number, scene_stage, reliable_range)
-    opened.records.push(name_run_folder(folder.name))
-    files += _rewrite_report(store, run)
     rows = [_point_row(point) for point in reliable_range.points]
     print_rows(f"{ingested.log}, chunk {number}, after {scene_stage}", rows)
+    files += _update_run(store, run, number, scene_stage, reliable_range)
     typer.echo(f"{reliable_range}; wrote {', '.join(files)}")
     if following is not None:
         psnr_by_distance = median_psnr_by_distance(measure_seam((apply_plan(ingested, plan), scene), following))
@@ -111,15 +106,21 @@ def _load_detector(path_or_name: str | None) -> Detector | None:
     return open_actor_detector(path_or_name)
 
 
-def _rewrite_report(store: str, run: str) -> list[str]:
-    """The report's path in a list; an empty one where the report cannot be made any more, which is told."""
+def _update_run(store: str, run: str, chunk: int, stage: str, reliable_range: ReliableRange) -> list[str]:
+    """Writes the range into the run's folder and report; the report's path in a list, which is empty after an error."""
+    from flows.reconstruction.range_record import write_range_record
     from flows.reconstruction.rewritten_report import rewrite_report
-    from genre_tasks.errors import ArtifactCorruptError, InputError
+    from flows.reconstruction.run_records import find_run_folder, name_run_folder
+    from genre_tasks.errors import GenreError
+    from storage.opening import open_store
 
     try:
+        folder = find_run_folder(store, run)
+        write_range_record(folder, chunk, stage, reliable_range)
+        open_store(store).records.push(name_run_folder(folder.name))
         return [str(rewrite_report(store, run))]
-    except (InputError, ArtifactCorruptError) as error:
-        # The range itself is there, and took minutes.
+    except (OSError, GenreError) as error:
+        # The range itself is there, and took minutes: the store may be one that can only be read.
         typer.echo(f"note: the run's report stays as it was: {error}", err=True)
         return []
 

@@ -121,6 +121,7 @@ def run(
     from flows.cli.outcome import add_facts
     from flows.cli.parsing import parse_duration, parse_memory, parse_numbers
     from flows.configuration import load_configuration
+    from genre_tasks.logs.registry import make_log_absolute
 
     # Known from here on, whatever happens: what a program reads where the run does not come to its end.
     add_facts(log=log, preset=preset, store=store, run=None, report=None, chunks=[], left_out=[])
@@ -129,7 +130,8 @@ def run(
     memory_gib = parse_memory(memory, "--memory")
     limit_settings = [] if memory_gib is None else [f"limits.memory_gib={memory_gib!r}"]
     request = RunRequest(
-        log=log,
+        # The run's record names the log, and is read from other folders.
+        log=make_log_absolute(log),
         preset=preset,
         store=store,
         chunks=parse_numbers(chunks, "--chunks"),

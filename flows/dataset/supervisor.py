@@ -219,7 +219,7 @@ class Supervisor:
         for watch in list(self._state.watches.values()):
             run = found.get(watch.run.id)
             if run is None:
-                self._end_attempt(watch, "the flow run was deleted")
+                self._end_attempt(watch, {"why": "the flow run was deleted"})
                 continue
             # That the server misses heartbeats is no sign of life.
             if run.state not in (watch.run.state, SILENT):
@@ -293,14 +293,17 @@ class Supervisor:
             self._finish(watch, {"status": "failed", "why": "cancelled"})
         elif watch.run.state == "CRASHED" or outcome is None or outcome["is_passing"]:
             # A run that says nothing was ended from outside, or by an error of its surroundings.
-            self._end_attempt(watch, outcome["why"] if outcome else watch.run.message or watch.run.state.lower())
+            self._end_attempt(watch, outcome or {"why": watch.run.message or watch.run.state.lower()})
         else:
-            self._finish(watch, {name: value for name, value in outcome.items() if name != "is_passing"})
+            self._finish(watch, outcome)
 
-    def _end_attempt(self, watch: _Watch, why: str) -> None:
+    def _end_attempt(self, watch: _Watch, outcome: dict[str, Any]) -> None:
         unit = watch.run.unit
+        why = outcome["why"]
         if self._state.attempts.get(unit, 0) >= self._limits.attempts:
-            self._finish(watch, {"status": "failed", "why": f"{why} (attempt {self._state.attempts[unit]})"})
+            # Of a log of several chunks some may be done.
+            last = {"status": "failed"} | outcome | {"why": f"{why} (attempt {self._state.attempts[unit]})"}
+            self._finish(watch, last)
             return
         del self._state.watches[watch.run.id]
         self._state.rows[unit] |= {"status": "waiting", "why": why}
@@ -309,7 +312,8 @@ class Supervisor:
     def _finish(self, watch: _Watch, outcome: dict[str, Any]) -> None:
         del self._state.watches[watch.run.id]
         # The log's URI and chunk stay as this flow names them.
-        self._state.rows[watch.run.unit] |= {k: v for k, v in outcome.items() if k not in ("log", "chunk")}
+        left = ("log", "chunk", "is_passing")
+        self._state.rows[watch.run.unit] |= {k: v for k, v in outcome.items() if k not in left}
 
     def _update_row(self, run: ChildRun) -> None:
         self._state.rows[run.unit] |= {

@@ -66,7 +66,7 @@ def label_recorded(job: Job, ref: ArtifactRef, every: int = 1) -> list[LabelledI
         every: every n-th frame.
 
     Raises:
-        InputError: the log has no annotations, or an image or a sweep cannot be read.
+        InputError: the log has no annotations, or an image cannot be read.
     """
     from genre_tasks.training_sets.label_boxes import labeller_of
 
@@ -88,17 +88,19 @@ def render_shifted(
         shifts_m: metres to the left.
 
     Raises:
-        InputError: the log has no annotations, or a sweep cannot be read.
+        InputError: the log has no annotations.
         NonFiniteError: an image is not finite.
     """
     from flows.perception.labelled_renders import render_labelled_images
+    from genre_tasks.config import PipelineConfig
     from genre_tasks.effects.apply_plan import apply_plan
 
     job = source.job
     # Poses and lenses are those that the scene was fitted with.
     chunk = apply_plan(read_artifact(job, refs["ingest"]), read_artifact(job, refs["effects"]))
     scene = read_artifact(job, refs[str(source.end)]).scene
-    return list(render_labelled_images(cached_log(job.log), chunk, scene, shifts_m, recorded=False))
+    ingest = PipelineConfig.model_validate(job.config).ingest
+    return list(render_labelled_images(cached_log(job.log), chunk, scene, shifts_m, recorded=False, ingest=ingest))
 
 
 def label_truth(job: Job, ref: ArtifactRef, shifts_m: Sequence[float], every: int) -> list[LabelledImage]:

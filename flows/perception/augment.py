@@ -76,12 +76,13 @@ def augment_runs(
 
 
 def _open_sources(request: AugmentRequest) -> list[tuple[RunScenes, DrivingLog]]:
-    from flows.pipeline.log_cache import cached_log
+    from flows.simulation.recorded_log import open_recorded_log
     from flows.simulation.run_scenes import RunScenes
     from genre_tasks.training_sets.label_boxes import labeller_of
 
     sources = []
     names: set[str] = set()
+    digest_of: dict[str, str] = {}
     known: dict[tuple[str, int], str] = {}
     for run in request.runs:
         scenes = RunScenes(request.store, run, request.stage)
@@ -94,17 +95,32 @@ def _open_sources(request: AugmentRequest) -> list[tuple[RunScenes, DrivingLog]]
             # The log's annotation knows neither of removed actors nor of moved ones.
             problem = f"the traffic of the run {name} is edited, and the labels would be those of the recorded traffic"
             raise InputError(problem, remedy=f"Take the recorded run {edited['run']}.")
-        log = cached_log(scenes.record["log"])
+        log = open_recorded_log(scenes)
         # Raises where there is nothing to label with.
         labeller_of(log)
-        for number in scenes.chunk_numbers:
-            other = known.setdefault((log.name, number), name)
+        if digest_of.setdefault(log.name, log.digest()) != log.digest():
+            # By its log's name a set tells where an image was taken.
+            problem = f"two logs are called {log.name}"
+            raise InputError(problem, remedy="Make a training set of each.", log=log.uri)
+        for frame in _list_frames(scenes):
+            other = known.setdefault((log.name, frame), name)
             # Two scenes of one place would put every recorded image into the set twice.
             if other != name:
-                problem = f"the runs {other} and {name} both have chunk {number} of the log {log.name}"
+                problem = f"the runs {other} and {name} both have frame {frame} of the log {log.name}"
                 raise InputError(problem, remedy="Make a training set of each.", log=log.uri)
         sources.append((scenes, log))
     return sources
+
+
+def _list_frames(scenes: RunScenes) -> list[int]:
+    from flows.reconstruction.chunk_configuration import read_chunk_config
+
+    frames: list[int] = []
+    for number in scenes.chunk_numbers:
+        count = read_chunk_config(scenes.record, number).ingest.chunk_frames
+        # The last chunk may be shorter, and then the log has no frame beyond it.
+        frames += range(number * count, (number + 1) * count)
+    return frames
 
 
 def _render_sources(
@@ -114,6 +130,7 @@ def _render_sources(
     part_started: PartStarted,
 ) -> Iterator[LabelledImage]:
     from flows.perception.labelled_renders import render_labelled_images
+    from flows.reconstruction.chunk_configuration import read_chunk_config
     from genre_tasks.training_sets.label_filter import keep_visible_boxes
 
     for scenes, log in sources:
@@ -128,6 +145,7 @@ def _render_sources(
                 every=request.every,
                 recorded=request.recorded,
                 progress=progress,
+                ingest=read_chunk_config(scenes.record, number).ingest,
             )
             for labelled in images:
                 yield keep_visible_boxes(labelled, request.min_points)

@@ -10,6 +10,7 @@ from genre_tasks.errors import InputError
 from genre_tasks.progress import Progress, silent
 
 if TYPE_CHECKING:
+    from genre_tasks.config import IngestConfig
     from genre_tasks.logs.types import DrivingLog, Lens
     from genre_tasks.render import RenderSettings
     from genre_tasks.scene.chunk import Chunk, View
@@ -29,6 +30,7 @@ def render_labelled_images(
     recorded: bool = True,
     progress: Progress = silent,
     settings: RenderSettings | None = None,
+    ingest: IngestConfig | None = None,
 ) -> Iterator[LabelledImage]:
     """Renders a scene at recorded poses moved to the side, labels the renders, and labels the recorded images too.
 
@@ -45,23 +47,28 @@ def render_labelled_images(
         recorded: whether the recorded images are among the results.
         progress: called with the images done and their total.
         settings: of the renderer; ``None``: its own.
+        ingest: that the chunk was made with; ``None``: the default. Renders have no box of a moving object that it left
+            out.
 
     Yields:
         LabelledImage: frame by frame; within a frame recorded images first, then renders in the order of ``shifts_m``,
         each in the order of the rig.
 
     Raises:
-        InputError: the log has no annotations or is not the chunk's, the chunk lacks one of the frames, or an image or
-            a sweep cannot be read.
+        InputError: the log has no annotations or is not the chunk's, the chunk lacks one of the frames, or an image
+            cannot be read.
         NonFiniteError: an image is not finite.
     """
+    from genre_tasks.config import IngestConfig
     from genre_tasks.scene.novel_poses import place_novel_views
+    from genre_tasks.training_sets.absent_objects import find_absent_objects
     from genre_tasks.training_sets.label_boxes import labeller_of
 
     chosen = _choose_frames(chunk, frames, every)
     if log.name != chunk.log:
         raise InputError(f"the chunk is of another log, {chunk.log}", remedy="Give its own log.", log=log.uri)
     labeller = labeller_of(log)
+    absent = find_absent_objects(log.tracks(), chunk, ingest or IngestConfig())
     lenses = {camera.name: camera.lens.resized(chunk.width_px, chunk.height_px) for camera in log.cameras}
     total = sum(view.frame in chosen for view in chunk.views) * (len(shifts_m) + recorded)
     done = 0
@@ -71,7 +78,7 @@ def render_labelled_images(
             groups.append([replace(v, lens=_lens_of(v, lenses)) for v in chunk.views if v.frame == frame])
         groups += [place_novel_views(chunk, (shift_m,), frames=(frame,)) for shift_m in shifts_m]
         for views in groups:
-            for image in _label_renders(labeller, chunk, scene, views, settings):
+            for image in _label_renders(labeller, chunk, scene, views, settings, absent):
                 progress(done, total, f"frame {frame}")
                 yield image
                 done += 1
@@ -102,6 +109,7 @@ def _label_renders(
     scene: SceneGraph,
     views: Sequence[View | NovelView],
     settings: RenderSettings | None,
+    absent: frozenset[str],
 ) -> Iterator[LabelledImage]:
     """The images of one frame and shift: of recorded views the recorded ones, of others the renders."""
     import torch
@@ -122,6 +130,8 @@ def _label_renders(
     for view, color, depth in zip(views, render.color, depths.cpu().numpy(), strict=True):
         if isinstance(view, NovelView):
             pixels = to_pixels(color)
-            yield labeller.label_view(chunk, view, pixels, shift_m=view.shift_m, rendered=True, depth=depth)
+            yield labeller.label_view(
+                chunk, view, pixels, shift_m=view.shift_m, rendered=True, depth=depth, absent=absent
+            )
         else:
             yield labeller.label_recorded_image(chunk, view, depth)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from flows.machine.memory import memory_limit_gib
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ResourceError
+from genre_tasks.logs.log_selection import choose_working_size
 
 if TYPE_CHECKING:
     from flows.pipeline.definition import StageSpec
@@ -139,12 +140,13 @@ def estimate_chunk_size(log: DrivingLog, cameras: Sequence[Camera], config: Pipe
     frames = min(config.ingest.chunk_frames, log.frame_count)
     # As if every frame had all images: a log with gaps takes less.
     source_views = -(-frames // config.ingest.source_every) * len(cameras)
+    width_px, height_px = choose_working_size(config.ingest, cameras)
     return ChunkSize(
         cameras=len(cameras),
         source_views=source_views,
         novel_views=source_views * len(config.novel_views.shifts_m),
-        width_px=config.ingest.width_px,
-        height_px=config.ingest.height_px,
+        width_px=width_px,
+        height_px=height_px,
         native_px=max((camera.lens.width_px * camera.lens.height_px for camera in cameras), default=0),
         gaussians=config.initial.max_points + config.initial.distant_count,
     )

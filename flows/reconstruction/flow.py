@@ -27,6 +27,7 @@ from flows.reconstruction.run_summary import RunSummary
 from flows.reconstruction.stored_run import find_stored_run
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ConfigError, GenreError
+from genre_tasks.logs.registry import make_log_absolute
 from storage.opening import open_store
 
 if TYPE_CHECKING:
@@ -77,6 +78,8 @@ def reconstruct_log(
         print(reconstruct_log("synthetic:street?seed=1000", preset="demo", store="genre-store")["report"])
     """
     try:
+        # The run's record names the log, and is read from other folders.
+        log = make_log_absolute(log)
         effective = _effective_config(preset, config, settings)
         record = _take_from_store(log, preset, store, chunks, effective) if budget_s is None else None
         if record is None:

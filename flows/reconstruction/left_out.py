@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from flows.error_record import describe_record, record_error
-from genre_tasks.errors import ConfigError, GenreError, InputError
+from genre_tasks.errors import ConfigError, GenreError, InputError, ResourceError, TransientIOError
 
 
 class ChunksLeftOutError(GenreError):
@@ -23,6 +23,7 @@ class ChunksLeftOutError(GenreError):
         left_out: of each chunk that could not be reconstructed, its error as plain values with ``chunk``.
         status: ``partly_done`` where other chunks are done; otherwise ``refused`` if every chunk's input or
             configuration is at fault, and ``failed`` if not.
+        is_passing: whether any chunk failed by its surroundings, so that another try may succeed.
 
     >>> errors = {1: InputError("no source view", remedy="Take more frames.")}
     >>> error = ChunksLeftOutError("synthetic:street", 2, errors, record={"run": "5f41"})
@@ -41,6 +42,7 @@ class ChunksLeftOutError(GenreError):
         super().__init__(f"{len(failures)} of {count} chunks left out: {problems}", remedy=remedies, log=log)
         self.record = record
         self.left_out = record_failures(log, failures)
+        self.is_passing = any(isinstance(error, TransientIOError | ResourceError) for error in failures.values())
         is_refused = all(isinstance(error, InputError | ConfigError) for error in failures.values())
         self.status: Literal["partly_done", "refused", "failed"] = "refused" if is_refused else "failed"
         if record is not None:

@@ -11,7 +11,7 @@ from typing import Any
 
 from prefect.artifacts import create_table_artifact
 
-from flows.reconstruction.left_out import describe_log
+from flows.reconstruction.left_out import ChunksLeftOutError, describe_log
 from genre_tasks.errors import GenreError, ResourceError, TransientIOError
 
 DATASET_VARIABLE = "GENRE_DATASET"
@@ -39,6 +39,12 @@ def publish_outcome(log: str, record: Mapping[str, Any] | None, error: Exception
     """
     if not is_child_run():
         return
-    is_final = isinstance(error, GenreError) and not isinstance(error, TransientIOError | ResourceError)
-    row = describe_log(log, record, error) | {"is_passing": error is not None and not is_final}
+    row = describe_log(log, record, error) | {"is_passing": error is not None and not _is_final(error)}
     create_table_artifact(table=[row], key=OUTCOME_KEY, description="read by the dataset's flow")
+
+
+def _is_final(error: Exception) -> bool:
+    """Whether another try would end in the same error."""
+    if isinstance(error, ChunksLeftOutError):
+        return not error.is_passing
+    return isinstance(error, GenreError) and not isinstance(error, TransientIOError | ResourceError)

@@ -7,7 +7,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Protocol
 
-from flows.simulation.film import FilmWriter
+from flows.simulation.film import FilmWriter, count_repeats
+from genre_tasks.logs.types import Float64
 from genre_tasks.rollout.render_rollout import RolloutImages
 from genre_tasks.rollout.rig import RigCamera
 from storage.codecs.exr import write_channels, write_exr
@@ -42,15 +43,17 @@ class Films:
     Args:
         folder: where to write.
         rig: the cameras.
-        images_per_s: how fast the films play.
+        times_s: [F] of the poses. Over a pause the films stand still.
+        pose_s: seconds for which the films show a pose.
     """
 
-    def __init__(self, folder: Path, rig: Sequence[RigCamera], images_per_s: float) -> None:
+    def __init__(self, folder: Path, rig: Sequence[RigCamera], times_s: Float64, pose_s: float) -> None:
+        self._repeats = count_repeats(times_s, pose_s)
         self._writers: list[FilmWriter] = []
         try:
             for camera in rig:
                 path = folder / f"{camera.name}.mp4"
-                self._writers.append(FilmWriter(path, camera.lens.width_px, camera.lens.height_px, images_per_s))
+                self._writers.append(FilmWriter(path, camera.lens.width_px, camera.lens.height_px, 1 / pose_s))
         except BaseException:
             self.abort()
             raise
@@ -58,7 +61,8 @@ class Films:
     def write(self, images: RolloutImages) -> None:
         """Appends an image to each film."""
         for writer, pixels in zip(self._writers, to_pixels(images.color), strict=True):
-            writer.write(pixels)
+            for _ in range(self._repeats[images.index]):
+                writer.write(pixels)
 
     def close(self) -> None:
         """Completes the films."""

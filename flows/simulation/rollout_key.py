@@ -6,7 +6,7 @@ from pathlib import Path
 
 from flows.pipeline.definition import STAGE_BY_NAME, digest_stage_weights
 from flows.simulation.edited_runs import OpenedRun, digest_edits
-from flows.simulation.parked_actors import find_log
+from flows.simulation.recorded_log import find_recorded_log
 from flows.simulation.request import SimulationRequest
 from flows.simulation.run_scenes import RunScenes
 from flows.simulation.sensors import MODULES as SENSOR_MODULES
@@ -18,7 +18,7 @@ from storage.code_digest import code_digest
 from storage.keys import digest_file, stage_key
 
 # Raised when the layout of the files changes, which no digest of code notices: writers lie outside of the closure.
-_LAYOUT = 1
+_LAYOUT = 2
 _MODULES = (
     "genre_tasks.ego_paths.behaviours",
     "genre_tasks.ego_paths.collisions",
@@ -53,7 +53,7 @@ def compute_rollout_key(request: SimulationRequest, run: OpenedRun, config: Pipe
         modules += SENSOR_MODULES[sensor]
     # Parked vehicles are known from the log alone, and which rays a sensor sends is read from its sweeps. Where it is
     # gone, a path is not checked against them.
-    log = find_log(run.recorded.record["log"])
+    log = find_recorded_log(run.recorded)
     inputs["log"] = "gone" if log is None else log.digest()
     if len(edits):
         inputs["edits"] = digest_edits(request.store, _open_all_chunks(request, run), edits, config.simulate)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from flows.pipeline.log_cache import cached_log
 from flows.simulation.outputs import (
     DEPTH_FOLDER,
     Films,
@@ -16,6 +15,7 @@ from flows.simulation.outputs import (
     write_linear_image,
 )
 from flows.simulation.prepared_rollout import PreparedRollout
+from flows.simulation.recorded_log import open_recorded_log
 from flows.simulation.request import SimulationRequest
 
 MODULES: dict[str, tuple[str, ...]] = {
@@ -61,8 +61,8 @@ def open_sensors(request: SimulationRequest, rollout: PreparedRollout, folder: P
     if "lidar" in request.sensors:
         from flows.simulation.lidar_files import LidarSweeps
 
-        log = cached_log(rollout.recorded.record["log"])
+        log = open_recorded_log(rollout.recorded)
         outputs.append(LidarSweeps(folder, log, rollout.checked.path))
     if "rgb" in request.sensors:
-        outputs.append(Films(folder, rollout.rig, 1 / rollout.pose_s))
+        outputs.append(Films(folder, rollout.rig, rollout.checked.path.times_s, rollout.pose_s))
     return outputs

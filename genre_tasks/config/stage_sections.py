@@ -25,7 +25,7 @@ class IngestConfig(Section):
         ge=16,
         le=4096,
         description="Working width of all images, pixels. Images of another shape are used at as many pixels in "
-        "their own.",
+        "their own, and none is enlarged beyond the size of the largest.",
     )
     height_px: int = Field(720, ge=16, le=4096, description="Working height of all images, pixels; see width_px.")
     cameras: TextList | None = Field(None, description="Names of the cameras to use; null: all.")

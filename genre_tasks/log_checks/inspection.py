@@ -47,7 +47,10 @@ class LogInspector:
         self._total_steps = log.frame_count * (len(self.cameras) + 1)
 
     def _can_open(self, camera: Camera) -> bool:
-        # A reader opens the files of a camera when it is first asked for a time.
+        # A reader opens the files of a camera when it is first asked for a time. One frame may be broken by itself.
+        last = self.log.frame_count - 1
+        if last > 0 and _read_or_note(partial(self.log.camera_timestamp_s, camera.name, last), []) is not None:
+            return True
         first_time = self.try_reading(lambda: self.log.camera_timestamp_s(camera.name, 0), "fatal", "unreadable_camera")
         return first_time is not None
 

@@ -192,12 +192,15 @@ def count_source_frames(source_every: int, has_images: Mapping[str, Sequence[boo
 def choose_working_size(config: IngestConfig, cameras: Sequence[Camera]) -> tuple[int, int]:
     """Chooses the size at which a log's images are used: as many pixels as configured, in the images' own shape.
 
+    Images are not enlarged, which would add time and memory but no detail, and blur what sharp images are told by.
+
     Args:
         config: with width and height.
         cameras: those that are used.
 
     Returns:
-        Width and height in pixels; those of the configuration where the cameras differ in shape.
+        Width and height in pixels. They have the configured shape where the cameras differ in theirs, and no more
+        pixels than the largest image.
 
     >>> from genre_tasks.logs.types import Lens
     >>> wide = Camera("image_02", Lens(721.5, 721.5, 609.6, 172.9, 1242, 375))
@@ -205,13 +208,17 @@ def choose_working_size(config: IngestConfig, cameras: Sequence[Camera]) -> tupl
     (436, 132)
     """
     configured = config.width_px, config.height_px
+    if not cameras:
+        return configured
+    configured_shape = config.width_px / config.height_px
     shapes = [camera.lens.width_px / camera.lens.height_px for camera in cameras]
     # One size holds for all images of a chunk: some are stretched where portrait and landscape cameras meet.
-    if not shapes or max(shapes) > (1 + _MAX_SHAPE_ERROR) * min(shapes):
+    is_shared = max(shapes) <= (1 + _MAX_SHAPE_ERROR) * min(shapes)
+    has_configured_shape = not is_shared or abs(shapes[0] / configured_shape - 1) < _MAX_SHAPE_ERROR
+    largest_px = max(camera.lens.width_px * camera.lens.height_px for camera in cameras)
+    if has_configured_shape and config.width_px * config.height_px <= largest_px:
         return configured
-    shape = shapes[0]
-    if abs(shape * config.height_px / config.width_px - 1) < _MAX_SHAPE_ERROR:
-        return configured
-    area = min(config.width_px * config.height_px, min(c.lens.width_px * c.lens.height_px for c in cameras))
+    shape = shapes[0] if is_shared else configured_shape
+    area = min(config.width_px * config.height_px, largest_px)
     width = max(_SIDE_STEP_PX, round((area * shape) ** 0.5 / _SIDE_STEP_PX) * _SIDE_STEP_PX)
     return width, max(_SIDE_STEP_PX, round(width / shape / _SIDE_STEP_PX) * _SIDE_STEP_PX)

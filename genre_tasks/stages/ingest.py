@@ -57,7 +57,7 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
     frames = select_frames(config, log, chunk_index)
     _require_numbered_frames(log, frames, chunk_index)
     cameras = select_cameras(config, log)
-    _require_cameras(log, cameras, chunk_index)
+    _require_cameras(log, cameras, frames[0], chunk_index)
     width_px, height_px = choose_working_size(config, cameras)
     config = config.model_copy(update={"width_px": width_px, "height_px": height_px})
     poses = np.stack([log.world_SE3_lidar(frame) for frame in frames])
@@ -123,10 +123,10 @@ def _require_numbered_frames(log: DrivingLog, frames: Sequence[int], chunk: int)
         raise InputError(problem, remedy=remedy, log=log.name, chunk=chunk)
 
 
-def _require_cameras(log: DrivingLog, cameras: tuple[Camera, ...], chunk: int) -> None:
+def _require_cameras(log: DrivingLog, cameras: tuple[Camera, ...], frame: int, chunk: int) -> None:
     """Raises what ``genre check`` calls fatal: no camera at all, or one whose poses or times cannot be opened."""
     for camera in cameras:
-        log.camera_timestamp_s(camera.name, 0)
+        log.camera_timestamp_s(camera.name, frame)
     if cameras:
         return
     findings = collect_reader_findings(log, range(log.frame_count), ())

@@ -1,7 +1,7 @@
 """Images of a log, recorded or rendered, with the boxes that its annotation gives them.
 
-Boxes stand where the annotation has them at the image's frame, which is where a scene is rendered with them. What a
-moving object moves between the sweep and the image is left out.
+Boxes stand where the annotation has them at the image's frame, interpolated between annotated frames, which is where a
+scene is rendered with them. What a moving object moves between the sweep and the image is left out.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from genre_tasks.errors import InputError
 from genre_tasks.logs.types import CuboidTrack, DrivingLog, Float32, Float64
+from genre_tasks.scene.actor_track import ValidAnnotations
 from genre_tasks.scene.chunk import Chunk, View
 from genre_tasks.scene.image_decoding import decode_pixels
 from genre_tasks.scene.novel_views import NovelView
@@ -27,7 +28,7 @@ from genre_tasks.training_sets.box_outlines import (
 from genre_tasks.training_sets.labelled_images import LabelledBox, LabelledImage
 
 NO_SWEEP_POINTS = -1
-"""What ``lidar_points`` is where the frame has no sweep."""
+"""What ``lidar_points`` is where the frame has no sweep that can be read."""
 
 # A chunk has twenty frames, and neighbours share some.
 _CACHED_FRAMES = 64
@@ -62,7 +63,7 @@ class LogLabeller:
         if not self._tracks:
             remedy = "Choose a log with boxes: labels are made from them."
             raise InputError("the log has no annotations", remedy=remedy, log=log.uri)
-        self._velocities = [_velocities(track, log) for track in self._tracks]
+        self._annotations = [ValidAnnotations.from_track(track) for track in self._tracks]
         self._frames: OrderedDict[int, _FrameBoxes] = OrderedDict()
 
     def label_recorded_image(self, chunk: Chunk, view: View, depth: Float32 | None = None) -> LabelledImage:
@@ -77,7 +78,7 @@ class LogLabeller:
             The image with its boxes.
 
         Raises:
-            InputError: the image cannot be decoded, or the sweep cannot be read.
+            InputError: the image cannot be decoded.
         """
         try:
             image = decode_pixels(view.image, view.lens.width_px, view.lens.height_px)
@@ -96,6 +97,7 @@ class LogLabeller:
         shift_m: float,
         rendered: bool,
         depth: Float32 | None,
+        absent: frozenset[str] = frozenset(),
     ) -> LabelledImage:
         """Labels an image of any viewpoint.
 
@@ -106,12 +108,10 @@ class LogLabeller:
             shift_m: metres to the left of the recorded path.
             rendered: whether a scene was rendered.
             depth: [H, W] metres along the camera's axis, 0 where nothing is; ``None``: unknown.
+            absent: ids of objects that the image does not show, although the annotation has them.
 
         Returns:
             The image with its boxes. A box that is not in the image has none, nor has one that holds the camera.
-
-        Raises:
-            InputError: the frame's sweep cannot be read.
         """
         world_SE3_camera = chunk.world_SE3_chunk @ view.chunk_SE3_camera
         ego = chunk.chunk_SE3_ego[chunk.frames.index(view.frame)]
@@ -127,7 +127,7 @@ class LogLabeller:
             world_SE3_ego=chunk.world_SE3_chunk @ shift_laterally(ego, ego, shift_m),
             lens=view.lens,
             image=image,
-            boxes=self._label_boxes(view, world_SE3_camera, depth),
+            boxes=self._label_boxes(view, world_SE3_camera, depth, absent),
         )
 
     def _find_time(self, chunk: Chunk, view: NovelView) -> float:
@@ -137,7 +137,7 @@ class LogLabeller:
         return self.log.camera_timestamp_s(view.camera, view.frame) if time_s is None else time_s
 
     def _label_boxes(
-        self, view: View | NovelView, world_SE3_camera: Float64, depth: Float32 | None
+        self, view: View | NovelView, world_SE3_camera: Float64, depth: Float32 | None, absent: frozenset[str]
     ) -> tuple[LabelledBox, ...]:
         found = self._boxes_of(view.frame)
         camera_SE3_world = invert_se3(world_SE3_camera)
@@ -147,12 +147,12 @@ class LogLabeller:
         labelled = []
         for k in find_boxes_in_view(corners, view.lens):
             outline = outline_box(corners[k], view.lens)
-            if outline is None or _holds_camera(poses[k], found.size_m[k]):
+            track = found.tracks[k]
+            if outline is None or track.track_id in absent or _holds_camera(poses[k], found.size_m[k]):
                 continue
             occluded = float("nan")
             if depth is not None:
                 occluded = measure_occlusion(poses[k], found.size_m[k], view.lens, depth)
-            track = found.tracks[k]
             labelled.append(
                 LabelledBox(
                     track_id=track.track_id,
@@ -176,21 +176,38 @@ class LogLabeller:
         return self._frames[frame]
 
     def _collect_boxes(self, frame: int) -> _FrameBoxes:
-        rows = [
-            (number, int(index[0]))
-            for number, track in enumerate(self._tracks)
-            if len(index := np.flatnonzero(track.frames == frame))
-        ]
-        tracks = tuple(self._tracks[number] for number, _ in rows)
-        poses = np.array([self._tracks[number].world_SE3_box[k] for number, k in rows]).reshape(-1, 4, 4)
+        # Between annotations boxes stand where scenes have the object.
+        found = [(k, annotations.find_pose(frame)) for k, annotations in enumerate(self._annotations)]
+        rows = [(k, pose) for k, pose in found if pose is not None]
+        tracks = tuple(self._tracks[k] for k, _ in rows)
+        poses = np.array([pose for _, pose in rows]).reshape(-1, 4, 4)
         sizes = np.array([track.size_m for track in tracks]).reshape(-1, 3)
-        velocities = np.array([self._velocities[number][k] for number, k in rows]).reshape(-1, 3)
-        sweep = self.log.sweep(frame)
+        velocities = np.array([self._measure_velocity(self._annotations[k], frame) for k, _ in rows]).reshape(-1, 3)
+        return _FrameBoxes(tracks, poses, sizes, velocities, self._count_points(frame, poses, sizes))
+
+    def _count_points(self, frame: int, world_SE3_box: Float64, size_m: Float64) -> NDArray[np.int64]:
+        try:
+            sweep = self.log.sweep(frame)
+        except InputError:
+            # Reconstruction went on without it, too.
+            sweep = None
         if sweep is None:
-            counts = np.full(len(rows), NO_SWEEP_POINTS, np.int64)
-        else:
-            counts = count_points_in_boxes(sweep.points_world, poses, sizes)
-        return _FrameBoxes(tracks, poses, sizes, velocities, counts)
+            return np.full(len(size_m), NO_SWEEP_POINTS, np.int64)
+        return count_points_in_boxes(sweep.points_world, world_SE3_box, size_m)
+
+    def _measure_velocity(self, annotations: ValidAnnotations, frame: int) -> Float64:
+        """[3] metres per second in the world, from the annotations before and after; 0 where no time is known."""
+        last = len(annotations.frames) - 1
+        before = max(int(np.searchsorted(annotations.frames, frame)) - 1, 0)
+        after = min(int(np.searchsorted(annotations.frames, frame, "right")), last)
+        try:
+            times = [self.log.frame_timestamp_s(int(annotations.frames[k])) for k in (before, after)]
+        except InputError:
+            return np.zeros(3)
+        elapsed = times[1] - times[0]
+        moved: Float64 = annotations.world_SE3_box[after, :3, 3] - annotations.world_SE3_box[before, :3, 3]
+        # A log may state one time for all of its frames.
+        return moved / elapsed if elapsed > 0 else np.zeros(3)
 
 
 _labellers: OrderedDict[int, LogLabeller] = OrderedDict()
@@ -247,19 +264,3 @@ def _holds_camera(camera_SE3_box: Float64, size_m: Float64) -> bool:
     # A moved camera may stand in another car, whose outside no pixel shows.
     eye = (camera_SE3_box[:3, :3] * camera_SE3_box[:3, 3, None]).sum(0)
     return bool((np.abs(eye) < size_m / 2).all())
-
-
-def _velocities(track: CuboidTrack, log: DrivingLog) -> Float64:
-    """[F, 3] metres per second in the world, from the poses before and after."""
-    count = len(track.frames)
-    if count < 2:
-        return np.zeros((count, 3))
-    times = np.array([log.frame_timestamp_s(int(frame)) for frame in track.frames])
-    before = np.maximum(np.arange(count) - 1, 0)
-    after = np.minimum(np.arange(count) + 1, count - 1)
-    centres = track.world_SE3_box[:, :3, 3]
-    elapsed = times[after] - times[before]
-    # A log may state one time for all of its frames.
-    moved = (centres[after] - centres[before]) / np.where(elapsed > 0, elapsed, np.inf)[:, None]
-    found: Float64 = moved
-    return found

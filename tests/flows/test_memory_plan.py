@@ -16,6 +16,7 @@ from flows.pipeline.memory_plan import (
     ChunkSize,
     StageMemory,
     choose_threads,
+    estimate_chunk_size,
     grow_until,
     needs_disk,
     predict_memory,
@@ -28,9 +29,16 @@ from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ResourceError
 from genre_tasks.losses.ssim import KEPT_PIXELS
 from storage.opening import open_store
+from tests.fakes import FakeLog
 from tests.faults.small_run import LOG, SETTINGS
 
 HD = ChunkSize(6, 30, 60, 1280, 720, 1920 * 1080, 310_000)
+
+
+def test_small_images_are_predicted_at_their_size() -> None:
+    log = FakeLog(width_px=128, height_px=72)
+    size = estimate_chunk_size(log, log.cameras, load_configuration("hd"))
+    assert (size.width_px, size.height_px) == (128, 72)
 
 
 def limited(memory_gib: float | None, preset: str = "hd") -> PipelineConfig:

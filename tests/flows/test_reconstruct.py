@@ -10,13 +10,16 @@ from typing import Any
 
 import pytest
 from prefect.artifacts import Artifact
+from typer.testing import CliRunner
 
+from flows.cli import run as cli_run
+from flows.cli.main import app
 from flows.dataset.flow import reconstruct_dataset
 from flows.pipeline import stage_task
 from flows.pipeline.definition import PIPELINE
 from flows.pipeline.log_cache import cached_log, expand_logs
 from flows.pipeline.stage_runner import Job
-from flows.reconstruction import flow, run_records, stored_values
+from flows.reconstruction import flow, outcome_artifact, run_records, stored_values
 from flows.reconstruction.left_out import ChunksLeftOutError, LogsFailedError
 from genre_tasks.errors import ConfigError, DiskFullError, InputError, ResourceError, TransientIOError
 from tests.faults.small_run import LOG, SETTINGS
@@ -80,6 +83,32 @@ def test_what_a_retry_can_cure_is_retried(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(stage_task, "run_stage", failing)
     assert served(run(tmp_path)) == [False] * 3
     assert attempts == [0, 0, 0, 1, 2]
+
+
+def test_a_runs_log_is_found_from_other_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def compute(log: str, *args: Any) -> dict[str, Any]:
+        asked.append(log)
+        return {}
+
+    monkeypatch.setattr(flow, "_compute", compute)
+    monkeypatch.setattr(cli_run, "check_request", lambda request: None)
+    monkeypatch.setattr(cli_run, "reconstruct", lambda request, as_json: asked.append(request.log))
+    monkeypatch.chdir(tmp_path)
+    run(tmp_path, "genre:007")
+    CliRunner().invoke(app, ["run", "genre:007", "--store", str(tmp_path)], catch_exceptions=False)
+    assert asked == [f"genre:{tmp_path}/007"] * 2
+
+
+def test_a_chunk_that_failed_by_its_surroundings_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows: list[dict[str, Any]] = []
+    monkeypatch.setenv(outcome_artifact.DATASET_VARIABLE, "streets")
+    monkeypatch.setattr(outcome_artifact, "create_table_artifact", lambda table, **_: rows.extend(table))
+    log_at_fault = InputError("no image", remedy="Copy it.")
+    for errors in ({1: log_at_fault}, {1: log_at_fault, 2: TransientIOError("the store is away", remedy="Wait.")}):
+        outcome_artifact.publish_outcome(LOG, None, ChunksLeftOutError(LOG, 3, errors))
+    assert [row["is_passing"] for row in rows] == [False, True]
 
 
 @pytest.mark.parametrize("kind", [ConfigError, DiskFullError])

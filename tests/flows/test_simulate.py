@@ -166,6 +166,16 @@ def test_a_rendered_film_stands_still_over_a_pause_of_the_log(
     assert max(steps[:4]) < min(steps[4:])
 
 
+def test_a_simulations_film_stands_still_over_a_pause_of_its_path(recorded: SimulationRequest, tmp_path: Path) -> None:
+    times_s = (0.0, 0.1, 0.2, 0.6, 0.7)
+    poses = [{"time_s": t, "frame": k, "lateral_m": 0.0, "ahead_m": 0.0} for k, t in enumerate(times_s)]
+    file = tmp_path / "path.json"
+    file.write_text(json.dumps(poses))
+    change = {"path_file": file, "cameras": ("front_camera",), "allow_implausible": True}
+    simulate_run(replace(recorded, out=tmp_path / "out", **change))  # type: ignore[arg-type]
+    assert len(imageio.imread(tmp_path / "out" / "front_camera.mp4")) == len(poses) + 3
+
+
 def test_a_path_without_poses_is_refused(recorded: SimulationRequest, tmp_path: Path) -> None:
     file = tmp_path / "empty.json"
     file.write_text("[]")

@@ -13,12 +13,14 @@ import pyarrow.parquet as pq
 import pytest
 from plyfile import PlyData, PlyElement
 
+from genre_tasks.config import IngestConfig
 from genre_tasks.errors import InputError
 from genre_tasks.log_checks.check_log import check_log
 from genre_tasks.logs.genre_layout.writer import write_genre_layout
 from genre_tasks.logs.pandaset.writer import write_pandaset
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.types import Camera, DrivingLog
+from genre_tasks.stages.ingest import ingest
 from tests.fakes import FakeLog
 from tests.log_checks.edited_log import EditedLog
 from tests.logs.kitti_folder import write_kitti
@@ -290,7 +292,7 @@ def test_many_boxes_are_read(folder: Path) -> None:
 
 
 def test_a_large_sweep_is_read_and_a_huge_one_refused(folder: Path) -> None:
-    for count, allowed in ((2_000_000, True), (300_000_000, False)):
+    for count, allowed in ((2_000_000, True), (30_000_000, False)):
         path = folder / "lidar/large.parquet"
         # Zeros take next to no file.
         batch = pa.table({name: np.zeros(10_000_000 if not allowed else count, np.float32) for name in "xyz"})
@@ -357,6 +359,22 @@ def test_the_check_reports_a_frame_without_a_time(folder: Path, change: Any) -> 
     check = check_log(open_log(f"genre:{folder}"))
     (finding,) = [finding for finding in check.findings if finding.word == "missing_timestamp"]
     assert finding.frames == (2,) and "frame 2 has no finite number time_s" in finding.message
+
+
+def test_a_first_frame_without_a_time_costs_its_chunk_alone(folder: Path) -> None:
+    def drop(values: dict[str, Any]) -> None:
+        for frame in values["frames"]:
+            for image in frame["images"].values():
+                image.pop("time_s", None)
+        values["frames"][0].pop("time_s")
+
+    _change(folder, drop)
+    log = open_log(f"genre:{folder}")
+    assert [finding.word for finding in check_log(log).findings if finding.severity == "fatal"] == []
+    config = IngestConfig(chunk_frames=2, source_every=1, width_px=32, height_px=16)
+    assert ingest(config, log, 1).frames == (2, 3)
+    with pytest.raises(InputError, match="frame 0 has no finite number time_s"):
+        ingest(config, log, 0)
 
 
 @pytest.mark.parametrize("name", ["../../x", "/home/u/x", "..", "front camera", "a\\b", ""])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +25,7 @@ from flows.reconstruction.run_records import (
     write_run_record,
 )
 from flows.reconstruction.stored_values import find_last_stage, read_stage_value
+from genre_tasks import atomic_path
 from genre_tasks.config import RangeConfig
 from genre_tasks.effects.types import EffectsPlan
 from genre_tasks.errors import ConfigError, InputError
@@ -190,6 +192,18 @@ def test_the_command_answers_for_a_finished_run(finished: FinishedRun, tmp_path:
             CliRunner().invoke(app, [*command, "--stage", "enet"], catch_exceptions=False)
     with pytest.raises(InputError, match="runs of this store begin with"):
         CliRunner().invoke(app, ["range", "zzz", "--store", finished.store], catch_exceptions=False)
+
+
+def test_a_store_that_may_only_be_read_answers_too(
+    finished: FinishedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, data: bytes) -> None:
+        raise OSError(errno.EROFS, "Read-only file system", str(path))
+
+    monkeypatch.setattr(atomic_path, "write_atomically", refuse)
+    done = CliRunner().invoke(app, ["range", finished.name, "--store", finished.store, "--out", str(tmp_path)])
+    assert done.exit_code == 0, done.output
+    assert "usable to" in done.output and "the run's report stays as it was" in done.output
 
 
 @pytest.mark.parametrize("suffix", ["png", "exr", "mp4"])

@@ -12,6 +12,7 @@ from genre_tasks.config import EffectsConfig, IngestConfig
 from genre_tasks.effects import multi_view_stereo
 from genre_tasks.effects.apply_plan import apply_plan
 from genre_tasks.effects.plan import EFFECT_NAMES, plan_effects
+from genre_tasks.effects.types import EffectParameters
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.synthetic.log import SyntheticStreet
 from genre_tasks.scene.box_projection import project_box
@@ -27,7 +28,7 @@ from genre_tasks.scene.stereo_points import (
 )
 from genre_tasks.stages.ingest import ingest
 
-STREET = "synthetic:street?seed=903&cameras=3&width=160&height=90&samples=4&frames=12"
+STREET = "synthetic:street?seed=903&cameras=3&width=160&height=90&samples=4&frames=8"
 ONLY_STEREO = EffectsConfig(**{name: "auto" if name == "multi_view_stereo" else "off" for name in EFFECT_NAMES})
 
 
@@ -133,9 +134,12 @@ def test_images_are_compared_at_one_size() -> None:
 
 def test_the_gate_flips_at_its_threshold(monkeypatch: pytest.MonkeyPatch) -> None:
     cameras = open_log(STREET).cameras
+    # The points do not depend on the threshold, so they are found once.
+    effect = replace(multi_view_stereo.EFFECT, fit=lambda _: EffectParameters(stereo_points=stereo_points()))
+    monkeypatch.setattr(multi_view_stereo, "EFFECT", effect)
     value = plan_effects(ONLY_STEREO, chunk(), cameras)["multi_view_stereo"].value
     for factor, choice in ((0.98, "on"), (1.02, "off")):
-        moved = replace(multi_view_stereo.EFFECT, threshold=factor * value)
+        moved = replace(effect, threshold=factor * value)
         monkeypatch.setattr(multi_view_stereo, "EFFECT", moved)
         plan = plan_effects(ONLY_STEREO, chunk(), cameras)
         assert plan["multi_view_stereo"].choice == choice

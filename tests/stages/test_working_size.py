@@ -38,6 +38,25 @@ def test_images_are_not_enlarged_beyond_their_own_size() -> None:
     assert width <= 124 + 2 and height <= 38 + 2
 
 
+def test_images_of_the_configured_shape_are_not_enlarged_either() -> None:
+    small = replace(WIDE, lens=WIDE.lens.resized(320, 180))
+    assert choose_working_size(IngestConfig(), [small]) == (320, 180)
+
+
+def test_a_rig_of_several_shapes_is_as_large_as_its_largest_images() -> None:
+    wide = replace(WIDE, lens=WIDE.lens.resized(640, 192))
+    portrait = replace(PORTRAIT, lens=PORTRAIT.lens.resized(150, 200))
+    width, height = choose_working_size(IngestConfig(), [wide, portrait])
+    assert width / height == pytest.approx(16 / 9, rel=0.02)
+    assert width * height == pytest.approx(640 * 192, rel=0.02)
+
+
+def test_one_camera_of_fewer_pixels_does_not_reduce_the_others() -> None:
+    large = replace(WIDE, lens=WIDE.lens.resized(1280, 720))
+    small = replace(WIDE, lens=WIDE.lens.resized(640, 360))
+    assert choose_working_size(IngestConfig(), [small, large]) == (1280, 720)
+
+
 def test_a_chunk_has_the_size_that_was_chosen() -> None:
     log = open_log("synthetic:street?seed=900&frames=8&cameras=2&width=240&height=72&samples=1")
     chunk = ingest(IngestConfig(width_px=160, height_px=90), log, 0)

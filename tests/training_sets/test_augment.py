@@ -18,6 +18,7 @@ from flows.pipeline.definition import STAGE_BY_NAME
 from flows.pipeline.log_cache import cached_log
 from flows.pipeline.stage_runner import ArtifactRef, Job, run_stage
 from flows.reconstruction.run_records import FinishedRun, summarise_run, write_run_record
+from flows.simulation import recorded_log
 from flows.simulation.edited_runs import write_edited_run
 from flows.simulation.run_scenes import RunScenes
 from genre_tasks.errors import ConfigError, GenreError, InputError
@@ -138,7 +139,37 @@ def test_what_cannot_work_is_refused_before_anything_is_rendered(finished: Finis
     assert "holds something already" in str(refusal(finished, "--out", str(out)))
     other = replace(finished, preset="other")
     write_run_record(other, summarise_run(other), {})
-    assert "both have chunk 0 of the log" in str(refusal(finished, other.name, "--out", str(tmp_path / "two")))
+    assert "both have frame 0 of the log" in str(refusal(finished, other.name, "--out", str(tmp_path / "two")))
+
+
+def test_runs_with_other_chunks_share_frames(finished: FinishedRun, tmp_path: Path) -> None:
+    config = {**finished.config, "ingest": {**finished.config["ingest"], "chunk_frames": 4, "source_every": 2}}
+    job, refs = Job(LOG, 1, finished.store, config), dict[str, ArtifactRef]()
+    for name in STAGES:
+        refs[name] = run_stage(name, job, {k: refs[k] for k in STAGE_BY_NAME[name].inputs})
+    halved = FinishedRun(LOG, "demo", finished.store, config, {}, {1: refs})
+    write_run_record(halved, summarise_run(halved), {})
+    problem = str(refusal(finished, halved.name, "--out", str(tmp_path / "two")))
+    assert f"the runs {finished.name} and {halved.name} both have frame 4" in problem
+
+
+def test_renders_have_no_box_of_what_their_chunk_left_out(finished: FinishedRun) -> None:
+    part, log = RunScenes(finished.store, finished.name).load(0), cached_log(LOG)
+    gone = part.chunk.actors[0].track_id
+    without = replace(part.chunk, actors=tuple(a for a in part.chunk.actors if a.track_id != gone))
+    found = []
+    for chunk in (part.chunk, without):
+        images = list(render_labelled_images(log, chunk, part.scene, (0.0,), frames=chunk.frames[::4]))
+        found.append([{box.track_id for i in images if i.rendered is r for box in i.boxes} for r in (True, False)])
+    assert gone in found[0][0] and found[1] == [found[0][0] - {gone}, found[0][1]]
+
+
+def test_another_log_in_the_place_of_the_runs_is_refused(
+    finished: FinishedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there = LOG.replace("seed=900", "seed=901")
+    monkeypatch.setattr(recorded_log, "cached_log", lambda uri: cached_log(there))
+    assert "another log is where the run's was" in str(refusal(finished, "--out", str(tmp_path / "set")))
 
 
 def test_a_run_counts_once_and_edited_traffic_has_no_labels(finished: FinishedRun, tmp_path: Path) -> None:

@@ -205,6 +205,34 @@ def test_a_log_has_one_labeller_that_counts_a_frame_once(monkeypatch: pytest.Mon
     assert sorted(read) == list(chunk.frames)
 
 
+def test_between_annotations_boxes_stand_where_scenes_have_the_object() -> None:
+    log = replace(LOG, uri="fake:every third", track_every=3, _images={})
+    exact = {(i.camera, i.frame): i for i in label_street()}
+    for image in label_street(log):
+        for box in image.boxes:
+            expected = find(exact[image.camera, image.frame], box.track_id)
+            assert box.camera_SE3_box == pytest.approx(expected.camera_SE3_box, abs=1e-6)
+            assert box.velocity_m_s == pytest.approx(expected.velocity_m_s, abs=1e-6)
+    assert {i.frame for i in label_street(log) if i.boxes} == {0, 1, 2, 3}
+
+
+def test_a_sweep_or_a_time_that_cannot_be_read_costs_no_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    log = replace(LOG, uri="fake:unreadable", _images={})
+    chunk = chunk_of(log)
+    fail = InputError("row 7 is cut off", remedy="Copy the sweep.")
+
+    def refuse(self: FakeLog, frame: int) -> object:
+        raise fail
+
+    monkeypatch.setattr(FakeLog, "sweep", refuse)
+    monkeypatch.setattr(FakeLog, "frame_timestamp_s", refuse)
+    labeller = LogLabeller(log)
+    images = [labeller.label_recorded_image(chunk, view) for view in chunk.views]
+    boxes = [box for image in images for box in image.boxes]
+    assert boxes and {box.lidar_points for box in boxes} == {-1}
+    assert {box.velocity_m_s for box in boxes} == {(0.0, 0.0, 0.0)}
+
+
 def test_a_log_without_annotations_is_one_clear_error() -> None:
     log = FakeLog(without_tracks=True)
     with pytest.raises(InputError, match=r"has no annotations.*Choose a log with boxes"):

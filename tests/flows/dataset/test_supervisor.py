@@ -174,6 +174,15 @@ def test_an_error_that_may_pass_is_tried_again() -> None:
     assert (row["status"], row["why"], row["attempts"]) == ("done", "", 2)
 
 
+def test_what_is_done_after_the_last_attempt_stays_in_the_row() -> None:
+    runs = FakeRuns({A: [["FAILED"]] * 3})
+    runs.outcomes["synthetic:a/0"] = {"status": "partly_done", "run": "5f41", "why": "disk full", "is_passing": True}
+    runs.outcomes["synthetic:a/1"] = runs.outcomes["synthetic:a/2"] = runs.outcomes["synthetic:a/0"]
+    (row,) = supervise(runs, [A])
+    assert (row["status"], row["run"], row["why"]) == ("partly_done", "5f41", "disk full (attempt 3)")
+    assert "is_passing" not in row
+
+
 def test_active_and_ended_runs_are_adopted() -> None:
     runs = FakeRuns({A: [["RUNNING", "COMPLETED"]], B: [["COMPLETED"]]})
     runs.runs["synthetic:a/0"] = ChildRun("synthetic:a/0", A, "RUNNING", is_ours=False)
