@@ -213,7 +213,7 @@ class Store(Protocol):
         """Removes an artifact, sound or not; nothing happens where there is none.
 
         Args:
-            target: the artifact or its address.
+            target: the artifact, which stays where another one has replaced it; or the address of any.
 
         Raises:
             NewerSchemaError: a newer version of the project wrote it; it is not removed.
