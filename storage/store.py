@@ -175,7 +175,8 @@ class Store(Protocol):
     def fetch(self, artifact: Artifact, suffix: str = "") -> Path:
         """Brings an artifact's files to this machine, for a reader of single files.
 
-        Files that come over the network are verified; a local store's are used as they are.
+        Files of a remote store are verified, also where they are on this machine already; a local store's are used as
+        they are.
 
         Args:
             artifact: the artifact.
