@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import math
+import mmap
 import os
 import tempfile
 from collections.abc import Iterator
@@ -83,12 +84,9 @@ def allocate_images(*shape: int, device: torch.device | str = "cpu") -> Tensor:
 
 def _map_file(folder: Path, count: int) -> Tensor:
     """[count] float32 in a new file of a folder, which has lost its name already."""
-    handle, name = tempfile.mkstemp(prefix=".genre-images-", dir=folder)
-    try:
+    # Without a name before its blocks are reserved, which takes long: a process may be killed meanwhile.
+    with tempfile.TemporaryFile(prefix=".genre-images-", dir=folder) as file:
         # Without its blocks a full disk would kill the process, at the first write to a page.
-        os.posix_fallocate(handle, 0, 4 * count)
-        return torch.from_file(name, shared=True, size=count, dtype=torch.float32)
-    finally:
-        # The mapping keeps the blocks; the name would outlive a process that is killed.
-        os.close(handle)
-        Path(name).unlink()
+        os.posix_fallocate(file.fileno(), 0, 4 * count)
+        # The mapping keeps the file.
+        return torch.frombuffer(mmap.mmap(file.fileno(), 4 * count), dtype=torch.float32)

@@ -82,6 +82,25 @@ def test_other_faults_of_the_disk_may_be_retried(tmp_path: Path, monkeypatch: py
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="the system reserves no blocks")
+def test_a_process_that_is_killed_while_blocks_are_reserved_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reserve = os.posix_fallocate
+    names: list[list[Path]] = []
+
+    def look_around(handle: int, offset: int, size: int) -> None:
+        names.append(list(tmp_path.iterdir()))
+        reserve(handle, offset, size)
+
+    monkeypatch.setattr(os, "posix_fallocate", look_around)
+    with hold_images_on_disk(tmp_path):
+        images = allocate_images(*LARGE)
+    assert names == [[]]
+    # Mapped all the same: it can be written to its end.
+    assert images.fill_(0.5).sum() == 0.5 * images.numel()
+
+
 def test_a_folder_that_is_gone_is_a_clear_error(tmp_path: Path) -> None:
     with hold_images_on_disk(tmp_path / "gone"), pytest.raises(ResourceError, match="gone"):
         allocate_images(*LARGE)
