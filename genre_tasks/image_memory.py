@@ -7,7 +7,9 @@ The values are the same.
 
 from __future__ import annotations
 
+import errno
 import math
+import mmap
 import os
 import tempfile
 from collections.abc import Iterator
@@ -18,10 +20,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from genre_tasks.errors import ResourceError
+from genre_tasks.errors import DiskFullError, ResourceError
 
 _MIN_BYTES = 2**24
 """Smaller tensors stay in memory: each file takes a mapping and whole pages."""
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 _scratch_folder: ContextVar[Path | None] = ContextVar("scratch_folder", default=None)
 
@@ -57,7 +60,8 @@ def allocate_images(*shape: int, device: torch.device | str = "cpu") -> Tensor:
         float32, not initialised.
 
     Raises:
-        ResourceError: the disk has no space for it.
+        DiskFullError: the disk has no space for it, or a quota or a limit of file sizes is reached.
+        ResourceError: the file cannot be made or mapped.
     """
     folder = _scratch_folder.get()
     count = math.prod(shape)
@@ -69,20 +73,20 @@ def allocate_images(*shape: int, device: torch.device | str = "cpu") -> Tensor:
     try:
         return _map_file(folder, count).view(shape)
     except OSError as error:
-        raise ResourceError(
-            f"the disk of {folder} has no space for {size / 2**20:.0f} MiB of images ({error.strerror})",
-            remedy="Free some space, or let the run use more memory (--memory).",
-        ) from error
+        what = f"{size / 2**20:.0f} MiB of images"
+        remedy = "Free some space, or let the run use more memory (--memory)."
+        # A kind that is not retried: the next try would reserve as much.
+        if error.errno in _DISK_FULL:
+            problem = f"the disk of {folder} has no space for {what} ({error.strerror})"
+            raise DiskFullError(problem, remedy=remedy) from error
+        raise ResourceError(f"{what} cannot be put into {folder} ({error.strerror})", remedy=remedy) from error
 
 
 def _map_file(folder: Path, count: int) -> Tensor:
     """[count] float32 in a new file of a folder, which has lost its name already."""
-    handle, name = tempfile.mkstemp(prefix=".genre-images-", dir=folder)
-    try:
+    # Without a name before its blocks are reserved, which takes long: a process may be killed meanwhile.
+    with tempfile.TemporaryFile(prefix=".genre-images-", dir=folder) as file:
         # Without its blocks a full disk would kill the process, at the first write to a page.
-        os.posix_fallocate(handle, 0, 4 * count)
-        return torch.from_file(name, shared=True, size=count, dtype=torch.float32)
-    finally:
-        # The mapping keeps the blocks; the name would outlive a process that is killed.
-        os.close(handle)
-        Path(name).unlink()
+        os.posix_fallocate(file.fileno(), 0, 4 * count)
+        # The mapping keeps the file.
+        return torch.frombuffer(mmap.mmap(file.fileno(), 4 * count), dtype=torch.float32)

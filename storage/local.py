@@ -196,8 +196,11 @@ class LocalStore:
         address = target.address if isinstance(target, Artifact) else target
         folder = self.root / address.relative_path
         with os_errors_translated(folder, address):
-            # Only for the error: a newer version's artifact is not ours to remove.
-            find_sound_manifest(folder)
+            # It raises where a newer version wrote it: that is not ours to remove.
+            manifest = find_sound_manifest(folder)
+            if isinstance(target, Artifact) and manifest is not None and manifest != target.manifest:
+                # Another process has replaced it already.
+                return
             trash = move_to_trash(folder)
             if trash is not None:
                 sync(folder.parent)

@@ -175,7 +175,8 @@ class Store(Protocol):
     def fetch(self, artifact: Artifact, suffix: str = "") -> Path:
         """Brings an artifact's files to this machine, for a reader of single files.
 
-        Files that come over the network are verified; a local store's are used as they are.
+        Files of a remote store are verified, also where they are on this machine already; a local store's are used as
+        they are.
 
         Args:
             artifact: the artifact.
@@ -213,7 +214,7 @@ class Store(Protocol):
         """Removes an artifact, sound or not; nothing happens where there is none.
 
         Args:
-            target: the artifact or its address.
+            target: the artifact, which stays where another one has replaced it; or the address of any.
 
         Raises:
             NewerSchemaError: a newer version of the project wrote it; it is not removed.

@@ -142,14 +142,14 @@ def artifact_address(stage: str, job: Job, key: str) -> Address:
     return Address(dataset=log.dataset, log=log.name, chunk=job.chunk, stage=stage, key=key)
 
 
-def find_artifact(spec: StageSpec, job: Job, inputs: Mapping[str, ArtifactRef], repair: bool = True) -> FoundArtifact:
+def find_artifact(spec: StageSpec, job: Job, inputs: Mapping[str, ArtifactRef], repair: bool = False) -> FoundArtifact:
     """Looks in the store for a stage's artifact and verifies it.
 
     Args:
         spec: the stage.
         job: log, chunk, store and configuration.
         inputs: references of at least the stage's inputs, by stage name.
-        repair: whether a damaged artifact is removed, so that it can be computed again.
+        repair: whether a damaged artifact is removed, so that it can be computed again; under its lease alone.
 
     Returns:
         The artifact's address, its reference if a sound one is there, and a note if a damaged one is there.
@@ -160,14 +160,15 @@ def find_artifact(spec: StageSpec, job: Job, inputs: Mapping[str, ArtifactRef], 
     store = open_store(job.store)
     key, _ = compute_key(spec, job, inputs)
     address = artifact_address(spec.name, job, key)
+    artifact = None
     try:
-        artifact = store.find(address)
-        if artifact is not None:
+        if (artifact := store.find(address)) is not None:
             store.verify(artifact)
     except ArtifactCorruptError as error:
         # Damage is no error of the run: the artifact is computed again, and the note says so.
         if repair:
-            store.discard(address)
+            # Just the one that was found: at its address there may be a sound one by now.
+            store.discard(artifact or address)
         return FoundArtifact(address, None, f"{error.problem} ({error.file}): computed again")
     return FoundArtifact(address, None if artifact is None else _reference(artifact, cached=True), "")
 
@@ -212,10 +213,11 @@ def run_stage(
         return ref
     store = open_store(job.store)
     with store.lease(address, measure_lease_wait(progress)):
-        # The process that had the lease before has probably committed the artifact.
-        _, ref, _ = find_artifact(spec, job, inputs)
+        # The process that had the lease before has probably committed the artifact, or replaced a damaged one.
+        _, ref, damage = find_artifact(spec, job, inputs, repair=True)
         if ref is not None:
             return ref
+        note = damage or note
         artifact = _compute_artifact(spec, job, inputs, store, address, note, attempt, progress)
         trim_memory()  # only now, as the stage's values are gone
     return _reference(artifact, cached=False, note=note)
@@ -313,10 +315,8 @@ def _group_issues(issues: Iterable[LogIssue]) -> list[str]:
         details_by_kind.setdefault(issue.kind.replace("_", " "), []).append(issue.detail)
     lines = []
     for kind, details in details_by_kind.items():
-        line = f"{kind}: {details[0]}"
-        if len(details) > 1:
-            line += f" (and {len(details) - 1} more)"
-        lines.append(line)
+        more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
+        lines.append(f"{kind}: {details[0]}{more}")
     return lines
 
 

@@ -7,6 +7,7 @@ The store's manifests alone decide what is cached. Prefect's own result cache is
 from __future__ import annotations
 
 from typing import Any
+from uuid import UUID
 
 from prefect import task
 from prefect.cache_policies import NO_CACHE
@@ -23,6 +24,9 @@ from genre_tasks.errors import DiskFullError, ResourceError, TransientIOError
 
 # Each retry halves the batch of a stage that has one, so three retries divide it by eight.
 RETRIES = 3
+
+_memory_failures: dict[UUID, int] = {}
+"""How many tries of a task run ended in ``ResourceError``; Prefect repeats a task in the process that began it."""
 
 
 async def _can_retry(task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
@@ -67,12 +71,20 @@ def stage_task(stage: str, chunk: int, job: Job, inputs: dict[str, ArtifactRef])
         GenreError: as the stage raises it, after the retries.
     """
     context = TaskRunContext.get()
-    # Prefect counts runs from 1; every earlier run of this task ended in an error that a retry can cure.
-    attempt = context.task_run.run_count - 1 if context else 0
+    run_id = context.task_run.id if context else None
+    # Not Prefect's count of tries: a store that was away for a moment must not change the batch, and so the payload.
+    attempt = 0 if run_id is None else _memory_failures.get(run_id, 0)
     reporter = get_reporter()
     reporter.stage_started(stage, chunk)
-    with gpu_slot(stage):
-        ref = run_stage(stage, job, inputs, attempt=max(attempt, 0), progress=reporter.progress)
+    try:
+        with gpu_slot(stage):
+            ref = run_stage(stage, job, inputs, attempt=attempt, progress=reporter.progress)
+    except ResourceError:
+        if run_id is not None:
+            _memory_failures[run_id] = attempt + 1
+        raise
+    if run_id is not None:
+        _memory_failures.pop(run_id, None)
     reporter.stage_ended(stage, chunk, ref)
     # The name of the state is what Prefect's UI shows.
     if ref.cached:

@@ -17,11 +17,13 @@ from torch import Tensor
 
 from genre_tasks.atomic_path import write_atomically
 from genre_tasks.errors import InputError
+from genre_tasks.learned.learned_optimiser import LearnedOptimiser
 from genre_tasks.learned.meta_episodes import Episode, EpisodeConfig
 from genre_tasks.learned.meta_training import MetaTraining
 from genre_tasks.learned.network import NetworkConfig
 from genre_tasks.optimiser.gradients import Gradients
 from genre_tasks.optimiser.objective import LossAndGradients
+from genre_tasks.weight_checks import require_weights_fit
 
 STATE_NAMES = {
     "offsets": "offsets",
@@ -115,6 +117,21 @@ def resume(training: MetaTraining, path: Path, origin: Mapping[str, str] | None 
         training.pool.append(_restore_episode(training, entry, _with_prefix(tensors, f"pool.{i}.")))
     # Last, so that nothing above can have drawn from it.
     training.generator.set_state(tensors["generator"])
+
+
+def load_weights(network: LearnedOptimiser, path: Path) -> None:
+    """Gives a network the weights of a checkpoint.
+
+    Args:
+        network: of the checkpoint's shape, on the CPU; changed in place.
+        path: of the checkpoint.
+
+    Raises:
+        InputError: its weights are not those of such a network.
+    """
+    weights = _with_prefix(_read_tensors(path, torch.device("cpu")), "weights.")
+    require_weights_fit(weights, network.state_dict(), path, REMEDY)
+    network.load_state_dict(weights)
 
 
 def _describe_settings(training: MetaTraining) -> dict[str, Any]:

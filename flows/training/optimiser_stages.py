@@ -21,6 +21,7 @@ from flows.training.stage_scenes import StageScene, list_stage_scenes, load_trai
 from flows.training.train_job import TrainJob
 from flows.training.validation import Validation, list_validation_recipes
 from genre_tasks.learned.meta_episodes import TrainingScene
+from genre_tasks.learned.weights import save_optimiser
 from genre_tasks.losses.rendering_loss import ImageDistance
 from genre_tasks.optimiser.unroll import UnrollSettings
 from genre_tasks.progress import Progress, silent
@@ -68,6 +69,9 @@ def _train_or_find(job: TrainJob, stage: Stage, progress: Progress) -> TrainedSt
     # Computed before any scene is loaded, so that a finished stage is found within a second.
     origin = _digest_origin(job, stage, stage_scenes)
     if (folder / CHECKPOINT_FILE).is_file() and _is_finished(folder / CHECKPOINT_FILE, stage, origin):
+        # Someone may have deleted the weights after the last checkpoint, which still has them.
+        if not (weights.is_file() and weights.with_suffix(".json").is_file()):
+            _restore_weights(stage, folder)
         return TrainedStage(stage.name, str(weights), cached=True)
     initial = None if stage.initial_weights is None else job.stage_weights(stage.initial_weights)
     device = choose_device(job.device)
@@ -116,6 +120,13 @@ def _is_finished(path: Path, stage: Stage, origin: dict[str, str]) -> bool:
     # One that does not fit counts as unfinished: resuming it is what names the difference.
     fits = (described["config"], described["network"], described["origin"]) == (config, network, origin)
     return fits and described["done"] >= stage.config.steps
+
+
+def _restore_weights(stage: Stage, folder: Path) -> None:
+    """Writes the weights of a finished training from its checkpoint."""
+    network = initialise_network(stage.network, 0)
+    checkpoint.load_weights(network, folder / CHECKPOINT_FILE)
+    save_optimiser(network, folder / WEIGHTS_FILE)
 
 
 def _load_distance(stage: Stage, device: torch.device) -> ImageDistance | None:

@@ -93,7 +93,7 @@ class TrainJob:
             The weights' path.
 
         Raises:
-            InputError: the stage is not trained to its end.
+            InputError: the stage is not trained to its end, or its weights were deleted.
         """
         # Weights that ship were trained to their end, and have no checkpoint.
         if name.startswith(SHIPPED):
@@ -112,4 +112,9 @@ class TrainJob:
         steps = described["config"]["steps"]
         if done < steps:
             raise InputError(f"the stage {name} has made {done} of {steps} weight updates", remedy=remedy, file=path)
-        return folder / WEIGHTS_FILE
+        weights = folder / WEIGHTS_FILE
+        for file in (weights, weights.with_suffix(".json")):
+            # The command of the remedy takes them from the checkpoint.
+            if not file.is_file():
+                raise InputError(f"weights of the stage {name} are missing", remedy=remedy, file=file)
+        return weights

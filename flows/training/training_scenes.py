@@ -29,7 +29,7 @@ from genre_tasks.stages.ingest import ingest
 from genre_tasks.stages.initial import initial
 from storage.address import Address
 from storage.keys import digest_value
-from storage.store import Store
+from storage.store import Artifact, Store
 
 TRAINING_SEEDS = range(0, 900)
 """Seeds of the synthetic street (configs/seeds.yaml): no other may be used to train."""
@@ -217,9 +217,25 @@ def get_or_make(store: Store, address: Address, kind: str, make: Callable[[], An
         if (artifact := store.find(address)) is not None:
             return store.read(artifact)
     except ArtifactCorruptError:
-        # Only damage: an artifact of a newer version raises here, since it is not ours to remove.
-        store.discard(address)
+        if (artifact := _find_or_discard(store, address)) is not None:
+            return store.read(artifact)
     return store.read(store.commit(address, kind, make()))
+
+
+def _find_or_discard(store: Store, address: Address) -> Artifact | None:
+    """Looks a damaged artifact up again under its lease: another process may have repaired it; if not, it goes."""
+    with store.lease(address):
+        artifact = None
+        try:
+            artifact = store.find(address)
+            if artifact is not None:
+                # Not only verified: its codec may refuse what another version wrote.
+                store.read(artifact)
+            return artifact
+        except ArtifactCorruptError:
+            # Only damage: an artifact of a newer version raises here, since it is not ours to remove.
+            store.discard(artifact or address)
+            return None
 
 
 def ray_cast_true_views(log: DrivingLog, chunk: Chunk, recipe: SceneRecipe) -> FixedViews:

@@ -83,12 +83,14 @@ def repair_artifacts(
 def _discard_if_damaged(store: Store, address: Address) -> None:
     # A run may have computed it again since the store was read, which takes long.
     with store.lease(address):
+        artifact = None
         try:
             artifact = store.find(address)
             if artifact is not None:
                 store.verify(artifact)
         except ArtifactCorruptError:
-            store.discard(address)
+            # Just the one that was found: commits need no lease.
+            store.discard(artifact or address)
 
 
 def _explain(address: Address, records: list[dict[str, Any]]) -> str:

@@ -24,6 +24,8 @@ from genre_tasks.fixer.weights import trainable_state
 
 CHECKPOINT_FILE = "fixer.pt"
 AUTOENCODER_FILE = "autoencoder.pt"
+REMEDY = "Delete it to train again, or train into another folder."
+_STATE_FIELDS = ("settings", "weights", "average", "optimiser", "generator", "step", "losses")
 
 
 @dataclass
@@ -93,11 +95,11 @@ def restore_checkpoint(state: TrainingState, path: Path, settings: TrainingSetti
         origin: what else the training depends on: name → digest.
 
     Raises:
-        InputError: the checkpoint is of other settings, pairs or starting weights.
+        InputError: the checkpoint is of other settings, pairs or starting weights, or cannot be read.
     """
     if not path.exists():
         return
-    stored = torch.load(path, weights_only=True)
+    stored = _read(path, _STATE_FIELDS)
     _require_same_settings(stored["settings"], settings, path, tuple(settings.as_plain()))
     _require_same_origin(stored, origin, path)
     # Frozen weights are not in the checkpoint: they follow from the start, whose digest was compared.
@@ -117,9 +119,12 @@ def count_steps(path: Path) -> tuple[int, int]:
 
     Returns:
         Steps that are done, and all of them.
+
+    Raises:
+        InputError: the checkpoint cannot be read.
     """
     # Mapped, as most of a checkpoint is weights and moments.
-    stored = torch.load(path, weights_only=True, mmap=True)
+    stored = _read(path, ("settings", "step"), mmap=True)
     return int(stored["step"]), int(stored["settings"]["steps"])
 
 
@@ -155,12 +160,12 @@ def load_autoencoder(path: Path, settings: TrainingSettings, origin: Mapping[str
         ``None`` where there is no file.
 
     Raises:
-        InputError: it was trained with other settings or on other pairs.
+        InputError: it was trained with other settings or on other pairs, or cannot be read.
     """
     # Fixers of several inputs share the first part, which is the same for all of them.
     if not path.exists():
         return None
-    stored = torch.load(path, weights_only=True)
+    stored = _read(path, ("settings", "scale", "weights"))
     _require_same_settings(stored["settings"], settings, path, AUTOENCODER_SETTINGS)
     _require_same_origin(stored, origin, path)
     return TrainedAutoencoder(stored["scale"], stored["weights"])
@@ -188,6 +193,21 @@ def _write(document: dict[str, Any], path: Path) -> None:
     buffer = io.BytesIO()
     torch.save(document, buffer)
     write_atomically(path, buffer.getvalue())
+
+
+def _read(path: Path, fields: Sequence[str], mmap: bool = False) -> dict[str, Any]:
+    try:
+        stored = torch.load(path, weights_only=True, mmap=mmap)
+    except Exception as error:  # what torch raises of a damaged file has no common class
+        # The file may be sound: torch has no class for a lack of memory either.
+        if isinstance(error, MemoryError) or "alloc" in str(error):
+            raise
+        # Not torch's text, which recommends to let the file run code.
+        detail = f": {error.strerror}" if isinstance(error, OSError) and error.strerror else ""
+        raise InputError(f"the checkpoint cannot be read{detail}", remedy=REMEDY, file=path) from error
+    if not isinstance(stored, dict) or not set(fields) <= stored.keys():
+        raise InputError("the file is no checkpoint of this training", remedy=REMEDY, file=path)
+    return stored
 
 
 def _require_same_settings(

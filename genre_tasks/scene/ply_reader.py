@@ -36,6 +36,10 @@ _TYPES = {
     "float64": "<f8",
 }
 _COLORS = ("red", "green", "blue")
+_MAX_BYTE = 255
+_MAX_SHORT = 65535
+# Colours in [0, 1] that a program computed may exceed 1 a little; bytes up to 2 would be a black cloud.
+_MAX_UNIT_FLOAT = 2.0
 # Comments may be long, but no program writes more of them.
 _MAX_HEADER_BYTES = 1 << 18
 _MAX_COUNT_DIGITS = 18
@@ -49,12 +53,12 @@ def read_ply(path: str | Path) -> tuple[Float64, NDArray[np.uint8] | None]:
         path: of the file.
 
     Returns:
-        Positions [P, 3] float64, and colours [P, 3] uint8, ``None`` without them. Colours that are stored as floats are
-        taken to be in [0, 1].
+        Positions [P, 3] float64, and colours [P, 3] uint8, ``None`` without them. Their range in the file follows from
+        the largest of them: to 255 or to 65535 for integers, to 1 or to 255 for floats.
 
     Raises:
-        InputError: the file cannot be read, is no such PLY file, has no vertices, or a vertex is not finite; with the
-            file and, where there is one, the line.
+        InputError: the file cannot be read, is no such PLY file, has no vertices, a vertex is not finite, or colours
+            are in no such range; with the file and, where there is one, the line.
     """
     file = Path(path)
     try:
@@ -72,12 +76,28 @@ def read_ply(path: str | Path) -> tuple[Float64, NDArray[np.uint8] | None]:
     # Missing colours are no error: the images can colour the points.
     if not set(_COLORS) <= set(header.columns):
         return positions, None
-    colors = np.stack([table[c] for c in _COLORS], 1)
-    # Files from 3DGS tools have colours as floats.
-    if header.columns["red"] in ("<f4", "<f8"):
-        # Rounded, because the cast below truncates.
-        colors = np.round(colors.clip(0, 1) * 255)
-    return positions, colors.clip(0, 255).astype(np.uint8)
+    return positions, _scale_to_bytes(np.stack([table[c] for c in _COLORS], 1), file)
+
+
+def _scale_to_bytes(colors: NDArray, file: Path) -> NDArray[np.uint8]:
+    """Brings colours [P, 3] of any type into [0, 255]."""
+    if not np.isfinite(colors).all():
+        raise InputError("colours of vertices are not finite", remedy=_REMEDY, file=file)
+    is_float = colors.dtype.kind == "f"
+    largest = colors.max()
+    if largest > (_MAX_BYTE if is_float else _MAX_SHORT):
+        remedy = "Write colours as uchar from 0 to 255, as ushort from 0 to 65535, or as float from 0 to 1."
+        raise InputError(f"a colour is {largest:g}, and no known range has it", remedy=remedy, file=file)
+    # Programs that come from 3DGS write floats up to 1, others floats up to 255.
+    if is_float and largest <= _MAX_UNIT_FLOAT:
+        # In the file's precision, and rounded, because the cast below truncates.
+        colors = np.round(colors.clip(0, 1) * _MAX_BYTE)
+    elif is_float:
+        colors = np.round(colors)
+    # PDAL writes the 16-bit colours of LAS as they are.
+    elif largest > _MAX_BYTE:
+        colors = np.round(colors * (_MAX_BYTE / _MAX_SHORT))
+    return colors.clip(0, _MAX_BYTE).astype(np.uint8)
 
 
 def check_ply_header(path: str | Path) -> int:

@@ -27,6 +27,8 @@ _PAYLOAD = re.compile(
 )
 # More threads gain little, and a server that is slow already gets slower by them.
 _THREADS = 4
+_digested: dict[Path, tuple[str, int, int, int]] = {}
+"""Files of caches that this process has found sound: their sha256, and what the system changes when one is altered."""
 
 
 class Payloads:
@@ -120,7 +122,7 @@ class Payloads:
         Args:
             artifact: the artifact; its files come into ``artifact.path``.
             entries: of the files that are needed.
-            trusts_cache: whether a file of the right size counts as present, as it was digested when it came.
+            trusts_cache: whether a file that this process has digested counts as present until it is written to.
 
         Raises:
             ArtifactCorruptError: a file is missing or altered.
@@ -128,7 +130,7 @@ class Payloads:
             TransientIOError: the store does not answer.
         """
         folder = artifact.path
-        missing = [entry for entry in entries if not _is_cached(folder, entry, trusts_cache)]
+        missing = [entry for entry in entries if not _is_cached(folder / entry.path, entry, trusts_cache)]
         if missing:
             folder.mkdir(parents=True, exist_ok=True)
             # At first, so that no other process makes room here while the files come.
@@ -217,11 +219,17 @@ def _describe_damage(entry: FileEntry, digest: str, size: int) -> str | None:
     return None if digest == entry.sha256 else "A file does not have the sha256 of the manifest"
 
 
-def _is_cached(folder: Path, entry: FileEntry, trusts_cache: bool) -> bool:
-    path = folder / entry.path
-    if not trusts_cache:
-        return find_damage(path, entry) is None
+def _is_cached(path: Path, entry: FileEntry, trusts_cache: bool) -> bool:
     try:
-        return path.stat().st_size == entry.size
+        status = path.lstat()
     except FileNotFoundError:
         return False
+    # Taken before the digest: a file that is altered meanwhile is digested once more.
+    stamp = (entry.sha256, status.st_ino, status.st_mtime_ns, status.st_ctime_ns)
+    # Not the size alone, which a damaged disk or an editor may keep.
+    if trusts_cache and _digested.get(path) == stamp:
+        return True
+    if find_damage(path, entry) is not None:
+        return False
+    _digested[path] = stamp
+    return True

@@ -120,6 +120,15 @@ class StoreSuite:
         assert list(store.artifacts()) == []
         assert self.commit(store, "evaluation").address == one.address
 
+    def test_an_artifact_that_was_replaced_is_not_discarded(self, store: Store) -> None:
+        old = self.commit(store, "evaluation", warnings=("old",))
+        store.discard(old)
+        new = self.commit(store, "evaluation", warnings=("new",))
+        store.discard(old)
+        found = store.find(address())
+        assert found is not None and found.manifest == new.manifest
+        store.verify(found)
+
     def test_artifacts_filters(self, store: Store) -> None:
         places = [
             ("evaluate/gnet", KEY, 0),

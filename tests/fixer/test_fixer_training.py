@@ -10,6 +10,7 @@ import torch
 from genre_tasks.errors import InputError, NonFiniteError
 from genre_tasks.fixer.architectures import small_architecture
 from genre_tasks.fixer.training import train
+from genre_tasks.fixer.training_checkpoint import count_steps
 from genre_tasks.fixer.training_settings import TrainingSettings
 from tests.fixer.test_fixer_pairs import some_pairs
 
@@ -102,6 +103,27 @@ def test_a_training_on_other_pairs_or_from_other_weights_is_not_taken_for_this_o
         train(other, further, tmp_path / "further", distance, start=first)
     with pytest.raises(InputError, match=r"other starting weights \(file .*fixer\.pt"):
         train(pairs, further, tmp_path / "further", distance, start=again)
+
+
+@pytest.mark.parametrize("name", ["fixer.pt", "autoencoder.pt"])
+@pytest.mark.parametrize("damage", ["empty", "cut", "text", "other"])
+def test_a_damaged_checkpoint_is_named_with_a_remedy(tmp_path, name, damage):
+    train(some_pairs(), SETTINGS, tmp_path, distance, architecture=TOY)
+    path = tmp_path / name
+    data = path.read_bytes()
+    if damage == "other":
+        torch.save({"weights": {}}, path)
+    else:
+        path.write_bytes({"empty": b"", "cut": data[: len(data) // 2], "text": b"no checkpoint"}[damage])
+    with pytest.raises(InputError, match=rf"checkpoint .*{name}\)\. Delete it to train again"):
+        train(some_pairs(), SETTINGS, tmp_path, distance, architecture=TOY)
+
+
+def test_steps_of_a_damaged_checkpoint_are_not_counted(tmp_path):
+    path = tmp_path / "fixer.pt"
+    path.write_bytes(b"no checkpoint")
+    with pytest.raises(InputError, match=r"the checkpoint cannot be read .*fixer\.pt"):
+        count_steps(path)
 
 
 def test_pairs_smaller_than_a_crop_are_refused(tmp_path):

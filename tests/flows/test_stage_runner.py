@@ -15,7 +15,9 @@ from flows.pipeline.log_cache import cached_log
 from flows.pipeline.stage_runner import ArtifactRef, Job, compute_key, run_stage
 from genre_tasks.code_closure import import_closure
 from genre_tasks.config import EffectsConfig, EvaluateConfig, PipelineConfig
-from genre_tasks.errors import InputError, ResourceError
+from genre_tasks.errors import ArtifactCorruptError, InputError, ResourceError
+from storage.local import LocalStore
+from storage.store import Artifact
 from tests.faults.small_run import LOG, SETTINGS
 
 EARLY = ("ingest", "effects", "initial")
@@ -145,6 +147,29 @@ def test_a_damaged_file_is_found_named_and_computed_again(store: Path, damage: s
     assert cached(again) == {"ingest": True, "effects": True, "initial": False}
     assert ("stray.bin" if damage == "add" else file.name) in again["initial"].note
     assert again["initial"].payload_digest == refs["initial"].payload_digest
+
+
+def test_a_repair_leaves_what_another_process_has_computed_meanwhile(
+    store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ref = run(job(store), *EARLY)["initial"]
+    sorted((store / str(ref.address)).glob("*.parquet"))[0].write_bytes(b"else")
+    verify = LocalStore.verify
+    replaced: list[ArtifactRef] = []
+
+    def verify_slowly(opened: LocalStore, artifact: Artifact) -> None:
+        try:
+            verify(opened, artifact)
+        except ArtifactCorruptError:
+            # After this one found the damage, and before it does anything, another one has repaired it.
+            monkeypatch.setattr(LocalStore, "verify", verify)
+            replaced.append(run(job(store), *EARLY)["initial"])
+            raise
+
+    monkeypatch.setattr(LocalStore, "verify", verify_slowly)
+    again = run(job(store), *EARLY)["initial"]
+    assert [made.cached for made in replaced] == [False] and again.cached
+    assert replaced[0].note and not again.note
 
 
 def test_out_of_memory_becomes_a_resource_error() -> None:

@@ -25,12 +25,16 @@ from flows.training.stage_scenes import list_stage_scenes
 from flows.training.train_job import TrainJob
 from flows.training.training_scenes import SceneRecipe, build_training_scene, prepare_scene
 from genre_tasks.config import LossConfig
-from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.errors import ArtifactCorruptError, ConfigError, InputError
 from genre_tasks.learned.meta_training import MetaConfig
 from genre_tasks.learned.network import NetworkConfig
 from genre_tasks.learned.weights import load_optimiser
 from genre_tasks.optimiser.tuned_adam import GNET_LEARNING_RATES
 from storage.files import digest_file
+from storage.local import LocalStore
+from storage.store import Artifact
+from tests.contracts.store_suite import address
+from tests.storage.artifact_values import assert_same, make
 
 SMALL = "&frames=8&cameras=1&width=32&height=18&lidar_beams=16&lidar_azimuths=150"
 NETWORK = NetworkConfig(hidden=8, channels=(4, 6), rates=GNET_LEARNING_RATES.as_tuple())
@@ -151,6 +155,19 @@ def test_a_stopped_stage_resumes_to_the_same_bytes(trained: Trained, tmp_path: P
     assert [{**row, "seconds": 0} for row in curves[0]] == [{**row, "seconds": 0} for row in curves[1]]
 
 
+@pytest.mark.parametrize("name", ["weights.safetensors", "weights.json"])
+def test_deleted_weights_come_from_the_checkpoint(trained: Trained, tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "again"
+    shutil.copytree(trained[0], folder)
+    (folder / "gnet/only" / name).unlink()
+    with pytest.raises(InputError, match=r"weights of the stage gnet/only are missing .*--stage gnet/only"):
+        train_stage(TrainJob(str(folder), "tiny"), TABLE[2])
+    again = train_network("gnet", str(folder), "tiny")
+    assert again["stages"] == [("enet/3dgs", True), ("gnet/only", True)]
+    for file in (folder / "gnet/only" / name, folder / f"gnet{Path(name).suffix}"):
+        assert digest_file(file) == digest_file(trained[0] / "gnet/only" / name)
+
+
 def test_a_checkpoint_of_another_training_is_refused(trained: Trained, tmp_path: Path) -> None:
     folder = tmp_path / "other"
     shutil.copytree(trained[0], folder)
@@ -268,3 +285,31 @@ def test_an_unsound_scene_is_made_anew(trained: Trained, tmp_path: Path) -> None
     file.write_bytes(before[:-9] + b"x" + before[-8:])
     stage_scenes.make_scene_artifacts(job, recipe, stage_scenes.list_scene_uses(TABLE, None)[recipe])
     assert file.read_bytes() == before
+
+
+def test_a_repair_leaves_what_another_training_has_made_meanwhile(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    store = LocalStore(tmp_path)
+    damaged = store.commit(address(), "evaluation", make("evaluation"))
+    (damaged.path / "metrics.parquet").write_bytes(b"else")
+    verify = LocalStore.verify
+
+    def verify_slowly(opened: LocalStore, artifact: Artifact) -> None:
+        try:
+            verify(opened, artifact)
+        except ArtifactCorruptError:
+            monkeypatch.setattr(LocalStore, "verify", verify)
+            store.commit(address(), "evaluation", make("evaluation", 1))
+            raise
+
+    def refuse() -> None:
+        raise AssertionError("nothing is left to make")
+
+    monkeypatch.setattr(LocalStore, "verify", verify_slowly)
+    found = training_scenes.get_or_make(store, address(), "evaluation", refuse)
+    assert_same(make("evaluation", 1), found, "evaluation")
+    # What nobody has repaired is made again.
+    (damaged.path / "metrics.parquet").write_bytes(b"else")
+    again = training_scenes.get_or_make(store, address(), "evaluation", lambda: make("evaluation", 2))
+    assert_same(make("evaluation", 2), again, "evaluation")

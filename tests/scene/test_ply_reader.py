@@ -76,3 +76,43 @@ def test_errors_name_file_and_line(tmp_path: Path, old: str, new: str, match: st
 def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot read the point file"):
         read_ply(tmp_path / "none.ply")
+
+
+def _write_colors(folder: Path, kind: str, values: list[tuple[object, ...]]) -> Path:
+    lines = "\n".join(f"0 0 0 {' '.join(map(str, value))}" for value in values)
+    header = ASCII.partition("1.5")[0].replace("property uchar", f"property {kind}")
+    return _write(folder, header.replace("vertex 2", f"vertex {len(values)}") + lines + "\n")
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "expected"),
+    [
+        ("ushort", [(65535, 32896, 0), (257, 128, 514)], [[255, 128, 0], [1, 0, 2]]),
+        ("int", [(65535, 32896, 0), (257, -1, 514)], [[255, 128, 0], [1, 0, 2]]),
+        # Bytes that were written in a wide column.
+        ("ushort", [(255, 128, 0)], [[255, 128, 0]]),
+        ("float", [(1.0, 0.5, 0.0)], [[255, 128, 0]]),
+        # A little above 1 is still a colour in [0, 1].
+        ("float", [(1.02, 0.5, -0.1)], [[255, 128, 0]]),
+        ("double", [(255, 127.6, 0), (1, 2, 3)], [[255, 128, 0], [1, 2, 3]]),
+    ],
+)
+def test_the_range_of_colours_follows_from_the_largest(
+    tmp_path: Path, kind: str, values: list[tuple[object, ...]], expected: list[list[int]]
+) -> None:
+    _, colors = read_ply(_write_colors(tmp_path, kind, values))
+    assert colors is not None and colors.dtype == np.uint8 and colors.tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("kind", "largest", "match"),
+    [
+        ("float", 65535.0, r"a colour is 65535, .*Write colours as uchar from 0 to 255"),
+        ("uint", 70000, r"a colour is 70000, .*Write colours as uchar"),
+        ("float", "nan", "colours of vertices are not finite"),
+    ],
+)
+def test_colours_in_no_known_range_are_refused(tmp_path: Path, kind: str, largest: object, match: str) -> None:
+    with pytest.raises(InputError, match=match) as caught:
+        read_ply(_write_colors(tmp_path, kind, [(0, largest, 0)]))
+    assert caught.value.file is not None

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from genre_tasks import image_memory
-from genre_tasks.errors import ResourceError
+from genre_tasks.errors import DiskFullError, ResourceError
 from genre_tasks.image_memory import allocate_images, hold_images_on_disk
 
 LARGE = (8, 1024, 1024, 3)  # 96 MiB
@@ -58,14 +58,47 @@ def test_small_tensors_and_those_of_other_devices_stay_where_they_are(
         assert allocate_images(*LARGE, device="meta").device.type == "meta"
 
 
-def test_a_full_disk_is_a_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])
+def test_a_full_disk_is_a_clear_error_that_is_not_retried(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int
+) -> None:
     def fill_up(*arguments: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr(os, "posix_fallocate", fill_up, raising=False)
-    with hold_images_on_disk(tmp_path), pytest.raises(ResourceError, match=r"no space for 96 MiB.*Free some space"):
+    with hold_images_on_disk(tmp_path), pytest.raises(DiskFullError, match=r"no space for 96 MiB.*Free some space"):
         allocate_images(*LARGE)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_other_faults_of_the_disk_may_be_retried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def run_out_of_handles(*arguments: object) -> None:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    monkeypatch.setattr(os, "posix_fallocate", run_out_of_handles, raising=False)
+    with hold_images_on_disk(tmp_path), pytest.raises(ResourceError, match="96 MiB of images cannot be put") as caught:
+        allocate_images(*LARGE)
+    assert not isinstance(caught.value, DiskFullError)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="the system reserves no blocks")
+def test_a_process_that_is_killed_while_blocks_are_reserved_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reserve = os.posix_fallocate
+    names: list[list[Path]] = []
+
+    def look_around(handle: int, offset: int, size: int) -> None:
+        names.append(list(tmp_path.iterdir()))
+        reserve(handle, offset, size)
+
+    monkeypatch.setattr(os, "posix_fallocate", look_around)
+    with hold_images_on_disk(tmp_path):
+        images = allocate_images(*LARGE)
+    assert names == [[]]
+    # Mapped all the same: it can be written to its end.
+    assert images.fill_(0.5).sum() == 0.5 * images.numel()
 
 
 def test_a_folder_that_is_gone_is_a_clear_error(tmp_path: Path) -> None:

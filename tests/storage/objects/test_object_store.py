@@ -7,6 +7,9 @@ from typing import Any
 
 import pytest
 
+from storage import manifest_writer
+from storage.manifest import FileEntry
+from storage.objects import payloads
 from storage.objects.object_store import ObjectStore
 from storage.opening import open_store
 from tests.contracts.store_suite import StoreSuite
@@ -35,3 +38,25 @@ class TestObjectStore(StoreSuite):
     @pytest.fixture(autouse=True)
     def reach_bucket(self, store: ObjectStore) -> None:
         self._bucket = store._bucket
+
+    def test_an_altered_file_of_the_cache_is_fetched_again(self, store: ObjectStore) -> None:
+        made = self.commit(store, "evaluation")
+        file = made.path / "metrics.parquet"
+        sound = file.read_bytes()
+        # Of the same size, as a damaged disk leaves it.
+        file.write_bytes(sound[:-1] + bytes([sound[-1] ^ 4]))
+        assert (store.fetch(made, ".parquet") / file.name).read_bytes() == sound
+
+    def test_a_file_of_the_cache_is_digested_once(self, store: ObjectStore, monkeypatch: pytest.MonkeyPatch) -> None:
+        made = self.commit(store, "evaluation")
+        digested: list[str] = []
+
+        def find_damage(path: Path, entry: FileEntry) -> str | None:
+            digested.append(entry.path)
+            return manifest_writer.find_damage(path, entry)
+
+        monkeypatch.setattr(payloads, "find_damage", find_damage)
+        for _ in range(2):
+            # As every command opens it.
+            open_store(store.uri).fetch(made)
+        assert sorted(digested) == sorted(entry.path for entry in made.manifest.files)

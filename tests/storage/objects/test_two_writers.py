@@ -90,16 +90,6 @@ def test_a_repair_replaces_no_artifact_of_another(store: ObjectStore, monkeypatc
     assert_same(make("evaluation", 1), store.read(late), "evaluation")
 
 
-def test_an_artifact_that_was_replaced_is_not_discarded(store: ObjectStore) -> None:
-    old = store.commit(address(), "evaluation", make("evaluation"), Provenance(warnings=("old",)))
-    store.discard(old)
-    new = store.commit(address(), "evaluation", make("evaluation"), Provenance(warnings=("new",)))
-    store.discard(old)
-    found = store.find(address())
-    assert found is not None and found.manifest == new.manifest
-    store.verify(found)
-
-
 def test_a_file_that_does_not_belong_goes_at_the_repair(store: ObjectStore) -> None:
     made = store.commit(address(), "evaluation", make("evaluation"))
     (info,) = [info for info in store._bucket.list(str(address())) if info.name.endswith("metrics.parquet")]
