@@ -58,7 +58,7 @@ def cost(
     check_output_folder(out, "--out", ("cost.parquet", "cost_cells.parquet", "cost.png", "cost.md"))
     chunk_numbers = parse_numbers(chunks, "--chunks")
     seed_numbers = parse_numbers(seeds, "--seeds")
-    knob_names = None if knobs is None else knobs.split(",")
+    knob_names = None if knobs is None else [name.strip() for name in knobs.split(",")]
     sweep = Sweep(preset, tuple(settings or ()), store)
     # Mistakes in the request show here, before Prefect's server takes seconds to start.
     cells = SweepRequest(sweep, logs, chunk_numbers, seed_numbers, knob_names).cells()

@@ -10,6 +10,7 @@ import typer
 
 from flows.cli.options import SceneStageOption, StoreOption
 from flows.defaults import DEFAULT_STORE
+from flows.simulators.service import MAX_QUEUE
 
 if TYPE_CHECKING:
     from flows.simulators.image_request import RenderLimits
@@ -33,7 +34,10 @@ def serve(
     stage: SceneStageOption = None,
     max_width: Annotated[int, typer.Option(help="Widest image that a client may ask for, pixels.")] = 1920,
     max_height: Annotated[int, typer.Option(help="Highest image that a client may ask for, pixels.")] = 1280,
-    queue: Annotated[int, typer.Option(help="How many requests may wait; further ones are refused as busy.")] = 16,
+    queue: Annotated[
+        int,
+        typer.Option(help=f"How many requests may wait, at most {MAX_QUEUE}; further ones are refused as busy."),
+    ] = 16,
     metrics_port: Annotated[
         int | None, typer.Option(help="Port with counters for Prometheus. No counters if not given.")
     ] = None,
@@ -58,7 +62,7 @@ def serve(
     check_number(0 if metrics_port is None else metrics_port, "--metrics-port", 0, _MAX_PORT)
     check_number(max_width, "--max-width", 1, _MAX_SIDE_PX)
     check_number(max_height, "--max-height", 1, _MAX_SIDE_PX)
-    check_number(queue, "--queue", 0, 10_000)
+    check_number(queue, "--queue", 0, MAX_QUEUE)
     open_existing_store(store)
     start_service = load_protocol(protocol)
     from flows.simulators.image_request import RenderLimits

@@ -18,6 +18,7 @@ from flows.pipeline.stage_runner import ArtifactRef, Job, read_artifact, run_sta
 from genre_tasks.config import PipelineConfig
 from genre_tasks.temporary_names import temporary_folder
 from genre_tasks.threads import torch_threads
+from storage.opening import is_remote
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class Sweep:
         config = cell.setting.configuration(self.preset, self.settings, cell.seed)
         threads = cell.setting.threads
         # A shared store would hand a cell the seconds of another number of threads.
-        store = f"{self.store.rstrip('/')}-threads-{threads}" if threads else self.store
+        store = _name_threads_store(self.store, threads) if threads else self.store
         return Job(cell.where.log, cell.where.chunk, store, config.model_dump(mode="json"))
 
     def reference_job(self, cell: Cell) -> Job:
@@ -77,6 +78,18 @@ class Sweep:
             cell: its chunk, seed and number of threads are kept.
         """
         return self.job(Cell(cell.where, cell.seed, Setting(PRESET_ITSELF, "", threads=cell.setting.threads)))
+
+
+def _name_threads_store(store: str, threads: int) -> str:
+    """Names the store of a number of threads.
+
+    >>> _name_threads_store("stores/main/", 2), _name_threads_store("s3://bucket", 2)
+    ('stores/main-threads-2', 's3://bucket/.threads-2')
+    """
+    place = store.rstrip("/")
+    # Beside a bucket is another bucket, which may be anyone's. Hidden, as a store passes over such folders: it would
+    # take the artifacts of a store within it for its own that were moved.
+    return f"{place}/.threads-{threads}" if is_remote(store) else f"{place}-threads-{threads}"
 
 
 def list_cells(places: Sequence[LogChunk], seeds: Sequence[int], settings: Sequence[Setting]) -> list[Cell]:

@@ -128,13 +128,11 @@ def _plot_guards(axes: Axes, reliable_range: ReliableRange) -> None:
     curves = {
         "shown": ([point.shown - on_path.shown for point in points], -limits.max_hidden),
         "thin": ([point.thin - on_path.thin for point in points], limits.max_thin),
-        "floating": ([point.floating - on_path.floating for point in points], 0.0),
+        "floating": ([point.floating - on_path.floating for point in points], limits.max_floating),
     }
     for name, (values, limit) in curves.items():
         (line,) = axes.plot(shifts, values, "o-", label=name)
-        # What floats has no limit of its own: it is shown, as a reader may want to know it.
-        if limit:
-            axes.axhline(limit, color=line.get_color(), linestyle=":")
+        axes.axhline(limit, color=line.get_color(), linestyle=":")
     # NaN without a detector, and without any actor in view.
     if math.isfinite(on_path.detected):
         axes.plot(shifts, [p.detected - on_path.detected for p in points], "s--", color="0.4", label="detected")

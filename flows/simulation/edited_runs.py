@@ -158,7 +158,8 @@ def write_edited_run(store: str, run: str, edits: EditList, config: SimulateConf
         config: of re-simulation; ``None``: the run's.
 
     Returns:
-        The new run's record, with ``edited``: the recorded run and all edits.
+        The new run's record, with ``edited``: the recorded run and all edits. It lacks the chunks that the recorded
+        run lacks, and has its budget.
 
     Raises:
         InputError: there is no such run or actor, or an artifact is gone.
@@ -182,9 +183,13 @@ def write_edited_run(store: str, run: str, edits: EditList, config: SimulateConf
         differs={key: (before, after) for key, (before, after) in record["differs"].items()},
         chunks=chunks,
         notes=dict.fromkeys(chunks, f"the traffic of run {record['run']} is edited"),
+        # Edits bring no chunk back that could not be reconstructed.
+        left_out=record.get("left_out", ()),
     )
-    edited = {"run": record["run"], "edits": named.model_dump(mode="json")}
-    return write_run_record(finished, summarise_run(finished), {"edited": edited})
+    # The scenes are those that the budget's choices made, whatever was asked for.
+    extra = {name: record[name] for name in ("budget",) if name in record}
+    extra["edited"] = {"run": record["run"], "edits": named.model_dump(mode="json")}
+    return write_run_record(finished, summarise_run(finished), extra)
 
 
 def _name_source_run(store: str, edit: Edit) -> Edit:

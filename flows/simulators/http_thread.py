@@ -14,8 +14,9 @@ from genre_tasks.errors import ResourceError
 # A command has to end within seconds of a signal.
 _SECONDS_TO_END = 3
 _SECONDS_TO_START = 30.0
-# A request of the largest size may be read at each of them.
-_MAX_CONNECTIONS = 64
+# Beside those that wait: clients that are refused with a sentence, and connections that are open without a request. A
+# request of the largest size may be read at each.
+_FURTHER_CONNECTIONS = 48
 
 
 class HttpThread:
@@ -25,13 +26,14 @@ class HttpThread:
         app: the application.
         host: address to listen at.
         port: 0: any free one.
+        max_waiting: requests that the application lets wait. Far more connections are refused before it hears of them.
 
     Raises:
         ConfigError: the address cannot be listened at.
         ResourceError: the server does not start.
     """
 
-    def __init__(self, app: Any, host: str, port: int) -> None:
+    def __init__(self, app: Any, host: str, port: int, max_waiting: int) -> None:
         self._socket = bind_socket(host, port)
         name, bound_port = self._socket.getsockname()[:2]
         self._address = f"http://[{name}]:{bound_port}" if ":" in name else f"http://{name}:{bound_port}"
@@ -40,7 +42,7 @@ class HttpThread:
             log_config=None,
             access_log=False,
             lifespan="off",
-            limit_concurrency=_MAX_CONNECTIONS,
+            limit_concurrency=max_waiting + _FURTHER_CONNECTIONS,
             timeout_graceful_shutdown=_SECONDS_TO_END,
         )
         self._server = uvicorn.Server(config)

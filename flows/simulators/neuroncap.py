@@ -5,11 +5,11 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Awaitable, Callable
-from typing import Literal
+from typing import Literal, TypeVar, TypeVarTuple
 
 import numpy as np
+from anyio import CapacityLimiter, to_thread
 from starlette.applications import Starlette
-from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
@@ -34,12 +34,16 @@ from genre_tasks.errors import ConfigError, GenreError, InputError, ResourceErro
 MAX_BODY_BYTES = 64 * 2**20
 """Of one request: a thousand actors over twenty seconds take less, at some 300 bytes a pose."""
 
+# Beside those that wait and render: requests that are read, refused or answered without a render.
+_FURTHER_THREADS = 24
 _REFUSED_FORMAT = 406
 _TOO_LARGE = 413
 _UNFIT = 422
 _FAULT = 500
 _BUSY = 503
 
+T = TypeVar("T")
+Arguments = TypeVarTuple("Arguments")
 Handler = Callable[[Request], Awaitable[Response]]
 
 
@@ -114,6 +118,8 @@ class NeuroncapApp:
         self._renderer = renderer
         self._metrics = metrics
         self._state = ActorState(renderer)
+        # The usual forty threads would all wait in a longer queue, and its end would hear nothing.
+        self._threads = CapacityLimiter(renderer.limits.max_waiting + _FURTHER_THREADS)
 
     def build(self) -> Starlette:
         """Makes the application that a server runs."""
@@ -143,7 +149,7 @@ class NeuroncapApp:
         return JSONResponse(round(self._renderer.time_range_s[0] * MICROSECONDS))
 
     async def _get_actors(self, request: Request) -> Response:
-        return JSONResponse(await run_in_threadpool(write_trajectories, self._state.trajectories))
+        return JSONResponse(await self._run(write_trajectories, self._state.trajectories))
 
     async def _update_actors(self, request: Request) -> Response:
         body = await _read_body(request)
@@ -151,12 +157,16 @@ class NeuroncapApp:
         def update() -> None:
             self._state.replace_all(parse_trajectories(body))
 
-        await run_in_threadpool(update)
+        await self._run(update)
         return JSONResponse(None)
 
     async def _render_image(self, request: Request) -> Response:
         body = await _read_body(request)
-        return await run_in_threadpool(self._answer_image, body)
+        return await self._run(self._answer_image, body)
+
+    async def _run(self, function: Callable[[*Arguments], T], *arguments: *Arguments) -> T:
+        """Calls a function in a thread, so that other requests are answered meanwhile."""
+        return await to_thread.run_sync(function, *arguments, limiter=self._threads)
 
     def _answer_image(self, body: bytes) -> Response:
         message = parse_image(body)
@@ -184,7 +194,8 @@ def start_neuroncap(request: ServiceRequest) -> RunningService:
             remedy="Name one run, and start a service for each at a --port of its own.",
         )
     (renderer,) = request.renderers.values()
-    return HttpThread(NeuroncapApp(renderer, request.metrics).build(), request.host, request.port)
+    app = NeuroncapApp(renderer, request.metrics).build()
+    return HttpThread(app, request.host, request.port, renderer.limits.max_waiting)
 
 
 async def _guard(handler: Handler, request: Request) -> Response:

@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from flows.simulators.service_metrics import ServiceMetrics
 
 
+MAX_QUEUE = 256
+"""At most so many requests may wait: each takes a thread and a connection, and a process may open some 1000 files."""
+
+
 @dataclass(frozen=True)
 class ServiceRequest:
     """What a service is started with.

@@ -20,6 +20,8 @@ from genre_tasks.scene.transforms import shift_laterally
 MAX_OFFSET_M = 6.0
 FRUSTA: tuple[Frusta, ...] = ("this frame", "all frames", "none")
 _LOOK_AHEAD_M = 10.0
+_NO_CAMERA = "none"
+_NO_PIXELS = np.zeros((1, 1, 3), np.uint8)
 _RANGE_WAITS = "The reliable range is being computed, which takes a minute once."
 
 
@@ -167,13 +169,14 @@ class ClientSession:
 
     def _add_drive(self, viewed: ViewedChunk) -> None:
         gui = self._client.gui
-        with gui.add_folder("Drive along"):
+        # Without an image there is no camera to drive along with, and nothing to show.
+        self._drive_folder = gui.add_folder("Drive along", visible=bool(viewed.images))
+        with self._drive_folder:
             hint = "The camera follows the recorded path; frusta are hidden."
             self.drive = gui.add_checkbox("Drive along", False, hint=hint)
             self.offset = gui.add_slider("Metres to the left", -MAX_OFFSET_M, MAX_OFFSET_M, 0.25, 0.0)
-            cameras = viewed.camera_names
-            self.camera = gui.add_dropdown("Camera", cameras, initial_value=cameras[0])
-            self._image = gui.add_image(viewed.images[0].pixels, label="Recorded")
+            self.camera = gui.add_dropdown("Camera", viewed.camera_names or (_NO_CAMERA,))
+            self._image = gui.add_image(viewed.images[0].pixels if viewed.images else _NO_PIXELS, label="Recorded")
         for control in (self.drive, self.offset, self.camera):
             self._on_update(control, self._change_drive)
 
@@ -189,6 +192,8 @@ class ClientSession:
 
     def _follow(self) -> None:
         image = self._find_image()
+        if image is None:
+            return
         self._image.image = image.pixels
         if not self.drive.value:
             return
@@ -203,11 +208,11 @@ class ClientSession:
         camera.look_at = pose[:3, 3] + _LOOK_AHEAD_M * pose[:3, 2]
         camera.up_direction = -pose[:3, 1]
 
-    def _find_image(self) -> CameraImage:
+    def _find_image(self) -> CameraImage | None:
         viewed = self.drawing.viewed
         frame = viewed.frames[self.drawing.row]
         images = [image for image in viewed.images if image.camera == self.camera.value]
-        return min(images, key=lambda image: (abs(image.frame - frame), image.frame))
+        return min(images, key=lambda image: (abs(image.frame - frame), image.frame), default=None)
 
     def _add_visibility(self, viewed: ViewedChunk) -> None:
         gui = self._client.gui

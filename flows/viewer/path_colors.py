@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from flows.viewer.path_drawing import list_image_frames
 from genre_tasks.logs.types import Float32
 from genre_tasks.progress import Progress, silent
 from genre_tasks.render.api import build_cameras, compute_view_colors, render
@@ -57,7 +58,7 @@ def measure_path_colors(
         Weights and colours. A Gaussian that no view shows has weight 0 and the colour that the first view would see.
 
     Raises:
-        ValueError: the chunk has no views.
+        ValueError: the chunk has no images.
     """
     views = _select_views(chunk, shifts_m)
     if not views:
@@ -82,9 +83,11 @@ def measure_path_colors(
 
 def _select_views(chunk: Chunk, shifts_m: Sequence[float]) -> tuple[NovelView, ...]:
     per_frame = max(1, len(chunk.camera_names) * len(shifts_m))
-    count = min(len(chunk.frames), max(2, _MAX_VIEWS // per_frame))
-    rows = np.unique(np.linspace(0, len(chunk.frames) - 1, count).round().astype(int))
-    views = place_novel_views(chunk, shifts_m, frames=[chunk.frames[row] for row in rows])
+    # Cameras may be slower than the log's frames, and a frame without an image has no view.
+    frames = list_image_frames(chunk)
+    count = min(len(frames), max(2, _MAX_VIEWS // per_frame))
+    rows = np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))
+    views = place_novel_views(chunk, shifts_m, frames=[frames[row] for row in rows])
     # Small images tell the same weights, in a fraction of the time.
     return tuple(replace(v, lens=v.lens.resized_to_width(min(v.lens.width_px, _MAX_WIDTH_PX))) for v in views)
 

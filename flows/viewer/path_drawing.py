@@ -121,11 +121,23 @@ def _box_bottoms(poses: Float64, height_m: float) -> Float64:
     return np.asarray(poses[:, :3, 3] - 0.5 * height_m * poses[:, :3, 2])
 
 
+def list_image_frames(chunk: Chunk) -> tuple[int, ...]:
+    """Lists the frames at which some camera has an image.
+
+    Args:
+        chunk: its cameras may be slower than its frames.
+
+    Returns:
+        Log frames, in order.
+    """
+    return tuple(sorted({view.frame for view in chunk.views}))
+
+
 def select_image_frames(frames: tuple[int, ...]) -> tuple[int, ...]:
     """Selects the frames whose recorded images are shown.
 
     Args:
-        frames: of a chunk.
+        frames: of a chunk, those with images.
 
     >>> select_image_frames((3, 4, 5)), len(select_image_frames(tuple(range(200))))
     ((3, 4, 5), 20)
@@ -141,12 +153,13 @@ def collect_images(chunk: Chunk) -> tuple[CameraImage, ...]:
         chunk: whose images.
 
     Returns:
-        Images in the order of frames and cameras, at the frames of :func:`select_image_frames`.
+        Images in the order of frames and cameras, at the frames of :func:`select_image_frames`; none where the chunk
+        has none.
 
     Raises:
         InputError: an image cannot be decoded.
     """
-    selected = set(select_image_frames(chunk.frames))
+    selected = set(select_image_frames(list_image_frames(chunk)))
     return tuple(_read_image(view) for view in chunk.views if view.frame in selected)
 
 

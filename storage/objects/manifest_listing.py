@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import PurePosixPath
 
+from genre_tasks.errors import GenreError, InputError, TransientIOError
 from storage.manifest import MANIFEST
 from storage.objects.bucket import Bucket, ObjectInfo
 from storage.objects.payloads import find_payload_owner
@@ -66,15 +67,35 @@ class ManifestListing:
             InputError: the store must not be read.
             TransientIOError: the store does not answer.
         """
+        for info, data in self.try_read_all(infos):
+            if isinstance(data, GenreError):
+                raise data
+            yield info, data
+
+    def try_read_all(self, infos: Iterable[ObjectInfo]) -> Iterator[tuple[ObjectInfo, bytes | GenreError]]:
+        """Reads manifests; one that cannot be read does not keep those after it from being read.
+
+        Args:
+            infos: from :meth:`find`.
+
+        Yields:
+            The manifests' objects with their contents or why they cannot be read, in the order of the artifacts' paths.
+        """
         # A listing is in the order of bytes, in which "-" comes before "/".
         ordered = sorted(infos, key=lambda info: PurePosixPath(info.name).parts)
         with ThreadPoolExecutor(_MANIFESTS_AT_ONCE) as pool:
             for start in range(0, len(ordered), 4 * _MANIFESTS_AT_ONCE):
                 some = ordered[start : start + 4 * _MANIFESTS_AT_ONCE]
-                for info, data in zip(some, pool.map(self._read, some), strict=True):
+                for info, data in zip(some, pool.map(self._try_read, some), strict=True):
                     # One that is gone was discarded after the listing.
                     if data is not None:
                         yield info, data
+
+    def _try_read(self, info: ObjectInfo) -> bytes | GenreError | None:
+        try:
+            return self._read(info)
+        except (InputError, TransientIOError) as error:
+            return error
 
     def _read(self, info: ObjectInfo) -> bytes | None:
         tag = hashlib.sha256(f"{info.name} {info.e_tag}".encode()).hexdigest()

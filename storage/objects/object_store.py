@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from genre_tasks.cache_folder import find_cache_folder
-from genre_tasks.errors import ArtifactCorruptError, ConfigError, GenreError, TransientIOError
+from genre_tasks.errors import ArtifactCorruptError, ConfigError, GenreError, InputError, TransientIOError
 from genre_tasks.progress import Progress, silent
 from genre_tasks.temporary_names import describe_owner
 from storage.address import Address
@@ -207,15 +207,18 @@ class ObjectStore:
 
         Yields:
             (relative path, what is wrong with it or ``None``).
+
+        Raises:
+            InputError: the store must not be listed.
+            TransientIOError: the store does not answer.
         """
-        for info, data in self._manifests.read_all(self._manifests.find()):
+        for info, data in self._manifests.try_read_all(self._manifests.find()):
             name = info.name.removesuffix(f"/{MANIFEST}")
-            try:
-                artifact = self._make_artifact(None, data, info.name)
-                self._payloads.verify(artifact, reads_all=True)
-                yield name, None
-            except ArtifactCorruptError as error:
-                yield name, error
+            error = self._find_fault(info.name, data)
+            yield name, error
+            if isinstance(error, TransientIOError):
+                # One object may be away for itself. A server that is away must not be waited for at every artifact.
+                self.exists()
 
     def clean_temporaries(self, older_than_s: float = 3600.0, everywhere: bool = False) -> int:
         """Removes this machine's temporary folders, payloads without a manifest, and leases that nobody renews.
@@ -237,6 +240,16 @@ class ObjectStore:
         finally:
             self._bucket.delete([probe])
         return removed + len(old)
+
+    def _find_fault(self, name: str, data: bytes | GenreError) -> GenreError | None:
+        """What is wrong with an artifact, or why it cannot be read; ``data`` is what came of its manifest."""
+        if isinstance(data, GenreError):
+            return data
+        try:
+            self._payloads.verify(self._make_artifact(None, data, name), reads_all=True)
+        except (ArtifactCorruptError, InputError, TransientIOError) as error:
+            return error
+        return None
 
     def _write_probe(self) -> str:
         name = f"{PROBE_START}{describe_owner()}-{uuid.uuid4().hex}"

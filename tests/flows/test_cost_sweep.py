@@ -178,6 +178,13 @@ def test_a_number_of_threads_has_a_store_beside_the_store(tmp_path: Path) -> Non
     cell = Cell(LogChunk(LOG, 0), 0, Setting("threads", "1", threads=1))
     # A shell completes the name of a folder with a slash.
     assert Sweep("demo", (), f"{tmp_path}/store/").job(cell).store == f"{tmp_path}/store-threads-1"
+    assert Sweep("demo", (), f"file://{tmp_path}/store").job(cell).store == f"file://{tmp_path}/store-threads-1"
+
+
+@pytest.mark.parametrize("uri", ["s3://bucket", "s3://bucket/", "s3://bucket/prefix"])
+def test_a_number_of_threads_stays_in_the_bucket(uri: str) -> None:
+    cell = Cell(LogChunk(LOG, 0), 0, Setting("threads", "2", threads=2))
+    assert Sweep("demo", (), uri).job(cell).store == f"{uri.rstrip('/')}/.threads-2"
 
 
 def test_the_command_lists_what_it_would_run_and_refuses_what_it_does_not_know(tmp_path: Path) -> None:
@@ -185,6 +192,8 @@ def test_the_command_lists_what_it_would_run_and_refuses_what_it_does_not_know(t
     done = CliRunner().invoke(app, told, terminal_width=200)
     assert done.exit_code == 0, done.output
     assert "fixer=off" in done.output and "minutes" in done.output
+    spaced = CliRunner().invoke(app, [*told, "--knobs", " views, fixer"], terminal_width=200)
+    assert spaced.exit_code == 0 and "fixer=off" in spaced.output and "views=6" in spaced.output
     with pytest.raises(ConfigError, match="--seeds"):
         CliRunner().invoke(app, ["cost", LOG, "--seeds", "one"], catch_exceptions=False)
 

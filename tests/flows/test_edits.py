@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from flows.reconstruction.chunk_configuration import read_chunk_config
+from flows.reconstruction.left_out import record_failures
+from flows.reconstruction.rewritten_report import read_finished_run
+from flows.reconstruction.run_records import find_run_record, summarise_run, write_run_record
 from flows.simulation.edit_file import parse_edit_options, read_edit_file
-from genre_tasks.errors import ConfigError
-from genre_tasks.scene_edits.actor_names import resolve_actor
+from flows.simulation.edited_runs import write_edited_run
+from flows.simulation.run_scenes import RunScenes
+from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.scene_edits.actor_names import name_actors, resolve_actor
 from genre_tasks.scene_edits.edits import Insert, Move, Remove, Retime, Rotate, ScaleSpeed
 from tests.flows.command_line import genre
+from tests.flows.small_simulation import make_run
 
 ALL_KINDS = """
 edits:
@@ -136,6 +144,23 @@ def test_mistakes_in_options_are_named(option: str, text: str, message: str) -> 
     with pytest.raises(ConfigError) as caught:
         parse_edit_options(**{option: [text]})
     assert message in str(caught.value)
+
+
+def test_an_edited_run_has_the_gaps_and_the_budget_of_its_source(tmp_path: Path) -> None:
+    store = str(tmp_path)
+    whole = read_finished_run(store, find_run_record(store, make_run(tmp_path)))
+    failure = InputError("the chunk has no image", remedy="Choose others with --chunks.", chunk=2)
+    partly = replace(whole, left_out=record_failures(whole.log, {2: failure}))
+    chosen = {"chunk": 1, "settings": ["gnet.iterations=1"], "choices": []}
+    budget = {"budget_s": 60.0, "used_s": 50.0, "chunks": [chosen]}
+    source = write_run_record(partly, summarise_run(partly), {"budget": budget})
+    car = name_actors(RunScenes(store, source["run"]))["car-0"]
+    written = write_edited_run(store, source["run"], parse_edit_options(remove=[car]))
+    edited = find_run_record(store, written["run"])
+    assert edited["status"] == source["status"] == "partly_done" and edited["edited"]["run"] == source["run"]
+    assert [entry["chunk"] for entry in edited["left_out"]] == [2]
+    assert edited["left_out"] == source["left_out"] and "no image" in Path(edited["report"]).read_text()
+    assert read_chunk_config(edited, 1).gnet.iterations == 1 != read_chunk_config(edited, 0).gnet.iterations
 
 
 def test_commands_say_what_is_missing(tmp_path: Path) -> None:

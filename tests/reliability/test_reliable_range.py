@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
+from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
 from flows.cli.main import app
@@ -18,7 +19,7 @@ from flows.configuration import load_configuration
 from flows.pipeline.definition import STAGE_BY_NAME
 from flows.pipeline.log_cache import cached_log
 from flows.pipeline.stage_runner import ArtifactRef, Job, run_stage
-from flows.reconstruction.reliable_range import write_range
+from flows.reconstruction.reliable_range import _plot_guards, write_range
 from flows.reconstruction.run_records import (
     FinishedRun,
     summarise_run,
@@ -174,6 +175,16 @@ def test_every_shift_is_rendered_on_both_sides(chunk: Chunk, scene: SceneGraph, 
     rows = pq.read_table(table)
     assert rows.num_rows == 10 and rows.schema.metadata[b"left_m"] == f"{found.left_m:.3f}".encode()
     assert picture.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_the_picture_has_every_limit_that_ends_the_range() -> None:
+    limits = RangeConfig(shifts_m=(1.0,), max_hidden=0.2, max_thin=0.03, max_floating=0.05)
+    found = find_reliable_range([view(0.0, 30.0), view(1.0, 30.0, floating=0.1), view(-1.0, 30.0)], limits)
+    assert found.left_m == pytest.approx(0.5)
+    axes = Figure().subplots()
+    _plot_guards(axes, found)
+    drawn = {line.get_ydata()[0] for line in axes.get_lines() if line.get_linestyle() == ":"}
+    assert drawn == {-0.2, 0.03, 0.05}
 
 
 def test_the_command_answers_for_a_finished_run(finished: FinishedRun, tmp_path: Path) -> None:

@@ -7,7 +7,12 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
+import time
+import urllib.error
 import urllib.request
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -15,9 +20,12 @@ from typer.testing import CliRunner
 
 from flows.cli.main import app
 from flows.simulators import protocols
+from flows.simulators.image_request import RenderLimits
+from flows.simulators.neuroncap import start_neuroncap
 from flows.simulators.protocols import ProtocolEntry, load_protocol
-from flows.simulators.service import bind_socket, is_loopback
-from flows.simulators.service_metrics import PrometheusMetrics
+from flows.simulators.scene_renderer import SceneRenderer
+from flows.simulators.service import ServiceRequest, bind_socket, is_loopback
+from flows.simulators.service_metrics import PrometheusMetrics, SilentMetrics
 from genre_tasks.errors import ConfigError, GenreError, InputError
 from tests.flows.command_line import GENRE, environment
 
@@ -61,6 +69,47 @@ def test_a_service_answers_until_a_signal(number: signal.Signals, served: tuple[
         read(f"{address}/alive")
 
 
+def ask_for_image(address: str, message: bytes) -> tuple[int, Mapping[str, str], bytes]:
+    request = urllib.request.Request(f"{address}/render_image", message)
+    try:
+        with urllib.request.urlopen(request, timeout=60) as answer:
+            return answer.status, answer.headers, answer.read()
+    except urllib.error.HTTPError as error:
+        return error.code, error.headers, error.read()
+
+
+def test_as_many_requests_wait_as_the_queue_takes(served: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    # More than a thread pool of 40 and 64 connections would let wait.
+    renderer = SceneRenderer(*served, limits=RenderLimits(max_waiting=70))
+    release = threading.Event()
+    render = renderer._render
+    monkeypatch.setattr(renderer, "_render", lambda requests: release.wait(60) and render(requests))
+    camera = renderer.cameras["front_camera"]
+    pose = renderer.ego_trajectory()[1][2] @ camera.rig_SE3_camera
+    timestamp = round(renderer.ego_trajectory()[0][2] * 1e6)
+    fields = {"pose": pose.tolist(), "timestamp": timestamp, "camera_name": camera.name, "image_format": "png"}
+    message = json.dumps(fields).encode()
+    service = start_neuroncap(ServiceRequest({renderer.name: renderer}, "127.0.0.1", 0, SilentMetrics()))
+    try:
+        with ThreadPoolExecutor(71) as pool:
+            asked = [pool.submit(ask_for_image, service.address, message) for _ in range(71)]
+            deadline = time.monotonic() + 30
+            while renderer.queue_length < 71 and time.monotonic() < deadline:
+                time.sleep(0.02)
+            try:
+                assert renderer.queue_length == 71
+                status, headers, body = ask_for_image(service.address, message)
+                assert read(f"{service.address}/alive") == "true"
+            finally:
+                # Also after a failure: the pool waits for all that were asked.
+                release.set()
+        assert (status, headers["Retry-After"]) == (503, "1")
+        assert "70 requests wait, and 70 may" in json.loads(body)["detail"]
+        assert {answer.result()[0] for answer in asked} == {200}
+    finally:
+        service.close()
+
+
 def refusal(*words: str) -> GenreError:
     error = CliRunner().invoke(app, ["serve", *words]).exception
     assert isinstance(error, GenreError)
@@ -72,6 +121,7 @@ def test_mistakes_are_named(served: tuple[str, str]) -> None:
     assert "Did you mean 'neuroncap'" in str(refusal(run, "--store", store, "--protocol", "neuroncp"))
     assert "--port 70000 is out of range" in str(refusal(run, "--store", store, "--port", "70000"))
     assert "--max-width 0 is out of range" in str(refusal(run, "--store", store, "--max-width", "0"))
+    assert "--queue 257 is out of range" in str(refusal("nosuchrun", "--store", store, "--queue", "257"))
     assert isinstance(refusal("nosuchrun", "--store", store, "--port", "0"), InputError)
     assert isinstance(refusal(run, "--store", store, "--port", "0", "--stage", "enet"), InputError)
     with socket.create_server(("127.0.0.1", 0)) as taken:

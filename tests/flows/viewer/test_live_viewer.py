@@ -10,6 +10,7 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -19,7 +20,7 @@ from typer.testing import CliRunner
 from flows.cli.main import app
 from flows.viewer.client_session import ClientSession, _describe_chunk
 from flows.viewer.live_viewer import LiveViewer
-from flows.viewer.local_server import find_free_port
+from flows.viewer.local_server import find_free_port, start_server, stop_server
 from flows.viewer.viewed_chunks import ViewedRun
 from genre_tasks.errors import ConfigError, InputError
 from tests.browser import needs_browser, open_page
@@ -50,6 +51,21 @@ def viewer() -> Iterator[tuple[LiveViewer, MadeUpRun]]:
 def only_session(viewer: LiveViewer) -> ClientSession:
     (session,) = viewer.sessions.values()
     return session
+
+
+def test_a_chunk_without_images_is_shown_without_their_panel() -> None:
+    server = start_server("127.0.0.1", 0, "test")
+    # What a session asks of a client, without a browser.
+    client = SimpleNamespace(gui=server.gui, scene=server.scene, atomic=server.atomic, camera=SimpleNamespace())
+    try:
+        for images in ((), make_viewed().images):
+            viewed = replace(make_viewed(), images=images)
+            session = ClientSession(cast(Any, client), cast(ViewedRun, MadeUpRun()), viewed, with_range=False)
+            session.frame.value = 5
+            assert session.drawing.row == 5
+            assert session._drive_folder.visible == bool(images)
+    finally:
+        stop_server(server)
 
 
 def set_value(control: Any, value: Any) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from flows.simulation.stored_ranges import SideRange
-from flows.viewer.path_drawing import ABOVE_GROUND_M, PathDrawing, draw_path, measure_fov
+from flows.viewer.path_drawing import ABOVE_GROUND_M, PathDrawing, collect_images, draw_path, measure_fov
 from genre_tasks.config import IngestConfig
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.types import Lens
@@ -47,6 +49,16 @@ def test_the_path_lies_on_the_ground() -> None:
         assert place[2] - ABOVE_GROUND_M == pytest.approx(np.percentile(near, 10), abs=0.1)
     assert np.allclose(np.einsum("fi,fi->f", drawing.left, ego[:, :3, 0]), 0, atol=0.05)
     assert np.allclose(np.linalg.norm(drawing.left, axis=1), 1)
+
+
+def test_images_are_taken_where_there_are_some() -> None:
+    log = "synthetic:street?seed=900&frames=6&cameras=1&width=64&height=36&lidar_beams=32&lidar_azimuths=300&samples=1"
+    chunk = ingest(IngestConfig(width_px=64, height_px=36, chunk_frames=6), open_log(log), 0)
+    # Evenly spread over all frames, the rows up to here are even ones.
+    views = tuple(replace(view, frame=2 * view.frame + 1) for view in chunk.views)
+    sparse = replace(chunk, frames=tuple(range(40)), views=views)
+    assert [image.frame for image in collect_images(sparse)] == [1, 3, 5, 7, 9, 11]
+    assert collect_images(replace(sparse, views=())) == ()
 
 
 def test_the_field_of_view_is_the_lens_s() -> None:

@@ -139,6 +139,16 @@ def test_weights_are_the_pixels_that_gaussians_fill(scene: SceneGraph, chunk: Ch
     assert np.array_equal(measured.colors, np.clip(scene.gaussians.colors.numpy(), 0, 1))
 
 
+def test_the_path_is_seen_where_there_are_images(scene: SceneGraph, chunk: Chunk) -> None:
+    # Of six cameras and three shifts, few frames are taken: evenly spread over all of them, none would be frame 3.
+    views = tuple(replace(view, role="source") for view in chunk.views if view.frame == 3)
+    sparse = replace(chunk, views=views, camera_names=("front", "back", "left", "right", "near", "far"))
+    weights = measure_path_colors(scene, sparse, shifts_m=(0.0, -3.0, 3.0)).weights
+    with torch.no_grad():
+        rendered = render_views(scene, place_novel_views(sparse, (0.0, -3.0, 3.0), frames=(3,)))
+    assert weights.sum() == pytest.approx(float(rendered.alpha.sum()), rel=1e-3)
+
+
 def test_a_gaussian_behind_a_wall_counts_for_nothing(scene: SceneGraph, chunk: Chunk) -> None:
     view = place_novel_views(chunk, (0.0,), frames=chunk.frames[:1])[0]
     means = scene.gaussians.means.clone()

@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 
 from flows.operations import ObjectServer
-from genre_tasks.errors import InputError, TransientIOError
+from genre_tasks.errors import ArtifactCorruptError, InputError, TransientIOError
 from storage.local import LocalStore
+from storage.manifest import MANIFEST
 from storage.objects.bucket import Bucket
 from storage.objects.object_lease import LEASES_FOLDER
 from storage.objects.object_store import ObjectStore
@@ -66,6 +67,32 @@ def test_every_other_request_fails(store: ObjectStore, proxy: FaultyProxy, tmp_p
     assert_same(value, store.read(found), "novel_views", COLORS)
     assert [error for _, error in store.verify_all()] == [None]
     assert list(store._bucket.list(LEASES_FOLDER)) == []
+
+
+@pytest.mark.parametrize("part", ["manifest.json", "metrics.parquet"])
+def test_an_object_that_cannot_be_read_hides_no_other(store: ObjectStore, proxy: FaultyProxy, part: str) -> None:
+    keys = [f"{k:064d}" for k in range(3)]
+    made = [store.commit(address(key=key), "evaluation", make("evaluation")) for key in keys]
+    store._bucket.write(f"{made[2].address}/{MANIFEST}", b"damaged")
+    body = '<?xml version="1.0"?>\n<Error><Code>AccessDenied</Code></Error>'
+    denied = Fault(status=403, text=body)
+    proxy.choose = lambda method, path: denied if keys[0] in path and path.endswith(part) else SOUND
+    errors = {name.rpartition("/")[2]: error for name, error in store.verify_all()}
+    assert [type(errors[key]) for key in keys] == [InputError, type(None), ArtifactCorruptError]
+
+
+def test_a_store_that_is_away_ends_its_check_at_once(
+    store: ObjectStore, proxy: FaultyProxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for k in range(3):
+        store.commit(address(key=f"{k:064d}"), "evaluation", make("evaluation"))
+    monkeypatch.setenv("GENRE_STORE_RETRY_SECONDS", "1")
+    checked = store.verify_all()
+    assert next(checked)[1] is None
+    proxy.choose = lambda method, path: Fault(refuses=True)
+    assert isinstance(next(checked)[1], TransientIOError)
+    with pytest.raises(TransientIOError):
+        next(checked)
 
 
 def test_a_store_that_is_away_for_a_while_loses_nothing(store: ObjectStore, proxy: FaultyProxy) -> None:

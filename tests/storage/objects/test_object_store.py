@@ -26,6 +26,15 @@ class TestObjectStore(StoreSuite):
         monkeypatch.setenv("GENRE_CACHE_DIR", str(tmp_path / "other-cache"))
         return open_store(store.uri)
 
+    def test_a_store_in_a_hidden_folder_is_no_part_of_it(self, store: ObjectStore) -> None:
+        inner = open_store(f"{store.uri}/.threads-2")
+        made = self.commit(inner, "evaluation")
+        self.commit(store, "evaluation")
+        assert [found.path != made.path for found in store.artifacts()] == [True]
+        assert [error for _, error in store.verify_all()] == [None]
+        store.clean_temporaries(older_than_s=-60, everywhere=True)
+        inner.verify(made)
+
     def damage(self, artifact: Any, name: str) -> None:
         bucket = self._bucket
         (info,) = [i for i in bucket.list(str(artifact.address)) if i.name.endswith(f"/{name}")]

@@ -15,7 +15,9 @@ import pytest
 from flows.simulators.alpasim import common_pb2, sensorsim_pb2
 from flows.simulators.alpasim.server import SensorServer
 from flows.simulators.alpasim.start import start_alpasim
+from flows.simulators.image_request import RenderLimits
 from flows.simulators.protocols import load_protocol
+from flows.simulators.scene_renderer import SceneRenderer
 from flows.simulators.service import ServiceRequest
 from genre_tasks.errors import ConfigError, ResourceError
 from tests.flows.simulators.alpasim.wire_client import ServedRun, WireClient
@@ -88,6 +90,31 @@ def test_a_service_of_runs_is_started_and_counts_images(served: ServedRun) -> No
     service.close()
     assert metrics.images == 3
     assert metrics.counts["batch_render_rgb", "OK"] == 1
+
+
+def test_as_many_calls_wait_as_the_queue_takes(served: ServedRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    renderer = SceneRenderer(served.store, served.run, limits=RenderLimits(max_waiting=80))
+    release = threading.Event()
+    render = renderer._render
+    monkeypatch.setattr(renderer, "_render", lambda requests: release.wait(60) and render(requests))
+    service = start_alpasim(ServiceRequest({renderer.name: renderer}, "127.0.0.1", 0, CountingMetrics()))
+    try:
+        with WireClient(service.address) as client, ThreadPoolExecutor(81) as pool:
+            payload = client.image_request().SerializeToString()
+            calls = [pool.submit(client.status, "render_rgb", payload) for _ in range(81)]
+            deadline = time.monotonic() + 30
+            while renderer.queue_length < 81 and time.monotonic() < deadline:
+                time.sleep(0.02)
+            try:
+                assert renderer.queue_length == 81
+                status, details = client.status("render_rgb", payload)
+            finally:
+                # Also after a failure: the pool waits for all that were asked.
+                release.set()
+            assert {call.result()[0] for call in calls} == {"OK"}
+        assert status == "RESOURCE_EXHAUSTED" and "80 requests wait, and 80 may" in details
+    finally:
+        service.close()
 
 
 def test_genre_serve_knows_the_protocol() -> None:
