@@ -8,9 +8,12 @@ from contextlib import contextmanager
 
 from genre_tasks.errors import ResourceError
 
+# One for the process: renderers of several runs share its cores and its memory.
+_RENDER_LOCK = threading.Lock()
+
 
 class RenderQueue:
-    """Lets one caller after the other render, and refuses those that would wait too long.
+    """Lets one caller of the process after the other render, and refuses those that would wait too long.
 
     Args:
         max_waiting: calls that may wait while another one is rendered.
@@ -24,7 +27,6 @@ class RenderQueue:
     def __init__(self, max_waiting: int) -> None:
         self._max_waiting = max_waiting
         self._count_lock = threading.Lock()
-        self._render_lock = threading.Lock()
         self._count = 0
 
     @property
@@ -47,7 +49,7 @@ class RenderQueue:
                 )
             self._count += 1
         try:
-            with self._render_lock:
+            with _RENDER_LOCK:
                 yield
         finally:
             with self._count_lock:

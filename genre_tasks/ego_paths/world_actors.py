@@ -60,8 +60,11 @@ class WorldActor:
         """
         nearest = np.rint(frames).astype(np.int64)
         index = np.clip(np.searchsorted(self.frames, nearest), 0, len(self.frames) - 1)
-        first = np.maximum(index - 1, 0)
-        last = np.minimum(index + 1, len(self.frames) - 1)
+        before = np.maximum(index - 1, 0)
+        after = np.minimum(index + 1, len(self.frames) - 1)
+        # Across a gap there is no motion, see ``ActorNode.motion``.
+        first = np.where(self.frames[before] == nearest - 1, before, index)
+        last = np.where(self.frames[after] == nearest + 1, after, index)
         span = np.maximum(self.frames[last] - self.frames[first], 1)
         center = self.world_SE3_box[:, :3, 3]
         heading = np.unwrap(np.arctan2(self.world_SE3_box[:, 1, 0], self.world_SE3_box[:, 0, 0]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -12,7 +13,7 @@ from genre_tasks.lidar_simulation.lidar_surfaces import LidarSurfaces
 from genre_tasks.lidar_simulation.sensor import LidarSensor, estimate_sensor, to_ego_axes
 from genre_tasks.lidar_simulation.simulate_sweep import LidarModel, SimulatedSweep, simulate_sweep
 from genre_tasks.lidar_simulation.sweep_pattern import SweepPattern, build_pattern
-from genre_tasks.logs.types import DrivingLog, Float64
+from genre_tasks.logs.types import DrivingLog, Float64, Sweep
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene_edits.chunk_scene import ChunkScene
 
@@ -43,13 +44,13 @@ class LidarSimulator:
 
     @cached_property
     def sensor(self) -> LidarSensor:
-        """Where the sensor sits, by the first sweep.
+        """Where the sensor sits, by the first sweep that can be read.
 
         Raises:
             InputError: the log has no sweep.
         """
         # One by one, as reading a sweep may take long.
-        sweeps = (self._log.sweep(frame) for frame in range(self._log.frame_count))
+        sweeps = (self._read_sweep(frame) for frame in self._frames)
         sweep = next((sweep for sweep in sweeps if sweep is not None), None)
         if sweep is None:
             raise self._describe_no_sweep()
@@ -68,10 +69,10 @@ class LidarSimulator:
             Its rays.
 
         Raises:
-            InputError: the log has no sweep, or that one cannot be read.
+            InputError: the log has no sweep.
         """
         # The nearest first: sequences may lack sweeps.
-        for candidate in sorted(range(self._log.frame_count), key=lambda known: abs(known - frame)):
+        for candidate in sorted(self._frames, key=lambda known: abs(known - frame)):
             pattern = self._read_pattern(candidate)
             if pattern is not None:
                 return pattern
@@ -104,21 +105,40 @@ class LidarSimulator:
         )
 
     def _build_pattern(self, frame: int) -> SweepPattern | None:
-        sweep = self._log.sweep(frame)
+        sweep = self._read_sweep(frame)
         if sweep is None:
             return None
         points = to_ego_axes(sweep, self._times_s, self._poses)
-        offsets = sweep.timestamps_s - self._times_s[frame]
+        offsets = sweep.timestamps_s - self._times_s[self._frames.index(frame)]
         return build_pattern(points, offsets, sweep.intensity.astype(np.float64), self.sensor)
+
+    def _read_sweep(self, frame: int) -> Sweep | None:
+        # One that cannot be read is as good as none: reconstruction went on without it, too.
+        with suppress(InputError):
+            return self._log.sweep(frame)
+        return None
 
     def _describe_no_sweep(self) -> InputError:
         problem = "the log has no LiDAR sweep, whose rays a simulated one could have"
         return InputError(problem, remedy="Simulate without lidar.", log=self._log.uri)
 
     @cached_property
+    def _path(self) -> list[tuple[int, float, Float64]]:
+        """Frame, seconds and pose, of frames that have both."""
+        path = []
+        for frame in range(self._log.frame_count):
+            with suppress(InputError):
+                path.append((frame, self._log.frame_timestamp_s(frame), self._log.world_SE3_lidar(frame)))
+        return path
+
+    @cached_property
+    def _frames(self) -> list[int]:
+        return [frame for frame, _, _ in self._path]
+
+    @cached_property
     def _times_s(self) -> Float64:
-        return np.array([self._log.frame_timestamp_s(frame) for frame in range(self._log.frame_count)])
+        return np.array([time_s for _, time_s, _ in self._path])
 
     @cached_property
     def _poses(self) -> Float64:
-        return np.stack([self._log.world_SE3_lidar(frame) for frame in range(self._log.frame_count)])
+        return np.stack([pose for _, _, pose in self._path])

@@ -77,9 +77,10 @@ def estimate_rig(chunks: Sequence[Chunk]) -> tuple[RigCamera, ...]:
         rig.append(
             RigCamera(
                 name=name,
-                lens=views[0][1].lens,
+                lens=max((view.lens for _, view in views), key=lambda lens: any(lens.distortion)),
                 ego_SE3_camera=compose_se3(rotation, stacked[:, :3, 3].mean(0)),
                 # Plans are made for each chunk: where the vehicle is slow, a shutter is left out as it does nothing.
+                # So is the distortion of a camera without source images.
                 readout_s=max(0.0 if view.shutter is None else view.shutter.readout_s for _, view in views),
                 exposure_s=max(0.0 if view.blur is None else view.blur.exposure_s for _, view in views),
             )

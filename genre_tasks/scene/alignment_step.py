@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from genre_tasks.logs.brown_conrady import distort, distortion_jacobian
 from genre_tasks.logs.types import Float32, Float64, Lens
 from genre_tasks.scene.chunk import View
+from genre_tasks.scene.lens_distortion import fold_radius
 from genre_tasks.scene.transforms import invert_se3
 from genre_tasks.threads import map_single_threaded, multiply_transposed, torch_threads
 
@@ -143,13 +144,16 @@ def project_points(points: Float64, pose: Float64, lens: Lens) -> tuple[Float64,
     z = np.where(local[:, 2] > _NEAR_M, local[:, 2], np.inf)
     x: Float64 = local[:, 0] / z
     y: Float64 = local[:, 1] / z
+    inside = np.isfinite(z)
     if any(lens.distortion):
+        # Rays beyond would be folded back into the image.
+        inside &= x * x + y * y < fold_radius(lens.coefficients) ** 2
         bent = distort(x, y, lens.coefficients)
         x, y = bent[0].astype(np.float64), bent[1].astype(np.float64)
     # Half a pixel: an index is that of a pixel's centre.
     u = x * lens.fx_px + lens.cx_px - 0.5
     v = y * lens.fy_px + lens.cy_px - 0.5
-    inside = np.isfinite(z) & (u > _BORDER_PX) & (u < lens.width_px - _BORDER_PX - 1)
+    inside &= (u > _BORDER_PX) & (u < lens.width_px - _BORDER_PX - 1)
     inside &= (v > _BORDER_PX) & (v < lens.height_px - _BORDER_PX - 1)
     return local, u, v, inside
 

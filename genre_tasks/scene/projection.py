@@ -106,9 +106,9 @@ def splat_depth(projected: Projected, lens: Lens, footprint_m: float, max_radius
 
     Args:
         projected: points in the image of ``lens``.
-        lens: of the depth map.
+        lens: of the depth map. Where its pixels are no squares, those of the points are as wide as high in the world.
         footprint_m: half the side of a point's square; at least one pixel.
-        max_radius_px: half the side of the largest square.
+        max_radius_px: half the width of the largest square.
 
     Returns:
         Nearest depth of each pixel [H, W] float32 metres, ∞ where there is no point.
@@ -125,8 +125,15 @@ def splat_depth(projected: Projected, lens: Lens, footprint_m: float, max_radius
         # By torch: NumPy's ``minimum.at`` gives the same in thirty times the time.
         depth = torch.from_numpy(projected.depth[chosen])
         torch.from_numpy(out).view(-1).scatter_reduce_(0, torch.from_numpy(pixel[chosen]), depth, "amin")
-        out = _spread_minimum(_spread_minimum(out).T).T
+        for _ in range(_count_rows(size, lens) - _count_rows(size - 1, lens)):
+            out = _spread_minimum(out)
+        out = _spread_minimum(out.T).T
     return out
+
+
+def _count_rows(columns: int, lens: Lens) -> int:
+    """How many rows a square reaches above and below its centre that reaches so many columns to the sides."""
+    return max(1, round(columns * lens.fy_px / lens.fx_px)) if columns else 0
 
 
 def _spread_minimum(depth: Float32) -> Float32:

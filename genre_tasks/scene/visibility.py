@@ -105,8 +105,12 @@ def color_point_clouds(
 
 
 def occlusion_lens(lens: Lens) -> Lens:
-    """Gives the lens of the depth maps that decide on occlusion: the same view at a fixed width."""
-    return lens.resized_to_width(_BUFFER_WIDTH_PX)
+    """Gives the lens of the depth maps that decide on occlusion: the same view at a fixed width, with square pixels.
+
+    Images of a rig of several shapes are stretched, and squares in them would hide what lies farther along the road.
+    """
+    height = _BUFFER_WIDTH_PX * lens.height_px / lens.width_px * lens.fx_px / lens.fy_px
+    return lens.resized(_BUFFER_WIDTH_PX, max(1, round(height)))
 
 
 def find_visible_points(points: Float32, view: View) -> tuple[NDArray[np.int64], Float32, Float32]:

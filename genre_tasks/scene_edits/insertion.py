@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from genre_tasks.ego_paths.ego_path import EgoPath
@@ -78,6 +79,17 @@ def _upright(yaw: Float64, normal: Float64) -> Float64:
     return np.asarray(Rotation.from_rotvec(tilt).as_matrix() @ level, np.float64)
 
 
+def _find_distinct(places: Float64) -> NDArray[np.bool_]:
+    # Which of the places [P, 2] are away from the last such place: a standing vehicle jitters, which is no way.
+    found = np.zeros(len(places), bool)
+    last = np.full(2, np.inf)
+    for k, place in enumerate(places):
+        if not np.linalg.norm(place - last) < _MIN_STEP_M:
+            found[k] = True
+            last = place
+    return found
+
+
 class _PathLine:
     # The recorded path as a line, by its length; straight on at both ends.
 
@@ -85,12 +97,10 @@ class _PathLine:
         self._frames = path.frames
         places = path.world_SE3_ego[:, :2, 3]
         forward = path.world_SE3_ego[:, :2, 0]
-        steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
-        # A standing vehicle jitters, which is no way.
-        steps[steps < _MIN_STEP_M] = 0.0
-        self._length_of_frame = np.concatenate([[0.0], np.cumsum(steps)])
-        distinct = np.concatenate([[True], steps > 0])
-        self._length = self._length_of_frame[distinct]
+        distinct = _find_distinct(places)
+        steps = np.linalg.norm(np.diff(places[distinct], axis=0), axis=1)
+        self._length = np.concatenate([[0.0], np.cumsum(steps)])
+        self._length_of_frame = self._length[np.cumsum(distinct) - 1]
         self._places = places[distinct]
         self._yaw = np.unwrap(np.arctan2(forward[distinct, 1], forward[distinct, 0]))
 

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from genre_tasks.ego_paths.frame_clock import FrameClock
 from genre_tasks.logs.types import Float64
+from genre_tasks.scene.actor_track import MOST_GAP_FRAMES
 from genre_tasks.scene.transforms import interpolate_pose
 from genre_tasks.scene_edits.edits import ActorChange
 from genre_tasks.scene_edits.ground import Ground
@@ -115,8 +116,8 @@ def change_trajectory(recorded: Trajectory, change: ActorChange, clock: FrameClo
     """Changes the path of an actor.
 
     With a delay an actor exists at its recorded frames and at the delayed ones. Before its path begins and after it
-    ends the actor drives straight on; one that stands there stands. Delays and speeds count the seconds of pauses of
-    the recording too.
+    ends the actor drives straight on; one that stands there stands. In long gaps of its recording it is absent. Delays
+    and speeds count the seconds of pauses of the recording too.
 
     Args:
         recorded: at least one pose.
@@ -139,6 +140,9 @@ def change_trajectory(recorded: Trajectory, change: ActorChange, clock: FrameClo
         times_s = clock.find_times(frames) - float(change.delay_s)
         if change.speed_factor != 1:
             times_s = timed.scale_progress(times_s, float(change.speed_factor))
+        there = _find_recorded(clock.find_frames(times_s), recorded.frames)
+        frames = frames[there]
+        times_s = times_s[there]
         reference = np.stack([timed.pose_at(time_s) for time_s in times_s])
         poses = np.stack([timed.extrapolate(t, pose) for t, pose in zip(times_s, reference, strict=True)])
         # Frames are those of this run, and shapes those of the actor's recording: for an inserted actor they differ.
@@ -203,6 +207,16 @@ def _list_delayed_frames(recorded: NDArray[np.int64], delay_s: float, clock: Fra
     is_after = (clock.frames >= recorded[0]) | (clock.times_s > begin_s - margin_s)
     is_before = (clock.frames <= recorded[-1]) | (clock.times_s < end_s + margin_s)
     return clock.frames[is_after & is_before].astype(np.int64)
+
+
+def _find_recorded(moments: Float64, recorded: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which moments lie in no gap of the recorded frames that is too long to be bridged."""
+    after = np.searchsorted(recorded, moments)
+    low = recorded[(after - 1).clip(0)]
+    high = recorded[after.clip(max=len(recorded) - 1)]
+    # Beyond both ends the two are one frame, and at a recorded frame there is nothing to bridge.
+    found: NDArray[np.bool_] = (high - low <= MOST_GAP_FRAMES + 1) | (high - moments < _FRAME_TOLERANCE)
+    return found | (moments - low < _FRAME_TOLERANCE)
 
 
 def _shift_level(poses: Float64, shift: Float64) -> Float64:

@@ -102,7 +102,7 @@ def test_actors_are_where_they_are_at_that_moment_of_the_log() -> None:
     assert find_collisions(path, [car(30.0, 0.0, frames=range(0, 20))], 0.0) == ()
 
 
-@pytest.mark.parametrize("frame", [3.0, 3.25, 3.5, 3.75, 0.0, 7.0])
+@pytest.mark.parametrize("frame", [3.0, 3.25, 3.5, 3.75, 0.0, 7.0, 5.25, 6.75])
 def test_boxes_are_where_renders_draw_the_actor(frame: float) -> None:
     rng = np.random.default_rng(1)
     frames = np.array([0, 1, 2, 3, 4, 5, 7])

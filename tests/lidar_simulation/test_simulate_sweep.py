@@ -44,6 +44,20 @@ class SpinningLog:
         return ego_path()[1][frame]
 
 
+class DamagedLog(SpinningLog):
+    """Frame 0 has no pose that can be read, and frame 1 no sweep."""
+
+    def sweep(self, frame: int) -> Sweep | None:
+        if frame == 1:
+            raise InputError("the file is cut off", remedy="Copy it.", frame=frame)
+        return super().sweep(frame)
+
+    def world_SE3_lidar(self, frame: int) -> np.ndarray:
+        if frame == 0:
+            raise InputError("the pose is not finite", remedy="Correct it.", frame=frame)
+        return super().world_SE3_lidar(frame)
+
+
 @pytest.fixture(scope="module")
 def chunk_scene() -> ChunkScene:
     return ChunkScene(build_chunk((0, 2, 4)), EMPTY)
@@ -116,6 +130,15 @@ def test_a_rollout_takes_the_rays_of_the_nearest_sweep(chunk_scene: ChunkScene):
     comparison = compare_sweeps(sweep, cast_street(sweep.origins, sweep.directions), 30.0)
     assert comparison.median_range_error_m < 0.02
     assert comparison.recall > 0.95
+
+
+def test_sweeps_and_poses_that_cannot_be_read_are_passed_over(chunk_scene: ChunkScene):
+    times, poses = ego_path()
+    simulator = LidarSimulator(DamagedLog())
+    assert simulator.pattern_at(0.0) is simulator.pattern_at(2.2)
+    sweep = simulator.simulate(EgoPath(times, np.arange(5.0), poses), 1, chunk_scene)
+    comparison = compare_sweeps(sweep, cast_street(sweep.origins, sweep.directions), 30.0)
+    assert comparison.median_range_error_m < 0.02
 
 
 def test_a_log_without_sweeps_is_one_clear_error():

@@ -16,10 +16,12 @@ from genre_tasks.effects.apply_plan import apply_plan, move_views
 from genre_tasks.effects.plan import EFFECT_NAMES, plan_effects
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.synthetic.log import SyntheticStreet
+from genre_tasks.logs.types import Lens
 from genre_tasks.scene import pose_alignment
-from genre_tasks.scene.alignment_step import AlignedImage
+from genre_tasks.scene.alignment_step import AlignedImage, project_points
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.pose_alignment import PoseAlignment, align_poses
+from genre_tasks.scene.projection import project
 from genre_tasks.stages.ingest import ingest
 from genre_tasks.stages.initial import initial
 
@@ -233,3 +235,12 @@ def test_means_of_the_surroundings_stay_in_place(blur_px: float) -> None:
     image[50, 50] = 1
     averaged = pose_alignment._average_surround(image, blur_px)
     assert np.allclose(averaged, averaged[::-1, ::-1], atol=1e-7)
+
+
+def test_points_that_a_lens_folds_back_are_in_no_image() -> None:
+    lens = Lens(200.0, 200.0, 160.0, 90.0, 320, 180, (-0.3, 0.0, 0.0, 0.0, 0.0))
+    angle = np.radians(np.linspace(-80, 80, 161))
+    points = np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], 1) * 10
+    inside = project_points(points, np.eye(4), lens)[3]
+    seen = project(points.astype(np.float32), np.eye(4), lens).index
+    assert inside.sum() > 50 and set(np.flatnonzero(inside)) <= set(seen.tolist())

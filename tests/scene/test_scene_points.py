@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,7 @@ from genre_tasks.scene.actor_track import MOST_GAP_FRAMES, ActorTrack, cut_track
 from genre_tasks.scene.chunk import View
 from genre_tasks.scene.projection import project, splat_depth
 from genre_tasks.scene.road_completion import complete_road
-from genre_tasks.scene.visibility import GREY, PointCloud, color_point_clouds
+from genre_tasks.scene.visibility import GREY, PointCloud, color_point_clouds, find_visible_points
 from genre_tasks.scene.voxel_grid import count_voxels, distance_octaves, find_voxel_size, group_by_voxel
 from tests.fakes import camera_turn, yaw_pose
 
@@ -60,6 +62,26 @@ def test_splats_are_squares_whose_side_follows_from_distance() -> None:
         square = expected[max(v - half_px, 0) : v + half_px + 1, max(u - half_px, 0) : u + half_px + 1]
         np.minimum(square, distance_m, out=square)
     assert len(seen.depth) > 30 and np.array_equal(splat_depth(seen, LENS, 0.2), expected)
+
+
+def test_squares_of_a_stretched_image_are_as_wide_as_high_in_the_world() -> None:
+    narrow = Lens(50.0, 100.0, 25.0, 40.0, 50, 80)
+    seen = project(np.array([[5, 0, 0]], np.float32), _view().chunk_SE3_camera, narrow)
+    rows, columns = np.nonzero(np.isfinite(splat_depth(seen, narrow, 0.1)))
+    # ± 10 cm at 5 m are one column and two rows.
+    assert (np.unique(columns).tolist(), np.unique(rows).tolist()) == ([24, 25, 26], [38, 39, 40, 41, 42])
+
+
+def test_the_road_is_seen_in_a_stretched_image_too() -> None:
+    x, y = np.meshgrid(np.arange(4, 30, 0.05), np.arange(-3, 3, 0.05))
+    road = np.stack([x.ravel(), y.ravel(), np.full(x.size, -1.5)], 1).astype(np.float32)
+    portrait = Lens(160.0, 160.0, 80.0, 120.0, 160, 240)
+    found = []
+    # Beside a camera of another shape, an upright one is used at the size of a wide image.
+    for lens in (portrait, portrait.resized(320, 180)):
+        index, _, _ = find_visible_points(road, replace(_view(), lens=lens))
+        found.append(len(index) / len(project(road, _view().chunk_SE3_camera, lens).index))
+    assert found[0] > 0.95 and found[1] == pytest.approx(found[0], abs=0.01)
 
 
 def test_occluded_points_stay_grey() -> None:

@@ -7,14 +7,17 @@ import pytest
 import torch
 
 from genre_tasks.config.simulation_sections import SimulateConfig
+from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.errors import InputError
 from genre_tasks.scene.graph import FIRST_ACTOR
 from genre_tasks.scene_edits.actor_names import name_actors
 from genre_tasks.scene_edits.edited_scenes import EditedScenes
 from genre_tasks.scene_edits.edits import Insert, Move, Remove, Retime, Rotate, ScaleSpeed
 from genre_tasks.scene_edits.ground import Ground
+from genre_tasks.scene_edits.insertion import _PathLine
 from genre_tasks.scene_edits.trajectories import rest_on_ground
 from genre_tasks.srgb import srgb_to_linear
+from tests.fakes import yaw_pose
 from tests.scene_edits.edited_runs import (
     NO_SHADOW,
     SIZE_M,
@@ -166,6 +169,16 @@ def test_inserted_actor_drives_along_the_path_on_the_ground(run: MadeRun) -> Non
     assert poses[0, :2, 3] == pytest.approx([5.0, -2.0], abs=0.2)
     assert [ground_distance(pose) for pose in poses] == pytest.approx(np.zeros(12), abs=0.02)
     assert edited.load(0).removed == ()
+
+
+def test_a_path_is_as_long_as_its_vehicle_crept() -> None:
+    x = np.cumsum(np.concatenate([[0.0], np.full(40, 0.03), np.full(10, 0.3), 0.01 * (-1.0) ** np.arange(20)]))
+    path = EgoPath(0.03 * np.arange(len(x)), np.arange(float(len(x))), np.stack([yaw_pose(0, (k, 0, 0)) for k in x]))
+    line = _PathLine(path)
+    # What the vehicle jitters while it stands is no way, and the creeping before is one.
+    assert line.length_at(50.0) == pytest.approx(4.2, abs=0.05) == line.length_at(70.0)
+    places, _ = line.at(np.linspace(0, 4.0, 41), 0.0)
+    assert np.diff(places[:, 0]) == pytest.approx(np.full(40, 0.1), abs=1e-6)
 
 
 def test_oncoming_actor_drives_towards_the_vehicle(run: MadeRun) -> None:

@@ -16,6 +16,7 @@ from genre_tasks.scene_edits.chunk_scene import ChunkScene
 from genre_tasks.scene_edits.edits import ActorChange, Insert, Retime, ScaleSpeed
 from genre_tasks.scene_edits.run_survey import survey_run
 from genre_tasks.scene_edits.trajectories import Trajectory, change_trajectory, measure_speed
+from tests.fakes import yaw_pose
 from tests.scene_edits.edited_runs import MadeRun, edit, find_node, world_poses
 
 PAUSE_S = 2.0
@@ -66,6 +67,17 @@ def test_shapes_follow_the_seconds_of_a_delay(run: PausedRun) -> None:
     # Frame 6 is at 2.6 s, and shows what was at 0.4 s.
     assert delayed.frames.tolist() == list(range(12))
     assert delayed.shape_frames[[5, 6, 7]].tolist() == [0.0, 4.0, 5.0]
+
+
+def test_a_delayed_actor_stays_absent_in_long_gaps(run: PausedRun) -> None:
+    clock = FrameClock(np.arange(60.0), 0.1 * np.arange(60))
+    frames = np.concatenate([np.arange(10), np.arange(14, 20), np.arange(40, 50)])
+    poses = np.stack([yaw_pose(0.0, (float(frame), 0.0, 0.0)) for frame in frames])
+    path = Trajectory(frames, poses, frames.astype(np.float64))
+    delayed = change_trajectory(path, ActorChange(delay_s=Fraction("0.2")), clock, survey_run(run).ground)
+    # Of the gaps the one of four frames is bridged, as in the recording.
+    assert delayed.frames.tolist() == [*range(22), *range(42, 52)]
+    assert delayed.world_SE3_box[:, 0, 3] == pytest.approx(delayed.frames - 2.0, abs=1e-6)
 
 
 def test_speeds_count_the_seconds_of_a_pause(run: PausedRun) -> None:

@@ -243,6 +243,22 @@ def test_who_would_wait_too_long_is_refused() -> None:
         assert queue.length == 1
 
 
+def test_renderers_of_several_runs_take_turns() -> None:
+    queues = [RenderQueue(max_waiting=0), RenderQueue(max_waiting=0)]
+    entered = threading.Event()
+
+    def render() -> None:
+        with queues[1].turn():
+            entered.set()
+
+    thread = threading.Thread(target=render)
+    with queues[0].turn():
+        thread.start()
+        assert not entered.wait(0.2)
+    thread.join(30)
+    assert entered.is_set()
+
+
 def test_a_renderer_describes_its_run(renderer: SceneRenderer, served: tuple[str, str]) -> None:
     times_s, poses = renderer.ego_trajectory()
     assert times_s.shape == (12,) and poses.shape == (12, 4, 4)
