@@ -300,10 +300,9 @@ class Supervisor:
     def _end_attempt(self, watch: _Watch, outcome: dict[str, Any]) -> None:
         unit = watch.run.unit
         why = outcome["why"]
-        if self._state.attempts.get(unit, 0) >= self._limits.attempts:
+        if (attempt := self._state.attempts.get(unit, 0)) >= self._limits.attempts:
             # Of a log of several chunks some may be done.
-            last = {"status": "failed"} | outcome | {"why": f"{why} (attempt {self._state.attempts[unit]})"}
-            self._finish(watch, last)
+            self._finish(watch, {"status": "failed"} | outcome | {"why": f"{why} (attempt {attempt})"})
             return
         del self._state.watches[watch.run.id]
         self._state.rows[unit] |= {"status": "waiting", "why": why}
@@ -312,8 +311,7 @@ class Supervisor:
     def _finish(self, watch: _Watch, outcome: dict[str, Any]) -> None:
         del self._state.watches[watch.run.id]
         # The log's URI and chunk stay as this flow names them.
-        left = ("log", "chunk", "is_passing")
-        self._state.rows[watch.run.unit] |= {k: v for k, v in outcome.items() if k not in left}
+        self._state.rows[watch.run.unit] |= {k: outcome[k] for k in outcome if k not in ("log", "chunk", "is_passing")}
 
     def _update_row(self, run: ChildRun) -> None:
         self._state.rows[run.unit] |= {

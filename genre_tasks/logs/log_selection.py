@@ -192,7 +192,7 @@ def count_source_frames(source_every: int, has_images: Mapping[str, Sequence[boo
 def choose_working_size(config: IngestConfig, cameras: Sequence[Camera]) -> tuple[int, int]:
     """Chooses the size at which a log's images are used: as many pixels as configured, in the images' own shape.
 
-    Images are not enlarged, which would add time and memory but no detail, and blur what sharp images are told by.
+    Images are not enlarged: that would add time and memory but no detail, and mislead what measures sharpness.
 
     Args:
         config: with width and height.

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from flows.configuration import load_configuration
 from flows.pipeline import memory_plan, stage_inputs
@@ -134,13 +135,13 @@ def test_images_on_disk_give_the_same_bytes(tmp_path: Path, monkeypatch: pytest.
     # A street's images are small: every stack goes to disk all the same.
     monkeypatch.setattr(image_memory, "_MIN_BYTES", 0)
     held: list[int] = []
-    allocate = image_memory.torch.from_file
+    map_file = image_memory._map_file
 
-    def from_file(*arguments: Any, **options: Any) -> Any:
-        held.append(options["size"])
-        return allocate(*arguments, **options)
+    def count(folder: Path, size: int) -> torch.Tensor:
+        held.append(size)
+        return map_file(folder, size)
 
-    monkeypatch.setattr(image_memory.torch, "from_file", from_file)
+    monkeypatch.setattr(image_memory, "_map_file", count)
     digests: dict[bool, dict[str, str]] = {}
     for on_disk in (False, True):
         monkeypatch.setattr(stage_inputs, "needs_disk", lambda *_, answer=on_disk: answer)
