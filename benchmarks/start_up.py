@@ -111,8 +111,9 @@ def measure_cached_run(seed: str, settings: tuple[str, ...], rounds: int) -> Row
         home = Path(folder) / "prefect"
         run = partial(run_genre, f"synthetic:street?seed={seed}", home, *options, "--store", f"{folder}/store")
         run()
-        # Once more for the operating system's cache of files.
-        run()
+        if rounds > 1:
+            # Once more for the operating system's cache of files.
+            run()
         return {"seconds": Quartiles.from_values([_time(run) for _ in range(rounds)]).as_row()}
 
 

@@ -208,7 +208,7 @@ def test_people_walk_with_their_arms_and_as_near_as_asked_for():
     arms = []
     for log in (still, walking):
         for track in (t for t in log.tracks() if t.label == "Pedestrian" and t.moving):
-            for frame in range(12):
+            for frame in range(0, 12, 2):
                 at = np.flatnonzero(track.frames == frame)
                 local = in_box(log.sweep(frame).points_world, track.world_SE3_box[at[0]])
                 hands = (np.abs(local[:, 1]) > 0.2) & (np.abs(local[:, 1]) < 0.34) & (np.abs(local[:, 2]) < 0.25)
