@@ -60,6 +60,7 @@ def dataset(
     """
     from flows.cli.outcome import add_facts
     from flows.configuration import load_configuration
+    from flows.configuration.settings import make_setting_absolute
     from flows.dataset.dataset_record import name_dataset
     from flows.pipeline.log_cache import expand_logs
     from genre_tasks.errors import ConfigError
@@ -85,6 +86,7 @@ def dataset(
         # A worker runs in a folder of its own, which is removed with all that a relative store has got there.
         store = make_address_absolute(store)
         expanded = [make_log_absolute(log) for log in expanded]
+        settings = [make_setting_absolute(setting) for setting in settings or ()]
     name = name_dataset(expanded, preset, store, settings)
     facts = {"dataset": name, "preset": preset, "store": store}
     add_facts(**facts, logs=[])

@@ -54,16 +54,19 @@ def enhance(
     from flows.cli.parsing import parse_numbers
     from flows.configuration import load_configuration
     from flows.enhancement.enhancement_request import EnhancementInputs, prepare_enhancement
+    from genre_tasks.logs.registry import make_log_absolute
 
     add_facts(scene=str(scene), preset=preset, store=store, run=None, report=None, chunks=[], left_out=[])
     inputs = EnhancementInputs(scene, cameras, images, lidar, up, scale, chunk_frames)
     prepared = prepare_enhancement(inputs, load_configuration(preset))
-    add_facts(log=prepared.log)
+    # As of a run: the record names the log, and is read from other folders.
+    log = make_log_absolute(prepared.log)
+    add_facts(log=log)
     for line in prepared.explanation:
         # On stderr: with --json, stdout is the object alone.
         typer.echo(line, err=True)
     request = RunRequest(
-        log=prepared.log,
+        log=log,
         preset=preset,
         store=store,
         chunks=parse_numbers(chunks, "--chunks"),

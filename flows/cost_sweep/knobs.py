@@ -6,12 +6,12 @@ product, which would take years.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from flows.configuration import load_configuration
+from flows.machine.facts import count_cores
 from genre_tasks.config import EffectsConfig, PipelineConfig
 from genre_tasks.errors import ConfigError
 from genre_tasks.suggestions import did_you_mean
@@ -164,7 +164,7 @@ def _knobs(base: PipelineConfig) -> Mapping[str, list[Setting]]:
             for name in _switchable_effects()
             for state in ("on", "off")
         ],
-        "threads": [Setting("threads", f"{n}", threads=n) for n in _fewer_threads(os.cpu_count() or 1)],
+        "threads": [Setting("threads", f"{n}", threads=n) for n in _fewer_threads(count_cores())],
         TOGETHER: _combinations(points, (enet_iterations[0], enet_iterations[-1])),
         MORE_GAUSSIANS: _settings_of_more_gaussians(base, enet_iterations[1:3]),
     }

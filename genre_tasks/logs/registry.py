@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from genre_tasks.errors import InputError
@@ -27,6 +28,7 @@ class ReaderEntry:
         install_hint: what to install if importing the module fails.
         lister: ``"module:function"`` that lists the logs of a pattern, where logs are no folders; empty: they are.
         path_options: options behind the question mark whose values are paths, too.
+        is_quoted: whether special characters of a path are written with %, as ``split_log_address`` reads them.
     """
 
     target: str
@@ -34,6 +36,7 @@ class ReaderEntry:
     install_hint: str
     lister: str = ""
     path_options: tuple[str, ...] = ()
+    is_quoted: bool = False
 
 
 # Targets are text, not functions: importing every reader would need the packages of all, and would slow down each
@@ -54,12 +57,14 @@ _READERS: dict[str, ReaderEntry] = {
         "kitti:PATH/2011_09_26/2011_09_26_drive_0009_sync",
         "pip install genre (scipy and pillow are part of it)",
         path_options=("labels",),
+        is_quoted=True,
     ),
     "nuscenes": ReaderEntry(
         "genre_tasks.logs.nuscenes.reader:open_nuscenes",
         "nuscenes:PATH/scene-0061",
         "pip install genre (scipy and pillow are part of it)",
         "genre_tasks.logs.nuscenes.scene_address:list_scenes",
+        is_quoted=True,
     ),
     "pandaset": ReaderEntry(
         "genre_tasks.logs.pandaset.reader:open_pandaset",
@@ -71,6 +76,7 @@ _READERS: dict[str, ReaderEntry] = {
         "posed_images:PATH/transforms.json?images=DIR",
         "pip install genre (scipy and pillow are part of it)",
         path_options=("images",),
+        is_quoted=True,
     ),
     "synthetic": ReaderEntry(
         "genre_tasks.logs.synthetic:open_synthetic",
@@ -172,14 +178,30 @@ def make_log_absolute(uri: str) -> str:
         return uri
     path, mark, query = rest.partition("?")
     options = "&".join(_make_option_absolute(option, entry) for option in query.split("&"))
-    return f"{name}:{expand_user_path(path).absolute()}{mark}{options}"
+    return f"{name}:{_make_path_absolute(path, entry)}{mark}{options}"
 
 
 def _make_option_absolute(option: str, entry: ReaderEntry) -> str:
     key, equals, value = option.partition("=")
     if key not in entry.path_options or not value:
         return option
-    return f"{key}{equals}{expand_user_path(value).absolute()}"
+    return f"{key}{equals}{_make_path_absolute(value, entry)}"
+
+
+def _make_path_absolute(text: str, entry: ReaderEntry) -> Path:
+    first, *rest = Path(text).parts or (".",)
+    if Path(text).is_absolute():
+        return Path(text)
+    # What is put before the user's text is not written by the user: a folder's name may look like an address.
+    start = expand_user_path(first) if first.startswith("~") else Path.cwd()
+    before = Path(_quote(str(start))) if entry.is_quoted else start
+    return before.joinpath(*rest) if first.startswith("~") else before / text
+
+
+def _quote(path: str) -> str:
+    for character in "%?&":
+        path = path.replace(character, f"%{ord(character):02X}")
+    return path
 
 
 def list_logs(uri: str) -> list[str] | None:

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from flows.cli.main import app
 from flows.configuration import load_configuration
+from flows.cost_sweep import knobs
 from flows.cost_sweep.cell import Cell, Sweep, list_cells, measure_cold_start, predict_cells, run_cell
 from flows.cost_sweep.flow import SweepRequest, write_results
 from flows.cost_sweep.knobs import PRESET_ITSELF, Setting, list_settings
@@ -101,6 +102,13 @@ def test_settings_start_with_the_preset_and_differ_from_it() -> None:
     assert {s.knob for s in settings} >= {"gnet_iterations", "resolution", "gaussians", "fixer", "shifts", "threads"}
     with pytest.raises(ConfigError, match=r"no knob 'view'.*Did you mean 'views'"):
         list_settings("small", knobs=["view"])
+
+
+def test_threads_are_fewer_than_the_cores_that_may_be_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A container may have two of the machine's many cores."""
+    for cores, expected in ((1, []), (2, ["1"]), (8, ["1", "2", "4"])):
+        monkeypatch.setattr(knobs, "count_cores", lambda n=cores: n)
+        assert [setting.value for setting in list_settings("small", knobs=["threads"])[1:]] == expected
 
 
 COMMAND = "genre cost 'synthetic:street?seed=900' --preset small --seeds 0,1 --knobs fixer --set enet.snapshots=0"

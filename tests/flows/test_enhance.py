@@ -12,6 +12,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+from flows.cli import enhance as cli_enhance
 from flows.cli.main import app
 from flows.configuration import load_configuration
 from flows.enhancement.enhancement_request import EnhancementInputs, prepare_enhancement
@@ -252,3 +253,16 @@ def test_far_and_large_gaussians_are_distant(colourful: SplatCloud, tmp_path: Pa
     chunk = replace(street[0], world_SE3_chunk=np.eye(4), chunk_SE3_ego=np.eye(4)[None])
     scene = initial(InitialConfig(scene=str(tmp_path / "scene.ply")), chunk).scene
     assert torch.nonzero(scene.nodes)[:, 0].tolist() == [0, 1]
+
+
+def test_the_log_of_an_enhanced_scene_is_found_from_other_folders(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr(cli_enhance, "check_request", lambda request: None)
+    monkeypatch.setattr(cli_enhance, "reconstruct", lambda request, as_json: asked.append(request.log))
+    monkeypatch.chdir(folder.parent)
+    words = ["enhance", f"{folder.name}/scene.ply", "--cameras", folder.name, "--scale", "2.5"]
+    done = CliRunner().invoke(app, words, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    assert len(asked) == 1 and asked[0].startswith(f"posed_images:{folder}")

@@ -10,7 +10,8 @@ import pytest
 
 from genre_tasks.errors import InputError
 from genre_tasks.logs import registry
-from genre_tasks.logs.registry import known_readers, open_log, register
+from genre_tasks.logs.log_address import split_log_address
+from genre_tasks.logs.registry import known_readers, make_log_absolute, open_log, register
 from tests.fakes import FakeLog
 
 
@@ -80,3 +81,16 @@ def test_readers_are_imported_when_used() -> None:
     root = Path(__file__).resolve().parents[2]
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_folders_name_may_look_like_an_address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "R&D 100%25?"
+    (folder / "a log").mkdir(parents=True)
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("HOME", str(folder))
+    for given in ("kitti:a log?labels=l.txt", "kitti:~/a%20log?labels=~/l.txt"):
+        path, options = split_log_address(make_log_absolute(given).removeprefix("kitti:"), ("labels",), "KITTI")
+        assert (path, options) == (f"{folder}/a log", {"labels": f"{folder}/l.txt"})
+    # Readers that take a path as it is get it as it is.
+    assert make_log_absolute("pandaset:002") == f"pandaset:{folder}/002"
+    assert make_log_absolute("kitti:/data/a%20log") == "kitti:/data/a%20log"

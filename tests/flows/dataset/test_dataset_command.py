@@ -28,7 +28,10 @@ def test_paths_are_absolute_on_a_pool(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(dataset, "_submit", submit)
     monkeypatch.chdir(tmp_path)
     logs = ["pandaset:data/002", "posed_images:t.json?images=i&scale=2", "kitti:d?labels=/l", "synthetic:street?seed=1"]
-    CliRunner().invoke(app, ["dataset", *logs, "--pool", "genre", "--store", "kept"], catch_exceptions=False)
+    (tmp_path / "fnet.safetensors").touch()
+    sets = ["fnet.weights=fnet.safetensors", "gnet.weights=builtin", "gnet.iterations=9"]
+    words = [word for setting in sets for word in ("--set", setting)]
+    CliRunner().invoke(app, ["dataset", *logs, "--pool", "genre", "--store", "kept", *words], catch_exceptions=False)
     CliRunner().invoke(app, ["dataset", *logs, "--pool", "genre", "--store", "s3://bucket/x"], catch_exceptions=False)
     absolute = [
         f"pandaset:{tmp_path}/data/002",
@@ -40,6 +43,7 @@ def test_paths_are_absolute_on_a_pool(tmp_path: Path, monkeypatch: pytest.Monkey
         (str(tmp_path / "kept"), absolute),
         ("s3://bucket/x", absolute),
     ]
+    assert submitted[0]["settings"] == [f"fnet.weights={tmp_path}/fnet.safetensors", *sets[1:]]
 
 
 @pytest.mark.parametrize(
