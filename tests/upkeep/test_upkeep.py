@@ -21,8 +21,9 @@ from flows.upkeep.pins import add_pin, list_pins, remove_pin
 from flows.upkeep.repair import repair_artifacts
 from flows.upkeep.store_copy import copy_store
 from flows.upkeep.what_if import find_recomputations
-from genre_tasks.errors import ArtifactCorruptError, ConfigError, GenreError, InputError
+from genre_tasks.errors import ArtifactCorruptError, ConfigError, GenreError, InputError, TransientIOError
 from storage.local import LocalStore
+from storage.manifest import NewerSchemaError
 from tests.contracts.store_suite import address
 from tests.faults.small_run import LOG, SETTINGS
 from tests.storage.artifact_values import make
@@ -194,6 +195,19 @@ def test_a_file_that_cannot_be_read_hides_no_damage(store: LocalStore, genre: Ca
     code, text = genre("verify")
     assert code == 1 and text.count("damaged: ") == 2
     assert "repaired: " in genre("verify", "--repair")[1]
+
+
+def test_what_cannot_be_read_or_is_newer_is_no_damage(
+    genre: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kinds = (None, TransientIOError, NewerSchemaError)
+    faults = [(str(kind), None if kind is None else kind("not now", remedy="Wait.")) for kind in kinds]
+    monkeypatch.setattr(LocalStore, "verify_all", lambda _: iter(faults))
+    code, text = genre("verify")
+    assert code == 1 and "1 artifacts are sound, 0 damaged, 1 unreadable, 1 of a newer version" in text
+    assert "damaged: " not in text and "--repair" not in text
+    code, text = genre("verify", "--repair")
+    assert code == 1 and text.count("left: ") == 2
 
 
 def test_damage_is_not_copied_and_all_else_is(store: LocalStore, tmp_path: Path) -> None:
