@@ -307,6 +307,15 @@ def test_a_large_sweep_is_read_and_a_huge_one_refused(folder: Path) -> None:
                 open_log(f"genre:{folder}").sweep(0)
 
 
+def test_intensities_of_another_scale_are_named_once(folder: Path) -> None:
+    count = 300
+    table = pa.table({name: np.ones(count, np.float32) for name in "xyz"} | {"intensity": np.arange(count) % 256.0})
+    pq.write_table(table, folder / "lidar/wide.parquet")
+    _change(folder, lambda values: [frame.update(sweep="lidar/wide.parquet") for frame in values["frames"][:3]])
+    (finding,) = [f for f in check_log(open_log(f"genre:{folder}")).findings if f.word == "intensity_scale"]
+    assert finding.severity == "warning" and finding.numbers["largest"] == 255 and "0 to 1" in finding.remedy
+
+
 def test_a_folder_above_names_its_logs(folder: Path) -> None:
     with pytest.raises(InputError, match=r"no log\.json") as caught:
         open_log(f"genre:{folder.parent}")

@@ -40,6 +40,8 @@ from genre_tasks.user_paths import expand_user_path
 
 # A frame with ten cameras has two kilobytes.
 _MAX_JSON_BYTES = 1 << 28
+# Rounding may lead just above 1.
+_LARGEST_INTENSITY = 1.01
 
 
 def open_genre_layout(rest: str) -> GenreLayoutLog:
@@ -224,9 +226,14 @@ class GenreLayoutLog(RecordedLog):
         path = self._sweep_file(frame)
         if path is None:
             return None
-        sweep, invalid = read_sweep(path, self.frame_timestamp_s(frame), self.uri, frame)
+        sweep, invalid, largest_intensity = read_sweep(path, self.frame_timestamp_s(frame), self.uri, frame)
         if invalid:
             self._report_invalid_points(invalid, frame)
+        if largest_intensity > _LARGEST_INTENSITY:
+            # Of one scale in all sweeps: said once, and not of each.
+            message = "sweeps have intensities above 1, which are cut to 1"
+            numbers = {"largest": largest_intensity}
+            self._report(Finding("intensity_scale", "warning", message, "Write them from 0 to 1.", numbers))
         return sweep
 
     def _sweep_file(self, frame: int) -> Path | None:

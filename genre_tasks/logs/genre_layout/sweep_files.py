@@ -8,7 +8,7 @@ import re
 import zipfile
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -49,7 +49,21 @@ def write_sweep(path: Path, sweep: Sweep) -> None:
                 np.lib.format.write_array(file, values, allow_pickle=False)
 
 
-def read_sweep(path: Path, frame_time_s: float, log: str, frame: int) -> tuple[Sweep, int]:
+class ReadSweep(NamedTuple):
+    """A sweep of a file.
+
+    Attributes:
+        sweep: the finite points; without intensities all are 0.
+        invalid: how many points are not finite and left out.
+        largest_intensity: in the file; more than 1 is cut to 1.
+    """
+
+    sweep: Sweep
+    invalid: int
+    largest_intensity: float
+
+
+def read_sweep(path: Path, frame_time_s: float, log: str, frame: int) -> ReadSweep:
     """Reads a sweep.
 
     Args:
@@ -59,7 +73,7 @@ def read_sweep(path: Path, frame_time_s: float, log: str, frame: int) -> tuple[S
         frame: log frame, for errors.
 
     Returns:
-        The sweep of the finite points, and how many others there were. Without intensities all are 0.
+        The sweep, and what is odd about it.
 
     Raises:
         InputError: the file is missing, damaged, too large, or lacks a column.
@@ -88,7 +102,8 @@ def read_sweep(path: Path, frame_time_s: float, log: str, frame: int) -> tuple[S
     finite = np.isfinite(rows).all(axis=1)
     rows = rows[finite]
     intensity = np.clip(rows[:, 3], 0.0, 1.0).astype(np.float32)
-    return Sweep(np.ascontiguousarray(rows[:, :3]), intensity, rows[:, 4].copy()), int((~finite).sum())
+    sweep = Sweep(np.ascontiguousarray(rows[:, :3]), intensity, rows[:, 4].copy())
+    return ReadSweep(sweep, int((~finite).sum()), float(rows[:, 3].max(initial=0.0)))
 
 
 def _read_npz(path: Path) -> dict[str, Float64]:
