@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from flows.dataset.dataset_record import DATASETS
-from flows.reconstruction.record_files import read_sound_records, summarise_damage
+from flows.reconstruction.record_files import read_record, read_sound_records, summarise_damage
 from flows.reconstruction.run_records import find_run_record, name_run_folder
 from flows.upkeep.garbage import add_ancestors, list_sources, measure_bytes
 from flows.upkeep.pins import PINS, list_pins, list_run_keys
@@ -31,7 +31,7 @@ class CopyResult:
         copied: artifacts that the target did not have.
         skipped: artifacts that it had.
         bytes_copied: of the copied artifacts' files.
-        records: folders of records that were copied.
+        records: folders of records of which the target lacked something.
     """
 
     copied: int
@@ -51,7 +51,7 @@ def copy_store(
 
     Args:
         source: to copy from; nothing in it is changed.
-        target: to copy to; what it has stays.
+        target: to copy to; what it has stays, be it artifacts or files of records.
         runs: names of runs, or their first characters: only these are copied, and not the rest of the store.
         pinned: whether only pinned runs and artifacts are copied, beside those of ``runs``.
         report: called with how many artifacts are done, how many there are, and the bytes copied.
@@ -69,8 +69,7 @@ def copy_store(
     artifacts = selection.artifacts
     copied, damaged = _copy_artifacts(source, target, artifacts, report)
     # After the artifacts: a record must not refer to what is not there yet.
-    for name in selection.records:
-        _copy_record(source, target, name)
+    copied_records = [name for name in selection.records if _copy_record(source, target, name)]
     # Once more, since `genre gc` removes what no record refers to, and the records have come only now.
     sound = [artifact for artifact in artifacts if artifact.address.key not in damaged]
     added, damaged_since = _copy_artifacts(source, target, sound, lambda done, total, bytes_copied: None)
@@ -78,7 +77,7 @@ def copy_store(
     damaged |= damaged_since
     # All that is sound is copied first: whoever moves away from a failing disk needs that most.
     _require_complete(source, selection, damaged)
-    return CopyResult(len(copied), len(artifacts) - len(copied), measure_bytes(copied.values()), len(selection.records))
+    return CopyResult(len(copied), len(artifacts) - len(copied), measure_bytes(copied.values()), len(copied_records))
 
 
 @dataclass(frozen=True)
@@ -178,25 +177,33 @@ def _list_records(store: Store) -> list[str]:
     return [f"{parent}/{path.parent.name}" for parent, file in _RECORDS for path in store.records.find(parent, file)]
 
 
-def _copy_record(source: Store, target: Store, name: str) -> None:
+def _copy_record(source: Store, target: Store, name: str) -> bool:
+    """Copies the files of a folder that the target lacks; whether there were any."""
     folder = source.records.pull(name)
     goal = target.records.pull(name)
+    # A run's record comes last: a folder without it belongs to a run that did not end.
+    files = sorted(_list_files(folder), key=lambda path: path == folder / _RUN_RECORD)
+    is_changed = False
     try:
-        for path in _list_files(folder):
+        for path in files:
             place = goal / path.relative_to(folder)
+            # What the target has may be newer, such as the record of a run that was repeated there.
+            if place.exists():
+                continue
+            is_changed = True
             place.parent.mkdir(parents=True, exist_ok=True)
             with atomic_path(place) as part:
-                shutil.copyfile(path, part)
-        record = goal / _RUN_RECORD
-        if record.is_file():
-            values = json.loads(record.read_bytes())
-            # Where the record is now; all else is as it was.
-            values |= {"store": target.uri, "report": str(goal / "report.html")}
-            with atomic_path(record) as part:
-                part.write_text(json.dumps(values, indent=1), encoding="utf-8")
+                if path == folder / _RUN_RECORD:
+                    # Where the record is now; all else is as it was.
+                    values = read_record(path) | {"store": target.uri, "report": str(goal / "report.html")}
+                    part.write_text(json.dumps(values, indent=1), encoding="utf-8")
+                else:
+                    shutil.copyfile(path, part)
     except OSError as error:
         raise as_genre_error(error, goal) from error
+    # Even without a change: a copy that was stopped may have left files that are in no bucket yet.
     target.records.push(name)
+    return is_changed
 
 
 def _list_files(folder: Path) -> Iterable[Path]:

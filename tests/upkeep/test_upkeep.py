@@ -223,6 +223,24 @@ def test_a_damaged_record_is_left_out_of_a_copy_and_all_else_is_copied(store: Lo
     assert [record["run"] for record in list_runs(target.uri)] == [run]
 
 
+def test_a_copy_leaves_newer_records_of_the_target(store: LocalStore, tmp_path: Path) -> None:
+    target = LocalStore(tmp_path / "target")
+    copy_store(store, target)
+    name = f"runs/{record_of(store)['run']}"
+    newer = json.loads((target.root / name / "run.json").read_text()) | {"store": "elsewhere", "status": "partly_done"}
+    (target.root / name / "run.json").write_text(json.dumps(newer))
+    (target.root / name / "report.html").write_text("newer")
+    (store.root / name / "more.txt").write_text("more")
+    assert copy_store(store, target).records == 1
+    assert json.loads((target.root / name / "run.json").read_text()) == newer
+    assert (target.root / name / "report.html").read_text() == "newer"
+    assert (target.root / name / "more.txt").read_text() == "more"
+    # What a stopped copy lacks is copied with its new place.
+    (target.root / name / "run.json").unlink()
+    assert copy_store(store, target).records == 1 and list_runs(target.uri)[0]["store"] == target.uri
+    assert copy_store(store, target).records == 0
+
+
 def test_a_copy_puts_back_what_was_removed_before_the_records_came(store: LocalStore, tmp_path: Path) -> None:
     target = LocalStore(tmp_path / "target")
     removed = []
