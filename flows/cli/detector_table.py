@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,11 +43,11 @@ class DetectorTableParts:
     settings: list[str] | None
     out: Path
 
-    def request(self, seeds: int, steps: int | None) -> DetectorRequest:
+    def request(self, seeds: int | None, steps: int | None) -> DetectorRequest:
         """Makes the request.
 
         Args:
-            seeds: trainings of each row.
+            seeds: trainings of each row; ``None``: the request's default.
             steps: of a training.
         """
         from flows.paper_tables.detector_flow import DetectorRequest
@@ -58,22 +59,26 @@ class DetectorTableParts:
             store=self.store,
             chunks=None if self.chunks is None else tuple(self.chunks),
             settings=tuple(self.settings or ()),
-            seeds=seeds,
+            seeds=DetectorRequest.seeds if seeds is None else seeds,
             steps=steps,
             out=str(self.out),
         )
 
+    def measure(self, seeds: int | None, steps: int | None, dry_run: bool) -> None:
+        """Measures the table, or prints what it would take.
 
-def measure_detector_table(request: DetectorRequest, dry_run: bool) -> None:
-    """Measures table 8, or prints what it would take.
+        Args:
+            seeds: trainings of each row; ``None``: the request's default.
+            steps: of a training.
+            dry_run: whether nothing is computed.
 
-    Args:
-        request: what the user asked for.
-        dry_run: whether nothing is computed.
+        Raises:
+            GenreError: the request is wrong, or a stage or training fails.
+        """
+        _measure_detector_table(self.request(seeds, steps), dry_run)
 
-    Raises:
-        GenreError: the request is wrong, or a stage or training fails.
-    """
+
+def _measure_detector_table(request: DetectorRequest, dry_run: bool) -> None:
     from flows.cli.terminal import report_on_terminal
     from flows.paper_tables.detector_flow import detector_table
 
@@ -97,34 +102,37 @@ def measure_detector_table(request: DetectorRequest, dry_run: bool) -> None:
     typer.echo(f"{done['trainings']} trainings; wrote {', '.join(done['files'])}")
 
 
-def refuse_table_8_options(test: list[str] | None, steps: int | None) -> None:
+def refuse_table_8_options(test: list[str] | None, seeds: int | None, steps: int | None) -> None:
     """Checks that options of table 8 are not given for another table.
 
     Args:
         test: logs to test on.
+        seeds: trainings of each row.
         steps: of a training.
 
     Raises:
         ConfigError: one is given.
     """
     # An option without effect would hide a mistake in the number of the table.
-    for option, value in (("--test", test), ("--steps", steps)):
+    for option, value in (("--test", test), ("--seeds", seeds), ("--steps", steps)):
         if value is not None:
             raise ConfigError(f"{option} belongs to table {NUMBER}", remedy=f"Leave it out, or ask for table {NUMBER}.")
 
 
-def refuse_other_options(*values: object) -> None:
+def refuse_other_options(*values: object, scene_options: Mapping[str, object]) -> None:
     """Checks that options of other tables are not given for table 8.
 
     Args:
         values: those of ``OTHER_OPTIONS``; ``None``, ``False`` and an empty list stand for one that is not given.
+        scene_options: the values of those that belong to a scene.
 
     Raises:
         ConfigError: one is given.
     """
-    for option, value in zip(OTHER_OPTIONS, values, strict=True):
-        # Without an effect it would be taken for one that has one.
-        if value:
+    by_option = {**dict(zip(OTHER_OPTIONS, values, strict=True)), **scene_options}
+    for option, value in by_option.items():
+        # Without an effect it would be taken for one that has one. A zero is a value, too.
+        if value is not None and value is not False and value != []:
             raise ConfigError(f"table {NUMBER} has no use for {option}", remedy="Leave it out.")
 
 

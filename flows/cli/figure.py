@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -79,6 +80,15 @@ FigureFileOption = Annotated[
     ),
 ]
 
+# Of the options that choose what of a log is shown.
+_CHOICES: Mapping[str, Sequence[str]] = {
+    "recon": ("--camera", "--frame"),
+    "fixers": ("--camera", "--frame"),
+    "swerve": ("--camera",),
+    "manipulation": ("--camera", "--frame", "--actor"),
+    "agreement": ("--frame",),
+}
+
 
 def figure(
     kind: FigureKindArgument,
@@ -116,6 +126,8 @@ def figure(
     from storage.codecs.png import write_png
 
     parsed_kind = parse_kind(kind)
+    choice = _Choice(camera, frame, actor)
+    _refuse_unused(parsed_kind, choice)
     # Checked before any stage is computed, which may take minutes.
     check_output_file(out, "--out", (".png",))
     # Edits are shown at one moment, and reading more chunks for it would take minutes.
@@ -132,7 +144,7 @@ def figure(
         detector=detector,
     )
     checked = request.check()
-    strips = _make_strips(parsed_kind, checked, _Choice(camera, frame, actor))
+    strips = _make_strips(parsed_kind, checked, choice)
     shown = ", ".join(str(where.chunk) for where in checked.places)
     title = " ".join([f"{log} chunk {shown}, preset {preset}", *request.settings])
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -148,6 +160,18 @@ class _Choice:
     camera: str | None
     frame: int | None
     actor: str | None
+
+
+def _refuse_unused(kind: Kind, choice: _Choice) -> None:
+    from genre_tasks.errors import ConfigError
+
+    options = {"--camera": choice.camera, "--frame": choice.frame, "--actor": choice.actor}
+    for option, value in options.items():
+        # Without an effect it would be taken for one that has one.
+        if value is not None and option not in _CHOICES[kind]:
+            kinds = ", ".join(name for name, taken in _CHOICES.items() if option in taken)
+            remedy = f"Leave it out; it belongs to {kinds}."
+            raise ConfigError(f"the figure {kind} has no use for {option}", remedy=remedy)
 
 
 def _make_strips(kind: Kind, checked: CheckedRequest, choice: _Choice) -> list[ComparisonStrip]:

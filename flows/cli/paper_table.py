@@ -10,7 +10,6 @@ import typer
 from flows.cli.detector_table import (
     NUMBER,
     DetectorTableParts,
-    measure_detector_table,
     refuse_other_options,
     refuse_table_8_options,
 )
@@ -33,6 +32,7 @@ from flows.cli.scene_options import (
     SceneCamerasOption,
     SceneOption,
     UpOption,
+    list_scene_options,
     make_scene_inputs,
 )
 from flows.defaults import DEFAULT_STORE
@@ -80,7 +80,10 @@ TestLogsOption = Annotated[
     list[str] | None,
     typer.Option("--test", help="For table 8, a log to test detectors on, as LOG. May be given several times."),
 ]
-SeedsOption = Annotated[int, typer.Option(help="For table 8, the number of trainings of each row.")]
+SeedsOption = Annotated[
+    int | None,
+    typer.Option(help="For table 8, the number of trainings of each row. If not given, 3."),
+]
 StepsOption = Annotated[
     int | None,
     typer.Option(help="For table 8, the gradient steps of a training. If not given, 3000."),
@@ -113,7 +116,7 @@ def table(
     chunk_frames: ChunkFramesOption = None,
     detector: TableDetectorOption = None,
     test: TestLogsOption = None,
-    seeds: SeedsOption = 3,
+    seeds: SeedsOption = None,
     steps: StepsOption = None,
     dry_run: DryRunOption = False,
 ) -> None:
@@ -136,10 +139,10 @@ def table(
     _check_outputs(out, into)
     numbers = parse_numbers(chunks, "--chunks")
     if number == NUMBER:
-        refuse_other_options(methods, weights, into, remarks, stored, scene, detector)
-        parts = DetectorTableParts(logs, test, preset, store, numbers, settings, out)
-        return measure_detector_table(parts.request(seeds, steps), dry_run)
-    refuse_table_8_options(test, steps)
+        options = list_scene_options(cameras, images, lidar, up=up, scale=scale, chunk_frames=chunk_frames)
+        refuse_other_options(methods, weights, into, remarks, stored, scene, detector, scene_options=options)
+        return DetectorTableParts(logs, test, preset, store, numbers, settings, out).measure(seeds, steps, dry_run)
+    refuse_table_8_options(test, seeds, steps)
     request = TableRequest(
         number=number,
         logs=tuple(logs or ()),

@@ -87,18 +87,11 @@ def make_scene_inputs(
     Raises:
         ConfigError: there is a scene and no cameras, or an option of a scene and no scene.
     """
-    from flows.enhancement.enhancement_request import AUTO, EnhancementInputs
+    from flows.enhancement.enhancement_request import EnhancementInputs
     from genre_tasks.errors import ConfigError
 
     if scene is None:
-        options = {
-            "--cameras": cameras,
-            "--images": images,
-            "--lidar": lidar,
-            "--up": None if up == AUTO else up,
-            "--scale": scale,
-            "--chunk-frames": chunk_frames,
-        }
+        options = list_scene_options(cameras, images, lidar, up=up, scale=scale, chunk_frames=chunk_frames)
         for name, value in options.items():
             # Ignored, it would leave the user believing that it was used.
             if value is not None:
@@ -110,3 +103,37 @@ def make_scene_inputs(
             remedy="Give --cameras transforms.json, or --cameras with the folder of a COLMAP model.",
         )
     return EnhancementInputs(scene, cameras, images, lidar, up, scale, chunk_frames)
+
+
+def list_scene_options(
+    cameras: Path | None,
+    images: Path | None,
+    lidar: Path | None,
+    *,
+    up: str,
+    scale: str | None,
+    chunk_frames: int | None,
+) -> dict[str, Path | str | int | None]:
+    """Lists the options that belong to a scene.
+
+    Args:
+        cameras: transforms.json, or the folder of a COLMAP model.
+        images: folder of images.
+        lidar: PLY of points.
+        up: ``auto``, or a direction.
+        scale: ``auto``, or metres a unit.
+        chunk_frames: frames of a chunk.
+
+    Returns:
+        Their values by name; ``None`` where one is not given, or is the default.
+    """
+    from flows.enhancement.enhancement_request import AUTO
+
+    return {
+        "--cameras": cameras,
+        "--images": images,
+        "--lidar": lidar,
+        "--up": None if up == AUTO else up,
+        "--scale": scale,
+        "--chunk-frames": chunk_frames,
+    }

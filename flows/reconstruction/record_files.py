@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +76,40 @@ def read_record(path: Path) -> dict[str, Any]:
             file=path,
         ) from error
     return record
+
+
+def read_sound_records(paths: Iterable[Path]) -> tuple[list[dict[str, Any]], dict[str, InputError]]:
+    """Reads the records of runs, and goes on where one is damaged.
+
+    Args:
+        paths: of each ``run.json``.
+
+    Returns:
+        The sound records, in the order of their paths, and the errors of the damaged ones by name of the folder.
+    """
+    sound = []
+    damaged = {}
+    for path in paths:
+        try:
+            sound.append(read_record(path))
+        except InputError as error:
+            damaged[path.parent.name] = error
+    return sound, damaged
+
+
+def summarise_damage(damaged: Mapping[str, InputError], remedy: str = "") -> InputError:
+    """Makes one error of all damaged records, for the end of a command that went on.
+
+    Args:
+        damaged: from :func:`read_sound_records`, not empty.
+        remedy: what to do after the records are mended.
+
+    Returns:
+        The error, with the file and the remedy of the first one.
+    """
+    first = next(iter(damaged.values()))
+    problem = f"{len(damaged)} records of runs are damaged, and all else is done; the first: {first.problem}"
+    return InputError(problem, remedy=f"{first.remedy} {remedy}".strip(), file=first.file)
 
 
 def _describe(error: Exception) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from flows.reconstruction.run_records import list_runs
+from flows.reconstruction.record_files import read_sound_records, summarise_damage
 from flows.upkeep.pins import list_run_keys
 from genre_tasks.errors import ArtifactCorruptError, GenreError
 from storage.address import Address
@@ -47,9 +47,9 @@ def repair_artifacts(
         What became of each artifact.
 
     Raises:
-        InputError: a run's record is damaged, or the store cannot be written.
+        InputError: a run's record is damaged, which is said when all else is done, or the store cannot be written.
     """
-    records = list_runs(store.uri)
+    records, damaged_records = read_sound_records(store.records.find("runs", "run.json"))
     addresses: dict[str, Address] = {}
     for name, error in damaged.items():
         try:
@@ -76,8 +76,11 @@ def repair_artifacts(
         if store.find(address) is not None:
             yield Repair(name, damaged[name].problem, "repaired")
         else:
-            why = failures.get(name, _explain(address, records))
+            why = failures.get(name, _explain(address, records, bool(damaged_records)))
             yield Repair(name, damaged[name].problem, "removed", why)
+    # At the end: one damaged record must not keep the runs of the others from being mended.
+    if damaged_records:
+        raise summarise_damage(damaged_records)
 
 
 def _discard_if_damaged(store: Store, address: Address) -> None:
@@ -93,10 +96,10 @@ def _discard_if_damaged(store: Store, address: Address) -> None:
             store.discard(artifact or address)
 
 
-def _explain(address: Address, records: list[dict[str, Any]]) -> str:
+def _explain(address: Address, records: list[dict[str, Any]], some_unread: bool) -> str:
     found = [record for record in records if address.key in list_run_keys(record)]
     if not found:
-        return "no run refers to it"
+        return "no run whose record can be read refers to it" if some_unread else "no run refers to it"
     if all("edited" in record for record in found):
         return f"`genre edit` makes it again for run {found[0]['run']}"
     return "the code, the weights or the log have changed since: run the log again"

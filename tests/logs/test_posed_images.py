@@ -14,7 +14,7 @@ from PIL import Image
 
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.logs.posed_images.colmap_model import read_colmap_model
-from genre_tasks.logs.posed_images.frame_grouping import FrameGroups
+from genre_tasks.logs.posed_images.frame_grouping import FrameGroups, group_frames
 from genre_tasks.logs.posed_images.image_log import PosedImagesLog
 from genre_tasks.logs.posed_images.posed_image import PosedImage
 from genre_tasks.logs.posed_images.rig_poses import fill_rig_poses
@@ -73,6 +73,52 @@ def test_times_and_labels_of_the_file_make_the_frames(tmp_path: Path, written: P
     log = open_log(rewrite(tmp_path, written, label))
     assert [camera.name for camera in log.cameras] == ["a", "b", "c"]
     assert [log.frame_timestamp_s(frame) for frame in range(3)] == [93.0, 94.0, 95.0]
+
+
+def move_into_moments(folder: Path, written: Path, has_labels: bool) -> str:
+    """The same images in a folder for each moment, such as ``000001/front_camera.png``."""
+
+    def move(values: dict[str, Any]) -> None:
+        for frame in values["frames"]:
+            source = written / frame["file_path"]
+            name = f"images/{int(source.stem):06d}/{source.parent.name}.png"
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source, folder / name)
+            frame.update(file_path=name, **{key: values["frames"][0][key] for key in ("fl_x", "fl_y", "cx", "cy")})
+            if has_labels:
+                frame["camera"] = source.parent.name.removesuffix("_camera")
+
+    rewrite(folder, written, move)
+    return f"posed_images:{folder}"
+
+
+def test_labels_are_cameras_where_folders_are_moments(tmp_path: Path, written: Path) -> None:
+    log = open_log(move_into_moments(tmp_path, written, has_labels=True))
+    recorded = open_log(f"posed_images:{written}")
+    assert [f"{camera.name}_camera" for camera in log.cameras] == [camera.name for camera in recorded.cameras]
+    assert log.frame_count == recorded.frame_count == 8
+    for frame in range(8):
+        for camera in log.cameras:
+            image = log.image_bytes(camera.name, frame)
+            assert image is not None and image == recorded.image_bytes(f"{camera.name}_camera", frame)
+
+
+def test_moments_without_labels_of_cameras_are_refused(tmp_path: Path, written: Path) -> None:
+    with pytest.raises(InputError, match="8 numbered folders have images such as front_camera") as caught:
+        open_log(move_into_moments(tmp_path, written, has_labels=False))
+    assert "`camera`" in caught.value.remedy
+
+
+@pytest.mark.parametrize("label", ["a camera's", "an image's", "one for all", "none"])
+def test_numbered_folders_of_cameras_stay_cameras(label: str) -> None:
+    def image(camera: int, frame: int) -> PosedImage:
+        labels = {"a camera's": f"c{camera}", "an image's": f"{camera}-{frame}", "one for all": "1", "none": None}
+        name = f"images/{camera}/{frame:04d}.png"
+        return PosedImage(name, np.eye(4), Lens(60.0, 60.0, 32.0, 18.0, 64, 36), labels[label])
+
+    found = group_frames([image(camera, frame) for camera in range(5) for frame in range(3)], Path("poses"))
+    assert found.cameras == tuple("01234") and len(found.frames) == 3
+    assert [frame["4"].name for frame in found.frames] == [f"images/4/000{frame}.png" for frame in range(3)]
 
 
 def test_cameras_that_fire_one_after_the_other_share_frames(tmp_path: Path, written: Path) -> None:

@@ -220,6 +220,41 @@ def test_damage_is_not_copied_and_all_else_is(store: LocalStore, tmp_path: Path)
     assert len(list(target.artifacts())) == len(PIPELINE) - 1 and len(list_runs(target.uri)) == 1
 
 
+def add_damaged_record(store: LocalStore) -> None:
+    folder = store.root / "runs" / ("d" * 12)
+    folder.mkdir()
+    (folder / "run.json").write_text("{")
+
+
+def test_a_damaged_record_is_left_out_of_a_copy_and_all_else_is_copied(store: LocalStore, tmp_path: Path) -> None:
+    run = record_of(store)["run"]
+    add_damaged_record(store)
+    target = LocalStore(tmp_path / "target")
+    with pytest.raises(InputError, match=r"1 records of runs are damaged, and all else is done.*d{12}/run\.json"):
+        copy_store(store, target)
+    assert len(list(target.artifacts())) == len(PIPELINE)
+    # The damaged one would make this an error.
+    assert [record["run"] for record in list_runs(target.uri)] == [run]
+
+
+def test_a_copy_leaves_newer_records_of_the_target(store: LocalStore, tmp_path: Path) -> None:
+    target = LocalStore(tmp_path / "target")
+    copy_store(store, target)
+    name = f"runs/{record_of(store)['run']}"
+    newer = json.loads((target.root / name / "run.json").read_text()) | {"store": "elsewhere", "status": "partly_done"}
+    (target.root / name / "run.json").write_text(json.dumps(newer))
+    (target.root / name / "report.html").write_text("newer")
+    (store.root / name / "more.txt").write_text("more")
+    assert copy_store(store, target).records == 1
+    assert json.loads((target.root / name / "run.json").read_text()) == newer
+    assert (target.root / name / "report.html").read_text() == "newer"
+    assert (target.root / name / "more.txt").read_text() == "more"
+    # What a stopped copy lacks is copied with its new place.
+    (target.root / name / "run.json").unlink()
+    assert copy_store(store, target).records == 1 and list_runs(target.uri)[0]["store"] == target.uri
+    assert copy_store(store, target).records == 0
+
+
 def test_a_copy_puts_back_what_was_removed_before_the_records_came(store: LocalStore, tmp_path: Path) -> None:
     target = LocalStore(tmp_path / "target")
     removed = []
@@ -232,6 +267,23 @@ def test_a_copy_puts_back_what_was_removed_before_the_records_came(store: LocalS
 
     copy_store(store, target, report=remove_garbage)
     assert len(removed) == len(list(target.artifacts())) == len(PIPELINE)
+
+
+def test_a_repair_goes_on_past_a_damaged_record(store: LocalStore) -> None:
+    run = record_of(store)["run"]
+    add_damaged_record(store)
+    (gnet,) = store.artifacts(stage="gnet")
+    stray = store.commit(address(), "evaluation", make("evaluation"))
+    for artifact in (gnet, stray):
+        next(artifact.path.glob("*.parquet")).write_bytes(b"else")
+    damage = {name: error for name, error in store.verify_all() if error is not None}
+    again: list[object] = []
+    found = {}
+    with pytest.raises(InputError, match=r"1 records of runs are damaged, and all else is done.*d{12}/run\.json"):
+        for repair in repair_artifacts(store, damage, lambda record: again.append(record["run"])):
+            found[repair.name] = repair.why
+    assert again == [run] and store.find(gnet.address) is None and len(found) == 2
+    assert found[str(stray.address.relative_path)] == "no run whose record can be read refers to it"
 
 
 def test_a_repair_leaves_what_has_become_sound_meanwhile(store: LocalStore) -> None:

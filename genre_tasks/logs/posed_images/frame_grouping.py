@@ -1,4 +1,5 @@
-"""Which images were taken together: by labels and times of the file, or by folders with equal file names.
+"""Which images were taken together: by labels and times of the file, by folders with equal file names, or by labels
+within folders that are moments.
 
 Cameras of a rig need not fire at once: by times, an image belongs to the nearest one of the camera with most images.
 """
@@ -20,6 +21,10 @@ ONE_CAMERA = "camera"
 _REMEDY = (
     "Keep the images of each camera in a folder of its own, with equal file names for images of one moment, or write "
     "`camera` and `time` into every frame of transforms.json."
+)
+_LABEL_REMEDY = (
+    "Write the label `camera` into every frame of transforms.json, or keep the images of each camera in a folder of "
+    "its own, with equal file names for images of one moment."
 )
 _TIME_REMEDY = "Write times of one clock in seconds; images of one moment are less than half a frame apart."
 _LENS_REMEDY = "Give each camera a folder of its own; COLMAP then needs --ImageReader.single_camera_per_folder 1."
@@ -58,19 +63,25 @@ def group_frames(images: Sequence[PosedImage], file: Path) -> FrameGroups:
         Frames in the order of their times, or of their names without times.
 
     Raises:
-        InputError: names of several folders do not agree, two images claim one place, a camera has two lenses, its
-            name would lead out of a folder, or some images have a time and others have none.
+        InputError: names of several folders do not agree, or are those of moments without labels of cameras; two
+            images claim one place, a camera has two lenses, its name would lead out of a folder, or some images have a
+            time and others have none.
     """
     _require_times_of_all(images, file)
     has_times = all(image.time_s is not None for image in images)
-    cameras = _name_cameras(images)
+    has_moment_folders = not has_times and _has_moment_folders(images)
+    if not has_times and not has_moment_folders:
+        _refuse_unlabelled_moments(images, file)
+    cameras = [str(image.camera) for image in images] if has_moment_folders else _name_cameras(images)
     names = sorted(set(cameras), key=_natural_key)
     require_camera_names(names, file=file)
-    keys: Sequence[float | str] = (
-        _match_times(images, cameras, names, file)
-        if has_times
-        else [PurePosixPath(image.name).stem for image in images]
-    )
+    keys: Sequence[float | str]
+    if has_times:
+        keys = _match_times(images, cameras, names, file)
+    elif has_moment_folders:
+        keys = [_name_folder(image) for image in images]
+    else:
+        keys = [PurePosixPath(image.name).stem for image in images]
     frames: dict[float | str, dict[str, PosedImage]] = {}
     for image, camera, key in zip(images, cameras, keys, strict=True):
         frame = frames.setdefault(key, {})
@@ -79,7 +90,11 @@ def group_frames(images: Sequence[PosedImage], file: Path) -> FrameGroups:
             raise InputError(problem, remedy=_REMEDY, file=file)
         frame[camera] = image
     if len(names) > 1:
-        _require_shared_frames(frames.values(), names, file, has_times)
+        if has_times:
+            _require_shared_frames(frames.values(), names, file, partner="near their time", remedy=_TIME_REMEDY)
+        else:
+            partner = "in their folder" if has_moment_folders else "of the same name in the folders of other cameras"
+            _require_shared_frames(frames.values(), names, file, partner=partner, remedy=_REMEDY)
     order = sorted(frames) if has_times else sorted(map(str, frames), key=_natural_key)
     _require_one_lens(images, cameras, file)
     groups = tuple(frames[key] for key in order)
@@ -118,9 +133,34 @@ def _require_times_of_all(images: Sequence[PosedImage], file: Path) -> None:
         raise InputError(problem, remedy=remedy, file=file)
 
 
+def _has_moment_folders(images: Sequence[PosedImage]) -> bool:
+    """Whether labels name the cameras and folders the moments: a folder has several of the few labels."""
+    labels_of: dict[str, set[str | None]] = {}
+    for image in images:
+        labels_of.setdefault(_name_folder(image), set()).add(image.camera)
+    labels = {label for found in labels_of.values() for label in found}
+    # COLMAP numbers a camera for every image unless it is asked not to: such labels are more than folders.
+    return None not in labels and len(labels) < len(labels_of) and any(len(found) > 1 for found in labels_of.values())
+
+
+def _refuse_unlabelled_moments(images: Sequence[PosedImage], file: Path) -> None:
+    """Raises where folders are numbered like moments and files named like cameras, which would swap the two."""
+    folders = {_name_folder(image) for image in images}
+    stems = {PurePosixPath(image.name).stem for image in images}
+    # Frames have numbers. Names without any in more folders than there are names can only be those of cameras.
+    is_numbered = all(PurePosixPath(folder).name.isdecimal() for folder in folders)
+    if is_numbered and 1 < len(stems) < len(folders) and not any(re.search(r"\d", stem) for stem in stems):
+        problem = f"{len(folders)} numbered folders have images such as {', '.join(sorted(stems)[:3])}: one a moment"
+        raise InputError(problem, remedy=_LABEL_REMEDY, file=file)
+
+
+def _name_folder(image: PosedImage) -> str:
+    return PurePosixPath(image.name).parent.as_posix()
+
+
 def _name_cameras(images: Sequence[PosedImage]) -> list[str]:
     """The camera of each image: by its label, or by its folder where labels do not say what was taken together."""
-    folders = [PurePosixPath(image.name).parent.as_posix() for image in images]
+    folders = [_name_folder(image) for image in images]
     labelled = all(image.camera is not None for image in images)
     # A model's number of a camera alone does not say which images were taken together; folders do.
     if labelled and (len(set(folders)) == 1 or all(image.time_s is not None for image in images)):
@@ -144,15 +184,14 @@ def _shared_parts(folders: Sequence[str]) -> tuple[str, ...]:
 
 
 def _require_shared_frames(
-    frames: Collection[Mapping[str, PosedImage]], names: Sequence[str], file: Path, has_times: bool
+    frames: Collection[Mapping[str, PosedImage]], names: Sequence[str], file: Path, *, partner: str, remedy: str
 ) -> None:
     counts = Counter(name for frame in frames for name in frame)
     together = Counter(name for frame in frames if len(frame) > 1 for name in frame)
     for name in names:
         if together[name] < _MIN_SHARED * counts[name]:
-            partner = "near their time" if has_times else "of the same name in the folders of other cameras"
             problem = f"{counts[name] - together[name]} of {counts[name]} images of {name} have no partner {partner}"
-            raise InputError(problem, remedy=_TIME_REMEDY if has_times else _REMEDY, file=file)
+            raise InputError(problem, remedy=remedy, file=file)
 
 
 def _require_one_lens(images: Sequence[PosedImage], cameras: Sequence[str], file: Path) -> None:
