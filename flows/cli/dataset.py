@@ -60,12 +60,9 @@ def dataset(
     """
     from flows.cli.outcome import add_facts
     from flows.configuration import load_configuration
-    from flows.configuration.settings import make_setting_absolute
     from flows.dataset.dataset_record import name_dataset
     from flows.pipeline.log_cache import expand_logs
     from genre_tasks.errors import ConfigError
-    from genre_tasks.logs.registry import make_log_absolute
-    from storage.opening import make_address_absolute
 
     if unit not in ("log", "chunk"):
         raise ConfigError(f"--by is '{unit}'", remedy="Give log or chunk.")
@@ -83,10 +80,7 @@ def dataset(
     load_configuration(preset, settings=settings or ())
     expanded = expand_logs(logs)
     if pool is not None:
-        # A worker runs in a folder of its own, which is removed with all that a relative store has got there.
-        store = make_address_absolute(store)
-        expanded = [make_log_absolute(log) for log in expanded]
-        settings = [make_setting_absolute(setting) for setting in settings or ()]
+        expanded, store, settings = _make_absolute(expanded, store, settings)
     name = name_dataset(expanded, preset, store, settings)
     facts = {"dataset": name, "preset": preset, "store": store}
     add_facts(**facts, logs=[])
@@ -98,6 +92,17 @@ def dataset(
     run_id = _submit(name, {**parameters, **on_pool}, follow, as_json)
     if follow:
         _follow(run_id, facts, as_json)
+
+
+def _make_absolute(logs: list[str], store: str, settings: list[str] | None) -> tuple[list[str], str, list[str]]:
+    """The same logs, store and settings for a worker, which runs in a folder of its own."""
+    from flows.configuration.settings import make_setting_absolute
+    from genre_tasks.logs.registry import make_log_absolute
+    from storage.opening import make_address_absolute
+
+    # Its folder is removed with all that a relative store has got there.
+    store = make_address_absolute(store)
+    return [make_log_absolute(log) for log in logs], store, [make_setting_absolute(s) for s in settings or ()]
 
 
 def _run_here(parameters: Mapping[str, Any], facts: Mapping[str, Any], as_json: bool) -> None:

@@ -223,8 +223,8 @@ def test_without_common_points_nothing_is_refined(monkeypatch: pytest.MonkeyPatc
 
 
 def test_the_images_of_one_camera_do_not_move_the_poses_of_an_exact_street() -> None:
-    uri = "synthetic:street?seed=12&samples=1&width=160&height=90&lidar_beams=32&lidar_azimuths=300"
-    config = IngestConfig(width_px=160, height_px=90, cameras=("front_camera",))
+    uri = "synthetic:street?seed=12&samples=1&lidar_beams=32&lidar_azimuths=300"
+    config = IngestConfig(width_px=320, height_px=180, cameras=("front_camera",))
     decision = plan_effects(ONLY, ingest(config, street(uri), 0), street(uri).cameras)["pose_refinement"]
     assert decision.choice == "off" and decision.reason == "5 source images are too few to tell"
 
