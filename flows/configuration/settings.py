@@ -10,7 +10,7 @@ from genre_tasks.errors import ConfigError
 from genre_tasks.user_paths import expand_user_path
 
 _HOW = "Write --set section.key=value."
-_PATH_KEYS = frozenset({"points", "scene", "weights", "inception", "lpips"})
+PATH_KEYS = frozenset({"points", "scene", "weights", "inception", "lpips"})
 """Last parts of the keys that take the path of a file or folder."""
 
 
@@ -61,11 +61,11 @@ def make_setting_absolute(setting: str) -> str:
     """
     path, value = parse_setting(setting)
     annotation = find_annotation(path)
-    if annotation is None or not takes_text(annotation) or not isinstance(value, str):
+    is_path = path[-1] in PATH_KEYS and annotation is not None and takes_text(annotation)
+    if not is_path or not isinstance(value, str):
         return setting
     file = expand_user_path(value)
-    is_path = path[-1] in _PATH_KEYS and file.exists()
-    return f"{'.'.join(path)}={file.absolute()}" if is_path else setting
+    return f"{'.'.join(path)}={file.absolute()}" if file.exists() else setting
 
 
 def _parse_value(path: KeyPath, text: str) -> Any:

@@ -76,7 +76,6 @@ def augment_runs(
 
 
 def _open_sources(request: AugmentRequest) -> list[tuple[RunScenes, DrivingLog]]:
-    from flows.simulation.recorded_log import open_recorded_log
     from flows.simulation.run_scenes import RunScenes
     from genre_tasks.training_sets.label_boxes import labeller_of
 
@@ -95,14 +94,14 @@ def _open_sources(request: AugmentRequest) -> list[tuple[RunScenes, DrivingLog]]
             # The log's annotation knows neither of removed actors nor of moved ones.
             problem = f"the traffic of the run {name} is edited, and the labels would be those of the recorded traffic"
             raise InputError(problem, remedy=f"Take the recorded run {edited['run']}.")
-        log = open_recorded_log(scenes)
+        log = scenes.log
         # Raises where there is nothing to label with.
         labeller_of(log)
         if digest_of.setdefault(log.name, log.digest()) != log.digest():
             # By its log's name a set tells where an image was taken.
             problem = f"two logs are called {log.name}"
             raise InputError(problem, remedy="Make a training set of each.", log=log.uri)
-        for frame in _list_frames(scenes):
+        for frame in _list_frames(scenes, log):
             other = known.setdefault((log.name, frame), name)
             # Two scenes of one place would put every recorded image into the set twice.
             if other != name:
@@ -112,14 +111,13 @@ def _open_sources(request: AugmentRequest) -> list[tuple[RunScenes, DrivingLog]]
     return sources
 
 
-def _list_frames(scenes: RunScenes) -> list[int]:
+def _list_frames(scenes: RunScenes, log: DrivingLog) -> list[int]:
     from flows.reconstruction.chunk_configuration import read_chunk_config
+    from genre_tasks.logs.log_selection import select_frames
 
     frames: list[int] = []
     for number in scenes.chunk_numbers:
-        count = read_chunk_config(scenes.record, number).ingest.chunk_frames
-        # The last chunk may be shorter, and then the log has no frame beyond it.
-        frames += range(number * count, (number + 1) * count)
+        frames += select_frames(read_chunk_config(scenes.record, number).ingest, log, number)
     return frames
 
 

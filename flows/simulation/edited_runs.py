@@ -187,7 +187,7 @@ def write_edited_run(store: str, run: str, edits: EditList, config: SimulateConf
         left_out=record.get("left_out", ()),
     )
     # The scenes are those that the budget's choices made, whatever was asked for.
-    extra = {name: record[name] for name in ("budget",) if name in record}
+    extra = {"budget": record["budget"]} if "budget" in record else {}
     extra["edited"] = {"run": record["run"], "edits": named.model_dump(mode="json")}
     return write_run_record(finished, summarise_run(finished), extra)
 

@@ -2,9 +2,26 @@
 
 from __future__ import annotations
 
-from flows.simulation.recorded_log import find_recorded_tracks
 from flows.simulation.run_scenes import RunScenes
 from genre_tasks.ego_paths.world_actors import WorldActor, list_parked_actors
+from genre_tasks.errors import InputError
+from genre_tasks.logs.types import CuboidTrack
+
+
+def find_tracks(recorded: RunScenes) -> tuple[CuboidTrack, ...] | None:
+    """Finds the annotated objects of a run's log.
+
+    Args:
+        recorded: the run.
+
+    Returns:
+        The objects; ``None`` where the log is gone or another one, as for a store that was copied from another machine,
+        or its boxes cannot be read, without which the run went on too.
+    """
+    try:
+        return recorded.log.tracks()
+    except InputError:
+        return None
 
 
 def list_parked(recorded: RunScenes) -> tuple[WorldActor, ...]:
@@ -14,9 +31,9 @@ def list_parked(recorded: RunScenes) -> tuple[WorldActor, ...]:
         recorded: the run.
 
     Returns:
-        The vehicles; none where the log is gone, or its boxes cannot be read.
+        The vehicles; none where :func:`find_tracks` finds nothing.
     """
-    tracks = find_recorded_tracks(recorded)
+    tracks = find_tracks(recorded)
     if tracks is None:
         return ()
     # Those of the chunks as recorded: an actor that an edit has removed is not parked in its place.

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from flows.pipeline.definition import STAGE_BY_NAME, digest_stage_weights
 from flows.simulation.edited_runs import OpenedRun, digest_edits
-from flows.simulation.recorded_log import find_recorded_log
 from flows.simulation.request import SimulationRequest
 from flows.simulation.run_scenes import RunScenes
 from flows.simulation.sensors import MODULES as SENSOR_MODULES
@@ -53,8 +52,7 @@ def compute_rollout_key(request: SimulationRequest, run: OpenedRun, config: Pipe
         modules += SENSOR_MODULES[sensor]
     # Parked vehicles are known from the log alone, and which rays a sensor sends is read from its sweeps. Where it is
     # gone, a path is not checked against them.
-    log = find_recorded_log(run.recorded)
-    inputs["log"] = "gone" if log is None else log.digest()
+    inputs["log"] = _digest_log(run.recorded)
     if len(edits):
         inputs["edits"] = digest_edits(request.store, _open_all_chunks(request, run), edits, config.simulate)
     configuration = {
@@ -78,6 +76,13 @@ def compute_rollout_key(request: SimulationRequest, run: OpenedRun, config: Pipe
     planners = [behaviour.target.partition(":")[0] for behaviour in BEHAVIOURS.values()]
     code = code_digest("genre_tasks.rollout.render_rollout", (*modules, *planners))
     return stage_key("rollout", code, configuration, inputs, weights)
+
+
+def _digest_log(recorded: RunScenes) -> str:
+    try:
+        return recorded.log.digest()
+    except InputError:
+        return "gone"
 
 
 def _open_all_chunks(request: SimulationRequest, run: OpenedRun) -> RunScenes:

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 
+import numpy as np
+
+from flows.pipeline.log_cache import cached_log
 from flows.reconstruction.run_records import find_run_record, name_run_folder
 from flows.reconstruction.stored_values import find_last_stage, read_stage_scene, read_stage_value
 from genre_tasks.effects.apply_plan import apply_plan
 from genre_tasks.errors import InputError
+from genre_tasks.logs.types import DrivingLog
+from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene_edits.chunk_scene import CHUNKS_IN_MEMORY, ChunkScene
 from storage.opening import open_store
+
+_SAME_POSE = 1e-3
 
 
 class RunScenes:
@@ -43,6 +50,20 @@ class RunScenes:
     def chunk_numbers(self) -> Sequence[int]:
         """Numbers of the chunks, in the order of the log."""
         return self._numbers
+
+    @cached_property
+    def log(self) -> DrivingLog:
+        """The log that the run was made of, for what its scenes do not hold.
+
+        Raises:
+            InputError: the log is gone, or another one is in its place.
+            ArtifactCorruptError: an artifact is damaged.
+        """
+        log = cached_log(self.record["log"])
+        if not _is_log_of(log, self.load(self._numbers[0]).chunk):
+            remedy = "Put the run's log back, or run the one that is there now."
+            raise InputError("another log is where the run's was", remedy=remedy, log=log.uri)
+        return log
 
     @property
     def folder(self) -> Path:
@@ -120,3 +141,11 @@ class RunScenes:
         if missing:
             raise InputError(f"the artifact of {missing[0]} is gone", remedy="Run the log again.", file=self._store)
         return found
+
+
+def _is_log_of(log: DrivingLog, chunk: Chunk) -> bool:
+    frame = chunk.frames[-1]
+    if log.name != chunk.log or frame >= log.frame_count:
+        return False
+    expected = chunk.world_SE3_chunk @ chunk.chunk_SE3_ego[-1]
+    return bool(np.allclose(log.world_SE3_lidar(frame), expected, rtol=0, atol=_SAME_POSE))

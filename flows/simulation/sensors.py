@@ -15,7 +15,6 @@ from flows.simulation.outputs import (
     write_linear_image,
 )
 from flows.simulation.prepared_rollout import PreparedRollout
-from flows.simulation.recorded_log import open_recorded_log
 from flows.simulation.request import SimulationRequest
 
 MODULES: dict[str, tuple[str, ...]] = {
@@ -61,8 +60,7 @@ def open_sensors(request: SimulationRequest, rollout: PreparedRollout, folder: P
     if "lidar" in request.sensors:
         from flows.simulation.lidar_files import LidarSweeps
 
-        log = open_recorded_log(rollout.recorded)
-        outputs.append(LidarSweeps(folder, log, rollout.checked.path))
+        outputs.append(LidarSweeps(folder, rollout.recorded.log, rollout.checked.path))
     if "rgb" in request.sensors:
         outputs.append(Films(folder, rollout.rig, rollout.checked.path.times_s, rollout.pose_s))
     return outputs

@@ -11,9 +11,9 @@ from flows.machine.facts import describe_environment
 from flows.machine.resource_usage import ResourceUsage, measure_usage
 from flows.simulation.edited_runs import open_run
 from flows.simulation.outputs import open_outputs
+from flows.simulation.parked_actors import find_tracks
 from flows.simulation.poses_table import write_poses
 from flows.simulation.prepared_rollout import PreparedRollout, prepare_rollout
-from flows.simulation.recorded_log import find_recorded_tracks
 from flows.simulation.repair import choose_repair
 from flows.simulation.request import SimulationRequest
 from flows.simulation.rollout_folder import KIND, find_rollout, write_rollout
@@ -116,7 +116,7 @@ def _render(
 def _list_warnings(rollout: PreparedRollout, metrics: dict[str, Any]) -> tuple[str, ...]:
     warnings = [f"implausible: {violation}" for violation in rollout.checked.violations]
     warnings += [f"collision: {collision}" for collision in rollout.checked.collisions]
-    if find_recorded_tracks(rollout.recorded) is None:
+    if find_tracks(rollout.recorded) is None:
         reason = "the log is gone or another one, or its boxes cannot be read"
         warnings.append(f"{reason}: the path was not checked against parked vehicles")
     reliable = metrics.get("reliable_fraction")

@@ -10,7 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flows.configuration import apply_settings, load_configuration, validate_config
+from flows.configuration.settings import PATH_KEYS, make_setting_absolute
 from genre_tasks.config import PipelineConfig
+from genre_tasks.config.section import Section
 from genre_tasks.errors import ConfigError
 
 ODD_TEXTS = (
@@ -167,3 +169,16 @@ def test_effects_take_words_in_every_spelling(tmp_path: Path) -> None:
         file = _write(tmp_path / "c.yaml", text)
         assert load_configuration("small", file).effects.exposure == "on"
     assert load_configuration("small", settings=["effects=off"]).effects.exposure == "off"
+
+
+def test_every_key_that_takes_a_file_is_made_absolute_for_workers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fields = [(name, field) for section in Section.__subclasses__() for name, field in section.model_fields.items()]
+    files = {name for name, field in fields if "expanduser" in f"{field.annotation} {field.metadata}"}
+    assert len(files) >= 4 and files | {"weights"} == PATH_KEYS
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "adam").mkdir()
+    # A folder of that name does not make a path of a method.
+    assert make_setting_absolute("gnet.method=adam") == "gnet.method=adam"
+    assert make_setting_absolute("gnet.weights=adam") == f"gnet.weights={tmp_path}/adam"

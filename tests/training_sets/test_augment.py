@@ -18,7 +18,7 @@ from flows.pipeline.definition import STAGE_BY_NAME
 from flows.pipeline.log_cache import cached_log
 from flows.pipeline.stage_runner import ArtifactRef, Job, run_stage
 from flows.reconstruction.run_records import FinishedRun, summarise_run, write_run_record
-from flows.simulation import recorded_log
+from flows.simulation import run_scenes
 from flows.simulation.edited_runs import write_edited_run
 from flows.simulation.run_scenes import RunScenes
 from genre_tasks.errors import ConfigError, GenreError, InputError
@@ -168,7 +168,7 @@ def test_another_log_in_the_place_of_the_runs_is_refused(
     finished: FinishedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     there = LOG.replace("seed=900", "seed=901")
-    monkeypatch.setattr(recorded_log, "cached_log", lambda uri: cached_log(there))
+    monkeypatch.setattr(run_scenes, "cached_log", lambda uri: cached_log(there))
     assert "another log is where the run's was" in str(refusal(finished, "--out", str(tmp_path / "set")))
 
 
