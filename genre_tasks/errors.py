@@ -106,5 +106,9 @@ class DiskFullError(ResourceError):
     """A disk is full, or a quota or a limit of file sizes is reached; not retried, as a retry fills it once more."""
 
 
+class UnsupportedMachineError(ResourceError):
+    """The machine lacks a part, such as a compiled kernel, a package or a GPU; not retried, as it still would."""
+
+
 class TransientIOError(GenreError):
     """A read or write failed in a way that may pass, such as a busy network store; retried after a pause."""

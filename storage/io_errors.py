@@ -30,7 +30,7 @@ class _Translation:
 
 
 # The class decides what a flow does: it repeats a TransientIOError after a pause, and a ResourceError with less memory
-# at a time, unless it is a DiskFullError. Everything else stops the run.
+# at a time, unless it is one of those that no retry cures. Everything else stops the run.
 _TRANSLATIONS = (
     _Translation(
         # No retry helps here, so the remedy says what is most feared: nothing is lost.

@@ -80,13 +80,14 @@ FigureFileOption = Annotated[
     ),
 ]
 
-# Of the options that choose what of a log is shown.
+# Of the options that choose what of a log is shown, and of which methods.
 _CHOICES: Mapping[str, Sequence[str]] = {
-    "recon": ("--camera", "--frame"),
-    "fixers": ("--camera", "--frame"),
-    "swerve": ("--camera",),
+    "recon": ("--camera", "--frame", "--method"),
+    "fixers": ("--camera", "--frame", "--method"),
+    "swerve": ("--camera", "--method"),
+    # It edits the scene of one method, GenRe+.
     "manipulation": ("--camera", "--frame", "--actor"),
-    "agreement": ("--frame",),
+    "agreement": ("--frame", "--method"),
 }
 
 
@@ -127,7 +128,7 @@ def figure(
 
     parsed_kind = parse_kind(kind)
     choice = _Choice(camera, frame, actor)
-    _refuse_unused(parsed_kind, choice)
+    _refuse_unused(parsed_kind, choice, methods)
     # Checked before any stage is computed, which may take minutes.
     check_output_file(out, "--out", (".png",))
     # Edits are shown at one moment, and reading more chunks for it would take minutes.
@@ -162,10 +163,10 @@ class _Choice:
     actor: str | None
 
 
-def _refuse_unused(kind: Kind, choice: _Choice) -> None:
+def _refuse_unused(kind: Kind, choice: _Choice, methods: Sequence[Path] | None) -> None:
     from genre_tasks.errors import ConfigError
 
-    options = {"--camera": choice.camera, "--frame": choice.frame, "--actor": choice.actor}
+    options = {"--camera": choice.camera, "--frame": choice.frame, "--actor": choice.actor, "--method": methods or None}
     for option, value in options.items():
         # Without an effect it would be taken for one that has one.
         if value is not None and option not in _CHOICES[kind]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from flows.configuration import load_configuration
-from flows.cost_sweep.knobs import PRESET_ITSELF, Setting
+from flows.cost_sweep.knobs import PRESET_ITSELF, RESOLUTION, Setting
 from flows.experiments.log_chunks import LogChunk
 from flows.experiments.stage_prediction import StagePredictor
 from flows.experiments.stages import StageRunner, image_counts, metric_values, read_stage_costs, run_stages
@@ -119,13 +119,16 @@ def run_cell(sweep: Sweep, cell: Cell, runner: StageRunner) -> dict[str, Any] | 
 
     Returns:
         A row: seconds, CPU seconds and memory of the stages, number of Gaussians, and the metrics of the end's scene.
-        ``None`` for an effect that the plan sets as the cell would, or that the log makes impossible.
+        ``None`` for an effect that the plan sets as the cell would, or that the log makes impossible, and for larger
+        images than the log's that ingest leaves at the preset's size.
 
     Raises:
         GenreError: as the stages raise it.
     """
     # A cell that equals the preset would show the noise of timing as a gain.
     if cell.setting.effect is not None and not _changes_the_plan(sweep, cell, runner):
+        return None
+    if cell.setting.knob == RESOLUTION and not _changes_the_images(sweep, cell, runner):
         return None
     job = sweep.job(cell)
     # The end belongs to the setting, because some knobs leave out ENet altogether.
@@ -178,6 +181,15 @@ def _changes_the_plan(sweep: Sweep, cell: Cell, runner: StageRunner) -> bool:
     # Off without a measured value means that the log lacks what the effect needs.
     impossible = decision.choice == "off" and math.isnan(decision.value)
     return decision.choice != cell.setting.effect_state and not impossible
+
+
+def _changes_the_images(sweep: Sweep, cell: Cell, runner: StageRunner) -> bool:
+    """Tells whether the cell's images have another size than the preset's; none is enlarged beyond the log's own."""
+    sizes = []
+    for job in (sweep.job(cell), sweep.reference_job(cell)):
+        chunk = read_artifact(job, runner("ingest", job, {}))
+        sizes.append([(view.lens.width_px, view.lens.height_px) for view in chunk.views])
+    return sizes[0] != sizes[1]
 
 
 def predict_cells(sweep: Sweep, cells: Sequence[Cell]) -> list[dict[str, Any]]:

@@ -21,6 +21,7 @@ PRESET_ITSELF = "preset"
 TOGETHER = "together"
 MORE_GAUSSIANS = "more_gaussians"
 EFFECTS = "effects"
+RESOLUTION = "resolution"
 GNET_ITERATIONS = (1, 4, 8, 16, 24, 48, 72, 144)
 ENET_FRACTIONS = (1 / 6, 1 / 3, 2 / 3, 2.0)
 """ENet's iterations, as fractions of the preset's."""
@@ -140,8 +141,8 @@ def _knobs(base: PipelineConfig) -> Mapping[str, list[Setting]]:
     return {
         "gnet_iterations": [_turn("gnet_iterations", f"{n}", f"gnet.iterations={n}") for n in GNET_ITERATIONS],
         "enet_iterations": [_turn("enet_iterations", f"{n}", f"enet.iterations={n}") for n in enet_iterations],
-        "resolution": [
-            _turn("resolution", f"{w}x{h}", f"ingest.width_px={w}", f"ingest.height_px={h}") for w, h in IMAGE_SIZES
+        RESOLUTION: [
+            _turn(RESOLUTION, f"{w}x{h}", f"ingest.width_px={w}", f"ingest.height_px={h}") for w, h in IMAGE_SIZES
         ],
         "gaussians": [
             _turn("gaussians", f"{n}", f"initial.max_points={n}")

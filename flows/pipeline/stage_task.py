@@ -20,7 +20,7 @@ from flows.observability.stage_context import with_stage_context
 from flows.pipeline.gpu_slot import gpu_slot
 from flows.pipeline.progress import get_reporter
 from flows.pipeline.stage_runner import ArtifactRef, Job, run_stage
-from genre_tasks.errors import DiskFullError, ResourceError, TransientIOError
+from genre_tasks.errors import DiskFullError, ResourceError, TransientIOError, UnsupportedMachineError
 
 # Each retry halves the batch of a stage that has one, so three retries divide it by eight.
 RETRIES = 3
@@ -33,8 +33,8 @@ async def _can_retry(task: Task[..., Any], run: TaskRun, state: State[Any]) -> b
     """Whether a retry can cure the failure: with less memory after ``ResourceError``, later after an I/O error."""
     try:
         await state.aresult()
-    except DiskFullError:
-        # The stage would be computed to its end once more, and write as much.
+    except (DiskFullError, UnsupportedMachineError):
+        # A full disk would let the stage be computed to its end once more, and a machine stays what it is.
         return False
     except (ResourceError, TransientIOError):
         return True

@@ -101,14 +101,14 @@ def summarise_damage(damaged: Mapping[str, InputError], remedy: str = "") -> Inp
     """Makes one error of all damaged records, for the end of a command that went on.
 
     Args:
-        damaged: from :func:`read_sound_records`, not empty.
+        damaged: the errors, by name of the record, such as from :func:`read_sound_records`; not empty.
         remedy: what to do after the records are mended.
 
     Returns:
         The error, with the file and the remedy of the first one.
     """
     first = next(iter(damaged.values()))
-    problem = f"{len(damaged)} records of runs are damaged, and all else is done; the first: {first.problem}"
+    problem = f"{len(damaged)} records are damaged, and all else is done; the first: {first.problem}"
     return InputError(problem, remedy=f"{first.remedy} {remedy}".strip(), file=first.file)
 
 

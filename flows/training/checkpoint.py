@@ -6,7 +6,6 @@ them in JSON. Names in the file are those of older versions where these differ, 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from genre_tasks.atomic_path import write_atomically
+from genre_tasks.checkpoint_files import read_checkpoint, read_description, write_checkpoint
 from genre_tasks.errors import InputError
 from genre_tasks.learned.learned_optimiser import LearnedOptimiser
 from genre_tasks.learned.meta_episodes import Episode, EpisodeConfig
@@ -39,6 +38,7 @@ HELD_OUT_VIEWS = "judges"
 
 ADAM_NAMES = ("step", "exp_avg", "exp_avg_sq")
 REMEDY = "Train with the same settings, or into an empty folder."
+_READ_REMEDY = "Delete it to train the stage anew."
 
 
 def save(training: MetaTraining, path: Path, origin: Mapping[str, str] | None = None) -> None:
@@ -49,8 +49,6 @@ def save(training: MetaTraining, path: Path, origin: Mapping[str, str] | None = 
         path: of the file.
         origin: what else the training depends on, name → digest; :func:`resume` compares it.
     """
-    from safetensors.torch import save as serialise
-
     tensors = {f"weights.{name}": value for name, value in training.network.state_dict().items()}
     for name, value in _adam_tensors(training):
         tensors[f"optimiser.{name}"] = value
@@ -63,9 +61,7 @@ def save(training: MetaTraining, path: Path, origin: Mapping[str, str] | None = 
         "origin": dict(origin or {}),
         "pool": [_describe_episode(episode) for episode in training.pool],
     }
-    # Clones, because safetensors refuses tensors that share memory, as the moments of a new state do.
-    copies = {name: value.detach().clone().contiguous() for name, value in tensors.items()}
-    write_atomically(path, serialise(copies, {"training": json.dumps(description)}))
+    write_checkpoint(path, tensors, description)
 
 
 def describe(path: Path) -> dict[str, Any]:
@@ -80,17 +76,12 @@ def describe(path: Path) -> dict[str, Any]:
     Raises:
         InputError: the file is no checkpoint.
     """
-    from safetensors import SafetensorError, safe_open
-
+    description = read_description(path, _READ_REMEDY)
     try:
-        with safe_open(path, "pt") as file:
-            description: dict[str, Any] = json.loads((file.metadata() or {})["training"])
         # Older checkpoints lack settings that have since been added; they mean the defaults.
         description["network"] = NetworkConfig(**description["network"]).model_dump(mode="json")
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise InputError(
-            f"The checkpoint cannot be read: {error}", remedy="Delete it to train the stage anew.", file=path
-        ) from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"the checkpoint cannot be read: {error}", remedy=_READ_REMEDY, file=path) from error
     return description
 
 
@@ -103,7 +94,7 @@ def resume(training: MetaTraining, path: Path, origin: Mapping[str, str] | None 
         origin: as for :func:`save`.
 
     Raises:
-        InputError: the checkpoint was saved with others, or is none.
+        InputError: the checkpoint was saved with others, is damaged, or is none.
     """
     description = describe(path)
     # Before anything is changed: a refused checkpoint leaves the new training as it was.
@@ -127,7 +118,7 @@ def load_weights(network: LearnedOptimiser, path: Path) -> None:
         path: of the checkpoint.
 
     Raises:
-        InputError: its weights are not those of such a network.
+        InputError: its weights are not those of such a network, or the file is damaged.
     """
     weights = _with_prefix(_read_tensors(path, torch.device("cpu")), "weights.")
     require_weights_fit(weights, network.state_dict(), path, REMEDY)
@@ -155,10 +146,7 @@ def _check_settings(
 
 
 def _read_tensors(path: Path, device: torch.device) -> dict[str, Tensor]:
-    from safetensors import safe_open
-
-    with safe_open(path, "pt") as file:
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dictionary
+    _, tensors = read_checkpoint(path, _READ_REMEDY)
 
     # Adam counts its steps, and generators keep their state, on the CPU.
     def stays(name: str) -> bool:

@@ -103,16 +103,33 @@ def list_pins(store: Store) -> list[Pin]:
     Raises:
         InputError: one is damaged.
     """
+    pins, damaged = read_sound_pins(store)
+    # To ignore it would let what it keeps be removed.
+    for error in damaged.values():
+        raise error
+    return pins
+
+
+def read_sound_pins(store: Store) -> tuple[list[Pin], dict[str, InputError]]:
+    """Reads all pins of a store, and goes on where one is damaged.
+
+    Args:
+        store: to look in.
+
+    Returns:
+        The sound pins, oldest first, and the errors of the damaged ones by name of the folder.
+    """
     pins = []
+    damaged = {}
     for path in store.records.find(PINS, _FILE):
         try:
             values = json.loads(path.read_bytes())
             keys = tuple(str(key) for key in values["keys"])
             pins.append(Pin(str(values["name"]), keys, str(values["note"]), str(values["pinned_at"])))
-        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-            # To ignore it would let what it keeps be removed.
-            raise InputError("the pin is damaged", remedy="Remove the folder, and pin again.", file=path) from error
-    return pins
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            error = InputError("the pin is damaged", remedy="Remove the folder, and pin again.", file=path)
+            damaged[path.parent.name] = error
+    return pins, damaged
 
 
 def list_run_keys(record: dict[str, object]) -> list[str]:

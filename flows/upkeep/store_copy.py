@@ -13,7 +13,7 @@ from flows.dataset.dataset_record import DATASETS
 from flows.reconstruction.record_files import read_record, read_sound_records, summarise_damage
 from flows.reconstruction.run_records import find_run_record, name_run_folder
 from flows.upkeep.garbage import add_ancestors, list_sources, measure_bytes
-from flows.upkeep.pins import PINS, list_pins, list_run_keys
+from flows.upkeep.pins import PINS, list_run_keys, read_sound_pins
 from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import ArtifactCorruptError, InputError
 from storage.io_errors import as_genre_error
@@ -83,7 +83,7 @@ def copy_store(
 @dataclass(frozen=True)
 class _Selection:
     # What of the source is asked for: artifacts and folders of records that it has, keys that it lacks, and the errors
-    # of records of runs that are left out.
+    # of records that are left out.
     artifacts: Sequence[Artifact]
     records: Sequence[str]
     missing: Sequence[str]
@@ -96,16 +96,17 @@ def _select_all(source: Store) -> _Selection:
     names = _list_records(source)
     sound, damaged = read_sound_records(source.records.find("runs", _RUN_RECORD))
     wanted = {key for record in sound for key in list_run_keys(record)}
-    wanted |= {key for pin in list_pins(source) for key in pin.keys}
-    left_out = {name_run_folder(name) for name in damaged}
+    pins, damaged_pins = read_sound_pins(source)
+    wanted |= {key for pin in pins for key in pin.keys}
+    left_out = {name_run_folder(name) for name in damaged} | {f"{PINS}/{name}" for name in damaged_pins}
     records = [name for name in names if name not in left_out]
-    return _Selection(artifacts, records, sorted(wanted - keys), damaged)
+    return _Selection(artifacts, records, sorted(wanted - keys), damaged | damaged_pins)
 
 
 def _select_named(source: Store, runs: Sequence[str], pinned: bool) -> _Selection:
     artifacts = list(source.artifacts())
     by_key = {artifact.address.key: artifact for artifact in artifacts}
-    pins = list_pins(source) if pinned else []
+    pins, damaged_pins = read_sound_pins(source) if pinned else ([], {})
     pinned_runs = [pin.name for pin in pins if source.records.find("runs", _RUN_RECORD, pin.name)]
     found = _find_with_recorded([find_run_record(source.uri, run) for run in (*runs, *pinned_runs)], source)
     wanted = {key for record in found for key in list_run_keys(dict(record))}
@@ -117,7 +118,7 @@ def _select_named(source: Store, runs: Sequence[str], pinned: bool) -> _Selectio
         artifacts=[artifact for artifact in artifacts if artifact.address.key in needed],
         records=[name for name in _list_records(source) if name in names],
         missing=sorted(wanted - set(by_key)),
-        damaged_records={},
+        damaged_records=damaged_pins,
     )
 
 
@@ -125,7 +126,7 @@ def _require_complete(source: Store, selection: _Selection, damaged: Mapping[str
     """Raises where something that is asked for could not be copied."""
     remedy = "Run `genre verify --repair` there, and copy again."
     damaged_records = selection.damaged_records
-    note = f"; so are {len(damaged_records)} records of runs" if damaged_records else ""
+    note = f"; so are {len(damaged_records)} records" if damaged_records else ""
     if damaged:
         first = next(iter(damaged.values()))
         problem = f"{len(damaged)} artifacts are damaged{note}, and all else is copied; the first: {first.problem}"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from genre_tasks.compiled import build
 from genre_tasks.compiled.build import Kernel
-from genre_tasks.errors import ConfigError, ResourceError
+from genre_tasks.errors import ConfigError, UnsupportedMachineError
 
 REMEDY = "Run `pip install -e .` in the repository (it needs a C++ compiler: g++, clang++ or what CXX names)"
 _NEEDED_FLAGS = {
@@ -47,7 +47,7 @@ def candidate_instruction_sets() -> list[str]:
 
     Raises:
         ConfigError: ``GENRE_RENDER_ISA`` names what this machine cannot run.
-        ResourceError: the machine runs none.
+        UnsupportedMachineError: the machine runs none.
     """
     supported = supported_instruction_sets()
     wanted = os.environ.get("GENRE_RENDER_ISA")
@@ -57,7 +57,7 @@ def candidate_instruction_sets() -> list[str]:
             f"GENRE_RENDER_ISA={wanted} cannot run on this machine", remedy=f"Unset it, or choose from {supported}"
         )
     if not supported:
-        raise ResourceError(
+        raise UnsupportedMachineError(
             "the CPU is older than the kernel's oldest instruction set (SSE4.2)", remedy="Use backend reference"
         )
     return [wanted] if wanted else supported
@@ -75,20 +75,20 @@ def load(kernel: Kernel, folder: Path) -> ctypes.CDLL:
 
     Raises:
         ConfigError: ``GENRE_RENDER_ISA`` names what this machine cannot run.
-        ResourceError: the library was never compiled, is older than its sources, or does not load.
+        UnsupportedMachineError: the library was never compiled, is older than its sources, or does not load.
     """
     # The best that exists: a compiler may not have been able to make the best that runs.
     paths = [folder / kernel.library_name(isa) for isa in candidate_instruction_sets()]
     path = next((p for p in paths if p.exists()), None)
     if path is None:
-        raise ResourceError(f"{kernel.title} is not compiled", remedy=REMEDY, file=paths[0])
+        raise UnsupportedMachineError(f"{kernel.title} is not compiled", remedy=REMEDY, file=paths[0])
     try:
         library = ctypes.CDLL(str(path))
         # The digest comes first: argument types declared on a stale library would crash, not raise.
         library.genre_digest.restype = ctypes.c_char_p
         digest = library.genre_digest().decode()
     except (OSError, AttributeError) as error:
-        raise ResourceError(f"{kernel.title} does not load: {error}", remedy=REMEDY, file=path) from error
+        raise UnsupportedMachineError(f"{kernel.title} does not load: {error}", remedy=REMEDY, file=path) from error
     if digest != kernel.source_digest():
-        raise ResourceError(f"{kernel.title} is older than its sources", remedy=REMEDY, file=path)
+        raise UnsupportedMachineError(f"{kernel.title} is older than its sources", remedy=REMEDY, file=path)
     return library

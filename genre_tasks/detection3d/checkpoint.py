@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from genre_tasks.atomic_path import write_atomically
+from genre_tasks.checkpoint_files import read_checkpoint, write_checkpoint
 from genre_tasks.detection3d.network import Detector3dNetwork
 from genre_tasks.detection3d.settings import Detector3dConfig
 from genre_tasks.errors import InputError
@@ -48,8 +47,6 @@ def save_checkpoint(training: DetectorTraining, path: Path, config: Detector3dCo
         config: of the training.
         examples_digest: of the training examples.
     """
-    from safetensors.torch import save
-
     tensors = {f"weights.{name}": value for name, value in training.network.state_dict().items()}
     for name, parameter in training.network.named_parameters():
         # By name and not by index, so that a checkpoint does not depend on the order of parameters.
@@ -57,9 +54,7 @@ def save_checkpoint(training: DetectorTraining, path: Path, config: Detector3dCo
             tensors[f"optimiser.{key}.{name}"] = torch.as_tensor(value)
     tensors["losses"] = torch.tensor(training.losses, dtype=torch.float64)
     description = {"step": training.step, "config": config.model_dump(mode="json"), "examples": examples_digest}
-    # Clones, because safetensors refuses tensors that share memory.
-    copies = {name: value.detach().clone().contiguous() for name, value in tensors.items()}
-    write_atomically(path, save(copies, {"training": json.dumps(description)}))
+    write_checkpoint(path, tensors, description)
 
 
 def restore_checkpoint(training: DetectorTraining, path: Path, config: Detector3dConfig, examples_digest: str) -> None:
@@ -72,20 +67,16 @@ def restore_checkpoint(training: DetectorTraining, path: Path, config: Detector3
         examples_digest: of the training examples.
 
     Raises:
-        InputError: the file is no checkpoint, or one of other images or settings.
+        InputError: the file is no checkpoint, is damaged, or is one of other images or settings.
     """
-    from safetensors import SafetensorError, safe_open
-
     if not path.exists():
         return
+    description, tensors = read_checkpoint(path, REMEDY, STAGE)
     try:
-        with safe_open(path, "pt") as file:
-            description: dict[str, Any] = json.loads((file.metadata() or {})["training"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dictionary
         losses = tensors.pop("losses").tolist()
         step = int(description["step"])
         changed = _find_changes(description, config, examples_digest)
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"the checkpoint cannot be read: {error}", remedy=REMEDY, file=path, stage=STAGE) from error
     if changed:
         problem = f"the checkpoint is of a training with other {', '.join(changed)}"

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from genre_tasks.errors import ConfigError, ResourceError
+from genre_tasks.errors import ConfigError, UnsupportedMachineError
 from genre_tasks.render import constants as const
 from genre_tasks.render.types import Cameras
 from genre_tasks.scene.gaussians import Splats
@@ -29,21 +29,21 @@ def render_cuda(splats: Splats, cameras: Cameras) -> tuple[tuple[Tensor, Tensor,
         Colour [V, H, W, 3], alpha and depth [V, H, W], float32, on the splats' device; and the culled counts by reason.
 
     Raises:
-        ResourceError: gsplat or a GPU is missing, or this gsplat has neither distortion nor rolling shutter.
-        ConfigError: a shutter, and Gaussians with velocities of their own, which gsplat does not know; or anti-aliasing
-            together with a distortion or a shutter.
+        UnsupportedMachineError: gsplat or a GPU is missing, or this gsplat has neither distortion nor rolling shutter.
+        ConfigError: the splats are on the CPU; a shutter, and Gaussians with velocities of their own, which gsplat does
+            not know; or anti-aliasing together with a distortion or a shutter.
         ValueError: the gradient in a pose is asked for with a distortion or a shutter; gsplat has none.
     """
     try:
         from gsplat import rasterization
     except ImportError as error:
-        raise ResourceError(
+        raise UnsupportedMachineError(
             "the cuda backend needs gsplat, which is not installed", remedy="Run `pip install -e '.[cuda]'` or use cpu"
         ) from error
     if not torch.cuda.is_available():
-        raise ResourceError("the cuda backend found no GPU", remedy="Use backend cpu")
+        raise UnsupportedMachineError("the cuda backend found no GPU", remedy="Use backend cpu")
     if splats.means.device.type != "cuda":
-        raise ResourceError("the cuda backend got tensors on the CPU", remedy="Move the splats to the GPU, or use cpu")
+        raise ConfigError("the cuda backend got tensors on the CPU", remedy="Move the splats to the GPU, or use cpu")
     # Checked before any work on the GPU: what gsplat cannot render raises here with its remedy.
     options = _camera_options(splats, cameras)
     safe, culled = _replace_invalid(splats, len(cameras))
@@ -90,7 +90,7 @@ def _camera_options(splats: Splats, cameras: Cameras) -> dict[str, Any]:
 
     # The first releases with this function know neither; their error would be about an unexpected argument.
     if not hasattr(gsplat, "RollingShutterType"):
-        raise ResourceError(
+        raise UnsupportedMachineError(
             "this gsplat renders neither lens distortion nor rolling shutter",
             remedy="Run `pip install 'gsplat>=1.5.3'` or use backend cpu",
         )

@@ -21,7 +21,14 @@ from flows.pipeline.log_cache import cached_log, expand_logs
 from flows.pipeline.stage_runner import Job
 from flows.reconstruction import flow, outcome_artifact, run_records, stored_values
 from flows.reconstruction.left_out import ChunksLeftOutError, LogsFailedError
-from genre_tasks.errors import ConfigError, DiskFullError, InputError, ResourceError, TransientIOError
+from genre_tasks.errors import (
+    ConfigError,
+    DiskFullError,
+    InputError,
+    ResourceError,
+    TransientIOError,
+    UnsupportedMachineError,
+)
 from tests.faults.small_run import LOG, SETTINGS
 
 OTHER_LOG = LOG.replace("seed=900", "seed=902")
@@ -122,7 +129,7 @@ def test_a_chunk_that_failed_by_its_surroundings_is_tried_again(monkeypatch: pyt
     assert [row["is_passing"] for row in rows] == [False, True]
 
 
-@pytest.mark.parametrize("kind", [ConfigError, DiskFullError])
+@pytest.mark.parametrize("kind", [ConfigError, DiskFullError, UnsupportedMachineError])
 def test_what_no_retry_can_cure_is_not_retried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: type) -> None:
     calls: list[str] = []
 

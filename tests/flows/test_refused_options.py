@@ -15,7 +15,7 @@ from genre_tasks.errors import ConfigError
 
 LOG = "synthetic:street?seed=1000"
 TEST_LOG = "synthetic:street?seed=1001"
-CHOICES = (["--camera", "front_camera"], ["--frame", "0"], ["--actor", "car"])
+CHOICES = (["--camera", "front_camera"], ["--frame", "0"], ["--actor", "car"], ["--method", "method.yaml"])
 
 
 class Checked(Exception):
@@ -67,11 +67,11 @@ def test_table_8_has_three_seeds_unless_it_is_asked_for_others() -> None:
 @pytest.mark.parametrize(
     ("kind", "used"),
     [
-        ("recon", {"--camera", "--frame"}),
-        ("fixers", {"--camera", "--frame"}),
-        ("swerve", {"--camera"}),
+        ("recon", {"--camera", "--frame", "--method"}),
+        ("fixers", {"--camera", "--frame", "--method"}),
+        ("swerve", {"--camera", "--method"}),
         ("manipulation", {"--camera", "--frame", "--actor"}),
-        ("agreement", {"--frame"}),
+        ("agreement", {"--frame", "--method"}),
     ],
 )
 def test_a_figure_refuses_what_it_does_not_use(
@@ -84,4 +84,4 @@ def test_a_figure_refuses_what_it_does_not_use(
         else:
             assert isinstance(result.exception, ConfigError)
             assert result.exception.problem == f"the figure {kind} has no use for {option[0]}"
-            assert "manipulation" in result.exception.remedy
+            assert "it belongs to" in result.exception.remedy

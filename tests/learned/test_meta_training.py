@@ -144,6 +144,21 @@ def test_a_checkpoint_from_before_networks_were_told_residuals_resumes(tmp_path:
     assert again.done == 1 and whole.step() == again.step()
 
 
+def test_a_checkpoint_whose_bytes_changed_is_refused(tmp_path: Path) -> None:
+    scenes, path = [_scene(0)], tmp_path / "c.safetensors"
+    training = MetaTraining(initialise_network(NETWORK, 0), scenes, CONFIG)
+    checkpoint.save(training, path)
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+    assert checkpoint.describe(path)["done"] == 0
+    before = _weights(training)
+    for read in (checkpoint.resume, lambda training, path: checkpoint.load_weights(training.network, path)):
+        with pytest.raises(InputError, match=r"bytes have changed since it was written .*c\.safetensors.*Delete it"):
+            read(training, path)
+    assert all(map(torch.equal, before, _weights(training)))
+
+
 def test_a_checkpoint_of_other_settings_is_refused(tmp_path: Path) -> None:
     scenes = [_scene(0)]
     checkpoint.save(MetaTraining(initialise_network(NETWORK, 0), scenes, CONFIG), tmp_path / "c.safetensors")

@@ -230,11 +230,28 @@ def test_a_damaged_record_is_left_out_of_a_copy_and_all_else_is_copied(store: Lo
     run = record_of(store)["run"]
     add_damaged_record(store)
     target = LocalStore(tmp_path / "target")
-    with pytest.raises(InputError, match=r"1 records of runs are damaged, and all else is done.*d{12}/run\.json"):
+    with pytest.raises(InputError, match=r"1 records are damaged, and all else is done.*d{12}/run\.json"):
         copy_store(store, target)
     assert len(list(target.artifacts())) == len(PIPELINE)
     # The damaged one would make this an error.
     assert [record["run"] for record in list_runs(target.uri)] == [run]
+
+
+@pytest.mark.parametrize("pinned", [False, True])
+def test_a_damaged_pin_is_left_out_of_a_copy_and_all_else_is_copied(
+    store: LocalStore, tmp_path: Path, pinned: bool
+) -> None:
+    run = record_of(store)["run"]
+    add_pin(store, run)
+    (store.root / "pins" / ("d" * 12)).mkdir()
+    (store.root / "pins" / ("d" * 12) / "pin.json").write_text("{")
+    target = LocalStore(tmp_path / "target")
+    with pytest.raises(
+        InputError, match=r"1 records are damaged, and all else is done.*pin is damaged.*d{12}/pin\.json"
+    ):
+        copy_store(store, target, pinned=pinned)
+    assert len(list(target.artifacts())) == len(PIPELINE) and len(list_runs(target.uri)) == 1
+    assert [pin.name for pin in list_pins(target)] == [run]
 
 
 def test_a_copy_leaves_newer_records_of_the_target(store: LocalStore, tmp_path: Path) -> None:
@@ -279,7 +296,7 @@ def test_a_repair_goes_on_past_a_damaged_record(store: LocalStore) -> None:
     damage = {name: error for name, error in store.verify_all() if error is not None}
     again: list[object] = []
     found = {}
-    with pytest.raises(InputError, match=r"1 records of runs are damaged, and all else is done.*d{12}/run\.json"):
+    with pytest.raises(InputError, match=r"1 records are damaged, and all else is done.*d{12}/run\.json"):
         for repair in repair_artifacts(store, damage, lambda record: again.append(record["run"])):
             found[repair.name] = repair.why
     assert again == [run] and store.find(gnet.address) is None and len(found) == 2
