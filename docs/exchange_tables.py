@@ -50,7 +50,8 @@ def claims() -> str:
         measured = "not measured" if claim["measured"] is None else _format(claim["measured"])
         unit = claim["unit"] if claim["unit"] in UNITS else ""
         target = f"{claim['op']} {claim['target']:g} {unit}".strip()
-        verdict = "yes" if claim["holds"] else "**missed**"
+        # A number that nobody took neither holds nor misses.
+        verdict = "–" if claim["measured"] is None else "yes" if claim["holds"] else "**missed**"
         lines.append([CLAIM_WORDS[claim["id"]], target, measured, verdict])
     return table(["claim", "target", "measured", "holds"], lines) + "\n" + provenance(NAME)
 

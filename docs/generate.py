@@ -107,6 +107,9 @@ FILES: Mapping[str, Callable[[], str]] = {
 
 def filled(text: str) -> str:
     """A page with every generated block written anew; an unknown block is a ``KeyError``."""
+    # A block without an end would swallow the sentences up to the next one's.
+    if text.count("<!-- generated: ") != len(BLOCK.findall(text)):
+        raise ValueError("a generated block has no end")
     return BLOCK.sub(lambda m: f"<!-- generated: {m[1]} -->\n\n{BLOCKS[m[1]]()}\n<!-- end -->", text)
 
 

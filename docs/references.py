@@ -90,7 +90,10 @@ def cli_reference() -> str:
 
     from flows.cli.main import app
 
-    parts = ["# Commands\n\nThis page is generated from the commands' own help.\n"]
+    parts = [
+        "# Commands\n\nThis page is generated from the commands' own help. `genre --version` prints the version.\n"
+        "Every command takes `--debug`, which shows the traceback of an error.\n"
+    ]
     root = typer.main.get_command(app)
     parts += [_command(f"genre {name}", command) for name, command in root.commands.items()]  # type: ignore[attr-defined]
     return "\n".join(parts)
@@ -106,13 +109,15 @@ def _command(path: str, command: Any) -> str:
             continue
         names = f"`{parameter.name.upper()}`" if parameter.param_type_name == "argument" else _option(parameter)
         default = parameter.default
-        shown = "required" if parameter.required else f"`{default}`" if default not in (None, (), [], False, "") else ""
+        # 0 is a default like any other, and equals False.
+        is_shown = default not in (None, (), [], "") and default is not False
+        shown = "required" if parameter.required else f"`{default}`" if is_shown else ""
         rows.append([names, shown, " ".join((getattr(parameter, "help", "") or "").split()).replace("|", "\\|")])
     return text + "\n" + (table(["argument or option", "default", "meaning"], rows) if rows else "")
 
 
 def _option(parameter: Any) -> str:
-    return ", ".join(f"`{name}`" for name in parameter.opts)
+    return ", ".join(f"`{name}`" for name in (*parameter.opts, *parameter.secondary_opts))
 
 
 def _paragraphs(text: str) -> str:

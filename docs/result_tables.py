@@ -92,10 +92,17 @@ def claims(name: str, several: str = "logs") -> str:
     return table(["claim", "target", "measured", "n", "holds"], rows) + "\n" + provenance(name)
 
 
+_READERS = {"pandaset": "PandaSet", "kitti": "KITTI"}
+
+
 def short_log(row: Mapping[str, Any]) -> str:
     """``street 1001`` or ``PandaSet 002, chunk 1``."""
     seed = re.search(r"seed=(\d+)", row["log"])
-    return f"street {seed[1]}" if seed else f"PandaSet 002, chunk {row['chunk']}"
+    if seed:
+        return f"street {seed[1]}"
+    reader, _, path = row["log"].partition(":")
+    folder = path.partition("?")[0].rstrip("/").rsplit("/", 1)[-1]
+    return f"{_READERS.get(reader, reader)} {folder}, chunk {row['chunk']}"
 
 
 METHODS = {
@@ -204,7 +211,9 @@ def preset_choice() -> str:
             metrics = found["metrics"]
             cells = [f"{metrics[k]:.{digits}f}" if k in metrics else "–" for k, digits in columns.values()]
             lines.append([short_log(row), f"`{preset}`", *cells, f"{found['cpu_seconds']:.0f}"])
-    return table(["validation log", "preset", *columns, "CPU seconds ↓"], lines)
+    loaded = result("preset_choice")
+    origin = f"Measured on {loaded['machine']} at commit `{loaded['commit'][:12]}`.\n"
+    return table(["validation log", "preset", *columns, "CPU seconds ↓"], lines) + "\n" + origin
 
 
 def raster_times() -> str:

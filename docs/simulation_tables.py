@@ -104,6 +104,7 @@ def comparison_claims() -> str:
             bounds = ["not measured" if c["measured"] is None else f"{c['measured']:+.3f}" for c in found]
             held = sum(c["holds"] for c in found)
             verdict = "yes" if held == len(found) else f"**{held} of {len(found)}**"
+            verdict = "–" if all(c["measured"] is None for c in found) else verdict
             lines.append([words, METHODS[other], *bounds, f"{found[0]['op']} 0", verdict])
     head = ["metric", "GenRe+ less", *(behaviour.replace("_", " ") for behaviour in BEHAVIOURS), "target", "holds"]
     return table(head, lines)
@@ -118,6 +119,7 @@ def claims() -> str:
         measured = "not measured" if claim["measured"] is None else number(claim["measured"])
         unit = claim["unit"] if claim["unit"] in ("dB", "m", "images/s", "of 255") else ""
         target = f"{claim['op']} {claim['target']:g} {unit}".strip()
-        verdict = "yes" if claim["holds"] else "**missed**"
+        # A number that nobody took neither holds nor misses.
+        verdict = "–" if claim["measured"] is None else "yes" if claim["holds"] else "**missed**"
         lines.append([CLAIM_WORDS[claim["id"]], target, measured, str(claim["n"]), verdict])
     return table(["claim", "target", "measured", "n", "holds"], lines) + "\n" + provenance(NAME)

@@ -183,7 +183,7 @@ def _panel(axis: Any, title: str, races: Sequence[Row], column: int) -> None:
     threads = f", {n} threads" if (n := races[0].get("threads", 2)) > 1 else ", 1 thread"
     title = f"{title.partition(' order')[0]} (GNet: {gnet['seconds']:.1f} s{threads})"
     axis.set_title(title, fontsize=9)
-    axis.set(xscale="log", xlabel="seconds, in GNet's", ylabel=label)
+    axis.set(xscale="log", xlabel="seconds ÷ GNet's seconds", ylabel=label)
     axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axis.xaxis.set_major_formatter("{x:g}")
     axis.xaxis.set_minor_formatter(NullFormatter())

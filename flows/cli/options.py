@@ -35,7 +35,9 @@ SettingsOption = Annotated[
         "several times.",
     ),
 ]
-StoreOption = Annotated[str, typer.Option(help="The folder that keeps the result of every stage.")]
+StoreOption = Annotated[
+    str, typer.Option(help="The folder, or bucket such as s3://bucket/path, that keeps the result of every stage.")
+]
 ChunksOption = Annotated[
     str | None,
     typer.Option(help="Numbers of the chunks to use, separated by commas, such as 0,1. All chunks if not given."),

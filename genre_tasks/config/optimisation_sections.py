@@ -147,7 +147,8 @@ class OptimiserConfig(Section):
     learning_rates: LearningRates | None = Field(
         None,
         description="Learning rates of the learned optimiser; null: those that its weights were trained with. Presets "
-        "are tuned for the built-in weights, so set null with others. gnet.refine.lr_before_refine takes precedence.",
+        "are tuned for the built-in weights, so set null with others. Of GNet alone, gnet.refine.lr_before_refine "
+        "takes precedence.",
     )
     constrain_ground: bool = Field(
         True, description="Let Gaussians that lie on the ground move and turn within the ground's plane only."

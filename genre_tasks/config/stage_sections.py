@@ -197,7 +197,7 @@ class RangeConfig(Section):
     )
     every: int = Field(4, ge=1, le=1_000_000, description="Every n-th frame of the chunk is rendered.")
     max_drop_db: float = Field(
-        3.0, gt=0, le=1000, description="Largest drop of the median view's estimated PSNR against the path, dB."
+        3.0, gt=0, le=100, description="Largest drop of the median view's estimated PSNR against the path, dB."
     )
     max_hidden: float = Field(
         0.1, gt=0, le=1, description="Largest extra fraction of pixels whose depth agrees with no recorded image."

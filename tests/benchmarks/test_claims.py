@@ -9,6 +9,8 @@ import pytest
 from pydantic import ValidationError
 
 from benchmarks.common.claims import Claim, Result, claim, write_json
+from benchmarks.common.merge import merge_results, read_result
+from flows.cli.bench import _BENCHES, load_bench
 
 DOCUMENTS = sorted((Path(__file__).parents[2] / "docs/results/data").glob("*.json"))
 
@@ -19,6 +21,16 @@ def test_committed_results_follow_the_schema(path: Path) -> None:
     assert result.rows
     names = [(c.id, c.data) for c in result.claims]
     assert names and len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize("name", sorted({path.stem for path in DOCUMENTS} & set(_BENCHES)))
+def test_committed_claims_are_those_of_today(name: str) -> None:
+    committed = read_result(DOCUMENTS[0].with_name(f"{name}.json"))
+    today = merge_results(load_bench(name), [committed])
+    fields = {"id", "op", "target", "unit", "measured", "n", "holds"}
+    assert [c.model_dump(include=fields) for c in committed.claims] == [
+        c.model_dump(include=fields) for c in today.claims
+    ]
 
 
 @pytest.mark.parametrize(

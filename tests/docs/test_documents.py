@@ -47,6 +47,11 @@ def test_generated_parts_are_those_of_code_and_measurements(generator: dict[str,
     assert not stale, f"run `make docs`: {stale}"
 
 
+def test_a_block_without_an_end_is_refused(generator: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="no end"):
+        generator["filled"]("<!-- generated: presets -->\nwords\n<!-- generated: glance -->\n<!-- end -->\n")
+
+
 @pytest.mark.parametrize("page", [PAGES[0], *sorted((ROOT / "docs/results").glob("*.md"))], ids=lambda p: p.name)
 def test_no_measured_number_is_typed_by_hand(page: Path) -> None:
     text = NO_MEASUREMENT.sub("", prose(page.read_text()))
