@@ -66,11 +66,18 @@ def map_single_threaded(function: Callable[[Item], Result], items: Sequence[Item
             return [function(item) for item in items]
         # As many workers as threads before, each with a single one: the CPU is as busy as it would be.
         workers = min(threads, len(items))
-        with ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        with ThreadPoolExecutor(workers, initializer=_take_one_thread) as pool:
             # In the order of the items; an exception is that of the first item that failed.
             return list(pool.map(function, items))
     finally:
         torch.set_num_threads(threads)
+
+
+def _take_one_thread() -> None:
+    # A thread takes the process's number at its first question. Asked later, it would replace the 1, should another
+    # thread have restored the number by then.
+    torch.get_num_threads()
+    torch.set_num_threads(1)
 
 
 def multiply_transposed(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -14,6 +14,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import uuid
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -188,20 +189,35 @@ def build(
                 jobs.append(_Job(kernel, folder, isa, [*flags, *constants, *switches]))
     # The compiler is a process: threads only wait for it.
     with ThreadPoolExecutor(max(2, os.cpu_count() or 1)) as pool:
-        return list(pool.map(lambda job: _compile(compiler, job), jobs))
+        libraries = list(pool.map(lambda job: _compile(compiler, job), jobs))
+    if isas is None:
+        _remove_what_is_not_made(kernels, set(instruction_sets_for(compiler)))
+    return libraries
+
+
+def _remove_what_is_not_made(kernels: Sequence[tuple[Kernel, Path]], made: set[str]) -> None:
+    """Removes libraries of another compiler, which would stay behind, older than their sources, and be preferred."""
+    for kernel, folder in kernels:
+        for isa in instruction_sets().keys() - made:
+            (folder / kernel.library_name(isa)).unlink(missing_ok=True)
 
 
 def _compile(compiler: tuple[str, ...], job: _Job) -> Path:
     kernel = job.kernel
     job.folder.mkdir(parents=True, exist_ok=True)
     out = job.folder / kernel.library_name(job.isa)
-    # Renamed at the end: another process may load the library at any moment.
-    part = out.with_name(f"{out.name}.{os.getpid()}.tmp")
+    # Renamed at the end: another process may load the library at any moment. Containers that share a folder may have
+    # processes of the same number.
+    part = out.with_name(f"{out.name}.{os.getpid()}-{uuid.uuid4().hex[:8]}.tmp")
     source = str(kernel.folder / kernel.sources[0])
     command = [*compiler, *SHARED_FLAGS, *kernel.flags, *job.options, source, "-o", str(part)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise RuntimeError(f"{compiler[0]} failed on {kernel.title} ({job.isa}):\n" + done.stderr[-2000:])
+        part.replace(out)
+    except OSError as error:
+        raise RuntimeError(f"the C++ compiler {compiler[0]} does not start: {error.strerror}") from error
+    finally:
         part.unlink(missing_ok=True)
-        raise RuntimeError(f"{compiler[0]} failed on {kernel.title} ({job.isa}):\n" + done.stderr[-2000:])
-    part.replace(out)
     return out

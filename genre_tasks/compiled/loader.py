@@ -12,9 +12,11 @@ from genre_tasks.compiled.build import Kernel
 from genre_tasks.errors import ConfigError, UnsupportedMachineError
 
 REMEDY = "Run `pip install -e .` in the repository (it needs a C++ compiler: g++, clang++ or what CXX names)"
+# Linux calls LZCNT abm. A CPU without it takes its code for BSR, and computes something else.
+_X86_64_V3_FLAGS = {"avx", "avx2", "fma", "bmi1", "bmi2", "f16c", "movbe", "abm"}
 _NEEDED_FLAGS = {
-    "avx512": {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl", "avx2", "fma", "bmi2"},
-    "avx2": {"avx", "avx2", "fma", "bmi1", "bmi2", "f16c", "movbe"},
+    "avx512": _X86_64_V3_FLAGS | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"},
+    "avx2": _X86_64_V3_FLAGS,
     "sse42": {"sse4_2", "popcnt", "ssse3"},
 }
 """What /proc/cpuinfo must list for the x86-64 level that the library was compiled for."""

@@ -3,7 +3,6 @@
 #include <exception>
 #include <mutex>
 #include <new>
-#include <system_error>
 #include <thread>
 #include <vector>
 
@@ -26,8 +25,8 @@ static void parallel(int threads, F f) {
   for (int w = 1; w < threads; w++) {
     try {
       thread_team.emplace_back(run, w);
-    } catch (const std::system_error&) {
-      run(w);  // the system has no more threads: run it here
+    } catch (const std::exception&) {
+      run(w);  // the system has no more threads, or no memory for one: run it here
     }
   }
   run(0);

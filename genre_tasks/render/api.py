@@ -274,6 +274,7 @@ def _take_to_camera_frame(splats: Splats, cameras: Cameras, v: int) -> tuple[Spl
     # The rotation's gradient goes through a small turn next to the constant rotation, whose quaternion is (1, ω/2) to
     # first order: exact for rigid motions, and without the square roots of a matrix-to-quaternion conversion.
     # Velocities are constants.
+    splats = _replace_non_finite_poses(splats)
     pose = cameras.camera_SE3_chunk[v]
     rotation = pose[:3, :3]
     turn = rotation @ rotation.detach().T  # the identity, with a gradient
@@ -288,3 +289,19 @@ def _take_to_camera_frame(splats: Splats, cameras: Cameras, v: int) -> tuple[Spl
     colors = splats.colors[v : v + 1] if splats.colors.dim() == 3 else splats.colors
     moved = replace(splats, means=means, quats=quats, colors=colors, velocities=velocities)
     return moved, replace(cameras.select([v]), camera_SE3_chunk=torch.eye(4)[None])
+
+
+def _replace_non_finite_poses(splats: Splats) -> Splats:
+    """Moves Gaussians without a finite place or turn to the origin, where the NaN of their opacity still culls them.
+
+    Their gradient of 0 times NaN would be NaN in the gradient of the camera's pose.
+    """
+    finite = torch.isfinite(splats.means).all(1) & torch.isfinite(splats.quats).all(1)
+    if bool(finite.all()):
+        return splats
+    return replace(
+        splats,
+        means=torch.where(finite[:, None], splats.means, 0.0),
+        quats=torch.where(finite[:, None], splats.quats, 0.0),
+        opacities=torch.where(finite, splats.opacities, torch.nan),
+    )

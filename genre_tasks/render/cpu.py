@@ -155,8 +155,11 @@ def backward(
 
     Raises:
         ResourceError: memory does not suffice.
+        ValueError: the residual or the weights of views have another shape or type.
     """
+    _check_residual(images, residual, view_weights)
     # Autograd may hand over expanded or transposed tensors, while the kernel counts in plain rows.
+    view_weights = None if view_weights is None else view_weights.contiguous()
     image_gradients_ = [x.contiguous() for x in image_gradients]
     sums = None if residual is None else torch.empty(len(splats[0]), 5)
     residual = None if residual is None else residual.contiguous()
@@ -176,6 +179,17 @@ def backward(
     )
     check_status(status)
     return sums
+
+
+def _check_residual(images: ImageTensors, residual: Tensor | None, view_weights: Tensor | None) -> None:
+    # The kernel gets addresses: it would read other bytes than are meant, or beyond their end.
+    for name, value, shape in (
+        ("a residual", residual, images[0].shape),
+        ("weights of views", view_weights, images[0].shape[:1]),
+    ):
+        if value is not None and (value.shape != shape or value.dtype != torch.float32):
+            found = f"{value.dtype} {tuple(value.shape)}"
+            raise ValueError(f"expected {name} as float32 {tuple(shape)}, got {found}")
 
 
 def _pointer(tensor: Tensor | None) -> int | None:

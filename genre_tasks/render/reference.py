@@ -107,7 +107,7 @@ def _project(splats: Splats, cameras: Cameras, v: int, culled: dict[str, int]) -
         xx, _, yy = geometry.covariance
         opacities = splats.opacities[rows] * geometry.compensation
         sound = (geometry.determinant > 0) & (torch.maximum(xx, yy) <= const.MAX_VARIANCE_PX2)
-        sound &= (geometry.center.abs() <= const.MAX_CENTER_PX).all(1)
+        sound &= (geometry.center.abs() <= const.MAX_CENTER_PX).all(1) & torch.isfinite(geometry.exposed_z)
         culled["degenerate"] += int((~sound).sum())
         # A little wider than where alpha reaches ALPHA_MIN, so that rounding never cuts a pixel off.
         level = 2 * torch.log(opacities / const.ALPHA_MIN) * (1 + 1e-6)

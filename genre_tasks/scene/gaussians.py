@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from genre_tasks.scene.constants import LOWEST_LOGIT
+from genre_tasks.scene.constants import LARGEST_LOG_SCALE, LOWEST_LOGIT
 
 OPACITY_CLAMP = 1e-6
 """Opacities are clamped to [1e-6, 1 − 1e-6] when they are taken to logits, so that the logit is finite."""
@@ -58,8 +58,10 @@ class Gaussians:
         >>> gaussian.activate().scales.tolist(), gaussian.activate().opacities.tolist()
         ([[1.0, 1.0, 1.0]], [0.5])
         """
+        # An infinite scale is culled, and its gradient of 0 times infinity would be NaN. What is drawn does not change.
+        scales = self.log_scales.clamp_max(LARGEST_LOG_SCALE).exp()
         # Quaternions are not normalised here: the renderer does it, with the gradient through the norm.
-        return Splats(self.means, self.log_scales.exp(), self.quats, sigmoid(self.logit_opacities), self.colors)
+        return Splats(self.means, scales, self.quats, sigmoid(self.logit_opacities), self.colors)
 
     def pack(self) -> Tensor:
         """Copies all attributes into one tensor, as networks and optimisers take them.

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import threading
+
 import torch
 
 from genre_tasks.scene.gaussians import sigmoid
+from genre_tasks.threads import map_single_threaded, torch_threads
 
 
 def test_sigmoid_is_the_same_bits_at_any_thread_count_and_bounded() -> None:
@@ -26,3 +29,23 @@ def test_sigmoid_of_extreme_logits_has_a_finite_gradient() -> None:
     value.sum().backward()
     assert bool(((value >= 0) & (value <= 1)).all()) and bool(torch.isfinite(x.grad).all())
     assert bool(torch.isnan(sigmoid(torch.tensor([torch.nan]))).all())
+
+
+def test_items_stay_on_one_thread_while_another_thread_restores_the_number() -> None:
+    begun, restored = threading.Event(), threading.Event()
+
+    def restore() -> None:
+        with torch_threads(1):
+            begun.wait()
+        restored.set()
+
+    def count(_: int) -> int:
+        begun.set()
+        restored.wait()
+        return torch.get_num_threads()
+
+    with torch_threads(3):
+        other = threading.Thread(target=restore)
+        other.start()
+        assert map_single_threaded(count, [0, 1]) == [1, 1]
+        other.join()

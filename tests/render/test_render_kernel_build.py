@@ -98,6 +98,23 @@ def test_a_failing_compiler_leaves_nothing(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_compiler_that_is_not_there_is_one_clear_line(tmp_path, monkeypatch):
+    monkeypatch.setenv("CXX", "clang++-99")
+    with pytest.raises(RuntimeError, match=r"the C\+\+ compiler clang\+\+-99 does not start"):
+        build.build([(KERNEL, tmp_path)], isas=["sse42", "generic"])
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_build_removes_what_its_compiler_does_not_make(tmp_path, monkeypatch):
+    made = dict(list(build.instruction_sets().items())[-1:])
+    for isa in build.instruction_sets():
+        (tmp_path / KERNEL.library_name(isa)).write_bytes(b"of another compiler")
+    monkeypatch.setattr(build, "instruction_sets_for", lambda compiler: made)
+    monkeypatch.setattr(build, "_compile", lambda compiler, job: job.folder / job.kernel.library_name(job.isa))
+    build.build([(KERNEL, tmp_path)])
+    assert [path.name for path in tmp_path.iterdir()] == [KERNEL.library_name(isa) for isa in made]
+
+
 @pytest.mark.slow
 def test_a_fresh_build_loads(tmp_path, fresh_loader):
     paths = build.build([(KERNEL, tmp_path)])

@@ -47,6 +47,36 @@ def test_pose_gradient_leaves_the_image_and_other_gradients(scene, gradients):
     assert moving.culled == still.culled
 
 
+@pytest.mark.parametrize("settings", [CPU, REFERENCE], ids=["cpu", "reference"])
+@pytest.mark.parametrize("attribute", ["means", "quats"])
+def test_a_culled_gaussian_leaves_the_pose_gradient_finite(scene, settings, attribute):
+    splats, cameras = scene(3)
+    sound = replace(splats, opacities=splats.opacities * torch.tensor([1.0, 0.0, 1.0]))
+    broken = getattr(splats, attribute).clone()
+    broken[1, 0] = torch.nan
+    gradients = []
+    for given in (sound, replace(splats, **{attribute: broken})):
+        pose = cameras.camera_SE3_chunk.clone().requires_grad_()
+        image = render(given, replace(cameras, camera_SE3_chunk=pose), settings)
+        image.color.sum().backward()
+        gradients.append(pose.grad)
+    assert image.culled == {"non_finite": 1} and gradients[0].abs().max() > 0
+    torch.testing.assert_close(gradients[0], gradients[1])
+
+
+@pytest.mark.parametrize("settings", [CPU, REFERENCE], ids=["cpu", "reference"])
+def test_a_depth_that_overflows_poisons_no_neighbour(scene, settings):
+    splats, cameras = scene(3)
+    turn = torch.tensor([[0.5**0.5, 0, 0.5**0.5, 0], [0, 1, 0, 0], [-(0.5**0.5), 0, 0.5**0.5, 0], [0, 0, 0, 1]])
+    means = splats.means @ turn[:3, :3]
+    means[1] = 3e38 * (turn[:3, :3].T @ torch.tensor([0.0, 0.0, 1.0])) * 2**0.5
+    given = replace(splats, means=means.requires_grad_())
+    image = render(given, replace(cameras, camera_SE3_chunk=turn[None].to(cameras.camera_SE3_chunk)), settings)
+    (image.color.sum() + image.depth.sum()).backward()
+    assert torch.isfinite(image.depth).all() and torch.isfinite(means.grad).all()
+    assert image.culled == {"degenerate": 1}
+
+
 def test_reference_gradients_against_finite_differences():
     splats, cameras = smooth()
     inputs = [x.requires_grad_() for x in (splats.means, splats.scales, splats.quats, splats.opacities, splats.colors)]

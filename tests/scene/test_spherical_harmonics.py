@@ -235,3 +235,22 @@ def test_harmonics_of_zero_change_nothing_but_colours_below_it() -> None:
     assert torch.equal(render_views(begun, [view]).color, render_views(scene, [view]).color)
     with pytest.raises(ValueError, match="expected a scene with harmonics"):
         compute_view_dependent_colors(scene, [1], np.zeros((1, 3)))
+
+
+def test_a_black_colour_that_is_not_clamped_has_a_gradient() -> None:
+    scene = with_zero_spherical_harmonics(replace(_street(), spherical_harmonics=None))
+    g = scene.gaussians
+    gradients = []
+    for see in (compute_view_dependent_colors, evaluate_sh_colors_by_view):
+        colors = g.colors.clone()
+        colors[0], colors[1, 2], colors[2, 0] = 0.0, 0.0, -0.1
+        colors.requires_grad_()
+        waves = torch.zeros(len(g), 3, 3, requires_grad=True)
+        seen = see(
+            scene.with_gaussians(replace(g, colors=colors)).with_spherical_harmonics(waves), [0, 2], np.zeros((2, 3))
+        )
+        gradients.append(torch.autograd.grad(seen.sum(), (colors, waves)))
+    (ours, ours_of_waves), (theirs, theirs_of_waves) = gradients
+    assert (ours[0] > 0).all() and ours[1, 2] > 0 and ours[2, 0] == 0
+    torch.testing.assert_close(ours, theirs)
+    torch.testing.assert_close(ours_of_waves, theirs_of_waves)

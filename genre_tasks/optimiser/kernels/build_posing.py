@@ -15,6 +15,6 @@ KERNEL = Kernel(
     folder=Path(__file__).resolve().parent,
     sources=("posing.cpp", "../../scene/constants.py", "build_posing.py"),
     constants_file="../../scene/constants.py",
-    constants=("ABSENT_LOGIT", "LOWEST_LOGIT"),
+    constants=("ABSENT_LOGIT", "LARGEST_LOG_SCALE", "LOWEST_LOGIT"),
 )
 """The recipe of the kernel's libraries."""

@@ -35,9 +35,9 @@ struct Splats {
   float *means, *scales, *quats, *opacities, *colors;
 };
 
-// e^x within 2e-7, relative, from -87 to 88; constant below, infinite above.
+// e^x within 2e-7, relative, from -87 to 88; constant below and above.
 static inline float exponential(float x) {
-  const float clamped = x < -87.f ? -87.f : x > 88.f ? 88.f : x;
+  const float clamped = x < -87.f ? -87.f : x > LARGEST_LOG_SCALE ? LARGEST_LOG_SCALE : x;
   const float n = (clamped * 1.44269504f + 12582912.f) - 12582912.f;  // 1.5 * 2^23: rounds to the nearest integer
   const float r = (clamped - n * 0.693359375f) + n * 2.12194440e-4f;  // ln 2 in two parts
   float p = 1.9875691500e-4f;
@@ -50,7 +50,7 @@ static inline float exponential(float x) {
   const uint32_t bits = (uint32_t)((int32_t)n + 127) << 23;
   float power;
   std::memcpy(&power, &bits, 4);
-  return x > 88.f ? INFINITY : p * power;
+  return p * power;
 }
 
 static inline float opacity_of(float exponent) { return 1.f / (1.f + exponent); }
@@ -137,7 +137,9 @@ static void gradient_of_one(const Gaussians& in, const Frames& frames, int64_t i
     sum[QUAT + 3] += p[0] * q[3] - p[1] * q[2] + p[2] * q[1] - p[3] * q[0];
     if (pose.present != 0) sum[OPACITY] += by_splats.opacities[slot];
   }
-  for (int k = 0; k < 3; k++) sum[MEAN + k] *= unit, sum[SCALE + k] *= scale[k];
+  // A scale at its limit does not grow with its logarithm; the comparison leaves NaN without a gradient, too.
+  const float limit = exponential(LARGEST_LOG_SCALE);
+  for (int k = 0; k < 3; k++) sum[MEAN + k] *= unit, sum[SCALE + k] *= scale[k] < limit ? scale[k] : 0.f;
   sum[OPACITY] *= slope;
   put<ATTRIBUTES>(out, sum);
 }

@@ -4,8 +4,8 @@
 #include <atomic>
 #include <condition_variable>
 #include <cstddef>
+#include <exception>
 #include <mutex>
-#include <system_error>
 #include <thread>
 #include <vector>
 
@@ -48,7 +48,7 @@ class ThreadTeam {
     for (int w = 1; w < threads; w++) {
       try {
         others.emplace_back([this, w, &work] { Member member(*this, w); work(member); });
-      } catch (const std::system_error&) {
+      } catch (const std::exception&) {
         break;
       }
     }

@@ -65,9 +65,16 @@ struct MemoryPool {
     free.pop_back(), pooled_bytes -= x->bytes();
     return x;
   }
-  void give(std::unique_ptr<T> x) {
+  // Called by destructors and by functions without a status, so that it must not throw.
+  void give(std::unique_ptr<T> x) noexcept {
     std::lock_guard<std::mutex> lock(guard);
-    if (pooled_bytes + x->bytes() <= LIMIT) pooled_bytes += x->bytes(), free.push_back(std::move(x));
+    const size_t bytes = x->bytes();
+    if (pooled_bytes + bytes > LIMIT) return;
+    try {
+      free.push_back(std::move(x));
+      pooled_bytes += bytes;
+    } catch (const std::bad_alloc&) {  // then its memory is freed
+    }
   }
   void clear() {
     std::lock_guard<std::mutex> lock(guard);

@@ -185,7 +185,7 @@ INLINE int footprints(const Camera& c, const GaussianArrays& in, uint32_t first,
   const Lanes det = p.determinant(), &x = p.x, &y = p.y;
 #ifndef GENRE_ABLATE_GUARDS
   drop(bits((det > 0.f) & (p.c00 <= MAX_VARIANCE_PX2) & (p.c11 <= MAX_VARIANCE_PX2) & (abs(x) <= MAX_CENTER_PX) &
-            (abs(y) <= MAX_CENTER_PX)), DEGENERATE);
+            (abs(y) <= MAX_CENTER_PX) & is_finite(p.pz)), DEGENERATE);
 #endif
   Lanes log2_opacity;
   if constexpr (ANTIALIASED) {

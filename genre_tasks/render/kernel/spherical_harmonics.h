@@ -86,16 +86,23 @@ static void sh_colors_backward(const ShGaussians& g, int threads, const float* v
                                float* grad_means, float* grad_colors, float* grad_coefficients) {
   parallel_for(g.count, threads, [&](int64_t i) {
     const int64_t K = g.sh_count;
-    const float* coefficients = g.coefficients + 3 * K * i;
+    const float *coefficients = g.coefficients + 3 * K * i, *color = g.colors + 3 * i;
     float *grad_mean = grad_means + 3 * i, *grad_color = grad_colors + 3 * i, *grad_coefficient = grad_coefficients + 3 * K * i;
     std::fill(grad_mean, grad_mean + 3, 0.f), std::fill(grad_color, grad_color + 3, 0.f);
     std::fill(grad_coefficient, grad_coefficient + 3 * K, 0.f);
     if (!is_finite_gaussian(g, i)) return;
     for_each_view_direction(g, i, [&](int64_t, int64_t splat, const float* d, float inverse, bool distance_clamped) {
       float v[3], Y[MAX_SH_COUNT], D[MAX_SH_COUNT][3], grad_direction[3] = {};
-      for (int c = 0; c < 3; c++) v[c] = view_colors[3 * splat + c] > 0 ? grad_view_colors[3 * splat + c] : 0.f;
+      for (int c = 0; c < 3; c++) v[c] = view_colors[3 * splat + c] >= 0 ? grad_view_colors[3 * splat + c] : 0.f;
       if (v[0] == 0 && v[1] == 0 && v[2] == 0) return;
       evaluate_sh_basis<true>(K, d[0], d[1], d[2], Y, D);
+      // A colour of 0 was clamped, which has no gradient, or is 0 by itself, such as that of a black point.
+      for (int c = 0; c < 3; c++) {
+        if (view_colors[3 * splat + c] > 0) continue;
+        float sum = color[c];
+        for (int64_t k = 0; k < K; k++) sum += Y[k] * coefficients[3 * k + c];
+        if (sum < 0) v[c] = 0;
+      }
       for (int c = 0; c < 3; c++) grad_color[c] += v[c];
       for (int64_t k = 0; k < K; k++) {
         float grad_Y = 0;
