@@ -11,7 +11,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from functools import partial
 
-from benchmarks.common.bench import Bench, Cell, Row, SmallestForm, list_not_measured, measured_rows, split_option
+from benchmarks.common.bench import (
+    TINY_STREET_PARAMETERS,
+    Bench,
+    Cell,
+    Row,
+    SmallestForm,
+    list_not_measured,
+    measured_rows,
+    split_option,
+)
 from benchmarks.common.claims import Claim, claim
 from benchmarks.log_faults.faults import FAULTS
 from benchmarks.log_faults.measures import ChunkOfLog, measure_fault, measure_sound_log
@@ -45,7 +54,7 @@ class LogFaultsBench:
     smallest = SmallestForm(
         {
             "seeds": "900",
-            "street": "frames=8&width=64&height=36&samples=1&cameras=1&lidar_beams=32&lidar_azimuths=300",
+            "street": TINY_STREET_PARAMETERS.removeprefix("&"),
             "sound_seeds": "",
             "pandaset": "",
             "kitti": "",

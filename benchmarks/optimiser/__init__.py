@@ -28,6 +28,7 @@ from benchmarks.common.bench import (
     SmallestForm,
     logs_from_options,
     settings_from_options,
+    split_option,
 )
 from benchmarks.common.claims import Claim
 from benchmarks.optimiser import claims, race_table
@@ -136,7 +137,7 @@ class Optimiser:
             ConfigError: a part, family or method is unknown.
         """
         logs = logs_from_options(options)
-        orders = _split(options["orders"])
+        orders = split_option(options["orders"])
         methods = _known("method", options["methods"], METHODS)
         parts = _known("part", options["parts"], PARTS)
         families = _known("family", options["families"], FAMILIES)
@@ -159,7 +160,7 @@ class Optimiser:
                 out += [factory.race(*log, order, m) for m in methods for log in logs]
             if "enhancement" in parts:
                 out += [factory.enhancement(*log, order) for log in logs]
-            if str(order) in _split(options["long_orders"]):
+            if str(order) in split_option(options["long_orders"]):
                 out += [factory.distillation(*log, order, families) for log in logs if "distillation" in parts]
                 out += [factory.converged(*log, order) for log in logs if "converged" in parts]
             if order == int(orders[0]) and "stability" in parts:
@@ -309,14 +310,10 @@ def _with_deadline(deadline: float, cell: Cell) -> Cell:
 
 
 def _known(kind: str, text: str, known: Sequence[str]) -> list[str]:
-    parts = _split(text)
+    parts = split_option(text)
     if unknown := set(parts) - set(known):
         raise ConfigError(f"the benchmark has no {kind} {sorted(unknown)}", remedy=f"Known: {', '.join(known)}.")
     return parts
-
-
-def _split(text: str) -> list[str]:
-    return [part for part in text.split(",") if part]
 
 
 BENCH: Bench = Optimiser()

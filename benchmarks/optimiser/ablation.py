@@ -22,7 +22,9 @@ from benchmarks.common.bench import (
     Cell,
     Row,
     SmallestForm,
+    list_not_measured,
     logs_from_options,
+    measured_rows,
     settings_from_options,
 )
 from benchmarks.common.claims import Claim
@@ -131,7 +133,7 @@ class SwitchAblation:
 
     def claims(self, rows: Mapping[str, Row]) -> Iterator[Claim]:
         """Medians of what GNet gains over the streets, and the real chunk's gain."""
-        found = [row for row in rows.values() if "not_measured" not in row]
+        found = measured_rows(rows)
         streets = [row for row in found if row["log"].startswith("synthetic:")]
         reals = [row for row in found if row not in streets]
         sets = (("street_heldout_db", streets, 0), ("street_3m_db", streets, 1), ("real_heldout_db", reals, 0))
@@ -145,13 +147,12 @@ class SwitchAblation:
         """A line for each log and kind."""
         yield f"| log | {self.subject} | initial: held out | at 3 m | GNet: held out | at 3 m | GNet, s |"
         yield "|---|---|---|---|---|---|---|"
-        for row in (r for r in rows.values() if "not_measured" not in r):
+        for row in measured_rows(rows):
             for kind in KINDS:
                 found = row[kind]
                 cells = ["" if x is None else f"{x:.2f}" for x in (*found["initial"], *found["gnet"])]
                 yield f"| {cell_label(row)} | {kind} | {' | '.join(cells)} | {found['gnet_s']:.2f} |"
-        for name in (n for n, r in rows.items() if "not_measured" in r):
-            yield f"\n{name}: not measured: {rows[name]['not_measured']}"
+        yield from list_not_measured(rows)
 
 
 def save_comparison(setting: str, log: str, store: str, path: Path) -> None:

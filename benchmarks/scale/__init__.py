@@ -12,6 +12,7 @@ from functools import partial
 
 from benchmarks.common.bench import (
     TINY_SETTINGS,
+    TINY_STREET_PARAMETERS,
     Bench,
     Cell,
     Row,
@@ -30,8 +31,6 @@ from benchmarks.scale.datasets import (
     measure_throughput,
 )
 
-_TINY_STREET = "&width=64&height=36&samples=1&frames=8&cameras=1&lidar_beams=32&lidar_azimuths=300"
-
 
 class Scale:
     """Datasets on workers, the store on S3, and the fuzzers."""
@@ -43,7 +42,7 @@ class Scale:
         "preset": "small",
         "throughput_preset": "demo",
         "settings": "",
-        "cached_street": _TINY_STREET,
+        "cached_street": TINY_STREET_PARAMETERS,
         "cluster": "1000x100",
         "seconds_scale": "0.4",
         "inputs": "10000",
