@@ -29,6 +29,7 @@ from benchmarks.common.bench import (
     split_option,
 )
 from benchmarks.common.claims import Claim, claim
+from benchmarks.common.lazy_modules import STAGE_MODULES
 from benchmarks.common.run_stages import read_metrics, reconstruct
 from benchmarks.common.task import require_log_folder
 from flows.cli.parsing import parse_memory
@@ -74,14 +75,9 @@ class FullSize:
         "flows.pipeline.memory_plan",
         "flows.pipeline.stage_inputs",
         "flows.machine.memory_reuse",
-        "genre_tasks.stages.ingest",
-        "genre_tasks.stages.effects",
-        "genre_tasks.stages.initial",
-        "genre_tasks.stages.optimise",
-        "genre_tasks.stages.novel_views",
-        "genre_tasks.stages.fnet",
-        "genre_tasks.stages.evaluate",
+        *STAGE_MODULES,
         "genre_tasks.logs.pandaset.reader",
+        "genre_tasks.logs.synthetic",
     )
     smallest = SmallestForm({"log": f"synthetic:street?seed={TINY_STREET}", "settings": TINY_SETTINGS}, only="run")
 

@@ -29,6 +29,7 @@ from benchmarks.common.bench import (
     settings_from_options,
 )
 from benchmarks.common.claims import Claim, Op, claim
+from benchmarks.common.lazy_modules import STAGE_MODULES
 from benchmarks.common.run_stages import SETTINGS, read_metrics, reconstruct
 from benchmarks.common.task import require_log_folder
 from flows.configuration import load_configuration
@@ -199,7 +200,7 @@ class PipelineBench:
     }
     code: tuple[str, ...] = (
         "benchmarks.pipeline",
-        *(spec.module for spec in PIPELINE),
+        *STAGE_MODULES,
         "genre_tasks.logs.pandaset.reader",
         "genre_tasks.logs.synthetic",
     )

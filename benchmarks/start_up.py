@@ -16,6 +16,7 @@ from pathlib import Path
 from benchmarks.common.bench import TINY_SETTINGS, TINY_STREET, Bench, Cell, Row, SmallestForm, settings_from_options
 from benchmarks.common.claims import Claim, claim
 from benchmarks.common.command import run_genre
+from benchmarks.common.lazy_modules import CODEC_MODULES, STAGE_MODULES
 from benchmarks.common.timing import Quartiles
 from flows.machine.facts import CHECKOUT
 
@@ -42,7 +43,15 @@ class StartUp:
 
     name = "start_up"
     options: Mapping[str, str] = {"seed": "1000", "settings": ""}
-    code: tuple[str, ...] = ("benchmarks.start_up", "flows.prefect_api.connection", "flows.cli.run")
+    code: tuple[str, ...] = (
+        "benchmarks.start_up",
+        "flows.prefect_api.connection",
+        "flows.cli.run",
+        "storage.local",
+        *CODEC_MODULES,
+        *STAGE_MODULES,
+        "genre_tasks.logs.synthetic",
+    )
     smallest = SmallestForm({"seed": TINY_STREET, "settings": TINY_SETTINGS}, only="cached_run")
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:

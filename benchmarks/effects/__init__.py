@@ -23,6 +23,7 @@ from benchmarks.common.bench import (
     split_option,
 )
 from benchmarks.common.claims import Claim
+from benchmarks.common.lazy_modules import STAGE_MODULES
 from benchmarks.effects.cases import CASES
 from benchmarks.effects.cells import ChunkLocation, measure_on_pandaset, measure_on_street
 from benchmarks.effects.report import BENCH_NAME, make_claims, make_table
@@ -62,11 +63,7 @@ class EffectsBench:
         "benchmarks.effects.cells",
         "benchmarks.effects.whole_plans",
         "benchmarks.effects.instruction_count",
-        "genre_tasks.stages.optimise",
-        "genre_tasks.stages.ingest",
-        "genre_tasks.stages.initial",
-        "genre_tasks.stages.effects",
-        *STAGE_BY_NAME["effects"].lazy_modules,
+        *STAGE_MODULES,
         "genre_tasks.logs.pandaset.reader",
         "genre_tasks.logs.synthetic",
     )

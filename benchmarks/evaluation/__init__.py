@@ -23,6 +23,7 @@ from benchmarks.common.bench import (
     split_option,
 )
 from benchmarks.common.claims import Claim
+from benchmarks.common.lazy_modules import STAGE_MODULES
 from benchmarks.evaluation.budgets import budget_claims, budget_table, run_with_budget
 from benchmarks.evaluation.range_seconds import measure_range_seconds, range_seconds_claims, range_seconds_table
 from benchmarks.evaluation.reliability import measure_street, reliability_claims, reliability_table
@@ -58,11 +59,10 @@ class EvaluationBench:
         "benchmarks.evaluation.range_seconds",
         "benchmarks.evaluation.reliability",
         "flows.budget.budget",
+        "flows.cli.run",
         "genre_tasks.reliability.reliable_range",
-        "genre_tasks.stages.ingest",
-        "genre_tasks.stages.initial",
-        "genre_tasks.stages.optimise",
-        "genre_tasks.stages.fnet",
+        *STAGE_MODULES,
+        "genre_tasks.logs.pandaset.reader",
         "genre_tasks.logs.synthetic",
     )
     smallest = SmallestForm(

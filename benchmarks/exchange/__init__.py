@@ -26,6 +26,7 @@ from benchmarks.common.bench import (
     split_option,
 )
 from benchmarks.common.claims import Claim
+from benchmarks.common.lazy_modules import FORMAT_MODULES, STAGE_MODULES
 from benchmarks.exchange.answer_time import answer_time_claims, answer_time_table, measure_answer_time
 from benchmarks.exchange.enhancement import enhancement_claims, enhancement_table, measure_enhancement
 from benchmarks.exchange.import_speed import import_speed_claims, import_speed_table, measure_import_speed
@@ -82,19 +83,17 @@ class ExchangeBench:
         "benchmarks.exchange.service_fuzz",
         "benchmarks.exchange.alpasim_client",
         "benchmarks.exchange.http_service",
-        # Those below are named by registries alone, or imported by rooms that the digest does not follow.
-        "genre_tasks.exchange.ply",
-        "genre_tasks.exchange.antimatter_splat",
-        "genre_tasks.exchange.spz.format",
-        "genre_tasks.exchange.gltf.format",
-        "genre_tasks.exchange.usd.format",
+        # Those below are named by registries alone, or do the work of what is measured.
+        "flows.simulators.alpasim.start",
+        "flows.simulators.neuroncap",
+        "flows.viewer.offline_page",
+        *FORMAT_MODULES,
+        *STAGE_MODULES,
+        # Enhancement reads a file of Gaussians in place of a log's points.
+        "genre_tasks.stages.scene_file",
+        "genre_tasks.stages.scene_points",
         "genre_tasks.logs.posed_images.image_log",
         "genre_tasks.logs.synthetic",
-        "genre_tasks.stages.ingest",
-        "genre_tasks.stages.initial",
-        "genre_tasks.stages.optimise",
-        "genre_tasks.stages.novel_views",
-        "genre_tasks.stages.fnet",
         "genre_tasks.render.wide_lens",
         "genre_tasks.ego_paths.bicycle",
     )

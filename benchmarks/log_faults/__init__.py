@@ -48,6 +48,7 @@ class LogFaultsBench:
         "benchmarks.log_faults.measures",
         "benchmarks.log_faults.faults",
         "genre_tasks.log_checks.plausibility",
+        "genre_tasks.logs.kitti.reader",
         "genre_tasks.logs.pandaset.reader",
         "genre_tasks.logs.synthetic",
     )

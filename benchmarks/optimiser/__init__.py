@@ -31,6 +31,7 @@ from benchmarks.common.bench import (
     split_option,
 )
 from benchmarks.common.claims import Claim
+from benchmarks.common.lazy_modules import STAGE_MODULES
 from benchmarks.optimiser import claims, race_table
 from benchmarks.optimiser.cells import ADAM, METHODS, measure_race, measure_stability, variants
 from benchmarks.optimiser.convergence import LONG_RENDERS, PRESET, long_variants, measure_converged
@@ -93,7 +94,6 @@ class Optimiser:
         "benchmarks.common.task",
         "benchmarks.raster.scenes",
         "benchmarks.common.timing",
-        "genre_tasks.stages.optimise",
         "benchmarks.common.novel_view_truth",
         "benchmarks.optimiser.convergence",
         "benchmarks.optimiser.distillation",
@@ -101,10 +101,9 @@ class Optimiser:
         "benchmarks.optimiser.enhancement",
         "benchmarks.common.pipeline_inputs",
         "benchmarks.optimiser.iteration_tradeoff",
-        "genre_tasks.stages.novel_views",
-        "genre_tasks.stages.fnet",
-        "genre_tasks.stages.ingest",
-        "genre_tasks.stages.initial",
+        # It scores the scenes.
+        "flows.training.optimiser_training",
+        *STAGE_MODULES,
         "genre_tasks.logs.pandaset.reader",
         "genre_tasks.logs.synthetic",
     )

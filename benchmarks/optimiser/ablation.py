@@ -29,6 +29,7 @@ from benchmarks.common.bench import (
 )
 from benchmarks.common.claims import Claim
 from benchmarks.common.context import THREADS, cell_label
+from benchmarks.common.lazy_modules import STAGE_MODULES
 from benchmarks.common.over_cells import claim_over_cells
 from benchmarks.common.pipeline_inputs import render_images
 from benchmarks.common.task import OptimisationTask, load_task
@@ -103,9 +104,9 @@ class SwitchAblation:
     )
     code: tuple[str, ...] = (
         "benchmarks.optimiser.ablation",
-        "genre_tasks.stages.optimise",
-        "genre_tasks.stages.ingest",
-        "genre_tasks.stages.initial",
+        # It scores the scenes.
+        "flows.training.optimiser_training",
+        *STAGE_MODULES,
         "genre_tasks.logs.pandaset.reader",
         "genre_tasks.logs.synthetic",
     )

@@ -22,6 +22,7 @@ from benchmarks.common.bench import (
     split_option,
 )
 from benchmarks.common.claims import Claim, claim
+from benchmarks.common.lazy_modules import STAGE_MODULES
 from benchmarks.real_logs.measures import NOISE, LogOfBench, measure_chain, measure_effects, measure_pose_noise
 from benchmarks.real_logs.optimiser_race import METHODS, format_races, make_race_claims, measure_race
 
@@ -55,12 +56,9 @@ class RealLogsBench:
         "genre_tasks.logs.kitti.reader",
         "genre_tasks.logs.pandaset.reader",
         "genre_tasks.logs.synthetic",
-        "genre_tasks.effects.multi_view_stereo",
-        "genre_tasks.effects.pose_refinement",
-        "genre_tasks.effects.exposure",
-        "genre_tasks.stages.gnet",
-        "genre_tasks.stages.enet",
-        "genre_tasks.stages.evaluate",
+        # It scores the scenes of races.
+        "flows.training.optimiser_training",
+        *STAGE_MODULES,
     )
     smallest = SmallestForm(
         {"seeds": TINY_STREET, "kitti": "", "pandaset": "", "preset": "demo", "settings": TINY_SETTINGS}, "effects"

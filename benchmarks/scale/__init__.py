@@ -22,6 +22,7 @@ from benchmarks.common.bench import (
     split_option,
 )
 from benchmarks.common.claims import Claim, claim
+from benchmarks.common.lazy_modules import CODEC_MODULES, FORMAT_MODULES, STAGE_MODULES
 from benchmarks.fuzz.input_fuzz import FINDINGS, measure_input_fuzz
 from benchmarks.scale.cluster import measure_cluster
 from benchmarks.scale.datasets import (
@@ -53,7 +54,14 @@ class Scale:
         "flows.dataset.flow",
         "flows.reconstruction.flow",
         "flows.operations",
+        "storage.local",
         "storage.objects.object_store",
+        *CODEC_MODULES,
+        *FORMAT_MODULES,
+        *STAGE_MODULES,
+        "genre_tasks.logs.pandaset.reader",
+        "genre_tasks.logs.posed_images.image_log",
+        "genre_tasks.logs.synthetic",
     )
     # The other cells need PostgreSQL and minutes.
     smallest = SmallestForm({"inputs": "60"}, only="fuzz")
