@@ -40,6 +40,12 @@ from benchmarks.exchange.round_trips import (
     round_trip_table,
 )
 from benchmarks.exchange.service_fuzz import REQUESTS, service_fuzz_claims, service_fuzz_table
+from benchmarks.exchange.service_report import (
+    http_service_claims,
+    http_service_table,
+    service_claims,
+    service_table,
+)
 from flows.exchange.stored_scenes import open_stored_scenes
 from flows.machine.facts import git_commit
 
@@ -147,7 +153,8 @@ class ExchangeBench:
         yield from enhancement_claims(_select(rows, "enhancement"))
         yield from pages_claims(_select(rows, "page"))
         yield from answer_time_claims(_select(rows, "answers"))
-        yield from _service_claims(rows)
+        yield from service_claims(_select(rows, "service alpasim"))
+        yield from http_service_claims(_select(rows, "service neuroncap"), _select(rows, "driving"))
         yield from service_fuzz_claims(_select(rows, "fuzz"))
 
     def table(self, rows: Mapping[str, Row]) -> Iterator[str]:
@@ -159,8 +166,12 @@ class ExchangeBench:
             ("Enhanced scenes", enhancement_table, (_select(rows, "enhancement"),)),
             ("Pages", pages_table, (_select(rows, "page"),)),
             ("Answers", answer_time_table, (_select(rows, "answers"),)),
-            ("AlpaSim", _service_table, (_select(rows, "service alpasim"),)),
-            ("NeuroNCAP and driving", _http_table, (_select(rows, "service neuroncap"), _select(rows, "driving"))),
+            ("AlpaSim", service_table, (_select(rows, "service alpasim"),)),
+            (
+                "NeuroNCAP and driving",
+                http_service_table,
+                (_select(rows, "service neuroncap"), _select(rows, "driving")),
+            ),
             ("Malformed requests", service_fuzz_table, (_select(rows, "fuzz"),)),
         ]
         first = True
@@ -268,29 +279,6 @@ def _require(module: str, extra: str) -> None:
 
     if importlib.util.find_spec(module) is None:
         raise NotMeasuredError(f"{module} is missing: pip install 'genre[{extra}]'")
-
-
-def _service_claims(rows: Mapping[str, Row]) -> Iterator[Claim]:
-    # Imported here: the messages need gRPC, without which there are no rows either.
-    try:
-        from benchmarks.exchange.http_service import http_service_claims
-        from benchmarks.exchange.service import service_claims
-    except ModuleNotFoundError:
-        return
-    yield from service_claims(_select(rows, "service alpasim"))
-    yield from http_service_claims(_select(rows, "service neuroncap"), _select(rows, "driving"))
-
-
-def _service_table(rows: list[Row]) -> Iterator[str]:
-    from benchmarks.exchange.service import service_table
-
-    return service_table(rows)
-
-
-def _http_table(rows: list[Row], driving: list[Row]) -> Iterator[str]:
-    from benchmarks.exchange.http_service import http_service_table
-
-    return http_service_table(rows, driving)
 
 
 BENCH: Bench = ExchangeBench()
