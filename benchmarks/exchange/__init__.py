@@ -25,10 +25,16 @@ from benchmarks.common.bench import (
     settings_from_options,
     split_option,
 )
+from benchmarks.common.cell_parameters import describe_preset
 from benchmarks.common.claims import Claim
 from benchmarks.common.lazy_modules import FORMAT_MODULES, STAGE_MODULES
 from benchmarks.exchange.answer_time import answer_time_claims, answer_time_table, measure_answer_time
-from benchmarks.exchange.enhancement import enhancement_claims, enhancement_table, measure_enhancement
+from benchmarks.exchange.enhancement import (
+    EnhancementCase,
+    enhancement_claims,
+    enhancement_table,
+    measure_enhancement,
+)
 from benchmarks.exchange.import_speed import import_speed_claims, import_speed_table, measure_import_speed
 from benchmarks.exchange.interop import interop_claims, interop_table, measure_interop
 from benchmarks.exchange.measured_run import RunCase
@@ -110,8 +116,11 @@ class ExchangeBench:
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
         """Lists the cells; ``quick``: the first seed alone, fewer steps and requests."""
-        case = RunCase(options["log"], options["preset"], settings_from_options(options), options["store"])
-        parameters = {"log": case.log, "preset": case.preset, "settings": list(case.settings)}
+        settings = settings_from_options(options)
+        case = RunCase(options["log"], options["preset"], settings, options["store"])
+        resolved = describe_preset(case.preset, settings)
+        parameters = {"log": case.log, **resolved}
+        rounds = 3 if quick else _ROUNDS
         steps = _QUICK_STEPS if quick else _STEPS
         requests = _QUICK_REQUESTS if quick else REQUESTS
         trips = [(name, 0) for name in _FORMATS] + [(name, 3) for name in _HARMONIC_FORMATS]
@@ -125,12 +134,17 @@ class ExchangeBench:
             for k, (name, degree) in enumerate(trips)
         ]
         cells += [
-            Cell("import speed", _SPEED_S, partial(measure_import_speed, 3 if quick else _ROUNDS)),
+            Cell("import speed", _SPEED_S, partial(measure_import_speed, rounds), {"rounds": rounds}),
             Cell("other tools", _TOOLS_S, partial(_measure_tools, case), parameters),
             Cell("page viewer", _PAGE_S, partial(_measure_viewer, case), parameters),
             Cell("page report", _PAGE_S, partial(_measure_report, case), parameters),
             # Whole commands depend on all of the code, which no list of modules covers.
-            Cell("answers", _ANSWER_S, partial(measure_answer_time, 3 if quick else _ROUNDS), {"commit": git_commit()}),
+            Cell(
+                "answers",
+                _ANSWER_S,
+                partial(measure_answer_time, rounds),
+                {"commit": git_commit(), "rounds": rounds},
+            ),
             Cell("service alpasim", _SERVICE_S, partial(_measure_alpasim, case, steps), parameters | {"steps": steps}),
             Cell("service neuroncap", _SERVICE_S, partial(_measure_neuroncap, case), parameters),
             Cell("driving", _SERVICE_S, partial(_measure_driving, case), parameters),
@@ -141,8 +155,9 @@ class ExchangeBench:
             cells.append(Cell(f"fuzz {protocol}", _FUZZ_S, measure, fuzzed))
         for seed in split_option(options["seeds"])[: 1 if quick else None]:
             log = f"synthetic:street?seed={seed}"
-            measure = partial(measure_enhancement, log, options["store"], ("scene", "lidar"))
-            cells.append(Cell(f"enhancement {log}", _ENHANCE_S, measure, {"log": log}))
+            enhanced = EnhancementCase(log, options["store"], options["preset"], settings)
+            measure = partial(measure_enhancement, enhanced, ("scene", "lidar"))
+            cells.append(Cell(f"enhancement {log}", _ENHANCE_S, measure, {"log": log, **resolved}))
         return cells
 
     def claims(self, rows: Mapping[str, Row]) -> Iterator[Claim]:
