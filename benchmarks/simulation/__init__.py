@@ -23,6 +23,7 @@ from benchmarks.common.bench import (
 )
 from benchmarks.common.claims import Claim
 from benchmarks.common.lazy_modules import STAGE_MODULES
+from benchmarks.common.task import has_log_folder
 from benchmarks.simulation.behaviour_quality import (
     COMPARED_METHODS,
     behaviour_claims,
@@ -117,7 +118,8 @@ class SimulationBench:
         cases = cases_from_options(options, settings)
         real = [case for case in cases if case.log.startswith("pandaset:")]
         streets = [case for case in cases if case not in real]
-        logs = [case.log for case in cases]
+        # Logs that are not there are left out of the key too, so that it changes when one is downloaded.
+        logs = [case.log for case in cases if has_log_folder(case.log)]
         if quick:
             streets = streets[:1]
             real = real[: not streets]
