@@ -76,11 +76,15 @@ class LogFaultsBench:
             kitti = ChunkOfLog(f"kitti:{options['kitti']}", 0)
             sound.append(kitti)
             real.append(kitti)
-        cells = [Cell(f"sound {chunk.name}", _SOUND_S, partial(measure_sound_log, chunk)) for chunk in sound]
+        # Names are short: what streets look like, and where folders lie, is in the URI alone.
+        cells = [
+            Cell(f"sound {chunk.name}", _SOUND_S, partial(measure_sound_log, chunk), {"log": chunk.uri})
+            for chunk in sound
+        ]
         for chunk in [*faulty, *real]:
             for fault in FAULTS:
                 seconds = _FAULT_S * len(fault.strengths)
-                parameters = {"strengths": list(fault.strengths)}
+                parameters = {"log": chunk.uri, "strengths": list(fault.strengths)}
                 measure = partial(measure_fault, chunk, fault)
                 cells.append(Cell(f"{chunk.name} {fault.name}", seconds, measure, parameters))
         return cells
@@ -110,7 +114,7 @@ class LogFaultsBench:
         for row in measured_rows(rows):
             if row["fault"] == "none":
                 if row["words"]:
-                    yield f"| {row['name']} | none | | | **{', '.join(row['warnings'])}** |"
+                    yield f"| {row['name']} | none | | | **{', '.join(row['words'])}** |"
                 continue
             yield f"| {row['name']} | {row['fault']} | {' | '.join(format_strengths(row))} |"
         yield from list_not_measured(rows)
