@@ -10,6 +10,7 @@ import pytest
 from benchmarks.common.bench import TINY_STREET, Bench
 from benchmarks.evaluation import EVALUATION
 from benchmarks.log_faults import BENCH as LOG_FAULTS
+from benchmarks.scale import BENCH as SCALE
 from benchmarks.start_up import BENCH as START_UP
 
 
@@ -60,3 +61,22 @@ def test_budgets_depend_on_the_content_of_their_table(tmp_path: Path) -> None:
     assert changed_cells(EVALUATION, table=str(table)) == {
         cell.name for cell in EVALUATION.cells(dict(EVALUATION.options), False) if cell.name.startswith("budget")
     }
+
+
+@pytest.mark.parametrize(
+    ("options", "names"),
+    [
+        ({"preset": "demo"}, {"orchestration", "object_store"}),
+        ({"settings": "gnet.iterations=3"}, {"throughput", "orchestration", "object_store"}),
+        ({"street": "&cameras=2&frames=8"}, {"throughput", "object_store"}),
+        ({"cached_street": "&cameras=2"}, {"cached"}),
+        ({"cluster": "10x2"}, {"cluster"}),
+        ({"inputs": "60"}, {"fuzz"}),
+    ],
+)
+def test_cells_of_scale_depend_on_the_options_that_they_read(options: dict[str, str], names: set[str]) -> None:
+    assert changed_cells(SCALE, **options) == names
+
+
+def test_fewer_rounds_are_another_measurement_of_scale() -> None:
+    assert changed_cells(SCALE, quick=True) == {"cached", "object_store"}
