@@ -29,6 +29,7 @@ from benchmarks.common.bench import (
     split_option,
 )
 from benchmarks.common.claims import Claim, claim
+from benchmarks.common.lazy_modules import STAGE_MODULES
 from benchmarks.common.run_stages import read_metrics, reconstruct
 from benchmarks.common.task import require_log_folder
 from flows.cli.parsing import parse_memory
@@ -53,6 +54,7 @@ _LIMIT_FNET_S = 2.0
 _KERNEL_CUT = 0.25
 _SHARPER = 0.20
 _MEMORY_ERROR = 0.15
+_NOT_MEASURED = "not measured"
 _MEASURED = ("seconds", "cpu_seconds", "peak_gib", "predicted_gib")
 
 
@@ -74,14 +76,9 @@ class FullSize:
         "flows.pipeline.memory_plan",
         "flows.pipeline.stage_inputs",
         "flows.machine.memory_reuse",
-        "genre_tasks.stages.ingest",
-        "genre_tasks.stages.effects",
-        "genre_tasks.stages.initial",
-        "genre_tasks.stages.optimise",
-        "genre_tasks.stages.novel_views",
-        "genre_tasks.stages.fnet",
-        "genre_tasks.stages.evaluate",
+        *STAGE_MODULES,
         "genre_tasks.logs.pandaset.reader",
+        "genre_tasks.logs.synthetic",
     )
     smallest = SmallestForm({"log": f"synthetic:street?seed={TINY_STREET}", "settings": TINY_SETTINGS}, only="run")
 
@@ -114,13 +111,20 @@ class FullSize:
         ]
 
     def claims(self, rows: Mapping[str, Row]) -> Iterator[Claim]:
-        """Makes the claims, chunk by chunk."""
-        for row in rows.values():
-            if row.get("kind") == "run":
-                yield from _run_claims(row)
-            if row.get("kind") == "quality":
-                yield from _quality_claims(row)
-        yield from _memory_claims(rows)
+        """Makes the claims, chunk by chunk; those without a chunk say that they were not measured."""
+        runs = [row for row in rows.values() if row.get("kind") == "run"]
+        free: list[Row | None] = [row for row in runs if row["limit_gib"] is None]
+        quality: list[Row | None] = [row for row in rows.values() if row.get("kind") == "quality"]
+        # A limited run alone says nothing of bytes: it has nothing to be compared with.
+        chunks = {row["chunk"]: row for row in runs if row["limit_gib"] is None}
+        limited = [row for row in runs if row["limit_gib"] is not None and row["chunk"] in chunks]
+        pairs: list[tuple[Row, Row] | None] = [(chunks[row["chunk"]], row) for row in limited]
+        for row in free or [None]:
+            yield from _run_claims(row)
+        for row in quality or [None]:
+            yield from _quality_claims(row)
+        for pair in pairs or [None]:
+            yield from _memory_claims(pair)
 
     def table(self, rows: Mapping[str, Row]) -> Iterator[str]:
         """Makes the table that the command prints."""
@@ -255,45 +259,49 @@ def _judge_scaled_up(job: Job, views: tuple[View, ...]) -> float:
     return sum(score.perceptual for score in collector.scores) / len(collector.scores)
 
 
-def _memory_claims(rows: Mapping[str, Row]) -> Iterator[Claim]:
-    runs = [row for row in rows.values() if row.get("kind") == "run"]
-    free = {row["chunk"]: row for row in runs if row["limit_gib"] is None}
-    for row in runs:
-        # A limited run alone says nothing of bytes: it has nothing to be compared with.
-        if row["limit_gib"] is None or row["chunk"] not in free:
-            continue
-        pair = (free[row["chunk"]], row)
-        where = f"{_place(row)}, freely and with at most {row['limit_gib']:.2f} GiB"
-        stages = [stage for run in pair for stage in run["stages"].values()]
-        largest = max(stages, key=lambda stage: abs(stage["peak_gib"] / stage["predicted_gib"] - 1))
-        error = largest["peak_gib"] / largest["predicted_gib"] - 1
-        # Digests of files and not of values: a stage that wrote other bytes would count.
-        changed = [s for s in STAGES if len({run["stages"][s]["payload_digest"] for run in pair}) > 1]
-        yield claim("full_size.limited_gib", row["peak_gib"], "<=", row["limit_gib"], "GiB", _place(row))
-        yield claim("full_size.memory_error", abs(error), "<=", _MEMORY_ERROR, "share", f"{where}; of all stages")
-        yield claim("full_size.changed_stages", len(changed), "<=", 0, "stages", where)
+def _memory_claims(pair: tuple[Row, Row] | None) -> Iterator[Claim]:
+    if pair is None:
+        limit_gib = parse_memory(FullSize.options["memory"], "memory") or 0.0
+        yield claim("full_size.limited_gib", None, "<=", limit_gib, "GiB", _NOT_MEASURED)
+        yield claim("full_size.memory_error", None, "<=", _MEMORY_ERROR, "share", _NOT_MEASURED)
+        yield claim("full_size.changed_stages", None, "<=", 0, "stages", _NOT_MEASURED)
+        return
+    row = pair[1]
+    where = f"{_place(row)}, freely and with at most {row['limit_gib']:.2f} GiB"
+    stages = [stage for run in pair for stage in run["stages"].values()]
+    largest = max(stages, key=lambda stage: abs(stage["peak_gib"] / stage["predicted_gib"] - 1))
+    error = largest["peak_gib"] / largest["predicted_gib"] - 1
+    # Digests of files and not of values: a stage that wrote other bytes would count.
+    changed = [s for s in STAGES if len({run["stages"][s]["payload_digest"] for run in pair}) > 1]
+    yield claim("full_size.limited_gib", row["peak_gib"], "<=", row["limit_gib"], "GiB", _place(row))
+    yield claim("full_size.memory_error", abs(error), "<=", _MEMORY_ERROR, "share", f"{where}; of all stages")
+    yield claim("full_size.changed_stages", len(changed), "<=", 0, "stages", where)
 
 
 def _place(row: Row) -> str:
     return f"chunk {row['chunk']} of {row['log'].rpartition('/')[2]} with preset hd, without evaluation"
 
 
-def _run_claims(row: Row) -> Iterator[Claim]:
-    if row["limit_gib"] is not None:
-        return
-    where = _place(row)
-    fnet_s = row["stages"]["fnet"]["seconds"] / row["fixed_views"]
-    yield claim("full_size.minutes", row["seconds"] / 60, "<=", _LIMIT_MINUTES, "minutes", where)
-    yield claim("full_size.peak_gib", row["peak_gib"], "<=", _LIMIT_GIB, "GiB", where)
+def _run_claims(row: Row | None) -> Iterator[Claim]:
+    where = _NOT_MEASURED if row is None else _place(row)
+    minutes = None if row is None else row["seconds"] / 60
+    peak_gib = None if row is None else row["peak_gib"]
+    fnet_s = None if row is None else row["stages"]["fnet"]["seconds"] / row["fixed_views"]
+    yield claim("full_size.minutes", minutes, "<=", _LIMIT_MINUTES, "minutes", where)
+    yield claim("full_size.peak_gib", peak_gib, "<=", _LIMIT_GIB, "GiB", where)
     yield claim("full_size.fnet_s", fnet_s, "<=", _LIMIT_FNET_S, "s", f"{where}, an image with reading and writing")
 
 
-def _quality_claims(row: Row) -> Iterator[Claim]:
-    where = f"chunk {row['chunk']} of {row['log'].rpartition('/')[2]} with preset hd"
-    gnet, enet = row["metrics"]["gnet"], row["metrics"]["enet"]
-    cut = 1 - enet["shift_3m/kernel"] / gnet["shift_3m/kernel"]
-    gain = enet["interpolation/psnr"] - gnet["interpolation/psnr"]
-    sharper = 1 - enet["interpolation/perceptual"] / row["small_scaled_up"]
+def _quality_claims(row: Row | None) -> Iterator[Claim]:
+    where = _NOT_MEASURED
+    cut = gain = sharper = None
+    if row is not None:
+        where = f"chunk {row['chunk']} of {row['log'].rpartition('/')[2]} with preset hd"
+        gnet = row["metrics"]["gnet"]
+        enet = row["metrics"]["enet"]
+        cut = 1 - enet["shift_3m/kernel"] / gnet["shift_3m/kernel"]
+        gain = enet["interpolation/psnr"] - gnet["interpolation/psnr"]
+        sharper = 1 - enet["interpolation/perceptual"] / row["small_scaled_up"]
     yield claim("full_size.kernel_cut", cut, ">=", _KERNEL_CUT, "share", where)
     yield claim("full_size.heldout_gain", gain, ">=", 0.0, "dB", where)
     yield claim("full_size.perceptual_gain", sharper, ">=", _SHARPER, "share", where)

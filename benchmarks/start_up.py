@@ -12,13 +12,17 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from benchmarks.common.bench import TINY_SETTINGS, TINY_STREET, Bench, Cell, Row, SmallestForm, settings_from_options
+from benchmarks.common.cell_parameters import describe_preset
 from benchmarks.common.claims import Claim, claim
 from benchmarks.common.command import run_genre
+from benchmarks.common.lazy_modules import CODEC_MODULES, STAGE_MODULES
 from benchmarks.common.timing import Quartiles
 from flows.machine.facts import CHECKOUT
 
+_PRESET = "demo"
 _START = """
 import time
 from flows.cli.main import prepare_environment
@@ -42,7 +46,15 @@ class StartUp:
 
     name = "start_up"
     options: Mapping[str, str] = {"seed": "1000", "settings": ""}
-    code: tuple[str, ...] = ("benchmarks.start_up", "flows.prefect_api.connection", "flows.cli.run")
+    code: tuple[str, ...] = (
+        "benchmarks.start_up",
+        "flows.prefect_api.connection",
+        "flows.cli.run",
+        "storage.local",
+        *CODEC_MODULES,
+        *STAGE_MODULES,
+        "genre_tasks.logs.synthetic",
+    )
     smallest = SmallestForm({"seed": TINY_STREET, "settings": TINY_SETTINGS}, only="cached_run")
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
@@ -56,15 +68,17 @@ class StartUp:
             Three cells.
         """
         rounds = 1 if quick else 9
-        run = partial(measure_cached_run, options["seed"], settings_from_options(options))
-        measures: tuple[tuple[str, Callable[[int], Row], float], ...] = (
-            ("cached_run", run, 60.0),
-            ("api", partial(measure_api, False), 5.0),
-            ("first_api", partial(measure_api, True), 8.0),
+        settings = settings_from_options(options)
+        run = partial(measure_cached_run, options["seed"], settings)
+        street = {"seed": options["seed"], **describe_preset(_PRESET, settings)}
+        measures: tuple[tuple[str, Callable[[int], Row], float, dict[str, Any]], ...] = (
+            ("cached_run", run, 60.0, street),
+            ("api", partial(measure_api, False), 5.0, {}),
+            ("first_api", partial(measure_api, True), 8.0, {}),
         )
         return [
-            Cell(name, first_s + 5.0 * rounds, partial(measure, rounds), {"rounds": rounds})
-            for name, measure, first_s in measures
+            Cell(name, first_s + 5.0 * rounds, partial(measure, rounds), {"rounds": rounds, **parameters})
+            for name, measure, first_s, parameters in measures
         ]
 
     def claims(self, rows: Mapping[str, Row]) -> Iterator[Claim]:
@@ -104,7 +118,7 @@ def measure_cached_run(seed: str, settings: tuple[str, ...], rounds: int) -> Row
     Returns:
         ``seconds`` of the command.
     """
-    options = ["--preset", "demo"]
+    options = ["--preset", _PRESET]
     for setting in settings:
         options += ["--set", setting]
     with tempfile.TemporaryDirectory() as folder:

@@ -123,11 +123,11 @@ CLAIM_WORDS = {
     "log_faults.found_strongest": "Fraction of faults and logs of which the strongest form is found",
     "log_faults.seconds": "CPU seconds of all checks of a chunk, six cameras",
     "scale.two_workers": "Time of 16 logs with one worker, over that with two, on two cores",
-    "scale.orchestration_share": "A worker's time for a log without computation, over the computation",
+    "scale.orchestration_share": "A worker's time for a log without computation, over the computation with evaluation",
     "scale.cached_log_s": "A worker's time for a log whose stages are all in the store",
     "scale.object_store_ratio": "Time of a run with its store on S3, over a store on the local disk",
     "scale.cluster_lost": "Stages lost in the simulated dataset",
-    "scale.cluster_doubled": "Stages of the simulated dataset that the store holds twice",
+    "scale.cluster_doubled": "Stages of the simulated dataset that were put or computed twice",
     "scale.fuzz_findings": "Damaged and harmful files that are a finding",
 }
 EFFECT_WORDS = {name: name.replace("_", " ") for name in CASES} | {

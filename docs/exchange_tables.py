@@ -16,6 +16,7 @@ CLAIM_WORDS = {
     "exchange.spz_bytes": "Size of SPZ without harmonics",
     "exchange.glb_error": "Largest error of any attribute in a GLB file",
     "exchange.usdz_error": "Largest error of any attribute in a USDZ file",
+    "exchange.interop_missing": "Gaussians that tools of others lose or add, the most on any way through them",
     "exchange.interop_spz": "Largest error of positions, our SPZ read by Niantic's library",
     "exchange.interop_validator": "Errors of glTF's validator",
     "exchange.interop_animation": "Largest error of actors' places when three.js plays our GLB",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from benchmarks.scale.report import sum_evaluation
 from docs.result_tables import number, result, table
 
 NAME = "scale"
@@ -21,7 +22,8 @@ def workers() -> str:
         [f"{throughput['logs']} logs, two workers", number(throughput["two_workers_s"])],
         ["one log on a worker, from its start to the end of its process", number(run["worker_s"])],
         ["the computation in it", number(run["compute_s"])],
-        ["the computation in it without evaluation", number(_sum_without_evaluation(run["stages_s"]))],
+        ["the computation in it without evaluation", number(run["compute_s"] - sum_evaluation(run["stages_s"]))],
+        ["the rest of it: orchestration", number(run["worker_s"] - run["compute_s"])],
         ["a log whose stages are all in the store, on a worker", _spread(cached)],
         ["one log into a store of this machine", _spread(objects["local_s"])],
         ["one log into a store on an S3 server of this machine", _spread(objects["s3_s"])],
@@ -97,10 +99,6 @@ def fuzz() -> str:
 def _row(cell: str) -> dict[str, Any]:
     (row,) = [row for row in result(NAME)["rows"] if row["cell"] == cell]
     return row
-
-
-def _sum_without_evaluation(seconds: Mapping[str, float]) -> float:
-    return sum(value for stage, value in seconds.items() if not stage.startswith("evaluate/"))
 
 
 def _spread(quartiles: Mapping[str, float]) -> str:

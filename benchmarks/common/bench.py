@@ -11,7 +11,10 @@ from benchmarks.common.claims import Claim
 Row = dict[str, Any]
 """What a cell measured, as JSON values; ``not_measured`` alone where it says why nothing was."""
 
-TINY_STREET = "900&width=64&height=36&samples=1&frames=8&cameras=1&lidar_beams=32&lidar_azimuths=300"
+TINY_STREET_PARAMETERS = "&width=64&height=36&samples=1&frames=8&cameras=1&lidar_beams=32&lidar_azimuths=300"
+"""What a seed of a street is followed by in its URI for eight small frames of one camera."""
+
+TINY_STREET = f"900{TINY_STREET_PARAMETERS}"
 """A seed with further parameters of the street's URI: eight small frames of one camera, read within a second."""
 
 TINY_SETTINGS = (

@@ -33,12 +33,16 @@ class Claim(_Strict):
     """One requirement: ``holds`` says whether ``measured op target``; a claim that was not measured does not hold."""
 
     id: str = Field(pattern=r"^[a-z0-9_]+(\.[a-z0-9_]+)+$", description="Benchmark and name, joined by a dot.")
-    measured: float | None = Field(description="A median where n > 1; null: not measured, its row says why.")
+    measured: float | None = Field(
+        description="One measurement, or the median, mean, share, sum or worst of n; null: not measured."
+    )
     op: Op = Field(description="How the number has to compare with the target.")
     target: float = Field(description="In the unit of the number.")
     unit: str = Field(min_length=1, description="Such as dB, s or ratio.")
     n: int = Field(ge=0, description="Measurements behind the number.")
-    spread: tuple[float, float] | None = Field(description="First and third quartile of the n measurements.")
+    spread: tuple[float, float] | None = Field(
+        description="First and third quartile of the n measurements, or the 95 % interval where the data names one."
+    )
     data: str = Field(min_length=1, description="What it was measured on.")
     holds: bool = Field(description="Whether the number meets the target.")
 
@@ -81,7 +85,7 @@ def claim(
         unit: such as ``dB``, ``s`` or ``ratio``.
         data: what it was measured on.
         n: number of measurements behind the number.
-        spread: first and third quartile of the measurements.
+        spread: first and third quartile of the measurements, or a 95 % interval that the data names.
 
     Returns:
         The claim; without a number its ``n`` is 0 and it has no spread.

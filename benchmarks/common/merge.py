@@ -23,8 +23,8 @@ def merge_results(bench: Bench, results: Sequence[Result]) -> Result:
         results: at least one; of a cell in several of them the last one's row counts, unless it was not measured there.
 
     Returns:
-        All rows, in the order in which their cells first appear. Machine and commit are the last result's; a row from
-        elsewhere carries its own.
+        All rows, in the order in which the counted ones were read: a cell that is measured again moves behind those
+        before it. Machine and commit are the last result's; a row from elsewhere carries its own.
 
     Raises:
         ValueError: there is no result.
@@ -38,6 +38,8 @@ def merge_results(bench: Bench, results: Sequence[Result]) -> Result:
             name = str(row["cell"])
             # A later partial run leaves most cells out, and must not erase what an earlier one measured.
             if "not_measured" not in row or name not in rows:
+                # Two cells may measure the same; of those the later one counts, which has to be the newer one.
+                rows.pop(name, None)
                 rows[name] = _with_origin(row, result, last)
     # Claims are made again, because they may span cells of several files.
     named = {name: {k: v for k, v in row.items() if k != "cell"} for name, row in rows.items()}

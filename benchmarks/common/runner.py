@@ -76,7 +76,8 @@ def find_cached_rows(
         cache: folder of the rows.
 
     Returns:
-        The cells in order. A row counts for one name, parameters, code and machine.
+        The cells in order. A row counts for one name, parameters, code and machine; one that was measured at another
+        commit than today's says so as ``commit``.
 
     Raises:
         ArtifactCorruptError: a cached row cannot be read.
@@ -84,6 +85,7 @@ def find_cached_rows(
     code = code_digest(bench.code[0], bench.code[1:])
     # Seconds of another machine are no measurement of this one.
     machine = describe_machine()
+    commit = git_commit()
     found = []
     for cell in bench.cells(options, quick):
         text = json.dumps([bench.name, cell.name, dict(cell.parameters), code, machine], sort_keys=True)
@@ -92,20 +94,23 @@ def find_cached_rows(
         # The name is for people; the key alone tells cells apart.
         readable = re.sub(r"[^\w.-]+", "_", cell.name)
         path = cache / bench.name / f"{readable}-{key}.json"
-        found.append(CachedCell(cell, path, None if fresh else _read_row(path)))
+        found.append(CachedCell(cell, path, None if fresh else _read_row(path, commit)))
     return found
 
 
-def _read_row(path: Path) -> Row | None:
+def _read_row(path: Path, commit: str) -> Row | None:
     if not path.exists():
         return None
     try:
-        row = json.loads(path.read_text(encoding="utf-8"))["row"]
-    except (ValueError, KeyError, TypeError) as error:
+        cached = json.loads(path.read_text(encoding="utf-8"))
+        row = dict(cached["row"])
+        measured_at = cached.get("commit", "unknown")
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ArtifactCorruptError(
             f"a measured cell cannot be read: {error}", remedy="Delete the file, or use --fresh.", file=path
         ) from error
-    return dict(row)
+    # The file that is written of all rows states today's commit, which would be false for this one.
+    return row if measured_at == commit else {"commit": measured_at, **row}
 
 
 def measure_cells(
@@ -124,6 +129,8 @@ def measure_cells(
         which is not cached.
     """
     rows: dict[str, Row] = {}
+    # Of the code that runs: the checkout may change while a benchmark runs for hours.
+    commit = git_commit()
     began = time.monotonic()
     for cached in cells:
         name = cached.cell.name
@@ -147,28 +154,29 @@ def measure_cells(
             continue
         seconds = time.monotonic() - start
         # Written after each cell, so that a run that is killed loses one cell at most.
-        _write_row(cached, rows[name], seconds)
+        _write_row(cached, rows[name], seconds, commit)
         report(f"{name}: measured in {seconds:.1f} s")
     return rows
 
 
-def _write_row(cached: CachedCell, row: Row, seconds: float) -> None:
-    parameters = dict(cached.cell.parameters)
-    write_json(cached.path, {"cell": cached.cell.name, "parameters": parameters, "seconds": seconds, "row": row})
+def _write_row(cached: CachedCell, row: Row, seconds: float, commit: str) -> None:
+    facts = {"parameters": dict(cached.cell.parameters), "seconds": seconds, "commit": commit}
+    write_json(cached.path, {"cell": cached.cell.name, **facts, "row": row})
 
 
-def make_result(bench: Bench, rows: Mapping[str, Row]) -> Result:
+def make_result(bench: Bench, rows: Mapping[str, Row], commit: str) -> Result:
     """Makes the benchmark's file of its rows.
 
     Args:
         bench: makes the claims.
         rows: by cell.
+        commit: that the rows were measured at which name none of their own.
 
     Returns:
         Rows and claims with machine and commit, checked against the schema.
     """
     named = [{"cell": name, **row} for name, row in rows.items()]
-    return Result(machine=describe_machine(), commit=git_commit(), rows=named, claims=list(bench.claims(rows)))
+    return Result(machine=describe_machine(), commit=commit, rows=named, claims=list(bench.claims(rows)))
 
 
 def run_bench(
@@ -197,9 +205,10 @@ def run_bench(
     Raises:
         ArtifactCorruptError: a cached row cannot be read.
     """
+    commit = git_commit()
     cells = find_cached_rows(bench, options, quick, fresh, cache)
     rows = measure_cells(cells, print_progress, QUICK_S if quick else None, only)
-    result = make_result(bench, rows)
+    result = make_result(bench, rows, commit)
     write_json(json_file, result.model_dump(mode="json"))
     for line in bench.table(rows):
         sys.stdout.write(line + "\n")

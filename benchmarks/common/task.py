@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
+from urllib.parse import unquote
 
 from benchmarks.common.bench import NotMeasuredError
 from benchmarks.common.novel_view_truth import load_true_targets
@@ -19,11 +19,13 @@ from genre_tasks.effects.types import DEFAULT_EFFECTS, DEFAULT_PLAN, EffectsPlan
 from genre_tasks.losses.targets import Target, source_targets, view_targets
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.stages.gnet import prepare_start
+from genre_tasks.user_paths import expand_user_path
 
 HELDOUT_VIEWS = 12
 """Number of held-out views that a scene is evaluated by, spread evenly: a curve has some twenty points."""
 WITHOUT_EFFECTS = ("effects=none", *(f"effects.{name}=on" for name in sorted(DEFAULT_EFFECTS)))
 """Optimisers are compared on what all of them model; ``genre bench effects`` measures the rest."""
+_READERS_OF_PARTS = ("nuscenes", "waymo")
 SIDE_M = 3.0
 """Metres beside the path at which curves are evaluated: where the fixer works."""
 
@@ -135,7 +137,27 @@ def require_log_folder(log: str) -> None:
     Traceback (most recent call last):
     benchmarks.common.bench.NotMeasuredError: there is no folder nowhere/002; name it in the option of the log
     """
-    reader, _, path = log.partition(":")
     # A missing download is no failure of the code, so the cell says why it was not measured.
-    if reader == "pandaset" and not Path(path).is_dir():
-        raise NotMeasuredError(f"there is no folder {path}; name it in the option of the log")
+    if not has_log_folder(log):
+        raise NotMeasuredError(f"there is no folder {_log_path(log)}; name it in the option of the log")
+
+
+def has_log_folder(log: str) -> bool:
+    """Says whether the files of a log are there.
+
+    Args:
+        log: URI of a log; a synthetic one needs none.
+
+    >>> has_log_folder("kitti:nowhere/drive?labels=labels.txt")
+    False
+    """
+    if log.startswith("synthetic:"):
+        return True
+    path = expand_user_path(_log_path(log))
+    # The last part of these names a scene or a segment, and is no file.
+    return path.parent.is_dir() if log.partition(":")[0] in _READERS_OF_PARTS else path.exists()
+
+
+def _log_path(log: str) -> str:
+    # Options stand behind the question mark, as those of KITTI do; a path writes special characters with %.
+    return unquote(log.partition(":")[2].partition("?")[0])

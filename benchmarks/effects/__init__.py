@@ -23,10 +23,17 @@ from benchmarks.common.bench import (
     split_option,
 )
 from benchmarks.common.claims import Claim
+from benchmarks.common.lazy_modules import STAGE_MODULES
 from benchmarks.effects.cases import CASES
 from benchmarks.effects.cells import ChunkLocation, measure_on_pandaset, measure_on_street
 from benchmarks.effects.report import BENCH_NAME, make_claims, make_table
-from benchmarks.effects.whole_plans import TRAINED_EFFECTS, compare_auto_with_on, compare_trained, count_plain_cost
+from benchmarks.effects.whole_plans import (
+    TRAINED_EFFECTS,
+    compare_auto_with_on,
+    compare_trained,
+    count_plain_cost,
+    describe_training,
+)
 from flows.configuration import load_configuration
 from flows.pipeline.definition import STAGE_BY_NAME, digest_stage_weights
 from genre_tasks.errors import ConfigError
@@ -62,11 +69,7 @@ class EffectsBench:
         "benchmarks.effects.cells",
         "benchmarks.effects.whole_plans",
         "benchmarks.effects.instruction_count",
-        "genre_tasks.stages.optimise",
-        "genre_tasks.stages.ingest",
-        "genre_tasks.stages.initial",
-        "genre_tasks.stages.effects",
-        *STAGE_BY_NAME["effects"].lazy_modules,
+        *STAGE_MODULES,
         "genre_tasks.logs.pandaset.reader",
         "genre_tasks.logs.synthetic",
     )
@@ -145,13 +148,10 @@ class _CellMaker:
             for query in ("", TRAINED_EFFECTS)
         ]
         locations += [self._location(f"pandaset:{self._pandaset}", chunk) for chunk in chunks]
+        # A training that goes on changes its weights, and so does another folder.
+        parameters = self._parameters | {"training": describe_training(folder)}
         return [
-            Cell(
-                f"{TRAINED} {x.log} chunk {x.chunk}",
-                WHOLE_PLAN_S,
-                partial(compare_trained, x, folder),
-                self._parameters,
-            )
+            Cell(f"{TRAINED} {x.log} chunk {x.chunk}", WHOLE_PLAN_S, partial(compare_trained, x, folder), parameters)
             for x in locations
         ]
 

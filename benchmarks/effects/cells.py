@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -135,6 +136,9 @@ def evaluate_settings(
 
     Returns:
         ``measure``; PSNR held out and at ±3 m (``None`` without truth) in dB; seconds of GNet and of the plan.
+
+    Raises:
+        NotMeasuredError: nothing in the views is what the measure is about.
     """
     job = location.job(*settings)
     refs = reconstruct(job, STAGES)
@@ -144,8 +148,12 @@ def evaluate_settings(
     evaluated = replace(plan, parameters=replace(plan.parameters, ego_masks=parameters.ego_masks))
     chunk = apply_plan(read_artifact(job, refs["ingest"]), evaluated)
     truth = cached_log(location.log).truth
+    value = measure(chunk, scene, truth)
+    # JSON has no NaN: it would end the benchmark, and all cells that follow.
+    if not math.isfinite(value):
+        raise NotMeasuredError(f"{location.log}: no pixel of the views is what the measure is about")
     return {
-        "measure": measure(chunk, scene, truth),
+        "measure": value,
         "heldout_db": heldout_psnr(chunk, scene),
         "beside_db": None if truth is None else novel_view_psnr(chunk, scene, truth),
         "gnet_s": open_artifact(job, refs["gnet"]).manifest.seconds,

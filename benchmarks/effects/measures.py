@@ -87,7 +87,7 @@ def heldout_people_psnr(chunk: Chunk, scene: SceneGraph, _truth: Truth | None = 
         difference = _render_as_recorded(scene, view) - decode_view_image(view).numpy()
         error += float(np.square(difference).mean(-1)[people].sum(dtype=np.float64))
         count += int(people.sum())
-    return -10 * math.log10(error / count) if count else heldout_psnr(chunk, scene)
+    return _pooled_psnr(error, count) if count else heldout_psnr(chunk, scene)
 
 
 def heldout_depth_score(chunk: Chunk, scene: SceneGraph, _truth: Truth | None = None) -> float:
@@ -199,4 +199,9 @@ def psnr_where_footprints_change(chunk: Chunk, scene: SceneGraph, views: Sequenc
         image = _render_as_recorded(scene, view)
         error += float(np.square(image[v, u] - true[v, u]).mean(-1).sum(dtype=np.float64))
         count += len(u)
-    return -10 * math.log10(error / count) if count else math.nan
+    return _pooled_psnr(error, count) if count else math.nan
+
+
+def _pooled_psnr(error: float, count: int) -> float:
+    # Identical pixels have no logarithm; the floor keeps them at 100 dB, as that of whole images does.
+    return -10 * math.log10(max(error / count, 1e-10))

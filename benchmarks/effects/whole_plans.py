@@ -9,14 +9,18 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 from benchmarks.common.bench import NotMeasuredError, Row
 from benchmarks.common.context import THREADS
 from benchmarks.common.run_stages import reconstruct
+from benchmarks.common.task import require_log_folder
 from benchmarks.effects.cells import STAGES, ChunkLocation, evaluate_settings
 from benchmarks.effects.measures import every_heldout_psnr, heldout_psnr
 from flows.machine.facts import CHECKOUT, git_commit
+from flows.pipeline.definition import digest_weights
 from flows.training.train_job import TrainJob
+from genre_tasks.errors import InputError
 from genre_tasks.threads import torch_threads
 
 EVERYTHING = (
@@ -104,21 +108,46 @@ def compare_trained(location: ChunkLocation, folder: str) -> Row:
         A row: ``shipped``, ``plain`` and ``effects``, see :func:`benchmarks.effects.cells.evaluate_settings`.
 
     Raises:
-        NotMeasuredError: there is no folder.
+        NotMeasuredError: there is no folder, or none of the log; or a stage is not trained to its end.
     """
     if not folder:
         # Training takes hours, so this benchmark never starts one by itself.
         raise NotMeasuredError("no training; run `genre train gnet --recipe effects`, give its folder: training=PATH")
+    require_log_folder(location.log)
     job = TrainJob(folder, "effects")
+    try:
+        trained = {stage.name.partition("/")[2]: job.stage_weights(stage.name) for stage in job.stages()}
+    except InputError as error:
+        raise NotMeasuredError(str(error)) from error
     with torch_threads(THREADS):
         parameters = location.plan().parameters
         row: Row = {"whole": "trained", "log": location.log, "chunk": location.chunk, "commit": git_commit()}
         row["shipped"] = evaluate_settings(location, parameters, every_heldout_psnr)
-        for stage in job.stages():
-            weights = f"gnet.weights={job.stage_weights(stage.name)}"
-            variant = stage.name.partition("/")[2]
-            row[variant] = evaluate_settings(location, parameters, every_heldout_psnr, weights)
+        for variant, path in trained.items():
+            row[variant] = evaluate_settings(location, parameters, every_heldout_psnr, f"gnet.weights={path}")
     return row
+
+
+def describe_training(folder: str) -> dict[str, Any]:
+    """Says which weights a training has made, for the cells' cache.
+
+    Args:
+        folder: of ``genre train gnet --recipe effects``; empty without one.
+
+    Returns:
+        The digest of the weights of each stage; ``null`` for a stage that is not trained to its end.
+    """
+    if not folder:
+        return {}
+    job = TrainJob(folder, "effects")
+    return {stage.name: _digest_trained(job, stage.name) for stage in job.stages()}
+
+
+def _digest_trained(job: TrainJob, stage: str) -> str | None:
+    try:
+        return digest_weights(job.stage_weights(stage))
+    except InputError:
+        return None
 
 
 def _with_query(location: ChunkLocation, query: str) -> ChunkLocation:

@@ -22,12 +22,12 @@ from benchmarks.common.bench import (
     settings_from_options,
     split_option,
 )
+from benchmarks.common.cell_parameters import describe_preset
 from benchmarks.common.claims import Claim
-from benchmarks.evaluation.budgets import budget_claims, budget_table, run_with_budget
+from benchmarks.common.lazy_modules import STAGE_MODULES
+from benchmarks.evaluation.budgets import budget_claims, budget_table, digest_table, run_with_budget
 from benchmarks.evaluation.range_seconds import measure_range_seconds, range_seconds_claims, range_seconds_table
 from benchmarks.evaluation.reliability import measure_street, reliability_claims, reliability_table
-from flows.configuration import load_configuration
-from flows.pipeline.definition import STAGE_BY_NAME, digest_stage_weights
 
 GUARDS_S = 150.0
 RANGE_S = 90.0
@@ -58,11 +58,10 @@ class EvaluationBench:
         "benchmarks.evaluation.range_seconds",
         "benchmarks.evaluation.reliability",
         "flows.budget.budget",
+        "flows.cli.run",
         "genre_tasks.reliability.reliable_range",
-        "genre_tasks.stages.ingest",
-        "genre_tasks.stages.initial",
-        "genre_tasks.stages.optimise",
-        "genre_tasks.stages.fnet",
+        *STAGE_MODULES,
+        "genre_tasks.logs.pandaset.reader",
         "genre_tasks.logs.synthetic",
     )
     smallest = SmallestForm(
@@ -74,12 +73,9 @@ class EvaluationBench:
         seeds = split_option(options["seeds"])
         budgets = split_option(options["budgets"])
         settings = settings_from_options(options)
-        config = load_configuration("small", settings=settings)
-        parameters = {
-            "configuration": config.model_dump(mode="json"),
-            "weights": [digest_stage_weights(STAGE_BY_NAME[s], config) for s in ("gnet", "fnet", "enet")],
-            "table": options["table"],
-        }
+        parameters = describe_preset("small", settings)
+        # The table alone decides what a budget is spent on; a sweep writes a new one over the old one.
+        planned = parameters | {"table": digest_table(options["table"])}
         cells = []
         for seed in seeds[:1] if quick else seeds:
             for stage in split_option(options["stages"]):
@@ -91,7 +87,7 @@ class EvaluationBench:
                 # Shifted by one each round, so that after some rounds every budget has met every seed.
                 seed = seeds[(i + k) % len(seeds)]
                 run = partial(run_with_budget, seed, float(budget), options["table"], settings)
-                cells.append(Cell(f"budget {budget} s street {seed}", float(budget) + START_S, run, parameters))
+                cells.append(Cell(f"budget {budget} s street {seed}", float(budget) + START_S, run, planned))
         # One street is enough: the seconds depend on the number of views and their size.
         stage = split_option(options["stages"])[-1]
         logs = {f"street {seeds[0]}": f"synthetic:street?seed={seeds[0]}"}

@@ -20,7 +20,9 @@ from flows.budget.cost_table import CostPoint, CostTable, find_shipped_table, lo
 from flows.experiments.warm_up import TINY_LOG
 from flows.machine.facts import git_commit
 from flows.pipeline.definition import stages_until
+from storage.files import digest_file
 
+PRESET = "small"
 EVALUATION_SETTINGS = (
     "evaluate.shifts_m=[3.0]",
     "evaluate.every=4",
@@ -61,7 +63,7 @@ def run_with_budget(seed: str, budget_s: float, table: str, settings: Sequence[s
     if not prefect_home.is_dir():
         with tempfile.TemporaryDirectory() as store:
             run_genre(TINY_LOG, prefect_home, "--preset", "demo", "--store", store)
-    options = ["--preset", "small"]
+    options = ["--preset", PRESET]
     for setting in (*EVALUATION_SETTINGS, *settings):
         options += ["--set", setting]
     if table:
@@ -94,6 +96,23 @@ def run_with_budget(seed: str, budget_s: float, table: str, settings: Sequence[s
     }
 
 
+def digest_table(table: str) -> str | None:
+    """Digests the table of costs that budgets are planned with.
+
+    Args:
+        table: path of a sweep's table; the shipped one if empty.
+
+    Returns:
+        64 hex digits; ``None`` where there is no such file, which the run itself reports.
+    """
+    path = _find_table(table)
+    return digest_file(path) if path.is_file() else None
+
+
+def _find_table(table: str) -> Path:
+    return Path(table) if table else find_shipped_table(PRESET)
+
+
 def budget_claims(rows: Sequence[Row]) -> Iterator[Claim]:
     """Claims that budgets are kept, not passed by much, used where something costlier fits, and worth it.
 
@@ -109,9 +128,17 @@ def budget_claims(rows: Sequence[Row]) -> Iterator[Claim]:
     note = f"seconds used over the budget, the worst run; {data}"
     yield claim("evaluation.budget_overrun", max(used, default=None), "<=", MOST_OVERRUN, "ratio", note, len(rows))
     # A run that ends early is only to blame where a better setting would have fitted.
-    with_time_left = [_used_part(r) for r in rows if seconds_to_better_setting(r) <= r["budget_s"] - r["used_s"]]
+    missing_s = [seconds_to_better_setting(r) for r in rows]
+    with_time_left = [
+        _used_part(r)
+        for r, seconds in zip(rows, missing_s, strict=True)
+        if seconds is not None and seconds <= r["budget_s"] - r["used_s"]
+    ]
     least = min(with_time_left, default=None)
-    note = f"seconds used over the budget, the least of the runs that had time for a better setting; {data}"
+    note = "seconds used over the budget, the least of the runs that had time for a better setting"
+    if unknown := missing_s.count(None):
+        note += f"; without {unknown}, whose setting the table no longer has"
+    note += f"; {data}"
     yield claim("evaluation.budget_used", least, ">=", LEAST_USED, "ratio", note, len(with_time_left))
     # More time may not make a scene worse than runs of one setting differ among themselves.
     rises = [after - before for values in _distances_by_log(rows) for before, after in itertools.pairwise(values)]
@@ -120,7 +147,7 @@ def budget_claims(rows: Sequence[Row]) -> Iterator[Claim]:
     yield claim("evaluation.budget_worth", worst, "<=", DISTANCE_NOISE, "distance", note, len(rises))
 
 
-def seconds_to_better_setting(row: Row) -> float:
+def seconds_to_better_setting(row: Row) -> float | None:
     """Estimates in hindsight what the nearest better setting would have taken beyond what was used.
 
     Args:
@@ -128,10 +155,13 @@ def seconds_to_better_setting(row: Row) -> float:
 
     Returns:
         The table's seconds of the stages after ingest, times what the run's took over the table's; infinite where no
-        setting is better.
+        setting is better; ``None`` where the table no longer has the setting that the run chose.
     """
-    table = load_cost_table(Path(row["table"]) if row.get("table") else find_shipped_table("small"), "small")
-    chosen = next(p for p in table.points if p.name == row["choices"][-1]["point"])
+    table = load_cost_table(_find_table(row.get("table", "")), PRESET)
+    chosen = next((p for p in table.points if p.name == row["choices"][-1]["point"]), None)
+    # A table that was swept again since the run may have other settings.
+    if chosen is None:
+        return None
     foreseen = _foreseen_seconds(chosen, table)
     done = [s for s in row["seconds"] if s != "ingest"]
     # A stage that the table's setting does not have still has its border and first calls.

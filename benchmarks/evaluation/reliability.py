@@ -69,18 +69,23 @@ def reliability_claims(rows: Sequence[Row]) -> Iterator[Claim]:
     Args:
         rows: see :func:`measure_street`.
     """
-    streets = ", ".join(f"{r['log']} {r['stage']}" for r in rows) or "not measured"
     for stage in ("gnet", "enet"):
-        views = [v for r in rows if r["stage"] == stage for v in r["views"]]
+        of_stage = [r for r in rows if r["stage"] == stage]
+        views = [v for r in of_stage for v in r["views"]]
         correlation = rank_correlation(views) if views else None
-        note = f"rank correlation of estimate and true PSNR over the views beside the path; {streets}"
+        note = f"rank correlation of estimate and true PSNR over the views beside the path; {_list_streets(of_stage)}"
         name = "evaluation.reliability" if stage == "enet" else f"evaluation.reliability_{stage}"
-        yield claim(name, correlation, ">=", LEAST_CORRELATION, "rank correlation", note, len(views))
+        count = len(_select_shifted(views))
+        yield claim(name, correlation, ">=", LEAST_CORRELATION, "rank correlation", note, count)
     worst = min((rank_correlation(r["views"]) for r in rows), default=None)
-    note = f"the worst street; {streets}"
+    note = f"the worst street; {_list_streets(rows)}"
     yield claim(
         "evaluation.reliability_worst", worst, ">=", LEAST_CORRELATION, "rank correlation", data=note, n=len(rows)
     )
+
+
+def _list_streets(rows: Sequence[Row]) -> str:
+    return ", ".join(f"{r['log']} {r['stage']}" for r in rows) or "not measured"
 
 
 def rank_correlation(views: Sequence[Row]) -> float:
@@ -99,9 +104,13 @@ def rank_correlation(views: Sequence[Row]) -> float:
 
 def _estimates_and_truths(views: Sequence[Row]) -> tuple[list[float], list[float]]:
     """Gives both in dB for the views beside the path."""
-    # Views on the path are good everywhere, so they would raise the correlation without any merit.
-    shifted = [v for v in views if v["shift_m"]]
+    shifted = _select_shifted(views)
     return [_guards_of(v).estimate_db for v in shifted], [v["psnr"] for v in shifted]
+
+
+def _select_shifted(views: Sequence[Row]) -> list[Row]:
+    # Views on the path are good everywhere, so they would raise the correlation without any merit.
+    return [v for v in views if v["shift_m"]]
 
 
 def _guards_of(view: Row) -> Guards:

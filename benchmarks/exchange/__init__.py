@@ -25,9 +25,16 @@ from benchmarks.common.bench import (
     settings_from_options,
     split_option,
 )
+from benchmarks.common.cell_parameters import describe_preset
 from benchmarks.common.claims import Claim
+from benchmarks.common.lazy_modules import FORMAT_MODULES, STAGE_MODULES
 from benchmarks.exchange.answer_time import answer_time_claims, answer_time_table, measure_answer_time
-from benchmarks.exchange.enhancement import enhancement_claims, enhancement_table, measure_enhancement
+from benchmarks.exchange.enhancement import (
+    EnhancementCase,
+    enhancement_claims,
+    enhancement_table,
+    measure_enhancement,
+)
 from benchmarks.exchange.import_speed import import_speed_claims, import_speed_table, measure_import_speed
 from benchmarks.exchange.interop import interop_claims, interop_table, measure_interop
 from benchmarks.exchange.measured_run import RunCase
@@ -39,6 +46,12 @@ from benchmarks.exchange.round_trips import (
     round_trip_table,
 )
 from benchmarks.exchange.service_fuzz import REQUESTS, service_fuzz_claims, service_fuzz_table
+from benchmarks.exchange.service_report import (
+    http_service_claims,
+    http_service_table,
+    service_claims,
+    service_table,
+)
 from flows.exchange.stored_scenes import open_stored_scenes
 from flows.machine.facts import git_commit
 
@@ -82,19 +95,17 @@ class ExchangeBench:
         "benchmarks.exchange.service_fuzz",
         "benchmarks.exchange.alpasim_client",
         "benchmarks.exchange.http_service",
-        # Those below are named by registries alone, or imported by rooms that the digest does not follow.
-        "genre_tasks.exchange.ply",
-        "genre_tasks.exchange.antimatter_splat",
-        "genre_tasks.exchange.spz.format",
-        "genre_tasks.exchange.gltf.format",
-        "genre_tasks.exchange.usd.format",
+        # Those below are named by registries alone, or do the work of what is measured.
+        "flows.simulators.alpasim.start",
+        "flows.simulators.neuroncap",
+        "flows.viewer.offline_page",
+        *FORMAT_MODULES,
+        *STAGE_MODULES,
+        # Enhancement reads a file of Gaussians in place of a log's points.
+        "genre_tasks.stages.scene_file",
+        "genre_tasks.stages.scene_points",
         "genre_tasks.logs.posed_images.image_log",
         "genre_tasks.logs.synthetic",
-        "genre_tasks.stages.ingest",
-        "genre_tasks.stages.initial",
-        "genre_tasks.stages.optimise",
-        "genre_tasks.stages.novel_views",
-        "genre_tasks.stages.fnet",
         "genre_tasks.render.wide_lens",
         "genre_tasks.ego_paths.bicycle",
     )
@@ -105,8 +116,11 @@ class ExchangeBench:
 
     def cells(self, options: Mapping[str, str], quick: bool) -> list[Cell]:
         """Lists the cells; ``quick``: the first seed alone, fewer steps and requests."""
-        case = RunCase(options["log"], options["preset"], settings_from_options(options), options["store"])
-        parameters = {"log": case.log, "preset": case.preset, "settings": list(case.settings)}
+        settings = settings_from_options(options)
+        case = RunCase(options["log"], options["preset"], settings, options["store"])
+        resolved = describe_preset(case.preset, settings)
+        parameters = {"log": case.log, **resolved}
+        rounds = 3 if quick else _ROUNDS
         steps = _QUICK_STEPS if quick else _STEPS
         requests = _QUICK_REQUESTS if quick else REQUESTS
         trips = [(name, 0) for name in _FORMATS] + [(name, 3) for name in _HARMONIC_FORMATS]
@@ -120,12 +134,17 @@ class ExchangeBench:
             for k, (name, degree) in enumerate(trips)
         ]
         cells += [
-            Cell("import speed", _SPEED_S, partial(measure_import_speed, 3 if quick else _ROUNDS)),
+            Cell("import speed", _SPEED_S, partial(measure_import_speed, rounds), {"rounds": rounds}),
             Cell("other tools", _TOOLS_S, partial(_measure_tools, case), parameters),
             Cell("page viewer", _PAGE_S, partial(_measure_viewer, case), parameters),
             Cell("page report", _PAGE_S, partial(_measure_report, case), parameters),
             # Whole commands depend on all of the code, which no list of modules covers.
-            Cell("answers", _ANSWER_S, partial(measure_answer_time, 3 if quick else _ROUNDS), {"commit": git_commit()}),
+            Cell(
+                "answers",
+                _ANSWER_S,
+                partial(measure_answer_time, rounds),
+                {"commit": git_commit(), "rounds": rounds},
+            ),
             Cell("service alpasim", _SERVICE_S, partial(_measure_alpasim, case, steps), parameters | {"steps": steps}),
             Cell("service neuroncap", _SERVICE_S, partial(_measure_neuroncap, case), parameters),
             Cell("driving", _SERVICE_S, partial(_measure_driving, case), parameters),
@@ -136,8 +155,9 @@ class ExchangeBench:
             cells.append(Cell(f"fuzz {protocol}", _FUZZ_S, measure, fuzzed))
         for seed in split_option(options["seeds"])[: 1 if quick else None]:
             log = f"synthetic:street?seed={seed}"
-            measure = partial(measure_enhancement, log, options["store"], ("scene", "lidar"))
-            cells.append(Cell(f"enhancement {log}", _ENHANCE_S, measure, {"log": log}))
+            enhanced = EnhancementCase(log, options["store"], options["preset"], settings)
+            measure = partial(measure_enhancement, enhanced, ("scene", "lidar"))
+            cells.append(Cell(f"enhancement {log}", _ENHANCE_S, measure, {"log": log, **resolved}))
         return cells
 
     def claims(self, rows: Mapping[str, Row]) -> Iterator[Claim]:
@@ -148,7 +168,8 @@ class ExchangeBench:
         yield from enhancement_claims(_select(rows, "enhancement"))
         yield from pages_claims(_select(rows, "page"))
         yield from answer_time_claims(_select(rows, "answers"))
-        yield from _service_claims(rows)
+        yield from service_claims(_select(rows, "service alpasim"))
+        yield from http_service_claims(_select(rows, "service neuroncap"), _select(rows, "driving"))
         yield from service_fuzz_claims(_select(rows, "fuzz"))
 
     def table(self, rows: Mapping[str, Row]) -> Iterator[str]:
@@ -160,8 +181,12 @@ class ExchangeBench:
             ("Enhanced scenes", enhancement_table, (_select(rows, "enhancement"),)),
             ("Pages", pages_table, (_select(rows, "page"),)),
             ("Answers", answer_time_table, (_select(rows, "answers"),)),
-            ("AlpaSim", _service_table, (_select(rows, "service alpasim"),)),
-            ("NeuroNCAP and driving", _http_table, (_select(rows, "service neuroncap"), _select(rows, "driving"))),
+            ("AlpaSim", service_table, (_select(rows, "service alpasim"),)),
+            (
+                "NeuroNCAP and driving",
+                http_service_table,
+                (_select(rows, "service neuroncap"), _select(rows, "driving")),
+            ),
             ("Malformed requests", service_fuzz_table, (_select(rows, "fuzz"),)),
         ]
         first = True
@@ -269,29 +294,6 @@ def _require(module: str, extra: str) -> None:
 
     if importlib.util.find_spec(module) is None:
         raise NotMeasuredError(f"{module} is missing: pip install 'genre[{extra}]'")
-
-
-def _service_claims(rows: Mapping[str, Row]) -> Iterator[Claim]:
-    # Imported here: the messages need gRPC, without which there are no rows either.
-    try:
-        from benchmarks.exchange.http_service import http_service_claims
-        from benchmarks.exchange.service import service_claims
-    except ModuleNotFoundError:
-        return
-    yield from service_claims(_select(rows, "service alpasim"))
-    yield from http_service_claims(_select(rows, "service neuroncap"), _select(rows, "driving"))
-
-
-def _service_table(rows: list[Row]) -> Iterator[str]:
-    from benchmarks.exchange.service import service_table
-
-    return service_table(rows)
-
-
-def _http_table(rows: list[Row], driving: list[Row]) -> Iterator[str]:
-    from benchmarks.exchange.http_service import http_service_table
-
-    return http_service_table(rows, driving)
 
 
 BENCH: Bench = ExchangeBench()

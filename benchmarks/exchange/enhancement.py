@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -35,69 +35,106 @@ LEAST_GAIN_DB = 0.3
 LEAST_PERCEPTUAL_CUT = 0.10
 MOST_HELDOUT_LOSS_DB = 0.3
 ITERATIONS = 1000
-PRESET = "small"
 DEPTHS = ("scene", "lidar")
 """Where the depth comes from: the scene's own, or the log's LiDAR as a PLY file."""
 
 _OPENGL_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def measure_enhancement(log: str, store: str, depths: Sequence[str] = ("scene",), settings: Sequence[str] = ()) -> Row:
+@dataclass(frozen=True)
+class EnhancementCase:
+    """A street whose scene is made, and enhanced.
+
+    Attributes:
+        log: URI of a synthetic street.
+        store: folder of the artifacts; files go into its folder ``enhancement``.
+        preset: of the scene and of its enhancement; small, for claims.
+        settings: over the preset, of both.
+    """
+
+    log: str
+    store: str
+    preset: str = "small"
+    settings: tuple[str, ...] = ()
+
+    def base_job(self) -> Job:
+        """Builds the job that makes the scene by per-scene 3DGS."""
+        # Behind the user's settings: another method would be no scene of another program.
+        recipe = (*BUILT_IN["3dgs"].settings, f"gnet.per_scene.iterations={ITERATIONS}", "gnet.snapshots=0")
+        config = load_configuration(self.preset, settings=(*self.settings, *recipe))
+        return Job(self.log, 0, self.store, config.model_dump(mode="json"))
+
+    def enhancement_job(self, folder: Path, depth: str) -> Job:
+        """Builds the job that ``genre enhance`` would run.
+
+        Args:
+            folder: with ``scene.ply``, ``transforms.json``, images and ``points.ply``.
+            depth: one of :data:`DEPTHS`.
+        """
+        inputs = EnhancementInputs(
+            scene=folder / "scene.ply",
+            cameras=folder / "transforms.json",
+            lidar=folder / "points.ply" if depth == "lidar" else None,
+            scale="1",
+        )
+        prepared = prepare_enhancement(inputs, load_configuration(self.preset))
+        # The user's settings come last, and win, as those of the command do.
+        settings = (*prepared.settings, "enet.snapshots=0", *self.settings)
+        config = load_configuration(self.preset, settings=settings)
+        return Job(prepared.log, 0, self.store, config.model_dump(mode="json"))
+
+
+def measure_enhancement(case: EnhancementCase, depths: Sequence[str] = ("scene",)) -> Row:
     """Makes a scene of chunk 0 by per-scene 3DGS, exports it, enhances the file, and compares with the truth.
 
     Args:
-        log: URI of a synthetic street.
-        store: folder of the artifacts; files go into its folder ``enhancement``.
+        case: the street.
         depths: some of :data:`DEPTHS`.
-        settings: over the preset ``small``, of the enhancement.
 
     Returns:
         The row: for the scene as it was given and for each enhanced one, held-out PSNR, and PSNR and perceptual
         distance at 3 m.
     """
-    folder, chunk = make_base_scene(log, store)
-    return {"log": log, "iterations": ITERATIONS, **score_enhancement(log, folder, chunk, store, depths, settings)}
+    folder, chunk = make_base_scene(case)
+    scores = score_enhancement(case, folder, chunk, depths)
+    return {"log": case.log, "preset": case.preset, "iterations": ITERATIONS, **scores}
 
 
-def make_base_scene(log: str, store: str) -> tuple[Path, Chunk]:
+def make_base_scene(case: EnhancementCase) -> tuple[Path, Chunk]:
     """Makes a scene of chunk 0 by per-scene 3DGS, and writes it with images, poses and points.
 
     Args:
-        log: URI of a synthetic street.
-        store: folder of the artifacts.
+        case: the street.
 
     Returns:
         The folder of the files, and the chunk.
     """
-    base = Job(log, 0, store, load_configuration(PRESET, settings=_base_settings()).model_dump(mode="json"))
+    base = case.base_job()
     refs = reconstruct(base, ("ingest", "effects", "initial", "gnet"))
     chunk: Chunk = read_artifact(base, refs["ingest"])
     scene: SceneGraph = read_artifact(base, refs["gnet"]).scene
-    folder = Path(store) / "enhancement" / cached_log(log).name
-    write_files(folder, cached_log(log), chunk, scene)
+    log = cached_log(case.log)
+    folder = Path(case.store) / "enhancement" / log.name
+    write_files(folder, log, chunk, scene)
     return folder, chunk
 
 
-def score_enhancement(
-    log: str, folder: Path, chunk: Chunk, store: str, depths: Sequence[str], settings: Sequence[str]
-) -> Row:
+def score_enhancement(case: EnhancementCase, folder: Path, chunk: Chunk, depths: Sequence[str]) -> Row:
     """Enhances the files of a folder, and scores the scene as it was given and each enhanced one.
 
     Args:
-        log: URI of the street, which has the truth.
+        case: the street, which has the truth.
         folder: from :func:`make_base_scene`.
         chunk: of the street.
-        store: folder of the artifacts.
         depths: some of :data:`DEPTHS`.
-        settings: over the preset ``small``, of the enhancement.
 
     Returns:
         Scores by name of the scene.
     """
-    truth = load_true_targets(log, store, chunk, SHIFT_M)
+    truth = load_true_targets(case.log, case.store, chunk, SHIFT_M)
     row: Row = {}
     for depth in depths:
-        job = make_enhancement_job(folder, store, depth, settings)
+        job = case.enhancement_job(folder, depth)
         made = reconstruct(job, ("ingest", "effects", "initial", "gnet", "novel_views", "fnet", "enet"))
         enhanced_chunk: Chunk = read_artifact(job, made["ingest"])
         scenes = {name: read_artifact(job, made[stage]).scene for name, stage in (("given", "gnet"), (depth, "enet"))}
@@ -107,30 +144,6 @@ def score_enhancement(
             row[name] = {"heldout_psnr": mean_psnr(enhanced, heldout), **scores[name]}
         row[f"{depth}_points"] = len(enhanced_chunk.static)
     return row
-
-
-def _base_settings() -> tuple[str, ...]:
-    return (*BUILT_IN["3dgs"].settings, f"gnet.per_scene.iterations={ITERATIONS}", "gnet.snapshots=0")
-
-
-def make_enhancement_job(folder: Path, store: str, depth: str, settings: Sequence[str]) -> Job:
-    """Builds the job that ``genre enhance`` would run.
-
-    Args:
-        folder: with ``scene.ply``, ``transforms.json``, images and ``points.ply``.
-        store: folder of the artifacts.
-        depth: one of :data:`DEPTHS`.
-        settings: over the preset.
-    """
-    inputs = EnhancementInputs(
-        scene=folder / "scene.ply",
-        cameras=folder / "transforms.json",
-        lidar=folder / "points.ply" if depth == "lidar" else None,
-        scale="1",
-    )
-    prepared = prepare_enhancement(inputs, load_configuration(PRESET))
-    config = load_configuration(PRESET, settings=[*prepared.settings, "enet.snapshots=0", *settings])
-    return Job(prepared.log, 0, store, config.model_dump(mode="json"))
 
 
 def write_files(folder: Path, log: DrivingLog, chunk: Chunk, scene: SceneGraph) -> None:
@@ -189,7 +202,9 @@ def enhancement_claims(rows: Sequence[Row]) -> Iterator[Claim]:
     Args:
         rows: see :func:`measure_enhancement`, with the depth of the scene.
     """
-    note = f"3DGS of {ITERATIONS} iterations as PLY with images and poses, chunk 0; {', '.join(r['log'] for r in rows)}"
+    presets = ", ".join(sorted({str(row.get("preset", "small")) for row in rows})) or "not measured"
+    note = f"3DGS of {ITERATIONS} iterations as PLY with images and poses, chunk 0, preset {presets}; "
+    note += ", ".join(row["log"] for row in rows)
     gains = [_change(row, "psnr") for row in rows]
     cuts = [-_change(row, "perceptual") / row["given"]["perceptual"] for row in rows]
     losses = [-_change(row, "heldout_psnr") for row in rows]

@@ -5,14 +5,13 @@ from __future__ import annotations
 import io
 import json
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 import torch
 from PIL import Image
 
 from benchmarks.common.bench import Row
-from benchmarks.common.claims import Claim, claim
 from benchmarks.common.context import THREADS
 from benchmarks.common.timing import Quartiles
 from benchmarks.exchange.neuroncap_client import NeuroncapClient
@@ -25,9 +24,6 @@ from flows.simulators.service_metrics import SilentMetrics
 
 IMAGES = 60
 STEPS = 15
-MOST_OVERHEAD_MS = 30.0
-MOST_DIFFERENCE = 1
-LEAST_STEPS_PER_S = 2.0
 _RELIABLE_M = 4.0
 
 
@@ -112,45 +108,3 @@ def _list_requests(renderer: SceneRenderer, count: int) -> Iterator[ImageRequest
         pose = poses[row] @ camera.rig_SE3_camera
         time_s = float(times_s[row])
         yield ImageRequest(camera.lens, pose, pose, time_s, time_s, camera=camera.name)
-
-
-def http_service_claims(rows: Sequence[Row], driving: Sequence[Row]) -> Iterator[Claim]:
-    """Claims that HTTP adds little to an image and changes nothing of it, and that a drive is bearable.
-
-    Args:
-        rows: see :func:`measure_http_service`.
-        driving: see :func:`measure_driving`.
-    """
-    note = ", ".join(f"{row['images']} images of {row['size_px'][0]}×{row['size_px'][1]}" for row in rows) or "no run"
-    count = sum(int(row["images"]) for row in rows)
-    added = [float(row["http_ms"]["median"] - row["library_ms"]["median"]) for row in rows]
-    yield claim("exchange.http_overhead", max(added, default=None), "<=", MOST_OVERHEAD_MS, "ms", note, count)
-    differences = [float(row["max_difference"]) for row in rows]
-    most = max(differences, default=None)
-    yield claim("exchange.http_difference", most, "<=", MOST_DIFFERENCE, "of 255", note, count)
-    slowest = min((float(row["steps_per_s"]["median"]) for row in driving), default=None)
-    note = ", ".join(f"{row['cameras']} cameras, {THREADS} threads" for row in driving) or "no run"
-    n = sum(int(row["steps_per_s"]["n"]) for row in driving)
-    yield claim("exchange.driving_steps", slowest, ">=", LEAST_STEPS_PER_S, "steps/s", note, n)
-
-
-def http_service_table(rows: Sequence[Row], driving: Sequence[Row]) -> Iterator[str]:
-    """Gives a line for each run.
-
-    Args:
-        rows: see :func:`measure_http_service`.
-        driving: see :func:`measure_driving`.
-    """
-    yield "| run | images | by HTTP, ms | by the library, ms | largest difference of 255 |"
-    yield "|---|---|---|---|---|"
-    for row in rows:
-        size = f"{row['images']} of {row['size_px'][0]}×{row['size_px'][1]}"
-        times = [_show(row[name]) for name in ("http_ms", "library_ms")]
-        yield f"| {row['run']} | {size} | {times[0]} | {times[1]} | {row['max_difference']} |"
-    for row in driving:
-        rate = _show(row["steps_per_s"])
-        yield f"\nThe driving environment makes {rate} steps a second with {row['cameras']} cameras."
-
-
-def _show(quartiles: Row) -> str:
-    return f"{quartiles['median']:.1f} ({quartiles['low']:.1f}–{quartiles['high']:.1f})"

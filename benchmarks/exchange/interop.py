@@ -227,8 +227,12 @@ def interop_claims(rows: Sequence[Row]) -> Iterator[Claim]:
         rows: see :func:`measure_interop`.
     """
     note = "largest over the scenes; tools from npm"
-    spz = [row["ways"]["spz, ply"]["means_m"] for row in rows]
-    yield claim("exchange.interop_spz", max(spz, default=None), "<=", MOST_SPZ_METRES, "m", note)
+    missing = [abs(way["missing"]) for row in rows for way in row["ways"].values()]
+    yield claim("exchange.interop_missing", max(missing, default=None), "<=", 0, "Gaussians", f"{note}, any way")
+    # A way that loses Gaussians has no differences: which of them belong together is not known.
+    spz = [row["ways"]["spz, ply"].get("means_m") for row in rows]
+    farthest_m = None if None in spz else max(spz, default=None)
+    yield claim("exchange.interop_spz", farthest_m, "<=", MOST_SPZ_METRES, "m", note)
     errors = [row["validator"]["errors"] for row in rows]
     yield claim("exchange.interop_validator", max(errors, default=None), "<=", 0, "errors", note)
     places = [row["three_place"] for row in rows]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from benchmarks.common.run_stages import reconstruct
+from benchmarks.common.task import require_log_folder
 from flows.configuration import diff_from_preset, load_configuration
 from flows.pipeline.stage_runner import Job
 from flows.reconstruction.run_records import FinishedRun, summarise_run, write_run_record
@@ -31,7 +32,11 @@ class RunCase:
 
         Returns:
             The run's name.
+
+        Raises:
+            NotMeasuredError: the log's folder is missing.
         """
+        require_log_folder(self.log)
         config = load_configuration(self.preset, settings=self.settings)
         values = config.model_dump(mode="json")
         refs = reconstruct(Job(self.log, 0, self.store, values))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import grpc
@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from benchmarks.common.bench import NotMeasuredError, Row
-from benchmarks.common.claims import Claim, claim
 from benchmarks.common.context import THREADS
-from benchmarks.exchange.simulator_client import CAMERAS, Simulator, ask, make_plain_request
+from benchmarks.exchange.service_report import CAMERAS, IMAGE_PX
+from benchmarks.exchange.simulator_client import Simulator, ask, make_plain_request
 from flows.simulators.alpasim import sensorsim_pb2
 from flows.simulators.alpasim.local_frame import LocalFrame, read_local_frame
 from flows.simulators.alpasim.sensor_service import SensorService
@@ -34,12 +34,7 @@ from genre_tasks.scene_edits.chunk_scene import ChunkScene
 from storage.codecs.png import to_pixels
 
 STEPS = 200
-IMAGE_PX = (512, 320)
-"""Width and height of AlpaSim's default camera."""
-
 SHUTTER_US = 15_000
-MOST_MS = 150.0
-MOST_DIFFERENCE = 1
 _SIDEWAYS_M = 1.0
 _AHEAD_M = 0.5
 _COMPARED_FRAMES = 8
@@ -77,6 +72,7 @@ def measure_service(store: str, run: str, steps: int = STEPS) -> Row:
         "run": renderer.name,
         "steps": steps,
         "cameras": CAMERAS,
+        "size_px": list(IMAGE_PX),
         **rollout,
         "max_difference": difference,
     }
@@ -227,37 +223,3 @@ def _measure_difference(
     with Image.open(io.BytesIO(answer.image_bytes)) as image:
         pixels = np.array(image).astype(int)
     return int(np.abs(pixels - expected).max())
-
-
-def service_claims(rows: Sequence[Row]) -> Iterator[Claim]:
-    """Claims that no call fails, that an image is there in time, and that it is the library's.
-
-    Args:
-        rows: see :func:`measure_service`.
-    """
-    runs = ", ".join(f"{row['log']}, {row['steps']} steps" for row in rows) or "no run"
-    cameras = f"{CAMERAS} cameras of {IMAGE_PX[0]}×{IMAGE_PX[1]}, {THREADS} threads; {runs}"
-    images = sum(int(row["images"]) for row in rows)
-    failed = [float(row["failed"]) for row in rows]
-    slowest = max((float(row["alone_ms"]["p95"]) for row in rows), default=None)
-    difference = max((float(row["max_difference"]) for row in rows), default=None)
-    yield claim("exchange.service_failed", sum(failed) if rows else None, "<=", 0, "calls", cameras, n=images)
-    yield claim("exchange.service_p95", slowest, "<=", MOST_MS, "ms", f"95 of 100 images; {cameras}", n=images)
-    note = f"against the library's render at recorded poses, of 255; {runs}"
-    yield claim("exchange.service_difference", difference, "<=", MOST_DIFFERENCE, "levels", note, n=len(rows))
-
-
-def service_table(rows: Sequence[Row]) -> Iterator[str]:
-    """Gives a line for each run.
-
-    Args:
-        rows: see :func:`measure_service`.
-    """
-    times = "ms an image, median | 95 of 100 | in batches, median | 95 of 100"
-    yield f"| log | images | failed calls | {times} | difference |"
-    yield "|---|---|---|---|---|---|---|---|"
-    for row in rows:
-        alone = row["alone_ms"]
-        batch = row["batch_ms"]
-        times = " | ".join(f"{value:.0f}" for value in (alone["median"], alone["p95"], batch["median"], batch["p95"]))
-        yield f"| {row['log']} | {row['images']} | {row['failed']} | {times} | {row['max_difference']} of 255 |"

@@ -9,13 +9,12 @@ import grpc
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.exchange.service_report import CAMERAS
 from flows.simulators.alpasim import common_pb2, sensorsim_pb2
 from flows.simulators.alpasim.server import SERVICE
 from flows.simulators.alpasim.wire_poses import read_pose, write_pose
 from genre_tasks.lidar_simulation.ego_motion import interpolate_poses
 from genre_tasks.logs.types import Float64
-
-CAMERAS = 3
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from benchmarks.common.bench import (
     split_option,
 )
 from benchmarks.common.claims import Claim
+from benchmarks.common.lazy_modules import STAGE_MODULES
 from benchmarks.fixer.cells import FixerCase, find_ablation_weights, measure_fixer
 from benchmarks.fixer.report import make_claims, make_table
 from flows.configuration import load_configuration
@@ -48,11 +49,7 @@ class FixerBench:
     }
     code: tuple[str, ...] = (
         "benchmarks.fixer.cells",
-        "genre_tasks.stages.optimise",
-        "genre_tasks.stages.novel_views",
-        "genre_tasks.stages.fnet",
-        "genre_tasks.stages.ingest",
-        "genre_tasks.stages.initial",
+        *STAGE_MODULES,
         "genre_tasks.logs.pandaset.reader",
         "genre_tasks.logs.synthetic",
     )

@@ -112,7 +112,8 @@ def _gate_claim(streets: Sequence[Row]) -> Claim:
     gates = [g for row in streets for g in row["gate"]]
     # Relative to the render, because a distance of a near view is small in any case.
     losses = [fixed / render - 1 for g in gates for render, fixed in zip(g["render"], g["fixed"], strict=True)]
-    subject = "perceptual distance of a fixed view over its render's, less 1: the worst at 0.25 to 3 m"
+    shifts = ", ".join(f"{shift:g}" for shift in sorted({g["shift"] for g in gates})) or "no"
+    subject = f"perceptual distance of a fixed view over its render's, less 1: the worst at {shifts} m"
     data = f"{subject}; {cell_labels(streets)}"
     return claim("fixer.no_view_worse", max(losses, default=None), "<=", 0.02, "part", data, len(losses))
 

@@ -11,7 +11,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from functools import partial
 
-from benchmarks.common.bench import Bench, Cell, Row, SmallestForm, list_not_measured, measured_rows, split_option
+from benchmarks.common.bench import (
+    TINY_STREET_PARAMETERS,
+    Bench,
+    Cell,
+    Row,
+    SmallestForm,
+    list_not_measured,
+    measured_rows,
+    split_option,
+)
 from benchmarks.common.claims import Claim, claim
 from benchmarks.log_faults.faults import FAULTS
 from benchmarks.log_faults.measures import ChunkOfLog, measure_fault, measure_sound_log
@@ -39,13 +48,14 @@ class LogFaultsBench:
         "benchmarks.log_faults.measures",
         "benchmarks.log_faults.faults",
         "genre_tasks.log_checks.plausibility",
+        "genre_tasks.logs.kitti.reader",
         "genre_tasks.logs.pandaset.reader",
         "genre_tasks.logs.synthetic",
     )
     smallest = SmallestForm(
         {
             "seeds": "900",
-            "street": "frames=8&width=64&height=36&samples=1&cameras=1&lidar_beams=32&lidar_azimuths=300",
+            "street": TINY_STREET_PARAMETERS.removeprefix("&"),
             "sound_seeds": "",
             "pandaset": "",
             "kitti": "",
@@ -66,11 +76,15 @@ class LogFaultsBench:
             kitti = ChunkOfLog(f"kitti:{options['kitti']}", 0)
             sound.append(kitti)
             real.append(kitti)
-        cells = [Cell(f"sound {chunk.name}", _SOUND_S, partial(measure_sound_log, chunk)) for chunk in sound]
+        # Names are short: what streets look like, and where folders lie, is in the URI alone.
+        cells = [
+            Cell(f"sound {chunk.name}", _SOUND_S, partial(measure_sound_log, chunk), {"log": chunk.uri})
+            for chunk in sound
+        ]
         for chunk in [*faulty, *real]:
             for fault in FAULTS:
                 seconds = _FAULT_S * len(fault.strengths)
-                parameters = {"strengths": list(fault.strengths)}
+                parameters = {"log": chunk.uri, "strengths": list(fault.strengths)}
                 measure = partial(measure_fault, chunk, fault)
                 cells.append(Cell(f"{chunk.name} {fault.name}", seconds, measure, parameters))
         return cells
@@ -100,7 +114,7 @@ class LogFaultsBench:
         for row in measured_rows(rows):
             if row["fault"] == "none":
                 if row["words"]:
-                    yield f"| {row['name']} | none | | | **{', '.join(row['warnings'])}** |"
+                    yield f"| {row['name']} | none | | | **{', '.join(row['words'])}** |"
                 continue
             yield f"| {row['name']} | {row['fault']} | {' | '.join(format_strengths(row))} |"
         yield from list_not_measured(rows)

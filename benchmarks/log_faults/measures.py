@@ -9,7 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from benchmarks.common.bench import NotMeasuredError, Row
+from benchmarks.common.bench import Row
 from benchmarks.common.task import require_log_folder
 from benchmarks.log_faults.changed_log import ChangedLog
 from benchmarks.log_faults.faults import Fault
@@ -91,13 +91,10 @@ class _OpenLog:
 # One log only: faults follow one another on the same log, whose images are drawn once.
 @lru_cache(maxsize=1)
 def _open_chunk_log(uri: str) -> _OpenLog:
-    kind, _, rest = uri.partition(":")
-    if kind != "kitti":
-        require_log_folder(uri)
+    require_log_folder(uri)
+    if not uri.startswith("kitti:"):
         log = open_log(uri)
         return _OpenLog(log, _CachedSweeps(log))
-    if not Path(rest).is_dir():
-        raise NotMeasuredError(f"there is no folder {rest}; give it with --set kitti=PATH")
     folder = tempfile.TemporaryDirectory(prefix="genre-kitti-")
     written = write_pandaset(open_log(uri), Path(folder.name) / "0009")
     log = open_log(f"pandaset:{written}")

@@ -28,8 +28,10 @@ from benchmarks.common.bench import (
     SmallestForm,
     logs_from_options,
     settings_from_options,
+    split_option,
 )
 from benchmarks.common.claims import Claim
+from benchmarks.common.lazy_modules import STAGE_MODULES
 from benchmarks.optimiser import claims, race_table
 from benchmarks.optimiser.cells import ADAM, METHODS, measure_race, measure_stability, variants
 from benchmarks.optimiser.convergence import LONG_RENDERS, PRESET, long_variants, measure_converged
@@ -92,7 +94,6 @@ class Optimiser:
         "benchmarks.common.task",
         "benchmarks.raster.scenes",
         "benchmarks.common.timing",
-        "genre_tasks.stages.optimise",
         "benchmarks.common.novel_view_truth",
         "benchmarks.optimiser.convergence",
         "benchmarks.optimiser.distillation",
@@ -100,10 +101,9 @@ class Optimiser:
         "benchmarks.optimiser.enhancement",
         "benchmarks.common.pipeline_inputs",
         "benchmarks.optimiser.iteration_tradeoff",
-        "genre_tasks.stages.novel_views",
-        "genre_tasks.stages.fnet",
-        "genre_tasks.stages.ingest",
-        "genre_tasks.stages.initial",
+        # It scores the scenes.
+        "flows.training.optimiser_training",
+        *STAGE_MODULES,
         "genre_tasks.logs.pandaset.reader",
         "genre_tasks.logs.synthetic",
     )
@@ -136,7 +136,7 @@ class Optimiser:
             ConfigError: a part, family or method is unknown.
         """
         logs = logs_from_options(options)
-        orders = _split(options["orders"])
+        orders = split_option(options["orders"])
         methods = _known("method", options["methods"], METHODS)
         parts = _known("part", options["parts"], PARTS)
         families = _known("family", options["families"], FAMILIES)
@@ -159,7 +159,7 @@ class Optimiser:
                 out += [factory.race(*log, order, m) for m in methods for log in logs]
             if "enhancement" in parts:
                 out += [factory.enhancement(*log, order) for log in logs]
-            if str(order) in _split(options["long_orders"]):
+            if str(order) in split_option(options["long_orders"]):
                 out += [factory.distillation(*log, order, families) for log in logs if "distillation" in parts]
                 out += [factory.converged(*log, order) for log in logs if "converged" in parts]
             if order == int(orders[0]) and "stability" in parts:
@@ -309,14 +309,10 @@ def _with_deadline(deadline: float, cell: Cell) -> Cell:
 
 
 def _known(kind: str, text: str, known: Sequence[str]) -> list[str]:
-    parts = _split(text)
+    parts = split_option(text)
     if unknown := set(parts) - set(known):
         raise ConfigError(f"the benchmark has no {kind} {sorted(unknown)}", remedy=f"Known: {', '.join(known)}.")
     return parts
-
-
-def _split(text: str) -> list[str]:
-    return [part for part in text.split(",") if part]
 
 
 BENCH: Bench = Optimiser()

@@ -72,6 +72,8 @@ def converged_row(task: OptimisationTask, gnet: GnetConfig, configs: Mapping[str
     Returns:
         The highest PSNR of all variants, and the seconds of GNet and of the first variant to within ``CLOSE_DB`` of it.
     """
+    # Otherwise GNet, which runs first, would pay for code that tuned Adam finds loaded.
+    race.warm_up(task, gnet, order)
     # A constant schedule gets as many renders as the longest cosine, so that neither is cut short.
     most = max(c.iterations * c.views_per_iteration for c in configs.values())
     gnet_curve = run_to_convergence(task, gnet, order, gnet.iterations * gnet.views_per_iteration)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 
-from benchmarks.common.bench import Row
+from benchmarks.common.bench import Row, list_not_measured
 from benchmarks.common.context import cell_label
 from benchmarks.optimiser import enhancement_claims
 
@@ -46,8 +46,7 @@ def markdown(rows: Mapping[str, Row]) -> Iterator[str]:
             losses = ", ".join(f"{k} T: {v:.5f}" for k, v in row["loss"].items())
             name = {"gnet": "GNet", "enet": "ENet"}[row.get("network", "gnet")]
             yield f"\n{cell_label(row)}, {name} past its length: loss at {losses}; 10 T over T {row['ratio']:.4f}"
-        if "not_measured" in row:
-            yield f"\n{name}: not measured: {row['not_measured']}"
+    yield from list_not_measured(rows)
 
 
 def _race(row: Row) -> Iterator[str]:

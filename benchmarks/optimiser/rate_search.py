@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
+from benchmarks.common.run_stages import print_progress
 from genre_tasks.optimiser.tuned_adam import GNET_LEARNING_RATES
 
 ENOUGH_DB = 0.02
@@ -137,8 +137,3 @@ def search(
         if found - before < ENOUGH_DB:
             break
     return best, found
-
-
-def print_progress(text: str) -> None:
-    """Prints a line to stderr, as stdout is for the variants alone."""
-    sys.stderr.write(text + "\n")

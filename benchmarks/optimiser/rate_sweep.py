@@ -18,42 +18,33 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import statistics
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
 import yaml
 
-from benchmarks.common.novel_view_truth import load_true_targets, views_at_shift
-from benchmarks.common.pipeline_inputs import load_pipeline_inputs
-from benchmarks.common.task import HELDOUT_VIEWS, SIDE_M, OptimisationTask
-from benchmarks.optimiser.distillation import KERNEL_VIEWS
-from benchmarks.optimiser.distillation_scores import NovelViewScorer
 from benchmarks.optimiser.rate_search import Setting, moves, network_moves, search
-from flows.configuration import load_configuration
+from benchmarks.optimiser.tuning_scenes import TuningScene, load_enet_scene, load_gnet_scene, scene_uris
 from flows.paper_tables.baselines import load_baselines
 from flows.training.optimiser_training import mean_psnr
-from flows.training.training_scenes import SceneRecipe, build_training_scene, evenly_spaced, prepare_scene
 from genre_tasks.atomic_path import write_atomically
 from genre_tasks.config import LearningRates, LossConfig
 from genre_tasks.errors import ConfigError
 from genre_tasks.learned.learned_optimiser import LearnedOptimiser
-from genre_tasks.learned.meta_episodes import TrainingScene
 from genre_tasks.learned.weights import load_optimiser
-from genre_tasks.metrics.scoring import real_image_features
 from genre_tasks.optimiser.objective import Objective
 from genre_tasks.optimiser.step_rules import StepRule
 from genre_tasks.optimiser.tuned_adam import GNET_LEARNING_RATES, TunedAdam
 from genre_tasks.optimiser.unroll import UnrollSettings, unroll
-from genre_tasks.scene.graph import SceneGraph
 from storage.files import digest_file
 from storage.local import LocalStore
 
 LENGTHS = "24x6,48x3,72x2,144x1,240x1,24x30,960x1,2880x1"
+POINTS = 40_000
 LOSS = LossConfig(perceptual=0.0)
 """What GNet sees in the presets demo and small."""
 SEEDS_FILE = Path(__file__).resolve().parents[2] / "configs" / "seeds.yaml"
@@ -86,21 +77,6 @@ def load_network(weights: Path) -> tuple[Setting, Callable[[Setting], StepRule]]
     return Setting(config.rates, relaxation=config.relaxation), tuned
 
 
-@dataclass(frozen=True)
-class TuningScene:
-    """A scene that a setting is scored on.
-
-    Attributes:
-        scene: to optimise, with its views.
-        split: fraction of Gaussians that are split first.
-        closeness: dB of a result that are added to its PSNR; ``None``: nothing is added.
-    """
-
-    scene: TrainingScene
-    split: float = 0.0
-    closeness: Callable[[SceneGraph], float] | None = None
-
-
 class Scores:
     """Scores in dB of settings, each measured once and then read from the file.
 
@@ -114,6 +90,7 @@ class Scores:
         scenes: Mapping[int | str, Callable[[], TuningScene]],
         rule_of: Callable[[Setting], StepRule] = make_adam,
         novel_weight: float = 0.0,
+        origins: Mapping[int | str, str] | None = None,
     ) -> None:
         """Reads the scores that an earlier sweep measured.
 
@@ -122,11 +99,13 @@ class Scores:
             scenes: makers of the scenes, by name; a scene is made when its first score is missing.
             rule_of: makes the step rule of a setting.
             novel_weight: factor of the PSNR at novel views, where a scene has their truth.
+            origins: what scenes are made of, by name, where the name alone does not say it.
         """
         self.file = file
         self._scenes = scenes
         self._rule_of = rule_of
         self._novel_weight = novel_weight
+        self._origins = origins or {}
         self._made: dict[int | str, TuningScene] = {}
         self._known: dict[str, float] = json.loads(file.read_text()) if file.is_file() else {}
 
@@ -144,7 +123,9 @@ class Scores:
         return statistics.fmean(self._one(name, setting, iterations, views) for name in self._scenes)
 
     def _one(self, name: int | str, setting: Setting, iterations: int, views: int) -> float:
-        key = json.dumps({"scene": name, "iterations": iterations, "views": views, **asdict(setting)})
+        # Another log under the same name, or fewer points of it, would have other scores.
+        scene = self._origins.get(name, name)
+        key = json.dumps({"scene": scene, "iterations": iterations, "views": views, **asdict(setting)})
         if key not in self._known:
             # Scenes are made only when a score is missing: a finished sweep is read in a second.
             if name not in self._made:
@@ -205,81 +186,13 @@ def validation_seeds(text: str) -> list[int]:
     return seeds
 
 
-def scene_makers(
-    seeds: Sequence[int], real: str | None, make: Callable[[str], TuningScene]
-) -> dict[int | str, Callable[[], TuningScene]]:
-    """Lists the scenes of a sweep.
-
-    Args:
-        seeds: of synthetic streets.
-        real: URI of a log whose chunk 0 counts as one more scene; ``None``: none does.
-        make: makes a scene from a URI.
-
-    Returns:
-        Makers by seed; the real scene's name is ``real``.
-    """
-    uris: dict[int | str, str] = {seed: f"synthetic:street?seed={seed}" for seed in seeds}
-    uris |= {} if real is None else {"real": real}
-    return {name: partial(make, uri) for name, uri in uris.items()}
-
-
-def load_gnet_scene(store: LocalStore, points: int, uri: str) -> TuningScene:
-    """Loads GNet's task: an initial scene at 320×180, with all source views and twelve held-out ones.
-
-    Args:
-        store: artifacts of the sweep.
-        points: LiDAR points at most; a tenth as many Gaussians are distant.
-        uri: of the log.
-
-    Returns:
-        TuningScene: without a split.
-    """
-    recipe = SceneRecipe(uri, max_points=points, distant_count=points // 10)
-    return TuningScene(build_training_scene(prepare_scene(store, recipe)))
-
-
-def load_enet_scene(store: str, split: float | None, uri: str) -> TuningScene:
-    """Loads ENet's task: GNet's scene and FNet's images in the preset ``small``.
-
-    Args:
-        store: folder of the sweep's artifacts.
-        split: fraction of Gaussians to split; ``None``: the preset's.
-        uri: of the log.
-
-    Returns:
-        TuningScene: its closeness is the kernel distance at 3 m, in dB.
-    """
-    split = load_configuration("small").enet.split_fraction if split is None else split
-    steps = load_pipeline_inputs(uri, 0, store, 0, enet=False)
-    heldout = evenly_spaced(steps.heldout, HELDOUT_VIEWS)
-    truth = load_true_targets(uri, store, steps.chunk, SIDE_M)
-    scene = TrainingScene(uri, steps.gnet, steps.source, heldout, steps.fixed, truth)
-    task = OptimisationTask(steps.gnet, steps.source, heldout, truth)
-    scorer = NovelViewScorer(views_at_shift(steps.chunk, SIDE_M, KERNEL_VIEWS), real_image_features(steps.chunk), task)
-    return TuningScene(scene, split, partial(kernel_db, scorer))
-
-
-def kernel_db(scorer: NovelViewScorer, scene: SceneGraph) -> float:
-    """Expresses the kernel distance at 3 m to the real images in dB, so that it can be added to a PSNR.
-
-    Args:
-        scorer: with the views and the real images.
-        scene: to score.
-
-    Returns:
-        dB, higher is better: a tenth less distance is half a decibel.
-    """
-    # The unbiased estimate may fall to zero or below, where there is no logarithm.
-    return -10 * math.log10(max(scorer.score(scene, 0.0, 0).kernel, 1e-3))
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--seeds", default="900,901,902")
     parser.add_argument("--lengths", default=LENGTHS, help="iterations x views of each, with commas")
     parser.add_argument("--start", help="a variant of tuned_adam in configs/baselines.yaml to search from")
-    parser.add_argument("--points", type=int, default=40_000)
+    parser.add_argument("--points", type=int, help=f"LiDAR points of GNet's scenes at most; {POINTS:,} without it")
     parser.add_argument("--rounds", type=int, default=4)
     parser.add_argument("--factor", type=float, default=2.0, help="of a move")
     parser.add_argument("--weights", type=Path, help="a network's, to tune its rates instead of Adam's")
@@ -291,20 +204,38 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def main() -> None:
-    """Tunes every length in turn and prints its variant."""
-    parser = _parser()
-    options = parser.parse_args()
+def _refuse_options_without_effect(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    # A sweep takes hours, after which it would turn out that an option was not looked at.
     if options.weights is not None and (options.start is not None or options.rates is not None):
         parser.error("--start and --rates are Adam's; a network's search starts from its own rates")
+    if options.start is not None and options.rates is not None:
+        parser.error("--start and --rates both say where the search begins; give one of them")
+    if options.enet and options.points is not None:
+        parser.error("--points is of GNet's scenes; with --enet the preset says how many points there are")
+    if options.split is not None and not options.enet:
+        parser.error("--split is ENet's; give it with --enet")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Tunes every length in turn and prints its variant.
+
+    Args:
+        arguments: of the command; those of the process if ``None``.
+    """
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    _refuse_options_without_effect(parser, options)
     options.folder.mkdir(parents=True, exist_ok=True)
-    seeds = validation_seeds(options.seeds)
     store = options.folder / "store"
-    make: Callable[[str], TuningScene] = partial(load_gnet_scene, LocalStore(store), options.points)
+    uris = scene_uris(validation_seeds(options.seeds), options.real)
+    points = POINTS if options.points is None else options.points
+    make: Callable[[str], TuningScene] = partial(load_gnet_scene, LocalStore(store), points)
+    origins = {name: f"{uri}, {points} points" for name, uri in uris.items()}
     if options.enet:
         make = partial(load_enet_scene, str(store), options.split)
+        origins = uris
     # Functions and not scenes: making one takes minutes, and all scores may be known already.
-    makers = scene_makers(seeds, options.real, make)
+    makers = {name: partial(make, uri) for name, uri in uris.items()}
     best = Setting() if options.start is None else load_setting(options.start)
     if options.rates is not None:
         best = Setting(tuple(float(rate) for rate in options.rates.split(",")), "constant")
@@ -317,7 +248,7 @@ def main() -> None:
     digest = "" if options.weights is None else f"-{digest_file(options.weights)[:8]}"
     task = f"-enet{'' if options.split is None else f'-{options.split}'}" if options.enet else ""
     file = options.folder / f"scores{task}{digest}{f'-{options.beside}' if options.beside else ''}.json"
-    scores = Scores(file, makers, rule_of, options.beside)
+    scores = Scores(file, makers, rule_of, options.beside, origins)
     for length in options.lengths.split(","):
         iterations, views = (int(part) for part in length.split("x"))
 

@@ -21,6 +21,7 @@ from benchmarks.common.bench import (
     split_option,
 )
 from benchmarks.common.claims import Claim
+from benchmarks.common.lazy_modules import STAGE_MODULES
 from benchmarks.perception.camera_transfer import camera_transfer_claims, camera_transfer_table, measure_camera_transfer
 from benchmarks.perception.metric_checks import measure_metrics, metric_claims
 from benchmarks.perception.scenes import METHOD, OTHER_METHODS, PerceptionCase
@@ -63,15 +64,11 @@ class PerceptionBench:
         "benchmarks.perception.training",
         "benchmarks.perception.speed",
         "benchmarks.perception.metric_checks",
-        # Imported by flows alone, whose imports the digest does not follow.
-        "genre_tasks.detection3d.training",
-        "genre_tasks.detection3d.evaluate",
-        "genre_tasks.training_sets.label_boxes",
-        "genre_tasks.stages.ingest",
-        "genre_tasks.stages.initial",
-        "genre_tasks.stages.optimise",
-        "genre_tasks.stages.novel_views",
-        "genre_tasks.stages.fnet",
+        # They render, detect, train and test.
+        "flows.paper_tables.agreement_cells",
+        "flows.paper_tables.detector_study",
+        "flows.perception.camera_transfer",
+        *STAGE_MODULES,
         "genre_tasks.logs.pandaset.reader",
         "genre_tasks.logs.synthetic",
     )

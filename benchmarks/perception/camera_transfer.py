@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -31,6 +32,9 @@ MEASURES: Mapping[str, str] = {
     "iou_all": "mean_overlap",
 }
 """Attributes of an agreement by the words of metrics."""
+
+KINDS = ("box", "mask")
+"""What agrees: boxes of all detectors, masks of those that have them."""
 
 RESAMPLES = 1000
 
@@ -68,7 +72,7 @@ def measure_camera_transfer(case: PerceptionCase, folder: str, detectors: tuple[
             method: drop_missing(agreement_metrics([pair], has_masks=detector.has_masks))
             for method, pair in pairs.items()
         }
-        for kind in ("box", "mask") if detector.has_masks else ("box",):
+        for kind in KINDS if detector.has_masks else KINDS[:1]:
             differences += [
                 _compare(pairs[METHOD], pairs[other], kind, measure) | {"detector": name, "other": other}
                 for other in OTHER_METHODS
@@ -96,17 +100,22 @@ def _compare(ours: DetectionPairs, others: DetectionPairs, kind: str, measure: s
 def camera_transfer_claims(rows: Sequence[Row]) -> Iterator[Claim]:
     """Claims that GenRe+ agrees better than each other method, in every number of the paper.
 
-    A claim is about the difference; its spread is the 95 % interval over images.
+    A claim is about the difference; its spread is the 95 % interval over images. A number that no row has is claimed
+    as not measured.
 
     Args:
         rows: see :func:`measure_camera_transfer`.
     """
+    measured = {(d["other"], d["measure"]) for row in rows for d in row["differences"]}
+    for other, measure in itertools.product(OTHER_METHODS, (f"{kind}/{name}" for kind in KINDS for name in MEASURES)):
+        if (other, measure) not in measured:
+            yield claim(_claim_name(other, measure), None, ">", 0.0, "difference", "not measured")
     for row in rows:
         for difference in row["differences"]:
             # Unknown where too few images have a find.
             low, high = difference["interval"]
             yield claim(
-                f"perception.transfer_{difference['other']}_{difference['measure'].replace('/', '_')}",
+                _claim_name(difference["other"], difference["measure"]),
                 difference["mean"],
                 ">",
                 0.0,
@@ -116,6 +125,10 @@ def camera_transfer_claims(rows: Sequence[Row]) -> Iterator[Claim]:
                 1,
                 None if low is None or high is None else (low, high),
             )
+
+
+def _claim_name(other: str, measure: str) -> str:
+    return f"perception.transfer_{other}_{measure.replace('/', '_')}"
 
 
 def camera_transfer_table(rows: Sequence[Row]) -> Iterator[str]:
@@ -129,7 +142,7 @@ def camera_transfer_table(rows: Sequence[Row]) -> Iterator[str]:
     for row in rows:
         for detector, methods in row["agreement"].items():
             for method, metrics in methods.items():
-                for kind in ("box", "mask"):
+                for kind in KINDS:
                     if f"{kind}/instances" not in metrics:
                         continue
                     values = [metrics.get(f"{kind}/{name}") for name in MEASURES]

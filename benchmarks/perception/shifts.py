@@ -106,6 +106,10 @@ def shift_claims(rows: Sequence[Row]) -> Iterator[Claim]:
         rows: see :func:`measure_shifts`.
     """
     streets = f"{len(rows)} streets"
+    if not rows:
+        yield claim("perception.shift_rises", None, "<=", 0.0, "steps", "not measured")
+        for name in ("shift_fall", *(_shift_name(shift) for shift in SHIFTS_M[1:])):
+            yield claim(f"perception.{name}", None, ">", 0.0, "difference", "not measured")
     for detector in sorted({name for row in rows for name in row["agreement"]}):
         curve = [mean_number(rows, detector, METHOD, shift, "ap") for shift in SHIFTS_M]
         known = [value for value in curve if value is not None]
@@ -126,7 +130,7 @@ def shift_claims(rows: Sequence[Row]) -> Iterator[Claim]:
             value = mean(differences) if differences else None
             note = f"{streets}, {detector}, {shift:g} m: box AP, GenRe+ less 3DGS; spread: 95 % over streets"
             yield claim(
-                f"perception.shift_{shift:g}m_ap",
+                f"perception.{_shift_name(shift)}",
                 value,
                 ">",
                 0.0,
@@ -135,6 +139,10 @@ def shift_claims(rows: Sequence[Row]) -> Iterator[Claim]:
                 len(differences),
                 bootstrap_mean(differences),
             )
+
+
+def _shift_name(shift: float) -> str:
+    return f"shift_{shift:g}m_ap"
 
 
 def mean_number(rows: Sequence[Row], detector: str, method: str, shift: float, name: str) -> float | None:

@@ -18,6 +18,7 @@ IMAGES = 60
 """Three cameras × 20 frames."""
 SIZE_PX = (640, 360)
 ROUNDS = 3
+MOST_S = 20.0
 
 
 def measure_speed(folder: str, detectors: tuple[str, ...]) -> Row:
@@ -58,8 +59,10 @@ def speed_claims(rows: Sequence[Row]) -> Iterator[Claim]:
     Args:
         rows: see :func:`measure_speed`.
     """
+    if not rows:
+        yield claim("perception.speed_s", None, "<", MOST_S, "s", "not measured")
     for row in rows:
         for name, seconds in row["seconds"].items():
             quartiles = Quartiles.from_values(seconds)
             note = f"{name}, {row['images']} images of 640×360, {row['threads']} threads"
-            yield claim("perception.speed_s", quartiles.median, "<", 20.0, "s", note, len(seconds), quartiles.spread)
+            yield claim("perception.speed_s", quartiles.median, "<", MOST_S, "s", note, len(seconds), quartiles.spread)

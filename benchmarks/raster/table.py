@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from benchmarks.common.bench import Row
+from benchmarks.common.bench import Row, list_not_measured
 from benchmarks.raster.scenes import CASES
 
 
@@ -23,9 +23,7 @@ def markdown(rows: Mapping[str, Row]) -> Iterator[str]:
     yield from _work(rows)
     yield ""
     yield from _rest(rows)
-    for name, row in rows.items():
-        if "not_measured" in row:
-            yield f"| {name} | not measured: {row['not_measured']} |"
+    yield from list_not_measured(rows)
 
 
 def _times(rows: Mapping[str, Row]) -> Iterator[str]:

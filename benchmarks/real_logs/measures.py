@@ -10,7 +10,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from benchmarks.common.bench import Row
+from benchmarks.common.cell_parameters import describe_preset
 from benchmarks.common.run_stages import read_metrics, reconstruct
+from benchmarks.common.task import require_log_folder
 from flows.configuration import load_configuration
 from flows.pipeline.stage_runner import ArtifactRef, Job, read_artifact
 from genre_tasks.effects.types import EffectsPlan
@@ -57,7 +59,7 @@ class LogOfBench:
     @property
     def parameters(self) -> dict[str, Any]:
         """What is measured, as far as a cell's name does not say it."""
-        return {"uri": self.uri, "chunk": self.chunk, "preset": self.preset, "settings": list(self.settings)}
+        return {"uri": self.uri, "chunk": self.chunk, **describe_preset(self.preset, self.settings)}
 
     def job(self, settings: Sequence[str], suffix: str = "") -> Job:
         """Describes a run.
@@ -80,11 +82,18 @@ def measure_chain(log: LogOfBench) -> Row:
         log: a log without a truth beside its path.
 
     Returns:
-        The row: of GNet's and ENet's scene the held-out PSNR, with fitted colours too, and the kernel distance at 3 m.
+        The row: of GNet's and ENet's scene the held-out PSNR, with fitted colours too, and the kernel distance at 3 m;
+        how many cameras the chunk has, and the size of their images.
+
+    Raises:
+        NotMeasuredError: the log's folder is missing.
     """
+    require_log_folder(log.uri)
     job = log.job(["evaluate.shifts_m=[3]"])
     refs = reconstruct(job)
-    row: Row = {"kind": "chain", "log": log.name}
+    views = read_artifact(job, refs["ingest"]).views
+    size_px = [views[0].lens.width_px, views[0].lens.height_px]
+    row: Row = {"kind": "chain", "log": log.name, "cameras": len({v.camera for v in views}), "size_px": size_px}
     for stage in ("gnet", "enet"):
         metrics = read_metrics(job, refs[f"evaluate/{stage}"])
         row[stage] = {
@@ -140,6 +149,7 @@ def measure_pose_noise(log: LogOfBench) -> Row:
 
 
 def _reconstruct_path(log: LogOfBench, settings: Sequence[str], suffix: str = "") -> tuple[Job, dict[str, ArtifactRef]]:
+    require_log_folder(log.uri)
     job = log.job([*_HELDOUT_ONLY, *settings], suffix)
     return job, reconstruct(job, ("ingest", "effects", "initial", "gnet", "evaluate/gnet"))
 

@@ -6,8 +6,9 @@ from collections.abc import Iterator, Sequence
 
 from benchmarks.common.bench import Row
 from benchmarks.common.claims import Claim
+from benchmarks.common.context import THREADS
 from benchmarks.common.over_cells import claim_over_cells
-from benchmarks.common.task import load_planned_task
+from benchmarks.common.task import load_planned_task, require_log_folder
 from benchmarks.optimiser.cells import race_row, variants
 from benchmarks.optimiser.claims import gain_at_equal_renders, time_ratio_to_gnet
 from benchmarks.real_logs.measures import LogOfBench
@@ -15,6 +16,7 @@ from flows.configuration import load_configuration
 from genre_tasks.config import GnetConfig
 from genre_tasks.effects.types import EffectsPlan
 from genre_tasks.stages.optimise import drop_unplanned_losses
+from genre_tasks.threads import torch_threads
 
 METHODS = ("tuned_adam", "tuned_adam_split")
 CAP = 5.0
@@ -35,16 +37,38 @@ def measure_race(log: LogOfBench, order: int, method: str) -> Row:
 
     Returns:
         The row of the cell.
+
+    Raises:
+        NotMeasuredError: the log's folder is missing.
     """
-    task = load_planned_task(log.job(()))
-    gnet = load_configuration(log.preset, settings=log.settings).gnet
-    # Only the loss depends on the plan: the effects themselves are in the scene and in its targets.
-    configs = {name: _planned(config, task.plan) for name, config in variants(method).items()}
-    row = race_row(task, _planned(gnet, task.plan), configs, order, method, CAP)
+    require_log_folder(log.uri)
+    # As many threads for both sides as all benchmarks have, whatever earlier cells left behind.
+    with torch_threads(THREADS):
+        task = load_planned_task(log.job(()))
+        gnet = load_configuration(log.preset, settings=log.settings).gnet
+        # Only the loss depends on the plan: the effects themselves are in the scene and in its targets.
+        configs = {name: _planned(config, task.plan) for name, config in variants(method).items()}
+        row = race_row(task, _planned(gnet, task.plan), configs, order, method, CAP)
     # No page draws these curves, and they would be most of the file.
     for run in (row["gnet"], *row["variants"].values()):
         del run["curve"]
-    return {"kind": "race", "log": log.name, "order": order} | row
+    return {"kind": "race", "log": log.name, "order": order, "threads": THREADS} | row
+
+
+def describe_race(log: LogOfBench, order: int, method: str) -> Row:
+    """Says what a race depends on beyond the code, for the cells' cache.
+
+    Args:
+        log: a real log.
+        order: seed of the order of views.
+        method: one of :data:`METHODS`.
+
+    Returns:
+        JSON values.
+    """
+    # Variants are in a file of configuration, and no code tells when one changes.
+    configs = {name: config.model_dump(mode="json") for name, config in variants(method).items()}
+    return {**log.parameters, "order": order, "method": method, "variants": configs, "cap": CAP}
 
 
 def make_race_claims(rows: Sequence[Row]) -> Iterator[Claim]:

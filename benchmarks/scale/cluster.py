@@ -115,6 +115,7 @@ def _run_cluster(
         database=subtract_counters(after, before) | {"connections": connections},
         drain_s=drain_s,
         event_delays=watch.delays,
+        is_given_up=watch.is_over,
     )
 
 
@@ -134,6 +135,7 @@ class _DatasetWatch:
 
     def __init__(self, database: str, end_s: float) -> None:
         self.delays: list[float] = []
+        self.is_over = False
         self._database = database
         self._end_s = end_s
         self._table = LiveTable()
@@ -142,6 +144,7 @@ class _DatasetWatch:
     def on_change(self, rows: list[Row]) -> None:
         now_s = time.monotonic()
         if now_s > self._end_s:
+            self.is_over = True
             raise _TimeOverError
         self._table.show(rows)
         if now_s >= self._next_s:

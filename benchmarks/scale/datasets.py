@@ -28,7 +28,8 @@ def measure_throughput(logs: Sequence[str], preset: str, settings: Sequence[str]
         settings: over it.
 
     Returns:
-        ``one_worker_s`` and ``two_workers_s``, the seconds of the whole command, and their ``ratio``.
+        ``one_worker_s`` and ``two_workers_s``, the seconds of the whole command, and their ``ratio``; the number of
+        ``logs``, the first ``log`` and the ``preset``.
     """
     options = options_from_settings(preset, settings)
     seconds = {}
@@ -42,6 +43,8 @@ def measure_throughput(logs: Sequence[str], preset: str, settings: Sequence[str]
             shutil.rmtree(store)
     return {
         "logs": len(logs),
+        "log": logs[0],
+        "preset": preset,
         "one_worker_s": seconds[1],
         "two_workers_s": seconds[2],
         "ratio": seconds[1] / seconds[2],
@@ -57,8 +60,9 @@ def measure_orchestration(log: str, preset: str, settings: Sequence[str]) -> Row
         settings: over it.
 
     Returns:
-        ``worker_s``, from the worker's taking the run to the end of its process; ``compute_s``, of all stages, each
-        of them in ``stages_s``; ``share``, of the difference in the computation.
+        ``worker_s``, from the worker's taking the run to the end of its process; ``compute_s``, of all stages, those
+        of evaluation included, each of them in ``stages_s``; ``orchestration_s``, the difference; ``share``, what that
+        is of the computation; ``log`` and ``preset``.
     """
     options = options_from_settings(preset, settings)
     with start_deployment(workers=1) as deployment:
@@ -69,8 +73,16 @@ def measure_orchestration(log: str, preset: str, settings: Sequence[str]) -> Row
         (worker_s,) = clock.read_seconds(dataset)
         stages_s = read_compute_seconds(store)
     compute_s = sum(stages_s.values())
-    share = (worker_s - compute_s) / compute_s
-    return {"worker_s": worker_s, "compute_s": compute_s, "share": share, "stages_s": stages_s}
+    orchestration_s = worker_s - compute_s
+    return {
+        "log": log,
+        "preset": preset,
+        "worker_s": worker_s,
+        "compute_s": compute_s,
+        "orchestration_s": orchestration_s,
+        "share": orchestration_s / compute_s,
+        "stages_s": stages_s,
+    }
 
 
 def measure_cached_logs(logs: Sequence[str], preset: str, settings: Sequence[str], rounds: int) -> Row:
@@ -83,7 +95,8 @@ def measure_cached_logs(logs: Sequence[str], preset: str, settings: Sequence[str
         rounds: how often.
 
     Returns:
-        ``seconds`` of a worker's time for one log, quartiles over logs and rounds.
+        ``seconds`` of a worker's time for one log, quartiles over logs and rounds; the first ``log`` and the
+        ``preset``.
     """
     options = options_from_settings(preset, settings)
     with start_deployment(workers=1) as deployment:
@@ -94,7 +107,7 @@ def measure_cached_logs(logs: Sequence[str], preset: str, settings: Sequence[str
             for _ in range(rounds):
                 deployment.run_dataset(logs, store, options)
         seconds = clock.read_seconds(dataset)
-    return {"seconds": Quartiles.from_values(seconds).as_row()}
+    return {"log": logs[0], "preset": preset, "seconds": Quartiles.from_values(seconds).as_row()}
 
 
 def measure_object_store(log: str, preset: str, settings: Sequence[str], rounds: int) -> Row:
@@ -107,7 +120,8 @@ def measure_object_store(log: str, preset: str, settings: Sequence[str], rounds:
         rounds: how often.
 
     Returns:
-        ``local_s`` and ``s3_s``, seconds of the command, and the quartiles of their ``ratio`` round by round.
+        ``local_s`` and ``s3_s``, seconds of the command, and the quartiles of their ``ratio`` round by round; ``log``
+        and ``preset``.
     """
     options = options_from_settings(preset, settings)
     seconds: dict[str, list[float]] = {"local": [], "s3": []}
@@ -123,6 +137,8 @@ def measure_object_store(log: str, preset: str, settings: Sequence[str], rounds:
     # The first round warms the caches of files, and makes Prefect's database.
     local, objects = seconds["local"][1:], seconds["s3"][1:]
     return {
+        "log": log,
+        "preset": preset,
         "local_s": Quartiles.from_values(local).as_row(),
         "s3_s": Quartiles.from_values(objects).as_row(),
         "ratio": ratio(objects, local).as_row(),

@@ -187,7 +187,8 @@ def read_compute_seconds(store: Path) -> dict[str, float]:
         store: its folder.
 
     Returns:
-        Wall seconds of each stage's function, from the manifests, summed over logs and chunks.
+        Wall seconds of each stage's function, from the manifests, summed over logs and chunks; those of evaluation,
+        whose names begin with ``evaluate/``, are among them.
     """
     seconds: dict[str, float] = {}
     for path in sorted(store.glob("*/*/*/**/manifest.json")):

@@ -126,11 +126,11 @@ def count_artifacts(commits: Mapping[str, int], logs: int) -> dict[str, int]:
     """Compares the artifacts that were committed with those that a dataset must have.
 
     Args:
-        commits: how often each manifest was put where there was none.
-        logs: of the dataset.
+        commits: how often each manifest was put where there was none; the store refuses a second one.
+        logs: whose artifacts have to be there.
 
     Returns:
-        ``stages``, ``lost`` and ``doubled``.
+        ``stages``; ``lost``, those that were never put; ``doubled``, those that were put more than once.
 
     >>> count_artifacts({"a": 2, "b": 1}, 1)["doubled"]
     1

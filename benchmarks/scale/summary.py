@@ -39,6 +39,7 @@ class ClusterRun:
         database: what PostgreSQL counted during the dataset.
         drain_s: seconds from the dataset's end until its task runs were recorded.
         event_delays: how far the server was behind with events, in seconds, every ten seconds.
+        is_given_up: whether the dataset was ended by its time limit, before all logs were done.
     """
 
     logs: int
@@ -54,6 +55,7 @@ class ClusterRun:
     database: Mapping[str, Any]
     drain_s: float
     event_delays: Sequence[float] = ()
+    is_given_up: bool = False
 
     @property
     def wall_s(self) -> float:
@@ -89,6 +91,7 @@ def summarise_cluster(run: ClusterRun) -> Row:
         "offered_logs_per_minute": round(60 * run.workers / (sum(run.seconds.values()) * run.scale + POLL_S / 2), 2),
         "logs_done": statuses["done"],
         "statuses": dict(statuses),
+        "is_given_up": run.is_given_up,
         "attempts": sum(int(row["attempts"]) for row in run.outcomes),
         "stages": _count_stages(run),
         "cores": cores,
@@ -138,14 +141,23 @@ def find_limit(cores: Mapping[str, float]) -> str:
 def _count_stages(run: ClusterRun) -> Row:
     commits = Counter(name for process in run.processes for name in process["commits"])
     computed = Counter(stage for process in run.processes for stage in process["computed"])
-    # Of a dataset that was given up, only the logs that were done must be complete.
-    done = {row["log"] for row in run.outcomes if row["status"] == "done"}
-    counts = count_artifacts({name: n for name, n in commits.items() if name.split("/")[1] in done}, len(done))
+    logs = run.logs
+    if run.is_given_up:
+        # Only the logs that were done must be complete: the others were still on their way.
+        done = {row["log"] for row in run.outcomes if row["status"] == "done"}
+        commits = Counter({name: n for name, n in commits.items() if name.split("/")[1] in done})
+        logs = len(done)
+    counts = count_artifacts(commits, logs)
+    twice = sum(count - 1 for count in computed.values())
+    refused = sum(len(process["refused"]) for process in run.processes)
     return {
         **counts,
+        # The store refuses a second manifest, so that a stage of two workers is never put twice: it is refused to the
+        # slower one, or was computed twice.
+        "doubled": counts["doubled"] + refused + twice,
         "computed": computed.total(),
-        "computed_twice": sum(count - 1 for count in computed.values()),
-        "refused_commits": sum(len(process["refused"]) for process in run.processes),
+        "computed_twice": twice,
+        "refused_commits": refused,
         "run_errors": [error for process in run.processes for error in process["errors"]][:10],
     }
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from benchmarks.common.bench import Row
 from benchmarks.common.claims import Claim, claim
+from benchmarks.common.task import require_log_folder
 from benchmarks.simulation.scenes import METHOD, SimulationCase, log_label
 from flows.paper_tables.builtin_methods import BUILT_IN
 from flows.paper_tables.method_differences import MethodDifference, compare_methods, compare_on_log
@@ -41,7 +42,11 @@ def measure_behaviours(case: SimulationCase, rollouts: Sequence[TableRollout], t
     Returns:
         ``rollouts``: metrics by method and rollout; on a recorded log ``differences`` of kernel distances, paired by
         frames.
+
+    Raises:
+        NotMeasuredError: the log's folder is missing.
     """
+    require_log_folder(case.log)
     rows: list[RolloutRow] = []
     for key in (METHOD, *COMPARED_METHODS):
         method = BUILT_IN[key]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common.bench import Row
+from benchmarks.common.bench import NotMeasuredError, Row
 from benchmarks.common.claims import Claim, claim
 from benchmarks.simulation.scenes import SimulationCase, edit_scenes, log_label, open_scenes
 from flows.pipeline.log_cache import cached_log
@@ -42,7 +42,12 @@ def measure_plausibility(logs: Sequence[str], count: int = RANDOM_BEHAVIOURS) ->
     Returns:
         ``planned`` and ``within``: how many were planned, and how many of those keep within all bounds; ``refused``:
         how many were refused, by behaviour; ``worst``: the violations.
+
+    Raises:
+        NotMeasuredError: there is no log.
     """
+    if not logs:
+        raise NotMeasuredError("there is no log whose path could be driven otherwise")
     # Fixed: the same behaviours in every run.
     rng = np.random.default_rng(_SEED)
     paths = [_read_recorded_path(log) for log in logs]

@@ -10,6 +10,7 @@ import numpy as np
 
 from benchmarks.common.bench import NotMeasuredError, Row, split_option
 from benchmarks.common.run_stages import print_progress
+from benchmarks.common.task import require_log_folder
 from flows.paper_tables.builtin_methods import BUILT_IN
 from flows.paper_tables.layouts import SIMULATION_PROTOCOL
 from flows.paper_tables.rollouts import PlannedRollout, TableRollout, plan_rollout
@@ -76,9 +77,13 @@ class LogScenes:
     Attributes:
         source: the scenes of all chunks.
         config: of the method.
+
+    Raises:
+        NotMeasuredError: the log's folder is missing.
     """
 
     def __init__(self, case: SimulationCase) -> None:
+        require_log_folder(case.log)
         jobs = case.jobs()
         end = BUILT_IN[METHOD].end
         refs = [_run_quietly(job, end) for job in jobs]

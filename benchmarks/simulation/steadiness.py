@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.common.bench import Row
+from benchmarks.common.bench import NotMeasuredError, Row
 from benchmarks.common.claims import Claim, claim
 from benchmarks.common.timing import Quartiles
 from benchmarks.simulation.scenes import LogScenes, SimulationCase, cut_path, log_label, open_scenes, truth_view
@@ -153,11 +153,14 @@ def measure_handover(case: SimulationCase) -> Row:
 
     Returns:
         ``rollouts``: for each the seam's PSNR at the border and where the fade was put, and the largest steps with the
-        fade, with a cut, and within chunks; ``not_measured`` alone without a second chunk.
+        fade, with a cut, and within chunks.
+
+    Raises:
+        NotMeasuredError: there is no second chunk, or no log.
     """
-    scenes = open_scenes(case)
     if len(case.chunks) < 2:
-        return {"not_measured": "a single chunk has no border"}
+        raise NotMeasuredError("a single chunk has no border")
+    scenes = open_scenes(case)
     found = []
     for rollout in STEADY_ROLLOUTS:
         planned = scenes.plan(rollout)

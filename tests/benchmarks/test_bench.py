@@ -68,6 +68,24 @@ def test_what_is_measured_again(bench: Tiny, monkeypatch: pytest.MonkeyPatch) ->
     assert measured() == 2
 
 
+def test_a_cached_row_says_at_which_commit_it_was_measured(bench: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
+    def rows(commit: str, *arguments: str) -> list[dict[str, object]]:
+        monkeypatch.setattr(runner, "git_commit", lambda: commit * 40)
+        assert _bench("tiny", "--json", "result.json", *arguments).exit_code == 0
+        result = json.loads(Path("result.json").read_text())
+        assert result["commit"] == commit * 40
+        return [{name: value for name, value in row.items() if name == "commit"} for row in result["rows"]]
+
+    assert rows("a", "--only", "first") == [{}, {}]
+    assert rows("b") == [{"commit": "a" * 40}, {}]
+    assert rows("c") == [{"commit": "a" * 40}, {"commit": "b" * 40}]
+    assert rows("a", "--fresh") == [{}, {}]
+    # A file of a version that did not note the commit: nobody knows it.
+    cell = next(Path(".genre/bench/tiny").glob("first-*.json"))
+    cell.write_text(json.dumps({name: v for name, v in json.loads(cell.read_text()).items() if name != "commit"}))
+    assert rows("a") == [{"commit": "unknown"}, {}]
+
+
 def test_what_cannot_be_measured_says_why_and_is_tried_again(bench: Tiny) -> None:
     def meet(name: str) -> None:
         if name == "second":

@@ -14,6 +14,7 @@ import pytest
 from obstore.store import MemoryStore
 
 from benchmarks.scale.cluster import measure_cluster
+from benchmarks.scale.report import scale_claims
 from benchmarks.scale.request_meter import Request, RequestMeter, metered_clients
 from benchmarks.scale.server_load import LoadSample
 from benchmarks.scale.simulated_run import RunCounts
@@ -179,6 +180,28 @@ def test_two_workers_on_one_stage_compute_it_once(store: ObjectStore, meter: Req
 def test_a_missing_and_a_doubled_stage_are_counted() -> None:
     commits = {f"log-0 {spec.name}": 1 for spec in PIPELINE[1:]} | {f"log-0 {PIPELINE[1].name}": 2}
     assert count_artifacts(commits, 1) == {"stages": len(PIPELINE) - 1, "lost": 1, "doubled": 1}
+
+
+def test_lost_and_doubled_stages_can_be_claimed(store: ObjectStore, meter: RequestMeter) -> None:
+    def counted(rows: list[dict[str, Any]], counts: RunCounts, **changes: Any) -> dict[str, float | None]:
+        row = summarise_cluster(_cluster_run(rows, counts, meter, **changes))
+        claims = {claim.id: claim for claim in scale_claims({"cluster": row})}
+        return {name: claims[f"scale.cluster_{name}"].measured for name in ("lost", "doubled")}
+
+    rows, counts = _run(store)
+    assert counted(rows, counts) == {"lost": 0.0, "doubled": 0.0}
+    # A stage that two workers computed, and whose second manifest the store refused.
+    twice = replace(counts, computed=[*counts.computed, counts.computed[0]])
+    assert counted(rows, twice)["doubled"] == 1.0
+    meter.refused.append(meter.commits[0])
+    assert counted(rows, twice)["doubled"] == 2.0
+    meter.refused.clear()
+    # The last log failed at its last stage: it is not done, and the stage is lost.
+    failed = [*rows[:-1], rows[-1] | {"status": "failed"}]
+    meter.commits.remove(next(name for name in meter.commits if f"/{rows[-1]['log']}/" in f"/{name}"))
+    assert counted(failed, counts)["lost"] == 1.0
+    # A dataset that was given up has logs that were still on their way.
+    assert counted(failed, counts, is_given_up=True)["lost"] == 0.0
 
 
 def test_the_numbers_are_those_of_the_samples(meter: RequestMeter) -> None:

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from benchmarks.common.bench import TINY_SETTINGS, TINY_STREET, NotMeasuredError
 from benchmarks.effects import EFFECTS
 from benchmarks.effects.cases import CASES, LONGEST_S, MILD_FACTOR
-from benchmarks.effects.cells import ChunkLocation, measure_on_pandaset
+from benchmarks.effects.cells import ChunkLocation, evaluate_settings, measure_on_pandaset
 from benchmarks.effects.measures import FOOTPRINT_RATIO, psnr_where_footprints_change
 from benchmarks.effects.report import find_threshold
+from benchmarks.effects.whole_plans import compare_trained
 from flows.cli.bench import load_bench
+from flows.training.train_job import TrainJob
 from genre_tasks.config import IngestConfig, InitialConfig
 from genre_tasks.effects.anti_aliasing import footprint_ratios
 from genre_tasks.effects.plan import EFFECT_NAMES as NAMES
+from genre_tasks.effects.types import EffectParameters
 from genre_tasks.logs.registry import open_log
 from genre_tasks.metrics.scoring import decode_view_image
+from genre_tasks.render.api import render_views
 from genre_tasks.scene.visibility import find_visible_points
 from genre_tasks.stages.ingest import ingest
 from genre_tasks.stages.initial import initial
@@ -132,3 +138,33 @@ def test_what_is_seen_from_far_and_near_is_judged_alone() -> None:
     )
     assert elsewhere == as_it_is and there < as_it_is - 1
     assert np.isnan(psnr_where_footprints_change(chunk, scene, []))
+    # Where nothing differs there is no logarithm.
+    with torch.no_grad():
+        drawn = render_views(scene, [view]).color.clamp(0, 1)[0].numpy()
+    assert psnr_where_footprints_change(chunk, scene, [(view, drawn)]) == pytest.approx(100.0)
+
+
+def test_a_measure_of_nothing_ends_its_cell_alone(tmp_path: Path) -> None:
+    location = ChunkLocation(f"synthetic:street?seed={TINY_STREET}", 0, str(tmp_path), tuple(TINY_SETTINGS.split()))
+    with pytest.raises(NotMeasuredError, match="no pixel"):
+        evaluate_settings(location, EffectParameters(), lambda *_: math.nan)
+
+
+def test_a_trainings_weights_are_in_the_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    options = dict(EFFECTS.options) | {"effects": "trained", "seeds": "900", "pandaset": ""}
+
+    def digests(folder: Path | str) -> set[str | None]:
+        (first, *_) = EFFECTS.cells(options | {"training": str(folder)}, False)
+        return set(first.parameters["training"].values())
+
+    assert (digests(""), digests(tmp_path)) == (set(), {None})
+    with pytest.raises(NotMeasuredError, match="not trained yet"):
+        compare_trained(ChunkLocation("synthetic:street?seed=900", 0, "store"), str(tmp_path))
+    weights = tmp_path / "weights.safetensors"
+    monkeypatch.setattr(TrainJob, "stage_weights", lambda job, name: weights)
+    found = []
+    for content in (b"first", b"second"):
+        weights.write_bytes(content)
+        (digest,) = digests(tmp_path)
+        found.append(digest)
+    assert None not in found and found[0] != found[1]

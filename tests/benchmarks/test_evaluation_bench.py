@@ -66,6 +66,14 @@ def test_each_claim_can_fail(row: Any, failing: set[str]) -> None:
     assert {name for name, c in found.items() if not c.holds} == failing
 
 
+def test_a_setting_that_the_table_no_longer_has_does_not_count() -> None:
+    gone = run(60, 30, 0.6)
+    gone["choices"] = [{"point": "of an older sweep", "why": "the best that fits"}]
+    used = by_name(budget_claims([run(100, 60, 0.5), gone]))["budget_used"]
+    assert used.n == 1 and used.measured == pytest.approx(0.6)
+    assert "without 1, whose setting the table no longer has" in used.data
+
+
 def guards(log: str, stage: str, agreement: list[float]) -> Any:
     """Views at 0, 1, 2 … m on both sides, each a dB worse than the one before it in truth."""
     views = [
@@ -84,7 +92,8 @@ def test_guards_are_judged_beside_the_path_over_all_streets_and_on_the_worst() -
     )
     found = by_name(reliability_claims([good]))
     assert found["reliability"].measured == pytest.approx(1.0)
-    assert found["reliability"].holds and found["reliability"].n == 10
+    # Ten views, of which two are on the path.
+    assert found["reliability"].holds and found["reliability"].n == 8
     assert found["reliability_gnet"].measured is None and not found["reliability_gnet"].holds
     both = by_name(reliability_claims([good, bad]))
     assert not both["reliability"].holds and both["reliability_worst"].measured == pytest.approx(-1.0)

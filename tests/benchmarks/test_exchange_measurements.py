@@ -10,6 +10,7 @@ import pytest
 from benchmarks.common.bench import NotMeasuredError, Row
 from benchmarks.exchange import round_trips
 from benchmarks.exchange.import_speed import import_speed_claims, import_speed_table, measure_import_speed
+from benchmarks.exchange.interop import interop_claims
 from benchmarks.exchange.round_trips import RoundTripCase, measure_round_trip, round_trip_claims, round_trip_table
 from genre_tasks.exchange.conversion import to_scene_graph
 from genre_tasks.logs.types import Lens
@@ -60,6 +61,20 @@ def test_claims_of_round_trips(rows: list[Row]) -> None:
 def test_what_is_read_only_is_not_measured() -> None:
     with pytest.raises(NotMeasuredError, match="read only"):
         measure_round_trip("compressed.ply", CASE)
+
+
+def test_a_tool_that_loses_gaussians_misses_its_claims() -> None:
+    sound = {"missing": 0, "matched": 1.0, "means_m": 1e-4}
+    shared: Row = {"validator": {"errors": 0}, "three_place": 0.0}
+    for ways, missing, farthest_m in (
+        ({"spz, ply": sound, "ply, spz": sound}, 0, 1e-4),
+        ({"spz, ply": {"missing": 3}, "ply, spz": sound}, 3, None),
+        ({"spz, ply": sound, "ply, spz": {"missing": -2}}, 2, 1e-4),
+    ):
+        claims = {claim.id.rpartition("_")[2]: claim for claim in interop_claims([shared | {"ways": ways}])}
+        assert (claims["missing"].measured, claims["spz"].measured) == (missing, farthest_m)
+        assert claims["missing"].holds == (missing == 0) and claims["spz"].holds == (farthest_m is not None)
+    assert not any(claim.holds for claim in interop_claims([]))
 
 
 def test_import_speed() -> None:

@@ -57,6 +57,12 @@ def test_a_cell_that_was_not_measured_leaves_the_one_that_was() -> None:
     assert found.rows == [{"cell": "first", "number": 3.0}, {"cell": "second", "not_measured": "no time"}]
 
 
+def test_a_cell_that_is_measured_again_comes_behind_those_before_it() -> None:
+    results = [_result("m", A, first=3.0, second=5.0), _result("m", A, first=1.0)]
+    found = merge.merge_results(Tiny(), results)
+    assert [(row["cell"], row["number"]) for row in found.rows] == [("second", 5.0), ("first", 1.0)]
+
+
 def test_files_are_read_and_written_in_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(command._BENCHES, "tiny", command.BenchEntry("tests.benchmarks.small_cells:BENCH", "two cells"))
     files = tmp_path / "all.json", tmp_path / "part.json"

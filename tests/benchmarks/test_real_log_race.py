@@ -34,6 +34,7 @@ def test_both_sides_of_the_race_show_the_planned_exposures(
     assert all(target.log_gain is not None for target in (*task.source, *task.heldout))
     row = optimiser_race.measure_race(log, 1, "tuned_adam")
     assert (row["order"], row["method"], row["gaussians"]) == (1, "tuned_adam", len(task.scene))
+    assert row["threads"] == 2
     assert row["gnet"]["renders"] > 0 and list(row["variants"]) == ["6x2"]
     assert row["gnet"]["psnr"] > task.psnr(task.scene)
 

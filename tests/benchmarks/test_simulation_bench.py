@@ -6,11 +6,14 @@ from typing import Any
 
 import pytest
 
-from benchmarks.common.bench import Row
+from benchmarks.common.bench import NotMeasuredError, Row
 from benchmarks.common.claims import Claim
 from benchmarks.simulation import BENCH
+from benchmarks.simulation.behaviour_quality import measure_behaviours
+from benchmarks.simulation.plausibility import measure_plausibility
 from benchmarks.simulation.removal import pool_psnr
-from benchmarks.simulation.scenes import cases_from_options
+from benchmarks.simulation.scenes import SimulationCase, cases_from_options
+from benchmarks.simulation.steadiness import measure_handover
 from flows.paper_tables.rollouts import BEHAVIOUR_LABELS
 
 LOGS = [f"synthetic:street?seed={seed}&frames=40" for seed in (1, 2, 3)]
@@ -143,3 +146,17 @@ def test_what_was_not_measured_holds_nothing() -> None:
     assert rows and not any(claim.holds for claim in BENCH.claims(rows))
     cases = cases_from_options(BENCH.options, ())
     assert [case.chunks for case in cases] == [(0, 1)] * 6
+
+
+def test_a_log_that_is_not_there_is_not_measured() -> None:
+    case = SimulationCase("pandaset:nowhere/002", (0, 1), "store", ())
+    for measure in (measure_handover, lambda case: measure_behaviours(case, ())):
+        with pytest.raises(NotMeasuredError, match="there is no folder nowhere/002"):
+            measure(case)
+    options = dict(BENCH.options) | {"seeds": "1", "pandaset": "nowhere/002"}
+    parameters = {cell.name: cell.parameters for cell in BENCH.cells(options, quick=False)}
+    assert parameters["plausibility"]["logs"] == ["synthetic:street?seed=1"]
+    with pytest.raises(NotMeasuredError, match="no log"):
+        measure_plausibility([])
+    with pytest.raises(NotMeasuredError, match="single chunk"):
+        measure_handover(SimulationCase("synthetic:street?seed=1", (0,), "store", ()))

@@ -67,6 +67,7 @@ def test_claims_are_means_over_views_and_the_worst_log() -> None:
     assert claims["fixer.vs_src"].measured == pytest.approx(0.04 / 0.45) and claims["fixer.vs_src"].holds
     assert claims["fixer.vs_ref_lidar"].measured is None and not claims["fixer.vs_ref_lidar"].holds
     assert claims["fixer.no_view_worse"].measured == pytest.approx(0.05) and not claims["fixer.no_view_worse"].holds
+    assert "the worst at 0.5 m" in claims["fixer.no_view_worse"].data
     text = "\n".join(BENCH.table(rows))
     assert "chunk 0 | not held | 21.000 | 22.500 | 0.500 | 0.400 |" in text
     assert "| 0.5 | 4 | 0.100 | 0.200 | 0.300 | 0.300 | 0.255 | +5.0% |" in text

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks.optimiser.rate_search import Setting, network_moves, search
-from benchmarks.optimiser.rate_sweep import Scores, TuningScene, load_network, validation_seeds
+from benchmarks.optimiser.rate_sweep import Scores, load_network, main, validation_seeds
+from benchmarks.optimiser.tuning_scenes import TuningScene
 from genre_tasks.errors import ConfigError
 from genre_tasks.learned.learned_optimiser import LearnedOptimiser
 from genre_tasks.learned.meta_episodes import TrainingScene
@@ -51,6 +52,42 @@ def test_scores_are_kept_and_not_measured_again(tmp_path: Path) -> None:
     for setting, iterations in ((Setting(), 3), (Setting(schedule="constant"), 2)):
         with pytest.raises(AssertionError, match="measured again"):
             again.mean(setting, iterations, 2)
+
+
+def test_scores_of_another_log_or_of_other_points_are_measured_anew(tmp_path: Path) -> None:
+    truth = street_scenes.scene()
+    made: list[str] = []
+
+    def score(origin: str) -> None:
+        def scene() -> TuningScene:
+            made.append(origin)
+            return TuningScene(TrainingScene("tiny", street_scenes.blurred(truth), views, views))
+
+        Scores(tmp_path / "scores.json", {"real": scene}, origins={"real": origin}).mean(Setting(), 1, 2)
+
+    views = street_scenes.targets(truth)
+    origins = ["pandaset:a, 40000 points", "pandaset:b, 40000 points", "pandaset:b, 100 points"]
+    for origin in [*origins, *origins]:
+        score(origin)
+    assert made == origins
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (("--enet", "--points", "100"), "--points is of GNet's scenes"),
+        (("--split", "0.1"), "--split is ENet's"),
+        (("--start", "240x1", "--rates", "1,1,1,1,1"), "give one of them"),
+        (("--weights", "w.safetensors", "--rates", "1,1,1,1,1"), "are Adam's"),
+    ],
+)
+def test_options_without_effect_are_refused(
+    arguments: tuple[str, ...], reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["--folder", str(tmp_path / "sweep"), *arguments])
+    assert reason in capsys.readouterr().err
+    assert not (tmp_path / "sweep").exists()
 
 
 def test_a_networks_rates_are_searched_with_its_relaxation(tmp_path: Path) -> None:

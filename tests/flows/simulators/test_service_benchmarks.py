@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from benchmarks.exchange.http_service import (
-    http_service_claims,
-    http_service_table,
-    measure_driving,
-    measure_http_service,
-)
+from benchmarks.exchange.http_service import measure_driving, measure_http_service
+from benchmarks.exchange.service_report import http_service_claims, http_service_table
 
 
 def test_http_and_driving_are_measured(served: tuple[str, str]) -> None:
