@@ -132,6 +132,8 @@ def prepare_environment(debug: bool) -> None:
         "DO_NOT_TRACK": "1",
         "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
         "PREFECT_LOGGING_LEVEL": "INFO" if debug else "CRITICAL",
+        # The server of this process has another level. It warns of every write that it tries again.
+        "PREFECT_SERVER_LOGGING_LEVEL": "WARNING" if debug else "CRITICAL",
         "PREFECT_LOGGING_TO_API_ENABLED": "false",
         # Idle OpenMP threads would spin and take the cores from the renderer's threads: ten times as slow on two cores.
         "OMP_WAIT_POLICY": "PASSIVE",

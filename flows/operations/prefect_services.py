@@ -24,6 +24,7 @@ EVENT_SETTINGS = {
 }
 """How many events a server writes at once. By default it writes each state of a task in a transaction of its own, and
 falls minutes behind with fifty workers."""
+_LEVEL_VARIABLE = "PREFECT_SERVER_LOGGING_LEVEL"
 _PREFECT = [sys.executable, "-m", "prefect"]
 
 
@@ -76,6 +77,9 @@ class PrefectServer(Service):
         variables = {**_QUIET, **EVENT_SETTINGS, "PREFECT_HOME": str(self.folder / "home"), "PREFECT_API_URL": self.url}
         # The database counts the slots: without their leases, a server that was killed would never take them back.
         variables["PREFECT_SERVER_CONCURRENCY_LEASE_STORAGE"] = LEASE_STORAGE
+        if os.environ.get(_LEVEL_VARIABLE) == "CRITICAL":
+            # The command silences the server of its own process; the log of a service must say why it ended.
+            variables[_LEVEL_VARIABLE] = "WARNING"
         if self.database_url:
             variables["PREFECT_API_DATABASE_CONNECTION_URL"] = self.database_url
         if self.authentication:

@@ -22,6 +22,7 @@ import yaml
 from prefect.settings.models.server.services import ServerServicesSettings
 
 from flows.operations import ObjectServer, PostgresServer, PrefectServer, Service, Worker
+from flows.operations import object_server as object_module
 from flows.operations import postgres_server as postgres_module
 from flows.operations.deployments import DEPLOYMENTS, RUN_QUEUE
 from flows.operations.prefect_services import EVENT_SETTINGS
@@ -30,6 +31,7 @@ from flows.operations.stack import Stack, describe_services, stop_stack
 from flows.operations.state_file import ServiceRecord, read_records, read_start_ticks, write_records
 from genre_tasks.errors import ConfigError, ResourceError
 from tests.faults import small_run
+from tests.waiting import wait_until
 
 
 class _Sleeper(Service):
@@ -58,8 +60,7 @@ def test_kill_ends_the_children_too(session: str, tmp_path: Path) -> None:
     service.spawn_options = lambda: {"cwd": tmp_path}  # type: ignore[method-assign]
     service.start()
     child = tmp_path / "child"
-    while not child.exists() or not child.read_text().strip():
-        time.sleep(0.02)
+    wait_until(lambda: child.exists() and bool(child.read_text().strip()), "the child does not start")
     service.kill()
     deadline = time.monotonic() + 5
     while read_start_ticks(int(child.read_text())) is not None and time.monotonic() < deadline:
@@ -97,6 +98,28 @@ def test_commands_hold_no_secret(tmp_path: Path) -> None:
     assert words[-4:] == ["--work-queue", "datasets", "--limit", "1"]
     assert not any(secret in word or "database-secret" in word for word in words)
     assert Worker(tmp_path, server.env()).environment()["PREFECT_FLOWS_HEARTBEAT_FREQUENCY"] == "30"
+
+
+def test_all_services_listen_on_the_loopback_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(object_module, "find_weed", lambda: "weed")
+    monkeypatch.setattr(postgres_module, "find_postgres_program", lambda name: name)
+    # Its free ports are chosen, and its files written, without its program.
+    objects = ObjectServer(tmp_path)
+    objects.prepare()
+    assert {"-ip=127.0.0.1", "-ip.bind=127.0.0.1"} <= set(objects.command())
+    words = PrefectServer(tmp_path).command()
+    assert words[words.index("--host") + 1] == "127.0.0.1"
+    words = PostgresServer(tmp_path).command()
+    assert words[words.index("listen_addresses=127.0.0.1") - 1] == "-c"
+
+
+def test_a_server_of_its_own_process_says_why_it_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    name = "PREFECT_SERVER_LOGGING_LEVEL"
+    # As the command sets it for the server of its own process.
+    monkeypatch.setenv(name, "CRITICAL")
+    assert PrefectServer(tmp_path).environment()[name] == "WARNING"
+    monkeypatch.setenv(name, "DEBUG")
+    assert name not in PrefectServer(tmp_path).environment()
 
 
 def test_a_killed_server_remembers_who_has_slots(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
-from prefect.settings import PREFECT_API_URL, temporary_settings
+from prefect.settings import PREFECT_API_URL, PREFECT_SERVER_LOGGING_LEVEL, temporary_settings
 
 from flows.cli.main import prepare_environment
 from flows.machine.state_folder import find_state_folder
@@ -50,7 +50,8 @@ def run_flow(
     folder: Path, script: str = FLOW, working_folder: Path | None = None, **variables: str
 ) -> subprocess.CompletedProcess[str]:
     inherited = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
-    settings = {"PREFECT_HOME": str(folder / "prefect"), "PYTHONPATH": str(ROOT), "PREFECT_LOGGING_LEVEL": "CRITICAL"}
+    settings = {"PREFECT_HOME": str(folder / "prefect"), "PYTHONPATH": str(ROOT)}
+    settings |= {"PREFECT_LOGGING_LEVEL": "CRITICAL", "PREFECT_SERVER_LOGGING_LEVEL": "CRITICAL"}
     settings |= {"DO_NOT_TRACK": "1", "PREFECT_SERVER_ANALYTICS_ENABLED": "false"}
     return subprocess.run(
         [sys.executable, "-c", script],
@@ -85,6 +86,15 @@ def test_a_flow_keeps_its_records_behind_a_proxy_and_in_a_folder_of_any_name(tmp
         "http://10.255.255.1:3128 None",
     ]
     assert {path.name for path in folder.iterdir()} == {"prefect"}
+
+
+def test_the_command_silences_prefect_and_its_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    variables = {"XDG_STATE_HOME": str(tmp_path), "PREFECT_LOGGING_LEVEL": "ERROR"}
+    monkeypatch.setattr(os, "environ", variables)
+    prepare_environment(debug=False)
+    # The server logs by a level of its own, even what it tries again with success.
+    assert variables[PREFECT_SERVER_LOGGING_LEVEL.name] == "CRITICAL"
+    assert variables["PREFECT_LOGGING_LEVEL"] == "ERROR"
 
 
 def test_two_at_once_share_a_new_database(tmp_path: Path) -> None:
