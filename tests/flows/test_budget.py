@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
@@ -151,6 +151,7 @@ def test_a_chunks_share_is_of_what_was_left_when_it_began() -> None:
     assert clock.now < 45.0 and by._until_s == 45.0
 
 
+@settings(deadline=None)
 @given(st.floats(5.0, 120.0), st.floats(0.3, 3.0))
 def test_accuracy_does_not_fall_as_the_budget_grows(budget_s: float, pace: float) -> None:
     accuracy = {p.name: p.accuracy for p in POINTS}
@@ -208,19 +209,36 @@ def test_images_of_a_chunk_are_frames_times_cameras() -> None:
     assert count_images("synthetic:street?seed=900&frames=25&cameras=2", 0, one) == 20
 
 
-def test_the_clock_stands_still_while_it_is_paused() -> None:
-    clock = Deadline(10.0, time.time() - 4.0)
+class FakeTime:
+    """The two clocks of a machine, moved by a test."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.wall_s = 1e9
+        self.monotonic_s = 50.0
+        clocks = SimpleNamespace(time=lambda: self.wall_s, monotonic=lambda: self.monotonic_s)
+        monkeypatch.setattr("flows.budget.deadline.time", clocks)
+
+    def go_on(self, seconds: float) -> None:
+        self.wall_s += seconds
+        self.monotonic_s += seconds
+
+
+def test_the_clock_stands_still_while_it_is_paused(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = FakeTime(monkeypatch)
+    clock = Deadline(10.0, now.wall_s - 4.0)
     with clock.paused():
-        time.sleep(0.2)
-    assert 3.9 < clock.used_s < 4.15 and clock.left_s == pytest.approx(6.0, abs=0.15)
+        now.go_on(0.25)
+    assert clock.used_s == pytest.approx(4.0) and clock.left_s == pytest.approx(6.0)
+    now.go_on(1.0)
+    assert clock.used_s == pytest.approx(5.0) and clock.left_s == pytest.approx(5.0)
 
 
 def test_a_corrected_wall_clock_does_not_change_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = Deadline(300.0, time.time() - 20.0)
-    now = time.time
-    for jump_s in (3600.0, -3600.0):
-        monkeypatch.setattr(time, "time", lambda jump_s=jump_s: now() + jump_s)
-        assert clock.left_s == pytest.approx(280.0, abs=5.0)
+    now = FakeTime(monkeypatch)
+    clock = Deadline(300.0, now.wall_s - 20.0)
+    for jump_s in (3600.0, -7200.0):
+        now.wall_s += jump_s
+        assert clock.left_s == pytest.approx(280.0)
 
 
 @pytest.mark.parametrize(("text", "value"), [("90", 90), ("90s", 90), ("1.5m", 90), ("2min", 120), ("1h", 3600)])

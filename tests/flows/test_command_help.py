@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import resource
 import shlex
 import subprocess
 import sys
-import time
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -67,11 +67,16 @@ def test_the_version_is_that_of_the_package() -> None:
 def test_the_help_answers_within_a_second() -> None:
     seconds = []
     for _ in range(3):
-        start = time.perf_counter()
+        start_s = cpu_seconds_of_children()
         done = subprocess.run(
             [sys.executable, "-m", "flows.cli.main", "--help"], cwd=ROOT, capture_output=True, check=True
         )
-        seconds.append(time.perf_counter() - start)
+        seconds.append(cpu_seconds_of_children() - start_s)
         assert b"Usage: " in done.stdout
-    # The fastest of three, as other tests may take the cores meanwhile.
+    # Not by the clock, as other tests take the cores meanwhile; the fastest of three, as they take the caches too.
     assert min(seconds) < 1.0
+
+
+def cpu_seconds_of_children() -> float:
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime

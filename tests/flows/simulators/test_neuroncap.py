@@ -78,6 +78,7 @@ def test_alive_and_start_time(service: RunningService, renderer: SceneRenderer) 
     assert ask(service, "GET", "/update_actors")[0] == 405 and ask(service, "GET", "/nothing")[0] == 404
 
 
+@pytest.mark.usefixtures("client")
 def test_images_are_the_renderers(service: RunningService, renderer: SceneRenderer) -> None:
     message = image_message(renderer, 8)
     pose = np.array(message["pose"])

@@ -25,6 +25,7 @@ from genre_tasks.scene.novel_poses import place_novel_views
 from genre_tasks.scene_edits.chunk_scene import ChunkScene
 from genre_tasks.scene_edits.edits import EditList, Move, Remove
 from storage.codecs.png import to_pixels
+from tests.waiting import wait_until
 
 Image = np.ndarray[Any, np.dtype[np.uint8]]
 
@@ -232,8 +233,7 @@ def test_who_would_wait_too_long_is_refused() -> None:
     for thread in threads:
         thread.start()
     assert entered.wait(30)
-    while queue.length < 2:
-        pass
+    wait_until(lambda: queue.length == 2, "the second request does not wait")
     with pytest.raises(ResourceError, match="busy: 1 requests wait, and 1 may"), queue.turn():
         pass
     leave.set()

@@ -21,6 +21,7 @@ from storage.objects.object_store import ObjectStore
 from tests.contracts.store_suite import KEY, address
 from tests.storage.artifact_values import COLORS, assert_same, make
 from tests.storage.objects.network_proxy import SOUND, Fault, FaultyProxy
+from tests.waiting import wait_until
 
 LEASE = f"{LEASES_FOLDER}/{KEY}.json"
 _MIB = 1 << 20
@@ -106,7 +107,7 @@ def test_a_store_that_is_away_for_a_while_loses_nothing(store: ObjectStore, prox
 def test_a_lease_outlasts_a_store_that_is_away(
     store: ObjectStore, proxy: FaultyProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("GENRE_LEASE_SECONDS", "2")
+    monkeypatch.setenv("GENRE_LEASE_SECONDS", "4")
     order: list[str] = []
     waiting = threading.Event()
 
@@ -119,9 +120,9 @@ def test_a_lease_outlasts_a_store_that_is_away(
         waiter.start()
         assert waiting.wait(30)
         # Longer than the lease: its holder cannot renew it, and is not dead.
-        end_s = time.monotonic() + 3.5
+        end_s = time.monotonic() + 5.5
         proxy.choose = lambda method, path: Fault(refuses=True) if time.monotonic() < end_s else SOUND
-        time.sleep(5.0)
+        time.sleep(7.0)
         order.append("holder")
     waiter.join()
     assert order == ["holder", "waiter"]
@@ -130,11 +131,10 @@ def test_a_lease_outlasts_a_store_that_is_away(
 def test_a_renewal_whose_answer_is_lost_keeps_the_lease(
     store: ObjectStore, proxy: FaultyProxy, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setenv("GENRE_LEASE_SECONDS", "1.5")
+    monkeypatch.setenv("GENRE_LEASE_SECONDS", "4.5")
     with store.lease(address()):
         proxy.choose = lambda method, path: Fault(loses_answer=True) if method == "PUT" else SOUND
-        while "could not be renewed" not in caplog.text:
-            time.sleep(0.05)
+        wait_until(lambda: "could not be renewed" in caplog.text, "no renewal fails")
         proxy.choose = lambda method, path: SOUND
     assert "taken over" not in caplog.text
     assert list(store._bucket.list(LEASES_FOLDER)) == []
