@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +14,12 @@ import torch
 from torch import Tensor
 
 from genre_tasks.config import GnetConfig, InitialConfig, LearningRates, LossConfig, OptimiserConfig
-from genre_tasks.effects.nonrigid_actors import add_rest_deformation, is_deformable, mask_deformable_actors
+from genre_tasks.effects.nonrigid_actors import (
+    DEFORMABLE_WORDS,
+    add_rest_deformation,
+    is_deformable,
+    mask_deformable_actors,
+)
 from genre_tasks.errors import ArtifactCorruptError, NonFiniteError
 from genre_tasks.optimiser.autograd_render import AutogradRender
 from genre_tasks.optimiser.auxiliary import AuxiliaryParameters
@@ -207,6 +214,17 @@ def test_a_gradient_that_is_not_finite_is_named(monkeypatch: pytest.MonkeyPatch)
             Objective(LossConfig(perceptual=0)),
             UnrollSettings(1, 1),
         )
+
+
+@pytest.mark.parametrize("word", DEFORMABLE_WORDS)
+def test_labels_of_people_deform(word: str) -> None:
+    assert is_deformable(word) and is_deformable(f"A {word.upper()}ist")
+
+
+def test_the_guide_has_the_words_of_people() -> None:
+    guide = (Path(__file__).resolve().parents[2] / "docs/guides/genre-layout.md").read_text()
+    (words,) = re.findall(r"`label` is free text\. With (.*) in it, the object may change its shape\.", guide)
+    assert tuple(re.findall(r"`(\w+)`", words)) == DEFORMABLE_WORDS
 
 
 def test_only_people_deform_and_at_the_frames_that_have_images() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import resource
 import shlex
 import subprocess
@@ -18,6 +19,7 @@ from typer.testing import CliRunner
 from flows.cli.main import app
 
 ROOT = Path(__file__).resolve().parents[2]
+UNRUN_COMMAND = re.compile(r"""^(?:docker compose exec \w+ |eval "\$\()?genre (.*?)(?:\)")?$""", flags=re.MULTILINE)
 
 
 def all_commands() -> Iterator[tuple[str, Any]]:
@@ -45,6 +47,25 @@ def test_every_example_in_the_help_parses(name: str) -> None:
         _, *words = shlex.split(example)
         assert " ".join(words).startswith(name)
         COMMANDS[name].make_context(name, words[len(name.split()) :])
+
+
+def unrun_examples() -> Iterator[Any]:
+    """The commands of the documents' ``text`` blocks, which need files or machines that the tests do not have."""
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
+        for block in re.findall(r"```text\n(.*?)```", page.read_text(), flags=re.DOTALL):
+            for line in UNRUN_COMMAND.findall(block):
+                yield pytest.param(line, id=f"{page.stem}: {line}")
+
+
+@pytest.mark.parametrize("line", list(unrun_examples()))
+def test_every_command_of_the_documents_that_is_not_run_parses(line: str) -> None:
+    words = shlex.split(line, comments=True)
+    name = " ".join(words[:2]) if " ".join(words[:2]) in COMMANDS else words[0]
+    COMMANDS[name].make_context(name, words[len(name.split()) :])
+
+
+def test_the_documents_have_commands_that_are_not_run() -> None:
+    assert len(list(unrun_examples())) >= 14
 
 
 @pytest.mark.parametrize("name", COMMANDS)

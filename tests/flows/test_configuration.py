@@ -90,6 +90,11 @@ def test_seeds_do_not_overlap() -> None:
     seeds = yaml.safe_load((ROOT / "configs/seeds.yaml").read_text())
     ranges = [seeds["training"], seeds["validation"], [seeds["demo"]] * 2, seeds["claims"]]
     assert all(a[1] < b[0] for a, b in itertools.pairwise(ranges))
+    guide = (ROOT / "docs/guides/training.md").read_text()
+    rows = re.findall(r"^\| (\d+)(?:–(\d+))? \| (.*) \|$", guide, flags=re.MULTILINE)
+    assert [[int(first), int(last or first)] for first, last, _ in rows] == ranges
+    uses = ["training", "validation and tuning", "the demo", "published numbers only"]
+    assert [use for _, _, use in rows] == uses
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from genre_tasks.config import FilePlacement, InitialConfig, PipelineConfig
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.exchange.one_cloud import make_resting_scene
 from genre_tasks.exchange.ply import PLY
+from genre_tasks.exchange.registry import load_format
 from genre_tasks.exchange.types import SplatCloud
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.types import Lens
@@ -34,6 +35,7 @@ from genre_tasks.scene.transforms import invert_se3
 from genre_tasks.stages.ingest import ingest
 from genre_tasks.stages.initial import initial
 from genre_tasks.stages.scene_file import read_placed_scene
+from tests.exchange.splat_clouds import make_driving_scene
 from tests.faults.small_run import LOG, SETTINGS
 from tests.flows.street_scene_files import SIZE, in_source_axes, make_resting_street, write_street
 
@@ -242,6 +244,12 @@ def test_files_without_gaussians_are_refused(tmp_path: Path) -> None:
         read_placed_scene(str(tmp_path / "empty.ply"), FilePlacement(), np.eye(4))
     with pytest.raises(InputError, match="no such file"):
         read_placed_scene(str(tmp_path / "none.ply"), FilePlacement(), np.eye(4))
+
+
+def test_files_with_moving_objects_are_refused(tmp_path: Path) -> None:
+    load_format("glb").write(tmp_path / "scene.glb", make_driving_scene())
+    with pytest.raises(InputError, match="moving parts"):
+        read_placed_scene(str(tmp_path / "scene.glb"), FilePlacement(), np.eye(4))
 
 
 def test_far_and_large_gaussians_are_distant(colourful: SplatCloud, tmp_path: Path, street: tuple) -> None:

@@ -85,6 +85,19 @@ def test_a_detector_without_road_users_is_refused(monkeypatch: pytest.MonkeyPatc
         open_actor_detector("x.onnx")
 
 
+def test_finds_count_from_the_score_of_the_guide(monkeypatch: pytest.MonkeyPatch) -> None:
+    scores: list[float] = []
+
+    def open_stub(name: str, min_score: float) -> Stub:
+        scores.append(min_score)
+        return Stub([])
+
+    monkeypatch.setattr(detected_actors, "open_detector", open_stub)
+    open_actor_detector("x.onnx")
+    guide = (Path(__file__).resolve().parents[2] / "docs/guides/reliable-range.md").read_text()
+    assert f"Its finds of a score of at least {scores[0]} count." in guide
+
+
 @pytest.mark.parametrize("name", ["FastestDet.onnx", "yolox_nano.onnx", "yolov8n-seg_int8.tflite"])
 def test_a_real_detector_finds_the_cars_of_recorded_images(name: str) -> None:
     if not (REAL / "detectors" / name).is_file():

@@ -96,6 +96,15 @@ def test_who_leaves_the_range_is_stopped(free_road: GenreDrivingEnv) -> None:
     assert reward == pytest.approx(after["progress_m"] - 0.1 * abs(after["lateral_m"]), abs=1e-3)
 
 
+@pytest.mark.parametrize("lateral", [0.0, 4.0])
+def test_the_lateral_distance_counts_by_its_weight(served: tuple[str, str], lateral: float) -> None:
+    weighted = GenreDrivingEnv(*served, reliable_m=3.0, weights=RewardWeights(lateral=lateral))
+    weighted.reset(options={"index": 0, "lateral_m": 1.5})
+    _, reward, _, _, after = weighted.step(STRAIGHT_ON)
+    assert abs(after["lateral_m"]) > 1.0
+    assert reward == pytest.approx(after["progress_m"] - 0.1 * lateral * abs(after["lateral_m"]), abs=1e-3)
+
+
 def test_a_collision_ends_the_drive(served: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     env = GenreDrivingEnv(*served, reliable_m=3.0, weights=RewardWeights(collision=7.0))
     _, info = env.reset(options={"index": 0})

@@ -11,15 +11,18 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
 from flows.cli.main import app
 from flows.simulators import protocols
+from flows.simulators.http_thread import _FURTHER_CONNECTIONS, HttpThread
 from flows.simulators.image_request import RenderLimits
 from flows.simulators.neuroncap import start_neuroncap
 from flows.simulators.protocols import ProtocolEntry, load_protocol
@@ -28,6 +31,7 @@ from flows.simulators.service import ServiceRequest, bind_socket, is_loopback
 from flows.simulators.service_metrics import PrometheusMetrics, SilentMetrics
 from genre_tasks.errors import ConfigError, GenreError, InputError
 from tests.flows.command_line import GENRE, environment
+from tests.waiting import wait_until
 
 
 def read(address: str) -> str:
@@ -106,6 +110,35 @@ def test_as_many_requests_wait_as_the_queue_takes(served: tuple[str, str], monke
         assert (status, headers["Retry-After"]) == (503, "1")
         assert "70 requests wait, and 70 may" in json.loads(body)["detail"]
         assert {answer.result()[0] for answer in asked} == {200}
+    finally:
+        service.close()
+
+
+def test_far_more_connections_than_may_wait_are_refused_unread() -> None:
+    asked: list[str] = []
+
+    async def answer(scope: dict[str, Any], receive: Any, send: Callable[[dict[str, Any]], Awaitable[None]]) -> None:
+        asked.append(scope["path"])
+        await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"0")]})
+        await send({"type": "http.response.body"})
+
+    def ask(path: str) -> int:
+        with socket.create_connection(address, timeout=30) as client:
+            client.sendall(f"GET {path} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
+            return int(client.recv(100).split()[1])
+
+    service = HttpThread(answer, "127.0.0.1", 0, max_waiting=0)
+    address = "127.0.0.1", int(service.address.rpartition(":")[2])
+    try:
+        with ExitStack() as idle:
+            for _ in range(_FURTHER_CONNECTIONS - 2):
+                idle.enter_context(socket.create_connection(address, timeout=30))
+            assert ask("/last") == 200
+            for _ in range(2):
+                idle.enter_context(socket.create_connection(address, timeout=30))
+            assert ask("/refused") == 503
+        wait_until(lambda: ask("/later") == 200, "closed connections still count")
+        assert asked == ["/last", "/later"]
     finally:
         service.close()
 

@@ -18,6 +18,7 @@ import pytest
 from typer.testing import CliRunner
 
 from flows.cli.main import app
+from flows.cli.view import PAGE_SPLATS
 from flows.viewer.client_session import ClientSession, _describe_chunk
 from flows.viewer.live_viewer import LiveViewer
 from flows.viewer.local_server import find_free_port, start_server, stop_server
@@ -205,6 +206,25 @@ def test_a_mistyped_option_is_refused_at_once(words: list[str], problem: str) ->
     done = CliRunner().invoke(app, ["view", "4b1c", *words])
     assert isinstance(done.exception, ConfigError | InputError)
     assert problem in str(done.exception)
+
+
+@pytest.mark.parametrize(("words", "expected"), [([], PAGE_SPLATS), (["--max-splats", "300"], 300)])
+def test_a_page_has_as_many_gaussians_as_the_guide_says(
+    words: list[str], expected: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[int | None] = []
+
+    def stop(store: str, run: str, max_splats: int | None) -> None:
+        asked.append(max_splats)
+        raise InputError("stopped", remedy="None.")
+
+    (tmp_path / "store").mkdir()
+    monkeypatch.setattr("flows.viewer.viewed_chunks.ViewedRun", stop)
+    page = ["--html", str(tmp_path / "scene.html")]
+    done = CliRunner().invoke(app, ["view", "4b1c", "--store", str(tmp_path / "store"), *page, *words])
+    assert isinstance(done.exception, InputError) and asked == [expected]
+    guide = (Path(__file__).resolve().parents[3] / "docs/guides/viewer.md").read_text()
+    assert f"A page has at most {PAGE_SPLATS:,} Gaussians" in guide
 
 
 @pytest.fixture(scope="module")
