@@ -203,6 +203,7 @@ def test_home_folders_are_found_where_no_shell_does_it(tmp_path: Path, monkeypat
     for uri in ("pandaset:~nobody-of-this-name/002", "pandaset:~nobody-of-this-name/*"):
         with pytest.raises(InputError, match="no home folder"):
             expand_logs([uri])
+        with pytest.raises(InputError, match="no home folder"):
             open_log(uri)
     for name in ("logs/#2 %2F [x]", "logs/001", "logs/.hidden"):
         (tmp_path / name).mkdir(parents=True)
