@@ -17,6 +17,8 @@ from storage.histograms import draw_histogram
 from storage.store import Artifact, Store
 
 _PIXELS_PER_IMAGE = 4096
+# Simulations write masks of 8 and 16 bits next to colours; versions of Pillow call 16 bits "I;16" or "I".
+_PICTURE_MODES = ("L", "I", "I;16", "RGB", "RGBA")
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ def summarise_files(store: Store, artifact: Artifact) -> list[TableSummary]:
         artifact: the artifact, which is verified first.
 
     Returns:
-        A summary for each Parquet table, for each folder of EXR images (a row a channel) and for all PNG pictures.
+        A summary for each Parquet table, for each folder of EXR images (a row a channel) and for each of PNG pictures.
 
     Raises:
         ArtifactCorruptError: a file is missing, unexpected or altered.
@@ -100,8 +102,10 @@ def summarise_files(store: Store, artifact: Artifact) -> list[TableSummary]:
     for folder in sorted({p.parent for p in files if p.suffix == ".exr"}):
         images = [p for p in files if p.parent == folder and p.suffix == ".exr"]
         summaries.append(_summarise_exr(artifact.path, images))
-    pictures = [p for p in files if p.suffix == ".png"]
-    return summaries + ([_summarise_png(artifact.path, pictures)] if pictures else [])
+    for folder in sorted({p.parent for p in files if p.suffix == ".png"}):
+        pictures = [p for p in files if p.parent == folder and p.suffix == ".png"]
+        summaries.append(_summarise_png(artifact.path, pictures))
+    return summaries
 
 
 def _summarise_table(folder: Path, path: Path) -> TableSummary:
@@ -188,11 +192,11 @@ def _read_channels(path: Path) -> Iterator[tuple[str, NDArray[Any]]]:
 
 
 def _summarise_png(folder: Path, paths: list[Path]) -> TableSummary:
-    from storage.codecs.png import read_png
+    from storage.codecs.png import decode_png
 
     rows = []
     for path in paths:
-        image = read_png(path)
+        image = decode_png(path, path, "The picture", _PICTURE_MODES)
         rows.append(
             {
                 "picture": path.stem,

@@ -6,7 +6,7 @@ import io
 import warnings
 from collections.abc import Collection
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,7 +78,7 @@ def read_png(path: Path) -> NDArray[np.uint8]:
 
 def decode_png(
     source: Path | BinaryIO, file: Path, name: str, modes: Collection[str] = ("L", "RGB", "RGBA")
-) -> NDArray[np.uint8]:
+) -> NDArray[Any]:
     """Decodes a picture of at most ``MAX_PIXELS``.
 
     Args:
@@ -88,7 +88,7 @@ def decode_png(
         modes: Pillow's names of the channels that it may have.
 
     Returns:
-        [H, W] or [H, W, C] uint8.
+        [H, W] or [H, W, C] uint8, or wider integers where ``modes`` has "I" or "I;16".
 
     Raises:
         ArtifactCorruptError: it is no such PNG, is too large, or does not decode.

@@ -19,7 +19,9 @@ DOCS_BYTES = 4_000_000
 SENTENCE_WORDS = 30
 # A measured number has a decimal point, a unit or a percent sign. Versions, sizes and settings are no measurements.
 MEASURED = re.compile(r"\d+\.\d+|\d+ ?%|\b\d+ (?:dB|ms|times)\b")
-NO_MEASUREMENT = re.compile(r"[Vv]ersion \d+\.\d+|Python \d+\.\d+|\d+\.\d+\.\d+|Apache-2\.0|0\.1|0\.2|prefect 3\.8")
+NO_MEASUREMENT = re.compile(
+    r"[Vv]ersion \d+\.\d+|Python \d+\.\d+|\d+\.\d+\.\d+|Apache-2\.0|(?<![\d.])0\.[12](?!\d)|prefect 3\.8"
+)
 
 
 @pytest.fixture(scope="module")

@@ -20,6 +20,7 @@ from genre_tasks.errors import (
 )
 from storage.local import LocalStore
 from tests.contracts.store_suite import address
+from tests.ordinary_user import as_ordinary_user
 from tests.storage.artifact_values import MAKERS, make
 
 ROOT = Path(__file__).parents[2]
@@ -138,14 +139,13 @@ def test_a_file_where_the_store_should_be(tmp_path: Path) -> None:
         store.commit(address(), "evaluation", make("evaluation"))
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write everywhere")
 def test_a_folder_without_permission(tmp_path: Path) -> None:
-    tmp_path.chmod(0o555)
-    try:
+    value = make("evaluation")
+    LocalStore(tmp_path / "store").commit(address(), "evaluation", value)
+    with as_ordinary_user() as folder:
+        folder.chmod(0o555)
         with pytest.raises(InputError, match="Not permitted"):
-            LocalStore(tmp_path / "store").commit(address(), "evaluation", make("evaluation"))
-    finally:
-        tmp_path.chmod(0o755)
+            LocalStore(folder / "store").commit(address(), "evaluation", value)
 
 
 def test_a_real_limit_on_the_size_of_files(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,15 @@ from typer.testing import CliRunner
 
 from flows.cli.main import app
 from flows.configuration import load_configuration
+from flows.cost_sweep import cell as cell_module
 from flows.cost_sweep import knobs
 from flows.cost_sweep.cell import Cell, Sweep, list_cells, measure_cold_start, predict_cells, run_cell
 from flows.cost_sweep.flow import SweepRequest, write_results
 from flows.cost_sweep.knobs import PRESET_ITSELF, Setting, list_settings
 from flows.cost_sweep.summary import KERNEL_3M, PERCEPTUAL_3M, novel_view_measure, pareto_front, summarise_settings
+from flows.experiments import warm_up
 from flows.experiments.log_chunks import LogChunk
+from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ConfigError
 from tests.faults.small_run import LOG, SETTINGS, Stopped, stopping
 
@@ -208,8 +212,29 @@ def test_the_command_lists_what_it_would_run_and_refuses_what_it_does_not_know(t
         CliRunner().invoke(app, ["cost", LOG, "--seeds", "one"], catch_exceptions=False)
 
 
-def test_first_calls_are_told_apart_from_the_stages_own_time() -> None:
-    # Distances between sets of images are no stage's own time.
-    cold = measure_cold_start(Sweep("demo", (*SWEEP_SETTINGS, "evaluate.distributions=false"), "never-used"))
-    assert list(cold) == ["ingest", "effects", "initial", "gnet", "novel_views", "fnet", "enet"]
-    assert all(0 <= s < 60 for s in cold.values()) and not Path("never-used").exists()
+@pytest.mark.parametrize(("first_s", "second_s", "start_s"), [(3.0, 1.0, 2.0), (1.0, 3.0, 0.0)])
+def test_first_calls_are_told_apart_from_the_stages_own_time(
+    monkeypatch: pytest.MonkeyPatch, first_s: float, second_s: float, start_s: float
+) -> None:
+    seconds = [first_s, second_s]
+    runs: list[tuple[str, ...]] = []
+
+    def measure(config: PipelineConfig, names: Sequence[str]) -> dict[str, float]:
+        runs.append(tuple(names))
+        return dict.fromkeys(names, seconds[len(runs) - 1])
+
+    monkeypatch.setattr(cell_module, "run_on_tiny_log", measure)
+    cold = measure_cold_start(Sweep("demo", SWEEP_SETTINGS, "never-used"))
+    stages = ["ingest", "effects", "initial", "gnet", "novel_views", "fnet", "enet"]
+    # The evaluation is run as well, but distances between sets of images are no stage's own time.
+    assert runs == [(*stages, "evaluate/enet")] * 2
+    assert cold == dict.fromkeys(stages, start_s)
+    assert not Path("never-used").exists()
+
+
+def test_stages_of_the_tiny_log_are_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    # The images of this one are smaller, and so is the time that drawing them takes.
+    monkeypatch.setattr(warm_up, "TINY_LOG", LOG)
+    stages = ["ingest", "effects", "initial"]
+    seconds = warm_up.run_on_tiny_log(load_configuration("demo", settings=SWEEP_SETTINGS), stages)
+    assert list(seconds) == stages and all(0 < value < 60 for value in seconds.values())

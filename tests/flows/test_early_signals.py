@@ -1,4 +1,4 @@
-"""Ctrl-C at moments that a random test seldom meets: while Python imports, and while a line is written."""
+"""Signals at moments that a random test seldom meets: while Python imports, and while a line is written."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ import pytest
 
 from tests.flows.command_line import environment
 
+NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
 
 def run_script(script: str, folder: Path, *words: str) -> subprocess.Popen[str]:
-    """A script in a process of its own that Ctrl-C stops."""
+    """A script in a process of its own that signals stop."""
     return subprocess.Popen(
         [sys.executable, "-c", script, *words],
         cwd=folder,
@@ -22,22 +24,23 @@ def run_script(script: str, folder: Path, *words: str) -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        # A shell that runs the tests in the background has them ignore Ctrl-C.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        # A shell that runs the tests in the background has them ignore Ctrl-C, and nohup the end of the session.
+        preexec_fn=lambda: [signal.signal(number, signal.SIG_DFL) for number in NUMBERS],
     )
 
 
 @pytest.mark.parametrize("moment_s", [0.1, 0.2, 0.4])
-def test_ctrl_c_while_python_imports(tmp_path: Path, moment_s: float) -> None:
+@pytest.mark.parametrize("number", NUMBERS, ids=lambda number: number.name)
+def test_a_signal_while_python_imports(tmp_path: Path, number: signal.Signals, moment_s: float) -> None:
     """Report: none found; case 9 of the list of odd logs."""
     # Ready once the handlers are there: before, Python itself starts.
     script = "from flows.cli.entry import *; end_on_signals(); sys.stderr.write('ready\\n'); main()"
     process = run_script(script, tmp_path, "doctor")
     assert process.stderr is not None and process.stderr.readline() == "ready\n"
     time.sleep(moment_s / 4)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, error = process.communicate(timeout=30)
-    assert process.returncode == 130 and error == "stopped\n"
+    assert process.returncode == 128 + number and error == "stopped\n"
 
 
 WRITING = """

@@ -160,16 +160,17 @@ def test_a_format_with_axes_of_its_own_is_refused(inputs: EnhancementInputs, tmp
 def test_errors_of_the_command(folder: Path, tmp_path: Path) -> None:
     scene = str(folder / "scene.ply")
     runner = CliRunner()
-    for words in (
-        [scene, "--cameras", str(folder)],
-        [scene, "--cameras", str(tmp_path), "--scale", "1"],
-        [str(tmp_path / "none.ply"), "--cameras", str(folder), "--scale", "1"],
-        [scene, "--cameras", str(folder), "--images", str(tmp_path), "--scale", "1"],
-        [scene, "--cameras", str(folder), "--scale", "0"],
-        [scene, "--cameras", str(folder), "--up", "up", "--scale", "1"],
-    ):
+    for reason, words in {
+        "how long a metre is": [scene, "--cameras", str(folder)],
+        "no camera poses": [scene, "--cameras", str(tmp_path), "--scale", "1"],
+        "no such file": [str(tmp_path / "none.ply"), "--cameras", str(folder), "--scale", "1"],
+        "none of the 8 images": [scene, "--cameras", str(folder), "--images", str(tmp_path), "--scale", "1"],
+        "'0' is no scale": [scene, "--cameras", str(folder), "--scale", "0"],
+        "'up' is no direction": [scene, "--cameras", str(folder), "--up", "up", "--scale", "1"],
+    }.items():
         done = runner.invoke(app, ["enhance", *words, "--store", str(tmp_path / "store")])
         assert isinstance(done.exception, InputError | ConfigError), words
+        assert reason in done.exception.problem, words
 
 
 def test_a_scene_elsewhere_is_an_error(inputs: EnhancementInputs) -> None:

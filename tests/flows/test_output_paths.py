@@ -15,6 +15,7 @@ from flows.pipeline.log_cache import expand_logs
 from genre_tasks.atomic_path import replace_folder
 from genre_tasks.errors import ConfigError, GenreError, InputError
 from genre_tasks.logs.registry import open_log
+from tests.ordinary_user import as_ordinary_user
 
 STREET = "synthetic:street?seed=900&frames=8"
 
@@ -114,15 +115,16 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
         check_output_folder(Path("/proc/out"), "--out")
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write everywhere")
 def test_permissions_are_respected(tmp_path: Path) -> None:
     """Report: jliljebl/flowblade#832."""
-    (tmp_path / "x.png").touch(mode=0o444)
-    with pytest.raises(InputError, match="write-protected"):
-        check_output_file(tmp_path / "x.png", "--out")
-    (tmp_path / "closed").mkdir(mode=0o555)
-    with pytest.raises(InputError, match="cannot be written"):
-        check_output_file(tmp_path / "closed" / "new" / "x.png", "--out")
+    check_output_file(tmp_path / "new" / "x.png", "--out")
+    with as_ordinary_user() as folder:
+        (folder / "x.png").touch(mode=0o444)
+        with pytest.raises(InputError, match="write-protected"):
+            check_output_file(folder / "x.png", "--out")
+        (folder / "closed").mkdir(mode=0o555)
+        with pytest.raises(InputError, match="cannot be written"):
+            check_output_file(folder / "closed" / "new" / "x.png", "--out")
 
 
 @pytest.mark.parametrize(
@@ -203,6 +205,7 @@ def test_home_folders_are_found_where_no_shell_does_it(tmp_path: Path, monkeypat
     for uri in ("pandaset:~nobody-of-this-name/002", "pandaset:~nobody-of-this-name/*"):
         with pytest.raises(InputError, match="no home folder"):
             expand_logs([uri])
+        with pytest.raises(InputError, match="no home folder"):
             open_log(uri)
     for name in ("logs/#2 %2F [x]", "logs/001", "logs/.hidden"):
         (tmp_path / name).mkdir(parents=True)

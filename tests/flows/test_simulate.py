@@ -221,10 +221,20 @@ def test_what_a_removed_actor_hid_is_in_the_output(recorded: SimulationRequest, 
     record = simulate_run(replace(recorded, out=out, edits=edits, cameras=("front_camera",), chunks=(0,)))
     masks = [imageio.imread(out / "filled" / "front_camera" / f"{index:06d}.png") for index in range(6)]
     assert all(mask.shape == (36, 64) and set(np.unique(mask)) <= {0, 255} for mask in masks)
+    assert all(mask.any() and not mask.all() for mask in masks)
+    shown = CliRunner().invoke(app, ["show", str(out)], catch_exceptions=False)
+    assert shown.exit_code == 0 and "filled/front_camera/*.png: 6 pictures" in shown.output
     plain = simulate_run(replace(recorded, out=tmp_path / "plain", cameras=("front_camera",), chunks=(0,)))
     assert plain["key"] != record["key"]
     with pytest.raises(InputError, match="no actor"):
         simulate_run(replace(recorded, out=tmp_path / "none", edits=parse_edit_options(remove=["car-99"])))
+
+
+def test_a_simulation_of_masks_is_shown(recorded: SimulationRequest, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    simulate_run(replace(recorded, out=out, sensors=("masks",), cameras=("front_camera",), chunks=(0,)))
+    shown = CliRunner().invoke(app, ["show", str(out)], catch_exceptions=False)
+    assert shown.exit_code == 0 and "front_camera/*.png: 6 pictures" in shown.output
 
 
 def find_seen_actor(recorded: SimulationRequest) -> str:

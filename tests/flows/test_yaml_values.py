@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import codecs
 import math
-import os
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import yaml
 
 from flows.yaml_values import MAX_BYTES, YamlError, parse_yaml, read_yaml_mapping
 from genre_tasks.errors import ConfigError
+from tests.ordinary_user import as_ordinary_user
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -135,14 +135,15 @@ def test_a_folder_a_device_and_a_missing_file_are_named(tmp_path: Path) -> None:
         assert str(path) in str(caught.value)
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
 def test_an_unreadable_file_is_named(tmp_path: Path) -> None:
     """Report: none found; case 15 of the list of odd logs."""
-    path = tmp_path / "c.yaml"
-    path.write_text("a: 1")
-    path.chmod(0)
-    with pytest.raises(ConfigError, match="Permission denied"):
-        read(path)
+    (tmp_path / "c.yaml").write_text("a: 1")
+    assert read(tmp_path / "c.yaml") == {"a": 1}
+    with as_ordinary_user(tmp_path) as folder:
+        assert read(folder / "c.yaml") == {"a": 1}
+        (folder / "c.yaml").chmod(0)
+        with pytest.raises(ConfigError, match="Permission denied"):
+            read(folder / "c.yaml")
 
 
 @pytest.mark.parametrize("data", [b"", b"# nothing\n", b"\n\n", b"---\n"])

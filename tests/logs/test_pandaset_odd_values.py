@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import json
-import os
 import pickle
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +16,7 @@ from PIL import Image
 from genre_tasks.errors import InputError
 from genre_tasks.logs.pandaset.layout import parse_pose
 from tests.logs.pandaset_folder import FRAMES, edit_json, findings, opened
+from tests.ordinary_user import as_ordinary_user
 
 START = 1557179160.5
 ISO = [f"2019-05-06T21:46:0{k}.5" for k in range(FRAMES)]
@@ -127,11 +127,12 @@ class TestUnreadable:
         found = findings(log)["unreadable_cuboids"]
         assert found.frames == (1,) and "Git LFS pointer" in found.message
 
-    @pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may read everything")
     def test_permissions(self, folder: Path) -> None:
-        (folder / "camera/left/01.png").chmod(0)
-        with pytest.raises(InputError, match="Permission denied"):
-            opened(folder).image_bytes("left", 1)
+        assert opened(folder).image_bytes("left", 1)
+        with as_ordinary_user(folder) as copy:
+            (copy / "camera/left/01.png").chmod(0)
+            with pytest.raises(InputError, match="Permission denied"):
+                opened(copy).image_bytes("left", 1)
 
 
 ODD_VALUES = [None, True, "text", "", [], {}, [[1.0]], {"a": 1}, 10**400]

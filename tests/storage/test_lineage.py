@@ -61,7 +61,9 @@ def test_description_of_gaussians(store: LocalStore) -> None:
 
 @pytest.mark.parametrize("kind", MAKERS)
 def test_every_kind_can_be_described(store: LocalStore, kind: str) -> None:
-    for table in summarise_files(store, store.commit(address(), kind, make(kind))):
+    tables = summarise_files(store, store.commit(address(), kind, make(kind)))
+    assert tables
+    for table in tables:
         assert table.rows and len({tuple(r) for r in table.rows}) == 1, table.name
 
 

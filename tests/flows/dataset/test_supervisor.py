@@ -212,7 +212,9 @@ def test_an_outage_of_the_server_does_not_make_runs_stale() -> None:
 
 
 def test_the_environment_changes_when_a_run_counts_as_dead() -> None:
-    assert read_limits(8, 3, {}) == SupervisionLimits(in_flight=8, attempts=3)
+    limits = read_limits(8, 3, {})
+    assert (limits.in_flight, limits.attempts) == (8, 3)
+    assert (limits.silent_s, limits.pending_s) == (90, 180)
     changed = read_limits(4, 2, {"GENRE_PENDING_SECONDS": "600", "GENRE_SILENT_SECONDS": "75.5"})
     assert changed == SupervisionLimits(in_flight=4, attempts=2, pending_s=600.0, silent_s=75.5)
 

@@ -79,13 +79,13 @@ REFUSED = {
     "endless fisheye": (partial(choose_fisheye, focal_px=inf), "INVALID_ARGUMENT", "scales"),
     "no polynomial": (choose_ftheta, "INVALID_ARGUMENT", "no polynomial"),
     "falling": (lambda request: choose_ftheta(request, 0.0, -30.0), "INVALID_ARGUMENT", "does not rise"),
-    "too sharp": (lambda request: choose_ftheta(request, 0.0, 1e5), "INVALID_ARGUMENT", ""),
+    "too sharp": (lambda request: choose_ftheta(request, 0.0, 1e5), "INVALID_ARGUMENT", "focal length fx"),
     "windshield": (add_windshield, "UNIMPLEMENTED", "windshield"),
     "rational": (change(f"{PINHOLE}.radial_coeffs", [0, 0, 0, 0.1]), "UNIMPLEMENTED", "k4"),
     "thin prism": (change(f"{PINHOLE}.thin_prism_coeffs", [0.1]), "UNIMPLEMENTED", "thin prism"),
     "seven coefficients": (change(f"{PINHOLE}.radial_coeffs", [0.0] * 7), "INVALID_ARGUMENT", "at most 6"),
     "infinite coefficient": (change(f"{PINHOLE}.tangential_coeffs", [inf]), "INVALID_ARGUMENT", "tangential"),
-    "folding lens": (change(f"{PINHOLE}.radial_coeffs", [-5000.0]), "INVALID_ARGUMENT", ""),
+    "folding lens": (change(f"{PINHOLE}.radial_coeffs", [-5000.0]), "INVALID_ARGUMENT", "folds back"),
     "no focal length": (change(f"{PINHOLE}.focal_length_x", 0.0), "INVALID_ARGUMENT", "focal"),
     "negative focal length": (change(f"{PINHOLE}.focal_length_y", -5.0), "INVALID_ARGUMENT", "focal"),
     "endless focal length": (change(f"{PINHOLE}.focal_length_y", inf), "INVALID_ARGUMENT", "focal"),
@@ -99,8 +99,8 @@ REFUSED = {
     "far away": (change("sensor_pose.end_pose.vec.y", 1e20), "INVALID_ARGUMENT", "origin"),
     "20 km away": (change("sensor_pose.start_pose.vec.y", 2e4), "INVALID_ARGUMENT", "within one image"),
     "ends before": (change("frame_end_us", 1), "INVALID_ARGUMENT", "before it starts"),
-    "another day": (change("frame_start_us", 1), "INVALID_ARGUMENT", ""),
-    "far future": (change("frame_end_us", 2**64 - 1), "INVALID_ARGUMENT", ""),
+    "another day": (change("frame_start_us", 1), "INVALID_ARGUMENT", "outside of the run"),
+    "far future": (change("frame_end_us", 2**64 - 1), "INVALID_ARGUMENT", "outside of the run"),
     "from below": (shut_from_below, "UNIMPLEMENTED", "shutter"),
     "no format": (clear("image_format"), "INVALID_ARGUMENT", "image format"),
     "film": (change("image_format", sensorsim_pb2.AV1), "UNIMPLEMENTED", "image format"),
@@ -116,6 +116,7 @@ REFUSED = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_a_request_without_an_image_is_refused(client: WireClient, case: str) -> None:
     apply, code, words = REFUSED[case]
+    assert words
     request = client.image_request()
     apply(request)
     found, details = client.status("render_rgb", request.SerializeToString())
@@ -132,7 +133,8 @@ def test_a_batch_of_too_many_images_is_refused(client: WireClient) -> None:
     batch = sensorsim_pb2.BatchRGBRenderRequest()
     for _ in range(1000):
         batch.items.add(camera_name="front")
-    assert client.status("batch_render_rgb", batch.SerializeToString())[0] == "INVALID_ARGUMENT"
+    code, details = client.status("batch_render_rgb", batch.SerializeToString())
+    assert (code, "too many for one call" in details) == ("INVALID_ARGUMENT", True), details
 
 
 def test_lidar_and_all_sensors_at_once_are_not_there(client: WireClient) -> None:
