@@ -33,8 +33,9 @@ def write_checkpoint(path: Path, tensors: Mapping[str, Tensor], description: Map
 
     # Clones, because safetensors refuses tensors that share memory, as the moments of a new state do.
     copies = {name: value.detach().cpu().clone().contiguous() for name, value in tensors.items()}
-    text = json.dumps(description)
-    write_atomically(path, save(copies, {_DESCRIPTION: text, _DIGEST: _digest(copies, text)}))
+    # Within the description: safetensors writes several entries in an order that differs from time to time.
+    text = json.dumps(dict(description) | {_DIGEST: _digest(copies, json.dumps(description))})
+    write_atomically(path, save(copies, {_DESCRIPTION: text}))
 
 
 def read_description(path: Path, remedy: str, stage: str | None = None) -> dict[str, Any]:
@@ -51,7 +52,7 @@ def read_description(path: Path, remedy: str, stage: str | None = None) -> dict[
     Raises:
         InputError: the file is no checkpoint.
     """
-    return _parse(_read(path, remedy, stage)[0], path, remedy, stage)
+    return _parse(_read(path, remedy, stage)[0], path, remedy, stage)[0]
 
 
 def read_checkpoint(path: Path, remedy: str, stage: str | None = None) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -69,9 +70,9 @@ def read_checkpoint(path: Path, remedy: str, stage: str | None = None) -> tuple[
         InputError: the file is no checkpoint, or its bytes are not those that were written.
     """
     metadata, tensors = _read(path, remedy, stage, with_tensors=True)
-    description = _parse(metadata, path, remedy, stage)
+    description, digest = _parse(metadata, path, remedy, stage)
     # Older checkpoints have no digest.
-    if _DIGEST in metadata and metadata[_DIGEST] != _digest(tensors, metadata[_DESCRIPTION]):
+    if digest is not None and digest != _digest(tensors, json.dumps(description)):
         problem = "the checkpoint's bytes have changed since it was written"
         raise InputError(problem, remedy=remedy, file=path, stage=stage)
     return description, tensors
@@ -90,7 +91,10 @@ def _read(
         raise InputError(f"the checkpoint cannot be read: {error}", remedy=remedy, file=path, stage=stage) from error
 
 
-def _parse(metadata: Mapping[str, str], path: Path, remedy: str, stage: str | None) -> dict[str, Any]:
+def _parse(
+    metadata: Mapping[str, str], path: Path, remedy: str, stage: str | None
+) -> tuple[dict[str, Any], str | None]:
+    """Gives the description, and the digest that was written with it."""
     try:
         description = json.loads(metadata[_DESCRIPTION])
     except (KeyError, ValueError, RecursionError) as error:
@@ -98,7 +102,8 @@ def _parse(metadata: Mapping[str, str], path: Path, remedy: str, stage: str | No
     if not isinstance(description, dict):
         problem = "the checkpoint cannot be read: its description is no object"
         raise InputError(problem, remedy=remedy, file=path, stage=stage)
-    return description
+    digest = description.pop(_DIGEST, None)
+    return description, digest
 
 
 def _digest(tensors: Mapping[str, Tensor], description: str) -> str:
