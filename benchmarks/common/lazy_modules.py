@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from flows.pipeline.definition import PIPELINE
+from genre_tasks.exchange.registry import list_format_modules
 from storage.codecs import KINDS
 
 STAGE_MODULES: tuple[str, ...] = tuple(
@@ -13,12 +14,5 @@ STAGE_MODULES: tuple[str, ...] = tuple(
 CODEC_MODULES: tuple[str, ...] = tuple(dict.fromkeys(KINDS.values()))
 """Of every kind of artifact: the code of a benchmark that measures what a store takes."""
 
-FORMAT_MODULES: tuple[str, ...] = (
-    "genre_tasks.exchange.ply",
-    "genre_tasks.exchange.compressed_ply",
-    "genre_tasks.exchange.antimatter_splat",
-    "genre_tasks.exchange.spz.format",
-    "genre_tasks.exchange.gltf.format",
-    "genre_tasks.exchange.usd.format",
-)
+FORMAT_MODULES: tuple[str, ...] = list_format_modules()
 """Of every format of scenes of other programs."""

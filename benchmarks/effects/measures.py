@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
+from benchmarks.common.scores import pooled_psnr
 from genre_tasks.effects.anti_aliasing import footprint_ratios
 from genre_tasks.effects.nonrigid_actors import mask_deformable_actors
 from genre_tasks.logs.types import Float32, Truth
@@ -87,7 +88,7 @@ def heldout_people_psnr(chunk: Chunk, scene: SceneGraph, _truth: Truth | None = 
         difference = _render_as_recorded(scene, view) - decode_view_image(view).numpy()
         error += float(np.square(difference).mean(-1)[people].sum(dtype=np.float64))
         count += int(people.sum())
-    return _pooled_psnr(error, count) if count else heldout_psnr(chunk, scene)
+    return pooled_psnr(error, count) if count else heldout_psnr(chunk, scene)
 
 
 def heldout_depth_score(chunk: Chunk, scene: SceneGraph, _truth: Truth | None = None) -> float:
@@ -199,9 +200,4 @@ def psnr_where_footprints_change(chunk: Chunk, scene: SceneGraph, views: Sequenc
         image = _render_as_recorded(scene, view)
         error += float(np.square(image[v, u] - true[v, u]).mean(-1).sum(dtype=np.float64))
         count += len(u)
-    return _pooled_psnr(error, count) if count else math.nan
-
-
-def _pooled_psnr(error: float, count: int) -> float:
-    # Identical pixels have no logarithm; the floor keeps them at 100 dB, as that of whole images does.
-    return -10 * math.log10(max(error / count, 1e-10))
+    return pooled_psnr(error, count) if count else math.nan

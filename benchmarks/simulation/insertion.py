@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from benchmarks.common.bench import NotMeasuredError, Row
 from benchmarks.common.claims import Claim, claim
+from benchmarks.common.scores import pooled_psnr
 from benchmarks.common.timing import Quartiles
 from benchmarks.simulation.removal import render_image
 from benchmarks.simulation.scenes import (
@@ -106,7 +107,7 @@ def _measure_turn(scenes: LogScenes, layout: StreetLayout, name: str) -> Row:
         pixels += int(area.sum())
         for key, inserted in (("turned", turned), ("straight", straight)):
             errors[key] += _squared_errors(render_image(inserted.scene.scene, view), truth, area)
-    psnr = {key: -10 * math.log10(max(math.fsum(values) / len(values), 1e-10)) for key, values in errors.items()}
+    psnr = {key: pooled_psnr(math.fsum(values), len(values)) for key, values in errors.items()}
     return {"actor": name, "label": find_actor(layout, name).label, "pixels": pixels, "psnr": psnr}
 
 

@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from benchmarks.common.bench import NotMeasuredError, Row
 from benchmarks.common.claims import Claim, claim
+from benchmarks.common.scores import pooled_psnr
 from benchmarks.common.timing import Quartiles
 from benchmarks.simulation.scenes import (
     LogScenes,
@@ -247,8 +248,7 @@ def pool_psnr(parts: Sequence[Row]) -> float | None:
     pixels = sum(part["pixels"] for part in parts)
     if not pixels:
         return None
-    # The floor stands for an image that is right to the bit.
-    return -10 * math.log10(max(sum(part["squared_error"] for part in parts) / pixels, 1e-10))
+    return pooled_psnr(sum(part["squared_error"] for part in parts), pixels)
 
 
 def removal_claims(rows: Sequence[Row]) -> Iterator[Claim]:

@@ -48,6 +48,15 @@ def known_formats() -> tuple[str, ...]:
     return tuple(_FORMATS)
 
 
+def list_format_modules() -> tuple[str, ...]:
+    """Lists the modules that formats are in, each once.
+
+    >>> list_format_modules()[:2]
+    ('genre_tasks.exchange.compressed_ply', 'genre_tasks.exchange.ply')
+    """
+    return tuple(dict.fromkeys(entry.target.partition(":")[0] for entry in _FORMATS.values()))
+
+
 def load_format(name: str) -> ExchangeFormat:
     """Loads a format by its name.
 
