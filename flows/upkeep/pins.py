@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from pathlib import Path
 
 from flows.reconstruction.named_results import NamedRun, find_named
 from genre_tasks.atomic_path import atomic_path
@@ -103,11 +104,8 @@ def list_pins(store: Store) -> list[Pin]:
     Raises:
         InputError: one is damaged.
     """
-    pins, damaged = read_sound_pins(store)
-    # To ignore it would let what it keeps be removed.
-    for error in damaged.values():
-        raise error
-    return pins
+    # To ignore a damaged one would let what it keeps be removed.
+    return [_read_pin(path) for path in store.records.find(PINS, _FILE)]
 
 
 def read_sound_pins(store: Store) -> tuple[list[Pin], dict[str, InputError]]:
@@ -123,13 +121,19 @@ def read_sound_pins(store: Store) -> tuple[list[Pin], dict[str, InputError]]:
     damaged = {}
     for path in store.records.find(PINS, _FILE):
         try:
-            values = json.loads(path.read_bytes())
-            keys = tuple(str(key) for key in values["keys"])
-            pins.append(Pin(str(values["name"]), keys, str(values["note"]), str(values["pinned_at"])))
-        except (OSError, ValueError, KeyError, TypeError, RecursionError):
-            error = InputError("the pin is damaged", remedy="Remove the folder, and pin again.", file=path)
+            pins.append(_read_pin(path))
+        except InputError as error:
             damaged[path.parent.name] = error
     return pins, damaged
+
+
+def _read_pin(path: Path) -> Pin:
+    try:
+        values = json.loads(path.read_bytes())
+        keys = tuple(str(key) for key in values["keys"])
+        return Pin(str(values["name"]), keys, str(values["note"]), str(values["pinned_at"]))
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError("the pin is damaged", remedy="Remove the folder, and pin again.", file=path) from error
 
 
 def list_run_keys(record: dict[str, object]) -> list[str]:

@@ -212,12 +212,17 @@ def _compile(compiler: tuple[str, ...], job: _Job) -> Path:
     source = str(kernel.folder / kernel.sources[0])
     command = [*compiler, *SHARED_FLAGS, *kernel.flags, *job.options, source, "-o", str(part)]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        done = _run_compiler(command)
         if done.returncode:
             raise RuntimeError(f"{compiler[0]} failed on {kernel.title} ({job.isa}):\n" + done.stderr[-2000:])
         part.replace(out)
-    except OSError as error:
-        raise RuntimeError(f"the C++ compiler {compiler[0]} does not start: {error.strerror}") from error
     finally:
         part.unlink(missing_ok=True)
     return out
+
+
+def _run_compiler(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError as error:
+        raise RuntimeError(f"the C++ compiler {command[0]} does not start: {error.strerror}") from error
