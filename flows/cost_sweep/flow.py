@@ -94,7 +94,7 @@ def _run_cells(sweep: Sweep, cells: Sequence[Cell]) -> tuple[list[dict[str, Any]
             reporter.part_ended(f"left out: {error}")
             continue
         if row is None:
-            reporter.part_ended("as the preset, its plan or the log's images have it")
+            reporter.part_ended("changes nothing on this log")
         else:
             rows.append(row)
             reporter.part_ended(f"{sum(row['seconds'].values()):.1f} s of stages")

@@ -61,7 +61,8 @@ def unrun_examples() -> Iterator[Any]:
 def test_every_command_of_the_documents_that_is_not_run_parses(line: str) -> None:
     words = shlex.split(line, comments=True)
     name = " ".join(words[:2]) if " ".join(words[:2]) in COMMANDS else words[0]
-    COMMANDS[name].make_context(name, words[len(name.split()) :])
+    context = COMMANDS[name].make_context(name, words[len(name.split()) :])
+    assert context.info_name == name
 
 
 def test_the_documents_have_commands_that_are_not_run() -> None:
