@@ -82,8 +82,13 @@ class _MovingPart:
 
     def street_SE3_part(self, times: Float64) -> Float64:
         """Where the part is at times [n]: [n, 4, 4]."""
-        pose = self.actor.street_SE3_actor(times)
-        return pose if self.part.actor_SE3_part is None else pose @ self.part.actor_SE3_part(times)
+        return self.place(self.actor.street_SE3_actor(times), times)
+
+    def place(self, street_SE3_actor: Float64, times: Float64) -> Float64:
+        """Where the part is at times [n] of an actor with poses [n, 4, 4]: [n, 4, 4]."""
+        if self.part.actor_SE3_part is None:
+            return street_SE3_actor
+        return street_SE3_actor @ self.part.actor_SE3_part(times)
 
 
 def _build_embree_scene(vertices: Float64) -> Any:
@@ -129,6 +134,7 @@ class RayCaster:
                 first_face += len(part.mesh)
         self.faces = join_meshes(meshes)
         self._normals = _face_normals(self.faces)
+        self._recent_poses: tuple[float, list[Float64]] = (np.nan, [])
 
     def cast(
         self,
@@ -162,13 +168,14 @@ class RayCaster:
             normal=self._normals[np.where(is_miss, 0, face)],
         )
         times = np.atleast_1d(np.asarray(time, float))
-        for moving in self._moving:
-            # One sphere for all rays of a sweep, at the middle of their times; the slack covers the rest.
-            middle_pose = moving.street_SE3_part(times[[len(times) // 2]])[0]
+        # One sphere for all rays of a sweep, at the middle of their times; the slack covers the rest.
+        middle_poses = self._street_SE3_parts(float(times[len(times) // 2]))
+        for moving, middle_pose in zip(self._moving, middle_poses, strict=True):
             centre = middle_pose[:3, :3] @ moving.centre + middle_pose[:3, 3]
             near = _find_rays_near_sphere(origin, directions, centre, moving.radius + slack_m)
             if len(near):
-                self._add_nearer_hits(hits, moving, origins, directions, times, near)
+                pose = middle_pose[None] if len(times) == 1 else moving.street_SE3_part(times[near])
+                self._add_nearer_hits(hits, moving, pose, origins, directions, near)
         # Faces have no outside: whichever side a ray meets is the one that is lit.
         facing_away = dot_rows(hits.normal, directions) > 0
         np.multiply(hits.normal, np.where(facing_away, np.float32(-1), np.float32(1))[:, None], out=hits.normal)
@@ -178,13 +185,12 @@ class RayCaster:
         self,
         hits: Hits,
         moving: _MovingPart,
+        pose: Float64,  # [1, 4, 4] or [m, 4, 4] of the part
         origins: Float32,  # [n, 3]
         directions: Float32,  # [n, 3]
-        times: Float64,  # [1] or [n]
         near: NDArray[np.int64],  # [m] the rays that may meet the part
     ) -> None:
         """Replaces hits, in place, where a moving part is nearer."""
-        pose = moving.street_SE3_part(times if len(times) == 1 else times[near])
         # The transposed rotation turns world rays into the part's frame; distances along them stay.
         rotation = pose[:, :3, :3]
         local_origins = np.einsum("nji,nj->ni", rotation, origins[near] - pose[:, :3, 3])
@@ -198,6 +204,24 @@ class RayCaster:
         hits.face[rays] = found["primID"][is_nearer] + moving.first_face
         rotations = np.broadcast_to(rotation, (len(near), 3, 3))[is_nearer]
         hits.normal[rays] = np.einsum("nij,nj->ni", rotations, self._normals[hits.face[rays]])
+
+    def _street_SE3_parts(self, time: float) -> list[Float64]:
+        """Where every moving part is: [4, 4] each."""
+        recent_time, recent_poses = self._recent_poses
+        # The rays of an image's row and their shadows ask for the same moment.
+        if recent_time == time:
+            return recent_poses
+        times = np.array([time])
+        poses: list[Float64] = []
+        actor: Actor | None = None
+        for moving in self._moving:
+            # The parts of an actor follow each other.
+            if moving.actor is not actor:
+                actor = moving.actor
+                street_SE3_actor = actor.street_SE3_actor(times)
+            poses.append(moving.place(street_SE3_actor, times)[0])
+        self._recent_poses = (time, poses)
+        return poses
 
     def find_shadowed(self, points: Float32, normals: Float32, sun: Float64, time: float) -> NDArray[np.bool_]:
         """Finds out which points lie in the shadow.
@@ -217,8 +241,7 @@ class RayCaster:
         # On the plane across the sun's direction, all rays are points: a part can only shade those in its circle.
         plane_axes = np.linalg.svd(sun[None])[2][1:]
         on_plane = origins @ plane_axes.T.astype(np.float32)
-        for moving in self._moving:
-            pose = moving.street_SE3_part(np.array([time]))[0]
+        for moving, pose in zip(self._moving, self._street_SE3_parts(time), strict=True):
             centre = pose[:3, :3] @ moving.centre + pose[:3, 3]
             offset = on_plane - (plane_axes @ centre).astype(np.float32)
             is_near = offset[:, 0] ** 2 + offset[:, 1] ** 2 < moving.radius**2
