@@ -28,14 +28,15 @@ def on_streets() -> str:
         called = _rows(name, _CALLED_FOR)
         plain = _rows(name, _NOT_CALLED_FOR)
         # An effect that was not measured yet has no line.
-        if not called or not plain:
+        if not called or (not plain and CASES[name].plain is not None):
             continue
         first = called[0]
         # The plan's choice shows whether the threshold tells the two kinds of streets apart.
         planned = f"{sum(row['choice'] == 'on' for row in called)} of {len(called)}"
-        planned_plain = f"{sum(row['choice'] == 'on' for row in plain)} of {len(plain)}"
+        planned_plain = f"{sum(row['choice'] == 'on' for row in plain)} of {len(plain)}" if plain else "–"
+        gains_plain = _gains(plain) if plain else "–"
         threshold = f"{first['threshold']:g} {first['property_unit']}"
-        lines.append([EFFECT_WORDS[name], threshold, planned, _gains(called), planned_plain, _gains(plain)])
+        lines.append([EFFECT_WORDS[name], threshold, planned, _gains(called), planned_plain, gains_plain])
     head = [
         "effect",
         "set on above",

@@ -109,7 +109,10 @@ class EffectsBench:
             cells += maker.trained(seeds, chunks, options["training"])
         for name in names:
             if name in CASES:
-                cells += [maker.street(name, s, float(f)) for s in seeds for f in split_option(options["factors"])]
+                factors = [float(f) for f in split_option(options["factors"])]
+                if CASES[name].plain is None:
+                    factors = [f for f in factors if f > 0]
+                cells += [maker.street(name, s, f) for s in seeds for f in factors]
                 cells += [maker.real(name, chunk) for chunk in chunks]
         return cells
 

@@ -50,6 +50,8 @@ def make_claims(rows: Mapping[str, Row]) -> Iterator[Claim]:
     )
     for name, case in CASES.items():
         for factor, kind, op, targets in kinds:
+            if kind == "loss" and case.plain is None:
+                continue
             # Other factors serve to place thresholds and are part of no claim.
             found = [r for r in _effect_rows(rows, name) if r["factor"] == factor]
             gains = [effect_gain(r) for r in found]

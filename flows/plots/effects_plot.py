@@ -11,6 +11,8 @@ from genre_tasks.effects.types import EffectsPlan
 
 _LEAST = 0.01
 """Where the logarithmic axis begins, in thresholds."""
+_MOST = 1000.0
+"""Where bars end at the latest: LiDAR's usual density is far above the least that is of use."""
 
 
 def plot_effects_plan(plan: EffectsPlan, title: str = "") -> NDArray[np.uint8]:
@@ -34,7 +36,7 @@ def plot_effects_plan(plan: EffectsPlan, title: str = "") -> NDArray[np.uint8]:
     axes = figure.add_subplot()
     measured = [not math.isnan(d.value) and d.threshold > 0 for d in decisions]
     in_thresholds = [
-        max(d.value / d.threshold, _LEAST) if is_measured else _LEAST
+        min(max(d.value / d.threshold, _LEAST), _MOST) if is_measured else _LEAST
         for d, is_measured in zip(decisions, measured, strict=True)
     ]
     widths = [value - _LEAST for value in in_thresholds]

@@ -55,8 +55,19 @@ def test_it_is_registered_and_its_cases_are_effects() -> None:
 def test_streets_can_be_asked_to_call_for_each(name: str) -> None:
     case = CASES[name]
     for factor in (0.0, 1.0, 4.0):
+        if factor == 0 and name == "lidar_depth":
+            continue
         # A parameter that streets do not have would be refused here.
         assert open_log(f"synthetic:street?seed=1{case.query(factor, 340.0)}").frame_count
+
+
+def test_no_street_is_without_a_use_for_lidar_depth() -> None:
+    with pytest.raises(ValueError, match="every street"):
+        CASES["lidar_depth"].query(0.0, 340.0)
+    cells = EFFECTS.cells(dict(EFFECTS.options) | {"seeds": "1", "effects": "lidar_depth", "pandaset": ""}, False)
+    assert [c.name for c in cells] == ["lidar_depth street 1 x 4"]
+    claims = [c.id for c in EFFECTS.claims({}) if c.id.endswith("lidar_depth")]
+    assert claims == ["effects.gain_lidar_depth"]
 
 
 def test_a_slow_street_takes_longer_for_as_many_pixels() -> None:
