@@ -13,6 +13,7 @@ from PIL import Image
 from genre_tasks.errors import InputError
 from genre_tasks.logs.synthetic import SyntheticStreet, open_synthetic
 from genre_tasks.logs.types import Truth
+from genre_tasks.threads import torch_threads
 
 SMALL = "street?seed=1000&frames=4&width=64&height=36&lidar_beams=16&lidar_azimuths=120"
 
@@ -166,6 +167,26 @@ def test_same_seed_same_bytes_in_two_processes(street: SyntheticStreet):
     for part in parts:
         state.update(part.tobytes())
     assert run.stdout == state.hexdigest()
+
+
+def test_an_image_has_the_same_bytes_at_any_number_of_threads():
+    images = []
+    for threads in (1, 3):
+        # More rays than are cast at once, so that threads have bands to share.
+        street = open_synthetic("street?seed=3&frames=2&cameras=1&width=320&height=180")
+        with torch_threads(threads):
+            images.append(street.image_bytes("front_camera", 1))
+    assert images[0] == images[1]
+
+
+def test_opening_a_log_and_its_digest_need_no_torch():
+    code = (
+        "import sys\n"
+        "from genre_tasks.logs.synthetic import open_synthetic\n"
+        "open_synthetic('street?seed=3').digest()\n"
+        "sys.exit('torch' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_seeds_differ():

@@ -57,7 +57,7 @@ class Renderer:
         gain: Float32 | None = None,  # [3]
         rows: slice = ALL_ROWS,
     ) -> Float32:
-        """Renders rows of an image in linear light.
+        """Renders rows of an image in linear light, on as many threads as torch has.
 
         Args:
             time: seconds since the first frame.
@@ -69,12 +69,15 @@ class Renderer:
         Returns:
             [rows, W, 3] in [0, 1].
         """
+        # Late, since it imports torch: a log that is opened for its digest renders nothing.
+        from genre_tasks.threads import map_single_threaded
+
         origin = street_SE3_camera[:3, 3]
         ray_angle = 1.0 / (max(lens.fx_px, 1e-6) * self.samples**0.5)
         rows_at_once = max(1, _RAYS_AT_ONCE // (lens.width_px * self.samples))
         start, stop, _ = rows.indices(lens.height_px)
-        bands = []
-        for first in range(start, stop, rows_at_once):
+
+        def render_band(first: int) -> Float32:
             band = slice(first, min(first + rows_at_once, stop))
             direction = rotate(street_SE3_camera[:3, :3], camera_rays(lens, self.samples, band))
             value = shade_rays(self.caster, self.light, origin, direction, time=time, ray_angle=ray_angle)
@@ -82,7 +85,10 @@ class Renderer:
             if gain is not None:
                 value = value * gain
             # Bright samples are clipped first, so that an edge against the sky stays as smooth as a camera's.
-            bands.append(np.minimum(value, 1.0).reshape(-1, self.samples, 3).mean(1))
+            mean: Float32 = np.minimum(value, 1.0).reshape(-1, self.samples, 3).mean(1)
+            return mean
+
+        bands = map_single_threaded(render_band, range(start, stop, rows_at_once))
         return np.concatenate(bands).reshape(stop - start, lens.width_px, 3)
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from genre_tasks.logs.synthetic.mesh import Mesh, join_meshes
 from genre_tasks.logs.synthetic.noise import Reals, dot_rows, rotate
+from genre_tasks.logs.synthetic.recent_values import RecentValues
 from genre_tasks.logs.synthetic.street_actors import Actor, Part
 from genre_tasks.logs.synthetic.street_layout import StreetLayout
 from genre_tasks.logs.types import Float32, Float64
@@ -22,6 +23,8 @@ from genre_tasks.logs.types import Float32, Float64
 # A shadow ray starts so far above its face, or the face would shade itself.
 _SHADOW_OFFSET_M = 0.01
 _RADIUS_MARGIN_M = 0.02
+# Some hundred parts at some ten moments.
+_RECENT_POSES_BYTES = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -134,7 +137,8 @@ class RayCaster:
                 first_face += len(part.mesh)
         self.faces = join_meshes(meshes)
         self._normals = _face_normals(self.faces)
-        self._recent_poses: tuple[float, list[Float64]] = (np.nan, [])
+        # The rays of an image's row and their shadows ask for the same moment, other threads for others.
+        self._recent_poses: RecentValues[list[Float64]] = RecentValues(_RECENT_POSES_BYTES, _count_bytes)
 
     def cast(
         self,
@@ -207,10 +211,9 @@ class RayCaster:
 
     def _street_SE3_parts(self, time: float) -> list[Float64]:
         """Where every moving part is: [4, 4] each."""
-        recent_time, recent_poses = self._recent_poses
-        # The rays of an image's row and their shadows ask for the same moment.
-        if recent_time == time:
-            return recent_poses
+        return self._recent_poses.get(time, lambda: self._pose_parts(time))
+
+    def _pose_parts(self, time: float) -> list[Float64]:
         times = np.array([time])
         poses: list[Float64] = []
         actor: Actor | None = None
@@ -220,7 +223,6 @@ class RayCaster:
                 actor = moving.actor
                 street_SE3_actor = actor.street_SE3_actor(times)
             poses.append(moving.place(street_SE3_actor, times)[0])
-        self._recent_poses = (time, poses)
         return poses
 
     def find_shadowed(self, points: Float32, normals: Float32, sun: Float64, time: float) -> NDArray[np.bool_]:
@@ -268,6 +270,10 @@ class RayCaster:
         u = hits.u[:, None]
         v = hits.v[:, None]
         return corners[:, 0] * (1 - u - v) + corners[:, 1] * u + corners[:, 2] * v
+
+
+def _count_bytes(poses: list[Float64]) -> int:
+    return sum(pose.nbytes for pose in poses)
 
 
 def _find_rays_near_sphere(origin: Float64, directions: Float32, centre: Float64, radius: float) -> NDArray[np.int64]:
