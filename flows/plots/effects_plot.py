@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from genre_tasks.effects.types import EffectsPlan
 
 _LEAST = 0.01
 """Where the logarithmic axis begins, in thresholds."""
+_TITLE_CHARACTERS = 95
 _MOST = 1000.0
 """Where bars end at the latest: LiDAR's usual density is far above the least that is of use."""
 
@@ -44,7 +46,9 @@ def plot_effects_plan(plan: EffectsPlan, title: str = "") -> NDArray[np.uint8]:
     axes.barh(range(len(decisions)), widths, left=_LEAST, color=colors)
     axes.axvline(1, color="black", linewidth=1)
     # The axis ends well to the right of the longest bar, so that the text beside it fits.
-    axes.set(xscale="log", xlim=(_LEAST, max(*in_thresholds, 10.0) * 30), title=title)
+    axes.set(xscale="log", xlim=(_LEAST, max(*in_thresholds, 10.0) * 30))
+    # Over the figure and in lines: the address of a log is often wider than the axes.
+    figure.suptitle(textwrap.fill(title, _TITLE_CHARACTERS), fontsize=9)
     axes.set_xlabel("value / threshold: right of the line it is called for")
     axes.set_yticks(range(len(decisions)), [d.name.replace("_", " ") for d in decisions])
     for row, d in enumerate(decisions):
