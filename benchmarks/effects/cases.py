@@ -11,6 +11,7 @@ from benchmarks.effects.measures import (
     heldout_depth_score,
     heldout_people_psnr,
     heldout_psnr,
+    masked_cameras_psnr,
     novel_view_psnr,
     sharp_psnr,
 )
@@ -129,6 +130,6 @@ CASES: dict[str, Case] = {
     # A vehicle that drives sees each thing from many distances: only a standing one does not call for anti-aliasing.
     # Away from the path footprints differ from those in any image that the scene was made from.
     "anti_aliasing": Case(_same_at_every_factor(""), footprint_change_psnr, plain="&standstill=1"),
-    "ego_mask": Case(_in_percent("bonnet", "ego_mask"), heldout_psnr),
+    "ego_mask": Case(_in_percent("bonnet", "ego_mask"), masked_cameras_psnr),
 }
 """The effects that are modelled and that a street can be made to call for or not."""

@@ -41,15 +41,25 @@ def heldout_psnr(chunk: Chunk, scene: SceneGraph, _truth: Truth | None = None) -
         scene: what to render.
 
     Returns:
-        dB; where the vehicle is in some cameras' images, over those cameras alone.
+        dB.
+    """
+    return _mean_psnr(scene, chunk.views_with_role("heldout"))
+
+
+def masked_cameras_psnr(chunk: Chunk, scene: SceneGraph, _truth: Truth | None = None) -> float:
+    """Averages as :func:`heldout_psnr`, over the cameras that have the recording vehicle in their images.
+
+    The other cameras' images hardly depend on its mask, and would hide what the mask is worth.
+
+    Args:
+        chunk: as its plan shows it.
+        scene: what to render.
+
+    Returns:
+        dB; over all cameras where the vehicle is in no image.
     """
     masked = {v.camera for v in chunk.views if v.ego_mask is not None}
     return _mean_psnr(scene, [v for v in chunk.views_with_role("heldout") if not masked or v.camera in masked])
-
-
-def every_heldout_psnr(chunk: Chunk, scene: SceneGraph, _truth: Truth | None = None) -> float:
-    """Averages as :func:`heldout_psnr`, over all cameras in any case."""
-    return _mean_psnr(scene, chunk.views_with_role("heldout"))
 
 
 def _mean_psnr(scene: SceneGraph, views: Sequence[View]) -> float:

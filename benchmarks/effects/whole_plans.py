@@ -16,7 +16,7 @@ from benchmarks.common.context import THREADS
 from benchmarks.common.run_stages import reconstruct
 from benchmarks.common.task import require_log_folder
 from benchmarks.effects.cells import STAGES, ChunkLocation, evaluate_settings
-from benchmarks.effects.measures import every_heldout_psnr, heldout_psnr
+from benchmarks.effects.measures import heldout_psnr
 from flows.machine.facts import CHECKOUT, git_commit
 from flows.pipeline.definition import digest_weights
 from flows.training.train_job import TrainJob
@@ -122,9 +122,9 @@ def compare_trained(location: ChunkLocation, folder: str) -> Row:
     with torch_threads(THREADS):
         parameters = location.plan().parameters
         row: Row = {"whole": "trained", "log": location.log, "chunk": location.chunk, "commit": git_commit()}
-        row["shipped"] = evaluate_settings(location, parameters, every_heldout_psnr)
+        row["shipped"] = evaluate_settings(location, parameters, heldout_psnr)
         for variant, path in trained.items():
-            row[variant] = evaluate_settings(location, parameters, every_heldout_psnr, f"gnet.weights={path}")
+            row[variant] = evaluate_settings(location, parameters, heldout_psnr, f"gnet.weights={path}")
     return row
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,12 @@ from benchmarks.common.bench import TINY_SETTINGS, TINY_STREET, NotMeasuredError
 from benchmarks.effects import EFFECTS
 from benchmarks.effects.cases import CASES, LONGEST_S, MILD_FACTOR
 from benchmarks.effects.cells import ChunkLocation, evaluate_settings, measure_on_pandaset
-from benchmarks.effects.measures import FOOTPRINT_RATIO, psnr_where_footprints_change
+from benchmarks.effects.measures import (
+    FOOTPRINT_RATIO,
+    heldout_psnr,
+    masked_cameras_psnr,
+    psnr_where_footprints_change,
+)
 from benchmarks.effects.report import find_threshold
 from benchmarks.effects.whole_plans import compare_trained
 from flows.cli.bench import load_bench
@@ -128,6 +134,22 @@ def test_a_threshold_is_read_between_two_measurements() -> None:
     assert find_threshold(rows, 0.1) == pytest.approx(3.0)
     assert find_threshold(rows[:1], 0.1) is None
     assert any("0.1 dB at 3 px" in line for line in EFFECTS.table(dict(zip("ab", rows, strict=True))))
+
+
+def test_all_cameras_are_judged_but_for_the_ego_mask() -> None:
+    street = open_log("synthetic:street?seed=1020&frames=8&cameras=2&width=96&height=54&samples=1")
+    chunk = ingest(IngestConfig(width_px=96, height_px=54), street, 0)
+    scene = initial(InitialConfig(max_points=2000, distant_count=200), chunk).scene
+    camera, other = chunk.camera_names
+    by_camera = {c: replace(chunk, views=tuple(v for v in chunk.views if v.camera == c)) for c in (camera, other)}
+    each = {c: heldout_psnr(part, scene) for c, part in by_camera.items()}
+    assert each[camera] != each[other]
+    nothing = np.zeros((54, 96), bool)
+    masked = replace(chunk, views=tuple(replace(v, ego_mask=nothing) if v.camera == camera else v for v in chunk.views))
+    assert masked_cameras_psnr(masked, scene) == pytest.approx(each[camera])
+    assert heldout_psnr(masked, scene) == pytest.approx(np.mean(list(each.values())))
+    assert masked_cameras_psnr(chunk, scene) == heldout_psnr(chunk, scene)
+    assert CASES["ego_mask"].measure is masked_cameras_psnr and CASES["exposure"].measure is heldout_psnr
 
 
 def test_what_is_seen_from_far_and_near_is_judged_alone() -> None:
