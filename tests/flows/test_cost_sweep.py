@@ -108,14 +108,14 @@ def test_settings_start_with_the_preset_and_differ_from_it() -> None:
         list_settings("small", knobs=["view"])
 
 
-def test_a_short_enet_takes_smaller_steps_and_splits_nothing() -> None:
+def test_a_short_enet_has_low_learning_rates_and_splits_nothing() -> None:
     by_value = {s.value: s for s in list_settings("small", knobs=["more_gaussians"])}
-    setting = by_value["160000, GNet 144, gentle ENet 16"]
+    setting = by_value["160000, GNet 144, ENet 16 at low rates"]
     config = setting.configuration("small", (), 0)
     base = load_configuration("small").enet
     assert config.enet.learning_rates is not None and base.learning_rates is not None
     ratios = [a / b for a, b in zip(config.enet.learning_rates.as_tuple(), base.learning_rates.as_tuple(), strict=True)]
-    assert ratios == pytest.approx([knobs.GENTLE_FACTOR] * 5, rel=1e-3)
+    assert ratios == pytest.approx([knobs.LOW_RATE_FACTOR] * 5, rel=1e-3)
     assert (config.enet.split_fraction, config.enet.iterations) == (0, 16)
     trained = list_settings("small", ["enet.learning_rates=null"], ["more_gaussians"])
     assert all("learning_rates" not in change for s in trained for change in s.changes)
