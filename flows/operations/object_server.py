@@ -81,11 +81,9 @@ class ObjectServer(Service):
             for name in _PORTS
             for grpc in (False, True)
         ]
-        # Catalogues of tables are not needed, and their ports are the same for every server of a machine.
-        words += ["-s3.port.iceberg=0", "-s3.port.lance=0"]
         # Small volumes: little disk is taken before there is data.
         words += [f"-s3.port.grpc={self._ports['s3.grpc']}", "-master.volumeSizeLimitMB=64", "-volume.max=0"]
-        # Two servers on a machine would both want the standard ports of what is not needed here.
+        # Catalogues of tables are not needed, and two servers of a machine would both want their standard ports.
         words += ["-s3.port.iceberg=0", "-s3.port.lance=0"]
         return [*words, "-master.volumePreallocate=false", "-master.telemetry=false"]
 

@@ -173,4 +173,4 @@ class ChunkMeasurements:
         sky_color = np.quantile(linear, _SKY_QUANTILE, (0, 1))
         # Zero instead of NaN: what is not observed has weight 0, and NaN times 0 would still be NaN.
         log_color = np.where(observed[..., None], colors.log_color, 0.0)
-        return estimate_gains_and_haze(log_color, colors.distance_m, observed, sky_color)
+        return estimate_gains_and_haze(log_color, colors.distance_m, colors.texture, observed, sky_color)

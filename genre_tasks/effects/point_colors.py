@@ -25,6 +25,8 @@ _ITERATIONS = 12
 _SMALLEST = 1e-6
 # Residuals of log colour from here on count less and less: wrong pixels, reflections, moving shadows.
 _OUTLIER = 0.1
+# Of a point with more texture than this, the colour says ever less of the gain.
+_TEXTURE = 0.1
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,7 @@ class GainEstimate:
 def estimate_gains_and_haze(
     log_color: Float64,  # [V, P, 3]
     distance_m: Float64,  # [V, P]
+    texture: Float64,  # [V, P]
     observed: NDArray[np.bool_],  # [V, P]
     sky_color: Float64,  # [3]
 ) -> GainEstimate:
@@ -82,9 +85,13 @@ def estimate_gains_and_haze(
     strength for all channels. It is solved by Gauss-Newton with reweighting, so that moving objects and wrong pixels
     count little.
 
+    Points with much texture count little too. From far away, a pixel mixes a leaf or an edge with what is around it,
+    and that would pass for haze.
+
     Args:
         log_color: logarithm of the linear colour of point p in view v; any finite value where not observed.
         distance_m: from the camera to the point.
+        texture: as in ``PointColors``; any value where not observed.
         observed: the view sees the point, and at least one other view does.
         sky_color: linear colour of the sky, which distant haze looks like.
 
@@ -93,12 +100,15 @@ def estimate_gains_and_haze(
 
     >>> gain = np.array([-0.2, 0.2])
     >>> log_color = np.log(0.5) + np.zeros((2, 30, 3)) + gain[:, None, None]
-    >>> found = estimate_gains_and_haze(log_color, np.zeros((2, 30)), np.ones((2, 30), bool), np.ones(3))
+    >>> smooth, seen = np.zeros((2, 30)), np.ones((2, 30), bool)
+    >>> found = estimate_gains_and_haze(log_color, np.zeros((2, 30)), smooth, seen, np.ones(3))
     >>> np.allclose(found.log_gain, gain[:, None])
     True
     """
     light = log_color.transpose(2, 0, 1)  # [3, V, P]
-    weight = observed.astype(np.float64)
+    # Zero instead of NaN where nothing is observed.
+    reliability = observed / np.square(1 + np.square(np.where(observed, texture, 0.0) / _TEXTURE))
+    weight = reliability
     point_color = _mean_over_views(light, weight)
     log_gain = np.zeros((3, len(observed), 1))
     haze = 0.0
@@ -116,7 +126,7 @@ def estimate_gains_and_haze(
         point_color = _mean_over_views(light - log_gain - haze_term, weight)
         residual = light - log_gain - haze_term - point_color
         # Cauchy weights, one for all channels: a wrong pixel is wrong in all of them.
-        weight = observed / (1 + np.square(residual / _OUTLIER).mean(0))
+        weight = reliability / (1 + np.square(residual / _OUTLIER).mean(0))
     gains = log_gain[..., 0].T
     linked = find_linked_views(observed)
     # A gain common to all views cannot be told from the scene's own brightness: zero mean is a convention.
