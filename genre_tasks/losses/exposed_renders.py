@@ -26,7 +26,7 @@ class ExposedRenders:
 
     Attributes:
         targets: V images to compare with.
-        color: [V, H, W, 3] sRGB, not clamped.
+        color: [V, H, W, 3] sRGB, not clamped; the images themselves on the ego vehicle.
         gains: V log gains [3], ``None`` for an image without one; empty where no image has a gain.
         beyond_clipped: V masks [H, W, 3] of what is brighter than a clipped image; empty where no image has a gain.
     """
@@ -48,12 +48,12 @@ class ExposedRenders:
             targets: V targets.
 
         Returns:
-            ExposedRenders: ``color`` itself where no target has a gain.
+            ExposedRenders: ``color`` itself where no target has a gain or an ego mask.
         """
         color = color.detach()
         # Most synthetic logs have no gain at all: nothing is to be done for them here, nor on the way back.
         if all(target.log_gain is None for target in targets):
-            return ExposedRenders(tuple(targets), color, (), ())
+            return ExposedRenders(tuple(targets), _show_images_on_ego(color, targets), (), ())
         gains = tuple(None if target.log_gain is None else color.new_tensor(target.log_gain) for target in targets)
         exposed = torch.empty_like(color)
 
@@ -66,7 +66,7 @@ class ExposedRenders:
             return beyond
 
         beyond_clipped = tuple(map_single_threaded(expose, range(len(targets))))
-        return ExposedRenders(tuple(targets), exposed, gains, beyond_clipped)
+        return ExposedRenders(tuple(targets), _show_images_on_ego(exposed, targets), gains, beyond_clipped)
 
     def undo_in_gradient(self, by_color: Tensor) -> None:
         """Turns the gradient at the exposed renders into that at the scene's own colours, in place.
@@ -96,3 +96,15 @@ class ExposedRenders:
                 difference[i].div_(gain_factor(gain))
 
         map_single_threaded(undo, range(len(self.gains)))
+
+
+def _show_images_on_ego(color: Tensor, targets: Sequence[Target]) -> Tensor:
+    """The renders [V, H, W, 3] with their images where these show the ego vehicle; the same tensor where none does."""
+    if all(target.ego_mask is None for target in targets):
+        return color
+    # A masked gradient alone would not do: SSIM's windows and perceptual features reach over the mask's edge.
+    shown = color.clone()
+    for i, target in enumerate(targets):
+        if target.ego_mask is not None:
+            shown[i][target.ego_mask] = target.image.pixels[target.ego_mask]
+    return shown

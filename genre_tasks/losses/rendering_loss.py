@@ -160,7 +160,7 @@ def image_gradients(
     depth_gradient = result.depth_gradient
     if distance is not None:
         loss += _add_perceptual(config, color, targets, terms, distance, color_gradient)
-    # Only gradients are masked: nothing else moves Gaussians, and the loss stays a mean over whole images.
+    # The ego vehicle's own pixels are their images' and add nothing; the loss stays a mean over whole images.
     for i, target in enumerate(targets):
         if target.ego_mask is not None:
             color_gradient[i][target.ego_mask] = 0.0

@@ -80,6 +80,9 @@ def view_targets(chunk: Chunk, views: Sequence[View], depth: bool = False) -> tu
             raise InputError(error.problem, remedy=error.remedy, **where) from error  # type: ignore[arg-type]
         if depths is not None:
             depths[index] = compute_lidar_depth(chunk, view)
+            if view.ego_mask is not None:
+                # Returns behind the vehicle would count in the mean without a gradient.
+                depths[index][torch.from_numpy(view.ego_mask)] = 0.0
         return Target(
             camera=view.camera,
             frame=view.frame,

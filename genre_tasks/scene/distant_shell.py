@@ -133,5 +133,10 @@ def find_sky_pixels(view: View, chunk: Chunk, background: PointCloud) -> tuple[F
     rays = np.stack([x, y, np.ones_like(u)], -1)
     rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)) @ view.chunk_SE3_camera[:3, :3].T
     sky: NDArray[np.bool_] = np.isinf(depth) & (rays[..., 2] > LOWEST_SINE)
+    if view.ego_mask is not None:
+        # LiDAR has no point on the recording vehicle either.
+        rows = (np.arange(lens.height_px) + 0.5) * view.ego_mask.shape[0] / lens.height_px
+        columns = (np.arange(lens.width_px) + 0.5) * view.ego_mask.shape[1] / lens.width_px
+        sky &= ~view.ego_mask[np.ix_(rows.astype(np.int64), columns.astype(np.int64))]
     colors = decode_pixels(view.image, lens.width_px, lens.height_px)
     return rays[sky], colors[sky].astype(np.float64) / 255.0

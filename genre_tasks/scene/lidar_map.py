@@ -107,7 +107,10 @@ def find_isolated(means: Float64, returns: NDArray[np.floating], octave: NDArray
     distance = tree.query(means, k=[_RETURNS])[0][:, 0]
     for k in np.unique(octave):
         of_octave = octave == k
-        isolated[of_octave] = distance[of_octave] > ISOLATED * np.median(distance[of_octave])
+        # Returns that repeat exactly, as of a simulated vehicle that stands, say nothing of the density.
+        apart = distance[of_octave & (distance > 0)]
+        if len(apart):
+            isolated[of_octave] = distance[of_octave] > ISOLATED * np.median(apart)
     return isolated
 
 

@@ -129,6 +129,11 @@ def test_nothing_pulls_where_the_vehicle_itself_is() -> None:
     renders = ExposedRenders.from_renders(color, [target])
     by_color = image_gradients(config, renders, torch.ones(1, 90, 160), loss_plan)[1]
     assert not by_color[0, 70:].any() and by_color[0, :60].any()
+    # What is rendered there changes nothing beside it either, though windows of SSIM reach over the edge.
+    other = torch.cat([color[:, :70], torch.zeros(1, 20, 160, 3)], 1)
+    renders = ExposedRenders.from_renders(other, [target])
+    assert torch.equal(image_gradients(config, renders, torch.ones(1, 90, 160), loss_plan)[1], by_color)
+    assert not color[:, 70:].eq(0).all()
     images = torch.rand(1, 90, 160, 3, generator=torch.Generator().manual_seed(3))
     worse = images.clone()
     worse[:, 70:] = 0

@@ -115,3 +115,7 @@ def test_a_sparse_recording_is_not_isolated() -> None:
     octave = np.repeat([0, 4], [len(near), len(far)])
     assert not find_isolated(returns, returns, octave).any()
     assert not find_isolated(returns[:3], returns[:3], octave[:3]).any()
+    # A simulated vehicle that stands repeats its returns exactly; what lies between them is not isolated for that.
+    repeated = np.repeat(returns, 5, axis=0)
+    means = np.concatenate([returns, returns[:1] + 1e-3])
+    assert not find_isolated(means, repeated, np.zeros(len(means), np.int64)).any()
