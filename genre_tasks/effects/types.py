@@ -48,7 +48,7 @@ class EffectParameters:
 
     Attributes:
         gains: natural logarithm of an image's gain in linear light, for red, green and blue. Its mean over the source
-            images is zero.
+            images that share points with others is zero.
         ego_masks: by camera, [H, W], true where the recording vehicle itself is in the image.
         shutters: how the camera moves while the rows of an image are read out.
         blurs: how the camera moves while an image is exposed.

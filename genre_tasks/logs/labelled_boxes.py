@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from genre_tasks.errors import InputError
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.types import CuboidTrack, Float64
 
@@ -48,19 +49,23 @@ def build_tracks(
         frame_count: boxes of later frames are left out.
 
     Returns:
-        Tracks by their ids, and ``repeated_box_id`` where an id stands twice in a frame, of which the first box counts.
+        Tracks by their ids, and findings: ``repeated_box_id`` where an id stands twice in a frame, of which the first
+        box counts, and ``unreadable_cuboids`` where the sensor has no pose in a frame, whose boxes are left out.
         Where labels do not say what moves, an object whose boxes are a metre apart does.
+
+    Raises:
+        InputError: no frame with boxes has a pose.
     """
+    poses, unposed = _find_poses({box.frame for box in boxes if 0 <= box.frame < frame_count}, world_SE3_sensor)
     by_track: dict[str, dict[int, LabelledBox]] = {}
     repeated = []
     for box in boxes:
-        if 0 <= box.frame < frame_count:
+        if box.frame in poses:
             box_at = by_track.setdefault(box.track_id, {})
             if box.frame in box_at:
                 repeated.append(box.frame)
             else:
                 box_at[box.frame] = box
-    poses = {frame: world_SE3_sensor(frame) for frame in {box.frame for box in boxes} if 0 <= frame < frame_count}
     tracks = []
     # As numbers are sorted, though they are text.
     for track_id in sorted(by_track, key=lambda name: (len(name), name)):
@@ -80,7 +85,27 @@ def build_tracks(
                 moving=bool(distances.max() > _MOVES_M),
             )
         )
-    return tuple(tracks), describe_repeated(repeated)
+    return tuple(tracks), (*describe_repeated(repeated), *unposed)
+
+
+def _find_poses(
+    frames: Iterable[int], world_SE3_sensor: Callable[[int], Float64]
+) -> tuple[dict[int, Float64], list[Finding]]:
+    """Gives the sensor's pose in each frame that has one, and what is wrong with the others."""
+    poses = {}
+    findings = []
+    error: InputError | None = None
+    for frame in sorted(frames):
+        try:
+            poses[frame] = world_SE3_sensor(frame)
+        except InputError as caught:
+            error = error or caught
+            message = f"the boxes of frame {frame} are left out: {caught.problem}"
+            findings.append(Finding("unreadable_cuboids", "warning", message, caught.remedy, frames=(frame,)))
+    # Without any pose, nothing would be left of the boxes but findings.
+    if error is not None and not poses:
+        raise error
+    return poses, findings
 
 
 def describe_repeated(frames: Iterable[int]) -> tuple[Finding, ...]:

@@ -57,7 +57,7 @@ def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Pr
     frames = select_frames(config, log, chunk_index)
     _require_numbered_frames(log, frames, chunk_index)
     cameras = select_cameras(config, log)
-    _require_cameras(log, cameras, frames[0], chunk_index)
+    _require_cameras(log, cameras, frames, chunk_index)
     width_px, height_px = choose_working_size(config, cameras)
     config = config.model_copy(update={"width_px": width_px, "height_px": height_px})
     poses = np.stack([log.world_SE3_lidar(frame) for frame in frames])
@@ -123,10 +123,10 @@ def _require_numbered_frames(log: DrivingLog, frames: Sequence[int], chunk: int)
         raise InputError(problem, remedy=remedy, log=log.name, chunk=chunk)
 
 
-def _require_cameras(log: DrivingLog, cameras: tuple[Camera, ...], frame: int, chunk: int) -> None:
+def _require_cameras(log: DrivingLog, cameras: tuple[Camera, ...], frames: Sequence[int], chunk: int) -> None:
     """Raises what ``genre check`` calls fatal: no camera at all, or one whose poses or times cannot be opened."""
     for camera in cameras:
-        log.camera_timestamp_s(camera.name, frame)
+        _require_times(log, camera, frames)
     if cameras:
         return
     findings = collect_reader_findings(log, range(log.frame_count), ())
@@ -134,6 +134,20 @@ def _require_cameras(log: DrivingLog, cameras: tuple[Camera, ...], frame: int, c
     problem = "; ".join(["no camera has an image that can be read", *(reason.message for reason in reasons[:1])])
     remedy = (reasons[0].remedy if reasons else "") or "Copy the camera folders of the sequence."
     raise InputError(problem, remedy=remedy, log=log.name, chunk=chunk)
+
+
+def _require_times(log: DrivingLog, camera: Camera, frames: Sequence[int]) -> None:
+    """Raises the first frame's error where no frame has a time of this camera: a file is missing or damaged."""
+    first: InputError | None = None
+    for frame in frames:
+        try:
+            log.camera_timestamp_s(camera.name, frame)
+        except InputError as error:
+            first = first or error
+        else:
+            return
+    if first is not None:
+        raise first
 
 
 def _note_reader_findings(

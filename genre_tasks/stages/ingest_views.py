@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -119,14 +120,26 @@ def _note_unsupervised_cameras(reading: ChunkReading, views: list[View]) -> None
 
 def _read_time(reading: ChunkReading, camera: Camera, frame: int) -> float:
     """An image's time in seconds; where it is not finite, the one that the camera's other images give."""
-    time_s = reading.log.camera_timestamp_s(camera.name, frame)
+    time_s = _read_stated_time(reading, camera, frame)
     if np.isfinite(time_s):
         return time_s
-    # The checks have noted it; what effects compute from times would be NaN in all views of the camera.
+    # What effects compute from times would be NaN in all views of the camera.
+    detail = "its time cannot be read; the camera's other images give it"
+    reading.add_issue("missing_timestamp", detail, frame, camera.name)
     frames = np.array(reading.frames, np.float64)
-    times = np.array([reading.log.camera_timestamp_s(camera.name, f) for f in reading.frames])
+    times = np.array([_read_stated_time(reading, camera, f) for f in reading.frames])
     known = np.isfinite(times)
     return float(np.interp(frame, frames[known], times[known])) if known.any() else _FRAME_S * frame
+
+
+def _read_stated_time(reading: ChunkReading, camera: Camera, frame: int) -> float:
+    """The time that the log states for an image, seconds; NaN where it cannot be read."""
+    try:
+        return reading.log.camera_timestamp_s(camera.name, frame)
+    except InputError:
+        if reading.config.strict:
+            raise
+        return math.nan
 
 
 def require_source_frames(reading: ChunkReading, sources: Sequence[View]) -> None:

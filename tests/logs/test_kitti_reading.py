@@ -82,6 +82,23 @@ def test_a_time_far_from_all_poses_has_none(drive: Path) -> None:
     assert np.isfinite(log.world_SE3_lidar(3)).all()
 
 
+def test_a_frame_without_a_pose_costs_its_own_boxes_alone(written: Path, drive: Path) -> None:
+    path = drive / "image_02/timestamps.txt"
+    lines = path.read_text().splitlines()
+    wrong = lines[3].replace(":24.", ":26.")
+    assert wrong != lines[3]
+    path.write_text("\n".join([*lines[:3], wrong, *lines[4:]]) + "\n")
+    log = open_log(f"kitti:{drive}?labels={written / 'labels.txt'}")
+    for track, expected in zip(log.tracks(), FAKE.tracks(), strict=True):
+        assert track.frames.tolist() == [frame for frame in expected.frames if frame != 3]
+    (finding,) = [finding for finding in log.findings() if finding.word == "unreadable_cuboids"]
+    assert finding.frames == (3,) and "0.5 s" in finding.message
+    # Without any pose there is nothing to go on with.
+    path.write_text("\n".join(line.replace(":24.", ":29.") for line in lines) + "\n")
+    with pytest.raises(InputError, match=r"0\.5 s"):
+        open_log(f"kitti:{drive}?labels={written / 'labels.txt'}").tracks()
+
+
 def test_points_are_placed_by_their_own_time(drive: Path) -> None:
     still = open_log(f"kitti:{drive}").sweep(2)
     assert still is not None

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from genre_tasks.logs.genre_layout.writer import write_genre_layout
+from genre_tasks.logs.nuscenes.reader import CAR_HIGH_M, CAR_LOW_M
 from genre_tasks.logs.pandaset.writer import write_pandaset
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.types import Sweep
@@ -111,8 +112,10 @@ def test_nuscenes(tmp_path: Path) -> None:
             if expected is not None:
                 pose = log.world_SE3_lidar(frame) @ LIDAR_MOUNT
                 local = (expected.points_world - pose[:3, 3]) @ pose[:3, :3]
-                # What is nearer counts as the vehicle's own roof.
+                # What is nearer counts as the vehicle's own roof or bonnet.
                 far = np.hypot(local[:, 0], local[:, 1]) >= 1.0
+                in_car = local @ LIDAR_MOUNT[:3, :3].T + LIDAR_MOUNT[:3, 3]
+                far &= ~((in_car[:, :2] > CAR_LOW_M) & (in_car[:, :2] < CAR_HIGH_M)).all(1)
                 expected = Sweep(expected.points_world[far], expected.intensity[far], expected.timestamps_s[far])
             _assert_same_sweep(found.sweep(frame), expected, atol=1e-4, times=False)
         tracks = {token(track.track_id): track for track in log.tracks()}

@@ -18,7 +18,7 @@ from genre_tasks.logs.posed_images.frame_grouping import FrameGroups, group_fram
 from genre_tasks.logs.posed_images.image_log import PosedImagesLog
 from genre_tasks.logs.posed_images.posed_image import PosedImage
 from genre_tasks.logs.posed_images.rig_poses import fill_rig_poses
-from genre_tasks.logs.posed_images.world_axes import find_up, place_vehicle, turn_up_to_z
+from genre_tasks.logs.posed_images.world_axes import choose_reference, find_up, place_vehicle, turn_up_to_z
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.types import Lens
 from tests.logs.posed_images_folder import STREET, Y_DOWN, write_colmap, write_transforms
@@ -346,6 +346,14 @@ def test_a_vehicle_that_stands_faces_where_its_cameras_look() -> None:
     poses = place_vehicle(np.zeros((3, 3)), np.array([0.0, 2.0, -1.0]))
     assert poses[0, :3, 0].tolist() == [0.0, 1.0, 0.0]
     assert poses[0, :3, 1].tolist() == [-1.0, 0.0, 0.0]
+
+
+def test_noise_of_poses_chooses_no_camera_where_the_vehicle_stands() -> None:
+    ahead, back = np.tile(np.eye(4), (2, 3, 1, 1))
+    back[:, 2, 2] = -1.0
+    along = np.array([0.0, 0.0, 1.0])
+    assert [choose_reference([ahead, back], sign * 5.0 * along) for sign in (1, -1)] == [0, 1]
+    assert choose_reference([ahead, back], -0.005 * along) == 0
 
 
 def test_assumed_times_are_a_note(written: Path) -> None:

@@ -252,6 +252,21 @@ def test_progress_rises_to_the_end(log: FakeLog) -> None:
     assert calls == sorted(calls) and calls[-1] == (60, 60) and len(calls) > 20
 
 
+def test_an_image_whose_time_cannot_be_read_costs_no_chunk(log: FakeLog, monkeypatch: pytest.MonkeyPatch) -> None:
+    def read_time(self: FakeLog, camera: str, frame: int) -> float:
+        if camera == "left" and frame in (0, 3):
+            raise InputError("no number", remedy="Write seconds.")
+        return self.frame_timestamp_s(frame)
+
+    monkeypatch.setattr(FakeLog, "camera_timestamp_s", read_time)
+    chunk = ingest(CONFIG, log, 0)
+    assert [issue.frame for issue in chunk.log_issues if issue.kind == "missing_timestamp"] == [0, 3]
+    at = {view.frame: view.timestamp_s for view in chunk.views if view.camera == "left"}
+    assert at[3] == pytest.approx(log.frame_timestamp_s(3), abs=1e-6) and 0 in at
+    with pytest.raises(InputError, match="frames 0, 3 have no finite time"):
+        ingest(CONFIG.model_copy(update={"strict": True}), log, 0)
+
+
 def test_an_image_without_a_time_takes_that_of_its_neighbours(log: FakeLog, monkeypatch: pytest.MonkeyPatch) -> None:
     def read_time(self: FakeLog, camera: str, frame: int) -> float:
         return float("nan") if camera == "left" and frame in (3, 4) else self.frame_timestamp_s(frame)

@@ -54,7 +54,7 @@ def open_pandaset(rest: str) -> PandaSetLog:
     uri = f"pandaset:{rest}"
     remedy = "Give the folder of one sequence, as in pandaset:PATH/002."
     if "*" in rest:
-        remedy += " Only `genre cost` and `genre table` take several, for which a star stands."
+        remedy += " Only `genre dataset`, `genre cost` and `genre table` take several, for which a star stands."
     folder = expand_user_path(rest)
     try:
         is_folder = bool(rest) and folder.is_dir()

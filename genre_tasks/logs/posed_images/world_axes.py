@@ -155,5 +155,8 @@ def choose_reference(world_SE3_cameras: Sequence[Float64], motion: Float64) -> i
     Returns:
         Its index; the first one where nothing moves.
     """
+    # Noise of poses must not choose.
+    if np.linalg.norm(motion) < STANDING_M:
+        return 0
     along = [float((poses[:, :3, 2] @ motion).mean()) for poses in world_SE3_cameras]
     return int(np.argmax(along))

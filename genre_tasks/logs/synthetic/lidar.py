@@ -55,7 +55,7 @@ def scan_sweep(
         The points that come back from 1 to 100 m, each with the time at which its beam was sent.
     """
     count = parameters.lidar_azimuths
-    # From behind through the right, the front and the left, as seen from above: clockwise turns have falling azimuth.
+    # From behind through the left, the front and the right, as seen from above: clockwise turns have falling azimuth.
     azimuth = np.pi - 2 * np.pi * (np.arange(count) + 0.5) / count
     # 0 straight ahead, so that the forward points fit the cameras, which fire at the frame's time.
     delay = -azimuth / (2 * np.pi) * parameters.sweep_s
