@@ -163,7 +163,7 @@ def write_edited_run(store: str, run: str, edits: EditList, config: SimulateConf
 
     Raises:
         InputError: there is no such run or actor, or an artifact is gone.
-        OSError: the store cannot be written.
+        GenreError: the store cannot be written.
     """
     opened = open_run(store, run)
     record = opened.recorded.record

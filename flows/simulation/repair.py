@@ -50,7 +50,8 @@ class FnetRepair:
             for view, mask in zip(images.views, fixed.filled.numpy(), strict=True):
                 path = image_path(folder, view.camera, images.index, ".png")
                 write_file(path, encode_png(mask.astype(np.uint8) * 255))
-        return replace(images, color=fixed.color.clamp(0, 1))
+        # With the render's opacity, an EXR file's colours would be divided by what they were not multiplied with.
+        return replace(images, color=fixed.color.clamp(0, 1), alpha=fixed.alpha)
 
 
 def choose_repair(request: SimulationRequest, config: PipelineConfig, rollout: PreparedRollout, folder: Path) -> Repair:

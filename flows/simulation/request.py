@@ -15,6 +15,8 @@ from genre_tasks.suggestions import did_you_mean
 SENSORS = ("rgb", "depth", "masks", "flow", "lidar")
 """What can be simulated: films, depth, instance and class masks, optical flow, LiDAR sweeps."""
 
+_SETTINGS_READ = ("simulate.", "fnet.", "novel_views.lidar_max_points.")
+
 
 @dataclass(frozen=True)
 class SimulationRequest:
@@ -82,6 +84,13 @@ class SimulationRequest:
         for name, value in (("--strength", self.strength), ("--delay", self.delay_s)):
             if not math.isfinite(value):
                 raise ConfigError(f"{name} is {value:g}", remedy="Give a finite number.")
+        for setting in self.settings:
+            key = setting.partition("=")[0].strip()
+            if key and not f"{key}.".startswith(_SETTINGS_READ):
+                remedy = (
+                    "Set keys of simulate and fnet, or novel_views.lidar_max_points; others are those of `genre run`."
+                )
+                raise ConfigError(f"{key} changes nothing of a simulation", remedy=remedy)
         if self.behaviour is not None and self.path_file is not None:
             raise ConfigError("--behaviour and --path both say how to drive", remedy="Give one of them.")
         if self.path_file is not None and self.start_offset_m is not None:

@@ -71,6 +71,7 @@ def make_path(request: SimulationRequest, config: SimulateConfig, recorded: EgoP
         strength=request.strength,
         delay_s=request.delay_s,
         side=request.side,
+        allow_implausible=request.allow_implausible,
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.simulators.driving_world import DrivingWorld
-from flows.simulators.image_request import CameraDescription, ImageRequest
+from flows.simulators.image_request import CameraDescription, ImageRequest, RenderLimits
 from flows.simulators.scene_renderer import SceneRenderer
 from genre_tasks.ego_paths.bicycle import MAX_STEER_RATE_RAD_S, BicycleModel
 from genre_tasks.ego_paths.collisions import Collision
@@ -30,6 +30,7 @@ ENVIRONMENT_ID = "genre/Driving-v0"
 
 Observation = dict[str, Any]
 _REACH_M = 1e4
+_UNLIMITED_PX = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,8 @@ class GenreDrivingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             remedy = "Give first_index up to last_index, and lateral_m of at least 0."
             raise ConfigError(f"no place lies in {start}", remedy=remedy)
         self.render_mode = render_mode
-        self._renderer = SceneRenderer(store, run, stage)
+        # Limits are for clients of a network, and this process has none.
+        self._renderer = SceneRenderer(store, run, stage, limits=RenderLimits(_UNLIMITED_PX, _UNLIMITED_PX))
         # Logs have frame rates of their own, and films of the environment are to be as fast as the drive.
         self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self._renderer.frame_s))}
         self._world = DrivingWorld(store, run, stage, reliable_m, progress)

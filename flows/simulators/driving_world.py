@@ -87,13 +87,15 @@ class DrivingWorld:
             model: for the steering angle.
         """
         time_s = self.recorded.times_s[index] - self.recorded.times_s[0]
-        moments = np.array([time_s - _RATE_S, time_s, time_s + _RATE_S])
+        # At either end of the path the difference is one-sided.
+        moments = np.clip([time_s - _RATE_S, time_s, time_s + _RATE_S], 0.0, self._reference.duration_s)
         speeds = self._reference.measure_speed(moments)
         points = self._reference.sample(self._reference.locate(moments[1:2]))
         heading = float(points.heading_rad[0])
         curvature = float(points.curvature_1_m[0])
         bounds = self.config.bounds
-        acceleration = float(speeds[2] - speeds[0]) / (2 * _RATE_S)
+        span_s = float(moments[2] - moments[0])
+        acceleration = float(speeds[2] - speeds[0]) / span_s if span_s > 0 else 0.0
         return VehicleState(
             x_m=float(points.position_m[0, 0]) - lateral_m * math.sin(heading),
             y_m=float(points.position_m[0, 1]) + lateral_m * math.cos(heading),

@@ -21,6 +21,7 @@ from flows.simulators.neuroncap_messages import (
     MICROSECONDS,
     ImageMessage,
     Trajectory,
+    are_equal,
     describe_recorded,
     parse_image,
     parse_trajectories,
@@ -58,6 +59,7 @@ class ActorState:
         self._renderer = renderer
         self._lock = threading.Lock()
         self._trajectories = describe_recorded(renderer.actors(), renderer.frame_s)
+        self._recorded = self._trajectories
         self._is_recorded = True
 
     @property
@@ -78,7 +80,8 @@ class ActorState:
         self._renderer.check_actors([trajectory.track_id for trajectory in trajectories])
         with self._lock:
             self._trajectories = trajectories
-            self._is_recorded = False
+            # Recorded actors stand where they were at each camera's own moment, which the messages do not carry.
+            self._is_recorded = are_equal(trajectories, self._recorded)
 
     def request_image(self, message: ImageMessage) -> ImageRequest:
         """Turns a message into a request of the renderer.

@@ -25,6 +25,7 @@ class BehaviourRequest:
         strength: from 0, which leaves the recorded driving as it is.
         delay_s: seconds from the first pose to the begin of the manoeuvre.
         side: towards which the vehicle moves; ``None``: see ``signed_side``.
+        allow_implausible: whether a path may break the bounds.
     """
 
     name: str
@@ -35,6 +36,7 @@ class BehaviourRequest:
     strength: float
     delay_s: float
     side: Side | None
+    allow_implausible: bool = False
 
     @property
     def signed_side(self) -> int:

@@ -55,10 +55,12 @@ def plan_behaviour(
     strength: float = 1.0,
     delay_s: float = 0.0,
     side: Side | None = None,
+    allow_implausible: bool = False,
 ) -> EgoPath:
     """Plans a path that starts at a lateral offset from the recorded one, and then drives otherwise.
 
-    Every path that it returns keeps within the bounds, as ``find_bound_violations`` measures them.
+    Every path that it returns keeps within the bounds, as ``find_bound_violations`` measures them, unless others are
+    allowed.
 
     Args:
         name: one of ``BEHAVIOURS``.
@@ -68,6 +70,7 @@ def plan_behaviour(
         strength: from 0, which drives as recorded at the offset.
         delay_s: seconds from the first pose to the begin of the manoeuvre.
         side: of a lane change or a swerve; by default the side of the recorded path, or the left where it starts on it.
+        allow_implausible: whether the path may break the bounds.
 
     Returns:
         A path with the recorded times and frames.
@@ -96,6 +99,7 @@ def plan_behaviour(
         strength=strength,
         delay_s=delay_s,
         side=side,
+        allow_implausible=allow_implausible,
     )
     if strength == 0:
         return _load_function(REPLAY)(request)

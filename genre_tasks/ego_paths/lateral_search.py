@@ -29,12 +29,15 @@ def plan_lateral(request: BehaviourRequest, shape: LateralShape) -> EgoPath:
         shape: of the manoeuvre.
 
     Returns:
-        The path with the shortest manoeuvre that keeps within the bounds.
+        The path with the shortest manoeuvre that keeps within the bounds; where none does and that is allowed, the one
+        that would on a straight road, as far as the recorded path goes.
 
     Raises:
         ConfigError: the recorded path is too short for it; the error says for what strength it is long enough.
     """
     path = _find_shortest(request, shape, request.strength)
+    if path is None and request.allow_implausible:
+        path = _plan_out_of_bounds(request, shape)
     if path is None:
         raise _explain_shortage(request, shape)
     return path
@@ -56,6 +59,16 @@ def _find_shortest(request: BehaviourRequest, shape: LateralShape, strength: flo
         if not find_bound_violations(path, request.config.bounds):
             return path
     return None
+
+
+def _plan_out_of_bounds(request: BehaviourRequest, shape: LateralShape) -> EgoPath | None:
+    start_m, available_m = _measure_stretch(request)
+    if available_m < _SHORTEST_M:
+        return None
+    amplitude_m = request.signed_side * request.strength * request.config.lane_m
+    length_m = min(max(_estimate_length(request, shape, request.strength), _SHORTEST_M), available_m)
+    offset = LateralManoeuvre(shape, request.start_offset_m, amplitude_m, start_m, length_m)
+    return place_path(request.reference, request.recorded, request.reference, offset)
 
 
 def _is_within_bounds(request: BehaviourRequest, offset: LateralManoeuvre) -> bool:

@@ -42,7 +42,7 @@ def check_recorded_driving(request: BehaviourRequest, path: EgoPath) -> EgoPath:
         ConfigError: it does.
     """
     violations = find_bound_violations(path, request.config.bounds)
-    if violations:
+    if violations and not request.allow_implausible:
         offset = request.start_offset_m
         moved = f", moved by {offset:.3g} m," if offset else ""
         remedy = "Widen simulate.bounds in the configuration, or take other chunks."
@@ -68,7 +68,7 @@ def check_planned_path(request: BehaviourRequest, path: EgoPath) -> EgoPath:
         ConfigError: it does.
     """
     violations = find_bound_violations(path, request.config.bounds)
-    if violations:
+    if violations and not request.allow_implausible:
         raise ConfigError(
             f"{request.name} at strength {request.strength:.3g} breaks the bounds: {describe_violations(violations)}",
             remedy=f"Ask for less: `--strength {0.5 * request.strength:.2g}`. Or widen simulate.bounds.",
@@ -92,7 +92,7 @@ def check_rate(request: BehaviourRequest, rate_m_s2: float, bound_m_s2: float, q
         ConfigError: it is more than the bound.
     """
     rate = request.strength * rate_m_s2
-    if rate > bound_m_s2:
+    if rate > bound_m_s2 and not request.allow_implausible:
         problem = f"{request.name} at strength {request.strength:.3g} has the {quantity} {rate:.3g} m/s²"
         # Rounded down, so that the strength in the remedy is one that works.
         largest = math.floor(100 * bound_m_s2 / rate_m_s2) / 100

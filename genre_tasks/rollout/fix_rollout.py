@@ -47,10 +47,12 @@ class FixedRolloutImages:
     Attributes:
         color: [C, H, W, 3] sRGB in [0, 1].
         filled: [C, H, W] true where a removed actor hid what no recorded image shows: FNet drew it.
+        alpha: [C, H, W] opacity in [0, 1]: 1 where FNet drew, else the render's.
     """
 
     color: Tensor
     filled: Tensor
+    alpha: Tensor
 
 
 @dataclass(frozen=True)
@@ -123,7 +125,7 @@ class RolloutFixer:
         novel, filled = self._paste_repaired(images, novel, chunk_images)
         color = self._run_network(images, novel, chunk_images, range(len(images.views)))
         self._last.remember(images, color)
-        return FixedRolloutImages(color, filled)
+        return FixedRolloutImages(color, filled, torch.ones_like(images.alpha))
 
     @torch.no_grad()
     def fill(self, images: RolloutImages) -> FixedRolloutImages:
@@ -140,7 +142,7 @@ class RolloutFixer:
         """
         nowhere = torch.zeros_like(images.alpha, dtype=torch.bool)
         if not images.chunk_scene.removed:
-            return FixedRolloutImages(images.color, nowhere)
+            return FixedRolloutImages(images.color, nowhere, images.alpha)
         chunk_images = self._load_chunk(images)
         novel = self._render_inputs(images, chunk_images)
         novel, filled = self._paste_repaired(images, novel, chunk_images)
@@ -151,7 +153,7 @@ class RolloutFixer:
             fixed = self._run_network(images, novel, chunk_images, rows)
             color[rows] = torch.where(filled[rows][..., None], fixed, color[rows])
         self._last.remember(images, color)
-        return FixedRolloutImages(color, filled)
+        return FixedRolloutImages(color, filled, images.alpha.masked_fill(filled, 1.0))
 
     def _load_chunk(self, images: RolloutImages) -> _ChunkImages:
         chunk = images.chunk_scene.chunk

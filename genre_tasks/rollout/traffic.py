@@ -73,7 +73,8 @@ def compose_scene(background: ChunkScene, traffic: ChunkScene) -> ChunkScene:
         spherical_harmonics=_join_spherical_harmonics(background.scene, still, traffic.scene, moving),
     )
     actors = _extend_tracks((), traffic.chunk.actors, chunk_SE3_other)
-    removed = _extend_tracks((), traffic.removed, chunk_SE3_other)
+    # What hid the background where it was recorded counts as well.
+    removed = _extend_tracks(background.removed, traffic.removed, chunk_SE3_other)
     return ChunkScene(replace(background.chunk, actors=actors), scene, removed)
 
 

@@ -96,9 +96,10 @@ def resolve_actor(word: str, names: Mapping[str, str]) -> str:
         return track_ids[word]
     by_number: dict[str, str] = {}
     for name, track_id in track_ids.items():
-        if "-" in name:
+        _, hyphen, number = name.rpartition("-")
+        if hyphen and number.isdecimal():
             # The first counts: an inserted actor, which comes last, may have been named like one of the log.
-            by_number.setdefault(name.rpartition("-")[2], track_id)
+            by_number.setdefault(number, track_id)
     if word in by_number:
         return by_number[word]
     if word in names:

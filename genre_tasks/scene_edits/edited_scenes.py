@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -247,12 +248,21 @@ class EditedScenes:
             if not isinstance(edit, Insert):
                 continue
             # Numbered on, so that a bare number names one actor alone.
-            name = edit.name or f"{make_slug(edit.actor.rpartition('-')[0] or 'actor')}-{len(taken) + len(out) + 1}"
+            name = edit.name or f"{self._name_class(edit)}-{len(taken) + len(out) + 1}"
             if name in taken or name in out:
                 problem = f"an actor '{name}' is there already"
                 raise self._at_edit(edit, InputError(problem, remedy="Give the inserted actor another name."))
             out[name] = edit
         return out
+
+    def _name_class(self, edit: Insert) -> str:
+        """Gives the first part of the actor's readable name; of another run's actor, of what the user wrote."""
+        name = edit.actor
+        if edit.from_run is None:
+            # An actor that is not known is an error where it is taken.
+            with suppress(InputError):
+                name = self._survey.names[resolve_actor(name, self._survey.names)]
+        return make_slug(name.rpartition("-")[0] or "actor")
 
     def _combine(self) -> dict[str, ActorChange]:
         by_actor: dict[str, list[object]] = {}

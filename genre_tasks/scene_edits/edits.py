@@ -30,7 +30,7 @@ class Insert(Section):
     kind: Literal["insert"] = "insert"
     actor: Actor
     from_run: Text | None = Field(None, description="Run that the actor is taken from; null: the edited run itself.")
-    name: Text | None = Field(None, description="Name of the new actor; null: made from its class.")
+    name: Text | None = Field(None, description="Name of the new actor; null: made from the actor's readable name.")
     ahead_m: Metres = Field(10.0, description="Metres along the recorded path from the ego vehicle at the start.")
     left_m: Metres = Field(0.0, description="Metres to the left of the recorded path; negative is to the right.")
     turn_deg: Degrees = Field(0.0, description="Turn to the left against the path; at 180 the actor is oncoming.")

@@ -37,6 +37,16 @@ def raw_motion(path: EgoPath) -> dict[str, np.ndarray]:
     }
 
 
+@pytest.mark.parametrize("name", ["brake", "accelerate", "lane-change", "swerve"])
+def test_what_breaks_the_bounds_is_planned_where_that_is_allowed(name: str) -> None:
+    # Three metres of radius are left on the inside, which breaks the bound of the curvature.
+    recorded = drive(60, lambda t: np.full_like(t, 8.0), lambda s: np.full_like(s, 0.12))
+    with pytest.raises(ConfigError, match="breaks the bounds"):
+        plan(name, recorded, offset_m=5.0)
+    path = plan(name, recorded, offset_m=5.0, allow_implausible=True)
+    assert find_bound_violations(path, CONFIG.bounds) and len(path) == len(recorded)
+
+
 def test_times_and_frames_are_the_recorded_ones() -> None:
     recorded = straight(40, 8.0)
     for name in BEHAVIOURS:

@@ -54,6 +54,8 @@ def test_file_holds_every_kind_of_edit(tmp_path: Path) -> None:
 def test_the_bare_number_of_an_actor_is_the_logs() -> None:
     names = {"a": "car-1", "inserted": "taxi-1"}
     assert resolve_actor("1", names) == "a" and resolve_actor("taxi-1", names) == "inserted"
+    # The last part of another name is no number: it would hide the start of an actor's name.
+    assert resolve_actor("bus", {"a": "car-1", "b": "bus-4", "inserted": "my-bus"}) == "b"
 
 
 def test_names_that_look_like_numbers_are_taken_as_they_are_written(tmp_path: Path) -> None:

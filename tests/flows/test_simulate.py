@@ -176,6 +176,14 @@ def test_a_simulations_film_stands_still_over_a_pause_of_its_path(recorded: Simu
     assert len(imageio.imread(tmp_path / "out" / "front_camera.mp4")) == len(poses) + 3
 
 
+@pytest.mark.parametrize("setting", ["gnet.iterations=8", "ingest.width_px=640", "novel_views.shifts_m=[1.0]"])
+def test_settings_that_change_nothing_of_a_simulation_are_refused(setting: str) -> None:
+    request = SimulationRequest(store="s", run="r", out=Path("o"), settings=(setting,))
+    with pytest.raises(ConfigError, match="changes nothing of a simulation"):
+        request.check()
+    replace(request, settings=("simulate.lane_m=2", "fnet.temporal=true", "novel_views.lidar_max_points=9")).check()
+
+
 def test_a_path_without_poses_is_refused(recorded: SimulationRequest, tmp_path: Path) -> None:
     file = tmp_path / "empty.json"
     file.write_text("[]")

@@ -27,6 +27,8 @@ def test_every_camera_comes_back_fixed():
     assert fixed.color.min() >= 0 and fixed.color.max() <= 1
     assert not torch.allclose(fixed.color, images.color, atol=1e-2)
     assert not fixed.filled.any()
+    # The network paints whole pixels, also where the render is thin.
+    assert images.alpha.min() < 1 and (fixed.alpha == 1).all()
 
 
 def test_the_same_view_is_fixed_alike_at_every_pose():
@@ -61,6 +63,7 @@ def test_filling_changes_what_the_actor_covered_and_nothing_else():
     assert area.any()
     assert torch.equal(filled.color[~area], images.color[~area])
     assert not torch.equal(filled.color[area], images.color[area])
+    assert (filled.alpha[area] == 1).all() and torch.equal(filled.alpha[~area], images.alpha[~area])
     # What the car did not cover was never hidden by it.
     covered = covered_by_car(2.0)
     assert (area & ~covered).sum() <= 0.1 * area.sum()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -96,6 +98,12 @@ def test_a_background_takes_the_actors_of_another_chunk() -> None:
     assert composed.chunk.world_SE3_chunk[0, 3] == 0 and composed.chunk.frames == BEFORE.chunk.frames
     posed = composed.scene.gaussians_at(5.0)
     assert np.allclose(posed.means[4].numpy(), [5.0, 0.0, 0.0])
+
+
+def test_what_was_removed_from_either_chunk_is_known() -> None:
+    removed = tuple(replace(part, removed=part.scene.actors[:1]) for part in (BEFORE, AFTER))
+    assert [track.track_id for track in compose_scene(*removed).removed] == ["a", "c"]
+    assert [track.track_id for track in extend_traffic(*removed).removed] == ["a", "c"]
 
 
 def test_a_standing_vehicle_is_at_the_place_of_its_moment() -> None:

@@ -276,6 +276,11 @@ def test_names_are_the_same_in_all_chunks(run: MadeRun) -> None:
     assert name_actors(edited) == {"a": "car-1", "b": "car-2", "c": "pedestrian-3", "taxi": "taxi"}
 
 
+def test_inserted_actors_are_named_after_the_actor_however_it_is_written(run: MadeRun) -> None:
+    for word in ("pedestrian-3", "3", "c", "ped"):
+        assert name_actors(edit(run, Insert(actor=word)))["pedestrian-7"] == "pedestrian-7", word
+
+
 def test_inserted_actors_are_edited_by_their_name(run: MadeRun) -> None:
     insert = Insert(actor="b", name="taxi", ahead_m=10, speed_m_s=0)
     plain = world_poses(edit(run, insert).load(0), "taxi")

@@ -17,6 +17,7 @@ from flows.simulation.stored_ranges import SideRange
 from flows.simulators import driving_world
 from flows.simulators.driving_env import ENVIRONMENT_ID, GenreDrivingEnv, RewardWeights, StartRange
 from flows.simulators.scene_renderer import SceneRenderer
+from genre_tasks.ego_paths.bicycle import BicycleModel
 from genre_tasks.ego_paths.world_actors import WorldActor
 from genre_tasks.errors import ConfigError, InputError
 
@@ -74,6 +75,16 @@ def test_the_start_is_the_recorded_one(free_road: GenreDrivingEnv) -> None:
     picture = free_road.render()
     assert picture is not None and picture.shape == (36, 128, 3)
     assert np.array_equal(picture[:, :64], observation["rgb"]["front_camera"])
+
+
+def test_the_first_pose_has_the_recorded_acceleration(
+    free_road: GenreDrivingEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = free_road._world
+    # A vehicle that brakes by 2 m/s² from the first moment on, and knows no earlier one.
+    monkeypatch.setattr(world._reference, "measure_speed", lambda moments: 9.0 - 2.0 * np.maximum(moments, 0.0))
+    model = BicycleModel(world.config.bounds)
+    assert [world.start(k, 0.0, model).acceleration_m_s2 for k in (0, 2)] == pytest.approx([-2.0, -2.0])
 
 
 def test_a_drive_ends_with_the_log(free_road: GenreDrivingEnv) -> None:

@@ -25,8 +25,14 @@ from benchmarks.exchange.service_fuzz import (
 )
 from flows.simulators import neuroncap
 from flows.simulators.image_request import ActorDescription, ActorPose, ImageRequest
-from flows.simulators.neuroncap import start_neuroncap
-from flows.simulators.neuroncap_messages import Trajectory, describe_recorded
+from flows.simulators.neuroncap import ActorState, start_neuroncap
+from flows.simulators.neuroncap_messages import (
+    ImageMessage,
+    Trajectory,
+    describe_recorded,
+    parse_trajectories,
+    write_trajectories,
+)
 from flows.simulators.scene_renderer import SceneRenderer
 from flows.simulators.service import RunningService, ServiceRequest
 from flows.simulators.service_metrics import SilentMetrics
@@ -112,6 +118,18 @@ def test_actors_come_back_and_can_be_moved(
     assert ask(service, "POST", "/update_actors", late)[0] == 200
     gone = read_image(ask(service, "POST", "/render_image", image_message(renderer, 2))[1])
     assert np.abs(empty.astype(int) - gone).max() <= 1
+
+
+def test_recorded_actors_that_are_sent_back_are_at_each_cameras_own_moment(renderer: SceneRenderer) -> None:
+    state = ActorState(renderer)
+    message = ImageMessage.model_validate(image_message(renderer, 2))
+    assert state.request_image(message).actors is None
+    sent_back = parse_trajectories(json.dumps(write_trajectories(state.trajectories)).encode())
+    state.replace_all(sent_back[1:])
+    present = [trajectory for trajectory in sent_back[1:] if trajectory.pose_at(message.timestamp) is not None]
+    assert len(state.request_image(message).actors or ()) == len(present)
+    state.replace_all(sent_back[::-1])
+    assert state.request_image(message).actors is None
 
 
 def test_trajectories_are_interpolated() -> None:
