@@ -102,7 +102,9 @@ def last_modified(folder: Path) -> float:
         Seconds since the epoch; now, where everything is gone.
     """
     times = []
-    for path in (folder, *folder.rglob("*")):
+    # Not by pathlib, which raises where a folder disappears while it is listed.
+    below = [Path(base) / name for base, names, files in os.walk(folder) for name in (*names, *files)]
+    for path in (folder, *below):
         with suppress(FileNotFoundError):
             # The link itself and not its target, which may lie anywhere.
             times.append(path.lstat().st_mtime)

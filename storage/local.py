@@ -233,12 +233,15 @@ class LocalStore:
             if not folder.name.startswith(key or key_start):
                 continue
             # A damaged artifact must not hide the sound ones after it; `verify_all` reports it.
-            with suppress(ArtifactCorruptError, ConfigError):
+            try:
                 manifest = load_manifest(folder)
                 address = manifest.address
-                fits = all(v is None or v == getattr(manifest, name) for name, v in wanted.items())
-                if fits and folder == self.root / address.relative_path:
-                    yield Artifact(address, folder, manifest)
+                is_in_place = folder == self.root / address.relative_path
+            except (ArtifactCorruptError, ConfigError, FileNotFoundError):
+                # One that is gone was discarded by another process since its folder was listed.
+                continue
+            if is_in_place and all(v is None or v == getattr(manifest, name) for name, v in wanted.items()):
+                yield Artifact(address, folder, manifest)
 
     def verify_all(self) -> Iterator[tuple[str, GenreError | None]]:
         """Checks every artifact of the store: see :meth:`storage.store.Store.verify_all`.
@@ -278,7 +281,8 @@ class LocalStore:
                 path = Path(folder) / name
                 is_temporary = name.startswith((TEMPORARY_PREFIX, TRASH_PREFIX))
                 # A process that was suspended for long goes on afterwards.
-                is_old = is_temporary and now - last_modified(path) >= older_than_s and not is_in_use(path)
+                # Whose owner lives is asked first: the folder's files come and go then.
+                is_old = is_temporary and not is_in_use(path) and now - last_modified(path) >= older_than_s
                 # Removed from the walk too, which would otherwise enter a folder that is going away.
                 if is_temporary and name in names:
                     names.remove(name)

@@ -109,9 +109,31 @@ class LocalRecordFolders:
     def find(self, parent: str, file: str, start: str = "") -> list[Path]:
         """Finds a file of many folders: see :meth:`RecordFolders.find`."""
         folder = self._root.joinpath(*split_record_name(parent))
+        if not can_start_name(start):
+            return []
         # Only folders that fit are looked into: a dataset asks for one of its thousand runs after the other.
         found = folder.glob(f"{glob.escape(start)}*/{file}")
-        return sorted(found, key=lambda path: path.stat().st_mtime)
+        return sorted(found, key=_modified_s)
+
+
+def can_start_name(start: str) -> bool:
+    """Says whether a folder's name may begin so; pathlib and buckets raise where a path is given in its place.
+
+    Args:
+        start: what a user wrote.
+
+    >>> can_start_name("5f41"), can_start_name("/data/runs/5f41")
+    (True, False)
+    """
+    return "/" not in start and "\0" not in start
+
+
+def _modified_s(path: Path) -> float:
+    try:
+        return path.stat().st_mtime
+    except FileNotFoundError:
+        # Another process has removed the record since; whoever reads it is told so.
+        return 0.0
 
 
 def split_record_name(name: str) -> tuple[str, ...]:

@@ -7,12 +7,25 @@ from pathlib import Path
 from typing import Any
 
 from flows.budget.chooser import Chooser, count_images
-from flows.budget.cost_table import CostTable, find_shipped_table, load_cost_table
+from flows.budget.cost_table import CostTable, find_shipped_table, load_cost_table, overlap
 from flows.budget.deadline import Deadline
 from flows.configuration import apply_settings, diff_from_preset
 from flows.machine.calibration import measure_calibration_s
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ConfigError
+
+_KEYS_OF_TIME = frozenset(
+    {
+        "gnet.method",
+        "gnet.views_per_iteration",
+        "enet.views_per_iteration",
+        "enet.novel_views_per_iteration",
+        "novel_views.shifts_m",
+        "fnet.model",
+        "fnet.max_network_px",
+    }
+)
+"""Settings by which stages take several times as long, so that a table without them predicts nothing."""
 
 
 def resolve_table(table: str | None, preset: str, config: PipelineConfig) -> CostTable:
@@ -27,15 +40,25 @@ def resolve_table(table: str | None, preset: str, config: PipelineConfig) -> Cos
         The table.
 
     Raises:
-        ConfigError: the table was measured with settings that the run does not have, or as
+        ConfigError: the table was measured with settings that the run does not have, or without some that change what
+            its stages take, or as
             :func:`flows.budget.cost_table.load_cost_table` and ``find_shipped_table`` raise it.
     """
     path = Path(table) if table else find_shipped_table(preset)
-    loaded = load_cost_table(path, preset, diff_from_preset(config, preset))
+    own_keys = diff_from_preset(config, preset)
+    loaded = load_cost_table(path, preset, own_keys)
     if lacking := [setting for setting in loaded.settings if apply_settings(config, [setting]) != config]:
         raise ConfigError(
             f"this table was measured with {', '.join(lacking)}, which this run does not have",
             remedy="Give the run the same with --set, or a table that was measured without.",
+            file=path,
+        )
+    measured_keys = [setting.partition("=")[0] for setting in loaded.settings]
+    own_keys_of_time = sorted(_KEYS_OF_TIME.intersection(own_keys))
+    if unknown := [key for key in own_keys_of_time if not any(overlap(key, other) for other in measured_keys)]:
+        raise ConfigError(
+            f"this table was measured without {', '.join(unknown)}, which changes what stages take",
+            remedy=f"Give the cost.parquet of `genre cost LOG --preset {preset} --set …` with --table.",
             file=path,
         )
     return loaded

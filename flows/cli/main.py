@@ -6,6 +6,7 @@ import logging
 import os
 import sys
 import warnings
+from contextlib import suppress
 from typing import Annotated
 
 import typer
@@ -126,8 +127,6 @@ def prepare_environment(debug: bool) -> None:
         debug: whether Prefect's own messages are shown.
     """
     defaults = {
-        # Not the working folder, which may be read-only.
-        "PREFECT_HOME": str(find_state_folder() / "prefect"),
         # Nothing is sent to Prefect's makers.
         "DO_NOT_TRACK": "1",
         "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
@@ -142,6 +141,11 @@ def prepare_environment(debug: bool) -> None:
         # An empty variable counts as none, as in Prefect: an empty home would be the working folder.
         if not os.environ.get(name):
             os.environ[name] = value
+    if not os.environ.get("PREFECT_HOME"):
+        # Where nothing can be written, only what needs a home may fail: help and checks do not.
+        with suppress(OSError):
+            # Not the working folder, which may be read-only.
+            os.environ["PREFECT_HOME"] = str(find_state_folder() / "prefect")
     if not debug:
         # Python prints what a library logs before it has set up its log.
         logging.getLogger("prefect").addHandler(logging.NullHandler())

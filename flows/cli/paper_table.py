@@ -213,3 +213,5 @@ def _measure_table(request: TableRequest) -> None:
             detector=request.detector,
         )
     typer.echo(f"{done['cells']} cells, {len(done['failed'])} left out; wrote {', '.join(done['files'])}")
+    if done["failed"]:
+        raise typer.Exit(1)

@@ -68,7 +68,7 @@ def _translate(error: Mapping[str, Any], places: Places) -> ConfigError:
     is_section = isinstance(error["input"], Mapping)
     got = "" if is_section else f" (got {describe_value(error['input'])})"
     place = places.find_last_change(path) if is_section else places.find(path)
-    remedy = "See `genre show config` for the keys, their values and their bounds."
+    remedy = "See `genre show config` for the keys and their values, and the configuration reference for bounds."
     annotation = find_annotation(path)
     if error["type"] == "tuple_type" and takes_list(annotation):
         remedy = f"Write a list: --set '{key}={example_list(annotation)}'."

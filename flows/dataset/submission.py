@@ -139,7 +139,7 @@ def _find_deployment(client: SyncPrefectClient, name: str) -> DeploymentResponse
     try:
         return client.read_deployment_by_name(name)
     except ObjectNotFound as error:
-        remedy = "Deploy it in the folder of prefect.yaml: prefect --no-prompt deploy --all."
+        remedy = "Deploy the flows: genre ops deploy --store STORE."
         raise ConfigError(f"the Prefect server has no deployment '{name}'", remedy=remedy) from error
 
 

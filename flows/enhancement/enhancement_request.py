@@ -172,7 +172,9 @@ def _count_gaussians(scene: Path) -> int:
 def _make_settings(inputs: EnhancementInputs, log: PosedImagesLog, ingest: IngestConfig) -> list[str]:
     chunk_frames = ingest.chunk_frames if inputs.chunk_frames is None else inputs.chunk_frames
     placement = f"{{scale: {log.metres_per_unit!r}, quat: {_find_quat(log.world_R_source)}}}"
-    points = f"ingest.points={inputs.lidar}" if inputs.lidar else f"ingest.scene={inputs.scene}"
+    # The run's record has these, and is read from other folders.
+    scene = inputs.scene.absolute()
+    points = f"ingest.points={inputs.lidar.absolute()}" if inputs.lidar else f"ingest.scene={scene}"
     width, height = choose_working_size(ingest, log.cameras[:1])
     frames = min(chunk_frames, log.frame_count)
     settings = [
@@ -181,7 +183,7 @@ def _make_settings(inputs: EnhancementInputs, log: PosedImagesLog, ingest: Inges
         f"ingest.placement={placement}",
         f"ingest.width_px={width}",
         f"ingest.height_px={height}",
-        f"initial.scene={inputs.scene}",
+        f"initial.scene={scene}",
         f"initial.placement={placement}",
         # The scene is another program's work, and starts ENet as it is.
         "gnet.method=none",

@@ -97,7 +97,8 @@ def _find_imported(store: str, name: str) -> list[Artifact]:
     artifacts = list(open_store(store).artifacts(dataset=IMPORTED, stage=IMPORT_STAGE))
     named = [artifact for artifact in artifacts if artifact.manifest.log == name]
     found = named or [artifact for artifact in artifacts if name and artifact.manifest.key.startswith(name)]
-    if len({artifact.manifest.chunk for artifact in found}) < len(found):
+    # Every chunk has a key of its own: the start of several keys means several scenes.
+    if len(found) > 1 and (not named or len({artifact.manifest.chunk for artifact in found}) < len(found)):
         keys = ", ".join(artifact.manifest.key[:12] for artifact in found)
         raise InputError(f"several imported scenes are called '{name}'", remedy=f"Give a key: {keys}.", file=store)
     return found

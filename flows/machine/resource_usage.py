@@ -37,7 +37,7 @@ class ResourceUsage:
 
 @contextmanager
 def measure_usage() -> Iterator[ResourceUsage]:
-    """Measures the time and the memory of a block, and turns running out of memory into one kind of error.
+    """Measures the time and the memory of a block; running out of memory is :func:`memory_errors_translated`'s error.
 
     Yields:
         The usage, complete once the block has ended.
@@ -58,7 +58,26 @@ def measure_usage() -> Iterator[ResourceUsage]:
     wall_start = time.perf_counter()
     cpu_start = time.process_time()
     try:
-        yield usage
+        with memory_errors_translated():
+            yield usage
+    finally:
+        usage.seconds = time.perf_counter() - wall_start
+        usage.cpu_seconds = time.process_time() - cpu_start
+        usage.peak_mib = peak.stop()
+
+
+@contextmanager
+def memory_errors_translated() -> Iterator[None]:
+    """Turns running out of memory, in Python or in a library, into one kind of error.
+
+    Yields:
+        Nothing.
+
+    Raises:
+        ResourceError: the block ran out of memory.
+    """
+    try:
+        yield
     except (MemoryError, RuntimeError) as error:
         text = str(error)
         # Torch raises a plain RuntimeError for a failed allocation; only its text tells.
@@ -67,10 +86,6 @@ def measure_usage() -> Iterator[ResourceUsage]:
                 f"memory ran out: {text[:200]}", remedy="Choose a smaller ingest.width_px or fewer cameras."
             ) from error
         raise
-    finally:
-        usage.seconds = time.perf_counter() - wall_start
-        usage.cpu_seconds = time.process_time() - cpu_start
-        usage.peak_mib = peak.stop()
 
 
 class _MemoryPeak:

@@ -31,7 +31,7 @@ from flows.paper_tables.request import (
 from flows.paper_tables.rollout_cells import measure_rollout_cell
 from flows.pipeline.progress import get_reporter
 from genre_tasks.atomic_path import atomic_path
-from genre_tasks.errors import GenreError
+from genre_tasks.errors import GenreError, InputError
 from storage.opening import open_store
 
 
@@ -109,6 +109,11 @@ def _measure(request: TableRequest, checked: CheckedRequest) -> dict[str, Any]:
     complete = [c for c in cells if c.method not in failed]
     if not complete and failed:
         raise next(iter(failed.values()))
+    # A table without a row would replace one that was measured.
+    if not complete:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in checked.missing.items())
+        problem = f"no method of table {request.number} is left ({reasons})"
+        raise InputError(problem, remedy="Check --store and --set, or leave out --stored.", file=request.store)
     missing = checked.missing | {name: f"it failed: {error}" for name, error in failed.items()}
     files = write_results(request, checked, complete, missing)
     return {"cells": len(complete), "failed": sorted(failed), "files": files}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import glob
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -119,8 +120,12 @@ def expand_logs(logs: list[str]) -> list[str]:
 
 def _match_folders(path: Path) -> list[Path]:
     start = next(index for index, part in enumerate(path.parts) if "*" in part)
-    # Only a star stands for other characters: brackets and question marks are parts of names.
-    names = ["*".join(glob.escape(text) for text in part.split("*")) for part in path.parts[start:]]
+    # Only a star stands for other characters: brackets and question marks are parts of names. Several in a row mean no
+    # more than one, but for a part of two alone, which pathlib takes for any number of folders.
+    names = [
+        part if part == "**" else "*".join(glob.escape(text) for text in re.split(r"\*+", part))
+        for part in path.parts[start:]
+    ]
     found = Path(*path.parts[:start]).glob("/".join(names))
     # Sorted by name, so that a dataset runs in the same order on every file system. Hidden folders hold no logs.
     return sorted(folder for folder in found if folder.is_dir() and not folder.name.startswith("."))

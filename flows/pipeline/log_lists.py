@@ -34,6 +34,10 @@ def expand_log_list(uri: str) -> list[str] | None:
     # A folder may really begin with the sign.
     if match is None or expand_user_path(text).is_dir():
         return None
+    above, below, _ = match["file"].partition("/")
+    # So may one above the logs, such as a subvolume of a file system.
+    if below and (expand_user_path(match["folder"]) / f"@{above}").is_dir():
+        return None
     # As in a shell, a path counts from where the user is; a split that comes with the data lies beside the logs.
     given = expand_user_path(match["file"])
     file = given if given.exists() else expand_user_path(match["folder"]) / given

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from flows.machine.facts import describe_environment
 from flows.machine.memory_reuse import trim_memory
-from flows.machine.resource_usage import measure_usage
+from flows.machine.resource_usage import measure_usage, memory_errors_translated
 from flows.observability.stage_observation import count_read, count_written, measure_lease_wait, note_key, observed
 from flows.pipeline.definition import (
     STAGE_BY_NAME,
@@ -102,8 +102,7 @@ def compute_key(spec: StageSpec, job: Job, inputs: Mapping[str, ArtifactRef]) ->
         KeyError: an input is missing.
     """
     config = PipelineConfig.model_validate(job.config)
-    # Payload digests and not keys: an input that was computed again by other code, but came out the same, changes no
-    # later key.
+    # Payload digests and not keys: an input that was computed again, but came out the same, changes no later key.
     digests = {name: inputs[name].payload_digest for name in spec.inputs}
     if spec.needs_log:
         log = cached_log(job.log)
@@ -223,6 +222,7 @@ def run_stage(
     return _reference(artifact, cached=False, note=note)
 
 
+@memory_errors_translated()
 def _compute_artifact(
     spec: StageSpec,
     job: Job,
@@ -236,7 +236,7 @@ def _compute_artifact(
     config = PipelineConfig.model_validate(job.config)
     configured = config_section(spec, config)
     module, _, name = spec.function.partition(":")
-    # Read here and not before the look-up: a hit reads the manifests alone.
+    # Read here and not before the look-up: a hit reads the manifests alone. It may take as much memory as the stage.
     artifacts = {name: _find_input(store, inputs[name], job) for name in spec.inputs}
     with open_inputs(spec, job.log, config, store, artifacts, is_retry=attempt > 0) as opened:
         values = opened.values | _special_arguments(spec, job)

@@ -27,6 +27,7 @@ from flows.reconstruction.run_summary import (
 )
 from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import InputError
+from storage.io_errors import os_errors_translated
 from storage.opening import open_store
 
 if TYPE_CHECKING:
@@ -92,13 +93,14 @@ def write_run_record(run: FinishedRun, summary: RunSummary, extra: Mapping[str, 
         The record, as plain values.
 
     Raises:
-        OSError: the folder cannot be written.
+        GenreError: the folder cannot be written.
     """
     from flows.reconstruction.report.writing import write_report
 
     folder = run.folder
-    folder.mkdir(parents=True, exist_ok=True)
-    report = write_report(folder / "report.html", summary)
+    with os_errors_translated(folder, None):
+        folder.mkdir(parents=True, exist_ok=True)
+        report = write_report(folder / "report.html", summary)
     record = {
         "status": "partly_done" if run.left_out else "done",
         "log": run.log,
@@ -120,7 +122,7 @@ def write_run_record(run: FinishedRun, summary: RunSummary, extra: Mapping[str, 
         **extra,
     }
     # Written last: a folder without run.json belongs to a run that did not end.
-    with atomic_path(folder / "run.json") as part:
+    with os_errors_translated(folder, None), atomic_path(folder / "run.json") as part:
         part.write_text(json.dumps(record, indent=1), encoding="utf-8")
     open_store(run.store).records.push(name_run_folder(run.name))
     return record

@@ -139,9 +139,10 @@ def _train_to_end(job: FixerJob, progress: Progress) -> tuple[Path, bool]:
         autoencoder=Path(job.folder) / "fnet",
     )
     # Someone may have deleted the weights after the last checkpoint, which still has them.
-    if not (folder / WEIGHTS_FILE).is_file():
+    weights = folder / WEIGHTS_FILE
+    if not (weights.is_file() and weights.with_suffix(".json").is_file()):
         recorder.save(fnet)
-    return folder / WEIGHTS_FILE, recorder.is_trained
+    return weights, recorder.is_trained
 
 
 def require_same_inputs(inputs: Sequence[str], job: FixerJob, path: Path) -> None:

@@ -144,6 +144,7 @@ def check_for_training(recipe: SceneRecipe) -> None:
         ConfigError: a synthetic seed is outside 0 to 899, or the chunk of any log is not chunk 0.
 
     >>> check_for_training(SceneRecipe("synthetic:street?seed=899"))
+    >>> check_for_training(SceneRecipe("pandaset:002?seed=of-somebody"))
     >>> check_for_training(SceneRecipe("synthetic:street?seed=900"))
     Traceback (most recent call last):
     ...
@@ -151,8 +152,8 @@ def check_for_training(recipe: SceneRecipe) -> None:
     """
     reader, _, query = recipe.uri.partition("?")
     # A street without a seed has seed 0, which is for training.
-    seed = int(parse_qs(query).get("seed", ["0"])[0])
-    if reader.startswith("synthetic:") and seed not in TRAINING_SEEDS:
+    seed = parse_qs(query).get("seed", ["0"])[0]
+    if reader.startswith("synthetic:") and not (seed.isdecimal() and int(seed) in TRAINING_SEEDS):
         raise ConfigError(
             f"seed {seed} of {recipe.uri} is not for training",
             remedy=f"Use seeds {TRAINING_SEEDS[0]} to {TRAINING_SEEDS[-1]}.",

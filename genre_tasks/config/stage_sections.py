@@ -118,7 +118,8 @@ class FnetConfig(Section):
 
     # The small network is the default, as it runs on a CPU and its weights ship.
     model: Literal["small", "sd-turbo"] = Field(
-        "small", description="small: the network that ships; sd-turbo: the paper's, which needs a GPU and its weights."
+        "small",
+        description="small: the network that ships; sd-turbo: the paper's, slow on a CPU, whose weights do not ship.",
     )
     weights: Text = Field("builtin", description="builtin, or the path of a folder with the model's weights.")
     timestep: int = Field(

@@ -14,7 +14,7 @@ from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import ConfigError
 from storage.files import digest_file
 from storage.objects.bucket import Bucket, ObjectInfo
-from storage.records import split_record_name
+from storage.records import can_start_name, split_record_name
 
 # Hidden, so that no record has this name: what every file was at the last pull or push.
 _SYNC = ".sync.json"
@@ -70,6 +70,8 @@ class ObjectRecordFolders:
     def find(self, parent: str, file: str, start: str = "") -> list[Path]:
         """Finds a file of many folders: see :meth:`storage.records.RecordFolders.find`."""
         split_record_name(parent)
+        if not can_start_name(start):
+            return []
         found: list[tuple[datetime, str, Path]] = []
         for info in self._bucket.list(parent, start):
             name, _, rest = info.name[len(parent) + 1 :].partition("/")

@@ -225,6 +225,9 @@ class StoreSuite:
         assert (second.records.pull("runs/ab") / "run.json").read_text() == "ab"
         assert [path.read_text() for path in second.records.find("runs", "run.json")] == ["aa", "ab"]
         assert [path.parent.name for path in second.records.find("runs", "run.json", "ab")] == ["ab"]
+        # Somebody may give a path in the place of a name.
+        assert second.records.find("runs", "run.json", "/data/runs/ab") == []
+        assert second.records.find("runs", "run.json", "ab/x") == []
         store.records.remove("runs/aa")
         store.records.remove("runs/none")
         assert [path.read_text() for path in second.records.find("runs", "run.json")] == ["ab"]

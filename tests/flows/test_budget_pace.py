@@ -9,12 +9,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from flows.budget import budget as budgets
 from flows.budget.budget import Budget, resolve_table
 from flows.budget.chooser import Chooser
 from flows.budget.cost_table import load_cost_table
 from flows.configuration import load_configuration
+from flows.cost_sweep import plot
 from flows.cost_sweep.parquet import write_settings
 from flows.cost_sweep.plot import draw_sweep
 from flows.cost_sweep.summary import PSNR, summarise_settings
@@ -80,6 +83,32 @@ def test_a_table_of_other_settings_is_refused(tmp_path: Path) -> None:
     assert resolve_table(table, "demo", load_configuration("demo", settings=own[:1])).settings == (own[0],)
 
 
+@pytest.mark.parametrize(
+    "setting", ["gnet.method=standard_3dgs", "fnet.max_network_px=null", "enet.novel_views_per_iteration=9"]
+)
+def test_settings_that_take_much_longer_than_the_table_says_are_refused(tmp_path: Path, setting: str) -> None:
+    table = str(written(tmp_path / "cost.parquet", preset="hd"))
+    key = setting.partition("=")[0]
+    with pytest.raises(ConfigError, match=rf"measured without {key}, which.*--table"):
+        resolve_table(table, "hd", load_configuration("hd", settings=[setting]))
+    # Weights and seeds take no time.
+    assert resolve_table(table, "hd", load_configuration("hd", settings=["gnet.seed=5"])).points
+
+
+@pytest.mark.parametrize("setting", ["enet.learning_rates=null", "enet.learning_rates.means=0.05"])
+def test_a_table_that_sets_a_section_leaves_no_key_of_it_to_the_user(tmp_path: Path, setting: str) -> None:
+    rows = [
+        table_row("", (), "enet", 2.0, 25.0),
+        table_row("slow", ("enet.learning_rates={means: 0.1, log_scales: 0.1}",), "enet", 1.0, 24.0),
+    ]
+    path = tmp_path / "cost.parquet"
+    facts = {"base": "small", "judged": "psnr", "calibration_s": "0.1", "cold_seconds": "{}", "machine": "somewhere"}
+    write_settings(path, summarise_settings(rows), facts)
+    with pytest.raises(ConfigError, match=r"enet\.learning_rates\S* is what a budget decides"):
+        resolve_table(str(path), "small", load_configuration("small", settings=[setting]))
+    assert resolve_table(str(path), "small", load_configuration("small")).points
+
+
 @pytest.mark.parametrize("settings", ["7", "not JSON", '["gnet.iteration=3"]'])
 def test_damaged_settings_of_a_table_are_an_error(tmp_path: Path, settings: str) -> None:
     with pytest.raises(ConfigError):
@@ -89,6 +118,22 @@ def test_damaged_settings_of_a_table_are_an_error(tmp_path: Path, settings: str)
 def unjudged(metrics: Mapping[str, float]) -> list[dict[str, object]]:
     rows = [table_row("", (), "gnet", 2.0, 0.0), table_row("short", ("gnet.iterations=1",), "gnet", 1.0, 0.0)]
     return [row | {"metrics": dict(metrics)} for row in rows]
+
+
+def test_a_sweep_whose_preset_failed_has_a_picture() -> None:
+    rows = unjudged({"interpolation/psnr": 20.0})[1:]
+    assert draw_sweep(summarise_settings(rows), PSNR, "no preset").std() > 0
+
+
+def test_labels_of_settings_at_one_point_do_not_hide_each_other() -> None:
+    figure = Figure()
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    for text, place in (("gate 0.05", 0.2), ("gate 0.2", 0.2), ("off", 0.8)):
+        axes.annotate(text, (place, place))
+    canvas.draw()
+    plot._remove_hidden_labels(axes)
+    assert [label.get_text() for label in axes.texts] == ["gate 0.05", "off"]
 
 
 def test_a_sweep_without_held_out_images_has_a_picture_and_its_table_is_refused(tmp_path: Path) -> None:

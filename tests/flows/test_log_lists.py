@@ -37,6 +37,23 @@ def test_a_folder_that_begins_with_the_sign(tmp_path: Path) -> None:
     (tmp_path / "@val").mkdir()
     assert expand_log_list(f"pandaset:{tmp_path}/@val") is None
     assert expand_log_list("pandaset:a@b/002") is None
+    # A folder above the logs may as well, also with a star, with options, or where a log is no folder.
+    for uri in (f"pandaset:{tmp_path}/@val/*", f"kitti:{tmp_path}/@val/drive?labels=x", f"nuscenes:{tmp_path}/@val/a"):
+        assert expand_log_list(uri) is None
+    (tmp_path / "@val" / "002").mkdir()
+    assert expand_logs([f"pandaset:{tmp_path}/@val/*"]) == [f"pandaset:{tmp_path}/@val/002"]
+    # A list in another folder is still one.
+    (tmp_path / "lists").mkdir()
+    (tmp_path / "lists" / "few.txt").write_text("@val/002\n")
+    assert expand_logs([f"pandaset:{tmp_path}/@lists/few.txt"]) == [f"pandaset:{tmp_path}/@val/002"]
+
+
+def test_several_stars_in_a_row_mean_one(tmp_path: Path) -> None:
+    for name in ("001", "002"):
+        (tmp_path / name / "part").mkdir(parents=True)
+    assert expand_logs([f"pandaset:{tmp_path}/0**"]) == [f"pandaset:{tmp_path}/{name}" for name in ("001", "002")]
+    below = expand_logs([f"pandaset:{tmp_path}/**/part"])
+    assert below == [f"pandaset:{tmp_path}/{name}/part" for name in ("001", "002")]
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from flows.cli import main
 from flows.machine import cgroups
 from flows.machine.facts import count_cores, describe_environment, describe_machine, git_commit
 from flows.machine.memory import memory_limit_gib
@@ -81,6 +82,20 @@ def test_limits_of_the_processs_own_cgroup_count(
         (tmp_path / "cgroup" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "cgroup" / name).write_text(text + "\n")
     assert (memory_limit_gib(), count_cores()) == (gib or without[0], cores or without[1])
+
+
+def test_help_needs_no_folder_to_write_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nowhere() -> Path:
+        raise FileNotFoundError("No usable temporary directory found")
+
+    variables: dict[str, str] = {}
+    monkeypatch.setattr(os, "environ", variables)
+    monkeypatch.setattr(main, "find_state_folder", nowhere)
+    main.prepare_environment(debug=True)
+    assert variables["DO_NOT_TRACK"] == "1" and "PREFECT_HOME" not in variables
+    monkeypatch.setattr(main, "find_state_folder", lambda: Path("/state"))
+    main.prepare_environment(debug=True)
+    assert variables["PREFECT_HOME"] == "/state/prefect"
 
 
 def test_a_state_folder_of_somebody_else_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

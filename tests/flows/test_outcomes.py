@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from typer.testing import CliRunner
 from flows.cli import outcome
 from flows.cli.main import app
 from flows.error_record import record_error
+from flows.paper_tables import flow as paper_flow
 from genre_tasks.errors import InputError
 from tests.flows.command_line import ROOT, faulty, genre
 
@@ -157,6 +159,17 @@ def test_an_error_is_recorded_with_its_place() -> None:
     error = InputError("no\nimage", remedy="Copy it.", camera="front", frame=3)
     expected = {"class": "InputError", "message": "no image", "remedy": "Copy it.", "camera": "front", "frame": 3}
     assert record_error(error) == expected
+
+
+def test_the_command_fails_where_a_method_is_left_out(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for failed, status in (([], 0), (["3DGS on a: memory ran out"], 1)):
+        done = {"cells": 2, "failed": failed, "files": ["table4.md"]}
+        monkeypatch.setattr(paper_flow, "paper_table", lambda *args, _done=done, **options: _done)
+        # Nothing runs, so no server is needed.
+        monkeypatch.setattr("flows.cli.terminal.report_on_terminal", nullcontext)
+        told = ["table", "4", STREET, "--preset", "demo", "--store", str(tmp_path), "--out", str(tmp_path / "out")]
+        ended = CliRunner().invoke(app, told)
+        assert ended.exit_code == status and f"{len(failed)} left out" in ended.output, ended.output
 
 
 def test_the_exit_statuses_are_documented() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 from collections.abc import Iterator
@@ -21,6 +22,7 @@ from flows.pipeline.log_cache import cached_log, expand_logs
 from flows.pipeline.stage_runner import Job
 from flows.reconstruction import flow, outcome_artifact, run_records, stored_values
 from flows.reconstruction.left_out import ChunksLeftOutError, LogsFailedError
+from flows.reconstruction.report import writing
 from genre_tasks.errors import (
     ConfigError,
     DiskFullError,
@@ -141,6 +143,18 @@ def test_what_no_retry_can_cure_is_not_retried(tmp_path: Path, monkeypatch: pyte
     with pytest.raises(kind, match="wrong"):
         run(tmp_path)
     assert calls == ["ingest"]
+
+
+@pytest.mark.parametrize("what", ["write_report", "atomic_path"])
+def test_a_disk_that_is_full_when_the_record_is_written_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    def full(path: Path, *args: Any) -> Any:
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr(writing if what == "write_report" else run_records, what, full)
+    with pytest.raises(DiskFullError, match="run.json" if what == "atomic_path" else "report.html"):
+        run(tmp_path)
 
 
 def test_a_chunk_that_cannot_be_made_leaves_the_others(tmp_path: Path) -> None:

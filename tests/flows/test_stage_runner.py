@@ -35,6 +35,20 @@ def run(work: Job, *stages: str) -> dict[str, ArtifactRef]:
     return refs
 
 
+@pytest.mark.parametrize("where", ["open_inputs", "describe_environment"])
+def test_memory_that_runs_out_beside_the_computation_is_retried_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    """Inputs are read before a stage, and its result is written after it."""
+
+    def no_memory(*args: object, **options: object) -> object:
+        raise RuntimeError("DefaultCPUAllocator: can't allocate memory")
+
+    monkeypatch.setattr(room, where, no_memory)
+    with pytest.raises(ResourceError, match="memory ran out"):
+        run(job(tmp_path / "store"), "ingest")
+
+
 @pytest.fixture(scope="module")
 def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     store = tmp_path_factory.mktemp("filled") / "store"

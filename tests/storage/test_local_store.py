@@ -8,15 +8,18 @@ import os
 import shutil
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from genre_tasks.errors import ArtifactCorruptError, ConfigError
 from genre_tasks.temporary_names import describe_owner
+from storage import local
+from storage.artifact_folders import last_modified
 from storage.local import LocalStore, Provenance
 from storage.manifest import MANIFEST, NewerSchemaError
 from storage.opening import open_local_store
-from tests.contracts.store_suite import KEY, StoreSuite, address
+from tests.contracts.store_suite import KEY, OTHER, StoreSuite, address
 from tests.storage.artifact_values import COLORS, MAKERS, assert_same, make
 
 
@@ -148,6 +151,31 @@ def test_an_old_folder_of_a_living_process_stays(tmp_path: Path) -> None:
     before = time.time() - 7200
     os.utime(living, (before, before))
     assert store.clean_temporaries(older_than_s=3600) == 0 and living.is_dir()
+
+
+def test_folders_that_disappear_meanwhile_end_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other processes commit, collect and repair while a store is listed and cleaned."""
+    store = LocalStore(tmp_path)
+    artifact = store.commit(address(), "evaluation", make("evaluation"))
+    other = store.commit(address(key=OTHER), "evaluation", make("evaluation"))
+    real = local.load_manifest
+
+    def removed_first(folder: Path) -> Any:
+        if folder == other.path:
+            shutil.rmtree(folder)
+        return real(folder)
+
+    monkeypatch.setattr(local, "load_manifest", removed_first)
+    assert [found.address for found in store.artifacts()] == [artifact.address]
+    assert last_modified(tmp_path / "nothing") == pytest.approx(time.time(), abs=60)
+    names = os.walk
+
+    def vanishing(top: Any, **options: Any) -> Any:
+        for base, folders, files in names(top, **options):
+            yield base, folders, [*files, "gone"]
+
+    monkeypatch.setattr(os, "walk", vanishing)
+    assert last_modified(artifact.path) <= time.time()
 
 
 def test_a_corrupt_one_that_another_writer_repaired_meanwhile_is_kept(
