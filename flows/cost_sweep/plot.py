@@ -15,6 +15,7 @@ from flows.cost_sweep.summary import PSNR, Measure, SettingSummary
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.transforms import Bbox
 
 LABELLED_CHANGE = 0.005
 """Effects that change a measure by less than this fraction of the preset's get no label: a dozen lie on one point."""
@@ -28,7 +29,7 @@ def draw_sweep(summaries: Sequence[SettingSummary], novel_measure: Measure, titl
     """Draws a sweep.
 
     Args:
-        summaries: the settings, the preset among them.
+        summaries: the settings; the preset among them gets a star.
         novel_measure: what settings are compared by away from the path.
         title: wrapped to the picture's width.
 
@@ -62,13 +63,18 @@ def draw_sweep(summaries: Sequence[SettingSummary], novel_measure: Measure, titl
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8)
     figure.suptitle(textwrap.fill(title, 50 * columns), fontsize=9)
+    # Where labels stand is known once the panels have their size.
+    canvas.draw()
+    for axes in panels.ravel():
+        _remove_hidden_labels(axes)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 def _draw_panel(axes: Axes, summaries: Sequence[SettingSummary], knob: str, measure: Measure) -> None:
-    preset = next(x for x in summaries if x.knob == PRESET_ITSELF)
-    preset_value = preset.values[measure.name].average
+    # A sweep whose preset failed has none.
+    preset = next((x for x in summaries if x.knob == PRESET_ITSELF), None)
+    star = () if preset is None else ((preset.seconds, preset.values[measure.name].average),)
     # The front is that of the whole sweep, so that a panel shows what other knobs reach in the same time.
     front = sorted((x for x in summaries if measure.name in x.on_front), key=lambda x: x.seconds)
     seconds, values, _ = _points(front, measure)
@@ -80,15 +86,17 @@ def _draw_panel(axes: Axes, summaries: Sequence[SettingSummary], knob: str, meas
     axes.errorbar(
         seconds, values, errors, fmt="o", color="C0", markersize=4, linewidth=1, label="a setting, ± over seeds"
     )
-    axes.set_xlim(*_limits([*seconds, preset.seconds], LEAST_WIDTH_S))
+    for x, y in star:
+        axes.plot([x], [y], "*", color="black", markersize=11, label="preset")
+    reference = star[0][1] if star else values[0]
+    axes.set_xlim(*_limits([*seconds, *(x for x, _ in star)], LEAST_WIDTH_S))
+    axes.set_ylim(*_limits([*values, *(y for _, y in star)], LEAST_HEIGHT * abs(reference)))
     for x, y, summary in zip(seconds, values, turned, strict=True):
-        if _is_labelled(summary, measure, preset_value):
+        if _is_labelled(summary, measure, reference):
             # Towards the middle of the panel, as long names would leave it.
             is_right = x > sum(axes.get_xlim()) / 2
             place = {"xytext": (-4, 3), "ha": "right"} if is_right else {"xytext": (4, 3)}
             axes.annotate(summary.value, (x, y), fontsize=7, textcoords="offset points", **place)
-    axes.plot([preset.seconds], [preset_value], "*", color="black", markersize=11, label="preset")
-    axes.set_ylim(*_limits([*values, preset_value], LEAST_HEIGHT * abs(preset_value)))
     # Up has to mean better in every panel, also for distances.
     if not measure.more_is_better:
         axes.invert_yaxis()
@@ -96,10 +104,21 @@ def _draw_panel(axes: Axes, summaries: Sequence[SettingSummary], knob: str, meas
     axes.grid(alpha=0.3)
 
 
-def _is_labelled(summary: SettingSummary, measure: Measure, preset_value: float) -> bool:
+def _remove_hidden_labels(axes: Axes) -> None:
+    """Removes labels that would lie on an earlier one: settings that change nothing share one point."""
+    shown: list[Bbox] = []
+    for label in list(axes.texts):
+        box = label.get_window_extent()
+        if any(box.overlaps(other) for other in shown):
+            label.remove()
+        else:
+            shown.append(box)
+
+
+def _is_labelled(summary: SettingSummary, measure: Measure, reference: float) -> bool:
     if summary.knob == EFFECTS:
         # Written with "not", so that an unknown gain, which is NaN, gets its label.
-        return not abs(summary.gains[measure.name].average) < LABELLED_CHANGE * abs(preset_value)
+        return not abs(summary.gains[measure.name].average) < LABELLED_CHANGE * abs(reference)
     # Two dozen combinations would hide each other's labels: only the best ones are named.
     return summary.knob not in (TOGETHER, MORE_GAUSSIANS) or measure.name in summary.on_front
 

@@ -144,7 +144,8 @@ def summarise_settings(rows: Sequence[Row]) -> list[SettingSummary]:
     """Summarises each setting.
 
     Args:
-        rows: see :func:`flows.cost_sweep.cell.run_cell`; rows of the preset itself have to be among them.
+        rows: see :func:`flows.cost_sweep.cell.run_cell`; without rows of the preset itself, no setting has gains and
+            none is on a front.
 
     Returns:
         A summary for each setting, in the order of the rows.
