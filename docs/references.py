@@ -19,7 +19,7 @@ def presets() -> str:
         "fine": "the default: real logs on a CPU",
         "long": "a longer GNet at the size of `small`",
         "hd": "the paper's image size on a CPU: minutes and 6 GB a chunk",
-        "paper": "the paper's settings with SD-Turbo; needs a GPU, never run whole",
+        "paper": "the paper's settings with SD-Turbo; too slow for a CPU, never run whole",
     }
     lines = []
     for name in PRESETS:
