@@ -6,6 +6,7 @@ import json
 import os
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -170,6 +171,15 @@ def test_the_command_fails_where_a_method_is_left_out(monkeypatch: pytest.Monkey
         told = ["table", "4", STREET, "--preset", "demo", "--store", str(tmp_path), "--out", str(tmp_path / "out")]
         ended = CliRunner().invoke(app, told)
         assert ended.exit_code == status and f"{len(failed)} left out" in ended.output, ended.output
+
+
+def test_a_table_without_any_row_replaces_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(paper_flow, "_run_cells", lambda checked: ([], {}))
+    monkeypatch.setattr(paper_flow, "write_results", lambda *args: pytest.fail("written"))
+    request: Any = SimpleNamespace(number=1, store="store")
+    checked: Any = SimpleNamespace(missing={"3DGS": "it is not in the store"})
+    with pytest.raises(InputError, match=r"no method of table 1 is left \(3DGS: it is not in the store\)"):
+        paper_flow._measure(request, checked)
 
 
 def test_the_exit_statuses_are_documented() -> None:
