@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from flows.budget.chooser import Chooser, count_images
-from flows.budget.cost_table import CostTable, find_shipped_table, load_cost_table, overlap
+from flows.budget.cost_table import CostTable, find_shipped_table, load_cost_table
 from flows.budget.deadline import Deadline
 from flows.configuration import apply_settings, diff_from_preset
+from flows.configuration.settings import keys_overlap
 from flows.machine.calibration import measure_calibration_s
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ConfigError
@@ -55,7 +56,7 @@ def resolve_table(table: str | None, preset: str, config: PipelineConfig) -> Cos
         )
     measured_keys = [setting.partition("=")[0] for setting in loaded.settings]
     own_keys_of_time = sorted(_KEYS_OF_TIME.intersection(own_keys))
-    if unknown := [key for key in own_keys_of_time if not any(overlap(key, other) for other in measured_keys)]:
+    if unknown := [key for key in own_keys_of_time if not any(keys_overlap(key, other) for other in measured_keys)]:
         raise ConfigError(
             f"this table was measured without {', '.join(unknown)}, which changes what stages take",
             remedy=f"Give the cost.parquet of `genre cost LOG --preset {preset} --set …` with --table.",

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flows.configuration import load_configuration
+from flows.configuration.settings import keys_overlap
 from flows.cost_sweep.knobs import EFFECTS
 from flows.cost_sweep.parquet import read_settings
 from flows.cost_sweep.summary import MEASURES, PSNR, Measure, SettingSummary
@@ -131,7 +132,7 @@ def load_cost_table(path: Path, preset: str, user_keys: Iterable[str] = ()) -> C
         raise ConfigError(f"no setting of this table has a {measure.label}", remedy=remedy, file=path)
     changed_keys = {change.partition("=")[0] for point in points for change in point.changes}
     # A key that both the user and the table set has no right value: one would silently lose.
-    if both := sorted(key for key in user_keys if any(overlap(key, changed) for changed in changed_keys)):
+    if both := sorted(key for key in user_keys if any(keys_overlap(key, changed) for changed in changed_keys)):
         raise ConfigError(
             f"{', '.join(both)} is what a budget decides", remedy="Leave out either --budget or that setting."
         )
@@ -151,19 +152,6 @@ def load_cost_table(path: Path, preset: str, user_keys: Iterable[str] = ()) -> C
         first_call_s=measured.first_call_s,
         machine=facts["machine"],
     )
-
-
-def overlap(key: str, other: str) -> bool:
-    """Says whether one of two keys of the configuration is the other, or a section that holds it.
-
-    Args:
-        key: such as ``enet.learning_rates.means``.
-        other: the same, or ``enet.learning_rates``.
-
-    >>> overlap("enet.loss.rgb", "enet.loss"), overlap("enet.loss", "enet.loss.rgb"), overlap("enet.los", "enet.loss")
-    (True, True, False)
-    """
-    return f"{key}.".startswith(f"{other}.") or f"{other}.".startswith(f"{key}.")
 
 
 @dataclass(frozen=True)

@@ -68,6 +68,19 @@ def make_setting_absolute(setting: str) -> str:
     return f"{'.'.join(path)}={file.absolute()}" if file.exists() else setting
 
 
+def keys_overlap(key: str, other: str) -> bool:
+    """Says whether one of two keys of the configuration is the other, or a section that holds it.
+
+    Args:
+        key: such as ``enet.learning_rates.means``.
+        other: the same, or ``enet.learning_rates``.
+
+    >>> keys_overlap("enet.loss.rgb", "enet.loss"), keys_overlap("enet.los", "enet.loss")
+    (True, False)
+    """
+    return f"{key}.".startswith(f"{other}.") or f"{other}.".startswith(f"{key}.")
+
+
 def _parse_value(path: KeyPath, text: str) -> Any:
     annotation = find_annotation(path)
     if annotation is not None and takes_text(annotation):

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from flows.configuration.settings import keys_overlap
 from genre_tasks.ego_paths.behaviour_request import Side
 from genre_tasks.errors import ConfigError
 from genre_tasks.scene_edits.edits import EditList
@@ -15,7 +16,7 @@ from genre_tasks.suggestions import did_you_mean
 SENSORS = ("rgb", "depth", "masks", "flow", "lidar")
 """What can be simulated: films, depth, instance and class masks, optical flow, LiDAR sweeps."""
 
-_SETTINGS_READ = ("simulate.", "fnet.", "novel_views.lidar_max_points.")
+_KEYS_READ = ("simulate", "fnet", "novel_views.lidar_max_points")
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ class SimulationRequest:
                 raise ConfigError(f"{name} is {value:g}", remedy="Give a finite number.")
         for setting in self.settings:
             key = setting.partition("=")[0].strip()
-            if key and not f"{key}.".startswith(_SETTINGS_READ):
+            if key and not any(keys_overlap(key, read) for read in _KEYS_READ):
                 remedy = (
                     "Set keys of simulate and fnet, or novel_views.lidar_max_points; others are those of `genre run`."
                 )

@@ -94,8 +94,6 @@ def are_equal(trajectories: Sequence[Trajectory], others: Sequence[Trajectory]) 
         trajectories: of some actors.
         others: of the same ones, or of others.
     """
-    if trajectories is others:
-        return True
     by_id = {other.track_id: other for other in others}
     if {trajectory.track_id for trajectory in trajectories} != by_id.keys():
         return False
