@@ -19,7 +19,14 @@ from flows.operations.object_server import ObjectServer
 from flows.operations.postgres_server import PostgresServer
 from flows.operations.prefect_services import HEARTBEAT_SECONDS, PrefectServer, Worker
 from flows.operations.service import Service, kill_group, kill_tree
-from flows.operations.state_file import ServiceRecord, locked, read_records, write_records
+from flows.operations.state_file import (
+    OPTIONS_FILE,
+    ServiceRecord,
+    keep_options,
+    locked,
+    read_records,
+    write_records,
+)
 from genre_tasks.errors import ConfigError
 from genre_tasks.process_start import read_start_ticks
 
@@ -46,18 +53,23 @@ class Stack:
     database: str = "postgres"
 
     def start(self) -> list[ServiceRecord]:
-        """Starts what does not run, then deploys the flows; a second call starts nothing.
+        """Starts what does not run, then deploys the flows; a second call starts no more than further workers.
 
         Returns:
             The records of the services, in the order of their start.
 
         Raises:
-            ConfigError: a program is missing, a port is taken or the folder cannot be written.
+            ConfigError: a program is missing, a port is taken, the folder cannot be written, or services run that
+                were started with another pool, store or database.
             ResourceError: a service did not become healthy.
         """
         if self.database not in ("postgres", "sqlite"):
             raise ConfigError(f"unknown database {self.database}", remedy="Use postgres or sqlite.")
         with locked(self.folder):
+            # Deployments would move to the new options, and the workers that live would stay with the old ones.
+            store_option = "--store-server" if self.store_server else "--no-store-server"
+            options = {"pool": f"--pool {self.pool}", "store": store_option, "database": f"--database {self.database}"}
+            keep_options(self.folder, options)
             env: dict[str, str] = {}
             store = str(self.folder / "store")
             if self.store_server:
@@ -134,6 +146,7 @@ def stop_stack(folder: Path, delete: bool = False) -> list[str]:
                 _stop(record)
                 stopped.append(record.name)
         (folder / "services.json").unlink(missing_ok=True)
+        (folder / OPTIONS_FILE).unlink(missing_ok=True)
         (folder / "env").unlink(missing_ok=True)
         if delete:
             for name in _DATA_FOLDERS:

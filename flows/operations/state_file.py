@@ -10,8 +10,13 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from genre_tasks.atomic_path import atomic_path
 from genre_tasks.errors import ConfigError
+from genre_tasks.json_files import read_json_object
 from genre_tasks.process_start import read_start_ticks
+
+OPTIONS_FILE = "options.json"
+"""Lies in the state folder and says what its services were started with."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +66,28 @@ def write_records(folder: Path, records: Mapping[str, ServiceRecord]) -> None:
     with os.fdopen(handle, "w") as stream:
         json.dump({key: asdict(record) for key, record in records.items()}, stream, indent=1)
     Path(name).replace(folder / "services.json")
+
+
+def keep_options(folder: Path, options: Mapping[str, str]) -> None:
+    """Records what services are started with, unless some run that were started otherwise.
+
+    Args:
+        folder: the state folder.
+        options: what each decides, and the command's option that decided it.
+
+    Raises:
+        ConfigError: services run that were started with others.
+    """
+    file = folder / OPTIONS_FILE
+    if file.exists() and any(record.alive for record in read_records(folder).values()):
+        remedy = "End them by `genre ops down`, or name another state folder with --folder."
+        known = read_json_object(file, "options of the services", remedy, kind=ConfigError)
+        for name, option in options.items():
+            if known.get(name, option) != option:
+                problem = f"services run that were started with {known[name]}, and not with {option}"
+                raise ConfigError(problem, remedy=remedy, file=folder)
+    with atomic_path(file) as part:
+        part.write_text(json.dumps(options))
 
 
 @contextmanager

@@ -28,7 +28,7 @@ from flows.operations.deployments import DEPLOYMENTS, RUN_QUEUE
 from flows.operations.prefect_services import EVENT_SETTINGS
 from flows.operations.service import find_free_port, keep_port, keep_secret
 from flows.operations.stack import Stack, describe_services, stop_stack
-from flows.operations.state_file import ServiceRecord, read_records, read_start_ticks, write_records
+from flows.operations.state_file import ServiceRecord, keep_options, read_records, read_start_ticks, write_records
 from genre_tasks.errors import ConfigError, ResourceError
 from tests.faults import small_run
 from tests.waiting import wait_until
@@ -175,6 +175,23 @@ def test_without_postgres_the_error_names_the_package(tmp_path: Path, monkeypatc
 def test_an_unknown_database_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="unknown database oracle"):
         Stack(tmp_path, database="oracle").start()
+
+
+def test_running_services_keep_their_options(tmp_path: Path) -> None:
+    ticks = read_start_ticks(os.getpid())
+    assert ticks is not None
+    options = {"pool": "--pool a", "store": "--store-server", "database": "--database sqlite"}
+    keep_options(tmp_path, options)
+    write_records(tmp_path, {"worker-0": _record(os.getpid(), ticks)})
+    keep_options(tmp_path, options)
+    expected = r"with --database sqlite, and not with --database postgres.*genre ops down"
+    with pytest.raises(ConfigError, match=expected):
+        Stack(tmp_path, pool="a").start()
+    # Those of services that have ended bind nobody.
+    write_records(tmp_path, {"worker-0": _record(os.getpid(), ticks - 1)})
+    keep_options(tmp_path, options | {"pool": "--pool b"})
+    stop_stack(tmp_path)
+    assert not (tmp_path / "options.json").exists()
 
 
 def test_deployments_are_those_of_prefect_yaml() -> None:
