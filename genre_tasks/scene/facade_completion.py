@@ -57,6 +57,8 @@ _MARGIN = 0.035
 _ENOUGH = 0.105
 _UNSEEN_MARGIN = 0.3 * _MARGIN
 _FAR_M = 5000.0
+# Points times views that are compared at a time; each takes 16 bytes and more. More views see other places.
+_BLOCK_VALUES = 2**24
 
 
 @dataclass(frozen=True)
@@ -147,6 +149,12 @@ def _compare_colors(points: Float32, views: Sequence[View]) -> tuple[Float64, Fl
         whether any other view sees the point [K] (1 or 0).
     """
     images = [_blurred_image(view) for view in views]
+    rows = max(1, _BLOCK_VALUES // len(views))
+    blocks = [_compare_block(points[k : k + rows], views, images) for k in range(0, max(1, len(points)), rows)]
+    return np.concatenate([better for better, _ in blocks]), np.concatenate([known for _, known in blocks])
+
+
+def _compare_block(points: Float32, views: Sequence[View], images: Sequence[Float32]) -> tuple[Float64, Float64]:
     colors = np.zeros((len(views), len(points), 3), np.float32)
     coarse = np.full((len(views), len(points)), np.inf, np.float32)  # depth per focal length: metres a pixel
     for k, (view, image) in enumerate(zip(views, images, strict=True)):
@@ -159,6 +167,9 @@ def _compare_colors(points: Float32, views: Sequence[View]) -> tuple[Float64, Fl
     count = np.zeros(len(points))
     for b, best_view in enumerate(views):
         judged = np.flatnonzero((best == b) & np.isfinite(coarse[b]))
+        # Columns are in order of their places, so most views see nothing of a block.
+        if not len(judged):
+            continue
         camera_centre = best_view.chunk_SE3_camera[:3, 3].astype(np.float32)
         ray = points[judged] - camera_centre
         ray *= np.float32(_FAR_M) / np.linalg.norm(ray, axis=1, keepdims=True)

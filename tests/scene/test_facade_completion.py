@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from genre_tasks.logs.types import Lens
+from genre_tasks.scene import facade_completion
 from genre_tasks.scene.chunk import View
 from genre_tasks.scene.facade_completion import LOWEST_TOP_M, SPACING_M, STEP_M, complete_facades
 from tests.fakes import camera_turn
@@ -110,3 +111,10 @@ def test_the_order_of_the_points_does_not_matter() -> None:
     a, b = (complete_facades(p, PATH, views) for p in (points, shuffled))
     assert np.allclose(np.sort(a, 0), np.sort(b, 0), atol=1e-4)
     assert np.array_equal(a, complete_facades(points, PATH, views))
+
+
+def test_blocks_of_candidates_make_the_same_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    points, views = _swept(6.0), _views(6.0)
+    whole = complete_facades(points, PATH, views)
+    monkeypatch.setattr(facade_completion, "_BLOCK_VALUES", 100 * len(views))
+    assert len(whole) and np.array_equal(whole, complete_facades(points, PATH, views))
