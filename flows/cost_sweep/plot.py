@@ -22,6 +22,8 @@ LABELLED_CHANGE = 0.005
 LEAST_WIDTH_S = 4.0
 LEAST_HEIGHT = 0.02
 """Height of a panel's range at least, as a fraction of the preset's value."""
+LABEL_WIDTH = 22
+"""Characters of a label's line at most: a panel is some sixty wide."""
 COLUMNS = 5
 
 
@@ -66,6 +68,7 @@ def draw_sweep(summaries: Sequence[SettingSummary], novel_measure: Measure, titl
     # Where labels stand is known once the panels have their size.
     canvas.draw()
     for axes in panels.ravel():
+        _move_labels_inside(axes)
         _remove_hidden_labels(axes)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
@@ -96,12 +99,28 @@ def _draw_panel(axes: Axes, summaries: Sequence[SettingSummary], knob: str, meas
             # Towards the middle of the panel, as long names would leave it.
             is_right = x > sum(axes.get_xlim()) / 2
             place = {"xytext": (-4, 3), "ha": "right"} if is_right else {"xytext": (4, 3)}
-            axes.annotate(summary.value, (x, y), fontsize=7, textcoords="offset points", **place)
+            text = textwrap.fill(summary.value, LABEL_WIDTH)
+            axes.annotate(text, (x, y), fontsize=7, textcoords="offset points", **place)
     # Up has to mean better in every panel, also for distances.
     if not measure.more_is_better:
         axes.invert_yaxis()
     axes.tick_params(labelsize=7)
     axes.grid(alpha=0.3)
+
+
+def _move_labels_inside(axes: Axes) -> None:
+    """Moves labels that leave the panel back to its border: beside it they would be taken for another panel's."""
+    figure = axes.get_figure(root=True)
+    # Every panel has one; only a type checker does not know.
+    assert figure is not None
+    points_per_px = 72.0 / figure.dpi
+    panel = axes.bbox
+    for label in axes.texts:
+        box = label.get_window_extent()
+        right_px = max(0.0, panel.x0 - box.x0) - max(0.0, box.x1 - panel.x1)
+        up_px = max(0.0, panel.y0 - box.y0) - max(0.0, box.y1 - panel.y1)
+        x, y = label.get_position()
+        label.set_position((x + points_per_px * right_px, y + points_per_px * up_px))
 
 
 def _remove_hidden_labels(axes: Axes) -> None:

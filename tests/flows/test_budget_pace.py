@@ -136,6 +136,26 @@ def test_labels_of_settings_at_one_point_do_not_hide_each_other() -> None:
     assert [label.get_text() for label in axes.texts] == ["gate 0.05", "off"]
 
 
+def test_labels_stay_in_their_panel() -> None:
+    figure = Figure()
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.subplots(2)[0]
+    axes.set(xlim=(0, 1), ylim=(0, 1))
+    for place, side in ((0.02, "right"), (0.5, "left"), (0.99, "left")):
+        offset = {"xytext": (4, 3), "textcoords": "offset points", "ha": side}
+        axes.annotate("160000, GNet 144,\nENet 32", (place, 0.95), **offset)
+    canvas.draw()
+    middle = axes.texts[1].get_position()[0]
+    plot._move_labels_inside(axes)
+    canvas.draw()
+    panel = axes.bbox.padded(0.5)
+    for label in axes.texts:
+        box = label.get_window_extent()
+        assert panel.x0 <= box.x0 < box.x1 <= panel.x1
+        assert panel.y0 <= box.y0 < box.y1 <= panel.y1
+    assert axes.texts[1].get_position()[0] == middle
+
+
 def test_a_sweep_without_held_out_images_has_a_picture_and_its_table_is_refused(tmp_path: Path) -> None:
     summaries = summarise_settings(unjudged({"shift_3m/kernel": 0.1, "shift_3m/n": 4.0}))
     assert math.isnan(summaries[0].values["psnr"].average)
