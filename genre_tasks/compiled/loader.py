@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import ctypes
 import os
-import platform
 from pathlib import Path
 
 from genre_tasks.compiled import build
 from genre_tasks.compiled.build import Kernel
 from genre_tasks.errors import ConfigError, UnsupportedMachineError
 
-REMEDY = "Run `pip install -e .` in the repository (it needs a C++ compiler: g++, clang++ or what CXX names)"
+REMEDY = "Run `pip install -e .` in the repository (it needs a C++ compiler: g++ 11, clang++ 12, or what CXX names)"
 # Linux calls LZCNT abm. A CPU without it takes its code for BSR, and computes something else.
 _X86_64_V3_FLAGS = {"avx", "avx2", "fma", "bmi1", "bmi2", "f16c", "movbe", "abm"}
 _NEEDED_FLAGS = {
@@ -35,8 +34,8 @@ def supported_instruction_sets() -> list[str]:
     if "generic" in build.instruction_sets():
         return ["generic"]
     flags = _cpu_flags()
-    if not flags and platform.system() != "Linux":
-        # No list to read: torch knows the machine's level by other means.
+    if not flags:
+        # No list to read, as on other systems and where a container hides it: torch knows the level by other means.
         import torch
 
         known = {"AVX512": ["avx512", "avx2", "sse42"], "AVX2": ["avx2", "sse42"]}

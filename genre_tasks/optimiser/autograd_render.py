@@ -114,5 +114,6 @@ class AutogradRender:
         out = posed.new_zeros((len(is_actor), posed.shape[1]))
         out[~is_actor] = posed[:static_count]
         # Frames lie one behind the other, each with all actors' Gaussians: that makes the sum a reshape.
-        out[is_actor] = posed[static_count:].reshape(-1, actor_count, posed.shape[1]).sum(0)
+        if actor_count:
+            out[is_actor] = posed[static_count:].reshape(-1, actor_count, posed.shape[1]).sum(0)
         return out

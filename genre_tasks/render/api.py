@@ -75,6 +75,10 @@ def render(
         return _render_on_cpu(splats, cameras, settings.threads, visible)
     # The other backends show all that they are given to all cameras, so views with the same Gaussians go together.
     colors_by_view = splats.colors.dim() == 3
+    if not len(cameras):
+        # There is no view whose colours could be taken.
+        colors = splats.means.new_zeros(splats.means.shape) if colors_by_view else splats.colors
+        return _render_elsewhere(backend, replace(splats, colors=colors), cameras)
     groups: dict[tuple[int, int, int], list[int]] = {}
     for v, (begin, end) in enumerate(visible.per_view):
         groups.setdefault((begin, end, v if colors_by_view else -1), []).append(v)

@@ -5,11 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from genre_tasks.logs.brown_conrady import distort
 from genre_tasks.logs.types import Float64
 from genre_tasks.scene.chunk import Actor, View
+from genre_tasks.scene.lens_distortion import fold_radius
 from genre_tasks.scene.novel_views import NovelView
 from genre_tasks.scene.projection import NEAR_M
 
+# Of an edge that a distorting lens bends.
+_EDGE_POINTS = 17
 AnyView = View | NovelView
 
 # Pairs of corners that differ along one axis; a corner's number has a bit for each axis.
@@ -19,7 +23,8 @@ _EDGES = np.array([(k, k | bit) for bit in (1, 2, 4) for k in range(8) if not k 
 def project_box(actor: Actor, view: AnyView) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Finds the rectangle of pixels that an actor's box covers in a view.
 
-    What is behind the camera plane is cut off there, edge by edge; the lens is taken to be free of distortion.
+    What is behind the camera plane is cut off there, edge by edge. Of a distorting lens, edges become curves, and what
+    lies beyond the angle where it folds back is left out.
 
     Args:
         actor: with its poses in the chunk.
@@ -35,13 +40,27 @@ def project_box(actor: Actor, view: AnyView) -> tuple[NDArray[np.int64], NDArray
     corners = np.stack(np.meshgrid(*[(-s / 2, s / 2) for s in actor.size_m], indexing="ij"), -1).reshape(-1, 3)
     camera_SE3_box = np.linalg.inv(view.chunk_SE3_camera) @ actor.chunk_SE3_box[index[0]]
     points = corners @ camera_SE3_box[:3, :3].T + camera_SE3_box[:3, 3]
-    points = _cut_behind_camera(points)
-    if not len(points):
-        return nothing, nothing
     lens = view.lens
-    u = (points[:, 0] / points[:, 2] * lens.fx_px + lens.cx_px).clip(0, lens.width_px)
-    v = (points[:, 1] / points[:, 2] * lens.fy_px + lens.cy_px).clip(0, lens.height_px)
+    distorts = any(lens.coefficients)
+    points = _sample_edges(points) if distorts else _cut_behind_camera(points)
+    x = points[:, 0] / points[:, 2]
+    y = points[:, 1] / points[:, 2]
+    if distorts:
+        is_seen = np.hypot(x, y) < fold_radius(lens.coefficients)
+        x, y = (np.asarray(part) for part in distort(x[is_seen], y[is_seen], lens.coefficients))
+    if not len(x):
+        return nothing, nothing
+    u = (x * lens.fx_px + lens.cx_px).clip(0, lens.width_px)
+    v = (y * lens.fy_px + lens.cy_px).clip(0, lens.height_px)
     return np.array([round(u.min()), round(v.min())]), np.array([round(u.max()), round(v.max())])
+
+
+def _sample_edges(corners: Float64) -> Float64:
+    """Points [K, 3] along the edges of a box [8, 3], of what lies ahead of the camera plane."""
+    first, last = corners[_EDGES].swapaxes(0, 1)
+    part = np.linspace(0.0, 1.0, _EDGE_POINTS)[:, None, None]
+    points = (first + part * (last - first)).reshape(-1, 3)
+    return np.concatenate([points[points[:, 2] >= NEAR_M], _cut_behind_camera(corners)])
 
 
 def _cut_behind_camera(corners: Float64) -> Float64:

@@ -26,6 +26,8 @@ DISTANT = 1
 FIRST_ACTOR = 2
 """Values of ``SceneGraph.nodes``; actor k has ``FIRST_ACTOR + k``."""
 
+# Frames and moments between them whose velocities of actors are kept.
+_MOST_MOTIONS = 4096
 DEFAULT_SH_DEGREE = 2
 """Degree of spherical harmonics, where a reconstruction has any."""
 
@@ -197,6 +199,9 @@ class SceneGraph:
             centres = self.actor_poses((frame,))[1][0]
             velocity, turn = (np.stack(x) for x in zip(*(a.motion(frame) for a in self.actors), strict=True))
             constant = velocity - np.cross(turn, centres)  # v + ω × (p − c) = (v − ω × c) + ω × p
+            # A simulator may ask for moments without end.
+            if len(self._motions) >= _MOST_MOTIONS:
+                self._motions.clear()
             self._motions[frame] = constant.astype(np.float32), turn.astype(np.float32)
         constant, turn = (x[self._moving_owners] for x in self._motions[frame])
         x, y, z = means.T

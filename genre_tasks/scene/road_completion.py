@@ -16,7 +16,8 @@ REACH_M = 9.0
 """Only this near to the path: farther away rings are close and the road is not known to be flat."""
 
 CELL_M = 0.1
-_MOST_CELLS = 2e8
+# Some 2.5 GB; a straight road of 750 m across the grid has as many.
+_MOST_CELLS = 3e7
 _COARSE_M = 1.0
 _SMOOTH_M = 0.8
 # A coarse cell's lowest point this near to the fitted road plane is road: kerbs and camber stay, cars do not.
@@ -84,7 +85,7 @@ def span_road_grid(path: Float64) -> tuple[Float64, NDArray[np.int64]]:
         The grid's corner [2] in metres, and its numbers of cells [2].
 
     Raises:
-        InputError: the path is so long that no memory would hold the grid.
+        InputError: the path is so long that the grid would take gigabytes.
     """
     low = path.min(0) - REACH_M
     sides = np.ceil((path.max(0) + REACH_M - low) / CELL_M)

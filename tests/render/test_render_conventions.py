@@ -10,6 +10,7 @@ import torch
 
 from genre_tasks.errors import NonFiniteError
 from genre_tasks.render import Cameras, RenderSettings, render
+from genre_tasks.render.types import VisibleRanges
 from genre_tasks.scene.gaussians import Splats
 
 BOTH = pytest.mark.parametrize(
@@ -74,6 +75,10 @@ def test_nothing_to_draw(scene, settings):
     splats, cameras = scene(50)
     none = replace(cameras, **{n: getattr(cameras, n)[:0] for n in ("camera_SE3_chunk", "focal_px", "center_px")})
     assert render(splats, none, settings).color.shape == (0, 48, 64, 3)
+    by_view = replace(splats, colors=torch.zeros(0, 50, 3))
+    assert render(by_view, none, settings).color.shape == (0, 48, 64, 3)
+    some = VisibleRanges(30, ())
+    assert render(splats, none, settings, some).color.shape == (0, 48, 64, 3)
 
 
 @BOTH

@@ -63,6 +63,12 @@ def test_an_instruction_set_that_is_lacking_is_never_loaded(fresh_loader, monkey
         assert loader.candidate_instruction_sets() == ["sse42"]
 
 
+def test_a_machine_that_hides_its_flags_is_not_taken_for_an_old_one(monkeypatch):
+    known = loader.supported_instruction_sets()
+    monkeypatch.setattr(loader, "_cpu_flags", set)
+    assert loader.candidate_instruction_sets()[-1] == known[-1]
+
+
 @pytest.mark.parametrize("beyond", [False, True], ids=["pinhole", "lens and shutter"])
 @pytest.mark.parametrize("isa", loader.supported_instruction_sets())
 def test_every_instruction_set_draws_the_same_picture(isa, beyond, scene, gradients, fresh_loader, monkeypatch):

@@ -12,7 +12,7 @@ from genre_tasks.logs.types import CuboidTrack, Lens
 from genre_tasks.scene.actor_track import MOST_GAP_FRAMES, ActorTrack, cut_track_to_chunk
 from genre_tasks.scene.chunk import View
 from genre_tasks.scene.projection import project, splat_depth
-from genre_tasks.scene.road_completion import complete_road
+from genre_tasks.scene.road_completion import complete_road, span_road_grid
 from genre_tasks.scene.visibility import GREY, PointCloud, color_point_clouds, find_visible_points
 from genre_tasks.scene.voxel_grid import count_voxels, distance_octaves, find_voxel_size, group_by_voxel
 from tests.fakes import camera_turn, yaw_pose
@@ -169,6 +169,12 @@ def test_a_pose_far_away_is_an_error_and_no_lack_of_memory() -> None:
     far[1, :2, 3] = [-5e5, 4e6]
     with pytest.raises(InputError, match="the chunk's path spans 4000000 m"):
         complete_road(_wall(5.0, 2.0), far)
+    # A single pose half a mile off would take gigabytes as well.
+    far[1, :2, 3] = 700.0
+    with pytest.raises(InputError, match="the chunk's path spans 700 m"):
+        span_road_grid(far[:, :2, 3])
+    far[1, :2, 3] = 500.0
+    assert span_road_grid(far[:, :2, 3])[1].prod() < 3e7
 
 
 def test_no_road_no_fill() -> None:
