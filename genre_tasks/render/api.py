@@ -73,6 +73,10 @@ def render(
         check_gradients(backend, splats, cameras)
     if backend == "cpu":
         return _render_on_cpu(splats, cameras, settings.threads, visible)
+    return _render_in_groups(backend, splats, cameras, visible)
+
+
+def _render_in_groups(backend: str, splats: Splats, cameras: Cameras, visible: VisibleRanges) -> Render:
     # The other backends show all that they are given to all cameras, so views with the same Gaussians go together.
     colors_by_view = splats.colors.dim() == 3
     if not len(cameras):
