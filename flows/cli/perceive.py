@@ -96,6 +96,8 @@ def perceive(
         perception = perceive_run(request, network, reporter.progress)
     title = f"{perception.log}, chunk {perception.chunk}, after {perception.stage}"
     print_rows(title, tabulate_perception(perception))
+    if perception.no_agreement:
+        typer.echo(f"no agreement: {perception.no_agreement}")
     # The list of all of a detector's classes would fill the screen.
     shown = perception.counted[:10]
     more = f" and {len(perception.counted) - len(shown)} more" if len(perception.counted) > len(shown) else ""

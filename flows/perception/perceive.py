@@ -78,9 +78,11 @@ class Perception:
         stage: whose scene was rendered.
         counted: names of the classes that are counted: the detector's road users, or all classes where it has none.
         counts: of the recorded images, and of the renders at each shift.
-        boxes: agreement of boxes between recorded images and renders on the path; ``None`` without shift 0.
-        masks: agreement of masks; ``None`` without shift 0, and from detectors without masks.
+        boxes: agreement of boxes between recorded images and renders on the path; ``None`` without shift 0, and of a
+            run with edited traffic.
+        masks: agreement of masks; ``None`` where that of boxes is, and from detectors without masks.
         files: paths of the files.
+        no_agreement: why renders on the path are not compared, although there are some; empty otherwise.
     """
 
     log: str
@@ -91,6 +93,7 @@ class Perception:
     boxes: Agreement | None
     masks: Agreement | None
     files: tuple[str, ...]
+    no_agreement: str = ""
 
 
 def perceive_run(request: PerceiveRequest, detector: Detector, progress: Progress = silent) -> Perception:
@@ -114,7 +117,9 @@ def perceive_run(request: PerceiveRequest, detector: Detector, progress: Progres
     part = scenes.load(number)
     views = select_views(part.chunk, request.cameras, request.every)
     frames = sorted({view.frame for view in views})
-    findings = _Findings(detector, frames[len(frames) // 2], has_path=0.0 in request.shifts_m)
+    edited = scenes.record.get("edited")
+    has_path = 0.0 in request.shifts_m
+    findings = _Findings(detector, frames[len(frames) // 2], has_path=has_path and edited is None)
     for perceived in perceive_views(part.chunk, part.scene, views, request.shifts_m, detector, progress):
         findings.add(perceived)
     # Read from the run, since the request may leave it open.
@@ -124,7 +129,21 @@ def perceive_run(request: PerceiveRequest, detector: Detector, progress: Progres
     counted = tuple(detector.class_names[label] for label in findings.counted)
     boxes = summarise_matches(findings.box_matches) if findings.box_matches else None
     masks = summarise_matches(findings.mask_matches) if findings.mask_matches else None
-    return Perception(part.chunk.log, number, stage, counted, findings.list_counts(), boxes, masks, files)
+    no_agreement = ""
+    if has_path and edited is not None:
+        # A detector that sees the edits would count as wrong.
+        no_agreement = f"its traffic is edited, and the recorded images show that of the run {edited['run']}"
+    return Perception(
+        log=part.chunk.log,
+        chunk=number,
+        stage=stage,
+        counted=counted,
+        counts=findings.list_counts(),
+        boxes=boxes,
+        masks=masks,
+        files=files,
+        no_agreement=no_agreement,
+    )
 
 
 @dataclass
@@ -134,7 +153,7 @@ class _Findings:
     Attributes:
         detector: whose finds they are.
         shown_frame: the frame whose images the picture has.
-        has_path: whether there are renders on the path, which are compared with the recorded images.
+        has_path: whether there are renders on the path that are compared with the recorded images.
     """
 
     detector: Detector
@@ -162,10 +181,12 @@ class _Findings:
         # The pixels of one frame alone are kept.
         if perceived.frame == self.shown_frame:
             self._shown.append(perceived)
+        if not self.has_path:
+            return
         place = (perceived.camera, perceived.frame)
-        if perceived.source == "recorded" and self.has_path:
+        if perceived.source == "recorded":
             self._recorded[place] = perceived.detections
-        elif perceived.source == "rendered" and perceived.shift_m == 0:
+        elif perceived.shift_m == 0:
             # Taken out, because masks of all images would not fit into memory.
             self._match(self._recorded.pop(place), perceived.detections)
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from genre_tasks.config import EvaluateConfig
 from genre_tasks.logs.types import Truth
 from genre_tasks.metrics.scoring import decode_view_image, truth_image
+from genre_tasks.metrics.view_scores import show_truth_on_ego
 from genre_tasks.render.types import RenderSettings
 from genre_tasks.scene.chunk import Chunk, View
 from genre_tasks.scene.graph import SceneGraph
@@ -28,6 +29,9 @@ def render_pictures(
 ) -> dict[str, NDArray[np.uint8]]:
     """Renders a scene at the report's viewpoints.
 
+    A render of a recorded view has the true pixels where the image shows the recording vehicle. No scene has them, and
+    maps of errors would count them.
+
     Args:
         config: how many pictures.
         chunk: that the scene is of.
@@ -43,10 +47,13 @@ def render_pictures(
         # One by one: the report needs a handful, at viewpoints of several cameras.
         name = _name_picture(view)
         ((_, images),) = render_batches(scene, [view], settings, None)
-        pictures[name] = _to_uint8(images[0])
         if isinstance(view, View):
-            pictures[f"{name}.truth"] = _to_uint8(decode_view_image(view))
-        elif truth is not None:
+            recorded = decode_view_image(view)
+            # As in metrics: the recording vehicle is neither an error of the scene nor its merit.
+            images = show_truth_on_ego([view], images, recorded[None])
+            pictures[f"{name}.truth"] = _to_uint8(recorded)
+        pictures[name] = _to_uint8(images[0])
+        if isinstance(view, NovelView) and truth is not None:
             pictures[f"{name}.truth"] = truth_image(chunk, truth, view)
     return pictures
 

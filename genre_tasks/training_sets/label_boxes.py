@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from genre_tasks.errors import InputError
 from genre_tasks.logs.types import CuboidTrack, DrivingLog, Float32, Float64
-from genre_tasks.scene.actor_track import ValidAnnotations
+from genre_tasks.scene.actor_track import MOST_GAP_FRAMES, ValidAnnotations
 from genre_tasks.scene.chunk import Chunk, View
 from genre_tasks.scene.image_decoding import decode_pixels
 from genre_tasks.scene.novel_views import NovelView
@@ -196,10 +196,15 @@ class LogLabeller:
         return count_points_in_boxes(sweep.points_world, world_SE3_box, size_m)
 
     def _measure_velocity(self, annotations: ValidAnnotations, frame: int) -> Float64:
-        """[3] metres per second in the world, from the annotations before and after; 0 where no time is known."""
+        """[3] metres per second in the world, from the annotations around; 0 without two near ones, or their times."""
         last = len(annotations.frames) - 1
         before = max(int(np.searchsorted(annotations.frames, frame)) - 1, 0)
         after = min(int(np.searchsorted(annotations.frames, frame, "right")), last)
+        # Poses are not interpolated over longer gaps either. The frame is annotated where a neighbour is so far.
+        if frame - int(annotations.frames[before]) > MOST_GAP_FRAMES + 1:
+            before += 1
+        if int(annotations.frames[after]) - frame > MOST_GAP_FRAMES + 1:
+            after -= 1
         try:
             times = [self.log.frame_timestamp_s(int(annotations.frames[k])) for k in (before, after)]
         except InputError:

@@ -23,7 +23,7 @@ class LabelledBox:
         truncated: share of the uncut rectangle that lies outside the image, in [0, 1].
         occluded: share of the object that nearer surfaces hide, in [0, 1]; NaN where no depth says it.
         lidar_points: points of the frame's sweep inside the box; −1 where the frame has no sweep.
-        velocity_m_s: [3] in camera axes; zeros where the track has no second pose.
+        velocity_m_s: [3] in camera axes; zeros where the track has no second pose near the frame.
     """
 
     track_id: str

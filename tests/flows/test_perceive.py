@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +19,13 @@ from flows.perception.perceived_images import perceive_views, select_views
 from flows.pipeline.definition import STAGE_BY_NAME
 from flows.pipeline.stage_runner import ArtifactRef, Job, run_stage
 from flows.reconstruction.run_records import FinishedRun, summarise_run, write_run_record
+from flows.simulation.edited_runs import write_edited_run
 from flows.simulation.run_scenes import RunScenes
 from genre_tasks.detection import detector as detector_module
 from genre_tasks.detection.coco_classes import COCO_CLASSES
 from genre_tasks.detection.detections import Detections
 from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.scene_edits.edits import EditList
 
 REAL = Path("../shared/data/detectors")
 WIDTH, HEIGHT = 64, 36
@@ -115,6 +118,27 @@ def test_next_to_the_path_nothing_is_compared(finished: FinishedRun, tmp_path: P
     found = perceive_run(request(finished, tmp_path, shifts_m=(3.0,), every=8), CornerDetector())
     assert found.boxes is None and found.masks is None and [c.shift_m for c in found.counts] == [0.0, 3.0]
     assert all(row["box AP"] == "" for row in tabulate_perception(found))
+
+
+def test_a_run_with_edited_traffic_has_counts_and_no_agreement(
+    finished: FinishedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    edited = write_edited_run(finished.store, finished.name, EditList())["run"]
+    wanted = PerceiveRequest(finished.store, edited, tmp_path / "on", shifts_m=(0.0, 2.0), every=4)
+    found = perceive_run(wanted, CornerDetector())
+    assert found.boxes is None and found.masks is None
+    assert [(c.source, c.shift_m, c.finds) for c in found.counts] == [
+        *(("recorded", 0.0, 4), ("rendered", 0.0, 4), ("rendered", 2.0, 4))
+    ]
+    assert f"that of the run {finished.name}" in found.no_agreement
+    next_to_the_path = perceive_run(replace(wanted, shifts_m=(2.0,)), CornerDetector())
+    assert next_to_the_path.no_agreement == ""
+    monkeypatch.setattr(detector_module, "open_detector", lambda *_: CornerDetector())
+    words = ["--store", finished.store, "--out", str(tmp_path / "out"), "--every", "4", "--detector", "x.onnx"]
+    done = CliRunner().invoke(app, ["perceive", edited, *words], catch_exceptions=False)
+    assert done.exit_code == 0 and "no agreement: its traffic is edited" in done.output
+    done = CliRunner().invoke(app, ["perceive", finished.name, *words], catch_exceptions=False)
+    assert done.exit_code == 0 and "no agreement" not in done.output
 
 
 def test_the_command_prints_a_row_for_each_shift(

@@ -7,6 +7,7 @@ import io
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -223,7 +224,18 @@ def test_effects_range_lineage_and_scene_are_in_the_page(tmp_path: Path) -> None
     (tmp_path / "scene.html").unlink()
     assert "scene.html" not in Reader(write_report(tmp_path / "r.html", run(full)).read_text()).addresses
     bare = ChunkSummary(0, stages)
-    assert "genre range 0123456789ab --chunk 0" in write_report(tmp_path / "r.html", run(bare)).read_text()
+    text = " ".join(Reader(write_report(tmp_path / "r.html", run(bare)).read_text()).text)
+    assert "genre range 0123456789ab --chunk 0 --store a/store" in text
+    assert "genre show KEY --store a/store" in text and "genre diff A B --store a/store" in text
+
+
+@pytest.mark.parametrize(
+    ("store", "option"), [("genre-store", ""), ("my 'store'", """ --store 'my '"'"'store'"'"''""")]
+)
+def test_commands_find_the_store_of_the_run(tmp_path: Path, store: str, option: str) -> None:
+    bare = ChunkSummary(0, (StageSummary("ingest", "i" * 64, True, 1, 1),))
+    text = Reader(write_report(tmp_path / "r.html", replace(run(bare), store=store)).read_text()).text
+    assert f"genre range 0123456789ab --chunk 0{option}" in text
 
 
 def test_curve_continues_where_gnet_ended() -> None:

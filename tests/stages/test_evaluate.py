@@ -161,6 +161,19 @@ def test_pictures_have_the_same_names_in_every_stage(chunk: Chunk, scene: SceneG
     assert evaluate_scene(none, chunk, "gnet", Reconstruction(scene), None).pictures == {}
 
 
+def test_pictures_show_the_true_recording_vehicle(chunk: Chunk, scene: SceneGraph, monkeypatch) -> None:
+    mask = np.zeros((chunk.height_px, chunk.width_px), bool)
+    mask[-8:] = True
+    masked = replace(chunk, views=tuple(replace(view, ego_mask=mask) for view in chunk.views))
+    monkeypatch.setattr(evaluation_renders, "render_views", oracle(chunk, noise=0.3))
+    pictures = evaluate_scene(CONFIG, masked, "gnet", Reconstruction(scene), FakeTruth(LOG)).pictures
+    differs = {name: picture != pictures[f"{name}.truth"] for name, picture in pictures.items() if ".truth" not in name}
+    on_path = differs.pop("0m_front_03")
+    assert not on_path[mask].any() and on_path[~mask].mean() > 0.9
+    # Next to the path no view has a mask.
+    assert len(differs) == 2 and all(other[mask].mean() > 0.9 for other in differs.values())
+
+
 def test_a_camera_of_any_name_has_pictures(chunk: Chunk, scene: SceneGraph, monkeypatch, tmp_path: Path) -> None:
     names = {name: f"{name} (öst), 100 %~=" for name in chunk.camera_names}
     views = tuple(replace(view, camera=names[view.camera]) for view in chunk.views)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from genre_tasks.errors import InputError
-from genre_tasks.logs.types import Lens
+from genre_tasks.logs.types import CuboidTrack, Lens
 from genre_tasks.scene.projection import project
 from genre_tasks.training_sets.box_outlines import box_corners, find_boxes_in_view, measure_occlusion, outline_box
 from genre_tasks.training_sets.label_boxes import (
@@ -214,6 +214,23 @@ def test_between_annotations_boxes_stand_where_scenes_have_the_object() -> None:
             assert box.camera_SE3_box == pytest.approx(expected.camera_SE3_box, abs=1e-6)
             assert box.velocity_m_s == pytest.approx(expected.velocity_m_s, abs=1e-6)
     assert {i.frame for i in label_street(log) if i.boxes} == {0, 1, 2, 3}
+
+
+def test_velocities_bridge_no_gap_that_poses_do_not() -> None:
+    frames = np.array([0, 1, 13, 14, 25])
+    poses = np.stack([np.eye(4)] * 5)
+    poses[:, :3, 3] = [(x, 4.0, 1.0) for x in (12.0, 13.0, 20.0, 20.5, 32.0)]
+    gap = CuboidTrack("gap", "car", frames, poses, (4.0, 1.8, 1.5), moving=True)
+    alone = CuboidTrack("alone", "car", frames[[0, 2]], poses[[0, 2]], (4.0, 1.8, 1.5), moving=True)
+    empty = FakeLog(frame_count=26, cars=(), camera_names=("front",))
+    labeller = LogLabeller(replace(empty, extra_tracks=(gap, alone)))
+    speeds = {}
+    for view in [v for v in chunk_of(empty).views if v.frame in (1, 13, 14)]:
+        for box in labeller.label_recorded_image(chunk_of(empty), view).boxes:
+            speeds[view.frame, box.track_id] = box.velocity_m_s[2]
+    # From the near side alone; a neighbour as far as poses are interpolated counts; without any it stands.
+    expected = {(1, "gap"): 10.0, (13, "gap"): 5.0, (14, "gap"): 10.0, (13, "alone"): 0.0}
+    assert speeds == pytest.approx(expected, abs=1e-6)
 
 
 def test_a_sweep_or_a_time_that_cannot_be_read_costs_no_image(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,6 +26,7 @@ from genre_tasks.logs.registry import list_logs, open_log
 from genre_tasks.scene.image_decoding import decode_pixels
 from genre_tasks.training_sets.class_words import find_class
 from genre_tasks.training_sets.kitti_writer import KITTI_CLASSES
+from genre_tasks.training_sets.label_boxes import NO_SWEEP_POINTS
 from genre_tasks.training_sets.labelled_images import LabelledImage
 from genre_tasks.training_sets.nuscenes_tables import find_category
 from genre_tasks.training_sets.reading import read_training_set
@@ -160,6 +161,25 @@ def test_coco_is_evaluated_by_its_own_tools(street: list[LabelledImage], tmp_pat
         assert np.array_equal(pixels, image.image) and (row["height"], row["width"]) == pixels.shape[:2]
 
 
+def test_coco_numbers_classes_by_name(street: list[LabelledImage], tmp_path: Path) -> None:
+    images = [i for i in street if i.boxes][:2]
+    labels = ("van", "bus")
+    found = []
+    for k, ordered in enumerate((labels, labels[::-1])):
+        named = [
+            replace(image, boxes=tuple(replace(box, label=label) for box in image.boxes))
+            for image, label in zip(images, ordered, strict=True)
+        ]
+        write_training_set(named, tmp_path / str(k), "coco")
+        tables = json.loads((tmp_path / str(k) / "annotations.json").read_text())
+        found.append(tables["categories"])
+        names = {row["id"]: row["name"] for row in tables["categories"]}
+        assert [names[row["category_id"]] for row in tables["annotations"]] == [
+            box.label for image in named for box in image.boxes
+        ]
+    assert found[0] == found[1] == [{"id": 1, "name": "bus"}, {"id": 2, "name": "van"}]
+
+
 def test_nuscenes_is_read_by_the_reader_of_nuscenes(street: list[LabelledImage], tmp_path: Path) -> None:
     out = tmp_path / "set"
     write_training_set(street, out, "nuscenes")
@@ -216,6 +236,34 @@ def test_nuscenes_takes_no_image_twice(street: list[LabelledImage], tmp_path: Pa
     with pytest.raises(InputError, match="two images of one camera and frame"):
         write_training_set([street[0], street[0]], tmp_path / "set", "nuscenes")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_nuscenes_has_one_calibration_of_a_camera(street: list[LabelledImage], tmp_path: Path) -> None:
+    first, second = [i for i in street if i.camera == "front" and not i.rendered][:2]
+    larger = replace(second.lens, fx_px=2 * second.lens.fx_px)
+    small = replace(second, lens=second.lens.resized(48, 32), image=second.image[::2, ::2])
+    for other in (replace(second, lens=larger), small):
+        with pytest.raises(InputError, match=r"different sizes or intrinsics.*front, frame 1.*a set for each run"):
+            write_training_set([first, other], tmp_path / "set", "nuscenes")
+    # The same lens, rectified.
+    assert write_training_set([first, *distorted([second], BARREL)], tmp_path / "set", "nuscenes").images == 2
+
+
+def test_nuscenes_refuses_two_cameras_of_one_name(street: list[LabelledImage], tmp_path: Path) -> None:
+    images = [replace(i, camera={"front": "front camera", "left": "front-camera"}[i.camera]) for i in street]
+    with pytest.raises(InputError, match=r"front camera and front-camera are both CAM_FRONT in nuScenes.*Rename one"):
+        write_training_set(images, tmp_path / "set", "nuscenes")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nuscenes_keeps_boxes_of_frames_without_sweeps(street: list[LabelledImage], tmp_path: Path) -> None:
+    image = next(i for i in street if len(i.boxes) > 2)
+    counts = (NO_SWEEP_POINTS, 0, 7)
+    boxes = tuple(replace(box, lidar_points=n) for box, n in zip(image.boxes, counts, strict=False))
+    write_training_set([replace(image, boxes=boxes)], tmp_path / "set", "nuscenes")
+    rows = json.loads((tmp_path / "set/v1.0-trainval/sample_annotation.json").read_text())
+    # nuScenes' development kit leaves out boxes with 0.
+    assert [row["num_lidar_pts"] for row in rows] == [1, 0, 7]
 
 
 @pytest.mark.parametrize("layout", ["kitti", "nuscenes"])

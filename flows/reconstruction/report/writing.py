@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from flows.defaults import DEFAULT_STORE
 from flows.reconstruction.report.chunk_section import STAGE_LABELS, ChunkPage, build_chunk_page
 from flows.reconstruction.report.error_maps import MAX_ERROR
 from flows.reconstruction.report.metric_table import SCORED_STAGES
@@ -41,6 +43,7 @@ def write_report(path: Path, run: RunSummary) -> Path:
         scene_file=SCENE_FILE if (path.parent / SCENE_FILE).is_file() else "",
         overview=build_overview(pages),
         environment=describe_environment(run.environment),
+        store_option=describe_store_option(run.store),
         scale=_error_scale(pages),
         max_error=f"{MAX_ERROR:g}",
     )
@@ -73,6 +76,21 @@ def render_page(template: str, **values: object) -> str:
         lstrip_blocks=True,
     )
     return environment.get_template(template).render(**values)
+
+
+def describe_store_option(store: str) -> str:
+    """Writes the option by which the report's commands find a store.
+
+    Args:
+        store: folder (or URI) of the store.
+
+    Returns:
+        The option after a space, quoted for a shell; empty for the store that commands take without it.
+
+    >>> describe_store_option("genre-store"), describe_store_option("my store")
+    ('', " --store 'my store'")
+    """
+    return "" if store == DEFAULT_STORE else f" --store {shlex.quote(store)}"
 
 
 def build_overview(pages: Sequence[ChunkPage]) -> tuple[list[str], list[tuple[int, list[str]]]]:
