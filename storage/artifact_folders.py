@@ -9,12 +9,15 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from genre_tasks.errors import ArtifactCorruptError
+from genre_tasks.errors import ArtifactCorruptError, GenreError
 from genre_tasks.temporary_names import describe_owner
+from storage.io_errors import as_genre_error
 from storage.manifest import MANIFEST, Manifest, NewerSchemaError, parse_manifest
 
 TEMPORARY_PREFIX = ".tmp-"
 TRASH_PREFIX = ".trash-"
+# Of the file system and not of the store, where this is a whole disk: root alone may look into it.
+_SYSTEM_FOLDER = "lost+found"
 
 
 def find_artifact_folders(base: Path) -> Iterator[Path]:
@@ -25,14 +28,66 @@ def find_artifact_folders(base: Path) -> Iterator[Path]:
 
     Yields:
         The folders in the order of their paths. Hidden folders, which are temporary, are left out.
+
+    Raises:
+        InputError: a folder must not be listed, and might hold artifacts.
+        TransientIOError: the file system does not answer.
     """
-    for folder, names, files in os.walk(base):
+    for folder, error in walk_artifact_folders(base):
+        if error is not None:
+            raise error
+        yield folder
+
+
+def walk_artifact_folders(base: Path) -> Iterator[tuple[Path, GenreError | None]]:
+    """Finds folders that hold a manifest, and goes on past folders that cannot be listed.
+
+    Args:
+        base: where to search; it need not exist.
+
+    Yields:
+        (a folder with a manifest, ``None``) as :func:`find_artifact_folders` finds them, and (a folder that cannot be
+        listed, its error).
+    """
+    faults: list[OSError] = []
+    # The walk leaves out what it cannot list, and with it every artifact below.
+    for folder, names, files in os.walk(base, onerror=faults.append):
+        yield from _take_faults(faults)
         # In place, which is how a walk is told where to go on and in which order.
-        names[:] = sorted(n for n in names if not n.startswith("."))
+        names[:] = sorted(n for n in names if not n.startswith(".") and n != _SYSTEM_FOLDER)
         if MANIFEST in files:
             # No artifact lies inside another: what is below is payload.
             names.clear()
-            yield Path(folder)
+            yield Path(folder), None
+    yield from _take_faults(faults)
+
+
+def _take_faults(faults: list[OSError]) -> Iterator[tuple[Path, GenreError]]:
+    for error in faults:
+        # Another process may have removed a folder since its name was read; the base need not exist at all.
+        if not isinstance(error, FileNotFoundError | NotADirectoryError):
+            folder = Path(error.filename)
+            yield folder, as_genre_error(error, folder)
+    faults.clear()
+
+
+def find_hidden(base: Path) -> Iterator[Path]:
+    """Finds hidden files and folders, which may be what killed processes left behind.
+
+    Payload is not looked into, as all of it is written before its folder has its name.
+
+    Args:
+        base: where to search; it need not exist.
+
+    Yields:
+        The paths. What is in a temporary folder is no part of them; it may be removed at once.
+    """
+    for folder, names, files in os.walk(base):
+        hidden = [name for name in (*names, *files) if name.startswith(".")]
+        # Before they are yielded: the walk would enter folders that are going away.
+        names[:] = [] if MANIFEST in files else [n for n in names if not n.startswith((TEMPORARY_PREFIX, TRASH_PREFIX))]
+        for name in hidden:
+            yield Path(folder) / name
 
 
 def load_manifest(folder: Path) -> Manifest:

@@ -97,7 +97,19 @@ def payload_files(folder: Path) -> Iterator[tuple[str, Path]]:
 
     Yields:
         (path relative to the folder with "/" between parts, path), sorted.
+
+    Raises:
+        OSError: a folder that is there cannot be listed; its files would count as missing.
     """
-    # Links are listed although they are never written: a manifest that does not name them shows that one was added.
-    found = [(p.relative_to(folder).as_posix(), p) for p in folder.rglob("*") if p.is_symlink() or not p.is_dir()]
+    found: list[tuple[str, Path]] = []
+    for base, names, files in os.walk(folder, onerror=_raise_unless_gone):
+        # Links are listed although they are never written: a manifest that does not name them shows that one was added.
+        links = [name for name in names if (Path(base) / name).is_symlink()]
+        paths = [Path(base) / name for name in (*links, *files)]
+        found += [(path.relative_to(folder).as_posix(), path) for path in paths]
     yield from sorted(found)
+
+
+def _raise_unless_gone(error: OSError) -> None:
+    if not isinstance(error, FileNotFoundError | NotADirectoryError):
+        raise error

@@ -21,10 +21,12 @@ from storage.artifact_folders import (
     TEMPORARY_PREFIX,
     TRASH_PREFIX,
     find_artifact_folders,
+    find_hidden,
     find_sound_manifest,
     last_modified,
     load_manifest,
     move_to_trash,
+    walk_artifact_folders,
 )
 from storage.codecs import get_codec
 from storage.file_lease import hold_file_lease
@@ -148,8 +150,8 @@ class LocalStore:
             raise make_corruption_error(address, path / MANIFEST, f"The manifest belongs to {manifest.address}")
         return Artifact(address, path, manifest)
 
-    def verify(self, artifact: Artifact) -> None:
-        """Checks that every file is there with its size and sha256, and none that is not listed.
+    def verify(self, artifact: Artifact, reads_all: bool = False) -> None:
+        """Reads every file, whatever ``reads_all`` is, and checks that none is there which is not listed.
 
         Raises:
             ArtifactCorruptError: as :meth:`storage.store.Store.verify` says.
@@ -240,6 +242,8 @@ class LocalStore:
             except (ArtifactCorruptError, ConfigError, FileNotFoundError):
                 # One that is gone was discarded by another process since its folder was listed.
                 continue
+            except OSError as error:
+                raise as_genre_error(error, folder / MANIFEST) from error
             if is_in_place and all(v is None or v == getattr(manifest, name) for name, v in wanted.items()):
                 yield Artifact(address, folder, manifest)
 
@@ -249,8 +253,11 @@ class LocalStore:
         Yields:
             (relative path, what is wrong with it or ``None``).
         """
-        for folder in find_artifact_folders(self.root):
+        for folder, fault in walk_artifact_folders(self.root):
             name = folder.relative_to(self.root).as_posix()
+            if fault is not None:
+                yield name, fault
+                continue
             try:
                 # A file that cannot be read must not hide what is wrong with those after it.
                 with os_errors_translated(folder / MANIFEST, None):
@@ -276,19 +283,14 @@ class LocalStore:
         """
         removed = 0
         now = _read_file_system_clock(self.root)
-        for folder, names, files in os.walk(self.root):
-            for name in [name for name in (*names, *files) if name.startswith(".")]:
-                path = Path(folder) / name
-                is_temporary = name.startswith((TEMPORARY_PREFIX, TRASH_PREFIX))
-                # A process that was suspended for long goes on afterwards.
-                # Whose owner lives is asked first: the folder's files come and go then.
-                is_old = is_temporary and not is_in_use(path) and now - last_modified(path) >= older_than_s
-                # Removed from the walk too, which would otherwise enter a folder that is going away.
-                if is_temporary and name in names:
-                    names.remove(name)
-                if is_old or is_abandoned(path):
-                    remove_path(path)
-                    removed += 1
+        for path in find_hidden(self.root):
+            is_temporary = path.name.startswith((TEMPORARY_PREFIX, TRASH_PREFIX))
+            # A process that was suspended for long goes on afterwards.
+            # Whose owner lives is asked first: the folder's files come and go then.
+            is_old = is_temporary and not is_in_use(path) and now - last_modified(path) >= older_than_s
+            if is_old or is_abandoned(path):
+                remove_path(path)
+                removed += 1
         return removed
 
     def _publish(self, temporary: Path, target: Path, address: Address) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import glob
+import os
 import shutil
 from pathlib import Path
 from typing import Protocol
@@ -73,6 +73,7 @@ class RecordFolders(Protocol):
             The files on this machine, the one that was written first at the front.
 
         Raises:
+            InputError: the folder above them must not be listed.
             TransientIOError: the store does not answer.
         """
         ...
@@ -111,9 +112,18 @@ class LocalRecordFolders:
         folder = self._root.joinpath(*split_record_name(parent))
         if not can_start_name(start):
             return []
-        # Only folders that fit are looked into: a dataset asks for one of its thousand runs after the other.
-        found = folder.glob(f"{glob.escape(start)}*/{file}")
-        return sorted(found, key=_modified_s)
+        try:
+            with os.scandir(folder) as entries:
+                # Only folders that fit are looked into: a dataset asks for one of its thousand runs after the other.
+                names = sorted(entry.name for entry in entries if entry.name.startswith(start))
+        except (FileNotFoundError, NotADirectoryError):
+            return []
+        except OSError as error:
+            # Records that are not known of must not count as removed: what they refer to would be garbage.
+            raise as_genre_error(error, folder) from error
+        times_s = {path: _modified_s(path) for path in (folder / name / file for name in names)}
+        found = {path: time_s for path, time_s in times_s.items() if time_s is not None}
+        return sorted(found, key=found.__getitem__)
 
 
 def can_start_name(start: str) -> bool:
@@ -128,11 +138,13 @@ def can_start_name(start: str) -> bool:
     return "/" not in start and "\0" not in start
 
 
-def _modified_s(path: Path) -> float:
+def _modified_s(path: Path) -> float | None:
     try:
         return path.stat().st_mtime
-    except FileNotFoundError:
-        # Another process has removed the record since; whoever reads it is told so.
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError:
+        # Whoever reads the record is told why it cannot be read.
         return 0.0
 
 

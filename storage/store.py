@@ -147,11 +147,13 @@ class Store(Protocol):
         """
         ...
 
-    def verify(self, artifact: Artifact) -> None:
+    def verify(self, artifact: Artifact, reads_all: bool = False) -> None:
         """Compares every file of an artifact with its manifest.
 
         Args:
             artifact: the artifact to check.
+            reads_all: whether every byte is read. Otherwise a bucket's listing is trusted where it shows a file to be
+                as it was uploaded; a folder's files are always read.
 
         Raises:
             ArtifactCorruptError: a file is missing, unexpected or altered; it is named.

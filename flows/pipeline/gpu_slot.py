@@ -40,7 +40,7 @@ def takes_gpu_slot(stage: str) -> bool:
 
 @contextmanager
 def gpu_slot(stage: str) -> Iterator[None]:
-    """Holds a slot of the limit that ``GENRE_GPU_LIMIT`` names, while a heavy stage runs, on any device.
+    """Holds a slot of the limit that ``GENRE_GPU_LIMIT`` names, while a heavy stage computes, on any device.
 
     Heavy are GNet, FNet, ENet and evaluations. The server takes the slot back some minutes after a worker died that had
     it.

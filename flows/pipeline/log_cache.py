@@ -7,6 +7,7 @@ import glob
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import unquote
 
 from flows.pipeline.log_lists import expand_log_list
 from genre_tasks.config import PipelineConfig
@@ -98,20 +99,24 @@ def expand_logs(logs: list[str]) -> list[str]:
     >>> expand_logs(["synthetic:street?seed=1", "pandaset:logs/002"])
     ['synthetic:street?seed=1', 'pandaset:logs/002']
     """
-    from genre_tasks.logs.registry import list_logs
+    from genre_tasks.logs.registry import list_logs, quote_path, takes_quoted_paths
 
     expanded: list[str] = []
     for uri in [name for entry in logs for name in expand_log_list(entry) or [entry]]:
         reader, _, text = uri.partition(":")
-        path = expand_user_path(text)
+        is_quoted = takes_quoted_paths(reader)
+        # Other readers take a question mark for a part of the name.
+        written, mark, options = text.partition("?") if is_quoted else (text, "", "")
+        path = expand_user_path(unquote(written) if is_quoted else written)
         # A folder may really have a star in its name.
-        if "*" not in text or path.is_dir():
+        if "*" not in written or path.is_dir():
             expanded.append(uri)
             continue
         # Logs of some layouts are rows of tables, or files beside one another.
         found = list_logs(uri)
         if found is None:
-            found = [f"{reader}:{folder}" for folder in _match_folders(path)]
+            names = [str(folder) for folder in _match_folders(path)]
+            found = [f"{reader}:{quote_path(name) if is_quoted else name}{mark}{options}" for name in names]
         if not found:
             raise InputError(f"no log matches {uri}", remedy="Name a folder that holds sequences.", file=path.parent)
         expanded += found

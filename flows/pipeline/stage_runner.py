@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from flows.machine.facts import describe_environment
 from flows.machine.memory_reuse import trim_memory
 from flows.machine.resource_usage import measure_usage, memory_errors_translated
 from flows.observability.stage_observation import count_read, count_written, measure_lease_wait, note_key, observed
+from flows.pipeline.damaged_artifacts import discard_damaged_inputs
 from flows.pipeline.definition import (
     STAGE_BY_NAME,
     StageSpec,
@@ -19,6 +21,7 @@ from flows.pipeline.definition import (
     find_scene_modules,
     stage_key,
 )
+from flows.pipeline.issue_lines import group_issues
 from flows.pipeline.log_cache import cached_log
 from flows.pipeline.memory_plan import shrink_batch
 from flows.pipeline.stage_inputs import open_inputs
@@ -29,9 +32,6 @@ from storage.address import Address
 from storage.code_digest import code_digest
 from storage.opening import open_store
 from storage.store import Artifact, Provenance, Store
-
-if TYPE_CHECKING:
-    from genre_tasks.scene.chunk import LogIssue
 
 
 @dataclass(frozen=True)
@@ -179,6 +179,7 @@ def run_stage(
     inputs: Mapping[str, ArtifactRef],
     attempt: int = 0,
     progress: Progress = silent,
+    slot: Callable[[], AbstractContextManager[None]] = nullcontext,
 ) -> ArtifactRef:
     """Makes a stage's artifact: takes it from the store if a sound one is there, else computes and commits it.
 
@@ -191,11 +192,13 @@ def run_stage(
         attempt: how many tries before this one ran out of memory. The stage's ``batch_setting`` is halved that often,
             which changes the payload by rounding at most.
         progress: called with how far the computation is.
+        slot: makes the context that the computation runs in, such as one that waits for a GPU.
 
     Returns:
         The reference of the artifact.
 
     Raises:
+        ArtifactCorruptError: an input is damaged; it is removed, so that the next run computes it again.
         ResourceError: memory or disk does not suffice.
         GenreError: any other kind, as the stage raises it.
 
@@ -211,14 +214,22 @@ def run_stage(
     if ref is not None:
         return ref
     store = open_store(job.store)
-    with store.lease(address, measure_lease_wait(progress)):
-        # The process that had the lease before has probably committed the artifact, or replaced a damaged one.
-        _, ref, damage = find_artifact(spec, job, inputs, repair=True)
-        if ref is not None:
-            return ref
-        note = damage or note
-        artifact = _compute_artifact(spec, job, inputs, store, address, note, attempt, progress)
-        trim_memory()  # only now, as the stage's values are gone
+    try:
+        with store.lease(address, measure_lease_wait(progress)):
+            # The process that had the lease before has probably committed the artifact, or replaced a damaged one.
+            _, ref, damage = find_artifact(spec, job, inputs, repair=True)
+            if ref is not None:
+                return ref
+            note = damage or note
+            # Only here, as what comes from the store needs no slot.
+            with slot():
+                artifact = _compute_artifact(spec, job, inputs, store, address, note, attempt, progress)
+            trim_memory()  # only now, as the stage's values are gone
+    except ArtifactCorruptError:
+        # Outside of lease and slot, for which a process may wait that has the input's lease.
+        addresses = [artifact_address(inputs[name].stage, job, inputs[name].key) for name in spec.inputs]
+        discard_damaged_inputs(store, addresses, progress)
+        raise
     return _reference(artifact, cached=False, note=note)
 
 
@@ -260,7 +271,7 @@ def _compute_artifact(
             measurements={
                 "cpu_seconds": usage.cpu_seconds,
                 "predicted_mib": opened.predicted_mib,
-                "marks": _group_issues(getattr(value, "log_issues", ())),
+                "marks": group_issues(getattr(value, "log_issues", ())),
             },
             warnings=(note,) if note else (),
         )
@@ -306,18 +317,6 @@ def _special_arguments(spec: StageSpec, job: Job) -> dict[str, Any]:
         log = cached_log(job.log)
         values |= {"log": log, "truth": log.truth}
     return values
-
-
-def _group_issues(issues: Iterable[LogIssue]) -> list[str]:
-    """Says what the chunk's log lacks, one line for each kind: the first detail, and how many more there are."""
-    details_by_kind: dict[str, list[str]] = {}
-    for issue in issues:
-        details_by_kind.setdefault(issue.kind.replace("_", " "), []).append(issue.detail)
-    lines = []
-    for kind, details in details_by_kind.items():
-        more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
-        lines.append(f"{kind}: {details[0]}{more}")
-    return lines
 
 
 def _find_input(store: Store, ref: ArtifactRef, job: Job) -> Artifact:

@@ -6,6 +6,7 @@ The store's manifests alone decide what is cached. Prefect's own result cache is
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 from uuid import UUID
 
@@ -77,8 +78,8 @@ def stage_task(stage: str, chunk: int, job: Job, inputs: dict[str, ArtifactRef])
     reporter = get_reporter()
     reporter.stage_started(stage, chunk)
     try:
-        with gpu_slot(stage):
-            ref = run_stage(stage, job, inputs, attempt=attempt, progress=reporter.progress)
+        slot = functools.partial(gpu_slot, stage)
+        ref = run_stage(stage, job, inputs, attempt=attempt, progress=reporter.progress, slot=slot)
     except ResourceError:
         if run_id is not None:
             _memory_failures[run_id] = attempt + 1

@@ -6,7 +6,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from flows.error_record import describe_record, record_error
-from genre_tasks.errors import ConfigError, GenreError, InputError, ResourceError, TransientIOError
+from genre_tasks.errors import (
+    ArtifactCorruptError,
+    ConfigError,
+    GenreError,
+    InputError,
+    ResourceError,
+    TransientIOError,
+)
+from storage.manifest import NewerSchemaError
 
 
 class ChunksLeftOutError(GenreError):
@@ -42,11 +50,29 @@ class ChunksLeftOutError(GenreError):
         super().__init__(f"{len(failures)} of {count} chunks left out: {problems}", remedy=remedies, log=log)
         self.record = record
         self.left_out = record_failures(log, failures)
-        self.is_passing = any(isinstance(error, TransientIOError | ResourceError) for error in failures.values())
+        self.is_passing = any(may_pass(error) for error in failures.values())
         is_refused = all(isinstance(error, InputError | ConfigError) for error in failures.values())
         self.status: Literal["partly_done", "refused", "failed"] = "refused" if is_refused else "failed"
         if record is not None:
             self.status = "partly_done"
+
+
+def may_pass(error: BaseException) -> bool:
+    """Says whether another try may succeed, of an error that is not of several chunks.
+
+    Args:
+        error: what ended a stage or a run.
+
+    Returns:
+        Whether its surroundings are at fault, or an artifact that is computed again.
+
+    >>> may_pass(ArtifactCorruptError("an altered file", remedy="Run again.")), may_pass(InputError("", remedy=""))
+    (True, False)
+    """
+    # A stage that meets a damaged input removes it. What a newer version wrote stays as it is.
+    if isinstance(error, NewerSchemaError):
+        return False
+    return isinstance(error, TransientIOError | ResourceError | ArtifactCorruptError)
 
 
 class LogsFailedError(GenreError):

@@ -11,8 +11,8 @@ from typing import Any
 
 from prefect.artifacts import create_table_artifact
 
-from flows.reconstruction.left_out import ChunksLeftOutError, describe_log
-from genre_tasks.errors import GenreError, ResourceError, TransientIOError
+from flows.reconstruction.left_out import ChunksLeftOutError, describe_log, may_pass
+from genre_tasks.errors import GenreError
 
 DATASET_VARIABLE = "GENRE_DATASET"
 """The environment variable that names the dataset of a child run."""
@@ -47,4 +47,4 @@ def _is_final(error: Exception) -> bool:
     """Whether another try would end in the same error."""
     if isinstance(error, ChunksLeftOutError):
         return not error.is_passing
-    return isinstance(error, GenreError) and not isinstance(error, TransientIOError | ResourceError)
+    return isinstance(error, GenreError) and not may_pass(error)

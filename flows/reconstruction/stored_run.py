@@ -29,8 +29,6 @@ def find_stored_run(
     Raises:
         InputError: the log cannot be opened, or does not have one of the chunks.
     """
-    # A killed run may have left half-written folders behind; no artifact is among them.
-    open_store(store).clean_temporaries()
     values = config.model_dump(mode="json")
     found: dict[int, dict[str, ArtifactRef]] = {}
     for chunk in select_chunks(log, config, chunks):
@@ -38,6 +36,8 @@ def find_stored_run(
         if refs is None:
             return None
         found[chunk] = refs
+    # A killed run may have left half-written folders behind. A run that computes removes them itself.
+    open_store(store).clean_temporaries()
     return FinishedRun(
         log=log,
         preset=preset,

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from flows.pipeline.damaged_artifacts import discard_if_damaged
 from flows.reconstruction.record_files import read_sound_records, summarise_damage
 from flows.upkeep.pins import list_run_keys
 from genre_tasks.errors import ArtifactCorruptError, GenreError
@@ -56,15 +57,17 @@ def repair_artifacts(
             # What cannot be read now may be whole: a mount that is away must not cost an artifact.
             if isinstance(error, NewerSchemaError) or not isinstance(error, ArtifactCorruptError):
                 raise error
-            addresses[name] = Address.parse(name)
-            _discard_if_damaged(store, addresses[name])
+            address = Address.parse(name)
+            discard_if_damaged(store, address)
         except GenreError as reason:
             yield Repair(name, error.problem, "left", f"{reason.problem}. {reason.remedy}")
+        else:
+            addresses[name] = address
     failures: dict[str, str] = {}
     for record in records:
         keys = set(list_run_keys(record))
         wanted = [name for name, address in addresses.items() if address.key in keys]
-        missing = [name for name in wanted if store.find(addresses[name]) is None]
+        missing = [name for name in wanted if _is_missing(store, addresses[name])]
         # An edited run is made from another one by its edits, not from a log.
         if not missing or "edited" in record:
             continue
@@ -73,27 +76,31 @@ def repair_artifacts(
         except GenreError as error:
             failures |= {name: str(error) for name in missing}
     for name, address in addresses.items():
-        if store.find(address) is not None:
-            yield Repair(name, damaged[name].problem, "repaired")
-        else:
-            why = failures.get(name, _explain(address, records, bool(damaged_records)))
-            yield Repair(name, damaged[name].problem, "removed", why)
+        why_missing = failures.get(name, _explain(address, records, bool(damaged_records)))
+        yield _find_outcome(store, name, address, damaged[name].problem, why_missing)
     # At the end: one damaged record must not keep the runs of the others from being mended.
     if damaged_records:
         raise summarise_damage(damaged_records)
 
 
-def _discard_if_damaged(store: Store, address: Address) -> None:
-    # A run may have computed it again since the store was read, which takes long.
-    with store.lease(address):
-        artifact = None
-        try:
-            artifact = store.find(address)
-            if artifact is not None:
-                store.verify(artifact)
-        except ArtifactCorruptError:
-            # Just the one that was found: commits need no lease.
-            store.discard(artifact or address)
+def _is_missing(store: Store, address: Address) -> bool:
+    try:
+        return store.find(address) is None
+    except GenreError:
+        # It is there, and what is wrong with it is said with its outcome.
+        return False
+
+
+def _find_outcome(store: Store, name: str, address: Address, problem: str, why_missing: str) -> Repair:
+    try:
+        artifact = store.find(address)
+        if artifact is None:
+            return Repair(name, problem, "removed", why_missing)
+        # What runs trust may be what was damaged in the first place.
+        store.verify(artifact, reads_all=True)
+    except GenreError as reason:
+        return Repair(name, problem, "left", f"{reason.problem}. {reason.remedy}")
+    return Repair(name, problem, "repaired")
 
 
 def _explain(address: Address, records: list[dict[str, Any]], some_unread: bool) -> str:

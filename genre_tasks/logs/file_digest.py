@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Iterable
 from pathlib import Path
 
 from genre_tasks.logs.findings import Finding
 
-# A sequence has gigabytes, and its digest is asked for again and again.
-_FILE_HASHES: dict[tuple[str, int, int], str] = {}
+# More than any sequence has files. A process that runs a dataset meets far more.
+_MAX_FILE_HASHES = 1 << 17
 
 
 def digest_files(root: Path, files: Iterable[Path], findings: Iterable[Finding]) -> str:
@@ -41,10 +42,13 @@ def digest_files(root: Path, files: Iterable[Path], findings: Iterable[Finding])
 
 
 def _hash_file(path: Path) -> str:
-    """sha256 of a file, remembered in this process by path, size and time of change."""
     stat = path.stat()
-    key = (str(path.resolve()), stat.st_size, stat.st_mtime_ns)
-    if key not in _FILE_HASHES:
-        with path.open("rb") as file:
-            _FILE_HASHES[key] = hashlib.file_digest(file, "sha256").hexdigest()
-    return _FILE_HASHES[key]
+    return _hash_content(str(path.resolve()), stat.st_size, stat.st_mtime_ns)
+
+
+# A sequence has gigabytes, and its digest is asked for again and again.
+@functools.lru_cache(maxsize=_MAX_FILE_HASHES)
+def _hash_content(path: str, size: int, mtime_ns: int) -> str:
+    """sha256 of a file; size and time of change are there so that it is read again once they differ."""
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

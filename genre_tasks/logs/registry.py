@@ -194,11 +194,37 @@ def _make_path_absolute(text: str, entry: ReaderEntry) -> Path:
         return Path(text)
     # What is put before the user's text is not written by the user: a folder's name may look like an address.
     start = expand_user_path(first) if first.startswith("~") else Path.cwd()
-    before = Path(_quote(str(start))) if entry.is_quoted else start
+    before = Path(quote_path(str(start))) if entry.is_quoted else start
     return before.joinpath(*rest) if first.startswith("~") else before / text
 
 
-def _quote(path: str) -> str:
+def takes_quoted_paths(reader: str) -> bool:
+    """Says whether a reader's paths have special characters written with %, and options behind a question mark.
+
+    Args:
+        reader: the name before the colon of a URI.
+
+    Returns:
+        Whether they have; false for a reader that nobody registered.
+
+    >>> takes_quoted_paths("kitti"), takes_quoted_paths("pandaset")
+    (True, False)
+    """
+    return reader in _READERS and _READERS[reader].is_quoted
+
+
+def quote_path(path: str) -> str:
+    """Writes a path as readers of quoted paths take it.
+
+    Args:
+        path: the path of a file or a folder.
+
+    Returns:
+        The path with what is special in a log's address written with %.
+
+    >>> quote_path("/data/100% done")
+    '/data/100%25 done'
+    """
     for character in "%?&":
         path = path.replace(character, f"%{ord(character):02X}")
     return path

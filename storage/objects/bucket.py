@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from storage.objects.client import check_uri, open_client
 from storage.objects.download import Download
-from storage.objects.retries import AbsentError, call_with_retries
+from storage.objects.retries import AbsentError, absence_translated, call_with_retries
 
 _PART_BYTES = 8 << 20
 _PARTS_AT_ONCE = 4
@@ -130,7 +130,8 @@ class Bucket:
         """
         import obstore
 
-        return _version_of(self._call(name, lambda: obstore.put(self._client(), name, data)))
+        with absence_translated(self.uri):
+            return _version_of(self._call(name, lambda: obstore.put(self._client(), name, data)))
 
     def create(self, name: str, data: bytes) -> ObjectVersion | None:
         """Writes an object where there is none; of two writers one succeeds.
@@ -146,7 +147,8 @@ class Bucket:
             InputError: it must not be written, or the bucket is missing.
             TransientIOError: the store does not answer.
         """
-        return self._put_if(name, data, "create")
+        with absence_translated(self.uri):
+            return self._put_if(name, data, "create")
 
     def replace(self, name: str, data: bytes, version: ObjectVersion) -> ObjectVersion | None:
         """Writes an object over the one that was read; of two writers one succeeds.
@@ -165,7 +167,11 @@ class Bucket:
         """
         # Both, where the server has both: each cloud compares another one. The client takes no None.
         named = {"e_tag": version.e_tag, "version": version.generation}
-        return self._put_if(name, data, {key: value for key, value in named.items() if value})
+        try:
+            return self._put_if(name, data, {key: value for key, value in named.items() if value})
+        except AbsentError:
+            # It is gone.
+            return None
 
     def _put_if(self, name: str, data: bytes, mode: Any) -> ObjectVersion | None:
         import obstore
@@ -177,11 +183,7 @@ class Bucket:
             except (AlreadyExistsError, PreconditionError):
                 return None
 
-        try:
-            version = self._call(name, call)
-        except AbsentError:
-            # To be replaced, and gone.
-            return None
+        version = self._call(name, call)
         if version is None:
             # The refusal may be the answer to a second try, after the first succeeded and its answer was lost.
             found = self.read(name)
@@ -209,7 +211,8 @@ class Bucket:
             result = obstore.put(self._client(), name, path, chunk_size=_PART_BYTES, max_concurrency=_PARTS_AT_ONCE)
             return result["e_tag"] or ""
 
-        return self._call(name, call)
+        with absence_translated(self.uri):
+            return self._call(name, call)
 
     def download(self, name: str, path: Path | None = None) -> tuple[str, int]:
         """Reads an object of any size in pieces.

@@ -107,13 +107,15 @@ class ObjectStore:
         found = self._bucket.read(name)
         return None if found is None else self._make_artifact(address, found.data)
 
-    def verify(self, artifact: Artifact) -> None:
+    def verify(self, artifact: Artifact, reads_all: bool = False) -> None:
         """Checks an artifact by a listing, and by its bytes where these may be altered: see :meth:`Store.verify`.
+
+        A disk of the server may damage bytes under an ETag that stays; only ``reads_all`` finds that.
 
         Raises:
             ArtifactCorruptError: as :meth:`storage.store.Store.verify` says.
         """
-        self._payloads.verify(artifact)
+        self._payloads.verify(artifact, reads_all)
 
     def read(self, artifact: Artifact) -> Any:
         """Brings an artifact's files to this machine, digests them and decodes them: see :meth:`Store.read`.

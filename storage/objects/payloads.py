@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import re
+from collections import OrderedDict
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
+from threading import Lock
 
 from storage.files import write_file
 from storage.io_errors import make_corruption_error
@@ -27,8 +29,40 @@ _PAYLOAD = re.compile(
 )
 # More threads gain little, and a server that is slow already gets slower by them.
 _THREADS = 4
-_digested: dict[Path, tuple[str, int, int, int]] = {}
-"""Files of caches that this process has found sound: their sha256, and what the system changes when one is altered."""
+# Several chunks have so many. A process that runs a dataset reads far more, each a few times soon after another.
+_MAX_SOUND_FILES = 1 << 14
+
+
+class _SoundFiles:
+    """Files of caches that this process has found sound, so that they are not digested again; the latest ones.
+
+    A stamp is a file's sha256, and what the system changes when the file is altered.
+    """
+
+    def __init__(self, max_count: int) -> None:
+        self._max_count = max_count
+        self._stamps: OrderedDict[Path, tuple[str, int, int, int]] = OrderedDict()
+        # Stages of several threads read artifacts at a time.
+        self._lock = Lock()
+
+    def has(self, path: Path, stamp: tuple[str, int, int, int]) -> bool:
+        """Tells whether a file was found sound with this stamp, and keeps it longer than those used less recently."""
+        with self._lock:
+            if self._stamps.get(path) != stamp:
+                return False
+            self._stamps.move_to_end(path)
+            return True
+
+    def add(self, path: Path, stamp: tuple[str, int, int, int]) -> None:
+        """Remembers a sound file; the one that was used least recently goes where there are too many."""
+        with self._lock:
+            self._stamps[path] = stamp
+            self._stamps.move_to_end(path)
+            if len(self._stamps) > self._max_count:
+                self._stamps.popitem(last=False)
+
+
+_sound_files = _SoundFiles(_MAX_SOUND_FILES)
 
 
 class Payloads:
@@ -227,9 +261,9 @@ def _is_cached(path: Path, entry: FileEntry, trusts_cache: bool) -> bool:
     # Taken before the digest: a file that is altered meanwhile is digested once more.
     stamp = (entry.sha256, status.st_ino, status.st_mtime_ns, status.st_ctime_ns)
     # Not the size alone, which a damaged disk or an editor may keep.
-    if trusts_cache and _digested.get(path) == stamp:
+    if trusts_cache and _sound_files.has(path, stamp):
         return True
     if find_damage(path, entry) is not None:
         return False
-    _digested[path] = stamp
+    _sound_files.add(path, stamp)
     return True

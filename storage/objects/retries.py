@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TypeVar
 
 from genre_tasks.errors import InputError, TransientIOError
@@ -17,8 +18,43 @@ _log = logging.getLogger("genre")
 T = TypeVar("T")
 
 
+# How S3, Azure and Google Cloud Storage say that the bucket itself is missing.
+_MISSING_BUCKET = ("NoSuchBucket", "ContainerNotFound", "bucket does not exist")
+# S3's word for an upload in parts that somebody ended: the bucket is there.
+_ENDED_UPLOAD = "NoSuchUpload"
+
+
 class AbsentError(Exception):
     """There is no such object."""
+
+
+@contextmanager
+def absence_translated(uri: str) -> Iterator[None]:
+    """Turns the absence of what is written just now into the error that its cause calls for.
+
+    A server whose words for a missing bucket are unknown answers so.
+
+    Args:
+        uri: of the store.
+
+    Yields:
+        Nothing.
+
+    Raises:
+        InputError: there is no such bucket.
+        TransientIOError: an upload in parts was ended by somebody else.
+    """
+    try:
+        yield
+    except AbsentError as error:
+        if _ENDED_UPLOAD in str(error.__cause__):
+            problem = "an upload was ended by the store or by somebody else"
+            raise TransientIOError(problem, remedy="Run again: it is uploaded once more.", file=uri) from error
+        raise _make_bucket_error(uri) from error
+
+
+def _make_bucket_error(uri: str) -> InputError:
+    return InputError("there is no such bucket", remedy="Make it, or correct --store.", file=uri)
 
 
 def call_with_retries(
@@ -70,8 +106,8 @@ def call_with_retries(
             # One of a file on this machine has a number.
             if isinstance(error, OSError) and error.errno is not None:
                 raise
-            if "NoSuchBucket" in str(error):
-                raise InputError("there is no such bucket", remedy="Make it, or correct --store.", file=uri) from error
+            if any(word in str(error) for word in _MISSING_BUCKET):
+                raise _make_bucket_error(uri) from error
             raise AbsentError(name) from error
         except (BaseError, PermissionError) as error:
             if isinstance(error, OSError) and error.errno is not None:

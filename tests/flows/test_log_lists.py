@@ -11,6 +11,7 @@ from flows.experiments.log_chunks import LogChunk, select_log_chunks
 from flows.pipeline.log_cache import expand_logs
 from flows.pipeline.log_lists import expand_log_list
 from genre_tasks.errors import InputError
+from genre_tasks.logs.log_address import split_log_address
 
 
 def test_names_of_a_file_stand_for_logs(tmp_path: Path) -> None:
@@ -54,6 +55,21 @@ def test_several_stars_in_a_row_mean_one(tmp_path: Path) -> None:
     assert expand_logs([f"pandaset:{tmp_path}/0**"]) == [f"pandaset:{tmp_path}/{name}" for name in ("001", "002")]
     below = expand_logs([f"pandaset:{tmp_path}/**/part"])
     assert below == [f"pandaset:{tmp_path}/{name}/part" for name in ("001", "002")]
+
+
+def test_stars_in_paths_that_are_written_with_percent_signs(tmp_path: Path) -> None:
+    for name in ("50% a", "b?"):
+        (tmp_path / "100% done" / name).mkdir(parents=True)
+    folder = f"{tmp_path}/100%25 done"
+    assert expand_logs([f"kitti:{folder}/*?labels=x"]) == [
+        f"kitti:{folder}/50%25 a?labels=x",
+        f"kitti:{folder}/b%3F?labels=x",
+    ]
+    # What such a reader is given opens the folder that was found.
+    (one,) = expand_logs([f"kitti:{folder}/b*"])
+    assert Path(split_log_address(one.partition(":")[2], (), "KITTI")[0]) == tmp_path / "100% done" / "b?"
+    # Other readers take a path as it is.
+    assert expand_logs([f"pandaset:{tmp_path}/100% done/b*"]) == [f"pandaset:{tmp_path}/100% done/b?"]
 
 
 @pytest.mark.parametrize(

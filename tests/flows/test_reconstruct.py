@@ -24,6 +24,7 @@ from flows.reconstruction import flow, outcome_artifact, run_records, stored_val
 from flows.reconstruction.left_out import ChunksLeftOutError, LogsFailedError
 from flows.reconstruction.report import writing
 from genre_tasks.errors import (
+    ArtifactCorruptError,
     ConfigError,
     DiskFullError,
     InputError,
@@ -31,6 +32,7 @@ from genre_tasks.errors import (
     TransientIOError,
     UnsupportedMachineError,
 )
+from storage.manifest import NewerSchemaError
 from tests.faults.small_run import LOG, SETTINGS
 
 OTHER_LOG = LOG.replace("seed=900", "seed=902")
@@ -93,12 +95,12 @@ def test_what_a_retry_can_cure_is_retried(
     monkeypatch.setattr(stage_task.stage_task, "retry_delay_seconds", 0)
     real = stage_task.run_stage
 
-    def failing(stage: str, job: Job, inputs: Any, attempt: int, progress: Any) -> Any:
+    def failing(stage: str, job: Job, inputs: Any, attempt: int, progress: Any, slot: Any) -> Any:
         if stage == "initial":
             attempts.append(attempt)
             if len(attempts) <= len(kinds):
                 raise kinds[len(attempts) - 1]("not now", remedy="Wait.")
-        return real(stage, job, inputs, attempt, progress)
+        return real(stage, job, inputs, attempt, progress, slot)
 
     monkeypatch.setattr(stage_task, "run_stage", failing)
     assert served(run(tmp_path)) == [False] * 3
@@ -126,9 +128,12 @@ def test_a_chunk_that_failed_by_its_surroundings_is_tried_again(monkeypatch: pyt
     monkeypatch.setenv(outcome_artifact.DATASET_VARIABLE, "streets")
     monkeypatch.setattr(outcome_artifact, "create_table_artifact", lambda table, **_: rows.extend(table))
     log_at_fault = InputError("no image", remedy="Copy it.")
-    for errors in ({1: log_at_fault}, {1: log_at_fault, 2: TransientIOError("the store is away", remedy="Wait.")}):
-        outcome_artifact.publish_outcome(LOG, None, ChunksLeftOutError(LOG, 3, errors))
-    assert [row["is_passing"] for row in rows] == [False, True]
+    passing = (TransientIOError("the store is away", remedy="Wait."), ArtifactCorruptError("altered", remedy="Again."))
+    newer = NewerSchemaError("of a newer version", remedy="Update.")
+    for error in (log_at_fault, newer, *passing):
+        outcome_artifact.publish_outcome(LOG, None, ChunksLeftOutError(LOG, 3, {1: log_at_fault, 2: error}))
+        outcome_artifact.publish_outcome(LOG, None, error)
+    assert [row["is_passing"] for row in rows] == [False] * 4 + [True] * 4
 
 
 @pytest.mark.parametrize("kind", [ConfigError, DiskFullError, UnsupportedMachineError])

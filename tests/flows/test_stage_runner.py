@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -184,6 +186,46 @@ def test_a_repair_leaves_what_another_process_has_computed_meanwhile(
     again = run(job(store), *EARLY)["initial"]
     assert [made.cached for made in replaced] == [False] and again.cached
     assert replaced[0].note and not again.note
+
+
+def test_an_input_that_only_its_bytes_show_to_be_damaged_is_removed(
+    store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A bucket's listing shows nothing of a damaged disk, and look-ups trust the listing."""
+    verify, read = LocalStore.verify, LocalStore.read
+
+    def trust_listing(opened: LocalStore, artifact: Artifact, reads_all: bool = False) -> None:
+        if reads_all:
+            verify(opened, artifact)
+
+    def read_all(opened: LocalStore, artifact: Artifact) -> object:
+        verify(opened, artifact)
+        return read(opened, artifact)
+
+    work = job(store, "initial.opacity=0.5")
+    early = run(work, "ingest", "effects")
+    sorted((store / str(early["ingest"].address)).glob("*.parquet"))[0].write_bytes(b"else")
+    monkeypatch.setattr(LocalStore, "verify", trust_listing)
+    monkeypatch.setattr(LocalStore, "read", read_all)
+    with pytest.raises(ArtifactCorruptError, match="Run again"):
+        run(work, *EARLY)
+    opened = LocalStore(store)
+    assert [opened.find(early[name].address) is None for name in ("ingest", "effects")] == [True, False]
+    assert cached(run(work, *EARLY)) == {"ingest": False, "effects": True, "initial": False}
+
+
+def test_what_comes_from_the_store_waits_for_no_slot(store: Path) -> None:
+    taken: list[str] = []
+
+    @contextmanager
+    def slot() -> Iterator[None]:
+        taken.append("taken")
+        yield
+
+    refs = run(job(store), *EARLY)
+    assert run_stage("initial", job(store), refs, slot=slot).cached and taken == []
+    assert not run_stage("initial", job(store, "initial.opacity=0.25"), refs, slot=slot).cached
+    assert taken == ["taken"]
 
 
 def test_out_of_memory_becomes_a_resource_error() -> None:

@@ -89,10 +89,11 @@ def test_a_server_that_is_away_is_no_missing_limit(
 def test_a_retried_stage_returns_its_slot_and_takes_it_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     taken: list[int] = []
 
-    def fails_once(stage: str, job: Job, *args: Any, **kwargs: Any) -> ArtifactRef:
-        taken.append(active_slots())
-        if len(taken) == 1:
-            raise TransientIOError("the store is away", remedy="Wait.")
+    def fails_once(stage: str, job: Job, *args: Any, slot: Any, **kwargs: Any) -> ArtifactRef:
+        with slot():
+            taken.append(active_slots())
+            if len(taken) == 1:
+                raise TransientIOError("the store is away", remedy="Wait.")
         return ArtifactRef(stage, "key", "digest", "path", cached=False)
 
     @flow
