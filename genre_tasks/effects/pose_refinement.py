@@ -6,8 +6,11 @@ from genre_tasks.effects.measurements import ChunkMeasurements
 from genre_tasks.effects.types import Effect, EffectParameters, Measurement
 from genre_tasks.scene.pose_alignment import align_poses
 
-MIN_WIDTH_PX = 320
-"""Narrower images are too coarse: on exact streets refined poses then move by as much as the gate's threshold."""
+MIN_PIXELS = 57_000
+"""Images of fewer are too coarse: on exact streets refined poses then move by as much as the gate's threshold.
+
+320×180 has 57 600 pixels, and images of another shape get as many within rounding: on exact streets at 278×208 and
+302×190 poses move by less than the threshold, too."""
 
 MIN_IMAGES = 8
 """Fewer source images do not hold a motion that all of them share: on exact streets it then exceeds the threshold."""
@@ -21,11 +24,11 @@ def measure(measurements: ChunkMeasurements) -> Measurement:
 
     Returns:
         Pixels at the working resolution, by which refined poses move LiDAR returns; no value where no two images see
-        the same points, source images are fewer than ``MIN_IMAGES``, or they are narrower than ``MIN_WIDTH_PX``.
+        the same points, source images are fewer than ``MIN_IMAGES``, or they have less than ``MIN_PIXELS``.
     """
-    width_px = measurements.chunk.width_px
-    if width_px < MIN_WIDTH_PX:
-        return Measurement(None, f"images of {width_px} pixels in width are too coarse to tell")
+    chunk = measurements.chunk
+    if chunk.width_px * chunk.height_px < MIN_PIXELS:
+        return Measurement(None, f"images of {chunk.width_px}×{chunk.height_px} pixels are too coarse to tell")
     count = len(measurements.source_views)
     if count < MIN_IMAGES:
         return Measurement(None, f"{count} source images are too few to tell")

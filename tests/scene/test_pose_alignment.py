@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -193,7 +194,15 @@ def test_the_gate_flips_at_its_threshold(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_images_that_are_too_coarse_are_left_alone() -> None:
     small = ingest(IngestConfig(width_px=160, height_px=90, source_every=2), street(NOISY), 0)
     decision = plan_effects(ONLY, small, street(NOISY).cameras)["pose_refinement"]
-    assert decision.choice == "off" and "160 pixels in width are too coarse" in decision.reason
+    assert decision.choice == "off" and "160×90 pixels are too coarse" in decision.reason
+
+
+@pytest.mark.parametrize("size_px", [(320, 180), (302, 190), (304, 190), (278, 208), (436, 132)])
+def test_images_of_every_shape_are_fine_enough_with_as_many_pixels(size_px: tuple[int, int]) -> None:
+    still = SimpleNamespace(displacement_px=0.25)
+    shaped = SimpleNamespace(width_px=size_px[0], height_px=size_px[1])
+    measurements = SimpleNamespace(chunk=shaped, source_views=range(15), coarse_alignment=still)
+    assert pose_refinement.measure(measurements).value == 0.25  # type: ignore[arg-type]
 
 
 def test_many_images_are_smaller_and_share_their_points(monkeypatch: pytest.MonkeyPatch) -> None:
