@@ -13,6 +13,7 @@ from flows.operations.service import HOST, Service, keep_port, keep_secret
 from genre_tasks.errors import ConfigError, ResourceError
 
 _USER = "prefect"
+_UNFINISHED_DATA = "data.part"
 # Linux bounds the path of a socket; PostgreSQL adds `/.s.PGSQL.12345.lock`.
 _SOCKET_PATH_MAX = 85
 
@@ -76,28 +77,44 @@ class PostgresServer(Service):
         options = self.spawn_options()
         self.port = keep_port(self.folder / "port", self.wanted_port)
         keep_secret(self.password_file)
-        for path in (self.data, self.sockets):
-            path.mkdir(mode=0o700, exist_ok=True)
+        self.sockets.mkdir(mode=0o700, exist_ok=True)
+        is_new = not (self.data / "PG_VERSION").exists()
+        # Made elsewhere and renamed: an interrupted initdb leaves a folder that a later start would take for whole.
+        data = self.folder / _UNFINISHED_DATA if is_new else self.data
+        if is_new:
+            shutil.rmtree(data, ignore_errors=True)
+            data.mkdir(mode=0o700)
         if os.geteuid() == 0:
             account = self._account()
-            for path in (self.folder, self.data, self.sockets, self.password_file):
+            for path in (self.folder, data, self.sockets, self.password_file):
                 os.chown(path, account.pw_uid, account.pw_gid)
-            self._check_reachable(options)
-        if (self.data / "PG_VERSION").exists():
-            return
-        words = [initdb, "-D", str(self.data), "-U", _USER, "--pwfile", str(self.password_file)]
+            self._check_reachable(data, options)
+        if is_new:
+            self._make_cluster(initdb, data, options)
+
+    def _make_cluster(self, initdb: str, unfinished: Path, options: dict[str, object]) -> None:
+        """Fills an empty folder with a database cluster, and gives it its name."""
+        words = [initdb, "-D", str(unfinished), "-U", _USER, "--pwfile", str(self.password_file)]
         words += ["--auth=scram-sha-256", "--encoding=UTF8", "--locale=C"]
         made = subprocess.run(words, capture_output=True, text=True, check=False, **options)  # type: ignore[call-overload]
         if made.returncode:
-            raise ResourceError(f"initdb failed: {made.stderr.strip()}", remedy="Free the folder.", file=self.data)
+            raise ResourceError(f"initdb failed: {made.stderr.strip()}", remedy="Free the folder.", file=unfinished)
+        try:
+            # Takes the place of an empty folder, and of no other.
+            unfinished.rename(self.data)
+        except OSError as error:
+            problem = f"the new database cannot take its place ({error})"
+            raise ResourceError(
+                problem, remedy="Remove this folder, which holds no database.", file=self.data
+            ) from error
 
-    def _check_reachable(self, options: dict[str, object]) -> None:
-        found = subprocess.run(["test", "-r", str(self.data)], check=False, **options)  # type: ignore[call-overload]
+    def _check_reachable(self, data: Path, options: dict[str, object]) -> None:
+        found = subprocess.run(["test", "-r", str(data)], check=False, **options)  # type: ignore[call-overload]
         if found.returncode:
             raise ConfigError(
                 f"the user {self.system_user}, who runs PostgreSQL where you are root, cannot enter the folder",
                 remedy="Name another with --folder, or make its parents enterable with chmod o+x.",
-                file=self.data,
+                file=data,
             )
 
     def command(self) -> list[str]:

@@ -86,11 +86,12 @@ class Stack:
             self._ensure(server)
             env.update(server.env())
             deploy_flows(server.url, env["PREFECT_API_AUTH_STRING"], self.pool, store, self.folder)
-            for worker in self._workers(env):
-                self._ensure(worker)
             # A run with slower heartbeats than the automation expects would be marked as crashed while it lives.
             heartbeat = {"PREFECT_FLOWS_HEARTBEAT_FREQUENCY": str(HEARTBEAT_SECONDS)}
+            # Before the workers: where one of them does not start, the others and the server are there for clients.
             self._write_env({**env, **heartbeat, "GENRE_STORE": store})
+            for worker in self._workers(env):
+                self._ensure(worker)
             return list(read_records(self.folder).values())
 
     def _workers(self, env: dict[str, str]) -> Iterator[Worker]:

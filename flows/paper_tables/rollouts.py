@@ -70,7 +70,11 @@ class PlannedRollout:
 
 
 def plan_rollout(
-    rollout: TableRollout, recorded: EgoPath, config: SimulateConfig, actors: Sequence[WorldActor] = ()
+    rollout: TableRollout,
+    recorded: EgoPath,
+    config: SimulateConfig,
+    actors: Sequence[WorldActor] = (),
+    center_ahead_m: float = 0.0,
 ) -> PlannedRollout:
     """Plans a behaviour as strong as the log has room for.
 
@@ -82,6 +86,7 @@ def plan_rollout(
         recorded: the recorded path.
         config: what a vehicle can do.
         actors: road users that it should not meet.
+        center_ahead_m: how far ahead of the path's poses the middle of the vehicle is.
 
     Returns:
         The path of the largest of ``STRENGTHS`` that a vehicle can drive without meeting a road user; where there is
@@ -105,7 +110,7 @@ def plan_rollout(
         except ConfigError as error:
             refusal = error
             continue
-        collisions = find_collisions(path, actors, config.collision_margin_m)
+        collisions = find_collisions(path, actors, config.collision_margin_m, center_ahead_m=center_ahead_m)
         planned = PlannedRollout(rollout, path, strength, tuple(str(collision) for collision in collisions))
         if not collisions:
             return planned

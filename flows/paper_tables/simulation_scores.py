@@ -18,6 +18,7 @@ from genre_tasks.config import EvaluateConfig, PipelineConfig
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.ego_paths.recorded_path import join_recorded_path
 from genre_tasks.ego_paths.world_actors import list_parked_actors, list_world_actors
+from genre_tasks.logs.vehicle_center import find_center_ahead
 from genre_tasks.metrics.network_files import NETWORK_ARGUMENTS, find_network_files
 from genre_tasks.rollout.handover import plan_handovers
 from genre_tasks.rollout.render_rollout import render_rollout
@@ -168,7 +169,8 @@ class LogMeasurement:
 
     def plan(self, rollout: TableRollout) -> PlannedRollout:
         """Plans a rollout on this log, see :func:`flows.paper_tables.rollouts.plan_rollout`."""
-        return plan_rollout(rollout, self.recorded, self._config.simulate, self._actors)
+        center_ahead_m = find_center_ahead(self._log)
+        return plan_rollout(rollout, self.recorded, self._config.simulate, self._actors, center_ahead_m=center_ahead_m)
 
     def is_stored(self, rollout: TableRollout, true_views: int = TRUE_VIEWS) -> bool:
         """Says whether a rollout was measured before.

@@ -16,6 +16,10 @@ from storage.codecs.tables import column, schema, write_table
 
 LIDAR_FOLDER = "lidar"
 
+_ASSUMED_PLACE = (
+    "the log does not say where its LiDAR is, and its sweeps do not show a spin: rays start at the ego vehicle's origin"
+)
+
 SWEEP = schema(
     "lidar_sweep/1",
     [
@@ -59,6 +63,10 @@ class LidarSweeps:
 
     def abort(self) -> None:
         """Nothing is under way between two poses."""
+
+    def list_warnings(self) -> tuple[str, ...]:
+        """Says so where rays start at an assumed place."""
+        return (_ASSUMED_PLACE,) if self._simulator.sensor.is_assumed else ()
 
 
 def write_sweep(path: Path, sweep: SimulatedSweep, world_SE3_chunk: Float64) -> None:

@@ -36,6 +36,10 @@ class RolloutOutput(Protocol):
         """Ends what is under way after an error; nothing happens after :meth:`close`."""
         ...
 
+    def list_warnings(self) -> tuple[str, ...]:
+        """Says what limits the files, for the manifest, once all poses are written."""
+        ...
+
 
 class Films:
     """One film for each camera, ``CAMERA.mp4``.
@@ -74,6 +78,10 @@ class Films:
         for writer in self._writers:
             writer.abort()
 
+    def list_warnings(self) -> tuple[str, ...]:
+        """Nothing limits them."""
+        return ()
+
 
 class ImageFiles:
     """A file for each image, ``CAMERA/000012.exr`` or ``.png``.
@@ -107,6 +115,10 @@ class ImageFiles:
 
     def abort(self) -> None:
         """Nothing is under way between two poses."""
+
+    def list_warnings(self) -> tuple[str, ...]:
+        """Nothing limits them."""
+        return ()
 
 
 def write_linear_image(path: Path, images: RolloutImages, camera: int) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flows.simulation.edited_runs import OpenedRun, open_edited_scenes
+from flows.simulation.ego_center import find_ego_center
 from flows.simulation.parked_actors import list_parked
 from flows.simulation.request import SimulationRequest
 from flows.simulation.rollout_path import CheckedPath, check_path, make_path
@@ -71,7 +72,8 @@ def prepare_rollout(
     recorded = join_recorded_path(chunks)
     path = make_path(request, config.simulate, recorded)
     actors = (*list_world_actors(chunks), *list_parked(run.recorded))
-    checked = check_path(request, config.simulate, path, recorded, actors)
+    center_ahead_m = find_ego_center(run.recorded)
+    checked = check_path(request, config.simulate, path, recorded, actors, center_ahead_m=center_ahead_m)
     # After the checks, which end most of the requests that are no good, and take no time.
     ranges = find_side_ranges(run.recorded, progress) if request.mark_range else {}
     progress(0, len(path), "hand-over")

@@ -76,7 +76,12 @@ def make_path(request: SimulationRequest, config: SimulateConfig, recorded: EgoP
 
 
 def check_path(
-    request: SimulationRequest, config: SimulateConfig, path: EgoPath, recorded: EgoPath, actors: Sequence[WorldActor]
+    request: SimulationRequest,
+    config: SimulateConfig,
+    path: EgoPath,
+    recorded: EgoPath,
+    actors: Sequence[WorldActor],
+    center_ahead_m: float = 0.0,
 ) -> CheckedPath:
     """Checks a path against the kinematic bounds and the boxes of actors.
 
@@ -86,6 +91,7 @@ def check_path(
         path: to check.
         recorded: the recorded path.
         actors: as they are simulated, and parked ones.
+        center_ahead_m: how far ahead of the path's poses the middle of the vehicle is.
 
     Returns:
         The path with what was found.
@@ -101,7 +107,8 @@ def check_path(
             f"no vehicle drives like this: {found}",
             remedy="Choose a smaller --strength or --start-offset, or render it all the same by --allow-implausible.",
         )
-    collisions = find_collisions(path, actors, config.collision_margin_m)
+    margin_m = config.collision_margin_m
+    collisions = find_collisions(path, actors, margin_m, center_ahead_m=center_ahead_m)
     if collisions and not request.allow_collision:
         found = "; ".join(str(collision) for collision in collisions[:_SHOWN_COLLISIONS])
         more = len(collisions) - _SHOWN_COLLISIONS
@@ -110,11 +117,13 @@ def check_path(
             remedy="Choose another --start-offset, --side or --delay, or render it all the same by --allow-collision.",
         )
     met = {collision.actor_id for collision in collisions}
-    colliding = _find_colliding_poses(path, [a for a in actors if a.actor_id in met], config.collision_margin_m)
+    colliding = _find_colliding_poses(path, [a for a in actors if a.actor_id in met], margin_m, center_ahead_m)
     return CheckedPath(path, recorded, violations, collisions, colliding, _list_maxima(motion))
 
 
-def _find_colliding_poses(path: EgoPath, actors: Sequence[WorldActor], margin_m: float) -> dict[int, tuple[str, ...]]:
+def _find_colliding_poses(
+    path: EgoPath, actors: Sequence[WorldActor], margin_m: float, center_ahead_m: float
+) -> dict[int, tuple[str, ...]]:
     """The actors that each pose meets, by its index; poses that meet none are left out."""
     if not actors:
         return {}
@@ -122,7 +131,8 @@ def _find_colliding_poses(path: EgoPath, actors: Sequence[WorldActor], margin_m:
     for index in range(len(path)):
         here = slice(index, index + 1)
         pose = EgoPath(path.times_s[here], path.frames[here], path.world_SE3_ego[here])
-        names = tuple(collision.actor_id for collision in find_collisions(pose, actors, margin_m))
+        found = find_collisions(pose, actors, margin_m, center_ahead_m=center_ahead_m)
+        names = tuple(collision.actor_id for collision in found)
         if names:
             colliding[index] = names
     return colliding

@@ -29,12 +29,21 @@ class RunScenes:
         run: the run's name, or the start of it.
         stage: initial, gnet or enet; ``None``: the last one of each chunk.
         chunks: numbers of the chunks to take; ``None``: all.
+        chunks_in_memory: how many chunks stay in memory.
 
     Raises:
         InputError: there is no such run or chunk.
     """
 
-    def __init__(self, store: str, run: str, stage: str | None = None, chunks: Sequence[int] | None = None) -> None:
+    def __init__(
+        self,
+        store: str,
+        run: str,
+        stage: str | None = None,
+        chunks: Sequence[int] | None = None,
+        *,
+        chunks_in_memory: int = CHUNKS_IN_MEMORY,
+    ) -> None:
         self.record = find_run_record(store, run)
         available = sorted(entry["chunk"] for entry in self.record["chunks"])
         unknown = sorted(set(chunks or ()) - set(available))
@@ -43,7 +52,7 @@ class RunScenes:
         self._numbers = [number for number in available if chunks is None or number in chunks]
         self._store = store
         self._stage = stage
-        self._read = lru_cache(CHUNKS_IN_MEMORY)(self._read_chunk_scene)
+        self._read = lru_cache(chunks_in_memory)(self._read_chunk_scene)
         self._digests: dict[str, str] | None = None
 
     @property
@@ -99,7 +108,7 @@ class RunScenes:
         return self._digests
 
     def load(self, number: int) -> ChunkScene:
-        """Reads one chunk and its scene; the last two stay in memory.
+        """Reads one chunk and its scene; the last few stay in memory.
 
         Args:
             number: of the chunk.

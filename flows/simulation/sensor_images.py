@@ -69,6 +69,10 @@ class MaskImages:
     def abort(self) -> None:
         """Nothing is under way between two poses."""
 
+    def list_warnings(self) -> tuple[str, ...]:
+        """Nothing limits them."""
+        return ()
+
     def _number_actor(self, actor: ActorNode) -> int:
         return self._instances.setdefault(actor.track_id, (len(self._instances) + 1, actor))[0]
 
@@ -107,6 +111,10 @@ class FlowImages:
 
     def abort(self) -> None:
         """Nothing is under way between two poses."""
+
+    def list_warnings(self) -> tuple[str, ...]:
+        """Nothing limits them."""
+        return ()
 
 
 def _make_folders(folder: Path, names: Sequence[str], rig: Sequence[RigCamera]) -> None:

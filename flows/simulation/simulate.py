@@ -24,6 +24,7 @@ from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import InputError
 from genre_tasks.progress import Progress, silent
 from genre_tasks.rollout.render_rollout import render_rollout
+from genre_tasks.scene_edits.edits import EditList
 from storage.manifest import FileEntry, Manifest, payload_digest, to_json_value
 
 
@@ -54,6 +55,7 @@ def simulate_run(request: SimulationRequest, progress: Progress = silent) -> dic
     rollout = prepare_rollout(request, run, config, progress)
     usage = ResourceUsage()
     metrics: dict[str, Any] = {}
+    warnings: list[str] = []
     chunk = rollout.source.load(rollout.source.chunk_numbers[0]).chunk
 
     def make_manifest(files: tuple[FileEntry, ...]) -> Manifest:
@@ -65,13 +67,7 @@ def simulate_run(request: SimulationRequest, progress: Progress = silent) -> dic
             stage=KIND,
             key=key,
             inputs=run.recorded.payload_digests(),
-            configuration={
-                "simulate": config.simulate.model_dump(mode="json"),
-                "fnet": config.fnet.model_dump(mode="json"),
-                "lidar_max_points": config.novel_views.lidar_max_points,
-                "request": request.key_values(),
-                "edits": (run.edits + request.edits).model_dump(mode="json")["edits"],
-            },
+            configuration=_describe_configuration(request, config, run.edits + request.edits),
             files=files,
             payload_digest=payload_digest(files),
             seconds=usage.seconds,
@@ -79,12 +75,14 @@ def simulate_run(request: SimulationRequest, progress: Progress = silent) -> dic
             created_at=datetime.now(UTC).isoformat(timespec="seconds"),
             environment=describe_environment(),
             measurements=to_json_value(metrics),
-            warnings=_list_warnings(rollout, metrics),
+            warnings=(*_list_warnings(rollout, metrics), *warnings),
         )
 
     with write_rollout(request.out, make_manifest) as folder:
         with measure_usage() as measured:
-            metrics.update(_render(request, config, rollout, folder, progress))
+            measured_metrics, found_warnings = _render(request, config, rollout, folder, progress)
+        metrics.update(measured_metrics)
+        warnings.extend(found_warnings)
         usage.seconds = measured.seconds
         usage.peak_mib = measured.peak_mib
     written = find_rollout(request.out, key, overwrite=False)
@@ -93,9 +91,21 @@ def simulate_run(request: SimulationRequest, progress: Progress = silent) -> dic
     return _describe(request.out, written, cached=False)
 
 
+def _describe_configuration(request: SimulationRequest, config: PipelineConfig, edits: EditList) -> dict[str, Any]:
+    """JSON values of all that a rollout was asked for."""
+    return {
+        "simulate": config.simulate.model_dump(mode="json"),
+        "fnet": config.fnet.model_dump(mode="json"),
+        "lidar_max_points": config.novel_views.lidar_max_points,
+        "request": request.key_values(),
+        "edits": edits.model_dump(mode="json")["edits"],
+    }
+
+
 def _render(
     request: SimulationRequest, config: PipelineConfig, rollout: PreparedRollout, folder: Path, progress: Progress
-) -> dict[str, Any]:
+) -> tuple[dict[str, Any], list[str]]:
+    """Renders a rollout, and returns its metrics and what limits its files."""
     path = rollout.checked.path
     row_maker = RowMaker(rollout)
     repair = choose_repair(request, config, rollout, folder)
@@ -107,10 +117,11 @@ def _render(
                 output.write(repaired)
             rows.append(row_maker.make_row(images))
             progress(images.index + 1, len(path), f"{len(rollout.rig)} cameras")
+        warnings = [warning for output in outputs for warning in output.list_warnings()]
     write_poses(folder, rows)
     metrics = measure_rollout(rollout, rows)
     write_metrics(folder, metrics)
-    return metrics
+    return metrics, warnings
 
 
 def _list_warnings(rollout: PreparedRollout, metrics: dict[str, Any]) -> tuple[str, ...]:

@@ -119,6 +119,7 @@ class GenreDrivingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         if start.first_index > start.last_index or start.lateral_m < 0:
             remedy = "Give first_index up to last_index, and lateral_m of at least 0."
             raise ConfigError(f"no place lies in {start}", remedy=remedy)
+        _check_numbers(width_px, reliable_m)
         self.render_mode = render_mode
         # Limits are for clients of a network, and this process has none.
         self._renderer = SceneRenderer(store, run, stage, limits=RenderLimits(_UNLIMITED_PX, _UNLIMITED_PX))
@@ -273,6 +274,15 @@ class GenreDrivingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             raise InputError(
                 f"an episode cannot start {lateral_m!r} m beside the path", remedy="Give metres to the left."
             )
+
+
+def _check_numbers(width_px: object, reliable_m: object) -> None:
+    if width_px is not None and not (isinstance(width_px, int | np.integer) and width_px >= 1):
+        raise ConfigError(f"images of width_px {width_px!r}", remedy="Give a whole number of at least 1, or None.")
+    is_number = isinstance(reliable_m, int | float | np.number)
+    if reliable_m is not None and not (is_number and 0 <= reliable_m < math.inf):  # type: ignore[operator]
+        remedy = "Give metres of at least 0, or None for the range as measured."
+        raise ConfigError(f"nobody can drive within a reliable_m of {reliable_m!r}", remedy=remedy)
 
 
 def _resize(cameras: Mapping[str, CameraDescription], width_px: int | None) -> dict[str, CameraDescription]:

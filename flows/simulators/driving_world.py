@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flows.simulation.edited_runs import open_run
+from flows.simulation.ego_center import find_ego_center
 from flows.simulation.parked_actors import list_parked
 from flows.simulation.run_scenes import RunScenes
 from flows.simulation.stored_ranges import SideRange, find_side_ranges
@@ -71,6 +72,7 @@ class DrivingWorld:
         moving = list_world_actors(chunks)
         opened = open_run(store, run, stage)
         self._actors: tuple[WorldActor, ...] = (*moving, *list_parked(opened.recorded))
+        self._center_ahead_m = find_ego_center(opened.recorded)
         self._reference: ReferencePath = fit_reference_path(self.recorded)
         self._layout: ChunkLayout = lay_out_chunks(scenes)
         if reliable_m is None:
@@ -161,5 +163,6 @@ class DrivingWorld:
             The first of them; ``None`` where there is none.
         """
         path = EgoPath(np.zeros(1), np.array([frame]), world_SE3_ego[None])
-        found = find_collisions(path, self._actors, self.config.collision_margin_m)
+        margin_m = self.config.collision_margin_m
+        found = find_collisions(path, self._actors, margin_m, center_ahead_m=self._center_ahead_m)
         return found[0] if found else None

@@ -35,6 +35,8 @@ class ImageRequest:
         actors: ``None``: the recorded actors of that moment; else exactly these, and no other actor is there.
         camera: name of the run's camera that this image stands for. Cameras of a rig fire at moments of their own, so
             it decides which log frame a time belongs to; ``None``: the mean over all cameras.
+        recorded_actors: track ids of actors that are, next to ``actors``, where they were recorded. Only for images
+            whose rows are read all at once.
     """
 
     lens: Lens
@@ -44,6 +46,7 @@ class ImageRequest:
     end_s: float
     actors: tuple[ActorPose, ...] | None = None
     camera: str | None = None
+    recorded_actors: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable
 from typing import Literal, TypeVar, TypeVarTuple
 
 import numpy as np
-from anyio import CapacityLimiter, to_thread
+from anyio import CapacityLimiter, from_thread, to_thread
 from starlette.applications import Starlette
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
@@ -21,12 +21,13 @@ from flows.simulators.neuroncap_messages import (
     MICROSECONDS,
     ImageMessage,
     Trajectory,
-    are_equal,
     describe_recorded,
+    find_unchanged,
     parse_image,
     parse_trajectories,
     write_trajectories,
 )
+from flows.simulators.render_queue import render_while
 from flows.simulators.scene_renderer import SceneRenderer
 from flows.simulators.service import RunningService, ServiceRequest
 from flows.simulators.service_metrics import ServiceMetrics
@@ -60,7 +61,7 @@ class ActorState:
         self._lock = threading.Lock()
         self._trajectories = describe_recorded(renderer.actors(), renderer.frame_s)
         self._recorded = self._trajectories
-        self._is_recorded = True
+        self._unchanged = tuple(trajectory.track_id for trajectory in self._recorded)
 
     @property
     def trajectories(self) -> tuple[Trajectory, ...]:
@@ -81,7 +82,7 @@ class ActorState:
         with self._lock:
             self._trajectories = trajectories
             # Recorded actors stand where they were at each camera's own moment, which the messages do not carry.
-            self._is_recorded = are_equal(trajectories, self._recorded)
+            self._unchanged = find_unchanged(trajectories, self._recorded)
 
     def request_image(self, message: ImageMessage) -> ImageRequest:
         """Turns a message into a request of the renderer.
@@ -96,7 +97,10 @@ class ActorState:
         pose = np.array(message.pose, np.float64)
         time_s = message.timestamp / MICROSECONDS
         with self._lock:
-            placed = None if self._is_recorded else [t.pose_at(message.timestamp) for t in self._trajectories]
+            trajectories = self._trajectories
+            unchanged = self._unchanged
+        is_recorded = len(unchanged) == len(trajectories) == len(self._recorded)
+        placed = [t.pose_at(message.timestamp) for t in trajectories if t.track_id not in unchanged]
         # One pose and one time: this protocol's cameras have a global shutter.
         return ImageRequest(
             lens=camera.lens,
@@ -104,7 +108,8 @@ class ActorState:
             end_world_SE3_camera=pose,
             start_s=time_s,
             end_s=time_s,
-            actors=None if placed is None else tuple(actor for actor in placed if actor is not None),
+            actors=None if is_recorded else tuple(actor for actor in placed if actor is not None),
+            recorded_actors=() if is_recorded else unchanged,
             camera=message.camera_name,
         )
 
@@ -165,18 +170,24 @@ class NeuroncapApp:
 
     async def _render_image(self, request: Request) -> Response:
         body = await _read_body(request)
-        return await self._run(self._answer_image, body)
+
+        def is_wanted() -> bool:
+            # Called in a thread, while the event loop answers others.
+            return not from_thread.run(request.is_disconnected)
+
+        return await self._run(self._answer_image, body, is_wanted)
 
     async def _run(self, function: Callable[[*Arguments], T], *arguments: *Arguments) -> T:
         """Calls a function in a thread, so that other requests are answered meanwhile."""
         return await to_thread.run_sync(function, *arguments, limiter=self._threads)
 
-    def _answer_image(self, body: bytes) -> Response:
+    def _answer_image(self, body: bytes, is_wanted: Callable[[], bool]) -> Response:
         message = parse_image(body)
         if message.image_format == "raw":
             detail = "the format raw, this protocol's default, is a pickle, which could run code: ask for png or jpg"
             return _refuse(_REFUSED_FORMAT, detail)
-        pixels = self._renderer.render(self._state.request_image(message))
+        with render_while(is_wanted):
+            pixels = self._renderer.render(self._state.request_image(message))
         self._metrics.count_images(1)
         image_format: Literal["png", "jpeg"] = "png" if message.image_format == "png" else "jpeg"
         return Response(encode_image(pixels, image_format), media_type=f"image/{image_format}")

@@ -87,20 +87,23 @@ class Trajectory:
         return ActorPose(self.track_id, pose, pose)
 
 
-def are_equal(trajectories: Sequence[Trajectory], others: Sequence[Trajectory]) -> bool:
-    """Says whether actors drive in the same way, in any order.
+def find_unchanged(trajectories: Sequence[Trajectory], others: Sequence[Trajectory]) -> tuple[str, ...]:
+    """Finds the actors that drive in the same way, in any order.
 
     Args:
         trajectories: of some actors.
         others: of the same ones, or of others.
+
+    Returns:
+        Track ids, in the order of ``trajectories``.
     """
     by_id = {other.track_id: other for other in others}
-    if {trajectory.track_id for trajectory in trajectories} != by_id.keys():
-        return False
-    return all(
-        trajectory.times_us == by_id[trajectory.track_id].times_us
-        and np.array_equal(trajectory.world_SE3_box, by_id[trajectory.track_id].world_SE3_box)
+    return tuple(
+        trajectory.track_id
         for trajectory in trajectories
+        if trajectory.track_id in by_id
+        and trajectory.times_us == by_id[trajectory.track_id].times_us
+        and np.array_equal(trajectory.world_SE3_box, by_id[trajectory.track_id].world_SE3_box)
     )
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
 from flows.simulators.image_request import ActorPose
 from genre_tasks.errors import InputError
@@ -18,6 +19,7 @@ from genre_tasks.scene_edits.chunk_scene import ChunkScene, SceneSource
 from genre_tasks.suggestions import did_you_mean
 
 _SCENES_IN_MEMORY = 2
+_SceneKey = tuple[object, ...]
 # Actors, and letters of a name, that an error repeats.
 _LISTED = 40
 
@@ -60,8 +62,8 @@ class ActorPlacer:
         self._chunks_by_track = chunks_by_track
         self._names = names
         self._track_by_name = {name: track_id for track_id, name in names.items()}
-        # The latest scenes with actors of other chunks, because joining copies Gaussians.
-        self._extended: list[tuple[ChunkScene, tuple[int, ...], ChunkScene]] = []
+        # The latest scenes with actors of other chunks, because joining copies Gaussians and reads those chunks.
+        self._extended: dict[_SceneKey, ChunkScene] = {}
 
     def resolve(self, words: Sequence[str]) -> tuple[str, ...]:
         """Finds which actors are meant.
@@ -117,32 +119,52 @@ class ActorPlacer:
         }
         if not others:
             return chunk_scene
-        key = tuple(sorted(others))
-        for scene, numbers, extended in self._extended:
-            if scene is chunk_scene and numbers == key:
-                return extended
-        extended = chunk_scene
-        for number in key:
-            extended = extend_traffic(extended, self._source.load(number))
-        self._extended = [*self._extended[1 - _SCENES_IN_MEMORY :], (chunk_scene, key, extended)]
+        numbers = tuple(sorted(others))
+        key = (*_describe_scene(chunk_scene), numbers)
+        extended = self._extended.pop(key, None)
+        if extended is None:
+            extended = chunk_scene
+            for number in numbers:
+                extended = extend_traffic(extended, self._source.load(number))
+        # The latest last, so that the oldest one makes room.
+        self._extended[key] = extended
+        while len(self._extended) > _SCENES_IN_MEMORY:
+            del self._extended[next(iter(self._extended))]
         return extended
 
 
-def place_actors(chunk_scene: ChunkScene, actors: Mapping[str, ActorPose], readout: Readout) -> SceneGraph:
+def _describe_scene(chunk_scene: ChunkScene) -> _SceneKey:
+    """What tells a scene from the others of its run, by value: sources read a scene anew once they have dropped it.
+
+    Scenes of one background differ by the chunk whose actors they show, and so by how many Gaussians those have.
+    """
+    counts = torch.bincount(chunk_scene.scene.nodes).tolist()
+    tracks = tuple((actor.track_id, tuple(actor.frames.tolist())) for actor in chunk_scene.scene.actors)
+    return chunk_scene.chunk.index, tracks, tuple(counts)
+
+
+def place_actors(
+    chunk_scene: ChunkScene, actors: Mapping[str, ActorPose], readout: Readout, recorded: Collection[str] = ()
+) -> SceneGraph:
     """Puts exactly some actors into a scene.
 
     Args:
         chunk_scene: that has Gaussians of them all.
-        actors: their poses, by track id; all other actors are absent.
+        actors: their poses, by track id; all others are absent, except for those of ``recorded``.
         readout: of the image.
+        recorded: track ids of actors that stay where they were recorded.
 
     Returns:
-        A scene to be rendered at the log frame of the readout; it shares its Gaussians with ``chunk_scene``.
+        A scene to be rendered at the log frame of the readout, or with recorded actors at its very moment. It shares
+        its Gaussians with ``chunk_scene``.
     """
     chunk_SE3_world = invert_se3(chunk_scene.chunk.world_SE3_chunk)
     nodes = []
     for node in chunk_scene.scene.actors:
         wanted = actors.get(node.track_id)
+        if wanted is None and node.track_id in recorded:
+            nodes.append(node)
+            continue
         if wanted is None:
             nodes.append(replace(node, frames=np.zeros(0, np.int64), chunk_SE3_box=np.zeros((0, 4, 4))))
             continue

@@ -77,6 +77,9 @@ def check_request(request: ImageRequest, limits: RenderLimits, positions: Float6
         )
     if request.actors is not None:
         _check_actors(request.actors)
+    if request.recorded_actors and request.start_s != request.end_s:
+        remedy = "Give poses of all actors where rows are read one after the other."
+        raise InputError("recorded actors cannot stand next to placed ones during a readout", remedy=remedy)
 
 
 def check_lens(lens: Lens, limits: RenderLimits) -> None:

@@ -51,6 +51,8 @@ __all__ = [
 ]
 
 DEFAULT_LIMITS = RenderLimits()
+_CHUNKS_IN_MEMORY = 4
+"""A client may ask for moments in any order, with actors of other chunks; a rollout drives on and needs two."""
 _CALL_PIXELS = 8_000_000
 """That are rendered at once: each takes twenty bytes, and more within the renderer."""
 
@@ -99,7 +101,7 @@ class SceneRenderer:
     def __init__(
         self, store: str, run: str, stage: str | None = None, *, limits: RenderLimits = DEFAULT_LIMITS
     ) -> None:
-        self._scenes = RunScenes(store, run, stage)
+        self._scenes = RunScenes(store, run, stage, chunks_in_memory=_CHUNKS_IN_MEMORY)
         self._facts = read_run_facts(self._scenes, _find_edited_names(store, run, stage))
         layout = lay_out_chunks(self._scenes)
         self._layout = layout
@@ -260,14 +262,16 @@ class SceneRenderer:
             frames = np.array([self._facts.clock.find_frame(time_s, request.camera) for time_s in times])
         else:
             readout = Readout(round(frame), readout_s)
-            frames = readout.frames
+            # A placed actor rests for an image that is taken at once, and recorded ones are where they were.
+            frames = np.array([frame]) if request.recorded_actors else readout.frames
             ids = self._placer.resolve([actor.track_id for actor in request.actors])
             wanted = dict(zip(ids, request.actors, strict=True))
             chunk_scene = self._placer.gather(chunk_scene, list(wanted))
             # Images of one moment with equal actors share a scene, and so a render.
-            key = (id(chunk_scene), readout, *(_describe_pose(track_id, pose) for track_id, pose in wanted.items()))
+            poses = (_describe_pose(track_id, pose) for track_id, pose in wanted.items())
+            key = (id(chunk_scene), readout, request.recorded_actors, *poses)
             if key not in scenes:
-                scenes[key] = place_actors(chunk_scene, wanted, readout)
+                scenes[key] = place_actors(chunk_scene, wanted, readout, request.recorded_actors)
             scene = scenes[key]
         return _PlacedImage(chunk_scene, scene, _place_view(request, middle, frames, chunk_scene))
 

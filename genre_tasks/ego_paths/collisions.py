@@ -13,8 +13,8 @@ from genre_tasks.ego_paths.world_actors import WorldActor
 from genre_tasks.logs.types import Float64
 
 EGO_SIZE_M = (4.8, 2.0, 1.6)
-"""Length, width and height of a passenger car. Logs do not say how far ahead of their origin its middle is: PandaSet's
-LiDAR is above the middle of the roof, and the synthetic street's is too, so that the middle is taken for the origin."""
+"""Length, width and height of a passenger car. Its middle is at the origin where the log does not say otherwise:
+PandaSet's LiDAR is above the middle of the roof, and so is the synthetic street's. See ``logs.vehicle_center``."""
 
 _VERTICAL_REACH_M = 2.5
 """The origin of a path is on the road in some logs and at the roof in others: boxes within this height of it count.
@@ -52,6 +52,7 @@ def find_collisions(
     actors: Sequence[WorldActor],
     margin_m: float,
     ego_size_m: tuple[float, float, float] = EGO_SIZE_M,
+    center_ahead_m: float = 0.0,
 ) -> tuple[Collision, ...]:
     """Finds the actors that the ego vehicle runs into.
 
@@ -62,14 +63,16 @@ def find_collisions(
         actors: in the same world.
         margin_m: boxes that come nearer than this count too.
         ego_size_m: length, width and height of the ego vehicle.
+        center_ahead_m: how far ahead of the path's poses the middle of the vehicle is.
 
     Returns:
         One entry for each actor, in the order of time.
     """
     if not len(path):
         return ()
-    ego_center = path.world_SE3_ego[:, :2, 3]
     ego_heading = np.arctan2(path.world_SE3_ego[:, 1, 0], path.world_SE3_ego[:, 0, 0])
+    ahead = np.stack([np.cos(ego_heading), np.sin(ego_heading)], axis=1)
+    ego_center = path.world_SE3_ego[:, :2, 3] + center_ahead_m * ahead
     # With the vehicle's height, since the origin may be at its foot or on its roof.
     reach = max(_VERTICAL_REACH_M, ego_size_m[2])
     height = path.world_SE3_ego[:, 2, 3]

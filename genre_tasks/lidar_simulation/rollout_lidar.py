@@ -51,13 +51,17 @@ class LidarSimulator:
         """
         # One by one, as reading a sweep may take long.
         sweeps = (self._read_sweep(frame) for frame in self._frames)
-        sweep = next((sweep for sweep in sweeps if sweep is not None), None)
+        row, sweep = next(((row, sweep) for row, sweep in enumerate(sweeps) if sweep is not None), (0, None))
         if sweep is None:
             raise self._describe_no_sweep()
+        stated_m = None
+        if sweep.sensor_world is not None:
+            stated_m = self._poses[row, :3, :3].T @ (sweep.sensor_world - self._poses[row, :3, 3])
         # A log of one frame has no steps; its sweep lasts about as long.
         steps = np.diff(self._times_s) if len(self._times_s) > 1 else np.ptp(sweep.timestamps_s)
         frame_s = float(np.median(steps))
-        return estimate_sensor(to_ego_axes(sweep, self._times_s, self._poses), sweep.timestamps_s, frame_s)
+        points = to_ego_axes(sweep, self._times_s, self._poses)
+        return estimate_sensor(points, sweep.timestamps_s, frame_s, stated_m)
 
     def pattern_at(self, frame: float) -> SweepPattern:
         """Gives the rays of the recorded sweep that is nearest to a moment.

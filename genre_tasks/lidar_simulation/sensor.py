@@ -1,8 +1,8 @@
-"""Finds where a spinning LiDAR sits on the vehicle, by what its returns have in common.
+"""Finds where a LiDAR sits on the vehicle: a spinning one by what its returns have in common, others as the log says.
 
-Logs state the pose of the vehicle, and not all say where on it the LiDAR is. A beam's azimuth about the sensor's axis
-rises evenly with time, and its elevation stays the same: seen from anywhere else, neither does. So the position is the
-one from which azimuths and elevations are sharpest, measured by the entropy of their histograms.
+Logs state the pose of the vehicle, and not all say where on it the LiDAR is. Where it spins, a beam's azimuth about
+the sensor's axis rises evenly with time, and its elevation stays the same: seen from anywhere else, neither does. So
+the position is the one from which azimuths and elevations are sharpest, measured by the entropy of their histograms.
 """
 
 from __future__ import annotations
@@ -40,12 +40,14 @@ class LidarSensor:
         position_m: [3] in ego axes.
         axes: [3, 3] takes the sensor's axes to the ego vehicle's; the last column is the axis that it turns about.
         turn_rad_s: how fast azimuths rise; negative for a sensor that turns clockwise; 0: it does not spin, or its
-            sweeps do not say so, and ``position_m`` is then the ego vehicle's origin.
+            sweeps do not say so.
+        is_assumed: nothing says where the sensor is, and ``position_m`` is the ego vehicle's origin.
     """
 
     position_m: Float64
     axes: Float64
     turn_rad_s: float
+    is_assumed: bool = False
 
 
 def to_ego_axes(sweep: Sweep, frame_times_s: Float64, world_SE3_ego: Float64) -> Float64:
@@ -63,18 +65,21 @@ def to_ego_axes(sweep: Sweep, frame_times_s: Float64, world_SE3_ego: Float64) ->
     return np.asarray(np.einsum("nij,ni->nj", pose[:, :3, :3], sweep.points_world - pose[:, :3, 3]))
 
 
-def estimate_sensor(points: Float64, times_s: Float64, frame_s: float) -> LidarSensor:
+def estimate_sensor(points: Float64, times_s: Float64, frame_s: float, stated_m: Float64 | None = None) -> LidarSensor:
     """Estimates where a LiDAR is.
 
     Args:
         points: [N, 3] metres in ego axes, as of :func:`to_ego_axes`.
         times_s: [N] when each was measured.
         frame_s: seconds of a log frame, in which a spinning LiDAR turns once.
+        stated_m: [3] where the log says that it is, in ego axes, for sweeps that do not show a spin; ``None``: nowhere.
 
     Returns:
         The sensor.
     """
-    still = LidarSensor(np.zeros(3), np.eye(3), 0.0)
+    # Many datasets state one time for all points of a sweep, which hides the spin.
+    position_m = np.zeros(3) if stated_m is None else stated_m
+    still = LidarSensor(position_m, np.eye(3), 0.0, is_assumed=stated_m is None)
     distance = np.linalg.norm(points, axis=1)
     rows = np.flatnonzero((distance > SAMPLE_RANGE_M[0]) & (distance < SAMPLE_RANGE_M[1]))
     if len(rows) < 100 or np.ptp(times_s) <= 0:

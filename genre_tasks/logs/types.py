@@ -9,8 +9,7 @@ Conventions of this project, from the log to the render:
 * **Units.** Metres, seconds since 1970, radians and pixels. Poses, points and times are float64: a float32 would round
   a world coordinate of 4 000 km to 0.25 m and a time of today to two minutes.
 * **Quaternions** are w, x, y, z.
-* **Image coordinates** are continuous: (0, 0) is the top-left corner of the image, (0.5, 0.5) the centre of its first
-  pixel.
+* **Image coordinates** are continuous: (0, 0) is the top-left corner, (0.5, 0.5) the centre of the first pixel.
 """
 
 from __future__ import annotations
@@ -169,11 +168,13 @@ class Sweep:
         points_world: [N, 3] float64, metres.
         intensity: [N] float32 in [0, 1].
         timestamps_s: [N] float64, seconds, when each point was measured.
+        sensor_world: [3] float64, metres, where the main LiDAR is at the frame's time; ``None``: the log does not say.
     """
 
     points_world: Float64
     intensity: Float32
     timestamps_s: Float64
+    sensor_world: Float64 | None = None
 
 
 @dataclass(frozen=True)
@@ -184,8 +185,7 @@ class CuboidTrack:
         track_id: unique in the log.
         label: class of the object, in the log's words.
         frames: [F] log frames in which it is annotated, increasing.
-        world_SE3_box: [F, 4, 4] float64; box axes x forward (length), y left (width), z up (height); origin at the
-            centre.
+        world_SE3_box: [F, 4, 4] float64; origin at the centre, x forward (length), y left (width), z up (height).
         size_m: length, width, height; the median over frames.
         moving: the annotation says that the object moves in at least one frame.
     """

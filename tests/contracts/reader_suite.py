@@ -153,6 +153,10 @@ class ReaderSuite(ABC):
             assert np.isfinite(sweep.points_world).all()
             assert sweep.intensity.min() >= 0 and sweep.intensity.max() <= 1
             assert np.abs(sweep.timestamps_s - log.frame_timestamp_s(frame)).max() < CLOCK_TOLERANCE_S
+            if sweep.sensor_world is not None:
+                assert sweep.sensor_world.shape == (3,) and sweep.sensor_world.dtype == np.float64
+                # On the vehicle itself.
+                assert np.linalg.norm(sweep.sensor_world - log.world_SE3_lidar(frame)[:3, 3]) < 5.0
         assert bool(read) == self.has_sweeps
 
     def test_missing_sweeps_are_none(self, log: DrivingLog) -> None:

@@ -143,6 +143,19 @@ def test_collisions_come_in_the_order_of_time() -> None:
     assert EGO_SIZE_M == (4.8, 2.0, 1.6)
 
 
+def test_the_box_is_where_the_middle_of_the_vehicle_is() -> None:
+    """Of logs whose origin is the rear axle, the bonnet is farther ahead, whichever way the vehicle looks."""
+    path = straight(1, 10.0)
+    ahead, behind = car(5.0, 0.0), car(-4.0, 0.0)
+    assert find_collisions(path, [ahead], 0.0) == ()
+    (collision,) = find_collisions(path, [ahead], 0.0, center_ahead_m=1.4)
+    assert collision.overlap_m == pytest.approx(0.8)
+    assert find_collisions(path, [behind], 0.0) != ()
+    assert find_collisions(path, [behind], 0.0, center_ahead_m=1.4) == ()
+    turned = replace(path, world_SE3_ego=path.world_SE3_ego @ yaw_pose(np.pi, (0.0, 0.0, 0.0)))
+    assert find_collisions(turned, [car(-5.0, 0.0)], 0.0, center_ahead_m=1.4) != ()
+
+
 def _chunk(frames: range, x: float, actors: dict[str, range]) -> Chunk:
     """Rebased to x, with actors that drive a metre a frame."""
     chunk = artifact_values.chunk(np.random.default_rng(0), frames=1, actors=0)

@@ -56,6 +56,10 @@ def test_a_behaviour_is_weaker_where_the_log_is_short_or_a_road_user_is_in_the_w
     assert behind.path.world_SE3_ego[-1, 0, 3] < reach_m - 4
     blocked = plan_rollout(TableRollout("accelerate", 3.0), long, config, [standing_car(20.0, 3.0, 60)])
     assert blocked.strength == 1.0 and "Car parked at" in blocked.collisions[0]
+    # Where poses are at the rear axle, the bonnet is nearer to who stands ahead.
+    near = [standing_car(reach_m + 4.5, 3.0, 60)]
+    assert plan_rollout(TableRollout("accelerate", 3.0), long, config, near).strength == 1.0
+    assert plan_rollout(TableRollout("accelerate", 3.0), long, config, near, center_ahead_m=1.4).strength < 1
     assert plan_rollout(TableRollout("swerve", 3.0), straight_path(10.0, 30), config).strength < 1
     with pytest.raises(ConfigError):
         plan_rollout(TableRollout("swerve", 3.0), straight_path(10.0, 8), config)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from genre_tasks.lidar_simulation.ego_motion import interpolate_poses
@@ -58,6 +60,34 @@ def scan(frame: int, frames: int = 5) -> Sweep:
     hit = np.isfinite(range_m)
     points = origins + directions * range_m[:, None]
     return Sweep(points[hit], np.full(hit.sum(), 0.5, np.float32), (times[frame] + offsets)[hit])
+
+
+@dataclass(frozen=True)
+class FlashLog:
+    """A log that gives all points of a sweep the time of its frame."""
+
+    states_sensor: bool
+    uri: str = "test:flash"
+    frame_count: int = 5
+
+    def sweep(self, frame: int) -> Sweep:
+        """The sweep of a frame."""
+        found = scan(frame)
+        place = ego_path()[1][frame, :3, 3] + POSITION_M
+        return Sweep(
+            points_world=found.points_world,
+            intensity=found.intensity,
+            timestamps_s=np.full(len(found.points_world), self.frame_timestamp_s(frame)),
+            sensor_world=place if self.states_sensor else None,
+        )
+
+    def frame_timestamp_s(self, frame: int) -> float:
+        """Seconds of a frame."""
+        return float(ego_path()[0][frame])
+
+    def world_SE3_lidar(self, frame: int) -> Float64:
+        """Pose of a frame."""
+        return ego_path()[1][frame]
 
 
 def build_chunk(frames: tuple[int, ...]) -> Chunk:

@@ -11,7 +11,7 @@ from genre_tasks.lidar_simulation.sensor import LidarSensor, estimate_sensor, to
 from genre_tasks.lidar_simulation.sweep_pattern import NO_RING, SweepPattern, build_pattern, find_rings
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.synthetic.ego_vehicle import LIDAR_HEIGHT_M
-from tests.lidar_simulation.spinning_lidar import AZIMUTHS, FRAME_S, POSITION_M, RINGS, beams, ego_path, scan
+from tests.lidar_simulation.spinning_lidar import AZIMUTHS, FRAME_S, POSITION_M, RINGS, FlashLog, beams, ego_path, scan
 
 
 def pattern_of(frame: int, sensor: LidarSensor) -> SweepPattern:
@@ -50,6 +50,34 @@ def test_a_sensor_that_does_not_spin_stays_at_the_origin():
     assert not sensor.position_m.any()
     flash = replace(sweep, timestamps_s=np.full_like(shuffled, times[2]))
     assert estimate_sensor(to_ego_axes(flash, times, poses), flash.timestamps_s, FRAME_S).turn_rad_s == 0
+
+
+def test_a_log_says_where_a_sensor_is_that_no_spin_shows():
+    """At the origin, which is at the road's height in many logs, rays would skim along the road."""
+    simulator = LidarSimulator(FlashLog(states_sensor=True))
+    assert np.abs(simulator.sensor.position_m - POSITION_M).max() < 1e-9
+    assert not simulator.sensor.is_assumed
+    pattern = simulator.pattern_at(2.0)
+    below = pattern.directions[:, 2] < 0
+    heights = pattern.range_m[below] * pattern.directions[below, 2] + POSITION_M[2]
+    # A tenth of a metre is the drive within a turn, which one time for all points hides.
+    assert heights.min() > -0.1
+    assert np.degrees(np.arcsin(pattern.directions[:, 2].min())) < -15
+
+
+def test_a_spin_tells_more_than_the_log():
+    times, poses = ego_path()
+    sweep = scan(2)
+    points = to_ego_axes(sweep, times, poses)
+    stated = estimate_sensor(points, sweep.timestamps_s, FRAME_S, np.array([0.0, 0.0, 1.0]))
+    np.testing.assert_array_equal(stated.position_m, estimate_sensor(points, sweep.timestamps_s, FRAME_S).position_m)
+    assert not stated.is_assumed
+
+
+def test_a_place_that_nothing_says_is_known_to_be_assumed():
+    sensor = LidarSimulator(FlashLog(states_sensor=False)).sensor
+    assert sensor.is_assumed
+    assert not sensor.position_m.any()
 
 
 def test_the_pattern_has_the_rays_that_came_back_and_those_that_did_not():

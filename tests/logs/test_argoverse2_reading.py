@@ -54,6 +54,17 @@ def test_a_written_log_comes_back(written: Path) -> None:
         np.testing.assert_allclose(found.world_SE3_box, shift @ track.world_SE3_box, atol=1e-7)
 
 
+def test_a_sweep_says_where_its_upper_lidar_is_where_the_calibration_does(folder: Path) -> None:
+    _set("calibration/egovehicle_SE3_sensor.feather", "tz_m", 1.64)(folder)
+    log = open_log(f"argoverse2:{folder}")
+    expected = log.world_SE3_lidar(2) @ [0.0, 0.0, 1.64, 1.0]
+    np.testing.assert_allclose(log.sweep(2).sensor_world, expected[:3], atol=1e-9)
+    mounts = folder / "calibration/egovehicle_SE3_sensor.feather"
+    table = feather.read_table(mounts)
+    feather.write_feather(table.filter(pa.compute.not_equal(table["sensor_name"], "up_lidar")), mounts)
+    assert open_log(f"argoverse2:{folder}").sweep(2).sensor_world is None
+
+
 def test_points_of_half_precision(tmp_path: Path) -> None:
     log = open_log(f"argoverse2:{write_argoverse2(FAKE, tmp_path / 'half', np.float16)}")
     points = FAKE.sweep(1).points_world - FAKE.world_SE3_lidar(0)[:3, 3]
@@ -104,7 +115,10 @@ def test_a_real_log_without_images() -> None:
     # Points lie in the boxes of their own sweep: cars have hundreds.
     (largest,) = sorted(boxes, key=lambda track: -_count_inside(sweep.points_world, track))[:1]
     assert _count_inside(sweep.points_world, largest) > 200
-    assert log.world_SE3_lidar(0)[2, 2] > 0.99
+    pose = log.world_SE3_lidar(0)
+    assert pose[2, 2] > 0.99
+    # The upper LiDAR of the calibration.
+    np.testing.assert_allclose((sweep.sensor_world - pose[:3, 3]) @ pose[:3, :3], [1.35018, 0, 1.64042], atol=1e-5)
 
 
 def _count_inside(points: Any, track: Any) -> int:

@@ -13,12 +13,14 @@ import pyarrow.parquet as pq
 import pytest
 
 from flows.pipeline.log_cache import expand_logs
+from genre_tasks.lidar_simulation.rollout_lidar import LidarSimulator
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.types import Camera
 from genre_tasks.logs.waymo.component_tables import ComponentTable
 from genre_tasks.logs.waymo.range_images import LidarCalibration, compute_points
 from tests.fakes import FakeCar, FakeLog
 from tests.logs.waymo_folder import (
+    LIDAR_MOUNT,
     NAMES,
     SEGMENT,
     START_US,
@@ -53,6 +55,16 @@ def test_a_written_segment_comes_back(tmp_path: Path) -> None:
         assert (found.label, found.moving, found.size_m) == ("vehicle", track.moving, track.size_m)
         np.testing.assert_allclose(found.world_SE3_box, track.world_SE3_box, atol=1e-9)
     assert log.findings() == ()
+
+
+def test_a_sweep_says_where_its_lidar_is(tmp_path: Path) -> None:
+    """All points have one time, so that nothing else tells it."""
+    log = open_log(f"waymo:{write_waymo(FAKE, tmp_path)}")
+    for frame in range(FAKE.frame_count):
+        expected = (FAKE.world_SE3_lidar(frame) @ LIDAR_MOUNT)[:3, 3]
+        np.testing.assert_allclose(log.sweep(frame).sensor_world, expected, atol=1e-9)
+    position_m = LidarSimulator(log).sensor.position_m
+    np.testing.assert_allclose(position_m, LIDAR_MOUNT[:3, 3], atol=1e-9)
 
 
 @pytest.mark.parametrize("uneven", [True, False])
@@ -239,7 +251,7 @@ def test_a_real_component() -> None:
     ahead = np.einsum("fk,fk->f", poses[:-1, :3, 0], np.diff(poses[:, :3, 3], axis=0))
     assert ahead.sum() > 0.95 * speeds.sum() * 0.1
     keys = ComponentTable(REAL / f"camera_hkp/{SEGMENT}.parquet", "CameraHumanKeypointsComponent", "waymo:real")
-    assert set(keys.read(["key.camera_name"])["key.camera_name"]) <= {
+    assert set(keys.read(["key.camera_name"], names=["key.camera_name"])["key.camera_name"]) <= {
         "FRONT",
         *NAMES.values(),
         "FRONT_LEFT",

@@ -24,6 +24,7 @@ from prefect.settings.models.server.services import ServerServicesSettings
 from flows.operations import ObjectServer, PostgresServer, PrefectServer, Service, Worker
 from flows.operations import object_server as object_module
 from flows.operations import postgres_server as postgres_module
+from flows.operations import stack as stack_module
 from flows.operations.deployments import DEPLOYMENTS, RUN_QUEUE
 from flows.operations.prefect_services import EVENT_SETTINGS
 from flows.operations.service import find_free_port, keep_port, keep_secret
@@ -170,6 +171,60 @@ def test_without_postgres_the_error_names_the_package(tmp_path: Path, monkeypatc
     monkeypatch.setattr(postgres_module.Path, "glob", lambda self, pattern: iter(()))
     with pytest.raises(ConfigError, match="package postgresql, or use --database sqlite"):
         PostgresServer(tmp_path).start()
+
+
+def test_an_interrupted_first_start_leaves_no_half_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    interrupted = [True]
+
+    def initdb(words: list[str], **options: Any) -> subprocess.CompletedProcess[str]:
+        folder = Path(words[words.index("-D") + 1])
+        assert not list(folder.iterdir())
+        (folder / "PG_VERSION").write_text("17")
+        if interrupted.pop():
+            raise KeyboardInterrupt
+        (folder / "global").mkdir()
+        return subprocess.CompletedProcess(words, 0, "", "")
+
+    monkeypatch.setattr(postgres_module.os, "geteuid", lambda: 1000)
+    monkeypatch.setattr(postgres_module, "find_postgres_program", lambda name: name)
+    monkeypatch.setattr(postgres_module.subprocess, "run", initdb)
+    server = PostgresServer(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        server.prepare()
+    assert not server.data.exists()
+    interrupted.append(False)
+    server.prepare()
+    assert (server.data / "global").is_dir()
+    # A whole one is taken as it is.
+    server.prepare()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "password", "port", "socket"]
+
+
+def test_a_folder_in_the_databases_place_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done = subprocess.CompletedProcess([], 0, "", "")
+    monkeypatch.setattr(postgres_module.os, "geteuid", lambda: 1000)
+    monkeypatch.setattr(postgres_module, "find_postgres_program", lambda name: name)
+    monkeypatch.setattr(postgres_module.subprocess, "run", lambda words, **options: done)
+    server = PostgresServer(tmp_path)
+    server.data.mkdir()
+    (server.data / "notes.txt").write_text("mine")
+    with pytest.raises(ResourceError, match=r"cannot take its place.*Remove this folder"):
+        server.prepare()
+    assert (server.data / "notes.txt").read_text() == "mine"
+
+
+def test_clients_find_the_server_where_a_worker_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def ensure(stack: Stack, service: Service) -> None:
+        if isinstance(service, Worker):
+            raise ResourceError("the worker did not become healthy", remedy="See its log.")
+        service.folder.mkdir(parents=True)
+
+    monkeypatch.setattr(Stack, "_ensure", ensure)
+    monkeypatch.setattr(stack_module, "deploy_flows", lambda *words: None)
+    with pytest.raises(ResourceError, match="worker"):
+        Stack(tmp_path, store_server=False, database="sqlite").start()
+    written = (tmp_path / "env").read_text()
+    assert "export PREFECT_API_URL=" in written and "export GENRE_STORE=" in written
 
 
 def test_an_unknown_database_is_an_error(tmp_path: Path) -> None:

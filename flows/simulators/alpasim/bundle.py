@@ -231,7 +231,7 @@ def _to_rows(poses: Float64) -> list[list[float]]:
 def _describe_losses(short_tracks: int) -> list[str]:
     losses = [
         "The bundle has no lane map: planners and traffic models that need one do not run on it.",
-        "Where the rear axle is on the vehicle, and how large the vehicle is, is assumed: logs do not say it.",
+        "Where the rear axle is on the vehicle, and how large the vehicle is, is assumed: most logs do not say it.",
     ]
     if short_tracks:
         losses.append(f"{short_tracks} actors exist at one frame only, and are left out.")

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flows.simulation.ego_center import find_ego_center
+from flows.simulation.run_scenes import RunScenes
 from genre_tasks.ego_paths.collisions import EGO_SIZE_M
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.logs.types import Float64
@@ -16,8 +18,8 @@ from genre_tasks.scene_edits.ground import Ground
 from genre_tasks.scene_edits.run_survey import survey_run
 
 REAR_AXLE_M = 1.4
-"""How far behind the ego pose the rear axle is taken to be. Logs do not say it: half the wheelbase of a car as long as
-``EGO_SIZE_M``, in whose middle the ego pose is."""
+"""How far behind the middle of the vehicle the rear axle is taken to be: half the wheelbase of a car as long as
+``EGO_SIZE_M``."""
 
 _SAMPLES = 20
 
@@ -30,19 +32,20 @@ class LocalFrame:
 
     Attributes:
         world_SE3_local: [4, 4] a translation to the first pose of the rig; axes are the log's, with z up.
-        ego_SE3_rig: [4, 4] from the ego pose down to the ground and back to the rear axle.
+        ego_SE3_rig: [4, 4] from the ego pose down to the ground and along the vehicle to the rear axle.
     """
 
     world_SE3_local: Float64
     ego_SE3_rig: Float64
 
     @staticmethod
-    def from_path(path: EgoPath, ground: Ground) -> LocalFrame:
+    def from_path(path: EgoPath, ground: Ground, center_ahead_m: float = 0.0) -> LocalFrame:
         """Measures how high the ego pose is above the ground.
 
         Args:
             path: recorded.
             ground: of the run.
+            center_ahead_m: how far ahead of the ego pose the middle of the vehicle is.
 
         >>> path = EgoPath(np.zeros(1), np.zeros(1), np.eye(4)[None])
         >>> frame = LocalFrame.from_path(path, Ground(np.zeros((0, 3)), np.array([[0.0, 0.0, -1.5]])))
@@ -53,7 +56,7 @@ class LocalFrame:
         positions = path.world_SE3_ego[rows, :3, 3]
         # The median: the ground is measured worse where LiDAR saw little of it.
         height = float(np.median(positions[:, 2] - ground.measure(positions[:, :2])[0]))
-        ego_SE3_rig = compose_se3(np.eye(3), np.array([-REAR_AXLE_M, 0.0, -height]))
+        ego_SE3_rig = compose_se3(np.eye(3), np.array([center_ahead_m - REAR_AXLE_M, 0.0, -height]))
         origin = (path.world_SE3_ego[0] @ ego_SE3_rig)[:3, 3]
         return LocalFrame(compose_se3(np.eye(3), origin), ego_SE3_rig)
 
@@ -74,8 +77,8 @@ class LocalFrame:
         return self.to_local(world_SE3_ego @ self.ego_SE3_rig)
 
 
-def read_local_frame(source: SceneSource) -> LocalFrame:
-    """Reads where a run's local frame is, from its first chunk.
+def read_local_frame(source: RunScenes) -> LocalFrame:
+    """Reads where a run's local frame is, from its first chunk and its log.
 
     Args:
         source: the scenes of the run.
@@ -88,7 +91,7 @@ def read_local_frame(source: SceneSource) -> LocalFrame:
     """
     # One chunk: the others would only be read to measure the same height again.
     survey = survey_run(_FirstChunk(source))
-    return LocalFrame.from_path(survey.path, survey.ground)
+    return LocalFrame.from_path(survey.path, survey.ground, find_ego_center(source))
 
 
 class _FirstChunk:

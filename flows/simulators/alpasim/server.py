@@ -13,6 +13,7 @@ import grpc
 from google.protobuf.message import DecodeError, Message
 
 from flows.simulators.alpasim import common_pb2, sensorsim_pb2
+from flows.simulators.render_queue import render_while
 from flows.simulators.service_metrics import ServiceMetrics, SilentMetrics
 from genre_tasks.errors import ConfigError, GenreError, InputError, NonFiniteError, ResourceError
 
@@ -166,7 +167,8 @@ class SensorServer:
         name = "OK"
         answer = b""
         try:
-            with self._large_requests if len(payload) > LARGE_REQUEST_BYTES else nullcontext():
+            large = self._large_requests if len(payload) > LARGE_REQUEST_BYTES else nullcontext()
+            with large, render_while(context.is_active):
                 answer = answer_call(self._service, method, payload)
         except Exception as error:
             name = find_status_name(error)

@@ -22,6 +22,7 @@ from genre_tasks.logs.nearest_images import find_nearest_images
 from genre_tasks.logs.recorded_log import RecordedLog
 from genre_tasks.logs.timed_poses import POSE_REACH_S, TimedPoses
 from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Lens, Sweep, Truth
+from genre_tasks.logs.vehicle_center import REAR_AXLE_TO_CENTER_M
 from genre_tasks.user_paths import expand_user_path
 
 _POSES = "city_SE3_egovehicle.feather"
@@ -35,6 +36,8 @@ _SIZE_COLUMNS = ("length_m", "width_m", "height_m")
 # The grey stereo pair looks where the front camera of the ring does.
 _RING = "ring_"
 _INTENSITY_SCALE = 255.0
+# Two LiDARs turn on the roof, one below the other by a hand's breadth.
+_MAIN_LIDAR = "up_lidar"
 _NS = 1e-9
 # Without a neighbour, what a sweep's frame lasts: ten sweeps a second.
 _PERIOD_NS = 100_000_000
@@ -76,6 +79,8 @@ class Argoverse2Log(RecordedLog):
     """
 
     dataset = "argoverse2"
+    # The vehicle's origin is at the rear axle, and the dataset does not document how long the car is.
+    center_ahead_m = REAR_AXLE_TO_CENTER_M
     truth: Truth | None = None
 
     def __init__(self, uri: str, folder: Path) -> None:
@@ -196,10 +201,12 @@ class Argoverse2Log(RecordedLog):
         local = np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=1)
         pose = self.world_SE3_lidar(frame)
         intensity = columns["intensity"].astype(np.float32) / np.float32(_INTENSITY_SCALE)
+        mount = self._mounts.get(_MAIN_LIDAR)
         return Sweep(
             points_world=local @ pose[:3, :3].T + pose[:3, 3],
             intensity=np.clip(intensity, 0.0, 1.0),
             timestamps_s=(time_ns + columns["offset_ns"].astype(np.int64)) * _NS,
+            sensor_world=None if mount is None else (pose @ mount)[:3, 3],
         )
 
     def tracks(self) -> tuple[CuboidTrack, ...]:

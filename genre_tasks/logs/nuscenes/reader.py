@@ -91,6 +91,7 @@ class NuScenesLog(RecordedLog):
     """
 
     dataset = "nuscenes"
+    center_ahead_m = (CAR_LOW_M[0] + CAR_HIGH_M[0]) / 2
     truth: Truth | None = None
 
     def __init__(self, uri: str, address: SceneAddress, rows: SceneRows) -> None:
@@ -185,10 +186,13 @@ class NuScenesLog(RecordedLog):
         if not found:
             return None
         parts = [self._read_sweep(datum, frame) for datum in found]
+        # Frames are the main LiDAR's data.
+        main = self._frames[frame]
         return Sweep(
             points_world=np.concatenate([part.points_world for part in parts]),
             intensity=np.concatenate([part.intensity for part in parts]),
             timestamps_s=np.concatenate([part.timestamps_s for part in parts]),
+            sensor_world=(main.world_SE3_vehicle @ main.vehicle_SE3_sensor)[:3, 3],
         )
 
     def _read_sweep(self, datum: SensorData, frame: int) -> Sweep:

@@ -16,6 +16,7 @@ from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.labelled_boxes import MAX_BOXES, LabelledBox
 from genre_tasks.logs.recorded_log import RecordedLog
 from genre_tasks.logs.types import Camera, CuboidTrack, Float32, Float64, Sweep, Truth
+from genre_tasks.logs.vehicle_center import REAR_AXLE_TO_CENTER_M
 from genre_tasks.logs.waymo.camera_rows import name_sensors, read_cameras
 from genre_tasks.logs.waymo.component_tables import ComponentTable
 from genre_tasks.logs.waymo.range_images import LidarCalibration, compute_points
@@ -68,6 +69,8 @@ class WaymoLog(RecordedLog):
     """
 
     dataset = "waymo"
+    # The vehicle's origin is at the rear axle, and the dataset does not document how long the car is.
+    center_ahead_m = REAR_AXLE_TO_CENTER_M
     truth: Truth | None = None
 
     def __init__(self, uri: str, segment: str, files: dict[str, Path]) -> None:
@@ -149,7 +152,13 @@ class WaymoLog(RecordedLog):
             # A few surfaces return a thousand times more light than others.
             intensity=np.tanh(np.maximum(intensity[finite], 0.0)).astype(np.float32),
             timestamps_s=np.full(int(finite.sum()), self.frame_timestamp_s(frame)),
+            sensor_world=self._find_upper(frame) if _UPPER in rows else None,
         )
+
+    def _find_upper(self, frame: int) -> Float64:
+        """[3] where the upper LiDAR is, which measures most of the points."""
+        pose: Float64 = self._poses[frame] @ self._calibrations[_UPPER].vehicle_SE3_lidar
+        return pose[:3, 3]
 
     @cached_property
     def _sweep_rows(self) -> dict[int, dict[str, int]]:

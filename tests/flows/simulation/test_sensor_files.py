@@ -14,7 +14,7 @@ from flows.simulation.sensor_images import FlowImages, MaskImages
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.rollout.rig import RigCamera
 from storage.codecs.exr import read_channels
-from tests.lidar_simulation.spinning_lidar import ego_path
+from tests.lidar_simulation.spinning_lidar import FlashLog, ego_path
 from tests.lidar_simulation.test_simulate_sweep import SpinningLog
 from tests.rollout.test_sensor_images import LENS, SETTINGS, actor, build_scene, images_at, rectangle, two_actors
 
@@ -70,3 +70,12 @@ def test_a_sweep_is_a_table_of_world_points(tmp_path: Path):
     assert set(table["frame"]) == {1.0}
     assert -0.1 <= min(table["time_s"]) < max(table["time_s"]) <= 0.0
     assert set(table["ring"]) <= set(range(24)) and len(set(table["ring"])) > 15
+    assert output.list_warnings() == ()
+
+
+def test_rays_from_an_assumed_place_are_a_warning(tmp_path: Path):
+    times, poses = ego_path()
+    path = EgoPath(times, np.arange(5.0), poses)
+    (warning,) = LidarSweeps(tmp_path, FlashLog(states_sensor=False), path).list_warnings()
+    assert "does not say where its LiDAR is" in warning
+    assert LidarSweeps(tmp_path, FlashLog(states_sensor=True), path).list_warnings() == ()

@@ -13,6 +13,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from flows.simulation import stored_ranges
+from flows.simulation.ego_center import find_ego_center
+from flows.simulation.run_scenes import RunScenes
 from flows.simulation.stored_ranges import SideRange
 from flows.simulators import driving_world
 from flows.simulators.driving_env import ENVIRONMENT_ID, GenreDrivingEnv, RewardWeights, StartRange
@@ -20,6 +22,7 @@ from flows.simulators.scene_renderer import SceneRenderer
 from genre_tasks.ego_paths.bicycle import BicycleModel
 from genre_tasks.ego_paths.world_actors import WorldActor
 from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.logs.synthetic.log import SyntheticStreet
 
 STRAIGHT_ON = np.zeros(2, np.float32)
 
@@ -128,6 +131,27 @@ def test_a_collision_ends_the_drive(served: tuple[str, str], monkeypatch: pytest
     assert rewards[-1] < -6.0 < rewards[-2]
 
 
+def test_a_bonnet_ahead_of_the_pose_collides_earlier(
+    free_road: GenreDrivingEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Logs with poses at the rear axle say how far ahead the middle of the car is."""
+    world = free_road._world
+    _, info = free_road.reset(options={"index": 0, "lateral_m": 0.0})
+    ahead = info["world_SE3_ego"].copy()
+    ahead[:3, 3] += 4.5 * ahead[:3, 0]
+    wall = WorldActor("wall", "car", (2.0, 4.0, 2.0), np.arange(12), np.tile(ahead, (12, 1, 1)))
+    monkeypatch.setattr(world, "_actors", (wall,))
+    assert world.find_collision(info["world_SE3_ego"], 0.0) is None
+    monkeypatch.setattr(world, "_center_ahead_m", 1.3)
+    assert world.find_collision(info["world_SE3_ego"], 0.0) is not None
+
+
+def test_the_middle_of_the_car_is_the_logs(served: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SyntheticStreet, "center_ahead_m", 1.3, raising=False)
+    assert GenreDrivingEnv(*served, reliable_m=3.0)._world._center_ahead_m == 1.3
+    assert find_ego_center(RunScenes(*served)) == 1.3
+
+
 @pytest.mark.parametrize(("frame_s", "fps"), [(0.5, 2), (3.0, 1)])
 def test_films_are_as_fast_as_the_log(
     served: tuple[str, str], monkeypatch: pytest.MonkeyPatch, frame_s: float, fps: int
@@ -183,6 +207,12 @@ def test_mistakes_are_named(env: GenreDrivingEnv, served: tuple[str, str]) -> No
     for start in (StartRange(5, 2), StartRange(0, 0, -1.0)):
         with pytest.raises(ConfigError, match="no place lies in"):
             GenreDrivingEnv(*served, start=start, reliable_m=1.0)
+    for reliable_m in (-1.0, float("nan"), float("inf"), "far"):
+        with pytest.raises(ConfigError, match=r"reliable_m.*at least 0"):
+            GenreDrivingEnv(*served, reliable_m=reliable_m)
+    for width_px in (0, -64, 32.5):
+        with pytest.raises(ConfigError, match=r"width_px.*at least 1"):
+            GenreDrivingEnv(*served, reliable_m=1.0, width_px=width_px)
     with pytest.raises(ConfigError, match="human"):
         GenreDrivingEnv(*served, render_mode="human")
     with pytest.raises(InputError, match="Did you mean 'front_camera'"):

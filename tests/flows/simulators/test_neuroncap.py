@@ -5,7 +5,10 @@ from __future__ import annotations
 import http.client
 import io
 import json
+import threading
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 from urllib.parse import urlsplit
@@ -37,6 +40,7 @@ from flows.simulators.scene_renderer import SceneRenderer
 from flows.simulators.service import RunningService, ServiceRequest
 from flows.simulators.service_metrics import SilentMetrics
 from genre_tasks.errors import ConfigError, ResourceError
+from tests.waiting import wait_until
 
 CAMERA = "front_camera"
 
@@ -125,11 +129,19 @@ def test_recorded_actors_that_are_sent_back_are_at_each_cameras_own_moment(rende
     message = ImageMessage.model_validate(image_message(renderer, 2))
     assert state.request_image(message).actors is None
     sent_back = parse_trajectories(json.dumps(write_trajectories(state.trajectories)).encode())
+    # A change of some actors leaves the others where they were recorded.
     state.replace_all(sent_back[1:])
-    present = [trajectory for trajectory in sent_back[1:] if trajectory.pose_at(message.timestamp) is not None]
-    assert len(state.request_image(message).actors or ()) == len(present)
+    request = state.request_image(message)
+    assert request.actors == () and request.recorded_actors == tuple(actor.track_id for actor in sent_back[1:])
+    shifted = replace(sent_back[0], world_SE3_box=sent_back[0].world_SE3_box + 1e-3)
+    present = replace(shifted, times_us=tuple(message.timestamp + k for k in range(len(shifted.times_us))))
+    state.replace_all((present, *sent_back[1:]))
+    request = state.request_image(message)
+    assert [actor.track_id for actor in request.actors or ()] == [present.track_id]
+    assert request.recorded_actors == tuple(actor.track_id for actor in sent_back[1:])
     state.replace_all(sent_back[::-1])
-    assert state.request_image(message).actors is None
+    request = state.request_image(message)
+    assert request.actors is None and request.recorded_actors == ()
 
 
 def test_trajectories_are_interpolated() -> None:
@@ -215,6 +227,38 @@ def test_a_busy_renderer_says_so(
     monkeypatch.setattr(renderer, "render", refuse)
     status, content = ask(service, "POST", "/render_image", image_message(renderer, 2))
     assert status == 503 and b"busy" in content
+
+
+def test_nobody_renders_for_a_client_that_has_gone(
+    service: RunningService, renderer: SceneRenderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    release = threading.Event()
+    rendered = []
+    render = renderer._render
+
+    def wait_and_render(requests: Any) -> Any:
+        rendered.append(len(requests))
+        release.wait(60)
+        return render(requests)
+
+    monkeypatch.setattr(renderer, "_render", wait_and_render)
+    message = image_message(renderer, 2)
+    place = urlsplit(service.address)
+    with ThreadPoolExecutor(1) as pool:
+        first = pool.submit(ask, service, "POST", "/render_image", message)
+        try:
+            wait_until(lambda: renderer.queue_length == 1, "the first request does not come")
+            hasty = http.client.HTTPConnection(place.hostname or "", place.port, timeout=60)
+            hasty.request("POST", "/render_image", body=json.dumps(message).encode())
+            wait_until(lambda: renderer.queue_length == 2, "the second request does not come")
+            hasty.close()
+            # The server hears of it a moment later.
+            time.sleep(0.3)
+        finally:
+            release.set()
+        assert first.result(60)[0] == 200
+    wait_until(lambda: renderer.queue_length == 0, "the second request does not end")
+    assert rendered == [1]
 
 
 def test_one_service_has_one_run(renderer: SceneRenderer, service: RunningService) -> None:

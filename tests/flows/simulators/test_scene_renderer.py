@@ -14,6 +14,7 @@ import torch
 from flows.simulation.edited_runs import write_edited_run
 from flows.simulation.run_scenes import RunScenes
 from flows.simulators.image_request import ActorPose, ImageRequest, RenderLimits
+from flows.simulators.placed_actors import ActorPlacer
 from flows.simulators.render_queue import RenderQueue
 from flows.simulators.scene_renderer import SceneRenderer
 from genre_tasks.errors import InputError, ResourceError
@@ -102,6 +103,58 @@ def test_actors_are_where_they_are_wanted_and_no_others(renderer: SceneRenderer,
     assert abs(changed.mean(0)[1] - 32) < 4
     again = renderer.render(replace(request, actors=(ActorPose(walker.track_id, box, box),)))
     assert difference(again, shown) == 0
+
+
+class FreshScenes:
+    """Reads a chunk anew whenever it is asked for, and counts; a ``SceneSource``."""
+
+    def __init__(self, scenes: RunScenes) -> None:
+        self._scenes = scenes
+        self.loads: list[int] = []
+        self.chunk_numbers = scenes.chunk_numbers
+
+    def load(self, number: int) -> ChunkScene:
+        self.loads.append(number)
+        return replace(self._scenes.load(number))
+
+
+def test_actors_of_other_chunks_are_read_once(renderer: SceneRenderer, served: tuple[str, str]) -> None:
+    """A source that has dropped a chunk gives it as another object with the same values."""
+    source = FreshScenes(RunScenes(*served))
+    chunks_by_track = renderer._facts.chunks_by_track
+    placer = ActorPlacer(source, chunks_by_track, renderer._facts.names)
+    wanted = [track_id for track_id, numbers in chunks_by_track.items() if 0 not in numbers]
+    assert wanted
+    extended = placer.gather(source.load(0), wanted)
+    assert {actor.track_id for actor in extended.scene.actors} >= set(wanted)
+    assert placer.gather(source.load(0), wanted) is extended
+    assert source.loads == [0, 1, 0]
+    # Other scenes of the same chunk have other actors; only the latest stay in memory.
+    other = source.load(0)
+    fewer = [replace(other, scene=replace(other.scene, actors=other.scene.actors[:count])) for count in (0, 1)]
+    joined = [placer.gather(scene, wanted) for scene in fewer]
+    assert joined[0] is not extended and joined[1] is not joined[0]
+    assert placer.gather(fewer[1], wanted) is joined[1]
+    assert placer.gather(source.load(0), wanted) is not extended
+
+
+def test_recorded_actors_stand_next_to_placed_ones(renderer: SceneRenderer, served: tuple[str, str]) -> None:
+    """Between two frames, too, where a placed actor would be elsewhere."""
+    still = request_at(renderer, served, 2, "front_camera")
+    request = replace(still, start_s=still.start_s + 0.03, end_s=still.start_s + 0.03)
+    ids = tuple(actor.track_id for actor in renderer.actors())
+    expected = renderer.render(request)
+    assert difference(renderer.render(replace(request, actors=(), recorded_actors=ids)), expected) == 0
+    empty = renderer.render(replace(request, actors=()))
+    assert difference(empty, expected) > 10
+    box = np.eye(4)
+    box[:3, 3] = request.start_world_SE3_camera[:3, 3] + 4.0 * request.start_world_SE3_camera[:3, 2]
+    placed = (ActorPose(ids[0], box, box),)
+    alone = renderer.render(replace(request, actors=placed))
+    both = renderer.render(replace(request, actors=placed, recorded_actors=ids[1:]))
+    assert difference(both, alone) > 10 and difference(both, expected) > 10
+    with pytest.raises(InputError, match="during a readout"):
+        renderer.render(replace(request, end_s=request.end_s + 0.01, actors=(), recorded_actors=ids))
 
 
 def sheared(chunk_scene: ChunkScene, request: ImageRequest, middle: Float64, velocity: Float64, frame: int) -> Image:

@@ -17,9 +17,11 @@ from scipy.spatial.transform import Rotation
 from flows.exchange.export_request import ExportRequest
 from flows.exchange.export_scenes import export_scenes
 from flows.simulators.alpasim.bundle import write_alpasim_bundle
+from flows.simulators.alpasim.local_frame import REAR_AXLE_M, describe_ego_box, read_local_frame
 from flows.simulators.alpasim.wire_poses import read_pose
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.exchange.scene_folder import find_changes, read_document, read_scene_folder
+from genre_tasks.logs.synthetic.log import SyntheticStreet
 from tests.flows.simulators.alpasim.wire_client import ServedRun, WireClient
 
 
@@ -37,6 +39,17 @@ def load(bundle: Path, name: str) -> Any:
     with zipfile.ZipFile(bundle) as archive:
         text = archive.read(name).decode()
     return yaml.safe_load(text) if name.endswith(".yaml") else json.loads(text)
+
+
+def test_the_rear_axle_is_behind_the_middle_that_the_log_states(
+    served: ServedRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert served.frame.ego_SE3_rig[0, 3] == -REAR_AXLE_M
+    monkeypatch.setattr(SyntheticStreet, "center_ahead_m", 1.3, raising=False)
+    frame = read_local_frame(served.renderer.scenes)
+    assert frame.ego_SE3_rig[0, 3] == pytest.approx(1.3 - REAR_AXLE_M)
+    # The box's middle is where the log says.
+    assert (frame.ego_SE3_rig @ [*describe_ego_box()["centroid"], 1.0])[0] == pytest.approx(1.3)
 
 
 def test_a_bundle_is_a_plain_zip_of_known_files(bundle: Path) -> None:

@@ -22,6 +22,7 @@ from flows.simulators.scene_renderer import SceneRenderer
 from flows.simulators.service import ServiceRequest
 from genre_tasks.errors import ConfigError, ResourceError
 from tests.flows.simulators.alpasim.wire_client import ServedRun, WireClient
+from tests.waiting import wait_until
 
 
 class FakeService:
@@ -115,6 +116,39 @@ def test_as_many_calls_wait_as_the_queue_takes(served: ServedRun, monkeypatch: p
             assert {call.result()[0] for call in calls} == {"OK"}
         assert status == "RESOURCE_EXHAUSTED" and "80 requests wait, and 80 may" in details
     finally:
+        service.close()
+
+
+def test_nobody_renders_for_a_client_that_has_gone(served: ServedRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    renderer = SceneRenderer(served.store, served.run)
+    release = threading.Event()
+    rendered = []
+    render = renderer._render
+
+    def wait_and_render(requests: Any) -> Any:
+        rendered.append(len(requests))
+        release.wait(60)
+        return render(requests)
+
+    monkeypatch.setattr(renderer, "_render", wait_and_render)
+    service = start_alpasim(ServiceRequest({renderer.name: renderer}, "127.0.0.1", 0, CountingMetrics()))
+    try:
+        with WireClient(service.address) as patient, ThreadPoolExecutor(1) as pool:
+            payload = patient.image_request().SerializeToString()
+            first = pool.submit(patient.status, "render_rgb", payload)
+            wait_until(lambda: renderer.queue_length == 1, "the first call does not come")
+            with WireClient(service.address) as hasty:
+                call = hasty.start("render_rgb", payload)
+                wait_until(lambda: renderer.queue_length == 2, "the second call does not come")
+                call.cancel()
+            # The server hears of it a moment later.
+            time.sleep(0.3)
+            release.set()
+            assert first.result(60)[0] == "OK"
+            wait_until(lambda: renderer.queue_length == 0, "the second call does not end")
+        assert rendered == [1]
+    finally:
+        release.set()
         service.close()
 
 

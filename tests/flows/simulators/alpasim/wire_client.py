@@ -77,6 +77,10 @@ class WireClient:
         answer: bytes = self._channel.unary_unary(PATH + method)(payload, timeout=60)
         return answer
 
+    def start(self, method: str, payload: bytes) -> Any:
+        """A call that may be cancelled."""
+        return self._channel.unary_unary(PATH + method).future(payload, timeout=60)
+
     def call(self, method: str, request: Any = None) -> Any:
         payload = b"" if request is None else request.SerializeToString()
         return ANSWERS[method].FromString(self.send(method, payload))
