@@ -15,7 +15,7 @@ from benchmarks.real_logs.measures import LogOfBench
 from flows.configuration import load_configuration
 from genre_tasks.config import GnetConfig
 from genre_tasks.effects.types import EffectsPlan
-from genre_tasks.stages.optimise import drop_unplanned_losses
+from genre_tasks.stages.planned_losses import drop_unplanned_losses
 from genre_tasks.threads import torch_threads
 
 METHODS = ("tuned_adam", "tuned_adam_split")

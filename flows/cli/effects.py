@@ -45,8 +45,10 @@ def effects(
     from flows.cli.printing import print_rows
     from flows.configuration import load_configuration
     from flows.pipeline.effects_plan import plan_effects
+    from flows.pipeline.log_cache import cached_log
     from flows.pipeline.stage_runner import Job
     from flows.preflight.requirements import check_requirements
+    from genre_tasks.logs.log_selection import choose_working_size, select_cameras
 
     if out is not None:
         check_output_folder(out, "--out", ("effects.parquet", "effects.png"))
@@ -58,7 +60,9 @@ def effects(
         {"effect": d.name, "choice": d.choice, "set": d.setting, "because": d.reason, "cost": d.cost}
         for d in plan.decisions
     ]
-    print_rows(f"{log} chunk {chunk}, {config.ingest.width_px}×{config.ingest.height_px}", rows)
+    # Images of another shape than the configured one are used in their own.
+    width_px, height_px = choose_working_size(config.ingest, select_cameras(config.ingest, cached_log(log)))
+    print_rows(f"{log} chunk {chunk}, {width_px}×{height_px}", rows)
     if out is not None:
         files = _write_plan(plan, out, f"{log} chunk {chunk}")
         typer.echo(f"wrote {', '.join(files)}")
@@ -79,8 +83,8 @@ def _write_plan(plan: EffectsPlan, folder: Path, title: str) -> list[str]:
         write_png(temporary / "effects.png", plot_effects_plan(plan, title))
         # An earlier plan may have had masks, points or poses that this one lacks. Anything else is the user's.
         if (folder / "effects.parquet").is_file():
-            earlier = [*(folder / "own").glob("*.png"), folder / "points.parquet", folder / "poses.parquet"]
-            for path in earlier:
+            tables = ("points.parquet", "poses.parquet", "ego_points.parquet")
+            for path in [*(folder / "own").glob("*.png"), *(folder / table for table in tables)]:
                 path.unlink(missing_ok=True)
         for source in sorted(temporary.rglob("*")):
             if source.is_file():

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from genre_tasks.effects.measurements import ChunkMeasurements
+from genre_tasks.effects.measurements import IMAGE_STEP_M, ChunkMeasurements
 from genre_tasks.effects.types import Effect, EffectParameters, Measurement
 from genre_tasks.logs.types import Float32
 from genre_tasks.scene.visibility import find_visible_points
@@ -72,14 +73,15 @@ def measure(measurements: ChunkMeasurements) -> Measurement:
         measurements: the chunk's images over time.
 
     Returns:
-        Percentage of the image's area. No value where the vehicle stands, since then all of the image never changes.
+        Percentage of the image's area. No value where the vehicle stands, since then all of the image never changes,
+        and none where too few images were taken at different places.
     """
     travel = _travel_m(measurements)
     if travel < MIN_TRAVEL_M:
         return Measurement(None, f"the vehicle travels {travel:.1f} m: all of the image stands still")
     parts = _find_still_parts(measurements)
     if not parts:
-        return Measurement(None, f"no camera has {MIN_FRAMES} images")
+        return Measurement(None, _explain_too_few_images(measurements))
     percents = {camera: 100 * float(part.mean()) for camera, part in parts.items()}
     percents_of_vehicle = {camera: percent for camera, percent in percents.items() if percent <= MAX_MASK_PERCENT}
     largest = max(percents_of_vehicle.values(), default=0.0)
@@ -135,6 +137,13 @@ def _find_ego_points(
     return found if len(found) else None
 
 
+def _explain_too_few_images(measurements: ChunkMeasurements) -> str:
+    image_counts = Counter(view.camera for view in measurements.chunk.views)
+    if max(image_counts.values(), default=0) < MIN_FRAMES:
+        return f"no camera has {MIN_FRAMES} images"
+    return f"no camera has {MIN_FRAMES} images taken {IMAGE_STEP_M} m apart: from one place, road stands still too"
+
+
 def _travel_m(measurements: ChunkMeasurements) -> float:
     centers = measurements.chunk.chunk_SE3_ego[:, :3, 3]
     return float(np.linalg.norm(centers - centers[:1], axis=1).max())
@@ -174,21 +183,38 @@ def find_vehicle(images: Float32) -> NDArray[np.bool_]:
     mean = images.mean(0).mean(-1)
     # Sobel's kernel weighs three rows by 1, 2 and 1: a quarter of it is the height of a step in levels.
     edge = np.hypot(ndimage.sobel(mean, 0), ndimage.sobel(mean, 1)) / 4
-    smooth = _parts_at_lower_edge((change <= STILL_LEVELS) & (edge < EDGE_LEVELS))
-    candidates = [part for part in smooth if _has_edge_around(part, edge)]
+    smooth = _find_largest_part((change <= STILL_LEVELS) & (edge < EDGE_LEVELS), edge, _has_edge_around)
     # Paint of the road's colour has no edge, and is found by what moves around it.
-    motionless = _parts_at_lower_edge(change <= MOTIONLESS_LEVELS)
-    candidates += [part for part in motionless if _changes_far_less_than_surroundings(part, change)]
-    largest = max(candidates, key=lambda part: int(part.sum()), default=np.zeros(change.shape, bool))
+    motionless = _find_largest_part(change <= MOTIONLESS_LEVELS, change, _changes_far_less_than_surroundings)
+    largest = motionless if motionless.sum() > smooth.sum() else smooth
     return _fill_below_outline(largest, edge) if largest.any() else largest
 
 
-def _parts_at_lower_edge(mask: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
-    """Connected parts that reach the last row."""
+def _find_largest_part(
+    mask: NDArray[np.bool_], levels: Float32, is_vehicle: Callable[[NDArray[np.bool_], Float32], bool]
+) -> NDArray[np.bool_]:
+    """Finds the largest connected part that reaches the last row and is of the vehicle.
+
+    Args:
+        mask: [H, W] true at the parts.
+        levels: [H, W] what a part is judged by.
+        is_vehicle: judges a part by the levels in and around it, up to ``RIM_PX`` + 1 pixels away.
+
+    Returns:
+        [H, W] true at the part; nowhere if there is none.
+    """
     from scipy import ndimage
 
     labels, _ = ndimage.label(mask)
-    return [labels == label for label in np.unique(labels[-1][labels[-1] > 0])]
+    at_edge = np.unique(labels[-1][labels[-1] > 0])
+    sizes = np.bincount(labels.ravel())[at_edge]
+    windows = ndimage.find_objects(labels)
+    # One part at a time and in its window alone: a noisy lower edge has hundreds of parts.
+    for label in at_edge[np.argsort(-sizes, kind="stable")]:
+        window = tuple(slice(max(side.start - RIM_PX - 2, 0), side.stop + RIM_PX + 2) for side in windows[label - 1])
+        if is_vehicle(labels[window] == label, levels[window]):
+            return np.asarray(labels == label)
+    return np.zeros(mask.shape, bool)
 
 
 def _has_edge_around(part: NDArray[np.bool_], edge: Float32) -> bool:

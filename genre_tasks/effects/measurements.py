@@ -28,6 +28,13 @@ from genre_tasks.threads import map_single_threaded
 IMAGES_OVER_TIME = 10
 """About so many images of each camera are compared over time."""
 
+# From one place, road is as still as the recording vehicle. The slow start of PandaSet 002 has steps of 0.15 m.
+SAME_PLACE_M = 0.1
+"""Where two images that follow were taken nearer to one another, the vehicle stands for a part of the chunk."""
+
+IMAGE_STEP_M = 0.3
+"""There, images that are compared over time were taken so far apart at least."""
+
 SAMPLE_COUNT = 6000
 """Static points whose colours are compared between images."""
 
@@ -89,13 +96,12 @@ class ChunkMeasurements:
 
     @cached_property
     def images_over_time(self) -> dict[str, NDArray[np.uint8]]:
-        """By camera, [F, H, W, 3]: images spread over the chunk, held-out ones too."""
+        """By camera, [F, H, W, 3]: images spread over the chunk, of different places; held-out ones too."""
         images_by_camera = {}
         for camera in self.chunk.camera_names:
-            views = [v for v in self.chunk.views if v.camera == camera]
             # Held-out images may take part: a mask takes nothing of the scene from them.
-            chosen = views[:: max(1, len(views) // IMAGES_OVER_TIME)]
-            images = [self.decode_view(v) for v in chosen]
+            views = [v for v in self.chunk.views if v.camera == camera]
+            images = [self.decode_view(v) for v in _select_views_over_time(views)]
             # A camera without images has an empty array, so that callers only ask for its length.
             images_by_camera[camera] = np.stack(images) if images else np.zeros((0, 1, 1, 3), np.uint8)
         return images_by_camera
@@ -174,3 +180,24 @@ class ChunkMeasurements:
         # Zero instead of NaN: what is not observed has weight 0, and NaN times 0 would still be NaN.
         log_color = np.where(observed[..., None], colors.log_color, 0.0)
         return estimate_gains_and_haze(log_color, colors.distance_m, colors.texture, observed, sky_color)
+
+
+def _select_views_over_time(views: Sequence[View]) -> list[View]:
+    """About ``IMAGES_OVER_TIME`` of a camera's views, spread over time; none of a place where the vehicle stood."""
+    spread = _spread_over_time(views)
+    positions = np.array([view.chunk_SE3_camera[:3, 3] for view in spread]).reshape(-1, 3)
+    steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    if (steps_m >= SAME_PLACE_M).all():
+        return spread
+    # Chosen from all views: of the few that were taken on the move, every second one would be left out otherwise.
+    apart: list[View] = []
+    for view in views:
+        distances_m = [np.linalg.norm((view.chunk_SE3_camera - other.chunk_SE3_camera)[:3, 3]) for other in apart]
+        # From all of them: a vehicle may come back to a place.
+        if min(distances_m, default=np.inf) >= IMAGE_STEP_M:
+            apart.append(view)
+    return _spread_over_time(apart)
+
+
+def _spread_over_time(views: Sequence[View]) -> list[View]:
+    return list(views[:: max(1, len(views) // IMAGES_OVER_TIME)])

@@ -5,6 +5,7 @@ Every image is decoded, coarsely, and every sweep is read.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -15,7 +16,8 @@ from genre_tasks.log_checks.images import summarise_findings
 from genre_tasks.log_checks.inspection import LogInspector
 from genre_tasks.log_checks.plausibility import assess_plausibility
 from genre_tasks.log_checks.reader_findings import collect_reader_findings
-from genre_tasks.log_checks.results import STANDSTILL_M, LogCheck
+from genre_tasks.log_checks.results import LogCheck
+from genre_tasks.log_checks.standstill import STANDSTILL_M, measure_travel_m
 from genre_tasks.logs.findings import Finding, ReportsFindings, Severity, format_frames
 from genre_tasks.logs.log_selection import count_source_frames
 from genre_tasks.logs.types import DrivingLog, Float64
@@ -28,6 +30,7 @@ _MIN_SOURCE_FRAMES = 2
 _MIN_SWEEP_POINTS = 1000
 # Sweeps of one sensor differ with what stands around it, and by less: such a part is half a turn or a cut file.
 _MIN_SWEEP_PART = 0.25
+_SEVERITIES: tuple[Severity, ...] = ("note", "warning", "fatal")
 
 
 def check_log(log: DrivingLog, chunk_frames: int = 20, progress: Progress = silent, source_every: int = 4) -> LogCheck:
@@ -70,12 +73,12 @@ def check_log(log: DrivingLog, chunk_frames: int = 20, progress: Progress = sile
         invalid=_count_left_out(log, inspector),
         # A position that cannot be read leaves a gap in the path, not a path of unknown length.
         travel_m=float(np.nansum(steps_m)),
-        # A chunk of n frames has n - 1 steps: the one into the next chunk belongs to neither.
-        chunk_travel_m=tuple(float(np.nansum(steps_m[start : start + chunk_frames - 1])) for start in chunk_starts),
+        chunk_travel_m=tuple(measure_travel_m(positions[start : start + chunk_frames]) for start in chunk_starts),
         findings=(),
     )
     _report_lost_chunks(positions, inspector, chunk_frames)
     _report_findings(check, inspector, chunk_frames)
+    _report_chunks(check, inspector, chunk_frames, source_every)
     _report_small_sweeps(point_counts, inspector)
     _report_chunks_without_sources(check, inspector, chunk_frames, source_every)
     return replace(check, findings=tuple(inspector.findings))
@@ -160,7 +163,6 @@ def _report_findings(check: LogCheck, inspector: LogInspector, chunk_frames: int
         message = "no cuboids: everything is taken as static"
         inspector.report(Finding("no_cuboids", "note", message, "Moving objects will smear."))
     _report_plausibility(inspector, chunk_frames)
-    _report_chunks(check, inspector, chunk_frames)
 
 
 def _report_reader_findings(inspector: LogInspector) -> None:
@@ -175,24 +177,33 @@ def _report_reader_findings(inspector: LogInspector) -> None:
 def _report_plausibility(inspector: LogInspector, chunk_frames: int) -> None:
     """Adds what is implausible, chunk by chunk as a run would meet it; each thing once, with the chunks it is in."""
     log = inspector.log
-    found: dict[tuple[str, str | None], tuple[Finding, list[int]]] = {}
+    found: dict[tuple[str, str | None, int], tuple[Finding, list[int]]] = {}
     for chunk, start in enumerate(range(0, log.frame_count, chunk_frames)):
         frames = tuple(range(start, min(start + chunk_frames, log.frame_count)))
+        # One word may stand for two things of a camera, such as a readout and an exposure in milliseconds.
+        counts: Counter[tuple[str, str | None]] = Counter()
         for finding in assess_plausibility(log, frames, inspector.cameras):
-            _, chunks = found.setdefault((finding.word, finding.camera), (finding, []))
-            chunks.append(chunk)
+            subject = (finding.word, finding.camera)
+            key = (*subject, counts[subject])
+            counts[subject] += 1
+            known, chunks = found.get(key, (finding, []))
+            # The first one of those that are most severe: a note in an earlier chunk must not hide a warning.
+            found[key] = (max(known, finding, key=lambda f: _SEVERITIES.index(f.severity)), [*chunks, chunk])
     for finding, chunks in found.values():
         suffix = f" (chunks {format_frames(chunks)})" if log.frame_count > chunk_frames else ""
         inspector.report(replace(finding, message=finding.message + suffix))
 
 
-def _report_chunks(check: LogCheck, inspector: LogInspector, chunk_frames: int) -> None:
+def _report_chunks(check: LogCheck, inspector: LogInspector, chunk_frames: int, source_every: int) -> None:
     if check.frames > MOST_FRAMES:
         message = f"chunks beyond the first {MOST_FRAMES:,} of {check.frames:,} frames cannot be reconstructed"
         remedy = "Divide the log, or leave these chunks out with --chunks."
         numbers = {"frames": float(check.frames), "limit": float(MOST_FRAMES)}
         inspector.report(Finding("too_many_frames", "warning", message, remedy, numbers))
     for chunk in check.standstill_chunks:
+        # Of a few frames, nothing is reconstructed anyway: another finding says so.
+        if min(chunk_frames, check.frames - chunk * chunk_frames) <= source_every:
+            continue
         travel = check.chunk_travel_m[chunk]
         message = f"chunk {chunk}: the ego vehicle stands still ({travel:.2f} m), no parallax"
         remedy = "Novel views rest on the LiDAR alone there; leave it out with --chunks."

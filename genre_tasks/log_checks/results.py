@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from genre_tasks.log_checks.standstill import STANDSTILL_M
 from genre_tasks.logs.findings import Finding
-
-# A chunk with less travel has next to no parallax: its geometry comes from the LiDAR alone.
-STANDSTILL_M = 0.5
 
 Verdict = Literal["good", "usable", "unusable"]
 
@@ -52,7 +50,7 @@ class LogCheck:
         tracks_static: annotated objects that do not.
         invalid: (kind, count) of what the reader left out.
         travel_m: length of the ego vehicle's path.
-        chunk_travel_m: the same for every chunk.
+        chunk_travel_m: for every chunk, the largest distance from its first position; NaN where it is not known.
         findings: everything to know, in the order in which it was found.
     """
 

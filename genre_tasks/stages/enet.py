@@ -9,7 +9,8 @@ from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.novel_views import FixedViews
 from genre_tasks.scene.reconstruction import Reconstruction
-from genre_tasks.stages.optimise import drop_unplanned_losses, optimise
+from genre_tasks.stages.optimise import optimise
+from genre_tasks.stages.planned_losses import drop_unplanned_losses
 
 
 def enet(
@@ -35,7 +36,8 @@ def enet(
 
     Raises:
         InputError: the chunk has no source view, an image is unreadable, or weights are missing or do not fit.
+        ConfigError: the plan leaves no term of the loss.
         NonFiniteError: the optimisation has diverged.
     """
-    config = drop_unplanned_losses(config, plan)
+    config = drop_unplanned_losses(config, plan, chunk)
     return optimise("enet", config, apply_plan(chunk, plan), reconstruction.scene, fixed, progress)

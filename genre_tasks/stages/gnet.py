@@ -9,7 +9,8 @@ from genre_tasks.progress import Progress, silent
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.graph import SceneGraph
 from genre_tasks.scene.reconstruction import Reconstruction
-from genre_tasks.stages.optimise import PER_SCENE_METHODS, drop_unplanned_losses, optimise
+from genre_tasks.stages.optimise import PER_SCENE_METHODS, optimise
+from genre_tasks.stages.planned_losses import drop_unplanned_losses
 
 
 def gnet(
@@ -35,13 +36,15 @@ def gnet(
 
     Raises:
         InputError: the chunk has no source view, an image is unreadable, or weights are missing or do not fit.
+        ConfigError: the plan leaves no term of the loss.
         NonFiniteError: the optimisation has diverged.
     """
     # A scene of another program is enhanced as it is.
     if config.method == "none":
         return Reconstruction(initial.scene)
     start = prepare_start(config, initial.scene, plan)
-    return optimise("gnet", drop_unplanned_losses(config, plan), apply_plan(chunk, plan), start, None, progress)
+    config = drop_unplanned_losses(config, plan, chunk)
+    return optimise("gnet", config, apply_plan(chunk, plan), start, None, progress)
 
 
 def prepare_start(config: OptimiserConfig, scene: SceneGraph, plan: EffectsPlan) -> SceneGraph:

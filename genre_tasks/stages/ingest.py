@@ -13,6 +13,7 @@ from genre_tasks.errors import InputError
 from genre_tasks.log_checks.images import LEFT_OUT
 from genre_tasks.log_checks.plausibility import assess_plausibility
 from genre_tasks.log_checks.reader_findings import collect_reader_findings
+from genre_tasks.log_checks.standstill import STANDSTILL_M, measure_travel_m
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.log_selection import choose_working_size, chunk_count, select_cameras, select_frames
 from genre_tasks.logs.types import Camera, DrivingLog
@@ -29,8 +30,6 @@ __all__ = ["STANDSTILL_M", "chunk_count", "ingest"]
 
 _NOTED_WITH_IMAGES = frozenset(LEFT_OUT)
 SCENE_POINTS_MODULE = "genre_tasks.stages.scene_points"
-STANDSTILL_M = 0.1
-"""An ego vehicle that travels less than this in a chunk stands still: there is no parallax."""
 
 
 def ingest(config: IngestConfig, log: DrivingLog, chunk_index: int, progress: Progress = silent) -> Chunk:
@@ -109,8 +108,7 @@ def _note_path_issues(reading: ChunkReading) -> None:
     if len(bad):
         detail = f"{len(bad)} timestamps do not come after the one before them; frame numbers are used for the order"
         reading.add_issue("timestamps", detail, frame=reading.frames[int(bad[0]) + 1])
-    centers = reading.chunk_SE3_ego[:, :3, 3]
-    travel = np.linalg.norm(centers - centers[0], axis=1).max()
+    travel = measure_travel_m(reading.chunk_SE3_ego[:, :3, 3])
     if travel < STANDSTILL_M:
         reading.add_issue("standstill", f"the ego vehicle travels {travel:.2f} m: no parallax")
 

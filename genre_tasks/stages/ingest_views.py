@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -14,7 +14,7 @@ from genre_tasks.errors import InputError
 from genre_tasks.log_checks.images import LEFT_OUT, find_unfit, read_image, summarise_findings
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.log_selection import SourceSchedule, select_source_frames
-from genre_tasks.logs.types import Camera
+from genre_tasks.logs.types import Camera, Float64
 from genre_tasks.scene.chunk import View
 from genre_tasks.scene.image_decoding import decode_with_facts
 from genre_tasks.scene.transforms import invert_se3
@@ -23,7 +23,7 @@ from genre_tasks.stages.chunk_reading import ChunkReading
 REMEDY = "Fetch the file again, or run without strict to go on without it."
 
 _STRICT_REMEDY = "Or run without strict to go on without it."
-# Between two frames of a camera without any time.
+# Between two frames where neither images nor sweeps have times.
 _FRAME_S = 0.1
 _MISSING = Finding("missing_image", "warning", "there is no image")
 
@@ -119,23 +119,53 @@ def _note_unsupervised_cameras(reading: ChunkReading, views: list[View]) -> None
 
 
 def _read_time(reading: ChunkReading, camera: Camera, frame: int) -> float:
-    """An image's time in seconds; where it is not finite, the one that the camera's other images give."""
-    time_s = _read_stated_time(reading, camera, frame)
+    """An image's time in seconds; where it is not finite, the one that sweeps and the camera's other images give."""
+    read_image_time = partial(reading.log.camera_timestamp_s, camera.name)
+    time_s = _read_stated_time(reading, read_image_time, frame)
     if np.isfinite(time_s):
         return time_s
     # What effects compute from times would be NaN in all views of the camera.
-    detail = "its time cannot be read; the camera's other images give it"
+    detail = "its time cannot be read; those of sweeps and of the camera's other images give it"
     reading.add_issue("missing_timestamp", detail, frame, camera.name)
-    frames = np.array(reading.frames, np.float64)
-    times = np.array([_read_stated_time(reading, camera, f) for f in reading.frames])
-    known = np.isfinite(times)
-    return float(np.interp(frame, frames[known], times[known])) if known.any() else _FRAME_S * frame
+    times = np.array([_read_stated_time(reading, read_image_time, f) for f in reading.frames])
+    sweep_times = np.array([_read_stated_time(reading, reading.log.frame_timestamp_s, f) for f in reading.frames])
+    return float(_fill_times(reading.frames, times, sweep_times)[reading.frames.index(frame)])
 
 
-def _read_stated_time(reading: ChunkReading, camera: Camera, frame: int) -> float:
-    """The time that the log states for an image, seconds; NaN where it cannot be read."""
+def _fill_times(frames: Sequence[int], times: Float64, sweep_times: Float64) -> Float64:
+    """Fills in the times of a camera's images where they are missing.
+
+    Args:
+        frames: [F] of the chunk.
+        times: [F] seconds, of the camera's images; NaN where they are missing.
+        sweep_times: [F] seconds, of the sweeps; NaN where they are missing.
+
+    Returns:
+        [F] those that are known. Others are the sweep's with the camera's usual offset, and without a sweep's time
+        they lie on the line between their neighbours.
+    """
+    offsets = (times - sweep_times)[np.isfinite(times) & np.isfinite(sweep_times)]
+    # The median, so that one wrong time moves no other.
+    offset_s = float(np.median(offsets)) if offsets.size else 0.0
+    filled = np.where(np.isfinite(times), times, sweep_times + offset_s)
+    known = np.flatnonzero(np.isfinite(filled))
+    positions = np.asarray(frames, np.float64)
+    if len(known) < 2:
+        start_s = filled[known[0]] - _FRAME_S * positions[known[0]] if len(known) else 0.0
+        return np.where(np.isfinite(filled), filled, start_s + _FRAME_S * positions)
+    for row in np.flatnonzero(~np.isfinite(filled)):
+        # At an end the line through the two nearest goes on, where one time for all would double velocities.
+        before = int(np.clip(np.searchsorted(known, row), 1, len(known) - 1)) - 1
+        first, second = known[before], known[before + 1]
+        fraction = (positions[row] - positions[first]) / (positions[second] - positions[first])
+        filled[row] = filled[first] + fraction * (filled[second] - filled[first])
+    return filled
+
+
+def _read_stated_time(reading: ChunkReading, read_time: Callable[[int], float], frame: int) -> float:
+    """The time that the log states for a frame, seconds; NaN where it cannot be read."""
     try:
-        return reading.log.camera_timestamp_s(camera.name, frame)
+        return read_time(frame)
     except InputError:
         if reading.config.strict:
             raise

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 from genre_tasks.config import GnetConfig, OptimiserConfig, RefineConfig
-from genre_tasks.effects.types import EffectsPlan
 from genre_tasks.learned.weights import load_optimiser
 from genre_tasks.losses import targets
 from genre_tasks.losses.rendering_loss import ImageDistance
@@ -195,25 +194,6 @@ def optimise(
     source = targets.source_targets(chunk, depth=method.needs_depth)
     novel = () if fixed is None else targets.novel_targets(fixed)
     return method.run(scene, source, novel, progress)
-
-
-def drop_unplanned_losses(config: OptimiserConfig, plan: EffectsPlan) -> OptimiserConfig:
-    """Leaves out the loss terms that the effects' plan leaves out.
-
-    Args:
-        config: a stage's section.
-        plan: of the chunk's effects.
-
-    Returns:
-        OptimiserConfig: without terms for depth, if the plan has LiDAR depth off.
-    """
-    # A weight of 0 and not a missing target: the loss is then the same code for every plan.
-    if plan.is_on("lidar_depth"):
-        return config
-    update: dict[str, object] = {"loss": config.loss.model_copy(update={"depth": 0.0})}
-    if isinstance(config, GnetConfig):
-        update["per_scene"] = config.per_scene.model_copy(update={"depth": 0.0})
-    return config.model_copy(update=update)
 
 
 def make_unroll_settings(stage: StageName, config: OptimiserConfig) -> UnrollSettings:

@@ -23,6 +23,7 @@ from genre_tasks.effects.ego_mask import fit as fit_ego_mask
 from genre_tasks.effects.measurements import ChunkMeasurements
 from genre_tasks.effects.plan import EFFECT_NAMES, plan_effects
 from genre_tasks.effects.types import DEFAULT_PLAN, Decision, EffectParameters, EffectsPlan
+from genre_tasks.errors import ConfigError
 from genre_tasks.fixer.source_images import load_source_images
 from genre_tasks.fixer.view_surface import unproject_surface
 from genre_tasks.fixer.warping import SourceImage, sample_source
@@ -43,7 +44,7 @@ from genre_tasks.stages.gnet import gnet
 from genre_tasks.stages.ingest import ingest
 from genre_tasks.stages.initial import initial
 from genre_tasks.stages.novel_views import novel_views
-from genre_tasks.stages.optimise import drop_unplanned_losses
+from genre_tasks.stages.planned_losses import drop_unplanned_losses
 from tests.effects.imports import assert_imports_no_effect
 
 SMALL = "&frames=8&cameras=2&width=160&height=90&samples=1"
@@ -350,6 +351,21 @@ def test_a_per_scene_depth_term_is_there_where_the_plan_has_it() -> None:
     first = initial(InitialConfig(max_points=2000, distant_count=200), chunk(STREET))
     told, untold = (gnet(config, chunk(STREET), first, with_(*p)) for p in (("lidar_depth",), ()))
     assert told.losses[0] > untold.losses[0]
+
+
+def test_a_plan_that_leaves_no_term_of_the_loss_is_refused() -> None:
+    depth_alone = LossConfig(rgb=0, perceptual=0, ssim=0, depth=0.1)
+    config = GnetConfig(iterations=2, method="adam", loss=depth_alone)
+    first = initial(InitialConfig(max_points=2000, distant_count=200), chunk(STREET))
+    with pytest.raises(ConfigError, match=r"depth is the only term of loss .*chunk 0.*loss\.rgb or .*lidar_depth=on"):
+        gnet(config, chunk(STREET), first, with_("rigid_actors"))
+    assert drop_unplanned_losses(config, with_("lidar_depth")) == config
+    # The loss of a method that is not used may be empty.
+    per_scene = config.model_copy(update={"method": "street_gs"})
+    drop_unplanned_losses(per_scene, with_())
+    empty = per_scene.model_copy(update={"per_scene": PerSceneConfig(rgb=0, ssim=0, depth=0.1)})
+    with pytest.raises(ConfigError, match=r"Give per_scene\.rgb or per_scene\.ssim a weight"):
+        drop_unplanned_losses(empty, with_())
 
 
 def test_targets_carry_what_effects_say() -> None:

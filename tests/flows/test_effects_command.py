@@ -17,9 +17,12 @@ SMALL = ["--set", "ingest.width_px=96", "--set", "ingest.height_px=54"]
 
 def test_the_command_says_why_and_writes_what_anyone_can_open(tmp_path) -> None:
     told = [STREET, *SMALL, "--store", str(tmp_path / "store"), "--out", str(tmp_path / "out")]
-    stale = [tmp_path / "out" / name for name in ("own/nobody.png", "points.parquet", "poses.parquet")]
+    names = ("own/nobody.png", "points.parquet", "poses.parquet", "ego_points.parquet")
+    stale = [tmp_path / "out" / name for name in names]
+    # An ego mask would write points of its own over the stale ones.
+    settings = ["--set", "effects.darkness=off", "--set", "effects.ego_mask=off"]
     for _ in range(2):  # the second time from the store, and over the first one's files
-        done = CliRunner().invoke(app, ["effects", *told, "--set", "effects.darkness=off"], terminal_width=200)
+        done = CliRunner().invoke(app, ["effects", *told, *settings], terminal_width=200)
         assert done.exit_code == 0, done.output
         assert not any(path.exists() and not path.stat().st_size for path in stale)
         for path in stale:  # as of another plan
@@ -36,6 +39,13 @@ def test_the_command_says_why_and_writes_what_anyone_can_open(tmp_path) -> None:
     assert table["choice"][table["name"].index("darkness")] == "off"
     assert (tmp_path / "out" / "effects.png").read_bytes()[:4] == b"\x89PNG"
     assert not [p for p in (tmp_path / "out").iterdir() if p.name.startswith("tmp")]
+
+
+def test_the_command_names_the_size_at_which_the_chunk_is_used(tmp_path) -> None:
+    wide = STREET.replace("height=54", "height=32")
+    done = CliRunner().invoke(app, ["effects", wide, *SMALL, "--store", str(tmp_path), "--set", "effects=off"])
+    assert done.exit_code == 0, done.output
+    assert "chunk 0, 96×32" in done.output.replace("\n", " ") and "96×54" not in done.output
 
 
 @pytest.mark.parametrize(

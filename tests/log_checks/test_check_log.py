@@ -15,13 +15,16 @@ from typer.testing import CliRunner
 from flows.cli.main import app
 from genre_tasks.log_checks.check_log import check_log
 from genre_tasks.log_checks.results import LogCheck
+from genre_tasks.log_checks.standstill import STANDSTILL_M
 from genre_tasks.logs import registry
+from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.pandaset.reader import open_pandaset
 from genre_tasks.logs.pandaset.writer import write_pandaset
 from genre_tasks.logs.registry import open_log
-from genre_tasks.logs.types import Sweep
+from genre_tasks.logs.types import Camera, Sweep
+from genre_tasks.stages import ingest
 from tests.fakes import FakeLog
-from tests.log_checks.edited_log import EditedLog
+from tests.log_checks.edited_log import EditedLog, with_ego
 from tests.logs.pandaset_folder import edit_json, edit_table, small_log
 
 REAL = Path(__file__).resolve().parents[3] / "shared/data/pandaset/002"
@@ -145,6 +148,69 @@ def test_standstill() -> None:
     check = check_log(log_of(speed_mps=0.0), source_every=1)
     assert check.standstill_chunks == (0,) and check.verdict == "usable"
     assert "stands still (0.00 m)" in messages(check, "warning")
+
+
+def test_creeping_is_no_standstill_and_noise_of_poses_is() -> None:
+    """The check and ``ingest`` measure alike: the largest distance from the first position, with one limit."""
+    assert ingest.STANDSTILL_M == STANDSTILL_M
+    creeping = check_log(log_of(frame_count=5, speed_mps=0.5))
+    assert creeping.chunk_travel_m == pytest.approx((0.2,)) and creeping.standstill_chunks == ()
+
+    def tremble(frame: int, pose: np.ndarray) -> np.ndarray:
+        moved = pose.copy()
+        moved[0, 3] += 0.05 * (frame % 2)
+        return moved
+
+    trembling = check_log(with_ego(log_of(frame_count=20, speed_mps=0.0), tremble))
+    assert trembling.travel_m > 0.9 and trembling.chunk_travel_m == pytest.approx((0.05,))
+    assert "chunk 0: the ego vehicle stands still (0.05 m)" in messages(trembling, "warning")
+
+
+@pytest.mark.parametrize("last_frames", [1, 4])
+def test_a_last_chunk_that_is_not_reconstructed_does_not_stand_still(last_frames: int) -> None:
+    driving = check_log(log_of(frame_count=5 + last_frames, speed_mps=20.0), chunk_frames=5)
+    standing = check_log(log_of(frame_count=5 + last_frames, speed_mps=0.0), chunk_frames=5)
+    assert "standstill" not in {finding.word for finding in driving.findings}
+    assert [f.message[:7] for f in standing.findings if f.word == "standstill"] == ["chunk 0"]
+    assert "the last chunk is short" in messages(driving, "note")
+
+
+def test_a_chunk_whose_poses_cannot_be_read_does_not_stand_still() -> None:
+    def lose(frame: int, pose: np.ndarray) -> np.ndarray:
+        return pose if frame < 5 else np.full((4, 4), np.nan)
+
+    check = check_log(with_ego(log_of(frame_count=10, speed_mps=20.0), lose, rig=False), chunk_frames=5)
+    assert check.chunk_travel_m[0] == pytest.approx(8.0) and np.isnan(check.chunk_travel_m[1])
+    words = {finding.word for finding in check.findings}
+    assert "lost_chunk" in words and "standstill" not in words
+
+
+def test_the_most_severe_finding_of_a_thing_stays_and_two_of_one_chunk_both_do(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    by_chunk = (
+        [Finding("odd_box_heading", "note", "backwards")],
+        [Finding("odd_box_heading", "warning", "sideways"), Finding("time_gap", "warning", "a gap")],
+        [Finding("odd_box_heading", "note", "backwards again")],
+    )
+
+    def assess(log: object, frames: tuple[int, ...], cameras: object) -> list[Finding]:
+        return by_chunk[frames[0] // 5]
+
+    monkeypatch.setattr("genre_tasks.log_checks.check_log.assess_plausibility", assess)
+    findings = check_log(log_of(frame_count=15, speed_mps=20.0), chunk_frames=5).findings
+    assert [(finding.word, finding.severity, finding.message) for finding in findings] == [
+        ("odd_box_heading", "warning", "sideways (chunks 0–2)"),
+        ("time_gap", "warning", "a gap (chunks 1)"),
+    ]
+
+
+def test_readout_and_exposure_in_milliseconds_are_two_findings() -> None:
+    log = log_of(frame_count=10, speed_mps=20.0, camera_names=("front",))
+    odd = EditedLog(log, cameras=(Camera("front", log.lens, readout_s=30.0, exposure_s=8.0),))
+    warnings = [finding.message for finding in check_log(odd, chunk_frames=5).findings if finding.camera == "front"]
+    assert [message.split(" is ")[0] for message in warnings] == ["front: readout_s", "front: exposure_s"]
+    assert all(message.endswith(" (chunks 0–1)") for message in warnings)
 
 
 @pytest.mark.parametrize(

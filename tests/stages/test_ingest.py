@@ -14,6 +14,7 @@ from genre_tasks.log_checks.check_log import check_log
 from genre_tasks.scene.chunk import MOST_FRAMES, NO_SWEEP, Chunk, LogIssue
 from genre_tasks.scene.facade_completion import STEP_M
 from genre_tasks.stages.ingest import chunk_count, ingest
+from genre_tasks.stages.ingest_views import _fill_times
 from tests.fakes import SENSOR_HEIGHT_M, WALL_HEIGHT_M, FakeLog
 
 CONFIG = IngestConfig(width_px=96, height_px=64)
@@ -277,3 +278,38 @@ def test_an_image_without_a_time_takes_that_of_its_neighbours(log: FakeLog, monk
     monkeypatch.setattr(FakeLog, "camera_timestamp_s", lambda self, camera, frame: float("nan"))
     times = [view.timestamp_s for view in ingest(CONFIG, log, 0).views if view.camera == "left"]
     assert np.diff(times) == pytest.approx(0.1)
+
+
+def test_images_at_the_ends_without_a_time_are_those_of_their_sweeps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The nearest image's time for all of them would double what is measured of their velocity."""
+    missing = {0, 1, 2, 18, 19}
+
+    def read_time(self: FakeLog, camera: str, frame: int) -> float:
+        return float("nan") if camera == "left" and frame in missing else self.frame_timestamp_s(frame) + 0.03
+
+    monkeypatch.setattr(FakeLog, "camera_timestamp_s", read_time)
+    # A vehicle's sweeps with a dropped frame: times on a line would be wrong.
+    log = FakeLog(timestamps_s=tuple(0.1 * (frame + (frame > 18)) for frame in range(20)))
+    for view in ingest(CONFIG, log, 0).views:
+        assert view.timestamp_s == pytest.approx(log.frame_timestamp_s(view.frame) + 0.03, abs=1e-6)
+
+
+def test_a_camera_without_any_time_has_those_of_the_sweeps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(FakeLog, "camera_timestamp_s", lambda self, camera, frame: float("nan"))
+    log = FakeLog(timestamps_s=tuple(100.0 + 0.5 * frame for frame in range(20)))
+    for view in ingest(CONFIG, log, 0).views:
+        assert view.timestamp_s == pytest.approx(100.0 + 0.5 * view.frame, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("times", "expected"),
+    [
+        ({12: 6.0, 13: 6.2, 15: 7.0}, [5.6, 5.8, 6.0, 6.2, 6.6, 7.0, 7.4]),
+        ({12: 6.0}, [5.8, 5.9, 6.0, 6.1, 6.2, 6.3, 6.4]),
+        ({}, [1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6]),
+    ],
+)
+def test_without_times_of_sweeps_the_line_of_the_others_goes_on(times: dict[int, float], expected: list[float]) -> None:
+    frames = range(10, 17)
+    known = np.array([times.get(frame, np.nan) for frame in frames])
+    assert _fill_times(frames, known, np.full(7, np.nan)) == pytest.approx(expected)
