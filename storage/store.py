@@ -233,7 +233,7 @@ class Store(Protocol):
         kind: str | None = None,
         key_start: str = "",
     ) -> Iterator[Artifact]:
-        """Lists artifacts in the order of their paths; what has no readable manifest is left out.
+        """Lists artifacts in the order of their paths; what has a damaged manifest is left out.
 
         Args:
             dataset: only artifacts of this dataset; ``None``, here and below, for any.
@@ -246,6 +246,10 @@ class Store(Protocol):
 
         Yields:
             The artifacts that fit.
+
+        Raises:
+            InputError: a folder must not be listed, or a manifest must not be read.
+            TransientIOError: the store does not answer.
         """
         ...
 
@@ -253,7 +257,8 @@ class Store(Protocol):
         """Checks every byte of every artifact, also of those whose manifest cannot be read.
 
         Yields:
-            (the artifact's path relative to the store, what is wrong with it or ``None``), in the order of the paths.
+            (the path relative to the store of an artifact, or of a folder that cannot be listed; what is wrong with it
+            or ``None``), in the order of the paths.
             It is damaged only where that is an ``ArtifactCorruptError``; with any other error it cannot be read now.
         """
         ...

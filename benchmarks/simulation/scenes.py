@@ -25,6 +25,7 @@ from genre_tasks.ego_paths.world_actors import list_world_actors
 from genre_tasks.logs.synthetic.edited_truth import TruthView
 from genre_tasks.logs.synthetic.log import SyntheticStreet
 from genre_tasks.logs.types import Float64, Lens
+from genre_tasks.logs.vehicle_center import find_center_ahead
 from genre_tasks.rollout.rig import RigCamera, RolloutView, estimate_rig
 from genre_tasks.rollout.rollout_scores import use_global_shutter
 from genre_tasks.scene.chunk import Chunk
@@ -120,7 +121,9 @@ class LogScenes:
         Raises:
             InputError: the log has no room for it.
         """
-        return plan_rollout(rollout, self.recorded, self.config.simulate, list_world_actors(self.chunks))
+        center_ahead_m = find_center_ahead(self.case.log)
+        actors = list_world_actors(self.chunks)
+        return plan_rollout(rollout, self.recorded, self.config.simulate, actors, center_ahead_m=center_ahead_m)
 
     @property
     def street(self) -> SyntheticStreet:

@@ -67,7 +67,7 @@ def perceive(
 
     The table has a row for every detection, with its mask where the detector gives masks. The picture shows the
     middle frame. Renders on the path are compared with the recorded images: what the detector finds there is taken for
-    the truth. Next to the path no image was recorded, and finds are counted alone.
+    the truth. Next to the path no image was recorded, and finds are counted alone; so they are with edited traffic.
 
     Example:
 

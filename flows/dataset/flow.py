@@ -56,7 +56,7 @@ def reconstruct_dataset(
         pool: the work pool of the child runs; ``None`` runs the logs in this process, one after another.
         in_flight: child runs that are submitted and have not ended, at most.
         unit: ``log`` for one child run a log, ``chunk`` for one a chunk.
-        attempts: how often a log whose run dies is submitted, at most.
+        attempts: how often a log is submitted, at most, where its run dies or meets a damaged artifact.
         gpu_limit: name of a global concurrency limit of Prefect, of which each heavy stage takes a slot, on any device.
 
     Returns:

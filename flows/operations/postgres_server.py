@@ -98,7 +98,8 @@ class PostgresServer(Service):
         words += ["--auth=scram-sha-256", "--encoding=UTF8", "--locale=C"]
         made = subprocess.run(words, capture_output=True, text=True, check=False, **options)  # type: ignore[call-overload]
         if made.returncode:
-            raise ResourceError(f"initdb failed: {made.stderr.strip()}", remedy="Free the folder.", file=unfinished)
+            remedy = "Read the message, and run it again."
+            raise ResourceError(f"initdb failed: {made.stderr.strip()}", remedy=remedy, file=unfinished)
         try:
             # Takes the place of an empty folder, and of no other.
             unfinished.rename(self.data)

@@ -15,6 +15,8 @@ from genre_tasks.errors import ConfigError
 from genre_tasks.json_files import read_json_object
 from genre_tasks.process_start import read_start_ticks
 
+# Services that no option changes, and that know nothing of the others.
+_INDEPENDENT = {"store-server", "postgres"}
 OPTIONS_FILE = "options.json"
 """Lies in the state folder and says what its services were started with."""
 
@@ -79,7 +81,9 @@ def keep_options(folder: Path, options: Mapping[str, str]) -> None:
         ConfigError: services run that were started with others.
     """
     file = folder / OPTIONS_FILE
-    if file.exists() and any(record.alive for record in read_records(folder).values()):
+    running = {name for name, record in read_records(folder).items() if record.alive}
+    # A start that failed for want of PostgreSQL may be tried again with another database: the object store serves both.
+    if file.exists() and running - _INDEPENDENT:
         remedy = "End them by `genre ops down`, or name another state folder with --folder."
         known = read_json_object(file, "options of the services", remedy, kind=ConfigError)
         for name, option in options.items():

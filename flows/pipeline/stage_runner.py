@@ -198,7 +198,7 @@ def run_stage(
         The reference of the artifact.
 
     Raises:
-        ArtifactCorruptError: an input is damaged; it is removed, so that the next run computes it again.
+        ArtifactCorruptError: an input is damaged; where its bytes are, the next run computes it again.
         ResourceError: memory or disk does not suffice.
         GenreError: any other kind, as the stage raises it.
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from flows.simulation.edited_runs import OpenedRun, open_edited_scenes
-from flows.simulation.ego_center import find_ego_center
 from flows.simulation.parked_actors import list_parked
 from flows.simulation.request import SimulationRequest
 from flows.simulation.rollout_path import CheckedPath, check_path, make_path
@@ -18,6 +17,7 @@ from genre_tasks.config import PipelineConfig
 from genre_tasks.ego_paths.recorded_path import DEFAULT_FRAME_S, join_recorded_path
 from genre_tasks.ego_paths.world_actors import list_world_actors
 from genre_tasks.errors import InputError
+from genre_tasks.logs.vehicle_center import find_center_ahead
 from genre_tasks.progress import Progress
 from genre_tasks.rollout.handover import Handover, plan_handovers
 from genre_tasks.rollout.rig import RigCamera, estimate_rig
@@ -72,7 +72,7 @@ def prepare_rollout(
     recorded = join_recorded_path(chunks)
     path = make_path(request, config.simulate, recorded)
     actors = (*list_world_actors(chunks), *list_parked(run.recorded))
-    center_ahead_m = find_ego_center(run.recorded)
+    center_ahead_m = find_center_ahead(str(run.recorded.record["log"]))
     checked = check_path(request, config.simulate, path, recorded, actors, center_ahead_m=center_ahead_m)
     # After the checks, which end most of the requests that are no good, and take no time.
     ranges = find_side_ranges(run.recorded, progress) if request.mark_range else {}

@@ -9,7 +9,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flows.simulation.edited_runs import open_run
-from flows.simulation.ego_center import find_ego_center
 from flows.simulation.parked_actors import list_parked
 from flows.simulation.run_scenes import RunScenes
 from flows.simulation.stored_ranges import SideRange, find_side_ranges
@@ -23,6 +22,7 @@ from genre_tasks.ego_paths.recorded_path import join_recorded_path
 from genre_tasks.ego_paths.reference_path import ReferencePath, fit_reference_path
 from genre_tasks.ego_paths.world_actors import WorldActor, list_world_actors
 from genre_tasks.logs.types import Float64
+from genre_tasks.logs.vehicle_center import find_center_ahead
 from genre_tasks.progress import Progress
 from genre_tasks.rollout.chunk_layout import ChunkLayout, lay_out_chunks
 
@@ -72,7 +72,7 @@ class DrivingWorld:
         moving = list_world_actors(chunks)
         opened = open_run(store, run, stage)
         self._actors: tuple[WorldActor, ...] = (*moving, *list_parked(opened.recorded))
-        self._center_ahead_m = find_ego_center(opened.recorded)
+        self._center_ahead_m = find_center_ahead(str(opened.recorded.record["log"]))
         self._reference: ReferencePath = fit_reference_path(self.recorded)
         self._layout: ChunkLayout = lay_out_chunks(scenes)
         if reliable_m is None:

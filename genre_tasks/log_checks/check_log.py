@@ -187,8 +187,12 @@ def _report_plausibility(inspector: LogInspector, chunk_frames: int) -> None:
             key = (*subject, counts[subject])
             counts[subject] += 1
             known, chunks = found.get(key, (finding, []))
-            # The first one of those that are most severe: a note in an earlier chunk must not hide a warning.
-            found[key] = (max(known, finding, key=lambda f: _SEVERITIES.index(f.severity)), [*chunks, chunk])
+            more_severe = _SEVERITIES.index(finding.severity) - _SEVERITIES.index(known.severity)
+            # The first of the most severe: a note in an earlier chunk must not hide a warning, nor share its chunks.
+            if more_severe > 0:
+                found[key] = (finding, [chunk])
+            elif more_severe == 0:
+                found[key] = (known, [*chunks, chunk])
     for finding, chunks in found.values():
         suffix = f" (chunks {format_frames(chunks)})" if log.frame_count > chunk_frames else ""
         inspector.report(replace(finding, message=finding.message + suffix))

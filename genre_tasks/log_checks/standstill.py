@@ -19,7 +19,7 @@ def measure_travel_m(positions: Float64) -> float:
         positions: [F, 3] metres, of the frames of a chunk; NaN where a pose cannot be read.
 
     Returns:
-        The largest distance from the first position; NaN for fewer than two positions, which say nothing of motion.
+        The largest distance from the first position; NaN where fewer than two of several can be read.
 
     >>> measure_travel_m(np.array([[0.0, 0, 0], [3, 4, 0], [1, 0, 0]]))
     5.0
@@ -27,7 +27,8 @@ def measure_travel_m(positions: Float64) -> float:
     nan
     """
     known = positions[np.isfinite(positions).all(axis=1)]
-    if len(known) < 2:
+    # They say nothing of motion. The last frame of a log may be a chunk of its own, and is where it is.
+    if len(known) < min(2, len(positions)):
         return math.nan
     # From the first position and not along the path: the noise of poses would add up, and turning adds no parallax.
     return float(np.linalg.norm(known - known[0], axis=1).max())

@@ -16,14 +16,10 @@ class RecordedLog:
 
     Args:
         uri: what the user wrote.
-
-    Attributes:
-        center_ahead_m: how far ahead of the vehicle's origin the middle of the car is; 0 where readers know no better.
     """
 
     # Readers know it once their tables are read.
     frame_count: int
-    center_ahead_m: float = 0.0
 
     def __init__(self, uri: str) -> None:
         self.uri = uri

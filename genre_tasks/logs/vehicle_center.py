@@ -1,35 +1,31 @@
-"""Where the middle of the recording car is: at the origin of some logs' vehicles, and ahead of that of others."""
+"""Where the middle of the recording car is: at the origin of some datasets' vehicles, and ahead of that of others."""
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
-
-from genre_tasks.logs.types import DrivingLog
-
-REAR_AXLE_TO_CENTER_M = 1.4
+_REAR_AXLE_TO_CENTER_M = 1.4
 """From the rear axle of a passenger car ahead to its middle: half of 4.8 m, less a rear overhang of one metre.
 It serves datasets whose vehicles have the origin there, and which do not document how long the car is."""
 
-
-@runtime_checkable
-class StatesVehicleCenter(Protocol):
-    """A log that says where the middle of the recording car is.
-
-    Attributes:
-        center_ahead_m: how far it is ahead of the origin of ``DrivingLog.world_SE3_lidar``.
-    """
-
-    center_ahead_m: float
+_CENTER_AHEAD_M = {
+    "argoverse2": _REAR_AXLE_TO_CENTER_M,
+    # Its car is known: see CAR_LOW_M and CAR_HIGH_M of the reader.
+    "nuscenes": 1.3,
+    "waymo": _REAR_AXLE_TO_CENTER_M,
+}
 
 
-def find_center_ahead(log: DrivingLog) -> float:
+def find_center_ahead(uri: str) -> float:
     """Finds how far ahead of the ego vehicle's origin the middle of the car is.
 
+    By the reader's name and not by the log: a scene is simulated where its log is not, and stays where it is.
+
     Args:
-        log: any log.
+        uri: of a log.
 
     Returns:
-        Metres; 0 where the log does not say it.
+        Metres; 0 for readers whose origin is the middle, and for those that do not say it.
+
+    >>> find_center_ahead("nuscenes:data/scene-0103"), find_center_ahead("pandaset:data/002")
+    (1.3, 0.0)
     """
-    # A property beyond the protocol: logs of other packages need not have it.
-    return float(log.center_ahead_m) if isinstance(log, StatesVehicleCenter) else 0.0
+    return _CENTER_AHEAD_M.get(uri.partition(":")[0], 0.0)

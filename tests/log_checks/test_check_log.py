@@ -200,7 +200,7 @@ def test_the_most_severe_finding_of_a_thing_stays_and_two_of_one_chunk_both_do(
     monkeypatch.setattr("genre_tasks.log_checks.check_log.assess_plausibility", assess)
     findings = check_log(log_of(frame_count=15, speed_mps=20.0), chunk_frames=5).findings
     assert [(finding.word, finding.severity, finding.message) for finding in findings] == [
-        ("odd_box_heading", "warning", "sideways (chunks 0–2)"),
+        ("odd_box_heading", "warning", "sideways (chunks 1)"),
         ("time_gap", "warning", "a gap (chunks 1)"),
     ]
 

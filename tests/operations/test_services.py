@@ -242,6 +242,10 @@ def test_running_services_keep_their_options(tmp_path: Path) -> None:
     expected = r"with --database sqlite, and not with --database postgres.*genre ops down"
     with pytest.raises(ConfigError, match=expected):
         Stack(tmp_path, pool="a").start()
+    # Nobody depends yet on a database whose server did not start.
+    write_records(tmp_path, {"store-server": _record(os.getpid(), ticks)})
+    keep_options(tmp_path, options | {"database": "--database postgres"})
+    keep_options(tmp_path, options)
     # Those of services that have ended bind nobody.
     write_records(tmp_path, {"worker-0": _record(os.getpid(), ticks - 1)})
     keep_options(tmp_path, options | {"pool": "--pool b"})

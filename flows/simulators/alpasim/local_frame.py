@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flows.simulation.ego_center import find_ego_center
 from flows.simulation.run_scenes import RunScenes
 from genre_tasks.ego_paths.collisions import EGO_SIZE_M
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.logs.types import Float64
+from genre_tasks.logs.vehicle_center import find_center_ahead
 from genre_tasks.scene.transforms import compose_se3, invert_se3
 from genre_tasks.scene_edits.chunk_scene import ChunkScene, SceneSource
 from genre_tasks.scene_edits.ground import Ground
@@ -91,7 +91,7 @@ def read_local_frame(source: RunScenes) -> LocalFrame:
     """
     # One chunk: the others would only be read to measure the same height again.
     survey = survey_run(_FirstChunk(source))
-    return LocalFrame.from_path(survey.path, survey.ground, find_ego_center(source))
+    return LocalFrame.from_path(survey.path, survey.ground, find_center_ahead(str(source.record["log"])))
 
 
 class _FirstChunk:

@@ -22,7 +22,6 @@ from genre_tasks.logs.nearest_images import find_nearest_images
 from genre_tasks.logs.recorded_log import RecordedLog
 from genre_tasks.logs.timed_poses import POSE_REACH_S, TimedPoses
 from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Lens, Sweep, Truth
-from genre_tasks.logs.vehicle_center import REAR_AXLE_TO_CENTER_M
 from genre_tasks.user_paths import expand_user_path
 
 _POSES = "city_SE3_egovehicle.feather"
@@ -79,8 +78,6 @@ class Argoverse2Log(RecordedLog):
     """
 
     dataset = "argoverse2"
-    # The vehicle's origin is at the rear axle, and the dataset does not document how long the car is.
-    center_ahead_m = REAR_AXLE_TO_CENTER_M
     truth: Truth | None = None
 
     def __init__(self, uri: str, folder: Path) -> None:

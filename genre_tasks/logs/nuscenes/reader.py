@@ -91,7 +91,6 @@ class NuScenesLog(RecordedLog):
     """
 
     dataset = "nuscenes"
-    center_ahead_m = (CAR_LOW_M[0] + CAR_HIGH_M[0]) / 2
     truth: Truth | None = None
 
     def __init__(self, uri: str, address: SceneAddress, rows: SceneRows) -> None:

@@ -16,7 +16,6 @@ from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.labelled_boxes import MAX_BOXES, LabelledBox
 from genre_tasks.logs.recorded_log import RecordedLog
 from genre_tasks.logs.types import Camera, CuboidTrack, Float32, Float64, Sweep, Truth
-from genre_tasks.logs.vehicle_center import REAR_AXLE_TO_CENTER_M
 from genre_tasks.logs.waymo.camera_rows import name_sensors, read_cameras
 from genre_tasks.logs.waymo.component_tables import ComponentTable
 from genre_tasks.logs.waymo.range_images import LidarCalibration, compute_points
@@ -69,8 +68,6 @@ class WaymoLog(RecordedLog):
     """
 
     dataset = "waymo"
-    # The vehicle's origin is at the rear axle, and the dataset does not document how long the car is.
-    center_ahead_m = REAR_AXLE_TO_CENTER_M
     truth: Truth | None = None
 
     def __init__(self, uri: str, segment: str, files: dict[str, Path]) -> None:

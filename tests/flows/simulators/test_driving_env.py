@@ -13,8 +13,6 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from flows.simulation import stored_ranges
-from flows.simulation.ego_center import find_ego_center
-from flows.simulation.run_scenes import RunScenes
 from flows.simulation.stored_ranges import SideRange
 from flows.simulators import driving_world
 from flows.simulators.driving_env import ENVIRONMENT_ID, GenreDrivingEnv, RewardWeights, StartRange
@@ -22,7 +20,7 @@ from flows.simulators.scene_renderer import SceneRenderer
 from genre_tasks.ego_paths.bicycle import BicycleModel
 from genre_tasks.ego_paths.world_actors import WorldActor
 from genre_tasks.errors import ConfigError, InputError
-from genre_tasks.logs.synthetic.log import SyntheticStreet
+from genre_tasks.logs import vehicle_center
 
 STRAIGHT_ON = np.zeros(2, np.float32)
 
@@ -147,9 +145,8 @@ def test_a_bonnet_ahead_of_the_pose_collides_earlier(
 
 
 def test_the_middle_of_the_car_is_the_logs(served: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(SyntheticStreet, "center_ahead_m", 1.3, raising=False)
+    monkeypatch.setitem(vehicle_center._CENTER_AHEAD_M, "synthetic", 1.3)
     assert GenreDrivingEnv(*served, reliable_m=3.0)._world._center_ahead_m == 1.3
-    assert find_ego_center(RunScenes(*served)) == 1.3
 
 
 @pytest.mark.parametrize(("frame_s", "fps"), [(0.5, 2), (3.0, 1)])

@@ -253,7 +253,7 @@ def test_nobody_renders_for_a_client_that_has_gone(
             wait_until(lambda: renderer.queue_length == 2, "the second request does not come")
             hasty.close()
             # The server hears of it a moment later.
-            time.sleep(0.3)
+            time.sleep(1.5)
         finally:
             release.set()
         assert first.result(60)[0] == 200

@@ -21,7 +21,7 @@ from flows.simulators.alpasim.local_frame import REAR_AXLE_M, describe_ego_box, 
 from flows.simulators.alpasim.wire_poses import read_pose
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.exchange.scene_folder import find_changes, read_document, read_scene_folder
-from genre_tasks.logs.synthetic.log import SyntheticStreet
+from genre_tasks.logs import vehicle_center
 from tests.flows.simulators.alpasim.wire_client import ServedRun, WireClient
 
 
@@ -45,7 +45,7 @@ def test_the_rear_axle_is_behind_the_middle_that_the_log_states(
     served: ServedRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert served.frame.ego_SE3_rig[0, 3] == -REAR_AXLE_M
-    monkeypatch.setattr(SyntheticStreet, "center_ahead_m", 1.3, raising=False)
+    monkeypatch.setitem(vehicle_center._CENTER_AHEAD_M, "synthetic", 1.3)
     frame = read_local_frame(served.renderer.scenes)
     assert frame.ego_SE3_rig[0, 3] == pytest.approx(1.3 - REAR_AXLE_M)
     # The box's middle is where the log says.

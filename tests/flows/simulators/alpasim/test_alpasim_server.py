@@ -142,7 +142,7 @@ def test_nobody_renders_for_a_client_that_has_gone(served: ServedRun, monkeypatc
                 wait_until(lambda: renderer.queue_length == 2, "the second call does not come")
                 call.cancel()
             # The server hears of it a moment later.
-            time.sleep(0.3)
+            time.sleep(1.5)
             release.set()
             assert first.result(60)[0] == "OK"
             wait_until(lambda: renderer.queue_length == 0, "the second call does not end")
