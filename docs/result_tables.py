@@ -254,12 +254,14 @@ def budget_runs() -> str:
     """Every budget that was tried: seconds used, and what was made of them."""
     lines = []
     for row in result("evaluation")["rows"]:
-        if "budget_s" in row:
+        if "multiple" in row:
+            multiple = f"{row['multiple']:g}"
             used = f"{row['used_s']:.1f}"
             ratio = f"{row['used_s'] / row['budget_s']:.2f}"
             made = ", ".join(row["settings"]) or "the preset"
-            lines.append([short_log(row), f"{row['budget_s']:.0f}", used, ratio, made, row["end"]])
-    return table(["log", "budget, s", "used, s", "used over budget", "settings", "last stage"], lines)
+            lines.append([short_log(row), multiple, f"{row['budget_s']:.0f}", used, ratio, made, row["end"]])
+    head = ["log", "budget over shortest run", "budget, s", "used, s", "used over budget", "settings", "last stage"]
+    return table(head, lines)
 
 
 LOG_TABLES = (

@@ -11,8 +11,8 @@ import pytest
 
 from benchmarks.common.bench import NotMeasuredError
 from benchmarks.common.claims import Claim
-from benchmarks.evaluation import EVALUATION
-from benchmarks.evaluation.budgets import budget_claims, budget_table, run_with_budget
+from benchmarks.evaluation import EVALUATION, budgets
+from benchmarks.evaluation.budgets import budget_claims, budget_table, measure_shortest_run, run_with_multiple
 from benchmarks.evaluation.range_seconds import range_seconds_claims, range_seconds_table
 from benchmarks.evaluation.reliability import fit_estimate, reliability_claims, reliability_table, true_reach_m
 from flows.budget.cost_table import find_shipped_table, load_cost_table
@@ -25,6 +25,8 @@ def run(budget_s: float, used_s: float, distance: float, log: str = "a", point: 
     return {
         "log": log,
         "budget_s": budget_s,
+        "multiple": budget_s / 10,
+        "shortest_s": 10.0,
         "used_s": used_s,
         "settings": [],
         "end": own.end,
@@ -135,9 +137,13 @@ def test_the_estimate_can_be_fitted_again() -> None:
 
 
 def test_rounds_bring_every_budget_to_every_seed() -> None:
-    options = dict(EVALUATION.options) | {"budgets": "30,60,90", "seeds": "1,2,3", "stages": "gnet"}
+    options = dict(EVALUATION.options) | {"budgets": "1.2,1.5,2", "seeds": "1,2,3", "stages": "gnet"}
     names = [c.name for c in EVALUATION.cells(options | {"rounds": "1"}, quick=False)]
-    assert names[3:-2] == ["budget 30 s street 1", "budget 60 s street 2", "budget 90 s street 3"]
+    assert names[3:-2] == [
+        "budget 1.2 x shortest street 1",
+        "budget 1.5 x shortest street 2",
+        "budget 2 x shortest street 3",
+    ]
     assert names[-2:] == ["range street 1 gnet", "range real chunk 0 gnet"]
     all_ = [c.name for c in EVALUATION.cells(options | {"range_log": ""}, quick=False)][3:-1]
     assert len(set(all_)) == len(all_) == 9
@@ -148,9 +154,26 @@ def test_a_run_that_fails_says_what_the_command_said(tmp_path: Path, monkeypatch
     monkeypatch.chdir(tmp_path)
     (tmp_path / ".genre" / "prefect-budgets").mkdir(parents=True)  # else a whole run would make it
     with pytest.raises(NotMeasuredError, match=r"there is no table.*nothing\.parquet"):
-        run_with_budget("900", 60.0, str(tmp_path / "nothing.parquet"))
+        run_with_multiple("900", 1.2, str(tmp_path / "nothing.parquet"))
+
+
+def test_a_budget_is_a_multiple_of_the_shortest_run_which_a_street_has_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def pretend(seed: str, budget_s: float, table: str, settings: tuple[str, ...] = ()) -> Any:
+        asked.append((seed, budget_s))
+        return run(budget_s, 20.04 if budget_s == budgets.SHORTEST_BUDGET_S else 0.9 * budget_s, 0.5)
+
+    monkeypatch.setattr(budgets, "run_with_budget", pretend)
+    measure_shortest_run.cache_clear()
+    try:
+        rows = [run_with_multiple("7", m, "") for m in (1.5, 2.0)]
+    finally:
+        measure_shortest_run.cache_clear()
+    assert asked == [("7", 1.0), ("7", 30.1), ("7", 40.1)]
+    assert [(r["multiple"], r["shortest_s"]) for r in rows] == [(1.5, 20.04), (2.0, 20.04)]
 
 
 def test_the_table_names_what_was_chosen() -> None:
     lines = list(budget_table([run(20, 19, 0.65)]))
-    assert "| 20 | " in lines[2] and "the preset" in lines[2] and "0.95" in lines[-1]
+    assert "| 2 | 20 | " in lines[2] and "the preset" in lines[2] and "0.95" in lines[-1]

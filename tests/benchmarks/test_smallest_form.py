@@ -58,6 +58,6 @@ def test_the_smallest_forms_name_options_that_there_are() -> None:
 @pytest.mark.slow
 def test_a_budget_is_run_as_a_user_starts_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    options = ["--only", "budget", "--set", f"seeds={TINY_STREET}", "--set", "budgets=60"]
+    options = ["--only", "budget", "--set", f"seeds={TINY_STREET}", "--set", "budgets=1.5"]
     (row,) = [row for row in _run("evaluation", ["--quick", *options]).rows if "not_measured" not in row]
-    assert row["used_s"] > 0 and row["choices"], row
+    assert row["used_s"] > 0 and row["budget_s"] > row["shortest_s"] > 0 and row["choices"], row
