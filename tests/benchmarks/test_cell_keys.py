@@ -46,12 +46,12 @@ def test_a_false_alarm_is_in_the_table() -> None:
 
 def test_budgets_depend_on_the_content_of_their_table(tmp_path: Path) -> None:
     table = tmp_path / "cost.parquet"
-    options = dict(EVALUATION.options) | {"seeds": "1", "budgets": "60", "table": str(table)}
+    options = dict(EVALUATION.options) | {"seeds": "1", "budgets": "1.5", "table": str(table)}
 
     def digests() -> Any:
         cells = {cell.name: cell.parameters for cell in EVALUATION.cells(options, False)}
         assert "table" not in cells["guards street 1 gnet"]
-        return cells["budget 60 s street 1"]["table"]
+        return cells["budget 1.5 x shortest street 1"]["table"]
 
     found = [digests()]
     for content in (b"first", b"second"):

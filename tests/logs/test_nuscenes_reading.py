@@ -11,11 +11,11 @@ import pytest
 
 from flows.pipeline.log_cache import expand_logs
 from genre_tasks.errors import ConfigError, InputError
-from genre_tasks.lidar_simulation.rollout_lidar import LidarSimulator
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.types import Camera, Lens, Sweep
 from tests.fakes import FakeCar, FakeLog
 from tests.logs.nuscenes_folder import LIDAR_MOUNT, START_US, VERSION, change_table, token, write_nuscenes
+from tests.logs.stated_sensor import check_stated_sensor
 
 FAKE = FakeLog(frame_count=6, camera_names=("front", "left"), lidar_azimuths=60, lidar_rings=8, ego_yaw_rad=0.4)
 REAL = Path(__file__).resolve().parents[3] / "shared/data/nuscenes_frame"
@@ -46,13 +46,7 @@ def test_a_written_scene_comes_back(tmp_path: Path) -> None:
 
 
 def test_a_sweep_says_where_its_lidar_is(tmp_path: Path) -> None:
-    """All points have one time, so that nothing else tells it."""
-    log = open_log(f"nuscenes:{write_nuscenes(FAKE, tmp_path)}")
-    for frame in range(FAKE.frame_count):
-        expected = (FAKE.world_SE3_lidar(frame) @ LIDAR_MOUNT)[:3, 3]
-        np.testing.assert_allclose(log.sweep(frame).sensor_world, expected, atol=1e-9)
-    position_m = LidarSimulator(log).sensor.position_m
-    np.testing.assert_allclose(position_m, LIDAR_MOUNT[:3, 3], atol=1e-9)
+    check_stated_sensor(open_log(f"nuscenes:{write_nuscenes(FAKE, tmp_path)}"), FAKE, LIDAR_MOUNT)
 
 
 def test_rates(tmp_path: Path) -> None:

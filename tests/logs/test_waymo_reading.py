@@ -13,12 +13,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from flows.pipeline.log_cache import expand_logs
-from genre_tasks.lidar_simulation.rollout_lidar import LidarSimulator
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.types import Camera
 from genre_tasks.logs.waymo.component_tables import ComponentTable
 from genre_tasks.logs.waymo.range_images import LidarCalibration, compute_points
 from tests.fakes import FakeCar, FakeLog
+from tests.logs.stated_sensor import check_stated_sensor
 from tests.logs.waymo_folder import (
     LIDAR_MOUNT,
     NAMES,
@@ -58,13 +58,7 @@ def test_a_written_segment_comes_back(tmp_path: Path) -> None:
 
 
 def test_a_sweep_says_where_its_lidar_is(tmp_path: Path) -> None:
-    """All points have one time, so that nothing else tells it."""
-    log = open_log(f"waymo:{write_waymo(FAKE, tmp_path)}")
-    for frame in range(FAKE.frame_count):
-        expected = (FAKE.world_SE3_lidar(frame) @ LIDAR_MOUNT)[:3, 3]
-        np.testing.assert_allclose(log.sweep(frame).sensor_world, expected, atol=1e-9)
-    position_m = LidarSimulator(log).sensor.position_m
-    np.testing.assert_allclose(position_m, LIDAR_MOUNT[:3, 3], atol=1e-9)
+    check_stated_sensor(open_log(f"waymo:{write_waymo(FAKE, tmp_path)}"), FAKE, LIDAR_MOUNT)
 
 
 @pytest.mark.parametrize("uneven", [True, False])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import http.client
 import io
 import json
-import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -40,6 +39,7 @@ from flows.simulators.scene_renderer import SceneRenderer
 from flows.simulators.service import RunningService, ServiceRequest
 from flows.simulators.service_metrics import SilentMetrics
 from genre_tasks.errors import ConfigError, ResourceError
+from tests.flows.simulators.held_renders import hold_renders
 from tests.waiting import wait_until
 
 CAMERA = "front_camera"
@@ -232,16 +232,7 @@ def test_a_busy_renderer_says_so(
 def test_nobody_renders_for_a_client_that_has_gone(
     service: RunningService, renderer: SceneRenderer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    release = threading.Event()
-    rendered = []
-    render = renderer._render
-
-    def wait_and_render(requests: Any) -> Any:
-        rendered.append(len(requests))
-        release.wait(60)
-        return render(requests)
-
-    monkeypatch.setattr(renderer, "_render", wait_and_render)
+    held = hold_renders(renderer, monkeypatch)
     message = image_message(renderer, 2)
     place = urlsplit(service.address)
     with ThreadPoolExecutor(1) as pool:
@@ -255,10 +246,10 @@ def test_nobody_renders_for_a_client_that_has_gone(
             # The server hears of it a moment later.
             time.sleep(1.5)
         finally:
-            release.set()
+            held.release.set()
         assert first.result(60)[0] == 200
     wait_until(lambda: renderer.queue_length == 0, "the second request does not end")
-    assert rendered == [1]
+    assert held.rendered == [1]
 
 
 def test_one_service_has_one_run(renderer: SceneRenderer, service: RunningService) -> None:

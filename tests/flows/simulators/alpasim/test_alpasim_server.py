@@ -22,6 +22,7 @@ from flows.simulators.scene_renderer import SceneRenderer
 from flows.simulators.service import ServiceRequest
 from genre_tasks.errors import ConfigError, ResourceError
 from tests.flows.simulators.alpasim.wire_client import ServedRun, WireClient
+from tests.flows.simulators.held_renders import hold_renders
 from tests.waiting import wait_until
 
 
@@ -121,16 +122,7 @@ def test_as_many_calls_wait_as_the_queue_takes(served: ServedRun, monkeypatch: p
 
 def test_nobody_renders_for_a_client_that_has_gone(served: ServedRun, monkeypatch: pytest.MonkeyPatch) -> None:
     renderer = SceneRenderer(served.store, served.run)
-    release = threading.Event()
-    rendered = []
-    render = renderer._render
-
-    def wait_and_render(requests: Any) -> Any:
-        rendered.append(len(requests))
-        release.wait(60)
-        return render(requests)
-
-    monkeypatch.setattr(renderer, "_render", wait_and_render)
+    held = hold_renders(renderer, monkeypatch)
     service = start_alpasim(ServiceRequest({renderer.name: renderer}, "127.0.0.1", 0, CountingMetrics()))
     try:
         with WireClient(service.address) as patient, ThreadPoolExecutor(1) as pool:
@@ -143,12 +135,12 @@ def test_nobody_renders_for_a_client_that_has_gone(served: ServedRun, monkeypatc
                 call.cancel()
             # The server hears of it a moment later.
             time.sleep(1.5)
-            release.set()
+            held.release.set()
             assert first.result(60)[0] == "OK"
             wait_until(lambda: renderer.queue_length == 0, "the second call does not end")
-        assert rendered == [1]
+        assert held.rendered == [1]
     finally:
-        release.set()
+        held.release.set()
         service.close()
 
 
