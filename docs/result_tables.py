@@ -258,9 +258,9 @@ def budget_runs() -> str:
             multiple = f"{row['multiple']:g}"
             used = f"{row['used_s']:.1f}"
             ratio = f"{row['used_s'] / row['budget_s']:.2f}"
-            made = ", ".join(row["settings"]) or "the preset"
-            lines.append([short_log(row), multiple, f"{row['budget_s']:.0f}", used, ratio, made, row["end"]])
-    head = ["log", "budget over shortest run", "budget, s", "used, s", "used over budget", "settings", "last stage"]
+            chosen = row["choices"][-1]["point"].replace("_", " ")
+            lines.append([short_log(row), multiple, f"{row['budget_s']:.0f}", used, ratio, chosen, row["end"]])
+    head = ["log", "budget over shortest run", "budget, s", "used, s", "used over budget", "setting", "last stage"]
     return table(head, lines)
 
 
