@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-_REAR_AXLE_TO_CENTER_M = 1.4
+REAR_AXLE_TO_CENTER_M = 1.4
 """From the rear axle of a passenger car ahead to its middle: half of 4.8 m, less a rear overhang of one metre.
-It serves datasets whose vehicles have the origin there, and which do not document how long the car is."""
+It serves datasets whose vehicles have the origin there without saying how long the car is, and simulators whose rig is
+there."""
 
 _CENTER_AHEAD_M = {
-    "argoverse2": _REAR_AXLE_TO_CENTER_M,
+    "argoverse2": REAR_AXLE_TO_CENTER_M,
     # Its car is known: see CAR_LOW_M and CAR_HIGH_M of the reader.
     "nuscenes": 1.3,
-    "waymo": _REAR_AXLE_TO_CENTER_M,
+    "waymo": REAR_AXLE_TO_CENTER_M,
 }
 
 

@@ -11,15 +11,11 @@ from flows.simulation.run_scenes import RunScenes
 from genre_tasks.ego_paths.collisions import EGO_SIZE_M
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.logs.types import Float64
-from genre_tasks.logs.vehicle_center import find_center_ahead
+from genre_tasks.logs.vehicle_center import REAR_AXLE_TO_CENTER_M, find_center_ahead
 from genre_tasks.scene.transforms import compose_se3, invert_se3
 from genre_tasks.scene_edits.chunk_scene import ChunkScene, SceneSource
 from genre_tasks.scene_edits.ground import Ground
 from genre_tasks.scene_edits.run_survey import survey_run
-
-REAR_AXLE_M = 1.4
-"""How far behind the middle of the vehicle the rear axle is taken to be: half the wheelbase of a car as long as
-``EGO_SIZE_M``."""
 
 _SAMPLES = 20
 
@@ -56,7 +52,7 @@ class LocalFrame:
         positions = path.world_SE3_ego[rows, :3, 3]
         # The median: the ground is measured worse where LiDAR saw little of it.
         height = float(np.median(positions[:, 2] - ground.measure(positions[:, :2])[0]))
-        ego_SE3_rig = compose_se3(np.eye(3), np.array([center_ahead_m - REAR_AXLE_M, 0.0, -height]))
+        ego_SE3_rig = compose_se3(np.eye(3), np.array([center_ahead_m - REAR_AXLE_TO_CENTER_M, 0.0, -height]))
         origin = (path.world_SE3_ego[0] @ ego_SE3_rig)[:3, 3]
         return LocalFrame(compose_se3(np.eye(3), origin), ego_SE3_rig)
 
@@ -118,7 +114,7 @@ def describe_ego_box() -> dict[str, list[float]]:
     [0.0, 0.0, 0.0]
     """
     return {
-        "centroid": [REAR_AXLE_M, 0.0, EGO_SIZE_M[2] / 2],
+        "centroid": [REAR_AXLE_TO_CENTER_M, 0.0, EGO_SIZE_M[2] / 2],
         "dim": list(EGO_SIZE_M),
         "rot": [0.0, 0.0, 0.0],
     }

@@ -17,11 +17,12 @@ from scipy.spatial.transform import Rotation
 from flows.exchange.export_request import ExportRequest
 from flows.exchange.export_scenes import export_scenes
 from flows.simulators.alpasim.bundle import write_alpasim_bundle
-from flows.simulators.alpasim.local_frame import REAR_AXLE_M, describe_ego_box, read_local_frame
+from flows.simulators.alpasim.local_frame import describe_ego_box, read_local_frame
 from flows.simulators.alpasim.wire_poses import read_pose
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.exchange.scene_folder import find_changes, read_document, read_scene_folder
 from genre_tasks.logs import vehicle_center
+from genre_tasks.logs.vehicle_center import REAR_AXLE_TO_CENTER_M
 from tests.flows.simulators.alpasim.wire_client import ServedRun, WireClient
 
 
@@ -44,10 +45,10 @@ def load(bundle: Path, name: str) -> Any:
 def test_the_rear_axle_is_behind_the_middle_that_the_log_states(
     served: ServedRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert served.frame.ego_SE3_rig[0, 3] == -REAR_AXLE_M
+    assert served.frame.ego_SE3_rig[0, 3] == -REAR_AXLE_TO_CENTER_M
     monkeypatch.setitem(vehicle_center._CENTER_AHEAD_M, "synthetic", 1.3)
     frame = read_local_frame(served.renderer.scenes)
-    assert frame.ego_SE3_rig[0, 3] == pytest.approx(1.3 - REAR_AXLE_M)
+    assert frame.ego_SE3_rig[0, 3] == pytest.approx(1.3 - REAR_AXLE_TO_CENTER_M)
     # The box's middle is where the log says.
     assert (frame.ego_SE3_rig @ [*describe_ego_box()["centroid"], 1.0])[0] == pytest.approx(1.3)
 
