@@ -121,9 +121,10 @@ class LogScenes:
         Raises:
             InputError: the log has no room for it.
         """
-        center_ahead_m = find_center_ahead(self.case.log)
+        config = self.config.simulate
+        center_ahead_m = find_center_ahead(self.case.log, config.center_ahead_m)
         actors = list_world_actors(self.chunks)
-        return plan_rollout(rollout, self.recorded, self.config.simulate, actors, center_ahead_m=center_ahead_m)
+        return plan_rollout(rollout, self.recorded, config, actors, center_ahead_m=center_ahead_m)
 
     @property
     def street(self) -> SyntheticStreet:

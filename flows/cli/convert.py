@@ -32,6 +32,7 @@ def convert(log: LogArgument, target: TargetArgument, as_json: JsonOption = Fals
     from genre_tasks.logs.genre_layout.writer import write_genre_layout
     from genre_tasks.logs.pandaset.writer import write_pandaset
     from genre_tasks.logs.registry import open_log
+    from genre_tasks.logs.vehicle_center import find_center_ahead
     from genre_tasks.user_paths import expand_user_path
 
     add_facts(log=log, target=target)
@@ -56,3 +57,8 @@ def convert(log: LogArgument, target: TargetArgument, as_json: JsonOption = Fals
         return
     counts = f"{record['frames']} frames, {record['cameras']} cameras, {record['tracks']} objects with boxes"
     typer.echo(f"wrote {record['written']}: {counts}")
+    if center_ahead_m := find_center_ahead(log):
+        typer.echo(
+            f"The middle of the car is {center_ahead_m:g} m ahead of the vehicle's origin, and the copy does not say "
+            f"so. Run it with --set simulate.center_ahead_m={center_ahead_m:g}."
+        )

@@ -27,6 +27,7 @@ from prefect.client.schemas.responses import DeploymentResponse
 from prefect.exceptions import ObjectNotFound
 from prefect.states import Crashed
 
+from flows.dataset.event_probe import EventProbe
 from flows.dataset.live_table import TABLE_KEY
 from flows.dataset.prefect_runs import DEPLOYMENT, count_heartbeats, dataset_tag, has_heartbeat, is_called_silent
 from flows.dataset.server_calls import call_server, read_last_outage
@@ -41,6 +42,8 @@ PARENT_TAG = "genre-dataset-parent"
 """Tag of the flow runs of parents; their child runs do not have it."""
 _SILENT_S = 3.0 * HEARTBEAT_S
 _HEARTBEAT_POLL_S = 5.0
+# A server that stores no events at all would keep a dead parent for ever.
+_MOST_DELAY_S = 900.0
 _ACTIVE = [StateType.SCHEDULED, StateType.PENDING, StateType.RUNNING, StateType.PAUSED]
 
 
@@ -193,7 +196,8 @@ def crash_run(client: SyncPrefectClient, run_id: UUID) -> None:
 class HeartbeatWatch:
     """Watches by this process's clock whether a running parent sends heartbeats.
 
-    Heartbeats are lost while the server is away, so that time does not count.
+    Heartbeats are lost while the server is away, so that time does not count. Nor does the time in which the server has
+    received heartbeats and not stored them yet.
 
     Args:
         client: of the server.
@@ -209,6 +213,8 @@ class HeartbeatWatch:
         self._began = datetime.now(UTC)
         self._since_s = clock()
         self._next_s = self._since_s
+        self._probe: EventProbe | None = None
+        self._probe_s = 0.0
 
     def restart(self) -> None:
         """Counts the time without a heartbeat from now on."""
@@ -221,11 +227,23 @@ class HeartbeatWatch:
         if now_s < self._next_s:
             return False
         self._next_s = now_s + _HEARTBEAT_POLL_S
+        # Asked before the heartbeats are counted: of those that came before the probe none is missed.
+        is_caught_up = self._is_caught_up(now_s)
         count = count_heartbeats(self._client, self._run_id, self._began)
         if count != self._count:
             self._count = count
             self._since_s = now_s
-        return now_s - self._since_s > _SILENT_S
+        return is_caught_up and now_s - self._since_s > _SILENT_S
+
+    def _is_caught_up(self, now_s: float) -> bool:
+        """Says whether the server has stored what it had received when the parent was first found silent."""
+        if now_s - self._since_s <= _SILENT_S:
+            self._probe = None
+            return False
+        if self._probe is None:
+            self._probe = EventProbe(self._client)
+            self._probe_s = now_s
+        return self._probe.is_stored() or now_s - self._probe_s > _MOST_DELAY_S
 
     def waits_for_life(self, sleep: Callable[[float], None] = time.sleep) -> bool:
         """Waits for a heartbeat; returns False if none comes for three periods."""

@@ -169,8 +169,9 @@ class LogMeasurement:
 
     def plan(self, rollout: TableRollout) -> PlannedRollout:
         """Plans a rollout on this log, see :func:`flows.paper_tables.rollouts.plan_rollout`."""
-        center_ahead_m = find_center_ahead(self._log.uri)
-        return plan_rollout(rollout, self.recorded, self._config.simulate, self._actors, center_ahead_m=center_ahead_m)
+        config = self._config.simulate
+        center_ahead_m = find_center_ahead(self._log.uri, config.center_ahead_m)
+        return plan_rollout(rollout, self.recorded, config, self._actors, center_ahead_m=center_ahead_m)
 
     def is_stored(self, rollout: TableRollout, true_views: int = TRUE_VIEWS) -> bool:
         """Says whether a rollout was measured before.

@@ -72,7 +72,7 @@ def prepare_rollout(
     recorded = join_recorded_path(chunks)
     path = make_path(request, config.simulate, recorded)
     actors = (*list_world_actors(chunks), *list_parked(run.recorded))
-    center_ahead_m = find_center_ahead(str(run.recorded.record["log"]))
+    center_ahead_m = find_center_ahead(str(run.recorded.record["log"]), config.simulate.center_ahead_m)
     checked = check_path(request, config.simulate, path, recorded, actors, center_ahead_m=center_ahead_m)
     # After the checks, which end most of the requests that are no good, and take no time.
     ranges = find_side_ranges(run.recorded, progress) if request.mark_range else {}

@@ -72,7 +72,7 @@ class DrivingWorld:
         moving = list_world_actors(chunks)
         opened = open_run(store, run, stage)
         self._actors: tuple[WorldActor, ...] = (*moving, *list_parked(opened.recorded))
-        self._center_ahead_m = find_center_ahead(str(opened.recorded.record["log"]))
+        self._center_ahead_m = find_center_ahead(str(opened.recorded.record["log"]), self.config.center_ahead_m)
         self._reference: ReferencePath = fit_reference_path(self.recorded)
         self._layout: ChunkLayout = lay_out_chunks(scenes)
         if reliable_m is None:

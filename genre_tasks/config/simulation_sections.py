@@ -41,6 +41,13 @@ class SimulateConfig(Section):
     accelerating_m_s2: float = Field(
         2.5, gt=0, le=100, description="Acceleration of the behaviour accelerate at strength 1."
     )
+    center_ahead_m: float | None = Field(
+        None,
+        ge=-10,
+        le=10,
+        description="Metres from the origin of the log's vehicle ahead to the middle of the car; null: as the log's "
+        "dataset has it, and 0 for logs of your own.",
+    )
     collision_margin_m: float = Field(
         0.0, ge=0, le=10, description="Boxes that come nearer than this count as overlapping, metres."
     )

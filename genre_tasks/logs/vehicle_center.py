@@ -15,18 +15,19 @@ _CENTER_AHEAD_M = {
 }
 
 
-def find_center_ahead(uri: str) -> float:
+def find_center_ahead(uri: str, stated_m: float | None = None) -> float:
     """Finds how far ahead of the ego vehicle's origin the middle of the car is.
 
     By the reader's name and not by the log: a scene is simulated where its log is not, and stays where it is.
 
     Args:
         uri: of a log.
+        stated_m: what the setting ``simulate.center_ahead_m`` says; ``None``: nothing.
 
     Returns:
-        Metres; 0 for readers whose origin is the middle, and for those that do not say it.
+        Metres, as stated. Otherwise 0 for readers whose origin is the middle, and for those that do not say it.
 
     >>> find_center_ahead("nuscenes:data/scene-0103"), find_center_ahead("pandaset:data/002")
     (1.3, 0.0)
     """
-    return _CENTER_AHEAD_M.get(uri.partition(":")[0], 0.0)
+    return _CENTER_AHEAD_M.get(uri.partition(":")[0], 0.0) if stated_m is None else stated_m

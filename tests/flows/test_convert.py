@@ -40,6 +40,13 @@ def test_a_layout_that_cannot_be_written(uri: str, target: str) -> None:
         CliRunner().invoke(app, ["convert", uri, target], catch_exceptions=False)
 
 
+def test_a_copy_says_how_its_middle_is_stated(tmp_path: Path) -> None:
+    fake = FakeLog(frame_count=3, camera_names=("front",), lidar_azimuths=60, lidar_rings=8)
+    uri = f"nuscenes:{write_nuscenes(fake, tmp_path / 'data')}"
+    done = CliRunner().invoke(app, ["convert", uri, f"genre:{tmp_path / 'out'}"], catch_exceptions=False)
+    assert "--set simulate.center_ahead_m=1.3" in done.stdout
+
+
 def test_a_folder_that_holds_something(uri: str, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out/notes.txt").write_text("mine")
@@ -72,4 +79,6 @@ def test_other_layouts_are_the_same_log_afterwards(layout: str, tmp_path: Path) 
         if expected is not None and sweep is not None:
             np.testing.assert_array_equal(sweep.points_world, expected.points_world)
             np.testing.assert_array_equal(sweep.intensity, expected.intensity)
+            assert expected.sensor_world is not None and sweep.sensor_world is not None
+            np.testing.assert_array_equal(sweep.sensor_world, expected.sensor_world)
     assert {track.track_id: track.label for track in found.tracks()} == {t.track_id: t.label for t in source.tracks()}

@@ -158,6 +158,7 @@ BROKEN = {
     "no camera pose": (lambda v: v["frames"][0]["images"]["left"].pop("pose"), "pose of left in frame 0"),
     "an image elsewhere": (lambda v: v["frames"][0]["images"]["left"].update(file="../../x.png"), "leads out"),
     "an image that is not there": (lambda v: v["frames"][0]["images"]["left"].update(file="x.png"), "lacks a file"),
+    "a position of two numbers": (lambda v: v["frames"][0].update(lidar_position=[1, 2]), "lidar_position of frame 0"),
     "a sweep that is not there": (lambda v: v["frames"][0].update(sweep="lidar/x.npz"), "no such sweep"),
     "a sweep of another format": (lambda v: v["frames"][0].update(sweep="log.json"), "no .json files"),
 }

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flows.simulation.run_scenes import RunScenes
+from genre_tasks.config import PipelineConfig
 from genre_tasks.ego_paths.collisions import EGO_SIZE_M
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.logs.types import Float64
@@ -87,7 +88,8 @@ def read_local_frame(source: RunScenes) -> LocalFrame:
     """
     # One chunk: the others would only be read to measure the same height again.
     survey = survey_run(_FirstChunk(source))
-    return LocalFrame.from_path(survey.path, survey.ground, find_center_ahead(str(source.record["log"])))
+    stated_m = PipelineConfig.model_validate(source.record["config"]).simulate.center_ahead_m
+    return LocalFrame.from_path(survey.path, survey.ground, find_center_ahead(str(source.record["log"]), stated_m))
 
 
 class _FirstChunk:

@@ -5,9 +5,11 @@
     {"format": "genre-log", "version": 1,
      "cameras": {"front": {"fx_px": …, "fy_px": …, "cx_px": …, "cy_px": …, "width_px": …, "height_px": …}},
      "frames": [{"time_s": …, "lidar_pose": POSE, "sweep": "lidar/000000.npz",
+                 "lidar_position": [X, Y, Z],
                  "images": {"front": {"file": "images/front/000000.jpg", "pose": POSE, "time_s": …}}}]}
 
-POSE is a 4×4 matrix, row by row, that takes the sensor's axes to the world's.
+POSE is a 4×4 matrix, row by row, that takes the sensor's axes to the world's. The position is needed where the pose is
+not the LiDAR's own.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ BOXES_FILE = "boxes.parquet"
 LENS_KEYS = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
 LOG_KEYS = ("format", "version", "cameras", "frames")
 CAMERA_KEYS = (*LENS_KEYS, "distortion", "readout_s", "exposure_s")
-FRAME_KEYS = ("time_s", "lidar_pose", "sweep", "images")
+FRAME_KEYS = ("time_s", "lidar_pose", "lidar_position", "sweep", "images")
 IMAGE_KEYS = ("file", "pose", "time_s")
 POINT_COLUMNS = ("x", "y", "z", "intensity", "time_s")
 BOX_COLUMNS = (
@@ -87,13 +89,41 @@ def parse_pose(value: object, what: str) -> Float64:
     error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
     if not (matrix[3] == [0, 0, 0, 1]).all() or error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
         raise EntryError(f"{what} is no rotation with a position: its last row must be 0, 0, 0, 1")
-    if np.abs(matrix[:3, 3]).max() > _MAX_POSITION_M:
-        raise EntryError(f"the position of {what} is beyond the Earth")
+    parse_position(matrix[:3, 3], f"the position of {what}")
     # Files of others are rounded to a few digits; what this project wrote is left as it is.
     if error > 1e-9:
         u, _, v = np.linalg.svd(rotation)
         matrix[:3, :3] = u @ v
     return matrix
+
+
+def parse_position(value: object, what: str) -> Float64 | None:
+    """Reads a position.
+
+    Args:
+        value: three numbers in metres; ``None`` where nothing is stated.
+        what: it is, for the error.
+
+    Returns:
+        [3] float64, or ``None``.
+
+    Raises:
+        EntryError: it is no list of three finite numbers near the Earth.
+
+    >>> parse_position([1, 2, 3], "x").tolist()
+    [1.0, 2.0, 3.0]
+    """
+    if value is None:
+        return None
+    try:
+        position = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        position = np.zeros(0)
+    if position.shape != (3,) or not np.isfinite(position).all():
+        raise EntryError(f"{what} is no list of three finite numbers")
+    if np.abs(position).max() > _MAX_POSITION_M:
+        raise EntryError(f"{what} is beyond the Earth")
+    return position
 
 
 def parse_number(values: Mapping[str, Any], key: str, what: str, default: float | None = None) -> float:

@@ -6,6 +6,7 @@ import re
 from bisect import bisect_left
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from genre_tasks.logs.genre_layout.layout import (
     parse_mapping,
     parse_number,
     parse_pose,
+    parse_position,
     resolve_file,
 )
 from genre_tasks.logs.genre_layout.sweep_files import read_sweep
@@ -234,7 +236,8 @@ class GenreLayoutLog(RecordedLog):
             message = "sweeps have intensities above 1, which are cut to 1"
             numbers = {"largest": largest_intensity}
             self._report(Finding("intensity_scale", "warning", message, "Write them from 0 to 1.", numbers))
-        return sweep
+        stated = self._frame(frame).get("lidar_position")
+        return replace(sweep, sensor_world=self._parse(parse_position, stated, f"lidar_position of frame {frame}"))
 
     def _sweep_file(self, frame: int) -> Path | None:
         name = self._frame(frame).get("sweep")

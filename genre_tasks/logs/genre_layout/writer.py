@@ -62,6 +62,8 @@ def _write_frame(log: DrivingLog, frame: int, root: Path) -> dict[str, Any]:
     sweep = log.sweep(frame)
     if sweep is not None:
         values["sweep"] = f"lidar/{frame:06d}.npz"
+        if sweep.sensor_world is not None:
+            values["lidar_position"] = sweep.sensor_world.tolist()
         (root / "lidar").mkdir(exist_ok=True)
         write_sweep(root / values["sweep"], sweep)
     values["images"] = {}

@@ -11,6 +11,7 @@ import pytest
 
 from flows.dataset import submission
 from flows.dataset.dataset_record import name_dataset
+from flows.dataset.event_probe import PROBE_EVENT
 from flows.dataset.prefect_runs import ChildRequest, PrefectRuns, has_heartbeat
 from flows.dataset.submission import HeartbeatWatch
 
@@ -20,18 +21,25 @@ class FakeClient:
 
     def __init__(self) -> None:
         self.events: list[SimpleNamespace] = []
+        self.probes: set[str] = set()
         self.count_requests = 0
+        self.is_behind = False
 
     def read_deployment_by_name(self, name: str) -> SimpleNamespace:
         return SimpleNamespace(name=name)
 
     def read_events(self, wanted: Any, limit: int) -> SimpleNamespace:
+        if wanted.event.name == [PROBE_EVENT]:
+            return SimpleNamespace(total=0 if self.is_behind else len(self.probes & set(wanted.resource.id)))
         self.asked_since = wanted.occurred.since
         newest = sorted(self.events, key=lambda event: event.occurred, reverse=True)
         return SimpleNamespace(events=newest[:limit], total=len(newest))
 
-    def request(self, method: str, path: str, path_params: dict[str, str], json: dict[str, Any]) -> SimpleNamespace:
-        assert path.format(**path_params) == "/events/count-by/resource"
+    def request(self, method: str, path: str, json: Any, path_params: dict[str, str] | None = None) -> SimpleNamespace:
+        if path == "/events":
+            self.probes |= {event["resource"]["prefect.resource.id"] for event in json}
+            return SimpleNamespace()
+        assert path.format(**path_params or {}) == "/events/count-by/resource"
         self.count_requests += 1
         counts = [{"value": id_, "count": len(self.events)} for id_ in json["filter"]["resource"]["id"]]
         return SimpleNamespace(json=lambda: counts if self.events else [])
@@ -86,18 +94,25 @@ def test_a_run_is_alive_by_the_time_of_receipt() -> None:
     assert has_heartbeat(client, "a", since_s=90.0)  # type: ignore[arg-type]
 
 
-def _silent_after(heartbeats_s: list[float], outages_s: list[float], monkeypatch: pytest.MonkeyPatch) -> float | None:
+def _silent_after(
+    heartbeats_s: list[float],
+    outages_s: list[float],
+    monkeypatch: pytest.MonkeyPatch,
+    behind_until_s: float = 0.0,
+    watched_s: float = 300.0,
+) -> float | None:
     """When a watch calls a parent silent, which sends heartbeats at some times, while the server is away at others."""
     client = FakeClient()
     now_s = 0.0
     watch = HeartbeatWatch(client, uuid4(), clock=lambda: now_s)  # type: ignore[arg-type]
-    while now_s < 300.0:
+    while now_s < watched_s:
         now_s += 2.0
         known = [outage_s for outage_s in outages_s if outage_s <= now_s]
         monkeypatch.setattr(submission, "read_last_outage", lambda known=known: max(known, default=float("-inf")))
         client.events = []
+        client.is_behind = now_s < behind_until_s
         for heartbeat_s in heartbeats_s:
-            if heartbeat_s <= now_s:
+            if heartbeat_s <= now_s and not client.is_behind:
                 client.send(0.0)
         if watch.is_silent():
             return now_s
@@ -112,6 +127,17 @@ def test_a_dead_parent_is_noticed_and_one_whose_heartbeats_were_lost_is_not(monk
     assert _silent_after([10.0, 160.0, 190.0, 220.0, 250.0, 280.0], [38.0, 68.0, 99.0, 128.0], monkeypatch) is None
     late_s = _silent_after([10.0], [60.0], monkeypatch)
     assert late_s is not None and late_s > 150.0
+
+
+def test_a_living_parent_outlives_a_server_that_is_behind_with_events(monkeypatch: pytest.MonkeyPatch) -> None:
+    alive = [10.0 + 30.0 * i for i in range(10)]
+    assert _silent_after(alive, [], monkeypatch, behind_until_s=240.0) is None
+    # A dead one is noticed as soon as the server has caught up.
+    dead_s = _silent_after([], [], monkeypatch, behind_until_s=240.0)
+    assert dead_s is not None and 240.0 <= dead_s < 250.0
+    # And at last also where it never does.
+    stuck_s = _silent_after(alive, [], monkeypatch, behind_until_s=2000.0, watched_s=2000.0)
+    assert stuck_s is not None and 900.0 < stuck_s < 1010.0
 
 
 def test_heartbeats_of_long_runs_are_counted_from_a_fixed_time() -> None:

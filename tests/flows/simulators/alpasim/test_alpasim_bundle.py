@@ -53,6 +53,12 @@ def test_the_rear_axle_is_behind_the_middle_that_the_log_states(
     assert (frame.ego_SE3_rig @ [*describe_ego_box()["centroid"], 1.0])[0] == pytest.approx(1.3)
 
 
+def test_the_middle_may_be_a_setting_of_the_run(served: ServedRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    scenes = served.renderer.scenes
+    monkeypatch.setitem(scenes.record["config"]["simulate"], "center_ahead_m", 1.0)
+    assert read_local_frame(scenes).ego_SE3_rig[0, 3] == pytest.approx(1.0 - REAR_AXLE_TO_CENTER_M)
+
+
 def test_a_bundle_is_a_plain_zip_of_known_files(bundle: Path) -> None:
     with zipfile.ZipFile(bundle) as archive:
         assert archive.testzip() is None
