@@ -158,7 +158,8 @@ def _require_axes_of_poses(scene: Path) -> None:
     if name in _FORMATS_WITH_AXES:
         raise InputError(
             f"a {name} file has axes of its own, in which the poses of the cameras need not be",
-            remedy="Give the scene as .ply or .splat, in the axes and units of the poses.",
+            remedy="Give the scene as .ply or .splat in the axes and units of the poses. Convert it with a tool that "
+            "leaves axes and units as they are; `genre import` and `genre export` turn them.",
             file=scene,
         )
 

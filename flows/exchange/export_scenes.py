@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,10 @@ from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.exchange.scene_folder import SCENE_FILE, read_document
 from genre_tasks.progress import Progress, silent
 from genre_tasks.temporary_names import temporary_folder
-from storage.files import make_folders, payload_files, sync
+from storage.files import digest_file, make_folders, payload_files, sync
 
 _FOLDER_MODE = 0o755
+_LISTED_FILES = 5
 
 
 def export_scenes(request: ExportRequest, progress: Progress = silent) -> dict[str, Any]:
@@ -32,7 +34,7 @@ def export_scenes(request: ExportRequest, progress: Progress = silent) -> dict[s
 
     Raises:
         ConfigError: the format is unknown, or ``out`` holds an export that may not be replaced.
-        InputError: there is no such scene, chunk or frame, or ``out`` holds other files.
+        InputError: there is no such scene, chunk or frame, or ``out`` holds other files or changed ones.
         OSError: a file cannot be written.
     """
     exporter = load_exporter(request.format)
@@ -47,6 +49,9 @@ def export_scenes(request: ExportRequest, progress: Progress = silent) -> dict[s
         folder.chmod(_FOLDER_MODE)
         for _, path in payload_files(folder):
             sync(path)
+        if held_files:
+            # Writing takes minutes, in which somebody may have edited a file of the old export.
+            _check_folder(request.out, request.overwrite)
         replace_folder(request.out, folder, held_files)
         sync(request.out.parent)
     return {"out": str(request.out), "format": request.format, "source": scenes.describe(), **written}
@@ -60,12 +65,28 @@ def _check_folder(folder: Path, overwrite: bool) -> None:
     if not (folder / SCENE_FILE).is_file():
         raise foreign
     try:
-        listed = {entry.path for entry in read_document(folder).files} | {SCENE_FILE}
+        digests = {entry.path: entry.sha256 for entry in read_document(folder).files}
     except InputError as error:
         raise foreign from error
-    if any(name not in listed for name, _ in payload_files(folder)):
+    if any(name not in digests and name != SCENE_FILE for name, _ in payload_files(folder)):
         raise foreign
     if not overwrite:
         raise ConfigError(
             "--out holds an export already", remedy="Name another folder, or replace it by --overwrite.", file=folder
         )
+    changed = _find_changed_files(folder, digests)
+    if changed:
+        more = f" and {len(changed) - _LISTED_FILES} more" if len(changed) > _LISTED_FILES else ""
+        listed = ", ".join(changed[:_LISTED_FILES]) + more
+        problem = f"--overwrite would lose what was changed after the export: {listed}"
+        raise InputError(problem, remedy="Move these files, or name another folder.", file=folder)
+
+
+def _find_changed_files(folder: Path, digests: Mapping[str, str]) -> list[str]:
+    """Names of the listed files whose bytes are others now; one that is missing has nothing that could be lost."""
+    return [
+        name
+        for name, path in payload_files(folder)
+        # An export has no links: somebody put it there.
+        if name in digests and (path.is_symlink() or digest_file(path) != digests[name])
+    ]

@@ -72,15 +72,16 @@ class FileExporter:
         """Writes the files: see :meth:`flows.exchange.export_request.SceneExporter.export`.
 
         Returns:
-            Numbers of chunks, nodes, Gaussians, files and bytes, and the losses.
+            Numbers of chunks, nodes, files and bytes, of the Gaussians in all files, and the losses.
 
         Raises:
-            InputError: no chunk has the frame, or there is no actor to write.
+            InputError: no chunk has the frame, there is no actor to write, or a part does not fit into the format.
         """
         layout = _choose_layout(request, self._format.carries_nodes)
         numbers = list(scenes.chunk_numbers)
         entries: list[ChunkEntry] = []
         chunks_by_loss: dict[str, list[int]] = {}
+        gaussians = 0
         for k, number in enumerate(numbers):
             scene = scenes.load(number)
             if request.frame is not None and request.frame not in scene.frames:
@@ -92,7 +93,8 @@ class FileExporter:
                 chunks_by_loss.setdefault(loss, []).append(number)
             for part in _split_scene(number, scene, layout, request.frame):
                 progress(k, len(numbers), part.name)
-                entry = self._write_part(folder, entry, part)
+                entry = self._write_part(folder, entry, part, request.out)
+                gaussians += sum(len(node.cloud) for node in part.scene.nodes)
             entries.append(entry)
         _check_found(entries, request, numbers)
         losses = _name_chunks(chunks_by_loss, len(entries)) + _describe_layout(layout, entries)
@@ -109,7 +111,7 @@ class FileExporter:
         return {
             "chunks": [entry.chunk for entry in entries],
             "nodes": sum(len(entry.nodes) for entry in entries),
-            "gaussians": sum(node.gaussians for entry in entries for node in entry.nodes),
+            "gaussians": gaussians,
             "files": [file.path for file in files],
             "bytes": sum(file.size for file in files),
             "losses": list(losses),
@@ -123,12 +125,22 @@ class FileExporter:
             written = make_resting_scene(merge_clouds([node.cloud for node in scene.nodes]))
         return (*scene.losses, *self._format.describe_losses(written))
 
-    def _write_part(self, folder: Path, entry: ChunkEntry, part: _Part) -> ChunkEntry:
-        """Writes one file; the chunk's entry with that file in it."""
+    def _write_part(self, folder: Path, entry: ChunkEntry, part: _Part, out: Path) -> ChunkEntry:
+        """Writes one file into the folder, which is ``out`` later; the chunk's entry with that file in it."""
         file = f"{part.name}{self._format.suffixes[0]}"
         path = folder / file
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._format.write(path, part.scene)
+        try:
+            self._format.write(path, part.scene)
+        except InputError as error:
+            # The folder is a hidden one, and gone before anybody reads the error.
+            raise InputError(
+                error.problem if part.node is None else f"{part.node}: {error.problem}",
+                remedy=error.remedy,
+                file=out / file,
+                chunk=entry.chunk,
+                frame=part.frame,
+            ) from error
         if part.frame is not None:
             return entry.model_copy(update={"posed": (*entry.posed, PosedFile(frame=part.frame, file=file))})
         if part.node is None:

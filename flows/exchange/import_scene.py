@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from flows.exchange.stored_scenes import IMPORT_STAGE, IMPORTED
+from flows.exchange.imported_scenes import CHUNK_COUNT, FILE_INPUT, IMPORT_STAGE, IMPORTED
 from flows.machine.facts import describe_environment
 from flows.machine.resource_usage import ResourceUsage, measure_usage
 from genre_tasks.errors import ConfigError
@@ -35,7 +35,7 @@ _NAME = re.compile(r"[\w.+=-]{1,100}")
 def import_scene(store: str, path: Path, name: str | None = None, progress: Progress = silent) -> dict[str, Any]:
     """Reads a file or an exported folder and commits its scenes as reconstructions.
 
-    The same file under the same name is committed once.
+    The same file under the same name is committed once. An import that was interrupted goes on where it ended.
 
     Args:
         store: folder (or URI) of the store; it is made where it is missing.
@@ -61,6 +61,7 @@ def import_scene(store: str, path: Path, name: str | None = None, progress: Prog
         file=path.absolute().name,
         digest=_digest_source(path),
         module=_find_module(path),
+        chunk_count=len(scenes),
         warnings=tuple(f"{file} was changed after the export." for file in changed),
         usage=usage,
     )
@@ -82,6 +83,7 @@ class _Source:
         file: name of the file or folder.
         digest: of its bytes.
         module: that reads it, as its format is named in a registry alone.
+        chunk_count: how many chunks it has.
         warnings: on the file as it is.
         usage: what reading it took.
     """
@@ -91,6 +93,7 @@ class _Source:
     file: str
     digest: str
     module: str
+    chunk_count: int
     warnings: tuple[str, ...]
     usage: ResourceUsage
 
@@ -101,6 +104,7 @@ def _commit_scene(source: _Source, number: int, scene: ExchangeScene) -> dict[st
     # What a scene graph does not hold, and an export of the imported scene states again.
     facts = {
         "file": source.file,
+        CHUNK_COUNT: source.chunk_count,
         "names": {node.track_id: node.name for node in limited.nodes if node.motion is not None},
         "times_s": limited.times_s.tolist(),
         "frames": list(limited.frames or range(len(limited.times_s))),
@@ -108,10 +112,11 @@ def _commit_scene(source: _Source, number: int, scene: ExchangeScene) -> dict[st
         "losses": list(limited.losses),
     }
     code = code_digest(_CODE, (source.module,))
-    key = stage_key(IMPORT_STAGE, code, facts, {"file": source.digest})
+    inputs = {FILE_INPUT: source.digest}
+    key = stage_key(IMPORT_STAGE, code, facts, inputs)
     address = Address(IMPORTED, source.name, number, IMPORT_STAGE, key)
     provenance = Provenance(
-        inputs={"file": source.digest},
+        inputs=inputs,
         configuration=facts,
         code_digest=code,
         seconds=source.usage.seconds,

@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
 
+from flows.exchange.imported_scenes import describe_unknown, find_import, list_imports
 from flows.exchange.plan_losses import describe_plan_losses
 from flows.reconstruction.run_records import list_runs
 from flows.reconstruction.stored_values import read_stage_value
-from flows.simulation.edited_runs import open_shown_scenes
+from flows.simulation.edited_runs import open_run
 from flows.simulation.run_scenes import RunScenes
 from genre_tasks.ego_paths.recorded_path import list_image_times, measure_frame_times
 from genre_tasks.errors import ConfigError, InputError
-from genre_tasks.exchange.conversion import to_exchange_scene
+from genre_tasks.exchange.conversion import BACKGROUND_NAME, DISTANT_NAME, to_exchange_scene
 from genre_tasks.exchange.types import ExchangeScene
 from genre_tasks.scene_edits.actor_names import name_actors
+from genre_tasks.scene_edits.edits import Insert
 from storage.opening import open_store
 from storage.store import Artifact
-
-IMPORTED = "imported"
-"""Dataset, in a store, of scenes that come from files."""
-
-IMPORT_STAGE = "import"
 
 _TIME_DIGITS = 6
 
@@ -70,38 +67,34 @@ class StoredScenes(Protocol):
 def open_stored_scenes(
     store: str, name: str, stage: str | None = None, chunks: Sequence[int] | None = None
 ) -> StoredScenes:
-    """Opens scenes by their name.
+    """Opens scenes by their name; a whole name counts before the start of another one.
 
     Args:
         store: folder (or URI) of the store.
-        name: of a run or an imported scene, the key of an imported scene, or the start of a run's name or a key.
+        name: of a run or an imported scene, the key of an imported scene, or the unique start of one of these.
         stage: initial, gnet or enet; ``None``: the last one of each chunk.
         chunks: numbers of the chunks to take; ``None``: all.
 
     Raises:
-        InputError: there is no such scene or chunk, or several begin with the name.
+        InputError: there is no such scene or chunk, several begin with the name, or an import was interrupted.
         ConfigError: a stage is named for an imported scene.
     """
-    imported = _find_imported(store, name)
-    if not imported:
+    imports = list_imports(store)
+    is_import = any(entry.name == name for entry in imports)
+    # Every name begins with an empty text, and so does that of every run.
+    runs = list_runs(store, name) if name and not is_import else []
+    if any(run["run"] == name for run in runs):
         return _RunStoredScenes(store, name, stage, chunks)
-    # A whole name is meant as it is, although the names of runs may begin so.
-    if all(artifact.manifest.log != name for artifact in imported) and list_runs(store, name):
+    imported = find_import(imports, name, store)
+    if imported is None:
+        if imports and not runs:
+            raise describe_unknown(imports, name, store)
+        return _RunStoredScenes(store, name, stage, chunks)
+    if runs:
         raise InputError(f"a run and an imported scene begin with '{name}'", remedy="Give more of it.", file=store)
     if stage is not None:
         raise ConfigError("an imported scene has no stages", remedy="Leave out --stage.")
-    return _ImportedScenes(store, imported, chunks)
-
-
-def _find_imported(store: str, name: str) -> list[Artifact]:
-    artifacts = list(open_store(store).artifacts(dataset=IMPORTED, stage=IMPORT_STAGE))
-    named = [artifact for artifact in artifacts if artifact.manifest.log == name]
-    found = named or [artifact for artifact in artifacts if name and artifact.manifest.key.startswith(name)]
-    # Every chunk has a key of its own: the start of several keys means several scenes.
-    if len(found) > 1 and (not named or len({artifact.manifest.chunk for artifact in found}) < len(found)):
-        keys = ", ".join(artifact.manifest.key[:12] for artifact in found)
-        raise InputError(f"several imported scenes are called '{name}'", remedy=f"Give a key: {keys}.", file=store)
-    return found
+    return _ImportedScenes(store, imported.artifacts, chunks)
 
 
 class _RunStoredScenes:
@@ -138,14 +131,28 @@ class _RunStoredScenes:
             chunk.frames,
             np.cumsum(steps_s).round(_TIME_DIGITS).tolist(),
             chunk.world_SE3_chunk,
-            names=self._names,
+            names=self._name_tracks(actor.track_id for actor in chunk_scene.scene.actors),
             losses=describe_plan_losses(plan),
         )
+
+    def _name_tracks(self, track_ids: Iterable[str]) -> dict[str, str]:
+        # The track of an inserted actor is called as the actor is.
+        return {track_id: self._names.get(track_id, track_id) for track_id in track_ids}
 
     @cached_property
     def _names(self) -> dict[str, str]:
         # Of all chunks, also those that are not exported: the names are those of `genre show actors`.
-        return name_actors(open_shown_scenes(self._store, self._run))
+        opened = open_run(self._store, self._run)
+        names = name_actors(opened.recorded)
+        inserted = {edit.name for edit in opened.edits.edits if isinstance(edit, Insert) and edit.name}
+        taken = {BACKGROUND_NAME, DISTANT_NAME, *names.values(), *inserted}
+        # Runs that were edited before these two names were reserved.
+        for name in sorted(inserted & {BACKGROUND_NAME, DISTANT_NAME}):
+            distinct = name
+            while distinct in taken:
+                distinct += "-moving"
+            names[name] = distinct
+        return names
 
 
 class _ImportedScenes:
@@ -153,14 +160,13 @@ class _ImportedScenes:
 
     run_scenes = None
 
-    def __init__(self, store: str, artifacts: Sequence[Artifact], chunks: Sequence[int] | None) -> None:
+    def __init__(self, store: str, artifacts: Mapping[int, Artifact], chunks: Sequence[int] | None) -> None:
         self._store = open_store(store)
-        by_chunk = {artifact.manifest.chunk: artifact for artifact in artifacts}
-        unknown = sorted(set(chunks or ()) - set(by_chunk))
+        unknown = sorted(set(chunks or ()) - set(artifacts))
         if unknown:
-            raise InputError(f"the scene has no chunk {unknown[0]}", remedy=f"It has {sorted(by_chunk)}.")
+            raise InputError(f"the scene has no chunk {unknown[0]}", remedy=f"It has {sorted(artifacts)}.")
         self._artifacts = {
-            number: artifact for number, artifact in sorted(by_chunk.items()) if chunks is None or number in chunks
+            number: artifact for number, artifact in artifacts.items() if chunks is None or number in chunks
         }
 
     @property

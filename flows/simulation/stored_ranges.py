@@ -5,6 +5,10 @@ from __future__ import annotations
 import json
 import logging
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from flows.simulation.run_scenes import RunScenes
 from genre_tasks.atomic_path import write_atomically
@@ -21,6 +25,8 @@ _log = logging.getLogger(__name__)
 # Coarser than `genre range`: marks need the distance to half a metre, and every shift is rendered for all cameras.
 MARKS_CONFIG = RangeConfig(shifts_m=(1.0, 2.0, 3.0, 4.0), every=10)
 
+_Metres = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
 
 @dataclass(frozen=True)
 class SideRange:
@@ -35,8 +41,16 @@ class SideRange:
     right_m: float
 
 
+class _RangeRecord(BaseModel):
+    # Strict, so that a truth value or a text is no number.
+    model_config = ConfigDict(strict=True)
+
+    left_m: _Metres
+    right_m: _Metres
+
+
 def find_side_ranges(scenes: RunScenes, progress: Progress) -> dict[int, SideRange]:
-    """Reads or computes the reliable range of each chunk's scene.
+    """Reads the reliable range of each chunk's scene, or computes it where none is stored or the file is damaged.
 
     Args:
         scenes: of a run, as they were reconstructed.
@@ -50,14 +64,14 @@ def find_side_ranges(scenes: RunScenes, progress: Progress) -> dict[int, SideRan
     """
     code = code_digest("genre_tasks.reliability.reliable_range")
     folder = scenes.folder / "ranges"
-    ranges = {}
+    ranges: dict[int, SideRange] = {}
     for number in scenes.chunk_numbers:
         digests = {name: d for name, d in scenes.payload_digests().items() if name.startswith(f"chunk {number} ")}
         parts = {"code": code, "configuration": MARKS_CONFIG.model_dump(mode="json"), "inputs": digests}
         file = folder / f"chunk-{number}-{digest_value(parts)[:16]}.json"
-        if file.is_file():
-            values = json.loads(file.read_text(encoding="utf-8"))
-            ranges[number] = SideRange(values["left_m"], values["right_m"])
+        stored = _read_range(file)
+        if stored is not None:
+            ranges[number] = stored
             continue
         loaded = scenes.load(number)
         found = estimate_reliable_range(MARKS_CONFIG, loaded.chunk, loaded.scene, DEFAULT_PLAN, progress)
@@ -70,3 +84,15 @@ def find_side_ranges(scenes: RunScenes, progress: Progress) -> dict[int, SideRan
         except (OSError, GenreError) as error:
             _log.warning("the reliable range of chunk %d is not kept for the next simulation: %s", number, error)
     return ranges
+
+
+def _read_range(file: Path) -> SideRange | None:
+    try:
+        record = _RangeRecord.model_validate_json(file.read_bytes())
+    except FileNotFoundError:
+        return None
+    except (OSError, ValidationError):
+        # Computing takes a minute; an error would stop all simulations of the run until somebody removes the file.
+        _log.warning("the stored reliable range %s cannot be read, and is computed again", file)
+        return None
+    return SideRange(record.left_m, record.right_m)

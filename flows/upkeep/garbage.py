@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-from flows.exchange.stored_scenes import IMPORTED
+from flows.exchange.imported_scenes import IMPORTED
 from flows.reconstruction.run_records import list_runs
 from flows.upkeep.pins import Pin, list_pins, list_run_keys
 from genre_tasks.errors import InputError

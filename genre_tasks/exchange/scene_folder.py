@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal
 
@@ -12,6 +13,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from genre_tasks.errors import InputError
+from genre_tasks.exchange.moments import Frame, is_rising
 from genre_tasks.exchange.registry import find_format, load_format
 from genre_tasks.exchange.types import ExchangeNode, ExchangeScene, NodeMotion
 from genre_tasks.json_files import read_json_object
@@ -28,7 +30,6 @@ _BLOCK_BYTES = 1 << 20
 _REMEDY = "Export the scene again, or give one of its files."
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Frame = Annotated[int, Field(ge=-(2**31), lt=2**31)]
 Row = tuple[Finite, Finite, Finite, Finite]
 Matrix = tuple[Row, Row, Row, Row]
 Layout = Literal["nodes", "scenes", "frames"]
@@ -234,7 +235,9 @@ def find_changes(folder: Path) -> tuple[str, ...]:
 
 def _read_chunk_file(folder: Path, _format: str, entry: ChunkEntry) -> ExchangeScene:
     path = _inside(folder, entry.file or "")
-    return find_format(path).read(path)
+    scene = find_format(path).read(path)
+    # A file repeats what the scene had lost before it was written; GLB files of old hold none of it.
+    return replace(scene, losses=tuple(dict.fromkeys((*entry.losses, *scene.losses))))
 
 
 def _read_nodes(folder: Path, format_name: str, entry: ChunkEntry) -> ExchangeScene:
@@ -297,16 +300,12 @@ def _check_document(document: SceneDocument, path: Path) -> None:
         is_sound = all(
             len(motion.present) == count and len(motion.scene_SE3_node) == sum(motion.present) for motion in motions
         )
-        if not is_sound or (chunk.frames and len(chunk.frames) != count) or not _is_rising(chunk.times_s):
+        if not is_sound or (chunk.frames and len(chunk.frames) != count) or not is_rising(chunk.times_s):
             raise InputError(f"the moments of chunk {chunk.chunk} do not fit", remedy=_REMEDY, file=path)
         if len({node.name for node in chunk.nodes}) != len(chunk.nodes):
             raise InputError(f"two nodes of chunk {chunk.chunk} have one name", remedy=_REMEDY, file=path)
     if len({chunk.chunk for chunk in document.chunks}) != len(document.chunks) or not document.chunks:
         raise InputError("the document has no chunk, or one twice", remedy=_REMEDY, file=path)
-
-
-def _is_rising(values: Sequence[float]) -> bool:
-    return bool((np.diff(np.asarray(values)) > 0).all())
 
 
 def _inside(folder: Path, name: str) -> Path:

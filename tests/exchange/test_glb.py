@@ -180,6 +180,28 @@ def test_the_fourth_degree_is_cut_and_stated(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.sh_rest, scene.nodes[0].cloud.sh_rest[:, :15])
 
 
+def test_losses_of_before_come_back(tmp_path: Path) -> None:
+    losses = ("Exposure is left out.", "Of the " + 2000 * "x")
+    document, binary = split_glb(write(tmp_path, replace(make_driving_scene(), losses=losses)))
+    found = GLB.read(tmp_path / "scene.glb").losses
+    # A sentence may name parts of files, and be as long as these names are.
+    assert found[0] == losses[0] and losses[1].startswith(found[1]) and len(found[1]) == 1000
+    # Files of old have none, and what is lost by reading comes after what was lost before, without repeats.
+    repeated = "Surfaces and points of the file that are no Gaussians are not read."
+    document["meshes"][0]["primitives"].append({"attributes": {"POSITION": 0}, "mode": 0})
+    for stated, expected in (
+        ([losses[0], repeated], (losses[0], repeated)),
+        ([losses[0]], (losses[0], repeated)),
+        (None, (repeated,)),
+    ):
+        extras = document["asset"]["extras"]["genre"]
+        extras["losses"] = stated
+        if stated is None:
+            del extras["losses"]
+        (tmp_path / "changed.glb").write_bytes(join_glb(document, binary))
+        assert GLB.read(tmp_path / "changed.glb").losses == expected
+
+
 def test_a_file_of_four_gibibytes_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("genre_tasks.exchange.gltf.binary_container._MOST_BYTES", 1000)
     with pytest.raises(InputError, match="less than 4 GiB"):

@@ -87,6 +87,9 @@ ATTRIBUTES = ("meshes", 0, "primitives", 0, "attributes")
         (set_at("nodes", 0, "extras", {"genre": {"label": 5}}), "genre do not fit: label"),
         (set_at("asset", "extras", {"genre": {"frames": [1, 2]}}), "2 log frames for 0 moments"),
         (set_at("asset", "extras", {"genre": {"world_SE3_scene": [1.0]}}), "world_SE3_scene"),
+        (set_at("asset", "extras", {"genre": {"frames": [10**30], "times_s": [0.0]}}), "genre do not fit: frames.0"),
+        (set_at("asset", "extras", {"genre": {"frames": [1, 2], "times_s": [0, 0]}}), "moments of the file do not"),
+        (set_at("asset", "extras", {"genre": {"losses": ["x" * 1001]}}), "genre do not fit: losses.0"),
     ],
 )
 def test_unsound_documents(tmp_path: Path, change: Change, problem: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import subprocess
 import sys
@@ -13,10 +14,12 @@ import numpy as np
 import pytest
 from pxr import Usd, UsdGeom, UsdValidation, UsdVol
 
+import genre_tasks
 from genre_tasks.errors import InputError
 from genre_tasks.exchange.cloud_errors import CloudErrors, compare_clouds
 from genre_tasks.exchange.types import NodeMotion
 from genre_tasks.exchange.usd.format import USDZ
+from genre_tasks.exchange.usd.stage_process import run_stage_dump
 from tests.exchange.format_suite import FormatSuite
 from tests.exchange.splat_clouds import make_driving_scene
 from tests.exchange.usd_layers import make_layer
@@ -161,6 +164,46 @@ def test_the_process_reads_and_passes_errors_on(package: Path, tmp_path: Path) -
         with pytest.raises(InputError, match=words) as caught:
             USDZ.read(tmp_path / f"{name}.usda")
         assert caught.value.file == str(tmp_path / f"{name}.usda")
+
+
+@pytest.mark.usefixtures("real_process")
+def test_the_process_runs_no_module_of_the_current_folder(
+    package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "downloads"
+    folder.mkdir()
+    # What the process imports: a module of one file, and a package.
+    for name in ("json.py", "resource.py", "numpy/__init__.py", "pxr/__init__.py", "genre_tasks/__init__.py"):
+        module = folder / name
+        module.parent.mkdir(exist_ok=True)
+        module.write_text(f"open({str(tmp_path / 'was-run')!r}, 'w').close()\n")
+    monkeypatch.chdir(folder)
+    # As in an interactive session: the empty path is the current folder.
+    monkeypatch.setattr(sys, "path", ["", *sys.path])
+    assert len(USDZ.read(package).nodes) == 4
+    assert not (tmp_path / "was-run").exists()
+
+
+def test_the_process_finds_a_checkout_that_is_not_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = "genre_tasks.exchange.usd.stage_process"
+    root = str(Path(genre_tasks.__file__).parents[1])
+    environments = []
+
+    def run(*_: object, env: dict[str, str], **__: object) -> subprocess.CompletedProcess[bytes]:
+        environments.append(env)
+        return subprocess.CompletedProcess([], 1)
+
+    monkeypatch.setattr(f"{module}.subprocess.run", run)
+    make_layer(tmp_path / "any.usda")
+    # By the empty path, or by that of the checkout, which then keeps its place.
+    for paths, expected in (
+        (["", "lib", "/other"], [root, str(Path("lib").absolute()), "/other"]),
+        (["/other", root], ["/other", root]),
+    ):
+        with monkeypatch.context() as patch, pytest.raises(InputError, match="OpenUSD cannot read"):
+            patch.setattr(sys, "path", paths)
+            run_stage_dump(tmp_path / "any.usda", tmp_path, tmp_path / "any.usda")
+        assert environments.pop()["PYTHONPATH"].split(os.pathsep) == expected
 
 
 def test_the_memory_of_the_process_is_limited() -> None:

@@ -245,11 +245,16 @@ def test_a_scene_with_broken_data_of_ours_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "scene.usda"
     USDZ.write(path, make_driving_scene())
     text = path.read_text()
-    for before, after in (
-        ("double[] timesS = [0,", "double[] timesS = [9,"),
-        ("int64[] frames = [20, ", "int64[] frames = ["),
+    for before, after, words in (
+        ("double[] timesS = [0,", "double[] timesS = [9,", "do not rise"),
+        ("int64[] frames = [20, ", "int64[] frames = [", "do not rise"),
+        ("int64[] frames = [20, ", "double[] frames = [inf, ", "no numbers of log frames"),
+        ("int64[] frames = [20, ", "int64[] frames = [1000000000000, ", "no numbers of log frames"),
+        ("int64[] frames = [20, ", 'string[] frames = ["x"] # ', "no numbers of log frames"),
+        ("double3 sizeM = (4.5, 1.8, 1.5)", 'string[] sizeM = ["a", "b", "c"]', "no array of numbers"),
+        ("matrix4d worldSE3Scene = ", 'string[] worldSE3Scene = ["x"] # ', "no array of numbers"),
     ):
-        assert before in text
+        assert before in text, before
         path.write_text(text.replace(before, after))
-        with pytest.raises(InputError, match="do not rise"):
+        with pytest.raises(InputError, match=words):
             USDZ.read(path)

@@ -10,9 +10,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from genre_tasks.errors import InputError
 from genre_tasks.exchange.gltf.document import EXTRAS_KEY, Matrix4, Number, Vector3
+from genre_tasks.exchange.moments import Frame
 from genre_tasks.exchange.types import ExchangeNode, ExchangeScene
 
-_Word = Annotated[str, Field(max_length=1000)]
+_LONGEST_WORD = 1000
+_Word = Annotated[str, Field(max_length=_LONGEST_WORD)]
 
 
 class _Extras(BaseModel):
@@ -26,11 +28,13 @@ class SceneExtras(_Extras):
         frames: log frames of the moments.
         times_s: seconds of the moments, as precisely as the log has them; keyframes have them as float32.
         world_SE3_scene: the scene's place in the log's world, row by row.
+        losses: sentences on what the scene lost before it was written.
     """
 
-    frames: list[int] = []
+    frames: list[Frame] = []
     times_s: list[Number] = []
     world_SE3_scene: Matrix4 = np.eye(4).ravel().tolist()
+    losses: list[_Word] = []
 
 
 class NodeExtras(_Extras):
@@ -64,6 +68,8 @@ def describe_scene(scene: ExchangeScene) -> dict[str, Any]:
         frames=list(scene.frames),
         times_s=scene.times_s.tolist(),
         world_SE3_scene=scene.world_SE3_scene.ravel().tolist(),
+        # Sentences name parts of files, whose names may be of any length.
+        losses=[loss[:_LONGEST_WORD] for loss in scene.losses],
     )
     return {EXTRAS_KEY: extras.model_dump()}
 

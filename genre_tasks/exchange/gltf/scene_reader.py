@@ -24,6 +24,7 @@ from genre_tasks.exchange.gltf.placement import (
     split_motion,
 )
 from genre_tasks.exchange.gltf.splat_attributes import is_splats, read_primitive
+from genre_tasks.exchange.moments import is_rising
 from genre_tasks.exchange.types import ExchangeNode, ExchangeScene, NodeMotion, SplatCloud
 from genre_tasks.logs.types import Float64
 
@@ -67,7 +68,8 @@ class SceneReader:
             A node for each one of the file that has Gaussians.
 
         Raises:
-            InputError: nodes form a circle, have several parents or no finite place, or an array is not sound.
+            InputError: nodes form a circle, have several parents or no finite place, moments do not rise, or an array
+                is not sound.
         """
         names: set[str] = set()
         nodes = []
@@ -87,6 +89,8 @@ class SceneReader:
             times = stated if agree else times
         else:
             times = stated if not len(self._times_s) else np.zeros(0)
+        if not is_rising(times):
+            raise InputError("the moments of the file do not rise", remedy=_REMEDY, file=self._path)
         if extras.frames and len(extras.frames) != len(times):
             problem = f"the file names {len(extras.frames)} log frames for {len(times)} moments"
             raise InputError(problem, remedy=_REMEDY, file=self._path)
@@ -95,7 +99,7 @@ class SceneReader:
             times_s=times,
             frames=tuple(extras.frames),
             world_SE3_scene=np.array(extras.world_SE3_scene, np.float64).reshape(4, 4),
-            losses=tuple(self._losses),
+            losses=tuple(dict.fromkeys((*extras.losses, *self._losses))),
         )
 
     def _read_curves(self) -> dict[int, dict[str, Curve]]:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from genre_tasks.errors import InputError
 from genre_tasks.exchange.activations import (
-    colors_to_sh_dc,
     logits_to_opacities,
     logs_to_scales,
     opacities_to_logits,
@@ -27,9 +26,10 @@ from genre_tasks.exchange.gltf.accessors import (
     BufferBuilder,
 )
 from genre_tasks.exchange.gltf.document import SPLATTING, Primitive
+from genre_tasks.exchange.linear_light import LINEAR_LOSS, linear_harmonics_to_srgb
 from genre_tasks.exchange.types import SH_REST_COUNTS, SplatCloud
-from genre_tasks.logs.types import Float32, Float64
-from genre_tasks.srgb import linear_to_srgb, srgb_to_linear
+from genre_tasks.logs.types import Float32
+from genre_tasks.srgb import srgb_to_linear
 
 MOST_SH_DEGREE = 3
 """Highest degree of harmonics that the extension knows."""
@@ -40,16 +40,12 @@ SRGB = "srgb_rec709_display"
 LINEAR = "lin_rec709_display"
 """The other colour space of the extension, which is converted when it is read."""
 
-LINEAR_LOSS = "The file's colours are linear light: their tint by direction is converted to sRGB to first order only."
-"""What is lost of such a file."""
-
 _POINTS = 0
 _ROTATION_KINDS = {(FLOAT, False), (BYTE, True), (SHORT, True)}
 _SCALE_KINDS = {(FLOAT, False), *((kind, flag) for kind in (UNSIGNED_BYTE, UNSIGNED_SHORT) for flag in (False, True))}
 _OPACITY_KINDS = {(FLOAT, False), (UNSIGNED_BYTE, True), (UNSIGNED_SHORT, True)}
 _FLOATS = {(FLOAT, False)}
 _SMALLEST_SCALE = float(np.finfo(np.float32).tiny)
-_SLOPE_STEP = 1e-4
 _REMEDY = "Export it as uncompressed Gaussians with KHR_gaussian_splatting."
 
 
@@ -149,7 +145,7 @@ def read_primitive(path: Path, primitive: Primitive, reader: AccessorReader) -> 
     sh_dc = _read_attribute(path, primitive, reader, _name_harmonic(0, 0), width=3, kinds=_FLOATS, count=count)
     sh_rest = _read_harmonics(path, primitive, reader, count)
     if linear:
-        sh_dc, sh_rest = _linear_to_srgb(sh_dc, sh_rest)
+        sh_dc, sh_rest = linear_harmonics_to_srgb(sh_dc, sh_rest)
     cloud = SplatCloud(
         means=means,
         # Flat Gaussians are allowed here, and have no logarithm.
@@ -213,10 +209,3 @@ def _read_harmonics(path: Path, primitive: Primitive, reader: AccessorReader, co
             values = _read_attribute(path, primitive, reader, name, width=3, kinds=_FLOATS, count=count)
             sh_rest[:, degree**2 - 1 + n] = values
     return sh_rest
-
-
-def _linear_to_srgb(sh_dc: Float32, sh_rest: Float32) -> tuple[Float32, Float32]:
-    """Constant terms by the curve, and all others by its slope there."""
-    light = sh_dc_to_colors(sh_dc)
-    slope: Float64 = (linear_to_srgb(light + _SLOPE_STEP) - linear_to_srgb(light - _SLOPE_STEP)) / (2 * _SLOPE_STEP)
-    return colors_to_sh_dc(linear_to_srgb(light)), (sh_rest * slope[:, None]).astype(np.float32)

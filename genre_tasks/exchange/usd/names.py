@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+COLOR_SPACE = "colorSpace:name"
+"""Of a prim, for its colours and those of all prims below it."""
+
 COEFFICIENTS = "radiance:sphericalHarmonicsCoefficients"
 DEGREE = "radiance:sphericalHarmonicsDegree"
 
 COLORS = "displayColor"
 MATRICES = "matrices"
 SHOWN = "shown"
-"""Names of arrays between the process that reads a stage and its caller, as is the one before."""
+"""Names of arrays between the process that reads a stage and its caller, as is that of the coefficients."""
 
 VERSION = "genre:version"
 """Of these entries, on the scene's root prim; the others count only where it is there."""

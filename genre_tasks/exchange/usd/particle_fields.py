@@ -10,10 +10,13 @@ import numpy as np
 from genre_tasks.errors import InputError
 from genre_tasks.exchange.activations import colors_to_sh_dc, scales_to_logs
 from genre_tasks.exchange.checks import check_finite_values
+from genre_tasks.exchange.linear_light import linear_harmonics_to_srgb
 from genre_tasks.exchange.types import SH_REST_COUNTS, SplatCloud
 from genre_tasks.exchange.usd import names
+from genre_tasks.exchange.usd.color_spaces import is_linear
 from genre_tasks.exchange.usd.stage_writer import LARGEST_OPACITY
 from genre_tasks.logs.types import Float32
+from genre_tasks.srgb import linear_to_srgb
 
 _SMALLEST_OPACITY = 1e-30
 """Smaller ones become this one: the logit of 0 would be infinite."""
@@ -27,13 +30,17 @@ class FieldArrays:
     Args:
         arrays: [N, width] float32 each, by the attribute's name.
         degree: of the spherical harmonics; ``None`` where the file does not state it.
+        color_space: name of the colours' space; empty where the file does not state it.
         path: of the prim, for errors.
         file: for errors.
     """
 
-    def __init__(self, arrays: Mapping[str, Float32], degree: int | None, path: str, file: Path) -> None:
+    def __init__(
+        self, arrays: Mapping[str, Float32], degree: int | None, color_space: str, path: str, file: Path
+    ) -> None:
         self._arrays = arrays
         self._degree = degree
+        self._color_space = color_space
         self._path = path
         self._file = file
 
@@ -52,6 +59,11 @@ class FieldArrays:
             raise self._damage("has negative scales, which look like logarithms; OpenUSD's scales are linear")
         count = len(means)
         sh = self._take_harmonics(count)
+        sh_dc = np.ascontiguousarray(sh[:, 0])
+        sh_rest = np.ascontiguousarray(sh[:, 1:])
+        # Where no space is stated they are sRGB, as 3DGS optimises them: files of ours were such once.
+        if names.COEFFICIENTS in self._arrays and is_linear(self._color_space):
+            sh_dc, sh_rest = linear_harmonics_to_srgb(sh_dc, sh_rest)
         # In memory OpenUSD's quaternions have the real part last.
         quats = np.roll(self._take("orientations", count, (0.0, 0.0, 0.0, 1.0)), 1, axis=1)
         return SplatCloud(
@@ -59,8 +71,8 @@ class FieldArrays:
             log_scales=scales_to_logs(self._file, scales),
             quats=np.ascontiguousarray(quats),
             logit_opacities=self._to_logits(self._take("opacities", count, (1.0,))),
-            sh_dc=np.ascontiguousarray(sh[:, 0]),
-            sh_rest=np.ascontiguousarray(sh[:, 1:]),
+            sh_dc=sh_dc,
+            sh_rest=sh_rest,
         )
 
     def _take(self, name: str, count: int | None, default: tuple[float, ...] | None = None) -> Float32:
@@ -93,11 +105,17 @@ class FieldArrays:
         return values.reshape(count, per_gaussian, 3)
 
     def _take_display_color(self, count: int) -> Float32:
-        values = self._arrays.get(names.COLORS, np.full((1, 3), 0.5, np.float32))
+        values = self._arrays.get(names.COLORS)
+        if values is None:
+            return np.zeros((count, 1, 3), np.float32)
         if len(values) not in (1, count):
             raise self._damage(f"has {len(values)} colours for {count} positions")
         check_finite_values(self._file, f"{self._path}.{names.COLORS}", values)
-        return np.broadcast_to(colors_to_sh_dc(values.astype(np.float64))[:, None], (count, 1, 3))
+        colors = values.astype(np.float64)
+        # Other than harmonics: for an attribute that all of OpenUSD has, no stated space means linear light.
+        if not self._color_space or is_linear(self._color_space):
+            colors = linear_to_srgb(colors)
+        return np.broadcast_to(colors_to_sh_dc(colors)[:, None], (count, 1, 3))
 
     def _to_logits(self, opacities: Float32) -> Float32:
         if ((opacities < -_HALF_ROUNDING) | (opacities > 1 + _HALF_ROUNDING)).any():

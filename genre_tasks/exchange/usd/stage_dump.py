@@ -1,8 +1,8 @@
 """Reads a layer with OpenUSD in a process of its own, and leaves plain arrays and JSON for the caller.
 
 OpenUSD takes the memory that a file asks for: a few damaged bytes ask for terabytes, and the system then ends the
-process. Run as ``python -m genre_tasks.exchange.usd.stage_dump LAYER FOLDER BYTES``, with a limit on its memory. This
-module imports neither torch nor SciPy, so that it starts at once.
+process. Run as ``python -P -m genre_tasks.exchange.usd.stage_dump LAYER FOLDER BYTES``, with a limit on its memory.
+This module imports neither torch nor SciPy, so that it starts at once.
 """
 
 from __future__ import annotations
@@ -31,6 +31,9 @@ WIDTHS = {"positions": 3, "scales": 3, "orientations": 4, "opacities": 1, names.
 _MAX_FIELDS = 10_000
 _MAX_POSES = 2_000_000
 """Fields times moments: a file may state a moment for one field that all others get a place for."""
+
+_COLOR_SPACE_CHARACTERS = 100
+"""One name may hold for all fields, and is written for each of them: a long one would take much memory."""
 
 _BASE_BYTES = 1 << 30
 _BYTES_PER_BYTE = 24
@@ -129,6 +132,7 @@ def _dump_field(
     prim: Any, codes: list[float], prefix: str, arrays: dict[str, Any], budget: ReadBudget, losses: list[str]
 ) -> dict[str, Any]:
     """Puts a field's arrays among the others; the rest of it as JSON values."""
+    color_attribute = None
     for name, width in WIDTHS.items():
         for attribute in (prim.GetAttribute(name), prim.GetAttribute(f"{name}h")):
             if not attribute or not attribute.HasAuthoredValue():
@@ -139,12 +143,15 @@ def _dump_field(
             if value is not None:
                 budget.spend(len(value) * width * 4)
                 arrays[prefix + name] = np.asarray(value, dtype=np.float32).reshape(-1, width)
+                if name == names.COEFFICIENTS:
+                    color_attribute = attribute
                 break
     color = UsdGeom.Gprim(prim).GetDisplayColorPrimvar()
     value = color.ComputeFlattened() if color and color.HasAuthoredValue() else None
     if value is not None and prefix + names.COEFFICIENTS not in arrays:
         budget.spend(len(value) * 12)
         arrays[prefix + names.COLORS] = np.asarray(value, dtype=np.float32).reshape(-1, 3)
+        color_attribute = color.GetAttr()
     degree = prim.GetAttribute(names.DEGREE)
     node_prim = prim if prim.GetCustomDataByKey(names.NAME) is not None else prim.GetParent()
     node = _read_data(node_prim, names.NODE_ENTRIES)
@@ -160,9 +167,22 @@ def _dump_field(
     return {
         "path": str(prim.GetPath()),
         "degree": int(degree.Get()) if degree and degree.HasAuthoredValue() else None,
+        "color_space": _find_color_space(color_attribute) if color_attribute is not None else "",
         "moves": moves,
         "node": node,
     }
+
+
+def _find_color_space(attribute: Any) -> str:
+    """The colour space of an attribute by OpenUSD's rule: its own, or that of the nearest prim; empty without one."""
+    if attribute.HasColorSpace():
+        return str(attribute.GetColorSpace())[:_COLOR_SPACE_CHARACTERS]
+    for prim in _walk_up(attribute.GetPrim()):
+        stated = prim.GetAttribute(names.COLOR_SPACE)
+        space = stated.Get(Usd.TimeCode.EarliestTime()) if stated and stated.HasAuthoredValue() else None
+        if space:
+            return str(space)[:_COLOR_SPACE_CHARACTERS]
+    return ""
 
 
 def _walk_up(prim: Any) -> Iterator[Any]:

@@ -18,6 +18,9 @@ _MODULE = "genre_tasks.exchange.usd.stage_dump"
 _BASE_S = 300.0
 _S_PER_BYTE = 1e-6
 
+_ROOT = Path(__file__).absolute().parents[3]
+"""The folder that this package is in: of the checkout, or of installed packages."""
+
 
 def run_stage_dump(layer: Path, folder: Path, file: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """Reads a stage in a process whose memory and time are bounded by the file's size.
@@ -36,14 +39,15 @@ def run_stage_dump(layer: Path, folder: Path, file: Path) -> tuple[dict[str, Any
     size = file.stat().st_size
     # One thread: each would take memory of its own. The child finds this package wherever its caller found it.
     environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
+        "PYTHONPATH": os.pathsep.join(_list_python_paths()),
         "PXR_WORK_THREAD_LIMIT": "1",
         "OPENBLAS_NUM_THREADS": "1",
         "MALLOC_ARENA_MAX": "1",
     }
     try:
         done = subprocess.run(
-            [sys.executable, "-m", _MODULE, str(layer), str(folder), str(size)],
+            # Without -P the current folder comes first, and its numpy.py would be run.
+            [sys.executable, "-P", "-m", _MODULE, str(layer.absolute()), str(folder.absolute()), str(size)],
             env=environment,
             capture_output=True,
             check=False,
@@ -59,6 +63,13 @@ def run_stage_dump(layer: Path, folder: Path, file: Path) -> tuple[dict[str, Any
         raise InputError(values["error"]["problem"], remedy=values["error"]["remedy"], file=file)
     with np.load(folder / ARRAYS_FILE, allow_pickle=False) as arrays:
         return values, {name: arrays[name] for name in arrays.files}
+
+
+def _list_python_paths() -> list[str]:
+    """Where this process finds modules, as absolute paths but for the current folder, which an empty one stands for."""
+    paths = [str(Path(path).absolute()) for path in sys.path if path]
+    # In a checkout that is not installed, the empty path may be what the package was found by.
+    return paths if str(_ROOT) in paths else [str(_ROOT), *paths]
 
 
 def _damage(file: Path) -> InputError:

@@ -9,11 +9,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
 
 from genre_tasks.errors import InputError
 from genre_tasks.exchange.checks import check_finite_cloud
+from genre_tasks.exchange.moments import Frame, is_rising
 from genre_tasks.exchange.types import ExchangeNode, ExchangeScene, NodeMotion, SplatCloud
 from genre_tasks.exchange.usd import names
+from genre_tasks.exchange.usd.color_spaces import describe_color_losses
 from genre_tasks.exchange.usd.particle_fields import FieldArrays
 from genre_tasks.exchange.usd.similarity import place_cloud, scale_cloud, split_similarity
 from genre_tasks.logs.types import Float64
@@ -21,6 +24,8 @@ from genre_tasks.logs.types import Float64
 _Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 _SCALE_TOLERANCE = 1e-4
+
+_FRAMES = TypeAdapter(tuple[Frame, ...])
 
 
 def make_scene(stage: Mapping[str, Any], arrays: Mapping[str, Any], file: Path) -> ExchangeScene:
@@ -42,6 +47,7 @@ def make_scene(stage: Mapping[str, Any], arrays: Mapping[str, Any], file: Path) 
     nodes = []
     taken: set[str] = set()
     hidden = 0
+    color_losses: dict[str, None] = {}
     for k, field in enumerate(stage["fields"]):
         prefix = f"{k}/"
         mine = {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
@@ -51,9 +57,11 @@ def make_scene(stage: Mapping[str, Any], arrays: Mapping[str, Any], file: Path) 
         node = _make_node(field, mine, scene_from_stage, file)
         check_finite_cloud(file, node.cloud)
         nodes.append(replace(node, name=_choose_name(node.name, taken)))
+        has_harmonics = names.COEFFICIENTS in mine
+        color_losses |= dict.fromkeys(describe_color_losses(field["color_space"], has_harmonics=has_harmonics))
     if not stage["scene"] and not any(node.motion for node in nodes):
         scene = replace(scene, times_s=np.zeros(0))
-    losses = [*scene.losses, *stage["losses"]]
+    losses = [*scene.losses, *stage["losses"], *color_losses]
     if hidden:
         losses.append(f"Invisible are {hidden} fields of Gaussians, which are not read.")
     return replace(scene, nodes=tuple(nodes), losses=tuple(losses))
@@ -69,16 +77,30 @@ def _make_moments(stage: Mapping[str, Any], file: Path) -> ExchangeScene:
     times_s = (codes - codes[:1]) / rate
     if not ours:
         return ExchangeScene((), times_s, (), np.eye(4))
-    times_s = np.array(ours.get(names.TIMES_S, ()), np.float64).reshape(-1)
-    frames = tuple(int(frame) for frame in ours.get(names.FRAMES, ()))
-    is_rising = np.isfinite(times_s).all() and bool((np.diff(times_s) > 0).all())
-    if not is_rising or (frames and len(frames) != len(times_s)):
+    times_s = _to_numbers(ours.get(names.TIMES_S, ()), "times", file).reshape(-1)
+    frames = _to_frames(ours.get(names.FRAMES, ()), file)
+    if not is_rising(times_s) or (frames and len(frames) != len(times_s)):
         raise _damage("the scene's times do not rise, or are not as many as its frames", file)
-    world = np.array(ours.get(names.WORLD_SE3_SCENE, np.eye(4)), np.float64)
+    world = _to_numbers(ours.get(names.WORLD_SE3_SCENE, np.eye(4)), "place in the world", file)
     if world.shape != (4, 4) or not np.isfinite(world).all():
         raise _damage("the scene's place in the world is no finite matrix", file)
     losses = tuple(str(loss) for loss in ours.get(names.LOSSES, ()))
     return ExchangeScene((), times_s, frames, world.T.copy(), losses)
+
+
+def _to_numbers(values: Any, what: str, file: Path) -> Float64:
+    """What an entry of ours should be: anybody may have put other values there."""
+    try:
+        return np.array(values, np.float64)
+    except (TypeError, ValueError) as error:
+        raise _damage(f"the scene's {what} is no array of numbers", file) from error
+
+
+def _to_frames(values: Any, file: Path) -> tuple[int, ...]:
+    try:
+        return _FRAMES.validate_python(values)
+    except ValidationError as error:
+        raise _damage(f"the scene's frames are no numbers of log frames: {error.errors()[0]['msg']}", file) from error
 
 
 def _find_axes(stage: Mapping[str, Any], file: Path) -> Float64:
@@ -95,7 +117,7 @@ def _make_node(
 ) -> ExchangeNode:
     path = field["path"]
     node = field["node"]
-    cloud = FieldArrays(arrays, field["degree"], path, file).to_cloud()
+    cloud = FieldArrays(arrays, field["degree"], field["color_space"], path, file).to_cloud()
     cloud = replace(cloud, antialiased=node.get(names.ANTIALIASED))
     matrices = scene_from_stage @ arrays[names.MATRICES]
     if not np.isfinite(matrices).all():
@@ -105,8 +127,8 @@ def _make_node(
         cloud, motion = _move_cloud(cloud, matrices, arrays[names.SHOWN], path, file)
     else:
         cloud = place_cloud(cloud, matrices[0], path, file)
-    size = [float(side) for side in node.get(names.SIZE_M, (0.0, 0.0, 0.0))]
-    if len(size) != 3 or not np.isfinite(size).all():
+    size = _to_numbers(node.get(names.SIZE_M, (0.0, 0.0, 0.0)), "size of a node", file)
+    if size.shape != (3,) or not np.isfinite(size).all():
         raise _damage(f"the size of {path} is not three finite numbers", file)
     return ExchangeNode(
         # Where the file has no name of ours, a name fit for a file's name: of letters, digits and underscores.
@@ -115,7 +137,7 @@ def _make_node(
         motion=motion,
         label=node.get(names.LABEL, ""),
         track_id=node.get(names.TRACK_ID, ""),
-        size_m=(size[0], size[1], size[2]),
+        size_m=(float(size[0]), float(size[1]), float(size[2])),
     )
 
 

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from genre_tasks.exchange.activations import logits_to_opacities, logs_to_scales
 from genre_tasks.exchange.types import ExchangeNode, ExchangeScene, NodeMotion, SplatCloud
 from genre_tasks.exchange.usd import names
+from genre_tasks.exchange.usd.color_spaces import SRGB
 from genre_tasks.logs.types import Float32, Float64
 
 LARGEST_OPACITY = 1.0 - 2.0**-24
@@ -134,6 +135,8 @@ def _set_cloud(field: Any, cloud: SplatCloud, file: Path) -> None:
     # Written always: a file that leaves it out has degree 3.
     field.CreateRadianceSphericalHarmonicsDegreeAttr(cloud.sh_degree)
     field.CreateRadianceSphericalHarmonicsCoefficientsAttr(Vt.Vec3fArray.FromNumpy(coefficients))
+    # OpenUSD takes colours for linear light where none is stated, and a stage around this one may state another.
+    Usd.ColorSpaceAPI.Apply(field.GetPrim()).CreateColorSpaceNameAttr(SRGB)
     UsdGeom.Boundable(field).CreateExtentAttr(_find_extent(cloud.means, scales, quats))
 
 

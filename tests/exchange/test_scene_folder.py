@@ -1,0 +1,43 @@
+"""Exported folders: what their document says and a file does not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from genre_tasks.errors import InputError
+from genre_tasks.exchange.gltf.format import GLB
+from genre_tasks.exchange.moments import is_rising
+from genre_tasks.exchange.scene_folder import SceneDocument, describe_chunk, read_scene_folder, write_document
+from genre_tasks.exchange.types import ExchangeScene
+from tests.exchange.splat_clouds import make_driving_scene
+
+EXPOSURE = "Exposure is left out."
+SHUTTER = "The rolling shutter is left out."
+
+
+def write_folder(folder: Path, in_file: ExchangeScene, in_document: ExchangeScene) -> None:
+    """An exported folder of one chunk, whose file may be an older one than its document."""
+    GLB.write(folder / "chunk-0.glb", in_file)
+    entry = describe_chunk(0, in_document, {}).model_copy(update={"file": "chunk-0.glb"})
+    write_document(folder, SceneDocument(format="glb", layout="scenes", chunks=(entry,)))
+
+
+def test_losses_of_document_and_file_are_joined_without_repeats(tmp_path: Path) -> None:
+    scene = make_driving_scene()
+    write_folder(tmp_path, replace(scene, losses=(EXPOSURE,)), replace(scene, losses=(EXPOSURE, SHUTTER)))
+    assert read_scene_folder(tmp_path)[0].losses == (EXPOSURE, SHUTTER)
+    write_folder(tmp_path, scene, replace(scene, losses=(SHUTTER,)))
+    assert read_scene_folder(tmp_path)[0].losses == (SHUTTER,)
+
+
+def test_moments_that_do_not_rise_are_refused(tmp_path: Path) -> None:
+    scene = make_driving_scene()
+    times = scene.times_s.copy()
+    times[1] = times[0]
+    assert is_rising(scene.times_s) and not is_rising(times)
+    write_folder(tmp_path, scene, replace(scene, times_s=times))
+    with pytest.raises(InputError, match="moments of chunk 0 do not fit"):
+        read_scene_folder(tmp_path)
