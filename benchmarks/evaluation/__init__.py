@@ -85,8 +85,8 @@ class EvaluationBench:
                 # Shifted by one each round, so that after some rounds every budget has met every seed.
                 seed = seeds[(i + k) % len(seeds)]
                 run = partial(run_with_multiple, seed, float(budget), options["table"], settings)
-                # The first run of a street measures its shortest run, too.
-                seconds = float(budget) * SHORTEST_S + START_S + (0.0 if k or i >= len(seeds) else SHORTEST_S)
+                # The street's shortest run comes before each.
+                seconds = (1.0 + float(budget)) * SHORTEST_S + 2.0 * START_S
                 cells.append(Cell(f"budget {budget} x shortest street {seed}", seconds, run, planned))
         # One street is enough: the seconds depend on the number of views and their size.
         stage = split_option(options["stages"])[-1]

@@ -6,7 +6,6 @@ the same choice, while a run of the same seconds does not.
 
 from __future__ import annotations
 
-import functools
 import itertools
 import json
 import math
@@ -49,30 +48,14 @@ DISTANCE_NOISE = 0.01
 """Three standard deviations of the distance over seeds and runs of one setting (a sweep says 0.001 to 0.003)."""
 
 
-@functools.cache
-def measure_shortest_run(seed: str, table: str, settings: tuple[str, ...] = ()) -> Row:
-    """Runs a street with the shortest setting, which a budget of a second leads to.
-
-    Args:
-        seed: see :func:`run_with_budget`.
-        table: see :func:`run_with_budget`.
-        settings: see :func:`run_with_budget`.
-
-    Returns:
-        A row as :func:`run_with_budget` returns it; a process measures a street once.
-
-    Raises:
-        NotMeasuredError: the command fails.
-    """
-    return run_with_budget(seed, SHORTEST_BUDGET_S, table, settings)
-
-
 def run_with_multiple(seed: str, multiple: float, table: str, settings: Sequence[str] = ()) -> Row:
     """Runs a street of the preset ``small`` within a multiple of its shortest run's seconds.
 
+    The shortest run comes right before, as a shared machine may be a third faster or slower half an hour later.
+
     Args:
         seed: see :func:`run_with_budget`.
-        multiple: of the shortest run's seconds, which are measured first.
+        multiple: of the shortest run's seconds.
         table: see :func:`run_with_budget`.
         settings: see :func:`run_with_budget`.
 
@@ -82,7 +65,7 @@ def run_with_multiple(seed: str, multiple: float, table: str, settings: Sequence
     Raises:
         NotMeasuredError: a command fails.
     """
-    shortest_s = measure_shortest_run(seed, table, tuple(settings))["used_s"]
+    shortest_s = run_with_budget(seed, SHORTEST_BUDGET_S, table, settings)["used_s"]
     # A command's budget has whole tenths of seconds, as a user would write it.
     row = run_with_budget(seed, round(multiple * shortest_s, 1), table, settings)
     return row | {"multiple": multiple, "shortest_s": shortest_s}
@@ -242,11 +225,12 @@ def _used_part(row: Row) -> float:
 
 
 def _distances_by_log(rows: Sequence[Row]) -> list[list[float]]:
-    """Gives the distance of each log's runs, by ascending budget."""
+    """Gives the distance of each log's runs, by ascending multiple of its shortest run."""
     out = []
     for log in sorted({r["log"] for r in rows}):
-        # Only budgets of one street are compared: streets differ more than budgets do.
-        runs = sorted((r for r in rows if r["log"] == log), key=lambda r: float(r["budget_s"]))
+        # Only budgets of one street are compared: streets differ more than budgets do. By multiples, as the seconds of
+        # the shortest run change with the machine's speed.
+        runs = sorted((r for r in rows if r["log"] == log), key=lambda r: float(r["multiple"]))
         out.append([float(r["metrics"][DISTANCE]) for r in runs])
     return out
 

@@ -9,7 +9,9 @@ from typing import Any
 from flows.budget.chooser import Chooser, count_images
 from flows.budget.cost_table import CostTable, find_shipped_table, load_cost_table
 from flows.budget.deadline import Deadline
+from flows.budget.memory_filter import keep_points_that_fit
 from flows.configuration import apply_settings, diff_from_preset
+from flows.configuration.absolute_paths import make_paths_absolute
 from flows.configuration.settings import keys_overlap
 from flows.machine.calibration import measure_calibration_s
 from genre_tasks.config import PipelineConfig
@@ -17,6 +19,7 @@ from genre_tasks.errors import ConfigError
 
 _KEYS_OF_TIME = frozenset(
     {
+        "ingest.source_every",
         "gnet.method",
         "gnet.views_per_iteration",
         "enet.views_per_iteration",
@@ -48,7 +51,10 @@ def resolve_table(table: str | None, preset: str, config: PipelineConfig) -> Cos
     path = Path(table) if table else find_shipped_table(preset)
     own_keys = diff_from_preset(config, preset)
     loaded = load_cost_table(path, preset, own_keys)
-    if lacking := [setting for setting in loaded.settings if apply_settings(config, [setting]) != config]:
+    # A table may name a file by a path that is relative to this folder; a run's paths are absolute.
+    absolute = make_paths_absolute(config)
+    required = {setting: apply_settings(config, [setting]) for setting in loaded.settings}
+    if lacking := [setting for setting, other in required.items() if make_paths_absolute(other) != absolute]:
         raise ConfigError(
             f"this table was measured with {', '.join(lacking)}, which this run does not have",
             remedy="Give the run the same with --set, or a table that was measured without.",
@@ -95,6 +101,7 @@ class Budget:
         self._config = config
         self.speed: float | None = None
         self.choosers: dict[int, Chooser] = {}
+        self._fitting_tables: dict[str, CostTable] = {}
 
     def make_chooser(self, log: str, chunk: int) -> Chooser:
         """Makes the chooser of a chunk and keeps it for the record.
@@ -105,21 +112,32 @@ class Budget:
 
         Returns:
             The chooser, which asks for this machine's speed when it needs it.
+
+        Raises:
+            ResourceError: no setting of the table fits into the memory that the user allows.
         """
+        fitting = self._keep_what_fits(log)
         chooser = Chooser(
-            self._table,
+            fitting,
             self._config,
             self.deadline,
             image_factor=count_images(log, chunk, self._config) / self._table.images,
             measure_speed=self.measure_speed,
             # The first stage of a kind in a process loads code and weights.
             warm_stages={stage for earlier in self.choosers.values() for stage in earlier.computed_stages},
+            left_out=len(self._table.points) - len(fitting.points),
         )
         # The first chunk has to wait with this; later ones know it from the start.
         if self.speed is not None:
             chooser.calibrate()
         self.choosers[chunk] = chooser
         return chooser
+
+    def _keep_what_fits(self, log: str) -> CostTable:
+        """The table without the settings that memory is too small for; found once, as it takes from the budget."""
+        if log not in self._fitting_tables:
+            self._fitting_tables[log] = keep_points_that_fit(self._table, self._config, log)
+        return self._fitting_tables[log]
 
     def measure_speed(self) -> float:
         """Measures this machine's speed once; later calls give the same number.

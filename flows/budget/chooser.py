@@ -73,6 +73,7 @@ class Chooser:
         image_factor: images of the chunk over images of a chunk of the table.
         measure_speed: gives this machine's calibration over the table's.
         warm_stages: stages that this process has computed before; their first calls are over.
+        left_out: how many settings were left out before, as memory is too small for them; for the explanation.
 
     Attributes:
         deadline: the time of the run.
@@ -89,6 +90,7 @@ class Chooser:
         image_factor: float,
         measure_speed: Callable[[], float],
         warm_stages: Collection[str] = (),
+        left_out: int = 0,
     ) -> None:
         self.deadline = deadline
         self.choices: list[BudgetChoice] = []
@@ -97,6 +99,7 @@ class Chooser:
         self._table = table
         self._image_factor = image_factor
         self._measure_speed = measure_speed
+        self._left_out = left_out
         # More pixels take more time. Fewer do not take as much less: points and Gaussians stay as many.
         self._pixel_factor = max(1.0, base.ingest.width_px * base.ingest.height_px / table.pixels)
         self._first_call_s = {s: seconds for s, seconds in table.first_call_s.items() if s not in warm_stages}
@@ -235,6 +238,8 @@ class Chooser:
         if chosen is None:
             return "nothing fits; this is the shortest"
         reason = f"the best {self._table.accuracy_label} that fits"
+        if self._left_out:
+            reason += f" ({self._left_out} left out for lack of memory)"
         better = ranked[: ranked.index(chosen)]
         if not better:
             return f"{reason}, and of all {len(ranked)}"

@@ -17,6 +17,7 @@ from flows.pipeline.definition import RECONSTRUCTION_STAGES, STAGE_BY_NAME
 from genre_tasks.errors import ConfigError
 
 _CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+_SIZE_KEYS = frozenset({"ingest.width_px", "ingest.height_px"})
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,8 @@ class CostTable:
         points: the settings.
         images: images in a chunk of the sweep, source views and held-out ones.
         pixels: of an image of the sweep.
-        settings: ``section.key=value`` over the preset that all of the sweep was measured with, as far as they change
-            a scene or what it takes.
+        settings: ``section.key=value`` over the preset that all of the sweep was measured with, as far as a run needs
+            them: those that change a scene or what it takes, but for the size of images.
         calibration_s: seconds of :func:`flows.machine.calibration.measure_calibration_s` on the sweep's machine.
         first_call_s: by stage, how many seconds more the first call in a process takes than a later one.
         machine: the sweep's machine, one line.
@@ -147,7 +148,7 @@ def load_cost_table(path: Path, preset: str, user_keys: Iterable[str] = ()) -> C
         points=points,
         images=summaries[0].source_images,
         pixels=ingest.width_px * ingest.height_px,
-        settings=tuple(setting for setting in measured.settings if _changes_scenes(setting)),
+        settings=tuple(setting for setting in measured.settings if _must_match(setting)),
         calibration_s=measured.calibration_s,
         first_call_s=measured.first_call_s,
         machine=facts["machine"],
@@ -184,10 +185,15 @@ def _list_points(summaries: Sequence[SettingSummary], measure: Measure) -> tuple
     )
 
 
-def _changes_scenes(setting: str) -> bool:
-    section, _, key = setting.partition("=")[0].partition(".")
+def _must_match(setting: str) -> bool:
+    """Whether a run must have this setting of the sweep."""
+    key = setting.partition("=")[0].strip()
+    # Predictions allow for the number of pixels, which the table has.
+    if key in _SIZE_KEYS:
+        return False
+    section, _, name = key.partition(".")
     # Evaluation is no part of a budget, and what is kept for its curve takes next to no time.
-    return section in {STAGE_BY_NAME[stage].section for stage in RECONSTRUCTION_STAGES} and key != "snapshots"
+    return section in {STAGE_BY_NAME[stage].section for stage in RECONSTRUCTION_STAGES} and name != "snapshots"
 
 
 def _budget_may_choose(summary: SettingSummary) -> bool:

@@ -52,6 +52,7 @@ def cost(
     from flows.cli.output_paths import check_output_folder
     from flows.cli.parsing import parse_numbers
     from flows.cli.printing import print_rows
+    from flows.configuration.absolute_paths import make_setting_absolute
     from flows.cost_sweep.cell import Sweep, predict_cells
     from flows.cost_sweep.request import SweepRequest
 
@@ -59,7 +60,8 @@ def cost(
     chunk_numbers = parse_numbers(chunks, "--chunks")
     seed_numbers = parse_numbers(seeds, "--seeds")
     knob_names = None if knobs is None else [name.strip() for name in knobs.split(",")]
-    sweep = Sweep(preset, tuple(settings or ()), store)
+    # The table names them, and a budget compares them with those of a run, whose paths are absolute.
+    sweep = Sweep(preset, tuple(map(make_setting_absolute, settings or ())), store)
     # Mistakes in the request show here, before Prefect's server takes seconds to start.
     cells = SweepRequest(sweep, logs, chunk_numbers, seed_numbers, knob_names).cells()
     if dry_run:
@@ -78,7 +80,7 @@ def cost(
             chunks=chunk_numbers,
             seeds=seed_numbers,
             knobs=knob_names,
-            settings=settings,
+            settings=list(sweep.settings),
             out=str(out),
         )
     typer.echo(f"{done['cells']} cells, {len(done['failed'])} left out; wrote {', '.join(done['files'])}")

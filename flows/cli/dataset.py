@@ -60,6 +60,7 @@ def dataset(
     """
     from flows.cli.outcome import add_facts
     from flows.configuration import load_configuration
+    from flows.configuration.absolute_paths import make_setting_absolute
     from flows.dataset.dataset_record import name_dataset
     from flows.pipeline.log_cache import expand_logs
     from genre_tasks.errors import ConfigError
@@ -78,9 +79,11 @@ def dataset(
             raise ConfigError(f"{option} is for a dataset on a pool", remedy="Give a --pool, too, or leave it out.")
     # A mistake in a setting or a path shows here, before anything is submitted.
     load_configuration(preset, settings=settings or ())
+    # Records of runs name files, and are read from other folders.
+    settings = [make_setting_absolute(setting) for setting in settings or ()]
     expanded = expand_logs(logs)
     if pool is not None:
-        expanded, store, settings = _make_absolute(expanded, store, settings)
+        expanded, store = _make_absolute(expanded, store)
     name = name_dataset(expanded, preset, store, settings)
     facts = {"dataset": name, "preset": preset, "store": store}
     add_facts(**facts, logs=[])
@@ -94,15 +97,14 @@ def dataset(
         _follow(run_id, facts, as_json)
 
 
-def _make_absolute(logs: list[str], store: str, settings: list[str] | None) -> tuple[list[str], str, list[str]]:
-    """The same logs, store and settings for a worker, which runs in a folder of its own."""
-    from flows.configuration.settings import make_setting_absolute
+def _make_absolute(logs: list[str], store: str) -> tuple[list[str], str]:
+    """The same logs and store for a worker, which runs in a folder of its own."""
     from genre_tasks.logs.registry import make_log_absolute
     from storage.opening import make_address_absolute
 
     # Its folder is removed with all that a relative store has got there.
     store = make_address_absolute(store)
-    return [make_log_absolute(log) for log in logs], store, [make_setting_absolute(s) for s in settings or ()]
+    return [make_log_absolute(log) for log in logs], store
 
 
 def _run_here(parameters: Mapping[str, Any], facts: Mapping[str, Any], as_json: bool) -> None:

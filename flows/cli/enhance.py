@@ -53,7 +53,7 @@ def enhance(
     from flows.cli.outcome import add_facts
     from flows.cli.parsing import parse_numbers
     from flows.configuration import load_configuration
-    from flows.configuration.settings import make_setting_absolute
+    from flows.configuration.absolute_paths import make_paths_absolute
     from flows.enhancement.enhancement_request import EnhancementInputs, prepare_enhancement
     from genre_tasks.logs.registry import make_log_absolute
 
@@ -72,7 +72,7 @@ def enhance(
         store=store,
         chunks=parse_numbers(chunks, "--chunks"),
         # The user's settings come last, and win.
-        config=load_configuration(preset, settings=[*prepared.settings, *map(make_setting_absolute, settings or [])]),
+        config=make_paths_absolute(load_configuration(preset, settings=[*prepared.settings, *(settings or [])])),
         budget_s=None,
         start_time=psutil.Process().create_time(),
         table=None,

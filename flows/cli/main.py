@@ -47,6 +47,7 @@ from flows.cli.train import app as train_app
 from flows.cli.verify import verify
 from flows.cli.view import view
 from flows.machine.state_folder import find_state_folder
+from genre_tasks.errors import ConfigError
 
 app = typer.Typer(
     name="genre",
@@ -142,8 +143,8 @@ def prepare_environment(debug: bool) -> None:
         if not os.environ.get(name):
             os.environ[name] = value
     if not os.environ.get("PREFECT_HOME"):
-        # Where nothing can be written, only what needs a home may fail: help and checks do not.
-        with suppress(OSError):
+        # Where nothing can be written, or the folder is not the user's, only what needs a home may fail: help does not.
+        with suppress(OSError, ConfigError):
             # Not the working folder, which may be read-only.
             os.environ["PREFECT_HOME"] = str(find_state_folder() / "prefect")
     if not debug:

@@ -32,6 +32,16 @@ FolderOption = Annotated[
     ),
 ]
 
+TrainingFolderOption = Annotated[
+    Path | None,
+    typer.Option(
+        parser=parse_path,
+        metavar="PATH",
+        help="The folder of the training deployments, by the path that it has for workers. `training` in this folder "
+        "if not given.",
+    ),
+]
+
 
 def _find_folder(folder: Path | None) -> Path:
     from flows.machine.state_folder import find_state_folder
@@ -79,7 +89,8 @@ def status(
     \b
         genre ops status --json
     """
-    from flows.operations.stack import describe_services
+    from flows.cli.outcome import print_outcome
+    from flows.operations.stack import describe_services, read_client_environment
     from genre_tasks.errors import InputError
 
     state = _find_folder(folder)
@@ -89,6 +100,9 @@ def status(
     file = state / "env"
     if not file.exists():
         raise InputError("no services were started", remedy="Start them by `genre ops up`.", file=file)
+    if json:
+        print_outcome("done", {"environment": read_client_environment(file)})
+        return
     typer.echo(file.read_text(), nl=False)
 
 
@@ -114,6 +128,7 @@ def down(
 def deploy(
     pool: Annotated[str, typer.Option(help="The name of the work pool.")] = "genre",
     store: Annotated[str, typer.Option(help="The default store of the deployments.")] = "genre-store",
+    training_folder: TrainingFolderOption = None,
 ) -> None:
     """Deploy the flows at the Prefect server of PREFECT_API_URL.
 
@@ -132,7 +147,8 @@ def deploy(
         raise ConfigError("PREFECT_API_URL is not set", remedy="Set it to the address of the Prefect API.")
     address = make_address_absolute(store)
     check_server(url)
-    for name in deploy_flows(url, None, pool, address, Path.cwd()):
+    trainings = Path("training") if training_folder is None else training_folder
+    for name in deploy_flows(url, None, pool, address, trainings.absolute()):
         typer.echo(name)
 
 

@@ -35,6 +35,8 @@ def pin(
 
     if (name is None) != list_all:
         raise ConfigError("give a run or a key, or --list", remedy="`genre show runs` lists the runs.")
+    if list_all and note:
+        raise ConfigError("--list has no use for --note", remedy="Leave it out, or give a run or a key to pin.")
     opened = open_existing_store(store)
     if name is None:
         rows = [

@@ -121,7 +121,7 @@ def run(
     from flows.cli.outcome import add_facts
     from flows.cli.parsing import parse_duration, parse_memory, parse_numbers
     from flows.configuration import load_configuration
-    from flows.configuration.settings import make_setting_absolute
+    from flows.configuration.absolute_paths import make_paths_absolute
     from genre_tasks.logs.registry import make_log_absolute
 
     # Known from here on, whatever happens: what a program reads where the run does not come to its end.
@@ -130,14 +130,14 @@ def run(
     strict_settings = ["ingest.strict=true"] if strict else []
     memory_gib = parse_memory(memory, "--memory")
     limit_settings = [] if memory_gib is None else [f"limits.memory_gib={memory_gib!r}"]
-    # The run's record names files and the log, and is read from other folders.
-    own_settings = [make_setting_absolute(setting) for setting in settings or []]
+    effective = load_configuration(preset, config, [*(settings or []), *strict_settings, *limit_settings])
     request = RunRequest(
         log=make_log_absolute(log),
         preset=preset,
         store=store,
         chunks=parse_numbers(chunks, "--chunks"),
-        config=load_configuration(preset, config, [*own_settings, *strict_settings, *limit_settings]),
+        # The record names files and the log, and is read from other folders.
+        config=make_paths_absolute(effective),
         budget_s=parse_duration(budget, "--budget"),
         # A budget counts from when the user pressed return, imports included.
         start_time=psutil.Process().create_time(),

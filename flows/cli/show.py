@@ -62,9 +62,9 @@ def show(
     from flows.cli.existing_store import open_existing_store
     from flows.cli.printing import print_fields, print_rows
 
-    _check_options(what, run, picture)
+    _check_options(what, run, preset, chunk, picture)
     if _is_folder(what):
-        _show_folder(Path(what), picture)
+        _show_folder(Path(what), chunk, picture)
         return
     if what == "config":
         from flows.configuration import load_configuration
@@ -88,7 +88,7 @@ def show(
         _show_run_or_artifact(what, opened, chunk, picture)
 
 
-def _check_options(what: str, run: str | None, picture: Path | None) -> None:
+def _check_options(what: str, run: str | None, preset: str, chunk: int | None, picture: Path | None) -> None:
     from flows.cli.output_paths import check_output_file
 
     if picture is not None:
@@ -98,6 +98,10 @@ def _check_options(what: str, run: str | None, picture: Path | None) -> None:
             raise _no_picture(f"a list of {what}" if what != "config" else "a configuration")
     if run is not None and what != "actors":
         raise _second_word(what, run)
+    if preset != DEFAULT_PRESET and what != "config":
+        raise _no_preset(what)
+    if chunk is not None and what in _LISTS:
+        raise _no_chunk(f"'{what}'")
 
 
 def _show_run_or_artifact(name: str, opened: Store, chunk: int | None, picture: Path | None) -> None:
@@ -111,6 +115,8 @@ def _show_run_or_artifact(name: str, opened: Store, chunk: int | None, picture: 
             raise _no_picture("a run")
         print_run_record(found.record, chunk)
         return
+    if chunk is not None:
+        raise _no_chunk("an artifact")
     if picture is not None:
         # Before the tables, which would hide an error about the picture.
         write_picture(opened, found, picture)
@@ -128,12 +134,14 @@ def _is_folder(what: str) -> bool:
     return False
 
 
-def _show_folder(folder: Path, picture: Path | None) -> None:
+def _show_folder(folder: Path, chunk: int | None, picture: Path | None) -> None:
     from flows.cli.show_artifact import print_artifact, read_folder_artifact
     from storage.local import LocalStore
 
     if picture is not None:
         raise _no_picture("a folder outside of a store")
+    if chunk is not None:
+        raise _no_chunk("a folder outside of a store")
     # The folder stands alone: what it was made from is named in its manifest, and may be in any store.
     print_artifact(LocalStore(folder), read_folder_artifact(folder))
 
@@ -142,6 +150,21 @@ def _second_word(what: str, run: str) -> Exception:
     from genre_tasks.errors import ConfigError
 
     return ConfigError(f"'{run}' after '{what}' has no meaning", remedy="Only `genre show actors` takes a second word.")
+
+
+def _no_preset(what: str) -> Exception:
+    from genre_tasks.errors import ConfigError
+
+    return ConfigError(f"--preset has no meaning for '{what}'", remedy="Only `genre show config` takes a preset.")
+
+
+def _no_chunk(what: str) -> Exception:
+    from genre_tasks.errors import ConfigError
+
+    return ConfigError(
+        f"--chunk has no meaning for {what}",
+        remedy="Give --chunk with the name of a run; `genre show runs` lists them.",
+    )
 
 
 def _no_picture(what: str) -> Exception:

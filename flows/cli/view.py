@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 PAGE_SPLATS = 100_000
 """Gaussians of a page unless the user says otherwise: some megabytes, which an ordinary laptop shows smoothly."""
 
+_DEFAULT_HOST = "127.0.0.1"
+_DEFAULT_PORT = 8080
 _LEAST_SPLATS = 100
 _MOST_SPLATS = 5_000_000
 
@@ -59,8 +61,8 @@ def view(
     stage: SceneStageOption = None,
     chunk: RunChunkOption = None,
     max_splats: MaxSplatsOption = None,
-    host: HostOption = "127.0.0.1",
-    port: PortOption = 8080,
+    host: HostOption = _DEFAULT_HOST,
+    port: PortOption = _DEFAULT_PORT,
     open_browser: OpenOption = False,
     no_range: ViewNoRangeOption = False,
     store: StoreOption = DEFAULT_STORE,
@@ -84,6 +86,7 @@ def view(
     # Checked first, because reading a scene takes seconds.
     if html is not None:
         check_output_file(html, "--html", (".html", ".htm"))
+        _refuse_viewer_options(host, port, open_browser)
     if max_splats is not None:
         check_number(max_splats, "--max-splats", _LEAST_SPLATS, _MOST_SPLATS)
     check_number(port, "--port", 0, 65535)
@@ -135,6 +138,17 @@ def _link_from_report(path: Path, run: ViewedRun, store: str) -> None:
 
     if path.resolve() == (run.folder / SCENE_FILE).resolve() and (run.folder / "report.html").is_file():
         typer.echo(f"wrote {rewrite_report(store, run.name)}, which links to it")
+
+
+def _refuse_viewer_options(host: str, port: int, open_browser: bool) -> None:
+    from genre_tasks.errors import ConfigError
+
+    of_the_viewer = {"--host": host != _DEFAULT_HOST, "--port": port != _DEFAULT_PORT, "--open": open_browser}
+    if given := [option for option, is_given in of_the_viewer.items() if is_given]:
+        raise ConfigError(
+            f"a page by --html has no use for {', '.join(given)}",
+            remedy="Leave that out, or leave out --html to start the viewer.",
+        )
 
 
 def _check_host(host: str) -> None:

@@ -14,7 +14,7 @@ from flows.comparison.picture_pairs import pair_pictures
 from flows.comparison.setting_differences import list_differences
 from flows.reconstruction.chunk_configuration import read_chunk_config
 from flows.reconstruction.stored_values import SCENE_STAGES
-from genre_tasks.errors import InputError
+from genre_tasks.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
     from storage.store import Artifact, Store
@@ -79,6 +79,7 @@ def compare_runs(a: RunSide, b: RunSide, chunk: int | None = None) -> Comparison
         The comparison.
 
     Raises:
+        ConfigError: a chunk is asked for, and the runs are of different logs.
         InputError: either run lacks the chunk.
         ArtifactCorruptError: an artifact that is compared is damaged.
     """
@@ -100,6 +101,8 @@ def compare_runs(a: RunSide, b: RunSide, chunk: int | None = None) -> Comparison
 
 def _choose_chunks(comparison: Comparison, a: RunSide, b: RunSide, chunk: int | None) -> list[int]:
     if a.record["log"] != b.record["log"]:
+        if chunk is not None:
+            raise ConfigError("chunks of different logs are not compared", remedy="Leave out --chunk.")
         comparison.notes.append("The runs are of different logs: only settings and mean metrics are compared.")
         return []
     common = [number for number in a.chunks if number in b.chunks]

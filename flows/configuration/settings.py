@@ -7,11 +7,8 @@ from typing import Any, get_args, get_origin
 from flows.configuration.keys import describe_value, find_annotation, list_kinds, section_type, takes_list, takes_text
 from flows.yaml_values import NULLS, KeyPath, YamlError, parse_yaml
 from genre_tasks.errors import ConfigError
-from genre_tasks.user_paths import expand_user_path
 
 _HOW = "Write --set section.key=value."
-PATH_KEYS = frozenset({"points", "scene", "weights", "inception", "lpips"})
-"""Last parts of the keys that take the path of a file or folder."""
 
 
 def parse_setting(setting: object) -> tuple[KeyPath, Any]:
@@ -42,30 +39,6 @@ def parse_setting(setting: object) -> tuple[KeyPath, Any]:
         raise ConfigError(f"cannot read --set {describe_value(setting)}", remedy=_HOW)
     path = tuple(part.strip() for part in key.split("."))
     return path, _parse_value(path, text.strip())
-
-
-def make_setting_absolute(setting: str) -> str:
-    """Writes a setting so that it names the same file from every working folder.
-
-    Args:
-        setting: ``section.key=value``.
-
-    Returns:
-        The setting with an absolute path, if its key takes a text and a file or folder of that name is here.
-
-    Raises:
-        ConfigError: as :func:`parse_setting` raises it.
-
-    >>> make_setting_absolute("fnet.weights=builtin"), make_setting_absolute("gnet.iterations=9")
-    ('fnet.weights=builtin', 'gnet.iterations=9')
-    """
-    path, value = parse_setting(setting)
-    annotation = find_annotation(path)
-    is_path = path[-1] in PATH_KEYS and annotation is not None and takes_text(annotation)
-    if not is_path or not isinstance(value, str):
-        return setting
-    file = expand_user_path(value)
-    return f"{'.'.join(path)}={file.absolute()}" if file.exists() else setting
 
 
 def keys_overlap(key: str, other: str) -> bool:

@@ -115,7 +115,7 @@ def list_settings(preset: str, settings: Sequence[str] = (), knobs: Sequence[str
         The preset itself first, then every value of the knobs that differs from the preset's.
 
     Raises:
-        ConfigError: there is no such knob.
+        ConfigError: there is no such knob, or one is named twice.
 
     >>> [s.name for s in list_settings("small", knobs=["views"])]
     ['preset', 'views=1', 'views=6', 'views=12']
@@ -126,11 +126,14 @@ def list_settings(preset: str, settings: Sequence[str] = (), knobs: Sequence[str
         if name not in known:
             remedy = f"{did_you_mean(name, known)}Known: {', '.join(known)}."
             raise ConfigError(f"there is no knob {name!r}", remedy=remedy)
+    if len(set(knobs)) != len(knobs):
+        raise ConfigError(f"the knobs {', '.join(knobs)} name one twice", remedy="Name each knob once.")
     # The preset comes first: without its cells nothing can be compared when a sweep is stopped.
     out = [Setting(PRESET_ITSELF, "")]
     for name in knobs or known:
         out += [setting for setting in known[name] if _differs_from_preset(setting, preset, settings, base)]
-    return out
+    # Rounding may give a value several times, and a setting with more cells than the preset is compared with nothing.
+    return list({setting.name: setting for setting in out}.values())
 
 
 def _differs_from_preset(setting: Setting, preset: str, settings: Sequence[str], base: PipelineConfig) -> bool:

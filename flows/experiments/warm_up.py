@@ -9,15 +9,20 @@ from flows.pipeline.stage_runner import Job, run_stage
 from genre_tasks.config import PipelineConfig
 from genre_tasks.temporary_names import temporary_folder
 
+_TINY_FRAMES = 8
 # Seed 900 is for tuning, so that no training or test street is touched.
-TINY_LOG = "synthetic:street?seed=900&frames=8&cameras=1"
+TINY_LOG = f"synthetic:street?seed=900&frames={_TINY_FRAMES}&cameras=1"
+
+EFFECTS_OF_STATED_TIMES = ("rolling_shutter", "motion_blur")
+"""Effects that are possible only where a log states readout or exposure times, which the tiny one does not."""
 
 
 def run_on_tiny_log(config: PipelineConfig, names: Sequence[str]) -> dict[str, float]:
     """Runs stages on a tiny synthetic log in a store that is deleted afterwards.
 
     Args:
-        config: what the stages run with; what it says of the user's log, such as names of its cameras, is left out.
+        config: what the stages run with. What it says of the user's log is left out, such as names of its cameras, and
+            what the tiny log does not support.
         names: stages in the pipeline's order.
 
     Returns:
@@ -31,11 +36,17 @@ def run_on_tiny_log(config: PipelineConfig, names: Sequence[str]) -> dict[str, f
 
 
 def _without_users_log(config: PipelineConfig) -> PipelineConfig:
-    """Cameras, points and scenes are of the user's log, and the tiny log has others."""
+    """The configuration with cameras, points, scenes, frames and effects as the tiny log has them."""
     of_log = {"ingest": ("cameras", "points", "scene", "placement"), "initial": ("scene", "placement")}
     sections = {}
     for name, fields in of_log.items():
         section = getattr(config, name)
         defaults = {field: type(section).model_fields[field].get_default(call_default_factory=True) for field in fields}
         sections[name] = section.model_copy(update=defaults)
-    return config.model_copy(update=sections)
+    # A chunk needs two source frames.
+    source_every = min(config.ingest.source_every, _TINY_FRAMES // 2)
+    frames = {"chunk_frames": _TINY_FRAMES, "source_every": source_every}
+    sections["ingest"] = sections["ingest"].model_copy(update=frames)
+    # Others stay on, so that their first calls are in no cell's seconds.
+    impossible = {name: "auto" for name in EFFECTS_OF_STATED_TIMES if getattr(config.effects, name) == "on"}
+    return config.model_copy(update={**sections, "effects": config.effects.model_copy(update=impossible)})

@@ -52,7 +52,26 @@ DEPLOYMENTS = (
 )
 
 
-def deploy_flows(api_url: str, auth_string: str | None, pool: str, store: str, folder: Path) -> list[str]:
+def fill_parameters(deployment: FlowDeployment, store: str, training_folder: Path) -> dict[str, Any]:
+    """Gives the parameters of a deployment, with the places where its runs keep what they make.
+
+    Args:
+        deployment: one of :data:`DEPLOYMENTS`.
+        store: the default store; a path must be absolute.
+        training_folder: as :func:`deploy_flows` takes it.
+
+    Returns:
+        Plain values by name.
+
+    >>> fill_parameters(DEPLOYMENTS[0], "/store", Path("/training"))["store"]
+    '/store'
+    """
+    # A training has its own store, below its folder.
+    place = {"folder": str(training_folder)} if "folder" in deployment.parameters else {"store": store}
+    return {**deployment.parameters, **place}
+
+
+def deploy_flows(api_url: str, auth_string: str | None, pool: str, store: str, training_folder: Path) -> list[str]:
     """Makes pool, queues, deployments and the heartbeat automation; what exists is brought up to date.
 
     Args:
@@ -60,7 +79,7 @@ def deploy_flows(api_url: str, auth_string: str | None, pool: str, store: str, f
         auth_string: its password; ``None``: the environment's.
         pool: the work pool, of type process.
         store: the default store of the deployments; a path must be absolute.
-        folder: the folder of trainings.
+        training_folder: what the workers of trainings keep, as they see it; an absolute path.
 
     Returns:
         The deployments' names, such as ``reconstruct-log/log``.
@@ -85,16 +104,11 @@ def deploy_flows(api_url: str, auth_string: str | None, pool: str, store: str, f
             # By its module, a run imports the flow where it starts; by its file, Prefect asks for steps to fetch it.
             entrypoint = deployment.entrypoint.replace(".py:", ".").replace("/", ".")
             loaded: Any = load_flow_from_entrypoint(entrypoint)
-            parameters = dict(deployment.parameters)
-            if "folder" in parameters:
-                parameters["folder"] = str(folder / "training")
-            else:
-                parameters["store"] = store
             client.create_deployment(
                 flow_id=client.create_flow_from_name(loaded.name),
                 name=deployment.name,
                 entrypoint=entrypoint,
-                parameters=parameters,
+                parameters=fill_parameters(deployment, store, training_folder),
                 parameter_openapi_schema=parameter_schema(loaded).model_dump_for_openapi(),
                 work_pool_name=pool,
                 work_queue_name=deployment.queue,

@@ -85,7 +85,7 @@ class Stack:
             server = PrefectServer(self.folder / "server", database_url)
             self._ensure(server)
             env.update(server.env())
-            deploy_flows(server.url, env["PREFECT_API_AUTH_STRING"], self.pool, store, self.folder)
+            deploy_flows(server.url, env["PREFECT_API_AUTH_STRING"], self.pool, store, self.folder / "training")
             # A run with slower heartbeats than the automation expects would be marked as crashed while it lives.
             heartbeat = {"PREFECT_FLOWS_HEARTBEAT_FREQUENCY": str(HEARTBEAT_SECONDS)}
             # Before the workers: where one of them does not start, the others and the server are there for clients.
@@ -175,3 +175,17 @@ def describe_services(folder: Path) -> list[dict[str, Any]]:
         del row["start_ticks"]
         rows.append({"service": row.pop("name"), "state": "running" if record.alive else "dead", **row})
     return rows
+
+
+def read_client_environment(file: Path) -> dict[str, str]:
+    """Reads the variables that clients of the services need, passwords included.
+
+    Args:
+        file: ``env`` of the state folder, lines for a shell.
+
+    Returns:
+        The values by name.
+    """
+    # As a shell reads them: a value may be quoted, and have spaces.
+    words = [word for word in shlex.split(file.read_text()) if word != "export"]
+    return dict(word.split("=", 1) for word in words)

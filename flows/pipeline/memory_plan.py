@@ -10,7 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from flows.machine.memory import memory_limit_gib
+from flows.pipeline.memory_limit import usable_memory_gib
+from flows.pipeline.scene_size import count_start_gaussians
 from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import ResourceError
 from genre_tasks.logs.log_selection import choose_working_size
@@ -31,9 +32,6 @@ _STATISTICS_CHANNELS = 6
 
 # As ``KEPT_PIXELS`` of the losses, whose module loads torch; a test compares the two.
 _LARGEST_WITH_STATISTICS_PX = 300_000
-
-_SHARE_OF_MACHINE = 0.85
-"""Of the machine's memory, where no limit is set: predictions are that exact, and other programs need some."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +146,7 @@ def estimate_chunk_size(log: DrivingLog, cameras: Sequence[Camera], config: Pipe
         width_px=width_px,
         height_px=height_px,
         native_px=max((camera.lens.width_px * camera.lens.height_px for camera in cameras), default=0),
-        gaussians=config.initial.max_points + config.initial.distant_count,
+        gaussians=count_start_gaussians(config.initial),
     )
 
 
@@ -214,20 +212,20 @@ def predict_memory(stage: str, size: ChunkSize, config: PipelineConfig, threads:
 
 
 def choose_threads(stage: str, size: ChunkSize, config: PipelineConfig, threads: int) -> int:
-    """Chooses how many threads a stage works with: under a limit as many as fit, since each holds images of its own.
+    """Chooses how many threads a stage works with: as many as fit, since each holds images of its own.
 
     Args:
         stage: the stage's name.
         size: of its chunk.
-        config: with the limit.
+        config: with the user's limit, if any.
         threads: that there are.
 
     Returns:
         From 1 to ``threads``; the stage's result does not depend on it.
     """
-    if config.limits.memory_gib is None:
-        return threads
-    limit_mib = config.limits.memory_gib * 1024
+    least_mib = predict_memory(stage, size, config, 1).working_mib
+    # Where even one thread takes too much, fewer threads may save nothing: then the stage has all that there are.
+    limit_mib = max(1024 * usable_memory_gib(config), least_mib)
     fewer = range(threads, 1, -1)
     return next((n for n in fewer if predict_memory(stage, size, config, n).working_mib <= limit_mib), 1)
 
@@ -236,7 +234,7 @@ def keeps_freed_memory(config: PipelineConfig) -> bool:
     """Decides whether freed memory may stay with the process, which is faster.
 
     Args:
-        config: with the limit.
+        config: with the user's limit, if any.
 
     Returns:
         False under a limit: later stages would take what earlier ones left, and pass the limit by it.
@@ -247,7 +245,7 @@ def keeps_freed_memory(config: PipelineConfig) -> bool:
 def _count_final_gaussians(stage: str, size: ChunkSize, config: PipelineConfig) -> int:
     """Gaussians of the scene that a stage works on at its end."""
     count = float(size.gaussians)
-    if stage == "gnet":
+    if stage == "gnet" and config.gnet.method != "none":
         refinement = config.gnet.refinement
         count *= (1 + config.gnet.split_fraction) * (1 + (0.0 if refinement is None else refinement.split_fraction))
         # Per-scene training adds Gaussians up to a bound of its own.
@@ -312,7 +310,7 @@ def needs_disk(stage: str, memory: StageMemory, config: PipelineConfig) -> bool:
     Args:
         stage: the stage's name.
         memory: that it will take.
-        config: with the limit.
+        config: with the user's limit, if any.
 
     Returns:
         True where they do not fit into memory.
@@ -321,14 +319,12 @@ def needs_disk(stage: str, memory: StageMemory, config: PipelineConfig) -> bool:
         ResourceError: the limit that is set is too low for the stage even so.
     """
     limit_gib = config.limits.memory_gib
-    if limit_gib is None:
-        # The machine's limit is no wish: where a prediction is too high, the stage may still succeed.
-        return memory.in_memory_mib > _SHARE_OF_MACHINE * memory_limit_gib() * 1024
-    if memory.working_mib > limit_gib * 1024:
+    # The machine's memory is no wish: where a prediction is too high, the stage may still succeed.
+    if limit_gib is not None and memory.working_mib > limit_gib * 1024:
         raise ResourceError(
             f"{stage} needs about {memory.working_mib / 1024:.1f} GiB of memory with its images on disk, and may use "
             f"{limit_gib:.1f} GiB",
             remedy="Allow more (--memory), or choose a smaller ingest.width_px or initial.max_points.",
             stage=stage,
         )
-    return memory.in_memory_mib > limit_gib * 1024
+    return memory.in_memory_mib > usable_memory_gib(config) * 1024

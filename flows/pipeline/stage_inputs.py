@@ -19,6 +19,7 @@ from flows.pipeline.memory_plan import (
     needs_disk,
     predict_memory,
 )
+from flows.pipeline.scene_size import count_start_gaussians
 from genre_tasks.config import PipelineConfig
 from storage.store import Artifact, Store
 
@@ -103,9 +104,9 @@ def _predict(spec: StageSpec, log: str, config: PipelineConfig, values: Mapping[
         opened = cached_log(log)
         size = estimate_chunk_size(opened, select_cameras(config.ingest, opened), config)
     else:
-        # The scene that the stage starts from; before there is one, the configuration says how large it may be.
+        # The scene that the stage starts from; before there is one, its file or the configuration says how large it is.
         scenes = [len(value.scene) for value in values.values() if hasattr(value, "scene")]
-        start = config.initial.max_points + config.initial.distant_count
+        start = count_start_gaussians(config.initial)
         size = measure_chunk_size(values["ingest"], config, max(scenes, default=start))
     threads = choose_threads(spec.name, size, config, torch.get_num_threads())
     return predict_memory(spec.name, size, config, threads), threads

@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING
 
 from flows.machine.facts import count_cores
 from flows.machine.memory import memory_limit_gib
-from flows.pipeline.memory_plan import ChunkSize, choose_threads, grow_until, needs_disk, predict_memory
+from flows.pipeline.memory_plan import (
+    ChunkSize,
+    choose_threads,
+    estimate_chunk_size,
+    grow_until,
+    needs_disk,
+    predict_memory,
+)
 from flows.preflight.store_checks import free_space_mib
 from genre_tasks.config import PipelineConfig
 
@@ -48,9 +55,11 @@ def estimate_disk_mib(log: DrivingLog, cameras: Sequence[Camera], config: Pipeli
     novel_views = source_frames * len(cameras) * len(config.novel_views.shifts_m)
     rendered_px = novel_views * config.ingest.width_px * config.ingest.height_px
     views = rendered_px * (_NOVEL_VIEW_BYTES_PER_PX + _FIXED_VIEW_BYTES_PER_PX)
-    gnet, enet = _count_gaussians(config)
-    start = config.initial.max_points + config.initial.distant_count
-    gaussians = start + gnet * (1 + config.gnet.snapshots) + enet * (1 + config.enet.snapshots)
+    # The most that there may be; LiDAR may give fewer.
+    size = estimate_chunk_size(log, cameras, config)
+    gnet = grow_until("evaluate/gnet", size, config).gaussians
+    enet = grow_until("evaluate/enet", size, config).gaussians
+    gaussians = size.gaussians + gnet * (1 + config.gnet.snapshots) + enet * (1 + config.enet.snapshots)
     return chunks * ((images + points + views + gaussians * _BYTES_PER_GAUSSIAN) / 2**20 + _REPORT_MIB)
 
 
@@ -93,21 +102,16 @@ def assess_memory(size: ChunkSize, config: PipelineConfig, stages: Iterable[str]
         memory = predict_memory(stage, grown, config, choose_threads(stage, grown, config, count_cores()))
         needs_disk(stage, memory, config)
         needed_mib = max(needed_mib, memory.with_images_on_disk_mib)
-    limit_gib = memory_limit_gib()
-    if config.limits.memory_gib is not None or limit_gib >= _CLEARLY_TOO_LITTLE * needed_mib / 1024:
-        return None
-    return (
-        f"this process may use {limit_gib:.1f} GiB of memory, and the run needs about {needed_mib / 1024:.1f} GiB; "
-        "smaller images or fewer Gaussians (ingest.width_px, initial.max_points) need less"
-    )
-
-
-def _count_gaussians(config: PipelineConfig) -> tuple[int, int]:
-    """The most Gaussians after GNet and after ENet; LiDAR may give fewer."""
-    count = config.initial.max_points + config.initial.distant_count
-    refinement = config.gnet.refinement
-    splits = [config.gnet.split_fraction, 0.0 if refinement is None else refinement.split_fraction]
-    gnet = round(count * (1 + splits[0]) * (1 + splits[1]))
-    if config.gnet.method in ("standard_3dgs", "street_gs"):
-        gnet = max(gnet, config.gnet.per_scene.density.max_gaussians)
-    return gnet, round(gnet * (1 + config.enet.split_fraction))
+    machine_gib = memory_limit_gib()
+    if machine_gib < _CLEARLY_TOO_LITTLE * needed_mib / 1024:
+        return (
+            f"this process may use {machine_gib:.1f} GiB of memory, and the run needs about {needed_mib / 1024:.1f} "
+            "GiB; smaller images or fewer Gaussians (ingest.width_px, initial.max_points) need less"
+        )
+    limit_gib = config.limits.memory_gib
+    if limit_gib is not None and machine_gib < limit_gib:
+        return (
+            f"the limit on memory is {limit_gib:.1f} GiB, and this process may use {machine_gib:.1f} GiB: stages are "
+            "planned for the smaller of the two"
+        )
+    return None

@@ -12,6 +12,7 @@ from prefect import flow
 from prefect.artifacts import create_image_artifact, create_link_artifact, create_table_artifact
 
 from flows.configuration import diff_from_preset, load_configuration, validate_config
+from flows.configuration.absolute_paths import make_paths_absolute
 from flows.defaults import DEFAULT_PRESET, DEFAULT_STORE
 from flows.pipeline.definition import PIPELINE, RECONSTRUCTION_STAGES, STAGE_BY_NAME, StageSpec
 from flows.pipeline.log_cache import select_chunks
@@ -78,9 +79,9 @@ def reconstruct_log(
         print(reconstruct_log("synthetic:street?seed=1000", preset="demo", store="genre-store")["report"])
     """
     try:
-        # The run's record names the log, and is read from other folders.
+        # The record names the log and files, and is read from other folders.
         log = make_log_absolute(log)
-        effective = _effective_config(preset, config, settings)
+        effective = make_paths_absolute(_effective_config(preset, config, settings))
         record = _take_from_store(log, preset, store, chunks, effective) if budget_s is None else None
         if record is None:
             budget = None if budget_s is None else _open_budget(budget_s, start_time, table, preset, effective)

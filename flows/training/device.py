@@ -13,28 +13,32 @@ from genre_tasks.errors import ConfigError
 from genre_tasks.learned.meta_episodes import TrainingScene
 
 
-def choose_device(name: str) -> torch.device:
+def choose_device(name: str, with_effects: bool = False) -> torch.device:
     """Chooses the device to train on.
 
     Args:
         name: ``cpu``, ``cuda``, or ``auto`` for a GPU where there is one and gsplat to render on it, else the CPU.
+        with_effects: scenes are as their plans of effects have them; ``auto`` then means the CPU.
 
     Returns:
         The device.
 
     Raises:
-        ConfigError: the name is unknown, or ``cuda`` lacks a GPU or gsplat.
+        ConfigError: the name is unknown, ``cuda`` lacks a GPU or gsplat, or cannot render the scenes.
 
-    >>> choose_device("cpu")
-    device(type='cpu')
+    >>> choose_device("cpu"), choose_device("auto", with_effects=True)
+    (device(type='cpu'), device(type='cpu'))
     """
     if name not in ("auto", "cpu", "cuda"):
         raise ConfigError(f"no device is called {name!r}", remedy="Give auto, cpu or cuda.")
+    # gsplat moves no Gaussians during a readout, and streets have cars and a rolling shutter.
+    if name == "cuda" and with_effects:
+        raise ConfigError("cuda cannot render scenes with effects", remedy="Give --device cpu.")
     # Both are needed: the CPU's kernel cannot render tensors that are on a GPU.
     lacking = [what for what, is_present in _REQUIREMENTS.items() if not is_present()]
     if name == "cuda" and lacking:
         raise ConfigError(f"cuda needs {' and '.join(lacking)}", remedy="Give --device cpu; `genre doctor` says more.")
-    return torch.device("cpu" if lacking or name == "cpu" else "cuda")
+    return torch.device("cpu" if lacking or with_effects or name == "cpu" else "cuda")
 
 
 _REQUIREMENTS = {"a GPU": torch.cuda.is_available, "gsplat": lambda: find_spec("gsplat") is not None}

@@ -32,7 +32,7 @@ def train_pairs(folder: str = "training", real: str | None = None, streets: int 
         ``pairs`` and ``scenes``: how many there are, and ``shares``: the fraction of each kind of pairs.
 
     Raises:
-        ConfigError: there is nothing to make pairs of, or a chunk is not for training.
+        ConfigError: there is nothing to make pairs of, a chunk is not for training, or the real log is not 16:9.
     """
     job = FixerJob(folder, real, streets)
     check_fixer_training(job, is_training=False)
@@ -76,7 +76,7 @@ def train_fnet(
         ``weights``: path of the weights.
 
     Raises:
-        ConfigError: an input or the preset is unknown, or ``paper`` lacks its start.
+        ConfigError: an input or the preset is unknown, ``paper`` lacks its start, or the real log is not 16:9.
         InputError: the folder holds another training, or the weights to start from do not fit.
     """
     job = FixerJob(folder, real, streets, inputs, preset, start, steps, validate)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from genre_tasks.errors import ConfigError
 from genre_tasks.fixer.network import INPUTS
 from genre_tasks.fixer.training_settings import PRESETS, STARTS_FROM, TrainingSettings
+from genre_tasks.user_paths import expand_user_path
 from storage.local import LocalStore
 
 CURVE_FILE = "curve.parquet"
@@ -82,17 +84,39 @@ class FixerJob:
 
     @property
     def sd_turbo(self) -> str | None:
-        """Where SD-Turbo is, for the preset that trains its adapters; ``None`` for the small network."""
-        return self.start if self.preset == "paper" else None
+        """Where SD-Turbo is, for the preset that trains its adapters; ``None`` for the small network.
+
+        Raises:
+            InputError: the start begins with the home folder of somebody unknown.
+        """
+        if self.preset != "paper" or self.start is None:
+            return None
+        # A hub id is no path, and stays as it is.
+        folder = expand_user_path(self.start)
+        return str(folder) if folder.is_dir() else self.start
+
+    @property
+    def adapters_base(self) -> str | None:
+        """How the adapters name SD-Turbo: its folder relative to theirs, or a hub id; ``None`` without adapters."""
+        base = self.sd_turbo
+        if base is None or not Path(base).is_dir():
+            return base
+        # A run reads it relative to the weights, whichever folder it is started in. Resolved, because `..` behind a
+        # link leads elsewhere.
+        return os.path.relpath(Path(base).resolve(), self.run_folder.resolve())
 
     @property
     def initial_weights(self) -> Path | None:
-        """The small network's weights to start from; ``None`` for random weights."""
+        """The small network's weights to start from; ``None`` for random weights.
+
+        Raises:
+            InputError: the start begins with the home folder of somebody unknown.
+        """
         # The paper's network has another shape: it starts from SD-Turbo, not from a file of weights.
         if self.preset == "paper":
             return None
         if self.start is not None:
-            return Path(self.start)
+            return expand_user_path(self.start)
         if self.preset in STARTS_FROM:
             return replace(self, preset=STARTS_FROM[self.preset]).run_folder / WEIGHTS_FILE
         return None

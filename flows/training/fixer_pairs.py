@@ -60,7 +60,7 @@ class PairSet:
         kind: what the pairs are called.
         count: how many of a street.
         location: ``beside`` the path at :data:`SHIFTS_M`, or at ``side`` (:data:`SIDE_M` alone), where a street's
-            truth is ray-cast; or at recorded images that the reconstruction does without: held-out frames and source
+            truth is ray-cast; or at recorded images that the reconstruction is not fitted to: held-out frames, source
             frames left out (``unseen``), or a camera left out (``camera``).
         real: how many of a real log.
         keep_every: of the source frames every n-th is kept.
@@ -204,7 +204,9 @@ def make_pairs(prepared: PreparedScene, recipe: PairRecipe) -> Pairs:
             continue
         partial, views = _choose_views(chunk, pair_set, count, rng)
         scene = scenes.get(partial, pair_set, rng)
-        # The fixer may look at what the reconstruction was made from, and at nothing else.
+        # The fixer samples the images that the reconstruction was fitted to, and no others. Points took their colours
+        # from all source views at ingest, though: of those that a set leaves out, the LiDAR map and the scene's start
+        # still hold pixels. The shipped weights were trained so.
         allowed = {(v.camera, v.frame) for v in partial.views_with_role("source")}
         references = [s for s in sources if (s.camera, s.frame) in allowed]
         truth = _load_truth(log, chunk, pair_set, views)

@@ -19,6 +19,7 @@ from genre_tasks.errors import InputError
 from genre_tasks.fixer.architectures import load_sd_turbo, small_architecture
 from genre_tasks.fixer.training import train
 from genre_tasks.fixer.training_checkpoint import CHECKPOINT_FILE
+from genre_tasks.fixer.weight_files import check_described_weights
 from genre_tasks.fixer.weights import load_fnet, save_fnet
 from genre_tasks.progress import Progress, silent
 
@@ -126,6 +127,9 @@ def _train_to_end(job: FixerJob, progress: Progress) -> tuple[Path, bool]:
         scenes = list_validation_scenes()
         validation = concatenate_pairs([get_pairs(job.store, scene, VALIDATION_PAIRS) for scene in scenes])
     initial = _load_initial(job)
+    # Scores without a checkpoint are of a training that was deleted since.
+    if not (folder / CHECKPOINT_FILE).is_file():
+        (folder / SCORES_FILE).unlink(missing_ok=True)
     recorder = _CheckpointRecorder(job, validation)
     fnet = train(
         pairs,
@@ -138,11 +142,21 @@ def _train_to_end(job: FixerJob, progress: Progress) -> tuple[Path, bool]:
         start=initial,
         autoencoder=Path(job.folder) / "fnet",
     )
-    # Someone may have deleted the weights after the last checkpoint, which still has them.
+    # Weights may have been deleted or damaged after the last checkpoint, which still has them.
     weights = folder / WEIGHTS_FILE
-    if not (weights.is_file() and weights.with_suffix(".json").is_file()):
+    if not _are_sound(weights, job):
         recorder.save(fnet)
     return weights, recorder.is_trained
+
+
+def _are_sound(weights: Path, job: FixerJob) -> bool:
+    """Whether the files of the weights are there, complete and as the job writes them, as far as headers tell."""
+    try:
+        _, described = check_described_weights(weights, "small" if job.sd_turbo is None else "sd-turbo")
+    except InputError:
+        return False
+    # Adapters of an older version may name SD-Turbo in a way that no run finds.
+    return job.sd_turbo is None or described.get("base") == job.adapters_base
 
 
 def require_same_inputs(inputs: Sequence[str], job: FixerJob, path: Path) -> None:
@@ -178,7 +192,7 @@ class _CheckpointRecorder:
     def __init__(self, job: FixerJob, validation: Pairs | None) -> None:
         self.is_trained = False
         self._folder = job.run_folder
-        self._base = job.sd_turbo
+        self._base = job.adapters_base
         self._validation = validation
         # Without a checkpoint a curve is of a training that was deleted since.
         has_checkpoint = (self._folder / CHECKPOINT_FILE).is_file()
@@ -200,7 +214,7 @@ class _CheckpointRecorder:
             save_sample_picture(fnet, self._validation, self._folder / f"sample-{step:06d}.png")
             path = self._folder / SCORES_FILE
             rows = [row for row in load_rows(path, FIXER_SCORES) if row["step"] < step]
-            # Rows from here on are of a training in the same folder that was deleted since.
+            # Rows from here on are of a checkpoint that was not completed: its steps are made again.
             scores = {"step": step, **asdict(score_fixer(fnet, self._validation))}
             save_rows(path, FIXER_SCORES, [*rows, scores])
         self._began = time.perf_counter()

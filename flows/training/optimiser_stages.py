@@ -12,15 +12,17 @@ import torch
 from flows.machine.folder_lock import hold_training_folder
 from flows.pipeline.definition import digest_weights
 from flows.training import checkpoint
-from flows.training.device import choose_device, move_scene
+from flows.training.device import move_scene
 from flows.training.fixed_images import fixed_images_key
 from flows.training.optimiser_training import CHECKPOINT_FILE, WEIGHTS_FILE, initialise_network, train_optimiser
 from flows.training.scene_starts import scene_start_key
 from flows.training.stage_recipe import Stage
 from flows.training.stage_scenes import StageScene, list_stage_scenes, load_training_scenes, rendered_start
 from flows.training.train_job import TrainJob
-from flows.training.validation import Validation, list_validation_recipes
+from flows.training.validation import SCORES_FILE, Validation, list_validation_recipes
+from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.learned.meta_episodes import TrainingScene
+from genre_tasks.learned.weight_files import check_optimiser_files
 from genre_tasks.learned.weights import save_optimiser
 from genre_tasks.losses.rendering_loss import ImageDistance
 from genre_tasks.optimiser.unroll import UnrollSettings
@@ -69,12 +71,15 @@ def _train_or_find(job: TrainJob, stage: Stage, progress: Progress) -> TrainedSt
     # Computed before any scene is loaded, so that a finished stage is found within a second.
     origin = _digest_origin(job, stage, stage_scenes)
     if (folder / CHECKPOINT_FILE).is_file() and _is_finished(folder / CHECKPOINT_FILE, stage, origin):
-        # Someone may have deleted the weights after the last checkpoint, which still has them.
-        if not (weights.is_file() and weights.with_suffix(".json").is_file()):
+        # Weights may have been deleted or damaged after the last checkpoint, which still has them.
+        if not _are_sound(weights):
             _restore_weights(stage, folder)
         return TrainedStage(stage.name, str(weights), cached=True)
+    # Scores without a checkpoint are of a training that was deleted since.
+    if not (folder / CHECKPOINT_FILE).is_file():
+        (folder / SCORES_FILE).unlink(missing_ok=True)
     initial = None if stage.initial_weights is None else job.stage_weights(stage.initial_weights)
-    device = choose_device(job.device)
+    device = job.choose_device()
     # Made on the CPU and then moved, so that new weights do not depend on the device.
     network = initialise_network(stage.network, 0, initial, stage.new_head).to(device)
     scenes = [move_scene(scene, device) for scene in load_training_scenes(job, stage, stage_scenes, progress)]
@@ -122,6 +127,15 @@ def _is_finished(path: Path, stage: Stage, origin: dict[str, str]) -> bool:
     return fits and described["done"] >= stage.config.steps
 
 
+def _are_sound(weights: Path) -> bool:
+    """Whether a stage's weights are there, complete and described, as far as headers tell."""
+    try:
+        check_optimiser_files(weights)
+    except (InputError, ConfigError):
+        return False
+    return True
+
+
 def _restore_weights(stage: Stage, folder: Path) -> None:
     """Writes the weights of a finished training from its checkpoint."""
     network = initialise_network(stage.network, 0)
@@ -141,7 +155,7 @@ def _load_distance(stage: Stage, device: torch.device) -> ImageDistance | None:
 
 def _build_validation(job: TrainJob, stage: Stage, folder: Path, distance: ImageDistance | None) -> Validation:
     config = stage.config
-    device = choose_device(job.device)
+    device = job.choose_device()
 
     # A function, because validation scenes are only made once a validation is due.
     def load_scenes() -> list[TrainingScene]:

@@ -56,7 +56,8 @@ def initialise_network(
         config: the network's shape, learning rates and, if any, residuals.
         seed: of the new weights.
         weights: a file of weights to start from.
-        new_head: the last layer is new all the same, so that the network's first step is tuned Adam's.
+        new_head: the last layer is new all the same, so that the network's first step is tuned Adam's, besides what
+            image residuals add.
 
     Returns:
         The network on the CPU.

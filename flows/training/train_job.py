@@ -5,11 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
+
 from flows.training import checkpoint
+from flows.training.device import choose_device
 from flows.training.optimiser_training import CHECKPOINT_FILE, WEIGHTS_FILE
 from flows.training.recipes import get_recipe
 from flows.training.stage_recipe import SHIPPED, Stage
 from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.learned.weight_files import check_optimiser_files
 from genre_tasks.weights import resolve_weights
 from storage.local import LocalStore
 
@@ -50,6 +54,18 @@ class TrainJob:
             The stages in the order of training.
         """
         return get_recipe(self.recipe, self.novel)
+
+    def choose_device(self) -> torch.device:
+        """Chooses the device of all the recipe's stages.
+
+        Returns:
+            The device.
+
+        Raises:
+            ConfigError: the device is unknown or lacks something, or cannot render what a stage is trained on.
+        """
+        # One for all stages: those of a recipe are compared, and should differ in nothing else.
+        return choose_device(self.device, any(stage.scenes.planned for stage in self.stages()))
 
     def weights_name(self, network: str) -> str:
         """Names the weights that a training makes.
@@ -93,7 +109,7 @@ class TrainJob:
             The weights' path.
 
         Raises:
-            InputError: the stage is not trained to its end, or its weights were deleted.
+            InputError: the stage is not trained to its end, or its weights were deleted or damaged.
         """
         # Weights that ship were trained to their end, and have no checkpoint.
         if name.startswith(SHIPPED):
@@ -113,8 +129,10 @@ class TrainJob:
         if done < steps:
             raise InputError(f"the stage {name} has made {done} of {steps} weight updates", remedy=remedy, file=path)
         weights = folder / WEIGHTS_FILE
-        for file in (weights, weights.with_suffix(".json")):
+        try:
+            check_optimiser_files(weights)
+        except (InputError, ConfigError) as error:
             # The command of the remedy takes them from the checkpoint.
-            if not file.is_file():
-                raise InputError(f"weights of the stage {name} are missing", remedy=remedy, file=file)
+            problem = f"weights of the stage {name} are missing or damaged"
+            raise InputError(problem, remedy=remedy, file=error.file or weights) from error
         return weights

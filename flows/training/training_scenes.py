@@ -135,7 +135,7 @@ class PreparedScene:
 
 
 def check_for_training(recipe: SceneRecipe) -> None:
-    """Refuses chunks that results are claimed on.
+    """Refuses streets and chunks that results are claimed on, as far as a URI tells.
 
     Args:
         recipe: the scene to train on.
@@ -158,7 +158,8 @@ def check_for_training(recipe: SceneRecipe) -> None:
             f"seed {seed} of {recipe.uri} is not for training",
             remedy=f"Use seeds {TRAINING_SEEDS[0]} to {TRAINING_SEEDS[-1]}.",
         )
-    # Results on real logs are claimed on their other chunks.
+    # Results on PandaSet 002 are claimed on its other chunks. No chunk of KITTI's recording may be trained on, see
+    # docs/guides/training.md: a path does not tell which recording it leads to, so this is left to the user.
     if recipe.chunk != 0:
         raise ConfigError(f"chunk {recipe.chunk} of {recipe.uri} is not for training", remedy="Use chunk 0.")
 

@@ -77,7 +77,7 @@ class Validation:
             network: the network in training.
         """
         path = self.folder / SCORES_FILE
-        # Rows of later updates are of a training in the same folder that was deleted since.
+        # Rows of later updates are of a checkpoint that was not completed: these updates are made again.
         rows = [row for row in load_rows(path, VALIDATION_SCORES) if row["step"] < done]
         last = max((row["step"] for row in rows), default=0)
         # Checkpoints need not fall on multiples of `every`: what counts is whether one was passed.

@@ -140,7 +140,7 @@ def load_sd_turbo(source: str, timestep: int = 200, rank: int = 16) -> Fnet:
     except (OSError, ValueError) as error:
         raise InputError(
             f"SD-Turbo cannot be loaded: {str(error).splitlines()[0]}",
-            remedy="Give by `fnet.weights` a folder with the subfolders vae and unet in diffusers' layout.",
+            remedy="Name a folder with vae and unet: by --start in training, by `base` in fnet.json for a run.",
             file=source,
             stage="fnet",
         ) from error

@@ -25,6 +25,7 @@ from genre_tasks.fixer.training_checkpoint import (
     CHECKPOINT_FILE,
     TrainedAutoencoder,
     TrainingState,
+    digest_architecture,
     digest_weights,
     load_autoencoder,
     restore_checkpoint,
@@ -202,7 +203,7 @@ def _build_with_autoencoder(
     total: int,
 ) -> Fnet:
     """The network after the first part, which is read from ``path`` or trained; the identity until it is trained on."""
-    origin = {"pairs": pairs.digest()}
+    origin = {"pairs": pairs.digest(), "architecture": digest_architecture(architecture)}
     autoencoder = load_autoencoder(path, settings, origin)
     if autoencoder is None:
         trained = train_autoencoder(pairs, settings, architecture, progress, total)

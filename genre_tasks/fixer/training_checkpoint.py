@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ from torch import Tensor
 
 from genre_tasks.atomic_path import write_atomically
 from genre_tasks.errors import InputError
-from genre_tasks.fixer.network import Fnet
+from genre_tasks.fixer.network import Fnet, FnetArchitecture
 from genre_tasks.fixer.training_settings import AUTOENCODER_SETTINGS, TrainingSettings
 from genre_tasks.fixer.weights import trainable_state
 
@@ -160,14 +161,14 @@ def load_autoencoder(path: Path, settings: TrainingSettings, origin: Mapping[str
         ``None`` where there is no file.
 
     Raises:
-        InputError: it was trained with other settings or on other pairs, or cannot be read.
+        InputError: it was trained with other settings, on other pairs or of another architecture, or cannot be read.
     """
     # Fixers of several inputs share the first part, which is the same for all of them.
     if not path.exists():
         return None
     stored = _read(path, ("settings", "scale", "weights"))
     _require_same_settings(stored["settings"], settings, path, AUTOENCODER_SETTINGS)
-    _require_same_origin(stored, origin, path)
+    _require_same_origin(stored, origin, path, may_lack=("architecture",))
     return TrainedAutoencoder(stored["scale"], stored["weights"])
 
 
@@ -185,6 +186,20 @@ def digest_weights(fnet: Fnet) -> str:
     for name, value in sorted(fnet.state_dict().items()):
         digest.update(name.encode() + value.detach().contiguous().numpy().tobytes())
     return digest.hexdigest()
+
+
+def digest_architecture(architecture: FnetArchitecture) -> str:
+    """Digests the configurations of an architecture's two models, which its weights are made for.
+
+    Args:
+        architecture: of the network.
+
+    Returns:
+        A SHA-256.
+    """
+    # Without the inputs: networks of several inputs share the first part of training.
+    described = json.dumps([architecture.vae, architecture.unet], sort_keys=True)
+    return hashlib.sha256(described.encode()).hexdigest()
 
 
 def _write(document: dict[str, Any], path: Path) -> None:
@@ -223,9 +238,14 @@ def _require_same_settings(
         )
 
 
-def _require_same_origin(stored: Mapping[str, Any], origin: Mapping[str, str], path: Path) -> None:
-    # An entry that an older checkpoint lacks counts as different.
-    different = [name for name, value in origin.items() if stored.get("origin", {}).get(name) != value]
+def _require_same_origin(
+    stored: Mapping[str, Any], origin: Mapping[str, str], path: Path, may_lack: Sequence[str] = ()
+) -> None:
+    known = stored.get("origin", {})
+    # An entry that an older checkpoint lacks counts as different, unless it came later than files that are in use.
+    different = [
+        name for name, value in origin.items() if known.get(name) != value and (name in known or name not in may_lack)
+    ]
     if different:
         raise InputError(
             f"the checkpoint was trained with other {' and '.join(different)}",

@@ -78,6 +78,14 @@ from those. ``paper`` trains SD-Turbo's LoRA adapters and skip connections."""
 STARTS_FROM = {"further": "small", "last": "further"}
 """The preset whose weights a preset starts from."""
 
-# The pairs count too, see ``training_checkpoint``.
-AUTOENCODER_SETTINGS = ("autoencoder_steps", "autoencoder_batch", "autoencoder_learning_rate", "crop", "kl", "seed")
+# The pairs and the architecture count too, see ``training``.
+AUTOENCODER_SETTINGS = (
+    "autoencoder_steps",
+    "autoencoder_batch",
+    "autoencoder_learning_rate",
+    "warmup",
+    "crop",
+    "kl",
+    "seed",
+)
 """Settings on which the first part depends: its result is used again only where all of these are the same."""

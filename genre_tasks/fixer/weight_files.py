@@ -9,12 +9,16 @@ from typing import Any
 from genre_tasks.config import FnetConfig
 from genre_tasks.errors import InputError
 from genre_tasks.json_files import read_json_object
+from genre_tasks.user_paths import expand_user_path
 from genre_tasks.weight_files import read_tensor_shapes
 from genre_tasks.weights import resolve_weights
 
 REMEDY = "Give weights that `genre train fnet` wrote for this version, or leave `fnet.weights` at builtin."
+_ADAPTERS_REMEDY = (
+    "Train adapters first: `genre train fnet --preset paper --start FOLDER`. "
+    "Then give their folder by `fnet.weights`, or set `fnet.model` to small."
+)
 WEIGHTS_FILE = "fnet.safetensors"
-
 _BASE_FOLDERS = ("vae", "unet")
 
 
@@ -28,16 +32,23 @@ def find_fixer_weights(config: FnetConfig) -> Path:
         A path that exists.
 
     Raises:
-        InputError: it does not exist, or the model has no built-in weights.
+        InputError: it does not exist, or holds no trained adapters where the model is SD-Turbo.
     """
-    # SD-Turbo's weights are large and have a licence of their own.
-    if config.model == "sd-turbo" and config.weights == "builtin":
-        raise InputError(
-            "no weights of sd-turbo ship with the package",
-            remedy="Give by `fnet.weights` a folder that `genre train fnet` wrote, or set `fnet.model` to small.",
-            stage="fnet",
-        )
+    if config.model == "sd-turbo":
+        return _find_adapters(config.weights)
     return resolve_weights("fnet", config.weights)
+
+
+def _find_adapters(configured: str) -> Path:
+    """Finds adapters on SD-Turbo: the only weights of that model that a run can take."""
+    # SD-Turbo's weights are large and have a licence of their own.
+    if configured.partition(":")[0] == "builtin":
+        raise InputError("no weights of sd-turbo ship with the package", remedy=_ADAPTERS_REMEDY, stage="fnet")
+    path = expand_user_path(configured)
+    # A hub id and SD-Turbo's own folder look like weights, and no other weights would help.
+    if not path.exists() or (path.is_dir() and not (path / WEIGHTS_FILE).with_suffix(".json").is_file()):
+        raise InputError("there are no adapters of sd-turbo", remedy=_ADAPTERS_REMEDY, file=path, stage="fnet")
+    return path
 
 
 def read_fixer_document(path: Path, model: str) -> dict[str, Any]:

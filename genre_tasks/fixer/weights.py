@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from genre_tasks.atomic_path import atomic_path
+from genre_tasks.atomic_path import write_atomically
 from genre_tasks.errors import InputError
 from genre_tasks.fixer.architectures import build_fnet, load_sd_turbo
 from genre_tasks.fixer.network import Fnet, FnetArchitecture
@@ -47,7 +47,7 @@ def save_fnet(fnet: Fnet, path: Path, base: str | None = None, rank: int | None 
             written.
         rank: of the adapters, with ``base``.
     """
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     if base is None:
         document: dict[str, Any] = {"model": "small", "architecture": fnet.architecture.as_json()}
@@ -55,12 +55,11 @@ def save_fnet(fnet: Fnet, path: Path, base: str | None = None, rank: int | None 
     else:
         document = {"model": "sd-turbo", "base": base, "rank": rank, "timestep": fnet.architecture.timestep}
         tensors = trainable_state(fnet)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(path) as part:
-        # Half precision halves the file; loading widens the weights again.
-        save_file({name: value.detach().half().contiguous().cpu() for name, value in sorted(tensors.items())}, part)
-    with atomic_path(path.with_suffix(".json")) as part:
-        part.write_text(json.dumps(document, indent=2, sort_keys=True) + "\n")
+    # Half precision halves the file; loading widens the weights again.
+    halves = {name: value.detach().half().contiguous().cpu() for name, value in sorted(tensors.items())}
+    # The configuration first: at no moment are there weights that nothing describes.
+    write_atomically(path.with_suffix(".json"), (json.dumps(document, indent=2, sort_keys=True) + "\n").encode())
+    write_atomically(path, save(halves))
 
 
 def load_fnet(path: Path, model: str = "small") -> Fnet:

@@ -31,7 +31,9 @@ class LearnedOptimiser(LearnedNetwork):
         Returns:
             LearnedOptimiser: with the same weights, in evaluation mode and without gradients.
         """
-        copy = LearnedOptimiser(self.config.model_copy(update={"rates": learning_rates.as_tuple()}))
+        # Its random weights are replaced at once, and must not change what others draw from the global generator.
+        with torch.random.fork_rng(devices=[]):
+            copy = LearnedOptimiser(self.config.model_copy(update={"rates": learning_rates.as_tuple()}))
         copy.load_state_dict(self.state_dict())
         return copy.eval().requires_grad_(False)
 

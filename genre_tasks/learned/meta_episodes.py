@@ -31,7 +31,9 @@ class TrainingScene:
         source: source views, which the optimiser sees.
         heldout: views of the log that only the held-out loss sees.
         fixed: fixed novel views, which the optimiser sees; may be empty.
-        truth: true or fixed images at novel views that only the held-out loss sees; may be empty.
+        truth: images at novel views that the held-out loss sees; may be empty. Of a street they are true, and the
+            optimiser sees none of them but through stand-ins, which are made of every other one. Of a real log they
+            are the images in ``fixed``, which the optimiser sees too.
     """
 
     name: str
@@ -149,7 +151,7 @@ class Episode:
         return (*self.loop.samplers, *self.held_out_samplers)
 
     def evaluate_heldout(self, objective: Objective, generator: torch.Generator) -> LossAndGradients:
-        """Takes the loss and its gradients on views that the optimiser does not see.
+        """Takes the loss and its gradients on held-out views and on the novel views in ``truth``.
 
         Args:
             objective: the held-out loss.

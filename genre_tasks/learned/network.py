@@ -1,12 +1,13 @@
 """The network of GNet and ENet (paper Sec. III-C, III-D): a head for each Gaussian over a sparse UNet, and its step.
 
 The step is ``Δ = −rate · schedule(t/T) · [exp(3 tanh(a/3)) · u + tanh(b)]``. Here ``u`` is Adam's normalised direction,
-and ``a, b`` [N, 14] come from the network. Its last layer starts at zero: untrained, it is tuned Adam to the bit.
+and ``a, b`` [N, 14] come from the network. Its last layer starts at zero: untrained, and without the ``residuals``
+below, it is tuned Adam to the bit.
 
-A network with ``residuals`` also moves colours by ``schedule(t/T) · (1 + tanh(c₀ + c)) · r̄``. Here r̄ is the mean
-residual of the pixels that show a Gaussian, c₀ comes from the configuration, and ``c`` [N] from the network. This is a
-step of the simultaneous algebraic reconstruction technique (Andersen and Kak 1984), which converges for a relaxation
-between 0 and 2.
+A network with ``residuals`` also moves colours by ``schedule(t/T) · (1 + tanh(c₀ + c)) · r̄``, untrained too. Here r̄
+is the mean residual of the pixels that show a Gaussian, c₀ comes from the configuration, and ``c`` [N] from the
+network. This is a step of the simultaneous algebraic reconstruction technique (Andersen and Kak 1984), which converges
+for a relaxation between 0 and 2.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ class LearnedNetwork(nn.Module):
         self.unet = SparseUNet(hidden, channels)
         self.mix = nn.Linear(hidden + channels[0], hidden)
         self.head = nn.Linear(hidden, 29 if self.uses_image_residuals else 28)
-        # Zero outputs make the untrained step that of tuned Adam, from which training starts.
+        # Zero outputs make the untrained step that of tuned Adam, besides what residuals add: training starts there.
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
 

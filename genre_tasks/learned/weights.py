@@ -52,12 +52,14 @@ def load_optimiser(weights: Path) -> LearnedOptimiser:
         tensors = load_file(weights, device="cpu")
     except (SafetensorError, OSError) as error:
         raise InputError(f"The weights cannot be read: {error}", remedy=REMEDY, file=weights) from error
-    # Without memory at first: the configuration may describe a network that is larger than the file.
-    with torch.device("meta"):
-        expected = LearnedOptimiser(config).state_dict()
-    # Compared by hand, since torch's strict loading casts other dtypes without a word.
-    require_weights_fit(tensors, expected, weights, REMEDY)
-    network = LearnedOptimiser(config)
+    # Random weights are replaced at once, and must not change what others draw from the global generator.
+    with torch.random.fork_rng(devices=[]):
+        # Without memory at first: the configuration may describe a network that is larger than the file.
+        with torch.device("meta"):
+            expected = LearnedOptimiser(config).state_dict()
+        # Compared by hand, since torch's strict loading casts other dtypes without a word.
+        require_weights_fit(tensors, expected, weights, REMEDY)
+        network = LearnedOptimiser(config)
     network.load_state_dict(tensors)
     return network.eval().requires_grad_(False)
 

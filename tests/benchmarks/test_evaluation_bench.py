@@ -12,7 +12,7 @@ import pytest
 from benchmarks.common.bench import NotMeasuredError
 from benchmarks.common.claims import Claim
 from benchmarks.evaluation import EVALUATION, budgets
-from benchmarks.evaluation.budgets import budget_claims, budget_table, measure_shortest_run, run_with_multiple
+from benchmarks.evaluation.budgets import budget_claims, budget_table, run_with_multiple
 from benchmarks.evaluation.range_seconds import range_seconds_claims, range_seconds_table
 from benchmarks.evaluation.reliability import fit_estimate, reliability_claims, reliability_table, true_reach_m
 from flows.budget.cost_table import find_shipped_table, load_cost_table
@@ -157,21 +157,22 @@ def test_a_run_that_fails_says_what_the_command_said(tmp_path: Path, monkeypatch
         run_with_multiple("900", 1.2, str(tmp_path / "nothing.parquet"))
 
 
-def test_a_budget_is_a_multiple_of_the_shortest_run_which_a_street_has_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_budget_is_a_multiple_of_the_shortest_run_right_before(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
+    # The machine is slower the second time.
+    shortest_s = iter([20.04, 30.0])
 
     def pretend(seed: str, budget_s: float, table: str, settings: tuple[str, ...] = ()) -> Any:
         asked.append((seed, budget_s))
-        return run(budget_s, 20.04 if budget_s == budgets.SHORTEST_BUDGET_S else 0.9 * budget_s, 0.5)
+        return run(budget_s, next(shortest_s) if budget_s == budgets.SHORTEST_BUDGET_S else 0.9 * budget_s, 0.5)
 
     monkeypatch.setattr(budgets, "run_with_budget", pretend)
-    measure_shortest_run.cache_clear()
-    try:
-        rows = [run_with_multiple("7", m, "") for m in (1.5, 2.0)]
-    finally:
-        measure_shortest_run.cache_clear()
-    assert asked == [("7", 1.0), ("7", 30.1), ("7", 40.1)]
-    assert [(r["multiple"], r["shortest_s"]) for r in rows] == [(1.5, 20.04), (2.0, 20.04)]
+    rows = [run_with_multiple("7", m, "") for m in (1.5, 1.2)]
+    assert asked == [("7", 1.0), ("7", 30.1), ("7", 1.0), ("7", 36.0)]
+    assert [(r["multiple"], r["shortest_s"]) for r in rows] == [(1.5, 20.04), (1.2, 30.0)]
+    # What a larger multiple buys is compared with a smaller one, whatever their seconds are.
+    later = [r | {"metrics": r["metrics"] | {budgets.DISTANCE: d}} for r, d in zip(rows, (0.4, 0.5), strict=True)]
+    assert by_name(budget_claims(later))["budget_worth"].measured == pytest.approx(-0.1)
 
 
 def test_the_table_names_what_was_chosen() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,6 +27,17 @@ def toy(seed: int = 0, trained: bool = True) -> Fnet:
             for parameter in module.parameters():
                 parameter.data = 0.1 * torch.randn(parameter.shape, generator=generator)
     return fnet.eval().requires_grad_(False)
+
+
+def save_toy_sd_turbo(folder: Path) -> Path:
+    """SD-Turbo's layout at toy size: four latent channels, text attention, image output, random weights."""
+    from diffusers import AutoencoderKL, UNet2DConditionModel
+
+    size = small_architecture((8, 8, 16, 16), 4, (16, 16))
+    torch.manual_seed(0)
+    AutoencoderKL(**{**size.vae, "out_channels": 3}).save_pretrained(folder / "vae")
+    UNet2DConditionModel(**size.unet).save_pretrained(folder / "unet")
+    return folder
 
 
 def random_views(count: int, height: int, width: int, seed: int = 0) -> FixerInputs:

@@ -89,6 +89,25 @@ def test_other_settings_are_refused(tmp_path):
         train(some_pairs(), replace(SETTINGS, kl=1.0), tmp_path, distance, architecture=TOY)
 
 
+def test_an_autoencoder_of_another_training_is_refused(tmp_path):
+    path = tmp_path / "autoencoder.pt"
+    train(some_pairs(), SETTINGS, tmp_path, distance, architecture=TOY)
+    slower = replace(SETTINGS, warmup=3)
+    with pytest.raises(InputError, match=r"other settings: warmup \(file .*autoencoder\.pt"):
+        train(some_pairs(), slower, tmp_path / "slower", distance, architecture=TOY, autoencoder=tmp_path)
+    # Shapes are equal, so that its weights could be loaded.
+    other = replace(TOY, vae={**TOY.vae, "norm_num_groups": 4})
+    with pytest.raises(InputError, match=r"other architecture \(file .*autoencoder\.pt"):
+        train(some_pairs(), SETTINGS, tmp_path / "other", distance, architecture=other, autoencoder=tmp_path)
+    fewer_inputs = replace(TOY, inputs=("render",))
+    train(some_pairs(), SETTINGS, tmp_path / "fewer", distance, architecture=fewer_inputs, autoencoder=tmp_path)
+    # An autoencoder of an older version, which knew no such digest, counts as the same.
+    stored = torch.load(path, weights_only=True)
+    del stored["origin"]["architecture"]
+    torch.save(stored, path)
+    train(some_pairs(), SETTINGS, tmp_path, distance, architecture=TOY)
+
+
 def test_a_training_on_other_pairs_or_from_other_weights_is_not_taken_for_this_one(tmp_path):
     first = train(some_pairs(), SETTINGS, tmp_path / "first", distance, architecture=TOY)
     train(some_pairs(), SETTINGS, tmp_path / "first", distance, architecture=TOY)  # finished: the same

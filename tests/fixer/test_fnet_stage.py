@@ -10,15 +10,17 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from flows.configuration import load_configuration
 from genre_tasks.config import FnetConfig
 from genre_tasks.errors import InputError
-from genre_tasks.fixer.architectures import add_lora, load_sd_turbo, small_architecture
-from genre_tasks.fixer.network import Fnet, FnetArchitecture
+from genre_tasks.fixer.architectures import add_lora, load_sd_turbo
+from genre_tasks.fixer.network import Fnet
 from genre_tasks.fixer.source_images import load_source_images
+from genre_tasks.fixer.weight_files import check_fixer_files
 from genre_tasks.fixer.weights import load_fnet, save_fnet
 from genre_tasks.stages.fnet import estimate_need, fnet
 from genre_tasks.weights import resolve_weights
-from tests.fixer.conftest import toy
+from tests.fixer.conftest import save_toy_sd_turbo, toy
 
 
 @pytest.fixture
@@ -153,13 +155,7 @@ def test_absent_weights_have_a_remedy(tmp_path):
 
 @pytest.fixture
 def base(tmp_path) -> Path:
-    """SD-Turbo's layout at toy size: four latent channels, text attention, image output, random weights."""
-    from diffusers import AutoencoderKL, UNet2DConditionModel
-
-    toy_size: FnetArchitecture = small_architecture((8, 8, 16, 16), 4, (16, 16))
-    torch.manual_seed(0)
-    AutoencoderKL(**{**toy_size.vae, "out_channels": 3}).save_pretrained(tmp_path / "base" / "vae")
-    UNet2DConditionModel(**toy_size.unet).save_pretrained(tmp_path / "base" / "unet")
+    return save_toy_sd_turbo(tmp_path / "base")
     return tmp_path / "base"
 
 
@@ -179,8 +175,26 @@ def test_sd_turbo_loads_trains_a_step_saves_and_reloads(base, scene, tmp_path):
 
 
 def test_a_base_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(InputError, match="SD-Turbo cannot be loaded"):
+    with pytest.raises(InputError, match=r"SD-Turbo cannot be loaded.*by --start in training, by `base` in fnet.json"):
         load_sd_turbo(str(tmp_path / "nowhere"))
+
+
+@pytest.mark.parametrize("configured", ["builtin", "builtin:fnet", "stabilityai/sd-turbo", "base", "~/base"])
+def test_sd_turbo_without_adapters_has_one_remedy(base, monkeypatch, configured):
+    monkeypatch.chdir(base.parent)
+    monkeypatch.setenv("HOME", str(base.parent))
+    remedy = r"Train adapters first: `genre train fnet --preset paper --start FOLDER`\."
+    with pytest.raises(InputError, match=remedy):
+        check_fixer_files(FnetConfig(model="sd-turbo", weights=configured))
+    with pytest.raises(InputError, match=remedy):
+        check_fixer_files(load_configuration("paper").fnet)
+
+
+def test_the_configuration_is_written_before_the_weights_and_outlives_a_loss_of_power(tmp_path, monkeypatch):
+    written = []
+    monkeypatch.setattr("genre_tasks.fixer.weights.write_atomically", lambda path, data: written.append(path.name))
+    save_fnet(toy(), tmp_path / "fnet.safetensors")
+    assert written == ["fnet.json", "fnet.safetensors"]
 
 
 def test_adapters_can_be_put_on_the_small_network_too():

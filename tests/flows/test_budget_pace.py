@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from flows.budget import budget as budgets
 from flows.budget.budget import Budget, resolve_table
-from flows.budget.chooser import Chooser
+from flows.budget.chooser import STAGE_OVERHEAD_S, Chooser
 from flows.budget.cost_table import load_cost_table
 from flows.configuration import load_configuration
 from flows.cost_sweep import plot
@@ -84,7 +84,13 @@ def test_a_table_of_other_settings_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "setting", ["gnet.method=standard_3dgs", "fnet.max_network_px=null", "enet.novel_views_per_iteration=9"]
+    "setting",
+    [
+        "gnet.method=standard_3dgs",
+        "fnet.max_network_px=null",
+        "enet.novel_views_per_iteration=9",
+        "ingest.source_every=1",
+    ],
 )
 def test_settings_that_take_much_longer_than_the_table_says_are_refused(tmp_path: Path, setting: str) -> None:
     table = str(written(tmp_path / "cost.parquet", preset="hd"))
@@ -93,6 +99,18 @@ def test_settings_that_take_much_longer_than_the_table_says_are_refused(tmp_path
         resolve_table(table, "hd", load_configuration("hd", settings=[setting]))
     # Weights and seeds take no time.
     assert resolve_table(table, "hd", load_configuration("hd", settings=["gnet.seed=5"])).points
+
+
+def test_a_table_of_another_image_size_serves(tmp_path: Path) -> None:
+    own = ["ingest.width_px=160", "ingest.height_px=90"]
+    path = written(tmp_path / "cost.parquet", settings=json.dumps(own))
+    demo = load_configuration("demo")
+    table = resolve_table(str(path), "demo", demo)
+    assert (table.pixels, table.settings) == (160 * 90, ())
+    by = Chooser(table, demo, Frozen(60.0), 1.0, lambda: 1.0)
+    # Four times the pixels.
+    measured_s = table.points[0].seconds["gnet"]
+    assert by._stage_s(table.points[0], "gnet") == pytest.approx(4 * measured_s + STAGE_OVERHEAD_S)
 
 
 @pytest.mark.parametrize("setting", ["enet.learning_rates=null", "enet.learning_rates.means=0.05"])

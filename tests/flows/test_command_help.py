@@ -102,3 +102,18 @@ def test_the_help_answers_within_a_second() -> None:
 def cpu_seconds_of_children() -> float:
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     return usage.ru_utime + usage.ru_stime
+
+
+def test_the_page_on_training_names_the_commands_that_take_an_option() -> None:
+    page = (ROOT / "docs/guides/training.md").read_text()
+    options = {
+        name.removeprefix("train "): {word for parameter in command.params for word in parameter.opts}
+        for name, command in COMMANDS.items()
+        if name.startswith("train ")
+    }
+    rows = re.findall(r"^\| `(--[a-z-]+)[^`]*` \| (.*) \|$", page, flags=re.MULTILINE)
+    assert {option for option, _ in rows} >= {"--streets", "--recipe"}
+    for option, meaning in rows:
+        # A row that names no command is of all of them.
+        named = set(re.findall(r"`(\w+)`", meaning)).intersection(options)
+        assert {name for name, words in options.items() if option in words} == (named or set(options)), option

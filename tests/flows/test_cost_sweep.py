@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,12 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
+from flows.budget.budget import resolve_table
 from flows.cli.main import app
 from flows.configuration import load_configuration
+from flows.configuration.absolute_paths import make_paths_absolute
 from flows.cost_sweep import cell as cell_module
+from flows.cost_sweep import flow as flow_module
 from flows.cost_sweep import knobs
 from flows.cost_sweep.cell import Cell, Sweep, list_cells, measure_cold_start, predict_cells, run_cell
 from flows.cost_sweep.flow import SweepRequest, write_results
@@ -22,6 +26,8 @@ from flows.cost_sweep.summary import KERNEL_3M, PERCEPTUAL_3M, novel_view_measur
 from flows.experiments import warm_up
 from flows.experiments.log_chunks import LogChunk
 from genre_tasks.config import PipelineConfig
+from genre_tasks.effects.plan import EFFECT_NAMES, load_effect
+from genre_tasks.effects.types import Effect
 from genre_tasks.errors import ConfigError
 from tests.faults.small_run import LOG, SETTINGS, Stopped, stopping
 
@@ -106,6 +112,15 @@ def test_settings_start_with_the_preset_and_differ_from_it() -> None:
     assert {s.knob for s in settings} >= {"gnet_iterations", "resolution", "gaussians", "fixer", "shifts", "threads"}
     with pytest.raises(ConfigError, match=r"no knob 'view'.*Did you mean 'views'"):
         list_settings("small", knobs=["view"])
+    with pytest.raises(ConfigError, match=r"the knobs fixer, views, fixer name one twice"):
+        list_settings("small", knobs=["fixer", "views", "fixer"])
+
+
+def test_values_that_rounding_makes_equal_are_one_setting() -> None:
+    settings = list_settings("small", ["enet.iterations=2"])
+    names = [s.name for s in settings]
+    assert len(set(names)) == len(names)
+    assert [name for name in names if name.startswith("enet_iterations")] == ["enet_iterations=1", "enet_iterations=4"]
 
 
 def test_a_short_enet_has_low_learning_rates_and_splits_nothing() -> None:
@@ -251,3 +266,45 @@ def test_stages_of_the_tiny_log_are_timed(monkeypatch: pytest.MonkeyPatch) -> No
     stages = ["ingest", "effects", "initial"]
     seconds = warm_up.run_on_tiny_log(load_configuration("demo", settings=SWEEP_SETTINGS), stages)
     assert list(seconds) == stages and all(0 < value < 60 for value in seconds.values())
+
+
+@pytest.mark.parametrize("setting", ["ingest.source_every=10", "effects.rolling_shutter=on", "effects.motion_blur=on"])
+def test_a_setting_that_the_tiny_log_does_not_support_is_left_out(
+    monkeypatch: pytest.MonkeyPatch, setting: str
+) -> None:
+    monkeypatch.setattr(warm_up, "TINY_LOG", LOG)
+    config = load_configuration("demo", settings=[*SWEEP_SETTINGS, setting])
+    assert list(warm_up.run_on_tiny_log(config, ["ingest", "effects"])) == ["ingest", "effects"]
+
+
+def test_effects_that_a_log_may_make_impossible_are_known_to_the_warm_up() -> None:
+    effects = {name: load_effect(name) for name in EFFECT_NAMES}
+    lacking = {name for name, effect in effects.items() if effect.find_missing is not Effect.find_missing}
+    assert lacking == set(warm_up.EFFECTS_OF_STATED_TIMES)
+
+
+def test_a_table_of_weights_in_this_folder_fits_a_run_with_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[list[str]] = []
+
+    def sweep(logs: list[str], *, settings: list[str], **options: Any) -> dict[str, Any]:
+        asked.append(settings)
+        speed = {"calibration_s": "0.1", "cold_seconds": "{}"}
+        files = write_results(Path(options["out"]), Sweep("small", tuple(settings), "store"), ROWS, [], "", speed)
+        return {"cells": len(ROWS), "failed": [], "files": files}
+
+    monkeypatch.setattr(SweepRequest, "cells", lambda request: [])
+    monkeypatch.setattr(flow_module, "cost_of_accuracy", sweep)
+    monkeypatch.setattr("flows.cli.terminal.report_on_terminal", nullcontext)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.safetensors").touch()
+    settings = ["gnet.weights=mine.safetensors"]
+    CliRunner().invoke(app, ["cost", LOG, "--set", *settings, "--out", "cost"], catch_exceptions=False)
+    assert asked == [[f"gnet.weights={tmp_path}/mine.safetensors"]]
+    # As `genre run` and its flow make it.
+    config = make_paths_absolute(load_configuration("small", settings=settings))
+    assert resolve_table("cost/cost.parquet", "small", config).settings == tuple(asked[0])
+    # A table of before names the file as the user wrote it.
+    sweep([LOG], settings=settings, out="before")
+    assert resolve_table("before/cost.parquet", "small", config).settings == tuple(settings)

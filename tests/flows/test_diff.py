@@ -21,7 +21,7 @@ from flows.comparison.metric_differences import Score, average_scores, compare_s
 from flows.comparison.output_files import write_page
 from flows.comparison.run_comparison import compare_runs, open_side
 from flows.comparison.setting_differences import list_differences
-from genre_tasks.errors import InputError
+from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.metrics.results import Evaluation, Metric
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import SceneGraph
@@ -142,6 +142,8 @@ def test_runs_of_different_logs_share_means_only(runs: Runs) -> None:
     (means,) = (rows for name, rows in tables(found).items() if "mean metrics" in name)
     assert next(row["B"] for row in means if row["metric"] == "shift_3m/psnr") == pytest.approx(21.9)
     assert not any("Gaussians" in name for name in tables(found))
+    with pytest.raises(ConfigError, match=r"different logs.*Leave out --chunk"):
+        runs.compare("aa11", "cc33", chunk=1)
 
 
 def test_many_chunks_are_compared_by_means_or_one_by_one(runs: Runs) -> None:

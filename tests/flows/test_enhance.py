@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from flows.cli import enhance as cli_enhance
 from flows.cli.main import app
+from flows.cli.run import RunRequest
 from flows.configuration import load_configuration
 from flows.enhancement.enhancement_request import EnhancementInputs, prepare_enhancement
 from flows.pipeline.definition import PIPELINE, STAGE_BY_NAME
@@ -153,7 +154,7 @@ def test_a_scale_has_to_come_from_somewhere(inputs: EnhancementInputs) -> None:
 def test_a_format_with_axes_of_its_own_is_refused(inputs: EnhancementInputs, tmp_path: Path, suffix: str) -> None:
     scene = tmp_path / f"scene{suffix}"
     scene.write_bytes(b"")
-    with pytest.raises(InputError, match="has axes of its own"):
+    with pytest.raises(InputError, match=r"has axes of its own.*leaves axes and units as they are; `genre import`"):
         prepare_enhancement(replace(inputs, scene=scene), PipelineConfig())
 
 
@@ -264,14 +265,16 @@ def test_far_and_large_gaussians_are_distant(colourful: SplatCloud, tmp_path: Pa
     assert torch.nonzero(scene.nodes)[:, 0].tolist() == [0, 1]
 
 
-def test_the_log_of_an_enhanced_scene_is_found_from_other_folders(
+def test_log_and_files_of_an_enhanced_scene_are_found_from_other_folders(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[str] = []
+    asked: list[RunRequest] = []
     monkeypatch.setattr(cli_enhance, "check_request", lambda request: None)
-    monkeypatch.setattr(cli_enhance, "reconstruct", lambda request, as_json: asked.append(request.log))
+    monkeypatch.setattr(cli_enhance, "reconstruct", lambda request, as_json: asked.append(request))
     monkeypatch.chdir(folder.parent)
     words = ["enhance", f"{folder.name}/scene.ply", "--cameras", folder.name, "--scale", "2.5"]
+    words += ["--set", f"ingest={{points: {folder.name}/scene.ply}}"]
     done = CliRunner().invoke(app, words, catch_exceptions=False)
     assert done.exit_code == 0, done.output
-    assert len(asked) == 1 and asked[0].startswith(f"posed_images:{folder}")
+    assert len(asked) == 1 and asked[0].log.startswith(f"posed_images:{folder}")
+    assert asked[0].config.ingest.points == str(folder / "scene.ply")

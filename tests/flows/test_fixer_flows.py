@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,20 +14,24 @@ import pytest
 import torch
 
 from flows.training import fixer_job, fixer_pairs, fixer_training, scene_lists
-from flows.training.curve_table import FIXER_CURVE, FIXER_SCORES, load_rows
+from flows.training.curve_table import FIXER_CURVE, FIXER_SCORES, load_rows, save_rows
 from flows.training.fixer_flow import train_fnet, train_pairs
 from flows.training.fixer_job import CURVE_FILE, SCORES_FILE, FixerJob
 from flows.training.fixer_pairs import TRAINING_PAIRS, PairRecipe, PairSet
 from flows.training.fixer_training import load_pairs, train_fixer
 from flows.training.requirements import check_fixer_training
 from flows.training.training_scenes import SceneRecipe
+from genre_tasks.config import FnetConfig
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.fixer import training
 from genre_tasks.fixer.architectures import small_architecture
 from genre_tasks.fixer.training_checkpoint import CHECKPOINT_FILE
 from genre_tasks.fixer.training_settings import TrainingSettings
+from genre_tasks.fixer.weight_files import check_fixer_files
 from genre_tasks.fixer.weights import load_fnet
+from genre_tasks.stages.fnet import load_configured_fnet
 from storage.files import digest_file
+from tests.fixer.conftest import save_toy_sd_turbo
 
 SMALL = "&frames=12&cameras=2&width=64&height=36&lidar_beams=16&lidar_azimuths=150"
 SETS = PairRecipe(
@@ -172,6 +177,48 @@ def test_what_is_trained_is_not_taken_for_another_training(trained, tmp_path) ->
         train_fnet(str(tmp_path), None, 2, steps=2)
     with pytest.raises(InputError, match=r"other pairs \(file .*autoencoder\.pt"):
         train_fnet(str(tmp_path), None, 1)
+
+
+@pytest.mark.parametrize("name", ["fnet.safetensors", "fnet.json"])
+def test_damaged_weights_come_from_the_checkpoint(trained, tmp_path, name) -> None:
+    folder, _ = trained
+    shutil.copytree(folder / "fnet", tmp_path / "fnet")
+    (tmp_path / "store").symlink_to(folder / "store")
+    damaged = tmp_path / "fnet" / name
+    content = damaged.read_bytes()
+    damaged.write_bytes(content[:-9])
+    assert train_fixer(FixerJob(str(tmp_path), streets=2)) == (tmp_path / "fnet" / "fnet.safetensors", False)
+    assert damaged.read_bytes() == content
+
+
+def test_scores_of_a_deleted_training_are_not_mixed_in(trained, tmp_path) -> None:
+    (tmp_path / "store").symlink_to(trained[0] / "store")
+    rows = load_rows(trained[0] / "fnet" / SCORES_FILE, FIXER_SCORES)
+    save_rows(tmp_path / "fnet" / SCORES_FILE, FIXER_SCORES, [{**rows[0], "step": 1}])
+    train_fixer(FixerJob(str(tmp_path), streets=2, validate=True))
+    assert load_rows(tmp_path / "fnet" / SCORES_FILE, FIXER_SCORES) == rows
+
+
+def test_adapters_name_sd_turbo_so_that_a_run_finds_it(trained, tmp_path, monkeypatch) -> None:
+    (tmp_path / "training").mkdir()
+    (tmp_path / "training" / "store").symlink_to(trained[0] / "store")
+    save_toy_sd_turbo(tmp_path / "turbo")
+    monkeypatch.chdir(tmp_path)
+    job = FixerJob("training", streets=2, preset="paper", start="turbo")
+    weights, is_trained = train_fixer(job)
+    assert is_trained
+    config = FnetConfig(model="sd-turbo", weights=str(tmp_path / weights))
+    described = weights.with_suffix(".json")
+    written = described.read_text()
+    # Older weights have the path as it was typed: the same command mends them.
+    described.write_text(json.dumps({**json.loads(written), "base": "turbo"}))
+    with pytest.raises(InputError, match=r"SD-Turbo \(turbo\) is not on this machine"):
+        check_fixer_files(config)
+    assert train_fixer(job) == (weights, False)
+    assert described.read_text() == written
+    monkeypatch.chdir(trained[0])
+    assert check_fixer_files(config) == tmp_path / weights
+    load_configured_fnet(config)
 
 
 def test_a_kill_at_the_last_checkpoint_loses_no_weights(trained, tmp_path, monkeypatch) -> None:

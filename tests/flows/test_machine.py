@@ -84,9 +84,17 @@ def test_limits_of_the_processs_own_cgroup_count(
     assert (memory_limit_gib(), count_cores()) == (gib or without[0], cores or without[1])
 
 
-def test_help_needs_no_folder_to_write_to(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "error",
+    [
+        FileNotFoundError("No usable temporary directory found"),
+        ConfigError("the folder belongs to another user", remedy="Set XDG_STATE_HOME to a folder of yours."),
+    ],
+    ids=["nowhere to write", "another user's folder"],
+)
+def test_help_needs_no_folder_to_write_to(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
     def nowhere() -> Path:
-        raise FileNotFoundError("No usable temporary directory found")
+        raise error
 
     variables: dict[str, str] = {}
     monkeypatch.setattr(os, "environ", variables)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
 from flows.configuration import load_configuration
-from flows.pipeline import memory_plan, stage_inputs
+from flows.pipeline import memory_limit, memory_plan, stage_inputs
 from flows.pipeline.definition import PIPELINE, STAGE_BY_NAME
 from flows.pipeline.memory_plan import (
     ChunkSize,
@@ -56,13 +57,34 @@ def test_images_lie_on_disk_where_they_do_not_fit(limit_gib: float, expected: bo
 
 def test_without_a_limit_it_is_the_machines(monkeypatch: pytest.MonkeyPatch) -> None:
     memory = StageMemory(working_mib=2048, images_mib=2048)
-    monkeypatch.setattr(memory_plan, "memory_limit_gib", lambda: 64.0)
+    monkeypatch.setattr(memory_limit, "memory_limit_gib", lambda: 64.0)
     assert not needs_disk("enet", memory, limited(None))
-    monkeypatch.setattr(memory_plan, "memory_limit_gib", lambda: 4.0)
+    monkeypatch.setattr(memory_limit, "memory_limit_gib", lambda: 4.0)
     assert needs_disk("enet", memory, limited(None))
     # A machine that is too small is tried: the prediction may be too high.
-    monkeypatch.setattr(memory_plan, "memory_limit_gib", lambda: 1.0)
+    monkeypatch.setattr(memory_limit, "memory_limit_gib", lambda: 1.0)
     assert needs_disk("enet", memory, limited(None))
+
+
+def test_a_limit_above_the_machines_does_not_switch_its_guard_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    memory = StageMemory(working_mib=2048, images_mib=2048)
+    monkeypatch.setattr(memory_limit, "memory_limit_gib", lambda: 4.0)
+    assert needs_disk("enet", memory, limited(64.0))
+    # The user allows as much: that the machine has less is no error.
+    monkeypatch.setattr(memory_limit, "memory_limit_gib", lambda: 1.0)
+    assert needs_disk("enet", memory, limited(64.0))
+
+
+def test_a_limit_above_the_machines_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machine_checks, "memory_limit_gib", lambda: 7.5)
+    names = [spec.name for spec in PIPELINE]
+    assert machine_checks.assess_memory(HD, limited(7.0), names) is None
+    warning = machine_checks.assess_memory(HD, limited(8.0), names)
+    assert warning is not None and "the limit on memory is 8.0 GiB, and this process may use 7.5 GiB" in warning
+    # What the run needs is the more important thing to say.
+    monkeypatch.setattr(machine_checks, "memory_limit_gib", lambda: 1.0)
+    warning = machine_checks.assess_memory(HD, limited(8.0), names)
+    assert warning is not None and "the run needs about" in warning
 
 
 def test_a_limit_that_is_too_low_is_an_error_before_the_stage() -> None:
@@ -109,19 +131,73 @@ def test_gaussians_are_split_before_later_stages() -> None:
     assert counts == {"gnet": 310_000, "enet": 403_000, "evaluate/enet": 604_500}
 
 
-def test_a_stage_works_with_as_many_threads_as_fit() -> None:
+def test_a_stage_works_with_as_many_threads_as_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory_limit, "memory_limit_gib", lambda: 64.0)
     size = replace(HD, gaussians=600_000)
     chosen = {gib: choose_threads("evaluate/enet", size, limited(gib), 16) for gib in (1.0, 3.725, 5.0, 100.0, None)}
     assert chosen[1.0] == 1 < chosen[3.725] < chosen[5.0] < chosen[100.0] == chosen[None] == 16
     for gib in (3.725, 5.0):
         fits = [predict_memory("evaluate/enet", size, limited(gib), chosen[gib] + more).working_mib for more in (0, 1)]
         assert fits[0] <= 1024 * gib < fits[1]
+    # The machine's memory bounds them as well, with a larger limit or with none.
+    monkeypatch.setattr(memory_limit, "memory_limit_gib", lambda: 4.0)
+    bounded = {gib: choose_threads("evaluate/enet", size, limited(gib), 16) for gib in (3.4, 100.0, None)}
+    assert set(bounded.values()) == {chosen[3.725]}
+    # GNet's memory does not go with threads: it keeps them where it may be too large.
+    assert predict_memory("gnet", size, limited(None), 1).working_mib > 3.4 * 1024
+    assert choose_threads("gnet", size, limited(None), 16) == 16
 
 
 def test_many_cores_do_not_pass_a_limit_that_two_keep(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine_checks, "count_cores", lambda: 64)
+    for module in (machine_checks, memory_limit):
+        monkeypatch.setattr(module, "memory_limit_gib", lambda: 64.0)
     names = [spec.name for spec in PIPELINE]
     assert machine_checks.assess_memory(HD, limited(4e9 / 2**30), names) is None
+
+
+PLY = b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nend_header\n" + bytes(3 * 4)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("scene.ply", PLY), ("scene.compressed.ply", PLY), ("scene.SPLAT", bytes(3 * 32))],
+    ids=["PLY", "compressed PLY", "splat"],
+)
+def test_a_scene_of_a_file_is_as_large_as_the_file(tmp_path: Path, name: str, content: bytes) -> None:
+    (tmp_path / name).write_bytes(content)
+    splits = ["gnet.split_fraction=1", "enet.split_fraction=1"]
+    settings = [f"initial.scene={tmp_path / name}", "gnet.method=none", *splits]
+    config = load_configuration("demo", settings=settings)
+    log = FakeLog()
+    size = estimate_chunk_size(log, log.cameras, config)
+    # GNet hands it on as it is.
+    counts = {stage: grow_until(stage, size, config).gaussians for stage in ("initial", "enet", "evaluate/enet")}
+    assert counts == {"initial": 3, "enet": 3, "evaluate/enet": 6}
+
+
+def test_a_large_scene_of_a_file_takes_memory_and_disk(tmp_path: Path) -> None:
+    gaussians = 2_000_000
+    file = tmp_path / "scene.splat"
+    with file.open("wb") as stream:
+        stream.truncate(32 * gaussians)
+    log = FakeLog()
+    preset = load_configuration("demo")
+    config = load_configuration("demo", settings=[f"initial.scene={file}"])
+    added_mib = [machine_checks.estimate_disk_mib(log, log.cameras, c, 1) for c in (preset, config)]
+    assert added_mib[1] - added_mib[0] > gaussians * 100 / 2**20
+    chunk = SimpleNamespace(views_with_role=lambda _: [], camera_names=["front"], width_px=64, height_px=36)
+    memory, _ = stage_inputs._predict(STAGE_BY_NAME["initial"], LOG, config, {"ingest": chunk})
+    assert memory.working_mib > gaussians * 1000 / 2**20
+
+
+@pytest.mark.parametrize("name", ["scene.spz", "gone.ply"])
+def test_a_scene_that_does_not_tell_its_size_is_taken_to_be_the_presets(tmp_path: Path, name: str) -> None:
+    (tmp_path / "scene.spz").write_bytes(bytes(100))
+    config = load_configuration("demo", settings=[f"initial.scene={tmp_path / name}"])
+    log = FakeLog()
+    size = estimate_chunk_size(log, log.cameras, config)
+    assert size.gaussians == config.initial.max_points + config.initial.distant_count
 
 
 def test_a_batch_is_halved_for_each_attempt_that_ran_out_of_memory() -> None:

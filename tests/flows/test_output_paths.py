@@ -15,7 +15,10 @@ from flows.pipeline.log_cache import expand_logs
 from genre_tasks.atomic_path import replace_folder
 from genre_tasks.errors import ConfigError, GenreError, InputError
 from genre_tasks.logs.registry import open_log
+from storage.local import LocalStore
+from tests.contracts.store_suite import address
 from tests.ordinary_user import as_ordinary_user
+from tests.storage.artifact_values import make
 
 STREET = "synthetic:street?seed=900&frames=8"
 
@@ -162,6 +165,17 @@ def test_an_option_that_would_be_ignored_is_refused(tmp_path: Path) -> None:
     assert "0 runs" in refusal("show", "", "--store", str(tmp_path)).problem
     assert "knob" in refusal("cost", STREET, "--knobs", "", "--dry-run").problem
     assert "0 runs" in refusal("render", "", "--out", picture, "--store", str(tmp_path)).problem
+    for what in ("runs", "stages", "config", "actors"):
+        assert f"--chunk has no meaning for '{what}'" in refusal("show", what, "--chunk", "3").problem
+    assert "--preset has no meaning for '4b1c'" in refusal("show", "4b1c", "--preset", "hd").problem
+    artifact = LocalStore(tmp_path / "store").commit(address(), "effects", make("effects"))
+    by_key = refusal("show", artifact.manifest.key[:8], "--chunk", "3", "--store", str(tmp_path / "store"))
+    by_folder = refusal("show", str(artifact.path), "--chunk", "3")
+    assert "for an artifact" in by_key.problem and "for a folder" in by_folder.problem
+    for option in (["--port", "9000"], ["--host", "0.0.0.0"], ["--open"]):
+        error = refusal("view", "4b1c", "--html", str(tmp_path / "x.html"), *option)
+        assert f"no use for {option[0]}" in error.problem and "--html" in error.remedy
+    assert "no use for --note" in refusal("pin", "--list", "--note", "why", "--store", str(tmp_path)).problem
 
 
 def test_a_mistyped_store_is_no_empty_store(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from flows.pipeline.stage_runner import Job
 from flows.reconstruction import flow, outcome_artifact, run_records, stored_values
 from flows.reconstruction.left_out import ChunksLeftOutError, LogsFailedError
 from flows.reconstruction.report import writing
+from genre_tasks.config import PipelineConfig
 from genre_tasks.errors import (
     ArtifactCorruptError,
     ConfigError,
@@ -121,6 +122,25 @@ def test_a_runs_log_is_found_from_other_folders(tmp_path: Path, monkeypatch: pyt
     run(tmp_path, "genre:007")
     CliRunner().invoke(app, ["run", "genre:007", "--store", str(tmp_path)], catch_exceptions=False)
     assert asked == [f"genre:{tmp_path}/007"] * 2
+
+
+def test_a_runs_files_are_found_from_other_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str | None] = []
+
+    def compute(log: str, preset: str, store: str, chunks: Any, effective: PipelineConfig, budget: Any) -> dict:
+        asked.append(effective.ingest.points)
+        return {}
+
+    monkeypatch.setattr(flow, "_compute", compute)
+    monkeypatch.setattr(cli_run, "check_request", lambda request: None)
+    monkeypatch.setattr(cli_run, "reconstruct", lambda request, as_json: asked.append(request.config.ingest.points))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "p.ply").touch()
+    (tmp_path / "own.yaml").write_text("ingest: {points: p.ply}\n")
+    flow.reconstruct_log(LOG, preset="demo", store=str(tmp_path), settings=["ingest.points=p.ply"])
+    for words in (["--config", "own.yaml"], ["--set", "ingest={points: p.ply}"]):
+        CliRunner().invoke(app, ["run", LOG, "--store", str(tmp_path), *words], catch_exceptions=False)
+    assert asked == [str(tmp_path / "p.ply")] * 3
 
 
 def test_a_chunk_that_failed_by_its_surroundings_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flows.configuration import apply_settings, load_configuration, validate_config
-from flows.configuration.settings import PATH_KEYS, make_setting_absolute
+from flows.configuration.absolute_paths import PATH_KEYS, make_paths_absolute, make_setting_absolute
+from flows.configuration.settings import parse_setting
 from genre_tasks.config import PipelineConfig
 from genre_tasks.config.section import Section
 from genre_tasks.errors import ConfigError
@@ -182,3 +183,52 @@ def test_every_key_that_takes_a_file_is_made_absolute_for_workers(
     # A folder of that name does not make a path of a method.
     assert make_setting_absolute("gnet.method=adam") == "gnet.method=adam"
     assert make_setting_absolute("gnet.weights=adam") == f"gnet.weights={tmp_path}/adam"
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "evaluate.lpips=vgg",
+        "evaluate.lpips=alex",
+        "gnet.weights=builtin",
+        "gnet.refine.weights=builtin:gnet",
+        "gnet={weights: 'builtin:enet'}",
+    ],
+)
+def test_a_file_with_the_name_of_a_network_changes_no_setting(
+    setting: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("vgg", "alex", "builtin", "builtin:gnet", "builtin:enet"):
+        (tmp_path / name).touch()
+    assert make_setting_absolute(setting) == setting
+    config = load_configuration("small", settings=[setting])
+    assert make_paths_absolute(config) is config
+
+
+def test_paths_are_absolute_wherever_they_are_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("p.ply", "w.safetensors", "net.pt"):
+        (tmp_path / name).touch()
+    file = _write(tmp_path / "own.yaml", "evaluate: {inception: net.pt}\ngnet: {refine: {weights: w.safetensors}}\n")
+    settings = ["ingest={points: p.ply}", "initial.scene=p.ply", "enet.weights=elsewhere", "fnet.weights=/a//b"]
+    merged = load_configuration("small", file, settings)
+    config = make_paths_absolute(merged)
+    assert (config.ingest.points, config.initial.scene) == (f"{tmp_path}/p.ply", f"{tmp_path}/p.ply")
+    assert config.evaluate.inception == f"{tmp_path}/net.pt"
+    assert config.gnet.refine is not None and config.gnet.refine.weights == f"{tmp_path}/w.safetensors"
+    # What is not here is named as the user wrote it, and an absolute path stays as it is written.
+    assert (config.enet.weights, config.fnet.weights) == ("elsewhere", "/a//b")
+    assert config.gnet.loss == merged.gnet.loss and make_paths_absolute(config) is config
+
+
+def test_a_setting_of_a_section_has_absolute_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "p.ply").touch()
+    setting = make_setting_absolute("ingest={points: p.ply, strict: true, cameras: [ü, 'on'], min_actor_travel_m: 1.5}")
+    assert parse_setting(setting) == (
+        ("ingest",),
+        {"points": f"{tmp_path}/p.ply", "strict": True, "cameras": ["ü", "on"], "min_actor_travel_m": 1.5},
+    )
+    for other in ("ingest={strict: true}", "evaluate.shifts_m=[1, 2.5]", "effects=off", "gnet.iterations=.nan"):
+        assert make_setting_absolute(other) == other

@@ -155,17 +155,31 @@ def test_a_stopped_stage_resumes_to_the_same_bytes(trained: Trained, tmp_path: P
     assert [{**row, "seconds": 0} for row in curves[0]] == [{**row, "seconds": 0} for row in curves[1]]
 
 
+@pytest.mark.parametrize("damage", ["deleted", "cut"])
 @pytest.mark.parametrize("name", ["weights.safetensors", "weights.json"])
-def test_deleted_weights_come_from_the_checkpoint(trained: Trained, tmp_path: Path, name: str) -> None:
+def test_lost_weights_come_from_the_checkpoint(trained: Trained, tmp_path: Path, name: str, damage: str) -> None:
     folder = tmp_path / "again"
     shutil.copytree(trained[0], folder)
-    (folder / "gnet/only" / name).unlink()
-    with pytest.raises(InputError, match=r"weights of the stage gnet/only are missing .*--stage gnet/only"):
+    lost = folder / "gnet/only" / name
+    content = lost.read_bytes()
+    lost.unlink()
+    if damage == "cut":
+        lost.write_bytes(content[:-9])
+    with pytest.raises(InputError, match=r"weights of the stage gnet/only are missing or damaged .*--stage gnet/only"):
         train_stage(TrainJob(str(folder), "tiny"), TABLE[2])
     again = train_network("gnet", str(folder), "tiny")
     assert again["stages"] == [("enet/3dgs", True), ("gnet/only", True)]
     for file in (folder / "gnet/only" / name, folder / f"gnet{Path(name).suffix}"):
         assert digest_file(file) == digest_file(trained[0] / "gnet/only" / name)
+
+
+def test_scores_of_a_deleted_training_are_not_mixed_in(trained: Trained, tmp_path: Path) -> None:
+    folder = tmp_path / "again"
+    shutil.copytree(trained[0], folder)
+    (folder / "gnet/only/checkpoint.safetensors").unlink()
+    train_stage(TrainJob(str(folder), "tiny", save_every=3, validate_every=3), TABLE[1])
+    rows = load_rows(folder / "gnet/only/validation.parquet", VALIDATION_SCORES)
+    assert [row["step"] for row in rows] == [3]
 
 
 def test_a_checkpoint_of_another_training_is_refused(trained: Trained, tmp_path: Path) -> None:

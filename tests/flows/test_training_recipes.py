@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
+import yaml
 
-from flows.training import recipes
+from benchmarks.real_logs import RealLogsBench
+from flows.configuration import load_configuration
+from flows.training import recipes, validation
 from flows.training.device import choose_device
+from flows.training.fixer_job import FixerJob
+from flows.training.fixer_pairs import TRAINING_PAIRS, list_pair_scenes, list_validation_scenes
 from flows.training.recipes import GNET_STAGES, get_recipe, select_stages
 from flows.training.scene_starts import Adam, ByGnet, PerScene
 from flows.training.stage_scenes import list_stage_scenes
+from flows.training.training_scenes import TRAINING_SEEDS
 from flows.training.validation import list_validation_recipes
 from genre_tasks.errors import ConfigError
+from genre_tasks.fixer.inference import TILE_PX
 from genre_tasks.learned.weights import load_optimiser
 from genre_tasks.weights import resolve_weights
 
+ROOT = Path(__file__).resolve().parents[2]
 REAL = "pandaset:002"
 
 
@@ -48,6 +58,44 @@ def test_the_shipped_weights_are_described() -> None:
     enet = ["enet/coarse", "enet/fine", "enet/dense", "enet/strides", "enet/held", "enet/many"]
     assert names == [*gnet, "gnet/told", *enet, "enet/swept"]
     assert table["enet/swept"].network == load_optimiser(resolve_weights("enet", "builtin")).config
+
+
+def _percentages(counts: dict[str, int]) -> dict[str, str]:
+    return {kind: f"{100 * count / sum(counts.values()):.0f} %" for kind, count in counts.items()}
+
+
+def test_the_fixers_card_has_the_fractions_of_its_pairs() -> None:
+    card = resolve_weights("fnet", "builtin").with_suffix(".md").read_text()
+    uris = [scene.uri for scene in list_pair_scenes(FixerJob("training").streets, REAL)]
+    real = uris.count(REAL)
+    today = {s.kind: (len(uris) - real) * s.count + real * s.real for s in TRAINING_PAIRS.sets}
+    # The shipped weights' first two trainings came before this kind.
+    earlier = {kind: count for kind, count in today.items() if kind != "loose ground"}
+    assert f"makes {sum(today.values())} pairs" in card and f"had {sum(earlier.values())}" in card
+    rows = re.findall(r"^\| ([\w -]+) \| (\d+ %|–) \| (\d+ %) \|", card, flags=re.MULTILINE)
+    expected = _percentages(earlier) | {"loose ground": "–"}
+    assert {kind: first for kind, first, _ in rows} == expected
+    assert {kind: last for kind, _, last in rows} == _percentages(today)
+    for input_name in ("render", "nearest recorded image", "LiDAR map"):
+        assert re.search(rf"^\| input \|.*{input_name}", card, flags=re.MULTILINE)
+    assert f"to {load_configuration('hd').fnet.max_network_px} pixels" in card and f"Above {TILE_PX} pixels" in card
+
+
+def test_seeds_are_those_of_the_configuration() -> None:
+    seeds = yaml.safe_load((ROOT / "configs/seeds.yaml").read_text())
+    first, last = seeds["training"]
+    assert range(first, last + 1) == TRAINING_SEEDS
+    lowest, highest = seeds["validation"]
+    uris = [scene.uri for scene in list_validation_scenes()]
+    used = [*validation.SEEDS, *(int(uri.partition("seed=")[2]) for uri in uris)]
+    assert len(used) == 6 and all(lowest <= seed <= highest for seed in used)
+
+
+def test_the_guide_says_which_recordings_are_not_for_training() -> None:
+    guide = (ROOT / "docs/guides/training.md").read_text()
+    drive = Path(RealLogsBench.options["kitti"].partition("?")[0]).name
+    assert re.search(rf"^\| KITTI `{drive}` \| .*never training \|$", guide, flags=re.MULTILINE)
+    assert re.search(r"^\| PandaSet 002, chunk 1 \| published numbers only \|$", guide, flags=re.MULTILINE)
 
 
 def test_the_paper_begins_with_enet() -> None:

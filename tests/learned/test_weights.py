@@ -13,6 +13,7 @@ from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.learned.learned_optimiser import LearnedOptimiser
 from genre_tasks.learned.network import NetworkConfig
 from genre_tasks.learned.weights import load_optimiser, save_optimiser
+from genre_tasks.optimiser.tuned_adam import GNET_LEARNING_RATES
 
 CONFIG = NetworkConfig(hidden=16, channels=(8, 12))
 
@@ -31,6 +32,14 @@ def test_round_trip(path: Path) -> None:
     for (name, a), (other, b) in zip(made.named_parameters(), loaded.named_parameters(), strict=True):
         assert name == other and torch.equal(a, b) and not b.requires_grad
     assert sorted(p.name for p in path.parent.iterdir()) == ["w.json", "w.safetensors"]
+
+
+def test_loading_leaves_the_global_random_state_alone(path: Path) -> None:
+    torch.manual_seed(3)
+    expected = torch.rand(3)
+    torch.manual_seed(3)
+    load_optimiser(path).with_learning_rates(GNET_LEARNING_RATES)
+    assert torch.equal(torch.rand(3), expected)
 
 
 def _changed(path: Path, change: str) -> None:

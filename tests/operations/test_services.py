@@ -20,16 +20,20 @@ from uuid import uuid4
 import pytest
 import yaml
 from prefect.settings.models.server.services import ServerServicesSettings
+from typer.testing import CliRunner
 
+from flows.cli.main import app
 from flows.operations import ObjectServer, PostgresServer, PrefectServer, Service, Worker
+from flows.operations import deployments as deployments_module
 from flows.operations import object_server as object_module
 from flows.operations import postgres_server as postgres_module
 from flows.operations import stack as stack_module
-from flows.operations.deployments import DEPLOYMENTS, RUN_QUEUE
+from flows.operations.deployments import DEPLOYMENTS, RUN_QUEUE, fill_parameters
 from flows.operations.prefect_services import EVENT_SETTINGS
 from flows.operations.service import find_free_port, keep_port, keep_secret
 from flows.operations.stack import Stack, describe_services, stop_stack
 from flows.operations.state_file import ServiceRecord, keep_options, read_records, read_start_ticks, write_records
+from flows.prefect_api import connection
 from genre_tasks.errors import ConfigError, ResourceError
 from tests.faults import small_run
 from tests.waiting import wait_until
@@ -225,6 +229,36 @@ def test_clients_find_the_server_where_a_worker_does_not_start(tmp_path: Path, m
         Stack(tmp_path, store_server=False, database="sqlite").start()
     written = (tmp_path / "env").read_text()
     assert "export PREFECT_API_URL=" in written and "export GENRE_STORE=" in written
+
+
+def test_variables_for_clients_are_one_object_with_json(tmp_path: Path) -> None:
+    (tmp_path / "env").write_text("export PREFECT_API_URL=http://127.0.0.1:4200/api\nexport GENRE_STORE='/a b=c'\n")
+    words = ["ops", "status", "--folder", str(tmp_path), "--env"]
+    found = json.loads(CliRunner().invoke(app, [*words, "--json"], catch_exceptions=False).stdout)
+    assert found["environment"] == {"PREFECT_API_URL": "http://127.0.0.1:4200/api", "GENRE_STORE": "/a b=c"}
+    assert (found["status"], found["exit_code"]) == ("done", 0)
+    assert CliRunner().invoke(app, words).stdout == (tmp_path / "env").read_text()
+
+
+def test_trainings_are_deployed_into_a_folder_that_workers_have(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders: list[Path] = []
+
+    def deploy(url: str, auth_string: None, pool: str, store: str, training_folder: Path) -> list[str]:
+        folders.append(training_folder)
+        return []
+
+    monkeypatch.setattr(deployments_module, "deploy_flows", deploy)
+    monkeypatch.setattr(connection, "read_api_url", lambda: "http://127.0.0.1:4200/api")
+    monkeypatch.setattr(connection, "check_server", lambda url: None)
+    monkeypatch.chdir(tmp_path)
+    for words in ([], ["--training-folder", "/data/training"]):
+        CliRunner().invoke(app, ["ops", "deploy", *words], catch_exceptions=False)
+    assert folders == [tmp_path / "training", Path("/data/training")]
+    filled = {d.name: fill_parameters(d, "/store", folders[1]) for d in DEPLOYMENTS}
+    assert filled["log"]["store"] == filled["dataset"]["store"] == "/store"
+    assert filled["training"]["folder"] == filled["training-scenes"]["folder"] == "/data/training"
 
 
 def test_an_unknown_database_is_an_error(tmp_path: Path) -> None:

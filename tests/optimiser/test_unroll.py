@@ -30,12 +30,11 @@ OBJECTIVE = Objective(LossConfig(perceptual=0))
 SMALL = NetworkConfig(hidden=16, channels=(8, 12), rates=GNET_LEARNING_RATES.as_tuple())
 
 
-def _network(seed: int = 0, trained: bool = True) -> LearnedOptimiser:
+def _network(seed: int = 0) -> LearnedOptimiser:
     """With a head that is not zero, as training would leave it."""
     torch.manual_seed(seed)
     network = LearnedOptimiser(SMALL)
-    if trained:
-        torch.nn.init.normal_(network.head.weight, std=0.02)
+    torch.nn.init.normal_(network.head.weight, std=0.02)
     return network.eval().requires_grad_(False)
 
 
@@ -50,12 +49,16 @@ def truth() -> SceneGraph:
     return street_scenes.scene()
 
 
-def test_an_untrained_network_is_tuned_adam_to_the_bit(truth: SceneGraph) -> None:
+@pytest.mark.parametrize("residuals", [False, True])
+def test_an_untrained_network_is_tuned_adam_to_the_bit_unless_residuals_move_colours(
+    truth: SceneGraph, residuals: bool
+) -> None:
     start, settings = street_scenes.blurred(truth), UnrollSettings(5, 2, 1)
     a = _run(TunedAdam(), start, truth, settings)
-    b = _run(_network(trained=False), start, truth, settings)
-    assert a.losses == b.losses
-    assert torch.equal(a.scene.gaussians.pack(), b.scene.gaussians.pack())
+    untrained = LearnedOptimiser(SMALL.model_copy(update={"residuals": residuals}))
+    b = _run(untrained.eval().requires_grad_(False), start, truth, settings)
+    assert (a.losses == b.losses) != residuals
+    assert torch.equal(a.scene.gaussians.pack(), b.scene.gaussians.pack()) != residuals
 
 
 @pytest.mark.parametrize("rule", [TunedAdam(), _network()], ids=["adam", "learned"])

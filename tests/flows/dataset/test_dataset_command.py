@@ -52,3 +52,13 @@ def test_paths_are_absolute_on_a_pool(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_options_of_a_pool_need_one(words: list[str]) -> None:
     with pytest.raises(ConfigError, match=f"{words[0]} is for a dataset on a pool"):
         CliRunner().invoke(app, ["dataset", "synthetic:street?seed=1", *words], catch_exceptions=False)
+
+
+def test_files_in_settings_are_absolute_without_a_pool_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Mapping[str, Any]] = []
+    monkeypatch.setattr(dataset, "_run_here", lambda parameters, facts, as_json: asked.append(parameters))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "p.ply").touch()
+    words = ["--set", "ingest={points: p.ply}", "--set", "gnet.iterations=9"]
+    CliRunner().invoke(app, ["dataset", "synthetic:street?seed=1", *words], catch_exceptions=False)
+    assert [entry["settings"] for entry in asked] == [[f'ingest={{"points": "{tmp_path}/p.ply"}}', "gnet.iterations=9"]]
