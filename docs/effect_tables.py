@@ -9,7 +9,7 @@ from benchmarks.effects.cases import CASES
 from benchmarks.effects.report import effect_gain
 from docs.claim_words import EFFECT_WORDS
 from docs.result_tables import claims as claims_of
-from docs.result_tables import provenance, result, short_log, table
+from docs.result_tables import number, provenance, result, short_log, table
 
 _CALLED_FOR = 4.0
 _NOT_CALLED_FOR = 0.0
@@ -36,11 +36,13 @@ def on_streets() -> str:
         planned_plain = f"{sum(row['choice'] == 'on' for row in plain)} of {len(plain)}" if plain else "–"
         gains_plain = _gains(plain) if plain else "–"
         threshold = f"{first['threshold']:g} {first['property_unit']}"
-        lines.append([EFFECT_WORDS[name], threshold, planned, _gains(called), planned_plain, gains_plain])
+        over = _over_threshold(called)
+        lines.append([EFFECT_WORDS[name], threshold, over, planned, _gains(called), planned_plain, gains_plain])
     head = [
         "effect",
         "set on above",
-        "streets that call for it: planned on",
+        "streets that call for it: measured over that",
+        "planned on",
         "gain, median (least to most)",
         "streets that do not: planned on",
         "gain, median (least to most)",
@@ -70,6 +72,12 @@ def whole_plans() -> str:
 
 def _rows(name: str, factor: float) -> list[Row]:
     return [row for row in result("effects")["rows"] if row.get("effect") == name and row["factor"] == factor]
+
+
+def _over_threshold(rows: list[Row]) -> str:
+    """By which factors the plan measured the property above its threshold, least to most."""
+    factors = [row["value"] / row["threshold"] for row in rows if row["value"] is not None]
+    return f"{number(min(factors))} to {number(max(factors))}" if factors else "–"
 
 
 def _gains(rows: list[Row]) -> str:

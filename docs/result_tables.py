@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import statistics
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -56,10 +58,23 @@ def provenance(name: str) -> str:
         if earlier
         else ""
     )
-    return (
-        f"Measured on {loaded['machine']} at commit `{loaded['commit'][:12]}` by "
-        f"`genre bench {name} --json docs/results/data/{name}.json`.{part}\n"
-    )
+    return f"Measured on {loaded['machine']} at commit `{loaded['commit'][:12]}` by {_command(name, loaded)}.{part}\n"
+
+
+def _command(name: str, loaded: Mapping[str, Any]) -> str:
+    """The command that measured a file, with options that were not the defaults, where the file notes them."""
+    noted = loaded.get("options", {})
+    # A row that was measured with other options than the last ones carries its own.
+    settings = Counter(_settings(row.get("options", noted)) for row in loaded["rows"])
+    command = f"genre bench {name} --json docs/results/data/{name}.json"
+    if len(settings) == 1:
+        return f"`{command}{next(iter(settings))}`"
+    parts = [f"`{text.strip()}` for {count}" for text, count in settings.items() if text]
+    return f"`{command}`, with {', '.join(parts)} of {len(loaded['rows'])} rows" if parts else f"`{command}`"
+
+
+def _settings(options: Mapping[str, str]) -> str:
+    return "".join(f" --set {shlex.quote(f'{key}={value}')}" for key, value in options.items())
 
 
 _UNITS_WITHOUT_WORD = ("share", "ratio", "share of runs", "part", "distance")
@@ -108,7 +123,7 @@ def short_log(row: Mapping[str, Any]) -> str:
 METHODS = {
     "initial": "initial scene from LiDAR",
     "street_gs": "per-scene 3DGS, 1,000 iterations, actors in 3D boxes",
-    "adam": "tuned Adam in GNet's place, preset `small`",
+    "adam": "Adam in GNet's place at its rates for 24 iterations, preset `small`",
     "small_gnet": "GNet, preset `small`",
     "small_enet": "GenRe, preset `small`",
     "fine_gnet": "GNet, preset `fine`",

@@ -38,7 +38,10 @@ CLAIM_WORDS = {
 
 
 def behaviours() -> str:
-    """Every method along every behaviour: mean over logs, streets against the truth and the real log as a set."""
+    """Every method along every behaviour: mean over logs, streets against the truth and the real log as a set.
+
+    The last rows count the rollouts that overlap a road user.
+    """
     rows = [row for row in result(NAME)["rows"] if row["cell"].startswith("behaviours") and "rollouts" in row]
     streets = [row for row in rows if "differences" not in row]
     real = [row for row in rows if "differences" in row]
@@ -48,8 +51,18 @@ def behaviours() -> str:
             logs = real if metric == "kernel" else streets
             means = [_mean(logs, behaviour.replace("_", "-"), label, metric) for behaviour in BEHAVIOURS]
             lines.append([words, label, *means])
+    for logs, words in ((streets, "streets"), (real, "the real log")):
+        lines.append([f"rollouts on {words} that overlap a road user", "all", *_overlaps(logs)])
     head = ["metric", "method", *(behaviour.replace("_", " ") for behaviour in BEHAVIOURS)]
     return table(head, lines)
+
+
+def _overlaps(rows: Sequence[dict[str, Any]]) -> list[str]:
+    # Imported here: the other tables do without what the benchmark imports.
+    from benchmarks.simulation.behaviour_quality import count_overlaps
+
+    counts = [count_overlaps(rows, behaviour.replace("_", "-")) for behaviour in BEHAVIOURS]
+    return [f"{overlapping} of {total}" if total else "–" for overlapping, total in counts]
 
 
 def _mean(rows: Sequence[dict[str, Any]], behaviour: str, method: str, metric: str) -> str:

@@ -61,6 +61,10 @@ class Result(_Strict):
 
     machine: str = Field(min_length=1, description="CPU model, cores, instruction set, torch version.")
     commit: str = Field(pattern=r"^([0-9a-f]{40}(\+changes)?|unknown)$", description="Of the checkout.")
+    options: dict[str, str] = Field(
+        default_factory=dict,
+        description="Those that differ from the benchmark's defaults; files of earlier versions note none.",
+    )
     rows: list[dict[str, JsonValue]] = Field(description="What each cell measured, with its name as `cell`.")
     claims: list[Claim] = Field(description="Made of the rows.")
 

@@ -1,6 +1,7 @@
 """Merges files of a benchmark that was measured part by part; claims are made again from all their rows.
 
 python -m benchmarks.common.merge optimiser docs/results/data/optimiser.json race.json enhancement.json
+python -m benchmarks.common.merge evaluation docs/results/data/evaluation.json budgets.json guards.json --set rounds=3
 """
 
 from __future__ import annotations
@@ -11,8 +12,12 @@ from pathlib import Path
 
 from benchmarks.common.bench import Bench, Row
 from benchmarks.common.claims import Result, write_json
+from benchmarks.common.runner import changed_options, parse_options
 from flows.cli.bench import load_bench
 from genre_tasks.errors import ArtifactCorruptError
+
+_ORIGIN = ("machine", "commit", "options")
+"""What a file says of all its rows, and a row of itself where it is from elsewhere."""
 
 
 def merge_results(bench: Bench, results: Sequence[Result]) -> Result:
@@ -24,7 +29,7 @@ def merge_results(bench: Bench, results: Sequence[Result]) -> Result:
 
     Returns:
         All rows, in the order in which the counted ones were read: a cell that is measured again moves behind those
-        before it. Machine and commit are the last result's; a row from elsewhere carries its own.
+        before it. Machine, commit and options are the last result's; a row from elsewhere carries its own.
 
     Raises:
         ValueError: there is no result.
@@ -47,9 +52,24 @@ def merge_results(bench: Bench, results: Sequence[Result]) -> Result:
 
 
 def _with_origin(row: Row, result: Result, last: Result) -> Row:
-    # A row that an earlier merge took from elsewhere keeps its own machine and commit.
-    complete = {"machine": result.machine, "commit": result.commit} | row
-    return {k: v for k, v in complete.items() if k not in ("machine", "commit") or v != getattr(last, k)}
+    # A row that an earlier merge took from elsewhere keeps its own.
+    complete: Row = {"machine": result.machine, "commit": result.commit, "options": dict(result.options)} | row
+    return {k: v for k, v in complete.items() if k not in _ORIGIN or v != getattr(last, k)}
+
+
+def add_options(bench: Bench, result: Result, settings: Sequence[str]) -> Result:
+    """Says with which options a file was measured that notes none.
+
+    Args:
+        bench: has the defaults.
+        result: of a version that did not note them; one that notes some stays as it is.
+        settings: ``NAME=VALUE``, as ``genre bench --set`` takes them.
+
+    Raises:
+        ConfigError: there is no such option.
+    """
+    options = changed_options(bench, parse_options(bench, settings))
+    return result if result.options else result.model_copy(update={"options": options})
 
 
 def read_result(path: Path) -> Result:
@@ -74,14 +94,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     Raises:
         ArtifactCorruptError: a file is no result.
-        ConfigError: there is no such benchmark.
+        ConfigError: there is no such benchmark or option.
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("bench", help="the benchmark's name")
     parser.add_argument("out", type=Path, help="file to write; may be one of those read")
     parser.add_argument("results", type=Path, nargs="+", help="files to read; of a cell in several the last counts")
+    words = "an option with which those files were measured that note none, as NAME=VALUE"
+    parser.add_argument("--set", dest="settings", action="append", default=[], help=words)
     options = parser.parse_args(arguments)
-    result = merge_results(load_bench(options.bench), [read_result(path) for path in options.results])
+    bench = load_bench(options.bench)
+    results = [add_options(bench, read_result(path), options.settings) for path in options.results]
+    result = merge_results(bench, results)
     write_json(options.out, result.model_dump(mode="json"))
 
 

@@ -63,6 +63,16 @@ def parse_options(bench: Bench, settings: Sequence[str]) -> dict[str, str]:
     return options
 
 
+def changed_options(bench: Bench, options: Mapping[str, str]) -> dict[str, str]:
+    """Lists the options that differ from a benchmark's defaults, for its file.
+
+    Args:
+        bench: has the defaults.
+        options: all of its options.
+    """
+    return {name: value for name, value in options.items() if value != bench.options[name]}
+
+
 def find_cached_rows(
     bench: Bench, options: Mapping[str, str], quick: bool, fresh: bool, cache: Path = CACHE
 ) -> list[CachedCell]:
@@ -164,19 +174,26 @@ def _write_row(cached: CachedCell, row: Row, seconds: float, commit: str) -> Non
     write_json(cached.path, {"cell": cached.cell.name, **facts, "row": row})
 
 
-def make_result(bench: Bench, rows: Mapping[str, Row], commit: str) -> Result:
+def make_result(bench: Bench, rows: Mapping[str, Row], commit: str, options: Mapping[str, str]) -> Result:
     """Makes the benchmark's file of its rows.
 
     Args:
         bench: makes the claims.
         rows: by cell.
         commit: that the rows were measured at which name none of their own.
+        options: all options of the benchmark.
 
     Returns:
         Rows and claims with machine and commit, checked against the schema.
     """
     named = [{"cell": name, **row} for name, row in rows.items()]
-    return Result(machine=describe_machine(), commit=commit, rows=named, claims=list(bench.claims(rows)))
+    return Result(
+        machine=describe_machine(),
+        commit=commit,
+        options=changed_options(bench, options),
+        rows=named,
+        claims=list(bench.claims(rows)),
+    )
 
 
 def run_bench(
@@ -208,7 +225,7 @@ def run_bench(
     commit = git_commit()
     cells = find_cached_rows(bench, options, quick, fresh, cache)
     rows = measure_cells(cells, print_progress, QUICK_S if quick else None, only)
-    result = make_result(bench, rows, commit)
+    result = make_result(bench, rows, commit, options)
     write_json(json_file, result.model_dump(mode="json"))
     for line in bench.table(rows):
         sys.stdout.write(line + "\n")

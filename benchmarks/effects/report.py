@@ -15,7 +15,9 @@ from benchmarks.effects.cases import CASES
 
 BENCH_NAME = "effects"
 LEAST_GAIN = {"dB": 0.5, "%": 20.0}
-"""What an effect has to gain on a street at four times its threshold, by the unit of its measure."""
+"""What an effect has to gain on a street made for four times its threshold, by the unit of its measure.
+
+A street may reach less, as its cameras and surfaces have bounds, or more, where no parameter sets the property."""
 MOST_LOSS = {"dB": 0.1, "%": 2.0}
 """What leaving an effect out of a street that does not call for it may lose; its threshold is where it gains that."""
 
@@ -39,7 +41,7 @@ def effect_gain(row: Row) -> float:
 
 
 def make_claims(rows: Mapping[str, Row]) -> Iterator[Claim]:
-    """Claims what enabling gains at four times the threshold, what is lost on a plain street, and two of whole plans.
+    """Claims what each effect gains on streets made for it, what is lost on plain ones, and two claims of whole plans.
 
     Args:
         rows: by cell.

@@ -172,7 +172,7 @@ def start_services(keep_folder: Path | None = None) -> Iterator[ClusterServices]
             stack.callback(_copy_logs, folder, keep_folder)
         stack.callback(services.kill_workers)
         auth = server.env()["PREFECT_API_AUTH_STRING"]
-        deploy_flows(server.url, auth, POOL, objects.store, folder)
+        deploy_flows(server.url, auth, POOL, objects.store, training_folder=folder / "training")
         stack.enter_context(temporary_settings({PREFECT_API_URL: server.url, PREFECT_API_AUTH_STRING: auth}))
         yield services
 

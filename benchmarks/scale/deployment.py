@@ -146,7 +146,9 @@ def start_deployment(workers: int, objects: bool = False) -> Iterator[Deployment
                 env |= stack.enter_context(ObjectServer(folder / "objects")).env()
         except (ConfigError, ResourceError) as error:
             raise NotMeasuredError(str(error)) from error
-        deploy_flows(server.url, server.env()["PREFECT_API_AUTH_STRING"], POOL, str(folder / "store"), folder)
+        auth = server.env()["PREFECT_API_AUTH_STRING"]
+        # Not the folder itself: a training keeps files of its own there, and a store.
+        deploy_flows(server.url, auth, POOL, str(folder / "store"), training_folder=folder / "training")
         coordinator = Worker(folder / "workers", env, POOL, COORDINATOR_QUEUE, limit=None, name="coordinator")
         deployment = Deployment(folder, server, env, stack.enter_context(coordinator))
         # Workers first: they ask the server for runs until they end.

@@ -9,7 +9,7 @@ from typing import Any
 from benchmarks.common.bench import Row
 from benchmarks.common.claims import Claim, claim
 from benchmarks.common.task import require_log_folder
-from benchmarks.simulation.scenes import METHOD, SimulationCase, log_label
+from benchmarks.simulation.scenes import METHOD, SimulationCase, describe_training, log_label
 from flows.paper_tables.builtin_methods import BUILT_IN
 from flows.paper_tables.method_differences import MethodDifference, compare_methods, compare_on_log
 from flows.paper_tables.methods import Method
@@ -109,6 +109,7 @@ def behaviour_claims(rows: Sequence[Row]) -> Iterator[Claim]:
     """Claims that GenRe+ is nearer to the truth, and on the real log to its images, than other methods.
 
     A claim is about the end of the 95 % interval that is nearest to 0, so that it holds where the interval excludes 0.
+    Its data says how many rollouts overlap a road user, and that chunk 0 of the real log is training data.
 
     Args:
         rows: see :func:`measure_behaviours`.
@@ -120,26 +121,29 @@ def behaviour_claims(rows: Sequence[Row]) -> Iterator[Claim]:
         found = compare_methods(measured, BUILT_IN[METHOD].name, BUILT_IN[other].name, ("psnr", "perceptual"))
         by_name = {(d.behaviour, d.metric): d for d in found}
         for behaviour in BEHAVIOUR_LABELS:
+            data = logs + _describe_overlaps(streets, behaviour)
             for metric in ("psnr", "perceptual"):
-                yield _claim_difference(by_name.get((behaviour, metric)), behaviour, metric, BUILT_IN[other], logs)
-    real = [difference for row in rows for difference in row.get("differences", ())]
-    where = ", ".join(log_label(row) for row in rows if "differences" in row) or "no real log"
+                yield _claim_difference(by_name.get((behaviour, metric)), behaviour, metric, BUILT_IN[other], data)
+    recorded = [row for row in rows if "differences" in row]
+    real = [difference for row in recorded for difference in row["differences"]]
+    where = (", ".join(log_label(row) for row in recorded) or "no real log") + describe_training(recorded)
     for other in COMPARED_METHODS:
         for behaviour in BEHAVIOUR_LABELS:
             matching = (d for d in real if d["behaviour"] == behaviour and d["other"] == BUILT_IN[other].name)
             entry = next(matching, None)
             difference = None if entry is None else _read_difference(entry)
-            yield _claim_difference(difference, behaviour, "kernel", BUILT_IN[other], where)
+            data = where + _describe_overlaps(recorded, behaviour)
+            yield _claim_difference(difference, behaviour, "kernel", BUILT_IN[other], data)
 
 
 def _claim_difference(
-    difference: MethodDifference | None, behaviour: str, metric: str, other: Method, logs: str
+    difference: MethodDifference | None, behaviour: str, metric: str, other: Method, data: str
 ) -> Claim:
     more_is_better = metric == "psnr"
     key = next(key for key, method in BUILT_IN.items() if method is other)
     name = f"simulation.{metric}_{behaviour.replace('-', '_')}_vs_{key}"
     end = "lower" if more_is_better else "upper"
-    note = f"{metric} of GenRe+ less that of {other.name}, {behaviour}: {end} end of the 95 % interval; {logs}"
+    note = f"{metric} of GenRe+ less that of {other.name}, {behaviour}: {end} end of the 95 % interval; {data}"
     bound = None
     if difference is not None:
         bound = difference.low if more_is_better else difference.high
@@ -149,6 +153,30 @@ def _claim_difference(
     unit = "dB" if more_is_better else "distance"
     n = 0 if difference is None else difference.n
     return claim(name, bound, ">" if more_is_better else "<", 0.0, unit, note, n)
+
+
+def count_overlaps(rows: Sequence[Row], behaviour: str) -> tuple[int, int]:
+    """Counts the rollouts that overlap a road user.
+
+    Args:
+        rows: see :func:`measure_behaviours`.
+        behaviour: which rollouts count.
+
+    Returns:
+        How many overlap one, and how many there are; all methods drive the same rollouts.
+    """
+    overlaps = {
+        (row["log"], entry["start_offset_m"]): bool(entry["collisions"])
+        for row in rows
+        for entry in row["rollouts"]
+        if entry["behaviour"] == behaviour
+    }
+    return sum(overlaps.values()), len(overlaps)
+
+
+def _describe_overlaps(rows: Sequence[Row], behaviour: str) -> str:
+    overlapping, total = count_overlaps(rows, behaviour)
+    return f"; {overlapping} of {total} rollouts overlap a road user" if total else ""
 
 
 def _read_rollout(log: str, entry: Mapping[str, Any]) -> RolloutRow:
@@ -175,17 +203,19 @@ def behaviour_table(rows: Sequence[Row]) -> Iterator[str]:
     Args:
         rows: see :func:`measure_behaviours`.
     """
-    yield "| log | behaviour | strength | method | PSNR to the truth, dB | perceptual distance | kernel distance |"
-    yield "|---|---|---|---|---|---|---|"
+    scores = "PSNR to the truth, dB | perceptual distance | kernel distance"
+    yield f"| log | behaviour | strength | overlapping a road user | method | {scores} |"
+    yield "|---|---|---|---|---|---|---|---|"
     for row in rows:
         for behaviour in BEHAVIOUR_LABELS:
+            overlaps = "{} of {}".format(*count_overlaps([row], behaviour))
             for key in (METHOD, *COMPARED_METHODS):
                 name = BUILT_IN[key].name
                 found = [e for e in row["rollouts"] if e["behaviour"] == behaviour and e["method"] == name]
                 if found:
                     strengths = "/".join(sorted({f"{e['strength']:g}" for e in found}))
                     values = [_format_mean(found, m, d) for m, d in (("psnr", 2), ("perceptual", 4), ("kernel", 4))]
-                    columns = (log_label(row), behaviour, strengths, name, *values)
+                    columns = (log_label(row), behaviour, strengths, overlaps, name, *values)
                     yield f"| {' | '.join(columns)} |"
 
 

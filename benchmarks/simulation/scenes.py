@@ -36,6 +36,8 @@ from genre_tasks.scene_edits.edits import Edit, EditList
 
 METHOD = "genre+"
 """What everything but the comparison of methods is measured with."""
+TRAINING_CHUNK = 0
+"""Of the real sequence: networks were trained, and settings tuned, on it (docs/guides/training.md)."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,7 @@ class LogScenes:
         return name_actors(self.source)
 
     def plan(self, rollout: TableRollout) -> PlannedRollout:
-        """Plans a rollout as table 6 does: as strong as a vehicle can drive it without meeting a road user.
+        """Plans a rollout as table 6 does, see :func:`flows.paper_tables.rollouts.plan_rollout`.
 
         Args:
             rollout: what to drive.
@@ -246,3 +248,23 @@ def log_label(row: Row) -> str:
     if kind == "synthetic":
         return "street " + rest.partition("seed=")[2].partition("&")[0]
     return f"{kind} {rest.rpartition('/')[2]}"
+
+
+def describe_training(rows: Sequence[Row]) -> str:
+    """Says that part of a real log is training data, to append to the data of a claim.
+
+    Args:
+        rows: with ``log`` and ``chunks``.
+
+    Returns:
+        A clause; empty where every log is one that was never trained on.
+
+    >>> describe_training([{"log": "pandaset:data/002", "chunks": [0, 1]}])
+    '; chunk 0 of pandaset 002 is training data'
+    >>> describe_training([{"log": "synthetic:street?seed=1001", "chunks": [0, 1]}])
+    ''
+    """
+    # Streets have seeds of their own for training, so that every chunk of the others is unseen.
+    recorded = [row for row in rows if not str(row["log"]).startswith("synthetic:")]
+    trained_on = [log_label(row) for row in recorded if TRAINING_CHUNK in row["chunks"]]
+    return f"; chunk {TRAINING_CHUNK} of {', '.join(trained_on)} is training data" if trained_on else ""

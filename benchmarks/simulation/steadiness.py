@@ -14,7 +14,15 @@ from torch import Tensor
 from benchmarks.common.bench import NotMeasuredError, Row
 from benchmarks.common.claims import Claim, claim
 from benchmarks.common.timing import Quartiles
-from benchmarks.simulation.scenes import LogScenes, SimulationCase, cut_path, log_label, open_scenes, truth_view
+from benchmarks.simulation.scenes import (
+    LogScenes,
+    SimulationCase,
+    cut_path,
+    describe_training,
+    log_label,
+    open_scenes,
+    truth_view,
+)
 from flows.paper_tables.rollouts import TableRollout
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.logs.synthetic.edited_truth import EditedStreet
@@ -205,6 +213,7 @@ def handover_claims(rows: Sequence[Row]) -> Iterator[Claim]:
     logs = ", ".join(log_label(row) for row in rows) or "no log"
     ratios = [r["largest_at_fade"] / r["largest_within"] for r in rollouts if r["largest_at_fade"] is not None]
     note = f"warped difference of consecutive images: largest across a hand-over over largest within chunks; {logs}"
+    note += describe_training(rows)
     worst = max(ratios, default=None)
     yield claim("simulation.handover_step", worst, "<=", MOST_STEP, "ratio, worst rollout", note, len(ratios))
 

@@ -116,7 +116,7 @@ class Budget:
         Raises:
             ResourceError: no setting of the table fits into the memory that the user allows.
         """
-        fitting = self._keep_what_fits(log)
+        fitting = self.keep_what_fits(log)
         chooser = Chooser(
             fitting,
             self._config,
@@ -133,8 +133,18 @@ class Budget:
         self.choosers[chunk] = chooser
         return chooser
 
-    def _keep_what_fits(self, log: str) -> CostTable:
-        """The table without the settings that memory is too small for; found once, as it takes from the budget."""
+    def keep_what_fits(self, log: str) -> CostTable:
+        """Leaves out the settings that memory is too small for.
+
+        Args:
+            log: the log's URI.
+
+        Returns:
+            The table with the settings that fit; found once for a log, as it takes from the budget.
+
+        Raises:
+            ResourceError: no setting of the table fits into the memory that the user allows.
+        """
         if log not in self._fitting_tables:
             self._fitting_tables[log] = keep_points_that_fit(self._table, self._config, log)
         return self._fitting_tables[log]

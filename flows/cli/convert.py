@@ -46,18 +46,21 @@ def convert(log: LogArgument, target: TargetArgument, as_json: JsonOption = Fals
     source = open_log(log)
     with TerminalReporter("reading the log") as reporter:
         written: Path = writers[layout](source, goal, reporter.progress)
+    # The copy does not say it, so that whoever made it has to know.
+    center_ahead_m = find_center_ahead(log)
     record = {
         "written": f"{layout}:{written}",
         "frames": source.frame_count,
         "cameras": len(source.cameras),
         "tracks": len(source.tracks()),
+        "center_ahead_m": center_ahead_m,
     }
     if as_json:
         print_outcome("done", record)
         return
     counts = f"{record['frames']} frames, {record['cameras']} cameras, {record['tracks']} objects with boxes"
     typer.echo(f"wrote {record['written']}: {counts}")
-    if center_ahead_m := find_center_ahead(log):
+    if center_ahead_m:
         typer.echo(
             f"The middle of the car is {center_ahead_m:g} m ahead of the vehicle's origin, and the copy does not say "
             f"so. Run it with --set simulate.center_ahead_m={center_ahead_m:g}."

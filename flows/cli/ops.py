@@ -148,7 +148,7 @@ def deploy(
     address = make_address_absolute(store)
     check_server(url)
     trainings = Path("training") if training_folder is None else training_folder
-    for name in deploy_flows(url, None, pool, address, trainings.absolute()):
+    for name in deploy_flows(url, None, pool, address, training_folder=trainings.absolute()):
         typer.echo(name)
 
 

@@ -163,11 +163,16 @@ def check_request(request: RunRequest) -> None:
     from genre_tasks.errors import ConfigError
 
     # Warnings are left to the run itself, which checks again wherever it runs.
-    check_requirements(request.log, request.store, request.chunks, request.config)
+    check_requirements(
+        request.log, request.store, request.chunks, request.config, has_budget=request.budget_s is not None
+    )
     if request.budget_s is not None:
         from flows.budget.budget import resolve_table
+        from flows.budget.memory_filter import keep_points_that_fit
 
-        resolve_table(request.table, request.preset, request.config)
+        table = resolve_table(request.table, request.preset, request.config)
+        # Raises where the limit on memory is too low for every setting.
+        keep_points_that_fit(table, request.config, request.log)
     elif request.table is not None:
         raise ConfigError("--table is what --budget chooses from", remedy="Give a --budget, too, or leave it out.")
 
@@ -264,7 +269,9 @@ def print_dry_run(request: RunRequest, as_json: bool) -> None:
     from flows.preflight.requirements import check_requirements
 
     config = request.config
-    report = check_requirements(request.log, request.store, request.chunks, config)
+    report = check_requirements(
+        request.log, request.store, request.chunks, config, has_budget=request.budget_s is not None
+    )
     # A budget may end the first chunk earlier; without one every chunk goes to the last stage.
     end = RECONSTRUCTION_STAGES[-1]
     if request.budget_s is not None:

@@ -58,6 +58,35 @@ def average_scores(found: Sequence[Mapping[str, Score]]) -> dict[str, Score]:
     return {name: Score(statistics.fmean(s[name].value for s in found if name in s)) for name in names}
 
 
+def compare_common_means(pairs: Sequence[tuple[Mapping[str, Score], Mapping[str, Score]]]) -> list[dict[str, Any]]:
+    """Arranges the means of each metric, over those chunks where both runs have it.
+
+    Args:
+        pairs: scores of A and of B, for each common chunk.
+
+    Returns:
+        Rows as of :func:`compare_scores`, with the number of ``chunks`` that the means are over. A metric of one run
+        alone stands without the other's. One that both runs have, but never in the same chunk, is left out.
+
+    >>> easy = {"shift_3m/psnr": Score(30.0)}
+    >>> hard = {"shift_3m/psnr": Score(20.0)}
+    >>> row = compare_common_means([(easy, easy), (hard, {})])[0]
+    >>> row["chunks"], row["A"], row["B"]
+    (1, 30.0, 30.0)
+    """
+    names_a = {name for a, _ in pairs for name in a}
+    names_b = {name for _, b in pairs for name in b}
+    # Chunks differ more than runs do: a mean over other chunks would show their difficulty as a difference of the runs.
+    used_a = [{name: a[name] for name in a if name in b or name not in names_b} for a, b in pairs]
+    used_b = [{name: b[name] for name in b if name in a or name not in names_a} for a, b in pairs]
+    rows = []
+    for row in compare_scores(average_scores(used_a), average_scores(used_b)):
+        name = row["metric"]
+        count = sum(name in a or name in b for a, b in zip(used_a, used_b, strict=True))
+        rows.append({"metric": name, "chunks": count} | row)
+    return rows
+
+
 def _compare(name: str, a: Score | None, b: Score | None) -> dict[str, Any]:
     row: dict[str, Any] = {
         "metric": name,

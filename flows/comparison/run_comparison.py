@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from flows.comparison.artifact_comparison import read_scores
 from flows.comparison.comparison import Comparison
 from flows.comparison.gaussian_differences import compare_gaussians
-from flows.comparison.metric_differences import Score, average_scores, compare_scores
+from flows.comparison.metric_differences import Score, average_scores, compare_common_means, compare_scores
 from flows.comparison.picture_pairs import pair_pictures
 from flows.comparison.setting_differences import list_differences
 from flows.reconstruction.chunk_configuration import read_chunk_config
@@ -120,11 +120,17 @@ def _choose_chunks(comparison: Comparison, a: RunSide, b: RunSide, chunk: int | 
 def _add_means(comparison: Comparison, a: RunSide, b: RunSide, chunks: Sequence[int]) -> None:
     """Mean metrics of each stage, over the common chunks where there are any."""
     sides = ((a, chunks or a.chunks), (b, chunks or b.chunks))
-    stages = dict.fromkeys(s for side, numbers in sides for n in numbers for s in side.stages(n))
-    counts = "" if chunks else f" of A's {len(a.chunks)} and B's {len(b.chunks)} chunks"
-    for stage in stages:
-        means = [average_scores([_find_scores(side, n, stage) for n in numbers]) for side, numbers in sides]
-        comparison.add_table(f"{stage}: mean metrics{counts}", compare_scores(means[0], means[1]))
+    for stage in dict.fromkeys(s for side, numbers in sides for n in numbers for s in side.stages(n)):
+        scores = [[_find_scores(side, n, stage) for n in numbers] for side, numbers in sides]
+        if not chunks:
+            counts = f"of A's {len(a.chunks)} and B's {len(b.chunks)} chunks"
+            rows = compare_scores(average_scores(scores[0]), average_scores(scores[1]))
+            comparison.add_table(f"{stage}: mean metrics {counts}", rows)
+            continue
+        # A budget may end runs of one log at other stages, chunk by chunk.
+        rows = compare_common_means(list(zip(scores[0], scores[1], strict=True)))
+        lacking = f"No chunk has metrics after {stage} in both runs." if any(map(any, scores)) else ""
+        comparison.add_table(f"{stage}: mean metrics", rows, if_empty=lacking)
     if chunks:
         comparison.notes.append(f"The runs have {len(chunks)} common chunks; --chunk N compares one of them in detail.")
         equal = sum(_are_same(a, b, number) for number in chunks)

@@ -8,17 +8,22 @@ from dataclasses import dataclass
 from typing import Any
 
 from flows.configuration import load_configuration
+from flows.cost_sweep.evaluation_plan import take_ego_pixels
 from flows.cost_sweep.knobs import PRESET_ITSELF, RESOLUTION, Setting
 from flows.experiments.log_chunks import LogChunk
 from flows.experiments.stage_prediction import StagePredictor
 from flows.experiments.stages import StageRunner, image_counts, metric_values, read_stage_costs, run_stages
 from flows.experiments.warm_up import run_on_tiny_log
+from flows.machine.facts import describe_environment
 from flows.pipeline.definition import STAGE_BY_NAME, stages_until
-from flows.pipeline.stage_runner import ArtifactRef, Job, read_artifact, run_stage
+from flows.pipeline.stage_runner import ArtifactRef, Job, artifact_address, read_artifact, run_stage
 from genre_tasks.config import PipelineConfig
 from genre_tasks.temporary_names import temporary_folder
 from genre_tasks.threads import torch_threads
-from storage.opening import is_remote
+from storage.code_digest import code_digest
+from storage.keys import stage_key
+from storage.opening import is_remote, open_store
+from storage.store import Provenance
 
 
 @dataclass(frozen=True)
@@ -110,7 +115,8 @@ def list_cells(places: Sequence[LogChunk], seeds: Sequence[int], settings: Seque
 def run_cell(sweep: Sweep, cell: Cell, runner: StageRunner) -> dict[str, Any] | None:
     """Measures a cell.
 
-    A scene is compared with the images at the preset's resolution, whatever it was reconstructed from.
+    A scene is compared with the images at the preset's resolution, whatever it was reconstructed from. Poses and gains
+    are those that it was reconstructed with.
 
     Args:
         sweep: what all cells share.
@@ -166,11 +172,27 @@ def _evaluation_inputs(
     inputs = {name: refs[name] for name in STAGE_BY_NAME[f"evaluate/{cell.setting.end}"].inputs}
     reference = sweep.reference_job(cell)
     ingest = runner("ingest", reference, {})
-    # Images of another size: the plan holds a mask of their pixels, so it has to be the reference's too.
+    # Images of another size: a mask of the recording vehicle has to be of their pixels, and poses stay the scene's.
     if ingest.key != refs["ingest"].key:
+        planned = runner("effects", reference, {"ingest": ingest})
         inputs["ingest"] = ingest
-        inputs["effects"] = runner("effects", reference, {"ingest": ingest})
+        inputs["effects"] = _commit_evaluation_plan(reference, refs["effects"], planned)
     return inputs
+
+
+def _commit_evaluation_plan(reference: Job, plan: ArtifactRef, planned: ArtifactRef) -> ArtifactRef:
+    """Stores a cell's plan with the reference's ego mask, which is of the pixels that are compared."""
+    value = take_ego_pixels(read_artifact(reference, plan), read_artifact(reference, planned))
+    code = code_digest(take_ego_pixels.__module__)
+    # No input is called `ingest`, by which predictions find the artifacts whose seconds are those of a stage.
+    key = stage_key("effects", code, {}, {"plan": plan.payload_digest, "ego_pixels": planned.payload_digest})
+    provenance = Provenance(
+        inputs={"plan": plan.key, "ego_pixels": planned.key}, code_digest=code, environment=describe_environment()
+    )
+    address = artifact_address("effects", reference, key)
+    # A sound one stays, and a damaged one is replaced.
+    artifact = open_store(reference.store).commit(address, "effects", value, provenance)
+    return ArtifactRef("effects", key, artifact.manifest.payload_digest, address, cached=False)
 
 
 def _changes_the_plan(sweep: Sweep, cell: Cell, runner: StageRunner) -> bool:

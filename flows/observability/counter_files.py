@@ -13,9 +13,12 @@ import uuid
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from genre_tasks.temporary_names import describe_owner, is_abandoned
+
+if TYPE_CHECKING:
+    from filelock import FileLock
 
 TOTALS = "totals.json"
 """The file of what was folded."""
@@ -85,14 +88,16 @@ class CounterFolder:
         Raises:
             OSError: the folder cannot be written.
         """
-        totals, live = self._fold()
-        sums = Counts(totals)
-        for path in live:
-            counts = _read_counts(path)
-            add_counts(sums.totals, counts.totals)
-            # Another machine's process may be long gone.
-            if not _is_foreign(path):
-                add_counts(sums.running, counts.running)
+        # Within the lock: what another process folds after the totals were read would be in neither.
+        with self._lock():
+            totals, live = self._fold()
+            sums = Counts(totals)
+            for path in live:
+                counts = _read_counts(path)
+                add_counts(sums.totals, counts.totals)
+                # Another machine's process may be long gone.
+                if not _is_foreign(path):
+                    add_counts(sums.running, counts.running)
         return sums
 
     def fold_if_many(self) -> None:
@@ -102,33 +107,37 @@ class CounterFolder:
             OSError: the folder cannot be written.
         """
         if sum(1 for _ in self._folder.glob(_PATTERN)) > MAX_FILES:
-            self._fold()
+            with self._lock():
+                self._fold()
 
-    def _fold(self) -> tuple[dict[Sample, float], list[Path]]:
-        """The totals of the processes that have ended, and the files of the others."""
+    def _lock(self) -> FileLock:
+        """The lock that whoever folds holds."""
         from filelock import FileLock
 
         self._folder.mkdir(parents=True, exist_ok=True)
-        with FileLock(self._folder / ".lock"):
-            totals, folded = self._read_totals()
-            live = []
-            ended = []
-            for path in sorted(self._folder.glob(_PATTERN)):
-                if path.name in folded:
-                    # Its folding was interrupted after the totals had been written.
-                    path.unlink(missing_ok=True)
-                elif is_abandoned(path) or _is_old_foreign(path):
-                    ended.append(path)
-                else:
-                    live.append(path)
-            if ended:
-                for path in ended:
-                    add_counts(totals, _read_counts(path).totals)
-                names = [path.name for path in ended]
-                self._replace(self._folder / TOTALS, {"totals": _as_rows(totals), "folded": names})
-                for path in ended:
-                    path.unlink(missing_ok=True)
-                self._remove_parts()
+        return FileLock(self._folder / ".lock")
+
+    def _fold(self) -> tuple[dict[Sample, float], list[Path]]:
+        """The totals of the processes that have ended, and the files of the others; the caller holds the lock."""
+        totals, folded = self._read_totals()
+        live = []
+        ended = []
+        for path in sorted(self._folder.glob(_PATTERN)):
+            if path.name in folded:
+                # Its folding was interrupted after the totals had been written.
+                path.unlink(missing_ok=True)
+            elif is_abandoned(path) or _is_old_foreign(path):
+                ended.append(path)
+            else:
+                live.append(path)
+        if ended:
+            for path in ended:
+                add_counts(totals, _read_counts(path).totals)
+            names = [path.name for path in ended]
+            self._replace(self._folder / TOTALS, {"totals": _as_rows(totals), "folded": names})
+            for path in ended:
+                path.unlink(missing_ok=True)
+            self._remove_parts()
         return totals, live
 
     def _read_totals(self) -> tuple[dict[Sample, float], set[str]]:

@@ -71,7 +71,7 @@ def fill_parameters(deployment: FlowDeployment, store: str, training_folder: Pat
     return {**deployment.parameters, **place}
 
 
-def deploy_flows(api_url: str, auth_string: str | None, pool: str, store: str, training_folder: Path) -> list[str]:
+def deploy_flows(api_url: str, auth_string: str | None, pool: str, store: str, *, training_folder: Path) -> list[str]:
     """Makes pool, queues, deployments and the heartbeat automation; what exists is brought up to date.
 
     Args:

@@ -11,7 +11,8 @@ import urllib.error
 import urllib.request
 from pathlib import Path
 
-from flows.operations.service import HOST, Service, find_free_port, is_listening, keep_port, keep_secret
+from flows.operations.service import HOST, Service, find_free_port, is_listening, is_port, keep_port, keep_secret
+from genre_tasks.atomic_path import write_atomically
 from genre_tasks.errors import ConfigError, ResourceError
 
 _PORTS = ("master", "volume", "filer")
@@ -60,11 +61,10 @@ class ObjectServer(Service):
         self.port = keep_port(self.folder / "port", self.wanted_port)
         ports_file = self.folder / "ports.json"
         # SeaweedFS records the addresses of its parts in its data, so they stay the same.
-        if ports_file.exists():
-            self._ports = json.loads(ports_file.read_text())
+        self._ports = _read_ports(ports_file)
         if not self._ports or any(is_listening(port) for port in self._ports.values()):
             self._ports = {name: find_free_port() for name in _ALL_PORTS}
-            ports_file.write_text(json.dumps(self._ports))
+            write_atomically(ports_file, json.dumps(self._ports).encode())
         keys = {"accessKey": self.env()["AWS_ACCESS_KEY_ID"], "secretKey": self.env()["AWS_SECRET_ACCESS_KEY"]}
         identity = {"name": "genre", "credentials": [keys], "actions": ["Admin", "Read", "Write", "List", "Tagging"]}
         handle = os.open(self.folder / "identities.json", os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
@@ -108,6 +108,16 @@ class ObjectServer(Service):
             raise ResourceError(
                 f"no bucket {self.bucket}: {made.stdout}{made.stderr}", remedy="Read the log.", file=self.log
             )
+
+
+def _read_ports(file: Path) -> dict[str, int]:
+    """The ports of the parts; empty where there is no file, or not all of them in it, as after a full disk."""
+    try:
+        ports = json.loads(file.read_text())
+    except (FileNotFoundError, ValueError):
+        return {}
+    is_complete = isinstance(ports, dict) and all(is_port(ports.get(name)) for name in _ALL_PORTS)
+    return {name: ports[name] for name in _ALL_PORTS} if is_complete else {}
 
 
 def find_weed() -> str:

@@ -147,7 +147,7 @@ def find_postgres_program(name: str) -> str:
     found = shutil.which(name)
     if found:
         return found
-    folders = sorted(Path("/usr/lib/postgresql").glob("*/bin"), key=lambda bin_: int(bin_.parent.name), reverse=True)
+    folders = sorted(Path("/usr/lib/postgresql").glob("*/bin"), key=_read_version, reverse=True)
     for folder in folders:
         if (folder / name).exists():
             return str(folder / name)
@@ -155,3 +155,9 @@ def find_postgres_program(name: str) -> str:
         f"PostgreSQL is not installed: no {name}",
         remedy="Install the package postgresql, or use --database sqlite.",
     )
+
+
+def _read_version(programs: Path) -> tuple[int, ...]:
+    """The numbers of a version that names the folder above, as 17 or 9.6; none where it is named otherwise."""
+    parts = programs.parent.name.split(".")
+    return tuple(int(part) for part in parts) if all(part.isdecimal() for part in parts) else ()

@@ -14,11 +14,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from genre_tasks.atomic_path import atomic_path, write_atomically
 from genre_tasks.errors import ConfigError, ResourceError
 
 HOST = "127.0.0.1"
 _LOG_LINES = 15
 _POLL_SECONDS = 0.2
+_MAX_PORT = 65_535
 
 
 class Service:
@@ -226,7 +228,7 @@ def keep_port(file: Path, wanted: int | None = None) -> int:
     """Returns the port that a file remembers, so that a service starts again where its clients expect it.
 
     Args:
-        file: the file of the port; written where it is missing.
+        file: the file of the port; written where it is missing, or holds no port.
         wanted: the port to use and to remember instead.
 
     Returns:
@@ -235,26 +237,86 @@ def keep_port(file: Path, wanted: int | None = None) -> int:
     Raises:
         ConfigError: another process listens at it.
     """
-    if wanted is not None:
-        port = wanted
-    elif file.exists():
-        port = int(file.read_text())
-    else:
-        port = find_free_port()
+    known = _read_port(file)
+    port = wanted if wanted is not None else known or find_free_port()
     if is_listening(port):
         raise ConfigError(f"port {port} is taken", remedy="End the process that listens there.", file=file)
-    file.write_text(f"{port}\n")
+    # Only where it changes: a full disk must not cost the port of before.
+    if port != known:
+        write_atomically(file, f"{port}\n".encode())
     return port
 
 
+def _read_port(file: Path) -> int | None:
+    """The port in a file; ``None`` where there is no file, or no port in it, as after a full disk."""
+    try:
+        port = int(file.read_text())
+    except (FileNotFoundError, ValueError):
+        return None
+    return port if is_port(port) else None
+
+
+def is_port(value: object) -> bool:
+    """Whether a value of a file is the number of a TCP port.
+
+    >>> is_port(4200), is_port(0), is_port(70_000), is_port("4200"), is_port(True)
+    (True, False, False, False, False)
+    """
+    # A bool is an int of Python.
+    return type(value) is int and 0 < value <= _MAX_PORT
+
+
 def keep_secret(file: Path) -> str:
-    """Returns the secret in a file of mode 600; a random one is made where the file is missing."""
+    """Returns the secret in a file of mode 600; a random one is made where the file is missing or empty.
+
+    Args:
+        file: the file; its folder is made where it is missing.
+
+    Returns:
+        The secret; the same in all processes that ask at once.
+    """
     file.parent.mkdir(parents=True, exist_ok=True)
-    with suppress(FileExistsError):
-        handle = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        with os.fdopen(handle, "w") as stream:
-            stream.write(secrets.token_hex(24))
-    return file.read_text().strip()
+    secret = ""
+    while not secret:
+        secret = _read_secret(file) or _make_secret(file)
+    return secret
+
+
+def _read_secret(file: Path) -> str:
+    try:
+        return file.read_text().strip()
+    except FileNotFoundError:
+        return ""
+
+
+def _make_secret(file: Path) -> str:
+    """Makes a secret, or waits for another process that makes it; empty where that one has replaced the file."""
+    import fcntl
+
+    handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o600)
+    with os.fdopen(handle, "r+") as lock:
+        # The empty file is the lock: the one who gets it first puts a complete file in its place.
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        secret = lock.read().strip()
+        if secret or not _is_still_there(file, handle):
+            return secret
+        secret = secrets.token_hex(24)
+        with atomic_path(file) as part:
+            part_handle = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            with os.fdopen(part_handle, "w") as stream:
+                stream.write(secret)
+                stream.flush()
+                # A rename can reach the disk before the secret does.
+                os.fsync(part_handle)
+        return secret
+
+
+def _is_still_there(file: Path, handle: int) -> bool:
+    """Whether a path leads to an open file, and not to one that has taken its place."""
+    try:
+        return os.path.samestat(file.stat(), os.fstat(handle))
+    except FileNotFoundError:
+        return False
 
 
 def merge_environments(*services: Service) -> Mapping[str, str]:

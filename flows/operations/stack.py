@@ -85,7 +85,9 @@ class Stack:
             server = PrefectServer(self.folder / "server", database_url)
             self._ensure(server)
             env.update(server.env())
-            deploy_flows(server.url, env["PREFECT_API_AUTH_STRING"], self.pool, store, self.folder / "training")
+            deploy_flows(
+                server.url, env["PREFECT_API_AUTH_STRING"], self.pool, store, training_folder=self.folder / "training"
+            )
             # A run with slower heartbeats than the automation expects would be marked as crashed while it lives.
             heartbeat = {"PREFECT_FLOWS_HEARTBEAT_FREQUENCY": str(HEARTBEAT_SECONDS)}
             # Before the workers: where one of them does not start, the others and the server are there for clients.

@@ -321,10 +321,14 @@ def needs_disk(stage: str, memory: StageMemory, config: PipelineConfig) -> bool:
     limit_gib = config.limits.memory_gib
     # The machine's memory is no wish: where a prediction is too high, the stage may still succeed.
     if limit_gib is not None and memory.working_mib > limit_gib * 1024:
+        # A scene from a file has the file's Gaussians, whatever the settings say.
+        less = "or choose a smaller ingest.width_px or initial.max_points"
+        if config.initial.scene is not None:
+            less = "choose a smaller ingest.width_px, or remove Gaussians from the file"
         raise ResourceError(
             f"{stage} needs about {memory.working_mib / 1024:.1f} GiB of memory with its images on disk, and may use "
             f"{limit_gib:.1f} GiB",
-            remedy="Allow more (--memory), or choose a smaller ingest.width_px or initial.max_points.",
+            remedy=f"Allow more (--memory), {less}.",
             stage=stage,
         )
     return memory.in_memory_mib > usable_memory_gib(config) * 1024

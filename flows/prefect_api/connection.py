@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import secrets
+import ssl
 import sys
 import tempfile
 import time
@@ -30,6 +31,7 @@ _SEND_TIMEOUT_S = 3.0
 _RECORD_TIMEOUT_S = 10.0
 _RECORD_STEP_S = 0.05
 _WITHOUT_PERMISSION = (401, 403)
+_CERTIFICATES = "PREFECT_API_SSL_CERT_FILE"
 
 
 @contextmanager
@@ -111,8 +113,9 @@ def _check_server_answers(url: str) -> None:
     for variable, reason in find_unusable_files().items():
         remedy = f"Correct or unset {variable}."
         raise ConfigError(f"{variable}={os.environ[variable]} cannot be used ({reason})", remedy=remedy)
+    context = _make_tls_context()
     try:
-        with urllib.request.urlopen(f"{url.rstrip('/')}/health", timeout=_ANSWER_TIMEOUT_S):
+        with urllib.request.urlopen(f"{url.rstrip('/')}/health", timeout=_ANSWER_TIMEOUT_S, context=context):
             return
     except urllib.error.HTTPError as error:
         # A server that wants a password answers too; whether it takes ours, Prefect's client finds out.
@@ -121,6 +124,25 @@ def _check_server_answers(url: str) -> None:
         raise _no_server(url, f"HTTP status {error.code}") from error
     except (OSError, ValueError, HTTPException) as error:
         raise _no_server(url, getattr(error, "reason", error)) from error
+
+
+def _make_tls_context() -> ssl.SSLContext:
+    """The certificates that Prefect's client trusts, by its settings: a server that it can use must count as one."""
+    import certifi
+    from prefect.settings import get_current_settings
+
+    api = get_current_settings().api
+    if api.tls_insecure_skip_verify:
+        context = ssl.create_default_context()
+        context.check_hostname = False
+        context.verify_mode = ssl.CERT_NONE
+        return context
+    try:
+        return ssl.create_default_context(cafile=api.ssl_cert_file or certifi.where())
+    except OSError as error:
+        problem = f"{_CERTIFICATES}={api.ssl_cert_file} cannot be used ({error.strerror or error})"
+        remedy = f"Name a file of certificates. {find_source(_CERTIFICATES) or ''}".strip()
+        raise ConfigError(problem, remedy=remedy) from error
 
 
 def _no_server(url: str, reason: object) -> ConfigError:
@@ -170,7 +192,7 @@ def _server_settings(url: str, home: Path) -> dict[str, str]:
         "PREFECT_SERVER_API_AUTH_STRING": password,
         "PREFECT_API_AUTH_STRING": password,
         # Certificates are read for every client, and those of SSL_CERT_FILE were noted when Prefect was imported.
-        "PREFECT_API_SSL_CERT_FILE": certifi.where(),
+        _CERTIFICATES: certifi.where(),
         # Prefect must never start a second server: it would stay behind.
         "PREFECT_SERVER_ALLOW_EPHEMERAL_MODE": "false",
         # Nothing is configured by blocks here, and they take a second of the start.

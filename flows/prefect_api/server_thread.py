@@ -7,6 +7,7 @@ behind after a kill, and takes three times as long to start.
 from __future__ import annotations
 
 import asyncio
+import errno
 import fcntl
 import os
 import resource
@@ -30,6 +31,8 @@ _STOP_TIMEOUT_S = 5.0
 _MIN_OPEN_FILES = 64
 # What the file is to blame for; others, such as a full disk, are not cured by its removal.
 _DAMAGED_CODES = (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+# NFS without a lock daemon, and some file systems of containers.
+_WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP)
 _DATABASE = "prefect.db"
 DATABASE_VARIABLES = ("PREFECT_API_DATABASE_CONNECTION_URL", "PREFECT_SERVER_DATABASE_CONNECTION_URL")
 """Either names the database of a server, also of the one in this process."""
@@ -136,12 +139,16 @@ class ServerThread:
             await lifespan.__aexit__(None, None, None)
 
     def _start_error(self, reason: str) -> GenreError:
+        cause = _root_cause(self._error)
+        if isinstance(cause, OSError) and cause.errno in _WITHOUT_LOCKS:
+            problem = f"Prefect's local API cannot start: files of its folder cannot be locked ({reason})"
+            remedy = "Set PREFECT_HOME or XDG_STATE_HOME to a local disk."
+            return ResourceError(problem, remedy=remedy, file=self._folder)
         if self._stated_database is not None:
             remedy = f"Correct or unset {self._stated_database}, which names its database."
             return ResourceError(f"Prefect's local API cannot start: {reason}", remedy=remedy)
         database = self._folder / _DATABASE
         remedy = "Free disk space and memory there."
-        cause = _root_cause(self._error)
         is_damaged = isinstance(cause, sqlite3.Error) and cause.sqlite_errorcode & 0xFF in _DAMAGED_CODES
         if is_damaged or "revision" in reason:
             remedy = "Delete that file if it is damaged or of another version: it holds records of runs, no results."

@@ -82,13 +82,17 @@ def assess_disk(root: Path, needed_mib: float) -> str | None:
     )
 
 
-def assess_memory(size: ChunkSize, config: PipelineConfig, stages: Iterable[str]) -> str | None:
+def assess_memory(
+    size: ChunkSize, config: PipelineConfig, stages: Iterable[str], *, has_budget: bool = False
+) -> str | None:
     """Compares the memory that this process may use with what the stages will take.
 
     Args:
         size: of a chunk.
         config: the effective configuration.
         stages: names of the stages that will run.
+        has_budget: whether a budget chooses the settings. It leaves out those that the limit is too low for, so that
+            the limit is no error here.
 
     Returns:
         A warning, or ``None``.
@@ -100,13 +104,15 @@ def assess_memory(size: ChunkSize, config: PipelineConfig, stages: Iterable[str]
     for stage in stages:
         grown = grow_until(stage, size, config)
         memory = predict_memory(stage, grown, config, choose_threads(stage, grown, config, count_cores()))
-        needs_disk(stage, memory, config)
+        if not has_budget:
+            # Raises where the limit is too low.
+            needs_disk(stage, memory, config)
         needed_mib = max(needed_mib, memory.with_images_on_disk_mib)
     machine_gib = memory_limit_gib()
     if machine_gib < _CLEARLY_TOO_LITTLE * needed_mib / 1024:
         return (
             f"this process may use {machine_gib:.1f} GiB of memory, and the run needs about {needed_mib / 1024:.1f} "
-            "GiB; smaller images or fewer Gaussians (ingest.width_px, initial.max_points) need less"
+            f"GiB; {_describe_what_needs_less(config, has_budget)}"
         )
     limit_gib = config.limits.memory_gib
     if limit_gib is not None and machine_gib < limit_gib:
@@ -115,3 +121,12 @@ def assess_memory(size: ChunkSize, config: PipelineConfig, stages: Iterable[str]
             "planned for the smaller of the two"
         )
     return None
+
+
+def _describe_what_needs_less(config: PipelineConfig, has_budget: bool) -> str:
+    if has_budget:
+        return "the budget chooses among its table's settings that need less, if there are any"
+    # A scene from a file has the file's Gaussians, whatever the settings say.
+    if config.initial.scene is not None:
+        return "smaller images (ingest.width_px) or fewer Gaussians in the file need less"
+    return "smaller images or fewer Gaussians (ingest.width_px, initial.max_points) need less"

@@ -69,6 +69,8 @@ def check_requirements(
     chunks: list[int] | None,
     config: PipelineConfig,
     stages: Iterable[str] = ALL_STAGES,
+    *,
+    has_budget: bool = False,
 ) -> RequirementReport:
     """Checks all that a run needs: nothing is computed, and nothing is left on the disk.
 
@@ -81,6 +83,8 @@ def check_requirements(
         chunks: numbers of chunks; ``None`` for all.
         config: the effective configuration.
         stages: names of the stages that will run.
+        has_budget: whether a budget chooses the settings. It leaves out those that the limit on memory is too low for,
+            so that the limit is no error here.
 
     Returns:
         What was checked, and warnings where disk or memory may not suffice, or frames at the log's end are left out.
@@ -110,7 +114,7 @@ def check_requirements(
     found = (
         _describe_short_tail(config, inputs.log, chunks),
         None if root is None else assess_disk(root, needed_mib),
-        assess_memory(size, config, stages),
+        assess_memory(size, config, stages, has_budget=has_budget),
     )
     return RequirementReport(checked, tuple(warning for warning in found if warning is not None))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import time
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,7 @@ from flows.pipeline.log_cache import select_chunks
 from flows.pipeline.progress import get_reporter
 from flows.pipeline.stage_runner import ArtifactRef, Job
 from flows.pipeline.stage_task import stage_task
-from flows.preflight.requirements import check_requirements
+from flows.preflight.requirements import ALL_STAGES, check_requirements
 from flows.reconstruction.chunk_configuration import read_chunk_config
 from flows.reconstruction.left_out import ChunksLeftOutError, record_failures
 from flows.reconstruction.outcome_artifact import is_child_run, publish_outcome
@@ -112,14 +113,14 @@ def recompute_run(store: str, run: str) -> None:
         chunk = entry["chunk"]
         try:
             config = read_chunk_config(record, chunk)
-            _check_needs(record["log"], store, [chunk], config)
+            # Within a budget a chunk may end at GNet's scene, as memory may be too small for what follows.
+            made = {stage["stage"] for stage in entry["stages"]}
+            specs = [spec for spec in PIPELINE if spec.name in made]
+            _check_needs(record["log"], store, [chunk], config, [spec.name for spec in specs])
             job = Job(record["log"], chunk, store, config.model_dump(mode="json"))
-            # Within a budget a chunk may end at GNet's scene.
-            names = {stage["stage"] for stage in entry["stages"]}
             refs: dict[str, ArtifactRef] = {}
-            for spec in PIPELINE:
-                if spec.name in names:
-                    refs[spec.name] = _run_stage_task(spec, job, refs)
+            for spec in specs:
+                refs[spec.name] = _run_stage_task(spec, job, refs)
         except GenreError as error:
             failures.append(error)
     if failures:
@@ -147,7 +148,7 @@ def _take_from_store(
 def _compute(
     log: str, preset: str, store: str, chunks: list[int] | None, effective: PipelineConfig, budget: Budget | None
 ) -> dict[str, Any]:
-    selected = _check_needs(log, store, chunks, effective)
+    selected = _check_needs(log, store, chunks, effective, budget=budget)
     # A killed run may have left half-written folders behind; no artifact is among them.
     open_store(store).clean_temporaries()
     values = effective.model_dump(mode="json")
@@ -179,11 +180,22 @@ def _effective_config(preset: str, config: dict[str, Any] | None, settings: list
     return validate_config(config, "parameters of the flow")
 
 
-def _check_needs(log: str, store: str, chunks: list[int] | None, config: PipelineConfig) -> list[int]:
+def _check_needs(
+    log: str,
+    store: str,
+    chunks: list[int] | None,
+    config: PipelineConfig,
+    stages: Iterable[str] = ALL_STAGES,
+    budget: Budget | None = None,
+) -> list[int]:
     """Checks all that the run needs before any work; the chunks to run."""
     # The command has checked this, too, but a worker may be on another machine.
-    for warning in check_requirements(log, store, chunks, config).warnings:
+    report = check_requirements(log, store, chunks, config, stages, has_budget=budget is not None)
+    for warning in report.warnings:
         get_reporter().message(f"warning: {warning}")
+    if budget is not None:
+        # One error here, and not one for each chunk.
+        budget.keep_what_fits(log)
     return select_chunks(log, config, chunks)
 
 

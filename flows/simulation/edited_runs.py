@@ -18,9 +18,11 @@ from flows.reconstruction.run_records import (
     write_run_record,
 )
 from flows.reconstruction.stored_values import find_last_stage, read_stage_value
+from flows.simulation.recorded_settings import read_recorded_edits, read_simulate_config
 from flows.simulation.run_scenes import RunScenes
-from genre_tasks.config import PipelineConfig
 from genre_tasks.config.simulation_sections import SimulateConfig
+from genre_tasks.errors import InputError
+from genre_tasks.exchange.conversion import BACKGROUND_NAME, DISTANT_NAME
 from genre_tasks.scene.reconstruction import Reconstruction
 from genre_tasks.scene_edits.actor_library import ActorLibrary
 from genre_tasks.scene_edits.edited_scenes import EditedScenes
@@ -62,13 +64,13 @@ def open_run(store: str, run: str, stage: str | None = None, chunks: Sequence[in
         The recorded run and the edits so far.
 
     Raises:
-        InputError: there is no such run or chunk.
+        InputError: there is no such run or chunk, or another version wrote edits that this one cannot read.
     """
     scenes = RunScenes(store, run, stage, chunks)
     edited = scenes.record.get("edited")
     if edited is None:
         return OpenedRun(scenes, EditList())
-    return OpenedRun(RunScenes(store, edited["run"], stage, chunks), EditList.model_validate(edited["edits"]))
+    return OpenedRun(RunScenes(store, edited["run"], stage, chunks), read_recorded_edits(scenes.record))
 
 
 def open_edited_scenes(
@@ -94,13 +96,24 @@ def open_edited_scenes(
         The edited scenes, whose chunks say which actors are removed or moved.
 
     Raises:
-        InputError: there is no such run, chunk or actor.
+        InputError: there is no such run, chunk or actor, or a new actor has the name of a part of every scene.
     """
     # Surveyed as a whole, whichever chunks are shown: names, tracks and the ground are those of the run.
     opened = open_run(store, run, stage)
+    _require_free_names(edits, before=len(opened.edits))
     shown = None if chunks is None else RunScenes(store, run, stage, chunks).chunk_numbers
     library = ActorLibrary(lambda name: open_shown_scenes(store, name))
     return EditedScenes(opened.recorded, opened.edits + edits, library, config, shown)
+
+
+def _require_free_names(edits: EditList, before: int) -> None:
+    """Refuses new actors with names of parts; stored edits may have them, from before these names were reserved."""
+    for number, edit in enumerate(edits.edits, start=before + 1):
+        if isinstance(edit, Insert) and edit.name in (BACKGROUND_NAME, DISTANT_NAME):
+            raise InputError(
+                f"edit {number} ({edit.kind}): every scene has a part that is called '{edit.name}'",
+                remedy="Give the inserted actor another name.",
+            )
 
 
 def open_shown_scenes(store: str, run: str) -> RunScenes | EditedScenes:
@@ -111,12 +124,13 @@ def open_shown_scenes(store: str, run: str) -> RunScenes | EditedScenes:
         run: the run's name, or the start of it.
 
     Raises:
+        ConfigError: another version wrote the record, with settings of simulations that this one does not know.
         InputError: there is no such run.
     """
     opened = open_run(store, run)
     if not len(opened.edits):
         return opened.recorded
-    config = PipelineConfig.model_validate(opened.recorded.record["config"]).simulate
+    config = read_simulate_config(opened.recorded.record)
     return open_edited_scenes(store, run, EditList(), config)
 
 
@@ -167,7 +181,7 @@ def write_edited_run(store: str, run: str, edits: EditList, config: SimulateConf
     """
     opened = open_run(store, run)
     record = opened.recorded.record
-    settings = PipelineConfig.model_validate(record["config"]).simulate if config is None else config
+    settings = read_simulate_config(record) if config is None else config
     scenes = open_edited_scenes(store, run, edits, settings)
     # The start of a name may be that of several runs one day.
     named = EditList(edits=tuple(_name_source_run(store, edit) for edit in scenes.edits.edits))

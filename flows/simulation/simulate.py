@@ -14,6 +14,7 @@ from flows.simulation.outputs import open_outputs
 from flows.simulation.parked_actors import find_tracks
 from flows.simulation.poses_table import write_poses
 from flows.simulation.prepared_rollout import PreparedRollout, prepare_rollout
+from flows.simulation.recorded_settings import read_recorded_config
 from flows.simulation.repair import choose_repair
 from flows.simulation.request import SimulationRequest
 from flows.simulation.rollout_folder import KIND, find_rollout, write_rollout
@@ -42,12 +43,13 @@ def simulate_run(request: SimulationRequest, progress: Progress = silent) -> dic
 
     Raises:
         InputError: there is no such run, chunk, stage or camera, or a file is unfit.
-        ConfigError: the path is implausible or meets an actor, or the folder holds another rollout.
+        ConfigError: the path is implausible or meets an actor, the folder holds another rollout, or another version
+            wrote the record, with settings that this one does not know.
         ResourceError: a film could not be written.
     """
     request.check()
     run = open_run(request.store, request.run, request.stage, request.chunks)
-    config = apply_settings(PipelineConfig.model_validate(run.recorded.record["config"]), request.settings)
+    config = apply_settings(read_recorded_config(run.recorded.record), request.settings)
     key = compute_rollout_key(request, run, config)
     found = find_rollout(request.out, key, request.overwrite)
     if found is not None:

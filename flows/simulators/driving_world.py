@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from flows.simulation.edited_runs import open_run
 from flows.simulation.parked_actors import list_parked
+from flows.simulation.recorded_settings import read_simulate_config
 from flows.simulation.run_scenes import RunScenes
 from flows.simulation.stored_ranges import SideRange, find_side_ranges
-from genre_tasks.config import PipelineConfig
 from genre_tasks.config.simulation_sections import SimulateConfig
 from genre_tasks.ego_paths.bicycle import BicycleModel, VehicleState
 from genre_tasks.ego_paths.collisions import Collision, find_collisions
@@ -61,12 +61,13 @@ class DrivingWorld:
         recorded: the recorded path.
 
     Raises:
+        ConfigError: another version wrote the record, with settings of simulations that this one does not know.
         InputError: there is no such run or stage, or the recorded vehicle drives backwards.
     """
 
     def __init__(self, store: str, run: str, stage: str | None, reliable_m: float | None, progress: Progress) -> None:
         scenes = RunScenes(store, run, stage)
-        self.config: SimulateConfig = PipelineConfig.model_validate(scenes.record["config"]).simulate
+        self.config: SimulateConfig = read_simulate_config(scenes.record)
         chunks = [scenes.load(number).chunk for number in scenes.chunk_numbers]
         self.recorded: EgoPath = join_recorded_path(chunks)
         moving = list_world_actors(chunks)

@@ -97,9 +97,12 @@ class FixerJob:
 
     @property
     def adapters_base(self) -> str | None:
-        """How the adapters name SD-Turbo: its folder relative to theirs, or a hub id; ``None`` without adapters."""
+        """How the adapters name SD-Turbo: its folder, or a hub id; ``None`` without adapters.
+
+        An absolute path stays as it is, so that the adapters may be copied. A relative one becomes relative to them.
+        """
         base = self.sd_turbo
-        if base is None or not Path(base).is_dir():
+        if base is None or not Path(base).is_dir() or Path(base).is_absolute():
             return base
         # A run reads it relative to the weights, whichever folder it is started in. Resolved, because `..` behind a
         # link leads elsewhere.

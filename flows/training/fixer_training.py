@@ -155,8 +155,19 @@ def _are_sound(weights: Path, job: FixerJob) -> bool:
         _, described = check_described_weights(weights, "small" if job.sd_turbo is None else "sd-turbo")
     except InputError:
         return False
-    # Adapters of an older version may name SD-Turbo in a way that no run finds.
-    return job.sd_turbo is None or described.get("base") == job.adapters_base
+    return job.sd_turbo is None or _is_base_found(described.get("base"), weights.parent, job)
+
+
+def _is_base_found(base: object, folder: Path, job: FixerJob) -> bool:
+    """Whether a run finds SD-Turbo by what the adapters in a folder call it."""
+    if base == job.adapters_base:
+        return True
+    if not isinstance(base, str) or job.sd_turbo is None:
+        return False
+    found = folder / base
+    # An older version wrote relative paths as they were typed, which start from another folder than the adapters'.
+    is_same = found.resolve() == Path(job.sd_turbo).resolve()
+    return found.is_dir() and (is_same or Path(base).is_absolute())
 
 
 def require_same_inputs(inputs: Sequence[str], job: FixerJob, path: Path) -> None:

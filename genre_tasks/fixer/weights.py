@@ -43,8 +43,8 @@ def save_fnet(fnet: Fnet, path: Path, base: str | None = None, rank: int | None 
     Args:
         fnet: the network.
         path: of the weights, …/fnet.safetensors; its folder is made where it is missing.
-        base: SD-Turbo's folder relative to that of ``path``, or a hub id. With it only what LoRA training changes is
-            written.
+        base: SD-Turbo's folder, absolute or relative to that of ``path``, or a hub id. With it only what LoRA
+            training changes is written.
         rank: of the adapters, with ``base``.
     """
     from safetensors.torch import save

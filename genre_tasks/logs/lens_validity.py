@@ -6,7 +6,7 @@ would bend every image a little wrongly, and nothing later would notice.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -26,8 +26,10 @@ _REMEDY = f"Undistort the images and leave the coefficients out, or calibrate wi
 _MODEL_KEYS = ("distortion_model", "camera_model", "model")
 _KNOWN_MODELS = ("brown_conrady", "plumb_bob", "radtan", "opencv", "pinhole", "simple_pinhole", "perspective", "none")
 _OTHER_MODELS = ("fisheye", "equi", "kannala", "kb4", "thin_prism", "rational", "omni", "mei", "ucm", "sphere", "theta")
-# Where other tools put what belongs under ``distortion``.
-_OTHER_NAMES = (
+_DISTORTION_KEY = "distortion"
+# Where tools put the coefficients; other readers than those of posed images read the first alone.
+_DISTORTION_NAMES = (
+    _DISTORTION_KEY,
     *("dist", "dist_coeffs", "distCoeffs", "distortion_coefficients", "distortion_coeffs", "distortion_params", "D"),
     *("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "radial", "tangential"),
 )
@@ -82,7 +84,7 @@ def read_distortion(intrinsics: Mapping[str, Any], **where: Any) -> tuple[float,
     (-0.2, 0.1, 0.0, 0.0, 0.0)
     """
     _refuse_other_model(intrinsics, where)
-    _refuse_other_names(intrinsics, where)
+    refuse_unread_distortion(intrinsics, (_DISTORTION_KEY,), f"Write them as {_DISTORTION_KEY}: [{_MODEL}].", **where)
     _refuse_skew(intrinsics, where)
     values = intrinsics.get("distortion")
     if values is None:
@@ -102,6 +104,24 @@ def read_distortion(intrinsics: Mapping[str, Any], **where: Any) -> tuple[float,
         raise InputError(problem, remedy=f"Write all five: {_MODEL}.", **where)
     # Zeros behind the model's own say nothing: OpenCV writes 8, 12 or 14 of them.
     return coefficients if any(coefficients[_COUNT:]) else coefficients[:_COUNT]
+
+
+def refuse_unread_distortion(intrinsics: Mapping[str, Any], read: Collection[str], remedy: str, **where: Any) -> None:
+    """Refuses distortion coefficients that stand under a name which a reader does not read.
+
+    Args:
+        intrinsics: of one camera, as a JSON file has them.
+        read: names that the reader reads.
+        remedy: where the coefficients belong.
+        where: file, log and camera for the error, as ``GenreError`` takes them.
+
+    Raises:
+        InputError: another name has a value that is not zero.
+    """
+    names = [name for name in _DISTORTION_NAMES if name not in read and _has_value(intrinsics.get(name))]
+    if names:
+        problem = f"distortion coefficients stand under {', '.join(names)}, which is not read"
+        raise InputError(problem, remedy=remedy, **where)
 
 
 def with_distortion(lens: Lens, intrinsics: Mapping[str, Any], **where: Any) -> Lens:
@@ -275,14 +295,6 @@ def _refuse_other_model(intrinsics: Mapping[str, Any], where: Mapping[str, Any])
         # Brown–Conrady is the rational model whose denominator is 1; more coefficients are refused by their count.
         if is_other and "rational" not in plain:
             raise InputError(f"the lens model is {name!r}; {_MODEL} were expected", remedy=_REMEDY, **where)
-
-
-def _refuse_other_names(intrinsics: Mapping[str, Any], where: Mapping[str, Any]) -> None:
-    """Raises for distortion coefficients under a name that is not read."""
-    names = [name for name in _OTHER_NAMES if _has_value(intrinsics.get(name))]
-    if names:
-        problem = f"distortion coefficients stand under {', '.join(names)}, which is not read"
-        raise InputError(problem, remedy=f"Write them as distortion: [{_MODEL}].", **where)
 
 
 def _refuse_skew(intrinsics: Mapping[str, Any], where: Mapping[str, Any]) -> None:

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 
+import numpy as np
+from numpy.typing import NDArray
+
 from genre_tasks.errors import InputError
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.labelled_boxes import LabelledBox, build_tracks
-from genre_tasks.logs.types import CuboidTrack, Float64
+from genre_tasks.logs.point_values import Numbers, fill_intensities, find_placed_points
+from genre_tasks.logs.types import CuboidTrack, Float32, Float64
 from genre_tasks.suggestions import did_you_mean
 
 
@@ -40,9 +44,17 @@ class RecordedLog:
         self._report(*findings)
         return tracks
 
-    def _report_invalid_points(self, count: int, frame: int) -> None:
-        message = f"{count} points of sweep {frame} are not finite and left out"
-        self._report(Finding("invalid_points", "warning", message, numbers={"points": count}, frames=(frame,)))
+    def _find_placed(self, points: Float32 | Float64, frame: int) -> NDArray[np.bool_]:
+        """[N] which of the points [N, 3] have a finite place; reports that the others are left out."""
+        placed, findings = find_placed_points(points, frame)
+        self._report(*findings)
+        return placed
+
+    def _fill_intensities(self, values: Numbers, frame: int) -> Numbers:
+        """[N] intensities as the file has them, with 0 where one is missing, which is reported."""
+        filled, findings = fill_intensities(values, frame)
+        self._report(*findings)
+        return filled
 
     def _check_frame(self, frame: int) -> int:
         if not 0 <= frame < self.frame_count:

@@ -34,10 +34,6 @@ from genre_tasks.scene_edits.symmetry import complete_by_symmetry
 from genre_tasks.scene_edits.tone import apply_tone, match_tone, measure_road_color
 from genre_tasks.scene_edits.trajectories import Trajectory, change_trajectory
 
-# Written out, since what files and viewers need must not change the keys of edited runs.
-_RESERVED_NAMES = frozenset({"background", "distant"})
-"""What the resting parts of a scene are called in viewers and in exported files."""
-
 
 @dataclass(frozen=True)
 class _ChangedActor:
@@ -253,10 +249,8 @@ class EditedScenes:
                 continue
             # Numbered on, so that a bare number names one actor alone.
             name = edit.name or f"{self._name_class(edit)}-{len(taken) + len(out) + 1}"
-            if name in _RESERVED_NAMES or name in taken or name in out:
+            if name in taken or name in out:
                 problem = f"an actor '{name}' is there already"
-                if name in _RESERVED_NAMES:
-                    problem = f"every scene has a part that is called '{name}'"
                 raise self._at_edit(edit, InputError(problem, remedy="Give the inserted actor another name."))
             out[name] = edit
         return out

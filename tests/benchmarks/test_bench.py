@@ -166,3 +166,10 @@ def test_cells_without_the_text_in_their_names_are_left_out_and_not_cached(bench
     assert "about 60 s" in _bench("tiny", "--dry-run", "--only", "first").stdout
     _bench("tiny", "--json", "result.json")
     assert bench.measured == ["second", "first"]
+
+
+def test_the_file_notes_options_that_are_not_the_defaults(bench: Tiny) -> None:
+    _bench("tiny", "--json", "result.json", "--set", "size=1")
+    assert json.loads(Path("result.json").read_text())["options"] == {}
+    _bench("tiny", "--json", "result.json", "--set", "size=2")
+    assert json.loads(Path("result.json").read_text())["options"] == {"size": "2"}

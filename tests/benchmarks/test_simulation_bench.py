@@ -73,6 +73,19 @@ def test_kernel_distances_are_compared_on_the_real_log() -> None:
     assert claims["kernel_brake_vs_difix"].measured is None
 
 
+def test_claims_count_the_rollouts_that_overlap_a_road_user() -> None:
+    rows = behaviours(CLEAR)
+    for entry in rows[f"behaviours {LOGS[1]}"]["rollouts"]:
+        if entry["behaviour"] == "accelerate":
+            entry["collisions"] = ["Car car-1 at 3.4 s (frame 34), 1.98 m deep"]
+    claims = claims_of(rows)
+    assert "; 1 of 3 rollouts overlap a road user" in claims["psnr_accelerate_vs_3dgs"].data
+    assert "; 0 of 3 rollouts overlap a road user" in claims["perceptual_brake_vs_difix"].data
+    table = list(BENCH.table(rows))
+    assert any(line.startswith("| street 2 | accelerate | 1 | 1 of 1 | GenRe+ |") for line in table)
+    assert any(line.startswith("| street 1 | accelerate | 1 | 0 of 1 | GenRe+ |") for line in table)
+
+
 def removed(squared_error: float, outside: float) -> Row:
     part = {"squared_error": squared_error, "pixels": 100}
     scores = {"recorded": part, "never_recorded": {"squared_error": 0.0, "pixels": 0}, "around": part}

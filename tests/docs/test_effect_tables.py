@@ -28,7 +28,7 @@ def row(factor: float, choice: str, gain_db: float) -> dict[str, Any]:
 
 @pytest.fixture(autouse=True)
 def measured(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = [row(4.0, "on", 2.0), row(4.0, "on", 1.0), row(0.0, "off", 0.0), row(-1.0, "off", -0.5)]
+    rows = [row(4.0, "on", 2.0), row(4.0, "on", 1.0) | {"value": 9.0}, row(0.0, "off", 0.0), row(-1.0, "off", -0.5)]
     monkeypatch.setattr(effect_tables, "result", lambda name: {"rows": rows})
     monkeypatch.setattr(effect_tables, "provenance", lambda name: "")
 
@@ -36,7 +36,8 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_streets_that_call_for_an_effect_stand_beside_those_that_do_not() -> None:
     lines = effect_tables.on_streets().strip().splitlines()
     # The other effects were not measured, and have no line.
-    assert lines[2:] == ["| ego mask | 2 % | 2 of 2 | +1.50 dB (+1.00 to +2.00) | 0 of 1 | +0.00 dB (+0.00 to +0.00) |"]
+    called = "4.00 to 4.50 | 2 of 2 | +1.50 dB (+1.00 to +2.00)"
+    assert lines[2:] == [f"| ego mask | 2 % | {called} | 0 of 1 | +0.00 dB (+0.00 to +0.00) |"]
 
 
 def test_real_chunks_show_what_decided_and_both_scores() -> None:

@@ -156,7 +156,6 @@ def test_absent_weights_have_a_remedy(tmp_path):
 @pytest.fixture
 def base(tmp_path) -> Path:
     return save_toy_sd_turbo(tmp_path / "base")
-    return tmp_path / "base"
 
 
 def test_sd_turbo_loads_trains_a_step_saves_and_reloads(base, scene, tmp_path):

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
+from flows.budget import budget as budgets
 from flows.budget.budget import Budget
+from flows.cli.main import app
 from flows.configuration import load_configuration
 from flows.cost_sweep.parquet import write_settings
 from flows.cost_sweep.summary import summarise_settings
 from flows.pipeline import memory_limit
+from flows.reconstruction import flow
 from genre_tasks.errors import ResourceError
 from tests.flows.test_budget import table_row
 
@@ -67,6 +72,74 @@ def test_a_limit_below_all_settings_is_an_error_before_work(table: str, monkeypa
     budget = budget_of(table, 0.5)
     with pytest.raises(ResourceError, match=r"gnet needs about 0\.\d GiB.*may use 0\.5 GiB.*--memory"):
         budget.make_chooser(LOG, 0)
+
+
+def run_words(table: str, store: Path, memory: str, *words: str) -> list[str]:
+    where = ["--preset", "fine", "--table", table, "--store", str(store)]
+    return ["run", LOG, *where, "--budget", "1000", "--memory", memory, *words]
+
+
+def test_a_dry_run_chooses_what_fits_where_the_preset_does_not(
+    table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(memory_limit, "memory_limit_gib", lambda: 64.0)
+    monkeypatch.setattr(budgets, "measure_calibration_s", lambda: 0.1)
+    done = CliRunner().invoke(app, run_words(table, tmp_path, "1.2GB", "--dry-run", "--json"), catch_exceptions=False)
+    assert done.exit_code == 0
+    assert "together=alone" in done.output and "2 left out for lack of memory" in done.output
+    stages = {row["stage"] for row in json.loads(done.stdout.splitlines()[-1])["stages"]}
+    assert stages == {"ingest", "effects", "initial", "gnet", "evaluate/initial", "evaluate/gnet"}
+
+
+@pytest.mark.parametrize("words", [(), ("--dry-run",)], ids=["run", "dry run"])
+def test_a_limit_below_all_settings_is_an_error_before_a_server_is_started(
+    table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    monkeypatch.setattr(flow, "reconstruct_log", None)  # would end in a TypeError
+    with pytest.raises(ResourceError, match=r"gnet needs about 0\.\d GiB.*may use 0\.5 GiB.*--memory"):
+        CliRunner().invoke(app, run_words(table, tmp_path, "0.5GB", *words), catch_exceptions=False)
+
+
+class ReachedError(Exception):
+    """The checks before the first stage have let the run go on."""
+
+
+def test_a_worker_checks_memory_as_the_command_does(
+    table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(memory_limit, "memory_limit_gib", lambda: 64.0)
+
+    def reach(*_: Any) -> None:
+        raise ReachedError
+
+    monkeypatch.setattr(flow, "_reconstruct_chunks", reach)
+    for limit_gib, expected in ((1.2, ReachedError), (0.5, ResourceError)):
+        budget = budget_of(table, limit_gib)
+        with pytest.raises(expected):
+            flow._compute(LOG, "fine", str(tmp_path), None, budget._config, budget)
+    # Without a budget nothing else is chosen.
+    with pytest.raises(ResourceError, match="enet needs about"):
+        flow._compute(LOG, "fine", str(tmp_path), None, budget_of(table, 1.2)._config, None)
+
+
+def test_a_chunk_that_ended_early_is_computed_again_within_its_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(memory_limit, "memory_limit_gib", lambda: 64.0)
+    config = load_configuration("fine", settings=["limits.memory_gib=1.2"])
+    made = ["ingest", "effects", "initial", "gnet"]
+    record = {
+        "run": "abc",
+        "log": LOG,
+        "config": config.model_dump(mode="json"),
+        "chunks": [{"chunk": 0, "stages": [{"stage": name} for name in made]}],
+        "budget": {"chunks": [{"chunk": 0, "settings": ["gnet.iterations=8"]}]},
+    }
+    again: list[str] = []
+    monkeypatch.setattr(flow, "find_run_record", lambda store, run: record)
+    monkeypatch.setattr(flow, "_run_stage_task", lambda spec, job, refs: again.append(spec.name))
+    flow.recompute_run.fn(str(tmp_path), "abc")
+    assert again == made
 
 
 @pytest.mark.parametrize("preset", ["small", "fine", "hd"])

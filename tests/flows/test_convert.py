@@ -31,6 +31,7 @@ def test_convert(uri: str, layout: str, tmp_path: Path) -> None:
     assert done.exit_code == 0
     record = json.loads(done.stdout)
     assert (record["written"], record["frames"], record["cameras"], record["tracks"]) == (target, 3, 1, 2)
+    assert record["center_ahead_m"] == 0.0
     assert open_log(target).image_bytes("front", 2) == open_log(uri).image_bytes("front", 2)
 
 
@@ -45,6 +46,8 @@ def test_a_copy_says_how_its_middle_is_stated(tmp_path: Path) -> None:
     uri = f"nuscenes:{write_nuscenes(fake, tmp_path / 'data')}"
     done = CliRunner().invoke(app, ["convert", uri, f"genre:{tmp_path / 'out'}"], catch_exceptions=False)
     assert "--set simulate.center_ahead_m=1.3" in done.stdout
+    done = CliRunner().invoke(app, ["convert", uri, f"genre:{tmp_path / 'again'}", "--json"], catch_exceptions=False)
+    assert json.loads(done.stdout)["center_ahead_m"] == 1.3
 
 
 def test_a_folder_that_holds_something(uri: str, tmp_path: Path) -> None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import nullcontext
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
@@ -20,16 +22,22 @@ from flows.cost_sweep import cell as cell_module
 from flows.cost_sweep import flow as flow_module
 from flows.cost_sweep import knobs
 from flows.cost_sweep.cell import Cell, Sweep, list_cells, measure_cold_start, predict_cells, run_cell
+from flows.cost_sweep.evaluation_plan import take_ego_pixels
 from flows.cost_sweep.flow import SweepRequest, write_results
 from flows.cost_sweep.knobs import PRESET_ITSELF, Setting, list_settings
 from flows.cost_sweep.summary import KERNEL_3M, PERCEPTUAL_3M, novel_view_measure, pareto_front, summarise_settings
 from flows.experiments import warm_up
 from flows.experiments.log_chunks import LogChunk
+from flows.pipeline.stage_runner import ArtifactRef, Job, read_artifact, run_stage
 from genre_tasks.config import PipelineConfig
+from genre_tasks.effects import pose_refinement
+from genre_tasks.effects.measurements import ChunkMeasurements
 from genre_tasks.effects.plan import EFFECT_NAMES, load_effect
-from genre_tasks.effects.types import Effect
+from genre_tasks.effects.types import Effect, EffectParameters, EffectsPlan, Measurement
 from genre_tasks.errors import ConfigError
+from genre_tasks.scene.chunk import Chunk
 from tests.faults.small_run import LOG, SETTINGS, Stopped, stopping
+from tests.storage.artifact_values import make
 
 
 def row(value: str, seed: int, seconds: float, psnr: float, log: str = "a", **more: float) -> dict[str, Any]:
@@ -172,6 +180,9 @@ def test_the_files_say_the_same(tmp_path: Path) -> None:
     assert f"* command: `{COMMAND}`" in text
 
 
+RIGHT = np.eye(1, 16, 3).reshape(4, 4)
+"""Added to a pose, moves it by one metre along the first axis of the chunk."""
+
 SWEEP_SETTINGS = tuple(s for s in SETTINGS if "snapshots" not in s)
 CELLS = [
     Cell(LogChunk(LOG, 0), 0, s)
@@ -208,6 +219,62 @@ def test_a_sweep_goes_on_where_it_was_stopped_and_judges_alike(tmp_path: Path) -
     assert [run_cell(sweep, cell, counted) for cell in CELLS] == rows and len(computed) == before
     told = predict_cells(sweep, CELLS[:1])
     assert told[0]["seconds"] == 0 and told[0]["cached"] == "8 of 8 stages"
+
+
+def test_a_plan_takes_only_the_recording_vehicles_pixels_of_another_size() -> None:
+    plan, reference = (make("effects", seed=seed) for seed in (1, 2))
+    plan, reference = (
+        replace(p, decisions=(replace(p.decisions[0], name="ego_mask", reason=reason), *p.decisions[1:]))
+        for p, reason in ((plan, "few pixels"), (reference, "many pixels"))
+    )
+    taken = take_ego_pixels(plan, reference)
+    pixels = ("ego_masks", "ego_points")
+    for field in fields(EffectParameters):
+        source = reference if field.name in pixels else plan
+        assert getattr(taken.parameters, field.name) is getattr(source.parameters, field.name), field.name
+    assert taken.decisions == (reference.decisions[0], *plan.decisions[1:])
+
+
+def _refine_poses_of_large_images(monkeypatch: pytest.MonkeyPatch, pixels: int) -> None:
+    """Has ``pose_refinement`` move every camera, as on logs whose poses err, but in no images of fewer pixels."""
+
+    def measure(measurements: ChunkMeasurements) -> Measurement:
+        chunk = measurements.chunk
+        return Measurement(9.0 if chunk.width_px * chunk.height_px >= pixels else None, "by the test")
+
+    def fit(measurements: ChunkMeasurements) -> EffectParameters:
+        views = measurements.chunk.views
+        return EffectParameters(poses={(v.camera, v.frame): v.chunk_SE3_camera + 0.01 * RIGHT for v in views})
+
+    monkeypatch.setattr(pose_refinement, "EFFECT", replace(pose_refinement.EFFECT, measure=measure, fit=fit))
+
+
+def test_scenes_of_every_image_size_are_judged_at_their_own_poses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _refine_poses_of_large_images(monkeypatch, 64 * 36)
+    sweep = Sweep("demo", SWEEP_SETTINGS, str(tmp_path))
+    planned: list[str] = []
+    judged: list[tuple[str, EffectsPlan, Chunk]] = []
+
+    def watch(stage: str, job: Job, inputs: dict[str, ArtifactRef]) -> ArtifactRef:
+        if stage.startswith("evaluate/"):
+            plan, chunk = (read_artifact(job, inputs[name]) for name in ("effects", "ingest"))
+            judged.append((inputs["effects"].key, plan, chunk))
+        ref = run_stage(stage, job, inputs)
+        planned.extend([ref.key] if stage == "effects" else [])
+        return ref
+
+    coarse = CELLS[1]
+    for cell in (Cell(coarse.where, 0, Setting("fixer", "off", end="gnet")), coarse, coarse):
+        assert run_cell(sweep, cell, watch) is not None
+    (key, plan, chunk), (coarse_key, coarse_plan, coarse_chunk), again = judged
+    # Of the preset's size, the stage's own plan.
+    assert key == planned[0] and set(plan.parameters.poses) == {(v.camera, v.frame) for v in chunk.views}
+    # Too coarse to be refined: GNet took the recorded poses, and so does the comparison with larger images.
+    assert coarse_plan.parameters.poses == {} and coarse_chunk.width_px == 64
+    assert not coarse_plan.is_on("pose_refinement") and plan.is_on("pose_refinement")
+    assert again[0] == coarse_key and coarse_key not in planned
 
 
 def test_a_stage_that_settings_share_is_predicted_once(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -156,6 +157,46 @@ def test_many_chunks_are_compared_by_means_or_one_by_one(runs: Runs) -> None:
     assert "chunk 5 stages" in tables(one) and len(one.pairs) == 1
     with pytest.raises(InputError, match="do not both have chunk 6"):
         runs.compare("dd44", "ee55", chunk=6)
+
+
+def record_run(name: str, stages: Mapping[str, Sequence[float | None]]) -> dict[str, Any]:
+    """A record whose artifacts are gone: of each stage the PSNR chunk by chunk, ``None`` where the chunk lacks it."""
+    chunks = []
+    for k in range(max(map(len, stages.values()))):
+        found = {stage: values[k] for stage, values in stages.items() if values[k] is not None}
+        entries = [
+            {"stage": s, "key": f"{name}{k}{s}", "seconds": 1.0, "metrics": {"x/psnr": v}} for s, v in found.items()
+        ]
+        chunks.append({"chunk": k, "stages": entries})
+    return {"run": name, "log": "synthetic:street", "preset": "demo", "config": {}, "chunks": chunks}
+
+
+def compare_records(store: LocalStore, a: dict[str, Any], b: dict[str, Any]) -> Comparison:
+    return compare_runs(open_side(store, a), open_side(store, b))
+
+
+def test_means_are_over_the_chunks_that_have_a_stage_in_both_runs(runs: Runs) -> None:
+    """A run with a budget may leave out ENet in chunks that are hard, and is then no better for it."""
+    gnet = [29.0, 29.0, 29.0, 19.0, 19.0]
+    every = record_run("aaaa", {"gnet": gnet, "enet": [30.0, 30.0, 30.0, 20.0, 20.0]})
+    budget = record_run("bbbb", {"gnet": gnet, "enet": [29.5, 29.5, 29.5, None, None]})
+    shown = tables(compare_records(runs.store, every, budget))
+    (row,) = shown["enet: mean metrics"]
+    assert (row["chunks"], row["A"], row["B"]) == (3, 30.0, 29.5)
+    assert (row["B − A"], row["B is"]) == (-0.5, "worse")
+    (row,) = shown["gnet: mean metrics"]
+    assert (row["chunks"], row["A"], row["B"], row["B is"]) == (5, 25.0, 25.0, "")
+
+
+def test_a_stage_that_no_chunk_has_in_both_runs_has_no_difference(runs: Runs) -> None:
+    gnet = [20.0] * 5
+    one = record_run("aaaa", {"gnet": gnet, "enet": [30.0, 26.0, None, None, None]})
+    alone = tables(compare_records(runs.store, one, record_run("bbbb", {"gnet": gnet})))
+    (row,) = alone["enet: mean metrics"]
+    assert (row["chunks"], row["A"], row["B"], row["B is"]) == (2, 28.0, "", "")
+    found = compare_records(runs.store, one, record_run("bbbb", {"gnet": gnet, "enet": [None, None, 29.0, None, None]}))
+    assert "enet: mean metrics" not in tables(found)
+    assert "No chunk has metrics after enet in both runs." in found.notes
 
 
 def test_an_artifact_that_is_gone_leaves_the_record(runs: Runs) -> None:

@@ -10,14 +10,15 @@ import pytest
 from flows.exchange.export_request import ExportRequest
 from flows.exchange.export_scenes import export_scenes
 from flows.exchange.import_scene import import_scene
-from flows.simulation.edited_runs import open_shown_scenes, write_edited_run
+from flows.simulation import edited_runs
+from flows.simulation.edited_runs import open_edited_scenes, open_shown_scenes, write_edited_run
 from flows.simulation.run_scenes import RunScenes
+from genre_tasks.config.simulation_sections import SimulateConfig
 from genre_tasks.errors import InputError
 from genre_tasks.exchange.registry import load_format
 from genre_tasks.exchange.scene_folder import read_document
-from genre_tasks.scene_edits import edited_scenes
 from genre_tasks.scene_edits.actor_names import name_actors
-from genre_tasks.scene_edits.edits import EditList, Insert
+from genre_tasks.scene_edits.edits import EditList, Insert, Move
 from genre_tasks.scene_edits.run_survey import survey_run
 from tests.exchange.splat_clouds import change_one, make_driving_scene
 from tests.flows.small_simulation import make_run
@@ -146,11 +147,22 @@ def test_inserted_actors_have_their_names_in_files(run: ExportRequest, tmp_path:
 def test_a_run_from_before_names_were_reserved_is_exported(
     run: ExportRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    edits = EditList(edits=(Insert(actor=find_actor(run), name="background"),))
-    with pytest.raises(InputError, match="Give the inserted actor another name"):
-        write_edited_run(run.store, run.scene, edits)
+    actor = find_actor(run)
+    insert = Insert(actor=actor, name="background")
+    reserved = r"\(insert\): every scene has a part that is called '{}'\. Give the inserted actor another name"
+    with pytest.raises(InputError, match="edit 1 " + reserved.format("background")):
+        write_edited_run(run.store, run.scene, EditList(edits=(insert,)))
     with monkeypatch.context() as patch:
-        patch.setattr(edited_scenes, "_RESERVED_NAMES", frozenset())
-        edited = str(write_edited_run(run.store, run.scene, edits)["run"])
+        patch.setattr(edited_runs, "_require_free_names", lambda *_, **__: None)
+        edited = str(write_edited_run(run.store, run.scene, EditList(edits=(insert,)))["run"])
+    # It is shown, and edited further; a new actor is refused there as well.
+    assert name_actors(open_shown_scenes(run.store, edited))["background"] == "background"
+    move = Move(actor="background", left_m=1.0)
+    moved = open_edited_scenes(run.store, edited, EditList(edits=(move,)), SimulateConfig())
+    assert moved.edits.edits == (insert, move)
+    assert "background" in {node.track_id for node in moved.load(0).scene.actors}
+    further = EditList(edits=(move, Insert(actor=actor, name="distant")))
+    with pytest.raises(InputError, match="edit 3 " + reserved.format("distant")):
+        open_edited_scenes(run.store, edited, further, SimulateConfig())
     found = list_node_names(run, edited, tmp_path / "out")
     assert {"background", "background-moving"} <= found

@@ -16,7 +16,7 @@ import torch
 from flows.training import fixer_job, fixer_pairs, fixer_training, scene_lists
 from flows.training.curve_table import FIXER_CURVE, FIXER_SCORES, load_rows, save_rows
 from flows.training.fixer_flow import train_fnet, train_pairs
-from flows.training.fixer_job import CURVE_FILE, SCORES_FILE, FixerJob
+from flows.training.fixer_job import CURVE_FILE, SCORES_FILE, WEIGHTS_FILE, FixerJob
 from flows.training.fixer_pairs import TRAINING_PAIRS, PairRecipe, PairSet
 from flows.training.fixer_training import load_pairs, train_fixer
 from flows.training.requirements import check_fixer_training
@@ -219,6 +219,31 @@ def test_adapters_name_sd_turbo_so_that_a_run_finds_it(trained, tmp_path, monkey
     monkeypatch.chdir(trained[0])
     assert check_fixer_files(config) == tmp_path / weights
     load_configured_fnet(config)
+
+
+def test_adapters_with_an_absolute_path_may_be_copied_and_stay_as_they_are(trained, tmp_path, monkeypatch) -> None:
+    (tmp_path / "training").mkdir()
+    (tmp_path / "training" / "store").symlink_to(trained[0] / "store")
+    save_toy_sd_turbo(tmp_path / "turbo")
+    monkeypatch.chdir(tmp_path)
+    job = FixerJob("training", streets=2, preset="paper", start=str(tmp_path / "turbo"))
+    weights, _ = train_fixer(job)
+    copied = tmp_path / "elsewhere" / "deeper" / "adapters"
+    shutil.copytree(weights.parent, copied)
+    assert check_fixer_files(FnetConfig(model="sd-turbo", weights=str(copied))) == copied / WEIGHTS_FILE
+    # Trained by a version that wrote every path as it was typed, and started now by a relative path.
+    described = weights.with_suffix(".json")
+    written = described.read_text()
+    assert json.loads(written)["base"] == str(tmp_path / "turbo")
+    assert train_fixer(replace(job, start="turbo")) == (weights, False)
+    assert described.read_text() == written
+    # The same folder, named relative to the adapters.
+    relative = json.dumps({**json.loads(written), "base": "../../turbo"})
+    described.write_text(relative)
+    assert train_fixer(job) == (weights, False) and described.read_text() == relative
+    # No run finds a folder that is gone.
+    described.write_text(json.dumps({**json.loads(written), "base": str(tmp_path / "gone")}))
+    assert train_fixer(job) == (weights, False) and described.read_text() == written
 
 
 def test_a_kill_at_the_last_checkpoint_loses_no_weights(trained, tmp_path, monkeypatch) -> None:

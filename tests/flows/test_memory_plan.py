@@ -27,7 +27,7 @@ from flows.pipeline.memory_plan import (
 from flows.pipeline.stage_runner import Job, run_stage
 from flows.preflight import machine_checks
 from genre_tasks import image_memory
-from genre_tasks.config import PipelineConfig
+from genre_tasks.config import LimitsConfig, PipelineConfig
 from genre_tasks.errors import ResourceError
 from genre_tasks.losses.ssim import KEPT_PIXELS
 from storage.opening import open_store
@@ -90,6 +90,35 @@ def test_a_limit_above_the_machines_is_a_warning(monkeypatch: pytest.MonkeyPatch
 def test_a_limit_that_is_too_low_is_an_error_before_the_stage() -> None:
     with pytest.raises(ResourceError, match=r"enet needs about 2\.0 GiB.*may use 1\.0 GiB.*--memory"):
         needs_disk("enet", StageMemory(2048, 10), limited(1.0))
+
+
+def test_a_scene_from_a_file_has_a_remedy_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The setting for the number of LiDAR points does nothing there."""
+    from_file = load_configuration("hd", settings=[f"initial.scene={tmp_path / 'a.ply'}", "limits.memory_gib=1"])
+    monkeypatch.setattr(machine_checks, "memory_limit_gib", lambda: 1.0)
+    names = [spec.name for spec in PIPELINE]
+    for config, fewer in (
+        (from_file, "remove Gaussians from the file."),
+        (limited(1.0), "smaller ingest.width_px or initial.max_points."),
+    ):
+        with pytest.raises(ResourceError) as caught:
+            machine_checks.assess_memory(HD, config, names)
+        assert caught.value.remedy.startswith("Allow more (--memory)") and caught.value.remedy.endswith(fewer)
+    warnings = [
+        machine_checks.assess_memory(HD, config.model_copy(update={"limits": LimitsConfig()}), names) or ""
+        for config in (from_file, limited(1.0))
+    ]
+    assert ["initial.max_points" in warning for warning in warnings] == [False, True]
+    assert "fewer Gaussians in the file" in warnings[0]
+
+
+def test_a_budget_chooses_what_fits_so_that_the_limit_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = [spec.name for spec in PIPELINE]
+    monkeypatch.setattr(machine_checks, "memory_limit_gib", lambda: 64.0)
+    assert machine_checks.assess_memory(HD, limited(1.0), names, has_budget=True) is None
+    monkeypatch.setattr(machine_checks, "memory_limit_gib", lambda: 1.0)
+    warning = machine_checks.assess_memory(HD, limited(None), names, has_budget=True)
+    assert warning is not None and "the budget chooses among its table's settings that need less" in warning
 
 
 def test_under_a_limit_freed_memory_goes_back(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -58,10 +58,11 @@ def test_a_start_is_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     (tmp_path / "turbo").mkdir()
-    for start in ("turbo", "~/turbo", str(tmp_path / "turbo")):
+    absolute = str(tmp_path / "turbo")
+    for start, base in (("turbo", "../../turbo"), ("~/turbo", absolute), (absolute, absolute)):
         job = FixerJob("training", preset="paper", start=start)
         assert job.sd_turbo is not None and Path(job.sd_turbo).samefile(tmp_path / "turbo")
-        assert job.adapters_base == "../../turbo"
+        assert job.adapters_base == base
     by_name = FixerJob("training", preset="paper", start="stabilityai/sd-turbo")
     assert by_name.sd_turbo == by_name.adapters_base == "stabilityai/sd-turbo"
     small = FixerJob("training", start="~/fnet")

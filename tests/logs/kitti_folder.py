@@ -96,6 +96,7 @@ def _write_calibration(log: DrivingLog, cameras: tuple[Camera, ...], day: Path) 
         assert np.allclose(first_SE3_camera[:3, :3], np.eye(3))
         matrix = np.array([[lens.fx_px, 0, lens.cx_px - 0.5], [0, lens.fy_px, lens.cy_px - 0.5], [0, 0, 1]])
         projection = np.column_stack([matrix, -matrix @ first_SE3_camera[:3, 3]])
+        lines.append(f"S_rect_{number + 2:02d}: {lens.width_px:.6e} {lens.height_px:.6e}")
         lines.append(f"P_rect_{number + 2:02d}: {_join(projection)}")
     (day / "calib_cam_to_cam.txt").write_text("calib_time: 09-Jan-2012 13:57:47\n" + "\n".join(lines) + "\n")
     for name, matrix in (("velo_to_cam", camera_SE3_velodyne), ("imu_to_velo", _VELODYNE_SE3_IMU)):

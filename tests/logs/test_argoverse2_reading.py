@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
+from PIL import Image
 from pyarrow import feather
 
 from genre_tasks.errors import InputError
@@ -100,6 +101,23 @@ def test_each_frame_has_the_nearest_image_and_its_pose(folder: Path) -> None:
     moved = log.world_SE3_camera("ring_front", 2)[:3, 3] - FAKE.world_SE3_camera("front", 2)[:3, 3]
     expected = 0.02 / 0.1 * 0.3 - FAKE.world_SE3_lidar(0)[0, 3]
     assert moved[0] == pytest.approx(expected, abs=1e-6)
+    # What is wrong with images of nobody is of no account.
+    assert log.findings() == ()
+
+
+def test_findings_on_images_name_frames(folder: Path) -> None:
+    images = sorted((folder / "sensors/cameras/ring_front").iterdir())
+    # As the image of frame 0 is missing, that of frame 3 is the third one of its folder.
+    images[0].unlink()
+    Image.open(images[3]).resize((12, 8)).save(images[3])
+    images[4].write_bytes(b"")
+    # Thumbnails between the sweeps outnumber the images of frames.
+    for index in range(10):
+        Image.new("RGB", (12, 8)).save(images[1].with_name(f"{int(images[1].stem) + 40_000_000 + index}.png"))
+    log = open_log(f"argoverse2:{folder}")
+    assert log.cameras[0].lens == FAKE.lens
+    found = {(finding.word, finding.frames) for finding in log.findings()}
+    assert found == {("odd_image_size", (3,)), ("unreadable_image", (4,))}
 
 
 @pytest.mark.real

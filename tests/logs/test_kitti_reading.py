@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.logs.registry import open_log
@@ -14,6 +16,7 @@ from tests.fakes import FakeLog
 from tests.logs.kitti_folder import DRIVE, START_S, shifted_world, write_kitti, write_tracking_labels
 
 FAKE = FakeLog(frame_count=6, camera_names=("front",), lidar_azimuths=60, lidar_rings=8, ego_yaw_rad=0.4)
+REAL = Path(__file__).resolve().parents[3] / "shared/data/kitti/2011_09_26/2011_09_26_drive_0009_sync"
 
 
 @pytest.fixture(scope="module")
@@ -117,6 +120,48 @@ def test_points_are_placed_by_their_own_time(drive: Path) -> None:
     assert step[:, 0].min() == pytest.approx(-0.15, abs=0.01)
     assert step[:, 0].max() == pytest.approx(0.15, abs=0.01)
     assert np.ptp(moved.timestamps_s) == pytest.approx(0.1, abs=0.01)
+
+
+def _resize(drive: Path, change: Callable[[Image.Image], Image.Image]) -> None:
+    for path in (drive / "image_02/data").iterdir():
+        change(Image.open(path)).save(path)
+
+
+def test_images_at_half_the_size_of_the_calibration_scale_the_lens(drive: Path) -> None:
+    _resize(drive, lambda image: image.resize((image.width // 2, image.height // 2)))
+    log = open_log(f"kitti:{drive}")
+    assert log.cameras[0].lens == FAKE.lens.resized(FAKE.width_px // 2, FAKE.height_px // 2)
+    assert [(f.word, f.severity) for f in log.findings()] == [("resampled_images", "note")]
+
+
+def test_images_that_were_cropped_are_named(drive: Path) -> None:
+    _resize(drive, lambda image: image.crop((0, 8, image.width, image.height)))
+    log = open_log(f"kitti:{drive}")
+    assert log.cameras[0].lens == FAKE.lens
+    (found,) = log.findings()
+    assert (found.word, found.frames, found.camera) == ("odd_image_size", tuple(range(FAKE.frame_count)), "image_02")
+
+
+@pytest.mark.parametrize("stated", [None, "0 0", "-1 64", "96 1e9"])
+def test_without_a_stated_size_that_of_most_images_counts(drive: Path, stated: str | None) -> None:
+    path = drive.parent / "calib_cam_to_cam.txt"
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("S_rect_02")]
+    path.write_text("\n".join(lines if stated is None else [*lines, f"S_rect_02: {stated}"]) + "\n")
+    _resize(drive, lambda image: image.crop((0, 8, image.width, image.height)))
+    log = open_log(f"kitti:{drive}")
+    lens = log.cameras[0].lens
+    assert (lens.width_px, lens.height_px) == (FAKE.width_px, FAKE.height_px - 8)
+    assert log.findings() == ()
+
+
+@pytest.mark.real
+@pytest.mark.skipif(not REAL.is_dir(), reason=f"no drive of KITTI beside the checkout ({REAL})")
+def test_a_real_drive_has_images_of_the_stated_size() -> None:
+    log = open_log(f"kitti:{REAL}")
+    assert {name: log._stated_sizes[name] for name in ("image_02", "image_03")} == {
+        camera.name: (1242, 375) for camera in log.cameras
+    }
+    assert {(camera.lens.width_px, camera.lens.height_px) for camera in log.cameras} == {(1242, 375)}
 
 
 def test_an_unknown_option(written: Path) -> None:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import sqlite3
 import tracemalloc
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -149,6 +152,46 @@ def test_an_index_that_cannot_be_written(root: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setenv("GENRE_CACHE_DIR", str(root / VERSION / "scene.json"))
     with pytest.raises(ResourceError, match="index cannot be written"):
         open_log(f"nuscenes:{root}/scene-0061")
+
+
+def _list_indexes(folder: Path) -> list[Path]:
+    return list((folder / "nuscenes").iterdir())
+
+
+@pytest.mark.parametrize("damage", ["empty", "zeros", "cut", "text", "other tables"])
+def test_a_damaged_index_is_made_again(
+    root: Path, damage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after a loss of power; it would be an error of every scene."""
+    monkeypatch.setenv("GENRE_CACHE_DIR", str(tmp_path / "cache"))
+    expected = open_log(f"nuscenes:{root}/scene-0061").digest()
+    (path,) = _list_indexes(tmp_path / "cache")
+    data = path.read_bytes()
+    damaged = {"empty": b"", "zeros": bytes(len(data)), "cut": data[: len(data) // 2], "text": b"no index" * 1000}
+    if damage == "other tables":
+        path.unlink()
+        with closing(sqlite3.connect(path)) as other:
+            other.execute("CREATE TABLE scene (token TEXT)")
+    else:
+        path.write_bytes(damaged[damage])
+    assert open_log(f"nuscenes:{root}/scene-0061").digest() == expected
+    assert _list_indexes(tmp_path / "cache") == [path] and path.read_bytes() == data
+
+
+def test_an_index_reaches_the_disk_before_its_name_does(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GENRE_CACHE_DIR", str(tmp_path / "cache"))
+    synchronised = []
+
+    def fsync(handle: int) -> None:
+        synchronised.append((os.fstat(handle).st_ino, [path.name for path in _list_indexes(tmp_path / "cache")]))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    open_log(f"nuscenes:{root}/scene-0061")
+    (path,) = _list_indexes(tmp_path / "cache")
+    ((inode, names),) = synchronised
+    assert inode == path.stat().st_ino and path.name not in names
 
 
 @pytest.mark.parametrize("text", ["", " \n"])

@@ -121,6 +121,17 @@ class TestRoundTrip:
         assert (written / f"camera/front/01{suffix}").read_bytes() == stream.getvalue()
         assert open_pandaset(str(written)).image_bytes("front", 1) == stream.getvalue()
 
+    def test_the_size_of_the_intrinsics_survives_images_of_another_one(self, tmp_path: Path) -> None:
+        """Most images of a camera are of another shape than its lens: they are left out before and after."""
+        log = small_log()
+        for frame in range(log.frame_count):
+            stream = io.BytesIO()
+            Image.new("RGB", (48, 24), (10, 200, 30)).save(stream, "PNG")
+            log._images[("front", frame)] = stream.getvalue()
+        found = open_pandaset(str(write_pandaset(log, tmp_path / "002")))
+        assert {(c.lens.width_px, c.lens.height_px) for c in found.cameras} == {(48, 32)}
+        assert {finding.word: finding.frames for finding in found.findings()} == {"odd_image_size": (0, 1, 2, 3)}
+
     def test_progress_ends_at_its_total(self, tmp_path: Path) -> None:
         calls: list[tuple[int, int]] = []
         write_pandaset(small_log(), tmp_path / "002", lambda done, total, note="": calls.append((done, total)))

@@ -360,3 +360,9 @@ def test_assumed_times_are_a_note(written: Path) -> None:
     log = open_log(f"posed_images:{written}")
     assert isinstance(log, PosedImagesLog)
     assert [finding.word for finding in log.findings()] == ["assumed_times"]
+
+
+@pytest.mark.parametrize("address", ["~nobody-of-this-name/x", "{}?images=~nobody-of-this-name/x"])
+def test_a_home_folder_of_nobody_is_an_error(address: str, written: Path) -> None:
+    with pytest.raises(InputError, match="no home folder of this user"):
+        open_log(f"posed_images:{address.format(written)}")

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import urllib.request
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pytest
 from prometheus_client import generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
+from flows.observability import counter_files
 from flows.observability import metric_definitions as metrics
 from flows.observability.counter_files import MAX_FILES, TOTALS, CounterFolder, Counts
 from flows.observability.exporter import (
@@ -299,3 +301,27 @@ def test_totals_name_what_they_hold(folder: Path) -> None:
     names = [path.name for path in counted_files(folder)]
     samples(folder)
     assert json.loads((folder / "counts" / TOTALS).read_text())["folded"] == names
+
+
+def test_a_process_that_is_folded_meanwhile_is_read_all_the_same(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    counters = CounterFolder(folder)
+    counters.write(counters.name_file(), Counts({(STAGE, "gnet", "computed"): 1.0}))
+    ended: set[str] = set()
+    read_counts = counter_files._read_counts
+    others: list[threading.Thread] = []
+
+    def end_before_it_is_read(path: Path) -> Counts:
+        # Once: the process ends, and another one that scrapes folds its file.
+        if not others:
+            ended.add(path.name)
+            others.append(threading.Thread(target=CounterFolder(folder).read))
+            others[0].start()
+            others[0].join(1.0)
+        return read_counts(path)
+
+    monkeypatch.setattr(counter_files, "is_abandoned", lambda path: path.name in ended)
+    monkeypatch.setattr(counter_files, "_read_counts", end_before_it_is_read)
+    assert counters.read().totals == {(STAGE, "gnet", "computed"): 1.0}
+    others[0].join(20)
+    assert counters.read().totals == {(STAGE, "gnet", "computed"): 1.0}
+    assert not counted_files(folder)

@@ -177,6 +177,22 @@ def test_without_postgres_the_error_names_the_package(tmp_path: Path, monkeypatc
         PostgresServer(tmp_path).start()
 
 
+def test_the_newest_postgres_is_taken_whatever_its_folder_is_called(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders = [tmp_path / name / "bin" for name in ("9.6", "17", "9.10", "beta", "15")]
+    for folder in folders:
+        folder.mkdir(parents=True)
+        (folder / "initdb").touch()
+    monkeypatch.setattr(postgres_module.shutil, "which", lambda name: None)
+    monkeypatch.setattr(postgres_module.Path, "glob", lambda self, pattern: iter(folders))
+    found = []
+    while folders:
+        found.append(Path(postgres_module.find_postgres_program("initdb")).parent)
+        folders.remove(found[-1])
+    assert [folder.parent.name for folder in found] == ["17", "15", "9.10", "9.6", "beta"]
+
+
 def test_an_interrupted_first_start_leaves_no_half_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     interrupted = [True]
 
@@ -224,7 +240,7 @@ def test_clients_find_the_server_where_a_worker_does_not_start(tmp_path: Path, m
         service.folder.mkdir(parents=True)
 
     monkeypatch.setattr(Stack, "_ensure", ensure)
-    monkeypatch.setattr(stack_module, "deploy_flows", lambda *words: None)
+    monkeypatch.setattr(stack_module, "deploy_flows", lambda *words, **named: None)
     with pytest.raises(ResourceError, match="worker"):
         Stack(tmp_path, store_server=False, database="sqlite").start()
     written = (tmp_path / "env").read_text()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sqlite3
 import subprocess
@@ -21,7 +22,7 @@ from flows.cli.main import prepare_environment
 from flows.machine.state_folder import find_state_folder
 from flows.prefect_api.connection import check_server, connect_to_prefect
 from flows.prefect_api.network_variables import find_unusable_files
-from flows.prefect_api.server_thread import ServerThread
+from flows.prefect_api.server_thread import ServerThread, _alone_in
 from flows.prefect_api.settings_sources import check_settings_files, find_prefect_home, find_source
 from genre_tasks.errors import ConfigError, InputError
 
@@ -349,3 +350,19 @@ def test_too_few_open_files_are_one_error(tmp_path: Path) -> None:
     )
     assert run_flow(tmp_path, script.format(soft=40, hard=40)).stderr.splitlines()[-1].endswith("ulimit -n 1024.")
     assert run_flow(tmp_path, script.format(soft=40, hard=200)).stdout == "64\n"
+
+
+@pytest.mark.parametrize("code", [errno.ENOLCK, errno.ENOTSUP])
+def test_a_folder_without_locks_is_named(code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(file: object, operation: int) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr("flows.prefect_api.server_thread.fcntl.flock", refuse)
+    server = ServerThread(tmp_path)
+    server.stop()
+    with pytest.raises(OSError, match="Errno") as caught, _alone_in(tmp_path):
+        raise AssertionError("the block must not run")
+    server._error = caught.value
+    error = server._start_error(os.strerror(code))
+    assert error.remedy == "Set PREFECT_HOME or XDG_STATE_HOME to a local disk."
+    assert error.file == str(tmp_path) and os.strerror(code) in str(error)

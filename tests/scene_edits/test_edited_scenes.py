@@ -9,9 +9,7 @@ import torch
 from genre_tasks.config.simulation_sections import SimulateConfig
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.errors import InputError
-from genre_tasks.exchange.conversion import BACKGROUND_NAME, DISTANT_NAME
 from genre_tasks.scene.graph import FIRST_ACTOR
-from genre_tasks.scene_edits import edited_scenes
 from genre_tasks.scene_edits.actor_names import name_actors
 from genre_tasks.scene_edits.edited_scenes import EditedScenes
 from genre_tasks.scene_edits.edits import Insert, Move, Remove, Retime, Rotate, ScaleSpeed
@@ -299,10 +297,6 @@ def test_inserted_actors_are_edited_by_their_name(run: MadeRun) -> None:
         ((Move(actor="car"),), "edit 1 (move): 2 actors begin with 'car': car-1, car-2"),
         ((Insert(actor="zzz"),), "edit 1 (insert): there is no actor 'zzz'"),
         ((Insert(actor="a", name="car-2"),), "edit 1 (insert): an actor 'car-2' is there already"),
-        (
-            (Insert(actor="a", name="background"),),
-            "edit 1 (insert): every scene has a part that is called 'background'. Give the inserted actor another name",
-        ),
         ((Insert(actor="a", name="x", start_s=9.0),), "would appear after 9 s, and the run ends at 1.1 s"),
     ],
 )
@@ -310,10 +304,6 @@ def test_impossible_edits_are_named(run: MadeRun, edits: tuple[object, ...], mes
     with pytest.raises(InputError) as caught:
         edit(run, *edits)
     assert message in str(caught.value)
-
-
-def test_parts_of_exported_scenes_have_reserved_names() -> None:
-    assert {BACKGROUND_NAME, DISTANT_NAME} == edited_scenes._RESERVED_NAMES
 
 
 def test_no_edits_leave_the_source_alone(run: MadeRun) -> None:

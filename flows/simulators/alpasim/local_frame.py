@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flows.simulation.recorded_settings import read_simulate_config
 from flows.simulation.run_scenes import RunScenes
-from genre_tasks.config import PipelineConfig
 from genre_tasks.ego_paths.collisions import EGO_SIZE_M
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.logs.types import Float64
@@ -84,11 +84,12 @@ def read_local_frame(source: RunScenes) -> LocalFrame:
         The frame; the same for the bundle and for the service.
 
     Raises:
+        ConfigError: another version wrote the record, with settings of simulations that this one does not know.
         InputError: an artifact is gone.
     """
     # One chunk: the others would only be read to measure the same height again.
     survey = survey_run(_FirstChunk(source))
-    stated_m = PipelineConfig.model_validate(source.record["config"]).simulate.center_ahead_m
+    stated_m = read_simulate_config(source.record).center_ahead_m
     return LocalFrame.from_path(survey.path, survey.ground, find_center_ahead(str(source.record["log"]), stated_m))
 
 

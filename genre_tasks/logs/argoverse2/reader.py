@@ -19,6 +19,7 @@ from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.image_sizes import choose_lens, measure_images, report_problems
 from genre_tasks.logs.labelled_boxes import MAX_BOXES, LabelledBox
 from genre_tasks.logs.nearest_images import find_nearest_images
+from genre_tasks.logs.point_values import fill_point_times
 from genre_tasks.logs.recorded_log import RecordedLog
 from genre_tasks.logs.timed_poses import POSE_REACH_S, TimedPoses
 from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Lens, Sweep, Truth
@@ -32,6 +33,7 @@ _TIMED_FILE = re.compile(r"([0-9]{1,19})\.(?:jpg|png|feather)")
 _REMEDY = "Give the folder of one log, as in argoverse2:PATH/7fab2350-7eaf-3b7e-a39d-6937a4c1bede."
 _LENS_COLUMNS = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
 _SIZE_COLUMNS = ("length_m", "width_m", "height_m")
+_POINT_COLUMNS = ("x", "y", "z", "intensity", "offset_ns")
 # The grey stereo pair looks where the front camera of the ring does.
 _RING = "ring_"
 _INTENSITY_SCALE = 255.0
@@ -142,7 +144,9 @@ class Argoverse2Log(RecordedLog):
             files = self._images[name]
             if not files:
                 continue
-            measured = measure_images(dict(enumerate(files.values())))
+            # Images that are nearest to no sweep are not read, and must not choose the size.
+            nearest = enumerate(self._nearest[name])
+            measured = measure_images({frame: files[time] for frame, time in nearest if time is not None})
             self._report(*report_problems(measured, name))
             lens, findings = choose_lens(lens, measured, name)
             self._report(*findings)
@@ -191,18 +195,23 @@ class Argoverse2Log(RecordedLog):
         time_ns = int(self._sweep_times_ns[self._check_frame(frame)])
         path = self._sweeps[time_ns]
         try:
-            columns = read_columns(path, ("x", "y", "z", "intensity", "offset_ns"), self.uri)
+            columns = read_columns(path, (), self.uri, unchecked=_POINT_COLUMNS)
         except InputError as error:
             error.frame = frame
             raise
-        local = np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=1)
+        local = np.stack([columns[name] for name in "xyz"], axis=1)
+        placed = self._find_placed(local, frame)
+        local = local[placed]
+        intensity = self._fill_intensities(columns["intensity"][placed], frame).astype(np.float32)
+        # Offsets count from the sweep's own time.
+        offsets_ns, findings = fill_point_times(columns["offset_ns"][placed], 0.0, frame, "offset_ns")
+        self._report(*findings)
         pose = self.world_SE3_lidar(frame)
-        intensity = columns["intensity"].astype(np.float32) / np.float32(_INTENSITY_SCALE)
         mount = self._mounts.get(_MAIN_LIDAR)
         return Sweep(
             points_world=local @ pose[:3, :3].T + pose[:3, 3],
-            intensity=np.clip(intensity, 0.0, 1.0),
-            timestamps_s=(time_ns + columns["offset_ns"].astype(np.int64)) * _NS,
+            intensity=np.clip(intensity / np.float32(_INTENSITY_SCALE), 0.0, 1.0),
+            timestamps_s=(time_ns + offsets_ns.astype(np.int64)) * np.float64(_NS),
             sensor_world=None if mount is None else (pose @ mount)[:3, 3],
         )
 

@@ -224,20 +224,21 @@ class GenreLayoutLog(RecordedLog):
         return None if name is None else self._parse(resolve_file, self.folder, name, what)
 
     def sweep(self, frame: int) -> Sweep | None:
-        """See ``DrivingLog``; points that are not finite are left out."""
+        """See ``DrivingLog``; points without a finite place are left out."""
         path = self._sweep_file(frame)
         if path is None:
             return None
-        sweep, invalid, largest_intensity = read_sweep(path, self.frame_timestamp_s(frame), self.uri, frame)
-        if invalid:
-            self._report_invalid_points(invalid, frame)
-        if largest_intensity > _LARGEST_INTENSITY:
+        found = read_sweep(path, self.frame_timestamp_s(frame), self.uri, frame)
+        self._report(*found.findings)
+        if found.largest_intensity > _LARGEST_INTENSITY:
             # Of one scale in all sweeps: said once, and not of each.
             message = "sweeps have intensities above 1, which are cut to 1"
-            numbers = {"largest": largest_intensity}
+            numbers = {"largest": found.largest_intensity}
             self._report(Finding("intensity_scale", "warning", message, "Write them from 0 to 1.", numbers))
         stated = self._frame(frame).get("lidar_position")
-        return replace(sweep, sensor_world=self._parse(parse_position, stated, f"lidar_position of frame {frame}"))
+        return replace(
+            found.sweep, sensor_world=self._parse(parse_position, stated, f"lidar_position of frame {frame}")
+        )
 
     def _sweep_file(self, frame: int) -> Path | None:
         name = self._frame(frame).get("sweep")

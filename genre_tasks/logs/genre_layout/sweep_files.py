@@ -14,7 +14,9 @@ import numpy as np
 
 from genre_tasks.bounded_parquet import FOR_COLUMNS, read_bounded_table
 from genre_tasks.errors import InputError
+from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.genre_layout.layout import POINT_COLUMNS
+from genre_tasks.logs.point_values import fill_intensities, fill_point_times, find_placed_points
 from genre_tasks.logs.types import Float64, Sweep
 
 # Four turns of the largest LiDAR.
@@ -53,13 +55,13 @@ class ReadSweep(NamedTuple):
     """A sweep of a file.
 
     Attributes:
-        sweep: the finite points; without intensities all are 0.
-        invalid: how many points are not finite and left out.
-        largest_intensity: in the file; more than 1 is cut to 1.
+        sweep: the points with a finite place; a missing intensity is 0, a missing time the frame's.
+        findings: ``invalid_points``, ``missing_intensity`` and ``missing_point_time``.
+        largest_intensity: of these points in the file; more than 1 is cut to 1.
     """
 
     sweep: Sweep
-    invalid: int
+    findings: tuple[Finding, ...]
     largest_intensity: float
 
 
@@ -99,11 +101,17 @@ def read_sweep(path: Path, frame_time_s: float, log: str, frame: int) -> ReadSwe
     count = len(arrays["x"])
     arrays = {"intensity": np.zeros(count), "time_s": np.full(count, frame_time_s)} | arrays
     rows = np.stack([arrays[name] for name in POINT_COLUMNS], axis=1)
-    finite = np.isfinite(rows).all(axis=1)
-    rows = rows[finite]
-    intensity = np.clip(rows[:, 3], 0.0, 1.0).astype(np.float32)
-    sweep = Sweep(np.ascontiguousarray(rows[:, :3]), intensity, rows[:, 4].copy())
-    return ReadSweep(sweep, int((~finite).sum()), float(rows[:, 3].max(initial=0.0)))
+    placed, unplaced = find_placed_points(rows[:, :3], frame)
+    rows = rows[placed]
+    intensities, without_intensity = fill_intensities(rows[:, 3], frame)
+    times_s, without_time = fill_point_times(rows[:, 4].copy(), frame_time_s, frame)
+    sweep = Sweep(
+        points_world=np.ascontiguousarray(rows[:, :3]),
+        intensity=np.clip(intensities, 0.0, 1.0).astype(np.float32),
+        timestamps_s=times_s,
+    )
+    findings = (*unplaced, *without_intensity, *without_time)
+    return ReadSweep(sweep, findings, largest_intensity=float(intensities.max(initial=0.0)))
 
 
 def _read_npz(path: Path) -> dict[str, Float64]:

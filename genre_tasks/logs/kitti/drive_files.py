@@ -156,26 +156,30 @@ def read_text(path: Path, log: str, frame: int | None = None) -> str:
         raise InputError(problem, remedy=_COPY_REMEDY, file=path, log=log, frame=frame) from error
 
 
-def read_calibration(path: Path, needed: Mapping[str, int], log: str) -> dict[str, Float64]:
+def read_calibration(
+    path: Path, needed: Mapping[str, int], log: str, optional: Mapping[str, int] | None = None
+) -> dict[str, Float64]:
     """Reads a file of lines ``NAME: numbers``.
 
     Args:
         path: the file.
         needed: name → how many numbers it has.
         log: URI of the log, for errors.
+        optional: the same, of names that may be missing.
 
     Returns:
-        Name → numbers, of the needed names.
+        Name → numbers, of the needed names and of those of the others that are there.
 
     Raises:
-        InputError: a name is missing, or has other numbers.
+        InputError: a needed name is missing, or a name has other numbers.
     """
     lines = dict(line.partition(":")[::2] for line in read_text(path, log).splitlines())
     found = {}
-    for name, count in needed.items():
-        if name not in lines:
+    for name, count in {**(optional or {}), **needed}.items():
+        if name in lines:
+            found[name] = parse_numbers(lines[name], count, name, path, log)
+        elif name in needed:
             raise InputError(f"the calibration lacks {name}", remedy=_COPY_REMEDY, file=path, log=log)
-        found[name] = parse_numbers(lines[name], count, name, path, log)
     return found
 
 

@@ -36,6 +36,7 @@ _POINT_BYTES = 16
 _PIXEL_CENTRE = 0.5
 # Ten times what its LiDAR measures in one turn.
 _MAX_POINTS = 2_000_000
+_MAX_SIDE_PX = 65_535
 _COPY_REMEDY = "Copy the drive again."
 
 
@@ -131,7 +132,10 @@ class KittiLog(RecordedLog):
         cameras, velodyne, inertial = (self._files.day / name for name in CALIBRATION_FILES)
         self._projections_file = cameras
         needed = {"R_rect_00": 9} | {f"P_rect_{name[-2:]}": 12 for name in self._files.cameras}
-        numbers = read_calibration(cameras, needed, self.uri)
+        # Sizes of the rectified images, which some calibrations of other tools leave out.
+        sizes = {f"S_rect_{name[-2:]}": 2 for name in self._files.cameras}
+        numbers = read_calibration(cameras, needed, self.uri, optional=sizes)
+        self._stated_sizes = {name: _read_size(numbers.get(f"S_rect_{name[-2:]}")) for name in self._files.cameras}
         self._projections = {name: numbers[f"P_rect_{name[-2:]}"].reshape(3, 4) for name in self._files.cameras}
         rigid = {"R": 9, "T": 3}
         camera_SE3_velodyne = _to_matrix(read_calibration(velodyne, rigid, self.uri))
@@ -151,7 +155,7 @@ class KittiLog(RecordedLog):
             if measured.majority is None:
                 self._report(describe_no_images(measured, name))
                 continue
-            width_px, height_px = measured.majority
+            width_px, height_px = self._stated_sizes[name] or measured.majority
             # Rectified images have neither distortion nor skew.
             matrix = self._projections[name]
             fx_px, fy_px = float(matrix[0, 0]), float(matrix[1, 1])
@@ -214,23 +218,20 @@ class KittiLog(RecordedLog):
         in_imu = rows[:, :3].astype(np.float64) @ self._imu_SE3_velodyne[:3, :3].T + self._imu_SE3_velodyne[:3, 3]
         return Sweep(
             points_world=rotations.apply(in_imu) + positions,
-            intensity=np.clip(rows[:, 3], 0.0, 1.0).astype(np.float32),
+            intensity=np.clip(self._fill_intensities(rows[:, 3], frame), 0.0, 1.0).astype(np.float32),
             timestamps_s=times,
         )
 
     def _read_points(self, path: Path, frame: int) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
-        """[N, 4] finite x, y, z and intensity in the axes of the LiDAR."""
+        """[N, 4] finite x, y, z in the axes of the LiDAR, and intensity as the file has it."""
         # Before it is read: the file may be anything. A link may lead nowhere, which reading says.
         size = path.stat().st_size if path.exists() else 0
         if size % _POINT_BYTES or size > _MAX_POINTS * _POINT_BYTES:
             problem = f"the sweep has {size} bytes, which are not up to {_MAX_POINTS} points of {_POINT_BYTES}"
             raise InputError(problem, remedy=_COPY_REMEDY, file=path, log=self.uri, frame=frame)
         rows = np.frombuffer(read_file(path, log=self.uri, frame=frame), dtype="<f4").reshape(-1, 4)
-        finite = np.isfinite(rows).all(axis=1)
-        if not finite.all():
-            self._report_invalid_points(int((~finite).sum()), frame)
-            rows = rows[finite]
-        return rows
+        placed = self._find_placed(rows[:, :3], frame)
+        return rows if placed.all() else rows[placed]
 
     @cached_property
     def _turns(self) -> tuple[Float64, Float64] | None:
@@ -302,3 +303,11 @@ def _to_matrix(numbers: dict[str, Float64]) -> Float64:
     matrix[:3, :3] = u @ v
     matrix[:3, 3] = numbers["T"]
     return matrix
+
+
+def _read_size(numbers: Float64 | None) -> tuple[int, int] | None:
+    """Width and height of a calibration; ``None`` where it states none, or numbers that are no size."""
+    if numbers is None or not ((numbers >= 1) & (numbers <= _MAX_SIDE_PX)).all():
+        return None
+    width_px, height_px = (round(float(number)) for number in numbers)
+    return width_px, height_px

@@ -202,10 +202,7 @@ class NuScenesLog(RecordedLog):
             problem = f"the sweep has {size} bytes, which are not up to {_MAX_POINTS} points of {_POINT_BYTES}"
             raise InputError(problem, remedy=_COPY_REMEDY, file=path, log=self.uri, frame=frame)
         rows = np.frombuffer(read_file(path, log=self.uri, frame=frame), dtype="<f4").reshape(-1, 5)[:, :4]
-        finite = np.isfinite(rows).all(axis=1)
-        if not finite.all():
-            self._report_invalid_points(int((~finite).sum()), frame)
-        rows = rows[finite]
+        rows = rows[self._find_placed(rows[:, :3], frame)]
         rows = rows[np.hypot(rows[:, 0], rows[:, 1]) >= _MIN_DISTANCE_M]
         mount = datum.vehicle_SE3_sensor
         place = rows[:, :3] @ mount[:2, :3].T + mount[:2, 3]
@@ -213,7 +210,7 @@ class NuScenesLog(RecordedLog):
         pose = datum.world_SE3_vehicle @ datum.vehicle_SE3_sensor
         return Sweep(
             points_world=rows[:, :3].astype(np.float64) @ pose[:3, :3].T + pose[:3, 3],
-            intensity=np.clip(rows[:, 3] / np.float32(_INTENSITY_SCALE), 0.0, 1.0),
+            intensity=np.clip(self._fill_intensities(rows[:, 3], frame) / np.float32(_INTENSITY_SCALE), 0.0, 1.0),
             timestamps_s=np.full(len(rows), datum.time_us * _US),
         )
 

@@ -7,6 +7,7 @@ so that tables that change get another index.
 from __future__ import annotations
 
 import hashlib
+import os
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -87,14 +88,39 @@ def open_scene_index(tables: Path, log: str, folder: Path | None = None) -> sqli
     path = (folder or find_cache_folder()) / "nuscenes" / f"{_digest_tables(tables, log)}.sqlite"
     try:
         if not path.is_file():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with atomic_path(path) as part:
-                _build_index(tables, part, log)
-        index = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
-    except (OSError, sqlite3.OperationalError) as error:
+            _write_index(tables, path, log)
+        try:
+            index = _connect(path)
+        except sqlite3.DatabaseError:
+            # A loss of power may leave half a file, which would be an error of every scene for good.
+            _write_index(tables, path, log)
+            index = _connect(path)
+    except (OSError, sqlite3.DatabaseError) as error:
         remedy = "Free space, or set GENRE_CACHE_DIR to a folder that can be written."
         raise ResourceError(f"the index cannot be written ({error})", remedy=remedy, file=path, log=log) from error
     index.row_factory = sqlite3.Row
+    return index
+
+
+def _write_index(tables: Path, path: Path, log: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as part:
+        _build_index(tables, part, log)
+        # SQLite writes without waiting for the disk: a rename could reach it before the rows do.
+        with part.open("rb") as file:
+            os.fsync(file.fileno())
+
+
+def _connect(path: Path) -> sqlite3.Connection:
+    """Opens an index to read it, and reads a row of every table: SQLite looks at a file only when it is asked."""
+    index = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
+    try:
+        for name in _TABLES:
+            # Names are those above, and no values of files.
+            index.execute(f"SELECT * FROM {name} LIMIT 1").fetchone()  # noqa: S608
+    except sqlite3.DatabaseError:
+        index.close()
+        raise
     return index
 
 

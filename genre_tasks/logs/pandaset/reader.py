@@ -225,7 +225,7 @@ class PandaSetLog(RecordedLog):
         return None if path is None else read_file(path, log=self.uri, camera=camera, frame=frame)
 
     def sweep(self, frame: int) -> Sweep | None:
-        """See ``DrivingLog``; points of the forward LiDAR, and points that are not finite, are left out.
+        """See ``DrivingLog``; points of the forward LiDAR, and points without a finite place, are left out.
 
         Raises:
             InputError: no such frame, or a sweep that cannot be read.
@@ -235,7 +235,8 @@ class PandaSetLog(RecordedLog):
         if path is None:
             return None
         table = read_table(path, log=self.uri, frame=frame)
-        sweep, findings = build_sweep(table, frame, file=path, log=self.uri)
+        frame_time_s = self.frame_timestamp_s(frame)
+        sweep, findings = build_sweep(table, frame, frame_time_s, file=path, log=self.uri)
         self._report(*findings)
         return sweep
 

@@ -14,6 +14,7 @@ from genre_tasks.logs.file_reading import convert_to_seconds
 from genre_tasks.logs.findings import Finding
 from genre_tasks.logs.pandaset.layout import INTENSITY_SCALE, SPINNING_SENSOR
 from genre_tasks.logs.pandaset.pickle_reader import Table
+from genre_tasks.logs.point_values import fill_intensities, fill_point_times, find_placed_points
 from genre_tasks.logs.types import Float64, Sweep
 
 _COLUMNS = ("x", "y", "z", "i", "t")
@@ -21,19 +22,21 @@ _WIDE_INTENSITY_SCALE = 65535.0
 _MAX_NAMES_LISTED = 12
 
 
-def build_sweep(table: Table, frame: int, **where: Any) -> tuple[Sweep, list[Finding]]:
+def build_sweep(table: Table, frame: int, frame_time_s: float = 0.0, **where: Any) -> tuple[Sweep, list[Finding]]:
     """Builds the sweep of a frame from its table.
 
-    Points of the forward LiDAR, and points that are not finite, are left out. Where all points are of other sensors
+    Points of the forward LiDAR, and points without a finite place, are left out. Where all points are of other sensors
     than the spinning one, they are used. Intensities may be 0 to 255 as in PandaSet, 0 to 1, or 0 to 65535.
 
     Args:
         table: columns x, y, z (metres, world), i (intensity), t (time) and, for the sensor, d.
         frame: log frame.
+        frame_time_s: seconds, of points without a time.
         where: ``log``, ``file``, … of the error, should there be one.
 
     Returns:
-        The sweep; and findings ``invalid_points``, ``other_lidar``, ``no_sensor_column``, ``intensity_scale``.
+        The sweep; and findings ``invalid_points``, ``missing_intensity``, ``missing_point_time``, ``other_lidar``,
+        ``no_sensor_column``, ``intensity_scale``.
 
     Raises:
         InputError: a column is missing, or is not numeric.
@@ -44,22 +47,22 @@ def build_sweep(table: Table, frame: int, **where: Any) -> tuple[Sweep, list[Fin
     rows = np.stack([read_numbers(table, name, **where) for name in _COLUMNS], axis=1)
     selected, findings = _select_sensor(table, frame, where)
     rows = rows[selected]
-    finite = np.isfinite(rows).all(axis=1)
-    if not finite.all():
-        count = int((~finite).sum())
-        message = f"{count} points of sweep {frame} are not finite and left out"
-        findings.append(Finding("invalid_points", "warning", message, numbers={"points": count}, frames=(frame,)))
-        rows = rows[finite]
-    scale = _find_intensity_scale(rows[:, 3])
+    placed, unplaced = find_placed_points(rows[:, :3], frame)
+    rows = rows[placed]
+    # Copies, or the few columns that are used would keep the rows of the file in memory.
+    points_world = np.ascontiguousarray(rows[:, :3])
+    intensities, without_intensity = fill_intensities(rows[:, 3].copy(), frame, "i")
+    times_s, without_time = fill_point_times(convert_to_seconds(rows[:, 4].copy()), frame_time_s, frame, "t")
+    findings += unplaced + without_intensity + without_time
+    scale = _find_intensity_scale(intensities)
     if scale != INTENSITY_SCALE:
         message = f"the intensities of sweep {frame} are 0 to {scale:g}, not 0 to {INTENSITY_SCALE:g}"
-        numbers = {"scale": scale, "largest": float(rows[:, 3].max())}
+        numbers = {"scale": scale, "largest": float(intensities.max())}
         findings.append(Finding("intensity_scale", "note", message, "They are scaled.", numbers, frames=(frame,)))
     sweep = Sweep(
-        # Copies, or the few columns that are used would keep the rows of the file in memory.
-        points_world=np.ascontiguousarray(rows[:, :3]),
-        intensity=np.clip(rows[:, 3] / scale, 0.0, 1.0).astype(np.float32),
-        timestamps_s=convert_to_seconds(rows[:, 4].copy()),
+        points_world=points_world,
+        intensity=np.clip(intensities / scale, 0.0, 1.0).astype(np.float32),
+        timestamps_s=times_s,
     )
     return sweep, findings
 

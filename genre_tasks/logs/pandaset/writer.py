@@ -38,8 +38,8 @@ def write_pandaset(log: DrivingLog, folder: Path, progress: Progress = silent) -
     """Writes a log as a PandaSet sequence folder, for tools that read that layout or to keep a synthetic log.
 
     Images keep their bytes (``.jpg``, ``.png``, ``.webp``, ``.tif`` or ``.bmp``); what is missing stays missing. The
-    folder appears complete or not at all. What PandaSet does not state (distortion, readout, a box's tilt) has fields
-    of its own. The same log gives the same bytes.
+    folder appears complete or not at all. What PandaSet does not state (size of the images, distortion, readout, a
+    box's tilt) has fields of its own. The same log gives the same bytes.
 
     Args:
         log: the log to write.
@@ -105,6 +105,9 @@ def _format_intrinsics(camera: Camera) -> dict[str, Any]:
         "fy": lens.fy_px,
         "cx": lens.cx_px - PIXEL_CENTRE,
         "cy": lens.cy_px - PIXEL_CENTRE,
+        # Which size the numbers above belong to: a reader would otherwise take that of most images.
+        "width": lens.width_px,
+        "height": lens.height_px,
         "readout_s": camera.readout_s,
         "exposure_s": camera.exposure_s,
     }

@@ -21,6 +21,7 @@ from genre_tasks.logs.posed_images.rig_poses import RigPoses, fill_rig_poses
 from genre_tasks.logs.posed_images.transforms_json import read_transforms
 from genre_tasks.logs.posed_images.world_axes import UpDirection, find_up, turn_up_to_z
 from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Sweep, Truth
+from genre_tasks.user_paths import expand_user_path
 
 _OPTIONS = ("images", "up", "scale")
 # What a file without times is taken for; frames must neither stand on one moment nor be minutes apart.
@@ -48,8 +49,8 @@ def open_posed_images(rest: str) -> PosedImagesLog:
     path, options = split_log_address(rest, _OPTIONS, "images with poses")
     return PosedImagesLog(
         uri=f"posed_images:{rest}",
-        poses=find_poses(Path(path).expanduser()),
-        images=Path(options["images"]).expanduser() if options.get("images") else None,
+        poses=find_poses(expand_user_path(path)),
+        images=expand_user_path(options["images"]) if options.get("images") else None,
         up=parse_direction(options["up"]) if options.get("up") else None,
         scale=parse_scale(options.get("scale", "1")),
     )

@@ -11,6 +11,7 @@ import numpy as np
 
 from genre_tasks.errors import InputError
 from genre_tasks.json_files import read_json_object
+from genre_tasks.logs.lens_validity import refuse_unread_distortion
 from genre_tasks.logs.posed_images.posed_image import MAX_IMAGES, PosedImage, make_lens, make_pose
 from genre_tasks.logs.types import Float64, Lens
 
@@ -18,6 +19,10 @@ _REMEDY = "Give a transforms.json of nerfstudio or instant-ngp, or a COLMAP mode
 _MAX_BYTES = 1 << 28
 # What each of them has of OPENCV's terms is written out in the file, so that one formula serves all.
 _CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
+# The order of its ``get_distortion_params``; its reader prefers the list to separate names.
+_NERFSTUDIO_LIST = "distortion_params"
+_NERFSTUDIO_ORDER = ("k1", "k2", "k3", "k4", "p1", "p2")
 # OpenGL looks along −z with y up; this project along z with y down.
 _OPENGL_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -90,11 +95,33 @@ def _read_lens(values: Mapping[str, Any], path: Path) -> Lens:
     values = {"fl_y": focal_x, "cx": width / 2, "cy": height / 2, **values}
     focal_px = (_read_number(values, "fl_x", path), _read_number(values, "fl_y", path))
     center_px = (_read_number(values, "cx", path), _read_number(values, "cy", path))
-    distortion = tuple(_read_number({key: 0.0, **values}, key, path) for key in ("k1", "k2", "p1", "p2", "k3"))
+    return make_lens(focal_px, center_px, (round(width), round(height)), _read_distortion(values, path), path)
+
+
+def _read_distortion(values: Mapping[str, Any], path: Path) -> tuple[float, ...]:
+    """k1, k2, p1, p2, k3."""
+    remedy = f"Write them as {', '.join(_COEFFICIENTS)}."
+    refuse_unread_distortion(values, (*_NERFSTUDIO_ORDER, _NERFSTUDIO_LIST), remedy, file=path)
+    # Of two statements, nerfstudio takes the list.
+    values = {**values, **_read_distortion_list(values, path)}
     # A fourth radial term has another meaning in every model, and leaving it out would bend the image.
     if values.get("k4"):
         raise InputError("a lens with k4 is not supported", remedy="Undistort the images first.", file=path)
-    return make_lens(focal_px, center_px, (round(width), round(height)), distortion, path)
+    return tuple(_read_number({key: 0.0, **values}, key, path) for key in _COEFFICIENTS)
+
+
+def _read_distortion_list(values: Mapping[str, Any], path: Path) -> dict[str, float]:
+    """The coefficients that nerfstudio's list states, by name; empty where there is none, or zeros alone."""
+    stated = values.get(_NERFSTUDIO_LIST)
+    if not stated or (isinstance(stated, list) and not any(stated)):
+        return {}
+    numbers = [_as_number(value) for value in stated] if isinstance(stated, list) else []
+    coefficients = [number for number in numbers if number is not None]
+    if len(numbers) != len(_NERFSTUDIO_ORDER) or len(coefficients) < len(numbers):
+        order = ", ".join(_NERFSTUDIO_ORDER)
+        problem = f"{_NERFSTUDIO_LIST} is no list of the six numbers {order}"
+        raise InputError(problem, remedy="Write all six, or undistort the images first.", file=path)
+    return dict(zip(_NERFSTUDIO_ORDER, coefficients, strict=True))
 
 
 def _read_number(values: Mapping[str, Any], key: str, path: Path) -> float:

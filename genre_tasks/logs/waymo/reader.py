@@ -141,14 +141,13 @@ class WaymoLog(RecordedLog):
         parts = [part for name, row in sorted(rows.items()) for part in self._read_lidar(name, row, frame)]
         points = np.concatenate([points for points, _ in parts] or [np.zeros((0, 3))])
         intensity = np.concatenate([values for _, values in parts] or [np.zeros(0, np.float32)])
-        finite = np.isfinite(points).all(axis=1) & np.isfinite(intensity)
-        if not finite.all():
-            self._report_invalid_points(int((~finite).sum()), frame)
+        placed = self._find_placed(points, frame)
+        intensity = self._fill_intensities(intensity[placed], frame)
         return Sweep(
-            points_world=points[finite],
+            points_world=points[placed],
             # A few surfaces return a thousand times more light than others.
-            intensity=np.tanh(np.maximum(intensity[finite], 0.0)).astype(np.float32),
-            timestamps_s=np.full(int(finite.sum()), self.frame_timestamp_s(frame)),
+            intensity=np.tanh(np.maximum(intensity, 0.0)).astype(np.float32),
+            timestamps_s=np.full(len(intensity), self.frame_timestamp_s(frame)),
             sensor_world=self._find_upper(frame) if _UPPER in rows else None,
         )
 

@@ -232,7 +232,8 @@ def start_cluster(keep_folder: bool = False) -> Iterator[Cluster]:
         server = PrefectServer(folder / "server", postgres.url)
         stack.enter_context(server)
         store = str(folder / "store")
-        deploy_flows(server.url, server.env()["PREFECT_API_AUTH_STRING"], POOL, store, folder / "training")
+        auth = server.env()["PREFECT_API_AUTH_STRING"]
+        deploy_flows(server.url, auth, POOL, store, training_folder=folder / "training")
         coordinator = make_coordinator(folder, server, {})
         workers = [make_worker(folder, server, faults, number, {}) for number in range(WORKERS)]
         cluster = Cluster(folder, postgres, server, faults, coordinator, workers)
