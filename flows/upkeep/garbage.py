@@ -9,9 +9,10 @@ from typing import Any
 
 from flows.exchange.imported_scenes import IMPORTED
 from flows.reconstruction.run_records import list_runs
+from flows.simulation.recorded_settings import read_recorded_edits
 from flows.upkeep.pins import Pin, list_pins, list_run_keys
 from genre_tasks.errors import InputError
-from genre_tasks.scene_edits.edits import EditList, Insert
+from genre_tasks.scene_edits.edits import Insert
 from storage.store import Artifact, Store
 
 MIN_AGE_S = 86_400.0
@@ -93,11 +94,14 @@ def list_sources(record: Mapping[str, Any]) -> list[str]:
 
     Returns:
         Names, or how they begin; none if the run is not edited.
+
+    Raises:
+        InputError: another version wrote the record, with edits that this one does not know.
     """
     edited = record.get("edited")
     if edited is None:
         return []
-    edits = EditList.model_validate(edited["edits"]).edits
+    edits = read_recorded_edits(record).edits
     givers = {edit.from_run for edit in edits if isinstance(edit, Insert) and edit.from_run is not None}
     return [str(edited["run"]), *sorted(givers)]
 
