@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import platform
 import re
 from typing import Any
@@ -104,10 +103,12 @@ def _weights() -> dict[str, str]:
 
 def _packages() -> dict[str, str]:
     """The version of each package, or what it would enable and how it is installed."""
+    from importlib.metadata import PackageNotFoundError
+
     packages = {}
     try:
         requirements = _read_requirements()
-    except importlib.metadata.PackageNotFoundError:
+    except PackageNotFoundError:
         return {"genre": "is not installed, so that nothing lists its packages: run `make setup`"}
     for name, extras in requirements.items():
         if None in extras:
@@ -124,17 +125,22 @@ def _packages() -> dict[str, str]:
 
 def _read_requirements() -> dict[str, list[str | None]]:
     """By package, the extras that need it; ``None`` stands for what every installation needs."""
+    # Here, as every command loads this module.
+    from importlib.metadata import requires
+
     requirements: dict[str, list[str | None]] = {}
     # As the package was installed: a list of our own would lack what is added later.
-    for line in importlib.metadata.requires("genre") or ():
+    for line in requires("genre") or ():
         if match := _REQUIREMENT.match(line):
             requirements.setdefault(match["package"], []).append(match["extra"])
     return requirements
 
 
 def _find_version(package: str) -> str | None:
+    from importlib.metadata import PackageNotFoundError, version
+
     # Its metadata are enough: importing transformers alone would take seconds.
     try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
+        return version(package)
+    except PackageNotFoundError:
         return None
