@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import statistics
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -40,7 +41,7 @@ CLAIM_WORDS = {
 def behaviours() -> str:
     """Every method along every behaviour: mean over logs, streets against the truth and the real log as a set.
 
-    The last rows count the rollouts that overlap a road user.
+    The last rows say how far beside the path rollouts start, and count those that overlap a road user.
     """
     rows = [row for row in result(NAME)["rows"] if row["cell"].startswith("behaviours") and "rollouts" in row]
     streets = [row for row in rows if "differences" not in row]
@@ -52,9 +53,22 @@ def behaviours() -> str:
             means = [_mean(logs, behaviour.replace("_", "-"), label, metric) for behaviour in BEHAVIOURS]
             lines.append([words, label, *means])
     for logs, words in ((streets, "streets"), (real, "the real log")):
+        lines.append([f"starts of rollouts on {words}", "all", *(_starts(logs, behaviour) for behaviour in BEHAVIOURS)])
         lines.append([f"rollouts on {words} that overlap a road user", "all", *_overlaps(logs)])
     head = ["metric", "method", *(behaviour.replace("_", " ") for behaviour in BEHAVIOURS)]
     return table(head, lines)
+
+
+def _starts(rows: Sequence[dict[str, Any]], behaviour: str) -> str:
+    """Counts the rollouts of a behaviour by how far beside the recorded path they start."""
+    starts = {
+        (row["log"], entry["start_offset_m"])
+        for row in rows
+        for entry in row["rollouts"]
+        if entry["behaviour"] == behaviour.replace("_", "-")
+    }
+    counts = Counter(abs(start_m) for _, start_m in starts)
+    return ", ".join(f"{counts[start_m]} at {start_m:g} m" for start_m in sorted(counts, reverse=True)) or "–"
 
 
 def _overlaps(rows: Sequence[dict[str, Any]]) -> list[str]:

@@ -67,7 +67,7 @@ def _describe(row: RolloutRow) -> dict[str, Any]:
     return {
         "method": row.method,
         "behaviour": row.rollout.behaviour,
-        "start_offset_m": row.rollout.start_offset_m,
+        "start_offset_m": row.start_offset_m,
         "strength": row.strength,
         "poses": row.poses,
         "collisions": list(row.collisions),
@@ -185,6 +185,7 @@ def _read_rollout(log: str, entry: Mapping[str, Any]) -> RolloutRow:
         log=log,
         chunks=(),
         rollout=TableRollout(entry["behaviour"], entry["start_offset_m"]),
+        start_offset_m=entry["start_offset_m"],
         strength=entry["strength"],
         poses=entry["poses"],
         metrics=entry["metrics"],

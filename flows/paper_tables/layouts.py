@@ -260,8 +260,8 @@ _RE_SIMULATION = Layout(
         "All chunks of a log make one recorded path. Each behaviour branches from it, 3 m to the left of its start "
         "and 3 m to the right; a number is the mean of both sides. A behaviour is as strong as a vehicle can drive it "
         "on this log without meeting a road user (1, 0.75, 0.5 or 0.25), in the place of the paper's vetting by hand. "
-        "Where every strength meets one, it is as strong as a vehicle can drive it, and the road users that it "
-        "overlaps are named below.",
+        "Where every strength meets one, it starts nearer to the recorded path, by half a metre at a time. Nearer "
+        "starts and road users that no start avoids are named below.",
         "All cameras are rendered with a global shutter, and their images are compared as a set with all real images "
         "of the log's chunks. Where a truth is known, 12 images of each rollout are compared with it, spread over "
         "poses and cameras.",

@@ -149,6 +149,7 @@ def average_by_behaviour(rows: Iterable[RolloutRow]) -> dict[str, float]:
     values: dict[str, float] = {}
     for row in rows:
         values |= {f"{row.rollout.name}/{name}": value for name, value in row.metrics.items()}
+        values[f"{row.rollout.name}/start_offset_m"] = row.start_offset_m
         values[f"{row.rollout.name}/strength"] = row.strength
     for behaviour in BEHAVIOUR_LABELS:
         metrics = [row.metrics for row in rows if row.rollout.behaviour == behaviour]

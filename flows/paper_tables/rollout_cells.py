@@ -65,7 +65,7 @@ def measure_rollout_cell(
 
 
 def describe_rollouts(rows: Iterable[RolloutRow]) -> tuple[str, ...]:
-    """Says which rollouts of a log are weaker than the paper's, and which run into an actor.
+    """Says which rollouts of a log are nearer or weaker than the paper's, and which run into an actor.
 
     Args:
         rows: of one log and method.
@@ -76,6 +76,8 @@ def describe_rollouts(rows: Iterable[RolloutRow]) -> tuple[str, ...]:
     remarks = []
     for row in rows:
         name = f"{row.rollout} on {row.log}"
+        if row.start_offset_m != row.rollout.start_offset_m:
+            remarks.append(f"{name} starts at {row.start_offset_m:+g} m, as road users are farther out")
         if row.strength < 1:
             remarks.append(f"{name} at strength {row.strength:g}, as there is no room for more")
         remarks += [f"{name}: {collision}" for collision in row.collisions]

@@ -55,7 +55,8 @@ class RolloutRow:
         method: label of the method.
         log: URI of the log.
         chunks: numbers of the chunks that were driven through.
-        rollout: behaviour and start.
+        rollout: behaviour and start that were asked for.
+        start_offset_m: where it starts, metres to the left of the recorded path.
         strength: of the behaviour, see :func:`flows.paper_tables.rollouts.plan_rollout`.
         poses: number of poses that were rendered.
         metrics: ``psnr``, ``ssim`` and ``perceptual`` over views with a truth, ``kernel``, ``frechet`` and ``fid`` of
@@ -68,6 +69,7 @@ class RolloutRow:
     log: str
     chunks: tuple[int, ...]
     rollout: TableRollout
+    start_offset_m: float
     strength: float
     poses: int
     metrics: Mapping[str, float]
@@ -160,6 +162,7 @@ class LogMeasurement:
             log=self._jobs[0].log,
             chunks=tuple(job.chunk for job in self._jobs),
             rollout=rollout,
+            start_offset_m=planned.start_offset_m,
             strength=planned.strength,
             poses=len(self._select_poses(planned)),
             metrics=_name_metrics(scores),
@@ -209,7 +212,7 @@ class LogMeasurement:
         if truth is None:
             return None
         path = self._select_poses(planned)
-        views = place_true_views(path, self.rig, count, planned.rollout.start_offset_m)
+        views = place_true_views(path, self.rig, count, planned.start_offset_m)
         images = [[v.camera, v.frame, v.lens.width_px, v.lens.height_px] for v in views]
         reader = code_digest(type(self._log).__module__)
         fields = {"log": self._log.digest(), "code": reader, "views": images, "path": _digest_path(path)}

@@ -17,7 +17,7 @@ from flows.paper_tables.layouts import LAYOUTS, PROTOCOL
 from flows.paper_tables.measure import Basis
 from flows.paper_tables.method_differences import average_by_behaviour, compare_methods
 from flows.paper_tables.request import TableRequest, find_unstored_methods, predict_table
-from flows.paper_tables.rollout_cells import measure_rollout_cell
+from flows.paper_tables.rollout_cells import describe_rollouts, measure_rollout_cell
 from flows.paper_tables.rollouts import TABLE_ROLLOUTS, TableRollout, plan_rollout, take_every
 from flows.paper_tables.simulation_scores import RolloutRow
 from flows.pipeline.stage_runner import run_stage
@@ -54,8 +54,7 @@ def test_a_behaviour_is_weaker_where_the_log_is_short_or_a_road_user_is_in_the_w
     behind = plan_rollout(TableRollout("accelerate", 3.0), long, config, [standing_car(reach_m, 3.0, 60)])
     assert behind.strength < 1 and behind.collisions == ()
     assert behind.path.world_SE3_ego[-1, 0, 3] < reach_m - 4
-    blocked = plan_rollout(TableRollout("accelerate", 3.0), long, config, [standing_car(20.0, 3.0, 60)])
-    assert blocked.strength == 1.0 and "Car parked at" in blocked.collisions[0]
+    assert (free.start_offset_m, behind.start_offset_m) == (3.0, 3.0)
     # Where poses are at the rear axle, the bonnet is nearer to who stands ahead.
     near = [standing_car(reach_m + 4.5, 3.0, 60)]
     assert plan_rollout(TableRollout("accelerate", 3.0), long, config, near).strength == 1.0
@@ -65,6 +64,20 @@ def test_a_behaviour_is_weaker_where_the_log_is_short_or_a_road_user_is_in_the_w
         plan_rollout(TableRollout("swerve", 3.0), straight_path(10.0, 8), config)
 
 
+def test_a_rollout_starts_nearer_to_the_recorded_path_where_road_users_are_in_the_way_of_every_strength() -> None:
+    config = SimulateConfig()
+    long = straight_path(10.0, 60)
+    parked = plan_rollout(TableRollout("accelerate", -3.0), long, config, [standing_car(20.0, -3.5, 60)])
+    assert parked.start_offset_m == -1.5 and parked.strength == 1.0 and parked.collisions == ()
+    assert parked.path.world_SE3_ego[0, 1, 3] == pytest.approx(-1.5, abs=1e-6)
+    # Half a metre farther out it would meet the car: nothing nearer was taken than what it takes.
+    row_of_cars = [standing_car(20.0, y, 60) for y in (3.5, 1.0)]
+    blocked = plan_rollout(TableRollout("accelerate", 3.0), long, config, row_of_cars)
+    assert blocked.start_offset_m == 3.0 and blocked.strength == 1.0 and "Car parked at" in blocked.collisions[0]
+    remarks = describe_rollouts([replace(row("A", "log", parked.rollout), start_offset_m=parked.start_offset_m)])
+    assert remarks == ("accelerate from -3 m on log starts at -1.5 m, as road users are farther out",)
+
+
 def test_every_second_pose_of_a_path() -> None:
     path = take_every(straight_path(10.0, 7), 2)
     assert path.frames.tolist() == [0, 2, 4, 6] and len(path) == 4
@@ -72,7 +85,7 @@ def test_every_second_pose_of_a_path() -> None:
 
 
 def row(method: str, log: str, rollout: TableRollout, **metrics: float) -> RolloutRow:
-    return RolloutRow(method, log, (0, 1), rollout, 1.0, 20, metrics)
+    return RolloutRow(method, log, (0, 1), rollout, rollout.start_offset_m, 1.0, 20, metrics)
 
 
 def test_differences_are_paired_by_log_and_their_interval_is_students() -> None:
