@@ -34,8 +34,9 @@ def render_labelled_images(
 ) -> Iterator[LabelledImage]:
     """Renders a scene at recorded poses moved to the side, labels the renders, and labels the recorded images too.
 
-    The scene's depth tells how much of each box nearer surfaces hide, in recorded images too. These keep the lens of
-    the log, renders have the lens that the scene was fitted with.
+    The scene's depth tells how much of each box nearer surfaces hide, in recorded images too. A pixel that the scene
+    covers by less than half hides nothing. Recorded images keep the lens of the log, renders have the lens that the
+    scene was fitted with.
 
     Args:
         log: with annotations; the chunk is of it.
@@ -116,6 +117,7 @@ def _label_renders(
 
     from genre_tasks.checks import check_finite
     from genre_tasks.render import RenderSettings, render_views
+    from genre_tasks.rollout.instance_masks import MIN_ALPHA
     from genre_tasks.scene.novel_views import NovelView
     from storage.codecs.png import to_pixels
 
@@ -124,7 +126,8 @@ def _label_renders(
         return
     with torch.no_grad():
         render = render_views(scene, views, settings or RenderSettings())
-    depths = render.expected_depth()
+    # A veil of faint splats would otherwise hide what shows through it.
+    depths = torch.where(render.alpha >= MIN_ALPHA, render.expected_depth(), 0.0)
     for name, values in (("color", render.color), ("depth", depths)):
         check_finite(values, name, "augment", log=chunk.log, chunk=chunk.index)
     for view, color, depth in zip(views, render.color, depths.cpu().numpy(), strict=True):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from typer.testing import CliRunner
 
 from flows.cli.main import app
@@ -162,6 +163,17 @@ def test_renders_have_no_box_of_what_their_chunk_left_out(finished: FinishedRun)
         images = list(render_labelled_images(log, chunk, part.scene, (0.0,), frames=chunk.frames[::4]))
         found.append([{box.track_id for i in images if i.rendered is r for box in i.boxes} for r in (True, False)])
     assert gone in found[0][0] and found[1] == [found[0][0] - {gone}, found[0][1]]
+
+
+def test_a_faint_scene_hides_nothing(finished: FinishedRun) -> None:
+    part, log = RunScenes(finished.store, finished.name).load(0), cached_log(LOG)
+    gaussians = part.scene.gaussians
+    thin = replace(gaussians, logit_opacities=torch.full_like(gaussians.logit_opacities, -4.0))
+    hidden = [
+        [box.occluded for i in render_labelled_images(log, part.chunk, scene, (2.0,), every=4) for box in i.boxes]
+        for scene in (part.scene, part.scene.with_gaussians(thin))
+    ]
+    assert max(hidden[0]) > 0.2 and set(hidden[1]) == {0.0}
 
 
 def test_another_log_in_the_place_of_the_runs_is_refused(
