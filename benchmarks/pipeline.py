@@ -6,11 +6,10 @@ genre bench pipeline --json docs/results/data/preset_choice.json --set seeds=900
 The second command measures validation logs, by which the default preset was chosen.
 
 Each log goes through the pipeline with the presets ``small`` and ``fine``, without Prefect, from and into a store, so
-that a run that was stopped goes on. Adam takes the place of GNet in ``small``: it has the same initial scene, renderer,
-loss, iterations and views an iteration, at the rates that were tuned for 24 iterations of 6 views. GNet renders every
-source view once more, to choose what it splits. Rates that were swept for 72 iterations of 3 views are a variant in
-``configs/baselines.yaml``, which ``genre bench optimiser`` and ``real_logs`` race. Per-scene 3DGS with actors in their
-boxes is the plain fit that the pictures show.
+that a run that was stopped goes on. Tuned Adam takes the place of GNet in ``small``: it has the same initial scene,
+renderer, loss, iterations and views an iteration, at rates that were swept for that length (``configs/baselines.yaml``),
+with and without a split of Gaussians. GNet renders every source view once more, to choose what it splits. Per-scene 3DGS
+with actors in their boxes is the plain fit that the pictures show.
 """
 
 from __future__ import annotations
@@ -36,12 +35,15 @@ from benchmarks.common.lazy_modules import STAGE_MODULES
 from benchmarks.common.run_stages import SETTINGS, read_metrics, reconstruct, warm_up
 from benchmarks.common.task import require_log_folder
 from flows.configuration import load_configuration
+from flows.paper_tables.baselines import load_baselines
 from flows.pipeline.definition import PIPELINE, digest_stage_weights
 from flows.pipeline.stage_runner import Job, open_artifact
 
 CELL_S = 480.0
 """Predicted for one chunk: both presets with evaluation, and the baselines."""
 PRESETS_MEASURED = ("small", "fine")
+ADAM_VARIANTS = {"tuned_adam": "72x3", "tuned_adam_split": "72x3+50%"}
+"""Baseline → its variant that has the iterations and views of GNet in ``small``."""
 GNET_STAGES = ("ingest", "effects", "initial", "gnet", "evaluate/gnet")
 EVALUATED = ("initial", "gnet", "fnet", "enet")
 TIMED = ("ingest", "effects", "initial", "gnet", "novel_views", "fnet", "enet")
@@ -55,15 +57,19 @@ def configurations(per_scene_iterations: str, settings: Sequence[str] = ()) -> d
         settings: ``section.key=value`` over all presets.
 
     Returns:
-        Run → the pipeline's configuration as plain values: ``small``, ``fine``, ``adam`` at the default rates, and
-        ``street_gs``.
+        Run → the pipeline's configuration as plain values: ``small``, ``fine``, ``tuned_adam``, ``tuned_adam_split``
+        and ``street_gs``.
     """
     presets = {name: load_configuration(name, settings=(*SETTINGS, *settings)) for name in PRESETS_MEASURED}
     values = {name: config.model_dump(mode="json") for name, config in presets.items()}
     small = values["small"]
     per_scene = small["gnet"]["per_scene"] | {"iterations": int(per_scene_iterations)}
+    baselines = load_baselines("small")
+    adams = {name: baselines[name].variant(length).model_dump(mode="json") for name, length in ADAM_VARIANTS.items()}
+    # The user's settings of iterations and views stay, so that Adam has as many as GNet in the smallest form too.
+    own = ("method", "adam", "split_fraction")
     return values | {
-        "adam": small | {"gnet": small["gnet"] | {"method": "adam"}},
+        **{name: small | {"gnet": small["gnet"] | {key: adam[key] for key in own}} for name, adam in adams.items()},
         "street_gs": small | {"gnet": small["gnet"] | {"method": "street_gs", "per_scene": per_scene}},
     }
 
@@ -162,7 +168,8 @@ def _minutes(row: Row) -> float:
 _PSNR = "interpolation/psnr"
 _EVERYWHERE = (
     Requirement("main.gnet_over_initial_db", _gain(_PSNR, "small_gnet", "initial"), ">=", 4.0, unit="dB"),
-    Requirement("main.gnet_vs_adam_db", _gain(_PSNR, "small_gnet", "adam"), ">=", 0.0, unit="dB"),
+    Requirement("main.gnet_vs_adam_db", _gain(_PSNR, "small_gnet", "tuned_adam"), ">=", 0.0, unit="dB"),
+    Requirement("main.gnet_vs_adam_split_db", _gain(_PSNR, "small_gnet", "tuned_adam_split"), ">=", 0.0, unit="dB"),
     Requirement("main.enet_interpolation_db", _gain(_PSNR, "small_enet", "small_gnet"), ">=", -0.5, unit="dB"),
     Requirement("main.minutes_per_chunk", _minutes, "<", 15.0, unit="min"),
     Requirement("main.fine_heldout_db", _gain(_PSNR, "fine_enet", "small_enet"), ">", 0.0, unit="dB"),

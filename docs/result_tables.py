@@ -123,7 +123,8 @@ def short_log(row: Mapping[str, Any]) -> str:
 METHODS = {
     "initial": "initial scene from LiDAR",
     "street_gs": "per-scene 3DGS, 1,000 iterations, actors in 3D boxes",
-    "adam": "Adam in GNet's place at its rates for 24 iterations, preset `small`",
+    "tuned_adam": "tuned Adam in GNet's place, preset `small`",
+    "tuned_adam_split": "tuned Adam on split Gaussians in GNet's place, preset `small`",
     "small_gnet": "GNet, preset `small`",
     "small_enet": "GenRe, preset `small`",
     "fine_gnet": "GNet, preset `fine`",
