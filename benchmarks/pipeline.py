@@ -6,10 +6,10 @@ genre bench pipeline --json docs/results/data/preset_choice.json --set seeds=900
 The second command measures validation logs, by which the default preset was chosen.
 
 Each log goes through the pipeline with the presets ``small`` and ``fine``, without Prefect, from and into a store, so
-that a run that was stopped goes on. Tuned Adam takes the place of GNet in ``small``: it has the same initial scene,
-renderer, loss, iterations and views an iteration, at rates that were swept for that length (``configs/baselines.yaml``),
-with and without a split of Gaussians. GNet renders every source view once more, to choose what it splits. Per-scene 3DGS
-with actors in their boxes is the plain fit that the pictures show.
+that a run that was stopped goes on. Tuned Adam takes the place of GNet in ``small``, with and without a split of
+Gaussians. It has the same initial scene, renderer, loss, iterations and views an iteration, at rates that were swept
+for that length (``configs/baselines.yaml``). GNet renders every source view once more, to choose what it splits.
+Per-scene 3DGS with actors in their boxes is the plain fit that the pictures show.
 """
 
 from __future__ import annotations
