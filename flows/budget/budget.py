@@ -24,6 +24,7 @@ _KEYS_OF_TIME = frozenset(
         "gnet.views_per_iteration",
         "enet.views_per_iteration",
         "enet.novel_views_per_iteration",
+        "novel_views.every",
         "novel_views.shifts_m",
         "fnet.model",
         "fnet.max_network_px",

@@ -142,7 +142,7 @@ def estimate_chunk_size(log: DrivingLog, cameras: Sequence[Camera], config: Pipe
     return ChunkSize(
         cameras=len(cameras),
         source_views=source_views,
-        novel_views=source_views * len(config.novel_views.shifts_m),
+        novel_views=_count_novel_views(source_views, len(cameras), config),
         width_px=width_px,
         height_px=height_px,
         native_px=max((camera.lens.width_px * camera.lens.height_px for camera in cameras), default=0),
@@ -181,9 +181,15 @@ def measure_chunk_size(chunk: Chunk, config: PipelineConfig, gaussians: int) -> 
         The sizes; recorded images play no part in stages after ``ingest``.
     """
     source_views = len(chunk.views_with_role("source"))
-    novel_views = source_views * len(config.novel_views.shifts_m)
     cameras = len(chunk.camera_names)
+    novel_views = _count_novel_views(source_views, cameras, config)
     return ChunkSize(cameras, source_views, novel_views, chunk.width_px, chunk.height_px, 0, gaussians)
+
+
+def _count_novel_views(source_views: int, cameras: int, config: PipelineConfig) -> int:
+    """Counts novel views, as if every source frame had an image of every camera."""
+    frames = -(-source_views // max(cameras, 1))
+    return -(-frames // config.novel_views.every) * cameras * len(config.novel_views.shifts_m)
 
 
 def predict_memory(stage: str, size: ChunkSize, config: PipelineConfig, threads: int) -> StageMemory:

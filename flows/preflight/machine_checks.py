@@ -48,15 +48,13 @@ def estimate_disk_mib(log: DrivingLog, cameras: Sequence[Camera], config: Pipeli
         MiB, as if nothing were in the store yet.
     """
     frames = min(config.ingest.chunk_frames, log.frame_count)
-    source_frames = -(-frames // config.ingest.source_every)
     recorded_px = sum(camera.lens.width_px * camera.lens.height_px for camera in cameras)
     images = frames * recorded_px * _RECORDED_BYTES_PER_PX
     points = frames * _POINTS_PER_SWEEP * _BYTES_PER_POINT
-    novel_views = source_frames * len(cameras) * len(config.novel_views.shifts_m)
-    rendered_px = novel_views * config.ingest.width_px * config.ingest.height_px
-    views = rendered_px * (_NOVEL_VIEW_BYTES_PER_PX + _FIXED_VIEW_BYTES_PER_PX)
-    # The most that there may be; LiDAR may give fewer.
+    # The most that there may be; LiDAR may give fewer Gaussians.
     size = estimate_chunk_size(log, cameras, config)
+    rendered_px = size.novel_views * config.ingest.width_px * config.ingest.height_px
+    views = rendered_px * (_NOVEL_VIEW_BYTES_PER_PX + _FIXED_VIEW_BYTES_PER_PX)
     gnet = grow_until("evaluate/gnet", size, config).gaussians
     enet = grow_until("evaluate/enet", size, config).gaussians
     gaussians = size.gaussians + gnet * (1 + config.gnet.snapshots) + enet * (1 + config.enet.snapshots)

@@ -108,6 +108,13 @@ class NovelViewsConfig(Section):
     shifts_m: Annotated[Shifts, Field(min_length=1)] = Field(
         (3.0, -3.0), description="Distances from the path in metres; positive is to the left."
     )
+    every: int = Field(
+        1,
+        ge=1,
+        le=1_000_000,
+        description="Each shift is used at every n-th source frame. Shifts take turns: with 2, one side at even and "
+        "the other at odd frames, so that half as many views are repaired.",
+    )
     lidar_max_points: int = Field(
         200_000, ge=100, le=100_000_000, description="Largest number of points drawn in the LiDAR map."
     )

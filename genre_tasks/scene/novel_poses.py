@@ -13,7 +13,7 @@ from genre_tasks.scene.transforms import shift_laterally
 
 
 def place_novel_views(
-    chunk: Chunk, shifts_m: Sequence[float], frames: Sequence[int] | None = None
+    chunk: Chunk, shifts_m: Sequence[float], frames: Sequence[int] | None = None, every: int = 1
 ) -> tuple[NovelView, ...]:
     """Moves the chunk's cameras sideways with the whole rig.
 
@@ -21,6 +21,7 @@ def place_novel_views(
         chunk: whose cameras; one without an image at a frame has no novel view there.
         shifts_m: metres to the left.
         frames: log frames; by default those of source views.
+        every: n from 1: each shift is used at every n-th of the frames, and each starts one frame after the one before.
 
     Returns:
         Novel views ordered by (shift, frame, camera), with the lenses of the rig and a global shutter.
@@ -36,10 +37,12 @@ def place_novel_views(
             f"expected frames of chunk {chunk.index}, {chunk.frames[0]} to {chunk.frames[-1]}, got {unknown}"
         )
     out = []
-    for shift_m in shifts_m:
+    for turn, shift_m in enumerate(shifts_m):
+        # Shifts take turns: what one side does not see at a frame, it sees at the next one, a metre or two farther on.
+        taken = {frame for k, frame in enumerate(sorted(chosen)) if (k - turn) % every == 0}
         for view in chunk.views:
             # Every camera's recorded pose is moved by itself, because cameras of a rig do not fire at one moment.
-            if view.frame in chosen:
+            if view.frame in taken:
                 ego = chunk.chunk_SE3_ego[chunk.frames.index(view.frame)]
                 pose = shift_laterally(view.chunk_SE3_camera, ego, shift_m)
                 nearest = find_nearest_reference(view.camera, pose, sources)

@@ -38,7 +38,7 @@ def novel_views(
     """Renders the scene and the coloured LiDAR points at the source frames' poses, moved by each shift.
 
     Args:
-        config: the shifts, and how many LiDAR points are drawn.
+        config: the shifts, at which source frames they are used, and how many LiDAR points are drawn.
         chunk: as ``ingest`` made it.
         reconstruction: whose scene is rendered.
         plan: of the chunk's effects.
@@ -53,7 +53,7 @@ def novel_views(
     """
     # The plan gives the lenses that novel views are rendered with.
     chunk = apply_plan(chunk, plan)
-    views = place_novel_views(chunk, config.shifts_m)
+    views = place_novel_views(chunk, config.shifts_m, every=config.every)
     return render_novel(chunk, reconstruction.scene, views, config.lidar_max_points, progress, settings)
 
 

@@ -140,6 +140,8 @@ def test_a_short_enet_has_low_learning_rates_and_splits_nothing() -> None:
     ratios = [a / b for a, b in zip(config.enet.learning_rates.as_tuple(), base.learning_rates.as_tuple(), strict=True)]
     assert ratios == pytest.approx([knobs.LOW_RATE_FACTOR] * 5, rel=1e-3)
     assert (config.enet.split_fraction, config.enet.iterations) == (0, 16)
+    turns = by_value["160000, GNet 144, ENet 16 at low rates, sides in turns"].configuration("small", (), 0)
+    assert turns == config.model_copy(update={"novel_views": config.novel_views.model_copy(update={"every": 2})})
     trained = list_settings("small", ["enet.learning_rates=null"], ["more_gaussians"])
     assert all("learning_rates" not in change for s in trained for change in s.changes)
 

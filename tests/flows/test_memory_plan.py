@@ -43,6 +43,18 @@ def test_small_images_are_predicted_at_their_size() -> None:
     assert (size.width_px, size.height_px) == (128, 72)
 
 
+def test_novel_views_that_take_turns_are_half_as_many() -> None:
+    log = FakeLog()
+    sizes = [
+        estimate_chunk_size(log, log.cameras, load_configuration("small", settings=[f"novel_views.every={n}"]))
+        for n in (1, 2)
+    ]
+    # One frame more where the number of source frames is odd.
+    frames = sizes[0].source_views // len(log.cameras)
+    assert [size.novel_views for size in sizes] == [2 * len(log.cameras) * n for n in (frames, (frames + 1) // 2)]
+    assert sizes[0].source_views == sizes[1].source_views
+
+
 def limited(memory_gib: float | None, preset: str = "hd") -> PipelineConfig:
     return load_configuration(preset, settings=[f"limits.memory_gib={json.dumps(memory_gib)}"])
 

@@ -159,6 +159,18 @@ def test_novel_poses_and_references(chunk: Chunk) -> None:
         place_novel_views(chunk, (1.0,), [99])
 
 
+def test_shifts_take_turns(chunk: Chunk) -> None:
+    both = place_novel_views(chunk, (3.0, -3.0))
+    half = place_novel_views(chunk, (3.0, -3.0), every=2)
+    # Source frames are 0, 4, 8, 12 and 16: the left side has the first, the right side the second.
+    assert {(v.shift_m, v.frame) for v in half} == {(3.0, 0), (3.0, 8), (3.0, 16), (-3.0, 4), (-3.0, 12)}
+    assert [v.frame for v in half if v.camera == "front"] == [0, 8, 16, 4, 12]
+    poses = {(v.camera, v.frame, v.shift_m): v.chunk_SE3_camera for v in both}
+    assert all(np.array_equal(v.chunk_SE3_camera, poses[v.camera, v.frame, v.shift_m]) for v in half)
+    # However rare a shift is, the first one has the first frame.
+    assert {(v.shift_m, v.frame) for v in place_novel_views(chunk, (3.0, -3.0), every=99)} == {(3.0, 0), (-3.0, 4)}
+
+
 def test_reference_of_a_camera_without_images_is_the_nearest_other(chunk: Chunk) -> None:
     fronts = [v for v in chunk.views_with_role("source") if v.camera == "front"]
     left = next(v for v in chunk.views if v.camera == "left" and v.frame == 9)
