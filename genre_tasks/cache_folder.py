@@ -8,6 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from genre_tasks.errors import ConfigError
+from genre_tasks.user_paths import expand_user_path
 
 FOLDER_VARIABLE = "GENRE_CACHE_DIR"
 """The environment variable for the folder."""
@@ -22,10 +23,11 @@ def find_cache_folder() -> Path:
 
     Raises:
         ConfigError: the folder among the temporary files belongs to another user.
+        InputError: ``$GENRE_CACHE_DIR`` begins with a ``~`` that stands for no home folder.
     """
     stated = os.environ.get(FOLDER_VARIABLE)
     if stated:
-        return Path(stated).expanduser().absolute()
+        return expand_user_path(stated).absolute()
     base = os.environ.get("XDG_CACHE_HOME", "")
     with suppress(RuntimeError):
         folder = (Path(base) if os.path.isabs(base) else Path.home() / ".cache") / "genre"  # noqa: PTH117

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 from flows.observability.counter_files import CounterFolder, Sample
 from flows.observability.metric_definitions import METRICS, MetricDefinition
 from flows.observability.process_counters import METRICS_FOLDER
-from genre_tasks.errors import ConfigError
+from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.user_paths import expand_user_path
 
 if TYPE_CHECKING:
     from prometheus_client import CollectorRegistry
@@ -98,6 +99,7 @@ def serve_metrics_if_asked(environment: Mapping[str, str] = os.environ) -> Itera
 
     Raises:
         ConfigError: as :func:`serve_metrics`, or only one of the variables is set, or the port is no number.
+        InputError: as :func:`read_metrics_address`.
 
     >>> with serve_metrics_if_asked({}) as port:
     ...     print(port)
@@ -122,6 +124,7 @@ def read_metrics_address(environment: Mapping[str, str]) -> tuple[Path, int]:
 
     Raises:
         ConfigError: a variable is missing, or the port is no number.
+        InputError: the folder begins with a ``~`` that stands for no home folder.
 
     >>> read_metrics_address({"GENRE_METRICS_DIR": "/tmp/counts", "GENRE_METRICS_PORT": "9464"})
     (PosixPath('/tmp/counts'), 9464)
@@ -132,7 +135,7 @@ def read_metrics_address(environment: Mapping[str, str]) -> tuple[Path, int]:
         raise ConfigError(f"{METRICS_FOLDER} is not set", remedy="Set it to the folder that workers count in.")
     if not port.isdecimal() or int(port) > 65535:
         raise ConfigError(f"{METRICS_PORT}={port} is no port", remedy="Set it to a number from 0 to 65535.")
-    return Path(folder).expanduser(), int(port)
+    return expand_user_path(folder), int(port)
 
 
 def make_registry(folder: Path) -> CollectorRegistry:
@@ -171,7 +174,7 @@ def main() -> None:
             sys.stderr.flush()
             while True:
                 time.sleep(_IDLE_S)
-    except ConfigError as error:
+    except (ConfigError, InputError) as error:
         sys.exit(str(error))
     except KeyboardInterrupt:
         # How a terminal stops it; there is nothing to save.

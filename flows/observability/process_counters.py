@@ -6,10 +6,10 @@ import logging
 import os
 import threading
 from bisect import bisect_left
-from pathlib import Path
 
 from flows.observability.counter_files import CounterFolder, Counts, Sample, add_counts
 from flows.observability.metric_definitions import MetricDefinition
+from genre_tasks.user_paths import expand_user_path
 
 METRICS_FOLDER = "GENRE_METRICS_DIR"
 """The variable of the environment that names the folder. The workers of one exporter share it."""
@@ -119,10 +119,13 @@ def get_counters() -> ProcessCounters | None:
 
     Returns:
         The counts, or ``None`` where :data:`METRICS_FOLDER` is not set.
+
+    Raises:
+        InputError: the folder begins with a ``~`` that stands for no home folder.
     """
     folder = os.environ.get(METRICS_FOLDER)
     if not folder:
         return None
     if folder not in _counters:
-        _counters[folder] = ProcessCounters(CounterFolder(Path(folder).expanduser()))
+        _counters[folder] = ProcessCounters(CounterFolder(expand_user_path(folder)))
     return _counters[folder]

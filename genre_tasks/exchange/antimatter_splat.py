@@ -81,7 +81,8 @@ class AntimatterSplatFormat:
         rows["rgba"][:, :3] = np.round(np.clip(sh_dc_to_colors(cloud.sh_dc), 0, 1) * 255)
         rows["rgba"][:, 3] = np.round(logits_to_opacities(cloud.logit_opacities) * 255)
         rows["quats"] = _pack_quats(cloud.quats)
-        rows.tofile(path)
+        # Not by `tofile`, whose errors do not say that the disk is full.
+        path.write_bytes(rows.data)
 
     def describe_losses(self, scene: ExchangeScene) -> tuple[str, ...]:
         """Lists what of a scene the format cannot carry: harmonics, anti-aliasing, fine steps, parts and motion.

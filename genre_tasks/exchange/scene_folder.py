@@ -242,28 +242,35 @@ def _read_chunk_file(folder: Path, _format: str, entry: ChunkEntry) -> ExchangeS
 
 def _read_nodes(folder: Path, format_name: str, entry: ChunkEntry) -> ExchangeScene:
     read = load_format(format_name).read
+    found = [_read_node(folder, read, node) for node in entry.nodes]
+    # Several nodes may lose the same: an editor leaves its marks in all files.
+    losses = dict.fromkeys((*entry.losses, *(loss for _, lost in found for loss in lost)))
     return ExchangeScene(
-        nodes=tuple(_read_node(folder, read, node) for node in entry.nodes),
+        nodes=tuple(node for node, _ in found),
         times_s=np.array(entry.times_s, np.float64),
         frames=entry.frames,
         world_SE3_scene=np.array(entry.world_SE3_scene, np.float64),
-        losses=entry.losses,
+        losses=tuple(losses),
     )
 
 
-def _read_node(folder: Path, read: Callable[[Path], ExchangeScene], node: NodeEntry) -> ExchangeNode:
+def _read_node(
+    folder: Path, read: Callable[[Path], ExchangeScene], node: NodeEntry
+) -> tuple[ExchangeNode, tuple[str, ...]]:
+    """The node, and what of its file is not in it."""
     path = _inside(folder, node.file or "")
-    nodes = read(path).nodes
-    if len(nodes) != 1 or nodes[0].motion is not None:
+    scene = read(path)
+    if len(scene.nodes) != 1 or scene.nodes[0].motion is not None:
         raise InputError("expected one part that rests", remedy=_REMEDY, file=path)
-    return ExchangeNode(
+    found = ExchangeNode(
         name=node.name,
-        cloud=nodes[0].cloud,
+        cloud=scene.nodes[0].cloud,
         motion=None if node.motion is None else _read_motion(node.motion),
         label=node.label,
         track_id=node.track_id,
         size_m=node.size_m,
     )
+    return found, scene.losses
 
 
 def _read_motion(entry: MotionEntry) -> NodeMotion:
@@ -312,7 +319,9 @@ def _inside(folder: Path, name: str) -> Path:
     """A file of the folder; a document from somebody else must not lead out of it."""
     parts = PurePosixPath(name).parts
     path = folder / name
-    if not parts or name.startswith("/") or ".." in parts or not path.is_file() or path.is_symlink():
+    leads_out = name.startswith("/") or ".." in parts
+    # A folder on the way may be a link, too.
+    if not parts or leads_out or not path.is_file() or path.resolve() != folder.resolve() / name:
         raise InputError(f"the folder has no file '{name}'", remedy=_REMEDY, file=folder)
     return path
 

@@ -80,7 +80,7 @@ def read_json(path: Path, log: str) -> Any:
     """
     data = read_file(path, log=log)
     try:
-        return json.loads(data, object_pairs_hook=_build_object)
+        return json.loads(data, object_pairs_hook=build_object)
     # Brackets within brackets may overflow the interpreter's stack.
     except (ValueError, RecursionError) as error:
         kind = describe_non_json(data)
@@ -89,8 +89,18 @@ def read_json(path: Path, log: str) -> Any:
         raise InputError(problem, remedy=remedy, file=path, log=log) from error
 
 
-def _build_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of JSON; of a key that stands twice, nobody knows which value is meant."""
+def build_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Makes an object of JSON: of a key that stands twice, nobody knows which value is meant.
+
+    Args:
+        pairs: keys and values.
+
+    Raises:
+        ValueError: a key stands twice.
+
+    >>> build_object([("a", 1), ("b", 2)])
+    {'a': 1, 'b': 2}
+    """
     value = dict(pairs)
     if len(value) < len(pairs):
         keys = [key for key, _ in pairs]

@@ -202,6 +202,18 @@ def test_losses_of_before_come_back(tmp_path: Path) -> None:
         assert GLB.read(tmp_path / "changed.glb").losses == expected
 
 
+def test_long_labels_and_track_ids_are_cut_and_stated(tmp_path: Path) -> None:
+    scene = make_driving_scene()
+    assert not GLB.describe_losses(scene)
+    for name in ("label", "track_id"):
+        long = replace(scene.nodes[2], **{name: 500 * "ab" + "c"})  # type: ignore[arg-type]
+        changed = replace(scene, nodes=(*scene.nodes[:2], long, scene.nodes[3]))
+        assert GLB.describe_losses(changed) == ("Labels and track ids of actors are cut to 1000 characters.",)
+        write(tmp_path, changed)
+        found = GLB.read(tmp_path / "scene.glb").nodes[2]
+        assert (found.label, found.track_id) == (long.label[:1000], long.track_id[:1000])
+
+
 def test_a_file_of_four_gibibytes_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("genre_tasks.exchange.gltf.binary_container._MOST_BYTES", 1000)
     with pytest.raises(InputError, match="less than 4 GiB"):

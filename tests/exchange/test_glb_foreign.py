@@ -217,6 +217,13 @@ def test_names_become_distinct(tmp_path: Path) -> None:
     assert [node.name for node in read_foreign(tmp_path, document, binary).nodes] == ["car", "car-1", "node-2"]
 
 
+def test_names_keep_letters_of_any_language(tmp_path: Path) -> None:
+    document, binary = foreign_file(float_attributes())
+    document["nodes"] = [{"mesh": 0, "name": "汽车 3"}, {"mesh": 0, "name": "Größe_2"}]
+    document["scenes"] = [{"nodes": [0, 1]}]
+    assert [node.name for node in read_foreign(tmp_path, document, binary).nodes] == ["汽车-3", "Größe_2"]
+
+
 def test_the_tests_player_knows_the_turn_of_a_quaternion() -> None:
     quat = Rotation.from_euler("xyz", [0.3, -0.7, 1.1]).as_quat()
     document, binary = foreign_file(float_attributes())

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import resource
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,17 +13,19 @@ import pytest
 
 from flows.exchange.export_request import ExportRequest
 from flows.exchange.export_scenes import export_scenes
+from flows.exchange.exporters import list_export_formats
 from flows.exchange.import_scene import import_scene
 from flows.simulation import edited_runs
 from flows.simulation.edited_runs import open_edited_scenes, open_shown_scenes, write_edited_run
 from flows.simulation.run_scenes import RunScenes
 from genre_tasks.config.simulation_sections import SimulateConfig
-from genre_tasks.errors import InputError
+from genre_tasks.errors import DiskFullError, GenreError, InputError
 from genre_tasks.exchange.registry import load_format
 from genre_tasks.exchange.scene_folder import read_document
 from genre_tasks.scene_edits.actor_names import name_actors
 from genre_tasks.scene_edits.edits import EditList, Insert, Move
 from genre_tasks.scene_edits.run_survey import survey_run
+from genre_tasks.temporary_names import describe_owner
 from tests.exchange.splat_clouds import change_one, make_driving_scene
 from tests.flows.small_simulation import make_run
 
@@ -118,6 +124,42 @@ def test_an_error_names_the_file_the_chunk_and_the_node(tmp_path: Path, posed: b
     assert (error.frame is not None) == posed
     assert error.problem.startswith("distant: ") != posed and "spz" in error.file
     assert not list(out.parent.iterdir())
+
+
+@contextmanager
+def limit_file_size(most_bytes: int) -> Iterator[None]:
+    """No file of this process may become longer meanwhile, as on a disk that is full."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("name", list_export_formats())
+def test_an_error_of_the_disk_names_the_folder_that_was_asked_for(
+    run: ExportRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    # Half of a module's byte code would stay in its place.
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    out = tmp_path / "out"
+    with limit_file_size(1024), pytest.raises(GenreError) as caught:
+        export_scenes(replace(run, format=name, out=out))
+    # OpenUSD does not say which error it was.
+    assert isinstance(caught.value, InputError if name == "usdz" else DiskFullError)
+    assert caught.value.file == str(out) and "--out" in caught.value.remedy
+    assert describe_owner() not in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_in_which_nobody_may_write_is_named(run: ExportRequest, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    # Whatever its permissions say, nobody can make files in the first one.
+    for out, named in ((Path("/proc/out"), Path("/proc/out")), (tmp_path / "file" / "out", tmp_path / "file")):
+        with pytest.raises(InputError, match="name another --out") as caught:
+            export_scenes(replace(run, out=out))
+        assert caught.value.file == str(named)
 
 
 # --- names of actors

@@ -16,12 +16,15 @@ import pytest
 
 from genre_tasks.errors import ConfigError, InputError, ResourceError
 from genre_tasks.logs.nuscenes.json_rows import stream_rows
+from genre_tasks.logs.nuscenes.scene_address import list_scenes
 from genre_tasks.logs.registry import open_log
 from tests.fakes import FakeLog
 from tests.logs.nuscenes_folder import VERSION, change_table, write_nuscenes
 
 FAKE = FakeLog(frame_count=3, camera_names=("front",), lidar_azimuths=24, lidar_rings=4, width_px=16, height_px=12)
 TABLES = ("scene", "sample", "sensor", "calibrated_sensor", "sample_data", "ego_pose", "category", "instance")
+# What SQLite reads and writes at once.
+_PAGE_BYTES = 4096
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +56,25 @@ def _cut(root: Path) -> None:
 
 def _repeat(root: Path) -> None:
     change_table(root, "ego_pose", lambda rows: rows.append(rows[0]))
+
+
+def _damage_middle(table: str, old: str, new: str) -> Callable[[Path], None]:
+    """Replaces the text that stands between two rows, near the middle of a table."""
+
+    def change(root: Path) -> None:
+        path = root / VERSION / f"{table}.json"
+        text = path.read_text()
+        at = text.index(old, len(text) // 2)
+        path.write_text(text[:at] + new + text[at + len(old) :])
+
+    return change
+
+
+def _spoil(root: Path) -> None:
+    path = root / VERSION / "ego_pose.json"
+    data = path.read_bytes()
+    half = len(data) // 2
+    path.write_bytes(data[:half] + b"\xff" * 64 + data[half + 64 :])
 
 
 BROKEN: dict[str, tuple[Callable[[Path], None], str, str]] = {
@@ -90,6 +112,22 @@ BROKEN: dict[str, tuple[Callable[[Path], None], str, str]] = {
     ),
     "a token twice": (_repeat, "two rows have the same token", "ego_pose"),
     "cut off": (_cut, "no list of JSON objects", "ego_pose"),
+    "a list that ends before its rows do": (
+        _damage_middle("sample_annotation", "},\n{", "}]\n{"),
+        r"after \d+ rows: '{' stands behind the end of the list",
+        "sample_annotation",
+    ),
+    "two rows in one": (
+        _damage_middle("sample_annotation", "},\n{", ",\n"),
+        r"after \d+ rows: the key token stands twice",
+        "sample_annotation",
+    ),
+    "zeros in a row": (
+        _damage_middle("sample_annotation", '"rotation"', "\0" * 10),
+        r"after \d+ rows: Expecting property name",
+        "sample_annotation",
+    ),
+    "no text": (_spoil, "after 0 rows: bytes are no UTF-8", "ego_pose"),
     "an object for a list": (_write("sample", "{}"), r"'\['", "sample"),
     "a list of numbers": (_write("sample", "[1, 2]"), "an object was expected", "sample"),
     "nested without end": (_write("sample", '[{"a":' + "[" * 200_000), "no list of JSON objects", "sample"),
@@ -176,6 +214,69 @@ def test_a_damaged_index_is_made_again(
         path.write_bytes(damaged[damage])
     assert open_log(f"nuscenes:{root}/scene-0061").digest() == expected
     assert _list_indexes(tmp_path / "cache") == [path] and path.read_bytes() == data
+
+
+def _clear(page: bytes) -> bytes:
+    return bytes(len(page))
+
+
+def _invert(page: bytes) -> bytes:
+    return bytes(255 - byte for byte in page)
+
+
+def _change_bit(page: bytes) -> bytes:
+    # Rows fill a page from its end.
+    return page[:-1] + bytes([page[-1] ^ 1])
+
+
+@pytest.mark.parametrize("damage", [_clear, _invert, _change_bit])
+def test_no_damaged_page_of_the_index_changes_a_scene(
+    root: Path, damage: Callable[[bytes], bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GENRE_CACHE_DIR", str(tmp_path / "cache"))
+    expected = open_log(f"nuscenes:{root}/scene-0061").digest()
+    (path,) = _list_indexes(tmp_path / "cache")
+    data = path.read_bytes()
+    made_again = 0
+    for start in range(0, len(data), _PAGE_BYTES):
+        page = data[start : start + _PAGE_BYTES]
+        damaged = data[:start] + damage(page) + data[start + _PAGE_BYTES :]
+        path.write_bytes(damaged)
+        assert open_log(f"nuscenes:{root}/scene-0061").digest() == expected
+        # No scene needs the tokens of boxes, for example: such a page may stay as it is.
+        assert path.read_bytes() in (data, damaged)
+        made_again += path.read_bytes() == data
+    assert made_again > len(data) // _PAGE_BYTES // 2
+
+
+def test_a_damaged_name_in_the_index_hides_no_scene(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GENRE_CACHE_DIR", str(tmp_path / "cache"))
+    pattern = f"{root}/scene-*"
+    expected = list_scenes(pattern)
+    (path,) = _list_indexes(tmp_path / "cache")
+    data = path.read_bytes()
+    for read in (lambda: list_scenes(pattern), lambda: [open_log(f"nuscenes:{root}/scene-0061").uri[9:]]):
+        path.write_bytes(data.replace(b"scene-0061", b"scene-0062"))
+        assert read() == expected
+
+
+def test_a_disk_that_damages_every_index_is_an_error(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GENRE_CACHE_DIR", str(tmp_path / "cache"))
+    fsync = os.fsync
+
+    def spoil(handle: int) -> None:
+        fsync(handle)
+        for path in _list_indexes(tmp_path / "cache"):
+            path.write_bytes(path.read_bytes().replace(b"scene-0061", b"scene-0062"))
+
+    monkeypatch.setattr(os, "fsync", spoil)
+    with pytest.raises(ResourceError, match="rows of the table scene are not those") as caught:
+        open_log(f"nuscenes:{root}/scene-0061")
+    assert "GENRE_CACHE_DIR" in caught.value.remedy
 
 
 def test_an_index_reaches_the_disk_before_its_name_does(

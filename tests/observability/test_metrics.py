@@ -20,6 +20,7 @@ from flows.observability import metric_definitions as metrics
 from flows.observability.counter_files import MAX_FILES, TOTALS, CounterFolder, Counts
 from flows.observability.exporter import (
     METRICS_PORT,
+    main,
     make_registry,
     read_metrics_address,
     serve_metrics,
@@ -294,6 +295,15 @@ def test_the_environment_decides_whether_there_is_an_exporter(folder: Path) -> N
         assert port
     with pytest.raises(ConfigError, match="GENRE_METRICS_DIR is not set"):
         read_metrics_address({METRICS_PORT: "9464"})
+
+
+def test_a_folder_of_counts_below_no_home_folder_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(METRICS_FOLDER, "~nobody-of-this-name/metrics")
+    monkeypatch.setenv(METRICS_PORT, "0")
+    with pytest.raises(InputError, match=r"no home folder of this user .*nobody-of-this-name"):
+        get_counters()
+    with pytest.raises(SystemExit, match=r"no home folder of this user .*nobody-of-this-name"):
+        main()
 
 
 def test_totals_name_what_they_hold(folder: Path) -> None:

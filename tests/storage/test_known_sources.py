@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from genre_tasks.cache_folder import FOLDER_VARIABLE
+from genre_tasks.errors import InputError
 from genre_tasks.source_code import KNOWN_SOURCES, read_source
 from storage import known_sources
 from storage.code_digest import _digest_closure, code_digest
@@ -83,3 +84,9 @@ def test_another_parser_is_not_believed(cache):
 def test_a_folder_that_cannot_be_written(cache):
     cache.parent.write_text("a file", encoding="utf-8")
     assert code_digest(MODULE)
+
+
+def test_a_cache_below_no_home_folder_is_refused(cache, monkeypatch):
+    monkeypatch.setenv(FOLDER_VARIABLE, "~nobody-of-this-name/cache")
+    with pytest.raises(InputError, match=r"no home folder of this user .*nobody-of-this-name"):
+        code_digest(MODULE)

@@ -13,8 +13,10 @@ from genre_tasks.exchange.gltf.document import EXTRAS_KEY, Matrix4, Number, Vect
 from genre_tasks.exchange.moments import Frame
 from genre_tasks.exchange.types import ExchangeNode, ExchangeScene
 
-_LONGEST_WORD = 1000
-_Word = Annotated[str, Field(max_length=_LONGEST_WORD)]
+LONGEST_WORD = 1000
+"""Longer text is cut when it is written, and refused when it is read."""
+
+_Word = Annotated[str, Field(max_length=LONGEST_WORD)]
 
 
 class _Extras(BaseModel):
@@ -69,7 +71,7 @@ def describe_scene(scene: ExchangeScene) -> dict[str, Any]:
         times_s=scene.times_s.tolist(),
         world_SE3_scene=scene.world_SE3_scene.ravel().tolist(),
         # Sentences name parts of files, whose names may be of any length.
-        losses=[loss[:_LONGEST_WORD] for loss in scene.losses],
+        losses=[loss[:LONGEST_WORD] for loss in scene.losses],
     )
     return {EXTRAS_KEY: extras.model_dump()}
 
@@ -82,8 +84,8 @@ def describe_node(node: ExchangeNode, sh_degree: int) -> dict[str, Any]:
         sh_degree: of what is written.
     """
     extras = NodeExtras(
-        label=node.label,
-        track_id=node.track_id,
+        label=node.label[:LONGEST_WORD],
+        track_id=node.track_id[:LONGEST_WORD],
         size_m=[float(size) for size in node.size_m],
         antialiased=node.cloud.antialiased,
         sh_degree=sh_degree,

@@ -8,6 +8,7 @@ from genre_tasks.exchange.checks import check_finite_cloud, read_file
 from genre_tasks.exchange.gltf.accessors import AccessorReader
 from genre_tasks.exchange.gltf.binary_container import split_container
 from genre_tasks.exchange.gltf.document import parse_document
+from genre_tasks.exchange.gltf.extras import LONGEST_WORD
 from genre_tasks.exchange.gltf.scene_reader import SceneReader
 from genre_tasks.exchange.gltf.scene_writer import SceneWriter
 from genre_tasks.exchange.gltf.splat_attributes import MOST_SH_DEGREE
@@ -72,6 +73,8 @@ class GlbFormat:
             losses.append(f"Spherical harmonics of degree {degree} are cut to degree {MOST_SH_DEGREE}.")
         if any(node.cloud.antialiased for node in scene.nodes):
             losses.append("The format glTF has no sign for anti-aliasing: this tool alone reads it back.")
+        if any(max(len(node.label), len(node.track_id)) > LONGEST_WORD for node in scene.nodes):
+            losses.append(f"Labels and track ids of actors are cut to {LONGEST_WORD} characters.")
         return tuple(losses)
 
 

@@ -30,7 +30,7 @@ from genre_tasks.logs.types import Float64
 
 _REMEDY = "Export it again, or check it with a glTF validator."
 _MATRIX_BYTES = 16 * 8
-_UNFIT = re.compile(r"[^A-Za-z0-9._-]+")
+_UNFIT = re.compile(r"[^\w.-]+")
 _LONGEST_NAME = 80
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+from pxr import Tf
+
 from genre_tasks.errors import InputError
 from genre_tasks.exchange.checks import check_finite_cloud, measure_file
 from genre_tasks.exchange.types import ExchangeScene
@@ -50,6 +52,7 @@ class UsdFormat:
 
         Raises:
             InputError: a value is not finite, or the scene is too large for a package.
+            OSError: the file cannot be written.
         """
         for node in scene.nodes:
             check_finite_cloud(path, node.cloud)
@@ -60,7 +63,11 @@ class UsdFormat:
         # Beside the target: moving it there must not copy it to another disk.
         with temporary_folder(path.parent) as folder:
             layer = folder / f"{_LAYER_NAME}{'.usdc' if suffix == '.usdz' else suffix}"
-            write_stage(layer, scene, path)
+            try:
+                write_stage(layer, scene, path)
+            except Tf.ErrorException as error:
+                # All values were checked: it is the disk, and OpenUSD keeps the number of the error to itself.
+                raise OSError("OpenUSD cannot write the layer") from error
             if suffix == ".usdz":
                 _check_size(layer.stat().st_size, path)
                 write_package(path, layer)

@@ -9,7 +9,7 @@ from typing import Any, TextIO
 
 from genre_tasks.errors import InputError
 from genre_tasks.logs.file_kinds import describe_non_json
-from genre_tasks.logs.file_reading import describe_os_error
+from genre_tasks.logs.file_reading import build_object, describe_os_error
 
 REMEDY = "Unpack the metadata of nuScenes again."
 
@@ -30,24 +30,36 @@ def stream_rows(path: Path, log: str) -> Iterator[dict[str, Any]]:
         The objects; no more than a megabyte of the file is held at a time, or the longest object.
 
     Raises:
-        InputError: the file is missing, unreadable, cut off, or no list of objects.
+        InputError: the file is missing, unreadable, cut off, damaged, or no list of objects.
     """
+    count = 0
     try:
         with path.open(encoding="utf-8-sig") as file:
-            yield from _split_rows(_TextWindow(file))
+            for row in _split_rows(_TextWindow(file)):
+                yield row
+                count += 1
     except FileNotFoundError as error:
         raise InputError(f"the table {path.name} is missing", remedy=REMEDY, file=path, log=log) from error
     except OSError as error:
         raise InputError(describe_os_error(error), remedy=REMEDY, file=path, log=log) from error
     # Brackets within brackets may overflow the interpreter's stack.
     except (ValueError, RecursionError) as error:
-        raise InputError(_describe(path, error), remedy=REMEDY, file=path, log=log) from error
+        raise InputError(_describe(path, count, error), remedy=REMEDY, file=path, log=log) from error
 
 
-def _describe(path: Path, error: Exception) -> str:
+def _describe(path: Path, count: int, error: Exception) -> str:
     with path.open("rb") as file:
         kind = describe_non_json(file.read(1024))
-    return f"the table is no list of JSON objects ({error})" if kind is None else f"no table: the file is {kind}"
+    if kind is not None:
+        return f"no table: the file is {kind}"
+    # Places in these errors are those in a part of the file.
+    if isinstance(error, json.JSONDecodeError):
+        reason = error.msg
+    elif isinstance(error, UnicodeDecodeError):
+        reason = "bytes are no UTF-8"
+    else:
+        reason = str(error)
+    return f"the table is no list of JSON objects (after {count} rows: {reason})"
 
 
 class _TextWindow:
@@ -77,18 +89,21 @@ class _TextWindow:
 
 
 def _split_rows(window: _TextWindow) -> Iterator[dict[str, Any]]:
-    decode = json.JSONDecoder().raw_decode
+    decode = json.JSONDecoder(object_pairs_hook=build_object).raw_decode
     _expect(window, "[")
-    if window.peek() == "]":
-        return
-    while True:
+    is_first = True
+    while window.peek() != "]":
+        if not is_first:
+            _expect(window, ",")
+        is_first = False
         # Numbers alone could be cut in two without notice; objects end with a bracket.
         if window.peek() != "{":
             raise ValueError(f"an object was expected, found {window.peek()!r}")
         yield _decode_row(window, decode)
-        if window.peek() == "]":
-            return
-        _expect(window, ",")
+    window.start += 1
+    # Rows behind a bracket that damage has made would be lost without notice.
+    if window.peek():
+        raise ValueError(f"{window.peek()!r} stands behind the end of the list")
 
 
 def _expect(window: _TextWindow, character: str) -> None:

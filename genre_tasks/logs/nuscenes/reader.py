@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -27,7 +26,7 @@ from genre_tasks.logs.nuscenes.box_interpolation import (
     leave_out_bad_boxes,
 )
 from genre_tasks.logs.nuscenes.scene_address import SceneAddress, parse_scene_address
-from genre_tasks.logs.nuscenes.scene_index import open_scene_index
+from genre_tasks.logs.nuscenes.scene_index import read_scene_index
 from genre_tasks.logs.nuscenes.scene_rows import SceneRows, SensorData, read_scene
 from genre_tasks.logs.recorded_log import RecordedLog
 from genre_tasks.logs.types import Camera, CuboidTrack, Float64, Lens, Sweep, Truth
@@ -70,8 +69,7 @@ def open_nuscenes(rest: str) -> NuScenesLog:
     """
     address = parse_scene_address(rest)
     uri = f"nuscenes:{rest}"
-    with closing(open_scene_index(address.tables, uri)) as index:
-        rows = read_scene(index, address.scene, address.tables, uri)
+    rows = read_scene_index(address.tables, uri, lambda index: read_scene(index, address.scene, address.tables, uri))
     return NuScenesLog(uri, address, rows)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fnmatch
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from urllib.parse import quote
 
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.logs.log_address import split_log_address
-from genre_tasks.logs.nuscenes.scene_index import open_scene_index
+from genre_tasks.logs.nuscenes.scene_index import read_scene_index
 from genre_tasks.logs.nuscenes.scene_rows import list_scene_names
 from genre_tasks.user_paths import expand_user_path
 
@@ -110,8 +109,7 @@ def list_scenes(rest: str) -> list[str]:
         InputError: there are no tables, or they cannot be read.
     """
     address = parse_scene_address(rest)
-    with closing(open_scene_index(address.tables, f"nuscenes:{rest}")) as index:
-        names = list_scene_names(index)
+    names = read_scene_index(address.tables, f"nuscenes:{rest}", list_scene_names)
     # Only a star stands for other characters, as in names of folders.
     pattern = address.scene.replace("[", "[[]").replace("?", "[?]")
     folder = expand_user_path(split_log_address(rest, _OPTIONS, "nuScenes")[0]).parent

@@ -10,22 +10,24 @@ import hashlib
 import os
 import sqlite3
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from genre_tasks.atomic_path import atomic_path
 from genre_tasks.cache_folder import find_cache_folder
 from genre_tasks.errors import InputError, ResourceError
 from genre_tasks.logs.nuscenes.json_rows import REMEDY, stream_rows
+from genre_tasks.logs.nuscenes.scene_rows import write_row_digests
 
 # Another number makes indexes of older releases useless.
-_INDEX_VERSION = 1
+_INDEX_VERSION = 2
 _CACHE_KIBIBYTES = 1 << 16
 _MAX_SENSORS = 1 << 20
 _RADAR = "radar"
 _MAX_FLOAT = 1e300
+_Rows = TypeVar("_Rows")
 
 
 @dataclass(frozen=True)
@@ -84,22 +86,55 @@ def open_scene_index(tables: Path, log: str, folder: Path | None = None) -> sqli
         InputError: a table is missing, malformed, or lacks a column.
         ResourceError: the index cannot be written.
     """
-    # One index for all scenes: reading the tables for each scene would take as long for every one.
-    path = (folder or find_cache_folder()) / "nuscenes" / f"{_digest_tables(tables, log)}.sqlite"
+    path = _locate_index(tables, log, folder)
     try:
         if not path.is_file():
             _write_index(tables, path, log)
         try:
-            index = _connect(path)
+            return _connect(path)
         except sqlite3.DatabaseError:
             # A loss of power may leave half a file, which would be an error of every scene for good.
             _write_index(tables, path, log)
-            index = _connect(path)
+            return _connect(path)
     except (OSError, sqlite3.DatabaseError) as error:
-        remedy = "Free space, or set GENRE_CACHE_DIR to a folder that can be written."
-        raise ResourceError(f"the index cannot be written ({error})", remedy=remedy, file=path, log=log) from error
-    index.row_factory = sqlite3.Row
-    return index
+        raise _describe_unwritable(error, path, log) from error
+
+
+def read_scene_index(tables: Path, log: str, read: Callable[[sqlite3.Connection], _Rows]) -> _Rows:
+    """Reads from the index of a version's tables; one that turns out to be damaged is made again.
+
+    Args:
+        tables: folder of a version, such as ``v1.0-mini``.
+        log: URI of the log, for errors.
+        read: reads from the index, and raises ``sqlite3.DatabaseError`` where it is damaged.
+
+    Returns:
+        What ``read`` returns.
+
+    Raises:
+        InputError: as :func:`open_scene_index` or ``read`` raises it.
+        ResourceError: the index cannot be written, or not be read right afterwards.
+    """
+    with suppress(sqlite3.DatabaseError), closing(open_scene_index(tables, log)) as index:
+        return read(index)
+    # A damaged page in the middle shows only now, as SQLite looks at a page when its rows are wanted.
+    path = _locate_index(tables, log)
+    try:
+        _write_index(tables, path, log)
+        with closing(_connect(path)) as index:
+            return read(index)
+    except (OSError, sqlite3.DatabaseError) as error:
+        raise _describe_unwritable(error, path, log) from error
+
+
+def _locate_index(tables: Path, log: str, folder: Path | None = None) -> Path:
+    # One index for all scenes: reading the tables for each scene would take as long for every one.
+    return (folder or find_cache_folder()) / "nuscenes" / f"{_digest_tables(tables, log)}.sqlite"
+
+
+def _describe_unwritable(error: Exception, path: Path, log: str) -> ResourceError:
+    remedy = "Free space, or set GENRE_CACHE_DIR to a folder that can be written."
+    return ResourceError(f"the index cannot be written ({error})", remedy=remedy, file=path, log=log)
 
 
 def _write_index(tables: Path, path: Path, log: str) -> None:
@@ -114,6 +149,7 @@ def _write_index(tables: Path, path: Path, log: str) -> None:
 def _connect(path: Path) -> sqlite3.Connection:
     """Opens an index to read it, and reads a row of every table: SQLite looks at a file only when it is asked."""
     index = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
+    index.row_factory = sqlite3.Row
     try:
         for name in _TABLES:
             # Names are those above, and no values of files.
@@ -154,6 +190,7 @@ def _build_index(tables: Path, path: Path, log: str) -> None:
                 raise InputError("two rows have the same token", remedy=REMEDY, file=file, log=log) from error
             for column in table.indexed:
                 index.execute(f"CREATE INDEX {name}_by_{column} ON {name} ({column})")
+        write_row_digests(index)
         index.execute("COMMIT")
 
 

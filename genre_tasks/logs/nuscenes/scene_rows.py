@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from genre_tasks.errors import InputError
 from genre_tasks.logs.labelled_boxes import MAX_BOXES
 from genre_tasks.logs.nuscenes.json_rows import REMEDY
+from genre_tasks.logs.nuscenes.row_digests import check_rows, create_digest_table, write_row_digest
 from genre_tasks.logs.types import Float64
 from genre_tasks.suggestions import did_you_mean
 
@@ -21,6 +22,7 @@ _MAX_SCENES_LISTED = 10
 _MAX_ROWS = MAX_BOXES
 _MIN_QUATERNION_NORM = 1e-6
 
+_SCENE_QUERY = "SELECT name, token FROM scene ORDER BY name, token"
 # Outer joins, so that a token that points nowhere is seen and not left out.
 _DATA_QUERY = """
     SELECT data.*, calibrated.token AS calibrated, sensor.token AS sensor, pose.token AS pose,
@@ -35,15 +37,16 @@ _DATA_QUERY = """
         LEFT JOIN calibrated_sensor AS calibrated ON calibrated.token = calibrated_sensor_token
         LEFT JOIN sensor ON sensor.token = sensor_token
         LEFT JOIN ego_pose AS pose ON pose.token = ego_pose_token
-    WHERE scene_token = ? ORDER BY data.timestamp, data.token LIMIT ?
+    WHERE scene_token = :scene ORDER BY data.timestamp, data.token LIMIT :limit
 """
 _BOX_QUERY = """
     SELECT box.*, sample.timestamp AS timestamp, instance.token AS instance, category.name AS label
     FROM sample JOIN sample_annotation AS box ON box.sample_token = sample.token
         LEFT JOIN instance ON instance.token = instance_token
         LEFT JOIN category ON category.token = category_token
-    WHERE scene_token = ? ORDER BY sample.timestamp, box.token LIMIT ?
+    WHERE scene_token = :scene ORDER BY sample.timestamp, box.token LIMIT :limit
 """
+_QUERIES = {"scene": _SCENE_QUERY, "sample_data": _DATA_QUERY, "sample_annotation": _BOX_QUERY}
 # Column that is null where a token points nowhere → the row's token, its table, the table it points to.
 _DATA_LINKS = {
     "calibrated": ("calibrated_sensor_token", "sample_data", "calibrated_sensor"),
@@ -139,13 +142,29 @@ class SceneRows:
     boxes: SceneBoxes
 
 
+def write_row_digests(index: sqlite3.Connection) -> None:
+    """Writes what :func:`read_scene` and :func:`list_scene_names` compare their rows with.
+
+    Args:
+        index: whose tables are complete.
+    """
+    create_digest_table(index)
+    tokens = [token for _, token in _select(index, "scene")]
+    parts = [("scene", ""), *((table, token) for token in tokens for table in ("sample_data", "sample_annotation"))]
+    for table, scene in parts:
+        write_row_digest(index, table, scene, _select(index, table, scene))
+
+
 def list_scene_names(index: sqlite3.Connection) -> list[str]:
     """Lists the names of all scenes of a version, sorted.
 
     Args:
         index: of the version's tables.
+
+    Raises:
+        sqlite3.DatabaseError: the index is damaged.
     """
-    return [name for (name,) in index.execute("SELECT name FROM scene ORDER BY name")]
+    return [row["name"] for row in _fetch(index, "scene")]
 
 
 def read_scene(index: sqlite3.Connection, name: str, tables: Path, log: str) -> SceneRows:
@@ -162,15 +181,16 @@ def read_scene(index: sqlite3.Connection, name: str, tables: Path, log: str) -> 
 
     Raises:
         InputError: there is no such scene, or a row points to one that is not there.
+        sqlite3.DatabaseError: the index is damaged.
     """
+    scenes = _fetch(index, "scene")
     # Names are what users know; nothing in the tables keeps two scenes from having the same one.
-    scenes = index.execute("SELECT token FROM scene WHERE name = ?", (name,)).fetchall()
-    if len(scenes) != 1:
-        raise _describe_no_scene(index, name, len(scenes), tables, log)
-    token = scenes[0]["token"]
-    data = _fetch(index, _DATA_QUERY, token, tables / "sample_data.json", log)
+    tokens = [row["token"] for row in scenes if row["name"] == name]
+    if len(tokens) != 1:
+        raise _describe_no_scene([row["name"] for row in scenes], name, len(tokens), tables, log)
+    data = _fetch_of_scene(index, "sample_data", tokens[0], tables, log)
     _check_links(data, _DATA_LINKS, tables, log)
-    boxes = _fetch(index, _BOX_QUERY, token, tables / "sample_annotation.json", log)
+    boxes = _fetch_of_scene(index, "sample_annotation", tokens[0], tables, log)
     _check_links(boxes, _BOX_LINKS, tables, log)
     file = tables / "sample_data.json"
     mounts = _compose(data, "mount", tables / "calibrated_sensor.json", log)
@@ -186,19 +206,29 @@ def read_scene(index: sqlite3.Connection, name: str, tables: Path, log: str) -> 
     return SceneRows(cameras, lidars, _build_boxes(boxes))
 
 
-def _describe_no_scene(index: sqlite3.Connection, name: str, count: int, tables: Path, log: str) -> InputError:
-    names = list_scene_names(index)
+def _describe_no_scene(names: Sequence[str], name: str, count: int, tables: Path, log: str) -> InputError:
     known = ", ".join(names[:_MAX_SCENES_LISTED]) + (", …" if len(names) > _MAX_SCENES_LISTED else "")
     problem = f"{tables.name} has {count} scenes of the name {name!r}"
     remedy = f"{did_you_mean(name, names)}It has {known or 'none'}."
     return InputError(problem, remedy=remedy, file=tables / "scene.json", log=log)
 
 
-def _fetch(index: sqlite3.Connection, query: str, scene: str, file: Path, log: str) -> list[sqlite3.Row]:
-    rows = index.execute(query, (scene, _MAX_ROWS + 1)).fetchall()
+def _fetch_of_scene(index: sqlite3.Connection, table: str, scene: str, tables: Path, log: str) -> list[sqlite3.Row]:
+    rows = _fetch(index, table, scene)
     if len(rows) > _MAX_ROWS:
-        raise InputError(f"a scene has more than {_MAX_ROWS} rows", remedy=REMEDY, file=file, log=log)
+        problem = f"a scene has more than {_MAX_ROWS} rows"
+        raise InputError(problem, remedy=REMEDY, file=tables / f"{table}.json", log=log)
     return rows
+
+
+def _fetch(index: sqlite3.Connection, table: str, scene: str = "") -> list[sqlite3.Row]:
+    rows = _select(index, table, scene).fetchall()
+    check_rows(index, table, scene, rows)
+    return rows
+
+
+def _select(index: sqlite3.Connection, table: str, scene: str = "") -> sqlite3.Cursor:
+    return index.execute(_QUERIES[table], {"scene": scene, "limit": _MAX_ROWS + 1})
 
 
 def _check_links(rows: list[sqlite3.Row], links: dict[str, tuple[str, str, str]], tables: Path, log: str) -> None:
