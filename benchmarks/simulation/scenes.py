@@ -21,7 +21,7 @@ from flows.simulation.stage_scenes import StageScenes
 from genre_tasks.config import PipelineConfig
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.ego_paths.recorded_path import join_recorded_path
-from genre_tasks.ego_paths.world_actors import list_world_actors
+from genre_tasks.ego_paths.world_actors import list_parked_actors, list_world_actors
 from genre_tasks.logs.synthetic.edited_truth import TruthView
 from genre_tasks.logs.synthetic.log import SyntheticStreet
 from genre_tasks.logs.types import Float64, Lens
@@ -125,7 +125,8 @@ class LogScenes:
         """
         config = self.config.simulate
         center_ahead_m = find_center_ahead(self.case.log, config.center_ahead_m)
-        actors = list_world_actors(self.chunks)
+        parked = list_parked_actors(cached_log(self.case.log).tracks(), self.chunks)
+        actors = (*list_world_actors(self.chunks), *parked)
         return plan_rollout(rollout, self.recorded, config, actors, center_ahead_m=center_ahead_m)
 
     @property

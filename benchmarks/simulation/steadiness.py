@@ -63,7 +63,7 @@ def measure_flicker(case: SimulationCase, poses: int = TRUE_POSES, fixers: bool 
         first = max(0, (len(planned.path) - poses) // 2)
         path = cut_path(planned.path, first, poses)
         values = _measure_versions(scenes, path, street, fixers)
-        found.append({"rollout": str(rollout), "strength": planned.strength, "poses": len(path), "flicker": values})
+        found.append({"rollout": str(planned), "strength": planned.strength, "poses": len(path), "flicker": values})
     return {"log": case.log, "chunks": list(case.chunks), "rollouts": found}
 
 
@@ -177,7 +177,7 @@ def measure_handover(case: SimulationCase) -> Row:
         cut = _measure_steps(scenes, planned.path, None)
         found.append(
             {
-                "rollout": str(rollout),
+                "rollout": str(planned),
                 "border_psnr": [dict(h.candidates).get(h.border_frame) for h in handovers],
                 "seam_psnr": [h.psnr_db if math.isfinite(h.psnr_db) else None for h in handovers],
                 "largest_at_fade": max((s.difference for s in faded if s.is_handover), default=None),

@@ -74,6 +74,9 @@ class PlannedRollout:
     strength: float
     collisions: tuple[str, ...] = ()
 
+    def __str__(self) -> str:
+        return str(replace(self.rollout, start_offset_m=self.start_offset_m))
+
 
 def plan_rollout(
     rollout: TableRollout,
