@@ -100,8 +100,10 @@ def status(
     file = state / "env"
     if not file.exists():
         raise InputError("no services were started", remedy="Start them by `genre ops up`.", file=file)
+    # Also before they are printed as they are: a shell would take half of a value for all of it.
+    values = read_client_environment(file)
     if json:
-        print_outcome("done", {"environment": read_client_environment(file)})
+        print_outcome("done", {"environment": values})
         return
     typer.echo(file.read_text(), nl=False)
 
@@ -109,7 +111,9 @@ def status(
 @app.command(name="down")
 def down(
     folder: FolderOption = None,
-    delete: Annotated[bool, typer.Option("--delete", help="Remove data, logs and passwords too.")] = False,
+    delete: Annotated[
+        bool, typer.Option("--delete", help="Remove data, logs and passwords too, but no trainings.")
+    ] = False,
 ) -> None:
     """Stop all services, workers first.
 

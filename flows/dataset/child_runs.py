@@ -12,6 +12,9 @@ SILENT = "SILENT"
 """The server missed heartbeats of a run and calls it Crashed; by its heartbeats it may live nevertheless."""
 ACTIVE_STATES = frozenset({"SCHEDULED", "PENDING", "RUNNING", "PAUSED", "CANCELLING", SILENT})
 """Types of states in which a run may still do something."""
+# One that is being cancelled sends until its worker has stopped it.
+SENDING_STATES = frozenset({"RUNNING", "CANCELLING", SILENT})
+"""Types of states in which a living run sends heartbeats."""
 
 
 @dataclass(frozen=True)

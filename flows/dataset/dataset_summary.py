@@ -1,18 +1,20 @@
-"""What a dataset's report and record show: every log with its metrics, what failed and why, and the worst views."""
+"""What a dataset's report and record show: every log or chunk with metrics, what failed and why, the worst views."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from flows.dataset.setting_differences import LogDifference, SettingDifference, count_differences, list_differences
 from flows.dataset.worst_views import WorstView, find_worst_views
 from flows.observability.redaction import redact
 from flows.reconstruction.range_record import FOLDER as RANGES
 from flows.reconstruction.range_record import read_range_record
 from flows.reconstruction.run_records import find_run_record, name_run_folder
-from genre_tasks.errors import GenreError, InputError
+from genre_tasks.errors import GenreError
 from storage.opening import open_store
 
 SCENE_STAGES = ("initial", "gnet", "enet")
@@ -44,11 +46,12 @@ class LogFailure:
 
 @dataclass(frozen=True)
 class LogSummary:
-    """One log of the dataset.
+    """One log of the dataset, or one chunk of a log where every chunk has a run of its own.
 
     Attributes:
         log: the log's URI.
         status: done, partly_done, failed, running or waiting.
+        chunk: number of the chunk that the run was about; ``None`` for all chunks of the log.
         run: the run's name; empty where it has none.
         seconds: wall time of the log's run.
         chunks: how many are done.
@@ -62,6 +65,7 @@ class LogSummary:
 
     log: str
     status: str
+    chunk: int | None = None
     run: str = ""
     seconds: float = 0.0
     chunks: int = 0
@@ -74,30 +78,13 @@ class LogSummary:
 
 
 @dataclass(frozen=True)
-class SettingDifference:
-    """A setting that some logs were not made with as the preset has it.
-
-    Attributes:
-        key: ``section.key``.
-        preset: the preset's value.
-        used: the value that was used.
-        logs: how many logs were made so.
-    """
-
-    key: str
-    preset: Any
-    used: Any
-    logs: int
-
-
-@dataclass(frozen=True)
 class DatasetSummary:
     """A dataset's run, complete or under way.
 
     Attributes:
         preset: the preset that all logs started from.
         store: path or URI of the store, without credentials.
-        logs: one entry for each log, in the order of the outcomes.
+        logs: one entry for each log, or for each chunk that has a run of its own, in the order of the outcomes.
         failures: what is not done.
         differs: settings that differ from the preset.
         worst_views: pictures of the chunks with the lowest accuracy, the worst first.
@@ -110,8 +97,22 @@ class DatasetSummary:
     differs: tuple[SettingDifference, ...] = ()
     worst_views: tuple[WorstView, ...] = ()
 
+    @property
+    def is_by_chunk(self) -> bool:
+        """Whether chunks have runs of their own, so that a log may have several entries."""
+        return any(log.chunk is not None for log in self.logs)
+
+    @property
+    def log_count(self) -> int:
+        """How many logs there are.
+
+        >>> DatasetSummary("demo", "store", (LogSummary("a", "done", 0), LogSummary("a", "done", 1))).log_count
+        1
+        """
+        return len({log.log for log in self.logs}) if self.is_by_chunk else len(self.logs)
+
     def count(self, status: str) -> int:
-        """Counts the logs that ended so.
+        """Counts the entries that ended so.
 
         Args:
             status: such as ``done``.
@@ -140,7 +141,8 @@ class DatasetSummary:
 def summarise_dataset(store: str, preset: str, outcomes: Sequence[Mapping[str, Any]]) -> DatasetSummary:
     """Gathers what the report of a dataset shows from the records of its runs.
 
-    A record that is missing or damaged becomes a failure with the reason; the other logs are shown nevertheless.
+    A record that is missing or damaged becomes a failure with the reason, and so does a damaged part of one. All else
+    is shown nevertheless.
 
     Args:
         store: folder (or URI) of the store.
@@ -163,30 +165,38 @@ def summarise_dataset(store: str, preset: str, outcomes: Sequence[Mapping[str, A
     logs = []
     failures: list[LogFailure] = []
     records = []
+    differences: list[LogDifference] = []
     for outcome in outcomes:
         record: dict[str, Any] = {}
         if outcome.get("run"):
-            try:
+            with _noted(failures, outcome):
                 record = find_run_record(store, str(outcome["run"]))
-            except GenreError as error:
-                failures.append(_describe_failure(outcome, None, error.problem, error.remedy))
         failures += _find_failures(outcome, record)
         log = _summarise_log(outcome, record)
         if record:
             records.append(record)
-            try:
+            with _noted(failures, outcome):
                 log = _add_range(log, store, record)
-            except GenreError as error:
-                failures.append(_describe_failure(outcome, None, error.problem, error.remedy))
+            with _noted(failures, outcome):
+                differences += list_differences(record)
         logs.append(log)
     return DatasetSummary(
         preset=preset,
         store=redact(opened.uri),
         logs=tuple(logs),
         failures=tuple(failures),
-        differs=_count_differences(records),
+        differs=count_differences(differences),
         worst_views=find_worst_views(opened, records),
     )
+
+
+@contextmanager
+def _noted(failures: list[LogFailure], outcome: Mapping[str, Any]) -> Iterator[None]:
+    """Makes an error a failure of this one log."""
+    try:
+        yield
+    except GenreError as error:
+        failures.append(_describe_failure(outcome, _find_chunk(outcome), error.problem, error.remedy))
 
 
 def _summarise_log(outcome: Mapping[str, Any], record: Mapping[str, Any]) -> LogSummary:
@@ -200,6 +210,7 @@ def _summarise_log(outcome: Mapping[str, Any], record: Mapping[str, Any]) -> Log
     return LogSummary(
         log=redact(str(outcome["log"])),
         status=str(outcome["status"]),
+        chunk=_find_chunk(outcome),
         run=str(record.get("run", "")),
         seconds=float(outcome.get("seconds") or 0.0),
         chunks=len(chunks) or int(outcome.get("chunks") or 0),
@@ -259,8 +270,13 @@ def _find_failures(outcome: Mapping[str, Any], record: Mapping[str, Any]) -> lis
     # The reason of a log that is partly done is that of its chunks.
     if left_out or not outcome.get("why"):
         return left_out
+    return [_describe_failure(outcome, _find_chunk(outcome), str(outcome["why"]), "")]
+
+
+def _find_chunk(outcome: Mapping[str, Any]) -> int | None:
+    # The table of logs has an empty text for a run of all chunks.
     chunk = outcome.get("chunk")
-    return [_describe_failure(outcome, chunk if isinstance(chunk, int) else None, str(outcome["why"]), "")]
+    return chunk if isinstance(chunk, int) else None
 
 
 def _describe_failure(outcome: Mapping[str, Any], chunk: int | None, reason: str, remedy: str) -> LogFailure:
@@ -273,20 +289,6 @@ def _describe_failure(outcome: Mapping[str, Any], chunk: int | None, reason: str
         where=redact(str(outcome.get("where") or "")),
         attempts=int(outcome.get("attempts") or 1),
     )
-
-
-def _count_differences(records: Iterable[Mapping[str, Any]]) -> tuple[SettingDifference, ...]:
-    counts: dict[tuple[str, str], SettingDifference] = {}
-    for record in records:
-        for key, values in record["differs"].items():
-            if not isinstance(values, list) or len(values) != 2:
-                raise InputError(
-                    f"the record of run {record['run']} names no two values for {key}", remedy="Run the log again."
-                )
-            before = counts.get((key, repr(values)))
-            count = 1 if before is None else before.logs + 1
-            counts[key, repr(values)] = SettingDifference(key, values[0], values[1], count)
-    return tuple(counts[key] for key in sorted(counts))
 
 
 def _without_infinities(value: Any) -> Any:

@@ -145,12 +145,7 @@ class PrefectRuns:
 
     def read_event_delay(self) -> float:
         """Measures how far the server is behind with the events that it has received."""
-        body = {"filter": _any_event().model_dump(mode="json", exclude_unset=True), "limit": _EVENTS_PER_REQUEST}
-        response = call_server(self._client.request, "POST", "/events/filter", json=body)
-        # Both times are the server's: its answers name the time in their header.
-        now = parsedate_to_datetime(response.headers["date"])
-        received = [datetime.fromisoformat(event["received"]) for event in response.json()["events"]]
-        return (now - max(received)).total_seconds() if received else 0.0
+        return min(_read_ages(self._client, _any_event()), default=0.0)
 
     def read_stages(self, ids: Sequence[str]) -> Mapping[str, str]:
         """Reads which stage runs are in."""
@@ -265,10 +260,7 @@ def has_heartbeat(client: SyncPrefectClient, run_id: str, since_s: float) -> boo
     Returns:
         Whether there is one.
     """
-    earliest = datetime.now(UTC) - timedelta(seconds=since_s)
-    page = call_server(client.read_events, _heartbeats_of([run_id]), limit=_EVENTS_PER_REQUEST)
-    # The time of the event itself is the worker's, whose clock may be wrong.
-    return any(event.received >= earliest for event in page.events)
+    return any(age_s <= since_s for age_s in _read_ages(client, _heartbeats_of([run_id])))
 
 
 def count_heartbeats(client: SyncPrefectClient, run_id: str, since: datetime) -> int:
@@ -284,6 +276,16 @@ def count_heartbeats(client: SyncPrefectClient, run_id: str, since: datetime) ->
         Their number.
     """
     return int(call_server(client.read_events, _heartbeats_of([run_id], since), limit=1).total)
+
+
+def _read_ages(client: SyncPrefectClient, wanted: EventFilter) -> list[float]:
+    """How many seconds ago the server has received events: the clocks of this machine and of workers may be wrong."""
+    body = {"filter": wanted.model_dump(mode="json", exclude_unset=True), "limit": _EVENTS_PER_REQUEST}
+    # Prefect's client keeps the answer's header, which names the server's time, to itself.
+    response = call_server(client.request, "POST", "/events/filter", json=body)
+    now = parsedate_to_datetime(response.headers["date"])
+    received = [datetime.fromisoformat(event["received"]) for event in response.json()["events"]]
+    return [(now - moment).total_seconds() for moment in received]
 
 
 def _heartbeats_of(run_ids: Sequence[str], watched_since: datetime | None = None) -> EventFilter:

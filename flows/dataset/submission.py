@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import time
@@ -17,13 +18,11 @@ from prefect.client.schemas.filters import (
     ArtifactFilterFlowRunId,
     ArtifactFilterKey,
     FlowRunFilter,
-    FlowRunFilterState,
-    FlowRunFilterStateName,
-    FlowRunFilterStateType,
     FlowRunFilterTags,
 )
 from prefect.client.schemas.objects import FlowRun, StateType
 from prefect.client.schemas.responses import DeploymentResponse
+from prefect.client.schemas.sorting import FlowRunSort
 from prefect.exceptions import ObjectNotFound
 from prefect.states import Crashed
 
@@ -31,9 +30,9 @@ from flows.dataset.event_probe import EventProbe
 from flows.dataset.live_table import TABLE_KEY
 from flows.dataset.prefect_runs import DEPLOYMENT, count_heartbeats, dataset_tag, has_heartbeat, is_called_silent
 from flows.dataset.server_calls import call_server, read_last_outage
+from flows.dataset.start_watch import StartWatch
 from flows.dataset.supervisor import HEARTBEAT_S
-from flows.operations.heartbeat_automation import SILENT_STATE_NAME
-from genre_tasks.errors import ConfigError
+from genre_tasks.errors import ConfigError, ResourceError
 
 _log = logging.getLogger("genre")
 PARENT_DEPLOYMENT = "reconstruct-dataset/dataset"
@@ -44,7 +43,7 @@ _SILENT_S = 3.0 * HEARTBEAT_S
 _HEARTBEAT_POLL_S = 5.0
 # A server that stores no events at all would keep a dead parent for ever.
 _MOST_DELAY_S = 900.0
-_ACTIVE = [StateType.SCHEDULED, StateType.PENDING, StateType.RUNNING, StateType.PAUSED]
+_ACTIVE = frozenset({StateType.SCHEDULED, StateType.PENDING, StateType.RUNNING, StateType.PAUSED})
 
 
 @dataclass(frozen=True)
@@ -78,12 +77,15 @@ def submit_dataset(name: str, parameters: Mapping[str, Any]) -> Submission:
         _find_deployment(client, DEPLOYMENT)
         _check_pool(client, str(parameters["pool"]))
         _check_pool(client, parent.work_pool_name or "")
-        running = _find_running(client, name)
+        parents = _read_parents(client, name)
+        running = _find_running(client, parents)
         if running is not None:
             return Submission(running.id, is_new=False)
-        run = client.create_flow_run_from_deployment(
+        run = call_server(
+            client.create_flow_run_from_deployment,
             parent.id,
             parameters=dict(parameters),
+            idempotency_key=_make_key(name, parents),
             name=f"dataset {name}",
             tags=[dataset_tag(name), PARENT_TAG],
             job_variables={"env": {"PREFECT_FLOWS_HEARTBEAT_FREQUENCY": str(HEARTBEAT_S)}},
@@ -117,25 +119,42 @@ def follow_dataset(
 
     Returns:
         The type of the run's last state with its message, and the final rows.
+
+    Raises:
+        ResourceError: the flow run was deleted.
     """
     with get_client(sync_client=True) as client:
-        watch = HeartbeatWatch(client, run_id)
-        while True:
-            run = call_server(client.read_flow_run, run_id)
-            if run.state is not None and run.state.type in (StateType.SCHEDULED, StateType.PENDING):
-                # A run that waits for its worker sends no heartbeats yet.
-                watch.restart()
-            is_silent = watch.is_silent()
-            if run.state is not None and run.state.type is StateType.RUNNING and is_silent:
-                # Nobody else notices that the parent's worker died with all its processes.
-                crash_run(client, run.id)
-                continue
-            rows = _read_table(client, run_id)
-            show(rows)
-            lives = is_called_silent(run) and not is_silent
-            if run.state is not None and run.state.is_final() and not lives:
-                return f"{run.state.type.value}: {run.state.message or ''}", _read_table(client, run_id)
-            time.sleep(poll_s)
+        try:
+            return _follow(client, run_id, show, poll_s)
+        except ObjectNotFound as error:
+            raise ResourceError(
+                f"the dataset's flow run {run_id} was deleted while it was followed",
+                remedy="Run the same command again: it takes over the runs of logs that go on.",
+            ) from error
+
+
+def _follow(
+    client: SyncPrefectClient, run_id: UUID, show: Callable[[Sequence[Mapping[str, Any]]], None], poll_s: float
+) -> tuple[str, list[dict[str, Any]]]:
+    watch = HeartbeatWatch(client, run_id)
+    start_watch = StartWatch(client)
+    while True:
+        run = call_server(client.read_flow_run, run_id)
+        start_watch.check(run)
+        if run.state is not None and run.state.type in (StateType.SCHEDULED, StateType.PENDING):
+            # A run that waits for its worker sends no heartbeats yet.
+            watch.restart()
+        is_silent = watch.is_silent()
+        if run.state is not None and run.state.type is StateType.RUNNING and is_silent:
+            # Nobody else notices that the parent's worker died with all its processes.
+            crash_run(client, run.id)
+            continue
+        rows = _read_table(client, run_id)
+        show(rows)
+        lives = is_called_silent(run) and not is_silent
+        if run.state is not None and run.state.is_final() and not lives:
+            return f"{run.state.type.value}: {run.state.message or ''}", _read_table(client, run_id)
+        time.sleep(poll_s)
 
 
 def _find_deployment(client: SyncPrefectClient, name: str) -> DeploymentResponse:
@@ -158,29 +177,36 @@ def _check_pool(client: SyncPrefectClient, pool: str) -> None:
         raise ConfigError(f"no worker of the work pool '{pool}' is online", remedy=remedy)
 
 
-def _find_running(client: SyncPrefectClient, name: str) -> FlowRun | None:
+def _read_parents(client: SyncPrefectClient, name: str) -> list[FlowRun]:
+    """All parents that this dataset has had, the newest first."""
+    wanted = FlowRunFilter(tags=FlowRunFilterTags(all_=[dataset_tag(name), PARENT_TAG]))
+    # Of more than the server gives at once, the oldest are left out.
+    return client.read_flow_runs(flow_run_filter=wanted, sort=FlowRunSort.EXPECTED_START_TIME_DESC)
+
+
+def _make_key(name: str, parents: Sequence[FlowRun]) -> str:
+    """The idempotency key of the parent that follows those that the dataset has had.
+
+    Two commands at one moment know of the same parents, so that the server gives both the same run. A later command
+    knows of that run, too.
+    """
+    known = sorted(str(run.id) for run in parents)
+    return hashlib.sha256(json.dumps([name, *known]).encode()).hexdigest()
+
+
+def _find_running(client: SyncPrefectClient, parents: Sequence[FlowRun]) -> FlowRun | None:
     """The parent that is running this dataset; one without a sign of life is set to Crashed."""
-    wanted = FlowRunFilter(
-        tags=FlowRunFilterTags(all_=[dataset_tag(name), PARENT_TAG]),
-        state=FlowRunFilterState(type=FlowRunFilterStateType(any_=_ACTIVE)),
-    )
-    for run in _find_called_silent(client, name):
+    for run in parents:
         # Without waiting for one more heartbeat: it may have ended long ago.
-        if has_heartbeat(client, str(run.id), since_s=_SILENT_S):
+        if is_called_silent(run) and has_heartbeat(client, str(run.id), since_s=_SILENT_S):
             return run
-    for run in client.read_flow_runs(flow_run_filter=wanted):
-        if run.state is None or run.state.type is not StateType.RUNNING or _shows_life(client, run):
+    for run in parents:
+        if run.state is None or run.state.type not in _ACTIVE:
+            continue
+        if run.state.type is not StateType.RUNNING or _shows_life(client, run):
             return run
         crash_run(client, run.id)
     return None
-
-
-def _find_called_silent(client: SyncPrefectClient, name: str) -> list[FlowRun]:
-    wanted = FlowRunFilter(
-        tags=FlowRunFilterTags(all_=[dataset_tag(name), PARENT_TAG]),
-        state=FlowRunFilterState(name=FlowRunFilterStateName(any_=[SILENT_STATE_NAME])),
-    )
-    return client.read_flow_runs(flow_run_filter=wanted)
 
 
 def crash_run(client: SyncPrefectClient, run_id: UUID) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from flows.dataset.child_runs import ACTIVE_STATES, SILENT, ChildRun, ChildRuns
+from flows.dataset.child_runs import ACTIVE_STATES, SENDING_STATES, SILENT, ChildRun, ChildRuns
 from flows.dataset.work_units import WorkUnit
 from genre_tasks.errors import ConfigError
 
@@ -23,8 +23,6 @@ HEARTBEAT_S = 30
 _MOST_DELAY = 10.0
 Rows = list[dict[str, Any]]
 _STATUS_BY_STATE = {"SCHEDULED": "waiting", "PENDING": "starting", "RUNNING": "running", SILENT: "running"}
-# States in which a living run sends heartbeats. One that is being cancelled does until its worker has stopped it.
-_SENDING = frozenset({"RUNNING", "CANCELLING", SILENT})
 
 
 @dataclass(frozen=True)
@@ -97,12 +95,14 @@ class _Watch:
         since_s: when its state or heartbeat changed.
         heartbeat: the last one.
         is_cancelled: whether somebody has asked for its end.
+        excused: the heartbeat after which a slow poll has put off its end.
     """
 
     run: ChildRun
     since_s: float
     heartbeat: str = ""
     is_cancelled: bool = False
+    excused: str | None = None
 
 
 @dataclass
@@ -212,36 +212,36 @@ class Supervisor:
         found = self._runs.read(list(self._state.watches))
         # After the call, which waits as long as the server is away.
         now = self._clock()
-        if now - self._last_poll_s > self._limits.silent_s / 3 or self._last_outage() >= self._last_poll_s:
-            # The server was away, and heartbeats with it: what is dead shows itself from here on.
-            for watch in self._state.watches.values():
-                watch.since_s = now
+        is_slow = now - self._last_poll_s > self._limits.silent_s / 3
+        was_away = self._last_outage() >= self._last_poll_s
         for watch in list(self._state.watches.values()):
             run = found.get(watch.run.id)
             if run is None:
                 self._end_attempt(watch, {"why": "the flow run was deleted"})
                 continue
             # That the server misses heartbeats is no sign of life.
-            if run.state not in (watch.run.state, SILENT):
+            has_changed = run.state not in (watch.run.state, SILENT)
+            # Heartbeats are away with the server. Where all polls are slow, only one of them stands for an outage.
+            if has_changed or was_away or (is_slow and watch.excused != watch.heartbeat):
                 watch.since_s = now
+                watch.excused = watch.heartbeat if is_slow else None
             watch.run = run
             watch.is_cancelled |= run.state == "CANCELLING"
             self._update_row(run)
-        self._judge(list(self._state.watches.values()))
+        # Signs first: a poll may take longer than a run may be silent.
         self._read_signs_of_life()
+        self._judge(list(self._state.watches.values()))
         self._last_poll_s = self._clock()
 
     def _read_signs_of_life(self) -> None:
-        running = {id_: watch for id_, watch in self._state.watches.items() if watch.run.state in _SENDING}
+        running = {id_: watch for id_, watch in self._state.watches.items() if watch.run.state in SENDING_STATES}
         if not running:
             return
         for id_, stage in self._runs.read_stages(list(running)).items():
             self._state.rows[running[id_].run.unit]["stage"] = stage
         # Asked only for runs that may be late: most polls ask for none.
         late = [id_ for id_, watch in running.items() if self._age(watch) > self._limits.silent_s / 3]
-        if not late:
-            return
-        for id_, heartbeat in self._runs.read_heartbeats(late).items():
+        for id_, heartbeat in (self._runs.read_heartbeats(late) if late else {}).items():
             if heartbeat != running[id_].heartbeat:
                 running[id_].heartbeat = heartbeat
                 running[id_].since_s = self._clock()
@@ -253,7 +253,7 @@ class Supervisor:
             run = watch.run
             if run.state == "PENDING" and self._age(watch) > self._limits.pending_s:
                 is_ended = self._free(watch, f"not started within {self._limits.pending_s:.0f} s")
-            elif run.state in _SENDING and self._is_silent(watch):
+            elif run.state in SENDING_STATES and self._is_silent(watch):
                 is_ended = self._free(watch, f"no heartbeat for {self._limits.silent_s:.0f} s")
             else:
                 is_ended = run.state not in ACTIVE_STATES

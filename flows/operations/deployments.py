@@ -97,7 +97,9 @@ def deploy_flows(api_url: str, auth_string: str | None, pool: str, store: str, *
     names = []
     with temporary_settings(settings), get_client(sync_client=True) as client:
         if pool not in {found.name for found in client.read_work_pools()}:
-            client.create_work_pool(WorkPoolCreate(name=pool, type="process"))
+            # Another deployment may have made it just now.
+            with suppress(ObjectAlreadyExists):
+                client.create_work_pool(WorkPoolCreate(name=pool, type="process"))
         with suppress(ObjectAlreadyExists):
             client.create_work_queue(name=COORDINATOR_QUEUE, work_pool_name=pool)
         for deployment in DEPLOYMENTS:

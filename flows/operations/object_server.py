@@ -15,6 +15,7 @@ from flows.operations.service import HOST, Service, find_free_port, is_listening
 from genre_tasks.atomic_path import write_atomically
 from genre_tasks.errors import ConfigError, ResourceError
 
+_SHELL_SECONDS = 60.0
 _PORTS = ("master", "volume", "filer")
 # Each component adds 10 000 for gRPC where it is not set, which may be taken or above the highest port.
 _ALL_PORTS = [*_PORTS, *(f"{name}.grpc" for name in _PORTS), "s3.grpc"]
@@ -99,11 +100,24 @@ class ObjectServer(Service):
             return False
 
     def finish_start(self) -> None:
-        """Makes the bucket, which may exist."""
+        """Makes the bucket, which may exist.
+
+        Raises:
+            ResourceError: there is none after it, or SeaweedFS does not answer.
+        """
         words = [find_weed(), "shell", f"-master={HOST}:{self._ports['master']}.{self._ports['master.grpc']}"]
         words += [f"-filer={HOST}:{self._ports['filer']}.{self._ports['filer.grpc']}"]
         script = f"s3.bucket.create -name {self.bucket}\ns3.bucket.list\nexit\n"
-        made = subprocess.run(words, input=script, capture_output=True, text=True, check=False, timeout=60)
+        try:
+            made = subprocess.run(
+                words, input=script, capture_output=True, text=True, check=False, timeout=_SHELL_SECONDS
+            )
+        except subprocess.TimeoutExpired as error:
+            raise ResourceError(
+                f"`weed shell` has not made the bucket {self.bucket} within {_SHELL_SECONDS:.0f} s",
+                remedy="Read the log, and start again when the machine has less to do.",
+                file=self.log,
+            ) from error
         if f"  {self.bucket}" not in made.stdout:
             raise ResourceError(
                 f"no bucket {self.bucket}: {made.stdout}{made.stderr}", remedy="Read the log.", file=self.log

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from flows.operations.service import HOST, Service, keep_port, keep_secret
+from flows.prefect_api.server_thread import DATABASE_VARIABLES, database_url
 
 HEARTBEAT_SECONDS = 30
 _QUIET = {"DO_NOT_TRACK": "1", "PREFECT_SERVER_ANALYTICS_ENABLED": "false"}
@@ -80,8 +81,8 @@ class PrefectServer(Service):
         if os.environ.get(_LEVEL_VARIABLE) == "CRITICAL":
             # The command silences the server of its own process; the log of a service must say why it ended.
             variables[_LEVEL_VARIABLE] = "WARNING"
-        if self.database_url:
-            variables["PREFECT_API_DATABASE_CONNECTION_URL"] = self.database_url
+        # By both names: the database that the user has named for another server would win by the other one.
+        variables |= dict.fromkeys(DATABASE_VARIABLES, self.database_url or database_url(self.folder / "home"))
         if self.authentication:
             variables["PREFECT_SERVER_API_AUTH_STRING"] = self._auth_string()
         return {**variables, **self.env(), **self.settings}
@@ -162,11 +163,16 @@ class Worker(Service):
             words += ["--limit", str(self.limit)]
         return words
 
+    @property
+    def home(self) -> Path:
+        """The worker's ``PREFECT_HOME``, which its runs have as well."""
+        return self.folder / f"{self.name}-home"
+
     def environment(self) -> dict[str, str]:
         """Returns the clients' variables, the heartbeat and quiet OpenMP threads."""
         return {
             **_QUIET,
-            "PREFECT_HOME": str(self.folder / f"{self.name}-home"),
+            "PREFECT_HOME": str(self.home),
             "PREFECT_FLOWS_HEARTBEAT_FREQUENCY": str(self.heartbeat_seconds),
             "PREFECT_LOGGING_EXTRA_LOGGERS": "genre",
             "PREFECT_LOGGING_TO_API_ENABLED": "true",

@@ -14,6 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from flows.operations.file_lock import lock_file
 from genre_tasks.atomic_path import atomic_path, write_atomically
 from genre_tasks.errors import ConfigError, ResourceError
 
@@ -274,6 +275,9 @@ def keep_secret(file: Path) -> str:
 
     Returns:
         The secret; the same in all processes that ask at once.
+
+    Raises:
+        ConfigError: the file is missing, and its folder has no locks.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
     secret = ""
@@ -291,12 +295,10 @@ def _read_secret(file: Path) -> str:
 
 def _make_secret(file: Path) -> str:
     """Makes a secret, or waits for another process that makes it; empty where that one has replaced the file."""
-    import fcntl
-
     handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o600)
     with os.fdopen(handle, "r+") as lock:
         # The empty file is the lock: the one who gets it first puts a complete file in its place.
-        fcntl.flock(lock, fcntl.LOCK_EX)
+        lock_file(lock, file)
         secret = lock.read().strip()
         if secret or not _is_still_there(file, handle):
             return secret

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shlex
 import shutil
@@ -16,6 +17,7 @@ from typing import Any
 
 from flows.operations.deployments import COORDINATOR_QUEUE, RUN_QUEUE, deploy_flows
 from flows.operations.object_server import ObjectServer
+from flows.operations.orphaned_runs import kill_runs
 from flows.operations.postgres_server import PostgresServer
 from flows.operations.prefect_services import HEARTBEAT_SECONDS, PrefectServer, Worker
 from flows.operations.service import Service, kill_group, kill_tree
@@ -27,11 +29,14 @@ from flows.operations.state_file import (
     read_records,
     write_records,
 )
-from genre_tasks.errors import ConfigError
+from genre_tasks.atomic_path import atomic_path, holds_files
+from genre_tasks.errors import ConfigError, ResourceError
 from genre_tasks.process_start import read_start_ticks
 
+_log = logging.getLogger("genre")
 _STOP_SECONDS = 40.0
 _DATA_FOLDERS = ("postgres", "server", "store-server", "workers", "store")
+_TRAINING_FOLDER = "training"
 
 
 @dataclass(frozen=True)
@@ -86,7 +91,11 @@ class Stack:
             self._ensure(server)
             env.update(server.env())
             deploy_flows(
-                server.url, env["PREFECT_API_AUTH_STRING"], self.pool, store, training_folder=self.folder / "training"
+                server.url,
+                env["PREFECT_API_AUTH_STRING"],
+                self.pool,
+                store,
+                training_folder=self.folder / _TRAINING_FOLDER,
             )
             # A run with slower heartbeats than the automation expects would be marked as crashed while it lives.
             heartbeat = {"PREFECT_FLOWS_HEARTBEAT_FREQUENCY": str(HEARTBEAT_SECONDS)}
@@ -106,27 +115,35 @@ class Stack:
         records = read_records(self.folder)
         found = records.get(service.name)
         if found is not None and found.alive:
-            # The running service's port, which ``start`` would have read.
             if hasattr(service, "port"):
-                service.port = int((service.folder / "port").read_text())
+                # As it runs: the file that ``start`` would have read may be lost.
+                service.port = found.port
             return
         service.start()
-        pid = service.pid
-        ticks = None if pid is None else read_start_ticks(pid)
-        if pid is None or ticks is None:
-            raise service._start_error("ended after its start")
-        # PostgreSQL's address holds its password, which belongs into its file of mode 600 alone.
-        url = service.url if service.name != "postgres" else f"postgresql://127.0.0.1:{getattr(service, 'port', 0)}"
-        since = datetime.now(UTC).isoformat(timespec="seconds")
-        record = ServiceRecord(service.name, pid, ticks, since, url, str(service.log))
-        write_records(self.folder, {**records, service.name: record})
+        try:
+            write_records(self.folder, {**records, service.name: _make_record(service)})
+        except BaseException:
+            # Without a record it would run on: `down` would not find it, and the next start would find its port taken.
+            service.stop()
+            raise
 
     def _write_env(self, env: dict[str, str]) -> None:
-        file = self.folder / "env"
-        handle = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-        with os.fdopen(handle, "w") as stream:
-            # Quoted for a shell: a state folder may have an apostrophe in its name.
-            stream.writelines(f"export {name}={shlex.quote(value)}\n" for name, value in env.items())
+        # Quoted for a shell: a state folder may have an apostrophe in its name.
+        lines = [f"export {name}={shlex.quote(value)}\n" for name, value in env.items()]
+        with atomic_path(self.folder / "env") as part:
+            part.touch(mode=0o600)
+            part.write_text("".join(lines))
+
+
+def _make_record(service: Service) -> ServiceRecord:
+    pid = service.pid
+    ticks = None if pid is None else read_start_ticks(pid)
+    if pid is None or ticks is None:
+        raise service._start_error("ended after its start")
+    # PostgreSQL's address holds its password, which belongs into its file of mode 600 alone.
+    url = service.url if service.name != "postgres" else f"postgresql://127.0.0.1:{getattr(service, 'port', 0)}"
+    since = datetime.now(UTC).isoformat(timespec="seconds")
+    return ServiceRecord(service.name, pid, ticks, since, url, str(service.log))
 
 
 def stop_stack(folder: Path, delete: bool = False) -> list[str]:
@@ -134,10 +151,13 @@ def stop_stack(folder: Path, delete: bool = False) -> list[str]:
 
     Args:
         folder: the state folder.
-        delete: whether data, logs and secrets are removed too.
+        delete: whether data, logs and secrets are removed too. Trainings are hours of work, and stay.
 
     Returns:
-        The names of those that ran.
+        The names of those that ran, and whose runs went on without their worker.
+
+    Raises:
+        ResourceError: the services have ended, but not all data could be removed.
     """
     if not folder.is_dir():
         return []
@@ -145,16 +165,40 @@ def stop_stack(folder: Path, delete: bool = False) -> list[str]:
         records = read_records(folder)
         stopped = []
         for record in reversed(records.values()):
-            if record.alive:
+            was_alive = record.alive
+            if was_alive:
                 _stop(record)
                 stopped.append(record.name)
+            if kill_runs(Worker(folder / "workers", {}, name=record.name).home) and not was_alive:
+                stopped.append(f"runs of {record.name}")
         (folder / "services.json").unlink(missing_ok=True)
         (folder / OPTIONS_FILE).unlink(missing_ok=True)
         (folder / "env").unlink(missing_ok=True)
         if delete:
-            for name in _DATA_FOLDERS:
-                shutil.rmtree(folder / name, ignore_errors=True)
+            _remove_data(folder)
         return stopped
+
+
+def _remove_data(folder: Path) -> None:
+    trainings = folder / _TRAINING_FOLDER
+    if holds_files(trainings):
+        _log.warning("trainings are kept in %s: remove that folder if you do not need them", trainings)
+    problems = []
+    for path in (folder / name for name in _DATA_FOLDERS):
+        # As much as can be removed. What stays says why, at the second time.
+        shutil.rmtree(path, ignore_errors=True)
+        try:
+            shutil.rmtree(path)
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            problems.append(f"{path.name} ({error.strerror or error})")
+    if problems:
+        raise ResourceError(
+            f"the services have ended, but data could not be removed: {', '.join(problems)}",
+            remedy="Remove these folders by hand.",
+            file=folder,
+        )
 
 
 def _stop(record: ServiceRecord) -> None:
@@ -187,7 +231,24 @@ def read_client_environment(file: Path) -> dict[str, str]:
 
     Returns:
         The values by name.
+
+    Raises:
+        ConfigError: the file is cut or damaged, as after a full disk.
     """
-    # As a shell reads them: a value may be quoted, and have spaces.
-    words = [word for word in shlex.split(file.read_text()) if word != "export"]
-    return dict(word.split("=", 1) for word in words)
+    values = _parse_exports(file.read_text(errors="replace"))
+    if values is None:
+        remedy = "Run `genre ops up` again with the same options, which writes them again."
+        raise ConfigError("the variables for clients are incomplete", remedy=remedy, file=file)
+    return values
+
+
+def _parse_exports(text: str) -> dict[str, str] | None:
+    """The values by name; ``None`` where the text is cut."""
+    try:
+        # As a shell reads them: a value may be quoted, and have spaces.
+        words = [word for word in shlex.split(text) if word != "export"]
+        values = dict(word.split("=", 1) for word in words)
+    except ValueError:
+        return None
+    # Half of a value would be taken for another one.
+    return values if text.endswith("\n") else None

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from urllib.parse import urlsplit
 
+from flows.operations.file_lock import lock_file
 from genre_tasks.atomic_path import atomic_path
-from genre_tasks.errors import ConfigError
+from genre_tasks.errors import ConfigError, ResourceError
 from genre_tasks.json_files import read_json_object
 from genre_tasks.process_start import read_start_ticks
 
@@ -46,6 +46,11 @@ class ServiceRecord:
         """Whether this very process still runs."""
         return read_start_ticks(self.pid) == self.start_ticks
 
+    @property
+    def port(self) -> int:
+        """The TCP port that it listens at; 0 where it listens nowhere."""
+        return urlsplit(self.url).port or 0
+
 
 def read_records(folder: Path) -> dict[str, ServiceRecord]:
     """Returns the records of a state folder by name, empty where there are none.
@@ -63,11 +68,23 @@ def read_records(folder: Path) -> dict[str, ServiceRecord]:
 
 
 def write_records(folder: Path, records: Mapping[str, ServiceRecord]) -> None:
-    """Replaces the records of a state folder in one step."""
-    handle, name = tempfile.mkstemp(dir=folder, prefix=".services-")
-    with os.fdopen(handle, "w") as stream:
-        json.dump({key: asdict(record) for key, record in records.items()}, stream, indent=1)
-    Path(name).replace(folder / "services.json")
+    """Replaces the records of a state folder in one step.
+
+    Raises:
+        ResourceError: they cannot be written, as on a full disk; those of before stay.
+    """
+    file = folder / "services.json"
+    text = json.dumps({name: asdict(record) for name, record in records.items()}, indent=1)
+    try:
+        with atomic_path(file) as part:
+            part.touch(mode=0o600)
+            part.write_text(text)
+    except OSError as error:
+        raise ResourceError(
+            f"the record of services cannot be written ({error.strerror})",
+            remedy="Free space there, or name another folder with --folder.",
+            file=file,
+        ) from error
 
 
 def keep_options(folder: Path, options: Mapping[str, str]) -> None:
@@ -99,17 +116,16 @@ def locked(folder: Path) -> Iterator[None]:
     """Keeps a second command out of the state folder until the first has ended.
 
     Raises:
-        ConfigError: the folder cannot be written.
+        ConfigError: the folder cannot be written, or has no locks.
     """
-    import fcntl
-
+    path = folder / "lock"
     try:
         # Enterable, so that PostgreSQL's user reaches its data; the files with secrets have mode 600.
         folder.mkdir(mode=0o711, parents=True, exist_ok=True)
-        stream = (folder / "lock").open("w")
+        stream = path.open("w")
     except OSError as error:
         remedy = "Name another with --folder."
         raise ConfigError(f"the state folder cannot be written: {error}", remedy=remedy, file=folder) from error
     with stream:
-        fcntl.flock(stream, fcntl.LOCK_EX)
+        lock_file(stream, path)
         yield

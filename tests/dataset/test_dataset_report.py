@@ -87,6 +87,45 @@ def test_missing_and_damaged_records_become_failures(tmp_path: Path) -> None:
     assert all(failure.remedy for failure in summary.failures)
 
 
+@pytest.mark.parametrize("damaged", [7, [1], {"a": 1}, None])
+def test_a_damaged_setting_of_one_run_costs_only_itself(tmp_path: Path, damaged: object) -> None:
+    write_run(tmp_path, make_record(0, LOG))
+    write_run(tmp_path, make_record(1, "b") | {"differs": {"gnet.iterations": damaged}})
+    write_range(tmp_path, name_run(1), 0, 1.0, 1.0)
+    outcomes = [make_outcome(LOG, name_run(0)), make_outcome("b", name_run(1))]
+    summary = summarise_dataset(str(tmp_path), "demo", outcomes)
+    (failure,) = summary.failures
+    assert failure.log == "b" and failure.remedy
+    assert f"run {name_run(1)} names no two values for gnet.iterations" in failure.reason
+    assert [(difference.used, difference.logs) for difference in summary.differs] == [(2, 1)]
+    assert summary.logs[1].metrics and summary.logs[1].range_m == 1.0
+    page = write_dataset_report(tmp_path / "report.html", summary).read_text()
+    assert "names no two values" in page
+
+
+def test_a_dataset_by_chunk_counts_logs_and_names_chunks(tmp_path: Path) -> None:
+    outcomes = []
+    for number, (log, chunk) in enumerate([(LOG, 0), (LOG, 1), ("b", 0)]):
+        record = make_record(number, log, chunks=1)
+        record["chunks"][0]["chunk"] = chunk
+        write_run(tmp_path, record)
+        outcomes.append(make_outcome(log, name_run(number), chunk=chunk))
+    outcomes += [
+        make_outcome("b", "f" * 12, "failed", chunk=1),
+        # A log that could not be opened where the chunks were counted.
+        make_outcome("c", "", "failed", chunk="", why="no such log"),
+    ]
+    summary = summarise_dataset(str(tmp_path), "demo", outcomes)
+    assert [(log.log, log.chunk) for log in summary.logs] == [(LOG, 0), (LOG, 1), ("b", 0), ("b", 1), ("c", None)]
+    assert [(failure.log, failure.chunk) for failure in summary.failures] == [("b", 1), ("c", None)]
+    assert summary.differs[0].logs == 2
+    rows = [row.log for row in build_log_rows(summary.logs, list_metric_columns(summary))]
+    assert rows == [f"{LOG} · chunk 0", f"{LOG} · chunk 1", "b · chunk 0", "b · chunk 1", "c"]
+    page = write_dataset_report(tmp_path / "report.html", summary).read_text()
+    assert [int(x) for x in re.findall(r"<strong>(\d+)</strong>", page)][:5] == [3, 5, 3, 0, 2]
+    assert "Dataset of 3 logs" in page and "of 5 runs" in page and "of 5 logs" not in page
+
+
 def test_chunks_that_were_left_out_have_reason_and_remedy(tmp_path: Path) -> None:
     left_out = {"class": "InputError", "message": "no source view", "remedy": "Take more frames.", "chunk": 1}
     write_run(tmp_path, make_record(0, LOG, chunks=1) | {"left_out": [left_out], "status": "partly_done"})

@@ -16,6 +16,8 @@ import pytest
 from flows.operations import ObjectServer
 from flows.operations import object_server as object_module
 from flows.operations.service import keep_port, keep_secret
+from flows.operations.stack import Stack, stop_stack
+from genre_tasks.errors import ConfigError
 
 
 @pytest.fixture
@@ -47,6 +49,23 @@ def test_a_secret_that_a_full_disk_refused_is_made_at_the_next_start(tmp_path: P
     assert len(secret) >= 32 and keep_secret(file) == file.read_text() == secret
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert list_names(tmp_path) == ["password"]
+
+
+@pytest.mark.parametrize("code", [errno.ENOLCK, errno.EOPNOTSUPP])
+def test_a_folder_without_locks_is_an_error_that_names_it(
+    tmp_path: Path, code: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of NFS without a lock service."""
+
+    def refuse(file: object, operation: int) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr("fcntl.flock", refuse)
+    for act in (Stack(tmp_path).start, lambda: stop_stack(tmp_path), lambda: keep_secret(tmp_path / "password")):
+        with pytest.raises(ConfigError, match=os.strerror(code)) as caught:
+            act()
+        assert caught.value.file == str(tmp_path)
+        assert caught.value.remedy == "Name a folder on a local disk with --folder."
 
 
 @pytest.mark.parametrize("content", ["", "\n"])

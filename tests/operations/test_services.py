@@ -34,6 +34,7 @@ from flows.operations.service import find_free_port, keep_port, keep_secret
 from flows.operations.stack import Stack, describe_services, stop_stack
 from flows.operations.state_file import ServiceRecord, keep_options, read_records, read_start_ticks, write_records
 from flows.prefect_api import connection
+from flows.prefect_api.server_thread import DATABASE_VARIABLES
 from genre_tasks.errors import ConfigError, ResourceError
 from tests.faults import small_run
 from tests.waiting import wait_until
@@ -125,6 +126,18 @@ def test_a_server_of_its_own_process_says_why_it_ends(tmp_path: Path, monkeypatc
     assert PrefectServer(tmp_path).environment()[name] == "WARNING"
     monkeypatch.setenv(name, "DEBUG")
     assert name not in PrefectServer(tmp_path).environment()
+
+
+@pytest.mark.parametrize("url", [None, "postgresql+asyncpg://u:secret@127.0.0.1/p"])
+def test_a_server_has_its_own_database_and_not_one_that_the_user_names(
+    url: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in DATABASE_VARIABLES:
+        monkeypatch.setenv(name, "postgresql+asyncpg://other@127.0.0.1/production")
+    # As the process gets them.
+    found = {**os.environ, **PrefectServer(tmp_path, url).environment()}
+    expected = url or f"sqlite+aiosqlite:///file%3A{tmp_path}/home/prefect.db?uri=true"
+    assert [found[name] for name in DATABASE_VARIABLES] == [expected] * 2
 
 
 def test_a_killed_server_remembers_who_has_slots(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The tables of the report: a row for each log, with metrics and with the seconds of stages."""
+"""The tables of the report: a row for each log or chunk, with metrics and with the seconds of stages."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class LogRow:
     """A row.
 
     Attributes:
-        log: the log's URI.
+        log: the log's URI, and the chunk's number where the row is about one chunk.
         status: for readers.
         link: to the report of its run, relative to the dataset's report; empty where there is none.
         cells: one for each column.
@@ -103,11 +103,11 @@ def build_log_rows(logs: Sequence[LogSummary], columns: Sequence[Column]) -> lis
         columns: of the table.
 
     Returns:
-        One row for each log.
+        One row for each entry of ``logs``.
     """
     return [
         LogRow(
-            log=log.log,
+            log=log.log if log.chunk is None else f"{log.log} · chunk {log.chunk}",
             status=describe_status(log.status),
             link=f"../../runs/{log.run}/report.html" if log.run else "",
             cells=tuple(_make_cell(column, log) for column in columns),

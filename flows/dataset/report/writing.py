@@ -84,6 +84,7 @@ def write_dataset_report(path: Path, summary: DatasetSummary) -> Path:
     stage_columns = list_stage_columns(summary)
     html = _render(
         summary=summary,
+        entries=_name_entries(summary),
         totals=_list_totals(summary),
         metric_columns=metric_columns,
         metric_rows=build_log_rows(summary.logs, metric_columns),
@@ -119,15 +120,22 @@ def _render(**values: object) -> str:
     return environment.get_template("dataset.html.jinja").render(**values)
 
 
+def _name_entries(summary: DatasetSummary) -> str:
+    return "runs" if summary.is_by_chunk else "logs"
+
+
 def _list_totals(summary: DatasetSummary) -> list[tuple[str, str, str]]:
     """(label, value, remark) of each tile."""
     count = len(summary.logs)
-    totals = [("Logs", str(count), "")]
+    remark = f"of {count} {_name_entries(summary)}"
+    totals = [("Logs", str(summary.log_count), "")]
+    if summary.is_by_chunk:
+        totals.append(("Runs", str(count), "one a chunk"))
     known = {log.status for log in summary.logs}
     for status in (*_STATUSES, *sorted(known - set(_STATUSES))):
         # Zero failures are news, zero waiting logs of a finished dataset are not.
         if status in known or status in _STATUSES[:3]:
-            totals.append((describe_status(status).capitalize(), str(summary.count(status)), f"of {count} logs"))
+            totals.append((describe_status(status).capitalize(), str(summary.count(status)), remark))
     seconds = sum(log.seconds for log in summary.logs)
     totals.append(("Time of all logs", describe_duration(seconds), f"{seconds:.0f} s"))
     stages = sum(log.stages for log in summary.logs)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime, timedelta
+from email.utils import format_datetime
 from types import SimpleNamespace
 from typing import Any
 from uuid import uuid4
@@ -24,6 +25,7 @@ class FakeClient:
         self.probes: set[str] = set()
         self.count_requests = 0
         self.is_behind = False
+        self.clock_error_s = 0.0
 
     def read_deployment_by_name(self, name: str) -> SimpleNamespace:
         return SimpleNamespace(name=name)
@@ -39,13 +41,21 @@ class FakeClient:
         if path == "/events":
             self.probes |= {event["resource"]["prefect.resource.id"] for event in json}
             return SimpleNamespace()
+        if path == "/events/filter":
+            newest = sorted(self.events, key=lambda event: event.occurred, reverse=True)[: json["limit"]]
+            events = [{"received": event.received.isoformat()} for event in newest]
+            now = datetime.now(UTC) + timedelta(seconds=self.clock_error_s)
+            return SimpleNamespace(
+                headers={"date": format_datetime(now, usegmt=True)},
+                json=lambda: {"events": events},
+            )
         assert path.format(**path_params or {}) == "/events/count-by/resource"
         self.count_requests += 1
         counts = [{"value": id_, "count": len(self.events)} for id_ in json["filter"]["resource"]["id"]]
         return SimpleNamespace(json=lambda: counts if self.events else [])
 
     def send(self, age_s: float, shift_s: float = 0.0) -> None:
-        received = datetime.now(UTC) - timedelta(seconds=age_s)
+        received = datetime.now(UTC) + timedelta(seconds=self.clock_error_s - age_s)
         self.events.append(SimpleNamespace(occurred=received + timedelta(seconds=shift_s), received=received))
 
 
@@ -91,6 +101,16 @@ def test_a_run_is_alive_by_the_time_of_receipt() -> None:
     assert not has_heartbeat(client, "a", since_s=90.0)  # type: ignore[arg-type]
     # A clock that is behind.
     client.send(10.0, shift_s=-3600.0)
+    assert has_heartbeat(client, "a", since_s=90.0)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("clock_error_s", [-600.0, 600.0])
+def test_a_run_is_alive_whatever_the_clock_of_this_machine(clock_error_s: float) -> None:
+    client = FakeClient()
+    client.clock_error_s = clock_error_s
+    client.send(300.0)
+    assert not has_heartbeat(client, "a", since_s=90.0)  # type: ignore[arg-type]
+    client.send(10.0)
     assert has_heartbeat(client, "a", since_s=90.0)  # type: ignore[arg-type]
 
 

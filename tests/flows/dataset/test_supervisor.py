@@ -260,3 +260,29 @@ def test_a_delay_does_not_keep_a_dead_run_for_ever() -> None:
     runs.event_delay_s = 1e6
     assert supervise(runs, [unit], limits)[0]["status"] == "done"
     assert len(runs.crashed) == 1
+
+
+def slow_down(runs: FakeRuns, seconds: float) -> None:
+    """Makes every reading of states take so long."""
+    real = runs.read
+
+    def read(ids: Sequence[str]) -> Mapping[str, ChildRun]:
+        runs.now_s += seconds
+        return real(ids)
+
+    runs.read = read  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize("states", [["RUNNING"], ["PENDING"]])
+def test_a_server_that_is_always_slow_keeps_no_dead_run_for_ever(states: list[str]) -> None:
+    runs = FakeRuns({A: [states, ["RUNNING", "COMPLETED"]]})
+    slow_down(runs, LIMITS.silent_s / 2)
+    (row,) = supervise(runs, [A])
+    assert (row["status"], row["attempts"]) == ("done", 2) and runs.crashed == ["synthetic:a/0"]
+
+
+def test_a_run_that_sends_heartbeats_lives_however_slow_the_server_is() -> None:
+    runs = FakeRuns({A: [["RUNNING"] * 15 + ["COMPLETED"]]})
+    runs.beating.add("synthetic:a/0")
+    slow_down(runs, 2 * LIMITS.silent_s)
+    assert supervise(runs, [A])[0]["status"] == "done" and not runs.crashed
