@@ -24,20 +24,31 @@ def overlapping(behaviour: str, *, real: bool) -> str:
     return f"{sum(found)} of {len(found)}"
 
 
-def test_every_rollout_with_collisions_is_counted_in_table_and_claims() -> None:
-    collided = [(row, entry) for row in ROWS for entry in row["rollouts"] if entry["collisions"]]
-    assert collided
+@pytest.mark.parametrize("real", [False, True], ids=["streets", "the real log"])
+@pytest.mark.parametrize("behaviour", ["brake", "accelerate", "lane-change", "swerve"])
+def test_rollouts_with_collisions_are_counted_in_table_and_claims(behaviour: str, real: bool) -> None:
+    count = overlapping(behaviour, real=real)
     lines = {line.split(" | ")[0]: line for line in simulation_tables.behaviours().splitlines()}
-    for row, entry in collided:
-        real = "differences" in row
-        count = overlapping(entry["behaviour"], real=real)
-        assert not count.startswith("0 ")
-        assert count in lines[f"| rollouts on {'the real log' if real else 'streets'} that overlap a road user"]
-        name = entry["behaviour"].replace("-", "_")
-        metrics = ("kernel",) if real else ("psnr", "perceptual")
-        ids = tuple(f"simulation.{metric}_{name}_vs_" for metric in metrics)
-        named = [claim for claim in CLAIMS if claim["id"].startswith(ids)]
-        assert named and all(f"{count} rollouts overlap a road user" in claim["data"] for claim in named)
+    cells = lines[f"| rollouts on {'the real log' if real else 'streets'} that overlap a road user"].split(" | ")
+    assert cells[2 + simulation_tables.BEHAVIOURS.index(behaviour.replace("-", "_"))].rstrip(" |") == count
+    name = behaviour.replace("-", "_")
+    ids = tuple(f"simulation.{metric}_{name}_vs_" for metric in (("kernel",) if real else ("psnr", "perceptual")))
+    named = [claim for claim in CLAIMS if claim["id"].startswith(ids)]
+    assert named and all(f"{count} rollouts overlap a road user" in claim["data"] for claim in named)
+
+
+@pytest.mark.parametrize("real", [False, True], ids=["streets", "the real log"])
+def test_starts_are_those_of_the_rollouts(real: bool) -> None:
+    rows = [row for row in ROWS if ("differences" in row) == real]
+    words = "the real log" if real else "streets"
+    line = next(
+        x for x in simulation_tables.behaviours().splitlines() if x.startswith(f"| starts of rollouts on {words}")
+    )
+    for cell, behaviour in zip(line.strip(" |").split(" | ")[2:], simulation_tables.BEHAVIOURS, strict=True):
+        entries = [e for row in rows for e in row["rollouts"] if e["behaviour"].replace("-", "_") == behaviour]
+        counts = dict(part.split(" at ")[::-1] for part in cell.split(", "))
+        starts = [f"{abs(e['start_offset_m']):g} m" for e in entries if e["method"] == "GenRe+"]
+        assert {start: str(starts.count(start)) for start in starts} == counts
 
 
 def test_claims_of_the_real_log_name_its_training_data() -> None:
