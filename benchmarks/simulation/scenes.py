@@ -121,7 +121,7 @@ class LogScenes:
             rollout: what to drive.
 
         Raises:
-            InputError: the log has no room for it.
+            ConfigError: the log has no room for it.
         """
         config = self.config.simulate
         center_ahead_m = find_center_ahead(self.case.log, config.center_ahead_m)

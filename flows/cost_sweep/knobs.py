@@ -227,7 +227,7 @@ def _settings_of_more_gaussians(base: PipelineConfig, enet_iterations: Sequence[
             unsplit = (start, f"gnet.iterations={most}", f"enet.iterations={enet}", *_low_rate_enet(base))
             name = f"{points}, GNet {most}, ENet {enet} at low rates"
             out.append(Setting(MORE_GAUSSIANS, name, unsplit))
-            # Between GNet alone and this there would be nothing for a third of the time.
+            # With both sides this takes half as long again as GNet alone, and budgets in between would find nothing.
             if enet == shortest:
                 out.append(Setting(MORE_GAUSSIANS, f"{name}, sides in turns", (*unsplit, IN_TURNS)))
     return out
